@@ -197,7 +197,7 @@ def texel_cases(n: int, width: int, height: int, device: torch.device) -> list[C
     fragments = replace(fragments, weight=weight, uv=uv)
     projection = replace(projection, geom=projection.geom.detach().requires_grad_())
     f, t, e = len(fragments), int((weight >= bound).sum()), len(field.texels)
-    b, p = fragments.layout.pairs, width * height
+    b, p = fragments.layout.handle.pairs, width * height
     base = scene.base_color(projection).detach().requires_grad_()
 
     def image() -> Tensor:
@@ -255,6 +255,6 @@ def _steps(
         def render(scene: Scene = scene, camera: Camera = camera, mode: str = mode) -> Tensor:
             return scene.render(camera, field_mode=mode).rgb
 
-        pairs = scene.render(camera, field_mode="off").fragments.layout.pairs
+        pairs = scene.render(camera, field_mode="off").fragments.layout.handle.pairs
         cases.append((name, training_step(render, loss, parameters), pairs))
     return cases + (gpu_gsplat.steps(n, width, height, loss, training_step, device) if options.peers else [])

@@ -1,5 +1,4 @@
-"""What is stored of texels, as their last steps see it: pages of BC7 blocks, say, or the integers of a compact
-bundle."""
+"""Codings of texels that their last optimisation steps draw: BC7 pages, or the codes of a compact bundle."""
 
 from __future__ import annotations
 
@@ -13,7 +12,6 @@ from bitymi_ns.bake.baked import Baked, encoded_pages
 from bitymi_ns.codec.pages import listed_texels, paged_texels
 from bitymi_ns.codec.quantise import EncodedAtlas
 from bitymi_ns.codec.texel_codes import TexelCodeOptions, TexelCoder, TexelCodes
-from bitymi_ns.ops import TexelTiles
 
 TO_START = 0.93
 """Share of the bytes that coded texels may have before their last steps, in which they grow a little."""
@@ -34,15 +32,15 @@ class Coding(Protocol[C]):
     """A way to store texels."""
 
     def first(self, texels: Tensor) -> C:
-        """Of texels [T, 3], before the steps."""
+        """Code texels [T, 3] before the steps."""
         ...
 
     def again(self, texels: Tensor) -> C:
-        """The same on the way, quickly."""
+        """Code texels between steps, quickly."""
         ...
 
     def last(self, coded: C) -> C:
-        """What is stored of the best that was found."""
+        """Final coding of the best texels."""
         ...
 
 
@@ -103,10 +101,15 @@ class PageTexels:
 class Pages:
     """An atlas in the format of the bake's options, in the range of values of the texels that come first."""
 
-    def __init__(self, baked: Baked, tiles: TexelTiles) -> None:
+    def __init__(self, baked: Baked, first: Tensor) -> None:
+        """
+        Args:
+            baked: with an atlas.
+            first: [N] int64, the first texel of every surfel in the list.
+        """
         assert baked.texels is not None
         self._pages, self._packing, self._options = baked.texels, baked.packing, baked.options
-        self._first, self._range = tiles.first, None
+        self._first, self._range = first, None
 
     def first(self, texels: Tensor) -> PageTexels:
         self._range = None

@@ -1,4 +1,4 @@
-"""What a descent on the training photographs keeps: the state that shows best the views that it did not learn from."""
+"""Early stopping: the state of an optimisation that shows its validation views best."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from bitymi_ns.train.losses import mean_psnr, psnr
 S = TypeVar("S")
 
 FEWEST_VIEWS = 4
-"""With fewer views none can be set aside: nothing is then learned from them."""
+"""With fewer views there are no validation views, and nothing is optimised."""
 
 
-class LookOptions(Protocol):
-    """The part of the options that decides when it is looked."""
+class StoppingOptions(Protocol):
+    """Options that decide when validation views are evaluated."""
 
     steps: int
     checks: int
     patience: int
 
 
-class Looks(Generic[S]):
-    """The looks at the views that were set aside.
+class EarlyStopping(Generic[S]):
+    """Best state by the PSNR of validation views.
 
     Attributes:
-        best: the state that showed them best, the first one where none was better; the last one where no view was set
-            aside.
-        curve: (step, dB over these views) of every look.
-        done: steps before the last look.
+        best: the state with the highest PSNR, the first one where none was better; the last one without validation
+            views.
+        curve: (step, dB over the validation views) of every evaluation.
+        done: steps before the last evaluation.
     """
 
-    def __init__(self, options: LookOptions, psnr: float, first: S) -> None:
+    def __init__(self, options: StoppingOptions, psnr: float, first: S) -> None:
         """
         Args:
-            options: see `LookOptions`.
+            options: see `StoppingOptions`.
             psnr: of the views before the first step, dB; NaN without any.
             first: the state then.
         """
@@ -48,18 +48,18 @@ class Looks(Generic[S]):
         self.best, self.curve, self.done = first, [] if math.isnan(psnr) else [(0, psnr)], 0
 
     def due(self, done: int) -> bool:
-        """Whether it is to be looked after so many steps."""
+        """True where the validation views are evaluated after so many steps."""
         return done % self._every == 0 or done == self._steps
 
-    def note(self, done: int, psnr: float, state: Callable[[], S]) -> bool:
-        """A look after so many steps.
+    def update(self, done: int, psnr: float, state: Callable[[], S]) -> bool:
+        """Record an evaluation after so many steps.
 
         Args:
             psnr: of the views, dB; NaN without any.
             state: makes a copy of the state.
 
         Returns:
-            whether more steps are worth it: some of the last looks were no worse than all before.
+            False where the last `patience` evaluations were all worse than the best.
         """
         self.done = done
         if math.isnan(psnr):
@@ -72,12 +72,12 @@ class Looks(Generic[S]):
             return True
         return not all(p < highest for _, p in self.curve[-self._patience :])
 
-    def statistics(self, views: int, set_aside: int, seconds: float, cpu_seconds: float) -> FineTuning:
-        """What is told of the descent."""
+    def statistics(self, views: int, validation_views: int, seconds: float, cpu_seconds: float) -> FineTuning:
+        """Statistics of the optimisation."""
         best_step, best = max(self.curve, key=lambda point: point[1], default=(self.done, math.nan))
         return FineTuning(
             views=views,
-            held_in_views=set_aside,
+            held_in_views=validation_views,
             steps=self.done,
             steps_asked=self._steps,
             best_step=best_step,
@@ -88,32 +88,31 @@ class Looks(Generic[S]):
         )
 
 
-def look(
+def evaluate(
     pictures: Iterable[tuple[Tensor, Tensor, Tensor | None]], count: int, progress: Progress = no_progress
 ) -> float:
     """Mean dB over the views of which any pixel counts.
 
     Args:
-        pictures: of every view what is drawn and what its photograph shows [H, W, 3], and the mask of the pixels that
-            count. They are made one by one.
+        pictures: rendering and photograph [H, W, 3] of every view, and the mask of the pixels that count; made one by
+            one.
         count: of them.
         progress: called after each.
     """
     values = []
     for rgb, target, mask in pictures:
         values.append(psnr(rgb.clamp(0.0, 1.0), target, mask))
-        progress("looking at the set-aside views", len(values), count)
+        progress("evaluating the validation views", len(values), count)
     return mean_psnr(values)
 
 
 def gain(before: float, after: float) -> Gain:
-    """Of two PSNRs, dB."""
+    """`Gain` of two PSNRs, dB."""
     return Gain(before=round(before, 4), after=round(after, 4))
 
 
-def set_aside(count: int, every: int) -> tuple[list[int], list[int]]:
-    """Numbers of the views that are looked at, every so-many-th one or with 0 none, and of those that are learned
-    from."""
+def validation_split(count: int, every: int) -> tuple[list[int], list[int]]:
+    """Indices of the validation views, every `every`-th or with 0 none, and of the views that are trained on."""
     if every == 0:
         return [], list(range(count))
     return list(range(0, count, every)), [i for i in range(count) if i % every]

@@ -1,4 +1,4 @@
-"""How precisely the numbers of surfels are kept: what an error of each costs in the pictures, measured by drawing."""
+"""Quantisation steps of the surfels' columns from the image error of rounding each, measured by drawing."""
 
 from __future__ import annotations
 
@@ -19,40 +19,41 @@ from bitymi_ns.train.views import View
 WIDEST, NARROWEST = 4.0, 1.0 / 64
 """Steps are chosen between these, in reference steps; beyond, errors are not proportional to them."""
 PER_BIT = 2.0 * math.log(2.0)
-"""An error that is proportional to the square of a step falls by this share of it for each bit that is spent."""
+"""Relative fall, per bit, of an error proportional to the square of a step."""
 
 
 class Pictures:
-    """Some of the training views, as what they look like is compared with the photographs.
+    """Training views sampled for the comparison of renderings with photographs.
 
     Attributes:
         views: how many there are.
         numbers: of all their pixels that count, three each.
     """
 
-    def __init__(self, views: Sequence[View], background: Tensor, most: int) -> None:
+    def __init__(
+        self, views: Sequence[View], background: Tensor, most: int, device: torch.device | str = "cpu"
+    ) -> None:
         """
         Args:
             views: training views, of which `most` are taken, spread over all.
             background: [3] colour behind the scene.
             most: how many.
+            device: where they are drawn.
         """
         chosen = [views[i] for i in range(0, len(views), max(1, math.ceil(len(views) / most)))]
-        self._background = background.cpu()
-        self._targets = [view.target(self._background, "cpu") for view in chosen]
-        self._masks = [None if view.mask is None else view.mask.cpu() for view in chosen]
-        self._cameras = [view.camera.to("cpu") for view in chosen]
-        self._shown = [view.shown for view in chosen]
+        self._device, self._background = device, background.to(device)
+        self._targets = [view.target(self._background, device) for view in chosen]
+        self._views = [v._replace(image=t).to(device) for v, t in zip(chosen, self._targets, strict=True)]
+        self._masks = [view.mask for view in self._views]
         self.views = len(chosen)
         counts = (t.numel() if m is None else 3 * int(m.sum()) for t, m in zip(self._targets, self._masks, strict=True))
         self.numbers = sum(counts)
 
     def of(self, scene: BakedScene) -> list[Tensor]:
         """[H, W, 3] each, as the photographs show them."""
-        drawn = (scene.render(camera, self._background) for camera in self._cameras)
-        return [
-            shown(d.rgb, d.alpha, self._background).clamp(0.0, 1.0) for shown, d in zip(self._shown, drawn, strict=True)
-        ]
+        scene = scene.to(self._device)
+        drawn = [(view, scene.render(view.camera, self._background)) for view in self._views]
+        return [view.shown(d.rgb, d.alpha, self._background).clamp(0.0, 1.0) for view, d in drawn]
 
     def square(self, pictures: Sequence[Tensor], than: Sequence[Tensor] | None = None) -> float:
         """Mean square difference from other pictures; None = from the photographs."""
@@ -69,7 +70,7 @@ class Pictures:
 
 @dataclass(frozen=True)
 class ColumnNoise:
-    """What rounding does to the pictures, by column of `REFERENCE`.
+    """Image error of rounding by column of `REFERENCE`.
 
     Attributes:
         noise: mean square error of the pictures by the square of the step; 0 = it is not seen.
@@ -79,24 +80,24 @@ class ColumnNoise:
     noise: Mapping[str, float]
     counts: Mapping[str, int]
 
-    def steps(self, price: float) -> dict[str, float]:
-        """Steps at which a further bit for each number of a column saves as much error as it is worth.
+    def steps(self, lmbda: float) -> dict[str, float]:
+        """Steps at which a further bit for each number of a column saves lambda.
 
         A column whose step is s adds D s^2 to the mean square error, and halving s takes a bit per number.
 
         Args:
-            price: mean square error of the pictures that a bit is worth; 0 = not known: the reference steps.
+            lmbda: mean square error of the images per bit; 0 = not known: the reference steps.
         """
-        if price == 0:
+        if lmbda == 0:
             return dict(REFERENCE)
-        return {name: _step(name, price * self.counts[name] / PER_BIT, self.noise[name]) for name in REFERENCE}
+        return {name: _step(name, lmbda * self.counts[name] / PER_BIT, self.noise[name]) for name in REFERENCE}
 
 
 @torch.no_grad()
 def column_noise(
     scene: BakedScene, sizes: npt.ArrayLike, pictures: Pictures, progress: Progress = no_progress
 ) -> ColumnNoise:
-    """Draws the views with each column rounded alone, at its reference step.
+    """Measure the image error of each column rounded alone, at its reference step.
 
     Args:
         scene: with lean view colours, on the CPU, of N surfels.

@@ -1,4 +1,4 @@
-"""Texels as integers: every tile's cosine transform, as coarse as the pictures allow."""
+"""Integer codes of texels: the quantised cosine transform of every tile."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LEAST_WEIGHT = 1e-3
 SPARSE_ROUNDS = 8
 """Round in which coefficients that only texels nobody sees would need are shrunk."""
 SHRINK = 0.6
-"""By how much of its step a coefficient is shrunk in a round, where all texels of its block are seen alike."""
+"""Soft threshold of an iteration as a share of the step, where all texels of a block are seen alike."""
 _ATTEMPTS = 16
 _FAST = 9
 _LARGEST_STEP = 50.0
@@ -108,7 +108,7 @@ class TexelCodes:
     Attributes:
         sizes: [N, 2] int64 sides of the tiles; (0, 0) = one constant.
         step: of the coefficients of a tile of grade 0, colour units.
-        residual: [N, 3] int64, mean of every tile or the constant, in steps: green, red less green, blue less green.
+        residual: [N, 3] int64, mean of every tile or the constant, in steps: green, red - green, blue - green.
         residual_step: of these, colour units.
         grades: [tiles] int64.
         coefficients: of every entry of `blocks_of(sizes)`, int32 [coefficients, B, 3] in their order; the channels are
@@ -146,7 +146,7 @@ class TexelCodes:
         of_tile, steps = every[tiled], _steps(self.step, self.grades)
         for blocks, coefficients in zip(blocks_of(self.sizes), self.coefficients, strict=True):
             count, texels_of = coefficients.shape[1], len(blocks.order)
-            channels = coefficients.view(texels_of, -1).T.float() @ _waves(blocks)  # [B 3, texels]: one product
+            channels = coefficients.view(texels_of, -1).T.float() @ _basis(blocks)  # [B 3, texels]: one product
             channels = channels.view(count, 3, -1).transpose(1, 2) * steps[blocks.tile, None, None]
             rgb = channels @ _OPPONENT + of_tile[blocks.tile, None, :]
             texels[blocks.texels.reshape(-1)] = rgb.reshape(-1, 3)
@@ -154,7 +154,7 @@ class TexelCodes:
 
 
 def constants(residual: npt.NDArray[np.int64], step: float) -> Tensor:
-    """[N, 3] float32 residuals of integers: green, red less green, blue less green."""
+    """[N, 3] float32 residuals of integers: green, red - green, blue - green."""
     g, r, b = np.ascontiguousarray(residual.T)
     values = np.stack([r + g, g, b + g], axis=1) * step
     return torch.from_numpy(np.clip(values, -RESIDUAL_LIMIT, RESIDUAL_LIMIT).astype(np.float32))
@@ -187,7 +187,7 @@ class SceneCodes:
 
 
 class TexelCoder:
-    """Codes texels of given tiles, as the weights of the texels in the views decide."""
+    """Coder of the texels of given tiles, weighted by their coverage in the views."""
 
     def __init__(self, sizes: Tensor, weights: Tensor, options: TexelCodeOptions) -> None:
         """
@@ -209,7 +209,7 @@ class TexelCoder:
         self.grades = (-torch.log2(mean[tiled])).round().long().clamp(low, high)
 
     def fit(self, texels: Tensor, most_bytes: float, rounds: int = SPARSE_ROUNDS) -> TexelCodes:
-        """Codes of texels [T, 3] of no more than so many bytes: makes this coder's step larger where that takes it.
+        """Code texels [T, 3] in at most `most_bytes`, with a larger step where that takes it.
 
         Bytes fall about as 1 / step. They are estimated with a fast packing until they fit nearly, and then counted.
         """
@@ -228,10 +228,10 @@ class TexelCoder:
 
     @torch.no_grad()
     def code(self, texels: Tensor, rounds: int = SPARSE_ROUNDS) -> TexelCodes:
-        """Codes of texels [T, 3].
+        """Code texels [T, 3].
 
-        Coefficients c minimise sum over texels of weight (t - t(c))^2 plus a price on their sizes: by as many rounds of
-        a gradient step and a shrinkage. So texels that nobody sees take what their visible neighbours need.
+        Coefficients c minimise sum over texels of weight (t - t(c))^2 plus an L1 penalty, by as many iterations of
+        ISTA (a gradient step and soft thresholding). So unseen texels take what their visible neighbours need.
         """
         weights = self._weights[:, None]
         means = self._sums(texels * weights) / self._sums(weights)
@@ -250,12 +250,12 @@ class TexelCoder:
         values = _forward(target)
         weight = self._weights[blocks.texels][..., None]
         most = weight.amax(dim=(1, 2), keepdim=True)
-        price = SHRINK * step * weight.mean(dim=(1, 2), keepdim=True) / most
+        threshold = SHRINK * step * weight.mean(dim=(1, 2), keepdim=True) / most
         pull = weight / most
         for _ in range(rounds):
             values = values + _forward(pull * (target - _inverse(values)))
             mean = values[:, 0, 0].clone()
-            values = torch.sign(values) * (values.abs() - price).clamp(min=0)
+            values = torch.sign(values) * (values.abs() - threshold).clamp(min=0)
             values[:, 0, 0] = mean
         return values
 
@@ -292,8 +292,8 @@ def _ordered(blocks: Blocks, values: Tensor) -> Tensor:
     return values[:, list(rows), list(columns)].transpose(0, 1).to(torch.int32).contiguous()
 
 
-def _waves(blocks: Blocks) -> Tensor:
-    """[coefficients, texels] what each coefficient adds to a block's texels, in the order in which they are kept."""
+def _basis(blocks: Blocks) -> Tensor:
+    """[coefficients, texels] basis of a block, in the order of the coefficients."""
     b_u, b_v = blocks.size
     v, u = _cosines(b_v), _cosines(b_u)
     rows, columns = (list(each) for each in zip(*blocks.order, strict=True))

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from bitymi_ns.files import reason
 from bitymi_ns.measure.report.pictures import ERROR_CAPTION, ERROR_SCALE, heat
-from bitymi_ns.ops import composite
+from bitymi_ns.ops import blended_image, composite
+from bitymi_ns.ops.constants import COLOR_BIAS
 from bitymi_ns.plugin.console import fail, say
 from bitymi_ns.plugin.export.target import replace_file, require_writable
 from bitymi_ns.plugin.export.trained import load_trained
@@ -55,10 +56,18 @@ def residual_parts(scene: Scene, output: RenderOutput) -> tuple[Tensor, Tensor]:
     p = scene.surfels
     bands = []
     for fragments in output.fragments.lists():
-        rho = fragments.weight.new_zeros(len(fragments), 3)
         if isinstance(scene.field, TexelField):
-            rho = scene.field.residual(fragments, scene.config.weight_bound)
-        elif scene.field is not None:
+            # over view colours of 0 a colour is the positive part of its residual
+            dark = torch.full_like(p["means"], -COLOR_BIAS)
+            texels, tiles, bound = scene.field.texels.detach(), scene.field.tiles, scene.config.weight_bound
+            parts = torch.cat(
+                [blended_image(fragments, output.projection, dark, t, tiles, bound)[:, :3] for t in (texels, -texels)],
+                dim=1,
+            )
+            bands.append(parts.view(fragments.height, fragments.width, 6))
+            continue
+        rho = fragments.weight.new_zeros(len(fragments), 3)
+        if scene.field is not None:
             textured = torch.nonzero(fragments.weight >= scene.config.weight_bound).squeeze(1)
             surfel = fragments.surfel[textured].long()
             u, v = fragments.uv[:, textured]

@@ -1,8 +1,8 @@
 """Differentiable torch operations over the compiled kernels; float64 twins are in `ops.reference`.
 
-Every function takes float32 or float64 tensors and dispatches on their device and dtype. `texel_image`, its
-gradient and `TexelFragments` are for the CPU only, `field_tiles` for a CUDA device only: elsewhere they raise a
-RuntimeError that says so. `baked.draw` draws a baked scene on both, by `baked_cpu` or `baked_cuda`.
+Every function takes float32 or float64 tensors and dispatches on their device and dtype. `field_tiles` is for a CUDA
+device only: elsewhere it raises a RuntimeError that says so. `baked.draw` draws a baked scene on both, by `baked_cpu`
+or `baked_cuda`.
 """
 
 from .bands import Bands, band, by_bands, fitting_lists, refused
@@ -14,15 +14,8 @@ from .field import FieldGeometry, field
 from .project import Projection, project
 from .shade import shade
 from .ssim import ssim
-from .texel import (
-    TexelDescent,
-    TexelFragments,
-    TexelTiles,
-    add_texel_gradient,
-    texel_colors,
-    texel_image,
-)
-from .trace import Fragments, masked_counts, trace
+from .texel import TexelDescent, TexelTiles
+from .trace import Fragments, masked_counts, select, trace
 from .view_color import view_color
 from .view_kinds import VIEW_COLORS
 
@@ -33,11 +26,9 @@ __all__ = [
     "Fragments",
     "Projection",
     "TexelDescent",
-    "TexelFragments",
     "TexelTiles",
     "TooManyFragments",
     "add_texel_coverage",
-    "add_texel_gradient",
     "band",
     "beta_map",
     "blended_image",
@@ -49,11 +40,10 @@ __all__ = [
     "masked_counts",
     "project",
     "refused",
+    "select",
     "shade",
     "soft_overdraw",
     "ssim",
-    "texel_colors",
-    "texel_image",
     "trace",
     "view_color",
 ]

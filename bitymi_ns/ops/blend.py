@@ -7,11 +7,11 @@ import functools
 import torch
 from torch import Tensor
 
-from .backend import cuda_backend, dense, kernel
+from .backend import cuda_backend, dense, kernel, module, on_same_device
 from .composite import check_projection
 from .constants import IMAGE_CHANNELS, MAP_CHANNELS
 from .project import Projection
-from .texel import TexelDescent, TexelTiles, backward_memory, check_texels
+from .texel import TexelDescent, TexelTiles
 from .trace import Fragments
 
 
@@ -22,35 +22,73 @@ def _no_tiles(surfels: int, dtype: torch.dtype, device: torch.device) -> TexelTi
     return TexelTiles.of_sizes(size, torch.zeros(surfels, dtype=dtype, device=device))
 
 
+def backward_memory(fragments: Fragments, maps: bool, texels: int) -> dict[str, Tensor]:
+    """Working memory of the backward kernel by name: none on the CPU.
+
+    Args:
+        fragments: of the view.
+        maps: as in `blended_image`.
+        texels: T of which gradients are added up. On CUDA a row of four numbers each; where torch is asked for
+            deterministic algorithms, int64 sums in its place, as in `field.backward_memory`.
+    """
+    like = fragments.weight
+    if not cuda_backend(like.device):
+        return {}
+    work = {"partial": like.new_empty(fragments.layout.handle.pairs, 8 if maps else 4)}  # of surfels, by pair
+    if texels and torch.are_deterministic_algorithms_enabled():
+        numbers = module(like.device).exact_size(4 * texels, 0, False)
+        work["exact_work"] = torch.empty(numbers, dtype=torch.int64, device=like.device)
+    elif texels:
+        work["texel_work"] = like.new_empty(4 * texels)
+    return work
+
+
 class _BlendedImage(torch.autograd.Function):
     @staticmethod
     def forward(ctx, weight, depth, uv, geom, base, texels, fragments, tiles, bound, maps, descent):
         g, b, t, arrays = dense(geom, geom), dense(base, geom), dense(texels, geom), fragments.arrays_for_layout
-        view = {"maps": maps, "width": fragments.width, "height": fragments.height, "layout": fragments.layout}
         image = geom.new_empty(fragments.width * fragments.height, MAP_CHANNELS if maps else IMAGE_CHANNELS)
-        ctx.given = {**view, **tiles.arrays, "bound": bound}
+        ctx.given = {"maps": maps, **fragments.view, **tiles.arrays, "bound": bound}
         kernel("blend_forward", geom)(**ctx.given, **arrays, geom=g, base=b, texels=t, image=image)
         ctx.save_for_backward(g, b, t, *arrays.values())
-        ctx.descent, ctx.names = descent, tuple(arrays)
+        ctx.descent, ctx.names, ctx.fragments = descent, tuple(arrays), fragments
         return image
 
     @staticmethod
     def backward(ctx, dimage):
         geom, base, texels, *rest = ctx.saved_tensors
         arrays = dict(zip(ctx.names, rest, strict=True))
-        _, _, moves, _, _, learns, *_ = ctx.needs_input_grad
-        out = {"dweight": torch.empty_like(arrays["weight"]), "dgeom": torch.empty_like(geom)}
+        weighs, _, moves, _, _, learns, *_ = ctx.needs_input_grad
+        out = {"dweight": torch.empty_like(arrays["weight"]) if weighs else None, "dgeom": torch.empty_like(geom)}
         out |= {"dbase": torch.empty_like(base), "dtexels": torch.empty_like(texels) if learns else None}
         out |= {"duv": torch.empty_like(arrays["uv"]) if moves else None}
         out |= {"ddepth": torch.empty_like(arrays["depth"]) if ctx.given["maps"] else None}
         step = {"rate": 0.0} if ctx.descent is None else ctx.descent.arguments(texels)
         inputs = {"geom": geom, "base": base, "texels": texels, "dimage": dense(dimage, geom)}
-        work = backward_memory(texels, 0, learns or ctx.descent is not None)
-        if cuda_backend(geom.device):  # what a pair of surfel and tile adds to its surfel
-            work["partial"] = geom.new_empty(ctx.given["layout"].pairs, 8 if ctx.given["maps"] else 4)
+        sums_texels = learns or ctx.descent is not None
+        work = backward_memory(ctx.fragments, ctx.given["maps"], len(texels) if sums_texels else 0)
         kernel("blend_backward", geom)(**ctx.given, **arrays, **inputs, **step, **work, **out)
         gradients = (out[name] for name in ("dweight", "ddepth", "duv", "dgeom", "dbase", "dtexels"))
         return *gradients, None, None, None, None, None
+
+
+def _check(fragments: Fragments, base: Tensor, texels: Tensor, tiles: TexelTiles, descent: TexelDescent | None) -> None:
+    """Refuse what does not belong together; see `blended_image`.
+
+    Raises:
+        ValueError: says what it is.
+    """
+    named = {} if descent is None else descent.arguments(texels)
+    named.pop("rate", None)
+    on_same_device(fragments.weight, base=base, texels=texels, **tiles.arrays, **named)
+    if tiles.count != texels.shape[0] or texels.shape[1:] != (3,):
+        raise ValueError(f"the tiles hold {tiles.count} texels, texels has the shape {list(texels.shape)}")
+    if tuple(base.shape) != (len(tiles.first), 3):
+        raise ValueError(f"base must have shape {[len(tiles.first), 3]}, not {list(base.shape)}")
+    if fragments.surfels != len(base):
+        raise ValueError(f"the fragments are those of {fragments.surfels} surfels, not of {len(base)}")
+    if descent is not None and (texels.requires_grad or not texels.is_contiguous()):
+        raise ValueError("texels that the backward pass moves are dense and ask for no gradient")
 
 
 def blended_image(
@@ -64,7 +102,12 @@ def blended_image(
     move_surfels: bool = True,
     descent: TexelDescent | None = None,
 ) -> Tensor:
-    """What `composite_image` gives for the colours of `texel_colors`, or of `shade` where there are no texels.
+    """Shade and composite: the image of surfels with texels, or with their view colours alone.
+
+    A fragment's colour is ReLU(ReLU(f_view(d) + 0.5) + r(u, v)), eq. (color) with the texels' residual r: bilinear
+    between the four nearest texel centres, constant beyond the outer ones. Differentiable in the fragments' weights,
+    depths and coordinates, `projection.geom`, `base` and `texels`. Along u and v the slope is that of the bilinear
+    fetch, and 0 beyond the outer texel centres.
 
     It is one pass over the fragments, and one backward, which list neither colours nor their gradients: of 64 bytes per
     fragment 40 are left on a card, 32 on the CPU. On the CPU the sums of the backward pass depend neither on the number
@@ -75,20 +118,28 @@ def blended_image(
         fragments: F fragments of an H x W view.
         projection: the view's, of N surfels.
         base: [N, 3] f_view of every surfel.
-        texels, tiles, bound, move_surfels, descent: as in `texel_colors`; without texels there is no residual.
+        texels: [T, 3] residual colours, of the fragments' dtype; None = there is no residual.
+        tiles: where they lie.
+        bound: fragments of weight below this, and those of surfels without a tile, keep ReLU(f_view + 0.5).
         maps: add depth and normal.
+        move_surfels: the gradient of r with respect to u and v reaches the fragments.
+        descent: the backward pass moves the texels that the view shows, in place, and keeps no gradient of them. So a
+            whole atlas need not be cleared and read for every view.
 
     Returns:
         [H * W, 5], with maps [H * W, 9]: as `composite_image` does.
 
     Raises:
-        ValueError: what `composite_image` and `texel_colors` raise.
+        ValueError: the tiles are not those of these texels or surfels, or the fragments those of others; or texels
+            that ask for a gradient are to be moved; or tensors lie on several devices.
     """
     check_projection(fragments, projection)
     if texels is None or tiles is None:
         tiles = _no_tiles(fragments.surfels, base.dtype, base.device)
         texels, move_surfels, descent = base.new_zeros(0, 3), False, None
-    check_texels(fragments, base, texels, tiles, descent)
+    _check(fragments, base, texels, tiles, descent)
     uv = fragments.uv if move_surfels else fragments.uv.detach()
+    if descent is not None and not base.requires_grad:
+        base = base.detach().requires_grad_()  # so that there is a backward pass, whatever else learns
     given = (projection.geom, base, texels, fragments, tiles, bound, maps, descent)
     return _BlendedImage.apply(fragments.weight, fragments.depth, uv, *given)

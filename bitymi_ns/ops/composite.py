@@ -19,7 +19,7 @@ class _CompositeImage(torch.autograd.Function):
         arrays = fragments.arrays_for_layout
         g, c = dense(geom, geom), dense(colors, geom)
         image = geom.new_empty(fragments.width * fragments.height, MAP_CHANNELS if maps else IMAGE_CHANNELS)
-        ctx.view = {"maps": maps, "width": fragments.width, "height": fragments.height, "layout": fragments.layout}
+        ctx.view = {"maps": maps, **fragments.view}
         kernel("composite_forward", geom)(**ctx.view, **arrays, geom=g, colors=c, image=image)
         ctx.save_for_backward(g, c, *arrays.values())
         ctx.names = tuple(arrays)

@@ -7,9 +7,10 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from .backend import cuda_backend, dense, kernel
+from .backend import dense, kernel
+from .blend import backward_memory
 from .constants import GEOM, IMAGE_CHANNELS
-from .texel import TexelTiles, backward_memory
+from .texel import TexelTiles
 from .trace import Fragments
 
 
@@ -52,17 +53,21 @@ def _add(
 ) -> None:
     """The same of one list with these weights, and for every pixel what it counts [H * W]: the gradient of colours of
     which no channel is cut off, as a step of length -1 by a share [T] of 1."""
-    base = total.new_zeros(fragments.surfels, 3)
-    step = {"base": base, "texels": total, "moved": total, "share": share, "rate": -1.0, "dtexels": None, "duv": None}
-    given = {**fragments.arrays_for_layout, **tiles.arrays, **step, "weight": weight, "bound": bound}
-    if cuda_backend(total.device):
-        # as colours, too: where they are 0 there is nothing to count
-        grey = (weight * counts[fragments.pixel.long()])[:, None].expand(-1, 3).contiguous()
-        memory = backward_memory(total, len(base), True)
-        kernel("texel_colors_backward", total)(**given, **memory, colors=grey, dcolors=grey, dbase=None)
-        return
+    surfels = fragments.surfels
+    base, geom = total.new_zeros(surfels, 3), total.new_zeros(surfels, GEOM)
     dimage = torch.nn.functional.pad(counts[:, None].expand(-1, 3), (0, IMAGE_CHANNELS - 3))
-    geom = total.new_zeros(fragments.surfels, GEOM)
-    view = {"maps": False, "width": fragments.width, "height": fragments.height, "layout": fragments.layout}
-    unused = {"dweight": torch.empty_like(weight), "ddepth": None, "dgeom": geom.clone(), "dbase": base.clone()}
-    kernel("blend_backward", total)(**given, **view, **unused, geom=geom, dimage=dimage)
+    step = {"texels": total, "moved": total, "share": share, "rate": -1.0, "dtexels": None}
+    kernel("blend_backward", total)(
+        **{**fragments.arrays_for_layout, "weight": weight},
+        **tiles.arrays,
+        **step,
+        **backward_memory(fragments, False, len(total)),
+        **fragments.view,
+        maps=False,
+        bound=bound,
+        base=base,
+        geom=geom,
+        dimage=dimage,
+        dgeom=torch.empty_like(geom),
+        dbase=torch.empty_like(base),
+    )

@@ -1,8 +1,9 @@
-"""What a list of fragments is made of, on a CPU and on a CUDA device alike."""
+"""Parts of a fragment list that the CPU and a CUDA device have in common."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,28 +17,46 @@ def empty_list(geom: Tensor, count: int) -> dict[str, Tensor]:
     return {name: geom.new_empty(count) for name in ("weight", "depth", "sigma")} | {"uv": geom.new_empty(2, count)}
 
 
-def empty_places(like: Tensor, count: int) -> dict[str, Tensor]:
-    """Whose they are and where, likewise: surfel, pixel [count] int32."""
+def empty_ids(like: Tensor, count: int) -> dict[str, Tensor]:
+    """Surfel and pixel of `count` fragments by name, [count] int32, likewise."""
     return {name: like.new_empty(count, dtype=torch.int32) for name in ("surfel", "pixel")}
 
 
-class Places:
-    """Whose the fragments of a list are and where. On the CPU the list's layout says it, which is enough for most of
-    what is done with a list: there the arrays are made when they are first asked for."""
+class Layout:
+    """How kernels find their way in a fragment list, and the surfel and pixel of every fragment.
 
-    def __init__(self, find: Callable[[], dict[str, Tensor]]) -> None:
-        self._find = find
-        self._found: dict[str, Tensor] | None = None
+    On the CPU the layout itself tells surfels and pixels, which is enough for most operations: there their arrays are
+    made when they are first asked for.
 
-    def arrays(self) -> dict[str, Tensor]:
+    Attributes:
+        handle: the kernels' object: `TilePacks` (csrc/cpu/packs.h) or `Pairs` (csrc/cuda/pairs.h).
+        arrays: the arrays that it refers to, by name.
+    """
+
+    def __init__(self, handle: Any, arrays: dict[str, Tensor], find_ids: Callable[[], dict[str, Tensor]]) -> None:
+        """
+        Args:
+            handle, arrays: see above.
+            find_ids: makes surfel, pixel [F] int32 by name.
+        """
+        self.handle, self.arrays = handle, arrays
+        self._find_ids = find_ids
+        self._ids: dict[str, Tensor] | None = None
+
+    def ids(self) -> dict[str, Tensor]:
         """surfel, pixel [F] int32."""
-        if self._found is None:
+        if self._ids is None:
             with torch.inference_mode(False):  # kept, so that a graph may need them later
-                self._found = self._find()
-        return self._found
+                self._ids = self._find_ids()
+        return self._ids
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays."""
+        return sum(array.nbytes for array in (*self.arrays.values(), *(self._ids or {}).values()))
 
 
-def too_many(geom: Tensor, projection: Projection, count: int, most: int, places: bool) -> TooManyFragments:
-    """The refusal of a list of `count` fragments: 5 numbers each like those of `geom`, and 8 bytes with `places`."""
-    size = 5 * geom.element_size() + 8 * places
+def too_many(geom: Tensor, projection: Projection, count: int, most: int, ids: bool) -> TooManyFragments:
+    """The refusal of a list of `count` fragments: 5 numbers each like those of `geom`, and 8 bytes with `ids`."""
+    size = 5 * geom.element_size() + 8 * ids
     return TooManyFragments(count, most, projection.camera.width, projection.camera.height, size)

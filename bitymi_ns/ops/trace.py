@@ -13,10 +13,10 @@ from . import trace_cpu, trace_cuda
 from .backend import cuda_backend, dense, function, kernel, on_same_device
 from .constants import GEOM
 from .errors import TooManyFragments
-from .fragment_list import Places
+from .fragment_list import Layout
 from .project import Projection
 
-__all__ = ["Fragments", "TooManyFragments", "masked_counts", "trace"]
+__all__ = ["Fragments", "TooManyFragments", "masked_counts", "select", "trace"]
 
 
 @dataclass
@@ -28,24 +28,19 @@ class Fragments:
         uv: [2, F] surfel coordinates in scale units, |u|, |v| <= 3, differentiable.
         depth: [F] camera z of the hit (of the centre in the low-pass branch), differentiable.
         sigma: [F] effective opacity, negative in the low-pass branch.
-        tile_start: [tiles + 1] int64, where each tile's fragments begin.
         width, height: of the image, pixels.
-        layout: how kernels find their way in the list: a handle on what packs of 4 x 4 pixels have of each surfel for
-            those of the CPU (csrc/cpu/packs.h), on the pairs of surfel and tile for those of CUDA (csrc/cuda/pairs.h).
+        layout: how kernels find their way in the list.
         surfels: number N of rows of the projection that they belong to.
-        places: whose the fragments are and where, as the layout says it.
     """
 
     weight: Tensor
     uv: Tensor
     depth: Tensor
     sigma: Tensor
-    tile_start: Tensor
     width: int
     height: int
-    layout: Any
+    layout: Layout
     surfels: int
-    places: Places
 
     def __len__(self) -> int:
         return self.weight.shape[0]
@@ -53,23 +48,33 @@ class Fragments:
     @property
     def surfel(self) -> Tensor:
         """[F] int32 row of the surfel."""
-        return self.places.arrays()["surfel"]
+        return self.layout.ids()["surfel"]
 
     @property
     def pixel(self) -> Tensor:
         """[F] int32, y * width + x."""
-        return self.places.arrays()["pixel"]
+        return self.layout.ids()["pixel"]
 
     @property
     def arrays(self) -> dict[str, Tensor]:
         """The list as kernels take it that do not know its layout, without the graph: by the names of `FragmentArrays`
         (csrc/ops/arguments.h)."""
-        return {**self._numbers, **self.places.arrays()}
+        return {**self._numbers, **self.layout.ids()}
 
     @property
     def arrays_for_layout(self) -> dict[str, Tensor]:
-        """The same for kernels that take the layout, from which those of the CPU know the places."""
-        return _for_layout(self._numbers, self.places)
+        """The same for kernels that take the layout, from which those of the CPU know surfels and pixels."""
+        return _for_layout(self._numbers, self.layout)
+
+    @property
+    def view(self) -> dict[str, Any]:
+        """Layout and size of the image, by the names of the kernels' arguments."""
+        return {"layout": self.layout.handle, "width": self.width, "height": self.height}
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays."""
+        return sum(array.nbytes for array in self._numbers.values()) + self.layout.nbytes
 
     @property
     def _numbers(self) -> dict[str, Tensor]:
@@ -90,22 +95,22 @@ class Fragments:
         return masked_counts(self, mask, n)
 
 
-def _for_layout(numbers: dict[str, Tensor], places: Places) -> dict[str, Tensor]:
-    return numbers | places.arrays() if cuda_backend(numbers["weight"].device) else numbers
+def _for_layout(numbers: dict[str, Tensor], layout: Layout) -> dict[str, Tensor]:
+    return numbers | layout.ids() if cuda_backend(numbers["weight"].device) else numbers
 
 
 class _Trace(torch.autograd.Function):
     @staticmethod
     def forward(ctx, geom, projection, rim, most):
         find_fragments = trace_cuda.find_fragments if cuda_backend(geom.device) else trace_cpu.find_fragments
-        layout, tile_start, found, places = find_fragments(geom.detach(), projection, most)
+        layout, found = find_fragments(geom.detach(), projection, most)
         weight, uv, depth, sigma = (found[name] for name in ("weight", "uv", "depth", "sigma"))
-        arrays = _for_layout(found, places)
+        arrays = _for_layout(found, layout)
         ctx.save_for_backward(geom, *arrays.values())
         ctx.projection, ctx.rim, ctx.layout, ctx.names = projection, rim, layout, tuple(arrays)
-        ctx.mark_non_differentiable(sigma, tile_start)
+        ctx.mark_non_differentiable(sigma)
         ctx.set_materialize_grads(False)
-        return weight, uv, depth, sigma, tile_start, layout, places
+        return weight, uv, depth, sigma, layout
 
     @staticmethod
     def backward(ctx, dweight, duv, ddepth, *_):
@@ -121,7 +126,7 @@ class _Trace(torch.autograd.Function):
             **grads,
             **work,
             rim=ctx.rim,
-            layout=ctx.layout,
+            layout=ctx.layout.handle,
             dgeom=dgeom,
             absgrad=absgrad,
         )
@@ -151,9 +156,31 @@ def trace(projection: Projection, rim: float = 1e-3, most: int | None = None) ->
         raise ValueError("surfels in a view of another size than the photographs are drawn by the baked renderer alone")
     if projection.geom.shape[1] != GEOM:
         raise ValueError(f"geom must have {GEOM} columns, not {projection.geom.shape[1]}")
-    weight, uv, depth, sigma, tile_start, layout, places = _Trace.apply(projection.geom, projection, rim, most)
+    weight, uv, depth, sigma, layout = _Trace.apply(projection.geom, projection, rim, most)
     camera, n = projection.camera, len(projection.geom)
-    return Fragments(weight, uv, depth, sigma, tile_start, camera.width, camera.height, layout, n, places)
+    return Fragments(weight, uv, depth, sigma, camera.width, camera.height, layout, n)
+
+
+def select(fragments: Fragments, keep: Tensor) -> Fragments:
+    """The fragments of a view that are kept, as a list of their own, without the graph.
+
+    Args:
+        fragments: F fragments.
+        keep: [F] bool.
+
+    Raises:
+        ValueError: `keep` has another length or lies on another device.
+    """
+    on_same_device(fragments.weight, keep=keep)
+    if keep.shape != fragments.weight.shape:
+        raise ValueError(f"keep must have shape {list(fragments.weight.shape)}, not {list(keep.shape)}")
+    by = trace_cuda if cuda_backend(keep.device) else trace_cpu
+    width, height = fragments.width, fragments.height
+    layout = by.select(fragments.layout, keep.to(torch.uint8).contiguous(), width, height)
+    rows = torch.nonzero(keep).squeeze(1)
+    weight, depth, sigma = (t.detach()[rows] for t in (fragments.weight, fragments.depth, fragments.sigma))
+    uv = fragments.uv.detach()[:, rows].contiguous()
+    return Fragments(weight, uv, depth, sigma, width, height, layout, fragments.surfels)
 
 
 def masked_counts(fragments: Fragments, mask: Tensor, n: int) -> Tensor:
@@ -177,6 +204,5 @@ def masked_counts(fragments: Fragments, mask: Tensor, n: int) -> Tensor:
         raise ValueError(f"the mask has {mask.numel()} pixels, the view {fragments.width * fragments.height}")
     counts = torch.zeros(n, dtype=torch.int32, device=mask.device)
     flat = mask.reshape(-1).to(torch.uint8).contiguous()
-    where = {"layout": fragments.layout, "width": fragments.width, "height": fragments.height}
-    function("masked_counts", counts.device)(**where, mask=flat, counts=counts)
+    function("masked_counts", counts.device)(**fragments.view, mask=flat, counts=counts)
     return counts

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from .backend import function, kernel_class, module, require
-from .fragment_list import Places, empty_list, empty_places, too_many
+from .fragment_list import Layout, empty_ids, empty_list, too_many
 from .pool import Pool
 from .project import Projection
 
@@ -25,9 +25,7 @@ def tracers(like: Tensor) -> Pool[Any]:
     return _pool(kernel_class("Trace", like))
 
 
-def find_fragments(
-    geom: Tensor, projection: Projection, most: int | None = None
-) -> tuple[Any, Tensor, dict[str, Tensor], Places]:
+def find_fragments(geom: Tensor, projection: Projection, most: int | None = None) -> tuple[Layout, dict[str, Tensor]]:
     """The fragments of a view.
 
     Args:
@@ -36,7 +34,7 @@ def find_fragments(
         most: fragments that there may be; 0 = `MOST`, None = any number.
 
     Returns:
-        layout, tile_start, the numbers of `Fragments` by name, and its places.
+        layout, and the numbers of `Fragments` by name.
 
     Raises:
         TooManyFragments: there are more than `most`.
@@ -47,21 +45,42 @@ def find_fragments(
     with tracers(geom).borrow() as tracer:
         n = tracer.run(**projection.view(geom), most=most)
         if most and n > most:
-            raise too_many(geom, projection, n, most, places=False)
+            raise too_many(geom, projection, n, most, ids=False)
         found = empty_list(geom, n)
-        starts = {name: torch.empty(tracer.tiles + 1, dtype=torch.int64) for name in ("tile_start", "pack_start")}
-        packs = torch.empty(tracer.packs, 2, dtype=torch.int32)
-        tracer.copy(**found, **starts, packs=packs)
-    layout = module(geom.device).TilePacks(**starts, packs=packs)
-    size = {"width": projection.camera.width, "height": projection.camera.height}
-    list_places = function("list_places", packs.device)
+        arrays = _empty_layout(tracer.tiles, tracer.packs)
+        tracer.copy(**found, **arrays)
+    return _layout(arrays, projection.camera.width, projection.camera.height), found
 
-    def places() -> dict[str, Tensor]:
-        listed = empty_places(packs, n)
-        list_places(layout=layout, **size, **listed)
+
+def select(layout: Layout, keep: Tensor, width: int, height: int) -> Layout:
+    """The layout of the fragments that are kept.
+
+    Args:
+        layout: of a list of F fragments.
+        keep: [F] uint8.
+        width, height: of the image, pixels.
+    """
+    arrays = _empty_layout(len(layout.arrays["tile_start"]) - 1, len(layout.arrays["packs"]))
+    function("select_fragments", keep.device)(layout=layout.handle, keep=keep, **arrays)
+    arrays["packs"] = arrays["packs"][: int(arrays["pack_start"][-1])].clone()
+    return _layout(arrays, width, height)
+
+
+def _empty_layout(tiles: int, packs: int) -> dict[str, Tensor]:
+    starts = {name: torch.empty(tiles + 1, dtype=torch.int64) for name in ("tile_start", "pack_start")}
+    return starts | {"packs": torch.empty(packs, 2, dtype=torch.int32)}
+
+
+def _layout(arrays: dict[str, Tensor], width: int, height: int) -> Layout:
+    cpu = arrays["packs"].device
+    handle, list_ids = module(cpu).TilePacks(**arrays), function("list_places", cpu)
+
+    def ids() -> dict[str, Tensor]:
+        listed = empty_ids(arrays["packs"], int(arrays["tile_start"][-1]))
+        list_ids(layout=handle, width=width, height=height, **listed)
         return listed
 
-    return layout, starts["tile_start"], found, Places(places)
+    return Layout(handle, arrays, ids)
 
 
 def count(projection: Projection) -> int:

@@ -7,14 +7,13 @@ of surfel and tile, and for the number of fragments.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from .backend import kernel, module, on_device, require, workspace
+from .backend import function, kernel, module, on_device, require, workspace
 from .constants import TILE
-from .fragment_list import Places, empty_list, empty_places, too_many
+from .fragment_list import Layout, empty_ids, empty_list, too_many
 from .project import Projection
 
 NUMBERS = 24
@@ -103,26 +102,29 @@ def tile_lists(geom: Tensor, projection: Projection) -> Bins:
     return Bins(**ranks, **lists)
 
 
-def blended(geom: Tensor, projection: Projection, bins: Bins) -> tuple[Any, Tensor]:
-    """Which pixels blend which pairs: the layout of the fragment list and tile_start [tiles + 1] int64; waits once for
-    the number of fragments."""
+def blended(geom: Tensor, projection: Projection, bins: Bins) -> Layout:
+    """Which pixels blend which pairs: the layout of the fragment list, its surfels and pixels still to be written;
+    waits once for the number of fragments."""
     require("trace_cuda.blended", "cuda", geom.device, "call `trace`")
     camera, pairs = projection.camera, bins.surfel.shape[0]
     marks = {"masks": _ints(geom, module(geom.device).TILE_WARPS, pairs), "offsets": _longs(geom, pairs + 1)}
-    tile_start = torch.empty_like(bins.tile_pairs)
     kernel("trace_mark", geom)(
         **projection.view(geom),
         **marks,
         surfel=bins.surfel,
         tile_pairs=bins.tile_pairs,
-        tile_start=tile_start,
         workspace=workspace("trace_mark", geom, pairs=pairs),
     )
-    count = int(marks["offsets"][-1])
-    size = {"width": camera.width, "height": camera.height}
-    with on_device(geom.device):
-        layout = module(geom.device).Pairs(**marks, **bins.layout, **size, fragments=count)
-    return layout, tile_start
+    return _layout(marks | bins.layout, camera.width, camera.height)
+
+
+def _layout(arrays: dict[str, Tensor], width: int, height: int, ids: dict[str, Tensor] | None = None) -> Layout:
+    """Of the arrays of `Pairs`, and of surfel and pixel [F] int32, which may be still to be written."""
+    offsets = arrays["offsets"]
+    count = int(offsets[-1])
+    with on_device(offsets.device):
+        handle = module(offsets.device).Pairs(**arrays, width=width, height=height, fragments=count)
+    return Layout(handle, arrays, lambda: empty_ids(offsets, count) if ids is None else ids)
 
 
 def fragment_capacity(geom: Tensor) -> int:
@@ -143,23 +145,21 @@ def check_capacity(geom: Tensor, projection: Projection, count: int, most: int |
         room.lists += 1
         most = room.capacity
     if most and count > most:
-        raise too_many(geom, projection, count, most, places=True)
+        raise too_many(geom, projection, count, most, ids=True)
 
 
-def fill(geom: Tensor, projection: Projection, layout: Any) -> tuple[dict[str, Tensor], Places]:
-    """The numbers of `Fragments` by name, and its places; raises TooManyFragments where they find no room."""
-    count = layout.fragments
+def fill(geom: Tensor, projection: Projection, layout: Layout) -> dict[str, Tensor]:
+    """The numbers of `Fragments` by name; raises TooManyFragments where they find no room."""
+    count = layout.handle.fragments
     try:
-        found, places = empty_list(geom, count), empty_places(geom, count)
+        found, ids = empty_list(geom, count), layout.ids()
     except torch.cuda.OutOfMemoryError as error:
-        raise too_many(geom, projection, count, fragment_capacity(geom), places=True) from error
-    kernel("trace_fill", geom)(**projection.view(geom), **found, **places, layout=layout)
-    return found, Places(lambda: places)
+        raise too_many(geom, projection, count, fragment_capacity(geom), ids=True) from error
+    kernel("trace_fill", geom)(**projection.view(geom), **found, **ids, layout=layout.handle)
+    return found
 
 
-def find_fragments(
-    geom: Tensor, projection: Projection, most: int | None = None
-) -> tuple[Any, Tensor, dict[str, Tensor], Places]:
+def find_fragments(geom: Tensor, projection: Projection, most: int | None = None) -> tuple[Layout, dict[str, Tensor]]:
     """The fragments of a view.
 
     Args:
@@ -168,18 +168,33 @@ def find_fragments(
         most: fragments that there may be; 0 = as many as a training step has memory for; None = any number.
 
     Returns:
-        layout, tile_start, the numbers of `Fragments` by name, and its places.
+        layout, and the numbers of `Fragments` by name.
 
     Raises:
         RuntimeError: 2^31 pairs of surfel and tile or more.
         TooManyFragments: there are more than that, or the device has no memory for their list.
     """
-    layout, tile_start = blended(geom, projection, tile_lists(geom, projection))
-    check_capacity(geom, projection, layout.fragments, most)
-    return layout, tile_start, *fill(geom, projection, layout)
+    layout = blended(geom, projection, tile_lists(geom, projection))
+    check_capacity(geom, projection, layout.handle.fragments, most)
+    return layout, fill(geom, projection, layout)
 
 
-def backward_memory(geom: Tensor, layout: Any) -> dict[str, Tensor]:
+def select(layout: Layout, keep: Tensor, width: int, height: int) -> Layout:
+    """The layout of the fragments that are kept.
+
+    Args:
+        layout: of a list of F fragments.
+        keep: [F] uint8.
+        width, height: of the image, pixels.
+    """
+    masks, counts = torch.empty_like(layout.arrays["masks"]), torch.empty_like(layout.arrays["offsets"][1:])
+    function("select_fragments", keep.device)(layout=layout.handle, keep=keep, masks=masks, counts=counts)
+    offsets, kept = torch.nn.functional.pad(counts.cumsum(0), (1, 0)), keep.bool()
+    ids = {name: value[kept] for name, value in layout.ids().items()}
+    return _layout(layout.arrays | {"masks": masks, "offsets": offsets}, width, height, ids)
+
+
+def backward_memory(geom: Tensor, layout: Layout) -> dict[str, Tensor]:
     """Working memory of the backward kernel, by name."""
-    partial = geom.new_empty(layout.pairs, module(geom.device).TRACE_SUMS)
-    return {"dsigma": geom.new_empty(layout.fragments), "partial": partial}
+    partial = geom.new_empty(layout.handle.pairs, module(geom.device).TRACE_SUMS)
+    return {"dsigma": geom.new_empty(layout.handle.fragments), "partial": partial}

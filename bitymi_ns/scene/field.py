@@ -16,9 +16,8 @@ from bitymi_ns.ops import (
     blended_image,
     composite_image,
     shade,
-    texel_colors,
 )
-from bitymi_ns.ops.constants import COLOR_BIAS, FEATURES, WIDTH
+from bitymi_ns.ops.constants import FEATURES, WIDTH
 from bitymi_ns.ops.field import FieldGeometry, field
 
 from .config import SceneConfig
@@ -233,10 +232,3 @@ class TexelField(nn.Module):
     def snapshot(self) -> Tensor | None:
         """See `ResidualField`."""
         return None if self.descent is None else self.texels.detach().clone()
-
-    @torch.no_grad()
-    def residual(self, fragments: Fragments, bound: float) -> Tensor:
-        """[F, 3] residual of every fragment, 0 below the weight `bound`."""
-        bright = 4.0  # so that no channel is cut off
-        base = self.texels.new_full((len(self.size), 3), bright - COLOR_BIAS)
-        return texel_colors(fragments, base, self.texels.detach(), self.tiles, bound, False) - bright

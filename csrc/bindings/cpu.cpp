@@ -107,8 +107,6 @@ void bind_operations(nb::module_& m) {
   BT_OPERATIONS(BT_BIND)
 #undef BT_BIND
   bind_tracer<S>(m);
-  bind_operation(m, name("texel_image_forward"), &texel_image_forward<S>);
-  bind_operation(m, name("texel_image_backward"), &texel_image_backward<S>);
   bind_operation(m, name("baked_forward"), &baked_forward<S>);
 }
 }  // namespace
@@ -134,6 +132,7 @@ NB_MODULE(BITYMI_MODULE, m) {
   bind_operations<double>(m);
   bind_operation(m, "masked_counts", &masked_counts);
   bind_operation(m, "list_places", &list_places);
+  bind_operation(m, "select_fragments", &select_fragments);
   m.attr("SUPPORT") = kSupport, m.attr("ALPHA_MAX") = kAlphaMax, m.attr("ALPHA_MIN") = kAlphaMin;
   m.attr("TRANSMITTANCE_MIN") = kTransmittanceMin, m.attr("BETA_MAX") = kBetaMax, m.attr("TILE") = kTile;
   m.attr("GEOM") = int(kGeom), m.attr("FRAME") = kFrame;

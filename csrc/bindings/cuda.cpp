@@ -110,6 +110,7 @@ void bind_all(nb::module_& m) {
   bind_operations<float>(m);
   bind_operations<double>(m);
   bind_operation(m, "masked_counts", &masked_counts);
+  bind_operation(m, "select_fragments", &select_fragments);
   bind_baked(m);
   m.attr("TILE_WARPS") = kTileWarps;
   m.attr("TRACE_SUMS") = kTraceSums;

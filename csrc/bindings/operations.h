@@ -20,7 +20,5 @@
   each(field_backward)        \
   each(shade_forward)         \
   each(shade_backward)        \
-  each(texel_colors_forward)  \
-  each(texel_colors_backward) \
   each(ssim)
 // clang-format on

@@ -113,25 +113,15 @@ BT_HD TexelCorners<S> texel_corners(S u, S v, const int32_t* size, S extent) {
   return c;
 }
 
-// Residual colour there, and its vector-Jacobian products.
+// The texels there, and the vector-Jacobian product of the fetch.
 template <class S>
 BT_HD void load_corners(const S* tile, const TexelCorners<S>& c, Vec3<S>* t) {
   for (int k = 0; k < 4; ++k) t[k] = load3(tile + 3 * c.at[k]);
-}
-template <class S>
-BT_HD Vec3<S> texel_fetch(const S* tile, const TexelCorners<S>& c) {
-  Vec3<S> t[4];
-  load_corners(tile, c, t);
-  return texel_mix(t, c.weight);
 }
 // add(k, gradient of corner k).
 template <class S, class F>
 BT_HD void texel_corner_gradients(const TexelCorners<S>& c, Vec3<S> g, F&& add) {
   for (int k = 0; k < 4; ++k) add(k, c.weight[k] * g);
-}
-template <class S>
-BT_HD void texel_fetch_vjp(const TexelCorners<S>& c, Vec3<S> g, S* dtile) {
-  texel_corner_gradients(c, g, [&](int k, Vec3<S> d) { store3(dtile + 3 * c.at[k], load3(dtile + 3 * c.at[k]) + d); });
 }
 // How the fetch changes with u and v, given its four texels: 0 from the outer texel centres on; at a centre between
 // them, where the slope jumps, that of the side of larger coordinates.

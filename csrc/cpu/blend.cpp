@@ -159,8 +159,9 @@ void run_backward(const Backward<S>& a, const PackedPicture<S, kChannels<kMaps>>
       d[c] = select(there, load(dimage.numbers(surfel.run.tile, part.pack) + c * kLanes), zero);
     surfel.colors(part, pack, colors);
     const P depth = kMaps ? expand(f.depth + at, part.lanes) : zero;
-    compress_until(a.dweight + end, a.dweight + at,
-                   weight_gradient<kMaps>(d, colors, surfel.beta, depth, surfel.normal), part.lanes);
+    if (a.dweight)
+      compress_until(a.dweight + end, a.dweight + at,
+                     weight_gradient<kMaps>(d, colors, surfel.beta, depth, surfel.normal), part.lanes);
     for (int k = 0; k < 3; ++k) {
       dcolors[k] = residual_gradient(colors[k], weight * d[k]);
       sums.view[k] += dcolors[k];
@@ -266,7 +267,7 @@ BT_HD void ask_for_next(const Backward<S>& a, const PackedPicture<S, channels>& 
   for (int64_t i = next.begin; i < next.end + line - 1; i += line) {
     const int64_t j = std::min(i, next.end - 1);
     __builtin_prefetch(f.weight + j), __builtin_prefetch(f.uv + j), __builtin_prefetch(f.uv + f.total + j);
-    __builtin_prefetch(a.dweight + j, 1);
+    if (a.dweight) __builtin_prefetch(a.dweight + j, 1);
     if (a.duv) __builtin_prefetch(a.duv + j, 1), __builtin_prefetch(a.duv + f.total + j, 1);
   }
   const PackRun soon = listed.run(ahead(1));
@@ -296,7 +297,11 @@ void backward_by_surfel(const Backward<S>& a, const PackedPicture<S, kChannels<k
     surfel_backward(a, id, total<kMaps>(sums));
     if (a.dtexels)
       for (int64_t t = 0; t < area; ++t) store3(a.dtexels + 3 * (patch.first + t), load3(own.data() + 4 * t));
-    if (a.moved) move_texels(a.moved + 3 * patch.first, own.data(), 4, a.rate, a.share + patch.first, area);
+    if (a.moved)
+      for (int64_t t = 0; t < area; ++t) {
+        S* texel = a.moved + 3 * (patch.first + t);
+        store3(texel, texel_step(load3(texel), load3(own.data() + 4 * t), a.rate, a.share[patch.first + t]));
+      }
   });
 }
 // Run after run, which is faster where there are no texels: what a pass reads follows each other.

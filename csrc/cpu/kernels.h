@@ -135,6 +135,25 @@ struct ListedPlaces {
 };
 void list_places(const ListedPlaces& a);
 
+// The layout of the fragments whose keep [F] is not 0. Written: tile_start, pack_start, and as many rows of packs as
+// the last pack_start says.
+struct SelectPacks {
+  TilePacks layout;
+  const uint8_t* keep;
+  int64_t *tile_start, *pack_start;
+  int32_t* packs;
+
+  template <class R>
+  void fields(R& r) {
+    take(r, "layout", layout);
+    r.array("keep", keep, layout.fragments);
+    r.array("tile_start", tile_start, layout.tiles + 1);
+    r.array("pack_start", pack_start, layout.tiles + 1);
+    r.array("packs", packs, 2 * layout.count);
+  }
+};
+void select_fragments(const SelectPacks& a);
+
 template <class S>
 void trace_backward(const TraceBackward<S, TilePacks>& a);
 template <class S>
@@ -160,14 +179,6 @@ void shade_forward(const ShadeForward<S>& a);
 template <class S>
 void shade_backward(const ShadeBackward<S>& a);
 
-template <class S>
-void texel_image_forward(const TexelForward<S>& a);
-template <class S>
-void texel_image_backward(const TexelBackward<S>& a);
-template <class S>
-void texel_colors_forward(const TexelColorsForward<S>& a);
-template <class S>
-void texel_colors_backward(const TexelColorsBackward<S>& a);
 template <class S>
 void blend_forward(const BlendForward<S, TilePacks>& a);
 template <class S>

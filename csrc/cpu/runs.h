@@ -13,24 +13,6 @@ namespace bt {
 // Runs are fragments of one surfel that follow each other in the list. `runs` says whose they are and how long:
 // runs.count(), runs.surfel(r), runs.length(r).
 
-// Runs from start[r] to start[r + 1] - 1.
-struct FragmentRuns {
-  const int32_t* of;  // the surfel of every fragment
-  const int64_t* start;
-  int64_t runs;
-
-  int64_t count() const { return runs; }
-  int32_t surfel(int64_t r) const { return of[start[r]]; }
-  int64_t length(int64_t r) const { return start[r + 1] - start[r]; }
-};
-// Where fragments of another surfel begin, and the end of the list.
-inline std::vector<int64_t> run_starts(const int32_t* surfel, int64_t fragments) {
-  std::vector<int64_t> start{0};
-  for (int64_t i = 1; i <= fragments; ++i)
-    if (i == fragments || surfel[i] != surfel[i - 1]) start.push_back(i);
-  return start;
-}
-
 // The runs surfel by surfel, these in the order in which the list first has them, n at most. So they are neighbours on
 // the screen that follow each other, whose runs lie near each other in the list, as their pixels do in the picture.
 template <class R>
@@ -64,13 +46,6 @@ void for_surfels(const R& runs, const int64_t* order, F&& fn) {
       fn(k, last);
     }
   });
-}
-
-// Moves `count` texels by their shares and gradients, which lie `row` numbers apart.
-template <class S>
-void move_texels(S* texels, const S* gradients, int row, S rate, const S* share, int64_t count) {
-  for (int64_t t = 0; t < count; ++t, texels += 3, gradients += row)
-    store3(texels, texel_step(load3(texels), load3(gradients), rate, share[t]));
 }
 
 }  // namespace bt

@@ -228,6 +228,25 @@ void list_places(const ListedPlaces& a) {
   });
 }
 
+void select_fragments(const SelectPacks& a) {
+  int64_t fragments = 0, packs = 0;
+  const uint8_t* keep = a.keep;
+  for (int64_t tile = 0; tile < a.layout.tiles; ++tile) {
+    a.tile_start[tile] = fragments, a.pack_start[tile] = packs;
+    for (int64_t k = a.layout.pack_start[tile]; k < a.layout.pack_start[tile + 1]; ++k) {
+      const PackPart part(a.layout, k);
+      uint32_t kept = 0;
+      for (uint32_t lanes = part.lanes; lanes; lanes &= lanes - 1)
+        if (*keep++) kept |= lanes & -lanes;
+      if (!kept) continue;
+      const PackPart left(kept, part.pack, part.surfel);
+      left.write(a.packs + 2 * packs++);
+      fragments += left.count();
+    }
+  }
+  a.tile_start[a.layout.tiles] = fragments, a.pack_start[a.layout.tiles] = packs;
+}
+
 void masked_counts(const MaskedCounts<TilePacks>& a) {
   for (int64_t tile = 0; tile < a.layout.tiles; ++tile)
     each_fragment(a.layout, tile, a.width,

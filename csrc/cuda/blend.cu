@@ -147,7 +147,7 @@ __global__ void __launch_bounds__(kTileThreads, resident<S, kMaps, kTexels>())
       if (mine) {
         const S* d = gradient + tile.at(pixel) * kChannels;
         const S rgb[3] = {color.x, color.y, color.z};
-        out.weight[i] = weight_gradient<kMaps>(d, rgb, beta, depth, normal);
+        if (out.weight) out.weight[i] = weight_gradient<kMaps>(d, rgb, beta, depth, normal);
         dcolor = residual_gradient(color, w * load3(d));
         sums[0] += w * d[4];
         sums[1] += dcolor.x, sums[2] += dcolor.y, sums[3] += dcolor.z;

@@ -71,8 +71,8 @@ int64_t bin_fill_workspace(int64_t pairs, int width, int height);
 template <class S>
 void bin_fill(const BinFill<S>& a, Stream stream);
 
-// Finds which pixels blend which pairs: masks [kTileWarps, pairs], offsets [pairs + 1] and tile_start [tiles + 1] are
-// written; the number of fragments is offsets[pairs].
+// Finds which pixels blend which pairs: masks [kTileWarps, pairs] and offsets [pairs + 1] are written; the number
+// of fragments is offsets[pairs].
 template <class S>
 struct TraceMark {
   View<S> view;
@@ -80,7 +80,7 @@ struct TraceMark {
   const int32_t* surfel;
   const int64_t* tile_pairs;
   uint32_t* masks;
-  int64_t *offsets, *tile_start;
+  int64_t* offsets;
   Workspace workspace;
 
   template <class R>
@@ -92,7 +92,6 @@ struct TraceMark {
     r.array("tile_pairs", tile_pairs, tiles + 1);
     r.array("masks", masks, kTileWarps * pairs);
     r.array("offsets", offsets, pairs + 1);
-    r.array("tile_start", tile_start, tiles + 1);
     r.memory("workspace", workspace);
   }
 };
@@ -126,6 +125,22 @@ void blend_forward(const BlendForward<S, Pairs>& a, Stream stream);
 template <class S>
 void blend_backward(const BlendBackward<S, Pairs>& a, Stream stream);
 void masked_counts(const MaskedCounts<Pairs>& a, Stream stream);
+// The layout of the fragments whose keep [F] is not 0. Written: masks, and how many fragments each pair then has.
+struct SelectPairs {
+  Pairs layout;
+  const uint8_t* keep;
+  uint32_t* masks;
+  int64_t* counts;
+
+  template <class R>
+  void fields(R& r) {
+    take(r, "layout", layout);
+    r.array("keep", keep, layout.fragments);
+    r.array("masks", masks, kTileWarps * layout.pairs);
+    r.array("counts", counts, layout.pairs);
+  }
+};
+void select_fragments(const SelectPairs& a, Stream stream);
 
 template <class S>
 void view_color_forward(const ViewColorForward<S>& a, Stream stream);
@@ -147,10 +162,6 @@ template <class S>
 void shade_forward(const ShadeForward<S>& a, Stream stream);
 template <class S>
 void shade_backward(const ShadeBackward<S>& a, Stream stream);
-template <class S>
-void texel_colors_forward(const TexelColorsForward<S>& a, Stream stream);
-template <class S>
-void texel_colors_backward(const TexelColorsBackward<S>& a, Stream stream);
 template <class S>
 void field_tiles(const FieldTiles<S>& a, Stream stream);
 

@@ -104,12 +104,6 @@ __global__ void __launch_bounds__(kThreads)
   counts[k] = count;
 }
 
-__global__ void __launch_bounds__(kThreads)
-    start_kernel(int64_t tiles, const int64_t* tile_pairs, const int64_t* offsets, int64_t* tile_start) {
-  const int64_t t = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (t <= tiles) tile_start[t] = offsets[tile_pairs[t]];
-}
-
 // A warp has about ten fragments of a pair, which rarely fill a sector of 32 bytes. If each warp wrote its own, most
 // sectors would be written in parts, by several warps, and memory takes longer for a part than for a whole sector. So a
 // block collects the fragments of up to 32 pairs, in the list's order, and writes them as one contiguous stretch.
@@ -184,6 +178,24 @@ __global__ void __launch_bounds__(kTileThreads) counts_kernel(Pairs p, const uin
     if (count) atomicAdd(counts + p.surfel[k], count);  // of integers: the order does not show
   }
 }
+
+// Pairs without fragments, such as those behind the tiles', may have no masks.
+__global__ void __launch_bounds__(kThreads)
+    select_kernel(Pairs p, const uint8_t* keep, uint32_t* masks, int64_t* counts) {
+  const int64_t k = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (k >= p.pairs) return;
+  int64_t at = p.offsets[k];
+  const bool some = at < p.offsets[k + 1];
+  int count = 0;
+  for (int w = 0; w < kTileWarps; ++w) {
+    uint32_t kept = 0;
+    for (uint32_t mark = some ? p.masks[w * p.pairs + k] : 0; mark; mark &= mark - 1)
+      if (keep[at++]) kept |= mark & (~mark + 1);
+    masks[w * p.pairs + k] = kept;
+    count += __popc(kept);
+  }
+  counts[k] = count;
+}
 }  // namespace
 
 int64_t trace_mark_workspace(int64_t pairs) {
@@ -206,8 +218,6 @@ void trace_mark(const TraceMark<S>& a, Stream stream) {
   BT_LAUNCH(size_kernel, dim3(unsigned(ceil_div(pairs + 1, kThreads))), dim3(kThreads), 0, stream, pairs,
             a.tile_pairs + tiles, a.masks, w.counts);
   exclusive_sum(w.counts, a.offsets, pairs + 1, w.temp, w.temp_size, stream);
-  BT_LAUNCH(start_kernel, dim3(unsigned(ceil_div(tiles + 1, kThreads))), dim3(kThreads), 0, stream, tiles, a.tile_pairs,
-            a.offsets, a.tile_start);
 }
 
 template <class S>
@@ -223,6 +233,13 @@ void trace_fill(const TraceFill<S>& a, Stream stream) {
 void masked_counts(const MaskedCounts<Pairs>& a, Stream stream) {
   if (!a.layout.pairs) return;
   BT_LAUNCH(counts_kernel, dim3(unsigned(a.layout.tiles())), dim3(kTileThreads), 0, stream, a.layout, a.mask, a.counts);
+}
+
+void select_fragments(const SelectPairs& a, Stream stream) {
+  const int64_t pairs = a.layout.pairs;
+  if (pairs)
+    BT_LAUNCH(select_kernel, dim3(unsigned(ceil_div(pairs, kThreads))), dim3(kThreads), 0, stream, a.layout, a.keep,
+              a.masks, a.counts);
 }
 
 #define BT_INSTANTIATE(S)                                \

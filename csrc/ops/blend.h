@@ -29,7 +29,8 @@ struct BlendedSurfels {
   }
 };
 
-// image [height, width, channels]: the sums of core/blend.h, with the colours of TexelColorsForward. Written.
+// image [height, width, channels]: the sums of core/blend.h of the colours relu(relu(base + 0.5) + texel(u, v)), below
+// `bound` and without a tile relu(base + 0.5). Written.
 template <class S, class Layout>
 struct BlendForward {
   BlendedSurfels<S, Layout> of;
@@ -45,9 +46,9 @@ struct BlendForward {
 // What a pair of surfel and tile adds to its surfel: beta and the colour, with maps also the normal and one unused.
 constexpr int blend_sums(bool maps) { return maps ? 8 : 4; }
 
-// dweight [F], ddepth [F] (maps only), dgeom [n, kGeom] (beta and normal columns) and dbase [n, 3] are written, and
-// what is given of duv [2, F] and dtexels [texels, 3]. `moved`, `share` and `rate` are those of TexelColorsBackward.
-// partial [pairs, blend_sums] and work are working memory.
+// ddepth [F] (maps only), dgeom [n, kGeom] (beta and normal columns) and dbase [n, 3] are written, and what is given of
+// dweight [F], duv [2, F] and dtexels [texels, 3]. With `moved` [texels, 3] the texels' gradient g is not kept: texel t
+// of `moved` moves by -rate share[t] g. partial [pairs, blend_sums] and work are working memory.
 template <class S, class Layout>
 struct BlendBackward {
   BlendedSurfels<S, Layout> of;
@@ -62,7 +63,7 @@ struct BlendBackward {
     of.fields(r);
     const int64_t total = of.fragments.f.total, n = of.table.n;
     r.array("dimage", dimage, of.numbers());
-    r.array("dweight", dweight, total);
+    r.maybe("dweight", dweight, total);
     r.maybe("duv", duv, 2 * total);
     of.maps ? r.array("ddepth", ddepth, total) : r.maybe("ddepth", ddepth, total);
     r.array("dgeom", dgeom, n * kGeom);

@@ -1,4 +1,4 @@
-// Arguments of the images and colours that texels give, and of their gradients.
+// Texels of surfels as operations take them, and the working memory of their gradients.
 #pragma once
 
 #include "core/shading.h"
@@ -50,100 +50,10 @@ struct TexelPatch {
         view(view_base(load3(tiles.base + 3 * id))) {}
   BT_HD bool textured() const { return size[0] > 0; }
   BT_HD TexelCorners<S> corners(S u, S v) const { return texel_corners(u, v, size, extent); }
-  BT_HD Vec3<S> color(const TexelCorners<S>& at) const { return shaded(view, texel_fetch(tile, at)); }
-  // adds the gradient with respect to u and v
-  BT_HD void uv_vjp(const TexelCorners<S>& at, Vec3<S> g, S& du, S& dv) const {
+  BT_HD Vec3<S> color(const TexelCorners<S>& at) const {
     Vec3<S> t[4];
     load_corners(tile, at, t);
-    const TexelSlopes<S> slopes = texel_slopes(t, at, size, extent);
-    du += dot(g, slopes.u), dv += dot(g, slopes.v);
-  }
-};
-template <class S>
-struct TexelFragments {
-  int64_t count;
-  const int32_t *surfel, *pixel;
-  const S *weight, *uv;  // uv [2, count]
-
-  template <class R>
-  void fields(R& r, const char* name, TileStarts& starts) {
-    r.rows("surfel", surfel, count, 1);
-    r.array("pixel", pixel, count);
-    r.array("weight", weight, count);
-    r.array("uv", uv, 2 * count);
-    take(r, name, starts);
-    if (starts.fragments != count) r.refuse("the starts do not belong to these fragments");
-  }
-};
-
-// image [pixels, 3] = sum of w relu(relu(base + 0.5) + texel(u, v)); below `bound` and without a tile w relu(base +
-// 0.5)
-template <class S>
-struct TexelForward {
-  TexelFragments<S> f;
-  TileStarts layout;  // of the screen's tiles
-  S bound;
-  TexelTiles<S> table;
-  int64_t pixels;
-  S* image;
-
-  template <class R>
-  void fields(R& r) {
-    f.fields(r, "tile_start", layout);
-    r.number("bound", bound);
-    table.fields(r);
-    r.rows("image", image, pixels, 3);
-  }
-};
-// Adds to dtexels [texels, 3] and writes dbase [n, 3]; either may be null. Fragments i with run_start[r] <= i <
-// run_start[r + 1] belong to one surfel; `order` sorts the runs by surfel.
-template <class S>
-struct TexelBackward {
-  TexelFragments<S> f;
-  TileStarts runs;
-  const int64_t* order;
-  S bound;
-  TexelTiles<S> table;
-  int64_t pixels;
-  const S* dimage;
-  S *dtexels, *dbase;
-
-  template <class R>
-  void fields(R& r) {
-    f.fields(r, "run_start", runs);
-    r.array("order", order, runs.tiles);
-    r.number("bound", bound);
-    table.fields(r);
-    r.rows("dimage", dimage, pixels, 3);
-    r.maybe("dtexels", dtexels, 3 * table.texels);
-    r.maybe("dbase", dbase, 3 * table.n);
-  }
-};
-
-// What the colours of fragments are made of.
-template <class S>
-struct TexelColors {
-  FragmentArrays<S> f;
-  S bound;
-  TexelTiles<S> table;
-
-  template <class R>
-  void fields(R& r) {
-    f.fields(r);
-    r.number("bound", bound);
-    table.fields(r);
-  }
-};
-// colors [F, 3] = relu(relu(base + 0.5) + texel(u, v)); below `bound` and without a tile relu(base + 0.5)
-template <class S>
-struct TexelColorsForward {
-  TexelColors<S> of;
-  S* colors;
-
-  template <class R>
-  void fields(R& r) {
-    of.fields(r);
-    r.array("colors", colors, 3 * of.f.total);
+    return shaded(view, texel_mix(t, at.weight));
   }
 };
 // Working memory of the backward pass on CUDA: where the texels' gradients are added up, rows of four, the last 0.
@@ -161,32 +71,4 @@ struct TexelWork {
       r.work("texel_work", sums, 4 * texels);
   }
 };
-// Writes dbase [n, 3], dtexels [texels, 3] and duv [2, F]; each may be null. With `moved`, the texels themselves, their
-// gradient g is not kept: every texel moves by -rate `share` [texels] g.
-template <class S>
-struct TexelColorsBackward {
-  TexelColors<S> of;
-  const S *colors, *dcolors;
-  const S* share;
-  S rate;
-  S *dbase, *dtexels, *duv, *moved;
-  TexelWork<S> work;
-
-  bool sums_texels() const { return dtexels || moved; }
-  template <class R>
-  void fields(R& r) {
-    of.fields(r);
-    r.array("colors", colors, 3 * of.f.total);
-    r.array("dcolors", dcolors, 3 * of.f.total);
-    r.maybe("dbase", dbase, 3 * of.table.n);
-    r.maybe("dtexels", dtexels, 3 * of.table.texels);
-    r.maybe("duv", duv, 2 * of.f.total);
-    r.maybe("moved", moved, 3 * of.table.texels);
-    r.maybe("share", share, of.table.texels);
-    r.number("rate", rate);
-    work.fields(r, sums_texels() ? of.table.texels : 0, of.table.n);
-    check_moved(r, moved, share, dtexels);
-  }
-};
-
 }  // namespace bt

@@ -11,12 +11,12 @@ import torch
 from bitymi_ns.bake import Baked, TuneOptions, compact, tune_atlas
 from bitymi_ns.bake.compact import (
     ENOUGH,
-    MOST_PRICE,
+    MAX_LAMBDA,
     START,
     TEXEL_SHARE,
     Coder,
     Compact,
-    chosen,
+    choose,
     compacted,
     with_coded_texels,
 )
@@ -60,7 +60,7 @@ def from_photographs(baked: Baked, views: list[View]) -> float:
 def test_it_costs_what_it_may_and_what_costs_less_takes_more_bytes(
     truth: Baked, views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(compact, "MOST_PRICE", math.inf)  # the share alone decides
+    monkeypatch.setattr(compact, "MAX_LAMBDA", math.inf)  # the share alone decides
     sizes = []
     for share in (0.02, 0.4):
         rounded, coding = compacted(truth, views, BACKGROUND, Compact(share=share, views=len(views)))
@@ -75,7 +75,7 @@ def test_it_costs_what_it_may_and_what_costs_less_takes_more_bytes(
 def test_a_large_error_of_the_bake_does_not_hide_that_of_rounding(truth: Baked, views: list[View]) -> None:
     dark = [View(view.camera, view.image / 2) for view in views]
     capped, coding = compacted(truth, dark, BACKGROUND, Compact(share=0.9))
-    assert coding.step == pytest.approx(255 * math.sqrt(TEXEL_SHARE * 12 * MOST_PRICE / PER_BIT))
+    assert coding.step == pytest.approx(255 * math.sqrt(TEXEL_SHARE * 12 * MAX_LAMBDA / PER_BIT))
     assert coding.step == pytest.approx(4.16, abs=0.02)
     asked, wider = compacted(truth, dark, BACKGROUND, Compact(psnr=Coder(truth, dark, BACKGROUND, Compact()).psnr - 2))
     assert wider.step > coding.step and asked.codes.surfels.nbytes() < capped.codes.surfels.nbytes()
@@ -97,7 +97,7 @@ def test_surfels_and_texels_fit_into_the_bytes_there_are(truth: Baked, views: li
     free, coding = compacted(truth, views, BACKGROUND, Compact(share=0.02))
     most = (free.codes.surfels.nbytes() + with_coded_texels(free, coding).codes.texels.nbytes()) * 7 // 10
     fitted, coding = compacted(truth, views, BACKGROUND, Compact(most_bytes=most))
-    tuned = tune_atlas(fitted, views, BACKGROUND, TuneOptions(steps=4, coded_steps=10, held_in_every=4), coding=coding)
+    tuned = tune_atlas(fitted, views, BACKGROUND, TuneOptions(steps=4, coded_steps=10, val_every=4), coding=coding)
     assert fitted.codes.surfels.nbytes() < free.codes.surfels.nbytes()
     assert most / 2 < tuned.codes.surfels.nbytes() + tuned.codes.texels.nbytes() <= most
     with pytest.raises(ValueError, match="are too few for 60 surfels"):
@@ -106,7 +106,7 @@ def test_surfels_and_texels_fit_into_the_bytes_there_are(truth: Baked, views: li
 
 def test_bytes_that_buy_nothing_are_not_spent(truth: Baked, views: list[View]) -> None:
     coder = Coder(truth, views, BACKGROUND, Compact(views=len(views)))
-    kept, coding = chosen(coder, Compact(most_bytes=10**9))
+    kept, coding = choose(coder, Compact(most_bytes=10**9))
     assert kept.statistics.rounding.mse <= 1.001 * ENOUGH * coder.error
     size = kept.codes.surfels.nbytes() + with_coded_texels(kept, coding).codes.texels.nbytes()
     assert size < 0.8 * coder.at(START / 1000).bytes
@@ -120,7 +120,7 @@ def test_without_views_the_reference_steps_are_taken(truth: Baked) -> None:
 
 
 def test_texels_learn_through_their_coding_and_are_what_is_stored(rounded: Baked, views: list[View], tmp_path) -> None:
-    options = TuneOptions(steps=8, coded_steps=40, coded_every=5, held_in_every=4)
+    options = TuneOptions(steps=8, coded_steps=40, coded_every=5, val_every=4)
     coarse = TexelCodeOptions(step=30.0)
     still = tune_atlas(rounded, views, BACKGROUND, replace(options, coded_steps=0), coding=coarse)
     tuned = tune_atlas(rounded, views, BACKGROUND, options, coding=coarse)

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from bitymi_ns.bake import BakeOptions, bake
-from bitymi_ns.bake.texel_scene import TexelScene
+from bitymi_ns.bake.texel_list import TexelList
+from bitymi_ns.bake.tuning_views import TuningViews
 from bitymi_ns.ops import Fragments, trace_cpu
 from bitymi_ns.ops import bands as bands_module
 from bitymi_ns.ops import trace as whole_trace
@@ -18,7 +19,7 @@ from bitymi_ns.scene.visibility import visibility
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.score import multi_view_scores
-from bitymi_ns.train.views import View
+from bitymi_ns.train.views import MemoryBudget, View
 from tests.bake.test_tune import BACKGROUND, cameras
 from tests.scene import bands
 
@@ -52,9 +53,9 @@ def test_of_a_bake(scene, made: list[int], most: int, monkeypatch: pytest.Monkey
     monkeypatch.setattr(trace_cpu, "MOST", most)
     views = cameras()[:3]
     visibility(large.surfels, views, 0.2)
-    texels, first = TexelScene(baked, BACKGROUND), len(made)
-    for camera in views:
-        texels.view(View(camera, PHOTO))
+    first, texels = len(made), TexelList(baked)
+    for _ in TuningViews(texels, [View(camera, PHOTO) for camera in views], BACKGROUND, MemoryBudget(0)):
+        pass
     assert len(made) - first == first and (first > 3) == (most == 3500)
 
 

@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake import Baked, BakeOptions, TuneOptions, bake, tune_atlas
-from bitymi_ns.bake.texel_scene import TexelScene, TexelView, TexelViews
-from bitymi_ns.ops import fitting_lists, project, trace_cpu
+from bitymi_ns.bake.texel_list import TexelList
+from bitymi_ns.bake.tuning_views import TuningView, TuningViews
+from bitymi_ns.ops import trace_cpu
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.scene.scene import GEOMETRY
 from bitymi_ns.train.views import MemoryBudget, View
 
 BACKGROUND = torch.tensor([0.2, 0.4, 0.6])
-OPTIONS = TuneOptions(steps=60, rate=0.3, held_in_every=4, coded_steps=0)
+OPTIONS = TuneOptions(steps=60, rate=0.3, val_every=4, coded_steps=0)
 
 
 def cameras() -> list[Camera]:
@@ -50,6 +50,15 @@ def waving(made: Any, **options: Any) -> Baked:
     baked.packing.tiles[0] = 0
     baked.mean_residual[0] = 0.3
     return baked
+
+
+def tuning_views(baked: Baked, views: list[View], budget: int = 1 << 30) -> TuningViews:
+    """Views of a bake, and its texels."""
+    return TuningViews(TexelList(baked), views, BACKGROUND, MemoryBudget(budget))
+
+
+def texels_of(baked: Baked) -> Tensor:
+    return TexelList(baked).values
 
 
 def photographs(truth: Baked) -> list[View]:
@@ -94,17 +103,17 @@ def test_tuning_finds_what_the_photographs_show(truth: Baked, wrong: Baked, view
 @pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
 def test_its_pictures_are_the_renderers(truth: Baked, prefilter: str) -> None:
     baked = replace(truth, scene=replace(truth.scene, prefilter=prefilter))
-    scene = TexelScene(baked, BACKGROUND)
     for camera in cameras()[:2]:
         want = render(baked, camera)
-        got = scene.render(scene.view(View(camera, want)), scene.texels)
+        drawn = tuning_views(baked, [View(camera, want)])
+        got = drawn.picture(drawn[0], texels_of(baked))
         torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-5)
 
 
 def test_texels_that_no_view_sees_stay_and_the_hardly_seen_hardly_move(wrong: Baked, views: list[View]) -> None:
-    scene = TexelScene(wrong, BACKGROUND)
-    seen = scene.coverage([v for i, v in enumerate(views) if i % 4])[:, 0]
-    tuned = TexelScene(tune_atlas(wrong, views, BACKGROUND, OPTIONS), BACKGROUND).texels
+    scene = TexelList(wrong)
+    seen = scene.coverage([v for i, v in enumerate(views) if i % 4])
+    tuned = texels_of(tune_atlas(wrong, views, BACKGROUND, OPTIONS))
     moved = (tuned - 0.1).abs().amax(1)
     last = scene.tiles.first[59]
     assert not moved[last:].any() and not moved[seen == 0].any()
@@ -114,33 +123,22 @@ def test_texels_that_no_view_sees_stay_and_the_hardly_seen_hardly_move(wrong: Ba
 
 
 def test_masked_pixels_are_not_seen(wrong: Baked, views: list[View]) -> None:
-    scene = TexelScene(wrong, BACKGROUND)
+    scene = TexelList(wrong)
     hidden = torch.zeros(40, 48, 1, dtype=torch.bool)
     masked = [views[0], *(View(v.camera, v.image, hidden) for v in views[1:3])]
     one, all_but_masked = (scene.coverage(each) for each in (views[:1], masked))
     assert torch.equal(one, all_but_masked) and one.any()
 
 
-def test_coverage_is_what_the_pictures_change_by_with_the_texels(wrong: Baked, views: list[View]) -> None:
-    """Of surfels so bright that no channel is cut off: the gradient of all pixels that count."""
-    scene = TexelScene(wrong, BACKGROUND)
-    mask = torch.rand(40, 48, 1, generator=torch.Generator().manual_seed(0)) > 0.3
-    views = [View(views[0].camera, views[0].image, mask), *views[1:5]]
-    both, squares, want, want_squares = (torch.zeros_like(scene.texels) for _ in range(4))
-    scene.add_coverage(views, both, squares)
-    covered = scene.coverage(views)
-    assert torch.equal(both[:, :1], covered) and torch.equal(scene.coverage(views, squared=True), squares[:, :1])
-    for view in views:
-        shown = scene.view(view)
-        bright = replace(shown, base=torch.zeros_like(shown.base))
-        counts = torch.ones(40, 48, 3) if view.mask is None else view.mask.expand(40, 48, 3).float()
-        none = torch.zeros_like(scene.texels)
-        scene.add_gradient(bright, none, counts, want)
-        fragments = replace(shown.fragments, weight=shown.fragments.weight.square())
-        scene.add_gradient(replace(bright, fragments=fragments), none, counts, want_squares)
-    assert covered.max() > 1 and (squares <= covered).all()
-    torch.testing.assert_close(covered, want[:, :1], rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(squares, want_squares, rtol=1e-4, atol=1e-5)
+def test_coverage_of_several_views_is_their_sum(wrong: Baked, views: list[View]) -> None:
+    texels = TexelList(wrong)
+    both, squares, want = (torch.zeros_like(texels.values) for _ in range(3))
+    texels.add_coverage(views[:5], both, squares)
+    covered = texels.coverage(views[:5])
+    assert torch.equal(both[:, 0], covered) and torch.equal(texels.coverage(views[:5], squared=True), squares[:, 0])
+    for view in views[:5]:
+        texels.add_coverage([view], want, None)
+    assert torch.equal(both, want) and covered.max() > 1 and (squares <= both).all()
 
 
 def test_it_ends_with_the_best_texels_of_the_held_in_views(wrong: Baked, views: list[View]) -> None:
@@ -158,20 +156,20 @@ def test_the_texels_kept_are_those_of_the_best_look(
 ) -> None:
     """Of a run that first gains and then loses, its rate rising instead of falling."""
     seen: list[tuple[float, Tensor]] = []
-    judge = TexelViews.psnr
+    judge = TuningViews.psnr
 
-    def noted(self: TexelViews, texels: Tensor, *arguments: Any) -> float:
+    def noted(self: TuningViews, texels: Tensor, *arguments: Any) -> float:
         seen.append((judge(self, texels, *arguments), texels.clone()))
         return seen[-1][0]
 
-    monkeypatch.setattr(TexelViews, "psnr", noted)
+    monkeypatch.setattr(TuningViews, "psnr", noted)
     monkeypatch.setattr("math.cos", lambda angle: 20.0 * angle**6 - 0.9)
     tuned = tune_atlas(wrong, views, BACKGROUND, replace(OPTIONS, patience=99))
     del seen[-1]  # of what is stored
     best = max(range(len(seen)), key=lambda i: seen[i][0])
     assert 0 < best < len(seen) - 1 and seen[-1][0] < seen[best][0] - 0.5
     assert tuned.statistics.finetune.psnr_held_in.after == pytest.approx(seen[best][0], abs=1e-4)
-    torch.testing.assert_close(TexelScene(tuned, BACKGROUND).texels, seen[best][1], rtol=0, atol=0)
+    torch.testing.assert_close(texels_of(tuned), seen[best][1], rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("patience", [2, 99])
@@ -195,11 +193,10 @@ def test_memory_for_the_views_does_not_change_the_result(wrong: Baked, views: li
 
 
 def test_the_views_set_aside_are_kept_first(wrong: Baked, views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
-    scene, trace = TexelScene(wrong, BACKGROUND), TexelScene.view
-    set_aside = [scene.view(view) for view in views[::4]]
+    set_aside, trace = list(tuning_views(wrong, views[::4])), TuningViews._traced
     traced, kept = [], []
 
-    def counted(self: TexelScene, view: View) -> TexelView:
+    def counted(self: TuningViews, view: View) -> TuningView:
         traced.append(next(i for i, v in enumerate(views) if v.image is view.image))
         return trace(self, view)
 
@@ -209,7 +206,7 @@ def test_the_views_set_aside_are_kept_first(wrong: Baked, views: list[View], mon
         return fits
 
     take = MemoryBudget.reserve
-    monkeypatch.setattr(TexelScene, "view", counted)
+    monkeypatch.setattr(TuningViews, "_traced", counted)
     monkeypatch.setattr(MemoryBudget, "reserve", keep)
     budget = sum(view.nbytes for view in set_aside)
     tune_atlas(wrong, views, BACKGROUND, replace(OPTIONS, steps=24, cache_bytes=budget))
@@ -221,18 +218,18 @@ def test_the_views_set_aside_are_kept_first(wrong: Baked, views: list[View], mon
 def test_a_view_with_many_fragments_is_traced_in_bands(
     wrong: Baked, views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scene = TexelScene(wrong, BACKGROUND)
-    whole = scene.view(views[0])
+    def learned() -> tuple[TuningView, Tensor]:
+        drawn, texels = tuning_views(wrong, views[:1]), texels_of(wrong)
+        drawn.step(0, texels, torch.ones(len(texels)), 1e-3, 0.2)
+        return drawn[0], texels
+
+    whole, texels = learned()
     monkeypatch.setattr(trace_cpu, "MOST", 3500)
-    camera, p = views[0].camera, wrong.scene.surfels
-    projection = project(*(p[name] for name in GEOMETRY), camera, wrong.scene.near)
-    assert len(list(fitting_lists(projection))) > 1
-    parts = scene.view(views[0])
-    for name in ("surfel", "pixel", "tile_start", "run_start", "order"):
-        assert torch.equal(getattr(parts.fragments, name), getattr(whole.fragments, name)), name
-    assert (parts.fragments.width, parts.fragments.height) == (48, 40)
-    torch.testing.assert_close(parts.fragments.weight, whole.fragments.weight, rtol=1e-4, atol=1e-5)
+    parts, same = learned()
+    assert len(whole.lists) == 1 < len(parts.lists) and sum(map(len, parts.lists)) == len(whole.lists[0])
     torch.testing.assert_close(parts.rest, whole.rest, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(same, texels, rtol=1e-4, atol=1e-5)
+    assert not torch.equal(texels, texels_of(wrong))
 
 
 def test_masked_pixels_and_alpha(wrong: Baked, views: list[View]) -> None:
@@ -257,28 +254,18 @@ def test_exposures_are_not_tuned_into_the_texels(truth: Baked, wrong: Baked, vie
         alpha = truth.unquantised().render(view.camera, BACKGROUND).alpha
         bare = view._replace(correction=log.exp().expand(3))
         exposed.append(bare._replace(image=bare.shown(view.image, alpha, BACKGROUND)))
-    scene = TexelScene(truth, BACKGROUND)
-    alike = TexelViews(scene, exposed, MemoryBudget(1 << 30))
-    assert alike.psnr(scene.texels) > 55  # background and all
+    assert tuning_views(truth, exposed).psnr(texels_of(truth)) > 55  # background and all
     blind = [view._replace(correction=None) for view in exposed]
     after = {}
     for name, each in (("known", exposed), ("unknown", blind)):
         tuned = tune_atlas(wrong, each, BACKGROUND, OPTIONS)
-        after[name] = TexelViews(TexelScene(tuned, BACKGROUND), views, MemoryBudget(1 << 30)).psnr(
-            TexelScene(tuned, BACKGROUND).texels
-        )
+        after[name] = tuning_views(tuned, views).psnr(texels_of(tuned))
     assert after["known"] > after["unknown"] + 1.0
 
 
 def test_too_few_views_leave_the_atlas_alone(wrong: Baked, views: list[View]) -> None:
     same = tune_atlas(wrong, views[:3], BACKGROUND)
     assert same.texels is wrong.texels and same.statistics.finetune.model_dump() == {"steps": 0, "views": 3}
-
-
-def test_a_bake_on_another_device_is_refused_and_not_copied(wrong: Baked, views: list[View]) -> None:
-    moved = replace(wrong, scene=wrong.scene.to("meta"))
-    with pytest.raises(RuntimeError, match="the fine-tuning runs on the CPU only.*'meta': give it the bake as it was"):
-        tune_atlas(moved, views, BACKGROUND, OPTIONS)
 
 
 def test_a_scene_without_texture_is_refused(scene, views: list[View]) -> None:
@@ -297,9 +284,7 @@ def test_an_interruption_leaves_the_bake_as_it_was(wrong: Baked, views: list[Vie
     assert torch.equal(wrong.texels, before)
 
 
-@pytest.mark.parametrize(
-    "bad", [{"steps": -1}, {"held_in_every": 1}, {"rate": 0.0}, {"prior": -1.0}, {"ssim_weight": 2}]
-)
+@pytest.mark.parametrize("bad", [{"steps": -1}, {"val_every": 1}, {"rate": 0.0}, {"prior": -1.0}, {"ssim_weight": 2}])
 def test_options_out_of_range_are_refused(wrong: Baked, views: list[View], bad: dict[str, float]) -> None:
     tune = partial(tune_atlas, wrong, views, BACKGROUND)
     with pytest.raises(ValueError, match=f"{next(iter(bad))}.*fine-tuning|fine-tuning.*{next(iter(bad))[:4]}|SSIM"):
@@ -320,8 +305,8 @@ def test_the_last_steps_see_what_is_stored(truth: Baked, views: list[View], form
     noise = 0.2 * torch.randn(truth.texels.shape, generator=generator)
     noisy = replace(truth, options=options).with_texels(truth.texels + noise)
     plain = noisy.encoded()
-    for held_in_every in (0, 4):
-        steps = TuneOptions(steps=0, coded_steps=40, coded_rate=0.3, held_in_every=held_in_every)
+    for val_every in (0, 4):
+        steps = TuneOptions(steps=0, coded_steps=40, coded_rate=0.3, val_every=val_every)
         tuned = tune_atlas(noisy, views, BACKGROUND, steps)
         assert error(tuned, views) < 0.8 * error(plain, views)
         assert tuned.statistics.finetune.steps == 40

@@ -29,7 +29,7 @@ def test_lists_that_find_no_memory(device: torch.device, fit: int, monkeypatch: 
 
     scene, camera = bands.make(device, 0)
     want = scene.render(camera)
-    assert want.fragments.layout.pairs < 500
+    assert want.fragments.layout.handle.pairs < 500
     monkeypatch.setattr(trace_cuda, "empty_list", small_ones)
     monkeypatch.setattr(trace_cuda, "fragment_capacity", lambda geom: 2 * fit)
     if fit == 500:

@@ -40,7 +40,7 @@ def test_pictures_and_gradients_are_those_of_the_cpu(
     with cpu():
         want = run(case, HERE, dtype, textured, maps, moves)
         fragments, _ = View(case, dtype, textured).fragments()
-    assert fragments.tile_start.diff().max() > 2048
+    assert fragments.layout.arrays["tile_start"].diff().max() > 2048
     for mine, cpus in zip(got, want, strict=True):
         assert relative(mine, cpus) < (1e-10 if dtype == torch.float64 else 3e-4)
 

@@ -96,12 +96,10 @@ class Shading:
         moved["uv"] = moved["uv"].clone().requires_grad_()
         fragments = ops.Fragments(
             **moved,
-            tile_start=f.tile_start.to(device),
             width=f.width,
             height=f.height,
-            layout=f.layout,
+            layout=changed(f.layout, lambda t: t.to(device)),
             surfels=f.surfels,
-            places=changed(f.places, lambda t: t.to(device)),
         )
         params = [w.detach().to(device).requires_grad_(mode in ("learn", "move")) for w in self.field.weights]
         geometry = None if mode == "plain" else self.field.geometry

@@ -109,7 +109,8 @@ def check_order(fragments: ops.Fragments) -> None:
     assert (tile.diff() >= 0).all()
     tiles = across * -(-fragments.height // 16)
     starts = torch.searchsorted(tile.contiguous(), torch.arange(tiles + 1))
-    assert torch.equal(fragments.tile_start.cpu(), starts)
+    arrays = fragments.layout.arrays
+    assert torch.equal(arrays["offsets"][arrays["tile_pairs"]].cpu(), starts)
     run = torch.stack([tile, fragments.surfel.cpu().long()])
     assert torch.unique_consecutive(run, dim=1).shape[1] == torch.unique(run, dim=1).shape[1]
 
@@ -172,7 +173,7 @@ def test_more_surfels_in_a_tile_than_a_warp_has_lanes_and_pixels_that_close(
         with cpu():
             want = render(case, torch.float64, torch.device("cpu"))
         compare(got, want)
-        assert got.fragments.layout.pairs > 3 * 64
+        assert got.fragments.layout.handle.pairs > 3 * 64
         alpha = got.image[:, 3]
         assert alpha.min() > 0.99 if closes else alpha.max() < 0.9
 
@@ -223,11 +224,9 @@ def test_lists_that_differ_from_the_counts_stay_in_their_slots(fewer: str, devic
         assert torch.equal(bins.tile_pairs, want.tile_pairs)
         pairs = int(want.tile_pairs[-1])
         assert pairs < len(slots) and torch.equal(bins.surfel[:pairs], want.surfel)
-        layout, tile_start = trace_cuda.blended(geom, listed, bins)
-        want_layout, want_start = trace_cuda.blended(geom, listed, want)
-        assert torch.equal(tile_start, want_start) and layout.fragments == want_layout.fragments > 0
-        filled = (trace_cuda.fill(geom, listed, each) for each in (layout, want_layout))
-        got, fragments = (numbers | places.arrays() for numbers, places in filled)
+        layouts = [trace_cuda.blended(geom, listed, each) for each in (bins, want)]
+        assert layouts[0].handle.fragments == layouts[1].handle.fragments > 0
+        got, fragments = (trace_cuda.fill(geom, listed, layout) | layout.ids() for layout in layouts)
         assert all(torch.equal(got[name], value) for name, value in fragments.items())
 
 
@@ -324,7 +323,7 @@ def test_discs_across_the_camera_plane_are_listed_where_they_show(
     shown = tiles_reached(weights, case.width, case.height)
     seen = projection.radii[:, 0].cpu() > 0
     assert not ((shown > 0) & ~seen).any() and (seen & (shown == 0)).sum() <= 10
-    assert fragments.layout.pairs <= 1.25 * int(shown.sum())
+    assert fragments.layout.handle.pairs <= 1.25 * int(shown.sum())
     count = int((weights > 0).sum())
     assert abs(fragments.surfel.shape[0] - count) <= (0 if dtype == torch.float64 else 1e-4 * count)
 

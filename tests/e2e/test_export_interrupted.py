@@ -23,8 +23,8 @@ def interrupted(*args: Any, **kwargs: Any) -> None:
     "module, function, options, replaces, message",
     [
         (tune, "photometric", {"tolerance": TOLERANCE}, False, "was not written"),
-        (bake_learn, "learned", {}, False, "was not written"),
-        (bake_learn, "learned", {"overwrite": True}, True, "is the earlier one"),
+        (bake_learn, "trained_texels", {}, False, "was not written"),
+        (bake_learn, "trained_texels", {"overwrite": True}, True, "is the earlier one"),
         (command, "read_bundle", {"finetune_steps": 0}, False, "is complete"),
     ],
     ids=["fine-tuning", "bake", "bake of a replacement", "comparison"],

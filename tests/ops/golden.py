@@ -20,9 +20,10 @@ from bitymi_ns.measure.stability.scenes import (
     quaternions,
     random_scene,
 )
-from bitymi_ns.ops.fragment_list import Places
+from bitymi_ns.ops.fragment_list import Layout
 from bitymi_ns.ops.reference import project as reference_project
 from bitymi_ns.ops.reference import trace as reference_trace
+from bitymi_ns.ops.reference.texel import texel_colors
 from bitymi_ns.scene import Camera
 
 __all__ = [
@@ -158,6 +159,16 @@ def dense(fragments: ops.Fragments, values: Tensor, n: int) -> Tensor:
     return out.index_put((fragments.pixel.long(), fragments.surfel.long()), values)
 
 
-def changed(places: Places, change: Callable[[Tensor], Tensor]) -> Places:
-    """Places whose arrays are changed: moved to another device, say."""
-    return Places(lambda: {name: change(t) for name, t in places.arrays().items()})
+def changed(layout: Layout, change: Callable[[Tensor], Tensor]) -> Layout:
+    """A layout whose surfels and pixels are changed: moved to another device, say."""
+    return Layout(layout.handle, layout.arrays, lambda: {name: change(t) for name, t in layout.ids().items()})
+
+
+def reference_colors(
+    fragments: ops.Fragments, base: Tensor, texels: Tensor, tiles: ops.TexelTiles, bound: float
+) -> Tensor:
+    """[F, 3] colours of fragments by `reference.texel`, in the dtype of their weights."""
+    rows = zip(tiles.first.tolist(), tiles.size.tolist(), strict=True)
+    listed = [texels[first : first + r_u * r_v].view(r_v, r_u, 3) for first, (r_u, r_v) in rows]
+    f = fragments
+    return texel_colors(f.weight.detach(), f.uv, f.surfel, base, listed, tiles.extent, bound)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.ops import backend
-from tests.ops.golden import SURFEL_KEYS, SceneCase, camera_of, load_golden, random_scene
+from tests.ops.golden import SURFEL_KEYS, SceneCase, camera_of, load_golden, random_scene, reference_colors
 
 SIZES = [(4, 8), (1, 1), (8, 4), (0, 0), (4, 4), (16, 4)]
 BOUND = 0.03
@@ -58,7 +58,8 @@ class View:
     def one_by_one(self, maps: bool = False, moves: bool = True) -> Tensor:
         fragments, projection = self.fragments()
         if self.given:
-            colors = ops.texel_colors(fragments, self.base, **self.given, bound=BOUND, move_surfels=moves)
+            listed = fragments if moves else replace(fragments, uv=fragments.uv.detach())
+            colors = reference_colors(listed, self.base, **self.given, bound=BOUND)
         else:
             colors = ops.shade(fragments, self.base, projection.frames)
         return ops.composite_image(fragments, projection, colors, maps)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from bitymi_ns.ops import Fragments, soft_overdraw
-from bitymi_ns.ops.fragment_list import Places
+from bitymi_ns.ops.fragment_list import Layout
 
 
 def a_list(weight: torch.Tensor, width: int = 4, height: int = 3) -> Fragments:
@@ -14,9 +14,8 @@ def a_list(weight: torch.Tensor, width: int = 4, height: int = 3) -> Fragments:
     n = len(weight)
     pixel = torch.arange(n, dtype=torch.int32) % (width * height)
     nothing = torch.zeros(n)
-    start = torch.tensor([0, n])
-    places = Places(lambda: {"surfel": pixel, "pixel": pixel})
-    return Fragments(weight, nothing.expand(2, n), nothing, nothing, start, width, height, start, n, places)
+    layout = Layout(None, {}, lambda: {"surfel": pixel, "pixel": pixel})
+    return Fragments(weight, nothing.expand(2, n), nothing, nothing, width, height, layout, n)
 
 
 def test_soft_overdraw_is_the_sum_over_a_pixel():

@@ -15,24 +15,9 @@ from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from tests.cuda.conftest import why_not_emulated
 from tests.ops.golden import SURFEL_KEYS, camera_of, random_scene, traced
-from tests.ops.test_texel import Case
 
 emulated = pytest.mark.skipif(why_not_emulated() is not None, reason=str(why_not_emulated()))
 GEOMETRY = ops.FieldGeometry(4, False, (0.0, 0.0, 0.0), 1.0)
-
-
-@emulated
-def test_texel_images_are_drawn_on_the_cpu_only() -> None:
-    case = Case()
-    fragments = ops.TexelFragments.of(case.fragments)
-    arguments = (fragments, case.base, case.texels, case.tiles)
-    with emulated_cuda():
-        with pytest.raises(RuntimeError, match="TexelFragments.of runs on the CPU only, .* move them to the CPU"):
-            ops.TexelFragments.of(case.fragments)
-        with pytest.raises(RuntimeError, match="texel_image runs on the CPU only, .* on 'cpu': move them to the CPU"):
-            ops.texel_image(*arguments)
-        with pytest.raises(RuntimeError, match="add_texel_gradient runs on the CPU only"):
-            ops.add_texel_gradient(torch.zeros(1), *arguments, 0.0, None)
 
 
 def test_tiles_are_evaluated_on_a_cuda_device_only() -> None:
@@ -77,8 +62,8 @@ def test_the_tracers_refuse_each_others_tensors() -> None:
             trace_cpu.find_fragments(geom, projection)
         with pytest.raises(RuntimeError, match=r"trace_cpu.count runs on the CPU only"):
             trace_cpu.count(projection)
-        with pytest.raises(RuntimeError, match="there is no kernel texel_image_forward_f64 for tensors on 'cpu'"):
-            kernel("texel_image_forward", geom.double())
+        with pytest.raises(RuntimeError, match="there is no kernel baked_forward_f64 for tensors on 'cpu'"):
+            kernel("baked_forward", geom.double())
 
 
 def test_an_image_that_the_cpu_does_not_draw_is_named() -> None:

@@ -9,7 +9,7 @@ from bitymi_ns import ops
 from bitymi_ns.ops import trace_cpu
 from bitymi_ns.ops.backend import function, kernel_class, module
 from bitymi_ns.ops.constants import TILE
-from bitymi_ns.ops.fragment_list import empty_list, empty_places
+from bitymi_ns.ops.fragment_list import empty_ids, empty_list
 from tests.ops.golden import SURFEL_KEYS, camera_of, random_scene
 
 
@@ -58,14 +58,15 @@ def test_packs_say_whose_fragments_are_and_where(
     assert len(surfel) == found["tile_start"][-1] > 0
     fragments = ops.trace(projection)
     assert surfel == fragments.surfel.tolist() and pixel == fragments.pixel.tolist()
-    for name in ("weight", "uv", "depth", "sigma", "tile_start"):
+    for name in ("weight", "uv", "depth", "sigma"):
         assert torch.equal(getattr(fragments, name), found[name])
+    assert torch.equal(fragments.layout.arrays["tile_start"], found["tile_start"])
 
 
 def test_places_are_listed_when_they_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """A step without a field, and what it is looked at for, need none: 8 bytes per fragment."""
     made = []
-    monkeypatch.setattr(trace_cpu, "empty_places", lambda *given: made.append(given) or empty_places(*given))
+    monkeypatch.setattr(trace_cpu, "empty_ids", lambda *given: made.append(given) or empty_ids(*given))
     case = random_scene(80, 1, width=64, height=48)
     surfels = [case.params[key].clone().requires_grad_() for key in SURFEL_KEYS]
     projection = ops.project(*surfels, camera_of(case, torch.float64))
@@ -77,10 +78,10 @@ def test_places_are_listed_when_they_are_asked_for(monkeypatch: pytest.MonkeyPat
     assert fragments.surfel is fragments.surfel and len(fragments.pixel) == len(fragments) and len(made) == 1
     listed = {"surfel": fragments.surfel, "pixel": fragments.pixel[1:]}
     with pytest.raises(ValueError, match="pixel has"):
-        function("list_places", torch.device("cpu"))(layout=fragments.layout, width=64, height=48, **listed)
+        function("list_places", torch.device("cpu"))(layout=fragments.layout.handle, width=64, height=48, **listed)
     with pytest.raises(ValueError, match="not that of such a list"):
         function("list_places", torch.device("cpu"))(
-            layout=fragments.layout, width=65, height=48, **fragments.places.arrays()
+            layout=fragments.layout.handle, width=65, height=48, **fragments.layout.ids()
         )
 
 

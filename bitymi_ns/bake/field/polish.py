@@ -1,4 +1,4 @@
-"""The polish: after the bake texels, geometry, opacities and view colours learn together, without the network."""
+"""Polish of a bake: texels, geometry, opacities and view colours are optimised together, without the network."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.baked import Baked
-from bitymi_ns.bake.early_stopping import FEWEST_VIEWS, Looks, gain, look, set_aside
-from bitymi_ns.bake.texel_scene import TexelScene
+from bitymi_ns.bake.early_stopping import FEWEST_VIEWS, EarlyStopping, evaluate, gain, validation_split
+from bitymi_ns.bake.texel_list import TexelList
 from bitymi_ns.bake.tune import TuneOptions
 from bitymi_ns.bundle.statistics import FineTuning
 from bitymi_ns.ops import TexelDescent
@@ -31,7 +31,7 @@ from bitymi_ns.train.views import OnDemand, View, background_changes, step_backg
 
 @dataclass
 class PolishOptions(TuneOptions):
-    """How a baked scene is polished: `rate` and `prior` are of the texels."""
+    """Options of the polish: `rate` and `prior` are of the texels."""
 
     steps: int = 300
     share: float = 0.4
@@ -42,9 +42,9 @@ class PolishOptions(TuneOptions):
     it."""
 
     def check(self) -> None:
-        """Refuses values that make no sense."""
+        """Refuse values that make no sense."""
         super().check()
-        for name, least in (("steps", 1), ("held_in_every", 2)):
+        for name, least in (("steps", 1), ("val_every", 2)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} of the polish must be at least {least}, not {getattr(self, name)}")
         for name in ("share", "pixels_per_texel"):
@@ -56,10 +56,16 @@ class _Polish:
     """One polish, step by step."""
 
     def __init__(
-        self, baked: Baked, views: Sequence[View], background: Tensor, options: PolishOptions, train: TrainConfig
+        self,
+        baked: Baked,
+        views: Sequence[View],
+        background: Tensor,
+        options: PolishOptions,
+        train: TrainConfig,
+        device: torch.device | str,
     ) -> None:
-        self.texels = TexelScene(baked, background)
-        drawn = baked.scene
+        self.texels, self.device = TexelList(baked, device), device
+        drawn = self.texels.scene
         config = SceneConfig(
             view_color=drawn.view_color,  # type: ignore[arg-type]
             weight_bound=drawn.weight_bound,
@@ -67,10 +73,10 @@ class _Polish:
             texture_moves_surfels=True,
         )
         tiles = self.texels.tiles
-        self.field = TexelField(tiles.size, tiles.extent, self.texels.texels)
+        self.field = TexelField(tiles.size, tiles.extent, self.texels.values)
         self.scene = Scene(config, drawn.surfels, self.field, near=drawn.near)
-        self.options, self.background = options, background.cpu()
-        centers = torch.stack([view.camera.center.cpu() for view in views])
+        self.options, self.background = options, background.to(device)
+        centers = torch.stack([view.camera.center.to(device) for view in views])
         extent = scene_extent(centers, drawn.surfels["means"])
         self.schedule = Schedule(replace(train, lr=train.lr.times(options.share)), options.steps, extent)
         self.optimizers = surfel_optimizers(self.scene)
@@ -78,16 +84,20 @@ class _Polish:
 
     def shown(self, view: View, background: Tensor | None) -> Tensor:
         """[H, W, 3] the scene as a view's photograph shows it, over a colour [3]."""
-        output = self.scene.render(view.camera.to("cpu"), background)
+        output = self.scene.render(view.camera.to(self.device), background)
         return view.shown(output.rgb, output.alpha, background)
 
     @torch.no_grad()
     def psnr(self, views: Sequence[View], progress: Progress = no_progress) -> float:
         """Mean dB over the views of which any pixel counts."""
         pictures = (
-            (self.shown(view, self.background), view.target(self.background, "cpu"), _mask(view)) for view in views
+            (self.shown(view, self.background), view.target(self.background, self.device), self._mask(view))
+            for view in views
         )
-        return look(pictures, len(views), progress)
+        return evaluate(pictures, len(views), progress)
+
+    def _mask(self, view: View) -> Tensor | None:
+        return None if view.mask is None else view.mask.to(self.device)
 
     def step(self, number: int, view: View, share: Tensor) -> bool:
         """A step on one view; False = it is not finite, and was not done."""
@@ -97,8 +107,8 @@ class _Polish:
         forget_gradients(self.optimizers.values())
         background = self.background
         if background_changes(self.train, view):
-            background = step_background(self.train, view, number, "cpu")
-        mask, target = _mask(view), view.target(background, "cpu")
+            background = step_background(self.train, view, number, self.device)
+        mask, target = self._mask(view), view.target(background, self.device)
         # the loss is a mean, the step wants a sum
         rate = self.factor * falling(options.rate, number, options.steps) * numbers(target, mask)
         self.field.descent = TexelDescent(share, rate)
@@ -112,11 +122,11 @@ class _Polish:
         return True
 
     def state(self) -> dict[str, Any]:
-        """A copy of what is learned."""
+        """Copy of the parameters."""
         return {name: value.detach().clone() for name, value in self.scene.state_dict().items()}
 
     def go_back(self, state: dict[str, Any]) -> None:
-        """To an earlier state, with slower steps from here on."""
+        """Restore an earlier state, with slower steps from here on."""
         self.scene.load_state_dict(state)
         self.optimizers = surfel_optimizers(self.scene)
         self.factor *= self.train.guard.rates
@@ -130,25 +140,25 @@ def polish_scene(
     train: TrainConfig | None = None,
     progress: Progress = no_progress,
     eval_views: Sequence[View] = (),
+    device: torch.device | str = "cpu",
 ) -> Baked:
-    """Lets texels and surfels of a bake learn together against its training photographs, 0.8 L1 + 0.2 (1 - SSIM).
+    """Optimise texels and surfels of a bake together against its training photographs, 0.8 L1 + 0.2 (1 - SSIM).
 
     Surfels move by Adam, texels as in `tune_atlas`, with the coverage of the bake. Surfels keep their tiles with their
     extents and sizes: a fragment beyond its tile reads the edge, while it learns and when it is drawn. Nothing is
-    densified. The state kept is the one that shows the set-aside views best, the bake itself where none is better. A
+    densified. The state kept is the one that shows the validation views best, the bake itself where none is better. A
     step that is not finite takes the scene back to that state, with smaller rates.
-
-    It runs on the CPU, as `tune_atlas` does.
 
     Args:
         baked: a bake with texels and all of its view colours, made with `pixels_per_texel`.
-        views: training views, with the corrections that training found; every `held_in_every`-th is set aside.
+        views: training views, with the corrections that training found; every `val_every`-th is for validation.
         background: [3] colour behind the scene, but for steps on views behind which it changes (`train.background`).
         options: see `PolishOptions`.
         train: options of the training, for the learning rates, the colours behind the scene, and for what is done when
             a step is not finite.
         progress: called after every step.
         eval_views: views of which the gain is stated; they decide nothing.
+        device: where the scene learns.
 
     Returns:
         a new bake with `statistics.polish`, to be `reduced`; `baked` itself without change where there are fewer than 4
@@ -164,16 +174,16 @@ def polish_scene(
     if len(views) < FEWEST_VIEWS:
         return replace(baked, statistics=baked.statistics.but(polish=FineTuning(steps=0, views=len(views))))
     started, cpu_started = time.perf_counter(), time.process_time()
-    held_in, learned = (
+    validation, trained = (
         OnDemand(len(rows), lambda i, rows=rows: views[rows[i]])
-        for rows in set_aside(len(views), options.held_in_every)
+        for rows in validation_split(len(views), options.val_every)
     )
-    run = _Polish(baked, views, background, options, train or TrainConfig())
+    run = _Polish(baked, views, background, options, train or TrainConfig(), device)
     before = run.psnr(eval_views) if eval_views else math.nan
-    looks = _learn(run, learned, held_in, progress)
-    run.scene.load_state_dict(looks.best)
+    stopping = _optimise(run, trained, validation, progress)
+    run.scene.load_state_dict(stopping.best)
     spent = time.perf_counter() - started, time.process_time() - cpu_started
-    statistics = looks.statistics(len(learned), len(held_in), *spent).but(
+    statistics = stopping.statistics(len(trained), len(validation), *spent).but(
         error_before=baked.statistics.error,
         psnr_held_out=gain(before, run.psnr(eval_views)) if eval_views else None,
     )
@@ -182,25 +192,22 @@ def polish_scene(
     return replace(result, statistics=result.statistics.but(polish=statistics))
 
 
-def _mask(view: View) -> Tensor | None:
-    return None if view.mask is None else view.mask.cpu()
-
-
-def _learn(run: _Polish, views: Sequence[View], held_in: Sequence[View], progress: Progress) -> Looks[dict[str, Any]]:
-    """The state that shows the set-aside views best, and the looks at these."""
+def _optimise(
+    run: _Polish, views: Sequence[View], validation: Sequence[View], progress: Progress
+) -> EarlyStopping[dict[str, Any]]:
+    """The state that shows the validation views best, and the evaluations."""
     options = run.options
-    looks = Looks(options, run.psnr(held_in, progress), run.state())
-    seen = run.texels.coverage(views, progress)
-    share, attempts = (1.0 / (seen + options.prior)).squeeze(1), 0  # [T]
+    stopping = EarlyStopping(options, run.psnr(validation, progress), run.state())
+    share, attempts = 1.0 / (run.texels.coverage(views, progress) + options.prior), 0  # [T]
     for number in range(options.steps):
         view = views[training_order(len(views), options.seed, number)]
         if not run.step(number, view, share):
             attempts += 1
-            run.go_back(looks.best)
+            run.go_back(stopping.best)
         more = attempts < run.train.guard.rollbacks
-        if not more or looks.due(number + 1):
-            more = looks.note(number + 1, run.psnr(held_in), run.state) and more
+        if not more or stopping.due(number + 1):
+            more = stopping.update(number + 1, run.psnr(validation), run.state) and more
         progress("polishing", number + 1, options.steps if more else number + 1)
         if not more:
             break
-    return looks
+    return stopping

@@ -26,7 +26,7 @@ def texel(tile: Tensor, uv: Tensor) -> Tensor:
         [M, C].
     """
     rows, columns = tile.shape[:2]
-    size = torch.tensor([columns, rows], dtype=uv.dtype)
+    size = torch.tensor([columns, rows], dtype=uv.dtype, device=uv.device)
     position = (uv.clamp(-SUPPORT, SUPPORT) + SUPPORT) / (2 * SUPPORT) * size - 0.5  # [M, 2] texels
     position = torch.minimum(position.clamp(min=0), size - 1)
     low = position.detach().floor().long()
@@ -37,32 +37,22 @@ def texel(tile: Tensor, uv: Tensor) -> Tensor:
     return top * (1 - fv) + bottom * fv
 
 
-def texel_image(
-    weight: Tensor,
-    uv: Tensor,
-    surfel: Tensor,
-    pixel: Tensor,
-    base: Tensor,
-    tiles: Sequence[Tensor],
-    extent: Tensor,
-    bound: float,
-    pixels: int,
+def texel_colors(
+    weight: Tensor, uv: Tensor, surfel: Tensor, base: Tensor, tiles: Sequence[Tensor], extent: Tensor, bound: float
 ) -> Tensor:
-    """Sum over the fragments of w ReLU(ReLU(base + 0.5) + texel(u, v)) per pixel, [pixels, 3].
+    """Colours ReLU(ReLU(base + 0.5) + texel(u, v)) of fragments, [F, 3].
 
     Args:
-        weight, uv, surfel, pixel: [F], [2, F] in scale units, [F], [F] of the fragments.
+        weight, uv, surfel: [F], [2, F] in scale units, [F] of the fragments.
         base: [N, 3] view-dependent colours without the 0.5.
         tiles: N tiles [r_v, r_u, 3]; one without texels is no tile.
         extent: [N] half side of each tile, scale units.
         bound: fragments of smaller weight have no residual.
     """
-    image = base.new_zeros(pixels, 3)
+    color = torch.relu(base + 0.5)[surfel.long()]
+    residual = torch.zeros_like(color)
     for i, tile in enumerate(tiles):
-        mine = surfel == i
-        color = torch.relu(base[i] + 0.5).expand(int(mine.sum()), 3)
         if tile.numel():
-            residual = texel(tile, uv[:, mine].T * (SUPPORT / extent[i]))
-            color = torch.where(weight[mine, None] >= bound, torch.relu(color + residual), color)
-        image = image.index_add(0, pixel[mine], weight[mine, None] * color)
-    return image
+            rows = torch.nonzero((surfel == i) & (weight >= bound)).squeeze(1)
+            residual = residual.index_put((rows,), texel(tile, uv[:, rows].T * (SUPPORT / extent[i])))
+    return torch.relu(color + residual)

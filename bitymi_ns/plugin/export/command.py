@@ -146,8 +146,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
         has_learned, textured = isinstance(model.scene.field, TexelField), model.scene.field is not None
         steps = self.polish_steps
         if steps is None:
-            polishes = model.device.type == "cpu" and textured and not has_learned
-            steps = max(PolishOptions.steps, FEWEST_PASSES * views) if polishes else 0
+            steps = max(PolishOptions.steps, FEWEST_PASSES * views) if textured and not has_learned else 0
         polish = PolishOptions(steps=steps) if steps and textured else None
         steps = self.finetune_steps
         if steps is None:
@@ -176,8 +175,6 @@ class ExportAtlas(BakeOptions, CompactOptions):
                     f"The {name} has {options_of.steps:,} steps for {len(views):,} training photographs, {passes:.1f} "
                     f"for each: more may gain (--{name}-steps)."
                 )
-        if (tune or polish) and model.device.type != "cpu":
-            say("Texels are polished and fine-tuned on the CPU: the kernels for it exist there alone.")
         if model.device.type == "cpu":
             kept, learning_surfels = tune.cache_bytes if tune else 0, len(model.scene) if polish else 0
             state_export(model.scene, views, kept, learning_surfels, self._is_compact)

@@ -14,7 +14,7 @@ from pathlib import Path
 import psutil
 import torch
 
-from bitymi_ns.bake.texel_scene import LEAST_KEPT
+from bitymi_ns.bake.tuning_views import LEAST_KEPT
 from bitymi_ns.bake.view_color_rate import choice_bytes
 from bitymi_ns.ops import project
 from bitymi_ns.ops.trace_cpu import MOST, count

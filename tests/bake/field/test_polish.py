@@ -28,7 +28,7 @@ from bitymi_ns.train.config import GuardConfig
 from bitymi_ns.train.views import View
 from tests.bake.test_tune import BACKGROUND, cameras, photographs, render, waving
 
-OPTIONS = PolishOptions(steps=40, rate=0.3, share=1.0, held_in_every=4)
+OPTIONS = PolishOptions(steps=40, rate=0.3, share=1.0, val_every=4)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def db(baked: Baked, views: list[View]) -> float:
 
 def test_everything_learns_and_the_gain_is_what_is_stated(wrong: Baked, views: list[View]) -> None:
     polished = polish_scene(wrong, views[:10], BACKGROUND, OPTIONS, eval_views=views[10:])
-    tuned = tune_atlas(wrong, views[:10], BACKGROUND, TuneOptions(steps=40, rate=0.3, held_in_every=4, coded_steps=0))
+    tuned = tune_atlas(wrong, views[:10], BACKGROUND, TuneOptions(steps=40, rate=0.3, val_every=4, coded_steps=0))
     told = polished.statistics.polish
     assert (told.views, told.held_in_views, told.steps) == (7, 3, 40)
     assert told.psnr_held_in.after > told.psnr_held_in.before + 3 and told.error_before == wrong.statistics.error
@@ -202,7 +202,7 @@ def test_too_few_views_leave_the_bake_alone(wrong: Baked, views: list[View]) -> 
 
 
 @pytest.mark.parametrize(
-    "bad", [{"steps": 0}, {"held_in_every": 1}, {"rate": 0.0}, {"share": 0.0}, {"pixels_per_texel": 0.0}]
+    "bad", [{"steps": 0}, {"val_every": 1}, {"rate": 0.0}, {"share": 0.0}, {"pixels_per_texel": 0.0}]
 )
 def test_options_out_of_range_are_refused(wrong: Baked, views: list[View], bad: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(bad))):

@@ -1,0 +1,89 @@
+"""The texels of a bake as one list, on the device where they learn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake.baked import Baked
+from bitymi_ns.codec.pages import listed_texels, paged_texels
+from bitymi_ns.ops import Projection, TexelTiles, add_texel_coverage, fitting_lists, project
+from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.scene import GEOMETRY
+from bitymi_ns.train.views import View
+
+
+class TexelList:
+    """The texels of a bake, tile after tile. A surfel without a tile has one texel, its constant residual.
+
+    Attributes:
+        scene: the surfels, on the device.
+        tiles: where the texels lie.
+        values: [T, 3] as baked, on the device.
+        sizes: [N, 2] int32 sides of the tiles, on the CPU; (0, 0) = none.
+    """
+
+    def __init__(self, baked: Baked, device: torch.device | str = "cpu") -> None:
+        """
+        Args:
+            baked: with an atlas.
+            device: where the texels learn.
+
+        Raises:
+            ValueError: there is no atlas.
+        """
+        if baked.texels is None:
+            raise ValueError("a scene without texture has no texels to tune")
+        self._baked, self.device = baked, torch.device(device)
+        self.scene = baked.scene.to(device)
+        self.sizes = torch.from_numpy(baked.packing.tiles[:, 3:])
+        self.tiles = TexelTiles.of_sizes(self.sizes.clamp(min=1).to(device), baked.extent.float().to(device))
+        self.values = listed_texels(baked.texels, baked.packing, baked.mean_residual).to(device)
+
+    def baked(self, texels: Tensor) -> Baked:
+        """The bake with these texels [T, 3], to be `encoded`."""
+        texels = texels.cpu()
+        pages = paged_texels(texels, self._baked.packing, self._baked.texels)
+        bare = self.sizes[:, 0] == 0
+        constants = torch.where(bare[:, None], texels[self.tiles.first.cpu()], self._baked.mean_residual)
+        return self._baked.with_mean_residual(constants).with_texels(pages)
+
+    def projection(self, camera: Camera) -> Projection:
+        """Of the surfels into a view."""
+        geometry = (self.scene.surfels[name] for name in GEOMETRY)
+        return project(*geometry, camera.to(self.device), self.scene.near, self.scene.through_pixel)
+
+    def coverage(self, views: Sequence[View], progress: Progress = no_progress, squared: bool = False) -> Tensor:
+        """Coverage of every texel, in pixels.
+
+        Args:
+            views: training views.
+            progress: called after every view.
+            squared: square the blending weights.
+
+        Returns:
+            [T] sum over views and fragments of the blending weight, or its square, times the bilinear weight, in pixels
+            that count; 0 where no view sees it.
+        """
+        total = torch.zeros_like(self.values)
+        self.add_coverage(views, None if squared else total, total if squared else None, progress)
+        return total[:, 0]
+
+    def add_coverage(
+        self, views: Sequence[View], total: Tensor | None, squares: Tensor | None, progress: Progress = no_progress
+    ) -> None:
+        """Add the same of both kinds.
+
+        Args:
+            views: training views.
+            total: [T, 3], added to, alike in all columns; None = not wanted.
+            squares: [T, 3], added to: that of the blending weights' squares. None = not wanted.
+            progress: called after every view.
+        """
+        for done, view in enumerate(views, start=1):
+            lists = fitting_lists(self.projection(view.camera))
+            add_texel_coverage(lists, self.tiles, view.mask, self.scene.weight_bound, total, squares)
+            progress("tracing the training views", done, len(views))

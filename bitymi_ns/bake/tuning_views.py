@@ -1,0 +1,154 @@
+"""Training views of surfels that stand still, whose texels learn: their fragments are traced once and kept."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake.early_stopping import evaluate
+from bitymi_ns.bake.texel_list import TexelList
+from bitymi_ns.ops import Fragments, Projection, TexelDescent, blended_image, fitting_lists, select, view_color
+from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.train.losses import numbers, photometric
+from bitymi_ns.train.views import MemoryBudget, View, shown
+
+LEAST_KEPT = 1 / 8
+"""Share of the views that fits where any are kept: of fewer, the memory is worth more than the time that they save."""
+
+
+@dataclass
+class TuningView:
+    """A photograph, and what the texels add to its picture.
+
+    Attributes:
+        lists: the fragments that show a texel, in bands from top to bottom.
+        base: [N, 3] f_view of every surfel.
+        rest: [H, W, 3] the picture without these fragments: the faint ones, and the background.
+        target: [H, W, 3] the photograph over the background.
+        mask: [H, W, 1] bool, True where the pixel counts; None = everywhere.
+        correction: of the photograph's exposure, as in `View`; None = there is none.
+        alpha: [H, W, 1] coverage; None without a correction.
+    """
+
+    lists: list[Fragments]
+    base: Tensor
+    rest: Tensor
+    target: Tensor
+    mask: Tensor | None
+    correction: Tensor | None = None
+    alpha: Tensor | None = None
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that it takes."""
+        arrays = (self.base, self.rest, self.target, self.mask, self.alpha, *self.lists)
+        return sum(array.nbytes for array in arrays if array is not None)
+
+
+class TuningViews(Sequence[TuningView]):
+    """Views of a bake, traced when they are needed and kept while there is budget for them."""
+
+    def __init__(self, texels: TexelList, views: Sequence[View], background: Tensor, budget: MemoryBudget) -> None:
+        """
+        Args:
+            texels: of the bake.
+            views: on any device.
+            background: [3] colour behind the scene.
+            budget: for the views that are kept.
+        """
+        self._texels, self._views, self._budget = texels, views, budget
+        self._background = background.to(texels.device)
+        self._kept: dict[int, TuningView] = {}
+        self._keeps: bool | None = None  # whether any; not known before the first one
+        self._projection: Projection | None = None
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def __getitem__(self, index: int) -> TuningView:  # type: ignore[override]
+        if index in self._kept:
+            return self._kept[index]
+        view = self._traced(self._views[index])
+        if self._keeps is None:
+            self._keeps = self._budget.left >= LEAST_KEPT * len(self) * view.nbytes
+        if self._keeps and self._budget.reserve(view.nbytes):
+            self._kept[index] = view
+        return view
+
+    @torch.no_grad()
+    def _traced(self, view: View) -> TuningView:
+        scene, projection = self._texels.scene, self._texels.projection(view.camera)
+        # Only the map of beta, which nobody asks for, needs a view's own projection: any will do, and one is kept.
+        self._projection = self._projection or projection
+        p, camera = scene.surfels, projection.camera
+        base = view_color(scene.view_color, p, p["means"], camera.exact_center, projection.visible)
+        lists, rest, alpha = [], [], []
+        for plain, chosen in self._chosen(projection, base):
+            alpha.append(plain[:, 3:4])
+            rest.append(plain[:, :3] - blended_image(chosen, projection, base)[:, :3])
+            lists.append(chosen)
+        size = (camera.height, camera.width)
+        covered = torch.cat(alpha)
+        behind = torch.cat(rest) + (1 - covered) * self._background
+        device = self._texels.device
+        return TuningView(
+            lists,
+            base,
+            behind.view(*size, 3),
+            view.target(self._background, device).contiguous(),
+            None if view.mask is None else view.mask.to(device).reshape(*size, 1),
+            None if view.correction is None else view.correction.detach().to(device),
+            None if view.correction is None else covered.reshape(*size, 1),
+        )
+
+    def _chosen(self, projection: Projection, base: Tensor) -> Iterator[tuple[Tensor, Fragments]]:
+        """Band by band the image [h * W, 5] of all fragments, and the fragments that show a texel."""
+        for fragments in fitting_lists(projection):
+            image = blended_image(fragments, projection, base)
+            chosen = select(fragments, fragments.weight >= self._texels.scene.weight_bound)
+            del fragments  # before the next list is made
+            yield image, chosen
+
+    def picture(self, view: TuningView, texels: Tensor, descent: TexelDescent | None = None) -> Tensor:
+        """[H, W, 3] what the photograph would show of these texels, by its correction.
+
+        Args:
+            view: of this sequence.
+            texels: [T, 3], as the baked renderer shows them before any quantisation.
+            descent: how the backward pass moves texels.
+        """
+        assert self._projection is not None
+        drawn = (self._projection, view.base, texels, self._texels.tiles)
+        rgb = torch.cat([blended_image(part, *drawn, descent=descent)[:, :3] for part in view.lists])
+        rgb = rgb.view_as(view.rest) + view.rest
+        return rgb if view.alpha is None else shown(rgb, view.correction, view.alpha, self._background)
+
+    def step(
+        self, index: int, texels: Tensor, share: Tensor, rate: float, ssim_weight: float, read: Tensor | None = None
+    ) -> None:
+        """Move texels by the gradient of a view's loss, as a sum over its numbers.
+
+        Args:
+            index: of the view.
+            texels: [T, 3], moved in place: texel t by -rate share[t] times its gradient.
+            share: [T].
+            rate: see there.
+            ssim_weight: share of 1 - SSIM in the loss.
+            read: [T, 3] texels that the picture shows; None = those that are moved.
+        """
+        view = self[index]
+        if read is None:
+            read = texels if len(view.lists) == 1 else texels.clone()  # a band must not read what another has moved
+        # the loss is a mean, the step wants a sum
+        descent = TexelDescent(share, rate * numbers(view.target, view.mask), texels)
+        photometric(self.picture(view, read, descent), view.target, ssim_weight, view.mask).backward()
+
+    @torch.no_grad()
+    def psnr(self, texels: Tensor, progress: Progress = no_progress) -> float:
+        """Mean dB over the views of which any pixel counts."""
+        texels = texels.to(self._texels.device)
+        pictures = ((self.picture(view, texels), view.target, view.mask) for view in self)
+        return evaluate(pictures, len(self), progress)

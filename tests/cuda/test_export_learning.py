@@ -1,0 +1,98 @@
+"""The learning of an export, on the device of the scene: coverage, rate-distortion search, polish and fine-tuning."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+
+import pytest
+import torch
+
+from bitymi_ns.bake import Baked, BakeOptions, Learning, PolishOptions, TuneOptions, bake_and_learn
+from bitymi_ns.bake.compact import Compact
+from bitymi_ns.ops import backend
+from bitymi_ns.ops.backend import cuda_backend
+from bitymi_ns.scene import Scene
+from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.fit import Trainer
+from bitymi_ns.train.views import View
+from tests.cuda.test_texel_training import HERE, START, config, scene_and_views
+
+Context = Callable[[], AbstractContextManager[None]]
+BACKGROUND = torch.tensor([0.2, 0.4, 0.6])
+
+
+@pytest.fixture
+def learned_on() -> Iterator[set[bool]]:
+    """Whether the kernels that move texels ran on CUDA, or its emulation."""
+    found: set[bool] = set()
+    plain = backend.function
+
+    def noted(name: str, device: torch.device):
+        if name.startswith("blend_backward"):
+            found.add(cuda_backend(device))
+        return plain(name, device)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(backend, "function", noted)
+        yield found
+
+
+def trained() -> tuple[Scene, list[View]]:
+    """A scene whose texels have learned a little on the CPU, and four photographs."""
+    scene, views = scene_and_views()
+    trainer = Trainer(scene, views, config(), 12)
+    for _ in range(START + 3):
+        trainer.advance()
+    return trainer.scene, [*views, *views]
+
+
+def exported(scene: Scene, views: list[View], device: torch.device, learning: Learning) -> Baked:
+    cameras = [view.camera.to(device) for view in views]
+    options = BakeOptions(tolerance=0.75, format="uint8")
+    return bake_and_learn(scene.to(device), cameras, views, BACKGROUND, options, learning)
+
+
+def db(baked: Baked, views: list[View]) -> float:
+    """Against the photographs, where they count."""
+    errors = [(baked.stored().render(v.camera, BACKGROUND).rgb - v.image).square() for v in views]
+    return -10 * float(torch.stack([e.mean() for e in errors]).mean().log10())
+
+
+@pytest.mark.parametrize("compact", [None, Compact(share=0.05, views=2)], ids=["pages", "compact"])
+def test_texels_are_tuned_as_on_the_cpu(
+    compact: Compact | None, device: torch.device, cpu: Context, learned_on: set[bool]
+) -> None:
+    with cpu():
+        scene, views = trained()
+    learning = Learning(tune=TuneOptions.of_learned(12), compact=compact)
+    learned_on.clear()
+    got = exported(scene, views, device, learning)
+    assert learned_on == {True}
+    with cpu():
+        want = exported(scene.to(HERE), views, HERE, learning)
+        plain = exported(scene, views, HERE, Learning(compact=compact))
+        mine, cpus, untuned = (db(each, views) for each in (got, want, plain))
+    assert got.statistics.finetune.steps == want.statistics.finetune.steps == 12
+    assert all(value.device == HERE for value in got.scene.surfels.values())
+    assert abs(mine - cpus) < 0.05 and cpus > untuned + 0.05
+    if compact is None:
+        torch.testing.assert_close(got.texels, want.texels, rtol=1e-3, atol=1e-3)
+
+
+def test_texels_and_surfels_are_polished_as_on_the_cpu(
+    device: torch.device, cpu: Context, learned_on: set[bool]
+) -> None:
+    with cpu():
+        scene, views = trained()
+    learning = Learning(
+        polish=PolishOptions(steps=6, val_every=2), tune=TuneOptions(steps=6, coded_steps=4), train=TrainConfig()
+    )
+    learned_on.clear()
+    got = exported(scene, views, device, learning)
+    assert learned_on == {True}
+    with cpu():
+        want = exported(scene.to(HERE), views, HERE, learning)
+        mine, cpus = (db(each, views) for each in (got, want))
+    assert got.statistics.polish.steps == want.statistics.polish.steps and got.statistics.finetune.steps > 4
+    assert abs(mine - cpus) < 0.1

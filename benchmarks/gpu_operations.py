@@ -112,8 +112,7 @@ def geometry_cases(n: int, width: int, height: int, device: torch.device) -> lis
     image, blended = ops.composite_image(fragments, projection, colors), ops.blended_image(fragments, projection, base)
 
     def trace() -> object:
-        layout, _ = trace_cuda.blended(geom, projection, bins)
-        return trace_cuda.fill(geom, projection, layout)
+        return trace_cuda.fill(geom, projection, trace_cuda.blended(geom, projection, bins))
 
     v, b = int(projection.visible.sum()), bins.slot.shape[0]
     f, p = len(fragments), width * height

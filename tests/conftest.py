@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import inspect
 import os
 import sys
@@ -43,3 +44,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Begin with the slow files where workers share the tests."""
     if hasattr(config, "workerinput"):
         items.sort(key=lambda item: item.path.parent.name not in FIRST)
+
+
+def pytest_collection_finish() -> None:
+    """Keep what has been imported and collected out of garbage collection, which would walk it in every large test."""
+    gc.collect()
+    gc.freeze()

@@ -145,7 +145,7 @@ def test_texels_that_learned_in_training_become_the_atlas(
 
 def test_a_bundle_is_drawn_by_the_renderer_that_is_asked_for(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def least() -> float:
-        return eval_setup(copied / "config.yml")[1].model._scene.transmittance_min
+        return eval_setup(copied / "config.yml")[1].model._renderer.scene.transmittance_min
 
     assert least() == TRANSMITTANCE_MIN
     monkeypatch.setenv(RENDERER, "fast")
@@ -160,7 +160,7 @@ def test_verify_compares_a_bundle_with_its_run(trained: BitymiTrainerConfig, cop
     assert main(["verify", str(copied), "--run", str(run / "config.yml")]) == 0
     bundle, _ = check_files(copied)
     assert bundle is not None
-    names = ["error of the view colours", "PSNR against the trained scene", "place of the scene"]
+    names = ["error of the view colours", "PSNR against the trained scene", "frame of the scene"]
     final = check_run(bundle, run, views=1)
     assert [check.name for check in final] == names and all(check.ok for check in final)
     earlier = check_run(bundle, min((run / "nerfstudio_models").glob("*.ckpt")), views=1)

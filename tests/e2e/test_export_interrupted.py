@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from bitymi_ns.bake import learn as bake_learn
-from bitymi_ns.bake import tune
+from bitymi_ns.bake import tuning_views
 from bitymi_ns.bundle import check_files
 from bitymi_ns.plugin.export import command
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
@@ -22,7 +22,7 @@ def interrupted(*args: Any, **kwargs: Any) -> None:
 @pytest.mark.parametrize(
     "module, function, options, replaces, message",
     [
-        (tune, "photometric", {"tolerance": TOLERANCE}, False, "was not written"),
+        (tuning_views, "photometric", {"tolerance": TOLERANCE}, False, "was not written"),
         (bake_learn, "trained_texels", {}, False, "was not written"),
         (bake_learn, "trained_texels", {"overwrite": True}, True, "is the earlier one"),
         (command, "read_bundle", {"finetune_steps": 0}, False, "is complete"),

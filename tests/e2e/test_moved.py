@@ -99,7 +99,7 @@ def test_what_needs_photographs_says_how_to_name_them(
     monkeypatch.setenv("BITYMI_DATA", str(moved))
     assert evaluate(alone / "config.yml", tmp_path / "out.json")["psnr"] > 10
     monkeypatch.setenv("BITYMI_DATA", str(tmp_path / "nowhere"))
-    with pytest.raises(InputError, match="BITYMI_DATA says that the capture is .*nowhere, which does not exist"):
+    with pytest.raises(InputError, match="BITYMI_DATA names .*nowhere as the capture, which does not exist"):
         eval_setup(alone / "config.yml")
 
 

@@ -101,7 +101,7 @@ def test_photographs_that_show_nothing(start: Start, capture: Path) -> None:
     for path in (capture / "images").iterdir():
         if path.is_file():
             Image.new("RGB", (48, 36), (9, 9, 9)).save(path)
-    with pytest.raises(InputError, match="nothing to learn from the 10 training photographs: of one colour"):
+    with pytest.raises(InputError, match="nothing to learn from the 10 training photographs: of one color"):
         ns_train.main(start(data=capture))
 
 

@@ -80,7 +80,7 @@ def test_ctrl_c_stops_both_and_the_resumed_run_ends_bit_for_bit_alike(
 @pytest.mark.slow
 def test_a_process_that_ends_ends_the_run_with_a_message(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     config = two(start(name="killed"))
-    at_step(monkeypatch, 25, lambda trainer: trainer._others._processes[0].kill())
+    at_step(monkeypatch, 25, lambda trainer: trainer._workers._processes[0].kill())
     with pytest.raises(InputError, match="process 2 of the 2 of this run has ended: exit status -9"):
         ns_train.main(config)
     assert [p.name for p in config.get_checkpoint_dir().iterdir()] == ["step-000000020.ckpt"]

@@ -66,7 +66,7 @@ class View:
 
     def gradients(self, image: Tensor) -> list[Tensor]:
         towards = torch.linspace(-1, 1, image.numel(), dtype=torch.float64).view_as(image).to(image)
-        return list(torch.autograd.grad(image, self.leaves, towards))
+        return list(torch.autograd.grad(image, self.leaves, towards, allow_unused=True, materialize_grads=True))
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])

@@ -7,28 +7,17 @@ replaced by a proxy that adds members to that union; tyro itself and every other
 
 from __future__ import annotations
 
-import functools
 import importlib.abc
 import importlib.machinery
 import sys
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from types import ModuleType, UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
 
 EXPORTER = "nerfstudio.scripts.exporter"
 COMMAND, MESH_COMMAND = "bitymi-atlas", "bitymi-mesh"
 DESCRIPTION = "Bake a trained bitymi scene into a bundle: surfels, a compressed texture atlas and a manifest."
-_MESH = "`ns-export bitymi-mesh --load-config ... --output-dir ...`"
-INSTEAD = {
-    "ExportPointCloud": f"{_MESH}, whose PLY file has the points as vertices",
-    "ExportTSDFMesh": _MESH,
-    "ExportPoissonMesh": f"{_MESH} with --watertight True",
-    "ExportMarchingCubesMesh": _MESH,
-    "ExportGaussianSplat": "`ns-export bitymi-atlas ... --extras gaussians`, or `bitymi extras BUNDLE` on a bundle",
-}
-"""What to use in place of nerfstudio's exporters, by class; they sample rays or expect Splatfacto. `cameras` works."""
 MESH_DESCRIPTION = "Extract the surface of a trained bitymi scene or of a bundle as a triangle mesh with vertex colors."
 
 
@@ -47,31 +36,10 @@ def install() -> None:
 
 
 def patch(module: ModuleType) -> None:
-    """Put the proxy into a module that has bound tyro, and let exporters that cannot read this method name those that
-    can; a second call changes nothing."""
+    """Put the proxy into a module that has bound tyro; a second call changes nothing."""
     tyro = getattr(module, "tyro", None)
-    if tyro is None or isinstance(tyro, _TyroProxy):
-        return
-    module.tyro = _TyroProxy(tyro, module)  # type: ignore[attr-defined]
-    for name, instead in INSTEAD.items():
-        exporter = getattr(module, name, None)
-        if exporter is not None:
-            exporter.main = _refusing(exporter.main, instead)
-
-
-def _refusing(main: Callable[[Any], None], instead: str) -> Callable[[Any], None]:
-    """The `main` of a stock exporter, which stops at a scene of this method."""
-
-    @functools.wraps(main)
-    def checked(self: Any) -> None:
-        path = Path(self.load_config)
-        if path.is_file() and b"bitymi_ns." in path.read_bytes():
-            from bitymi_ns.plugin.console import fail
-
-            fail(f"{path} is a bitymi scene, which this exporter of nerfstudio cannot read. Use {instead}.")
-        main(self)
-
-    return checked
+    if tyro is not None and not isinstance(tyro, _TyroProxy):
+        module.tyro = _TyroProxy(tyro, module)  # type: ignore[attr-defined]
 
 
 def extended(commands: Any) -> Any:

@@ -17,7 +17,7 @@ from bitymi_ns.plugin.console import fail
 DATA = "BITYMI_DATA"
 """Environment variable: where a capture is now; most of nerfstudio's commands that read a run have no option for it."""
 MOVED = f"If it was moved, say where it is now: `{DATA}=/where/it/is` before the command."
-_MESH = "For a textured mesh or Gaussian splats of a bundle run `bitymi extras`."
+_MESH = "For the surface as a mesh run `ns-export bitymi-mesh`, for Gaussian splats of a bundle `bitymi extras`."
 REFUSED = {
     "SpiralRender": (
         "ns-render spiral knows nerfstudio's own data managers alone. Use `ns-render interpolate` between the "
@@ -74,7 +74,7 @@ def how_to_say_where() -> str:
 LOOPBACK = "127.0.0.1"
 """The address that only this machine can reach. nerfstudio's default, 0.0.0.0, is open to the network."""
 HOST_OPTION = "--viewer.websocket-host"
-SCRIPTS = ("nerfstudio.scripts.viewer.run_viewer", "__main__")
+VIEWER_SCRIPTS = ("nerfstudio.scripts.viewer.run_viewer", "__main__")
 
 
 def adopt_viewer(config: Any) -> None:
@@ -83,7 +83,7 @@ def adopt_viewer(config: Any) -> None:
     ns-viewer replaces the recorded viewer options by those of its own command line, so config.yml cannot set the host;
     and it waits for Ctrl-C in a loop that ends in a traceback. Both are put right around its `_start_viewer`.
     """
-    for name in SCRIPTS:
+    for name in VIEWER_SCRIPTS:
         script = sys.modules.get(name)
         start = getattr(script, "_start_viewer", None)
         if start is not None:

@@ -2,7 +2,6 @@
 
 import importlib
 import sys
-from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Union, get_args
 
@@ -12,7 +11,6 @@ pytest.importorskip("nerfstudio")
 
 import tyro
 
-from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export import hook
 from bitymi_ns.plugin.export.command import ExportAtlas
 
@@ -78,21 +76,3 @@ def test_ns_export_lists_the_command(monkeypatch: pytest.MonkeyPatch, capsys: py
     assert stop.value.code == 0
     output = capsys.readouterr().out
     assert "bitymi-atlas" in output and "gaussian-splat" in output
-
-
-def test_stock_exporters_name_the_one_that_reads_this_method(tmp_path: Path) -> None:
-    from nerfstudio.scripts import exporter
-
-    hook.patch(exporter)
-    config = tmp_path / "config.yml"
-    config.write_text("!!python/object:bitymi_ns.plugin.run.config.BitymiTrainerConfig {}")
-    stock = {"load_config": config, "output_dir": tmp_path / "out"}
-    for command, instead in (
-        (exporter.ExportGaussianSplat(**stock), "bitymi extras BUNDLE"),
-        (exporter.ExportPointCloud(**stock), "ns-export bitymi-mesh"),
-        (exporter.ExportTSDFMesh(**stock), "ns-export bitymi-mesh"),
-        (exporter.ExportPoissonMesh(**stock), "--watertight True"),
-    ):
-        with pytest.raises(InputError, match=instead):
-            command.main()
-    assert not (tmp_path / "out").exists()

@@ -29,8 +29,8 @@ from matplotlib.figure import Figure
 
 from bitymi_ns.bake import Baked, BakeOptions, Learning, PolishOptions, TuneOptions, baked_and_reduced, tune_atlas
 from bitymi_ns.bake.compact import Coder, Compact
+from bitymi_ns.bake.learn import STEPS_AFTER_LEARNING
 from bitymi_ns.plugin.data.cameras import to_camera
-from bitymi_ns.plugin.export.command import STEPS_AFTER_LEARNING
 from bitymi_ns.plugin.export.trained import load_trained
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.field import TexelField

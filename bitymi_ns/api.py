@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake import BakeOptions, Learning, PolishOptions, TuneOptions, bake_and_learn
+from bitymi_ns.bake import BakeOptions, Learning, bake_and_learn
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bundle import Bundle, export, read_bundle
 from bitymi_ns.bundle.parts import CAMERAS
@@ -20,16 +20,12 @@ from bitymi_ns.ops.constants import COLOR_BIAS
 from bitymi_ns.plugin.export.cameras import camera_row
 from bitymi_ns.plugin.run.preset import load_preset
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import NEAR, RenderOutput, Scene
 from bitymi_ns.train.domain import build_scene
 from bitymi_ns.train.fit import TrainLog, fit
 from bitymi_ns.train.views import View
 
 __all__ = ["Bundle", "Camera", "View", "bake_scene", "rasterize", "read_bundle", "train_scene"]
-
-TUNE_STEPS = 100
-"""Fine-tuning steps of texels that training has learned; a baked field gets `TuneOptions.steps`."""
 
 
 def rasterize(
@@ -151,11 +147,7 @@ def bake_scene(
         BundleError: the folder exists or cannot be written.
     """
     background = torch.zeros(3) if background is None else background.cpu()
-    textured, has_texels = scene.field is not None, isinstance(scene.field, TexelField)
-    tune = None
-    if textured:
-        tune = TuneOptions.of_learned(steps=TUNE_STEPS) if has_texels else TuneOptions(steps=TUNE_STEPS)
-    learning = Learning(PolishOptions() if textured and not has_texels else None, tune, compact=Compact())
+    learning = Learning.of_scene(scene, len(views), compact=Compact())
     cameras = [view.camera for view in views]
     baked = bake_and_learn(scene, cameras, views, background, options or BakeOptions(), learning)
     rows = [camera_row(f"{i:04d}", camera, held_out=False) for i, camera in enumerate(cameras)]

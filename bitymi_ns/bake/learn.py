@@ -22,6 +22,11 @@ from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.views import View
 
+FEWEST_PASSES = 4
+"""Steps of polish or fine-tuning per photograph; more may gain where there are fewer."""
+STEPS_AFTER_LEARNING = 100
+"""Fine-tuning steps of texels that were trained already: they recover what the reduction of tiles and colours cost."""
+
 
 @dataclass(frozen=True)
 class Learning:
@@ -38,6 +43,40 @@ class Learning:
     tune: TuneOptions | None = None
     train: TrainConfig = field(default_factory=TrainConfig)
     compact: Compact | None = None
+
+    @classmethod
+    def of_scene(
+        cls,
+        scene: BakeableScene,
+        views: int,
+        polish_steps: int | None = None,
+        tune_steps: int | None = None,
+        cache_bytes: int = TuneOptions.cache_bytes,
+        train: TrainConfig | None = None,
+        compact: Compact | None = None,
+    ) -> Learning:
+        """Choose the steps by what the scene's texture has learned from.
+
+        Args:
+            scene: trained, with its texture as texels, as a field, or without texture.
+            views: number of training photographs.
+            polish_steps: 0 = no polish; None = none for texels, which training has learned; for a field 300, or
+                `FEWEST_PASSES` for each photograph where that is more.
+            tune_steps: 0 = no fine-tuning; None = `STEPS_AFTER_LEARNING`, or 400 where a field is not polished.
+            cache_bytes, train, compact: as in `TuneOptions` and here.
+        """
+        train = TrainConfig() if train is None else train
+        if scene.field is None:
+            return cls(train=train, compact=compact)
+        trained = isinstance(scene.field, TexelField)
+        if polish_steps is None:
+            polish_steps = 0 if trained else max(PolishOptions.steps, FEWEST_PASSES * views)
+        if tune_steps is None:
+            tune_steps = STEPS_AFTER_LEARNING if trained or polish_steps else TuneOptions.steps
+        options = TuneOptions.of_learned if trained else TuneOptions
+        polish = PolishOptions(steps=polish_steps) if polish_steps else None
+        tune = options(steps=tune_steps, cache_bytes=cache_bytes) if tune_steps else None
+        return cls(polish, tune, train, compact)
 
 
 def baked_and_reduced(

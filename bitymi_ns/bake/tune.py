@@ -36,7 +36,7 @@ class TuneOptions(TexelSteps):
     checks: int = 16
     """Evaluations of the validation views over the run."""
     patience: int = 6
-    """EarlyStopping without a gain after which the run ends."""
+    """Evaluations without a gain after which the run ends."""
     cache_bytes: int = 1_000_000_000
     """Memory for the fragments of the views, first of the validation views, which are drawn most often; what does not
     fit is traced anew whenever it is needed."""

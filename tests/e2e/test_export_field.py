@@ -15,7 +15,6 @@ from bitymi_ns.bake import learn as bake_learn
 from bitymi_ns.bundle import check_files
 from bitymi_ns.cli import main
 from bitymi_ns.plugin.console import InputError
-from bitymi_ns.plugin.export import command
 from bitymi_ns.plugin.export.trained import check_run
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from tests.e2e.exports import TOLERANCE, evaluate, run_export
@@ -90,7 +89,7 @@ def test_a_fine_tuning_that_ends_early_says_so(
     field_run: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     wild = partial(TuneOptions, rate=50.0, patience=2, coded_steps=0)
-    monkeypatch.setattr(command, "TuneOptions", wild)
+    monkeypatch.setattr(bake_learn, "TuneOptions", wild)
     run_export(field_run, tmp_path / "b", tolerance=TOLERANCE, finetune_steps=40, compare=False)
     out = " ".join(capsys.readouterr().out.replace("│", " ").split())
     steps = json.loads((tmp_path / "b" / "bundle.json").read_text())["statistics"]["finetune"]["steps"]

@@ -15,8 +15,9 @@ import torch
 import tyro
 import yaml
 
-from bitymi_ns.bake import BakeOptions, Learning, PolishOptions, TuneOptions, bake_and_learn, rich_progress
+from bitymi_ns.bake import BakeOptions, Learning, TuneOptions, bake_and_learn, rich_progress
 from bitymi_ns.bake.compact import Compact
+from bitymi_ns.bake.learn import FEWEST_PASSES
 from bitymi_ns.bundle import Bundle, BundleError, export, read_bundle
 from bitymi_ns.bundle.manifest import MANIFEST, dump
 from bitymi_ns.bundle.parts import CONFIG
@@ -38,10 +39,6 @@ from bitymi_ns.train.exposure import corrected
 from bitymi_ns.train.views import View
 
 INTERRUPTED = 130
-FEWEST_PASSES = 4
-"""Steps of polish or fine-tuning per photograph; with fewer than this a line says that more may gain."""
-STEPS_AFTER_LEARNING = 100
-"""Fine-tuning steps of texels that were trained already: they recover what the reduction of tiles and colours cost."""
 
 
 @dataclass(kw_only=True)
@@ -143,19 +140,9 @@ class ExportAtlas(BakeOptions, CompactOptions):
         """Optimisation after the bake for so many training photographs."""
         if self.exact:
             return Learning()
-        has_learned, textured = isinstance(model.scene.field, TexelField), model.scene.field is not None
-        steps = self.polish_steps
-        if steps is None:
-            steps = max(PolishOptions.steps, FEWEST_PASSES * views) if textured and not has_learned else 0
-        polish = PolishOptions(steps=steps) if steps and textured else None
-        steps = self.finetune_steps
-        if steps is None:
-            steps = TuneOptions.steps if polish is None and not has_learned else STEPS_AFTER_LEARNING
-        tune = None
-        if textured and steps:
-            options = TuneOptions.of_learned if has_learned else TuneOptions
-            tune = options(steps=steps, cache_bytes=int(self.finetune_memory * 1e9))
-        return Learning(polish, tune, model.train_config, compact)
+        kept = int(self.finetune_memory * 1e9)
+        steps = self.polish_steps, self.finetune_steps
+        return Learning.of_scene(model.scene, views, *steps, kept, model.train_config, compact)
 
     def _run(self, options: BakeOptions) -> None:
         config, pipeline = load_trained(self.load_config)

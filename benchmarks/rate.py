@@ -30,7 +30,7 @@ from matplotlib.figure import Figure
 from bitymi_ns.bake import Baked, BakeOptions, Learning, PolishOptions, TuneOptions, baked_and_reduced, tune_atlas
 from bitymi_ns.bake.compact import Coder, Compact
 from bitymi_ns.bake.learn import STEPS_AFTER_LEARNING
-from bitymi_ns.plugin.data.cameras import to_camera
+from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.export.trained import load_trained
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.field import TexelField
@@ -45,8 +45,7 @@ def polished(load_config: Path, steps: int) -> dict[str, Any]:
     """The reduced bake of a run, its training views, its held-out views, and the background."""
     _, pipeline = load_trained(load_config)
     model, data = pipeline.model, pipeline.datamanager
-    cameras = data.train_dataset.cameras
-    views = [to_camera(cameras[i : i + 1], torch.device("cpu")) for i in range(len(cameras))]
+    views = to_cameras(data.train_dataset.cameras, "cpu")
     photographs = list(corrected(data.train_views, model.resume_state.get("exposure")))
     background, trained = model.background.cpu(), isinstance(model.scene.field, TexelField)
     learning = Learning(None if trained else PolishOptions(steps=steps), train=model.train_config)

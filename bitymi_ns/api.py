@@ -69,12 +69,8 @@ def rasterize(
     geometry = (means, quats, scales.log(), torch.logit(opacities), torch.logit(betas / 4.0))
     projection = project(*geometry, camera, near)
     fragments = trace(projection)
-    image = blended_image(fragments, projection, colors - COLOR_BIAS, maps=maps).view(camera.height, camera.width, -1)
-    rgb, alpha = image[..., :3], image[..., 3:4]
-    if background is not None:
-        rgb = rgb + (1.0 - alpha) * background
-    depth, normal = (image[..., 5:6], image[..., 6:9]) if maps else (None, None)
-    return RenderOutput(rgb, alpha, image[..., 4:5], depth, normal, None, fragments, projection)
+    image = blended_image(fragments, projection, colors - COLOR_BIAS, maps=maps)
+    return RenderOutput.of_image(image, projection, fragments, background, maps)
 
 
 def train_scene(

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import torch
 from PIL import Image, features
 
-from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.scene.baked import BakedScene, as_bytes
 from bitymi_ns.scene.camera import Camera
 
 Pixels = npt.NDArray[np.uint8]
@@ -28,10 +28,8 @@ _SMALLEST = 16
 
 def draw_poster(scene: BakedScene, camera: Camera, background: Sequence[float]) -> Pixels:
     """[H, W, 3] the scene, on the CPU, as the camera sees it, at most `SIDE` pixels along a side."""
-    view = camera.to("cpu").scaled(min(1.0, SIDE / max(camera.width, camera.height)))
-    with torch.no_grad():
-        rgb = scene.render(view, torch.tensor(background, dtype=torch.float32)).rgb
-    return (rgb.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
+    view = camera.to("cpu").within(SIDE)
+    return as_bytes(scene.render(view, torch.tensor(background, dtype=torch.float32)).rgb).numpy()
 
 
 def most_bytes(scene: int) -> int:

@@ -28,7 +28,7 @@ from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.visibility import visibility
 from bitymi_ns.train.losses import mean_psnr, psnr
-from bitymi_ns.train.views import View, at_size
+from bitymi_ns.train.views import View, at_size, spread
 from bitymi_ns.trust import Refused, keep
 
 Kind = Literal["gaussians", "mesh"]
@@ -131,8 +131,8 @@ def write_extras(
     check_extras(kinds, folder, overwrite)
     to = to_capture(bundle.info.world) if frame == "capture" else None
     scene, background = bundle.scene, torch.tensor(bundle.info.render.background)
-    chosen = [view.to("cpu") for view in evenly(held_out, MEASURED_VIEWS)]
-    views = [at_size(view, smaller(view.camera, MEASURED_SIDE), "cpu") for view in chosen]
+    chosen = [held_out[i].to("cpu") for i in spread(len(held_out), MEASURED_VIEWS)]
+    views = [at_size(view, view.camera.within(MEASURED_SIDE), "cpu") for view in chosen]
     colors = _fitted_colors(scene, cameras, progress)
     base = _psnr(lambda camera: scene.render(camera, background).rgb, views, background)
     written: dict[str, Written] = {}
@@ -151,7 +151,7 @@ def write_extras(
                     quads = quads_of(scene, colors.color, LEVEL)
                     if not len(quads):
                         raise BundleError(f"no surfel of the bundle has an opacity above {LEVEL}: there is no mesh")
-                    chosen = [smaller(camera, COLORED_SIDE) for camera in evenly(cameras, COLORED_VIEWS)]
+                    chosen = [cameras[i].within(COLORED_SIDE) for i in spread(len(cameras), COLORED_VIEWS)]
                     picture = _picture(scene, background)
                     quads, count = recolored(quads, picture, chosen, scene.near, progress), len(quads)
                     value = _psnr(lambda c, q=quads: draw_quads(q, c, background, scene.near), views, background)
@@ -174,20 +174,9 @@ def summary_line(written: Written) -> str:
     return f"{line}; {written.psnr:.2f} dB in {written.views} held-out views, the bundle {written.psnr_bundle:.2f} dB"
 
 
-def evenly(items: Sequence, most: int) -> list:
-    """At most so many of them, evenly spaced, the first one too."""
-    count = min(len(items), most)
-    return [items[i * len(items) // count] for i in range(count)]
-
-
-def smaller(camera: Camera, side: int) -> Camera:
-    """The view in a picture of at most so many pixels along a side."""
-    return camera.scaled(min(1.0, side / max(camera.width, camera.height)))
-
-
 def _fitted_colors(scene: BakedScene, cameras: Sequence[Camera], progress: Progress) -> SurfelColors:
     """Fitted to what the cameras see."""
-    chosen = [smaller(camera, SEEN_SIDE) for camera in cameras]
+    chosen = [camera.within(SEEN_SIDE) for camera in cameras]
     seen = visibility(scene.surfels, chosen, scene.near, scene.weight_bound, scene.through_pixel, progress).seen
     return fit_colors(scene, weighted_residuals(scene), seen, centers_of(cameras, scene.surfels["means"]))
 

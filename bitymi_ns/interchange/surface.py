@@ -16,6 +16,7 @@ from torch import Tensor
 
 from bitymi_ns.ops import fitting_lists, project
 from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.scene.baked import as_bytes
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import GEOMETRY
 
@@ -163,7 +164,7 @@ def extract_surface(
     import open3d
 
     options.check()
-    small = [camera.scaled(min(1.0, BOX_SIDE / max(camera.width, camera.height))) for camera in cameras]
+    small = [camera.within(BOX_SIDE) for camera in cameras]
     depths = []
     for i, camera in enumerate(small):
         depths.append(median_depth(surfels, camera, near, through_pixel).cpu())
@@ -176,7 +177,7 @@ def extract_surface(
     for i, camera in enumerate(cameras):
         depth = median_depth(surfels, camera, near, through_pixel).cpu()
         depth = _cut(depth, camera, box)
-        rgb = (render(camera).clamp(0, 1) * 255).round().byte().cpu().numpy()
+        rgb = as_bytes(render(camera)).numpy()
         picture = open3d.geometry.RGBDImage.create_from_color_and_depth(
             open3d.geometry.Image(np.ascontiguousarray(rgb)),
             open3d.geometry.Image(np.ascontiguousarray(depth.float().numpy())),

@@ -19,7 +19,7 @@ from bitymi_ns.codec.quantise import STEPS
 from bitymi_ns.measure.machine import commit, machine, versions
 from bitymi_ns.ops.constants import ALPHA_MIN, TRANSMITTANCE_MIN
 from bitymi_ns.plugin.console import fail, say
-from bitymi_ns.plugin.data.cameras import to_camera
+from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.export.target import replace_file, require_writable
 from bitymi_ns.plugin.export.trained import load_trained
 from bitymi_ns.scene.baked import FAST, BakedScene
@@ -136,8 +136,7 @@ class Knobs:
         self.scene = model.scene
         self.background = model.background.cpu()
         self.options = replace(BakeOptions(), drop_unseen=False, tolerance=0.0)  # one knob at a time: all else is kept
-        cameras = pipeline.datamanager.train_dataset.cameras
-        self.views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
+        self.views = to_cameras(pipeline.datamanager.train_dataset.cameras, model.device)
         self.bound = float(self.scene.config.weight_bound)
         self.has_learned = isinstance(self.scene.field, TexelField)
 

@@ -21,9 +21,9 @@ from bitymi_ns.plugin.export.trained import load_trained
 from bitymi_ns.plugin.run.metrics import image_metrics
 from bitymi_ns.plugin.run.surfel_model import OVERDRAW_SCALE
 from bitymi_ns.scene import RenderOutput, Scene
+from bitymi_ns.scene.baked import as_bytes
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.init import tangents
-from bitymi_ns.train.views import as_bytes
 
 RESIDUAL_GAIN = 4.0
 """Residuals are small; the pictures of them are brightened by this factor."""

@@ -24,6 +24,11 @@ OUTPUTS = ("rgb", "alpha", "beta", "depth", "normal", "overdraw")
 """Fields of a `BakedOutput`."""
 
 
+def as_bytes(image: Tensor) -> Tensor:
+    """The image in [0, 1] as uint8 on the CPU; what is beyond is cut off."""
+    return (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu()
+
+
 def image_names(maps: bool) -> tuple[str, ...]:
     """Images to draw for a `BakedOutput`, names of `ops.baked.IMAGES`."""
     return OUTPUTS if maps else OUTPUTS[:2]

@@ -72,6 +72,10 @@ class Camera:
         shift[1, 2] = top
         return self._with(K=self.K - shift, height=bottom - top)
 
+    def within(self, side: int) -> Camera:
+        """The camera of the same view with its image scaled down to at most `side` pixels along its longer side."""
+        return self.scaled(min(1.0, side / max(self.width, self.height)))
+
     def scaled(self, factor: float) -> Camera:
         """The camera of the same view with its image resized by `factor` (size rounded to whole pixels)."""
         width = max(1, round(self.width * factor))

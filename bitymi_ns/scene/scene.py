@@ -64,6 +64,41 @@ class RenderOutput:
     projection: Projection
     image: Tensor | None = None
 
+    @classmethod
+    def of_image(
+        cls,
+        image: Tensor,
+        projection: Projection,
+        fragments: Fragments | Bands,
+        background: Tensor | None,
+        maps: bool,
+        soft_overdraw: bool = False,
+    ) -> RenderOutput:
+        """Name the channels of a blended image, over a background.
+
+        Args:
+            image: [H * W, C] of `ops.blended_image`, and the soft overdraw as last channel where there is one.
+            projection, fragments: of the view.
+            background: [3] colour behind the scene; None = black.
+            maps: the image has depth and normals.
+            soft_overdraw: it has the soft overdraw.
+        """
+        image = image.view(projection.camera.height, projection.camera.width, -1)
+        if background is not None:
+            behind = torch.nn.functional.pad(background, (0, image.shape[-1] - 3))
+            image = torch.addcmul(image, 1.0 - image[..., 3:4], behind)
+        return cls(
+            rgb=image[..., :3],
+            alpha=image[..., 3:4],
+            beta=image[..., 4:5],
+            depth=image[..., 5:6] if maps else None,
+            normal=image[..., 6:9] if maps else None,
+            soft_overdraw=image[..., -1:] if soft_overdraw else None,
+            fragments=fragments,
+            projection=projection,
+            image=image if image.shape[-1] == IMAGE_CHANNELS else None,
+        )
+
     @property
     def overdraw(self) -> Tensor:
         """[H, W, 1] int32: blended surfels per pixel."""
@@ -176,21 +211,7 @@ class Scene(nn.Module):
             if field is not None and learns:
                 read = field.snapshot()
             image, fragments = self._draw_in_bands(projection, draw, error)
-        image = image.view(camera.height, camera.width, -1)
-        if background is not None:
-            behind = torch.nn.functional.pad(background, (0, image.shape[-1] - 3))
-            image = torch.addcmul(image, 1.0 - image[..., 3:4], behind)
-        return RenderOutput(
-            rgb=image[..., :3],
-            alpha=image[..., 3:4],
-            beta=image[..., 4:5],
-            depth=image[..., 5:6] if maps else None,
-            normal=image[..., 6:9] if maps else None,
-            soft_overdraw=image[..., -1:] if overdraw_half is not None else None,
-            fragments=fragments,
-            projection=projection,
-            image=image if image.shape[-1] == IMAGE_CHANNELS else None,
-        )
+        return RenderOutput.of_image(image, projection, fragments, background, maps, overdraw_half is not None)
 
     def _draw_in_bands(
         self,

@@ -125,11 +125,6 @@ def as_float(image: Tensor) -> Tensor:
     return image / 255.0 if image.dtype == torch.uint8 else image.float()
 
 
-def as_bytes(image: Tensor) -> Tensor:
-    """The image in [0, 1] as uint8 on the CPU; what is beyond is cut off."""
-    return (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu()
-
-
 def downscale_image(image: Tensor, width: int, height: int) -> Tensor:
     """Area average of an image.
 

@@ -247,13 +247,18 @@ def test_masked_pixels_and_alpha(wrong: Baked, views: list[View]) -> None:
     assert torch.equal(*same)
 
 
-def test_exposures_are_not_tuned_into_the_texels(truth: Baked, wrong: Baked, views: list[View]) -> None:
-    logs = torch.linspace(-0.4, 0.4, len(views))
+def with_exposures(truth: Baked, views: list[View]) -> list[View]:
+    """The photographs of a bake with a known exposure each."""
     exposed = []
-    for view, log in zip(views, logs, strict=True):
+    for view, log in zip(views, torch.linspace(-0.4, 0.4, len(views)), strict=True):
         alpha = truth.unquantised().render(view.camera, BACKGROUND).alpha
         bare = view._replace(correction=log.exp().expand(3))
         exposed.append(bare._replace(image=bare.shown(view.image, alpha, BACKGROUND)))
+    return exposed
+
+
+def test_exposures_are_not_tuned_into_the_texels(truth: Baked, wrong: Baked, views: list[View]) -> None:
+    exposed = with_exposures(truth, views)
     assert tuning_views(truth, exposed).psnr(texels_of(truth)) > 55  # background and all
     blind = [view._replace(correction=None) for view in exposed]
     after = {}

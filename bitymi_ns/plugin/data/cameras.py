@@ -55,6 +55,11 @@ def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Cam
     return camera if device is None else camera.to(device)
 
 
+def to_cameras(cameras: Cameras, device: torch.device | str | None = None) -> list[Camera]:
+    """Convert each of nerfstudio's cameras [N]; see `to_camera`."""
+    return [to_camera(cameras[i : i + 1], device) for i in range(len(cameras))]
+
+
 def check_cameras(cameras: Sequence[Cameras], names: Sequence[object]) -> None:
     """Fail or warn at pinhole cameras that see nothing, or at focal lengths that do not go with the picture size.
 

@@ -11,8 +11,8 @@ import torch
 from PIL import Image
 
 from bitymi_ns.bundle.parts import CAMERAS
+from bitymi_ns.scene.baked import as_bytes
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.train.views import as_bytes
 
 MOST_PIXELS = 1600
 """Longer side of a photograph in a bundle."""

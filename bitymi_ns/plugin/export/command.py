@@ -24,7 +24,7 @@ from bitymi_ns.bundle.parts import CONFIG
 from bitymi_ns.bundle.read import download_bytes
 from bitymi_ns.interchange import Frame, Kind, check_extras, extras_folder, summary_line, write_extras
 from bitymi_ns.plugin.console import fail, say, warn
-from bitymi_ns.plugin.data.cameras import to_camera
+from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.export.cameras import camera_files
 from bitymi_ns.plugin.export.compact_options import BundleFormat, CompactOptions
 from bitymi_ns.plugin.export.summary import print_summary
@@ -147,8 +147,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
     def _run(self, options: BakeOptions) -> None:
         config, pipeline = load_trained(self.load_config)
         model, datamanager = pipeline.model, pipeline.datamanager
-        cameras = datamanager.train_dataset.cameras
-        views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
+        views = to_cameras(datamanager.train_dataset.cameras, model.device)
         first = datamanager.eval_views[0].camera if len(datamanager.eval_dataset) else views[0]
         shown = preview(model, first, "JPEG" if self._is_compact else "PNG")
         cameras_of = camera_files(datamanager, views, self.photographs)

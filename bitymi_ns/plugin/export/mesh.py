@@ -22,7 +22,7 @@ from bitymi_ns.interchange.bundle_cameras import named_cameras
 from bitymi_ns.interchange.frame import to_capture
 from bitymi_ns.interchange.surface import NoSurface, SurfaceOptions, extract_surface
 from bitymi_ns.plugin.console import fail, say, warn
-from bitymi_ns.plugin.data.cameras import to_camera
+from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.export.trained import load_trained, world_of
 from bitymi_ns.progress import rich_progress
 from bitymi_ns.scene.camera import Camera
@@ -146,8 +146,7 @@ def from_run(load_config: Path) -> Source:
     """The scene of a training run's last checkpoint."""
     _, pipeline = load_trained(load_config)
     model, datamanager = pipeline.model, pipeline.datamanager
-    rows = datamanager.train_dataset.cameras
-    cameras = [to_camera(rows[i : i + 1], model.device) for i in range(len(rows))]
+    cameras = to_cameras(datamanager.train_dataset.cameras, model.device)
     scene = model.scene
     surfels = {name: value.detach() for name, value in scene.surfels.items()}
     return Source(

@@ -23,12 +23,12 @@ from bitymi_ns.bundle.statistics import HeldOut
 from bitymi_ns.bundle.write import World
 from bitymi_ns.capture.frame import UP, read_frame
 from bitymi_ns.plugin.console import fail
-from bitymi_ns.plugin.data.cameras import to_camera
+from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.run.model import BitymiModel
+from bitymi_ns.scene.baked import as_bytes
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.train.losses import cc_psnr, psnr
-from bitymi_ns.train.views import as_bytes
 
 _PSNR_SLACK = 0.1  # dB
 
@@ -127,8 +127,7 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
     with CONSOLE.capture():  # nerfstudio reports at length what it loads
         _, pipeline = load_trained(config, step)
     model, datamanager = pipeline.model, pipeline.datamanager
-    cameras = datamanager.train_dataset.cameras
-    train = [to_camera(cameras[i : i + 1], torch.device("cpu")) for i in range(len(cameras))]
+    train = to_cameras(datamanager.train_dataset.cameras, "cpu")
     checks = [check_view_color(bundle, model.scene.surfels, train)]
     if isinstance(model.scene.field, HashField):
         checks.append(check_field(bundle, copy.deepcopy(model.scene.field).cpu(), train))

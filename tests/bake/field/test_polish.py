@@ -26,7 +26,7 @@ from bitymi_ns.bake import (
 from bitymi_ns.bake.field import polish as polish_module
 from bitymi_ns.train.config import GuardConfig
 from bitymi_ns.train.views import View
-from tests.bake.test_tune import BACKGROUND, cameras, photographs, render, waving
+from tests.bake.test_tune import BACKGROUND, cameras, photographs, render, waving, with_exposures
 
 OPTIONS = PolishOptions(steps=40, rate=0.3, share=1.0, val_every=4)
 
@@ -173,12 +173,7 @@ def test_masks_and_exposures(truth: Baked, wrong: Baked, views: list[View]) -> N
     polished = polish_scene(wrong, spoilt, BACKGROUND, replace(OPTIONS, steps=12))
     assert polished.texels.isfinite().all() and not torch.equal(polished.texels, wrong.texels)
     assert polished.statistics.polish.psnr_held_in.after > polished.statistics.polish.psnr_held_in.before
-    logs = torch.linspace(-0.4, 0.4, len(views))
-    exposed = []
-    for view, log in zip(views, logs, strict=True):
-        alpha = truth.unquantised().render(view.camera, BACKGROUND).alpha
-        bare = view._replace(correction=log.exp().expand(3))
-        exposed.append(bare._replace(image=bare.shown(view.image, alpha, BACKGROUND)))
+    exposed = with_exposures(truth, views)
     blind = [view._replace(correction=None) for view in exposed]
     known, unknown = (db(polish_scene(wrong, each, BACKGROUND, OPTIONS), views) for each in (exposed, blind))
     assert known > unknown + 1.0

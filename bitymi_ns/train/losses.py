@@ -1,4 +1,4 @@
-"""The training objective, L = L_photo + lambda L_beta + mu L_over: photometric loss, falloff and overdraw."""
+"""The training objective: photometric loss, falloff and overdraw, and depth and normals where a capture has them."""
 
 from __future__ import annotations
 
@@ -17,12 +17,20 @@ from bitymi_ns.train.config import LossConfig
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import RenderOutput
 
+DEPTH_EDGE = 0.1
+"""Relative difference of depth between neighbouring pixels that is an edge. Photographs blend both sides of it, depth
+maps do not, and those of sensors are least reliable there."""
 SSIM_WINDOW = 11
 """Side of the SSIM window in pixels; images narrower than this have no valid window."""
 
 
 def objective(
-    output: RenderOutput, target: Tensor, config: LossConfig, mask: Tensor | None = None
+    output: RenderOutput,
+    target: Tensor,
+    config: LossConfig,
+    mask: Tensor | None = None,
+    depth: Tensor | None = None,
+    normal: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """The terms of the objective, weighted: their sum is what training minimises.
 
@@ -32,9 +40,11 @@ def objective(
         target: [H, W, 3] the photograph at the same size, over the same background.
         config: weights and variants.
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
+        depth, normal: of the view, see `View`; they count where the view was rendered with maps.
 
     Returns:
-        `photometric`; `falloff` unless its weight is 0; `overdraw` where the view was rendered with `soft_overdraw`.
+        `photometric`; `falloff` unless its weight is 0; `overdraw` where the view was rendered with `soft_overdraw`;
+        `depth` and `normal` where they count and their weights are not 0.
     """
     image = output.image
     if (
@@ -54,6 +64,12 @@ def objective(
         terms["falloff"] = config.falloff_weight * mean_where_right(omega, output.beta, mask)
     if output.soft_overdraw is not None:
         terms["overdraw"] = config.overdraw_weight * mean_where_right(omega, output.soft_overdraw, mask)
+    if output.depth is not None and depth is not None and config.depth_weight > 0.0:
+        weight = config.depth_weight * config.geometry_interval
+        terms["depth"] = weight * depth_error(output.depth, output.alpha, depth, mask)
+    if output.normal is not None and normal is not None and config.normal_weight > 0.0:
+        weight = config.normal_weight * config.geometry_interval
+        terms["normal"] = weight * normal_error(output.normal, output.alpha, normal, mask)
     return terms
 
 
@@ -136,6 +152,60 @@ def mean_where_right(omega: Tensor, values: Tensor, mask: Tensor | None = None) 
         Scalar; 0 when no pixel counts.
     """
     return (omega * values).sum() / (omega.numel() if mask is None else mask.sum().clamp(min=1))
+
+
+def depth_error(rendered: Tensor, alpha: Tensor, depth: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Mean relative depth error |sum_i w_i (z_i - d)| / d over the pixels of known depth d that are not at its edges.
+
+    Args:
+        rendered: [H, W, 1] sum of w z, camera z.
+        alpha: [H, W, 1] sum of w.
+        depth: [H, W] or [H, W, 1] d; any float dtype. Unknown where it is not finite or not above 0.
+        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
+
+    Returns:
+        Scalar; 0 when no depth is known.
+    """
+    depth = depth.reshape(rendered.shape).to(rendered)
+    known = depth.isfinite() & (depth > 0.0)
+    depth = torch.where(known, depth, 1.0)
+    error = (rendered - alpha * depth).abs() / depth
+    return _mean_of(error, known & ~_edges(depth, known), mask)
+
+
+def _edges(depth: Tensor, known: Tensor) -> Tensor:
+    """[H, W, 1] bool, True where the 3 x 3 pixels around show surfaces of different depth."""
+
+    def largest(values: Tensor) -> Tensor:
+        return torch.nn.functional.max_pool2d(torch.where(known, values, 0.0)[None, ..., 0], 3, 1, 1)[0, ..., None]
+
+    return largest(depth) * largest(1.0 / depth) > 1.0 + DEPTH_EDGE
+
+
+def normal_error(rendered: Tensor, alpha: Tensor, normal: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Mean of sum_i w_i (1 - n_i . n) over the pixels of known normal n.
+
+    Args:
+        rendered: [H, W, 3] sum of w n, camera frame.
+        alpha: [H, W, 1] sum of w.
+        normal: [H, W, 3] n in the same frame; any float dtype. Unknown where it is not finite or 0.
+        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
+
+    Returns:
+        Scalar; 0 when no normal is known.
+    """
+    normal = normal.to(rendered)
+    length = normal.norm(dim=-1, keepdim=True)
+    known = length.isfinite() & (length > 0.0)
+    unit = torch.where(known, normal / length, 0.0)
+    return _mean_of(alpha - (rendered * unit).sum(-1, keepdim=True), known, mask)
+
+
+def _mean_of(values: Tensor, known: Tensor, mask: Tensor | None) -> Tensor:
+    """Mean over the known pixels that count; 0 when there is none."""
+    if mask is not None:
+        known = known & mask.reshape(known.shape)
+    return torch.where(known, values, 0.0).sum() / known.sum().clamp(min=1)
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:

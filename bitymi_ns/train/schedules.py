@@ -112,6 +112,11 @@ class Schedule:
             self.scaled(loss.overdraw_start) <= step < self.scaled(loss.overdraw_stop)
         )
 
+    def geometry_counts(self, step: int) -> bool:
+        """True where the depth and the normal loss are part of this step's objective, if the view has such maps."""
+        loss = self.config.loss
+        return max(loss.depth_weight, loss.normal_weight) > 0.0 and step % loss.geometry_interval == 0
+
     def after_first_reset(self, step: int) -> bool:
         """True where the first opacity reset is over: from then on size on screen counts for pruning."""
         return step > self.reset_every

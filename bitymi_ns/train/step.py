@@ -54,6 +54,7 @@ def view_losses(
         view.camera,
         background=background,
         field_mode="train" if schedule.field_trains(step) else "frozen",
+        maps=(view.depth is not None or view.normal is not None) and schedule.geometry_counts(step),
         overdraw_half=config.loss.overdraw_half if schedule.overdraw_counts(step) else None,
         beta_alone=config.loss.falloff_weight > 0.0 and config.loss.falloff_gradient == "beta_only",
     )
@@ -62,7 +63,7 @@ def view_losses(
         rgb = view.shown(output.rgb, output.alpha, background)
         image = None if output.image is None else torch.cat([rgb, output.image[..., 3:]], -1)
         shown = replace(output, rgb=rgb, image=image)
-    terms = objective(shown, view.target(background, device), config.loss, view.mask)
+    terms = objective(shown, view.target(background, device), config.loss, view.mask, view.depth, view.normal)
     own = watch or LossWatch()
     own.note(scene, step, terms)
     if watch is None:

@@ -1,4 +1,4 @@
-"""Training views: a camera, its photograph, and which pixels of it count."""
+"""Training views: a camera, its photograph, which pixels of it count, and depth and normals where they are known."""
 
 from __future__ import annotations
 
@@ -32,22 +32,26 @@ class View(NamedTuple):
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
         correction: how the photograph shows the scene's colours c: gains [3], gain c, or [3, 4], matrix c + offset;
             None = as they are.
+        depth: [H, W] or [H, W, 1] float, camera z in world units, 0 or NaN where it is unknown; None = everywhere.
+        normal: [H, W, 3] float, surface normals in the camera frame (OpenCV axes, facing the camera), 0 or NaN where
+            they are unknown; None = everywhere.
     """
 
     camera: Camera
     image: Tensor
     mask: Tensor | None = None
     correction: Tensor | None = None
+    depth: Tensor | None = None
+    normal: Tensor | None = None
 
     @property
     def nbytes(self) -> int:
-        """Memory of the picture and its mask."""
-        return self.image.nbytes + (0 if self.mask is None else self.mask.nbytes)
+        """Memory of the picture and of what belongs to its pixels."""
+        return sum(map_.nbytes for map_ in (self.image, self.mask, self.depth, self.normal) if map_ is not None)
 
     def to(self, device: torch.device | str) -> View:
-        """Camera, picture and mask on a device."""
-        mask, correction = (None if value is None else value.to(device) for value in (self.mask, self.correction))
-        return View(self.camera.to(device), self.image.to(device), mask, correction)
+        """The view on a device."""
+        return View(*(None if value is None else value.to(device) for value in self))  # type: ignore[arg-type]
 
     def shown(self, rgb: Tensor, alpha: Tensor, background: Tensor | None) -> Tensor:
         """`shown` by this photograph's correction."""
@@ -154,6 +158,15 @@ def downscale_mask(mask: Tensor, width: int, height: int) -> Tensor:
     return downscale_image(mask.float(), width, height) > 0.999
 
 
+def nearest(values: Tensor, width: int, height: int) -> Tensor:
+    """[height, width, ...]: the nearest of the values [H, W, ...]; depths are not averaged across an edge."""
+    rows, columns = (
+        ((torch.arange(new, device=values.device) + 0.5) * (old / new)).long()
+        for new, old in zip((height, width), values.shape[:2], strict=True)
+    )
+    return values if values.shape[:2] == (height, width) else values[rows[:, None], columns]
+
+
 def background_color(
     kind: Literal["black", "white", "random"], seed: int, step: int, device: torch.device | str = "cpu"
 ) -> Tensor | None:
@@ -201,15 +214,18 @@ def at_size(view: View, camera: Camera, device: torch.device | str) -> View:
     The picture may be of that size already.
     """
     image = as_float(view.image.to(device))
-    for picture, what in ((view.image, "image"), (view.mask, "mask")):
+    for what in ("image", "mask", "depth", "normal"):
+        picture = getattr(view, what)
         sizes = ((view.camera.height, view.camera.width), (camera.height, camera.width))
         if picture is not None and tuple(picture.shape[:2]) not in sizes:
             h, w = picture.shape[:2]
             raise ValueError(
                 f"the {what} is {w} x {h} pixels, but its camera {view.camera.width} x {view.camera.height}"
             )
-    mask = None if view.mask is None else downscale_mask(view.mask.to(device), camera.width, camera.height)
-    return View(camera, downscale_image(image, camera.width, camera.height), mask, view.correction)
+    size = (camera.width, camera.height)
+    mask = None if view.mask is None else downscale_mask(view.mask.to(device), *size)
+    depth, normal = (None if each is None else nearest(each.to(device), *size) for each in (view.depth, view.normal))
+    return View(camera, downscale_image(image, *size), mask, view.correction, depth, normal)
 
 
 class DownscaledViews:

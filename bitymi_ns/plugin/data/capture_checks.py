@@ -43,7 +43,7 @@ STOCK_FORMATS: dict[type[DataParserConfig], Format] = {
     ColmapDataParserConfig: "colmap",
 }
 """nerfstudio's parsers whose captures `bitymi-data` reads."""
-STOCK_IGNORED = ("_target", "depths_path", "depth_unit_scale_factor", "max_2D_matches_per_3D_point",
+STOCK_IGNORED = ("_target", "depths_path", "max_2D_matches_per_3D_point",
                  "downscale_rounding_mode", "load_3D_points")  # fmt: skip
 """Options of these that do not change what is read here, or are translated."""
 

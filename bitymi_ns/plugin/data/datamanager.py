@@ -25,6 +25,7 @@ from bitymi_ns.plugin.data.cameras import check_cameras, to_camera
 from bitymi_ns.plugin.data.capture_checks import check_capture, check_images, declares_box, reporting_input_errors
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.data.dataset import PHOTOGRAPH_BYTES, BitymiDataset, CachedImages, drop_blank_views
+from bitymi_ns.plugin.data.depth import with_depth
 from bitymi_ns.plugin.data.initial_points import reading_points
 from bitymi_ns.plugin.data.point_files import reporting_time
 from bitymi_ns.plugin.data.pose_checks import check_outliers, check_point_unit, warn_of_mirrored
@@ -202,6 +203,9 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         """Undistorted views of limited size without those that are masked out."""
         verbose = split == "training" and self.test_mode == "val"
         outputs = limit_size(with_lenses(outputs), self.config.longest_side, verbose)
+        if verbose and isinstance(self.config.dataparser, BitymiDataParserConfig):
+            parser = self.config.dataparser
+            outputs = with_depth(outputs, parser.depth, parser.depth_unit_scale_factor, parser.points == "auto")
         return drop_blank_views(outputs, split) if self._has_photos(self.test_mode) else outputs
 
     def check_pictures(self) -> None:
@@ -281,4 +285,6 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
 
 
 def _view(cameras: Cameras, batch: dict[str, Any]) -> View:
-    return View(to_camera(cameras), batch["image"], batch.get("mask"))
+    return View(
+        to_camera(cameras), batch["image"], batch.get("mask"), depth=batch.get("depth"), normal=batch.get("normal")
+    )

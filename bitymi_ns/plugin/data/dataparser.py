@@ -28,6 +28,7 @@ from bitymi_ns.plugin.data.colmap_views import (
     model_points,
     warn_of_left_out,
 )
+from bitymi_ns.plugin.data.depth import DepthKind
 from bitymi_ns.plugin.data.initial_points import (
     COLMAP_CONVENTIONS,
     JSON_CONVENTIONS,
@@ -96,6 +97,11 @@ class BitymiDataParserConfig(DataParserConfig):
     points: Choice = "auto"
     """Points to start from: those of the capture, triangulated ones where it has none (auto); triangulated ones in any
     case; or random ones."""
+    depth: DepthKind = "auto"
+    """Depth of the photographs, where the capture has it: metric, or relative (scale and shift fitted to the points),
+    as the points say (auto); off = neither depth nor normals are used."""
+    depth_unit_scale_factor: float | None = None
+    """Metres of a unit of depth; None = 0.001 for integers, 1 for floating-point numbers."""
     eval_mode: Literal["fraction", "filename", "interval", "all"] = "interval"
     """Photographs to hold out: evenly spaced ones, those with eval in their names, every n-th, or none (all are used
     for both)."""

@@ -18,12 +18,13 @@ from rich.progress import track
 from torch import Tensor
 
 from bitymi_ns.plugin.console import fail, listed, warn
+from bitymi_ns.plugin.data.depth import FITTED
 from bitymi_ns.plugin.data.images import ImageSummary, blank_masks, read_image, read_mask, summarize, wrong_size
 from bitymi_ns.plugin.data.lens import Lens
 from bitymi_ns.plugin.data.pose_checks import rotations
 from bitymi_ns.plugin.data.views import NO_PHOTOS, select_views
 from bitymi_ns.plugin.run.commands import MOVED
-from bitymi_ns.train.views import MemoryBudget, over_background
+from bitymi_ns.train.views import MemoryBudget, nearest, over_background
 
 PHOTOGRAPH_BYTES = 1 << 28
 """Memory for the images of a capture, training and held-out views together."""
@@ -93,7 +94,8 @@ class BitymiDataset(InputDataset):
         return data
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
-        """Read the image, and its mask [H, W, 1] bool where the capture has masks."""
+        """Read the image; its mask [H, W, 1] bool where the capture has masks; in training depth [H, W], in units of
+        the scene, and normal [H, W, 3], both float16, where they are used."""
         read = self.get_image_float32 if image_type == "float32" else self.get_image_uint8
         data: dict[str, Any] = {"image_idx": image_idx, "image": read(image_idx)}
         masks = self._dataparser_outputs.mask_filenames
@@ -103,8 +105,15 @@ class BitymiDataset(InputDataset):
             data["mask"] = torch.from_numpy(np.array(mask, dtype=bool))[..., None]
             if self.mask_color:
                 data["image"] = _fill(data["image"], data["mask"], self.mask_color)
+        data.update(self._maps(image_idx, (data["image"].shape[1], data["image"].shape[0])))
         data.update(self.get_metadata(data))
         return data
+
+    def _maps(self, image_idx: int, size: tuple[int, int]) -> dict[str, Tensor]:
+        """Depth and normals of a view in a picture of `size`."""
+        fitted = self._dataparser_outputs.metadata.get(FITTED)
+        found = {} if fitted is None else fitted[image_idx].read(self._lens(image_idx))
+        return {name: nearest(torch.from_numpy(values), *size).half() for name, values in found.items()}
 
     def _lens(self, image_idx: int) -> Lens:
         return self._dataparser_outputs.metadata["lenses"][image_idx]

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -90,12 +91,18 @@ class Lens:
     def undistort_mask(self, mask: Image.Image, path: Path) -> Image.Image:
         """Undistort a mask by nearest neighbors. It may have another size than the photograph, but not another aspect
         ratio; `path` is for the message."""
-        if not in_proportion(mask.size, self.stored):
-            fail(wrong_size(path, mask.size, self.stored))
-        pixels = np.asarray(mask.resize(self.size, Image.Resampling.NEAREST)).astype(np.uint8)
+        return Image.fromarray(self.undistort_map(np.asarray(mask).astype(np.uint8), path).astype(bool))
+
+    def undistort_map(self, values: npt.NDArray[Any], path: Path) -> npt.NDArray[Any]:
+        """Undistort uint8 or float32 values [H, W] or [H, W, C] by nearest neighbors. They may have another size than
+        the photograph, but not another aspect ratio; `path` is for the message."""
+        size = (values.shape[1], values.shape[0])
+        if not in_proportion(size, self.stored):
+            fail(wrong_size(path, size, self.stored))
+        values = cv2.resize(values, self.size, interpolation=cv2.INTER_NEAREST_EXACT)
         if self.distorts:
-            pixels = cv2.remap(pixels, *_maps(self), cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
-        return Image.fromarray(pixels.astype(bool))
+            values = cv2.remap(values, *_maps(self), cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+        return values
 
     def downscaled(self, factor: float) -> Lens:
         """Return the same lens for pictures scaled by `factor`."""

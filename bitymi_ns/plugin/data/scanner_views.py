@@ -14,6 +14,7 @@ from bitymi_ns.capture.photos import natural
 from bitymi_ns.capture.recognise import POLYCAM, Found, is_photograph
 from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.data.colmap_model import ModelCamera
+from bitymi_ns.plugin.data.depth_files import maps_beside
 from bitymi_ns.plugin.data.images import image_size
 from bitymi_ns.plugin.data.lens import rescaled
 from bitymi_ns.plugin.data.pose_checks import rotations
@@ -66,7 +67,8 @@ def scanner_photographs(found: Found, need_photos: bool) -> list[Photograph]:
                     "is another shape. Export it again."
                 )
             pinhole = rescaled("PINHOLE", pinhole, stated, size)
-        result.append(Photograph(path, ModelCamera("PINHOLE", *size, tuple(pinhole)), pose, f"the camera of {path}"))
+        camera, label = ModelCamera("PINHOLE", *size, tuple(pinhole)), f"the camera of {path}"
+        result.append(Photograph(path, camera, pose, label, maps=maps_beside(path)))
     return result
 
 

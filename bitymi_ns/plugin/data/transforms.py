@@ -18,7 +18,7 @@ from bitymi_ns.trust import json_of
 HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data <photos> --output-dir <capture>`."
 HOW_TO_MEND = "Correct it there (JSON has neither comments nor a comma behind the last entry), or write the file anew."
 INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
-FILE_KEYS = ("file_path", "mask_path", "depth_file_path")
+FILE_KEYS = ("file_path", "mask_path", "depth_file_path", "normal_file_path")
 MAX_SIDE = 1 << 20
 """Largest plausible width or height of a picture, pixels."""
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -58,7 +58,7 @@ def load_transforms(path: Path, own_format: bool, verbose: bool = True) -> dict[
 
 
 def _drop_nulls(meta: Any) -> None:
-    """Remove entries that are null, and empty names of masks and depths, which programs write for "none"."""
+    """Remove entries that are null, and empty names of masks and maps, which programs write for "none"."""
     frames = meta.get("frames") if isinstance(meta, dict) else None
     for holder in [meta, *frames] if isinstance(frames, list) else [meta]:
         for key, value in list(holder.items()) if isinstance(holder, dict) else ():

@@ -19,6 +19,7 @@ from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 from bitymi_ns.capture.panorama import PANORAMAS
 from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data.colmap_model import ModelCamera
+from bitymi_ns.plugin.data.depth_files import MAP_FILES, MapFiles
 from bitymi_ns.plugin.data.images import image_size
 from bitymi_ns.plugin.data.lens import colmap_distortion
 from bitymi_ns.plugin.data.names import FileFinder, renamed_message
@@ -26,6 +27,7 @@ from bitymi_ns.plugin.data.splits import NameLists
 from bitymi_ns.plugin.data.transforms import (
     COEFFICIENTS,
     DISTORTION,
+    FILE_KEYS,
     FOCALS,
     INTRINSICS,
     check_number,
@@ -35,7 +37,7 @@ from bitymi_ns.plugin.data.transforms import (
 from bitymi_ns.plugin.data.views import Photograph
 
 USED = {
-    "frames", "file_path", "mask_path", "transform_matrix", "camera_model", "is_fisheye", "fisheye", "ply_file_path",
+    "frames", *FILE_KEYS, "transform_matrix", "camera_model", "is_fisheye", "fisheye", "ply_file_path",
     "applied_transform", "applied_scale", "orientation_override", "aabb_scale",
     *INTRINSICS, *DISTORTION, *FOCALS["x"], *FOCALS["y"],
 }  # fmt: skip
@@ -88,6 +90,7 @@ def read_transforms(
     names = [frame["file_path"] for frame in frames]
     files = _find_photographs(path, names, need_photos)
     masks = _find_masks(path.parent, [frame.get("mask_path") for frame in frames], files, need_photos)
+    maps = _find_maps(path, frames, need_photos and verbose)
     cloud = meta.get("ply_file_path")
     if isinstance(cloud, str) and cloud and not (path.parent / cloud).is_file():
         there = FileFinder(path.parent, extensions=(".ply",)).find(cloud)
@@ -98,11 +101,11 @@ def read_transforms(
         _report_unused(path, meta, own_format)
     made: dict[ModelCamera, ModelCamera] = {}
     photographs = []
-    for frame, file, mask in zip(frames, files, masks, strict=True):
+    for frame, file, mask, beside in zip(frames, files, masks, maps, strict=True):
         camera = _camera(path, meta, frame, file)
         label = f"the camera of {frame['file_path']} in {path}"
         pose = np.array(frame["transform_matrix"])
-        photographs.append(Photograph(file, made.setdefault(camera, camera), pose, label, mask))
+        photographs.append(Photograph(file, made.setdefault(camera, camera), pose, label, mask, maps=beside))
     photographs.sort(key=lambda photograph: photograph.file)
     if downscale > 1:
         photographs = _downscaled(photographs, path.parent, downscale)
@@ -162,6 +165,19 @@ def _find_masks(
     taken = set(photographs)
     paths = {name: folder / name if path is None or path in taken else path for name, path in found.items()}
     return [None if name is None else paths[name] for name in names]
+
+
+def _find_maps(path: Path, frames: Sequence[dict[str, Any]], verbose: bool) -> list[MapFiles]:
+    """Find the maps of depth and normals, with a warning on those that are missing."""
+    finder = FileFinder(path.parent, outside=True, extensions=MAP_FILES)
+    found: dict[str, list[Path | None]] = {}
+    for key in ("depth_file_path", "normal_file_path"):
+        names = [frame.get(key) for frame in frames]
+        found[key] = [None if name is None else finder.find(name) for name in names]
+        lacking = [name for name, file in zip(names, found[key], strict=True) if name is not None and file is None]
+        if lacking and verbose:
+            warn(f"{path}: {len(lacking)} files of {key} are missing, and not used: {listed(lacking)}.")
+    return [MapFiles(depth, normal=normal) for depth, normal in zip(*found.values(), strict=True)]
 
 
 def check_photographs_exist(path: Path, photographs: Iterable[Photograph]) -> None:

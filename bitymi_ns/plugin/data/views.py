@@ -18,6 +18,7 @@ from nerfstudio.data.scene_box import SceneBox
 
 from bitymi_ns.plugin.console import fail, say
 from bitymi_ns.plugin.data.colmap_model import ModelCamera
+from bitymi_ns.plugin.data.depth_files import MAPS, MapFiles
 from bitymi_ns.plugin.data.images import THREADS, image_size
 from bitymi_ns.plugin.data.lens import Lens, Pinhole, colmap_distortion, make_lens, rescaled
 from bitymi_ns.plugin.data.point_files import Points
@@ -46,6 +47,7 @@ class Photograph:
         label: names the camera in messages.
         mask: mask file; None = none.
         downscaled: `file` is a copy that is downscaled already.
+        maps: depth and normals.
     """
 
     file: Path
@@ -54,6 +56,7 @@ class Photograph:
     label: str
     mask: Path | None = None
     downscaled: bool = False
+    maps: MapFiles = MapFiles()
 
 
 @dataclass(frozen=True)
@@ -136,6 +139,8 @@ def make_views(
     moved = transform @ poses
     moved[:, :3, 3] *= scale
     metadata: dict[str, Any] = {"lenses": lenses}
+    if any(photograph.maps != MapFiles() for photograph in photographs):
+        metadata[MAPS] = [photograph.maps for photograph in photographs]
     if points is not None and len(points.xyz):
         xyz = (points.xyz @ transform[:, :3].T + transform[:, 3]) * scale * applied_scale
         metadata["points3D_xyz"] = torch.from_numpy(xyz.astype(np.float32))

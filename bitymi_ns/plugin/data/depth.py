@@ -1,0 +1,345 @@
+"""Depth maps of the training photographs in the units of the scene, by what points and other photographs say of them,
+and initial points from them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+
+from bitymi_ns.plugin.console import say, warn
+from bitymi_ns.plugin.data.depth_files import MAPS, MapFiles, Values, read_depth, read_normal
+from bitymi_ns.plugin.data.images import THREADS, read_image
+from bitymi_ns.plugin.data.initial_points import GREY
+from bitymi_ns.plugin.data.lens import Lens, Pinhole
+from bitymi_ns.train.views import spread
+
+DepthKind = Literal["auto", "metric", "relative", "off"]
+"""metric = one scale for all maps; relative = scale and shift of each map; auto = as the points say; off = not used."""
+FITTED = "fitted maps"
+"""Metadata key of the `FittedMaps` of each view."""
+SIDE = 320
+"""Longest side in pixels at which maps are compared with points and with each other."""
+TOLERANCE = 0.05
+"""Relative difference of two depths that are of one surface."""
+FEW_PAIRS = 20
+"""Points in a photograph from which scale and shift of its depth can be told."""
+AGREES = 0.25
+"""Share of the points that usable depth agrees with: many are hidden in the pictures that they project into."""
+AGREE_MUTUALLY = 0.45
+"""Share of the pixels that another photograph confirms, of those that it confirms or sees through, where depth is
+usable. In the sample room 0.95; 0.57 with noise of 5 %; at most 0.39 in another unit, from 0.001 to 1,000 times."""
+BETTER = 0.15
+"""Share by which scale and shift of each map fit better where maps are not metric."""
+TRIALS = 200
+"""Pairs of points that scale and shift are computed from."""
+SEEN_BY = 16
+"""Photographs that a new point is compared with."""
+PIXELS_PER_POINT = 50
+"""Pixels of the training photographs per initial point."""
+MOST_POINTS = 200_000
+"""Initial points at most."""
+
+Floats = npt.NDArray[np.float64]
+
+
+class DepthFit(NamedTuple):
+    """Camera z in units of the scene from the values of a map: scale value + shift, or its inverse."""
+
+    scale: float
+    shift: float = 0.0
+    inverse: bool = False
+
+    def z(self, values: npt.NDArray[np.floating]) -> Values:
+        """Convert values; 0 = unknown."""
+        linear = self.scale * values + self.shift
+        known = (values > 0.0) & (linear > 0.0)
+        linear = np.where(known, linear, 1.0)
+        return np.where(known, 1.0 / linear if self.inverse else linear, 0.0).astype(np.float32)
+
+
+class FittedMaps(NamedTuple):
+    """Maps of a view in units of the scene; fit None = its depth is not used."""
+
+    files: MapFiles
+    fit: DepthFit | None
+    unit: float | None
+
+    def read(self, lens: Lens) -> dict[str, Values]:
+        """Read depth [H, W] and normal [H, W, 3] of those that are used, see `View`."""
+        found = {} if self.fit is None else {"depth": self.fit.z(read_depth(self.files, lens, self.unit))}
+        return found if self.files.normal is None else {**found, "normal": read_normal(self.files, lens)}
+
+
+class _Seen(NamedTuple):
+    """Map of a view, its camera and its pose: position, and rotation of OpenCV's camera axes to the world."""
+
+    values: Values
+    lens: Lens
+    center: Floats
+    rotation: Floats
+
+    @property
+    def camera(self) -> Pinhole:
+        return self.lens.pinhole
+
+    def fitted(self, fit: DepthFit) -> _Seen:
+        """The view with camera z in units of the scene in place of the values of the map."""
+        return self._replace(values=fit.z(self.values))
+
+
+def with_depth(
+    outputs: DataparserOutputs, kind: DepthKind = "auto", unit: float | None = None, add_points: bool = True
+) -> DataparserOutputs:
+    """Fit the depth maps of training views to the scene, and add points from them to those of the capture.
+
+    Args:
+        outputs: training views of limited size, with lenses.
+        kind: of the maps.
+        unit: see `read_depth`.
+        add_points: extend the points of the capture to one for PIXELS_PER_POINT pixels.
+
+    Returns:
+        The outputs with a `DepthFit` or None for each view, where depth is used at all.
+
+    Raises:
+        InputError: a map cannot be read, or has another shape than its photograph.
+    """
+    maps: Sequence[MapFiles] = outputs.metadata.get(MAPS) or []
+    if kind == "off" or not maps:
+        return outputs
+    _check_normals(outputs, maps)
+    rows = [i for i, files in enumerate(maps) if files.depth is not None]
+    seen = _read_maps(outputs, rows, unit)
+    old = outputs.metadata.get("points3D_xyz", torch.zeros(0, 3))
+    xyz = old.double().numpy()
+    fits = _fits(seen, xyz[np.isfinite(xyz).all(1)], kind, float(outputs.dataparser_scale)) if rows else []
+    fit_of = dict(zip(rows, fits, strict=True)) if fits is not None else {}
+    metadata = {**outputs.metadata, FITTED: [FittedMaps(files, fit_of.get(i), unit) for i, files in enumerate(maps)]}
+    used = [(i, each.fitted(fit_of[i])) for i, each in zip(rows, seen, strict=True) if fit_of.get(i) is not None]
+    pixels = int((outputs.cameras.width.long() * outputs.cameras.height.long()).sum())
+    count = min(MOST_POINTS, pixels // PIXELS_PER_POINT) - len(old) if add_points else 0
+    new, rgb = _new_points([each for _, each in used], [outputs.image_filenames[i] for i, _ in used], count)
+    if len(new):
+        say(f"{len(new):,} initial points are added from depth.")
+        own = outputs.metadata.get("points3D_rgb", torch.zeros(0, 3))
+        own = own if len(own) == len(old) else torch.full((len(old), 3), GREY)
+        metadata["points3D_xyz"] = torch.cat([old, torch.from_numpy(new.astype(np.float32))])
+        metadata["points3D_rgb"] = torch.cat([own.to(torch.uint8), torch.from_numpy(rgb)])
+    return dataclasses.replace(outputs, metadata=metadata)
+
+
+def _read_maps(outputs: DataparserOutputs, rows: Sequence[int], unit: float | None) -> list[_Seen]:
+    """Read the depth of views at small size."""
+    lenses, maps = outputs.metadata["lenses"], outputs.metadata[MAPS]
+    small = {lens: lens.downscaled(min(1.0, SIDE / max(lens.pinhole.width, lens.pinhole.height)))
+             for lens in dict.fromkeys(lenses[i] for i in rows)}  # fmt: skip
+    with ThreadPoolExecutor(THREADS) as pool:
+        values = list(pool.map(lambda i: read_depth(maps[i], small[lenses[i]], unit), rows))
+    poses = outputs.cameras.camera_to_worlds.double().numpy()
+    return [_Seen(each, small[lenses[i]], poses[i, :, 3], poses[i, :, :3] * (1.0, -1.0, -1.0))
+            for i, each in zip(rows, values, strict=True)]  # fmt: skip
+
+
+def _check_normals(outputs: DataparserOutputs, maps: Sequence[MapFiles]) -> None:
+    """Warn where normals are in another frame than that of the camera."""
+    rows = [i for i, files in enumerate(maps) if files.normal is not None]
+    for i in [rows[k] for k in spread(len(rows), 8)]:
+        lens: Lens = outputs.metadata["lenses"][i]
+        normal, to = read_normal(maps[i], lens), lens.pinhole
+        x, y = (np.arange(to.width) + 0.5 - to.cx) / to.fx, (np.arange(to.height) + 0.5 - to.cy) / to.fy
+        away = normal[..., 0] * x[None, :] + normal[..., 1] * y[:, None] + normal[..., 2] > 0.0
+        known = normal.any(-1)
+        if known.any() and away[known].mean() > 0.2:
+            warn(
+                f"{away[known].mean():.0%} of the normals of {maps[i].normal} face away from the camera: they are not "
+                "in its frame (x right, y up, z back). Correct them, or train without: `bitymi-data --depth off`."
+            )
+            return
+
+
+def _project(xyz: Floats, view: _Seen) -> tuple[npt.NDArray[np.intp], Floats, npt.NDArray[np.bool_]]:
+    """Pixel (flat index), camera z, and whether points [N, 3] are in the picture."""
+    to = view.camera
+    local = (xyz - view.center) @ view.rotation
+    front = local[:, 2] > 0.0
+    z = np.where(front, local[:, 2], 1.0)
+    x, y = np.floor(to.fx * local[:, 0] / z + to.cx), np.floor(to.fy * local[:, 1] / z + to.cy)
+    inside = front & (x >= 0) & (x < to.width) & (y >= 0) & (y < to.height)
+    return np.where(inside, y * to.width + x, 0).astype(np.intp), z, inside
+
+
+def _unproject(pixels: npt.NDArray[np.intp], view: _Seen) -> Floats:
+    """World positions [N, 3] of pixels of a fitted view."""
+    to, z = view.camera, view.values.ravel()[pixels]
+    x, y = (pixels % to.width + 0.5 - to.cx) / to.fx, (pixels // to.width + 0.5 - to.cy) / to.fy
+    return np.stack([x * z, y * z, z], -1) @ view.rotation.T + view.center
+
+
+def _fits(seen: Sequence[_Seen], xyz: Floats, kind: DepthKind, unit: float) -> list[DepthFit | None] | None:
+    """Fit each map to points of the scene, or take it as metric where there are none; None = depth is of no use.
+
+    Args:
+        seen: views with depth.
+        xyz: [N, 3] points.
+        kind: of the maps.
+        unit: units of the scene per metre, by the capture.
+    """
+    if not any(each.values.any() for each in seen):
+        warn("The depth maps have no valid pixel: depth is not used.")
+        return None
+    pairs = [_pairs(each, xyz) for each in seen]
+    values, z = (np.concatenate([pair[k] for pair in pairs]) for k in (0, 1))
+    if len(z) < FEW_PAIRS:
+        if kind == "relative":
+            warn("Relative depth needs points of the scene, and there are none in the pictures: depth is not used.")
+            return None
+        fit = DepthFit(unit)
+        agreement = _agreement([each.fitted(fit) for each in seen])
+        if agreement is not None and agreement < AGREE_MUTUALLY:
+            warn(
+                f"The depth maps agree with each other in {agreement:.0%} of their pixels by the poses, so depth is "
+                "not used: its unit may be another (`bitymi-data --depth-unit-scale-factor`)."
+            )
+            return None
+        say(f"Depth of {len(seen)} photographs is used as metric.")
+        return [fit] * len(seen)
+    scale = _mode(z / values)
+    metric = float((np.abs(scale * values / z - 1.0) < TOLERANCE).mean())
+    relative: list[DepthFit | None] = []
+    share = 0.0
+    if kind != "metric":
+        for inverse in (False, True):
+            found = [_affine(*pair, inverse) for pair in pairs]
+            mean = sum(s * len(pair[0]) for (_, s), pair in zip(found, pairs, strict=True)) / len(z)
+            if mean > share:
+                relative, share = [fit for fit, _ in found], mean
+    use_relative = kind == "relative" or (kind == "auto" and share > metric + BETTER)
+    if (share if use_relative else metric) < AGREES:
+        what = "with scale and shift fitted to each" if use_relative else "with one scale for all"
+        warn(
+            f"The depth maps agree with {max(share, metric):.0%} of the points in the pictures, {what}: depth is not "
+            "used. They may be of other photographs, or not of camera z."
+        )
+        return None
+    if use_relative:
+        inverse = any(fit is not None and fit.inverse for fit in relative)
+        say(
+            f"Depth of {sum(fit is not None for fit in relative)} of {len(seen)} photographs is relative"
+            f"{' and inverse' if inverse else ''}: scale and shift are fitted to the points."
+        )
+        return relative
+    ratio = scale / unit
+    other = "" if abs(ratio - 1.0) < 2 * TOLERANCE else f", times {ratio:.4g} by the points"
+    say(f"Depth of {len(seen)} photographs is used as metric{other}.")
+    return [DepthFit(scale)] * len(seen)
+
+
+def _pairs(view: _Seen, xyz: Floats) -> tuple[Floats, Floats]:
+    """Values of a map, and camera z, of the points that project into it."""
+    pixels, z, inside = _project(xyz, view)
+    values = view.values.ravel()[pixels]
+    kept = inside & (values > 0.0)
+    return values[kept].astype(np.float64), z[kept]
+
+
+def _mode(ratios: Floats) -> float:
+    """The ratio that most lie near to: hidden points are farther than what hides them."""
+    logs = np.sort(np.log(ratios))
+    width = np.searchsorted(logs, logs + 2 * TOLERANCE) - np.arange(len(logs))
+    start = int(width.argmax())
+    return float(np.exp(np.median(logs[start : start + width[start]])))
+
+
+def _affine(values: Floats, z: Floats, inverse: bool) -> tuple[DepthFit | None, float]:
+    """Fit scale and shift of a map by the largest set of points that agree, and state their share."""
+    if len(z) < FEW_PAIRS:
+        return None, 0.0
+    target = 1.0 / z if inverse else z
+    rng = np.random.default_rng(0)
+    first, second = rng.integers(len(z), size=(2, TRIALS))
+    step = values[second] - values[first]
+    usable = np.abs(step) > 1e-3 * np.abs(values).max()
+    if not usable.any():
+        return None, 0.0
+    scales = ((target[second] - target[first])[usable]) / step[usable]
+    shifts = target[first][usable] - scales * values[first][usable]
+
+    def agree(scale: npt.ArrayLike, shift: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        fitted = np.multiply.outer(scale, values) + np.asarray(shift)[..., None]
+        return np.abs(fitted / target - 1.0) < TOLERANCE
+
+    best = int(agree(scales, shifts).sum(1).argmax())
+    scale, shift = float(scales[best]), float(shifts[best])
+    for _ in range(2):
+        near = agree(scale, shift)
+        if near.sum() < FEW_PAIRS // 2 or np.ptp(values[near]) == 0.0:
+            break
+        relative = 1.0 / target[near]  # the error counts as a share of the depth
+        rows = np.stack([values[near] * relative, relative], 1)
+        scale, shift = np.linalg.lstsq(rows, np.ones(len(rows)), rcond=None)[0].tolist()
+    share = float(agree(scale, shift).mean())
+    return (DepthFit(scale, shift, inverse), share) if share >= AGREES else (None, share)
+
+
+def _agreement(seen: Sequence[_Seen]) -> float | None:
+    """Share of pixels that others see at the same depth, of those that they do not hide; None = too few are seen."""
+    rng = np.random.default_rng(0)
+    counts = np.zeros(3, np.int64)
+    for i in spread(len(seen), SEEN_BY):
+        known = np.flatnonzero(seen[i].values)
+        pixels = rng.choice(known, min(len(known), 500), replace=False)
+        counts += _votes(_unproject(pixels, seen[i]), i, seen).sum(1)
+    agree, through, _ = counts.tolist()
+    return agree / max(1, agree + through) if counts.sum() >= 50 else None
+
+
+def _votes(xyz: Floats, own: int, seen: Sequence[_Seen]) -> npt.NDArray[np.int64]:
+    """Count, [3, N], the other fitted views that see points [N, 3] on their surfaces, see through them, and hide
+    them."""
+    votes = np.zeros((3, len(xyz)), np.int64)
+    others = [j for j in range(len(seen)) if j != own]
+    for j in (others[k] for k in spread(len(others), SEEN_BY)):
+        pixels, z, inside = _project(xyz, seen[j])
+        depth = seen[j].values.ravel()[pixels]
+        known = inside & (depth > 0.0)
+        behind = z / np.where(known, depth, 1.0) - 1.0
+        votes += known & np.stack([np.abs(behind) < TOLERANCE, behind <= -TOLERANCE, behind >= TOLERANCE])
+    return votes
+
+
+def _new_points(seen: Sequence[_Seen], files: Sequence[Path], count: int) -> tuple[Floats, npt.NDArray[np.uint8]]:
+    """Points [N, 3] on what the maps show, with colors [N, 3], evenly thinned to at most `count`.
+
+    Points that more views see through than agree with are left out. A point is taken from one of the views that agree,
+    so that what many of them show gets no more points than the rest.
+    """
+    if count < 1 or not seen:
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    rng = np.random.default_rng(0)
+    numbers = [np.flatnonzero(each.values) for each in seen]
+    total = sum(map(len, numbers))
+    draws = [rng.choice(each, min(len(each), -(-4 * count * len(each) // total)), replace=False) for each in numbers]
+
+    def of_view(i: int) -> tuple[Floats, npt.NDArray[np.uint8], Floats]:
+        xyz = _unproject(draws[i], seen[i])
+        agree, through, _ = _votes(xyz, i, seen)
+        kept = agree >= through
+        lens = seen[i].lens
+        image = lens.undistort(read_image(files[i], lens.stored, lens.size).convert("RGB"))
+        return xyz[kept], np.asarray(image).reshape(-1, 3)[draws[i][kept]], 1.0 / (1.0 + agree[kept])
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        parts = list(pool.map(of_view, range(len(seen))))
+    xyz, rgb, weight = (np.concatenate([part[k] for part in parts]) for k in range(3))
+    if len(xyz) <= count:
+        return xyz, rgb
+    order = np.sort(np.argsort(rng.exponential(size=len(xyz)) / weight, kind="stable")[:count])
+    return xyz[order], rgb[order]

@@ -1,0 +1,126 @@
+"""Depth maps, their confidence, and normal maps in files, as programs and scanners write them."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from zipfile import BadZipFile
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from bitymi_ns.plugin.console import fail
+from bitymi_ns.plugin.data.lens import Lens
+
+MAP_FILES = (".png", ".tif", ".tiff", ".npy", ".npz", ".exr")
+"""Extensions of depth and normal maps."""
+MILLIMETER = 1e-3
+"""Metres of a unit of integer depth, where no other is stated: nerfstudio's convention."""
+MAPS = "maps"
+"""Metadata key of the `MapFiles` of each view."""
+FARTHEST = 65504.0
+"""Depth from which on a number stands for "no depth": the largest of half floats, below Blender's 1e10."""
+
+Values = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class MapFiles:
+    """Files with what is known of a photograph's pixels beside their colors; None = none.
+
+    Attributes:
+        depth: of camera z, see `read_depth`.
+        confidence: of the depth, 0 = low, at most of the size of the depth.
+        normal: see `read_normal`.
+    """
+
+    depth: Path | None = None
+    confidence: Path | None = None
+    normal: Path | None = None
+
+
+def maps_beside(photograph: Path) -> MapFiles:
+    """Find the depth and confidence of a scanner's photograph: files of its name in `depth` and `confidence` beside its
+    folder (Polycam, Record3D, ScanNet)."""
+
+    def find(folder: str) -> Path | None:
+        files = (photograph.parent.parent / folder / f"{photograph.stem}{ending}" for ending in MAP_FILES)
+        return next((file for file in files if file.is_file()), None)
+
+    return MapFiles(find("depth"), find("confidence"))
+
+
+def read_depth(files: MapFiles, lens: Lens, unit: float | None = None) -> Values:
+    """Read camera z [H, W] for the pinhole picture of a lens; 0 = unknown.
+
+    Integers count millimetres; 0 and the largest one are unknown. Floating-point numbers are metres; those that are not
+    finite, not above 0, or 65,504 and more are unknown. So is what has confidence 0.
+
+    Args:
+        files: with a depth.
+        lens: of the photograph. The map is resized to it and undistorted by nearest neighbors.
+        unit: metres of a unit; None = as above.
+
+    Raises:
+        InputError: a file cannot be read, or has another shape than the photograph.
+    """
+    assert files.depth is not None
+    stored = _read(files.depth)
+    if stored.ndim != 2:
+        fail(f"the depth map {files.depth} has {stored.shape[2]} channels: write depth as one. {_WITHOUT}")
+    whole = stored.dtype.kind in "iu"
+    values = stored.astype(np.float32)
+    known = np.isfinite(values) & (values > 0.0) & (values < (np.iinfo(stored.dtype).max if whole else FARTHEST))
+    if files.confidence is not None:
+        confidence = _read(files.confidence)
+        known &= cv2.resize(confidence, stored.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT) != 0
+    scale = unit if unit is not None else MILLIMETER if whole else 1.0
+    return lens.undistort_map(np.where(known, values * np.float32(scale), np.float32(0.0)), files.depth)
+
+
+def read_normal(files: MapFiles, lens: Lens) -> Values:
+    """Read normals [H, W, 3] for the pinhole picture of a lens, in its frame (OpenCV axes); 0 = unknown.
+
+    Files hold them in the camera frame of transforms.json (x right, y up, z back): floating-point numbers x, y, z, or
+    colors (n + 1) / 2, of which black is unknown.
+
+    Raises:
+        InputError: a file cannot be read, or has another shape than the photograph.
+    """
+    assert files.normal is not None
+    stored = _read(files.normal)
+    if stored.ndim != 3 or stored.shape[2] < 3:
+        fail(f"the normal map {files.normal} has no three channels. {_WITHOUT}")
+    normal = stored[..., :3].astype(np.float32)
+    if stored.dtype.kind in "iu":
+        black = (stored[..., :3] == 0).all(-1, keepdims=True)
+        normal = np.where(black, 0.0, normal * np.float32(2.0 / np.iinfo(stored.dtype).max) - 1.0)
+    return lens.undistort_map((normal * (1.0, -1.0, -1.0)).astype(np.float32), files.normal)
+
+
+_WITHOUT = "Write it anew, or train without: `bitymi-data --depth off`."
+
+
+def _read(path: Path) -> npt.NDArray[np.generic]:
+    """Read an array [H, W] or [H, W, C]; color channels in the order red, green, blue."""
+    try:
+        if path.suffix.lower() in (".npy", ".npz"):
+            loaded = np.load(path, allow_pickle=False)
+            values = loaded if isinstance(loaded, np.ndarray) else loaded[loaded.files[0]]
+            values = values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
+        else:
+            os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")  # OpenCV has the reader, switched off
+            values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            if values is None:
+                raise ValueError("not an image that OpenCV reads" if path.is_file() else "it does not exist")
+            if values.ndim == 3:
+                values = values[..., [2, 1, 0]]
+                if (values == values[..., :1]).all():  # depth that a program has written as grey
+                    values = values[..., 0]
+    except (OSError, ValueError, LookupError, EOFError, BadZipFile, cv2.error) as error:
+        fail(f"{path} cannot be read: {error}. {_WITHOUT}", error)
+    if values.ndim not in (2, 3) or values.dtype.kind not in "iuf" or 0 in values.shape:
+        fail(f"{path} is no map of numbers, but {values.dtype} {list(values.shape)}. {_WITHOUT}")
+    return values.astype(np.float32) if values.dtype.itemsize > 4 or values.dtype == np.float16 else values

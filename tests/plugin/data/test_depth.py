@@ -1,0 +1,228 @@
+"""Depth and normals of a capture: files, units, fits, initial points, and what is wrong with them."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from bitymi_ns.plugin.data.datamanager import BitymiDataManager
+from bitymi_ns.plugin.data.depth import DepthFit, _affine, _mode
+from bitymi_ns.plugin.data.depth_files import MapFiles, maps_beside, read_depth
+from bitymi_ns.plugin.data.lens import make_lens
+from bitymi_ns.sample.capture import View, first_hits, generate
+from bitymi_ns.sample.room import Room
+
+from .captures import expect, load
+
+WIDTH, HEIGHT = 64, 48
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> tuple[Path, list[np.ndarray]]:
+    """The sample room with few points, and camera z [H, W] of its photographs."""
+    folder = generate(tmp_path_factory.mktemp("depth") / "room", 16, WIDTH, HEIGHT, points=400)
+    meta, model = json.loads((folder / "transforms.json").read_text()), Room(0)
+    depths = []
+    for frame in meta["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        points, _ = first_hits(model, View(pose, meta["fl_x"], WIDTH, HEIGHT), np.arange(WIDTH * HEIGHT))
+        depths.append(((pose[:3, 3] - points) @ pose[:3, 2]).reshape(HEIGHT, WIDTH))
+    return folder, depths
+
+
+@pytest.fixture
+def capture(room, tmp_path):
+    """write(function of the depth of a frame, ...) -> the capture with those maps."""
+    folder, depths = room
+
+    def write(change=lambda z, i: z, ending: str = ".npy", points: bool = True, **entries) -> Path:
+        meta = json.loads((folder / "transforms.json").read_text())
+        for i, (frame, depth) in enumerate(zip(meta["frames"], depths, strict=True)):
+            frame["file_path"] = str(folder / frame["file_path"])
+            frame["depth_file_path"] = f"depth_{i}{ending}"
+            values = change(depth, i)
+            if ending == ".npy":
+                np.save(tmp_path / frame["depth_file_path"], values)
+            else:
+                os.environ["OPENCV_IO_ENABLE_OPENEXR"] = "1"
+                assert cv2.imwrite(str(tmp_path / frame["depth_file_path"]), values)
+        meta |= {"ply_file_path": str(folder / meta["ply_file_path"]), **entries}
+        if not points:
+            del meta["ply_file_path"]
+        (tmp_path / "transforms.json").write_text(json.dumps(meta))
+        return tmp_path
+
+    return write
+
+
+def check(manager: BitymiDataManager, depths: list[np.ndarray], tolerance: float = 0.01) -> None:
+    """Every training view has the exact depth, scaled as the poses were."""
+    scale = manager.train_dataparser_outputs.dataparser_scale
+    names = [path.name for path in manager.train_dataset.image_filenames]
+    for view, name in zip(manager.train_views, names, strict=True):
+        exact = depths[int(name[6:11]) - 1] * scale
+        assert view.depth.shape == (HEIGHT, WIDTH) and view.depth.dtype == torch.float16
+        known = view.depth.float().numpy() > 0
+        assert known.mean() > 0.5
+        assert np.abs(view.depth.float().numpy() / exact - 1.0)[known].max() < tolerance
+    assert all(view.depth is None for view in manager.eval_views)
+
+
+def on_surface(manager: BitymiDataManager, depths: list[np.ndarray]) -> None:
+    """Points come from training views, and lie on what they show."""
+    outputs = manager.train_dataparser_outputs
+    xyz = outputs.metadata["points3D_xyz"].double().numpy()
+    assert len(xyz) == 14 * WIDTH * HEIGHT // 50 and len(outputs.metadata["points3D_rgb"]) == len(xyz)
+    box = np.ptp(np.quantile(xyz, (0.02, 0.98), axis=0), axis=0) / outputs.dataparser_scale
+    assert (box > (3.0, 3.0, 1.5)).all()
+
+
+@pytest.mark.parametrize("ending", [".npy", ".png", ".exr"])
+def test_metric_depth_is_scaled_with_the_poses(capture, room, ending, capsys) -> None:
+    millimetres = lambda z, _: np.round(1000 * z).astype(np.uint16)  # noqa: E731
+    manager = load(capture(millimetres if ending == ".png" else lambda z, _: z.astype(np.float32), ending))
+    check(manager, room[1])
+    on_surface(manager, room[1])
+    out = " ".join(capsys.readouterr().out.split())
+    assert "Depth of 14 photographs is used as metric." in out and "initial points are added" in out
+
+
+def test_holes_and_values_that_are_not_depth(capture, room) -> None:
+    def holes(z, i):
+        z = z.copy()
+        z[:6], z[6:9], z[9:12], z[12:15] = 0.0, np.nan, np.inf, 1e10
+        return z
+
+    manager = load(capture(holes))
+    check(manager, room[1])
+    assert not manager.train_views[0].depth[:15].any()
+
+
+def test_another_unit_is_found_by_the_points(capture, room, capsys) -> None:
+    check(load(capture(lambda z, _: 1000.0 * z)), room[1])
+    assert "times 0.001 by the points" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("inverse", [False, True])
+def test_relative_depth_is_fitted_to_the_points(capture, room, inverse, capsys) -> None:
+    def relative(z, i):
+        return (0.3 + 0.02 * i) / z + 0.1 if inverse else (z + 0.4 * (1 + i % 3)) * (0.2 + 0.05 * i)
+
+    check(load(capture(relative)), room[1], 0.06)
+    out = " ".join(capsys.readouterr().out.split())
+    assert "is relative and inverse" in out if inverse else "is relative:" in out
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda z, _: 0.0 * z, "have no valid pixel"),
+        (lambda z, _: np.nan * z, "have no valid pixel"),
+        (lambda z, _: 0.0 * z + 2.0, "depth is not used"),
+        (lambda z, i: np.random.default_rng(i).uniform(0.5, 50.0, z.shape), "depth is not used"),
+    ],
+)
+def test_useless_depth_is_not_used(capture, change, message, capsys) -> None:
+    manager = load(capture(change))
+    assert message in " ".join(capsys.readouterr().out.split())
+    assert all(view.depth is None for view in manager.train_views)
+    assert len(manager.train_dataparser_outputs.metadata["points3D_xyz"]) == 400
+
+
+def test_without_points_photographs_are_compared(capture, room, capsys, monkeypatch) -> None:
+    monkeypatch.setattr("bitymi_ns.plugin.data.dataparser.initial_points", lambda *_: None)
+    manager = load(capture(points=False))
+    check(manager, room[1])
+    on_surface(manager, room[1])
+    load(capture(lambda z, _: 20.0 * z, points=False))
+    assert "its unit may be another" in " ".join(capsys.readouterr().out.split())
+    load(capture(points=False), depth="relative")
+    assert "Relative depth needs points" in " ".join(capsys.readouterr().out.split())
+
+
+def test_depth_that_cannot_be_read_is_refused(capture) -> None:
+    with expect(r"depth_\d+.npy has 32 x 48 pixels"):
+        load(capture(lambda z, _: z[:, ::2]))
+    with expect("has 3 channels"):
+        load(capture(lambda z, i: np.stack([z, z + 1, z], -1)))
+    folder = capture()
+    (folder / "depth_3.npy").write_bytes(b"no array")
+    with expect("depth_3.npy cannot be read"):
+        load(folder)
+
+
+def test_missing_maps_and_switching_off(capture, capsys) -> None:
+    folder = capture()
+    (folder / "depth_3.npy").unlink()
+    views = load(folder).train_views
+    assert "1 files of depth_file_path are missing" in " ".join(capsys.readouterr().out.split())
+    assert sum(view.depth is None for view in views) == 1
+    manager = load(folder, depth="off")
+    assert all(view.depth is None for view in manager.train_views)
+    assert len(manager.train_dataparser_outputs.metadata["points3D_xyz"]) == 400
+    assert len(load(folder, points="random").train_dataparser_outputs.metadata.get("points3D_xyz", ())) == 0
+
+
+def test_normals_of_a_capture(capture, room, capsys) -> None:
+    folder = capture()
+    meta = json.loads((folder / "transforms.json").read_text())
+    for i, frame in enumerate(meta["frames"]):
+        frame["normal_file_path"] = f"normal_{i}.png"
+        normal = np.zeros((HEIGHT, WIDTH, 3)) + (0.0, 0.6, 0.8)  # x right, y up, z back
+        image = np.round((normal + 1.0) / 2.0 * 255).astype(np.uint8)
+        image[:5] = 0
+        cv2.imwrite(str(folder / frame["normal_file_path"]), image[..., ::-1])
+    (folder / "transforms.json").write_text(json.dumps(meta))
+    normal = load(folder).train_views[0].normal.float()
+    assert normal.shape == (HEIGHT, WIDTH, 3) and not normal[:5].any()
+    torch.testing.assert_close(normal[20, 20], torch.tensor([0.0, -0.6, -0.8]), atol=0.01, rtol=0)
+    for i in range(16):
+        image = cv2.imread(str(folder / f"normal_{i}.png"))
+        cv2.imwrite(str(folder / f"normal_{i}.png"), 255 - image)
+    load(folder)
+    assert "face away from the camera" in " ".join(capsys.readouterr().out.split())
+
+
+def test_maps_of_scanners(tmp_path) -> None:
+    for name in ("images", "depth", "confidence"):
+        (tmp_path / name).mkdir()
+    depth = np.full((48, 64), 1500, np.uint16)
+    depth[0] = 65535
+    confidence = np.full((24, 32), 255, np.uint8)
+    confidence[-1] = 0
+    cv2.imwrite(str(tmp_path / "depth/7.png"), depth)
+    cv2.imwrite(str(tmp_path / "confidence/7.png"), confidence)
+    files = maps_beside(tmp_path / "images/7.jpg")
+    assert files == MapFiles(tmp_path / "depth/7.png", tmp_path / "confidence/7.png")
+    lens, _ = make_lens("PINHOLE", (100.0, 100.0, 64.0, 48.0), 128, 96, (128, 96), "")
+    read = read_depth(files, lens)
+    assert read.shape == (96, 128) and not read[:2].any() and not read[-4:].any()
+    assert np.allclose(read[2:-4], 1.5)
+    assert read_depth(files, lens, 0.01).max() == pytest.approx(15.0)
+
+
+def test_distorted_photographs_have_their_depth_moved(tmp_path) -> None:
+    lens, _ = make_lens("OPENCV", (60.0, 60.0, 32.0, 24.0, 0.1, 0.02, 0.0, 0.0), 64, 48, (64, 48), "a camera")
+    columns = np.broadcast_to(np.arange(1.0, 65.0), (48, 64))
+    np.save(tmp_path / "depth.npy", columns)
+    read = read_depth(MapFiles(tmp_path / "depth.npy"), lens)
+    assert read.shape == (lens.pinhole.height, lens.pinhole.width)
+    assert set(np.unique(read)) <= set(np.arange(1.0, 65.0))  # nearest: no blends
+    assert (np.diff(read[len(read) // 2]) >= 0).all()
+
+
+def test_fits_ignore_hidden_points() -> None:
+    rng = np.random.default_rng(0)
+    z = rng.uniform(1.0, 5.0, 400)
+    seen = np.where(np.arange(400) < 180, z * rng.uniform(0.2, 0.7, 400), z)  # the others are behind something
+    assert _mode(z / seen) == pytest.approx(1.0, abs=0.01)
+    fit, share = _affine(0.5 * seen + 0.3, z, inverse=False)
+    assert fit is not None and fit.scale == pytest.approx(2.0, rel=0.02) and share > 0.5
+    assert np.allclose(DepthFit(2.0, -0.6).z(np.array([0.8, 0.0, -1.0])), [1.0, 0.0, 0.0])
+    assert _affine(np.full(400, 2.0), z, inverse=False)[0] is None

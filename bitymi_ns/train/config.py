@@ -46,11 +46,11 @@ class LossConfig:
     """Step from which the overdraw loss is off again, so that the picture settles."""
     overdraw_half: Positive = 0.005
     """Blending weight of a fragment that counts as half a fragment in the overdraw loss."""
-    depth_weight: NonNegative = 0.1
+    depth_weight: NonNegative = 0.01
     """Weight of the depth loss, for captures with depth; 0 turns it off."""
     normal_weight: NonNegative = 0.02
     """Weight of the normal loss, for captures with normals; 0 turns it off."""
-    geometry_interval: PositiveCount = 2
+    geometry_interval: PositiveCount = 4
     """Steps between those with the depth and the normal loss, which weigh so many times as much there."""
 
 

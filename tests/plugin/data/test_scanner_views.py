@@ -29,6 +29,11 @@ def put(file: Path, target: Path) -> None:
     shutil.copyfile(file, target)
 
 
+def put_depth(target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.full((36, 48), 2000, np.uint16)).save(target)
+
+
 def polycam(capture: Path, folder: Path, corrected: bool = True) -> Path:
     frames, meta = frames_of(capture)
     for kind in ("", "corrected_") if corrected else ("",):
@@ -41,7 +46,7 @@ def polycam(capture: Path, folder: Path, corrected: bool = True) -> Path:
             place = folder / f"keyframes/{kind}cameras/{i}.json"
             place.parent.mkdir(parents=True, exist_ok=True)
             place.write_text(json.dumps({**values, **camera, "height": 36, "blur_score": 1.0}))
-            put(file, folder / f"keyframes/depth/{i}.png")
+            put_depth(folder / f"keyframes/depth/{i}.png")
     put(frames[0][0], folder / "thumbnail.png")
     return folder
 
@@ -57,7 +62,7 @@ def record3d(capture: Path, folder: Path) -> Path:
         here = Y_UP @ pose
         poses.append([*Rotation.from_matrix(here[:3, :3]).as_quat().tolist(), *here[:3, 3].tolist()])
         put(file, folder / f"rgb/{i}.png")
-        put(file, folder / f"depth/{i}.png")
+        put_depth(folder / f"depth/{i}.png")
     K = [2 * meta["fl_x"], 0, 0, 0, 2 * meta["fl_y"], 0, 2 * meta["cx"], 2 * meta["cy"], 1]
     (folder / "metadata").write_text(json.dumps({"K": K, "w": 96, "h": 72, "poses": poses, "fps": 60}))
     return folder
@@ -67,7 +72,7 @@ def scannet(capture: Path, folder: Path) -> Path:
     frames, meta = frames_of(capture)
     for i, (file, pose) in enumerate(frames):
         put(file, folder / f"color/{i}.png")
-        put(file, folder / f"depth/{i}.png")
+        put_depth(folder / f"depth/{i}.png")
         (folder / "pose").mkdir(exist_ok=True)
         np.savetxt(folder / f"pose/{i}.txt", pose @ np.diag([1, -1, -1, 1]))
     (folder / "intrinsic").mkdir()

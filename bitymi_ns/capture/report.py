@@ -17,10 +17,8 @@ if TYPE_CHECKING:  # those who read reports need not wait for it
     import pycolmap
 
 VALUES, PAGE, PICTURE = "report.json", "report.md", "cameras.png"
-FILES = (VALUES, PAGE, PICTURE, "frame.json")
-"""Files of a report; the last one is written by frame.py."""
-MOST_POINTS = 20_000
-"""Points in the plot; excess points are dropped at random."""
+FILES = (VALUES, PAGE, PICTURE, "frame.json")  # files of a report; the last one is written by frame.py
+MOST_POINTS = 20_000  # points in the plot; excess points are dropped at random
 
 
 def write_report(folder: Path, values: Mapping[str, object], model: pycolmap.Reconstruction) -> None:

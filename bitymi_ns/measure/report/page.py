@@ -19,8 +19,7 @@ from bitymi_ns.measure.report.records import Records, ReportError, over_seeds
 from bitymi_ns.measure.report.tables import NOTES, knob_tables, poses_tables, quality_tables, training_table
 
 PAGE = "index.html"
-GENERATOR = '<meta name="generator" content="bitymi report">'
-"""Marks a page as ours, so that it may be replaced."""
+GENERATOR = '<meta name="generator" content="bitymi report">'  # marks a page as ours, so that it may be replaced
 VIEWS_NOTE = f"The worst, the median and the best view by the PSNR of these pictures, with their {ERROR_CAPTION}."
 TRADE_OFF = "The dashed line is the Pareto front: of all points of a scene those that no other beats in both."
 KNOB_NOTE = (

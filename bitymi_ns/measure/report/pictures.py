@@ -23,17 +23,12 @@ from PIL import Image
 from bitymi_ns.measure.report.read import SIDE_BY_SIDE
 from bitymi_ns.measure.report.records import is_bundle_name
 
-ERROR_SCALE = 0.25
-"""Error at which an error map ends: mean absolute difference of the three colours."""
+ERROR_SCALE = 0.25  # error at which an error map ends: mean absolute difference of the three colours
 ERROR_CAPTION = f"error: mean of |difference| over the colours, 0 (black) to {ERROR_SCALE:g} (yellow)"
-MAX_SETS = 4
-"""Sets of photographs that a page shows views of."""
-MAX_WORST = 16
-"""Worst views that a page shows."""
-MAX_WIDTH = 1200
-"""Width in pixels to which wider images are scaled down."""
-MAX_PNG_BYTES = 400_000
-"""Images that are larger as PNG are embedded as JPEG of quality 92."""
+MAX_SETS = 4  # sets of photographs that a page shows views of
+MAX_WORST = 16  # worst views that a page shows
+MAX_WIDTH = 1200  # width in pixels to which wider images are scaled down
+MAX_PNG_BYTES = 400_000  # images that are larger as PNG are embedded as JPEG of quality 92
 _RANKS = (("Worst view", 0.0), ("Median view", 0.5), ("Best view", 1.0))
 
 Pixels = npt.NDArray[np.float32]

@@ -42,8 +42,7 @@ METRICS = {
     "lpips_vgg": ("LPIPS (VGG)", False, 0.01),
 }
 """Measure of quality -> title, True if more is better, least span of its axis."""
-MIN_POINTS = 3
-"""Plots of fewer points are left out: the tables say the same."""
+MIN_POINTS = 3  # plots of fewer points are left out: the tables say the same
 
 
 @dataclass(frozen=True)

@@ -23,13 +23,10 @@ from bitymi_ns.measure.report.records import (
 )
 
 CELLS, PICTURES = "cells.jsonl", "pictures.json"
-MAX_JSON_BYTES = 4 << 20
-"""Larger JSON files are no evaluation."""
+MAX_JSON_BYTES = 4 << 20  # larger JSON files are no evaluation
 MAX_JSONL_BYTES = 64 << 20
-MAX_DEPTH = 8
-"""Folders are searched this many levels down."""
-MAX_ENTRIES = 50_000
-"""A search stops after this many files."""
+MAX_DEPTH = 8  # folders are searched this many levels down
+MAX_ENTRIES = 50_000  # a search stops after this many files
 SIDE_BY_SIDE = re.compile(r"^eval_img_(?P<index>\d{4,})$", re.IGNORECASE)
 """Stem of a photograph beside its render, as `ns-eval --render-output-path` writes it."""
 

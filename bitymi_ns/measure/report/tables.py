@@ -264,8 +264,7 @@ def knob_tables(points: list[dict[str, Any]]) -> list[Table]:
     return tables
 
 
-MOST_NAMED = 60
-"""Photographs that a table names; report.json has them all."""
+MOST_NAMED = 60  # photographs that a table names; report.json has them all
 
 
 def poses_tables(values: Mapping[str, Any]) -> list[Table]:

@@ -27,15 +27,11 @@ from bitymi_ns.measure.stability.errors import (
 )
 from bitymi_ns.measure.stability.scenes import PLAIN, RIM, SWEEPS, WAYS, SceneCase, Sweep, Way, extreme_scenes
 
-ACCURATE = 1e-4
-"""Largest error that counts as accurate."""
-STEPS = round(1 / (255 * ACCURATE))
-"""An 8-bit step in units of ACCURATE."""
-ALLOWANCE = 4.0
-"""A case whose inputs, rounded, already do this share of the error is as good as float32 inputs allow."""
+ACCURATE = 1e-4  # largest error that counts as accurate
+STEPS = round(1 / (255 * ACCURATE))  # an 8-bit step in units of ACCURATE
+ALLOWANCE = 4.0  # a case whose inputs, rounded, already do this share of the error is as good as float32 inputs allow
 LIMITED = "as the inputs allow"
-EXTENDED_SIZE = 20_000
-"""Largest number of pixels times surfels for which extended precision is evaluated."""
+EXTENDED_SIZE = 20_000  # largest number of pixels times surfels for which extended precision is evaluated
 
 
 @dataclass(frozen=True)

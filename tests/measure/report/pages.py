@@ -1,7 +1,5 @@
 """Pages of reports with few parts."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from bitymi_ns.measure.report.page import compose, to_page

@@ -1,7 +1,5 @@
 """Tables: columns that are there, bold values, differences, means."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

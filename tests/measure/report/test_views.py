@@ -1,7 +1,5 @@
 """Held-out views: which are shown, and what is shown of them."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

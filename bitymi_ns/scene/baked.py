@@ -113,7 +113,7 @@ class BakedScene:
 
     @property
     def through_pixel(self) -> bool:
-        """Whether the kernel is seen through a pixel."""
+        """True if the kernel is averaged over a pixel."""
         return self.prefilter == "pixel"
 
     def __len__(self) -> int:
@@ -163,7 +163,7 @@ class BakedScene:
         return self._draw(cameras, background, images)
 
     def sampling(self, cameras: Sequence[Camera]) -> Sampling:
-        """How views that are drawn together are drawn: by the geometric mean of their sizes."""
+        """Sampling of views that are drawn together: by the geometric mean of their sizes."""
         if self.photographed is None or not len(self.photographed):
             return Sampling()
         sizes = [size_of(self.photographed, camera) for camera in cameras]

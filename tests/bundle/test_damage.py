@@ -136,16 +136,17 @@ def test_tiles_outside_the_atlas_are_refused(surfels, tmp_path):
             read_bundle(tmp_path / str(i))
 
 
-@pytest.fixture(scope="module")
-def good_bundle(tmp_path_factory):
-    return tmp_path_factory.mktemp("damage") / "b"
+@pytest.fixture(scope="module", params=["bc7", "fp16", "uint8"])
+def good_bundle(surfels, tmp_path_factory, request):
+    """A bundle of two surfels, as it is before and after every damage."""
+    folder = tmp_path_factory.mktemp("damage") / "b"
+    make(surfels, folder, "sb", request.param, count=2)
+    return folder
 
 
-@settings(deadline=None, max_examples=250)
+@settings(deadline=None, max_examples=150)
 @given(st.data())
-def test_damaged_files_raise_only_bundle_errors(surfels, good_bundle, data):
-    if not good_bundle.exists():
-        make(surfels, good_bundle, "sb", "bc7", count=2)
+def test_damaged_files_raise_only_bundle_errors(good_bundle, data):
     name = data.draw(st.sampled_from(["surfels.ply", "atlas.ktx2", "bundle.json"]))
     path = good_bundle / name
     good = path.read_bytes()
@@ -166,12 +167,10 @@ def test_damaged_files_raise_only_bundle_errors(surfels, good_bundle, data):
         path.write_bytes(good)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=20)
 @given(st.recursive(st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
                     lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner)), st.data())  # fmt: skip
-def test_any_json_in_any_place_raises_only_bundle_errors(surfels, good_bundle, value, data):
-    if not good_bundle.exists():
-        make(surfels, good_bundle, "sb", "bc7", count=2)
+def test_any_json_in_any_place_raises_only_bundle_errors(good_bundle, value, data):
     path = good_bundle / "bundle.json"
     good = path.read_bytes()
     info = json.loads(good)

@@ -1,7 +1,5 @@
 """Runs and bundles whose capture was moved or is gone, and nerfstudio's commands that cannot work on surfels."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

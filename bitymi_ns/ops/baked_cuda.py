@@ -32,7 +32,7 @@ class Stage(IntFlag):
 
 
 def draws_blocks(device: torch.device) -> bool:
-    """Whether the texture unit of a CUDA device decodes BC7 blocks, which is found out by drawing some."""
+    """Return True if the texture unit of a CUDA device decodes BC7 blocks; tested by drawing some."""
     with on_device(device):
         return module(device).draws_bc7()
 
@@ -45,7 +45,7 @@ def decoded(blocks: Tensor) -> Tensor:
 
 
 class Sheet(NamedTuple):
-    """How the pages of an atlas are put together to one texture: below each other, then beside.
+    """Arrangement of the pages of an atlas in one texture: below each other, then beside.
 
     Attributes:
         down: pages below each other.
@@ -174,7 +174,7 @@ def compiled(scene: BakedScene, photo_pixel: float = 1.0) -> Any:
             kind=scene.view_color,
             tiles=scene.tiles.contiguous(),
             near=scene.near,
-            through_pixel=scene.through_pixel,
+            prefilter=scene.prefilter,
         )
 
 
@@ -245,11 +245,11 @@ class Workspace:
 
     @property
     def complete(self) -> bool:
-        """Whether there was room for all pairs of the latest frame, which had surfels; waits for the device."""
+        """True if all pairs of the latest frame, which had surfels, had room; waits for the device."""
         return self.counts()[1] <= self.capacity
 
     def frame_fitted(self) -> bool:
-        """Whether the latest frame fitted; the next `resize` makes room for as many pairs and a quarter more.
+        """Return True if the latest frame fitted; the next `resize` makes room for as many pairs and a quarter more.
 
         Waits for the device.
         """
@@ -279,8 +279,8 @@ class ListedPairs(NamedTuple):
 
 
 def listed_pairs(workspace: Workspace, surfels: int, views: int, width: int, height: int) -> ListedPairs:
-    """What the latest frame, without normals, left in the working memory (`lay_out` of csrc/cuda/baked_frame.cu), on
-    the CPU: for tests and for counting what a frame costs."""
+    """Read the lists that the latest frame, without normals, left in the working memory (`lay_out` of
+    csrc/cuda/baked_frame.cu), on the CPU: for tests and benchmarks."""
     assert workspace.memory is not None
     memory, at = workspace.memory.cpu(), 256
     tiles, rows, slots = tiles_of(views, width, height), surfels * views, workspace.slots

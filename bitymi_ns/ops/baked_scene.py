@@ -1,4 +1,4 @@
-"""What is drawn of a baked scene, and what the renderers of both devices share."""
+"""Images of a baked scene, and the parts of its renderers that all devices share."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from .pool import Pool
-from .project import Camera
+from .project import Camera, Prefilter
 
 IMAGES: dict[str, tuple[int, torch.dtype]] = {
     "rgb": (3, torch.float32),
@@ -26,9 +26,9 @@ lowest."""
 
 
 class DrawCache:
-    """What drawing keeps of a scene from frame to frame: the atlas as its device reads it, and working memory.
+    """Memory of a scene from frame to frame: the atlas as its device reads it, and working memory.
 
-    Several threads may draw a scene, as those of nerfstudio's viewer do: what one makes the others wait for."""
+    Several threads may draw a scene, as those of nerfstudio's viewer do: the others wait for the one that fills it."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -38,7 +38,7 @@ class DrawCache:
         self._workspaces: Pool[Any] | None = None
 
     def atlas(self, make: Callable[[], Any], *sources: Tensor | str | None) -> Any:
-        """What `make` gives: made for the first frame, and again when a source is another one or was written to."""
+        """Return the atlas, made for the first frame and again when a source is another one or was written to."""
         now = [(t, t._version if isinstance(t, Tensor) else 0) for t in sources]
         with self._lock:
             if len(now) != len(self._sources) or any(
@@ -65,7 +65,7 @@ class DrawCache:
 
 
 class BakedScene(Protocol):
-    """What is drawn: `scene.baked.BakedScene`, which says what its attributes mean."""
+    """A baked scene; `scene.baked.BakedScene` documents its attributes."""
 
     surfels: Mapping[str, Tensor]
     view_color: str
@@ -79,20 +79,17 @@ class BakedScene(Protocol):
     near: float
     weight_bound: float
     transmittance_min: float
+    prefilter: Prefilter
     through_webgpu: bool
     cache: DrawCache
 
-    @property
-    def through_pixel(self) -> bool:
-        """Whether the kernel is seen through a pixel."""
-
 
 def residual(scene: BakedScene) -> dict[str, Any]:
-    """How texels change colours, as the kernels of both devices take it (`BakedResidual` of csrc/ops/baked.h)."""
+    """Arguments of the kernels for texels (`BakedResidual` of csrc/ops/texel.h)."""
     numbers = ("offset", "scale", "weight_bound", "transmittance_min")
     arrays = {"extent": scene.extent, "mean_residual": scene.mean_residual}
-    given = {name: None if t is None else t.detach().float().contiguous() for name, t in arrays.items()}
-    return {name: getattr(scene, name) for name in numbers} | given
+    dense = {name: None if t is None else t.detach().float().contiguous() for name, t in arrays.items()}
+    return {name: getattr(scene, name) for name in numbers} | dense
 
 
 def check_images(names: Sequence[str]) -> None:

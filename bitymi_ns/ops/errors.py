@@ -1,4 +1,4 @@
-"""What can go wrong in an operation that its caller may want to handle."""
+"""Errors of operations that callers handle."""
 
 from __future__ import annotations
 

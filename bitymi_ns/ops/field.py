@@ -17,7 +17,7 @@ WEIGHTS = ("table", "w1", "w2", "w3")
 
 @dataclass(frozen=True)
 class FieldGeometry:
-    """Where the hash grid lies in the world.
+    """Position of the hash grid in the world.
 
     Attributes:
         min_resolution: cells along an edge of the coarsest level; each level doubles it.
@@ -72,7 +72,7 @@ def backward_memory(
         like: tells device and dtype.
         table: the hash table where the field learns, else None.
         surfels: number of surfels whose base colours get gradients.
-        frames: whether their frames get some, too.
+        frames: their frames get gradients, too.
     """
     if not cuda_backend(like.device):
         return {}
@@ -110,7 +110,7 @@ def field(x: Tensor, geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Ten
 
     Args:
         x: [M, 3] world positions.
-        geometry: where the grid lies.
+        geometry: of the grid.
         table: [levels, T, 4] features, T a power of two; cells are hashed by XOR of coordinate times prime.
         w1, w2, w3: [4 levels, 16], [16, 16], [16, 3] weights, input-major.
 

@@ -23,13 +23,13 @@ def empty_ids(like: Tensor, count: int) -> dict[str, Tensor]:
 
 
 class Layout:
-    """How kernels find their way in a fragment list, and the surfel and pixel of every fragment.
+    """Index of a fragment list: its runs by tile, and the surfel and pixel of every fragment.
 
-    On the CPU the layout itself tells surfels and pixels, which is enough for most operations: there their arrays are
-    made when they are first asked for.
+    On the CPU the runs imply surfels and pixels, which is enough for most operations: the arrays of these are made at
+    their first use.
 
     Attributes:
-        handle: the kernels' object: `TilePacks` (csrc/cpu/packs.h) or `Pairs` (csrc/cuda/pairs.h).
+        handle: the kernels' object: `TileBlocks` (csrc/cpu/blocks.h) or `Pairs` (csrc/cuda/pairs.h).
         arrays: the arrays that it refers to, by name.
     """
 

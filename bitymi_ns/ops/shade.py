@@ -46,8 +46,8 @@ class _Shade(torch.autograd.Function):
             duv=duv,
             dframes=dframes,
         )
-        given = tuple(grads.values()) if learn else (None,) * len(params)
-        return dbase, dframes, duv, None, None, None, None, *given
+        dparams = tuple(grads.values()) if learn else (None,) * len(params)
+        return dbase, dframes, duv, None, None, None, None, *dparams
 
 
 def view_base(f_view: Tensor) -> Tensor:

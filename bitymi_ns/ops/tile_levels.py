@@ -32,10 +32,10 @@ def tile_levels(atlas: Tensor, tiles: Tensor) -> Iterator[tuple[str, Tensor, Ten
         name, pages, and the tiles on them: r_u = 0 where a tile has no such level, because its corner or its sides do
         not lie on the grid of the level. A bundle's tiles lie on a grid of four texels, so each has both levels.
     """
-    place = tiles.new_tensor([1, 1, 0, 1, 1])
+    scaled = tiles.new_tensor([1, 1, 0, 1, 1])
     for level, name in enumerate(LEVELS, start=1):
         atlas = halved(atlas)
         if 0 in atlas.shape:
             return
-        fits = (tiles * place % (1 << level) == 0).all(1, keepdim=True)
-        yield name, atlas.contiguous(), torch.where(fits, tiles >> (level * place), 0).contiguous()
+        fits = (tiles * scaled % (1 << level) == 0).all(1, keepdim=True)
+        yield name, atlas.contiguous(), torch.where(fits, tiles >> (level * scaled), 0).contiguous()

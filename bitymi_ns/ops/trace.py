@@ -29,7 +29,7 @@ class Fragments:
         depth: [F] camera z of the hit (of the centre in the low-pass branch), differentiable.
         sigma: [F] effective opacity, negative in the low-pass branch.
         width, height: of the image, pixels.
-        layout: how kernels find their way in the list.
+        layout: index of the list.
         surfels: number N of rows of the projection that they belong to.
     """
 
@@ -57,7 +57,7 @@ class Fragments:
 
     @property
     def arrays(self) -> dict[str, Tensor]:
-        """The list as kernels take it that do not know its layout, without the graph: by the names of `FragmentArrays`
+        """The list without the graph, for kernels that do not take the layout; by the names of `FragmentArrays`
         (csrc/ops/arguments.h)."""
         return {**self._numbers, **self.layout.ids()}
 
@@ -184,7 +184,7 @@ def select(fragments: Fragments, keep: Tensor) -> Fragments:
 
 
 def masked_counts(fragments: Fragments, mask: Tensor, n: int) -> Tensor:
-    """How many blended fragments of each surfel lie on masked pixels (FastGS's per-view importance).
+    """Count the blended fragments of each surfel on masked pixels (FastGS's per-view importance).
 
     Args:
         fragments: of a view of H x W pixels.

@@ -27,7 +27,7 @@ only other programs change the answer: torch keeps the memory of a list for the 
 
 @dataclass
 class _Room:
-    """What the free memory of a device was last found to hold.
+    """Fragments that the free memory of a device holds, as last measured.
 
     Attributes:
         capacity: fragments.
@@ -45,7 +45,7 @@ _rooms: dict[torch.device, _Room] = {}
 
 @dataclass(frozen=True)
 class Bins:
-    """Which surfels may touch which tiles; P pairs.
+    """Pairs of surfel and tile that may touch; P of them.
 
     Attributes:
         order: [N] int32 surfels front to back.
@@ -66,7 +66,7 @@ class Bins:
 
     @property
     def layout(self) -> dict[str, Tensor]:
-        """What finds its way in a fragment list."""
+        """Index of a fragment list, by name."""
         return {name: value for name, value in vars(self).items() if name != "differing"}
 
 
@@ -103,7 +103,7 @@ def tile_lists(geom: Tensor, projection: Projection) -> Bins:
 
 
 def blended(geom: Tensor, projection: Projection, bins: Bins) -> Layout:
-    """Which pixels blend which pairs: the layout of the fragment list, its surfels and pixels still to be written;
+    """Mark the pixels that blend each pair: the layout of the fragment list, with surfels and pixels unwritten;
     waits once for the number of fragments."""
     require("trace_cuda.blended", "cuda", geom.device, "call `trace`")
     camera, pairs = projection.camera, bins.surfel.shape[0]

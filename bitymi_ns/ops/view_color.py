@@ -121,6 +121,6 @@ def view_color(
         return out
     terms = check_view_color(kind, params, n)
     entry = entry_of(kind)
-    given = entry.of(params)
-    on_same_device(means, **dict(zip(entry.names, given, strict=True)))
-    return _ViewColor.apply(kind, terms, flags, center, means, *given)
+    values = entry.of(params)
+    on_same_device(means, **dict(zip(entry.names, values, strict=True)))
+    return _ViewColor.apply(kind, terms, flags, center, means, *values)

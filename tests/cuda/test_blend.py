@@ -65,7 +65,7 @@ def test_a_view_that_shows_nothing(textured: bool, device: torch.device) -> None
 
 
 def moved(case: SceneCase, device: torch.device, dtype: torch.dtype) -> list[Tensor]:
-    """What a descent leaves of the texels, and all gradients; on the CPU."""
+    """Texels after a descent, and all gradients; on the CPU."""
     view = View(case, dtype, True, learns=False, device=device)
     share = torch.linspace(0.1, 2.0, len(view.given["texels"]), dtype=dtype, device=device)
     gradients = view.gradients(view.image(descent=ops.TexelDescent(share, 0.3)))

@@ -24,7 +24,7 @@ BACKGROUND = torch.tensor([0.2, 0.4, 0.6])
 
 @pytest.fixture
 def learned_on() -> Iterator[set[bool]]:
-    """Whether the kernels that move texels ran on CUDA, or its emulation."""
+    """Record the backends of the kernels that move texels: True = CUDA or its emulation."""
     found: set[bool] = set()
     plain = backend.function
 

@@ -38,7 +38,7 @@ EXACT_RIM = 1e-12  # the references bound nothing
 
 @dataclass
 class Rendered:
-    """What is compared; all on the CPU, in double."""
+    """Results that are compared; all on the CPU, in double."""
 
     fragments: ops.Fragments
     image: Tensor
@@ -52,7 +52,7 @@ def render(
     device: torch.device,
     rim: float = EXACT_RIM,
     maps: bool = True,
-    prefilter: bool = False,
+    prefilter: str = "low_pass",
 ) -> Rendered:
     """Render a view, and its gradients along fixed directions for the image and for uv and depth of fragments."""
     leaves = {key: value.to(device, dtype).clone().requires_grad_() for key, value in case.params.items()}
@@ -126,7 +126,7 @@ def scenes() -> Iterator[Any]:
     yield pytest.param(random_scene(3, 0, 300, 80, scale=30.0), {}, {}, id="whole screen")
     for scale in (0.5, 0.01):
         case = random_scene(30, 4, 40, 24, scale=scale)
-        yield pytest.param(case, {"prefilter": True}, {"image": 1e-9, "gradient": 1e-9}, id=f"prefilter {scale}")
+        yield pytest.param(case, {"prefilter": "pixel"}, {"image": 1e-9, "gradient": 1e-9}, id=f"prefilter {scale}")
     for case in extreme_scenes():
         case = replace(
             case, params={key: value[:400] for key, value in case.params.items()}

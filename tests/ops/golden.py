@@ -106,13 +106,15 @@ def camera_of(case: SceneCase, dtype: torch.dtype = torch.float64) -> Camera:
     return Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height)
 
 
-def traced(case: SceneCase, values: Sequence[Tensor], prefilter: bool = False) -> tuple[ops.Fragments, ops.Projection]:
+def traced(
+    case: SceneCase, values: Sequence[Tensor], prefilter: str = "low_pass"
+) -> tuple[ops.Fragments, ops.Projection]:
     """The kernels' fragments of a case; values: those of SURFEL_KEYS."""
     projection = ops.project(*values, camera_of(case, values[0].dtype), prefilter=prefilter)
     return ops.trace(projection, 0.0), projection
 
 
-def reference(case: SceneCase, values: Sequence[Tensor], prefilter: bool = False) -> reference_trace.Trace:
+def reference(case: SceneCase, values: Sequence[Tensor], prefilter: str = "low_pass") -> reference_trace.Trace:
     """Every surfel at every pixel of a case; values: those of SURFEL_KEYS."""
     projected = reference_project.project(*values, case.viewmat, case.K)
     return reference_trace.trace(projected, case.width, case.height, prefilter=prefilter)

@@ -33,7 +33,7 @@ print([name for name in sys.modules if name.startswith("bitymi_ns._cpu")])
 
 @pytest.fixture
 def cpuinfo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """What stands for /proc/cpuinfo; the modules are those of a wheel."""
+    """Stand-in for /proc/cpuinfo; the modules are those of a wheel."""
     monkeypatch.setattr(backend, "CPUINFO", tmp_path / "cpuinfo")
     monkeypatch.setattr(_cpu_features, "FEATURES", BUILT)
     backend.cpu_module.cache_clear()

@@ -1,4 +1,4 @@
-"""What the CPU kernels hold of a long fragment list, in a process of its own."""
+"""Memory of the CPU kernels for a long fragment list, in a process of its own."""
 
 from __future__ import annotations
 

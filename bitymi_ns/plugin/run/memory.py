@@ -66,7 +66,7 @@ def most_fragments(scene: Scene, cameras: Sequence[Camera], bound: int = 0) -> i
     for i in spread(len(cameras), COUNTED_VIEWS):
         camera = cameras[i]
         geometry = (p[name] for name in GEOMETRY)
-        most = max(most, count(project(*geometry, camera, scene.near, scene.config.through_pixel)))
+        most = max(most, count(project(*geometry, camera, scene.near, scene.config.prefilter)))
     return min(int(MARGIN * most), bound or MOST)
 
 

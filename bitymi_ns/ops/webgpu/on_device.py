@@ -282,8 +282,8 @@ class SceneOnDevice:
         return target
 
     def rectangles(self) -> npt.NDArray[np.float32]:
-        """Read the rectangles of the latest view, front to back: [M, 6] a rectangle for each surfel, its axis (a unit vector on the
-        screen), its middle, and half its size along the axis and across, in pixels."""
+        """Read the rectangles of the latest view's surfels, front to back: [M, 6] axis (a unit vector on the screen),
+        middle, and half the size along the axis and across, in pixels."""
         queue = self._device.queue
         count = int(np.frombuffer(queue.read_buffer(self._visible), np.uint32)[0])
         order = np.frombuffer(queue.read_buffer(self._order[0]), np.uint32)[:count]

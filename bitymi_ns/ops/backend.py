@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from types import ModuleType
@@ -213,6 +213,17 @@ def on_same_device(like: Tensor, **tensors: Tensor) -> None:
     for name, tensor in tensors.items():
         if tensor.device != like.device:
             raise ValueError(f"{name} is on device '{tensor.device}', it must be on '{like.device}'")
+
+
+def check_shapes(**shapes: tuple[Tensor, Sequence[int]]) -> None:
+    """Check tensors against their shapes, by name.
+
+    Raises:
+        ValueError: one has another shape; names it.
+    """
+    for name, (tensor, shape) in shapes.items():
+        if tuple(tensor.shape) != tuple(shape):
+            raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")
 
 
 def dense(tensor: Tensor, like: Tensor) -> Tensor:

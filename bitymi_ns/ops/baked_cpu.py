@@ -10,11 +10,10 @@ import torch
 from torch import Tensor
 
 from .backend import kernel, module, require
-from .baked_scene import BakedScene, check_images, common_size, residual
+from .baked_scene import BakedScene, check_images, common_size, residual, tile_levels
 from .constants import BAKED_CHANNELS, MAP_CHANNELS
 from .pool import Pool
 from .project import GEOMETRY, Camera, project
-from .tile_levels import tile_levels
 from .view_color import view_color
 
 ON_CUDA = "move the scene to the CPU, or draw with `baked.draw`"

@@ -12,11 +12,10 @@ import torch
 from torch import Tensor
 
 from .backend import function, module, on_device, require
-from .baked_scene import IMAGES, BakedScene, check_images, common_size, residual
+from .baked_scene import IMAGES, BakedScene, check_images, common_size, residual, tile_levels
 from .bc7 import decode_bc7
 from .constants import TILE
 from .project import GEOMETRY, Camera
-from .tile_levels import tile_levels
 from .view_color import LEAN, check_lean, check_view_color, lettered
 from .view_kinds import VIEW_COLORS
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from .backend import cuda_backend
 from .constants import TILE
-from .errors import TooManyFragments
+from .fragment_list import TooManyFragments
 from .project import Projection
 from .trace import Fragments, masked_counts, trace
 

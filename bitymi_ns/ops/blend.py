@@ -7,7 +7,7 @@ import functools
 import torch
 from torch import Tensor
 
-from .backend import cuda_backend, dense, kernel, module, on_same_device
+from .backend import check_shapes, cuda_backend, dense, kernel, module, on_same_device
 from .composite import check_projection
 from .constants import IMAGE_CHANNELS, MAP_CHANNELS
 from .project import Projection
@@ -83,8 +83,7 @@ def _check(fragments: Fragments, base: Tensor, texels: Tensor, tiles: TexelTiles
     on_same_device(fragments.weight, base=base, texels=texels, **tiles.arrays, **named)
     if tiles.count != texels.shape[0] or texels.shape[1:] != (3,):
         raise ValueError(f"the tiles hold {tiles.count} texels, texels has the shape {list(texels.shape)}")
-    if tuple(base.shape) != (len(tiles.first), 3):
-        raise ValueError(f"base must have shape {[len(tiles.first), 3]}, not {list(base.shape)}")
+    check_shapes(base=(base, (len(tiles.first), 3)))
     if fragments.surfels != len(base):
         raise ValueError(f"the fragments are those of {fragments.surfels} surfels, not of {len(base)}")
     if descent is not None and (texels.requires_grad or not texels.is_contiguous()):

@@ -9,7 +9,7 @@ from typing import Any, Literal, Protocol
 import torch
 from torch import Tensor
 
-from .backend import cuda_backend, dense, kernel, on_same_device
+from .backend import check_shapes, cuda_backend, dense, kernel, on_same_device
 from .constants import FRAME, GEOM
 
 Prefilter = Literal["low_pass", "pixel"]
@@ -173,9 +173,7 @@ def project(
     n = means.shape[0]
     shapes = {"means": (means, (n, 3)), "quats": (quats, (n, 4)), "log_scales": (log_scales, (n, 2))}
     shapes |= {"opacity_logits": (opacity_logits, (n,)), "beta_raw": (beta_raw, (n,))}
-    for name, (tensor, shape) in shapes.items():
-        if tuple(tensor.shape) != shape:
-            raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")
+    check_shapes(**shapes)
     on_same_device(means, **{name: tensor for name, (tensor, _) in shapes.items()})
     if camera.skewed:
         raise ValueError("cameras with skew (K[0, 1] != 0) are not supported: undistort the images first")

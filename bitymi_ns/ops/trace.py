@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from . import trace_cpu, trace_cuda
-from .backend import cuda_backend, dense, function, kernel, on_same_device
+from .backend import check_shapes, cuda_backend, dense, function, kernel, on_same_device
 from .constants import GEOM
-from .errors import TooManyFragments
-from .fragment_list import Layout
+from .fragment_list import Layout, TooManyFragments
 from .project import Projection
 
 __all__ = ["Fragments", "TooManyFragments", "masked_counts", "select", "trace"]
@@ -172,8 +171,7 @@ def select(fragments: Fragments, keep: Tensor) -> Fragments:
         ValueError: `keep` has another length or lies on another device.
     """
     on_same_device(fragments.weight, keep=keep)
-    if keep.shape != fragments.weight.shape:
-        raise ValueError(f"keep must have shape {list(fragments.weight.shape)}, not {list(keep.shape)}")
+    check_shapes(keep=(keep, fragments.weight.shape))
     by = trace_cuda if cuda_backend(keep.device) else trace_cpu
     width, height = fragments.width, fragments.height
     layout = by.select(fragments.layout, keep.to(torch.uint8).contiguous(), width, height)

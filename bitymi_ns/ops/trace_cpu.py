@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from .backend import function, kernel_class, module, require
-from .fragment_list import Layout, empty_ids, empty_list, too_many
+from .fragment_list import Layout, TooManyFragments, empty_ids, empty_list
 from .pool import Pool
 from .project import Projection
 
@@ -45,7 +45,7 @@ def find_fragments(geom: Tensor, projection: Projection, most: int | None = None
     with tracers(geom).borrow() as tracer:
         n = tracer.run(**projection.view(geom), most=most)
         if most and n > most:
-            raise too_many(geom, projection, n, most, ids=False)
+            raise TooManyFragments(geom, projection, n, most, ids=False)
         found = empty_list(geom, n)
         arrays = _empty_layout(tracer.tiles, tracer.blocks)
         tracer.copy(**found, **arrays)

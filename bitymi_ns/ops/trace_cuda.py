@@ -13,7 +13,7 @@ from torch import Tensor
 
 from .backend import function, kernel, module, on_device, require, workspace
 from .constants import TILE
-from .fragment_list import Layout, empty_ids, empty_list, too_many
+from .fragment_list import Layout, TooManyFragments, empty_ids, empty_list
 from .project import Projection
 
 NUMBERS = 24
@@ -149,7 +149,7 @@ def check_capacity(geom: Tensor, projection: Projection, count: int, most: int |
         room.lists += 1
         most = room.capacity
     if most and count > most:
-        raise too_many(geom, projection, count, most, ids=True)
+        raise TooManyFragments(geom, projection, count, most, ids=True)
 
 
 def fill(geom: Tensor, projection: Projection, layout: Layout) -> dict[str, Tensor]:
@@ -158,7 +158,7 @@ def fill(geom: Tensor, projection: Projection, layout: Layout) -> dict[str, Tens
     try:
         found, ids = empty_list(geom, count), layout.ids()
     except torch.cuda.OutOfMemoryError as error:
-        raise too_many(geom, projection, count, fragment_capacity(geom), ids=True) from error
+        raise TooManyFragments(geom, projection, count, fragment_capacity(geom), ids=True) from error
     kernel("trace_fill", geom)(**projection.view(geom), **found, **ids, layout=layout.handle)
     return found
 

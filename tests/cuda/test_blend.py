@@ -1,7 +1,5 @@
 """Shading and blending in one pass by the CUDA kernels: against the CPU's, in any order of threads."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 

@@ -1,7 +1,5 @@
 """The learning of an export, on the device of the scene: coverage, rate-distortion search, polish and fine-tuning."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 

@@ -1,7 +1,5 @@
 """Losses and statistics of a training step by the CUDA kernels, against torch."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

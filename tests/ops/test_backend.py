@@ -1,7 +1,5 @@
 """The CPU kernels that are loaded are the best that this CPU can run, and none where it can run none."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Fragment lists of the CPU kernels by blocks of 4 x 4 pixels."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

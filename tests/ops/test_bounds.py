@@ -1,7 +1,5 @@
 """Tile bounds: no fragment is lost. Every scene is drawn with and without bounds and must come out the same."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

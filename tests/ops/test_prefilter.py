@@ -1,7 +1,5 @@
 """The kernel seen through a pixel: against the reference, its moments, no holes, no jumps."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

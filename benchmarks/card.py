@@ -144,8 +144,7 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
     }
 
 
-GAUSSIANS = (300_000, 1_000_000)
-"""Numbers that are trained to compare with."""
+GAUSSIANS = (300_000, 1_000_000)  # numbers that are trained to compare with
 
 
 def captures(data: Path) -> list[str]:

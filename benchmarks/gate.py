@@ -92,10 +92,8 @@ UNITS = {
 }
 
 
-ELSEWHERE = 2.0
-"""Factor of the limits on another kind of processor than the baseline's."""
-Scenes = dict[str, dict[str, float]]
-"""Scene -> figure -> value."""
+ELSEWHERE = 2.0  # factor of the limits on another kind of processor than the baseline's
+Scenes = dict[str, dict[str, float]]  # scene -> figure -> value
 
 
 class Calibration:

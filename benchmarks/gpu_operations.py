@@ -54,8 +54,7 @@ from bitymi_ns.scene.scene import GEOMETRY, Scene
 from bitymi_ns.train.optimizers import make_optimizers
 
 LEVELS = 4
-LOOK_UP, LEARN = 1550, 3850
-"""Operations of a look-up in the field, and of its gradients."""
+LOOK_UP, LEARN = 1550, 3850  # operations of a look-up in the field, and of its gradients
 HEADER = ("operation", "ms", "million/s", "of", "GB/s", "of the copy", "gathers GB/s", "Gflop/s", "of a product's")
 
 

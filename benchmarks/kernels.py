@@ -49,8 +49,7 @@ HEADER = (
     "kernel", "limit", "ms", "CPU ms", "Mop", "MB", "M loads", "GFLOP/s", "GB/s", "M loads/s", "of arithmetic",
     "of bandwidth", "of loads",
 )  # fmt: skip
-Case = tuple[str, Callable[[], object], float, float, float]
-"""Kernel, call, operations, bytes and loads."""
+Case = tuple[str, Callable[[], object], float, float, float]  # kernel, call, operations, bytes and loads
 
 
 def timed(run: Callable[[], object], runs: int) -> tuple[float, float]:

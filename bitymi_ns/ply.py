@@ -18,8 +18,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-HEADER_LIMIT = 1 << 16
-"""No header is longer, in bytes."""
+HEADER_LIMIT = 1 << 16  # no header is longer, in bytes
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),

@@ -1,7 +1,5 @@
 """Prose uses the field's words: documentation, comments, docstrings, messages; docstrings begin with the deed."""
 
-from __future__ import annotations
-
 import ast
 import io
 import re

@@ -14,8 +14,7 @@ from bitymi_ns.train.losses import mean_psnr, psnr
 
 S = TypeVar("S")
 
-FEWEST_VIEWS = 4
-"""With fewer views there are no validation views, and nothing is optimised."""
+FEWEST_VIEWS = 4  # with fewer views there are no validation views, and nothing is optimised
 
 
 class StoppingOptions(Protocol):

@@ -17,8 +17,7 @@ from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.visibility import Visibility, visibility
 
-POINTS = 256
-"""Points of `photo_resolution`; each takes 22 bytes of bundle.json, and time in every frame."""
+POINTS = 256  # points of `photo_resolution`; each takes 22 bytes of bundle.json, and time in every frame
 
 
 @dataclass(frozen=True)

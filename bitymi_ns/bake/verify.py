@@ -21,8 +21,7 @@ from bitymi_ns.scene.tile_sizes import kernel_parameters
 from bitymi_ns.scene.visibility import visibility
 
 _SLACK = 1.02  # sums in another order, rotations that were written with length 1
-_SLACK_COUNT = 2
-"""Surfels at the bound itself."""
+_SLACK_COUNT = 2  # surfels at the bound itself
 
 
 def check_field(bundle: Bundle, field: Field, cameras: Sequence[Camera]) -> Check:

@@ -23,15 +23,11 @@ from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import GEOMETRY
 
-BITS_PER_NUMBER = 5.5
-"""Bits of a number of a term in a compact bundle, about."""
-LEAST_WEIGHT = 1e-12
-"""Weight of any direction: a surfel that no view shows has a colour, too."""
-VIEW_SHARE = 0.5
-"""Weight of the training views; the rest are directions between and around them."""
+BITS_PER_NUMBER = 5.5  # bits of a number of a term in a compact bundle, about
+LEAST_WEIGHT = 1e-12  # weight of any direction: a surfel that no view shows has a colour, too
+VIEW_SHARE = 0.5  # weight of the training views; the rest are directions between and around them
 
-BLIND = 4
-"""Directions from so many of the nearest views that do not show the surfel count, too."""
+BLIND = 4  # directions from so many of the nearest views that do not show the surfel count, too
 BLIND_SHARE = 0.1
 """Weight of these as a share of what a view would show of the surfel from there: a new view may show it."""
 

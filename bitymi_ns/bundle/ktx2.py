@@ -16,8 +16,7 @@ IDENTIFIER = b"\xabKTX 20\xbb\r\n\x1a\n"
 
 _HEADER = struct.Struct("<12s9I4I2Q3Q")  # identifier, header, index, and the one level
 _KEY_LIMIT = 1 << 20
-HEADER_LIMIT = 1 << 10
-"""Header, index, level and data format descriptor are shorter, in bytes."""
+HEADER_LIMIT = 1 << 10  # header, index, level and data format descriptor are shorter, in bytes
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from bitymi_ns.codec.quantise import STEPS
 
-SIZE = 128
-"""M, the sums of a sketch."""
+SIZE = 128  # M, the sums of a sketch
 _CHUNK = 1 << 20
 
 

@@ -26,8 +26,7 @@ from bitymi_ns.files import Tell, explained, write_file
 from bitymi_ns.progress import Progress, no_progress
 
 T = TypeVar("T")
-DONE = "points"
-"""File that is written when the model is whole."""
+DONE = "points"  # file that is written when the model is whole
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,8 @@ USUAL_FOLDERS = ("images", "input", "image", "photos", "photographs", "rgb", "co
 """Names of a capture's folder of photographs, the most usual first."""
 LOSSY = {"JPEG", "MPO", "WEBP", "JPEG2000", "HEIF", "AVIF"}
 """Lossy formats by Pillow's names, in which black may come back as almost black."""
-MIDDLE = 127
-"""Threshold of lossy masks, of 255."""
-PROPORTIONS = 0.02
-"""Relative difference of aspect ratios that counts as rounding."""
+MIDDLE = 127  # threshold of lossy masks, of 255
+PROPORTIONS = 0.02  # relative difference of aspect ratios that counts as rounding
 
 
 def mask_folder(photographs: Path, data: Path, stated: Path | None = None, downscale: int = 1) -> Path | None:

@@ -16,8 +16,7 @@ from bitymi_ns.files import complete_file, complete_folder
 from bitymi_ns.progress import Progress
 
 JPEG_QUALITY = 97
-IMAGES = "images"
-"""Subfolder of the work folder for upright copies, or the frames of a video."""
+IMAGES = "images"  # subfolder of the work folder for upright copies, or the frames of a video
 
 
 def upright_photos(

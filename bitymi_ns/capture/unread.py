@@ -25,8 +25,7 @@ POSES = {
     "bundle.rd.out": "Bundler",
 }
 """Files of poses, in lower case, and the programs that write them."""
-METASHAPE = b"<camera "
-"""Content of the XML file to which Metashape exports cameras, whatever its name."""
+METASHAPE = b"<camera "  # content of the XML file to which Metashape exports cameras, whatever its name
 FOLDERS = {
     "mask": "masks", "masks": "masks", "depth": "depth maps", "depths": "depth maps", "depth_maps": "depth maps",
     "confidence": "confidence maps", "confidences": "confidence maps", "conf": "confidence maps",

@@ -10,8 +10,7 @@ import numpy.typing as npt
 import zstandard
 
 LEVEL = 19
-MOST_PLANES = 7
-"""Bytes of a number: what a float64 holds exactly."""
+MOST_PLANES = 7  # bytes of a number: what a float64 holds exactly
 _WINDOW = 1 << 23
 
 

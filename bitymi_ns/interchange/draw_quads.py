@@ -16,8 +16,7 @@ from bitymi_ns.interchange.quads import MASK, Quads
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.sampling import averaged
 
-SAMPLES = 2
-"""Samples per pixel along each axis, as a viewer's antialiasing takes four per pixel."""
+SAMPLES = 2  # samples per pixel along each axis, as a viewer's antialiasing takes four per pixel
 _AT_ONCE = 1 << 19  # pairs of quads and pixels
 
 

@@ -35,10 +35,8 @@ Kind = Literal["gaussians", "mesh"]
 Frame = Literal["scene", "capture"]
 FILES: dict[str, str] = {"gaussians": "gaussians.ply", "mesh": "mesh.glb"}
 SUMMARY = "extras.json"
-SUFFIX = ".extras"
-"""Suffix of the folder beside a bundle."""
-LEVEL = 0.15
-"""Opacity at which the quads of a mesh end."""
+SUFFIX = ".extras"  # suffix of the folder beside a bundle
+LEVEL = 0.15  # opacity at which the quads of a mesh end
 SEEN_SIDE, COLORED_SIDE, MEASURED_SIDE = 400, 800, 400
 """Longer side in pixels of the images for visibility, for the colours of a mesh, and for measuring the files."""
 COLORED_VIEWS, MEASURED_VIEWS = 64, 4

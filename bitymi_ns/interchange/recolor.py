@@ -14,8 +14,7 @@ from bitymi_ns.interchange.quads import Quads
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 
-PRIOR = 1.0
-"""A colour that was there before counts as much as so many pixels."""
+PRIOR = 1.0  # a colour that was there before counts as much as so many pixels
 
 
 @torch.no_grad()

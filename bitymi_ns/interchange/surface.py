@@ -23,23 +23,16 @@ from bitymi_ns.scene.scene import GEOMETRY
 if TYPE_CHECKING:
     import open3d
 
-HALF = 0.5
-"""Accumulated weight at which the median depth is reached."""
-TRUNCATION = 8.0
-"""Truncation distance of the TSDF in voxels; with 4, walls with noisy depth get more holes."""
-SMOOTHING = 10
-"""Iterations of Taubin smoothing, which takes the noise of depths and keeps volumes."""
-QUANTILE = 0.01
-"""Share of the observed points that the box leaves out at each of its sides."""
+HALF = 0.5  # accumulated weight at which the median depth is reached
+TRUNCATION = 8.0  # truncation distance of the TSDF in voxels; with 4, walls with noisy depth get more holes
+SMOOTHING = 10  # iterations of Taubin smoothing, which takes the noise of depths and keeps volumes
+QUANTILE = 0.01  # share of the observed points that the box leaves out at each of its sides
 REACH = 3.0
 """Half the side of the largest box, in units of the greatest distance of a camera from their mean or, where that is
 more, of the median depth of all views."""
-SMALLEST = 0.005
-"""Connected parts with less than this share of the triangles of the largest part are dropped."""
-BOX_SIDE = 160
-"""Longer side in pixels of the depth maps that the box is found from."""
-POISSON_DEPTH = 9
-"""Depth of the octree of the watertight reconstruction."""
+SMALLEST = 0.005  # connected parts with less than this share of the triangles of the largest part are dropped
+BOX_SIDE = 160  # longer side in pixels of the depth maps that the box is found from
+POISSON_DEPTH = 9  # depth of the octree of the watertight reconstruction
 
 
 class NoSurface(ValueError):

@@ -127,11 +127,15 @@ def _layout(arrays: dict[str, Tensor], width: int, height: int, ids: dict[str, T
     return Layout(handle, arrays, lambda: empty_ids(offsets, count) if ids is None else ids)
 
 
+def free_memory(device: torch.device) -> int:
+    """Bytes of a CUDA device that are free, with what torch keeps unused."""
+    kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return torch.cuda.mem_get_info(device)[0] + kept
+
+
 def fragment_capacity(geom: Tensor) -> int:
     """Fragments that the free memory of a CUDA device holds with all that a training step makes of them."""
-    free = torch.cuda.mem_get_info(geom.device)[0]
-    kept = torch.cuda.memory_reserved(geom.device) - torch.cuda.memory_allocated(geom.device)  # by torch, unused
-    return (free + kept) // (NUMBERS * geom.element_size())
+    return free_memory(geom.device) // (NUMBERS * geom.element_size())
 
 
 def check_capacity(geom: Tensor, projection: Projection, count: int, most: int | None) -> None:

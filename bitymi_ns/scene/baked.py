@@ -16,12 +16,10 @@ from bitymi_ns.ops.constants import TRANSMITTANCE_MIN
 from .camera import Camera
 from .sampling import Sampling, averaged, sampling_of, size_of
 
-FAST = 1 / 512
-"""Transmittance at which a pixel ends that is drawn for speed: half of an 8-bit step of light is left."""
+FAST = 1 / 512  # transmittance at which a pixel ends that is drawn for speed: half of an 8-bit step of light is left
 
 
-OUTPUTS = ("rgb", "alpha", "beta", "depth", "normal", "overdraw")
-"""Fields of a `BakedOutput`."""
+OUTPUTS = ("rgb", "alpha", "beta", "depth", "normal", "overdraw")  # fields of a `BakedOutput`
 
 
 def as_bytes(image: Tensor) -> Tensor:

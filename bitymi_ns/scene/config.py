@@ -7,8 +7,7 @@ from typing import Literal
 
 from bitymi_ns.ops.view_kinds import Kind
 
-Texture = Literal["hash", "texels", "none"]
-"""What colours a surfel beside its view colour."""
+Texture = Literal["hash", "texels", "none"]  # what colours a surfel beside its view colour
 
 
 @dataclass

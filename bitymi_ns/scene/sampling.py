@@ -19,10 +19,8 @@ SMALLEST, LARGEST = 0.5, 2.0
 ONE_SAMPLE, SAMPLE = 0.6, 0.42
 """A photograph's pixel is at least as many samples wide, as far as MOST_SAMPLES and MOST_PIXELS allow: with one sample
 per pixel, and with several, whose mean forgives more."""
-MOST_SAMPLES = 4
-"""Samples per pixel, along each axis."""
-MOST_PIXELS = 1 << 24
-"""Samples of a view: beyond, it has fewer samples per pixel."""
+MOST_SAMPLES = 4  # samples per pixel, along each axis
+MOST_PIXELS = 1 << 24  # samples of a view: beyond, it has fewer samples per pixel
 FARTHEST = (1.0 / 64, 64.0)
 
 

@@ -34,8 +34,7 @@ from .field import ResidualField, Shading, TexelField
 
 GEOMETRY = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
 """Names of the per-surfel parameters that every scene has."""
-NEAR = 0.02
-"""Nearest depth that is drawn, for cameras of extent 1."""
+NEAR = 0.02  # nearest depth that is drawn, for cameras of extent 1
 
 
 @dataclass

@@ -12,8 +12,7 @@ from bitymi_ns.ops import fitting_lists, project
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 
-PART = 1 << 20
-"""Fragments that are looked at together: what is computed of them then takes no memory from the system."""
+PART = 1 << 20  # fragments that are looked at together: what is computed of them then takes no memory from the system
 
 
 @dataclass(frozen=True)

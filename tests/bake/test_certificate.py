@@ -1,7 +1,5 @@
 """What a bundle states of how near its texels are to those before they were stored is true, and is measured again."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What is read of a bundle, and how much: nothing before its size is known to be right, nothing twice."""
 
-from __future__ import annotations
-
 import builtins
 import json
 import os

@@ -1,7 +1,5 @@
 """Runs that are finished: their checkpoints and configurations."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Knobs and pictures of a trained scene, and what the report makes of them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """From a trained scene to a bundle and back into nerfstudio's tools."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

@@ -1,7 +1,5 @@
 """Exports that are refused before the work, and bundles that are not opened."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

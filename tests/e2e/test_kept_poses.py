@@ -1,7 +1,5 @@
 """A run on photographs keeps the poses that it was trained with, whatever becomes of the photographs."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,7 +1,5 @@
 """`ns-train --machine.num-devices 2` on the CPU: what it leaves, how it goes on, what it says when a process ends."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Training through nerfstudio's own entry point: what it leaves behind, every method, and what it starts from."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

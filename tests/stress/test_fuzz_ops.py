@@ -3,8 +3,6 @@
 Examples are derived from the test alone (the same on every machine); BITYMI_FUZZ=n runs n times as many.
 """
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 

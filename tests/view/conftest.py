@@ -1,7 +1,5 @@
 """A small bundle with cameras and a photograph."""
 
-from __future__ import annotations
-
 import io
 import json
 from dataclasses import replace

@@ -3,8 +3,6 @@
 Both draw in software where there is no card. The bundles are random surfels with tiles, with a weight bound.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -15,10 +15,8 @@ from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.tile_sizes import kernel_parameters
 from bitymi_ns.train.init import tangents
 
-LEVEL_SHARE = 0.1
-"""Levels are left out while they change the residual by no more than this share of the tolerance."""
-POINTS = 16
-"""Points per surfel at which the field is evaluated."""
+LEVEL_SHARE = 0.1  # levels are left out while they change the residual by no more than this share of the tolerance
+POINTS = 16  # points per surfel at which the field is evaluated
 _CHUNK = 1 << 19
 
 

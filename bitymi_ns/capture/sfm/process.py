@@ -20,8 +20,7 @@ from bitymi_ns.progress import Progress
 from bitymi_ns.trust import no_links
 
 LOG = "colmap.log"
-LITTLE_SPACE = 50_000_000
-"""Bytes; where less is left, the disk is what stopped COLMAP."""
+LITTLE_SPACE = 50_000_000  # bytes; where less is left, the disk is what stopped COLMAP
 
 
 def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:

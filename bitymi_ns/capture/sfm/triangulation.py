@@ -12,8 +12,7 @@ from bitymi_ns.capture.sfm import features, pairs
 from bitymi_ns.capture.sfm.job import DATABASE, MODEL, Job, NoPoses, StageProgress
 from bitymi_ns.files import complete_folder
 
-LEAST = 10
-"""Fewer points are none to start from."""
+LEAST = 10  # fewer points are none to start from
 
 
 def triangulate(job: Job, tell: StageProgress) -> dict[str, object]:

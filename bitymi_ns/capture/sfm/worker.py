@@ -20,8 +20,7 @@ from bitymi_ns.capture.sfm import explain, features, mapping, pairs, triangulati
 from bitymi_ns.capture.sfm.job import DATABASE, MODEL, Job, NoPoses
 from bitymi_ns.files import complete_folder
 
-LEAST = 3
-"""Fewer placed photographs are no capture."""
+LEAST = 3  # fewer placed photographs are no capture
 
 
 class Stages:

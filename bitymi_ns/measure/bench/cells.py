@@ -21,8 +21,7 @@ from bitymi_ns.measure.machine import commit, machine, versions
 from bitymi_ns.trust import json_of, no_links
 
 FILE = "cells.jsonl"
-NAMES = ("suite", "row")
-"""Entries of a key that are labels and do not tell cells apart."""
+NAMES = ("suite", "row")  # entries of a key that are labels and do not tell cells apart
 
 
 def identity(key: dict[str, Any]) -> str:

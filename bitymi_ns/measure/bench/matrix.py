@@ -175,8 +175,7 @@ class Matrix:
         return [self.stages(run) for run in self.runs()]
 
 
-FORMATS = ("fp16", "uint8", "bc7", "compact")
-"""Formats of `ns-export bitymi-atlas`."""
+FORMATS = ("fp16", "uint8", "bc7", "compact")  # formats of `ns-export bitymi-atlas`
 
 
 @dataclass(frozen=True)

@@ -79,8 +79,7 @@ ROUNDING = {torch.float32: 2.0**-24, torch.float64: 2.0**-53}
 NOTHING = 1e-15
 """Images and gradients that are smaller than this everywhere are compared absolutely: beside the others of their scene
 they are rounding, of the reference too."""
-PROBES = 3
-"""Random roundings of the inputs from which `Errors.input_*` is taken."""
+PROBES = 3  # random roundings of the inputs from which `Errors.input_*` is taken
 
 
 @dataclass(frozen=True)

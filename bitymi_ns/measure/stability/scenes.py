@@ -268,12 +268,9 @@ SWEEPS: tuple[Sweep, ...] = (
 )
 
 
-RIM = 1e-3
-"""Bound of the kernel's derivative at the rim, the default of a scene, for the gradients on both sides."""
-TEXELS = "texels"
-"""Name of the texels among the parameters of a case."""
-TILE = (8, 4)
-"""Sides of a tile of a case, texels along u and v."""
+RIM = 1e-3  # bound of the kernel's derivative at the rim, the default of a scene, for the gradients on both sides
+TEXELS = "texels"  # name of the texels among the parameters of a case
+TILE = (8, 4)  # sides of a tile of a case, texels along u and v
 ON_A_TEXEL = 1e-6
 """Coordinates that are nearer than this to a texel's centre, as a share of the tile, may lie on either side of it."""
 
@@ -305,8 +302,7 @@ class Way:
 
 
 PLAIN = Way("plain")
-WAYS = (Way(TEXELS, texels=True), Way("pixel", through_pixel=True, rim=0.0))
-"""The modes beside the plain one."""
+WAYS = (Way(TEXELS, texels=True), Way("pixel", through_pixel=True, rim=0.0))  # the modes beside the plain one
 
 
 def tiles_of(texels: Tensor) -> TexelTiles:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
@@ -241,6 +242,13 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
     def fixed_indices_eval_dataloader(self) -> Sequence[tuple[Cameras, dict[str, Any]]]:  # type: ignore[override]
         """Held-out views in turn, each read when it is asked for."""
         return OnDemand(len(self.eval_dataset), self.eval_view)
+
+    @property
+    def eval_dataloader(self) -> SimpleNamespace:
+        """What ns-render spiral asks for its first camera: that of a held-out view, or of training where there is
+        none."""
+        cameras = (self.eval_dataset if len(self.eval_dataset) else self.train_dataset).cameras
+        return SimpleNamespace(get_camera=lambda image_idx: (cameras[image_idx : image_idx + 1], {}))
 
     def train_index(self, step: int) -> int:
         """Return the index of the training view of a step of this process."""

@@ -50,7 +50,7 @@ def render(
     residual: Callable[[Tensor], Tensor] | None = None,
     near: float = 0.2,
     rim: float = 0.0,
-    prefilter: bool = False,
+    prefilter: str = "low_pass",
 ) -> Render:
     """Render surfels; colour of a fragment: ReLU(f_view + 0.5), then ReLU(that + texture) where there is a texture.
 
@@ -58,7 +58,7 @@ def render(
         geometry: means, quats, log_scales, opacity_logits, beta_raw, see `project`.
         colors: [N, 3] view-dependent colour f_view(d) of each surfel, without the 0.5.
         camera: viewmat, K, see `project`, and the size of the image in pixels.
-        background: [3], black if not given.
+        background: [3], None = black.
         tiles: one texture tile [r_v, r_u, 3] per surfel.
         residual: residual colour field, world positions [M, 3] to colours [M, 3]; instead of `tiles`.
         near: see `project`.

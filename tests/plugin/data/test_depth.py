@@ -14,7 +14,7 @@ import torch
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.data.depth import DepthFit, _affine, _mode
 from bitymi_ns.plugin.data.depth_files import MapFiles, maps_beside, read_depth
-from bitymi_ns.plugin.data.lens import make_lens
+from bitymi_ns.plugin.data.lens import lenses_of
 from bitymi_ns.sample.capture import View, first_hits, generate
 from bitymi_ns.sample.room import Room
 
@@ -200,7 +200,7 @@ def test_maps_of_scanners(tmp_path) -> None:
     cv2.imwrite(str(tmp_path / "confidence/7.png"), confidence)
     files = maps_beside(tmp_path / "images/7.jpg")
     assert files == MapFiles(tmp_path / "depth/7.png", tmp_path / "confidence/7.png")
-    lens, _ = make_lens("PINHOLE", (100.0, 100.0, 64.0, 48.0), 128, 96, (128, 96), "")
+    (lens,), _ = lenses_of("PINHOLE", (100.0, 100.0, 64.0, 48.0), 128, 96, (128, 96), "")
     read = read_depth(files, lens)
     assert read.shape == (96, 128) and not read[:2].any() and not read[-4:].any()
     assert np.allclose(read[2:-4], 1.5)
@@ -208,7 +208,7 @@ def test_maps_of_scanners(tmp_path) -> None:
 
 
 def test_distorted_photographs_have_their_depth_moved(tmp_path) -> None:
-    lens, _ = make_lens("OPENCV", (60.0, 60.0, 32.0, 24.0, 0.1, 0.02, 0.0, 0.0), 64, 48, (64, 48), "a camera")
+    (lens,), _ = lenses_of("OPENCV", (60.0, 60.0, 32.0, 24.0, 0.1, 0.02, 0.0, 0.0), 64, 48, (64, 48), "a camera")
     columns = np.broadcast_to(np.arange(1.0, 65.0), (48, 64))
     np.save(tmp_path / "depth.npy", columns)
     read = read_depth(MapFiles(tmp_path / "depth.npy"), lens)

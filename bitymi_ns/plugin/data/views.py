@@ -17,10 +17,11 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 
+from bitymi_ns.capture.panorama import SPHERICAL_MODEL
 from bitymi_ns.plugin.console import fail, say
 from bitymi_ns.plugin.data.colmap_model import ModelCamera
 from bitymi_ns.plugin.data.images import THREADS, image_size
-from bitymi_ns.plugin.data.lens import SPHERICAL, Lens, Pinhole, colmap_distortion, lenses_of, rescaled
+from bitymi_ns.plugin.data.lens import Lens, Pinhole, colmap_distortion, lenses_of, rescaled
 from bitymi_ns.plugin.data.point_files import Points
 from bitymi_ns.plugin.data.pose_checks import check_spread, far_from_origin, orient
 
@@ -283,7 +284,7 @@ def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
         model, coefficients = colmap_distortion(CameraType(int(cameras.camera_type[i])), values, f"of {file}")
         pinhole = [float(getattr(cameras, name)[i]) for name in ("fx", "fy", "cx", "cy")]
         size = (int(cameras.width[i]), int(cameras.height[i]))
-        camera = ModelCamera(model, *size, size if model == SPHERICAL else (*pinhole, *coefficients))
+        camera = ModelCamera(model, *size, size if model == SPHERICAL_MODEL else (*pinhole, *coefficients))
         photographs.append(Photograph(file, camera, np.eye(4), f"the camera of {file}"))
     lenses, of, poses = _split(make_lenses(photographs), cameras.camera_to_worlds.double().numpy())
     outputs = select_views(outputs, of)

@@ -8,8 +8,6 @@ each step is a process with a limit of its own, its output is appended to RESULT
 line of the summary. Orders joined by a plus sign (check+gaussians) run at the same time: for what is not timed.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import shutil
@@ -144,8 +142,7 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
     }
 
 
-GAUSSIANS = (300_000, 1_000_000)
-"""Numbers that are trained to compare with."""
+GAUSSIANS = (300_000, 1_000_000)  # numbers that are trained to compare with
 
 
 def captures(data: Path) -> list[str]:

@@ -9,8 +9,6 @@ and after the parts, so that a busy machine, or a slower one of the same kind, g
 the figures become the new baseline, benchmarks/gate.json; the commit then shows what changed.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import json
@@ -92,10 +90,8 @@ UNITS = {
 }
 
 
-ELSEWHERE = 2.0
-"""Factor of the limits on another kind of processor than the baseline's."""
-Scenes = dict[str, dict[str, float]]
-"""Scene -> figure -> value."""
+ELSEWHERE = 2.0  # factor of the limits on another kind of processor than the baseline's
+Scenes = dict[str, dict[str, float]]  # scene -> figure -> value
 
 
 class Calibration:

@@ -6,8 +6,6 @@ curvature of the Beta kernels at their centres. Where the version has an inferen
 (`gsplat.experimental.GaussianInferenceRenderer`, of scenes packed to half precision), that is timed too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -18,8 +16,7 @@ from torch import Tensor
 
 from bitymi_ns.scene.camera import Camera
 
-TIMES = (1, 3, 10)
-"""Gaussians per surfel of ours: as many, and what equal quality takes at least and at most."""
+TIMES = (1, 3, 10)  # Gaussians per surfel of ours: as many, and what equal quality takes at least and at most
 NOTE = (
     "gsplat gets the same centres, orientations and opacities, the scales at which its Gaussians have the curvature of "
     "the Beta kernels at their centres, and SH of degree 3."
@@ -88,8 +85,7 @@ def frames(options: Options, ours: dict[tuple[int, int, int], float]) -> str:
     )
 
 
-Frames = Callable[[Camera], Callable[[], Tensor]]
-"""Makes for a camera a function that draws its view, [H, W, 3]."""
+Frames = Callable[[Camera], Callable[[], Tensor]]  # makes for a camera a function that draws its view, [H, W, 3]
 
 
 def rasterized(kind: str) -> Callable[[Any, dict[str, Tensor]], Frames]:

@@ -17,8 +17,6 @@ counted apart. What a later kernel of the same operation reads counts again.
   ... backward        12 f + 48 b + 20 p + 96 n
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -54,8 +52,7 @@ from bitymi_ns.scene.scene import GEOMETRY, Scene
 from bitymi_ns.train.optimizers import make_optimizers
 
 LEVELS = 4
-LOOK_UP, LEARN = 1550, 3850
-"""Operations of a look-up in the field, and of its gradients."""
+LOOK_UP, LEARN = 1550, 3850  # operations of a look-up in the field, and of its gradients
 HEADER = ("operation", "ms", "million/s", "of", "GB/s", "of the copy", "gathers GB/s", "Gflop/s", "of a product's")
 
 

@@ -1,7 +1,5 @@
 """Shared by the kernel benchmarks: timing on the device, the card's measured limits, scenes like trained ones."""
 
-from __future__ import annotations
-
 import math
 import statistics
 import time
@@ -28,12 +26,9 @@ SITES = 7
 LOG2_TABLE = 17
 FAILURES: list[str] = []
 T = TypeVar("T")
-CROSSING = 0.016
-"""Share of the surfels that cross the camera's plane out of view."""
-PIXEL_SCALE = 0.9
-"""Median scale of a surfel over the side of its share of the image."""
-CLOCK = 2.0e9
-"""Cycles per second, at most about what cards run at: how long `torch.cuda._sleep` spins."""
+CROSSING = 0.016  # share of the surfels that cross the camera's plane out of view
+PIXEL_SCALE = 0.9  # median scale of a surfel over the side of its share of the image
+CLOCK = 2.0e9  # cycles per second, at most about what cards run at: how long `torch.cuda._sleep` spins
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,6 @@ The formulas are in `cases`, with n surfels of which v are visible, p pixels, f 
 - blend, texels: neighbouring texels are gathered from the cache, so their loads are not counted.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import os
@@ -49,8 +47,7 @@ HEADER = (
     "kernel", "limit", "ms", "CPU ms", "Mop", "MB", "M loads", "GFLOP/s", "GB/s", "M loads/s", "of arithmetic",
     "of bandwidth", "of loads",
 )  # fmt: skip
-Case = tuple[str, Callable[[], object], float, float, float]
-"""Kernel, call, operations, bytes and loads."""
+Case = tuple[str, Callable[[], object], float, float, float]  # kernel, call, operations, bytes and loads
 
 
 def timed(run: Callable[[], object], runs: int) -> tuple[float, float]:

@@ -25,8 +25,7 @@ from rich.filesize import decimal
 
 from bitymi_ns.trust import UNFINISHED, Refused, is_left, no_links
 
-Tell = Callable[[str], None]
-"""Receives a warning for the user."""
+Tell = Callable[[str], None]  # receives a warning for the user
 
 
 class Busy(BlockingIOError):
@@ -185,8 +184,7 @@ def _holder(path: Path) -> str:
     return f"process {process}{where} is at work there: wait for it, or end it (kill {process})"
 
 
-_held: dict[tuple[str, int], Lock] = {}
-"""Locks by file and thread: who has one may take it again."""
+_held: dict[tuple[str, int], Lock] = {}  # locks by file and thread: who has one may take it again
 
 
 def hold(path: Path, tell: Tell = warnings.warn) -> None:

@@ -6,8 +6,6 @@ plyfile, the library for such files, is not used: it is under the GPL and this p
 memory for as many rows of text as a header claims. Here nothing is taken that the file does not have.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Iterator, Sequence
@@ -18,8 +16,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-HEADER_LIMIT = 1 << 16
-"""No header is longer, in bytes."""
+HEADER_LIMIT = 1 << 16  # no header is longer, in bytes
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),

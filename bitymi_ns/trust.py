@@ -1,8 +1,6 @@
 """Protection against files of others: links are not followed, folders that others can write to are not used, names stay
 inside a folder, JSON within a nesting depth, and text is printable."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os
@@ -13,10 +11,8 @@ from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-UNFINISHED = ".unfinished"
-"""Ends the name of a file on its way, which begins with a dot: a killed process leaves it."""
-DEEPEST = 100
-"""Levels of JSON that are read."""
+UNFINISHED = ".unfinished"  # ends the name of a file on its way, which begins with a dot: a killed process leaves it
+DEEPEST = 100  # levels of JSON that are read
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 

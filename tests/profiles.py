@@ -1,7 +1,5 @@
 """ICC profiles."""
 
-from __future__ import annotations
-
 import struct
 
 from PIL import ImageCms

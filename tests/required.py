@@ -1,7 +1,5 @@
 """What may be missing on a user's machine and not where changes are tested."""
 
-from __future__ import annotations
-
 import os
 from typing import NoReturn
 

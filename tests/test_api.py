@@ -1,7 +1,5 @@
 """The public functions, and the examples that use them."""
 
-from __future__ import annotations
-
 import importlib.util
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Links between the pages of the documentation lead somewhere; files and names that they mention are in the code."""
 
-from __future__ import annotations
-
 import ast
 import re
 import subprocess

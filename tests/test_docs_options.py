@@ -1,7 +1,5 @@
 """The README's table of options names options that exist, with their defaults."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import fields, is_dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Python snippets of the documentation run, in the order of their page, on a tiny scene."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """docs/glossary.md names files and functions that exist, for every numbered equation of the paper."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

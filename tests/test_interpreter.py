@@ -1,7 +1,5 @@
 """Processes of Python run nothing that lies in the current folder."""
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

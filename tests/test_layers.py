@@ -1,8 +1,6 @@
 """A layer imports only what stands below it, no two modules import each other, and nerfstudio is known to `plugin`
 and to what measures it alone."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """docs/licences.md names the packages of this environment that are not permissive."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What somebody else may have put where this package writes, and names that lead elsewhere."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

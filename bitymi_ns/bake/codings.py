@@ -1,7 +1,5 @@
 """Codings of texels that their last optimisation steps draw: BC7 pages, or the codes of a compact bundle."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
@@ -13,8 +11,7 @@ from bitymi_ns.codec.pages import listed_texels, paged_texels
 from bitymi_ns.codec.quantise import EncodedAtlas
 from bitymi_ns.codec.texel_codes import TexelCodeOptions, TexelCoder, TexelCodes
 
-TO_START = 0.93
-"""Share of the bytes that coded texels may have before their last steps, in which they grow a little."""
+TO_START = 0.93  # share of the bytes that coded texels may have before their last steps, in which they grow a little
 
 
 class Coded(Protocol):

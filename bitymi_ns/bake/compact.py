@@ -1,7 +1,5 @@
 """Rate-distortion choice of the codes of a compact bundle: one lambda decides the precision of everything."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -31,17 +29,14 @@ from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.train.views import View
 
-START = 8.0 / 255**2
-"""First lambda of the search: squared error per bit, colours from 0 to 1."""
+START = 8.0 / 255**2  # first lambda of the search: squared error per bit, colours from 0 to 1
 MAX_LAMBDA = 4.0 / 255**2
 """Largest lambda where a share of the error decides: much of a large error, as of exposure, is what no texel mends and
 does not hide that of rounding; and texels learn little behind steps above the 4.2 of 255 that this gives."""
-TEXEL_SHARE = 0.5
-"""Lambda of the texels, which are tuned after it, as a share of that of everything else."""
+TEXEL_SHARE = 0.5  # lambda of the texels, which are tuned after it, as a share of that of everything else
 ENOUGH = 0.002
 """Share of the error (0.009 dB) that may be added even where a size is asked for: finer is not worth bytes."""
-LEAST_ERROR = 1e-7
-"""Mean square error that is always allowed, of colours from 0 to 1: 70 dB."""
+LEAST_ERROR = 1e-7  # mean square error that is always allowed, of colours from 0 to 1: 70 dB
 _SEARCH = 7
 _CPU = torch.device("cpu")
 _FAST = 9

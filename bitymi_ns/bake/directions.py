@@ -1,7 +1,5 @@
 """Directions at which a surfel's view colour is evaluated: of the training views that show it, and others nearby."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -11,10 +9,8 @@ from torch.nn import functional as F
 
 from bitymi_ns.ops.sphere import fibonacci_sphere
 
-BETWEEN = 32
-"""Directions between and around those of the views."""
-SPHERE = 64
-"""Directions over the whole sphere for a surfel that no view sees."""
+BETWEEN = 32  # directions between and around those of the views
+SPHERE = 64  # directions over the whole sphere for a surfel that no view sees
 _REACH = 1.25  # a quarter farther out than the triangle of three views
 _CHUNK = 1 << 19  # directions at once
 

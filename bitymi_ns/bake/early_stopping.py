@@ -1,7 +1,5 @@
 """Early stopping: the state of an optimisation that shows its validation views best."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable
 from typing import Generic, Protocol, TypeVar
@@ -14,8 +12,7 @@ from bitymi_ns.train.losses import mean_psnr, psnr
 
 S = TypeVar("S")
 
-FEWEST_VIEWS = 4
-"""With fewer views there are no validation views, and nothing is optimised."""
+FEWEST_VIEWS = 4  # with fewer views there are no validation views, and nothing is optimised
 
 
 class StoppingOptions(Protocol):

@@ -1,7 +1,5 @@
 """Lean view colours: a surfel keeps the fewest sites that hold its colour, or one colour."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -26,8 +24,7 @@ from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.tile_sizes import kernel_parameters
 
 FIT_STEPS = 6
-FIT_VIEWS = 16
-"""Views of a surfel in the fit; the error is measured in all of them."""
+FIT_VIEWS = 16  # views of a surfel in the fit; the error is measured in all of them
 OUTSIDE, OUTSIDE_WEIGHT = 12, 0.05
 """Directions over the whole sphere, and their weight, in the fit: where no view is, the colour follows the trained one
 loosely instead of diverging."""

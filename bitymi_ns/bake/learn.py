@@ -22,8 +22,7 @@ from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.views import View
 
-FEWEST_PASSES = 4
-"""Steps of polish or fine-tuning per photograph; more may gain where there are fewer."""
+FEWEST_PASSES = 4  # steps of polish or fine-tuning per photograph; more may gain where there are fewer
 STEPS_AFTER_LEARNING = 100
 """Fine-tuning steps of texels that were trained already: they recover what the reduction of tiles and colours cost."""
 

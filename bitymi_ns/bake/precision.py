@@ -1,7 +1,5 @@
 """Quantisation steps of the surfels' columns from the image error of rounding each, measured by drawing."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,8 +16,7 @@ from bitymi_ns.train.views import View
 
 WIDEST, NARROWEST = 4.0, 1.0 / 64
 """Steps are chosen between these, in reference steps; beyond, errors are not proportional to them."""
-PER_BIT = 2.0 * math.log(2.0)
-"""Relative fall, per bit, of an error proportional to the square of a step."""
+PER_BIT = 2.0 * math.log(2.0)  # relative fall, per bit, of an error proportional to the square of a step
 
 
 class Pictures:

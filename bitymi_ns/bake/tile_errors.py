@@ -1,7 +1,5 @@
 """Errors of texels as the closest training view shows them: times the blending weight, averaged over its pixels."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -15,8 +13,7 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.tile_sizes import max_projected_extent
 from bitymi_ns.train.init import tangents
 
-_CONSTANT = (8, 8)
-"""Grid on which the weight of a surfel without a tile is evaluated."""
+_CONSTANT = (8, 8)  # grid on which the weight of a surfel without a tile is evaluated
 
 
 def weighted_rms(difference: Tensor, weight: Tensor) -> Tensor:

@@ -1,7 +1,5 @@
 """Rate-distortion choice of the view-colour terms: the error that every number of terms makes in the views."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -23,15 +21,11 @@ from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import GEOMETRY
 
-BITS_PER_NUMBER = 5.5
-"""Bits of a number of a term in a compact bundle, about."""
-LEAST_WEIGHT = 1e-12
-"""Weight of any direction: a surfel that no view shows has a colour, too."""
-VIEW_SHARE = 0.5
-"""Weight of the training views; the rest are directions between and around them."""
+BITS_PER_NUMBER = 5.5  # bits of a number of a term in a compact bundle, about
+LEAST_WEIGHT = 1e-12  # weight of any direction: a surfel that no view shows has a colour, too
+VIEW_SHARE = 0.5  # weight of the training views; the rest are directions between and around them
 
-BLIND = 4
-"""Directions from so many of the nearest views that do not show the surfel count, too."""
+BLIND = 4  # directions from so many of the nearest views that do not show the surfel count, too
 BLIND_SHARE = 0.1
 """Weight of these as a share of what a view would show of the surfel from there: a new view may show it."""
 
@@ -77,7 +71,7 @@ def shown_weights(scene: BakedScene, cameras: Sequence[Camera], progress: Progre
     found = torch.zeros(len(cameras), len(scene), device=device)
     geometry = [scene.surfels[name].to(device) for name in GEOMETRY]
     for done, camera in enumerate(cameras):
-        projection = project(*geometry, camera, scene.near, scene.through_pixel)
+        projection = project(*geometry, camera, scene.near, scene.prefilter)
         for fragments in fitting_lists(projection):
             found[done].index_add_(0, fragments.surfel.long(), fragments.weight.square())
             del fragments  # before the next list is made

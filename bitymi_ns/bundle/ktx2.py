@@ -3,8 +3,6 @@
 Written from the Khronos KTX File Format Specification 2.0 and the Khronos Data Format Specification 1.3.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,8 +14,7 @@ IDENTIFIER = b"\xabKTX 20\xbb\r\n\x1a\n"
 
 _HEADER = struct.Struct("<12s9I4I2Q3Q")  # identifier, header, index, and the one level
 _KEY_LIMIT = 1 << 20
-HEADER_LIMIT = 1 << 10
-"""Header, index, level and data format descriptor are shorter, in bytes."""
+HEADER_LIMIT = 1 << 10  # header, index, level and data format descriptor are shorter, in bytes
 
 
 @dataclass(frozen=True)

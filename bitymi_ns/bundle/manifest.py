@@ -23,20 +23,15 @@ from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, SUPPORT, T
 from bitymi_ns.ops.view_kinds import Kind
 
 FORMAT = "bitymi-bundle"
-VERSION = (3, 0)
-"""The newest version that is read: surfels and texels as columns of integers."""
-LEAN_VERSION = (2, 3)
-"""Version of a bundle with lean view colours in a PLY file, which readers of version 1 refuse."""
-FULL_VERSION = (1, 4)
-"""Version of a bundle whose surfels have all parameters."""
+VERSION = (3, 0)  # the newest version that is read: surfels and texels as columns of integers
+LEAN_VERSION = (2, 3)  # version of a bundle with lean view colours in a PLY file, which readers of version 1 refuse
+FULL_VERSION = (1, 4)  # version of a bundle whose surfels have all parameters
 _DIGEST_SINCE = {1: 2, 2: 1, 3: 0}  # major version to the minor one from which on bundle.json has a digest
 SURFELS, ATLAS, MANIFEST = "surfels.ply", "atlas.ktx2", "bundle.json"
 COMPACT_SURFELS, TEXELS = "surfels.bin", "texels.bin"
-POSTER = "poster.webp"
-"""A picture of what a viewer shows first, which a bundle may have: `bundle.poster`."""
+POSTER = "poster.webp"  # a picture of what a viewer shows first, which a bundle may have: `bundle.poster`
 ACTIVATIONS = {"opacity": "sigmoid", "scale": "exp", "beta": "4 * sigmoid", "rotation": "wxyz, unit"}
-UNIT_LENGTH = 1e-3
-"""By how much the length of a direction may differ from 1."""
+UNIT_LENGTH = 1e-3  # by how much the length of a direction may differ from 1
 _MOST_PROBLEMS = 3  # in one message
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 

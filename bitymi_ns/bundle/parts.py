@@ -1,7 +1,5 @@
 """Files of a bundle, a folder or one file: opening them, their names, and the folder to write."""
 
-from __future__ import annotations
-
 import os
 import re
 import stat
@@ -25,12 +23,9 @@ from bitymi_ns.bundle.manifest import (
 )
 from bitymi_ns.trust import Refused, json_of, keep
 
-MANIFEST_LIMIT = 4 << 20
-"""Bytes that a bundle.json may have."""
-DIRECTORY_LIMIT = 4 << 20
-"""Bytes that the directory of a bundle in one file may have."""
-CONFIG = "config.yml"
-"""Configuration for nerfstudio's tools, for which bundle.json does not vouch."""
+MANIFEST_LIMIT = 4 << 20  # bytes that a bundle.json may have
+DIRECTORY_LIMIT = 4 << 20  # bytes that the directory of a bundle in one file may have
+CONFIG = "config.yml"  # configuration for nerfstudio's tools, for which bundle.json does not vouch
 CAMERAS, PREVIEWS = "cameras.json", ("preview.jpg", "preview.png")
 _PHOTOGRAPH = re.compile(r"photograph-[0-9]{4,6}\.jpg")
 # The last records of a ZIP: where that of large files is, that of large files itself, and the end.

@@ -1,7 +1,5 @@
 """The poster of a bundle: a small picture of what a viewer shows first, there before the surfels are."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 
@@ -15,12 +13,9 @@ from bitymi_ns.scene.camera import Camera
 
 Pixels = npt.NDArray[np.uint8]
 
-SIDE = 480
-"""Pixels of its longer side, at most."""
-SHARE = 0.02
-"""Largest share of the bytes of surfels and texels."""
-LEAST = 2048
-"""Bytes that it may take however small these are."""
+SIDE = 480  # pixels of its longer side, at most
+SHARE = 0.02  # largest share of the bytes of surfels and texels
+LEAST = 2048  # bytes that it may take however small these are
 _QUALITIES = (80, 70, 60, 50, 40)
 _SMALLER = 0.75
 _SMALLEST = 16

@@ -44,8 +44,7 @@ BESIDE_LIMIT = 64 << 20
 LARGE_ATLAS = 64 << 20
 """Bytes of decoded texels of a compact bundle from which on a card gets BC7 blocks of them, a quarter of that. Fewer
 are no burden to any card, and blocks cost time, and some of the quality of texels that were not tuned to them."""
-LOAD_PROFILE: Profile = "veryfast"
-"""Encoder profile of these blocks: the next faster one loses more than twice as much."""
+LOAD_PROFILE: Profile = "veryfast"  # encoder profile of these blocks: the next faster one loses more than twice as much
 _CHUNK = 1 << 22
 
 

@@ -1,7 +1,5 @@
 """A bundle in one file: an uncompressed ZIP whose parts lie in the order in which a viewer needs them."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 from dataclasses import dataclass
@@ -14,8 +12,7 @@ from bitymi_ns.bundle.sizes import enough_memory, machine_memory
 from bitymi_ns.files import size_text, write_file
 
 _ORDER = (POSTER, COMPACT_SURFELS, TEXELS, SURFELS, ATLAS)
-SUFFIX = ".bitymi"
-"""Suffix of such a file."""
+SUFFIX = ".bitymi"  # suffix of such a file
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 

@@ -1,7 +1,5 @@
 """Checks of a bundle's files before they are read: headers, bundle.json, memory."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -13,8 +11,7 @@ from bitymi_ns.bundle.manifest import ATLAS, COMPACT_SURFELS, MANIFEST, SURFELS,
 from bitymi_ns.bundle.surfel_table import TERMS
 from bitymi_ns.files import size_text
 
-HEAD = max(ply.HEADER_LIMIT, ktx2.HEADER_LIMIT)
-"""Bytes from the start of a file that `check_head` reads."""
+HEAD = max(ply.HEADER_LIMIT, ktx2.HEADER_LIMIT)  # bytes from the start of a file that `check_head` reads
 _SURFEL_BYTES, _TERM_BYTES, _TEXEL_BYTES = 340, 150, 60
 """Bytes of a compact bundle while it is decoded: 2 million surfels took 370 each, 4 million terms 165, 17 million
 texels 67 with their pages."""
@@ -62,8 +59,7 @@ _CHECKS: dict[str, Callable[[Manifest, bytes, int], None]] = {
     COMPACT_SURFELS: _check_compact_size,
     TEXELS: _check_texels_size,
 }
-SCENE_FILES = frozenset(_CHECKS)
-"""The files of which a scene is made."""
+SCENE_FILES = frozenset(_CHECKS)  # the files of which a scene is made
 
 
 @contextmanager

@@ -6,8 +6,6 @@ deviation of at most sqrt(2 / M). So a bundle that holds the sketch of its texel
 decoded ones are from them.
 """
 
-from __future__ import annotations
-
 import base64
 
 import numpy as np
@@ -16,8 +14,7 @@ from torch import Tensor
 
 from bitymi_ns.codec.quantise import STEPS
 
-SIZE = 128
-"""M, the sums of a sketch."""
+SIZE = 128  # M, the sums of a sketch
 _CHUNK = 1 << 20
 
 

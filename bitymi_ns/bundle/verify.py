@@ -1,7 +1,5 @@
 """Checks of a bundle by itself: files, numbers, tiles, and what bundle.json states of them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,12 +18,10 @@ from bitymi_ns.codec.pages import listed_texels
 from bitymi_ns.codec.quantise import STEPS
 from bitymi_ns.scene.baked import BakedScene
 
-SLACK_STEPS = 0.02
-"""8-bit steps by which a measured error may exceed the stated one."""
+SLACK_STEPS = 0.02  # 8-bit steps by which a measured error may exceed the stated one
 _SLACK_CODES = 4.0
 """8-bit codes by which a sum of a sketch may differ: processors round values between two codes either way."""
-_SLACK_SKETCH = 1.4
-"""The square that sketches estimate is within 1.96 times the true one: 7 standard deviations."""
+_SLACK_SKETCH = 1.4  # the square that sketches estimate is within 1.96 times the true one: 7 standard deviations
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,5 @@
 """Cache folders of structure from motion, beside the photographs or in the user's cache, locked while in use."""
 
-from __future__ import annotations
-
 import atexit
 import hashlib
 import json
@@ -18,14 +16,10 @@ from bitymi_ns.files import Tell, write_file
 from bitymi_ns.trust import Refused, check_no_links, is_own, json_of, own_folder
 
 FOLDER = ".bitymi"
-OF = "of.json"
-"""File in a work folder with the source and the key of its content."""
-Kind = Literal["poses", "points"]
-"""First part of the name of a work folder: poses, or points of known poses."""
-IN_USE = ".in-use-"
-"""Prefix of the locks of processes that read from a work folder."""
-VERSION = 5
-"""Increased where the same photographs and options give other poses than before, to invalidate cached ones."""
+OF = "of.json"  # file in a work folder with the source and the key of its content
+Kind = Literal["poses", "points"]  # first part of the name of a work folder: poses, or points of known poses
+IN_USE = ".in-use-"  # prefix of the locks of processes that read from a work folder
+VERSION = 5  # increased where the same photographs and options give other poses than before, to invalidate cached ones
 
 
 def content_key(inputs: Iterable[tuple[str, Path]], settings: object) -> str:

@@ -1,7 +1,5 @@
 """EXIF of photographs: camera, focal length, exposure, GPS position, time and gravity, as far as they are plausible."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Mapping
@@ -9,16 +7,11 @@ from dataclasses import dataclass
 
 from PIL import ExifTags, Image
 
-FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)
-"""Millimetres; focal lengths "in 35 mm film" are relative to it."""
-SENSOR_ASPECTS = (4 / 3, 3 / 2, 16 / 9, 5 / 4)
-"""Aspect ratios of uncropped photographs."""
-SAME_ASPECT = 0.02
-"""Relative difference of equal aspect ratios: sizes are rounded to blocks of pixels."""
-FOCAL_RANGE = (0.3, 15.0)
-"""Plausible focal lengths, in units of the longer side."""
-STILL = 0.1
-"""Tolerance of the length of an acceleration, in g, for a phone that is held still."""
+FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)  # millimetres; focal lengths "in 35 mm film" are relative to it
+SENSOR_ASPECTS = (4 / 3, 3 / 2, 16 / 9, 5 / 4)  # aspect ratios of uncropped photographs
+SAME_ASPECT = 0.02  # relative difference of equal aspect ratios: sizes are rounded to blocks of pixels
+FOCAL_RANGE = (0.3, 15.0)  # plausible focal lengths, in units of the longer side
+STILL = 0.1  # tolerance of the length of an acceleration, in g, for a phone that is held still
 
 
 @dataclass(frozen=True)

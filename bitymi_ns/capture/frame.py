@@ -1,7 +1,5 @@
 """World frame of a model: z up by gravity, GPS or the cameras, and metric scale by GPS."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping
@@ -14,24 +12,17 @@ import pycolmap
 from bitymi_ns.files import write_file
 from bitymi_ns.trust import json_of
 
-EARTH = 6378137.0
-"""Equatorial radius in metres, WGS 84."""
+EARTH = 6378137.0  # equatorial radius in metres, WGS 84
 FLATTENING = 1 / 298.257223563
-GPS_ERROR = 5.0
-"""Error of a phone's GPS, metres."""
-LEAST_SPREAD = 4 * GPS_ERROR
-"""Least spread of positions, metres, that determines the scale."""
-SAME_SHAPE = 0.5
-"""Largest error of an accepted alignment, relative to the spread."""
+GPS_ERROR = 5.0  # error of a phone's GPS, metres
+LEAST_SPREAD = 4 * GPS_ERROR  # least spread of positions, metres, that determines the scale
+SAME_SHAPE = 0.5  # largest error of an accepted alignment, relative to the spread
 
 
-FILE = "frame.json"
-"""File of the frame, beside the report."""
-UP = (0.0, 0.0, 1.0)
-"""Up in the world frame."""
+FILE = "frame.json"  # file of the frame, beside the report
+UP = (0.0, 0.0, 1.0)  # up in the world frame
 SOURCES = ("gps", "gravity", "cameras")
-SAME_UP = np.cos(np.radians(10.0))
-"""Cosine of the largest angle between equal up directions."""
+SAME_UP = np.cos(np.radians(10.0))  # cosine of the largest angle between equal up directions
 STEEPEST = np.cos(np.radians(45.0))
 """Cosine of the largest tilt of GPS positions against gravity; beyond it, gravity is ignored."""
 

@@ -1,25 +1,18 @@
 """Tone mapping of high dynamic range frames (HLG or PQ, the 10-bit video of phones) to sRGB; without it they are
 pale."""
 
-from __future__ import annotations
-
 import av
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-PQ, HLG = 16, 18
-"""Transfer functions as ITU-T H.273 numbers them."""
+PQ, HLG = 16, 18  # transfer functions as ITU-T H.273 numbers them
 FULL_RANGE = 2
-WHITE = 203.0
-"""Candelas per square metre of white paper in such films (ITU-R BT.2408); a screen's white here."""
+WHITE = 203.0  # candelas per square metre of white paper in such films (ITU-R BT.2408); a screen's white here
 HLG_PEAK = 1000.0
-HLG_GAMMA = 1.2
-"""Peak luminance and gamma of the reference display of HLG (ITU-R BT.2100)."""
-KNEE = 0.8
-"""Light up to this share of white is kept; brighter light is compressed up to white."""
-LUMA = np.array([0.2627, 0.6780, 0.0593])
-"""Luma coefficients of BT.2020."""
+HLG_GAMMA = 1.2  # peak luminance and gamma of the reference display of HLG (ITU-R BT.2100)
+KNEE = 0.8  # light up to this share of white is kept; brighter light is compressed up to white
+LUMA = np.array([0.2627, 0.6780, 0.0593])  # luma coefficients of BT.2020
 TO_709 = np.array([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]])
 """BT.2020's red, green and blue to those of BT.709 and sRGB, linear."""
 

@@ -1,7 +1,5 @@
 """Triangulation of points from photographs with known poses."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import warnings
@@ -26,8 +24,7 @@ from bitymi_ns.files import Tell, explained, write_file
 from bitymi_ns.progress import Progress, no_progress
 
 T = TypeVar("T")
-DONE = "points"
-"""File that is written when the model is whole."""
+DONE = "points"  # file that is written when the model is whole
 
 
 @dataclass(frozen=True)

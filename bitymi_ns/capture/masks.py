@@ -1,8 +1,6 @@
 """Masks of photographs: their folder, the mask file of a photograph, and the pixels that count. Structure from motion
 and training share these rules."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path, PurePosixPath
 
@@ -18,10 +16,8 @@ USUAL_FOLDERS = ("images", "input", "image", "photos", "photographs", "rgb", "co
 """Names of a capture's folder of photographs, the most usual first."""
 LOSSY = {"JPEG", "MPO", "WEBP", "JPEG2000", "HEIF", "AVIF"}
 """Lossy formats by Pillow's names, in which black may come back as almost black."""
-MIDDLE = 127
-"""Threshold of lossy masks, of 255."""
-PROPORTIONS = 0.02
-"""Relative difference of aspect ratios that counts as rounding."""
+MIDDLE = 127  # threshold of lossy masks, of 255
+PROPORTIONS = 0.02  # relative difference of aspect ratios that counts as rounding
 
 
 def mask_folder(photographs: Path, data: Path, stated: Path | None = None, downscale: int = 1) -> Path | None:

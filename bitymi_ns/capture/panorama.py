@@ -1,8 +1,6 @@
 """Detection of 360-degree (equirectangular) pictures by metadata or content. An aspect ratio of 2 alone is no evidence:
 phones take such photographs, too."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -13,18 +11,13 @@ PANORAMAS = (
     "360-degree pictures cannot be trained on as they are. Cut them into perspective views with "
     "`ns-process-data images --camera-type equirectangular`, which finds their poses anew."
 )
-HEADER = 1 << 17
-"""Bytes at the start of a file that are searched for metadata."""
+HEADER = 1 << 17  # bytes at the start of a file that are searched for metadata
 SPHERICAL = re.compile(rb"GPano:ProjectionType|ProjectionType[^a-z]{1,8}(equirectangular|cylindrical)", re.IGNORECASE)
 """XMP entries of panoramas (Google Photo Sphere)."""
-ASPECT = 0.01
-"""Relative difference from aspect ratio 2 that counts as rounding."""
-ALIKE = 0.6
-"""Correlation of the details of the left and right edge from which on they match."""
-SMOOTH = 15
-"""Rows of the moving average that is subtracted to leave the detail."""
-DETAIL = 1.5
-"""Least standard deviation of detail, grey levels: edges of a bare background always match."""
+ASPECT = 0.01  # relative difference from aspect ratio 2 that counts as rounding
+ALIKE = 0.6  # correlation of the details of the left and right edge from which on they match
+SMOOTH = 15  # rows of the moving average that is subtracted to leave the detail
+DETAIL = 1.5  # least standard deviation of detail, grey levels: edges of a bare background always match
 POLE = 0.35
 """Largest standard deviation of the first and last row, each one point of the sphere, relative to the picture's."""
 

@@ -1,7 +1,5 @@
 """Photographs for structure from motion: find them, and read size, EXIF, thumbnail and sharpness of each."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Sequence
@@ -25,15 +23,11 @@ PLAIN = {
     "JPEG": (".jpg", ".jpeg"), "PNG": (".png",), "BMP": (".bmp",), "TIFF": (".tif", ".tiff"),
 }  # fmt: skip
 """Formats that COLMAP and nerfstudio read, with the extensions that they expect."""
-COPY = ".jpg"
-"""Extension appended to the name of a photograph for its upright copy."""
-THUMB = 256
-"""Longer side of the grey thumbnails for duplicate detection, pixels."""
-SHARPNESS_SIZE = 1024
-"""Longer side at which sharpness is measured, pixels."""
+COPY = ".jpg"  # extension appended to the name of a photograph for its upright copy
+THUMB = 256  # longer side of the grey thumbnails for duplicate detection, pixels
+SHARPNESS_SIZE = 1024  # longer side at which sharpness is measured, pixels
 
-BLURRED = 0.5
-"""A photograph is blurred if its sharpness is below this share of the set's median."""
+BLURRED = 0.5  # a photograph is blurred if its sharpness is below this share of the set's median
 DUPLICATE_SHIFT = 0.1
 """Two photographs are duplicates if they differ by less than a shift by this many pixels of their thumbnails."""
 
@@ -269,7 +263,7 @@ def duplicates(photos: Sequence[Photo]) -> dict[str, str]:
         means = np.empty(0)
         for photo in same:
             level = float(photo.thumb.mean())
-            # A duplicate has almost the same mean, so few are compared pixel by pixel.
+            # a duplicate has almost the same mean, so few are compared pixel by pixel.
             near = [kept[i] for i in np.flatnonzero(np.abs(means - level) < 2.0)]
             twin = next((other for other in near if shift(photo.thumb, other.thumb) < DUPLICATE_SHIFT), None)
             if twin is not None:

@@ -1,7 +1,5 @@
 """Structure from motion: camera poses of photographs or of the frames of a video."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import statistics
@@ -38,14 +36,10 @@ from bitymi_ns.capture.video import extract_frames
 from bitymi_ns.files import Tell, complete_folder, explained, write_file
 from bitymi_ns.progress import Progress, no_progress
 
-GUESSED_FOCAL = 1.2
-"""Initial focal length where it is unknown, in units of the longer side; COLMAP's own."""
-TELLING = 0.25
-"""Share of 360-degree pictures among photographs of one size from which on all of them count as such."""
-LEAST = 3
-"""Least number of photographs."""
-SPARSE = Path("sparse/0")
-"""Path of the model in a result."""
+GUESSED_FOCAL = 1.2  # initial focal length where it is unknown, in units of the longer side; COLMAP's own
+TELLING = 0.25  # share of 360-degree pictures among photographs of one size from which on all of them count as such
+LEAST = 3  # least number of photographs
+SPARSE = Path("sparse/0")  # path of the model in a result
 
 
 def find_poses(

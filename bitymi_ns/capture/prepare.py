@@ -1,7 +1,5 @@
 """Photographs and masks in forms that both COLMAP and nerfstudio read."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -16,8 +14,7 @@ from bitymi_ns.files import complete_file, complete_folder
 from bitymi_ns.progress import Progress
 
 JPEG_QUALITY = 97
-IMAGES = "images"
-"""Subfolder of the work folder for upright copies, or the frames of a video."""
+IMAGES = "images"  # subfolder of the work folder for upright copies, or the frames of a video
 
 
 def upright_photos(

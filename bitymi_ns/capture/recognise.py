@@ -1,7 +1,5 @@
 """Recognition of the format of a folder or file: a capture with poses, photographs, or a video."""
 
-from __future__ import annotations
-
 import os
 import struct
 from collections.abc import Iterator
@@ -30,14 +28,12 @@ FORMATS_OF_PICTURES = (
 """Formats of photographs and masks by Pillow's names, whatever the file name. EPS, among others, is excluded: it is a
 program that Ghostscript runs."""
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp")
-MODELS = ("sparse/0", "colmap/sparse/0", "sparse")
-"""Usual folders of a COLMAP model in a capture, the most usual first."""
+MODELS = ("sparse/0", "colmap/sparse/0", "sparse")  # usual folders of a COLMAP model in a capture, the most usual first
 NERFSTUDIOS_OWN = {"ply_file_path", "applied_transform", "camera_model", "orientation_override", "train_filenames"}
 """Entries of a transforms.json that only nerfstudio writes."""
 POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 """Folders of Polycam's images and their cameras, the better ones first."""
-SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
-"""Files of a Blender data set."""
+SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")  # files of a Blender data set
 INTRINSICS = {"fl_x", "fl_y", "cx", "cy", "w", "h"}
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,10 +17,8 @@ if TYPE_CHECKING:  # those who read reports need not wait for it
     import pycolmap
 
 VALUES, PAGE, PICTURE = "report.json", "report.md", "cameras.png"
-FILES = (VALUES, PAGE, PICTURE, "frame.json")
-"""Files of a report; the last one is written by frame.py."""
-MOST_POINTS = 20_000
-"""Points in the plot; excess points are dropped at random."""
+FILES = (VALUES, PAGE, PICTURE, "frame.json")  # files of a report; the last one is written by frame.py
+MOST_POINTS = 20_000  # points in the plot; excess points are dropped at random
 
 
 def write_report(folder: Path, values: Mapping[str, object], model: pycolmap.Reconstruction) -> None:
@@ -39,50 +37,56 @@ def write_report(folder: Path, values: Mapping[str, object], model: pycolmap.Rec
         _draw(folder / PICTURE, model, values.get("metres_per_unit") is not None)
 
 
-def _page(values: Mapping[str, object]) -> str:
-    lines = [
+def overview(values: Mapping[str, Any]) -> dict[str, str]:
+    """Statistics of report.json as texts; a dash stands for what is no number."""
+    numbers = {key: value for key, value in values.items() if isinstance(value, (int, float))}
+    stages = values["seconds"].items() if isinstance(values["seconds"], dict) else ()
+    seconds = [f"{stage} {value:.1f}" for stage, value in stages if isinstance(value, (int, float))]
+
+    def text(key: str, form: str) -> str:
+        return form.format(numbers[key]) if key in numbers else "–"
+
+    return {
+        "Photographs with a pose": f"{text('registered', '{:,}')} of {text('given', '{:,}')}",
+        "Mean reprojection error, pixels": text("reprojection_error", "{:.3f}"),
+        "Mean track length, photographs per point": text("track_length", "{:.2f}"),
+        "Points": text("points", "{:,}"),
+        "Median parallax, degrees": text("parallax_degrees", "{:.1f}"),
+        "Up, scale": _frame_text(values.get("up"), numbers),
+        "Seconds": ", ".join(seconds),
+    }
+
+
+def _page(values: Mapping[str, Any]) -> str:
+    cameras = [(c["model"], ", ".join(f"{p:.5g}" for p in c["params"]), c["prior"]) for c in values["cameras"]]
+    parts = [
         "# Camera poses",
-        "",
         f"Source: {_cell(values['source'])}",
-        "",
-        "| | |",
-        "|---|---|",
-        f"| photographs with a pose | {values['registered']} of {values['given']} |",
-        f"| mean reprojection error | {values['reprojection_error']:.3f} pixels |",
-        f"| mean track length | {values['track_length']:.2f} photographs per point |",
-        f"| points | {values['points']} |",
-        f"| median parallax | {values['parallax_degrees']:.1f} degrees |",
-        f"| up, scale | {frame_text(values)} |",
-        "",
+        _table(("", ""), overview(values).items()),
         f"![cameras and points, from above and from the side]({PICTURE})",
-        "",
     ]
-    for title, entries in (("Left out", values["left_out"]), ("Notes", values["notes"])):
-        if entries:
-            lines += [
-                f"## {title}",
-                "",
-                "| photograph | why |" if title == "Left out" else "| photograph | |",
-                "|---|---|",
-            ]
-            lines += [f"| {_cell(name)} | {_cell(why)} |" for name, why in entries.items()] + [""]
-    lines += ["## Cameras", "", "| model | parameters | focal length known from EXIF |", "|---|---|---|"]
-    lines += [
-        f"| {c['model']} | {', '.join(f'{p:.5g}' for p in c['params'])} | {c['prior']} |" for c in values["cameras"]
-    ]
-    lines += ["", "## Seconds", "", "| stage | seconds |", "|---|---|"]
-    lines += [f"| {stage} | {seconds:.1f} |" for stage, seconds in values["seconds"].items()]
-    return "\n".join(lines) + "\n"
+    if values["left_out"]:
+        parts += ["## Left out", _table(("photograph", "why"), values["left_out"].items())]
+    if values["notes"]:
+        parts += ["## Notes", _table(("photograph", ""), values["notes"].items())]
+    parts += ["## Cameras", _table(("model", "parameters", "focal length known from EXIF"), cameras)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    lines = [[_cell(cell) for cell in row] for row in (header, *rows)]
+    lines.insert(1, ["---"] * len(header))
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def _cell(text: object) -> str:
     return printable(str(text)).replace("|", "\\|").replace("\n", " ")
 
 
-def frame_text(values: Mapping[str, Any]) -> str:
+def _frame_text(up: object, numbers: Mapping[str, float]) -> str:
     """Describe the source of up and scale, from `up`, `metres_per_unit` and `gps_error`."""
-    metres, error = values.get("metres_per_unit") is not None, values.get("gps_error")
-    up = values.get("up") or ("gps" if metres else "cameras")  # earlier reports do not say
+    metres, error = "metres_per_unit" in numbers, numbers.get("gps_error")
+    up = up or ("gps" if metres else "cameras")  # earlier reports do not say
     text = {"gps": "z up by GPS", "gravity": "z up by gravity"}.get(str(up), "z up by the cameras")
     if not metres:
         return f"{text}, scale not known"

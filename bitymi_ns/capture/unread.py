@@ -1,7 +1,5 @@
 """Files of cameras and other programs that are not read as photographs or poses, to be reported."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -25,8 +23,7 @@ POSES = {
     "bundle.rd.out": "Bundler",
 }
 """Files of poses, in lower case, and the programs that write them."""
-METASHAPE = b"<camera "
-"""Content of the XML file to which Metashape exports cameras, whatever its name."""
+METASHAPE = b"<camera "  # content of the XML file to which Metashape exports cameras, whatever its name
 FOLDERS = {
     "mask": "masks", "masks": "masks", "depth": "depth maps", "depths": "depth maps", "depth_maps": "depth maps",
     "confidence": "confidence maps", "confidences": "confidence maps", "conf": "confidence maps",

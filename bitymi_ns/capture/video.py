@@ -1,7 +1,5 @@
 """Frames of a video: the sharpest of each stretch of equal camera motion."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Iterator
@@ -18,25 +16,18 @@ from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import complete_folder
 from bitymi_ns.progress import Progress
 
-SMALL = 160
-"""Longer side of frames for measuring motion, pixels."""
-FINE = 640
-"""Longer side of frames for measuring sharpness, pixels."""
-STRIDE = 0.08
-"""Motion between extracted frames, in units of the longer side: neighbors share about 90 %."""
-FEWEST, MOST = 20, 300
-"""Number of frames of a video whose camera moves at all."""
-STILL = 0.02
-"""Motion over the whole video, in units of the longer side, below which the camera stood still."""
-PER_SECOND = 15
-"""Frames surveyed per second by their timestamps: phones film at a rate that varies with the light."""
+SMALL = 160  # longer side of frames for measuring motion, pixels
+FINE = 640  # longer side of frames for measuring sharpness, pixels
+STRIDE = 0.08  # motion between extracted frames, in units of the longer side: neighbors share about 90 %
+FEWEST, MOST = 20, 300  # number of frames of a video whose camera moves at all
+STILL = 0.02  # motion over the whole video, in units of the longer side, below which the camera stood still
+PER_SECOND = 15  # frames surveyed per second by their timestamps: phones film at a rate that varies with the light
 TRUSTED = {
     "format_whitelist": "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpeg,mpegts,mpegvideo",
     "protocol_whitelist": "file",
 }
 """FFmpeg options: a file of any name may be a list of other files and URLs, which would be read."""
-LEAST_SURVEYED = 60
-"""Frames surveyed at least, where there are so many: all of a clip of a second or two."""
+LEAST_SURVEYED = 60  # frames surveyed at least, where there are so many: all of a clip of a second or two
 
 
 def extract_frames(video: Path, work: Path, count: int | None, progress: Progress) -> Path:
@@ -137,7 +128,7 @@ def displacement(first: np.ndarray, second: np.ndarray) -> float:
                 continue
             product = np.fft.rfft2((a - a.mean()) * window) * np.conj(np.fft.rfft2((b - b.mean()) * window))
             peak = np.fft.irfft2(product / np.maximum(np.abs(product), 1e-6), s=(size, size))
-            # A parabola through the peak and its neighbours finds shifts of less than a pixel.
+            # a parabola through the peak and its neighbours finds shifts of less than a pixel.
             at = np.array(np.unravel_index(peak.argmax(), peak.shape))
             shift = [_between(peak[:, at[1]], at[0]), _between(peak[at[0]], at[1])]
             shift = [s - size if s > size / 2 else s for s in shift]

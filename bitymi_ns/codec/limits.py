@@ -4,8 +4,6 @@ Far beyond what training reaches (an optimiser moves a parameter by at most its 
 enough that every number a renderer computes is finite and no channel of a picture exceeds `BRIGHTEST`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import torch
@@ -13,14 +11,10 @@ from torch import Tensor
 
 from bitymi_ns.ops.view_kinds import COLOR_LIMIT, SHAPE_LIMIT, VIEW_COLORS, VIEW_PARAMETERS, Limit
 
-RESIDUAL_LIMIT = 256.0
-"""Largest absolute value of a residual colour."""
-BRIGHTEST = 1e4
-"""No channel of a rendered picture exceeds this: a base colour, 32 lobes and a residual."""
-EXTENTS = (1e-6, 16.0)
-"""Half sides of tiles in scale units."""
-UNIT_SLACK = 0.01
-"""Tolerance of the length of a stored rotation."""
+RESIDUAL_LIMIT = 256.0  # largest absolute value of a residual colour
+BRIGHTEST = 1e4  # no channel of a rendered picture exceeds this: a base colour, 32 lobes and a residual
+EXTENTS = (1e-6, 16.0)  # half sides of tiles in scale units
+UNIT_SLACK = 0.01  # tolerance of the length of a stored rotation
 
 LIMITS: dict[str, Limit] = {
     "means": (1e9,),

@@ -1,7 +1,5 @@
 """Quantisation of the atlas: one global range, and the three texel formats."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -21,8 +19,7 @@ Format = Literal["bc7", "uint8", "fp16"]
 RangeRule = Literal["sigma6", "minmax", "auto"]
 Profile = Literal["slow", "basic", "fast", "veryfast", "ultrafast"]
 
-STEPS = 255.0
-"""8-bit steps in a colour of 1: the unit of errors and of the tolerance."""
+STEPS = 255.0  # 8-bit steps in a colour of 1: the unit of errors and of the tolerance
 BYTES_PER_TEXEL: dict[str, int] = {"bc7": 1, "uint8": 4, "fp16": 8}
 _STRIP = 64  # rows encoded at once: small enough to share among threads and to report progress
 _SMALLEST_SPAN = 1e-6

@@ -1,7 +1,5 @@
 """Columns of integers as Zstandard frames, one for each byte plane of each number, of known sizes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -10,8 +8,7 @@ import numpy.typing as npt
 import zstandard
 
 LEVEL = 19
-MOST_PLANES = 7
-"""Bytes of a number: what a float64 holds exactly."""
+MOST_PLANES = 7  # bytes of a number: what a float64 holds exactly
 _WINDOW = 1 << 23
 
 

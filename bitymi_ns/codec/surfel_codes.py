@@ -1,7 +1,5 @@
 """Integer codes of surfels, and the parameters that they decode to."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -18,10 +16,8 @@ from bitymi_ns.ops.view_kinds import COLOR_LIMIT, VIEW_COLORS
 
 Codes = npt.NDArray[np.int64]
 
-POSITION_BITS = 17
-"""Bits per axis of a position: three times as many are exact in a float64."""
-SMALLEST_SHARE = 1.0 / 1024
-"""Opacities and betas keep this distance from their ends, where a logit would be infinite."""
+POSITION_BITS = 17  # bits per axis of a position: three times as many are exact in a float64
+SMALLEST_SHARE = 1.0 / 1024  # opacities and betas keep this distance from their ends, where a logit would be infinite
 REFERENCE: dict[str, float] = {
     "place": 1.0 / 512,
     "rotation": 1.0 / 128,

@@ -1,7 +1,5 @@
 """Integer codes of texels: the quantised cosine transform of every tile."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,18 +15,12 @@ from bitymi_ns.codec.limits import RESIDUAL_LIMIT
 from bitymi_ns.codec.pages import size_classes
 from bitymi_ns.codec.surfel_codes import SurfelCodes
 
-BLOCK = 8
-"""Side of the largest block that is transformed, texels."""
-GRADES = (-8, 24)
-"""Range of the grades: a tile's step is the common one times 2^(grade / 2)."""
-RESIDUAL_STEP = 4.0 / 255
-"""Step of the mean residuals of tiles and of the residuals of surfels without a tile."""
-LEAST_WEIGHT = 1e-3
-"""Least weight of a texel, pixels, so that unseen ones stay near their values."""
-SPARSE_ROUNDS = 8
-"""Round in which coefficients that only texels nobody sees would need are shrunk."""
-SHRINK = 0.6
-"""Soft threshold of an iteration as a share of the step, where all texels of a block are seen alike."""
+BLOCK = 8  # side of the largest block that is transformed, texels
+GRADES = (-8, 24)  # range of the grades: a tile's step is the common one times 2^(grade / 2)
+RESIDUAL_STEP = 4.0 / 255  # step of the mean residuals of tiles and of the residuals of surfels without a tile
+LEAST_WEIGHT = 1e-3  # least weight of a texel, pixels, so that unseen ones stay near their values
+SPARSE_ROUNDS = 8  # round in which coefficients that only texels nobody sees would need are shrunk
+SHRINK = 0.6  # soft threshold of an iteration as a share of the step, where all texels of a block are seen alike
 _ATTEMPTS = 16
 _FAST = 9
 _LARGEST_STEP = 50.0

@@ -1,7 +1,5 @@
 """Cameras of a bundle's capture, and the held-out photographs, where it has these."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,8 +17,7 @@ from bitymi_ns.bundle.read import read_file
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import View
 
-PICTURES = ("JPEG", "PNG", "WEBP")
-"""Formats of photographs, as Pillow names them."""
+PICTURES = ("JPEG", "PNG", "WEBP")  # formats of photographs, as Pillow names them
 _Number = Annotated[float, Field(ge=-1e9, le=1e9)]
 _Size = Annotated[int, Field(ge=1, le=1 << 20)]
 

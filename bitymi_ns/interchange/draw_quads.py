@@ -3,8 +3,6 @@
 It is here to measure a mesh with, and small rather than fast: torch on the CPU.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,8 +14,7 @@ from bitymi_ns.interchange.quads import MASK, Quads
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.sampling import averaged
 
-SAMPLES = 2
-"""Samples per pixel along each axis, as a viewer's antialiasing takes four per pixel."""
+SAMPLES = 2  # samples per pixel along each axis, as a viewer's antialiasing takes four per pixel
 _AT_ONCE = 1 << 19  # pairs of quads and pixels
 
 

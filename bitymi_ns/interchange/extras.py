@@ -1,7 +1,5 @@
 """Files for other programs, beside a bundle: a preview as Gaussian splats, and a textured mesh."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable, Sequence
@@ -35,10 +33,8 @@ Kind = Literal["gaussians", "mesh"]
 Frame = Literal["scene", "capture"]
 FILES: dict[str, str] = {"gaussians": "gaussians.ply", "mesh": "mesh.glb"}
 SUMMARY = "extras.json"
-SUFFIX = ".extras"
-"""Suffix of the folder beside a bundle."""
-LEVEL = 0.15
-"""Opacity at which the quads of a mesh end."""
+SUFFIX = ".extras"  # suffix of the folder beside a bundle
+LEVEL = 0.15  # opacity at which the quads of a mesh end
 SEEN_SIDE, COLORED_SIDE, MEASURED_SIDE = 400, 800, 400
 """Longer side in pixels of the images for visibility, for the colours of a mesh, and for measuring the files."""
 COLORED_VIEWS, MEASURED_VIEWS = 64, 4
@@ -177,7 +173,7 @@ def summary_line(written: Written) -> str:
 def _fitted_colors(scene: BakedScene, cameras: Sequence[Camera], progress: Progress) -> SurfelColors:
     """Fitted to what the cameras see."""
     chosen = [camera.within(SEEN_SIDE) for camera in cameras]
-    seen = visibility(scene.surfels, chosen, scene.near, scene.weight_bound, scene.through_pixel, progress).seen
+    seen = visibility(scene.surfels, chosen, scene.near, scene.weight_bound, scene.prefilter, progress).seen
     return fit_colors(scene, weighted_residuals(scene), seen, centers_of(cameras, scene.surfels["means"]))
 
 

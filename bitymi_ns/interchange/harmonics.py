@@ -1,7 +1,5 @@
 """Real spherical harmonics up to degree 3, in the order and with the signs of 3DGS."""
 
-from __future__ import annotations
-
 import functools
 
 import torch
@@ -11,8 +9,7 @@ from bitymi_ns.ops import view_color
 from bitymi_ns.ops.sphere import fibonacci_sphere
 from bitymi_ns.ops.view_kinds import entry_of
 
-TERMS = 16
-"""Harmonics up to degree 3, that of degree 0 included."""
+TERMS = 16  # harmonics up to degree 3, that of degree 0 included
 _POWERS = [(i, j, n - i - j) for n in (2, 3) for i in range(n + 1) for j in range(n + 1 - i)]  # 6 + 10 = TERMS
 
 

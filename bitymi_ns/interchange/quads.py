@@ -15,8 +15,7 @@ from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.tile_sizes import kernel_parameters, next_power_of_two
 from bitymi_ns.train.init import tangents
 
-MASK = 0.5
-"""Texels whose alpha is read as less are not drawn."""
+MASK = 0.5  # texels whose alpha is read as less are not drawn
 _CORNERS = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
 _CHUNK = 1 << 20  # texels at once
 

@@ -1,7 +1,5 @@
 """The colours of a mesh whose quads hide what is behind them, from pictures of the scene that it stands for."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -14,8 +12,7 @@ from bitymi_ns.interchange.quads import Quads
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 
-PRIOR = 1.0
-"""A colour that was there before counts as much as so many pixels."""
+PRIOR = 1.0  # a colour that was there before counts as much as so many pixels
 
 
 @torch.no_grad()

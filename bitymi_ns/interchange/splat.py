@@ -3,8 +3,6 @@
 It is here to measure a preview with, and small rather than fast: torch on the CPU, a tile of the image at a time.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch
@@ -16,12 +14,9 @@ from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, TILE, TRAN
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.init import tangents
 
-DILATION = 0.3
-"""Pixels squared that 3DGS adds to the variances of a footprint."""
-REACH = 3.0
-"""A footprint ends at so many standard deviations along its longer axis."""
-BEYOND = 1.3
-"""Means farther out than this many half images are linearised as if they lay there."""
+DILATION = 0.3  # pixels squared that 3DGS adds to the variances of a footprint
+REACH = 3.0  # a footprint ends at so many standard deviations along its longer axis
+BEYOND = 1.3  # means farther out than this many half images are linearised as if they lay there
 _AT_ONCE = 512
 
 

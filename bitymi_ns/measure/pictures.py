@@ -1,7 +1,5 @@
 """Draw the worst held-out views: errors, and the contribution of each part of the scene."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path
@@ -25,8 +23,7 @@ from bitymi_ns.scene.baked import as_bytes
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.init import tangents
 
-RESIDUAL_GAIN = 4.0
-"""Residuals are small; the pictures of them are brightened by this factor."""
+RESIDUAL_GAIN = 4.0  # residuals are small; the pictures of them are brightened by this factor
 FILE = "pictures.json"
 
 KINDS = {

@@ -1,7 +1,5 @@
 """Rendering a baked scene frame after frame: working memory that is kept and, on a card, CUDA graphs."""
 
-from __future__ import annotations
-
 import gc
 import threading
 from collections.abc import Sequence
@@ -100,7 +98,7 @@ class BakedRenderer:
             self._draw(Stage.ALL)  # before recording: first calls load kernels
             torch.cuda.synchronize(self._viewmats.device)
             self._graph = torch.cuda.CUDAGraph()
-            # A texture that is freed waits for the device, which is an error while a graph is recorded.
+            # a texture that is freed waits for the device, which is an error while a graph is recorded.
             collects = gc.isenabled()
             gc.disable()
             try:

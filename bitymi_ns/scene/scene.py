@@ -34,8 +34,7 @@ from .field import ResidualField, Shading, TexelField
 
 GEOMETRY = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
 """Names of the per-surfel parameters that every scene has."""
-NEAR = 0.02
-"""Nearest depth that is drawn, for cameras of extent 1."""
+NEAR = 0.02  # nearest depth that is drawn, for cameras of extent 1
 
 
 @dataclass
@@ -186,7 +185,7 @@ class Scene(nn.Module):
             TooManyFragments: a single row of tiles has too many.
         """
         p = self.surfels
-        projection = project(*(p[name] for name in GEOMETRY), camera, self.near, self.config.through_pixel)
+        projection = project(*(p[name] for name in GEOMETRY), camera, self.near, self.config.prefilter)
         field = None if field_mode == "off" else self.field
         learns, bound = field_mode == "train", self.config.weight_bound if weight_bound is None else weight_bound
         base = self.base_color(projection)

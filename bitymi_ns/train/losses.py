@@ -164,18 +164,19 @@ def color_corrected(image: Tensor, target: Tensor, mask: Tensor | None = None) -
         image, target: [H, W, 3] in [0, 1].
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
     """
-    colors = torch.cat([image.reshape(-1, 3), torch.ones_like(image[..., :1]).reshape(-1, 1)], -1).double().cpu()
-    wanted = target.reshape(-1, 3).double().cpu()
+    colors = torch.cat([image.reshape(-1, 3), torch.ones_like(image[..., :1]).reshape(-1, 1)], -1).double()
+    both = torch.cat([colors, target.reshape(-1, 3)], -1)  # [HW, 7] double
     if mask is not None:
-        counts = mask.reshape(-1).bool().cpu()
-        fitted, wanted = colors[counts], wanted[counts]
-    else:
-        fitted = colors
-    if not bool(fitted.isfinite().all() & wanted.isfinite().all()):
+        both = both[mask.reshape(-1).bool()]
+    # normal equations; no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic
+    # algorithms
+    sums = torch.stack([(both[:, i : i + 1] * both).sum(0) for i in range(4)]).cpu()  # [4, 7]
+    if not bool(sums.isfinite().all()):
         return image
     # the pseudoinverse: a picture of one colour leaves the matrix open
-    affine = torch.linalg.pinv(fitted.T @ fitted, hermitian=True) @ (fitted.T @ wanted)  # [4, 3]
-    return (colors @ affine).clamp(0.0, 1.0).to(image).view_as(image)
+    affine = (torch.linalg.pinv(sums[:, :4], hermitian=True) @ sums[:, 4:]).to(colors)  # [4, 3]
+    fitted = sum((colors[:, i : i + 1] * affine[i] for i in range(1, 4)), colors[:, :1] * affine[0])
+    return fitted.clamp(0.0, 1.0).to(image).view_as(image)
 
 
 def cc_psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:

@@ -274,7 +274,7 @@ class RollbackGuard:
 
     def _capture(self) -> dict[str, Any]:
         scene = {name: value.detach() for name, value in self.scene.state_dict().items()}
-        # A long run has more texels than anything else. What never changes in place is kept once for all states, and
+        # a long run has more texels than anything else. What never changes in place is kept once for all states, and
         # the texels in half precision: going back is no resuming, and 2^-11 of a residual is nothing to see.
         textured = isinstance(self.scene.field, TexelField)
         steady = {f"field.{name}" for name in TexelField.STEADY} if textured else set()

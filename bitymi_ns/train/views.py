@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Generic, Literal, NamedTuple, TypeVar
@@ -45,9 +44,9 @@ class View(NamedTuple):
         return self.image.nbytes + (0 if self.mask is None else self.mask.nbytes)
 
     def to(self, device: torch.device | str) -> View:
-        """Camera, picture and mask on a device."""
-        mask, correction = (None if value is None else value.to(device) for value in (self.mask, self.correction))
-        return View(self.camera.to(device), self.image.to(device), mask, correction)
+        """Camera, picture and mask on a device. Copies to a card go through pinned memory: the host does not wait."""
+        image, mask, correction = (_moved(value, device) for value in (self.image, self.mask, self.correction))
+        return View(self.camera.to(device), image, mask, correction)
 
     def shown(self, rgb: Tensor, alpha: Tensor, background: Tensor | None) -> Tensor:
         """`shown` by this photograph's correction."""
@@ -68,7 +67,8 @@ class TrainingData:
         image_pixels: of all training views together.
         first_surfels: that training starts, or started, with.
         covered: share of their pixels that show something (`covered_share`).
-        exif_stops: log2 of the exposure of each photograph (`exposure.exif_stops`), NaN = unknown; None = of all.
+        exif_stops: log2 of the exposure of each view (`exposure.exif_stops`), NaN = unknown; None = of all.
+        photographs: number of the photograph of each view; None = each is one.
     """
 
     views: Sequence[View]
@@ -77,6 +77,13 @@ class TrainingData:
     first_surfels: int
     covered: float = 1.0
     exif_stops: Sequence[float] | None = None
+    photographs: Sequence[int] | None = None
+
+
+def _moved(value: Tensor | None, device: torch.device | str) -> Tensor | None:
+    if value is None or value.device.type != "cpu" or torch.device(device).type != "cuda":
+        return None if value is None else value.to(device)
+    return value.pin_memory().to(device, non_blocking=True)
 
 
 def spread(count: int, most: int) -> list[int]:
@@ -215,13 +222,14 @@ def at_size(view: View, camera: Camera, device: torch.device | str) -> View:
 class DownscaledViews:
     """Training views at the resolution of the moment; downscaled pictures are kept until the resolution changes.
 
-    On the CPU `DOWNSCALED_BYTES` of them are kept. On a CUDA device the full-size pictures stay in memory, up to a
-    quarter of what is free at the start: else every step would wait for a copy.
+    On the CPU `DOWNSCALED_BYTES` of them are kept. On a CUDA device full-size and reduced pictures share a budget, and
+    those that find no room in it are copied at every use.
 
     Args:
         views: at full size.
         device: where the pictures are wanted.
         correction: gives the correction of a view by its number, as it is at the moment; None = there is none.
+        resident_bytes: budget on a CUDA device; None = `photograph_budget`.
     """
 
     def __init__(
@@ -229,6 +237,7 @@ class DownscaledViews:
         views: Sequence[View],
         device: torch.device | str = "cpu",
         correction: Callable[[int], Tensor | None] | None = None,
+        resident_bytes: int | None = None,
     ) -> None:
         self._views = views
         self._correction = correction
@@ -236,10 +245,11 @@ class DownscaledViews:
         self._factor = 1.0
         self._kept: dict[int, View] = {}
         self._resident: dict[int, View] = {}
-        cuda = self._device.type == "cuda"
-        self._budget = MemoryBudget(torch.cuda.mem_get_info(self._device)[0] // 4 if cuda else 0)
-        self._reduced_bytes = sys.maxsize if cuda else DOWNSCALED_BYTES
-        self._reduced_budget = MemoryBudget(self._reduced_bytes)
+        if resident_bytes is None:
+            resident_bytes = photograph_budget(self._device)
+        self._budget = MemoryBudget(resident_bytes)
+        # a card has one budget for both: pictures of full size stay, reduced ones give theirs back
+        self._reduced_budget = self._budget if resident_bytes else MemoryBudget(DOWNSCALED_BYTES)
 
     def __len__(self) -> int:
         return len(self._views)
@@ -255,7 +265,8 @@ class DownscaledViews:
 
     def _at(self, index: int, factor: float) -> View:
         if factor != self._factor:
-            self._factor, self._kept, self._reduced_budget = factor, {}, MemoryBudget(self._reduced_bytes)
+            self._reduced_budget.left += sum(view.nbytes for view in self._kept.values())
+            self._factor, self._kept = factor, {}
         if index in self._kept:
             return self._kept[index]
         view = self._full_size(index)
@@ -277,6 +288,11 @@ class DownscaledViews:
         """`k` different views, or all of them when there are fewer; `generator` lives on the CPU."""
         order = torch.randperm(len(self), generator=generator).tolist()
         return [self.at(i, factor) for i in order[:k]]
+
+
+def photograph_budget(device: torch.device) -> int:
+    """Bytes of photographs that stay on a CUDA device: a quarter of its free memory. 0 on the CPU, where they are."""
+    return torch.cuda.mem_get_info(device)[0] // 4 if device.type == "cuda" else 0
 
 
 def training_order(n: int, seed: int, step: int) -> int:

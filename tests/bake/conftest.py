@@ -1,7 +1,5 @@
 """A small scene with an analytic field, so that every step of the bake has an exact answer."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest

@@ -1,7 +1,5 @@
 """Baked scenes for tests of bundles."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A bake becomes compact: surfels are rounded as far as the pictures allow, texels learn through their coding."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

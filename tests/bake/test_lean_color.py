@@ -1,7 +1,5 @@
 """View colours keep what is needed of them: the bound holds, and little is kept where little is needed."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """A fragment list is let go before the next one is made: memory is that of one view, however many there are."""
 
-from __future__ import annotations
-
 import weakref
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """Resolution of the photographs at points of the scene."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

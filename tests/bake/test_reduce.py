@@ -1,7 +1,5 @@
 """Tiles are as small as the tolerance allows, and no smaller."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

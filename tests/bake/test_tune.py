@@ -1,7 +1,5 @@
 """Fine-tuning of an atlas: photographs come from an atlas that is known, the bake starts from a wrong one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from statistics import fmean

@@ -1,7 +1,5 @@
 """View colours keep the terms that the pictures pay for: stated errors are those of pictures, prices decide."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

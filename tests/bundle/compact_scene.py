@@ -1,7 +1,5 @@
 """A compact bundle of a few random surfels."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Bundles that were changed on purpose and signed again, as a determined forger would."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Mapping

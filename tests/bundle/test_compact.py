@@ -1,7 +1,5 @@
 """Compact bundles: what goes in comes out, what contradicts itself is refused before it takes memory."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -1,7 +1,5 @@
 """bundle.json: no change goes unnoticed, and every refusal is one sentence."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

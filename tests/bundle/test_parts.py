@@ -1,7 +1,5 @@
 """How the files of a bundle are opened: whatever stands in their place, nothing is read before it is known to fit."""
 
-from __future__ import annotations
-
 import os
 import struct
 import time

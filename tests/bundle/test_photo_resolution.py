@@ -1,7 +1,5 @@
 """Resolution of the photographs in bundle.json."""
 
-from __future__ import annotations
-
 import base64
 import json
 

@@ -1,7 +1,5 @@
 """The poster of a bundle: small, listed and checked as other files are."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A bundle in one file: the parts in their order, and refused where it is damaged."""
 
-from __future__ import annotations
-
 import io
 import random
 import zipfile

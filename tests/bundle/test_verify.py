@@ -1,7 +1,5 @@
 """A bundle that was altered is found out."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

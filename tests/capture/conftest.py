@@ -1,7 +1,5 @@
 """A few photographs of the sample room, taken along an arc, so that neighbours overlap well."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

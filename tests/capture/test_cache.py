@@ -1,7 +1,5 @@
 """What is kept of earlier results, and what goes."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Features of a run that was killed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

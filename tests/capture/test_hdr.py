@@ -1,7 +1,5 @@
 """Frames of HLG and PQ videos become pictures as bright and as colourful as those of an ordinary video."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Which folder holds the masks of photographs, which file is that of one, and which of its pixels count."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

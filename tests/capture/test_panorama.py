@@ -1,7 +1,5 @@
 """Pictures of all directions at once are told from photographs of the same shape."""
 
-from __future__ import annotations
-
 import zlib
 from functools import cache
 from pathlib import Path

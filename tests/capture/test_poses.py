@@ -1,7 +1,5 @@
 """The whole way, on a few small photographs, and what users see when it cannot be gone."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """PostScript that is called a photograph: opening it would run it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Runs that are ended, or cannot write."""
 
-from __future__ import annotations
-
 import os
 import resource
 import signal

@@ -1,7 +1,5 @@
 """What a folder or a file is taken for."""
 
-from __future__ import annotations
-
 import json
 import re
 import struct

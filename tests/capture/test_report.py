@@ -1,7 +1,5 @@
 """The picture of a report."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 

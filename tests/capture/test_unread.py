@@ -1,7 +1,5 @@
 """What other programs leave in a capture."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from bitymi_ns.capture import unread

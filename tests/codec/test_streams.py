@@ -1,7 +1,5 @@
 """Columns of integers: they come back, and a frame takes no more memory than it is asked for."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import zstandard

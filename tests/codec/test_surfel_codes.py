@@ -1,7 +1,5 @@
 """Surfels as integers: errors are at most half a step, and the order is that of a Morton curve."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

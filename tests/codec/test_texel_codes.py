@@ -1,7 +1,5 @@
 """Texels as integers: fine steps lose nothing, unseen texels cost little, and weights decide where errors are."""
 
-from __future__ import annotations
-
 import torch
 
 from bitymi_ns.codec.texel_codes import BLOCK, TexelCodeOptions, TexelCoder, blocks_of

@@ -1,7 +1,5 @@
 """One short training run on a small ray-traced room, in this process, shared by the tests of this folder."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

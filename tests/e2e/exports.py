@@ -1,7 +1,5 @@
 """Exports of runs, and what nerfstudio's evaluation says of them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The command lines of `bitymi bench` are understood by nerfstudio: standard layouts, seeds and own captures."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

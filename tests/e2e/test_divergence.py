@@ -1,7 +1,5 @@
 """ns-train with learning rates far too high: a message, and a scene that can be used."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

@@ -1,7 +1,5 @@
 """Which checkpoint of a run is evaluated, and which are refused."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

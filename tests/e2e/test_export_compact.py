@@ -1,7 +1,5 @@
 """A compact bundle from a trained scene, and back into nerfstudio's tools."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Exports of runs whose texture is a field: baked, polished, fine-tuned, compared with the field."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from functools import partial

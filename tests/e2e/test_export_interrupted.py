@@ -1,7 +1,5 @@
 """Ctrl-C in an export: nothing is left half-written, and the message says what is there."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

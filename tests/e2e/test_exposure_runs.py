@@ -1,7 +1,5 @@
 """Colour corrections through nerfstudio's entry points: in checkpoints, in the export, in what is said."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

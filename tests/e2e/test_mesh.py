@@ -1,7 +1,5 @@
 """`ns-export bitymi-mesh` on a run and on its bundle."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

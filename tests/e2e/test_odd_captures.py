@@ -1,7 +1,5 @@
 """Training on captures with something wrong: what is learned all the same, and what stops the run before it starts."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

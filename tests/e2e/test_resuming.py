@@ -1,7 +1,5 @@
 """Runs that are interrupted and go on, and checkpoints from which none can."""
 
-from __future__ import annotations
-
 import copy
 import json
 import os

@@ -1,7 +1,5 @@
 """The folder of a run: one run at a time, and a disk that is full or cannot be written."""
 
-from __future__ import annotations
-
 import copy
 import errno
 import json

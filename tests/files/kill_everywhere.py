@@ -4,8 +4,6 @@ The write runs in forked children, the n-th of which ends without any cleaning u
 folder; then the same write is done to the end. Fails where something is lost, mixed or left over after that.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """Writing whole or not at all: kills at every step, locks of living and dead processes, and reasons that are true."""
 
-from __future__ import annotations
-
 import errno
 import os
 import signal

@@ -1,7 +1,5 @@
 """The small scenes of the bake's tests, and a bundle with texels."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

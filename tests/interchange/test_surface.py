@@ -1,7 +1,5 @@
 """Median depth against the float64 reference, and the surface fused from it against known geometry."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

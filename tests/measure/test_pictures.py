@@ -1,7 +1,5 @@
 """Pictures of what each part of a scene contributes."""
 
-from __future__ import annotations
-
 import torch
 
 from bitymi_ns import ops

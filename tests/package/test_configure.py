@@ -1,7 +1,5 @@
 """What CMake makes of the machine: which CPU and which cards the kernels are compiled for."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """What the package imports itself is what it declares: nothing comes by way of another package."""
 
-from __future__ import annotations
-
 import ast
 import re
 import sys

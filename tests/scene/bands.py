@@ -1,7 +1,5 @@
 """A training step whose view is drawn in bands, against the same step with all fragments at once."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """A textured scene of a few surfels, for comparing one way of drawing it with another."""
 
-from __future__ import annotations
-
 import torch
 
 from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig

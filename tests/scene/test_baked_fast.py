@@ -1,7 +1,5 @@
 """Pixels that end where half of an 8-bit step of light is left."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Views with more fragments than allowed are drawn in bands: same image, same gradients, less at a time."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

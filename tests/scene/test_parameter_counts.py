@@ -1,7 +1,5 @@
 """How many numbers a surfel is made of, for each view colour."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

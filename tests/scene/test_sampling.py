@@ -1,7 +1,5 @@
 """How large a view shows what was photographed, and how it is drawn then."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

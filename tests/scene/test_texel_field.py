@@ -1,7 +1,5 @@
 """A scene whose residual colours are texels: what the baked renderer shows, with gradients that steps confirm."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

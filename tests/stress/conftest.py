@@ -1,7 +1,5 @@
 """Run every test that takes `backend` on all backends, on a card where there is one; a new one is a BACKENDS entry."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

@@ -1,7 +1,5 @@
 """Places where an index is one step from being wrong: faces of hash cells, edges of atlas pages."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Numbers that misbehave: finite in, finite out, forward and backward; errors as stated."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Damaged bundles: an error that names the damage, or a bundle that renders; never a crash."""
 
-from __future__ import annotations
-
 import copy
 import json
 import math

@@ -4,8 +4,6 @@ BITYMI_FUZZ=500 makes 10^5 of them, in some minutes: then memory is measured, an
 twentieth alone.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import random

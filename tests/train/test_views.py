@@ -103,6 +103,18 @@ def test_reduced_views_take_only_so_much_memory(views, monkeypatch: pytest.Monke
         assert sum(again) == min(len(views), 2 if factor == 0.5 else 8)
 
 
+def test_a_card_keeps_photographs_within_one_budget(views) -> None:
+    """Full-size and reduced pictures together stay below it at every size, and all views come out the same."""
+    everything, full = DownscaledViews(views), views[0].nbytes
+    bounded = DownscaledViews(views, resident_bytes=2 * full + full // 2)
+    for factor in (0.5, 0.25, 1.0, 0.5):
+        for i in [*range(len(views))] * 2:
+            assert torch.equal(bounded.at(i, factor).image, everything.at(i, factor).image)
+        held = sum(view.nbytes for held in (bounded._resident, bounded._kept) for view in held.values())
+        assert held + bounded._budget.left == 2 * full + full // 2 and bounded._budget.left >= 0
+    assert len(bounded._resident) == 2
+
+
 def test_pixels_that_show_something(cameras) -> None:
     camera, opaque = cameras[0], torch.rand(4, 10, 3)
     half = torch.cat([opaque, torch.zeros(4, 10, 1)], -1)

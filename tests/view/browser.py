@@ -1,7 +1,5 @@
 """A headless Chromium, which the tests of a process share; each has a context of its own."""
 
-from __future__ import annotations
-
 import atexit
 import http.server
 import json

@@ -4,8 +4,6 @@ It is slow there, so bundles and screens are small. Pictures that stay are drawn
 blends it, else in half.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import time

@@ -1,7 +1,5 @@
 """An exported page with its bundle as one file, on servers that know ranges and on those that do not."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

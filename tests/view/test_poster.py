@@ -1,7 +1,5 @@
 """The poster on the page: there before the surfels, where the first picture will be, and gone with it."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

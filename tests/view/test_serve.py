@@ -1,7 +1,5 @@
 """What the server sends, and what not."""
 
-from __future__ import annotations
-
 import hashlib
 import http.client
 import json

@@ -1,7 +1,5 @@
 """Removal of the levels of a field that a scene does not need."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import torch
@@ -15,10 +13,8 @@ from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.tile_sizes import kernel_parameters
 from bitymi_ns.train.init import tangents
 
-LEVEL_SHARE = 0.1
-"""Levels are left out while they change the residual by no more than this share of the tolerance."""
-POINTS = 16
-"""Points per surfel at which the field is evaluated."""
+LEVEL_SHARE = 0.1  # levels are left out while they change the residual by no more than this share of the tolerance
+POINTS = 16  # points per surfel at which the field is evaluated
 _CHUNK = 1 << 19
 
 

@@ -1,7 +1,5 @@
 """Reasons why photographs have no pose, with advice on what to photograph differently."""
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,18 +9,14 @@ import pycolmap
 
 from bitymi_ns.capture.sfm.job import Job, NoPoses
 
-FEW_FEATURES = 60
-"""A photograph with fewer features shows hardly any detail."""
-PARALLAX = 1.0
-"""Degrees; if the rays to the points differ by less, the photographs were taken from one spot."""
-ROTATED = 2.0
-"""Pixels of the features' images within which a turn alone explains a match."""
+FEW_FEATURES = 60  # a photograph with fewer features shows hardly any detail
+PARALLAX = 1.0  # degrees; if the rays to the points differ by less, the photographs were taken from one spot
+ROTATED = 2.0  # pixels of the features' images within which a turn alone explains a match
 MOST = 0.9
 """Share of a pair's matches, and of the pairs, that a turn alone has to explain. Fewer are a far background, or
 neighbours that are almost at one place."""
 PAIRS_TRIED = 60
-TELLING = 30
-"""Matches of a pair that are enough to tell a turn from a step."""
+TELLING = 30  # matches of a pair that are enough to tell a turn from a step
 GUESSES = (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0, 3.0)
 """Focal lengths, in units of the longer side, that are tried where it is not known."""
 

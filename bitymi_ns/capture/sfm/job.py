@@ -8,8 +8,7 @@ from typing import Protocol
 
 DATABASE = "database.db"
 PAIRS = "pairs.txt"
-MODEL = "model"
-"""Names in the work folder: COLMAP's database, the pairs to match, and the resulting model."""
+MODEL = "model"  # names in the work folder: COLMAP's database, the pairs to match, and the resulting model
 
 SERIAL = 100
 """Number of photographs up to which one thread maps, so that runs are equal. For 50, two threads are no faster."""

@@ -1,7 +1,5 @@
 """Selection and matching of pairs of photographs."""
 
-from __future__ import annotations
-
 from itertools import combinations
 from pathlib import Path
 
@@ -13,12 +11,9 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from bitymi_ns.capture.sfm.job import PAIRS, Job, StageProgress
 from bitymi_ns.files import write_file
 
-FEW = 30
-"""Up to so many photographs are all compared with all."""
-WORTH_ALL = 150
-"""Up to so many are compared with all where too few get a pose without."""
-NEIGHBOURS = 20
-"""Photographs that each is compared with, by how alike they look, or by GPS."""
+FEW = 30  # up to so many photographs are all compared with all
+WORTH_ALL = 150  # up to so many are compared with all where too few get a pose without
+NEIGHBOURS = 20  # photographs that each is compared with, by how alike they look, or by GPS
 COARSE_FEATURES = (256, 128)
 """Features per photograph that decide how alike two look: the largest, because they are seen from afar and close by.
 The second number is for more than MANY photographs."""
@@ -26,8 +21,7 @@ MANY = 400
 COARSE_COSINE = 0.85
 """Two features are alike if the cosine between their descriptors is above this, and each is the other's nearest."""
 SEQUENCE_NEIGHBOURS = 6
-SEQUENCE_SHARE = 0.8
-"""Photographs are a sequence if so many neighbours in their order are among the most alike."""
+SEQUENCE_SHARE = 0.8  # photographs are a sequence if so many neighbours in their order are among the most alike
 
 
 def match(job: Job, database: Path, tell: StageProgress) -> None:

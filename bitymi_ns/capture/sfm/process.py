@@ -1,7 +1,5 @@
 """COLMAP in a process of its own: Ctrl-C ends it at once, and where it aborts, which its library does, only it does."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -20,8 +18,7 @@ from bitymi_ns.progress import Progress
 from bitymi_ns.trust import no_links
 
 LOG = "colmap.log"
-LITTLE_SPACE = 50_000_000
-"""Bytes; where less is left, the disk is what stopped COLMAP."""
+LITTLE_SPACE = 50_000_000  # bytes; where less is left, the disk is what stopped COLMAP
 
 
 def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:

@@ -1,7 +1,5 @@
 """The last bundle adjustment of a model, and the camera model that suits it."""
 
-from __future__ import annotations
-
 import copy
 
 import pycolmap
@@ -10,13 +8,11 @@ from bitymi_ns.capture.sfm.job import Job
 
 MAX_ERROR = 4.0
 """Observations farther off, in pixels of the images on which features were found, are dropped; COLMAP's own limit."""
-MIN_ANGLE = 1.5
-"""Degrees between rays below which a point has no depth to be trusted; COLMAP's own limit."""
+MIN_ANGLE = 1.5  # degrees between rays below which a point has no depth to be trusted; COLMAP's own limit
 GAIN = 0.03
 """OPENCV replaces SIMPLE_RADIAL if it lowers the reprojection error by this share: its four terms are there to be
 misused by few observations."""
-OBSERVATIONS_PER_CAMERA = 2000
-"""A camera with fewer observations keeps the simple model."""
+OBSERVATIONS_PER_CAMERA = 2000  # a camera with fewer observations keeps the simple model
 
 
 def refined(model: pycolmap.Reconstruction, job: Job, pixel: float) -> pycolmap.Reconstruction:

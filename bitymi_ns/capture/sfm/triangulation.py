@@ -1,7 +1,5 @@
 """Points for photographs whose cameras are known."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 
@@ -12,8 +10,7 @@ from bitymi_ns.capture.sfm import features, pairs
 from bitymi_ns.capture.sfm.job import DATABASE, MODEL, Job, NoPoses, StageProgress
 from bitymi_ns.files import complete_folder
 
-LEAST = 10
-"""Fewer points are none to start from."""
+LEAST = 10  # fewer points are none to start from
 
 
 def triangulate(job: Job, tell: StageProgress) -> dict[str, object]:

@@ -4,8 +4,6 @@ A line is {"stage", "done", "total", "counts"}, or at the end {"result"} or {"fa
 does, so that nothing goes on after whoever started it was killed. What COLMAP has to say goes to stderr.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys
@@ -20,8 +18,7 @@ from bitymi_ns.capture.sfm import explain, features, mapping, pairs, triangulati
 from bitymi_ns.capture.sfm.job import DATABASE, MODEL, Job, NoPoses
 from bitymi_ns.files import complete_folder
 
-LEAST = 3
-"""Fewer placed photographs are no capture."""
+LEAST = 3  # fewer placed photographs are no capture
 
 
 class Stages:

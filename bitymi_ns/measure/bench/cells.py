@@ -4,8 +4,6 @@ A line has `key` (every setting that decides the result), `value` (the figures; 
 and `made` (time, machine, versions, command).
 """
 
-from __future__ import annotations
-
 import datetime
 import fcntl
 import json
@@ -21,8 +19,7 @@ from bitymi_ns.measure.machine import commit, machine, versions
 from bitymi_ns.trust import json_of, no_links
 
 FILE = "cells.jsonl"
-NAMES = ("suite", "row")
-"""Entries of a key that are labels and do not tell cells apart."""
+NAMES = ("suite", "row")  # entries of a key that are labels and do not tell cells apart
 
 
 def identity(key: dict[str, Any]) -> str:

@@ -1,7 +1,5 @@
 """Command line of a matrix: `bitymi bench local`, `bitymi bench mipnerf360`, ..."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import sys
@@ -35,8 +33,7 @@ from bitymi_ns.trust import printable
 # A switch without its --no- twin, where this tyro knows how.
 Flag = tyro.conf.FlagCreatePairsOff[bool] if hasattr(tyro.conf, "FlagCreatePairsOff") else bool
 
-FAILED, INTERRUPTED = 1, 130
-"""Exit statuses when a cell failed, and after Ctrl-C."""
+FAILED, INTERRUPTED = 1, 130  # exit statuses when a cell failed, and after Ctrl-C
 
 
 @dataclass

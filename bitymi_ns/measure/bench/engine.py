@@ -4,8 +4,6 @@ Several processes may work on the same folder, each on another GPU or machine: a
 to it.
 """
 
-from __future__ import annotations
-
 import shutil
 import statistics
 import time
@@ -21,8 +19,7 @@ from bitymi_ns.measure.bench.process import BenchError, CommandFailed, run_measu
 from bitymi_ns.trust import json_of
 
 CURVE = "training_curve.jsonl"
-Chain = Sequence[Stage]
-"""The cells of one run; each may need those before it."""
+Chain = Sequence[Stage]  # the cells of one run; each may need those before it
 
 
 class Layout:

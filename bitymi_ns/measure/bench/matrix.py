@@ -1,7 +1,5 @@
 """Describe what is measured: scenes x rows x seeds, the cells of each run; standard data sets and plans by name."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -175,8 +173,7 @@ class Matrix:
         return [self.stages(run) for run in self.runs()]
 
 
-FORMATS = ("fp16", "uint8", "bc7", "compact")
-"""Formats of `ns-export bitymi-atlas`."""
+FORMATS = ("fp16", "uint8", "bc7", "compact")  # formats of `ns-export bitymi-atlas`
 
 
 @dataclass(frozen=True)

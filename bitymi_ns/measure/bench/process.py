@@ -1,7 +1,5 @@
 """Run commands as measured subprocesses."""
 
-from __future__ import annotations
-
 import datetime
 import os
 import shlex
@@ -15,10 +13,8 @@ from pathlib import Path
 from bitymi_ns.files import Lock
 from bitymi_ns.trust import no_links, printable
 
-TAIL = 25
-"""Lines of a failed command's log that are shown."""
-GRACE = 20.0
-"""Seconds from an interrupt until a command that has not ended is killed."""
+TAIL = 25  # lines of a failed command's log that are shown
+GRACE = 20.0  # seconds from an interrupt until a command that has not ended is killed
 
 
 class BenchError(Exception):

@@ -1,144 +1,74 @@
 """Put a report together and write it as one self-contained HTML page."""
 
-from __future__ import annotations
-
+import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from bitymi_ns import __version__
 from bitymi_ns.capture.report import PICTURE
 from bitymi_ns.files import check_writable, explained, write_file
 from bitymi_ns.measure.markdown import rendered
-from bitymi_ns.measure.report.pictures import (
-    ERROR_CAPTION,
-    ComparedSet,
-    Group,
-    Picture,
-    compare_views,
-    read_pictures,
-    worst_views,
-)
-from bitymi_ns.measure.report.plots import CURVES, Plot, draw_plots
+from bitymi_ns.measure.report.pictures import ERROR_CAPTION, compare_views, read_pictures, worst_views
+from bitymi_ns.measure.report.plots import Plot, draw_plots
 from bitymi_ns.measure.report.read import collect
-from bitymi_ns.measure.report.records import FoundPoses, Records, ReportError, over_seeds
-from bitymi_ns.measure.report.tables import (
-    NOTES,
-    Table,
-    knob_tables,
-    poses_tables,
-    quality_tables,
-    summary,
-    training_table,
-)
+from bitymi_ns.measure.report.records import Records, ReportError, over_seeds
+from bitymi_ns.measure.report.tables import NOTES, knob_tables, poses_tables, quality_tables, training_table
 
 PAGE = "index.html"
-GENERATOR = '<meta name="generator" content="bitymi report">'
-"""Marks a page as ours, so that it may be replaced."""
+GENERATOR = '<meta name="generator" content="bitymi report">'  # marks a page as ours, so that it may be replaced
 VIEWS_NOTE = f"The worst, the median and the best view by the PSNR of these pictures, with their {ERROR_CAPTION}."
 TRADE_OFF = "The dashed line is the Pareto front: of all points of a scene those that no other beats in both."
-KNOBS = "Quality knobs: error against time and bytes"
 KNOB_NOTE = (
     "Errors are against the exact setting, in 8-bit steps of a colour (1/255), over all pixels of the measured views. "
     "Milliseconds are per view at full size, of the renderer named."
 )
 
 
-@dataclass(frozen=True)
-class Section:
-    """Plots under one heading."""
-
-    name: str
-    plots: list[Plot]
-
-    @property
-    def note(self) -> str:
-        """An explanation of the plots, possibly empty."""
-        return TRADE_OFF if any(plot.name not in CURVES for plot in self.plots) else ""
-
-    @property
-    def full(self) -> bool:
-        """True if a plot needs the whole width of the page."""
-        return any(plot.panels > 1 for plot in self.plots)
-
-
-@dataclass(frozen=True)
-class Content:
-    """The parts of a report in their order on the page.
-
-    Attributes:
-        summary: sentences on how baking changed each scene.
-        views: held-out views with photograph, renders and errors.
-        poses: tables of found camera poses, and a picture of cameras and points.
-        worst: the worst views with their errors and decomposition.
-        notes: what was skipped and why.
-    """
-
-    title: str
-    intro: str
-    summary: list[str]
-    views: list[ComparedSet]
-    quality: list[Table]
-    training: Table | None
-    poses: list[tuple[list[Table], tuple[Picture, ...]]]
-    sections: list[Section]
-    knobs: list[Table]
-    worst: list[Group]
-    notes: list[str]
-
-
 def _counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
-def _unique(found: Sequence[FoundPoses]) -> list[FoundPoses]:
-    """Without the copies that several runs of one capture hold."""
-    return list({(each.source, *each.numbers.items(), *each.seconds.items()): each for each in found}.values())
-
-
-def compose(records: Records, title: str) -> Content:
-    """Build everything that a page shows of these records."""
+def compose(records: Records, title: str) -> dict[str, Any]:
+    """Build everything that a page shows of these records, by its names in the template."""
     notes = list(records.notes)
-    found = _unique(records.poses)
+    found = {json.dumps(values, sort_keys=True): (path, values) for path, values in records.poses.items()}
     counts = {
         "evaluation": len(records.evaluations),
         "training run": len(records.curves),
         "scene": len({row.scene for row in records.evaluations}),
         "knob setting": len(records.knobs),
-        "capture with found poses": len(found),
+        "capture with found poses": len(found),  # of several runs of one capture once
     }
     counted = ", ".join(_counted(number, noun) for noun, number in counts.items() if number)
     measured = f" Measured on: {'; '.join(records.machines)}." if records.machines else ""
-    merged = over_seeds(records.evaluations)
-    plots = draw_plots(records.evaluations, records.curves)
+    sections: dict[str, list[Plot]] = {}
+    for plot in draw_plots(records.evaluations, records.curves):
+        sections.setdefault(plot.section, []).append(plot)
     poses = []
-    for each in found:
-        path = each.file.parent / PICTURE
-        caption = "Cameras (red) and points, from above and from the side."
-        poses.append((poses_tables(each), read_pictures([(caption, path)] if path.is_file() else [], notes)))
-    return Content(
-        title=title,
-        intro=f"{counted}. Made by bitymi report {__version__}.{measured}",
-        summary=summary(merged),
-        views=compare_views(records.images, notes),
-        quality=quality_tables(merged),
-        training=training_table(records.curves),
-        poses=poses,
-        sections=[
-            Section(name, [plot for plot in plots if plot.section == name])
-            for name in dict.fromkeys(plot.section for plot in plots)
-        ],
-        knobs=knob_tables(records.knobs),
-        worst=worst_views(records.worst, notes),
-        notes=notes,
-    )
+    for path, values in found.values():
+        caption, picture = "Cameras (red) and points, from above and from the side.", path.with_name(PICTURE)
+        pictures = read_pictures([(caption, picture)] if picture.is_file() else [], notes)
+        poses.append((poses_tables(values), pictures))
+    return {
+        "title": title,
+        "intro": f"{counted}. Made by bitymi report {__version__}.{measured}",
+        "views": compare_views(records.images, notes),
+        "quality": quality_tables(over_seeds(records.evaluations)),
+        "training": training_table(records.curves),
+        "poses": poses,
+        "sections": sections,
+        "knobs": knob_tables(records.knobs),
+        "worst": worst_views(records.worst, notes),
+        "notes": notes,
+    }
 
 
-def to_page(content: Content) -> str:
+def to_page(content: dict[str, Any]) -> str:
     """Write the report as a single HTML document that needs no other file."""
-    notes = {"views": VIEWS_NOTE, "tables": NOTES, "knobs": KNOB_NOTE}
-    return rendered("report.html.j2", content=content, knobs=KNOBS, generator=GENERATOR, notes=notes)
+    texts = {"views": VIEWS_NOTE, "tables": NOTES, "knobs": KNOB_NOTE, "trade_off": TRADE_OFF}
+    return rendered("report.html.j2", content=content, generator=GENERATOR, texts=texts)
 
 
 def _check_output(output_dir: Path) -> None:

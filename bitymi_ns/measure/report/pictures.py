@@ -5,12 +5,11 @@ with the lowest, the median and the highest PSNR are shown. Folders of the same 
 its bundle) are compared view by view.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import math
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,19 +19,14 @@ import numpy.typing as npt
 from PIL import Image
 
 from bitymi_ns.measure.report.read import SIDE_BY_SIDE
-from bitymi_ns.measure.report.records import WorstView, is_bundle_name
+from bitymi_ns.measure.report.records import is_bundle_name
 
-ERROR_SCALE = 0.25
-"""Error at which an error map ends: mean absolute difference of the three colours."""
+ERROR_SCALE = 0.25  # error at which an error map ends: mean absolute difference of the three colours
 ERROR_CAPTION = f"error: mean of |difference| over the colours, 0 (black) to {ERROR_SCALE:g} (yellow)"
-MAX_SETS = 4
-"""Sets of photographs that a page shows views of."""
-MAX_WORST = 16
-"""Worst views that a page shows."""
-MAX_WIDTH = 1200
-"""Width in pixels to which wider images are scaled down."""
-MAX_PNG_BYTES = 400_000
-"""Images that are larger as PNG are embedded as JPEG of quality 92."""
+MAX_SETS = 4  # sets of photographs that a page shows views of
+MAX_WORST = 16  # worst views that a page shows
+MAX_WIDTH = 1200  # width in pixels to which wider images are scaled down
+MAX_PNG_BYTES = 400_000  # images that are larger as PNG are embedded as JPEG of quality 92
 _RANKS = (("Worst view", 0.0), ("Median view", 0.5), ("Best view", 1.0))
 
 Pixels = npt.NDArray[np.float32]
@@ -51,33 +45,10 @@ class Picture:
 
 @dataclass(frozen=True)
 class Group:
-    """Pictures under one heading."""
-
-    title: str
-    pictures: tuple[Picture, ...]
-
-
-@dataclass(frozen=True)
-class ComparedView:
-    """A view: its heading, and columns of pictures: the photograph, then for every folder the render and its error."""
+    """Columns of pictures under one heading."""
 
     title: str
     columns: tuple[tuple[Picture, ...], ...]
-
-    @property
-    def stacks(self) -> tuple[tuple[Picture, ...], ...]:
-        """Pictures that stand below each other: the columns; with one folder every picture, its error beside it."""
-        if len(self.columns) > 2:
-            return self.columns
-        return tuple((picture,) for column in self.columns for picture in column)
-
-
-@dataclass(frozen=True)
-class ComparedSet:
-    """The chosen views of one set of photographs."""
-
-    title: str
-    views: tuple[ComparedView, ...]
 
 
 @dataclass(frozen=True)
@@ -123,12 +94,12 @@ def read_pictures(files: Sequence[tuple[str, Path]], notes: list[str]) -> tuple[
     return tuple(pictures)
 
 
-def worst_views(views: list[WorstView], notes: list[str]) -> list[Group]:
+def worst_views(views: Mapping[str, Sequence[tuple[str, Path]]], notes: list[str]) -> list[Group]:
     """Encode the pictures of the worst views, one group per view."""
     if len(views) > MAX_WORST:
         notes.append(f"{len(views) - MAX_WORST} more worst views are not shown; the page holds {MAX_WORST}.")
-    groups = [Group(view.title, read_pictures(view.pictures, notes)) for view in views[:MAX_WORST]]
-    return [group for group in groups if group.pictures]
+    read = {title: read_pictures(files, notes) for title, files in list(views.items())[:MAX_WORST]}
+    return [Group(title, tuple((picture,) for picture in pictures)) for title, pictures in read.items() if pictures]
 
 
 def heat(values: Pixels, scale: float) -> Pixels:
@@ -136,10 +107,12 @@ def heat(values: Pixels, scale: float) -> Pixels:
     return matplotlib.colormaps["inferno"](np.clip(values / scale, 0.0, 1.0))[..., :3].astype(np.float32)
 
 
-def compare_views(images: Sequence[Path], notes: list[str]) -> list[ComparedSet]:
+def compare_views(images: Sequence[Path], notes: list[str]) -> list[Group]:
     """Choose and encode views among images of photographs beside renders; what cannot be read is noted.
 
-    Views are ranked by the PSNR of their pictures, averaged over the folders; masks are not known here.
+    The columns of a view are the photograph, then for every folder the render above its error; with one folder the
+    error stands beside the render. Views are ranked by the PSNR of their pictures, averaged over the folders; masks are
+    not known here.
     """
     folders: dict[Path, dict[int, _Render]] = {}
     for path in sorted(p.resolve() for p in images):
@@ -160,19 +133,15 @@ def compare_views(images: Sequence[Path], notes: list[str]) -> list[ComparedSet]
         notes.append(f"Views of {len(groups) - MAX_SETS} more sets are not shown; the page holds those of {MAX_SETS}.")
     names = _titles(list(folders))
     ordered = [sorted(g, key=lambda f: (is_bundle_name(names[f]), names[f])) for g in groups.values()]
-    return [_compared(group, folders, names) for group in ordered[:MAX_SETS]]
+    return [view for group in ordered[:MAX_SETS] for view in _compared(group, folders, names, len(ordered) > 1)]
 
 
 def _titles(folders: list[Path]) -> dict[Path, str]:
     """Folder paths without the components that all share."""
     if len(folders) < 2:
         return {folder: folder.name for folder in folders}
-    shared = 0
-    for names in zip(*(folder.parts for folder in folders), strict=False):
-        if len(set(names)) > 1:
-            break
-        shared += 1
-    return {folder: "/".join(folder.parts[shared:]) or folder.name for folder in folders}
+    shared = os.path.commonpath(folders)
+    return {folder: os.path.relpath(folder, shared) if str(folder) != shared else folder.name for folder in folders}
 
 
 def _halves(path: Path) -> tuple[Pixels, Pixels]:
@@ -188,13 +157,15 @@ def _psnr(a: Pixels, b: Pixels) -> float:
     return 10.0 * math.log10(1.0 / max(1e-10, float(np.mean((a - b) ** 2, dtype=np.float64))))
 
 
-def _compared(group: list[Path], folders: dict[Path, dict[int, _Render]], names: dict[Path, str]) -> ComparedSet:
+def _compared(
+    group: list[Path], folders: dict[Path, dict[int, _Render]], names: dict[Path, str], named: bool
+) -> list[Group]:
     renders = [folders[folder] for folder in group]
     ranked = sorted(renders[0], key=lambda index: sum(r[index].psnr for r in renders))
     chosen: dict[int, str] = {}
     for name, quantile in _RANKS:
         chosen.setdefault(ranked[round(quantile * (len(ranked) - 1))], name)
-    views = []
+    views, title = [], f"{', '.join(names[folder] for folder in group)}: " if named else ""
     for index, name in chosen.items():
         columns = []
         for folder, files in zip(group, renders, strict=True):
@@ -204,8 +175,10 @@ def _compared(group: list[Path], folders: dict[Path, dict[int, _Render]], names:
             error = heat(np.abs(photograph - render).mean(-1), ERROR_SCALE)
             caption = f"{names[folder]}: {files[index].psnr:.2f} dB"
             columns.append((encode(_image(render), caption), encode(_image(error), f"error of {names[folder]}")))
-        views.append(ComparedView(f"{name} of {len(ranked)}: number {index}", tuple(columns)))
-    return ComparedSet(", ".join(names[folder] for folder in group), tuple(views))
+        if len(group) == 1:
+            columns = [(picture,) for column in columns for picture in column]
+        views.append(Group(f"{title}{name} of {len(ranked)}: number {index}", tuple(columns)))
+    return views
 
 
 def _image(pixels: Pixels) -> Image.Image:

@@ -1,7 +1,5 @@
 """Draw the plots of a report: training curves, and quality against cost with Pareto fronts; one panel per scene."""
 
-from __future__ import annotations
-
 import io
 import math
 from collections import Counter
@@ -16,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from bitymi_ns.measure.report.records import Curve, Evaluation, trained_parent
+from bitymi_ns.measure.report.records import Curve, Evaluation
 
 PLAIN = ("default", {"text.parse_math": False})
 """Style of all plots, whatever a matplotlibrc in the current folder says: it may ask for LaTeX. Names may hold a $."""
@@ -28,12 +26,12 @@ MARKERS = ("s", "^", "D", "v", "P", "X", "*", "p", "<", ">", "h", "d", "8", "H")
 """Marks of baked evaluations, one per format."""
 TRAINING, RENDERING, SIZE = "Error against training time", "Error against rendering time", "Error against size"
 """Headings of the page's sections of plots."""
-CURVES = {
-    "psnr_seconds": ("PSNR in the course of training", "training seconds", "PSNR (dB)", ("seconds", "psnr")),
-    "psnr_cpu_seconds": ("PSNR by CPU seconds of training", "CPU seconds", "PSNR (dB)", ("cpu_seconds", "psnr")),
-    "surfels_steps": ("Surfels over training steps", "step", "surfels", ("step", "surfels")),
-}
-"""Plots of training curves: name -> title, axes, columns."""
+CURVES = (
+    ("PSNR in the course of training", "training seconds", "PSNR (dB)", ("seconds", "psnr")),
+    ("PSNR by CPU seconds of training", "CPU seconds", "PSNR (dB)", ("cpu_seconds", "psnr")),
+    ("Surfels over training steps", "step", "surfels", ("step", "surfels")),
+)
+"""Plots of training curves: title, axes, columns."""
 METRICS = {
     "psnr": ("PSNR (dB)", True, 0.5),
     "ssim": ("SSIM", True, 0.01),
@@ -42,33 +40,28 @@ METRICS = {
     "lpips_vgg": ("LPIPS (VGG)", False, 0.01),
 }
 """Measure of quality -> title, True if more is better, least span of its axis."""
-MIN_POINTS = 3
-"""Plots of fewer points are left out: the tables say the same."""
+MIN_POINTS = 3  # plots of fewer points are left out: the tables say the same
 
 
 @dataclass(frozen=True)
 class Plot:
-    """A plot: name, title, section of the page, number of panels, PNG bytes."""
+    """A plot: title, section of the page, number of panels, PNG bytes; `front`: it has a Pareto front."""
 
-    name: str
     title: str
     section: str
     panels: int
     png: bytes
+    front: bool
 
 
 @dataclass(frozen=True)
 class Cost:
-    """A cost axis: name, in titles and on the axis, section, value. `arrows`: baking changes it.
-    `curve`: the bundles of a method lie along a curve."""
+    """A cost axis: in titles, on the axis, section of the page, value."""
 
-    name: str
     title: str
     label: str
     section: str
     value: Callable[[Evaluation], float | None]
-    arrows: bool = False
-    curve: bool = False
 
 
 def costs(rows: list[Evaluation]) -> tuple[Cost, ...]:
@@ -81,9 +74,9 @@ def costs(rows: list[Evaluation]) -> tuple[Cost, ...]:
     whole = bool(baked) and all(e.get("bundle_bytes") for e in baked)
     key, what = ("bundle_bytes", "bundle") if whole else ("atlas_bytes", "atlas")
     return (
-        Cost("train_seconds", "training seconds", "training seconds", TRAINING, positive("train_seconds")),
-        Cost("render_ms", "render milliseconds", "milliseconds per view", RENDERING, positive("render_ms"), True),
-        Cost("bytes", f"{what} size", f"{what} MB", SIZE, positive(key, 1e-6), curve=True),
+        Cost("training seconds", "training seconds", TRAINING, positive("train_seconds")),
+        Cost("render milliseconds", "milliseconds per view", RENDERING, positive("render_ms")),
+        Cost(f"{what} size", f"{what} MB", SIZE, positive(key, 1e-6)),
     )
 
 
@@ -108,13 +101,14 @@ def draw_plots(evaluations: list[Evaluation], curves: list[Curve]) -> list[Plot]
     """Every plot for which there are at least MIN_POINTS points in a panel."""
     names = dict.fromkeys([*sorted({e.method for e in evaluations}), *sorted({c.label for c in curves})])
     colors = {name: COLORS[i % len(COLORS)] for i, name in enumerate(names)}
-    plots = [_curve_plot(name, curves, colors) for name in CURVES]
+    plots = [_curve_plot(*axes, curves, colors) for axes in CURVES]
     plots += [_pareto_plot(key, cost, evaluations, colors) for cost in costs(evaluations) for key in METRICS]
     return [plot for plot in plots if plot is not None]
 
 
-def _curve_plot(name: str, curves: list[Curve], colors: dict[str, str]) -> Plot | None:
-    title, x, y, keys = CURVES[name]
+def _curve_plot(
+    title: str, x: str, y: str, keys: tuple[str, str], curves: list[Curve], colors: dict[str, str]
+) -> Plot | None:
     drawn = [c for c in curves if c.series(*keys)[0]]
     if max((len(c.series(*keys)[0]) for c in drawn), default=0) < MIN_POINTS:
         return None
@@ -130,31 +124,27 @@ def _curve_plot(name: str, curves: list[Curve], colors: dict[str, str]) -> Plot 
 
     legend = [Line2D([], [], color=colors[label], label=label) for label in sorted({c.label for c in drawn})]
     scenes = sorted({c.scene for c in drawn})
-    return Plot(name, title, TRAINING, len(scenes), _png(scenes, panel, x, y, legend))
+    return Plot(title, TRAINING, len(scenes), _png(scenes, panel, x, y, legend), front=False)
 
 
 def pareto_panel(
     axes: Axes, rows: list[Evaluation], key: str, cost: Cost, colors: dict[str, str], markers: dict[str, str]
 ) -> None:
-    """Draw quality against cost of one scene: hollow circles before baking, filled marks after, a thin line from parent
-    to bundle or through the bundles of a method, and the Pareto front of all points."""
+    """Draw quality against cost of one scene: hollow circles before baking, filled marks after, a thin line through the
+    points of a method, and the Pareto front of all points."""
     _, up, span = METRICS[key]
     points = {id(e): (cost.value(e), e.get(key)) for e in rows}
     best = front(list(points.values()), up)
     if len(best) > 1:
         xs, ys = zip(*best, strict=True)
         axes.step(xs, ys, where="post", color=INK, linewidth=0.9, linestyle=(0, (4, 3)), alpha=0.6, zorder=1)
-    thin = {"linewidth": 0.9, "alpha": 0.55, "zorder": 2}
-    for method in sorted({e.method for e in rows}) if cost.curve else ():
+    for method in sorted({e.method for e in rows}):
         xs, ys = zip(*sorted(points[id(e)] for e in rows if e.method == method), strict=True)
-        axes.plot(xs, ys, color=colors[method], **thin)
+        axes.plot(xs, ys, color=colors[method], linewidth=0.9, alpha=0.55, zorder=2)
     for e in rows:
         x, y = points[id(e)]
         mark: dict[str, Any] = {"color": colors[e.method], "linestyle": "", "zorder": 3}
         if e.baked:
-            parent = trained_parent(e, rows) if cost.arrows else None
-            if parent is not None:
-                axes.plot(*zip(points[id(parent)], (x, y), strict=True), color=colors[e.method], **thin)
             axes.plot([x], [y], marker=markers[_variant(e)], ms=6, **mark)
         else:
             axes.plot([x], [y], marker="o", ms=7, markerfacecolor="white", markeredgewidth=1.8, **mark)
@@ -188,7 +178,7 @@ def _pareto_plot(key: str, cost: Cost, evaluations: list[Evaluation], colors: di
 
     png = _png(scenes, panel, cost.label, METRICS[key][0], legend)
     title = f"{METRICS[key][0].removesuffix(' (dB)')} against {cost.title}"
-    return Plot(f"{key}_{cost.name}", title, cost.section, len(scenes), png)
+    return Plot(title, cost.section, len(scenes), png, front=True)
 
 
 def _variant(row: Evaluation) -> str:

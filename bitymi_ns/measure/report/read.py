@@ -1,8 +1,6 @@
 """Read the inputs of a report: ns-eval files, training curves, cells, knobs, pictures and found poses, and folders that
 are searched for these."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -16,23 +14,17 @@ from bitymi_ns.measure.report.records import (
     Evaluation,
     Records,
     ReportError,
-    WorstView,
     curve_from,
     evaluation_from,
     finite_numbers,
-    knob_from,
     link,
-    poses_from,
 )
 
 CELLS, PICTURES = "cells.jsonl", "pictures.json"
-MAX_JSON_BYTES = 4 << 20
-"""Larger JSON files are no evaluation."""
+MAX_JSON_BYTES = 4 << 20  # larger JSON files are no evaluation
 MAX_JSONL_BYTES = 64 << 20
-MAX_DEPTH = 8
-"""Folders are searched this many levels down."""
-MAX_ENTRIES = 50_000
-"""A search stops after this many files."""
+MAX_DEPTH = 8  # folders are searched this many levels down
+MAX_ENTRIES = 50_000  # a search stops after this many files
 SIDE_BY_SIDE = re.compile(r"^eval_img_(?P<index>\d{4,})$", re.IGNORECASE)
 """Stem of a photograph beside its render, as `ns-eval --render-output-path` writes it."""
 
@@ -134,25 +126,25 @@ def read_jsonl(path: Path) -> tuple[list[Evaluation], list[Curve], list[str]]:
     return evaluations, [curve_from(points, path)] if points else [], notes
 
 
-def read_pictures(path: Path, run: str = "") -> list[WorstView]:
-    """Read the worst views that a pictures.json lists; empty when the file is something else.
+def read_pictures(path: Path, run: str = "") -> dict[str, list[tuple[str, Path]]]:
+    """Read the worst views that a pictures.json lists, as in `Records`; empty when the file is something else.
 
     Raises:
         ReportError: it is no valid JSON, or lists its views in another form.
     """
     data = parse_json(read_text(path, MAX_JSON_BYTES), str(path))
     if not isinstance(data, dict) or "bitymi_pictures" not in data:
-        return []
+        return {}
     scene, method = str(data.get("scene") or "unnamed scene"), run or str(data.get("method") or "")
-    views = []
+    views = {}
     try:
         for view in data["views"]:
             metrics = finite_numbers(view["metrics"])
             figures = [f"{metrics[key]:.{digits}f} {text}" for key, digits, text in _SHOWN if key in metrics]
             rank = "worst" if view["rank"] == 1 else f"number {view['rank']} from below"
             title = f"{scene}, {method}: view {view['view']}, {rank} of {view['of']}: {', '.join(figures)}"
-            pictures = tuple((data["captions"].get(k, k), path.parent / Path(f).name) for k, f in view["files"].items())
-            views.append(WorstView(title, pictures))
+            files = view["files"].items()
+            views[title] = [(data["captions"].get(kind, kind), path.parent / Path(name).name) for kind, name in files]
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ReportError(f"{path} does not list its views as bitymi bench pictures does: {error!r}.") from error
     return views
@@ -251,7 +243,7 @@ def _add_run(run: _Run, several_seeds: bool, path: Path, records: Records) -> No
                 run.scene, run.name, bool(bundle), group + seed, results, "", path, run.id, group, run.series, run.seed
             )
         )
-    records.knobs += [knob_from(point, run.scene, run.name + seed) for point in run.knobs]
+    records.knobs += [{**point, "scene": run.scene, "run": run.name + seed} for point in run.knobs]
     curve = path.parent / str(run.train["curve"]) if run.train.get("curve") else None
     if curve is not None and curve.is_file():
         _, curves, notes = read_jsonl(curve)
@@ -259,7 +251,7 @@ def _add_run(run: _Run, several_seeds: bool, path: Path, records: Records) -> No
         records.notes += notes
     listed = path.parent / run.pictures / PICTURES if run.pictures else None
     if listed is not None and listed.is_file():
-        records.worst += read_pictures(listed, run.name + seed)
+        records.worst |= read_pictures(listed, run.name + seed)
 
 
 # files and folders
@@ -297,7 +289,7 @@ def _read(path: Path, records: Records) -> bool:
     if path.suffix.lower() == ".png":
         records.images.append(path)
     elif path.name == PICTURES:
-        records.worst += read_pictures(path)
+        records.worst |= read_pictures(path)
     elif path.suffix.lower() == ".jsonl":
         numbered, notes = read_lines(path)
         records.notes += notes
@@ -305,7 +297,7 @@ def _read(path: Path, records: Records) -> bool:
             read_cells(numbered, path, records)
             return bool(numbered)
         if any(is_knob(value) for _, value in numbered):
-            records.knobs += [knob_from(value) for _, value in numbered if is_knob(value)]
+            records.knobs += [{**value, "run": value.get("method")} for _, value in numbered if is_knob(value)]
         else:
             evaluations, curves, _ = read_jsonl(path)
             records.evaluations += evaluations
@@ -313,7 +305,7 @@ def _read(path: Path, records: Records) -> bool:
     else:
         data = parse_json(read_text(path, MAX_JSON_BYTES), str(path))
         if isinstance(data, dict) and data.keys() >= _POSES:
-            records.poses.append(poses_from(data, path))
+            records.poses[path] = data
         elif is_evaluation(data):
             records.evaluations.append(evaluation_from(data, path))
     return sum(map(len, vars(records).values())) - len(records.notes) > before

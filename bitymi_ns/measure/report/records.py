@@ -1,15 +1,12 @@
 """Records of a report and how they relate: evaluations, training curves, knob settings, worst views, found poses."""
 
-from __future__ import annotations
-
 import math
 import re
+import statistics
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
-
-from bitymi_ns.capture.report import frame_text
 
 _BUNDLE = re.compile(r"(?<![a-z])(bundle|baked)(?![a-z])")
 _BUNDLE_SUFFIX = re.compile(r"[-_]?(bundle|baked)$")
@@ -75,62 +72,23 @@ class Curve:
         return next((p[key] for p in reversed(self.points) if key in p), None)
 
 
-@dataclass(frozen=True)
-class KnobPoint:
-    """A measured setting of a quality knob; `figures` has finite numbers: max_steps, mean_steps (errors against the
-    exact setting in 8-bit steps), psnr_exact, psnr, ms, cpu_ms, bytes."""
-
-    scene: str
-    run: str
-    knob: str
-    value: str
-    renderer: str
-    exact: bool
-    default: bool
-    against: str
-    figures: dict[str, float]
-
-
-@dataclass(frozen=True)
-class WorstView:
-    """Pictures of one of the worst held-out views of a run: (caption, file) in order."""
-
-    title: str
-    pictures: tuple[tuple[str, Path], ...]
-
-
-@dataclass(frozen=True)
-class FoundPoses:
-    """Statistics of the camera poses that were found for a capture.
-
-    Attributes:
-        source: the photographs or the video.
-        numbers: registered, given, reprojection_error, track_length, points, ...: those that are finite.
-        seconds: of every stage.
-        left_out: photographs without a pose -> reason; notes: photograph -> remark.
-        frame: origin of the up direction and of the scale.
-        file: the report.json that was read; the picture lies beside it.
-    """
-
-    source: str
-    numbers: dict[str, float]
-    seconds: dict[str, float]
-    left_out: dict[str, str]
-    notes: dict[str, str]
-    frame: str
-    file: Path
-
-
 @dataclass
 class Records:
-    """Everything that was read, with notes on what was skipped and why."""
+    """Everything that was read, with notes on what was skipped and why.
+
+    Attributes:
+        images: photographs beside renders, as ns-eval writes them.
+        knobs: lines of `bitymi bench knobs`, with `scene` and `run`.
+        worst: title of a view -> its pictures, (caption, file).
+        poses: report.json of found poses -> its content; a picture of the cameras lies beside it.
+    """
 
     evaluations: list[Evaluation] = field(default_factory=list)
     curves: list[Curve] = field(default_factory=list)
     images: list[Path] = field(default_factory=list)
-    knobs: list[KnobPoint] = field(default_factory=list)
-    worst: list[WorstView] = field(default_factory=list)
-    poses: list[FoundPoses] = field(default_factory=list)
+    knobs: list[dict[str, Any]] = field(default_factory=list)
+    worst: dict[str, list[tuple[str, Path]]] = field(default_factory=dict)
+    poses: dict[Path, dict[str, Any]] = field(default_factory=dict)
     machines: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -188,35 +146,6 @@ def curve_from(lines: list[dict[str, Any]], source: Path) -> Curve:
     return Curve(scene, label or source.stem, [points[step] for step in sorted(points)], source)
 
 
-def knob_from(data: dict[str, Any], scene: str = "", run: str = "") -> KnobPoint:
-    """Build a knob setting; `scene` and `run` override its own names."""
-    value = data.get("value")
-    return KnobPoint(
-        scene or str(data.get("scene") or "unnamed scene"),
-        run or str(data.get("method") or "unnamed method"),
-        data["knob"],
-        f"{value:.3g}" if isinstance(value, float) else str(value),
-        str(data.get("renderer") or ""),
-        bool(data.get("exact")),
-        bool(data.get("default")),
-        str(data.get("against") or ""),
-        finite_numbers({k: v for k, v in data.items() if k != "value"}),
-    )
-
-
-def poses_from(data: Mapping[str, Any], file: Path) -> FoundPoses:
-    """Build the statistics of found poses; entries of a wrong type are left out."""
-
-    def texts(key: str) -> dict[str, str]:
-        found = data.get(key)
-        return {name: str(why) for name, why in found.items()} if isinstance(found, dict) else {}
-
-    numbers, seconds = finite_numbers(data), data["seconds"]
-    times = finite_numbers(seconds) if isinstance(seconds, dict) else {}
-    frame = frame_text({"up": data.get("up"), **numbers})
-    return FoundPoses(str(data["source"]), numbers, times, texts("left_out"), texts("notes"), frame, file)
-
-
 def link(records: Records) -> None:
     """Name curves after the evaluation whose checkpoint lies in their folder, make labels unique, and give evaluations
     without it the training time of the one curve of their scene and method."""
@@ -242,7 +171,11 @@ def over_seeds(evaluations: list[Evaluation]) -> list[Evaluation]:
 
     Baked ones have `psnr_delta`, their PSNR minus that of the trained scene: of the same run each, before the mean.
     """
-    evaluations = [_with_delta(row, evaluations) for row in evaluations]
+    deltas = [psnr_delta(row, evaluations) for row in evaluations]
+    evaluations = [
+        row if delta is None else replace(row, results={**row.results, "psnr_delta": delta})
+        for row, delta in zip(evaluations, deltas, strict=True)
+    ]
     groups: dict[tuple, list[Evaluation]] = {}
     for i, row in enumerate(evaluations):
         key = (row.scene, row.baked, row.group, row.series) if row.group else (i,)
@@ -255,17 +188,11 @@ def over_seeds(evaluations: list[Evaluation]) -> list[Evaluation]:
         keys = set.intersection(*(set(row.results) for row in rows))
         means = {key: sum(row.results[key] for row in rows) / len(rows) for key in sorted(keys)}
         if "psnr" in means:
-            squares = sum((row.results["psnr"] - means["psnr"]) ** 2 for row in rows)
-            means["psnr_seeds"] = math.sqrt(squares / (len(rows) - 1))
+            means["psnr_seeds"] = statistics.stdev(row.results["psnr"] for row in rows)
         first = rows[0]
         label = f"{first.group} ({len(rows)} seeds)"
         merged.append(replace(first, label=label, results=means, run=first.series, seed=None))
     return merged
-
-
-def _with_delta(row: Evaluation, evaluations: list[Evaluation]) -> Evaluation:
-    delta = psnr_delta(row, evaluations)
-    return row if delta is None else replace(row, results={**row.results, "psnr_delta": delta})
 
 
 def psnr_delta(row: Evaluation, evaluations: list[Evaluation]) -> float | None:

@@ -1,14 +1,16 @@
 """Build the tables of a report; their HTML is in templates/report.html.j2."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
+from bitymi_ns.capture.report import overview
 from bitymi_ns.measure import markdown
 from bitymi_ns.measure.markdown import escaped
-from bitymi_ns.measure.report.records import Curve, Evaluation, FoundPoses, KnobPoint, psnr_delta, trained_parent
+from bitymi_ns.measure.report.records import Curve, Evaluation, finite_numbers, psnr_delta
+
+T = TypeVar("T")
+K = TypeVar("K", bound=Hashable)
 
 MISSING = "–"
 
@@ -143,15 +145,27 @@ def _rows(evaluations: list[Evaluation], columns: list[Column]) -> list[Row]:
     return [Row((row.label, *(column[i] for column in texts)), frozenset(best[i])) for i, row in enumerate(evaluations)]
 
 
+def _grouped(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
+    """Items by key, in the order of their first."""
+    groups: dict[K, list[T]] = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
+    return groups
+
+
+def _by_stage(title: str, columns: list[Column], rows: list[tuple[bool, Row]], note: str = "") -> Table:
+    """A table with a section for trained scenes and one for bundles."""
+    sections = []
+    for baked in (False, True):
+        of_stage = [row for stage, row in rows if stage is baked]
+        sections += [Row((STAGES[baked],), section=True), *of_stage] if of_stage else []
+    return Table(title, ("Method", *(c.heading for c in columns)), tuple(sections), note)
+
+
 def scene_table(scene: str, evaluations: list[Evaluation], columns: list[Column]) -> Table:
     """The evaluations of one scene: those before baking, then those after."""
-    ordered = sorted(evaluations, key=lambda e: (e.baked, e.label))
-    rows: list[Row] = []
-    for i, row in enumerate(_rows(ordered, columns)):
-        if i == 0 or ordered[i].baked != ordered[i - 1].baked:
-            rows.append(Row((STAGES[ordered[i].baked],), section=True))
-        rows.append(row)
-    return Table(scene, ("Method", *(c.heading for c in columns)), tuple(rows))
+    ordered = sorted(evaluations, key=lambda e: e.label)
+    return _by_stage(scene, columns, [(e.baked, row) for e, row in zip(ordered, _rows(ordered, columns), strict=True)])
 
 
 def mean_table(evaluations: list[Evaluation], columns: list[Column]) -> Table | None:
@@ -159,26 +173,19 @@ def mean_table(evaluations: list[Evaluation], columns: list[Column]) -> Table | 
 
     Only labels that cover the same scenes are put side by side: a mean over other scenes is not comparable.
     """
-    groups: dict[tuple[bool, str], list[Evaluation]] = {}
-    for row in evaluations:
-        groups.setdefault((row.baked, row.label), []).append(row)
+    groups = _grouped(evaluations, lambda e: (e.baked, e.label))
     covers = {key: frozenset(e.scene for e in rows) for key, rows in groups.items()}
     widest = max(covers.values(), key=len, default=frozenset())
     if len(widest) < 2:
         return None
-    kept = sorted(key for key, scenes in covers.items() if scenes == widest)
 
     def mean(rows: list[Evaluation], column: Column) -> str:
         values = [v for v in map(column.value, rows) if v is not None]
         return column.text(sum(values) / len(values)) if len(values) == len(rows) else MISSING
 
-    rows: list[Row] = []
-    for i, key in enumerate(kept):
-        if i == 0 or key[0] != kept[i - 1][0]:
-            rows.append(Row((STAGES[key[0]],), section=True))
-        rows.append(Row((key[1], *(mean(groups[key], column) for column in columns))))
-    header = ("Method", *(c.heading for c in columns))
-    return Table(f"Mean of {len(widest)} scenes", header, tuple(rows), "Scenes: " + ", ".join(sorted(widest)) + ".")
+    kept = sorted(key for key, scenes in covers.items() if scenes == widest)
+    rows = [(key[0], Row((key[1], *(mean(groups[key], column) for column in columns)))) for key in kept]
+    return _by_stage(f"Mean of {len(widest)} scenes", columns, rows, "Scenes: " + ", ".join(sorted(widest)) + ".")
 
 
 def training_table(curves: list[Curve]) -> Table | None:
@@ -213,27 +220,6 @@ def quality_tables(evaluations: list[Evaluation], training: bool = False) -> lis
     return [*tables, mean] if mean else tables
 
 
-def summary(evaluations: list[Evaluation], limit: int = 8) -> list[str]:
-    """A sentence for each baked evaluation with a trained parent; none when there are more than `limit`."""
-    lines = []
-    for row in sorted(evaluations, key=lambda e: (e.scene, e.label)):
-        delta = psnr_delta(row, evaluations)
-        parent = trained_parent(row, evaluations)
-        if parent is None or delta is None:
-            continue
-        parts = [f"{parent.results['psnr']:.2f} dB trained, {row.results['psnr']:.2f} dB baked ({signed(delta)})"]
-        before, after = parent.get("render_ms"), row.get("render_ms")
-        if before and after:
-            parts.append(
-                f"{significant(before)} ms to {significant(after)} ms per view ({before / after:.1f}× as fast)"
-            )
-        megabytes = _atlas_mb(row)
-        if megabytes:
-            parts.append(f"atlas of {significant(megabytes)} MB")
-        lines.append(f"{row.scene}, {row.label}: " + "; ".join(parts) + ".")
-    return lines if len(lines) <= limit else []
-
-
 KNOBS = {
     "weight_bound": "Weight bound",
     "transmittance": "Termination threshold",
@@ -245,69 +231,51 @@ KNOBS = {
 """Knob -> title of its table."""
 
 
-def knob_tables(points: list[KnobPoint]) -> list[Table]:
+KNOB_COLUMNS = {
+    "mean_steps": ("mean steps", "{:.3f}".format),
+    "max_steps": ("max steps", "{:.2f}".format),
+    "psnr_exact": ("dB to exact", lambda value: "equal" if value >= 100 else f"{value:.1f}"),
+    "psnr": ("PSNR", "{:.2f}".format),
+    "ms": ("ms", significant),
+    "cpu_ms": ("CPU ms", significant),
+    "bytes": ("MB", lambda value: significant(1e-6 * value)),
+}
+"""Figure of a setting -> title and text."""
+
+
+def knob_tables(points: list[dict[str, Any]]) -> list[Table]:
     """One table per knob; the error is against its exact setting."""
     tables = []
-    header = ("Setting", "mean steps", "max steps", "dB to exact", "PSNR", "ms", "CPU ms", "MB")
-    columns = (
-        ("mean_steps", 1.0, "{:.3f}".format), ("max_steps", 1.0, "{:.2f}".format), ("psnr_exact", 1.0, _decibel),
-        ("psnr", 1.0, "{:.2f}".format), ("ms", 1.0, significant), ("cpu_ms", 1.0, significant),
-        ("bytes", 1e-6, significant),
-    )  # fmt: skip
-    for knob in dict.fromkeys(p.knob for p in points):
-        groups: dict[str, list[KnobPoint]] = {}
-        of_knob = [p for p in points if p.knob == knob]
-        for p in of_knob:
-            groups.setdefault(f"{p.scene}, {p.run}, {p.renderer} renderer", []).append(p)
+    for knob, of_knob in _grouped(points, lambda p: p["knob"]).items():
         rows: list[Row] = []
-        for title, group in groups.items():
-            rows.append(Row((title,), section=True))
+        for title, group in _grouped(of_knob, lambda p: f"{p.get('scene')}, {p['run']}, {p.get('renderer')}").items():
+            rows.append(Row((f"{title} renderer",), section=True))
             for p in group:
-                marks = [text for text, holds in (("exact", p.exact), ("default", p.default)) if holds]
-                texts = (text(scale * p.figures[key]) if key in p.figures else MISSING for key, scale, text in columns)
-                rows.append(Row((p.value + (f" ({', '.join(marks)})" if marks else ""), *texts)))
-        note = f"{of_knob[0].against[:1].upper()}{of_knob[0].against[1:]}." if of_knob[0].against else ""
-        tables.append(Table(KNOBS.get(knob, knob), header, tuple(rows), note))
+                value, figures = p.get("value"), finite_numbers(p)
+                name = f"{value:.3g}" if isinstance(value, float) else str(value)
+                marks = ", ".join(mark for mark in ("exact", "default") if p.get(mark))
+                texts = (form(figures[k]) if k in figures else MISSING for k, (_, form) in KNOB_COLUMNS.items())
+                rows.append(Row((f"{name} ({marks})" if marks else name, *texts)))
+        against = str(of_knob[0].get("against") or "")
+        header = ("Setting", *(title for title, _ in KNOB_COLUMNS.values()))
+        tables.append(Table(KNOBS.get(knob, knob), header, tuple(rows), f"{against[:1].upper()}{against[1:]}"))
     return tables
 
 
-def _decibel(value: float) -> str:
-    return "equal" if value >= 100 else f"{value:.1f}"
+MOST_NAMED = 60  # photographs that a table names; report.json has them all
 
 
-MOST_NAMED = 60
-"""Photographs that a table names; report.json has them all."""
-
-
-def poses_tables(found: FoundPoses) -> list[Table]:
-    """Statistics of the camera poses of a capture, seconds of each stage, and photographs with a reason or remark."""
-
-    def text(key: str, form: str) -> str:
-        return form.format(found.numbers[key]) if key in found.numbers else MISSING
-
-    overview = {
-        "Photographs with a pose": f"{text('registered', '{:,.0f}')} of {text('given', '{:,.0f}')}",
-        "Mean reprojection error, pixels": text("reprojection_error", "{:.2f}"),
-        "Mean track length, photographs per point": text("track_length", "{:.2f}"),
-        "Points": text("points", "{:,.0f}"),
-        "Median parallax, degrees": text("parallax_degrees", "{:.1f}"),
-        "Up, scale": found.frame,
-    }
-    seconds = {stage: f"{value:.1f}" for stage, value in found.seconds.items()}
-    tables = [
-        Table("Poses", ("", found.source), tuple(map(Row, overview.items()))),
-        Table("Time of every stage", ("Stage", "Seconds"), tuple(map(Row, seconds.items()))),
-        _named(found.left_out, "Left out", "Why"),
-        _named(found.notes, "Notes", ""),
-    ]
-    return [table for table in tables if table.rows]
-
-
-def _named(photographs: Mapping[str, str], title: str, header: str) -> Table:
-    rows = tuple(map(Row, list(photographs.items())[:MOST_NAMED]))
-    more = len(photographs) - len(rows)
-    note = f"And {more:,} more, which report.json names." if more else ""
-    return Table(f"{title}: {len(photographs):,}", ("Photograph", header), rows, note)
+def poses_tables(values: Mapping[str, Any]) -> list[Table]:
+    """Statistics of the camera poses of a capture, and photographs with a reason or remark."""
+    tables = [Table("Poses", ("", str(values["source"])), tuple(map(Row, overview(values).items())))]
+    for key, title, header in (("left_out", "Left out", "Why"), ("notes", "Notes", "")):
+        named = values.get(key)
+        if isinstance(named, dict) and named:
+            rows = [Row((name, str(why))) for name, why in list(named.items())[:MOST_NAMED]]
+            more = len(named) - len(rows)
+            note = f"And {more:,} more, which report.json names." if more else ""
+            tables.append(Table(f"{title}: {len(named):,}", ("Photograph", header), tuple(rows), note))
+    return tables
 
 
 def to_markdown(table: Table) -> str:

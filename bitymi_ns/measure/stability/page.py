@@ -1,7 +1,5 @@
 """Write docs/stability.md: errors of float32, case by case and along each kind of stiffness."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,15 +25,11 @@ from bitymi_ns.measure.stability.errors import (
 )
 from bitymi_ns.measure.stability.scenes import PLAIN, RIM, SWEEPS, WAYS, SceneCase, Sweep, Way, extreme_scenes
 
-ACCURATE = 1e-4
-"""Largest error that counts as accurate."""
-STEPS = round(1 / (255 * ACCURATE))
-"""An 8-bit step in units of ACCURATE."""
-ALLOWANCE = 4.0
-"""A case whose inputs, rounded, already do this share of the error is as good as float32 inputs allow."""
+ACCURATE = 1e-4  # largest error that counts as accurate
+STEPS = round(1 / (255 * ACCURATE))  # an 8-bit step in units of ACCURATE
+ALLOWANCE = 4.0  # a case whose inputs, rounded, already do this share of the error is as good as float32 inputs allow
 LIMITED = "as the inputs allow"
-EXTENDED_SIZE = 20_000
-"""Largest number of pixels times surfels for which extended precision is evaluated."""
+EXTENDED_SIZE = 20_000  # largest number of pixels times surfels for which extended precision is evaluated
 
 
 @dataclass(frozen=True)
@@ -109,6 +103,12 @@ class Row:
     def trusted(self) -> float | None:
         """Largest error of the float64 reference against extended precision; None where that was too large to run."""
         return max(self.trust.forward, self.trust.gradient) if self.trust else None
+
+    @property
+    def errors(self) -> tuple[float, float, float, float]:
+        """Errors of the images and of rounded inputs, errors of the gradients and of rounded inputs."""
+        e = self.single
+        return e.forward, e.input_forward, e.gradient, e.input_gradient
 
     @property
     def verdict(self) -> str:
@@ -199,9 +199,8 @@ def _cases(rows: Sequence[Row]) -> str:
         e = row.single
         if e.drawn or row.verdict.startswith("**"):
             flipped = f"{100 * e.flipped:.2g} %" if e.flipped else "0"
-            errors = [_short(value) for value in (e.forward, e.input_forward, e.gradient, e.input_gradient)]
-            exact = [_short(row.exact), _short(row.trusted)]
-            lines.append([row.label, *errors, e.worst if e.gradient else "", flipped, *exact, row.verdict])
+            worst, exact = e.worst if e.gradient else "", [_short(row.exact), _short(row.trusted)]
+            lines.append([row.label, *map(_short, row.errors), worst, flipped, *exact, row.verdict])
     return markdown.table(CASES, lines, (0, 5, len(CASES) - 1))
 
 
@@ -210,18 +209,7 @@ def _sweeps(swept: Mapping[str, Sequence[Row]]) -> str:
     lines = []
     for sweep in SWEEPS:
         rows = swept[sweep.name]
-        singles = [row.single for row in rows]
-        errors = [
-            max(values)
-            for values in (
-                [e.forward for e in singles],
-                [e.input_forward for e in singles],
-                [e.gradient for e in singles],
-                [e.input_gradient for e in singles],
-                [row.exact for row in rows],
-                [row.trusted or 0.0 for row in rows],
-            )
-        ]
+        errors = map(max, zip(*((*row.errors, row.exact, row.trusted or 0.0) for row in rows), strict=True))
         inexact = [
             f"{row.label}{'' if row.verdict == LIMITED else f' ({row.verdict})'}"
             for row in rows
@@ -237,6 +225,11 @@ def _short(value: float | None) -> str:
 
 
 FORWARD, GRADIENT, DOUBLE = "#0b62b8", "#d1540b", "#6b6f76"
+LINES = (
+    ("float32 images", FORWARD, "-o"), ("rounded inputs, images", FORWARD, "--"), ("float32 gradients", GRADIENT, "-s"),
+    ("rounded inputs, gradients", GRADIENT, "--"), ("float64 images", DOUBLE, ":"), ("float64 gradients", DOUBLE, "-."),
+)  # fmt: skip
+"""Lines of a panel: label, colour, style."""
 LOWEST = 1e-17
 
 
@@ -255,17 +248,9 @@ def _plot(swept: dict[str, list[Row]]) -> bytes:
 
 def _panel(axes: Axes, sweep: Sweep, rows: Sequence[Row]) -> None:
     x = sweep.values
-    lines = (
-        ("float32 images", FORWARD, "-", "o", [r.single.forward for r in rows]),
-        ("rounded inputs, images", FORWARD, "--", "", [r.single.input_forward for r in rows]),
-        ("float32 gradients", GRADIENT, "-", "s", [r.single.gradient for r in rows]),
-        ("rounded inputs, gradients", GRADIENT, "--", "", [r.single.input_gradient for r in rows]),
-        ("float64 images", DOUBLE, ":", "", [r.double.forward for r in rows]),
-        ("float64 gradients", DOUBLE, "-.", "", [r.double.gradient for r in rows]),
-    )
-    for label, color, style, marker, values in lines:
-        shown = [max(value, LOWEST) for value in values]
-        axes.plot(x, shown, color=color, linestyle=style, marker=marker, markersize=4, linewidth=1.3, label=label)
+    columns = zip(*((*row.errors, row.double.forward, row.double.gradient) for row in rows), strict=True)
+    for (label, color, style), values in zip(LINES, columns, strict=True):
+        axes.plot(x, [max(value, LOWEST) for value in values], style, color=color, ms=4, lw=1.3, label=label)
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_ylim(LOWEST / 2, 30)

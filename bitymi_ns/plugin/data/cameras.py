@@ -34,25 +34,25 @@ def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Cam
     cameras = cameras.reshape((-1,))
     if cameras.shape[0] != 1:
         raise ValueError(f"expected one camera, found {cameras.shape[0]}")
-    if int(cameras.camera_type[0]) != CameraType.PERSPECTIVE.value:
-        kind = CameraType(int(cameras.camera_type[0])).name.lower()
-        fail(f"cameras of type {kind} cannot be rendered; only perspective cameras can")
-    distortion = cameras.distortion_params
-    if distortion is not None and bool((distortion != 0).any()):
+    names = ("camera_type", "fx", "fy", "cx", "cy", "width", "height", "camera_to_worlds", "distortion_params")
+    fields = (getattr(cameras, name) for name in names)
+    # one copy from the device: each waits for it
+    row = torch.cat([field[0].detach().flatten().double() for field in fields if field is not None]).cpu()
+    kind, fx, fy, cx, cy, width, height = row[:7].tolist()
+    if int(kind) != CameraType.PERSPECTIVE.value:
+        fail(f"cameras of type {CameraType(int(kind)).name.lower()} cannot be rendered; only perspective cameras can")
+    if bool((row[19:] != 0).any()):
         fail(
             "a camera has lens distortion, which this method does not render. Training and evaluation undistort the "
             "photographs on loading; for other tools undistort the capture first (COLMAP's image_undistorter)."
         )
-    c2w = cameras.camera_to_worlds[0].detach().double()  # [3, 4]
+    c2w = row[7:19].view(3, 4)
     rotation = c2w[:, :3] * c2w.new_tensor([1.0, -1.0, -1.0])
-    viewmat = torch.eye(4, dtype=torch.float64, device=c2w.device)
+    viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3, :3] = rotation.T
     viewmat[:3, 3] = -rotation.T @ c2w[:, 3]
-    K = torch.eye(3, dtype=torch.float64, device=c2w.device)
-    K[0, 0], K[1, 1] = cameras.fx[0].item(), cameras.fy[0].item()
-    K[0, 2], K[1, 2] = cameras.cx[0].item(), cameras.cy[0].item()
-    camera = Camera(viewmat.float(), K.float(), int(cameras.width[0]), int(cameras.height[0]))
-    return camera if device is None else camera.to(device)
+    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return Camera(viewmat.float(), K, int(width), int(height)).to(cameras.device if device is None else device)
 
 
 def to_cameras(cameras: Cameras, device: torch.device | str | None = None) -> list[Camera]:

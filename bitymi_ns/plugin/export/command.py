@@ -161,16 +161,17 @@ class ExportAtlas(BakeOptions, CompactOptions):
                     f"The {name} has {options_of.steps:,} steps for {len(views):,} training photographs, {passes:.1f} "
                     f"for each: more may gain (--{name}-steps)."
                 )
-        if model.device.type == "cpu":
-            kept, learning_surfels = tune.cache_bytes if tune else 0, len(model.scene) if polish else 0
-            state_export(model.scene, views, kept, learning_surfels, self._is_compact)
+        kept, learning_surfels = tune.cache_bytes if tune else 0, len(model.scene) if polish else 0
+        state_export(model.scene, views, kept, learning_surfels, self._is_compact)
         try:
             with rich_progress() as progress:
                 held_out = datamanager.eval_views if self.compare else ()
                 background = model.background.cpu()
                 photographs = datamanager.train_views
                 if polish or tune or learning.compact:
-                    photographs = corrected(photographs, model.resume_state.get("exposure"))
+                    photographs = corrected(
+                        photographs, model.resume_state.get("exposure"), datamanager.train_dataset.photographs
+                    )
                 baked = bake_and_learn(
                     model.scene, views, photographs, background, options, learning, progress, held_out
                 )

@@ -65,7 +65,8 @@ class TrainingRun:
             metadata["train_pixels"],
             metadata["first_surfels"],
             covered_share(self.datamanager.train_views),
-            exposure_stops(self.datamanager.train_dataset.image_filenames),
+            exposure_stops(self.datamanager.train_dataset.files),
+            self.datamanager.train_dataset.photographs,
         )
         optimizers = attributes.optimizers.optimizers
         try:
@@ -106,12 +107,11 @@ class TrainingRun:
         self.datamanager.check_pictures()
         if self.first_step == 0:
             self._check_start()
-        if background.device.type == "cpu":
-            train = self.datamanager.train_dataset.cameras
-            cameras = OnDemand(len(train), lambda i: to_camera(train[i : i + 1]))
-            learns = scene.config.texture == "texels"
-            texels, to_come = config.texels if learns else None, self.training.texels.views_to_come
-            state_training(scene, cameras, self.training.strategy.most, texels, to_come, processes.count)
+        train = self.datamanager.train_dataset.cameras
+        cameras = OnDemand(len(train), lambda i: to_camera(train[i : i + 1], "cpu"))
+        learns = scene.config.texture == "texels"
+        texels, to_come = config.texels if learns else None, self.training.texels.views_to_come
+        state_training(scene, cameras, self.training.strategy.most, texels, to_come, processes.count)
         self.datamanager.step_view = self.training.view
 
     def _check_start(self) -> None:

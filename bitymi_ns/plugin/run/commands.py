@@ -17,12 +17,11 @@ from bitymi_ns.plugin.console import fail
 DATA = "BITYMI_DATA"
 """Environment variable: where a capture is now; most of nerfstudio's commands that read a run have no option for it."""
 MOVED = f"If it was moved, say where it is now: `{DATA}=/where/it/is` before the command."
-_MESH = "For the surface as a mesh run `ns-export bitymi-mesh`, for Gaussian splats of a bundle `bitymi extras`."
+_MESH = (
+    "`ns-export bitymi-mesh` writes the surface, a mesh whose vertices are points with colors; `bitymi extras BUNDLE` "
+    "Gaussian splats."
+)
 REFUSED = {
-    "SpiralRender": (
-        "ns-render spiral knows nerfstudio's own data managers alone. Use `ns-render interpolate` between the "
-        "capture's cameras, or `ns-render camera-path` on a path made in the viewer."
-    ),
     "ExportPointCloud": f"ns-export pointcloud needs rays, and surfels are drawn as whole pictures. {_MESH}",
     "ExportTSDFMesh": f"ns-export tsdf needs rays, and surfels are drawn as whole pictures. {_MESH}",
     "ExportPoissonMesh": f"ns-export poisson needs rays, and surfels are drawn as whole pictures. {_MESH}",
@@ -48,12 +47,20 @@ def folder_being_evaluated() -> Path | None:
     return None
 
 
+def running_command() -> tuple[Any, dict[str, Any]] | None:
+    """The object of nerfstudio's script whose main function is loading a scene, and its module's namespace; or None."""
+    for frame in _callers():
+        command = frame.f_locals.get("self")
+        if frame.f_code.co_name == "main" and type(command).__module__.startswith(SCRIPTS):
+            return command, frame.f_globals
+    return None
+
+
 def refuse_others() -> None:
     """Stop where the command that loads a scene cannot work on it, before it is loaded."""
-    for frame in _callers():
-        owner = type(frame.f_locals.get("self"))
-        if owner.__name__ in REFUSED and owner.__module__.startswith(SCRIPTS):
-            fail(REFUSED[owner.__name__])
+    found = running_command()
+    if found is not None and type(found[0]).__name__ in REFUSED:
+        fail(REFUSED[type(found[0]).__name__])
 
 
 def moved_capture(datamanager: Any) -> None:

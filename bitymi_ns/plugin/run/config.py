@@ -28,6 +28,7 @@ from bitymi_ns.plugin.run.commands import LOOPBACK, adopt_viewer, folder_being_e
 from bitymi_ns.plugin.run.device import default_device_type, has_cuda_kernels, why_not_cuda
 from bitymi_ns.plugin.run.model import PARAMETER_GROUPS, BitymiModelConfig
 from bitymi_ns.plugin.run.preset import Preset, load_preset
+from bitymi_ns.plugin.run.render import adopt_render
 from bitymi_ns.plugin.run.trainer import BitymiPipelineConfig, BitymiTrainer
 from bitymi_ns.train.config import AdamConfig
 
@@ -203,6 +204,7 @@ class BitymiTrainerConfig(TrainerConfig):
         if evaluated is not None:
             refuse_others()
             adopt_viewer(self)
+            adopt_render()
             moved_capture(self.pipeline.datamanager)
         if isinstance(model, BakedModelConfig):
             model.bundle = find_bundle(model.bundle)

@@ -1,7 +1,8 @@
-"""Estimate of the memory that training or an export takes on the CPU, printed before it starts.
+"""Estimate of the memory that training or an export takes on its device, printed before it starts.
 
 What decides is the fragment list of one view (docs/training.md, Memory), whose length is found by counting those of
-a few views. The other numbers are measured; they belong to the default preset.
+a few views. The other numbers are measured on the CPU and belong to the default preset; those of a card are counted
+from its arrays.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from bitymi_ns.bake.tuning_views import LEAST_KEPT
 from bitymi_ns.bake.view_color_rate import choice_bytes
 from bitymi_ns.ops import project
 from bitymi_ns.ops.trace_cpu import MOST, count
+from bitymi_ns.ops.trace_cuda import NUMBERS, free_memory
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.plugin.console import say, warn
 from bitymi_ns.plugin.data.dataset import PHOTOGRAPH_BYTES
@@ -26,7 +28,7 @@ from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import GEOMETRY, Scene
 from bitymi_ns.train.config import TexelConfig
 from bitymi_ns.train.texels import SMALLEST, most_texels
-from bitymi_ns.train.views import DOWNSCALED_BYTES, spread
+from bitymi_ns.train.views import DOWNSCALED_BYTES, photograph_budget, spread
 
 COUNTED_VIEWS = 3
 """Views whose fragments are counted."""
@@ -45,6 +47,8 @@ PER_SURFEL = 3000
 
 PER_TEXEL = 28
 """Bytes in training: the texel, how far it moves, and the two states in half precision that a run could go back to."""
+PER_TEXEL_SUM = 16
+"""Bytes more of a texel on a card: its gradient, which the CPU adds tile by tile."""
 PER_BAKED_TEXEL = 96
 """Bytes in an export: eight copies of it, as it was learned, as it is listed and tuned, and in pages."""
 PER_KEPT_FRAGMENT, PER_KEPT_PIXEL = 20 * 0.22, 24
@@ -59,15 +63,17 @@ def most_fragments(scene: Scene, cameras: Sequence[Camera], bound: int = 0) -> i
 
     Args:
         scene: as it is.
-        cameras: of all views, on the CPU.
-        bound: views with more are drawn in bands; 0 = that of the CPU kernels.
+        cameras: of all views.
+        bound: views with more are drawn in bands; 0 = that of the CPU kernels, or what a card has memory for.
     """
     p, most = scene.surfels, 0
     for i in spread(len(cameras), COUNTED_VIEWS):
-        camera = cameras[i]
-        geometry = (p[name] for name in GEOMETRY)
-        most = max(most, count(project(*geometry, camera, scene.near, scene.config.through_pixel)))
-    return min(int(MARGIN * most), bound or MOST)
+        camera = cameras[i].to("cpu")
+        geometry = (p[name].cpu() for name in GEOMETRY)
+        most = max(most, count(project(*geometry, camera, scene.near, scene.config.prefilter)))
+    device = p["means"].device
+    capacity = int(free_memory(device)) // (4 * NUMBERS) if device.type == "cuda" else MOST
+    return min(int(MARGIN * most), bound or capacity)
 
 
 def state_training(
@@ -88,18 +94,23 @@ def state_training(
         to_come: views that they learn from, counted with repetition.
         processes: of the run, each of which takes as much.
     """
-    pixels, total = _pixels(cameras)
-    kept = min(PHOTOGRAPH_BYTES, 3 * total) + min(DOWNSCALED_BYTES, 6 * total)
+    (pixels, total), device = _pixels(cameras), scene.surfels["means"].device
+    card = device.type == "cuda"
     fragments = most_fragments(scene, cameras, scene.config.max_fragments)
-    needed = PROGRAM + kept + PER_PIXEL * pixels + _per_fragment(scene) * fragments
+    if card:
+        kept = min(photograph_budget(device), 3 * total + 6 * total)
+        needed = kept + PER_PIXEL * pixels + 4 * NUMBERS * fragments
+    else:
+        kept = min(PHOTOGRAPH_BYTES, 3 * total) + min(DOWNSCALED_BYTES, 6 * total)
+        needed = PROGRAM + kept + PER_PIXEL * pixels + _per_fragment(scene) * fragments
     surfels = max(len(scene), most_surfels)
     needed += PER_SURFEL * surfels
     if texels is not None:
         most = min(VIEWS_OF_TEXELS * pixels / texels.pixels_per_texel, most_texels(texels, to_come * pixels))
-        needed += PER_TEXEL * (SMALLEST**2 * surfels + most)
+        needed += (PER_TEXEL + card * PER_TEXEL_SUM) * (SMALLEST**2 * surfels + most)
         needed += len(cameras) * surfels  # of `Visibility`, a byte for each that is looked through: at most all
     advice = "draw large views in smaller parts, which takes longer: --pipeline.model.scene.max-fragments"
-    _state("Training", processes * needed, cameras, f"{advice} {max(1, fragments // 4)}")
+    _state("Training", needed if card else processes * needed, cameras, f"{advice} {max(1, fragments // 4)}", device)
 
 
 def state_export(
@@ -119,7 +130,9 @@ def state_export(
     fragments = most_fragments(scene, cameras)
     if finetune_bytes < LEAST_KEPT * len(cameras) * (PER_KEPT_FRAGMENT * fragments + PER_KEPT_PIXEL * pixels):
         finetune_bytes = 0  # too few views would fit
-    needed = PROGRAM + kept + PER_PIXEL * pixels + _per_fragment(scene) * fragments
+    device = scene.surfels["means"].device
+    per_fragment = 4 * NUMBERS if device.type == "cuda" else _per_fragment(scene)
+    needed = PROGRAM * (device.type != "cuda") + kept + PER_PIXEL * pixels + per_fragment * fragments
     kind = scene.config.view_color
     entry = VIEW_COLORS[kind]
     terms = scene.surfels[entry.parameters[1].name].shape[1] - entry.base_terms
@@ -128,7 +141,7 @@ def state_export(
     needed += max(seen, chosen, finetune_bytes + PER_SURFEL * learning)  # one after the other
     if isinstance(scene.field, TexelField):
         needed += PER_BAKED_TEXEL * len(scene.field.texels)
-    _state("The export", needed, cameras, "export with --finetune-memory 0, which takes longer")
+    _state("The export", needed, cameras, "export with --finetune-memory 0, which takes longer", device)
 
 
 def available_memory() -> float:
@@ -164,15 +177,17 @@ def _pixels(cameras: Sequence[Camera]) -> tuple[int, int]:
     return max(sizes), sum(sizes)
 
 
-def _state(what: str, needed: float, cameras: Sequence[Camera], advice: str) -> None:
-    """One line, and a warning where the machine has less."""
+def _state(what: str, needed: float, cameras: Sequence[Camera], advice: str, device: torch.device) -> None:
+    """One line, and a warning where the machine, or the card, has less."""
     sizes = {(camera.width, camera.height) for camera in cameras}
     width, height = max(sizes, key=lambda size: size[0] * size[1])
     photographs = f"{len(cameras)} training photographs of {'up to ' * (len(sizes) > 1)}{width} x {height}"
-    say(f"{what} will take about {needed / 1e9:.1f} GB of memory for {photographs}.")
-    available = available_memory()
+    card = device.type == "cuda"
+    memory, where = ("memory of the card", "the card") if card else ("memory", "this machine")
+    say(f"{what} will take about {needed / 1e9:.1f} GB of {memory} for {photographs}.")
+    available = free_memory(device) if card else available_memory()
     if needed > available:
         warn(
-            f"That is more than the {available / 1e9:.1f} GB that this machine has available. Close other programs, or "
+            f"That is more than the {available / 1e9:.1f} GB that {where} has available. Close other programs, or "
             f"{advice}."
         )

@@ -71,16 +71,19 @@ class SurfelModel(Model):
         return self if device is None else super().to(kernel_device(device))
 
     def get_outputs(self, ray_bundle: Any) -> dict[str, Any]:
-        """Outputs that the viewer and ns-render offer, each [H, W, C] float32:
-
-        rgb, accumulation; depth = expected distance along the ray (not z), normal = world normal as (n + 1) / 2 (0
-        where nothing is seen), beta = blended kernel exponent / 4, overdraw = surfels blended at the pixel /
-        OVERDRAW_SCALE (the tools' colour maps span 0 to 1).
-        """
+        """Render one of nerfstudio's cameras; see `outputs_of`."""
         if not isinstance(ray_bundle, Cameras):
             raise TypeError("this model renders cameras, not bundles of rays")
-        camera = to_camera(ray_bundle, self.device)
-        output = self.render(camera, self.background, maps=True)
+        return self.outputs_of(to_camera(ray_bundle, self.device), maps=True)
+
+    def outputs_of(self, camera: Camera, maps: bool) -> dict[str, Tensor]:
+        """Outputs that the viewer and ns-render offer, each [H, W, C] float32:
+
+        rgb, accumulation; with maps also depth = expected distance along the ray (not z), normal = world normal as
+        (n + 1) / 2 (0 where nothing is seen), beta = blended kernel exponent / 4, overdraw = surfels blended at the
+        pixel / OVERDRAW_SCALE (the tools' colour maps span 0 to 1).
+        """
+        output = self.render(camera, self.background, maps=maps)
         outputs = {"rgb": output.rgb.clamp(0.0, 1.0), "accumulation": output.alpha}
         if output.depth is not None:
             outputs["depth"] = ray_distance(output.depth, output.alpha, camera)
@@ -88,7 +91,8 @@ class SurfelModel(Model):
             outputs["normal"] = normal_image(output.normal, camera)
         if getattr(output, "beta", None) is not None:
             outputs["beta"] = output.beta / 4.0
-        outputs["overdraw"] = output.overdraw.float() / OVERDRAW_SCALE
+        if output.overdraw is not None:
+            outputs["overdraw"] = output.overdraw.float() / OVERDRAW_SCALE
         return outputs
 
     @torch.no_grad()

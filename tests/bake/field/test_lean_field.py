@@ -1,7 +1,5 @@
 """Levels that no surfel needs are not evaluated, and nothing changes."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

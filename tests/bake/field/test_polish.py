@@ -1,7 +1,5 @@
 """The polish: photographs come from a baked scene that is known, the bake starts from one that was moved and faded."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Stand-ins for nerfstudio's console scripts: they write what the real ones would, in no time, and keep a log."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

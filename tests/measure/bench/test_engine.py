@@ -1,7 +1,5 @@
 """The matrix engine: what is done, what is skipped, and what a failure or a kill costs."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

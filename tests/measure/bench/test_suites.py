@@ -1,7 +1,5 @@
 """Suites, plans and the command line of a matrix."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

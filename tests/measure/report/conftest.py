@@ -1,7 +1,5 @@
 """Results as short runs leave them (two scenes, two methods, three atlas formats), and a benchmark's work folder."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,17 +1,11 @@
-"""Pages of reports that say little."""
-
-from __future__ import annotations
+"""Pages of reports with few parts."""
 
 from typing import Any
 
-from bitymi_ns.measure.report.page import Content, to_page
-
-EMPTY: dict[str, Any] = {
-    "title": "", "intro": "", "summary": [], "views": [], "quality": [], "training": None, "poses": [], "sections": [],
-    "knobs": [], "worst": [], "notes": [],
-}  # fmt: skip
+from bitymi_ns.measure.report.page import compose, to_page
+from bitymi_ns.measure.report.records import Records
 
 
-def page_of(**said: Any) -> str:
-    """The HTML page of a report that says this alone."""
-    return to_page(Content(**{**EMPTY, **said}))
+def page_of(**parts: Any) -> str:
+    """The HTML page of a report that shows these parts alone."""
+    return to_page({**compose(Records(), ""), **parts})

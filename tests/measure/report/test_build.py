@@ -1,7 +1,5 @@
 """The report as a whole: what the page shows, and how a report fails."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

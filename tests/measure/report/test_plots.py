@@ -1,7 +1,5 @@
 """Pareto fronts, and the panel of bundles of several sizes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

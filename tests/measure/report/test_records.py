@@ -1,7 +1,5 @@
 """Reading evaluations and curves: what they hold, and what broken files say."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

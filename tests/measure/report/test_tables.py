@@ -1,13 +1,11 @@
 """Tables: columns that are there, bold values, differences, means."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
 
 from bitymi_ns.measure.report.records import evaluation_from
-from bitymi_ns.measure.report.tables import Row, Table, quality_tables, significant, summary, to_markdown
+from bitymi_ns.measure.report.tables import Row, Table, quality_tables, significant, to_markdown
 from tests.measure.report.pages import page_of
 
 
@@ -49,16 +47,6 @@ def test_means_only_over_what_covers_the_same_scenes():
     assert [row.cells for row in mean.rows if not row.section] == [("bitymi", "21.00")]
 
 
-def test_summary_says_what_baking_changed():
-    rows = [
-        make(psnr=27.0, render_ms=50.0),
-        make(psnr=26.99, render_ms=10.0, atlas_bytes=3_000_000, method="bitymi-bundle"),
-    ]
-    (line,) = summary(rows)
-    assert "27.00 dB trained, 26.99 dB baked (−0.010)" in line
-    assert "50.0 ms to 10.0 ms per view (5.0× as fast)" in line and "3.00 MB" in line
-
-
 @pytest.mark.parametrize(
     ("value", "text"), [(0.0, "0"), (0.0012345, "0.0012"), (0.1234, "0.123"), (3.14159, "3.14"), (61.72, "61.7")]
 )
@@ -69,7 +57,7 @@ def test_significant(value: float, text: str):
 def test_names_cannot_break_the_table():
     table = Table("t", ("Method", "A"), (Row(("<script>a|b</script>", "1"), frozenset({1})),))
     title = table.rows[0].cells[0]
-    page = page_of(title=title, summary=[title], quality=[table], training=table, knobs=[table], poses=[([table], ())])
+    page = page_of(title=title, notes=[title], quality=[table], training=table, knobs=[table], poses=[([table], ())])
     assert "<script>" not in page and page.count("<th>&lt;script&gt;a|b&lt;/script&gt;</th>") == 4
     assert page.count("<td><b>1</b></td>") == 4 and "<title>&lt;script&gt;a|b&lt;/script&gt;</title>" in page
     assert to_markdown(table).splitlines()[2] == "| <script>a\\|b</script> | **1** |"

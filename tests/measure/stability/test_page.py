@@ -1,7 +1,5 @@
 """The page of errors, on a few scenes of it."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -48,6 +48,40 @@ def test_one_line_says_what_will_be_taken(
     assert "GB that this machine has available" in said(capsys)
 
 
+class OnCard:
+    """Stands for a scene on a card: its tensors say so, and can be copied to the CPU."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.config, self.near, self.field, self._count = scene.config, scene.near, scene.field, len(scene)
+        card = torch.device("cuda", 0)
+        self.surfels = {
+            name: SimpleNamespace(device=card, cpu=lambda value=value: value.detach(), shape=value.shape)
+            for name, value in scene.surfels.items()
+        }
+
+    def __len__(self) -> int:
+        return self._count
+
+
+@pytest.mark.parametrize("what", ["training", "export"])
+def test_a_card_is_compared_with_its_own_memory(
+    scene: tuple[Scene, Camera], what: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    state = {"training": memory.state_training, "export": memory.state_export}[what]
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=0))  # the host's does not matter
+    monkeypatch.setattr(memory, "photograph_budget", lambda device: 2**30)
+    monkeypatch.setattr(memory, "PER_SURFEL" if what == "training" else "PER_PIXEL", 1e8)
+    needed = []
+    for free in (10**12, 10**9):
+        monkeypatch.setattr(memory, "free_memory", lambda device, free=free: free)
+        state(OnCard(scene[0]), [scene[1]] * 20, 0)  # type: ignore[operator]
+        text = said(capsys)
+        assert "GB of memory of the card for 20 training photographs" in text
+        assert ("more than the 1.0 GB that the card has available" in text) == (free == 10**9)
+        needed.append(gigabytes(text))
+    assert needed[0] > 1 and needed[1] <= needed[0]  # views with more fragments than it holds are drawn in bands
+
+
 def test_it_grows_with_fragments_up_to_the_bound_and_not_with_views(
     scene: tuple[Scene, Camera], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

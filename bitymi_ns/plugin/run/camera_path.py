@@ -1,0 +1,79 @@
+"""Check of the camera paths that `ns-render camera-path` reads, before the scene is loaded."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, Field, ValidationError
+
+from bitymi_ns.plugin.console import fail, warn
+
+MOST_PIXELS = 16_384
+"""Along a side of a frame."""
+SLACK = 1e-3
+"""Of a rotation that was stored with rounding."""
+HELP = "Record it in the viewer of the run or bundle, or write nerfstudio's format."
+
+
+def _pose(value: list[Any]) -> list[Any]:
+    """The 16 numbers of a matrix [4, 4] by rows: a rotation and a position."""
+    try:
+        matrix = np.array(value, np.float64).reshape(4, 4)
+    except (TypeError, ValueError):
+        raise ValueError("must be 16 numbers, a matrix by rows") from None
+    turn = matrix[:3, :3]
+    if not (np.isfinite(matrix).all() and np.abs(turn @ turn.T - np.eye(3)).max() < SLACK and np.linalg.det(turn) > 0):
+        raise ValueError("must be a rotation and a position: camera to world, x right, y up, z backward")
+    return value
+
+
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_Side = Annotated[int, Field(ge=1, le=MOST_PIXELS)]
+
+
+class _Frame(BaseModel):
+    camera_to_world: Annotated[list[Any], AfterValidator(_pose)]
+    fov: Annotated[float, Field(gt=0, lt=180)]
+
+
+class _Path(BaseModel):
+    render_width: _Side
+    render_height: _Side
+    seconds: _Positive
+    camera_path: Annotated[list[_Frame], Field(min_length=1)]
+    camera_type: str = "perspective"
+    crop: Any = None
+
+
+def check_camera_path(file: Path) -> float:
+    """Stop where a file is no camera path that can be rendered; warn of what is not heeded.
+
+    Returns:
+        frames per second.
+
+    Raises:
+        InputError: naming the file, the field and what is wrong with it.
+    """
+    try:
+        found = json.loads(file.read_text("utf-8"))
+        path = _Path.model_validate(found)
+    except OSError as error:
+        fail(f"the camera path {file} cannot be read: {error.strerror} (--camera-path-filename).", error)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(map(str, first["loc"]))
+        what = first["msg"].removeprefix("Value error, ")
+        fail(f"the camera path {file} cannot be used: {where + ': ' if where else ''}{what}. {HELP}", error)
+    except ValueError as error:
+        fail(f"the camera path {file} is no JSON in UTF-8 ({error}). {HELP}", error)
+    if path.camera_type.lower() not in ("perspective", "pinhole"):
+        fail(
+            f"the camera path {file} is for cameras of type {path.camera_type}: only perspective cameras can be "
+            "rendered. Choose perspective in the viewer's render tab and save the path again."
+        )
+    if path.crop is not None:
+        warn("Crop boxes are not supported: the whole scene is rendered.")
+    return len(path.camera_path) / path.seconds

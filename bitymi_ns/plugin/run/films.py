@@ -1,0 +1,117 @@
+"""Films as H.264 in MP4, encoded by PyAV, and pictures as files, all of them written whole or not at all."""
+
+from __future__ import annotations
+
+import gzip
+import os
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from PIL import Image
+
+from bitymi_ns.files import complete_file, complete_folder
+from bitymi_ns.plugin.console import fail
+
+RATES = (0.01, 1000.0)
+"""Frames per second of a film."""
+QUALITY = "18"
+"""Constant rate factor of H.264, at which its loss is hardly visible."""
+ENDINGS = {"jpeg": ".jpg", "png": ".png"}
+FRAME = re.compile(r"\d{5}\.(jpg|png)")
+
+Add = Callable[[np.ndarray], None]
+"""Receives the next frame: [H, W, 3], or [H, W, 4] where the format has transparency, uint8."""
+
+
+@contextmanager
+def film(path: Path, fps: float) -> Iterator[Add]:
+    """Open a film, which all browsers play: 8 bits, yuv420p of BT.709, with its index in front.
+
+    H.264 with halved colour needs even sizes: of odd ones the last row or column is left out.
+
+    Args:
+        path: of the film; an earlier one is replaced at the end.
+        fps: frames per second.
+
+    Raises:
+        InputError: the frames are too small or too large for H.264.
+        OSError: it cannot be written.
+    """
+    import av
+    from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
+
+    stream: Any = None
+    standard = {"dst_colorspace": Colorspace.ITU709, "dst_color_range": ColorRange.MPEG}
+
+    def add(image: np.ndarray) -> None:
+        nonlocal stream
+        height, width = (size - size % 2 for size in image.shape[:2])
+        if stream is None:
+            rate = Fraction(fps).limit_denominator(1001)  # 24000/1001 is one that is in use
+            stream = container.add_stream("libx264", rate=rate, options={"crf": QUALITY})
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+            context = stream.codec_context
+            context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
+            context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image[:height, :width]), "rgb24")
+        container.mux(stream.encode(frame.reformat(format="yuv420p", **standard)))
+
+    mp4: Any = {"format": "mp4", "options": {"movflags": "+faststart"}}
+    with complete_file(path) as file, av.open(os.path.abspath(file.name), "w", **mp4) as container:
+        try:
+            yield add
+            container.mux(stream.encode())
+        except av.FFmpegError as error:
+            if isinstance(error, OSError) and error.errno:
+                raise OSError(error.errno, error.strerror) from error
+            fail(f"{path}: H.264 cannot have it ({error}). Choose another size, or --output-format images.", error)
+
+
+@contextmanager
+def frames(folder: Path, form: str, quality: int) -> Iterator[Add]:
+    """Open a folder of pictures 00000.jpg, 00001.jpg and so on, or .png; one of earlier frames is replaced at the end.
+
+    Raises:
+        InputError: the folder holds anything else.
+        OSError: it cannot be written.
+    """
+    count = 0
+
+    def add(image: np.ndarray) -> None:
+        nonlocal count
+        with open(new / f"{count:05d}{ENDINGS[form]}", "wb") as file:
+            _save(file, image, form, quality)
+        count += 1
+
+    with complete_folder(folder, lambda: check_frames(folder)) as new:
+        yield add
+
+
+def check_frames(folder: Path) -> None:
+    """Stop where a folder holds anything but earlier frames, which would be lost."""
+    if folder.is_dir() and not all(FRAME.fullmatch(path.name) for path in folder.iterdir()):
+        fail(f"the folder {folder} holds other files than frames and is not replaced: choose another --output-path.")
+
+
+def write_image(path: Path, image: np.ndarray, *, fmt: str, quality: int = 100) -> None:
+    """Write a picture [H, W, 3 or 4], float in [0, 1] or uint8, whole or not at all; stands for mediapy's function."""
+    if image.dtype != np.uint8:
+        image = (np.clip(image, 0.0, 1.0) * 255.0).round().astype(np.uint8)
+    with complete_file(Path(path)) as file:
+        _save(file, image, fmt, quality)
+
+
+def _save(file: IO[bytes], image: np.ndarray, form: str, quality: int) -> None:
+    Image.fromarray(image).save(file, form, **({"quality": quality} if form == "jpeg" else {}))
+
+
+@contextmanager
+def open_gzip(path: Path, mode: str) -> Iterator[IO[bytes]]:
+    """Open a compressed file for writing, whole or not at all; stands for gzip's function."""
+    with complete_file(Path(path)) as file, gzip.GzipFile(fileobj=file, mode="wb") as compressed:
+        yield compressed  # type: ignore[misc]

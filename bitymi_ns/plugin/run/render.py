@@ -1,0 +1,286 @@
+"""`ns-render` on our scenes: films and frames without a program ffmpeg, options checked before a scene is loaded.
+
+nerfstudio's script reads a camera path, or makes one of the capture's cameras, and hands it to a function that renders
+and writes. `adopt_render` puts functions of this module into the script.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.utils import colormaps
+from torch import Tensor
+
+from bitymi_ns.files import check_writable, reason, size_text
+from bitymi_ns.plugin.console import fail, say, warn
+from bitymi_ns.plugin.data.cameras import to_camera
+from bitymi_ns.plugin.data.datamanager import BitymiDataManager
+from bitymi_ns.plugin.run.camera_path import MOST_PIXELS, check_camera_path
+from bitymi_ns.plugin.run.commands import running_command
+from bitymi_ns.plugin.run.films import RATES, check_frames, film, frames, open_gzip, write_image
+from bitymi_ns.plugin.run.surfel_model import SurfelModel
+from bitymi_ns.progress import rich_progress
+from bitymi_ns.scene.baked import as_bytes
+from bitymi_ns.train.views import spread
+
+TRAJECTORIES = ("RenderCameraPath", "RenderInterpolated", "SpiralRender")
+"""Classes of nerfstudio's script that render along a path."""
+OUTPUTS = ("rgb", "rgba", "accumulation", "depth", "normal", "beta", "overdraw")
+"""Outputs of all our scenes."""
+WITHOUT_MAPS = {"rgb", "rgba", "accumulation"}
+"""Outputs for which no maps need to be drawn."""
+DEPTH_VIEWS, DEPTH_SIDE, DEPTH_SHARE = 16, 160, 0.01
+"""Depth colours of a film span the depths of so many frames of this size, without this share at either end."""
+TURNS = 2
+"""Of a spiral."""
+INTERRUPTED = 130
+
+
+def adopt_render() -> None:
+    """Have ns-render, where it is the command that is about to load a scene of ours, write by our rules.
+
+    Raises:
+        InputError: an option or the camera path cannot be used.
+    """
+    found = running_command()
+    if found is None:
+        return
+    command, script = found
+    kind = type(command).__name__
+    if kind in (*TRAJECTORIES, "DatasetRender"):
+        _check(command)
+    if kind == "DatasetRender":
+        script["media"], script["gzip"] = SimpleNamespace(write_image=write_image), SimpleNamespace(open=open_gzip)
+    if kind not in TRAJECTORIES:
+        return
+    trajectory = script["_render_trajectory_video"]
+    stock = getattr(trajectory, "stock", {name: script[name] for name in _REPLACED})
+
+    def render_trajectory(pipeline: Any, cameras: Cameras, seconds: float, **options: Any) -> None:
+        script.update(stock)  # for another method in the same process
+        if not isinstance(pipeline.model, SurfelModel):
+            script["_render_trajectory_video"](pipeline, cameras, seconds=seconds, **options)
+            return
+        if kind == "SpiralRender":
+            cameras = spiral(pipeline.model, cameras, _spiral_frames(command), command.radius)
+        rate = len(cameras) / seconds if kind == "RenderCameraPath" else float(command.frame_rate)
+        write_trajectory(pipeline.model, cameras, command, rate)
+
+    render_trajectory.stock = stock  # type: ignore[attr-defined]
+    script.update(
+        install_checks=SimpleNamespace(check_ffmpeg_installed=lambda: None),
+        get_crop_from_json=lambda path: None,  # crops are not supported
+        get_interpolated_camera_path=lambda **options: _interpolated(stock["get_interpolated_camera_path"], **options),
+        get_spiral_path=lambda camera, **options: camera,
+        VanillaDataManager=(stock["VanillaDataManager"], BitymiDataManager),  # those that a spiral is allowed for
+        _render_trajectory_video=render_trajectory,
+    )
+
+
+_REPLACED = (
+    "install_checks",
+    "get_crop_from_json",
+    "get_interpolated_camera_path",
+    "get_spiral_path",
+    "VanillaDataManager",
+    "_render_trajectory_video",
+)
+
+
+def _spiral_frames(command: Any) -> int:
+    return int(command.frame_rate * command.seconds)
+
+
+def target_of(command: Any) -> Path:
+    """The file or folder that a command writes: a film without an ending gets .mp4, folders nerfstudio's names."""
+    path = Path(command.output_path)
+    if not hasattr(command, "output_format"):
+        return path / command.split
+    if command.output_format == "images":
+        return path.parent / path.stem
+    return path if path.suffix else path.with_suffix(".mp4")
+
+
+def _check(command: Any) -> None:
+    """Stop where options of a command cannot be used."""
+    as_film = getattr(command, "output_format", "images") == "video"
+    for name, low, high in (
+        ("downscale_factor", 1 / MOST_PIXELS, MOST_PIXELS),
+        ("jpeg_quality", 1, 100),
+        ("frame_rate", *RATES),
+        ("interpolation_steps", 1, math.inf),
+        ("seconds", 1 / RATES[1], math.inf),
+        ("radius", 0, math.inf),
+    ):
+        value = getattr(command, name, None)
+        if value is not None and not low <= value <= high:
+            between = f"from {low:g} to {high:,}" if high < math.inf else f"at least {low:g}"
+            fail(f"--{name.replace('_', '-')} must be {between}, not {value}.")
+    if command.render_nearest_camera or command.check_occlusions:
+        fail(
+            "--render-nearest-camera and --check-occlusions need rays, and surfels are drawn as whole pictures: leave "
+            "them out. `ns-render dataset` writes photographs beside renders."
+        )
+    _check_outputs(command, not as_film and command.image_format == "png")
+    path = target_of(command)
+    if as_film and path.suffix.lower() != ".mp4":
+        fail(f"films are MP4: --output-path must end in .mp4, {path} does not. Frames: --output-format images.")
+    try:
+        check_writable(path)
+    except OSError as error:
+        fail(f"{path} cannot be written: {reason(error, path)} (--output-path).", error)
+    if as_film and path.is_dir():
+        fail(f"{path} is a folder: choose another --output-path.")
+    if not as_film and hasattr(command, "output_format"):
+        check_frames(path)
+    if hasattr(command, "camera_path_filename"):
+        rate = check_camera_path(Path(command.camera_path_filename))
+        if as_film and not RATES[0] <= rate <= RATES[1]:
+            fail(f"{command.camera_path_filename} makes {rate:g} frames per second: correct its seconds.")
+    elif getattr(command, "seconds", None) is not None and _spiral_frames(command) < 1:
+        fail(f"{command.seconds} seconds have no frame at --frame-rate {command.frame_rate}: give more.")
+
+
+def _check_outputs(command: Any, transparency: bool) -> None:
+    """Stop at outputs that cannot be written in the format."""
+    names = command.rendered_output_names
+    if names is None:  # of a dataset: all of them
+        return
+    dataset = not hasattr(command, "output_format")
+    more = "; with raw- before it for raw values; gt-rgb" if dataset else ""
+    if not names:
+        fail("--rendered-output-names names nothing: give rgb, depth or another output.")
+    for name in names:
+        output = name.removeprefix("raw-") if dataset else name
+        if output not in OUTPUTS and not (dataset and output.startswith("gt-")):
+            fail(f"there is no output {name}: --rendered-output-names may be {', '.join(OUTPUTS)}{more}.")
+    if "rgba" in names and not transparency:
+        fail("rgba has transparency, which JPEG and films have not: add --image-format png (and frames, not a film).")
+    if "rgba" in names and len(names) > 1 and not dataset:
+        fail("rgba cannot stand beside other outputs in a frame: name it alone in --rendered-output-names.")
+
+
+def _interpolated(stock: Any, cameras: Cameras, **options: Any) -> Cameras:
+    """nerfstudio's path between cameras, in the size of the first one: it takes the principal point for the middle."""
+    if len(cameras) < 2:
+        fail(
+            f"a path leads from camera to camera, and there is {'only one' if len(cameras) else 'none'} to start from. "
+            "Choose --pose-source train, or `ns-render spiral`."
+        )
+    path = stock(cameras=cameras, **options)
+    _resize(path, cameras)
+    return path
+
+
+def _resize(path: Cameras, cameras: Cameras) -> None:
+    for name in ("width", "height"):
+        setattr(path, name, torch.full_like(getattr(path, name), int(getattr(cameras, name)[0])))
+
+
+@torch.no_grad()
+def spiral(model: SurfelModel, start: Cameras, steps: int, radius: float) -> Cameras:
+    """Cameras on a spiral around one, all turned to the point that the middle of its picture shows.
+
+    nerfstudio's own spiral takes the camera's axis in the world for the upward one in the camera, and rolls.
+
+    Args:
+        start: one camera.
+        steps: number of cameras.
+        radius: of the spiral in units of the scene, along all axes of the camera.
+    """
+    camera = to_camera(start, model.device).within(DEPTH_SIDE)
+    outputs = model.outputs_of(camera, maps=True)
+    y, x = camera.height // 3, camera.width // 3
+    middle = tuple(outputs[name][y : camera.height - y, x : camera.width - x] for name in ("depth", "accumulation"))
+    known = middle[0][middle[1] > 0.5]
+    target = torch.tensor([0.0, 0.0, -float(known.median()) if len(known) else -1e6], dtype=torch.float64)
+    angle = torch.arange(steps, dtype=torch.float64) * (2 * math.pi * TURNS / steps)
+    center = radius * torch.stack([angle.cos(), -angle.sin(), -(angle / TURNS).sin()], 1)
+    back = torch.nn.functional.normalize(center - target, dim=1)
+    right = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([[0.0, 1.0, 0.0]]).double(), back), dim=1)
+    local = torch.stack([right, torch.linalg.cross(back, right), back, center], 2)  # [steps, 3, 4]
+    pose = start.camera_to_worlds[0].cpu().double()
+    poses = pose[:, :3] @ local
+    poses[:, :, 3] += pose[:, 3]
+    scalars = {name: getattr(start, name)[0].item() for name in ("fx", "fy", "cx", "cy", "width", "height")}
+    return Cameras(poses.float(), **scalars)
+
+
+@torch.no_grad()
+def write_trajectory(model: SurfelModel, cameras: Cameras, command: Any, fps: float) -> None:
+    """Render cameras as a film or as frames, whole or not at all.
+
+    Args:
+        cameras: of the frames.
+        command: nerfstudio's command, with its options.
+        fps: frames per second of a film.
+
+    Raises:
+        InputError: the target cannot be written.
+    """
+    target, names = target_of(command), command.rendered_output_names
+    images, started = command.output_format == "images", time.monotonic()
+    cameras.rescale_output_resolution(1.0 / command.downscale_factor)
+    views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
+    width, height = views[0].width * len(names), views[0].height
+    if not images and (width % 2 or height % 2):
+        say(f"H.264 needs even sizes: of {width} x {height} pixels the last row or column is left out.")
+    if not images and min(width, height) < 2:
+        fail(f"a film of {width} x {height} pixels cannot be written: give a smaller --downscale-factor.")
+    planes = _depth_planes(model, views, command) if "depth" in names else {}
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        output = frames(target, command.image_format, command.jpeg_quality) if images else film(target, fps)
+        with output as add, rich_progress() as progress:
+            for i, camera in enumerate(views):
+                add(_picture(model, camera, names, planes, command.colormap_options))
+                progress("rendering", i + 1, len(views))
+    except OSError as error:
+        fail(f"{target} cannot be written: {reason(error, target)} (--output-path).", error)
+    except KeyboardInterrupt:
+        warn(f"The rendering was interrupted; nothing was written to {target}.")
+        raise SystemExit(INTERRUPTED) from None
+    what = f"{len(views)} frames of {width} x {height}"
+    if not images:
+        what += f", {fps:.3g} per second, {size_text(target.stat().st_size)}"
+    say(f"{target}: {what}; {time.monotonic() - started:.1f} s")
+
+
+def _picture(
+    model: SurfelModel, camera: Any, names: Sequence[str], planes: dict[str, float], options: Any
+) -> np.ndarray:
+    """[H, W, 3 or 4] uint8: the outputs of a camera side by side, as nerfstudio colours them."""
+    outputs = model.outputs_of(camera, maps=not WITHOUT_MAPS.issuperset(names))
+    outputs["rgba"] = model.get_rgba_image(outputs)
+    parts = []
+    for name in names:
+        image: Tensor = outputs[name]
+        if name == "depth":
+            image = colormaps.apply_depth_colormap(image, outputs["accumulation"], colormap_options=options, **planes)
+        elif name != "rgba":
+            image = colormaps.apply_colormap(image, options)
+        parts.append(image)
+    return as_bytes(torch.cat(parts, dim=1)).numpy()
+
+
+def _depth_planes(model: SurfelModel, views: Sequence[Any], command: Any) -> dict[str, float]:
+    """Return the nearest and farthest depth of the colours: those of the options, else of the whole film, so that a
+    colour means the same in all frames."""
+    seen = []
+    for i in spread(len(views), DEPTH_VIEWS):
+        outputs = model.outputs_of(views[i].within(DEPTH_SIDE), maps=True)
+        seen.append(outputs["depth"][outputs["accumulation"] > 0.5].cpu())
+    depths = torch.cat(seen).numpy()
+    near, far = np.quantile(depths, (DEPTH_SHARE, 1 - DEPTH_SHARE)).tolist() if len(depths) else (0.0, 1.0)
+    near = near if command.depth_near_plane is None else command.depth_near_plane
+    far = far if command.depth_far_plane is None else command.depth_far_plane
+    say(f"Depth colours span {near:.3g} to {far:.3g} units of the scene (--depth-near-plane, --depth-far-plane).")
+    return {"near_plane": near, "far_plane": far}

@@ -1,0 +1,68 @@
+"""A camera path of a bundle, on the bundle and on the run that it came from; a dataset as pictures."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.scripts import render
+from PIL import Image
+
+from bitymi_ns.bundle import read_bundle
+from bitymi_ns.interchange.bundle_cameras import named_cameras
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig
+from bitymi_ns.scene.baked import as_bytes
+
+
+@pytest.fixture
+def camera_path(bundle: Path, tmp_path: Path) -> Path:
+    """The bundle's cameras as nerfstudio's camera path: camera to world by rows, x right, y up, z backward."""
+    frames = []
+    for row in named_cameras(bundle, read_bundle(bundle).info):
+        pose = torch.linalg.inv(row.camera.viewmat.double()) @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).double()
+        fov = 2 * np.degrees(np.arctan(row.camera.height / 2 / float(row.camera.K[1, 1])))
+        frames.append({"camera_to_world": pose.flatten().tolist(), "fov": fov, "aspect": 4 / 3})
+    path = {"render_width": 48, "render_height": 36, "seconds": 1.0, "fps": len(frames), "camera_path": frames}
+    (tmp_path / "path.json").write_text(json.dumps(path))
+    return tmp_path / "path.json"
+
+
+def test_a_camera_path_is_that_of_the_bundle_and_of_its_run(
+    bundle: Path, trained: BitymiTrainerConfig, camera_path: Path, tmp_path: Path
+) -> None:
+    pictures = {}
+    for name, folder in (("bundle", bundle), ("run", trained.get_base_dir())):
+        options = {"output_path": tmp_path / name, "output_format": "images", "image_format": "png"}
+        render.RenderCameraPath(load_config=folder / "config.yml", camera_path_filename=camera_path, **options).main()
+        files = sorted((tmp_path / name).iterdir())
+        pictures[name] = np.stack([np.array(Image.open(file)) for file in files]).astype(int)
+    scene = read_bundle(bundle)
+    cameras = [row.camera for row in named_cameras(bundle, scene.info)]
+    drawn = np.stack([as_bytes(scene.render(camera).rgb).numpy() for camera in cameras]).astype(int)
+    # a path has the field of view alone: the principal point is in the middle, as the room's cameras have it
+    assert np.abs(pictures["bundle"] - drawn).max() <= 2
+    error = ((pictures["run"] - pictures["bundle"]) ** 2).mean()
+    assert 10 * np.log10(255**2 / error) > 30
+    assert np.abs(drawn[0] - drawn[5]).mean() > 2  # not what any camera shows
+
+
+def test_pictures_of_a_dataset(bundle: Path, tmp_path: Path) -> None:
+    names = ["rgb", "rgba", "raw-depth"]
+    render.DatasetRender(
+        load_config=bundle / "config.yml",
+        output_path=tmp_path / "maps",
+        rendered_output_names=names,
+        image_format="png",
+    ).main()
+    files = sorted(path.relative_to(tmp_path / "maps" / "test") for path in (tmp_path / "maps").rglob("*.*"))
+    assert len(files) == 6 and not [path for path in files if path.name.startswith(".")]
+    rgb, rgba = (np.array(Image.open(tmp_path / "maps" / "test" / n / "frame_00001.png")) for n in names[:2])
+    assert rgb.shape == (36, 48, 3) and rgba.shape == (36, 48, 4)
+    (packed, _) = sorted((tmp_path / "maps" / "test" / "raw-depth").iterdir())
+    with gzip.open(packed) as file:
+        depth = np.load(file)
+    assert depth.shape == (36, 48, 1) and depth.min() > 0

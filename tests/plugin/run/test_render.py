@@ -1,0 +1,304 @@
+"""`ns-render` on our scenes: films and frames by PyAV, whole or not at all; one line says what cannot be rendered."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("nerfstudio")
+
+import av
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.scripts import render
+from PIL import Image
+
+from bitymi_ns.plugin.console import InputError
+from bitymi_ns.plugin.data.datamanager import BitymiDataManager
+from bitymi_ns.plugin.run.render import adopt_render, spiral
+from bitymi_ns.plugin.run.surfel_model import SurfelModel
+from bitymi_ns.scene.camera import Camera
+
+DISTANCE = 3.0
+
+
+class Wall(SurfelModel):
+    """A coloured wall in front of every camera, at one depth; its blue tells the frame."""
+
+    def __init__(self) -> None:
+        torch.nn.Module.__init__(self)
+        self.device_indicator_param = torch.nn.Parameter(torch.zeros(0))
+        self.drawn: list[Camera] = []
+        self.before: Callable[[int], None] = lambda number: None
+
+    background = torch.zeros(3)
+
+    def surfel_count(self) -> int:
+        return 1
+
+    def render(self, camera: Camera, background: torch.Tensor, maps: bool) -> Any:
+        self.before(len(self.drawn))
+        self.drawn.append(camera)
+        one = torch.ones(camera.height, camera.width, 1)
+        rgb = torch.cat([0.8 * one, 0.4 * one, 0.05 * min(len(self.drawn), 20) * one], 2)
+        extra = {"depth": DISTANCE * one, "normal": 0 * rgb, "beta": one, "overdraw": one}
+        return SimpleNamespace(rgb=rgb, alpha=one, **(extra if maps else dict.fromkeys(extra)))
+
+
+@pytest.fixture
+def wall(monkeypatch: pytest.MonkeyPatch) -> Wall:
+    """The scene that nerfstudio's commands load."""
+    model = Wall()
+    for name in ("install_checks", "_render_trajectory_video", "get_crop_from_json", "VanillaDataManager", "media"):
+        monkeypatch.setattr(render, name, getattr(render, name))
+    for name in ("get_interpolated_camera_path", "get_spiral_path", "gzip"):
+        monkeypatch.setattr(render, name, getattr(render, name))
+
+    def eval_setup(*_: Any, **__: Any) -> tuple:
+        adopt_render()
+        manager = BitymiDataManager.__new__(BitymiDataManager)
+        torch.nn.Module.__init__(manager)
+        manager.eval_dataset = HeldOut()
+        return None, SimpleNamespace(model=model, datamanager=manager, device="cpu"), None, 0
+
+    monkeypatch.setattr(render, "eval_setup", eval_setup)
+    monkeypatch.setattr(render.install_checks, "check_ffmpeg_installed", lambda: pytest.fail("no ffmpeg is needed"))
+    return model
+
+
+class HeldOut:
+    """What is read of a data set."""
+
+    count = 3
+
+    def __len__(self) -> int:
+        return self.count
+
+    @property
+    def cameras(self) -> Cameras:
+        return cameras(self.count)
+
+
+def cameras(count: int) -> Cameras:
+    """Cameras in a row whose principal point is off the middle."""
+    poses = torch.eye(4)[:3].repeat(count, 1, 1)
+    poses[:, 0, 3] = torch.arange(count) * 0.1
+    return Cameras(poses, fx=40.0, fy=40.0, cx=17.0, cy=11.0, width=32, height=24)
+
+
+def path_of(count: int = 12, **changes: Any) -> dict[str, Any]:
+    """A camera path as nerfstudio's viewer writes it."""
+    pose = np.eye(4).flatten().tolist()
+    frames = [{"camera_to_world": pose, "fov": 60.0, "aspect": 4 / 3} for _ in range(count)]
+    found = {"camera_type": "perspective", "render_width": 32, "render_height": 24, "fps": 24, "crop": None}
+    return {**found, "seconds": count / 24, "camera_path": frames, **changes}
+
+
+@pytest.fixture
+def camera_path(tmp_path: Path) -> Callable[..., None]:
+    """Render a camera path to tmp_path / "film.mp4", or with other options."""
+
+    def command(found: Any = None, **options: Any) -> None:
+        file = tmp_path / "path.json"
+        file.write_text(json.dumps(path_of() if found is None else found))
+        options = {"camera_path_filename": file, "output_path": tmp_path / "film.mp4", **options}
+        render.RenderCameraPath(load_config=tmp_path / "config.yml", **options).main()
+
+    return command
+
+
+def decoded(path: Path) -> tuple[Any, list[np.ndarray]]:
+    with av.open(str(path)) as container:
+        return container.streams.video[0], [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
+
+
+def test_a_camera_path_becomes_a_film_that_browsers_play(wall: Wall, camera_path: Any, tmp_path: Path) -> None:
+    camera_path()
+    stream, frames = decoded(tmp_path / "film.mp4")
+    context = stream.codec_context
+    assert (context.name, context.pix_fmt, stream.average_rate) == ("h264", "yuv420p", 24)
+    assert len(frames) == 12 and frames[0].shape == (24, 32, 3)
+    for i, frame in enumerate(frames):  # the colours are those that were drawn
+        assert np.abs(frame.mean((0, 1)) - [204, 102, 255 * 0.05 * (i + 1)]).max() < 4
+    focal = float(wall.drawn[0].K[1, 1])
+    assert focal == pytest.approx(12 / math.tan(math.radians(30)), rel=1e-5)
+    data = (tmp_path / "film.mp4").read_bytes()
+    assert data.index(b"moov") < data.index(b"mdat")  # plays before it is there as a whole
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["film.mp4", "path.json"]
+
+
+def test_odd_sizes_and_single_frames(
+    wall: Wall, camera_path: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera_path(path_of(1, render_width=33, render_height=25), output_path=tmp_path / "new" / "odd")
+    _, frames = decoded(tmp_path / "new" / "odd.mp4")
+    assert [frame.shape for frame in frames] == [(24, 32, 3)]
+    assert "of 33 x 25 pixels the last row or column is left out" in capsys.readouterr().out
+
+
+def test_an_interrupted_film_leaves_the_earlier_one(wall: Wall, camera_path: Any, tmp_path: Path) -> None:
+    camera_path()
+    before = (tmp_path / "film.mp4").read_bytes()
+
+    def stop(number: int) -> None:
+        if number == 17:
+            raise KeyboardInterrupt
+
+    wall.before = stop
+    with pytest.raises(SystemExit) as ended:
+        camera_path()
+    assert ended.value.code == 130 and (tmp_path / "film.mp4").read_bytes() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["film.mp4", "path.json"]
+
+
+def test_frames_replace_earlier_frames_and_nothing_else(wall: Wall, camera_path: Any, tmp_path: Path) -> None:
+    frames = {"output_format": "images", "image_format": "png", "output_path": tmp_path / "frames"}
+    camera_path(rendered_output_names=["rgb", "depth"], **frames)
+    camera_path(path_of(2), rendered_output_names=["rgba"], **frames)
+    assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == ["00000.png", "00001.png"]
+    picture = np.array(Image.open(tmp_path / "frames" / "00000.png"))
+    assert picture.shape == (24, 32, 4) and (picture[..., 3] == 255).all()
+    (tmp_path / "frames" / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="holds other files than frames and is not replaced"):
+        camera_path(**frames)
+    assert len(list((tmp_path / "frames").iterdir())) == 3
+
+
+def test_depth_has_the_colours_of_its_planes(wall: Wall, camera_path: Any, tmp_path: Path) -> None:
+    options = {"output_format": "images", "image_format": "png", "rendered_output_names": ["depth"]}
+    for name, far in (("near", 100.0), ("far", 3.0)):
+        camera_path(path_of(1), output_path=tmp_path / name, depth_near_plane=0.0, depth_far_plane=far, **options)
+    near, far = (np.array(Image.open(tmp_path / name / "00000.png"))[12, 16].astype(int) for name in ("near", "far"))
+    assert near[2] > near[0] and far[0] > far[2]  # turbo: blue to red
+
+
+def test_paths_of_the_captures_cameras(wall: Wall, tmp_path: Path) -> None:
+    options: Any = {"load_config": tmp_path / "config.yml", "output_path": tmp_path / "film.mp4"}
+    render.RenderInterpolated(interpolation_steps=6, frame_rate=30, **options).main()
+    stream, frames = decoded(tmp_path / "film.mp4")
+    assert stream.average_rate == 30 and len(frames) == 12 and frames[0].shape == (24, 32, 3)
+    assert float(wall.drawn[0].K[0, 2]) == 17.0
+    render.SpiralRender(seconds=0.5, frame_rate=20, **options).main()
+    stream, frames = decoded(tmp_path / "film.mp4")
+    assert stream.average_rate == 20 and len(frames) == 10 and frames[0].shape == (24, 32, 3)
+
+
+def test_a_spiral_turns_to_what_the_camera_shows_and_does_not_roll(wall: Wall) -> None:
+    angle = math.radians(40)
+    turn = torch.tensor([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
+    start = cameras(1)
+    start.camera_to_worlds[0, :, :3] = turn
+    path = spiral(wall, start, 8, 0.2)
+    target = turn @ torch.tensor([0.0, 0.0, -DISTANCE])
+    for pose in path.camera_to_worlds:
+        toward = torch.nn.functional.normalize(target - pose[:, 3], dim=0)
+        assert float(toward @ -pose[:, 2]) > 0.995  # depth is that along the ray: a little more than that of the wall
+        assert abs(float(pose[1, 0])) < 1e-6  # level, as the first camera is
+        assert float((pose[:, 3] - start.camera_to_worlds[0, :, 3]).norm()) <= 0.2 * math.sqrt(2) + 1e-6
+
+
+BAD_PATHS = {
+    "render_width: Field required": lambda p: p.pop("render_width"),
+    "camera_path: List should have at least 1 item": lambda p: p.update(camera_path=[]),
+    "camera_path.1.fov: Field required": lambda p: p["camera_path"][1].pop("fov"),
+    "camera_path.0.fov: Input should be less than 180": lambda p: p["camera_path"][0].update(fov=180),
+    "camera_path.2.camera_to_world: must be 16 numbers": lambda p: p["camera_path"][2].update(camera_to_world=[1.0]),
+    "camera_path.0.camera_to_world: must be a rotation": lambda p: p["camera_path"][0].update(
+        camera_to_world=[2.0, 0, 0, 0, 0, 2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 1]
+    ),
+    "seconds: Input should be greater than 0": lambda p: p.update(seconds=0),
+    "seconds: Input should be a finite number": lambda p: p.update(seconds=math.inf),
+    "makes 12000 frames per second: correct its seconds": lambda p: p.update(seconds=0.001),
+    "render_height: Input should be less than or equal to 16384": lambda p: p.update(render_height=100_000),
+    "for cameras of type equirectangular: only perspective": lambda p: p.update(camera_type="equirectangular"),
+}
+
+
+@pytest.mark.parametrize("message", BAD_PATHS)
+def test_camera_paths_that_cannot_be_used(wall: Wall, camera_path: Any, tmp_path: Path, message: str) -> None:
+    found = path_of()
+    BAD_PATHS[message](found)
+    with pytest.raises(InputError, match=message.replace("(", r"\(")) as refused:
+        camera_path(json.loads(json.dumps(found)))
+    assert "path.json" in str(refused.value) and "\n" not in str(refused.value)
+    assert not wall.drawn and not (tmp_path / "film.mp4").exists()
+
+
+def test_files_that_are_no_camera_path(wall: Wall, camera_path: Any, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="gone.json cannot be read: No such file.*--camera-path-filename"):
+        camera_path(camera_path_filename=tmp_path / "gone.json")
+    (tmp_path / "other.json").write_bytes(b"\xff\xfe{")
+    with pytest.raises(InputError, match="other.json is no JSON in UTF-8"):
+        camera_path(camera_path_filename=tmp_path / "other.json")
+    with pytest.raises(InputError, match="path.json cannot be used: Input should be .*dictionary"):
+        camera_path([1, 2])
+
+
+@pytest.mark.parametrize(
+    ("command", "options", "message"),
+    [
+        ("RenderInterpolated", {"interpolation_steps": 0}, "--interpolation-steps must be at least 1, not 0"),
+        ("RenderInterpolated", {"frame_rate": 0}, "--frame-rate must be from 0.01 to 1,000.0, not 0"),
+        ("RenderInterpolated", {"downscale_factor": 0.0}, "--downscale-factor must be from"),
+        ("RenderInterpolated", {"downscale_factor": 24.0}, "a film of 1 x 1 pixels cannot be written"),
+        ("RenderInterpolated", {"render_nearest_camera": True}, "--render-nearest-camera .* need rays"),
+        ("RenderInterpolated", {"output_path": Path("film.gif")}, "--output-path must end in .mp4, film.gif does not"),
+        ("RenderInterpolated", {"output_path": Path("/proc/film.mp4")}, "/proc/film.mp4 cannot be written"),
+        ("RenderInterpolated", {"rendered_output_names": ["rgba"]}, "rgba has transparency"),
+        ("RenderInterpolated", {"rendered_output_names": []}, "--rendered-output-names names nothing"),
+        ("RenderInterpolated", {"rendered_output_names": ["rgb", "deep"]}, "there is no output deep: .* may be rgb,"),
+        (
+            "DatasetRender",
+            {"rendered_output_names": ["raw-deep"]},
+            "there is no output raw-deep: .*; with raw-",
+        ),
+        ("DatasetRender", {"downscale_factor": -1.0}, "--downscale-factor must be from"),
+        ("DatasetRender", {"output_path": Path("/proc/maps")}, "/proc/maps/test cannot be written"),
+        ("SpiralRender", {"seconds": 0.0}, "--seconds must be at least 0.001, not 0.0"),
+        ("SpiralRender", {"seconds": 0.01}, "0.01 seconds have no frame at --frame-rate 24"),
+        ("SpiralRender", {"radius": -1.0}, "--radius must be at least 0, not -1.0"),
+        ("DatasetRender", {"rendered_output_names": ["rgba"]}, "rgba has transparency"),
+    ],
+)
+def test_options_that_cannot_be_used(
+    wall: Wall, tmp_path: Path, command: str, options: dict[str, Any], message: str
+) -> None:
+    options = {"output_path": tmp_path / "film.mp4", **options}
+    with pytest.raises(InputError, match=message):
+        getattr(render, command)(load_config=tmp_path / "config.yml", **options).main()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_path_needs_two_cameras(wall: Wall, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(HeldOut, "count", 1)
+    with pytest.raises(InputError, match="there is only one to start from. Choose --pose-source train"):
+        render.RenderInterpolated(load_config=tmp_path / "c.yml", output_path=tmp_path / "film.mp4").main()
+
+
+def test_scenes_of_other_methods_are_rendered_as_before(
+    wall: Wall, camera_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stock: list[Any] = []
+    monkeypatch.setattr(render, "_render_trajectory_video", lambda pipeline, cameras, **_: stock.append(pipeline.model))
+    checks = SimpleNamespace(check_ffmpeg_installed=lambda: stock.append("checked"))
+    monkeypatch.setattr(render, "install_checks", checks)
+    loaded = render.eval_setup
+    camera_path()  # one of ours was loaded before, in the same process
+    assert stock == []
+
+    def eval_setup(*_: Any, **__: Any) -> tuple:
+        return None, SimpleNamespace(model="splatfacto", device="cpu"), None, 0
+
+    monkeypatch.setattr(render, "eval_setup", eval_setup)
+    camera_path()
+    assert stock == ["checked", "splatfacto"]
+    monkeypatch.setattr(render, "eval_setup", loaded)
+    camera_path()
+    assert len(stock) == 2

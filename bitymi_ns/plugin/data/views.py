@@ -48,6 +48,7 @@ class Photograph:
         label: names the camera in messages.
         mask: mask file; None = none.
         downscaled: `file` is a copy that is downscaled already.
+        frame: number that photographs share which a rig took together; None = it stands alone.
     """
 
     file: Path
@@ -56,6 +57,7 @@ class Photograph:
     label: str
     mask: Path | None = None
     downscaled: bool = False
+    frame: int | None = None
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,8 @@ def make_views(
     alpha_color: torch.Tensor | None = None,
 ) -> Views:
     """Build the views of a capture, in the order of the photographs. metadata has for each view its `Lens` ("lenses"),
-    photograph ("files"), and the number of the photograph ("photographs"), which views of one share.
+    photograph ("files"), the number of the photograph ("photographs"), which views of one share, and that of the first
+    photograph of the rig's frame ("frames").
 
     Args:
         photographs: at least two.
@@ -140,7 +143,10 @@ def make_views(
     moved[:, :3, 3] *= scale
     lenses, of, moved = _split(parts, moved)
     files = [photographs[i].file for i in of]
-    metadata: dict[str, Any] = {"lenses": lenses, "files": files, "photographs": of}
+    first: dict[Any, int] = {}
+    frames = [first.setdefault(i if each.frame is None else ("frame", each.frame), i)
+              for i, each in enumerate(photographs)]  # fmt: skip
+    metadata: dict[str, Any] = {"lenses": lenses, "files": files, "photographs": of, "frames": [frames[i] for i in of]}
     if points is not None and len(points.xyz):
         xyz = (points.xyz @ transform[:, :3].T + transform[:, 3]) * scale * applied_scale
         metadata["points3D_xyz"] = torch.from_numpy(xyz.astype(np.float32))

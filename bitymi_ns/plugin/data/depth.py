@@ -42,7 +42,7 @@ TRIALS = 200
 """Pairs of points that scale and shift are computed from."""
 SEEN_BY = 16
 """Photographs that a new point is compared with."""
-PIXELS_PER_POINT = 50
+PIXELS_PER_POINT = 30
 """Pixels of the training photographs per initial point."""
 MOST_POINTS = 200_000
 """Initial points at most."""

@@ -78,7 +78,7 @@ def on_surface(manager: BitymiDataManager, depths: list[np.ndarray]) -> None:
     """Points come from training views, and lie on what they show."""
     outputs = manager.train_dataparser_outputs
     xyz = outputs.metadata["points3D_xyz"].double().numpy()
-    assert len(xyz) == 14 * WIDTH * HEIGHT // 50 and len(outputs.metadata["points3D_rgb"]) == len(xyz)
+    assert len(xyz) == 14 * WIDTH * HEIGHT // 30 and len(outputs.metadata["points3D_rgb"]) == len(xyz)
     box = np.ptp(np.quantile(xyz, (0.02, 0.98), axis=0), axis=0) / outputs.dataparser_scale
     assert (box > (3.0, 3.0, 1.5)).all()
 

@@ -117,8 +117,7 @@ def _few(count: int) -> str:
 class _Kept(BaseModel, extra="forbid"):
     """Content of poses.json, which marks a result as complete."""
 
-    made: bool
-    """The photographs of the model are copies or frames in the work folder."""
+    made: bool  # the photographs of the model are copies or frames in the work folder
     left_out: dict[str, str]
     registered: int
     given: int

@@ -31,10 +31,8 @@ SHOOT = (
 class ViewGraph:
     """Matches between photographs."""
 
-    features: dict[str, int]
-    """Per photograph."""
-    inliers: dict[tuple[str, str], int]
-    """Matches per pair that fit a common geometry; pairs without are missing."""
+    features: dict[str, int]  # per photograph
+    inliers: dict[tuple[str, str], int]  # matches per pair that fit a common geometry; pairs without are missing
 
     def components(self) -> list[set[str]]:
         """Sets of photographs that hang together, the largest first; those alone are not among them."""

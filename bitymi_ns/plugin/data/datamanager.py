@@ -245,8 +245,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
 
     @property
     def eval_dataloader(self) -> SimpleNamespace:
-        """What ns-render spiral asks for its first camera: that of a held-out view, or of training where there is
-        none."""
+        """Serve ns-render spiral its first camera: that of a held-out view, or of training where there is none."""
         cameras = (self.eval_dataset if len(self.eval_dataset) else self.train_dataset).cameras
         return SimpleNamespace(get_camera=lambda image_idx: (cameras[image_idx : image_idx + 1], {}))
 

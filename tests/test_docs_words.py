@@ -23,7 +23,14 @@ WORDS = (
     ),
 )
 """Files whose prose is held to BANNED."""
-DOCSTRINGS = ("examples/*.py", "bitymi_ns/api.py", "bitymi_ns/cli.py", "bitymi_ns/measure/*.py", "bitymi_ns/ops/*.py")
+DOCSTRINGS = (
+    "examples/*.py",
+    "benchmarks/*.py",
+    "scripts/*.py",
+    *(f"bitymi_ns/{name}.py" for name in ("__init__", "api", "cli", "files", "interpreter", "ply", "presets", "trust")),
+    *(f"bitymi_ns/{name}/*.py" for name in ("bake", "bundle", "capture", "codec", "interchange")),
+    *(f"bitymi_ns/{name}/*.py" for name in ("measure", "ops", "sample", "scene")),
+)
 """Python files whose docstrings begin with what is done."""
 COMMENTS = ("csrc/*",)
 """C++ files whose comments do."""

@@ -1,7 +1,5 @@
 """First stages of the bake of trained texels: all of them as tiles, and reduced to a tolerance."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The texels of a bake as one list, on the device where they learn."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

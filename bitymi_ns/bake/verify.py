@@ -1,7 +1,5 @@
 """Checks of a bundle against the trained scene that it was baked from."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """Rate-distortion choice of the view-colour terms: the error that every number of terms makes in the views."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Files for other programs, beside a bundle: a preview as Gaussian splats, and a textured mesh."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable, Sequence

@@ -41,7 +41,7 @@ class NoSurface(ValueError):
 
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """How a surface is extracted.
+    """Options of the extraction of a surface.
 
     Attributes:
         resolution: voxels along the longest side of the box, at least 16.

@@ -159,7 +159,7 @@ class BakedScene:
         return self._draw(cameras, background, images)
 
     def sampling(self, cameras: Sequence[Camera]) -> Sampling:
-        """How views that are drawn together are drawn: by the geometric mean of their sizes."""
+        """Sampling of views that are drawn together: by the geometric mean of their sizes."""
         if self.photographed is None or not len(self.photographed):
             return Sampling()
         sizes = [size_of(self.photographed, camera) for camera in cameras]

@@ -1,6 +1,4 @@
-"""What a scene is made of: the options that decide its parameters and how they are rendered."""
-
-from __future__ import annotations
+"""Options that decide the parameters of a scene and how they are rendered."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -52,6 +50,6 @@ class SceneConfig:
 
     @property
     def residual_moves_surfels(self) -> bool:
-        """Whether the gradient of the residual reaches the surfels. A surfel takes its own texels along, so that they
+        """True if the gradient of the residual reaches the surfels. A surfel takes its own texels along, so that they
         tell it where to go."""
         return self.texture_moves_surfels or self.texture == "texels"

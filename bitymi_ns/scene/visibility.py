@@ -1,4 +1,4 @@
-"""What the training views see of every surfel: whether any fragment of it is blended, and through what."""
+"""Visibility of every surfel in the training views: blended fragments, and the transmittance in front of them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PART = 1 << 20  # fragments that are looked at together: what is computed of the
 
 @dataclass(frozen=True)
 class Visibility:
-    """What the views see of N surfels.
+    """Visibility of N surfels in the views.
 
     Attributes:
         transmittance: [N] float32 in [0, 1], the largest one in front of a blended fragment of the surfel, over all
@@ -50,7 +50,7 @@ def visibility(
     prefilter: Prefilter = "low_pass",
     progress: Progress = no_progress,
 ) -> Visibility:
-    """Which views see every surfel, and through what.
+    """Find the views that see every surfel, and the transmittance in front of it.
 
     Args:
         surfels: the per-surfel parameters of docs/overview.md, N rows, all of them finite and drawable.

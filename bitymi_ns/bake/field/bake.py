@@ -1,7 +1,5 @@
 """The bake of a residual field (paper, section Texture Baking), exact or within a tolerance."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Describe what is measured: scenes x rows x seeds, the cells of each run; standard data sets and plans by name."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -110,8 +108,7 @@ class Stage:
     run: Run
     kind: Kind
     bundle: Bundle | None = None
-    count: int = 0
-    """pictures: number of views."""
+    count: int = 0  # pictures: number of views
 
     @property
     def key(self) -> dict[str, Any]:

@@ -1,8 +1,6 @@
 """Build small float64 scenes for tests and measurements: random ones, numerically extreme ones, and sweeps along one
 kind of stiffness."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

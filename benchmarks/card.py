@@ -8,8 +8,6 @@ each step is a process with a limit of its own, its output is appended to RESULT
 line of the summary. Orders joined by a plus sign (check+gaussians) run at the same time: for what is not timed.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import shutil

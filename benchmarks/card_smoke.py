@@ -5,8 +5,6 @@
 --profile-from-start off), `--times` prints the device's time by kernel over a number of runs.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Shared by the scripts of this folder: Markdown pages and progress, as `bitymi bench` writes them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from bitymi_ns.measure.bench.process import say

@@ -9,8 +9,6 @@ and after the parts, so that a busy machine, or a slower one of the same kind, g
 the figures become the new baseline, benchmarks/gate.json; the commit then shows what changed.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import json

@@ -6,8 +6,6 @@ imported. `--emulated` runs the host's emulation of the kernels on tiny scenes, 
 times mean nothing.
 """
 
-from __future__ import annotations
-
 import argparse
 import subprocess
 import sys

@@ -15,8 +15,6 @@ each frame. "ends at 1/512" is the packed graph where a pixel takes no more ligh
 which may change it by half an 8-bit step of the brightest colour; "differs" is by how much it does.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -6,8 +6,6 @@ curvature of the Beta kernels at their centres. Where the version has an inferen
 (`gsplat.experimental.GaussianInferenceRenderer`, of scenes packed to half precision), that is timed too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -17,8 +17,6 @@ counted apart. What a later kernel of the same operation reads counts again.
   ... backward        12 f + 48 b + 20 p + 96 n
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial

@@ -8,8 +8,6 @@ gsplat's own example (positions 1.6e-4 times the extent of the cameras, falling 
 (1 - SSIM) with the weights of 0.01 on opacities and scales that the strategy asks for.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import sys

@@ -5,8 +5,6 @@ held-out PSNR against seconds of training, peak memory, bytes of the atlas, fram
 `--device cpu` runs the same on the CPU, to try the script: take few steps and a --downscale.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import sys

@@ -7,8 +7,6 @@ waiting is measured; its sums have the precision that the device blends in. The 
 8 bits per channel. `--layers` are the batches in which surfels are drawn (docs/viewer.md).
 """
 
-from __future__ import annotations
-
 import argparse
 import statistics
 import sys

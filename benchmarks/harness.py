@@ -1,7 +1,5 @@
 """Shared by the kernel benchmarks: timing on the device, the card's measured limits, scenes like trained ones."""
 
-from __future__ import annotations
-
 import math
 import statistics
 import time

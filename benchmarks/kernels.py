@@ -18,8 +18,6 @@ The formulas are in `cases`, with n surfels of which v are visible, p pixels, f 
 - blend, texels: neighbouring texels are gathered from the cache, so their loads are not counted.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import os

@@ -1,7 +1,5 @@
 """Read an undistorted capture with a transforms.json without nerfstudio: photographs, poses and points."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field
 from pathlib import Path

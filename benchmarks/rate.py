@@ -11,8 +11,6 @@ compact` does; `--keep` stores that in a file, from which the command continues 
   tuned       dB of the held-out views after it (--tune)
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

@@ -3,8 +3,6 @@
 The public functions are `rasterize`, `train_scene`, `bake_scene` and `read_bundle` (bitymi_ns/api.py).
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:

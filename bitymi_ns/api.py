@@ -1,7 +1,5 @@
 """The public functions: rasterize surfels, train a scene, bake it, read a bundle. None of them needs nerfstudio."""
 
-from __future__ import annotations
-
 import copy
 import json
 from collections.abc import Callable, Sequence

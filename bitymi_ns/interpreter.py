@@ -1,7 +1,5 @@
 """Python processes beside this one."""
 
-from __future__ import annotations
-
 import sys
 
 _CODE = "import sys; sys.path[:] = [folder for folder in sys.path if folder]; from {0} import {1}; sys.exit({1}())"

@@ -6,8 +6,6 @@ plyfile, the library for such files, is not used: it is under the GPL and this p
 memory for as many rows of text as a header claims. Here nothing is taken that the file does not have.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Progress of the slow steps, as a callback that anything can implement."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol

@@ -1,8 +1,6 @@
 """Protection against files of others: links are not followed, folders that others can write to are not used, names stay
 inside a folder, JSON within a nesting depth, and text is printable."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -73,7 +73,7 @@ foreach(cpu ${BITYMI_MARCH})
     endif()
     cpu_features(features "${options}")
     # No -ffast-math: NaN and infinity must stay what they are, they are tested for.
-    # -Wno-psabi: packs are wider than registers, but functions that take them are inlined or stay in their file.
+    # -Wno-psabi: Lanes are wider than registers, but functions that take them are inlined or stay in their file.
     # -Wno-bitwise-instead-of-logical: masks are joined by & whether they are of one number or of sixteen.
     target_compile_options(${name} PRIVATE
       -O3 -fno-math-errno -ffp-contract=fast -Wall -Wextra -Wno-psabi

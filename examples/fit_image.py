@@ -3,8 +3,6 @@
 python examples/fit_image.py --image photo.jpg --output fitted.png
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -3,8 +3,6 @@
 python examples/render_bundle.py --bundle demo/bundle --output pictures
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

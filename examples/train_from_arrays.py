@@ -6,8 +6,6 @@ photographs, and writes a bundle.
 python examples/train_from_arrays.py --capture room --bundle room-bundle
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

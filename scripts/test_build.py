@@ -5,8 +5,6 @@ The build may be by another compiler, for another CPU, or with the sanitizers (`
 be in the process before Python is: then this starts itself again with them.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib.util
 import os

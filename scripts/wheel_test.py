@@ -7,8 +7,6 @@ of this one, but not the checkout: the tests run on a copy of their folder, thos
 this CPU can run.
 """
 
-from __future__ import annotations
-
 import os
 import platform
 import shutil

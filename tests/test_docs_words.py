@@ -16,14 +16,24 @@ WORDS = (
     "Makefile",
     "method_configs/*.yaml",
     "examples/*.py",
+    "csrc/*",
     *(
         f"bitymi_ns/{name}"
-        for name in ("api.py", "cli.py", "codec/*.py", "interchange/*.py", "measure/*", "sample/*.py")
+        for name in ("api.py", "cli.py", "codec/*.py", "ops/*", "interchange/*.py", "measure/*", "sample/*.py")
     ),
 )
 """Files whose prose is held to BANNED."""
-DOCSTRINGS = ("examples/*.py", "bitymi_ns/api.py", "bitymi_ns/cli.py", "bitymi_ns/measure/*.py")
+DOCSTRINGS = (
+    "examples/*.py",
+    "benchmarks/*.py",
+    "scripts/*.py",
+    *(f"bitymi_ns/{name}.py" for name in ("__init__", "api", "cli", "files", "interpreter", "ply", "presets", "trust")),
+    *(f"bitymi_ns/{name}/*.py" for name in ("bake", "bundle", "capture", "codec", "interchange")),
+    *(f"bitymi_ns/{name}/*.py" for name in ("measure", "ops", "sample", "scene")),
+)
 """Python files whose docstrings begin with what is done."""
+COMMENTS = ("csrc/*",)
+"""C++ files whose comments do."""
 BANNED = {
     r"\bby lot\b": "at random",
     r"\bset(?:s|ting)?[- ]aside\b": "validation views; held back",
@@ -41,6 +51,7 @@ BANNED = {
     r"\bsurfels? (?:that )?speaks?\b|\bspeak to them\b": "affect",
     r"\bwhat a run's own\b|(?<!-)\bthinned\b": "limits; sampled",
     r"\blot of surfels\b|\bhouse word": "surfels",
+    r"\b(?:through_pixel|kPacks?|list_places)\b|\bPack<": "prefilter; blocks; ids; Lanes",
 }
 """Pattern: what to write instead."""
 QUESTION = re.compile(r"(?:What|Whether|How|Where|Who|Which|When)\b")
@@ -72,7 +83,11 @@ def found(path: Path) -> list[str]:
 
 
 def questions(path: Path) -> list[str]:
-    """Docstrings of a Python file that begin with a question word."""
+    """Docstrings of a Python file, or comments of another one, that begin with a question word."""
+    if path.suffix != ".py":
+        comments = re.findall(r"(?:^[ \t]*//.*\n)+", path.read_text("utf8"), re.MULTILINE)
+        texts = [comment.splitlines()[0].strip("/ ") for comment in comments]
+        return [f"{path}: {text}" for text in texts if QUESTION.match(text)]
     nodes = ast.walk(ast.parse(path.read_text("utf8")))
     documented = [node for node in nodes if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef))]
     texts = [(getattr(node, "name", path.stem), ast.get_docstring(node) or "") for node in documented]
@@ -89,7 +104,7 @@ def test_no_banned_words() -> None:
 
 @pytest.mark.skipif(not FILES, reason="not a git checkout")
 def test_docstrings_begin_with_what_is_done() -> None:
-    assert not [line for path in tracked(*DOCSTRINGS) for line in questions(path)]
+    assert not [line for path in tracked(*DOCSTRINGS, *COMMENTS) for line in questions(path)]
 
 
 @pytest.mark.parametrize(
@@ -114,5 +129,13 @@ def test_questions_are_found(tmp_path: Path) -> None:
     path = tmp_path / "a.py"
     path.write_text(
         '"""What this is."""\n\n\ndef f():\n    """Whether it is so."""\n\n\ndef g():\n    """Draw it."""\n'
+    )
+    assert len(questions(path)) == 2
+
+
+def test_questions_are_found_in_comments(tmp_path: Path) -> None:
+    path = tmp_path / "a.h"
+    path.write_text(
+        "// Whether it is so,\n// or not.\nint f();\n  // Where it is.\nint g;  // What it is\n// The rest.\n"
     )
     assert len(questions(path)) == 2

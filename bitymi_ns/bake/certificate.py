@@ -1,7 +1,5 @@
 """Certificate of a bake: the error of the stored texels against those before quantisation, as training views see it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

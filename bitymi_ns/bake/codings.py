@@ -1,7 +1,5 @@
 """Codings of texels that their last optimisation steps draw: BC7 pages, or the codes of a compact bundle."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 

@@ -1,7 +1,5 @@
 """Rate-distortion choice of the codes of a compact bundle: one lambda decides the precision of everything."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Directions at which a surfel's view colour is evaluated: of the training views that show it, and others nearby."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

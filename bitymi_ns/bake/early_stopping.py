@@ -1,7 +1,5 @@
 """Early stopping: the state of an optimisation that shows its validation views best."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable
 from typing import Generic, Protocol, TypeVar

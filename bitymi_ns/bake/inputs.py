@@ -11,6 +11,7 @@ from torch import Tensor
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.statistics import LeftOut
 from bitymi_ns.codec.limits import within
+from bitymi_ns.ops import Prefilter
 from bitymi_ns.ops.constants import ALPHA_MIN
 from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.progress import Progress, no_progress
@@ -27,7 +28,7 @@ class BakeInput:
     Attributes:
         surfels: per-surfel parameters by name, N rows, float32.
         cameras: training views; there may be none.
-        near, weight_bound, through_pixel: as the scene is drawn.
+        near, weight_bound, prefilter: as the scene is drawn.
         views: visibility in the cameras; None = not computed.
     """
 
@@ -35,7 +36,7 @@ class BakeInput:
     cameras: Sequence[Camera]
     near: float
     weight_bound: float
-    through_pixel: bool
+    prefilter: Prefilter
     views: Visibility | None = None
 
     @property
@@ -61,7 +62,7 @@ class BakeInput:
             return self
         return replace(
             self,
-            views=visibility(self.surfels, self.cameras, self.near, self.weight_bound, self.through_pixel, progress),
+            views=visibility(self.surfels, self.cameras, self.near, self.weight_bound, self.prefilter, progress),
         )
 
 

@@ -1,7 +1,5 @@
 """Lean view colours: a surfel keeps the fewest sites that hold its colour, or one colour."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """First stages of the bake of trained texels: all of them as tiles, and reduced to a tolerance."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -31,7 +29,7 @@ class BakeableScene(Protocol):
     surfels: Mapping[str, Tensor]
     field: Any  # a residual field, a `TexelField`, or None
     near: float
-    config: Any  # weight_bound, prefilter, through_pixel
+    config: Any  # weight_bound, prefilter
 
 
 @torch.no_grad()
@@ -95,7 +93,7 @@ def reduced(baked: Baked, cameras: Sequence[Camera], progress: Progress = no_pro
     kept[rows] = True
     scene, options, device = baked.scene, baked.options, device_of(cameras)
     surfels = {name: value[rows].to(device) for name, value in scene.surfels.items()}
-    inputs = BakeInput(surfels, cameras, scene.near, scene.weight_bound, scene.through_pixel)
+    inputs = BakeInput(surfels, cameras, scene.near, scene.weight_bound, scene.prefilter)
     inputs, seen = visible(inputs, options, progress)
     if seen is not None:
         gone = gone.but(unseen=int((~seen).sum()))

@@ -1,7 +1,5 @@
 """Quantisation steps of the surfels' columns from the image error of rounding each, measured by drawing."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

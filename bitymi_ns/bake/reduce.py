@@ -1,7 +1,5 @@
 """Smallest grids of tiles within a tolerance, and resampling of tiles as matrices along their axes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import lru_cache

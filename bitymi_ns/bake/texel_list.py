@@ -1,7 +1,5 @@
 """The texels of a bake as one list, on the device where they learn."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch
@@ -54,7 +52,7 @@ class TexelList:
     def projection(self, camera: Camera) -> Projection:
         """Of the surfels into a view."""
         geometry = (self.scene.surfels[name] for name in GEOMETRY)
-        return project(*geometry, camera.to(self.device), self.scene.near, self.scene.through_pixel)
+        return project(*geometry, camera.to(self.device), self.scene.near, self.scene.prefilter)
 
     def coverage(self, views: Sequence[View], progress: Progress = no_progress, squared: bool = False) -> Tensor:
         """Coverage of every texel, in pixels.

@@ -1,7 +1,5 @@
 """Errors of texels as the closest training view shows them: times the blending weight, averaged over its pixels."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import torch

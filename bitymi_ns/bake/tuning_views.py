@@ -1,7 +1,5 @@
 """Training views of surfels that stand still, whose texels learn: their fragments are traced once and kept."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

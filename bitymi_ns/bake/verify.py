@@ -1,7 +1,5 @@
 """Checks of a bundle against the trained scene that it was baked from."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -42,7 +40,7 @@ def check_field(bundle: Bundle, field: Field, cameras: Sequence[Camera]) -> Chec
             return Check(name, False, f"levels {first} to {first + count - 1} stated, the field has {field.levels}")
         field = field.only(first, count)
     options = statistics.options or BakeOptions()
-    inputs = BakeInput(bundle.scene.surfels, cameras, render.near, render.weight_bound, bundle.scene.through_pixel)
+    inputs = BakeInput(bundle.scene.surfels, cameras, render.near, render.weight_bound, bundle.scene.prefilter)
     plan = plan_of(field, inputs.with_visibility(options), options)
     tiled = bundle.scene.tiles[:, 3] > 0
     plan.extent = torch.where(tiled, bundle.scene.extent, plan.extent)
@@ -90,7 +88,7 @@ def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Seq
     means, render = bundle.scene.surfels["means"], bundle.info.render
     seen, transmittance = means.new_zeros(0, len(means), dtype=torch.bool), None
     if cameras:
-        views = visibility(trained, cameras, render.near, through_pixel=bundle.scene.through_pixel)
+        views = visibility(trained, cameras, render.near, prefilter=bundle.scene.prefilter)
         seen, transmittance = views.seen, views.in_front
     opacity, _ = kernel_parameters(trained, transmittance)
     at = (means, seen, centers_of(cameras, means), opacity)

@@ -1,7 +1,5 @@
 """Rate-distortion choice of the view-colour terms: the error that every number of terms makes in the views."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -73,7 +71,7 @@ def shown_weights(scene: BakedScene, cameras: Sequence[Camera], progress: Progre
     found = torch.zeros(len(cameras), len(scene), device=device)
     geometry = [scene.surfels[name].to(device) for name in GEOMETRY]
     for done, camera in enumerate(cameras):
-        projection = project(*geometry, camera, scene.near, scene.through_pixel)
+        projection = project(*geometry, camera, scene.near, scene.prefilter)
         for fragments in fitting_lists(projection):
             found[done].index_add_(0, fragments.surfel.long(), fragments.weight.square())
             del fragments  # before the next list is made

@@ -1,7 +1,5 @@
 """Spherical Voronoi colours with fewer sites: which sites may go, and the least-squares fit of those that are left."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn import functional as F

@@ -1,7 +1,5 @@
 """Options of the bake, which bundle.json states."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from bitymi_ns.codec.limits import EXTENTS

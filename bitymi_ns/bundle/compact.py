@@ -1,7 +1,5 @@
 """The two files of a compact bundle: surfels.bin and texels.bin, columns of integers that bundle.json describes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Any
 

@@ -3,8 +3,6 @@
 Written from the Khronos KTX File Format Specification 2.0 and the Khronos Data Format Specification 1.3.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

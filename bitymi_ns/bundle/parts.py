@@ -1,7 +1,5 @@
 """Files of a bundle, a folder or one file: opening them, their names, and the folder to write."""
 
-from __future__ import annotations
-
 import os
 import re
 import stat

@@ -1,7 +1,5 @@
 """The PLY file of a bundle: binary, little-endian, of float and int properties; `vertex`, and perhaps more after it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The poster of a bundle: a small picture of what a viewer shows first, there before the surfels are."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 

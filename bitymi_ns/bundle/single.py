@@ -1,7 +1,5 @@
 """A bundle in one file: an uncompressed ZIP whose parts lie in the order in which a viewer needs them."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Checks of a bundle's files before they are read: headers, bundle.json, memory."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path

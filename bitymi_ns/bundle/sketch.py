@@ -6,8 +6,6 @@ deviation of at most sqrt(2 / M). So a bundle that holds the sketch of its texel
 decoded ones are from them.
 """
 
-from __future__ import annotations
-
 import base64
 
 import numpy as np

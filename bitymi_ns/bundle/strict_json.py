@@ -1,7 +1,5 @@
 """JSON without its traps: one value for a key, finite numbers alone, and one way to write a value for a digest."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -9,8 +9,6 @@ Lean view colours (`ops.view_color.LEAN`) have view_base_0..2 and view_terms, th
 the terms themselves, surfel after surfel, are rows of a second element, `view_term`: term_0, term_1, ...
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

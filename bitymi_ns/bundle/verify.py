@@ -1,7 +1,5 @@
 """Checks of a bundle by itself: files, numbers, tiles, and what bundle.json states of them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Cache folders of structure from motion, beside the photographs or in the user's cache, locked while in use."""
 
-from __future__ import annotations
-
 import atexit
 import hashlib
 import json

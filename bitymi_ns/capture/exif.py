@@ -1,7 +1,5 @@
 """EXIF of photographs: camera, focal length, exposure, GPS position, time and gravity, as far as they are plausible."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Mapping

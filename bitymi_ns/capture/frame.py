@@ -1,7 +1,5 @@
 """World frame of a model: z up by gravity, GPS or the cameras, and metric scale by GPS."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping

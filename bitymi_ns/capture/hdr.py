@@ -1,8 +1,6 @@
 """Tone mapping of high dynamic range frames (HLG or PQ, the 10-bit video of phones) to sRGB; without it they are
 pale."""
 
-from __future__ import annotations
-
 import av
 import numpy as np
 import numpy.typing as npt

@@ -1,7 +1,5 @@
 """Triangulation of points from photographs with known poses."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import warnings

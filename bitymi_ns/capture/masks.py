@@ -1,8 +1,6 @@
 """Masks of photographs: their folder, the mask file of a photograph, and the pixels that count. Structure from motion
 and training share these rules."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path, PurePosixPath
 

@@ -1,7 +1,5 @@
 """Export of poses as a nerfstudio capture: photographs, transforms.json, point cloud, COLMAP model."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,8 +1,6 @@
 """Detection of 360-degree (equirectangular) pictures by metadata or content. An aspect ratio of 2 alone is no evidence:
 phones take such photographs, too."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Photographs for structure from motion: find them, and read size, EXIF, thumbnail and sharpness of each."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Sequence

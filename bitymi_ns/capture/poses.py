@@ -1,7 +1,5 @@
 """Structure from motion: camera poses of photographs or of the frames of a video."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import statistics

@@ -1,7 +1,5 @@
 """Photographs and masks in forms that both COLMAP and nerfstudio read."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Recognition of the format of a folder or file: a capture with poses, photographs, or a video."""
 
-from __future__ import annotations
-
 import os
 import struct
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Options and result of structure from motion."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal

@@ -1,7 +1,5 @@
 """Files of cameras and other programs that are not read as photographs or poses, to be reported."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Frames of a video: the sharpest of each stretch of equal camera motion."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ Far beyond what training reaches (an optimiser moves a parameter by at most its 
 enough that every number a renderer computes is finite and no channel of a picture exceeds `BRIGHTEST`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import torch

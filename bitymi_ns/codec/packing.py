@@ -1,7 +1,5 @@
 """Shelf-First-Fit-Decreasing packing of texture tiles into pages."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Indices of texels in the pages of an atlas, and texels as a list and as pages."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

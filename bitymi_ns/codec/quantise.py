@@ -1,7 +1,5 @@
 """Quantisation of the atlas: one global range, and the three texel formats."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor

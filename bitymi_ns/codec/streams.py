@@ -1,7 +1,5 @@
 """Columns of integers as Zstandard frames, one for each byte plane of each number, of known sizes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

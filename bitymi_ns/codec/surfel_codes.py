@@ -1,7 +1,5 @@
 """Integer codes of surfels, and the parameters that they decode to."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Integer codes of texels: the quantised cosine transform of every tile."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

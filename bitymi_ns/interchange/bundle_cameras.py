@@ -1,7 +1,5 @@
 """Cameras of a bundle's capture, and the held-out photographs, where it has these."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -3,8 +3,6 @@
 It is here to measure a mesh with, and small rather than fast: torch on the CPU.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Files for other programs, beside a bundle: a preview as Gaussian splats, and a textured mesh."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable, Sequence
@@ -175,7 +173,7 @@ def summary_line(written: Written) -> str:
 def _fitted_colors(scene: BakedScene, cameras: Sequence[Camera], progress: Progress) -> SurfelColors:
     """Fitted to what the cameras see."""
     chosen = [camera.within(SEEN_SIDE) for camera in cameras]
-    seen = visibility(scene.surfels, chosen, scene.near, scene.weight_bound, scene.through_pixel, progress).seen
+    seen = visibility(scene.surfels, chosen, scene.near, scene.weight_bound, scene.prefilter, progress).seen
     return fit_colors(scene, weighted_residuals(scene), seen, centers_of(cameras, scene.surfels["means"]))
 
 

@@ -1,7 +1,5 @@
 """From the scene's frame to the capture's own."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Quads as a binary glTF file, by trimesh."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

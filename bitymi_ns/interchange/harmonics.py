@@ -1,7 +1,5 @@
 """Real spherical harmonics up to degree 3, in the order and with the signs of 3DGS."""
 
-from __future__ import annotations
-
 import functools
 
 import torch

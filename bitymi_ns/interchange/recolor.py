@@ -1,7 +1,5 @@
 """The colours of a mesh whose quads hide what is behind them, from pictures of the scene that it stands for."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

@@ -3,8 +3,6 @@
 It is here to measure a preview with, and small rather than fast: torch on the CPU, a tile of the image at a time.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops import fitting_lists, project
+from bitymi_ns.ops import Prefilter, fitting_lists, project
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import as_bytes
 from bitymi_ns.scene.camera import Camera
@@ -41,7 +41,7 @@ class NoSurface(ValueError):
 
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """How a surface is extracted.
+    """Options of the extraction of a surface.
 
     Attributes:
         resolution: voxels along the longest side of the box, at least 16.
@@ -68,14 +68,16 @@ class SurfaceOptions:
 
 
 @torch.no_grad()
-def median_depth(surfels: Mapping[str, Tensor], camera: Camera, near: float, through_pixel: bool = False) -> Tensor:
+def median_depth(
+    surfels: Mapping[str, Tensor], camera: Camera, near: float, prefilter: Prefilter = "low_pass"
+) -> Tensor:
     """Depth at which half of the light of each pixel is blocked.
 
     Args:
         surfels: geometry by name (`GEOMETRY`), of N surfels.
         camera: the view.
         near: nearest depth that is drawn, camera z.
-        through_pixel: as in `ops.project`.
+        prefilter: as in `ops.project`.
 
     Returns:
         [H, W] camera z of the first fragment with which the blending weights of its pixel reach 0.5; 0 where they do
@@ -84,7 +86,7 @@ def median_depth(surfels: Mapping[str, Tensor], camera: Camera, near: float, thr
     Raises:
         TooManyFragments: a single row of screen tiles has more fragments than memory holds.
     """
-    projection = project(*(surfels[name] for name in GEOMETRY), camera, near, through_pixel)
+    projection = project(*(surfels[name] for name in GEOMETRY), camera, near, prefilter)
     rows = []
     for fragments in fitting_lists(projection):
         pixel = fragments.pixel.long()
@@ -136,7 +138,7 @@ def extract_surface(
     cameras: Sequence[Camera],
     near: float,
     options: SurfaceOptions = SurfaceOptions(),  # noqa: B008 - frozen
-    through_pixel: bool = False,
+    prefilter: Prefilter = "low_pass",
     progress: Progress = no_progress,
 ) -> open3d.geometry.TriangleMesh:
     """Fuse the median depths of views into a triangle mesh with vertex colors, in the scene's frame.
@@ -147,7 +149,7 @@ def extract_surface(
         cameras: of the training views.
         near: nearest depth that is drawn, camera z.
         options: resolution and budget.
-        through_pixel: as in `ops.project`.
+        prefilter: as in `ops.project`.
         progress: called after every view and step.
 
     Raises:
@@ -160,7 +162,7 @@ def extract_surface(
     small = [camera.within(BOX_SIDE) for camera in cameras]
     depths = []
     for i, camera in enumerate(small):
-        depths.append(median_depth(surfels, camera, near, through_pixel).cpu())
+        depths.append(median_depth(surfels, camera, near, prefilter).cpu())
         progress("finding the box", i + 1, len(small))
     box = observed_box(depths, small)
     voxel = float((box[1] - box[0]).max()) / options.resolution
@@ -168,7 +170,7 @@ def extract_surface(
         voxel, TRUNCATION * voxel, open3d.pipelines.integration.TSDFVolumeColorType.RGB8
     )
     for i, camera in enumerate(cameras):
-        depth = median_depth(surfels, camera, near, through_pixel).cpu()
+        depth = median_depth(surfels, camera, near, prefilter).cpu()
         depth = _cut(depth, camera, box)
         rgb = as_bytes(render(camera)).numpy()
         picture = open3d.geometry.RGBDImage.create_from_color_and_depth(

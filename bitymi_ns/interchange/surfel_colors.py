@@ -1,7 +1,5 @@
 """Surfel colours for other programs: spherical harmonics, one mean colour, one mean residual."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Measure each quality knob: error against its exact setting, milliseconds and bytes."""
 
-from __future__ import annotations
-
 import json
 import statistics
 import time

@@ -1,7 +1,5 @@
 """Describe what a figure was measured with: machine, versions, commit."""
 
-from __future__ import annotations
-
 import functools
 import importlib.metadata
 import os

@@ -1,7 +1,5 @@
 """Write Markdown tables and sections, and render the Jinja templates of the folder beside this module."""
 
-from __future__ import annotations
-
 import base64
 import datetime
 import os

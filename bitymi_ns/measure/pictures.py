@@ -1,7 +1,5 @@
 """Draw the worst held-out views: errors, and the contribution of each part of the scene."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path

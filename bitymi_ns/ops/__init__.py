@@ -9,9 +9,9 @@ from .bands import Bands, band, by_bands, fitting_lists, refused
 from .blend import blended_image
 from .composite import beta_map, composite, composite_image, soft_overdraw
 from .coverage import add_texel_coverage
-from .errors import TooManyFragments
 from .field import FieldGeometry, field
-from .project import Projection, project
+from .fragment_list import TooManyFragments
+from .project import Prefilter, Projection, project
 from .shade import shade
 from .ssim import ssim
 from .texel import TexelDescent, TexelTiles
@@ -24,6 +24,7 @@ __all__ = [
     "Bands",
     "FieldGeometry",
     "Fragments",
+    "Prefilter",
     "Projection",
     "TexelDescent",
     "TexelTiles",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from types import ModuleType
@@ -26,7 +26,7 @@ _emulated = False
 
 @contextmanager
 def emulated_cuda(seed: int = 0) -> Iterator[None]:
-    """Within this context tensors on the CPU go to the CUDA kernels, which run thread by thread on the host. For tests.
+    """Send tensors on the CPU to the CUDA kernels, which run thread by thread on the host. For tests.
 
     Args:
         seed: of the order in which the threads of a block take turns.
@@ -48,11 +48,11 @@ def emulated_cuda(seed: int = 0) -> Iterator[None]:
 def cpu_module() -> str:
     """Name of the module of CPU kernels: of those that were built, the last for which this CPU has all that it needs.
 
-    Asked before it is loaded: a CPU ends a process at an instruction that it does not have. Only Linux says what a CPU
-    has; elsewhere the first module is taken to run.
+    Asked before it is loaded: a CPU ends a process at an instruction that it does not have. Only Linux lists a CPU's
+    features; elsewhere the first module is taken to run.
 
     Raises:
-        KernelsUnavailable: this CPU has not what any of them needs; says what to do.
+        KernelsUnavailable: this CPU lacks a feature that each of them needs.
     """
     try:
         needs = importlib.import_module("bitymi_ns._cpu_features").FEATURES
@@ -99,14 +99,13 @@ def _set_up_process() -> None:
 
 
 def give_back_memory() -> None:
-    """What the process has freed, but keeps for the next views, goes back to the system. For where another part of a
-    run begins, whose views are of other sizes."""
+    """Return freed memory that the process keeps for the next views to the system, before views of other sizes."""
     if _set_up_process.cache_info().currsize:  # the CPU kernels have been asked for
         load("_cpu").give_back_memory()
 
 
 def cuda_backend(device: torch.device) -> bool:
-    """Whether tensors on that device go to the CUDA kernels (or to their emulation)."""
+    """Return True if tensors on that device go to the CUDA kernels or to their emulation."""
     return device.type == "cuda" or _emulated
 
 
@@ -213,7 +212,18 @@ def on_same_device(like: Tensor, **tensors: Tensor) -> None:
     """
     for name, tensor in tensors.items():
         if tensor.device != like.device:
-            raise ValueError(f"{name} is on device '{tensor.device}', what goes with it is on '{like.device}'")
+            raise ValueError(f"{name} is on device '{tensor.device}', it must be on '{like.device}'")
+
+
+def check_shapes(**shapes: tuple[Tensor, Sequence[int]]) -> None:
+    """Check tensors against their shapes, by name.
+
+    Raises:
+        ValueError: one has another shape; names it.
+    """
+    for name, (tensor, shape) in shapes.items():
+        if tuple(tensor.shape) != tuple(shape):
+            raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")
 
 
 def dense(tensor: Tensor, like: Tensor) -> Tensor:

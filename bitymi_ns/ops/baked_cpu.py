@@ -10,11 +10,10 @@ import torch
 from torch import Tensor
 
 from .backend import kernel, module, require
-from .baked_scene import BakedScene, check_images, common_size, residual
+from .baked_scene import BakedScene, check_images, common_size, residual, tile_levels
 from .constants import BAKED_CHANNELS, MAP_CHANNELS
 from .pool import Pool
 from .project import GEOMETRY, Camera, project
-from .tile_levels import tile_levels
 from .view_color import view_color
 
 ON_CUDA = "move the scene to the CPU, or draw with `baked.draw`"
@@ -71,11 +70,11 @@ def frame(scene: BakedScene, camera: Camera, maps: bool, photo_pixel: float = 1.
     atlas, tiles, p = scene.atlas, scene.tiles, scene.surfels
     if atlas is None and scene.blocks is not None:
         raise ValueError("the CPU needs decoded texels: read the bundle with decode=True")
-    projection = project(*(p[name] for name in GEOMETRY), camera, scene.near, scene.through_pixel, photo_pixel)
+    projection = project(*(p[name] for name in GEOMETRY), camera, scene.near, scene.prefilter, photo_pixel)
     geom = projection.geom
-    look = residual(scene)
+    texture = residual(scene)
     if atlas is not None and atlas.dtype == torch.uint8:
-        look["scale"] /= 255  # the kernel reads bytes as 0 to 255
+        texture["scale"] /= 255  # the kernel reads bytes as 0 to 255
     image = geom.new_empty(camera.height, camera.width, MAP_CHANNELS if maps else BAKED_CHANNELS)
     overdraw = torch.empty(camera.height, camera.width, 1, dtype=torch.int32) if maps else None
     patches = scene.cache.atlas(lambda: gather(atlas, tiles), atlas, tiles)
@@ -85,7 +84,7 @@ def frame(scene: BakedScene, camera: Camera, maps: bool, photo_pixel: float = 1.
     with _bins().borrow() as bins:
         kernel("baked_forward", geom)(
             **projection.view(geom),
-            **look,
+            **texture,
             base=view_color(scene.view_color, p, p["means"], camera.exact_center, projection.visible),
             patches=patches,
             **levels,

@@ -12,11 +12,10 @@ import torch
 from torch import Tensor
 
 from .backend import function, module, on_device, require
-from .baked_scene import IMAGES, BakedScene, check_images, common_size, residual
+from .baked_scene import IMAGES, BakedScene, check_images, common_size, residual, tile_levels
 from .bc7 import decode_bc7
 from .constants import TILE
 from .project import GEOMETRY, Camera
-from .tile_levels import tile_levels
 from .view_color import LEAN, check_lean, check_view_color, lettered
 from .view_kinds import VIEW_COLORS
 
@@ -32,7 +31,7 @@ class Stage(IntFlag):
 
 
 def draws_blocks(device: torch.device) -> bool:
-    """Whether the texture unit of a CUDA device decodes BC7 blocks, which is found out by drawing some."""
+    """Return True if the texture unit of a CUDA device decodes BC7 blocks; tested by drawing some."""
     with on_device(device):
         return module(device).draws_bc7()
 
@@ -45,7 +44,7 @@ def decoded(blocks: Tensor) -> Tensor:
 
 
 class Sheet(NamedTuple):
-    """How the pages of an atlas are put together to one texture: below each other, then beside.
+    """Arrangement of the pages of an atlas in one texture: below each other, then beside.
 
     Attributes:
         down: pages below each other.
@@ -174,7 +173,7 @@ def compiled(scene: BakedScene, photo_pixel: float = 1.0) -> Any:
             kind=scene.view_color,
             tiles=scene.tiles.contiguous(),
             near=scene.near,
-            through_pixel=scene.through_pixel,
+            prefilter=scene.prefilter,
         )
 
 
@@ -245,11 +244,11 @@ class Workspace:
 
     @property
     def complete(self) -> bool:
-        """Whether there was room for all pairs of the latest frame, which had surfels; waits for the device."""
+        """True if all pairs of the latest frame, which had surfels, had room; waits for the device."""
         return self.counts()[1] <= self.capacity
 
     def frame_fitted(self) -> bool:
-        """Whether the latest frame fitted; the next `resize` makes room for as many pairs and a quarter more.
+        """Return True if the latest frame fitted; the next `resize` makes room for as many pairs and a quarter more.
 
         Waits for the device.
         """
@@ -279,8 +278,8 @@ class ListedPairs(NamedTuple):
 
 
 def listed_pairs(workspace: Workspace, surfels: int, views: int, width: int, height: int) -> ListedPairs:
-    """What the latest frame, without normals, left in the working memory (`lay_out` of csrc/cuda/baked_frame.cu), on
-    the CPU: for tests and for counting what a frame costs."""
+    """Read the lists that the latest frame, without normals, left in the working memory (`lay_out` of
+    csrc/cuda/baked_frame.cu), on the CPU: for tests and benchmarks."""
     assert workspace.memory is not None
     memory, at = workspace.memory.cpu(), 256
     tiles, rows, slots = tiles_of(views, width, height), surfels * views, workspace.slots

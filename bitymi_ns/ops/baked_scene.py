@@ -1,16 +1,16 @@
-"""What is drawn of a baked scene, and what the renderers of both devices share."""
+"""Images of a baked scene, and the parts of its renderers that all devices share."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from .pool import Pool
-from .project import Camera
+from .project import Camera, Prefilter
 
 IMAGES: dict[str, tuple[int, torch.dtype]] = {
     "rgb": (3, torch.float32),
@@ -26,9 +26,9 @@ lowest."""
 
 
 class DrawCache:
-    """What drawing keeps of a scene from frame to frame: the atlas as its device reads it, and working memory.
+    """Memory of a scene from frame to frame: the atlas as its device reads it, and working memory.
 
-    Several threads may draw a scene, as those of nerfstudio's viewer do: what one makes the others wait for."""
+    Several threads may draw a scene, as those of nerfstudio's viewer do: the others wait for the one that fills it."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -38,7 +38,7 @@ class DrawCache:
         self._workspaces: Pool[Any] | None = None
 
     def atlas(self, make: Callable[[], Any], *sources: Tensor | str | None) -> Any:
-        """What `make` gives: made for the first frame, and again when a source is another one or was written to."""
+        """Return the atlas, made for the first frame and again when a source is another one or was written to."""
         now = [(t, t._version if isinstance(t, Tensor) else 0) for t in sources]
         with self._lock:
             if len(now) != len(self._sources) or any(
@@ -65,7 +65,7 @@ class DrawCache:
 
 
 class BakedScene(Protocol):
-    """What is drawn: `scene.baked.BakedScene`, which says what its attributes mean."""
+    """A baked scene; `scene.baked.BakedScene` documents its attributes."""
 
     surfels: Mapping[str, Tensor]
     view_color: str
@@ -79,20 +79,17 @@ class BakedScene(Protocol):
     near: float
     weight_bound: float
     transmittance_min: float
+    prefilter: Prefilter
     through_webgpu: bool
     cache: DrawCache
 
-    @property
-    def through_pixel(self) -> bool:
-        """Whether the kernel is seen through a pixel."""
-
 
 def residual(scene: BakedScene) -> dict[str, Any]:
-    """How texels change colours, as the kernels of both devices take it (`BakedResidual` of csrc/ops/baked.h)."""
+    """Arguments of the kernels for texels (`BakedResidual` of csrc/ops/texel.h)."""
     numbers = ("offset", "scale", "weight_bound", "transmittance_min")
     arrays = {"extent": scene.extent, "mean_residual": scene.mean_residual}
-    given = {name: None if t is None else t.detach().float().contiguous() for name, t in arrays.items()}
-    return {name: getattr(scene, name) for name in numbers} | given
+    dense = {name: None if t is None else t.detach().float().contiguous() for name, t in arrays.items()}
+    return {name: getattr(scene, name) for name in numbers} | dense
 
 
 def check_images(names: Sequence[str]) -> None:
@@ -120,3 +117,37 @@ def common_size(cameras: Sequence[Camera]) -> tuple[int, int]:
     if any(camera.skewed for camera in cameras):
         raise ValueError("cameras with skew (K[0, 1] != 0) are not supported: undistort the images first")
     return sizes.pop()
+
+
+LEVELS = ("half", "quarter")
+"""Names of the levels: what is left of a side."""
+
+
+def halved(atlas: Tensor) -> Tensor:
+    """Means of 2 x 2 texels, those of bytes rounded: [layers, height / 2, width / 2, 4] of [layers, height, width, 4];
+    an odd row or column is left out."""
+    layers, height, width, channels = atlas.shape
+    cut = atlas[:, : height // 2 * 2, : width // 2 * 2].reshape(layers, height // 2, 2, width // 2, 2, channels)
+    if atlas.dtype == torch.uint8:
+        return ((cut.to(torch.int16).sum((2, 4), dtype=torch.int16) + 2) >> 2).to(torch.uint8)
+    return cut.mean((2, 4))
+
+
+def tile_levels(atlas: Tensor, tiles: Tensor) -> Iterator[tuple[str, Tensor, Tensor]]:
+    """The levels of an atlas, finest first, without that of the atlas itself.
+
+    Args:
+        atlas: [layers, height, width, 4] uint8 or float.
+        tiles: [N, 5] int32: x, y, layer, r_u, r_v in texels.
+
+    Yields:
+        name, pages, and the tiles on them: r_u = 0 where a tile has no such level, because its corner or its sides do
+        not lie on the grid of the level. A bundle's tiles lie on a grid of four texels, so each has both levels.
+    """
+    scaled = tiles.new_tensor([1, 1, 0, 1, 1])
+    for level, name in enumerate(LEVELS, start=1):
+        atlas = halved(atlas)
+        if 0 in atlas.shape:
+            return
+        fits = (tiles * scaled % (1 << level) == 0).all(1, keepdim=True)
+        yield name, atlas.contiguous(), torch.where(fits, tiles >> (level * scaled), 0).contiguous()

@@ -15,14 +15,14 @@ from torch import Tensor
 
 from .backend import cuda_backend
 from .constants import TILE
-from .errors import TooManyFragments
+from .fragment_list import TooManyFragments
 from .project import Projection
 from .trace import Fragments, masked_counts, trace
 
 T = TypeVar("T")
 
 PASSING = 1 << 18
-"""Pixels of a list of the CPU that is looked at and dropped. Its memory then stays with the program; that of a whole
+"""Pixels of a list of the CPU that is read and dropped. Its memory then stays with the program; that of a whole
 view the system takes back and clears for the next, which takes longer than finding the fragments."""
 
 
@@ -70,7 +70,7 @@ class Bands:
 
 
 def fitting_lists(projection: Projection, most: int = 0) -> Iterator[Fragments]:
-    """The fragments of a view, to be looked at and dropped: as one list on a CUDA device, on the CPU as lists of some
+    """The fragments of a view, to be read and dropped: as one list on a CUDA device, on the CPU as lists of some
     rows of tiles each; smaller ones where one has too many.
 
     Args:

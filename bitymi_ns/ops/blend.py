@@ -7,7 +7,7 @@ import functools
 import torch
 from torch import Tensor
 
-from .backend import cuda_backend, dense, kernel, module, on_same_device
+from .backend import check_shapes, cuda_backend, dense, kernel, module, on_same_device
 from .composite import check_projection
 from .constants import IMAGE_CHANNELS, MAP_CHANNELS
 from .project import Projection
@@ -17,7 +17,7 @@ from .trace import Fragments
 
 @functools.lru_cache(maxsize=4)
 def _no_tiles(surfels: int, dtype: torch.dtype, device: torch.device) -> TexelTiles:
-    """Tiles of surfels without texels. Kept: a step on a card should not clear them anew."""
+    """Tiles of surfels without texels. Kept: a step on a card should not clear them again."""
     size = torch.zeros(surfels, 2, dtype=torch.int32, device=device)
     return TexelTiles.of_sizes(size, torch.zeros(surfels, dtype=dtype, device=device))
 
@@ -48,8 +48,8 @@ class _BlendedImage(torch.autograd.Function):
     def forward(ctx, weight, depth, uv, geom, base, texels, fragments, tiles, bound, maps, descent):
         g, b, t, arrays = dense(geom, geom), dense(base, geom), dense(texels, geom), fragments.arrays_for_layout
         image = geom.new_empty(fragments.width * fragments.height, MAP_CHANNELS if maps else IMAGE_CHANNELS)
-        ctx.given = {"maps": maps, **fragments.view, **tiles.arrays, "bound": bound}
-        kernel("blend_forward", geom)(**ctx.given, **arrays, geom=g, base=b, texels=t, image=image)
+        ctx.arguments = {"maps": maps, **fragments.view, **tiles.arrays, "bound": bound}
+        kernel("blend_forward", geom)(**ctx.arguments, **arrays, geom=g, base=b, texels=t, image=image)
         ctx.save_for_backward(g, b, t, *arrays.values())
         ctx.descent, ctx.names, ctx.fragments = descent, tuple(arrays), fragments
         return image
@@ -62,12 +62,12 @@ class _BlendedImage(torch.autograd.Function):
         out = {"dweight": torch.empty_like(arrays["weight"]) if weighs else None, "dgeom": torch.empty_like(geom)}
         out |= {"dbase": torch.empty_like(base), "dtexels": torch.empty_like(texels) if learns else None}
         out |= {"duv": torch.empty_like(arrays["uv"]) if moves else None}
-        out |= {"ddepth": torch.empty_like(arrays["depth"]) if ctx.given["maps"] else None}
+        out |= {"ddepth": torch.empty_like(arrays["depth"]) if ctx.arguments["maps"] else None}
         step = {"rate": 0.0} if ctx.descent is None else ctx.descent.arguments(texels)
         inputs = {"geom": geom, "base": base, "texels": texels, "dimage": dense(dimage, geom)}
         sums_texels = learns or ctx.descent is not None
-        work = backward_memory(ctx.fragments, ctx.given["maps"], len(texels) if sums_texels else 0)
-        kernel("blend_backward", geom)(**ctx.given, **arrays, **inputs, **step, **work, **out)
+        work = backward_memory(ctx.fragments, ctx.arguments["maps"], len(texels) if sums_texels else 0)
+        kernel("blend_backward", geom)(**ctx.arguments, **arrays, **inputs, **step, **work, **out)
         gradients = (out[name] for name in ("dweight", "ddepth", "duv", "dgeom", "dbase", "dtexels"))
         return *gradients, None, None, None, None, None
 
@@ -83,8 +83,7 @@ def _check(fragments: Fragments, base: Tensor, texels: Tensor, tiles: TexelTiles
     on_same_device(fragments.weight, base=base, texels=texels, **tiles.arrays, **named)
     if tiles.count != texels.shape[0] or texels.shape[1:] != (3,):
         raise ValueError(f"the tiles hold {tiles.count} texels, texels has the shape {list(texels.shape)}")
-    if tuple(base.shape) != (len(tiles.first), 3):
-        raise ValueError(f"base must have shape {[len(tiles.first), 3]}, not {list(base.shape)}")
+    check_shapes(base=(base, (len(tiles.first), 3)))
     if fragments.surfels != len(base):
         raise ValueError(f"the fragments are those of {fragments.surfels} surfels, not of {len(base)}")
     if descent is not None and (texels.requires_grad or not texels.is_contiguous()):
@@ -119,7 +118,7 @@ def blended_image(
         projection: the view's, of N surfels.
         base: [N, 3] f_view of every surfel.
         texels: [T, 3] residual colours, of the fragments' dtype; None = there is no residual.
-        tiles: where they lie.
+        tiles: of the texels.
         bound: fragments of weight below this, and those of surfels without a tile, keep ReLU(f_view + 0.5).
         maps: add depth and normal.
         move_surfels: the gradient of r with respect to u and v reaches the fragments.
@@ -141,5 +140,5 @@ def blended_image(
     uv = fragments.uv if move_surfels else fragments.uv.detach()
     if descent is not None and not base.requires_grad:
         base = base.detach().requires_grad_()  # so that there is a backward pass, whatever else learns
-    given = (projection.geom, base, texels, fragments, tiles, bound, maps, descent)
-    return _BlendedImage.apply(fragments.weight, fragments.depth, uv, *given)
+    rest = (projection.geom, base, texels, fragments, tiles, bound, maps, descent)
+    return _BlendedImage.apply(fragments.weight, fragments.depth, uv, *rest)

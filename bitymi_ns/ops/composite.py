@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from .backend import cuda_backend, dense, kernel, on_same_device
+from .backend import check_shapes, cuda_backend, dense, kernel, on_same_device
 from .constants import BETA_MAX, IMAGE_CHANNELS, MAP_CHANNELS
 from .project import Projection
 from .trace import Fragments
@@ -69,8 +69,7 @@ def composite_image(fragments: Fragments, projection: Projection, colors: Tensor
     """
     on_same_device(fragments.weight, colors=colors)
     check_projection(fragments, projection)
-    if tuple(colors.shape) != (len(fragments), 3):
-        raise ValueError(f"colors must have shape {[len(fragments), 3]}, not {list(colors.shape)}")
+    check_shapes(colors=(colors, (len(fragments), 3)))
     return _CompositeImage.apply(fragments.weight, fragments.depth, projection.geom, colors, fragments, maps)
 
 

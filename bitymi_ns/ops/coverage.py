@@ -1,4 +1,4 @@
-"""Coverage: how much of a view's picture every texel makes up, which decides how far it moves in a step."""
+"""Coverage: pixels of a view that every texel makes up, the weights of its step."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ def add_texel_coverage(
     total: Tensor | None,
     squares: Tensor | None = None,
 ) -> None:
-    """Adds to every texel how much of a view's picture it makes up, in pixels: the sum over the fragments of the
-    blending weight times the bilinear weight.
+    """Add the coverage of every texel in a view, in pixels: the sum over the fragments of blending weight times
+    bilinear weight.
 
     Args:
         lists: the fragments of an H x W view, from top to bottom, as of `fitting_lists`.
-        tiles: where the T texels lie.
-        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
+        tiles: of the T texels.
+        mask: [H, W] or [H, W, 1] bool, True for the pixels that count; None = all.
         bound: fragments of weight below this count as nothing.
         total: [T, 3] of the tiles' dtype, dense, added to, alike in all columns; None = not wanted.
         squares: [T, 3], added to: the same of the blending weights' squares. None = not wanted.

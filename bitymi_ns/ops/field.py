@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .backend import cuda_backend, dense, kernel, kernel_class, module, on_device, on_same_device
+from .backend import check_shapes, cuda_backend, dense, kernel, kernel_class, module, on_device, on_same_device
 from .constants import FEATURES, WIDTH
 
 WEIGHTS = ("table", "w1", "w2", "w3")
@@ -17,7 +17,7 @@ WEIGHTS = ("table", "w1", "w2", "w3")
 
 @dataclass(frozen=True)
 class FieldGeometry:
-    """Where the hash grid lies in the world.
+    """Position of the hash grid in the world.
 
     Attributes:
         min_resolution: cells along an edge of the coarsest level; each level doubles it.
@@ -43,10 +43,7 @@ def kernel_field(geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Tensor,
     log2_size = size.bit_length() - 1
     if features != FEATURES or size != 1 << log2_size:
         raise ValueError(f"field_table must be [levels, power of two, {FEATURES}], not {list(table.shape)}")
-    expected = [(levels * FEATURES, WIDTH), (WIDTH, WIDTH), (WIDTH, 3)]
-    for name, weight, shape in zip(("field_w1", "field_w2", "field_w3"), (w1, w2, w3), expected, strict=True):
-        if tuple(weight.shape) != shape:
-            raise ValueError(f"{name} must have shape {list(shape)}, not {list(weight.shape)}")
+    check_shapes(field_w1=(w1, (levels * FEATURES, WIDTH)), field_w2=(w2, (WIDTH, WIDTH)), field_w3=(w3, (WIDTH, 3)))
     weights = {name: dense(t, table) for name, t in zip(WEIGHTS, (table, w1, w2, w3), strict=True)}
     where = {"min_resolution": geometry.min_resolution, "contract": geometry.contract}
     where |= {"mid": tuple(geometry.mid), "half": geometry.half}
@@ -72,7 +69,7 @@ def backward_memory(
         like: tells device and dtype.
         table: the hash table where the field learns, else None.
         surfels: number of surfels whose base colours get gradients.
-        frames: whether their frames get some, too.
+        frames: their frames get gradients, too.
     """
     if not cuda_backend(like.device):
         return {}
@@ -110,7 +107,7 @@ def field(x: Tensor, geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Ten
 
     Args:
         x: [M, 3] world positions.
-        geometry: where the grid lies.
+        geometry: of the grid.
         table: [levels, T, 4] features, T a power of two; cells are hashed by XOR of coordinate times prime.
         w1, w2, w3: [4 levels, 16], [16, 16], [16, 3] weights, input-major.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .backend import dense, kernel, require
+from .backend import check_shapes, dense, kernel, require
 from .constants import FRAME
 from .field import FieldGeometry, kernel_field
 
@@ -44,10 +44,7 @@ def field_tiles(
     """
     require("field_tiles", "cuda", frames.device, "move them there, or evaluate `field` at the texel centres")
     n = frames.shape[0]
-    shapes = {"frames": (frames, (n, FRAME)), "extent": (extent, (n,)), "tiles": (tiles, (n, 5))}
-    for name, (tensor, shape) in shapes.items():
-        if tuple(tensor.shape) != shape:
-            raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")
+    check_shapes(frames=(frames, (n, FRAME)), extent=(extent, (n,)), tiles=(tiles, (n, 5)))
     where = tiles.to(frames.device, torch.int32).contiguous()
     warps = -(-(where[:, 3].long() * where[:, 4].long()) // WARP)
     first = torch.cat([warps.new_zeros(1), warps.cumsum(0)])

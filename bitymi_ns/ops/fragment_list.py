@@ -8,8 +8,27 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .errors import TooManyFragments
 from .project import Projection
+
+
+class TooManyFragments(RuntimeError):
+    """A view has more fragments than it may have.
+
+    Args:
+        geom: of the view.
+        projection: the view's.
+        count, most: fragments that there are, and that there may be; also attributes.
+        ids: surfel and pixel are listed, too: 8 bytes beside 5 numbers like those of `geom`.
+    """
+
+    def __init__(self, geom: Tensor, projection: Projection, count: int, most: int, ids: bool) -> None:
+        size, pixels = 5 * geom.element_size() + 8 * ids, projection.camera.width * projection.camera.height
+        super().__init__(
+            f"the view has {count:,} fragments, {count / pixels:.0f} per pixel; their list needs "
+            f"{count * size / 2**30:.2f} GiB, and there is room for {most:,}: render a smaller image or use fewer "
+            "surfels"
+        )
+        self.count, self.most = count, most
 
 
 def empty_list(geom: Tensor, count: int) -> dict[str, Tensor]:
@@ -23,13 +42,13 @@ def empty_ids(like: Tensor, count: int) -> dict[str, Tensor]:
 
 
 class Layout:
-    """How kernels find their way in a fragment list, and the surfel and pixel of every fragment.
+    """Index of a fragment list: its runs by tile, and the surfel and pixel of every fragment.
 
-    On the CPU the layout itself tells surfels and pixels, which is enough for most operations: there their arrays are
-    made when they are first asked for.
+    On the CPU the runs imply surfels and pixels, which is enough for most operations: the arrays of these are made at
+    their first use.
 
     Attributes:
-        handle: the kernels' object: `TilePacks` (csrc/cpu/packs.h) or `Pairs` (csrc/cuda/pairs.h).
+        handle: the kernels' object: `TileBlocks` (csrc/cpu/blocks.h) or `Pairs` (csrc/cuda/pairs.h).
         arrays: the arrays that it refers to, by name.
     """
 
@@ -54,9 +73,3 @@ class Layout:
     def nbytes(self) -> int:
         """Bytes of all arrays."""
         return sum(array.nbytes for array in (*self.arrays.values(), *(self._ids or {}).values()))
-
-
-def too_many(geom: Tensor, projection: Projection, count: int, most: int, ids: bool) -> TooManyFragments:
-    """The refusal of a list of `count` fragments: 5 numbers each like those of `geom`, and 8 bytes with `ids`."""
-    size = 5 * geom.element_size() + 8 * ids
-    return TooManyFragments(count, most, projection.camera.width, projection.camera.height, size)

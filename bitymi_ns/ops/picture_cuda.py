@@ -1,4 +1,4 @@
-"""What a training step computes of a picture and of the projected centres beside drawing, by the CUDA kernels.
+"""Losses of an image and statistics of projected centres in a training step, by the CUDA kernels.
 
 torch would do it in some fifty small operations, whose launches take the host longer than all of them take the card.
 """
@@ -21,7 +21,7 @@ class _PictureLosses(torch.autograd.Function):
         alike, dalike = similarity(pixels[..., :3], wanted, ctx.needs_input_grad[0])
         photometric, falloff = image.new_empty(()), image.new_empty(())
         sums = torch.empty(module(image.device).LOSS_SUMS, dtype=torch.float64, device=image.device)
-        ctx.given = {"gamma": gamma, "squared": squared, "share": share, "weight": weight}
+        ctx.arguments = {"gamma": gamma, "squared": squared, "share": share, "weight": weight}
         kernel("picture_loss", image)(
             image=pixels,
             target=wanted,
@@ -29,7 +29,7 @@ class _PictureLosses(torch.autograd.Function):
             sums=sums,
             photometric=photometric,
             falloff=falloff,
-            **ctx.given,
+            **ctx.arguments,
         )
         ctx.save_for_backward(pixels, wanted)
         ctx.dalike = dalike
@@ -46,7 +46,7 @@ class _PictureLosses(torch.autograd.Function):
             dphotometric=dense(dphotometric, image),
             dfalloff=dense(dfalloff, image),
             dimage=dimage,
-            **ctx.given,
+            **ctx.arguments,
         )
         return dimage, None, None, None, None, None
 

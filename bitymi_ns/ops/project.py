@@ -1,16 +1,19 @@
-"""Projection: what a camera sees of every surfel."""
+"""Projection of surfels into a camera."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import torch
 from torch import Tensor
 
-from .backend import cuda_backend, dense, kernel, on_same_device
+from .backend import check_shapes, cuda_backend, dense, kernel, on_same_device
 from .constants import FRAME, GEOM
+
+Prefilter = Literal["low_pass", "pixel"]
+"""How surfels smaller than a pixel are drawn, see `project`."""
 
 
 class Camera(Protocol):
@@ -45,7 +48,7 @@ class Projection:
         radii: [N, 2] half extents in pixels of the box in which a surfel can reach alpha 1/255; 0 = not visible.
         camera: the camera.
         near: nearest depth that is drawn, camera z.
-        through_pixel: the kernel is seen through a pixel: all that is done with the rows has to know.
+        prefilter: as in `project`; every kernel that reads the rows takes it.
         photo_pixel: side of a photograph's pixel in pixels of the view; rows of another one than 1 are for the baked
             renderer alone.
         broken: [1] int32, how many surfels were left out because a parameter is NaN or infinite.
@@ -59,7 +62,7 @@ class Projection:
     radii: Tensor
     camera: Camera
     near: float
-    through_pixel: bool
+    prefilter: Prefilter
     broken: Tensor
     photo_pixel: float = 1.0
     mean2d_grad: Tensor | None = None
@@ -77,13 +80,13 @@ class Projection:
             self.whole.mean2d_absgrad += absgrad
 
     def view(self, geom: Tensor) -> dict[str, Any]:
-        """What the kernels take of a view (`View` of csrc/ops/visibility.h).
+        """Arguments of the kernels for a view (`View` of csrc/ops/visibility.h).
 
         Args:
             geom: `self.geom` without its graph.
         """
         size = {"width": self.camera.width, "height": self.camera.height}
-        drawn = {"near": self.near, "through_pixel": self.through_pixel, "photo_pixel": self.photo_pixel}
+        drawn = {"near": self.near, "prefilter": self.prefilter, "photo_pixel": self.photo_pixel}
         return dict(geom=geom, radii=self.radii, **size, **drawn)
 
     @property
@@ -103,13 +106,13 @@ GEOMETRY = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, camera, near, through_pixel, photo_pixel, *geometry):
+    def forward(ctx, camera, near, prefilter, photo_pixel, *geometry):
         means = geometry[0]
         inputs = {name: dense(t, means) for name, t in zip(GEOMETRY, geometry, strict=True)}
         inputs |= {"viewmat": dense(camera.viewmat, means), "K": dense(camera.K, means)}
         geom, frames, radii = (means.new_empty(len(means), k) for k in (GEOM, FRAME, 2))
         broken = torch.zeros(1, dtype=torch.int32, device=means.device)
-        view = {"width": camera.width, "height": camera.height, "near": near, "through_pixel": through_pixel}
+        view = {"width": camera.width, "height": camera.height, "near": near, "prefilter": prefilter}
         view["photo_pixel"] = photo_pixel
         kernel("project_forward", means)(**inputs, **view, geom=geom, frames=frames, radii=radii, broken=broken)
         ctx.names = tuple(inputs)
@@ -142,7 +145,7 @@ def project(
     beta_raw: Tensor,
     camera: Camera,
     near: float = 0.2,
-    prefilter: bool = False,
+    prefilter: Prefilter = "low_pass",
     photo_pixel: float = 1.0,
 ) -> Projection:
     """Projects surfels into a camera (2DGS ray-splat formulation in coordinates centred on the projected mean).
@@ -155,11 +158,11 @@ def project(
         beta_raw: [N], beta = 4 sigmoid (eq. beta-kernel).
         camera: OpenCV axes.
         near: surfels with a centre nearer than this (camera z) are not seen.
-        prefilter: the kernel is seen through a pixel (csrc/core/prefilter.h) instead of being united with a low pass;
-            column 15 of geom then holds n = fx fy s_u s_v / z^2.
+        prefilter: low_pass = the maximum of the kernel and a low pass; pixel = the kernel averaged over a pixel
+            (csrc/core/prefilter.h), with n = fx fy s_u s_v / z^2 in the last column of geom.
         photo_pixel: side of a photograph's pixel in pixels of the view (csrc/core/resize.h); another one than 1 is for
-            the baked renderer on the CPU, without gradients, and does nothing with `prefilter`. Column 15 of geom then
-            holds the height of the low pass over that of the kernel.
+            the baked renderer on the CPU, without gradients, and does nothing with the prefilter `pixel`. The last
+            column of geom is then the height of the low pass over that of the kernel.
 
     Raises:
         ValueError: shapes or devices do not agree, the camera has skew, or a gradient or a CUDA device is asked for
@@ -170,9 +173,7 @@ def project(
     n = means.shape[0]
     shapes = {"means": (means, (n, 3)), "quats": (quats, (n, 4)), "log_scales": (log_scales, (n, 2))}
     shapes |= {"opacity_logits": (opacity_logits, (n,)), "beta_raw": (beta_raw, (n,))}
-    for name, (tensor, shape) in shapes.items():
-        if tuple(tensor.shape) != shape:
-            raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")
+    check_shapes(**shapes)
     on_same_device(means, **{name: tensor for name, (tensor, _) in shapes.items()})
     if camera.skewed:
         raise ValueError("cameras with skew (K[0, 1] != 0) are not supported: undistort the images first")

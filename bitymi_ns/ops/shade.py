@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .backend import dense, kernel, on_same_device
+from .backend import check_shapes, dense, kernel, on_same_device
 from .constants import COLOR_BIAS, FRAME
 from .field import FieldGeometry, backward_memory, gradients, kernel_field
 from .trace import Fragments
@@ -46,8 +46,8 @@ class _Shade(torch.autograd.Function):
             duv=duv,
             dframes=dframes,
         )
-        given = tuple(grads.values()) if learn else (None,) * len(params)
-        return dbase, dframes, duv, None, None, None, None, *given
+        dparams = tuple(grads.values()) if learn else (None,) * len(params)
+        return dbase, dframes, duv, None, None, None, None, *dparams
 
 
 def view_base(f_view: Tensor) -> Tensor:
@@ -79,9 +79,7 @@ def shade(
         [F, 3].
     """
     n = fragments.surfels
-    for name, tensor, shape in (("base", base, (n, 3)), ("frames", frames, (n, FRAME))):
-        if tuple(tensor.shape) != shape:
-            raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")
+    check_shapes(base=(base, (n, 3)), frames=(frames, (n, FRAME)))
     named = dict(zip(("field_table", "field_w1", "field_w2", "field_w3"), params, strict=False))
     on_same_device(fragments.weight, base=base, frames=frames, **named)
     return _Shade.apply(base, frames, fragments.uv, fragments, geometry, bound, move_surfels, *params)

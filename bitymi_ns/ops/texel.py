@@ -1,4 +1,4 @@
-"""Texels of surfels: where they lie in one list, and how a backward pass moves them."""
+"""Texels of surfels in one list, and the step that a backward pass takes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class TexelTiles:
-    """Where the tiles of the surfels lie in one list of texels, [T, 3].
+    """Offsets, sizes and extents of the surfels' tiles in one list of texels, [T, 3].
 
     Texel (i, j) of surfel s, i along u and j along v, is row first[s] + j r_u + i; its centre lies at
     u = (i + 0.5) / r_u * 2e - e, v likewise. A tile of 1 x 1 texel is a constant.
@@ -41,18 +41,18 @@ class TexelTiles:
 
     @property
     def arrays(self) -> dict[str, Tensor]:
-        """What the kernels take of each tile."""
+        """Arguments of the kernels, by name."""
         return {"first": self.first, "size": self.size, "extent": self.extent}
 
     @functools.cached_property
     def count(self) -> int:
-        """T: texels of all tiles. Read back once: a step must not wait for the device to tell."""
+        """T: texels of all tiles. Read back once: a step must not wait for the device."""
         return int(self.size.long().prod(dim=1).sum())
 
 
 @dataclass(frozen=True)
 class TexelDescent:
-    """How a backward pass moves texels: texel t by -rate share[t] times its gradient.
+    """Step of a backward pass for texels: texel t moves by -rate share[t] times its gradient.
 
     Attributes:
         share: [T] of the texels' dtype.

@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from . import trace_cpu, trace_cuda
-from .backend import cuda_backend, dense, function, kernel, on_same_device
+from .backend import check_shapes, cuda_backend, dense, function, kernel, on_same_device
 from .constants import GEOM
-from .errors import TooManyFragments
-from .fragment_list import Layout
+from .fragment_list import Layout, TooManyFragments
 from .project import Projection
 
 __all__ = ["Fragments", "TooManyFragments", "masked_counts", "select", "trace"]
@@ -29,7 +28,7 @@ class Fragments:
         depth: [F] camera z of the hit (of the centre in the low-pass branch), differentiable.
         sigma: [F] effective opacity, negative in the low-pass branch.
         width, height: of the image, pixels.
-        layout: how kernels find their way in the list.
+        layout: index of the list.
         surfels: number N of rows of the projection that they belong to.
     """
 
@@ -57,7 +56,7 @@ class Fragments:
 
     @property
     def arrays(self) -> dict[str, Tensor]:
-        """The list as kernels take it that do not know its layout, without the graph: by the names of `FragmentArrays`
+        """The list without the graph, for kernels that do not take the layout; by the names of `FragmentArrays`
         (csrc/ops/arguments.h)."""
         return {**self._numbers, **self.layout.ids()}
 
@@ -172,8 +171,7 @@ def select(fragments: Fragments, keep: Tensor) -> Fragments:
         ValueError: `keep` has another length or lies on another device.
     """
     on_same_device(fragments.weight, keep=keep)
-    if keep.shape != fragments.weight.shape:
-        raise ValueError(f"keep must have shape {list(fragments.weight.shape)}, not {list(keep.shape)}")
+    check_shapes(keep=(keep, fragments.weight.shape))
     by = trace_cuda if cuda_backend(keep.device) else trace_cpu
     width, height = fragments.width, fragments.height
     layout = by.select(fragments.layout, keep.to(torch.uint8).contiguous(), width, height)
@@ -184,7 +182,7 @@ def select(fragments: Fragments, keep: Tensor) -> Fragments:
 
 
 def masked_counts(fragments: Fragments, mask: Tensor, n: int) -> Tensor:
-    """How many blended fragments of each surfel lie on masked pixels (FastGS's per-view importance).
+    """Count the blended fragments of each surfel on masked pixels (FastGS's per-view importance).
 
     Args:
         fragments: of a view of H x W pixels.

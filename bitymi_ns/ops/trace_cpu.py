@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from .backend import function, kernel_class, module, require
-from .fragment_list import Layout, empty_ids, empty_list, too_many
+from .fragment_list import Layout, TooManyFragments, empty_ids, empty_list
 from .pool import Pool
 from .project import Projection
 
@@ -45,9 +45,9 @@ def find_fragments(geom: Tensor, projection: Projection, most: int | None = None
     with tracers(geom).borrow() as tracer:
         n = tracer.run(**projection.view(geom), most=most)
         if most and n > most:
-            raise too_many(geom, projection, n, most, ids=False)
+            raise TooManyFragments(geom, projection, n, most, ids=False)
         found = empty_list(geom, n)
-        arrays = _empty_layout(tracer.tiles, tracer.packs)
+        arrays = _empty_layout(tracer.tiles, tracer.blocks)
         tracer.copy(**found, **arrays)
     return _layout(arrays, projection.camera.width, projection.camera.height), found
 
@@ -60,23 +60,23 @@ def select(layout: Layout, keep: Tensor, width: int, height: int) -> Layout:
         keep: [F] uint8.
         width, height: of the image, pixels.
     """
-    arrays = _empty_layout(len(layout.arrays["tile_start"]) - 1, len(layout.arrays["packs"]))
+    arrays = _empty_layout(len(layout.arrays["tile_start"]) - 1, len(layout.arrays["blocks"]))
     function("select_fragments", keep.device)(layout=layout.handle, keep=keep, **arrays)
-    arrays["packs"] = arrays["packs"][: int(arrays["pack_start"][-1])].clone()
+    arrays["blocks"] = arrays["blocks"][: int(arrays["block_start"][-1])].clone()
     return _layout(arrays, width, height)
 
 
-def _empty_layout(tiles: int, packs: int) -> dict[str, Tensor]:
-    starts = {name: torch.empty(tiles + 1, dtype=torch.int64) for name in ("tile_start", "pack_start")}
-    return starts | {"packs": torch.empty(packs, 2, dtype=torch.int32)}
+def _empty_layout(tiles: int, blocks: int) -> dict[str, Tensor]:
+    starts = {name: torch.empty(tiles + 1, dtype=torch.int64) for name in ("tile_start", "block_start")}
+    return starts | {"blocks": torch.empty(blocks, 2, dtype=torch.int32)}
 
 
 def _layout(arrays: dict[str, Tensor], width: int, height: int) -> Layout:
-    cpu = arrays["packs"].device
-    handle, list_ids = module(cpu).TilePacks(**arrays), function("list_places", cpu)
+    cpu = arrays["blocks"].device
+    handle, list_ids = module(cpu).TileBlocks(**arrays), function("list_ids", cpu)
 
     def ids() -> dict[str, Tensor]:
-        listed = empty_ids(arrays["packs"], int(arrays["tile_start"][-1]))
+        listed = empty_ids(arrays["blocks"], int(arrays["tile_start"][-1]))
         list_ids(layout=handle, width=width, height=height, **listed)
         return listed
 

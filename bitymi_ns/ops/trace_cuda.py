@@ -13,7 +13,7 @@ from torch import Tensor
 
 from .backend import function, kernel, module, on_device, require, workspace
 from .constants import TILE
-from .fragment_list import Layout, empty_ids, empty_list, too_many
+from .fragment_list import Layout, TooManyFragments, empty_ids, empty_list
 from .project import Projection
 
 NUMBERS = 24
@@ -27,7 +27,7 @@ only other programs change the answer: torch keeps the memory of a list for the 
 
 @dataclass
 class _Room:
-    """What the free memory of a device was last found to hold.
+    """Fragments that the free memory of a device holds, as last measured.
 
     Attributes:
         capacity: fragments.
@@ -45,7 +45,7 @@ _rooms: dict[torch.device, _Room] = {}
 
 @dataclass(frozen=True)
 class Bins:
-    """Which surfels may touch which tiles; P pairs.
+    """Pairs of surfel and tile that may touch; P of them.
 
     Attributes:
         order: [N] int32 surfels front to back.
@@ -66,7 +66,7 @@ class Bins:
 
     @property
     def layout(self) -> dict[str, Tensor]:
-        """What finds its way in a fragment list."""
+        """Index of a fragment list, by name."""
         return {name: value for name, value in vars(self).items() if name != "differing"}
 
 
@@ -103,7 +103,7 @@ def tile_lists(geom: Tensor, projection: Projection) -> Bins:
 
 
 def blended(geom: Tensor, projection: Projection, bins: Bins) -> Layout:
-    """Which pixels blend which pairs: the layout of the fragment list, its surfels and pixels still to be written;
+    """Mark the pixels that blend each pair: the layout of the fragment list, with surfels and pixels unwritten;
     waits once for the number of fragments."""
     require("trace_cuda.blended", "cuda", geom.device, "call `trace`")
     camera, pairs = projection.camera, bins.surfel.shape[0]
@@ -149,7 +149,7 @@ def check_capacity(geom: Tensor, projection: Projection, count: int, most: int |
         room.lists += 1
         most = room.capacity
     if most and count > most:
-        raise too_many(geom, projection, count, most, ids=True)
+        raise TooManyFragments(geom, projection, count, most, ids=True)
 
 
 def fill(geom: Tensor, projection: Projection, layout: Layout) -> dict[str, Tensor]:
@@ -158,7 +158,7 @@ def fill(geom: Tensor, projection: Projection, layout: Layout) -> dict[str, Tens
     try:
         found, ids = empty_list(geom, count), layout.ids()
     except torch.cuda.OutOfMemoryError as error:
-        raise too_many(geom, projection, count, fragment_capacity(geom), ids=True) from error
+        raise TooManyFragments(geom, projection, count, fragment_capacity(geom), ids=True) from error
     kernel("trace_fill", geom)(**projection.view(geom), **found, **ids, layout=layout.handle)
     return found
 

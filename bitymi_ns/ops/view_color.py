@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from .backend import dense, kernel, on_same_device
+from .backend import check_shapes, dense, kernel, on_same_device
 from .constants import MAX_TERMS
 from .view_kinds import entry_of
 
@@ -61,9 +61,8 @@ def check_view_color(kind: str, params: Mapping[str, Tensor], n: int) -> int:
     """
     entry = entry_of(kind)
     terms = entry.terms(params)
-    for name, tensor, shape in zip(entry.names, entry.of(params), entry.shapes(terms), strict=True):
-        if tuple(tensor.shape) != (n, *shape):
-            raise ValueError(f"{name} must have shape {[n, *shape]}, not {list(tensor.shape)}")
+    rows = [(n, *shape) for shape in entry.shapes(terms)]
+    check_shapes(**{name: (params[name], row) for name, row in zip(entry.names, rows, strict=True)})
     problem = entry.problem(terms)
     if problem is not None:
         raise ValueError(problem)
@@ -121,6 +120,6 @@ def view_color(
         return out
     terms = check_view_color(kind, params, n)
     entry = entry_of(kind)
-    given = entry.of(params)
-    on_same_device(means, **dict(zip(entry.names, given, strict=True)))
-    return _ViewColor.apply(kind, terms, flags, center, means, *given)
+    values = entry.of(params)
+    on_same_device(means, **dict(zip(entry.names, values, strict=True)))
+    return _ViewColor.apply(kind, terms, flags, center, means, *values)

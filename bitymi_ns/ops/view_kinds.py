@@ -1,7 +1,7 @@
-"""The kinds of view colour: all that the package knows of each, in one entry of `VIEW_COLORS`.
+"""The kinds of view colour: one entry of `VIEW_COLORS` each.
 
-What a kind is worth in a direction is computed by csrc/core/view_kinds.h, and in float64 by
-`ops.reference.view_color`. Everything else that depends on the kind asks its entry here.
+csrc/core/view_kinds.h computes the colour in a direction, in float64 `ops.reference.view_color`. Everything else that
+depends on the kind is in its entry here.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class ViewColor:
         return [params[name] for name in self.names]
 
     def terms(self, params: Mapping[str, Tensor]) -> int:
-        """How many terms there are."""
+        """Return the number of terms."""
         return params[self.names[1]].shape[1] + self._in_first
 
     def shapes(self, terms: int) -> list[tuple[int, ...]]:
@@ -131,7 +131,7 @@ class ViewColor:
         return [tuple(rows if size < 0 else size for size in p.shape) for p in self.parameters]
 
     def problem(self, terms: int) -> str | None:
-        """What is wrong with a number of terms; None where nothing is."""
+        """Return what is wrong with a number of terms, None if nothing."""
         return None if terms in self.counts else f"{self.rule}, not {terms - self._in_first}"
 
     def first_values(self, color: Tensor, config: Any, generator: torch.Generator) -> dict[str, Tensor]:
@@ -284,7 +284,7 @@ Kind = Literal[tuple(VIEW_COLORS)]  # type: ignore[valid-type]
 
 
 def entry_of(kind: str) -> ViewColor:
-    """What is known of a kind.
+    """Return the entry of a kind.
 
     Raises:
         ValueError: there is none of this name.
@@ -295,7 +295,7 @@ def entry_of(kind: str) -> ViewColor:
 
 
 def kind_of(params: Mapping[str, Tensor]) -> str:
-    """Which view colour complete parameters belong to, by its name.
+    """Return the name of the view colour whose parameters are complete.
 
     Raises:
         ValueError: the parameters of none are there.

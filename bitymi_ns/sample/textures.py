@@ -166,7 +166,7 @@ def hang(wall: Image, picture: Image, left_m: float, bottom_m: float) -> None:
 
 
 def landscape(rng: np.random.Generator) -> Image:
-    """What is outside the window, [512, 2048, 3] over 80 by 20 metres: sky, clouds, hills, trees and houses."""
+    """Paint the view outside the window, [512, 2048, 3] over 80 by 20 metres: sky, clouds, hills, trees and houses."""
     h, w = 512, 2048
     v, u = np.meshgrid(np.linspace(0, 1, h, dtype=np.float32), np.linspace(0, 1, w, dtype=np.float32), indexing="ij")
     cloud = noise(rng, (h, w), (5, 14), 5)

@@ -1,4 +1,4 @@
-"""What is learned: surfels, their view colour, and the residual colour field."""
+"""Trained scenes: surfels, their view colour, and the residual colour field."""
 
 from .camera import Camera
 from .config import SceneConfig

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from bitymi_ns.ops import Prefilter
 from bitymi_ns.ops.backend import cuda_backend
 from bitymi_ns.ops.baked import DrawCache, common_size, draw, packed
 from bitymi_ns.ops.constants import TRANSMITTANCE_MIN
@@ -82,7 +83,7 @@ class BakedScene:
     mean_residual: Tensor | None = None
     near: float = 0.2
     weight_bound: float = 0.0
-    prefilter: str = "low_pass"
+    prefilter: Prefilter = "low_pass"
     transmittance_min: float = TRANSMITTANCE_MIN
     blocks: Tensor | None = None
     photographed: Tensor | None = None
@@ -110,11 +111,6 @@ class BakedScene:
         surfels = {name: value.to(device) for name, value in self.surfels.items()}
         optional = {"extent": moved(self.extent), "mean_residual": moved(self.mean_residual)}
         return replace(self, surfels=surfels, tiles=self.tiles.to(device), **optional)
-
-    @property
-    def through_pixel(self) -> bool:
-        """Whether the kernel is seen through a pixel."""
-        return self.prefilter == "pixel"
 
     def __len__(self) -> int:
         return len(self.tiles)
@@ -163,7 +159,7 @@ class BakedScene:
         return self._draw(cameras, background, images)
 
     def sampling(self, cameras: Sequence[Camera]) -> Sampling:
-        """How views that are drawn together are drawn: by the geometric mean of their sizes."""
+        """Sampling of views that are drawn together: by the geometric mean of their sizes."""
         if self.photographed is None or not len(self.photographed):
             return Sampling()
         sizes = [size_of(self.photographed, camera) for camera in cameras]

@@ -1,7 +1,5 @@
 """Rendering a baked scene frame after frame: working memory that is kept and, on a card, CUDA graphs."""
 
-from __future__ import annotations
-
 import gc
 import threading
 from collections.abc import Sequence

@@ -50,7 +50,7 @@ class Camera:
 
     @cached_property
     def skewed(self) -> bool:
-        """Whether K has skew. Looked up before a camera goes to a device, so that nothing waits for that later."""
+        """True if K has skew. Looked up before a camera goes to a device, so that nothing waits for that later."""
         return float(self.K[0, 1]) != 0.0
 
     def _with(self, **changes: Any) -> Camera:

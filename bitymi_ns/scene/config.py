@@ -1,10 +1,9 @@
-"""What a scene is made of: the options that decide its parameters and how they are rendered."""
-
-from __future__ import annotations
+"""Options that decide the parameters of a scene and how they are rendered."""
 
 from dataclasses import dataclass
 from typing import Literal
 
+from bitymi_ns.ops import Prefilter
 from bitymi_ns.ops.view_kinds import Kind
 
 Texture = Literal["hash", "texels", "none"]  # what colours a surfel beside its view colour
@@ -40,7 +39,7 @@ class SceneConfig:
     """Fragments whose blending weight is below this keep the surfel's colour without the residual field; 0 to 1."""
     texture_moves_surfels: bool = False
     """The gradient of the residual field with respect to position reaches the surfels; that of texels always does."""
-    prefilter: Literal["low_pass", "pixel"] = "low_pass"
+    prefilter: Prefilter = "low_pass"
     """How discs of a pixel or less are drawn: low_pass = never smaller than a fixed blob around their centre; pixel =
     as what they cover of each pixel, with the right moments (docs/numerics.md)."""
     max_fragments: int = 0
@@ -51,11 +50,6 @@ class SceneConfig:
 
     @property
     def residual_moves_surfels(self) -> bool:
-        """Whether the gradient of the residual reaches the surfels. A surfel takes its own texels along, so that they
+        """True if the gradient of the residual reaches the surfels. A surfel takes its own texels along, so that they
         tell it where to go."""
         return self.texture_moves_surfels or self.texture == "texels"
-
-    @property
-    def through_pixel(self) -> bool:
-        """Whether the kernel is seen through a pixel: the choice of the kernels (csrc/core/surfel.h)."""
-        return self.prefilter == "pixel"

@@ -24,7 +24,7 @@ from .config import SceneConfig
 
 
 class Shading(NamedTuple):
-    """How the image of a view is made of its fragments.
+    """Options of compositing a view from its fragments.
 
     Attributes:
         bound: fragments of weight below this have no residual.
@@ -42,7 +42,7 @@ class Shading(NamedTuple):
 
 
 class ResidualField(Protocol):
-    """What colours the fragments of a scene beside the surfels' view colours."""
+    """Residual colours of fragments, beside the surfels' view colours."""
 
     def image(self, fragments: Fragments, projection: Projection, base: Tensor, how: Shading) -> Tensor:
         """[H * W, C] what `composite_image` gives for colours ReLU(ReLU(f_view + 0.5) + residual).
@@ -55,8 +55,8 @@ class ResidualField(Protocol):
         """
 
     def snapshot(self) -> Tensor | None:
-        """What parts of a view have to read in place of the field itself, because the backward passes of other parts
-        change it before they have drawn themselves anew; None: nothing changes."""
+        """State that parts of a view read in place of the field itself, because the backward passes of other parts
+        change it before they have been drawn again; None: nothing changes."""
 
 
 class HashField(nn.Module):
@@ -126,7 +126,7 @@ class HashField(nn.Module):
 
     @property
     def geometry(self) -> FieldGeometry:
-        """Where the grid lies. Read back once: a step must not wait for the device to tell."""
+        """Geometry of the grid. Read back once: a step must not wait for the device to tell."""
         now = self._state_of_domain()
         if self._read_from[0] is not now[0] or self._read_from[1] != now[1]:
             *mid, half, contract = self.domain.tolist()
@@ -207,7 +207,7 @@ class TexelField(nn.Module):
 
     @property
     def tiles(self) -> TexelTiles:
-        """Where the texels of every surfel lie."""
+        """Tiles of the surfels: sizes and offsets of their texels."""
         now = self.size, -1 if self.size.is_inference() else self.size._version
         if self._tiles is None or self._tiles[0] is not now[0] or self._tiles[1] != now[1]:
             self._tiles = (*now, TexelTiles.of_sizes(self.size, self.extent))

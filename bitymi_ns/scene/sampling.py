@@ -1,6 +1,4 @@
-"""How a view of another size than the photographs is drawn: what it shows of their pixels, and samples per pixel."""
-
-from __future__ import annotations
+"""Sampling of views of another size than the photographs: resolution of the photographs, samples per pixel."""
 
 import math
 from dataclasses import dataclass
@@ -26,7 +24,7 @@ FARTHEST = (1.0 / 64, 64.0)
 
 @dataclass(frozen=True)
 class Sampling:
-    """How a view is drawn.
+    """Samples per pixel of a view.
 
     Attributes:
         samples: per pixel, along each axis.
@@ -38,7 +36,7 @@ class Sampling:
 
 
 def size_of(photographed: Tensor, camera: Camera) -> float:
-    """How large a view shows what was photographed: 1 = as large as the photographs, 0.5 = at half their size.
+    """Scale at which a view shows the photographs: 1 = as large as the photographs, 0.5 = at half their size.
 
     Args:
         photographed: [P, 4] points of the scene, and the pixels per unit of length with which they were photographed.
@@ -61,7 +59,7 @@ def size_of(photographed: Tensor, camera: Camera) -> float:
 
 
 def sampling_of(size: float, pixels: int) -> Sampling:
-    """How a view is drawn.
+    """Choose the samples per pixel of a view.
 
     Args:
         size: of `size_of`.

@@ -185,7 +185,7 @@ class Scene(nn.Module):
             TooManyFragments: a single row of tiles has too many.
         """
         p = self.surfels
-        projection = project(*(p[name] for name in GEOMETRY), camera, self.near, self.config.through_pixel)
+        projection = project(*(p[name] for name in GEOMETRY), camera, self.near, self.config.prefilter)
         field = None if field_mode == "off" else self.field
         learns, bound = field_mode == "train", self.config.weight_bound if weight_bound is None else weight_bound
         base = self.base_color(projection)

@@ -1,6 +1,4 @@
-"""How far a surfel's tile reaches, and how many texels it gets along each tangent axis."""
-
-from __future__ import annotations
+"""Extent of a surfel's tile, and number of its texels along each tangent axis."""
 
 from collections.abc import Mapping, Sequence
 

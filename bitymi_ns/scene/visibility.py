@@ -1,4 +1,4 @@
-"""What the training views see of every surfel: whether any fragment of it is blended, and through what."""
+"""Visibility of every surfel in the training views: blended fragments, and the transmittance in front of them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops import fitting_lists, project
+from bitymi_ns.ops import Prefilter, fitting_lists, project
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 
@@ -17,7 +17,7 @@ PART = 1 << 20  # fragments that are looked at together: what is computed of the
 
 @dataclass(frozen=True)
 class Visibility:
-    """What the views see of N surfels.
+    """Visibility of N surfels in the views.
 
     Attributes:
         transmittance: [N] float32 in [0, 1], the largest one in front of a blended fragment of the surfel, over all
@@ -47,17 +47,17 @@ def visibility(
     cameras: Sequence[Camera],
     near: float,
     weight_bound: float = 0.0,
-    through_pixel: bool = False,
+    prefilter: Prefilter = "low_pass",
     progress: Progress = no_progress,
 ) -> Visibility:
-    """Which views see every surfel, and through what.
+    """Find the views that see every surfel, and the transmittance in front of it.
 
     Args:
         surfels: the per-surfel parameters of docs/overview.md, N rows, all of them finite and drawable.
         cameras: the views.
         near: nearest drawn depth.
         weight_bound: fragments of smaller weight get no residual.
-        through_pixel: how the scene is drawn, see `ops.project`.
+        prefilter: as in `ops.project`.
         progress: called after every view.
     """
     means = surfels["means"]
@@ -67,7 +67,7 @@ def visibility(
     seen = torch.zeros(len(cameras), len(means), dtype=torch.bool, device=means.device)
     for done, camera in enumerate(cameras, start=1):
         here = torch.zeros_like(pixels)
-        projection = project(means, *geometry, camera.to(means.device), near, through_pixel)
+        projection = project(means, *geometry, camera.to(means.device), near, prefilter)
         for fragments in fitting_lists(projection):
             lists = (fragments.surfel, fragments.weight, fragments.sigma)
             for surfel, weight, sigma in zip(*(values.split(PART) for values in lists), strict=True):

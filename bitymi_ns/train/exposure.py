@@ -50,17 +50,22 @@ class Exposure:
         reason: why photographs are corrected or not; empty until decided.
     """
 
-    def __init__(self, kind: ExposureKind, exif: Sequence[float] | None = None) -> None:
+    def __init__(
+        self, kind: ExposureKind, exif: Sequence[float] | None = None, photographs: Sequence[int] | None = None
+    ) -> None:
         """
         Args:
             kind: the option.
-            exif: log2 of the exposure of each training photograph (`exif_stops`), NaN = unknown; None = of all.
+            exif: log2 of the exposure of each training view (`exif_stops`), NaN = unknown; None = of all.
+            photographs: number of the photograph of each training view, from 0 on: views of one share its correction;
+                None = each is a photograph of its own.
         """
         self.kind: ExposureKind = kind
         self.table: Parameter | None = None
         self.decided = kind == "off"
         self.reason = ""
         self._exif = exif
+        self._photographs = photographs
         self._optimizer: SparseAdam | None = None
 
     def start(self, points: Tensor, views: Sequence[View], near: float) -> None:
@@ -73,7 +78,7 @@ class Exposure:
         """
         self.decided = True
         agreement = estimate_gains(points, views, near)
-        prior = seeds(self._exif, len(views))
+        prior = self._pooled(seeds(self._exif, len(views)), torch.ones(len(views)))
         if self.kind == "auto":
             if math.isnan(agreement.explained):
                 enabled = float(prior.std(0, correction=0).max()) > EXIF_SPREAD
@@ -85,9 +90,26 @@ class Exposure:
                 return
         else:
             self.reason = "as asked for"
-        seen = agreement.points[:, None].float()
-        gains = (seen * agreement.log_gains + PRIOR_POINTS * prior) / (seen + PRIOR_POINTS)
+        points_seen = agreement.points.float()
+        log_gains = self._pooled(agreement.log_gains, points_seen)
+        seen = points_seen[:, None] if self._photographs is None else self._summed(points_seen[:, None])
+        gains = (seen * log_gains + PRIOR_POINTS * prior) / (seen + PRIOR_POINTS)
         self._begin(gains.to(points.device), affine=self.kind == "affine")
+
+    def _summed(self, values: Tensor) -> Tensor:
+        """Sum values [V, C] of the views of each photograph."""
+        rows = torch.tensor(self._photographs)
+        return values.new_zeros(self._count(len(values)), values.shape[1]).index_add_(0, rows, values)
+
+    def _pooled(self, values: Tensor, weights: Tensor) -> Tensor:
+        """Average values [V, C] of the views of each photograph by weights [V]; 0 where these are 0."""
+        if self._photographs is None:
+            return values
+        weights = weights[:, None]
+        return self._summed(values * weights) / self._summed(weights).clamp(min=1e-6)
+
+    def _count(self, views: int) -> int:
+        return views if self._photographs is None else max(self._photographs, default=-1) + 1
 
     def _begin(self, log_gains: Tensor, affine: bool) -> None:
         first = log_gains.new_zeros(len(log_gains), 12 if affine else 3)
@@ -111,9 +133,10 @@ class Exposure:
         return None if self.table is None else self.table.detach()[:, _diagonal(self.table)]
 
     def of(self, number: int) -> Tensor | None:
-        """The correction of a training photograph: [3] gains, or [3, 4] matrix and offset; None = as it is."""
+        """The correction of a training view: [3] gains, or [3, 4] matrix and offset; None = as it is."""
         if self.table is None:
             return None
+        number = number if self._photographs is None else self._photographs[number]
         row = embedding(torch.full((), number, device=self.table.device), self.table, sparse=True)
         if row.numel() == 3:
             return row.exp()
@@ -170,7 +193,7 @@ class Exposure:
 
         Args:
             state: None = of a run from before there were corrections: `auto` then leaves all as it is.
-            count: number of training photographs.
+            count: number of training views.
             device: where the corrections are wanted, because a checkpoint may have been loaded elsewhere; None = where
                 those of `state` are.
         """
@@ -178,7 +201,7 @@ class Exposure:
             self.decided = self.kind in ("off", "auto")
             return
         table = state["table"]
-        if state["kind"] != self.kind or (table is not None and len(table) != count):
+        if state["kind"] != self.kind or (table is not None and len(table) != self._count(count)):
             return
         self.decided, self.reason = bool(state["decided"]), str(state["finding"])
         if table is None:
@@ -190,24 +213,28 @@ class Exposure:
         self._optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
 
 
-def corrected(views: Sequence[View], state: Mapping[str, Any] | None) -> Sequence[View]:
-    """The training photographs with the corrections that a run ended with.
+def corrected(
+    views: Sequence[View], state: Mapping[str, Any] | None, photographs: Sequence[int] | None = None
+) -> Sequence[View]:
+    """The training views with the corrections that a run ended with.
 
     Args:
         views: of the run, at full size.
         state: of its `Exposure`; None = it had none.
+        photographs: see `Exposure`.
 
     Raises:
         ValueError: there are more or fewer photographs than the run had.
     """
     if state is None or state["table"] is None:
         return views
-    if len(state["table"]) != len(views):
+    exposure = Exposure(state["kind"], photographs=photographs)
+    count = exposure._count(len(views))
+    if len(state["table"]) != count:
         raise ValueError(
-            f"training learned the exposure of {len(state['table'])} photographs, and now there are {len(views)}: "
-            "restore the capture, or leave the texels as they are baked (--finetune-steps 0)"
+            f"training learned the exposure of {len(state['table'])} photographs, and now there are {count}: restore "
+            "the capture, or leave the texels as they are baked (--finetune-steps 0)"
         )
-    exposure = Exposure(state["kind"])
     exposure.load_state_dict(state, len(views))
     with torch.no_grad():
         found = [exposure.of(i) for i in range(len(views))]

@@ -120,7 +120,7 @@ class Training:
         self.strategy = Strategy(
             config, self.schedule, data.extent, on_resize, data.image_pixels, data.first_surfels, processes
         )
-        self.exposure = Exposure(config.exposure, data.exif_stops)
+        self.exposure = Exposure(config.exposure, data.exif_stops, data.photographs)
         self.schedule.lr("exposure", 0)
         self.guard = RollbackGuard(
             scene, optimizers, self.strategy, self.schedule, config, announce, self.exposure, processes

@@ -129,7 +129,7 @@ def blank_texels(
     bound = scene.config.weight_bound
     scale = survey_scale(cameras)
     smaller = [camera.scaled(scale) for camera in cameras]
-    seen = visibility(surfels, smaller, scene.near, bound, scene.config.through_pixel)
+    seen = visibility(surfels, smaller, scene.near, bound, scene.config.prefilter)
     seen = replace(seen, pixels=seen.pixels / scale**2)
     size, extent = tiles_as_seen(surfels, cameras, seen, scene.near, bound, options, to_come)
     field = TexelField(size, extent, extent.new_zeros(int(size.long().prod(1).sum()), 3))
@@ -227,6 +227,6 @@ def coverage(scene: Scene, field: TexelField, views: Sequence[View]) -> Tensor:
     for view in views:
         geometry = (scene.surfels[name].detach() for name in GEOMETRY)
         camera = view.camera.to(total.device)
-        projection = project(*geometry, camera, scene.near, scene.config.through_pixel)
+        projection = project(*geometry, camera, scene.near, scene.config.prefilter)
         add_texel_coverage(fitting_lists(projection), field.tiles, view.mask, scene.config.weight_bound, total)
     return total[:, 0]

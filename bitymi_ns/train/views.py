@@ -67,7 +67,8 @@ class TrainingData:
         image_pixels: of all training views together.
         first_surfels: that training starts, or started, with.
         covered: share of their pixels that show something (`covered_share`).
-        exif_stops: log2 of the exposure of each photograph (`exposure.exif_stops`), NaN = unknown; None = of all.
+        exif_stops: log2 of the exposure of each view (`exposure.exif_stops`), NaN = unknown; None = of all.
+        photographs: number of the photograph of each view; None = each is one.
     """
 
     views: Sequence[View]
@@ -76,6 +77,7 @@ class TrainingData:
     first_surfels: int
     covered: float = 1.0
     exif_stops: Sequence[float] | None = None
+    photographs: Sequence[int] | None = None
 
 
 def _moved(value: Tensor | None, device: torch.device | str) -> Tensor | None:

@@ -2,7 +2,7 @@
 // (csrc/ops); the caller allocates; shapes and dtypes are checked on the way (reader.h), values in Python.
 #include <nanobind/stl/optional.h>
 
-#include "bindings/operations.h"
+#include "bindings/reader.h"
 
 #if defined(__GLIBC__) || __has_include(<malloc.h>)
 #include <malloc.h>
@@ -45,10 +45,9 @@ void give_back_memory() {
 #endif
 }
 
-template <class Arguments>
-void bind_operation(nb::module_& m, const std::string& name, void (*run)(const Arguments&)) {
-  m.def(name.c_str(), [name, run](const nb::kwargs& given) {
-    Reader r(name, given, kHost);
+template <class Arguments> void bind_operation(nb::module_& m, const std::string& name, void (*run)(const Arguments&)) {
+  m.def(name.c_str(), [name, run](const nb::kwargs& kwargs) {
+    Reader r(name, kwargs, kHost);
     const Arguments a = read<Arguments>(r);
     nb::gil_scoped_release release;
     run(a);
@@ -63,26 +62,23 @@ struct Pages {
   int64_t n;
   const int32_t* tiles;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     r.number("layers", std::get<0>(shape));
     r.number("height", std::get<1>(shape));
     r.number("width", std::get<2>(shape));
     const int64_t texels = int64_t(std::get<0>(shape)) * std::get<1>(shape) * std::get<2>(shape) * 4;
-    r.maybe("bytes", bytes, texels);
-    r.maybe("floats", floats, texels);
+    r.maybes(texels, "bytes", bytes, "floats", floats);
     r.rows("tiles", tiles, n, 5);
   }
 };
 
-template <class S>
-void bind_tracer(nb::module_& m) {
+template <class S> void bind_tracer(nb::module_& m) {
   const std::string name = std::string("Trace") + kSuffix<S>;
   nb::class_<Trace<S>>(m, name.c_str())
       .def(nb::init<>())
       .def("run",
-           [](Trace<S>& t, const nb::kwargs& given) {
-             Reader r("Trace.run", given, kHost);
+           [](Trace<S>& t, const nb::kwargs& kwargs) {
+             Reader r("Trace.run", kwargs, kHost);
              const TraceForward<S> a = read<TraceForward<S>>(r);
              nb::gil_scoped_release release;
              trace_forward(a, t);
@@ -90,17 +86,16 @@ void bind_tracer(nb::module_& m) {
            })
       .def_prop_ro("tiles", [](const Trace<S>& t) { return int64_t(t.bins.tiles_x) * t.bins.tiles_y; })
       .def_prop_ro("pairs", [](const Trace<S>& t) { return int64_t(t.bins.surfels.size()); })
-      .def_prop_ro("packs", [](const Trace<S>& t) { return t.list.packs; })
-      .def("copy", [](Trace<S>& t, const nb::kwargs& given) {
-        Reader r("Trace.copy", given, kHost);
+      .def_prop_ro("blocks", [](const Trace<S>& t) { return t.list.blocks; })
+      .def("copy", [](Trace<S>& t, const nb::kwargs& kwargs) {
+        Reader r("Trace.copy", kwargs, kHost);
         const TraceCopy<S> a = read<TraceCopy<S>>(r);
         nb::gil_scoped_release release;
         trace_copy(a, t);
       });
 }
 
-template <class S>
-void bind_operations(nb::module_& m) {
+template <class S> void bind_operations(nb::module_& m) {
   const auto name = [](const char* base) { return std::string(base) + kSuffix<S>; };
   bind_class<FieldArrays<S>>(m, name("Field"), kHost, "The parameters of a residual field.");
 #define BT_BIND(operation) bind_operation(m, name(#operation), &operation<S>);
@@ -116,22 +111,22 @@ NB_MODULE(BITYMI_MODULE, m) {
   using namespace bt;
   nb::set_leak_warnings(false);  // tracers keep their memory until the process ends
   m.doc() = "CPU kernels: see bitymi_ns.ops for their meaning.";
-  m.attr("CPU_FEATURES") = BITYMI_CPU_FEATURES;  // what of a CPU this needs, as in bitymi_ns._cpu_features
+  m.attr("CPU_FEATURES") = BITYMI_CPU_FEATURES;  // the features of a CPU that this needs, as in bitymi_ns._cpu_features
   nb::class_<Bins>(m, "Bins", "Memory for a view's tile lists, kept from frame to frame.").def(nb::init<>());
   nb::class_<Patches>(m, "Patches", "An atlas, every surfel's tile in one run.")
-      .def("__init__", [](Patches* self, const nb::kwargs& given) {
-        Reader r("Patches", given, kHost);
+      .def("__init__", [](Patches* self, const nb::kwargs& kwargs) {
+        Reader r("Patches", kwargs, kHost);
         const Pages p = read<Pages>(r);
         new (self) Patches();
         nb::gil_scoped_release release;
         const auto [layers, height, width] = p.shape;
         gather_patches(layers, height, width, p.bytes, p.floats, p.n, p.tiles, *self);
       });
-  bind_class<TilePacks>(m, "TilePacks", kHost, "The tiles and packs of a fragment list.");
+  bind_class<TileBlocks>(m, "TileBlocks", kHost, "The tiles and blocks of a fragment list.");
   bind_operations<float>(m);
   bind_operations<double>(m);
   bind_operation(m, "masked_counts", &masked_counts);
-  bind_operation(m, "list_places", &list_places);
+  bind_operation(m, "list_ids", &list_ids);
   bind_operation(m, "select_fragments", &select_fragments);
   m.attr("SUPPORT") = kSupport, m.attr("ALPHA_MAX") = kAlphaMax, m.attr("ALPHA_MIN") = kAlphaMin;
   m.attr("TRANSMITTANCE_MIN") = kTransmittanceMin, m.attr("BETA_MAX") = kBetaMax, m.attr("TILE") = kTile;
@@ -142,7 +137,7 @@ NB_MODULE(BITYMI_MODULE, m) {
   m.attr("MAX_TERMS") = kMaxTerms, m.attr("LOG_TAU_MAX") = kLogTauMax, m.attr("SH_C0") = kShC0;
   m.attr("COLOR_BIAS") = kColorBias;
   m.def("set_up_process", &set_up_process, "Before the first kernel: threads that wait asleep, memory that is kept.");
-  m.def("give_back_memory", &give_back_memory, "What was freed and kept goes back to the system.");
+  m.def("give_back_memory", &give_back_memory, "Return freed memory to the system.");
   m.def("set_num_threads", &set_num_threads, "n"_a, "Threads of the kernels; 0 = as many as there are cores.");
   m.def("num_threads", &num_threads);
 }

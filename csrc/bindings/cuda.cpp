@@ -2,13 +2,9 @@
 // The same file with BITYMI_EMULATED is bitymi_ns._emulated, which runs the CUDA kernels on the host, for tests.
 #include <nanobind/stl/vector.h>
 
-#include "bindings/operations.h"
+#include "bindings/reader.h"
 #include "cuda/atlas_texture.h"
 #include "cuda/baked.h"
-#include "cuda/device_check.h"
-#if defined(BITYMI_EMULATED)
-#include "cuda/emulator_probe.h"
-#endif
 #include "cuda/kernels.h"
 #include "cuda/training.h"
 
@@ -23,28 +19,25 @@ const Device kCard = {nb::device::cuda::value, "a CUDA device", true};
 #endif
 
 // Its arguments and the stream, which torch gives as a number.
-template <class Arguments>
-struct OnStream {
+template <class Arguments> struct OnStream {
   Arguments arguments;
   uint64_t stream;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     arguments.fields(r);
-    if (r.given("stream")) r.number("stream", stream);
+    if (r.has("stream")) r.number("stream", stream);
   }
 };
 template <class Arguments>
 void bind_operation(nb::module_& m, const std::string& name, void (*run)(const Arguments&, Stream)) {
-  m.def(name.c_str(), [name, run](const nb::kwargs& given) {
-    Reader r(name, given, kCard);
+  m.def(name.c_str(), [name, run](const nb::kwargs& kwargs) {
+    Reader r(name, kwargs, kCard);
     const auto a = read<OnStream<Arguments>>(r);
     run(a.arguments, reinterpret_cast<Stream>(uintptr_t(a.stream)));
   });
 }
 
-template <class S>
-void bind_operations(nb::module_& m) {
+template <class S> void bind_operations(nb::module_& m) {
   const auto name = [](const char* base) { return std::string(base) + kSuffix<S>; };
   bind_class<FieldArrays<S>>(m, name("Field"), kCard, "The parameters of a residual field.");
 #define BT_BIND(operation) bind_operation(m, name(#operation), &operation<S>);
@@ -70,24 +63,22 @@ struct Texels {
   int format, height, width;
   const uint8_t* texels;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     r.choice("format", format, kFormats);
-    r.number("height", height);
-    r.number("width", width);
+    r.numbers("height", height, "width", width);
     const int bytes[] = {1, 4, 8};  // per texel
     r.array("texels", texels, bytes[format] * int64_t(height) * width);
   }
 };
 
 void bind_baked(nb::module_& m) {
-  nb::class_<AtlasTexture>(m, "AtlasTexture").def("__init__", [](AtlasTexture* to, const nb::kwargs& given) {
+  nb::class_<AtlasTexture>(m, "AtlasTexture").def("__init__", [](AtlasTexture* to, const nb::kwargs& kwargs) {
     const Device host = {nb::device::cpu::value, "the CPU", false};
-    Reader r("AtlasTexture", given, host);
+    Reader r("AtlasTexture", kwargs, host);
     const Texels t = read<Texels>(r);
     new (to) AtlasTexture(TexelFormat(t.format), t.height, t.width, t.texels);
   });
-  m.def("draws_bc7", &draws_bc7, "Whether the current device draws BC7 blocks; tried once.");
+  m.def("draws_bc7", &draws_bc7, "True where the current device draws BC7 blocks; tried once.");
   bind_class<BakedScene>(m, "BakedScene", kCard, "A baked scene as the kernels read it.");
   bind_operation(m, "baked_frame", &baked_frame);
   m.def(
@@ -103,8 +94,8 @@ void bind_baked(nb::module_& m) {
 
 void bind_all(nb::module_& m) {
   m.def("device_problem", &device_problem, "device"_a,
-        "Why the kernels cannot run on a CUDA device and what to do about it; empty when they can.");
-  bind_class<Pairs>(m, "Pairs", kCard, "How kernels find their way in a fragment list (csrc/cuda/pairs.h).")
+        "Reason why the kernels cannot run on a CUDA device, and the remedy; empty when they can.");
+  bind_class<Pairs>(m, "Pairs", kCard, "Index of a fragment list (csrc/cuda/pairs.h).")
       .def_prop_ro("pairs", [](const Held<Pairs>& p) { return p.pairs; })
       .def_prop_ro("fragments", [](const Held<Pairs>& p) { return p.fragments; });
   bind_operations<float>(m);
@@ -126,7 +117,7 @@ NB_MODULE(_emulated, m) {
   m.doc() = "The CUDA kernels, thread by thread on the host: for tests.";
   m.def("set_seed", &bt::emulator::set_seed, nanobind::arg("seed"),
         "Seed of the order in which blocks and their threads take turns.");
-  m.def("stale_numbers", &bt::emulator::stale_numbers, "Threads that find what another block left in shared memory.");
+  m.def("stale_numbers", &bt::emulator::stale_numbers, "Threads that read another block's values in shared memory.");
   m.def("open_barrier", &bt::emulator::open_barrier, "A kernel whose threads wait for one that does not come.");
   m.def("read_float4", &bt::emulator::read_float4, nanobind::arg("offset"), "A kernel that may read misaligned.");
 #else

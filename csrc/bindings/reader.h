@@ -1,4 +1,4 @@
-// The arguments of one call, given by keyword: fills the struct of an operation (ops/arguments.h), names what is wrong.
+// The arguments of one call, by keyword: fills the struct of an operation (ops/arguments.h), names what is wrong.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -21,7 +21,7 @@ namespace bt {
 
 namespace nb = nanobind;
 
-// What the kernels of a module run on.
+// The device of a module's kernels.
 struct Device {
   int32_t type;                                       // of DLPack
   const char* name;                                   // in messages
@@ -29,14 +29,14 @@ struct Device {
   void (*prepare)(void* at, size_t bytes) = nullptr;  // memory that is going to be written, if there is anything to do
 };
 
-// What an object of Python points into.
+// References to the arrays and objects that a Python object points into.
 struct References {
   std::vector<nb::ndarray<nb::ro>> read;
   std::vector<nb::ndarray<>> written;
   std::vector<nb::object> objects;
 };
 
-// What is read of torch's tensors without DLPack, whose capsule takes torch about 10 us of Python per tensor.
+// Reads torch's tensors without DLPack, whose capsule takes torch about 10 us of Python per tensor.
 class Torch {
  public:
   // Null while nobody has imported torch.
@@ -50,16 +50,16 @@ class Torch {
     const PyObject* type = reinterpret_cast<const PyObject*>(Py_TYPE(object.ptr()));
     return type == tensor_ || type == parameter_;
   }
-  // Where the numbers of a dense tensor begin, and how many they are; false where it is none of these.
-  bool look(nb::handle tensor, nb::dlpack::dtype dtype, int32_t device, void*& at, int64_t& size) const {
+  // Reads address and size of a dense tensor; false for any other.
+  bool read(nb::handle tensor, nb::dlpack::dtype dtype, int32_t device, void*& at, int64_t& size) const {
     const PyObject* wanted = dtype_of(dtype);
     if (!wanted || nb::steal(PyObject_GetAttr(tensor.ptr(), dtype_)).ptr() != wanted) return false;
     PyObject* here = device == nb::device::cpu::value    ? is_cpu_
                      : device == nb::device::cuda::value ? is_cuda_
                                                          : nullptr;
     if (!here || nb::steal(PyObject_GetAttr(tensor.ptr(), here)).ptr() != Py_True) return false;
-    if (ask(tensor, is_contiguous_).ptr() != Py_True) return false;
-    const nb::object pointer = ask(tensor, data_ptr_), count = ask(tensor, numel_);
+    if (call(tensor, is_contiguous_).ptr() != Py_True) return false;
+    const nb::object pointer = call(tensor, data_ptr_), count = call(tensor, numel_);
     if (!pointer.is_valid() || !count.is_valid()) return false;
     at = PyLong_AsVoidPtr(pointer.ptr()), size = PyLong_AsLongLong(count.ptr());
     return true;
@@ -81,8 +81,8 @@ class Torch {
       if (dtype == known[i]) return types_[i];
     return nullptr;
   }
-  static nb::object ask(nb::handle tensor, PyObject* what) {
-    nb::object answer = nb::steal(PyObject_CallMethodNoArgs(tensor.ptr(), what));
+  static nb::object call(nb::handle tensor, PyObject* method) {
+    nb::object answer = nb::steal(PyObject_CallMethodNoArgs(tensor.ptr(), method));
     if (!answer.is_valid()) PyErr_Clear();  // it has no memory
     return answer;
   }
@@ -95,8 +95,7 @@ class Torch {
 };
 
 class Reader;
-template <class T, class = void>
-struct IsDescribed : std::false_type {};
+template <class T, class = void> struct IsDescribed : std::false_type {};
 template <class T>
 struct IsDescribed<T, std::void_t<decltype(std::declval<T&>().fields(std::declval<Reader&>()))>> : std::true_type {};
 
@@ -109,55 +108,50 @@ inline namespace of_emulated {
 inline namespace of_cuda {
 #endif
 // Arguments that are an object of Python, with what they point to.
-template <class Arguments>
-struct Held : Arguments {
+template <class Arguments> struct Held : Arguments {
   References kept;
 };
 }
 
 class Reader {
  public:
-  Reader(std::string what, const nb::kwargs& given, const Device& device) : what_(std::move(what)), device_(device) {
-    given_.reserve(given.size()), kept_.objects.reserve(given.size());
+  Reader(std::string function, const nb::kwargs& kwargs, const Device& device)
+      : function_(std::move(function)), device_(device) {
+    arguments_.reserve(kwargs.size()), kept_.objects.reserve(kwargs.size());
     PyObject *key, *value;
-    for (Py_ssize_t at = 0; PyDict_Next(given.ptr(), &at, &key, &value);)
-      given_.push_back({PyUnicode_AsUTF8(key), value, false});
+    for (Py_ssize_t at = 0; PyDict_Next(kwargs.ptr(), &at, &key, &value);)
+      arguments_.push_back({PyUnicode_AsUTF8(key), value, false});
   }
 
-  bool given(const char* name) const {
-    const Given* found = look(name);
+  bool has(const char* name) const {
+    const Argument* found = lookup(name);
     return found && found->value != Py_None;
   }
-  template <class T>
-  void array(const char* name, T*& to, int64_t count) {
+  template <class T> void array(const char* name, T*& to, int64_t count) {
     int64_t size;
     to = take<T>(name, size, alignof(T));
     expect(name, size, count);
   }
-  template <class T>
-  void wide(const char* name, T*& to, int64_t count) {
+  template <class T> void wide(const char* name, T*& to, int64_t count) {
     int64_t size;
     to = take<T>(name, size, device_.cuda ? 16 : alignof(T));
     expect(name, size, count);
   }
-  // An empty array has no address, but it was given.
-  template <class T>
-  void maybe(const char* name, T*& to, int64_t count) {
+  // An empty array has no address, but it is there.
+  template <class T> void maybe(const char* name, T*& to, int64_t count) {
     static std::remove_const_t<T> nothing;
     to = nullptr;
-    if (!given(name)) return;
+    if (!has(name)) return;
     array(name, to, count);
     if (!to) to = &nothing;
   }
-  template <class T>
-  void rows(const char* name, T*& to, int64_t& n, int width) {
+  template <class T> void rows(const char* name, T*& to, int64_t& n, int width) {
     int64_t size;
     to = take<T>(name, size, alignof(T));
     if (size % width) expect(name, size, (size / width + 1) * width);
     n = size / width;
   }
-  template <class T>
-  void work(const char* name, T*& to, int64_t count) {
+  template <class T> void work(const char* name, T*& to, int64_t count) {
     to = nullptr;
     if (device_.cuda) array(name, to, count);
   }
@@ -166,28 +160,34 @@ class Reader {
     if (!device_.cuda) return;
     to.at = take<uint8_t>(name, to.bytes, 16);
   }
-  template <class T>
-  void number(const char* name, T& to) {
+  template <class T> void number(const char* name, T& to) {
     std::conditional_t<std::is_floating_point_v<T>, double, T> value = {};
     if (!nb::try_cast(find(name), value)) wrong(name, std::is_same_v<T, bool> ? "a bool" : "a number");
     to = T(value);
   }
-  template <class S>
-  void number(const char* name, S (&to)[3]) {
+  template <class S> void number(const char* name, S (&to)[3]) {
     std::tuple<double, double, double> value;
     if (!nb::try_cast(find(name), value)) wrong(name, "three numbers");
     to[0] = S(std::get<0>(value)), to[1] = S(std::get<1>(value)), to[2] = S(std::get<2>(value));
   }
-  template <size_t kCount>
-  void choice(const char* name, int& to, const char* const (&names)[kCount]) {
+  // More of one kind: name, target, name, target.
+  template <class... More> void numbers(const char* name, More&... more) {
+    each([this](const char* n, auto& to) { number(n, to); }, name, more...);
+  }
+  template <class... More> void arrays(int64_t count, const char* name, More&... more) {
+    each([&](const char* n, auto& to) { array(n, to, count); }, name, more...);
+  }
+  template <class... More> void maybes(int64_t count, const char* name, More&... more) {
+    each([&](const char* n, auto& to) { maybe(n, to, count); }, name, more...);
+  }
+  template <size_t kCount> void choice(const char* name, int& to, const char* const (&names)[kCount]) {
     std::string value;
     if (!nb::try_cast(find(name), value)) wrong(name, "a string");
     for (to = 0; to < int(kCount); ++to)
       if (value == names[to]) return;
     refuse(std::string(name) + " cannot be '" + value + "'");
   }
-  template <class T>
-  void object(const char* name, T*& to) {
+  template <class T> void object(const char* name, T*& to) {
     using Plain = std::remove_const_t<T>;
     std::conditional_t<IsDescribed<Plain>::value, Held<Plain>, Plain>* held = nullptr;
     const nb::handle found = find(name);
@@ -195,35 +195,40 @@ class Reader {
     kept_.objects.push_back(nb::borrow(found));
     to = held;
   }
-  template <class T>
-  void maybe_object(const char* name, T*& to) {
+  template <class T> void maybe_object(const char* name, T*& to) {
     to = nullptr;
-    if (given(name)) object(name, to);
+    if (has(name)) object(name, to);
   }
-  [[noreturn]] void refuse(const std::string& why) const { throw std::invalid_argument(what_ + ": " + why); }
+  [[noreturn]] void refuse(const std::string& why) const { throw std::invalid_argument(function_ + ": " + why); }
 
-  // Nothing else was given; None is as good as nothing.
+  // Refuses arguments that were not read; None counts as absent.
   void done() const {
-    for (const Given& g : given_)
-      if (!g.taken && g.value != Py_None) throw nb::type_error((what_ + " takes no argument '" + g.name + "'").c_str());
+    for (const Argument& g : arguments_)
+      if (!g.taken && g.value != Py_None)
+        throw nb::type_error((function_ + " takes no argument '" + g.name + "'").c_str());
   }
   References keep() { return std::move(kept_); }
 
  private:
-  // The names as Python keeps them: a look-up in the dictionary would make a string of each first.
-  struct Given {
+  template <class F, class T, class... More> static void each(const F& fn, const char* name, T& to, More&... more) {
+    fn(name, to);
+    if constexpr (sizeof...(More) > 0) each(fn, more...);
+  }
+
+  // The names as Python keeps them: the dictionary would make a string of each first.
+  struct Argument {
     const char* name;
     PyObject* value;
     bool taken;
   };
-  const Given* look(const char* name) const {
-    for (const Given& g : given_)
+  const Argument* lookup(const char* name) const {
+    for (const Argument& g : arguments_)
       if (!std::strcmp(g.name, name)) return &g;
     return nullptr;
   }
   nb::handle find(const char* name) {
-    Given* found = const_cast<Given*>(look(name));
-    if (!found) throw nb::type_error((what_ + " lacks the argument '" + name + "'").c_str());
+    Argument* found = const_cast<Argument*>(lookup(name));
+    if (!found) throw nb::type_error((function_ + " lacks the argument '" + name + "'").c_str());
     found->taken = true;
     return found->value;
   }
@@ -237,13 +242,12 @@ class Reader {
   template <class T>
   using Stored = std::conditional_t<std::is_same_v<T, uint32_t>, int32_t,
                                     std::conditional_t<std::is_same_v<T, uint64_t>, int64_t, T>>;
-  template <class T>
-  T* take(const char* name, int64_t& size, size_t alignment) {
+  template <class T> T* take(const char* name, int64_t& size, size_t alignment) {
     constexpr nb::dlpack::dtype kDtype = nb::dtype<Stored<std::remove_const_t<T>>>();
     const nb::handle object = find(name);
     void* at;
     if (const Torch* torch = Torch::get(); torch && torch->is_tensor(object)) {
-      if (!torch->look(object, kDtype, device_.type, at, size)) not_an_array(name, kDtype);
+      if (!torch->read(object, kDtype, device_.type, at, size)) not_an_array(name, kDtype);
       kept_.objects.push_back(nb::borrow(object));
     } else {
       at = take_other<T>(name, object, size);
@@ -254,8 +258,7 @@ class Reader {
       if (device_.prepare) device_.prepare(at, size_t(size) * sizeof(T));
     return static_cast<T*>(at);
   }
-  template <class T>
-  void* take_other(const char* name, nb::handle object, int64_t& size) {
+  template <class T> void* take_other(const char* name, nb::handle object, int64_t& size) {
     using Access = std::conditional_t<std::is_const_v<T>, nb::ndarray<nb::ro>, nb::ndarray<>>;
     constexpr nb::dlpack::dtype kDtype = nb::dtype<Stored<std::remove_const_t<T>>>();
     Access a;
@@ -269,8 +272,7 @@ class Reader {
       kept_.written.push_back(std::move(a));
     return at;
   }
-  template <class A>
-  static bool dense(const A& a) {
+  template <class A> static bool dense(const A& a) {
     int64_t step = 1;
     if (a.size() == 0) return true;
     for (size_t i = a.ndim(); i--; step *= int64_t(a.shape(i)))
@@ -279,14 +281,14 @@ class Reader {
   }
   [[noreturn]] void not_an_array(const char* name, nb::dlpack::dtype dtype) const;
 
-  const std::string what_;  // its own: callers give literals, too
+  const std::string function_;  // its own: callers pass literals, too
   Device device_;
-  std::vector<Given> given_;  // all of them; the call keeps the objects
+  std::vector<Argument> arguments_;  // all of them; the call keeps the objects
   References kept_;
 };
 
 inline void Reader::wrong(const char* name, const std::string& wanted) const {
-  const nb::handle value = look(name)->value;
+  const nb::handle value = lookup(name)->value;
   std::string is = nb::type_name(value.type()).c_str();
   for (const char* property : {"dtype", "device", "shape"}) {
     const nb::object has = nb::steal(PyObject_GetAttrString(value.ptr(), property));
@@ -295,7 +297,7 @@ inline void Reader::wrong(const char* name, const std::string& wanted) const {
     else
       PyErr_Clear();
   }
-  throw nb::type_error((what_ + ": " + name + " must be " + wanted + ", not " + is).c_str());
+  throw nb::type_error((function_ + ": " + name + " must be " + wanted + ", not " + is).c_str());
 }
 inline void Reader::not_an_array(const char* name, nb::dlpack::dtype dtype) const {
   const char* kind = dtype.code == uint8_t(nb::dlpack::dtype_code::Float) ? "float"
@@ -305,8 +307,7 @@ inline void Reader::not_an_array(const char* name, nb::dlpack::dtype dtype) cons
 }
 
 // Reads the arguments of one call.
-template <class Arguments>
-Arguments read(Reader& r) {
+template <class Arguments> Arguments read(Reader& r) {
   Arguments a = {};
   a.fields(r);
   r.done();
@@ -317,14 +318,33 @@ Arguments read(Reader& r) {
 template <class Arguments>
 nb::class_<Held<Arguments>> bind_class(nb::module_& m, const std::string& name, const Device& device, const char* doc) {
   return nb::class_<Held<Arguments>>(m, name.c_str(), doc)
-      .def("__init__", [name, device](Held<Arguments>* self, const nb::kwargs& given) {
-        Reader r(name, given, device);
+      .def("__init__", [name, device](Held<Arguments>* self, const nb::kwargs& kwargs) {
+        Reader r(name, kwargs, device);
         const Arguments a = read<Arguments>(r);
         new (self) Held<Arguments>{a, r.keep()};
       });
 }
 
-template <class S>
-constexpr const char* kSuffix = sizeof(S) == 4 ? "_f32" : "_f64";
+template <class S> constexpr const char* kSuffix = sizeof(S) == 4 ? "_f32" : "_f64";
 
 }  // namespace bt
+
+// The operations of both devices: functions of bt and of bt::cuda, templates of the type of number.
+// clang-format off
+#define BT_OPERATIONS(each)   \
+  each(project_forward)       \
+  each(project_backward)      \
+  each(trace_backward)        \
+  each(composite_forward)     \
+  each(composite_backward)    \
+  each(blend_forward)         \
+  each(blend_backward)        \
+  each(view_color_forward)    \
+  each(view_color_backward)   \
+  each(lean_color)            \
+  each(field_forward)         \
+  each(field_backward)        \
+  each(shade_forward)         \
+  each(shade_backward)        \
+  each(ssim)
+// clang-format on

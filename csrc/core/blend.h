@@ -8,25 +8,21 @@ namespace bt {
 // Sums over a pixel's fragments, each times its weight: rgb, 1 and beta; with maps also depth and normal.
 constexpr int kImageChannels = 5, kMapChannels = 9;
 
-// The weight of a fragment in front of which `transmittance` is left, and what is left behind it.
-template <class T>
-struct Blend {
+// The weight of a fragment at a transmittance, and the transmittance behind it.
+template <class T> struct Blend {
   T weight, behind;
 };
-template <class T>
-BT_HD Blend<T> blend(T sigma, T transmittance) {
+template <class T> BT_HD Blend<T> blend(T sigma, T transmittance) {
   const T weight = sigma * transmittance;
   return {weight, transmittance - weight};
 }
 
-// Which of the open pixels take the fragment, and which it ends, as it would leave them less than `stop`: they take no
-// more light. One that would leave less than kTransmittanceMin is not blended itself, unless `stop` is below that.
-template <class T>
-struct BlendTest {
+// The open pixels that take the fragment, and those that it ends, as it would leave them less than `stop`. One that
+// would leave less than kTransmittanceMin is not blended itself, unless `stop` is below that.
+template <class T> struct BlendTest {
   MaskOf<T> takes, ends;
 };
-template <class T>
-BT_HD BlendTest<T> blend_test(MaskOf<T> open, T sigma, T behind, T stop) {
+template <class T> BT_HD BlendTest<T> blend_test(MaskOf<T> open, T sigma, T behind, T stop) {
   const MaskOf<T> covers = open & (sigma >= T(kAlphaMin));
   BlendTest<T> v;
   v.takes = covers & (behind >= min_(stop, T(kTransmittanceMin)));
@@ -35,8 +31,7 @@ BT_HD BlendTest<T> blend_test(MaskOf<T> open, T sigma, T behind, T stop) {
 }
 
 // dL/dsigma of a fragment, back to front: `later` is the sum of w dL/dw over the fragments behind it, which it joins.
-template <class S>
-BT_HD S blend_vjp(S weight, S sigma, S dweight, S& later) {
+template <class S> BT_HD S blend_vjp(S weight, S sigma, S dweight, S& later) {
   const S dsigma = weight / sigma * dweight - later / (S(1) - sigma);
   later += weight * dweight;
   return dsigma;

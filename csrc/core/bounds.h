@@ -1,6 +1,6 @@
-// Which pixels a surfel can touch: the box SnugBox and the row intervals AccuTile (both Speedy-Splat, Hanson et al.
-// 2025) for the level set of the Beta kernel, united with the low pass. In the offset (dx, dy) from the projected
-// centre the level set u^2 + v^2 <= r_c^2 is the conic U^2 + V^2 <= r_c^2 W^2.
+// Bounds of the pixels that a surfel can touch: the box SnugBox and the row intervals AccuTile (both Speedy-Splat,
+// Hanson et al. 2025) for the level set of the Beta kernel, united with the low pass. In the offset (dx, dy) from the
+// projected centre the level set u^2 + v^2 <= r_c^2 is the conic U^2 + V^2 <= r_c^2 W^2.
 //
 // Always evaluated in double, from the same (rounded) coefficients that the fragments use: the conic of a needle with
 // axis ratio k loses k^2 in its determinant, and a bound that misses a pixel is a hole in the picture. This is what
@@ -13,8 +13,7 @@
 
 namespace bt {
 
-template <class T>
-struct ExtentOf : Outline<T> {
+template <class T> struct ExtentOf : Outline<T> {
   bool visible = false;
   MaskOf<T> thin = T(0.0f) < T(0.0f);  // the conic is too flat to intersect: use the box
   T qa = T(0), qb = T(0), qc = T(0), qd = T(0), qe = T(0), qf = T(0);
@@ -22,8 +21,7 @@ struct ExtentOf : Outline<T> {
 };
 using Extent = ExtentOf<double>;
 // The outermost points of a conic with a box.
-template <class T>
-BT_HD void find_outermost(ExtentOf<T>& e) {
+template <class T> BT_HD void find_outermost(ExtentOf<T>& e) {
   e.y_left = -(e.qb * e.x0 + e.qe) / e.qc, e.y_right = -(e.qb * e.x1 + e.qe) / e.qc;
 }
 
@@ -59,15 +57,13 @@ BT_HD Extent filtered_extent(const double* g) {
 
 // The level set of a row that is not seen through a pixel. `room`: by how much its logarithm is larger; 0 for doubles.
 constexpr double kFloatRoom = 1e-5;
-template <class T>
-struct Level {
+template <class T> struct Level {
   MaskOf<T> visible;
   T r2, blur;  // r_c^2; radius of the low pass
 };
-template <class Kernel, class T>
-BT_HD Level<T> level_of(const T* g, double sharp, double room) {
+template <class Kernel, class T> BT_HD Level<T> level_of(const T* g, double sharp, double room) {
   const T one = T(1.0f), almost = T(1.0 - 0.1 * room), ratio = times_drawn(g[kOpacity]);
-  const T blurred = Kernel::kResized ? ratio * g[kArea] : ratio;
+  const T blurred = Kernel::kResized ? ratio * g[kLowPassHeight] : ratio;
   Level<T> l;
   l.visible = max_(ratio, blurred) >= almost;
   const T level = log_(max_(ratio, one)) + T(room);
@@ -77,13 +73,12 @@ BT_HD Level<T> level_of(const T* g, double sharp, double room) {
     l.blur = select(blurred >= almost, low_pass_radius(log_(max_(blurred, one)) + T(room)) / T(sqrt_(sharp)), T(0.0f));
   return l;
 }
-// What core/kernel.h's `reached` takes of such a row: r_c^2, and the squared radius of the low pass, 0 where the kernel
-// covers it.
+// Arguments of core/kernel.h's `reached` for such a row: r_c^2, and the squared radius of the low pass, 0 where the
+// kernel covers it.
 struct ReachLevels {
   float r2, blur2;
 };
-template <class Kernel, class S>
-BT_HD ReachLevels reach_levels(const S* geom, S near, double sharp) {
+template <class Kernel, class S> BT_HD ReachLevels reach_levels(const S* geom, S near, double sharp) {
   double g[kGeom];
   for (int c = 0; c < kGeom; ++c) g[c] = double(geom[c]);
   const Level<double> l = level_of<Kernel>(g, sharp, kFloatRoom);
@@ -91,8 +86,7 @@ BT_HD ReachLevels reach_levels(const S* geom, S near, double sharp) {
   return {float(l.r2), blur * blur};
 }
 // Its conic and the box of that, in doubles; of an image of that size.
-template <class T>
-BT_HD ExtentOf<T> conic_extent(const T* g, T rc2, T blur, int width, int height) {
+template <class T> BT_HD ExtentOf<T> conic_extent(const T* g, T rc2, T blur, int width, int height) {
   const T zero = T(0.0f);
   const T u1 = g[kU1], u2 = g[kU2], v1 = g[kV1], v2 = g[kV2], w0 = g[kW0], w1 = g[kW1], w2 = g[kW2];
   ExtentOf<T> e;
@@ -121,9 +115,21 @@ BT_HD ExtentOf<T> conic_extent(const T* g, T rc2, T blur, int width, int height)
   return e;
 }
 
+// Level set and conic of rows that are not seen through a pixel; the conic, in doubles, without its outermost points.
+template <class T> struct LevelExtent {
+  Level<T> level;
+  ExtentOf<Widened<T>> conic;
+};
+template <class Kernel, class T>
+BT_HD LevelExtent<T> level_extent(const T* g, int width, int height, double sharp, double room) {
+  const Level<T> level = level_of<Kernel>(g, sharp, room);
+  Widened<T> wide[kGeom];
+  for (int k = kCx; k <= kW2; ++k) wide[k] = widened(g[k]);
+  return {level, conic_extent(wide, widened(level.r2), widened(level.blur), width, height)};
+}
+
 // In an image of that size.
-template <class Kernel, class F>
-BT_HD Extent extent(const F* geom, int width, int height, double sharp = 1) {
+template <class Kernel, class F> BT_HD Extent extent(const F* geom, int width, int height, double sharp = 1) {
   double g[kGeom];
   for (int i = 0; i < kGeom; ++i) g[i] = double(geom[i]);
   if (filtered<Kernel>(g)) return filtered_extent(g);
@@ -136,8 +142,7 @@ BT_HD Extent extent(const F* geom, int width, int height, double sharp = 1) {
 }
 
 // The x offsets that the surfel can touch between the lines y = lo and y = hi.
-template <class T>
-BT_HD Interval<T> row_interval(const ExtentOf<T>& e, T lo, T hi) {
+template <class T> BT_HD Interval<T> row_interval(const ExtentOf<T>& e, T lo, T hi) {
   const T zero = T(0.0f);
   const MaskOf<T> boxed = e.whole | (e.thin & e.ellipse);
   const MaskOf<T> crossed = e.ellipse & not_(boxed) & (hi >= e.y0) & (e.y1 >= lo);
@@ -169,18 +174,16 @@ BT_HD Interval<T> row_interval(const ExtentOf<T>& e, T lo, T hi) {
   return r;
 }
 
-// Which tiles: rows first, then the columns of a row.
+// Tiles: rows first, then the columns of a row.
 constexpr int kTile = 16;  // pixels along a side
 BT_HD int tiles_across(int pixels) { return (pixels + kTile - 1) / kTile; }
 
 // Whole numbers; none when first > last.
-template <class T>
-struct TileSpan {
+template <class T> struct TileSpan {
   T first, last;
 };
-// Those along an axis of `pixels` pixels that the offsets meet from c, the place of a centre; that of pixel i is i.
-template <class T>
-BT_HD TileSpan<T> tile_span(const Interval<T>& x, T c, int pixels) {
+// Those along an axis of `pixels` pixels that the offsets meet from c, the position of a centre; that of pixel i is i.
+template <class T> BT_HD TileSpan<T> tile_span(const Interval<T>& x, T c, int pixels) {
   const T zero = T(0.0f), one = T(1.0f), size = T(double(pixels));
   const MaskOf<T> none = x.empty() | (zero > c + x.x1) | (c + x.x0 > size - one);
   const T first = floor_(max_(zero, c + x.x0) * T(1.0 / kTile));
@@ -188,13 +191,11 @@ BT_HD TileSpan<T> tile_span(const Interval<T>& x, T c, int pixels) {
   return {select(none, zero, first), select(none, -one, min_(last, T(double(tiles_across(pixels) - 1))))};
 }
 // The surfel has radii above 0: its box meets the image.
-template <class F>
-BT_HD TileSpan<double> tile_rows(const Extent& e, const F* geom, int height) {
+template <class F> BT_HD TileSpan<double> tile_rows(const Extent& e, const F* geom, int height) {
   return tile_span(rows_of(e), double(geom[kCy]) - 0.5, height);
 }
 // cx, cy: of the projected centre.
-template <class T>
-BT_HD TileSpan<T> tile_columns(const ExtentOf<T>& e, T cx, T cy, T row, int width) {
+template <class T> BT_HD TileSpan<T> tile_columns(const ExtentOf<T>& e, T cx, T cy, T row, int width) {
   const T top = row * T(double(kTile)) - (cy - T(0.5));  // pixel centre i + 0.5 has the offset i + 0.5 - c
   return tile_span(row_interval(e, top, top + T(double(kTile - 1))), cx - T(0.5), width);
 }

@@ -1,5 +1,5 @@
 // Scalars, small vectors and the few functions that every formula needs, for host and device.
-// A "real" T is float, double, or a SIMD pack of them (cpu/simd.h) that overloads the same functions.
+// A "real" T is float, double, or Lanes (cpu/simd.h), which overload the same functions.
 #pragma once
 
 #include <cmath>
@@ -29,104 +29,55 @@ BT_HD double floor_(double x) { return floor(x); }
 BT_HD bool finite_(float x) { return fabsf(x) <= 3.402823466e38f; }  // false for NaN as well
 BT_HD bool finite_(double x) { return fabs(x) <= 1.7976931348623157e308; }
 
-// What comparing two reals gives: a bool, or one for each lane of a pack.
-template <class T>
-using MaskOf = decltype(std::declval<T>() < std::declval<T>());
+// The result of comparing two reals: a bool, or one for each lane.
+template <class T> using MaskOf = decltype(std::declval<T>() < std::declval<T>());
 BT_HD bool not_(bool m) { return !m; }
 BT_HD bool any_(bool m) { return m; }
 
-template <class T>
-BT_HD T select(bool condition, T yes, T no) {
-  return condition ? yes : no;
-}
-template <class T>
-BT_HD T max_(T a, T b) {
-  return select(a > b, a, b);
-}
-template <class T>
-BT_HD T min_(T a, T b) {
-  return select(a < b, a, b);
-}
-template <class T>
-BT_HD T abs_(T x) {
-  return select(x < T(0.0f), -x, x);
-}
+template <class T> BT_HD T select(bool condition, T yes, T no) { return condition ? yes : no; }
+template <class T> BT_HD T max_(T a, T b) { return select(a > b, a, b); }
+template <class T> BT_HD T min_(T a, T b) { return select(a < b, a, b); }
+template <class T> BT_HD T abs_(T x) { return select(x < T(0.0f), -x, x); }
 // NaN stays NaN: a broken parameter must show, not turn black
-template <class T>
-BT_HD T relu(T x) {
-  return select(x < T(0.0f), T(0.0f), x);
-}
-template <class T>
-BT_HD T clamp_(T x, T low, T high) {
-  return min_(max_(x, low), high);
-}
+template <class T> BT_HD T relu(T x) { return select(x < T(0.0f), T(0.0f), x); }
+template <class T> BT_HD T clamp_(T x, T low, T high) { return min_(max_(x, low), high); }
 
-// The double of a real, or doubles of a pack, and back.
+// A real in double, or lanes of doubles, and back.
 BT_HD double widened(float x) { return x; }
 BT_HD double widened(double x) { return x; }
-template <class T>
-using Widened = decltype(widened(std::declval<T>()));
-template <class T>
-BT_HD T narrowed(double x) {
-  return T(x);
-}
+template <class T> using Widened = decltype(widened(std::declval<T>()));
+template <class T> BT_HD T narrowed(double x) { return T(x); }
 
 // x^y for x > 0
-template <class T>
-BT_HD T power_(T x, T y) {
-  return exp_(y * log_(x));
-}
+template <class T> BT_HD T power_(T x, T y) { return exp_(y * log_(x)); }
 
 // sigmoid without overflow for any finite x
-template <class T>
-BT_HD T sigmoid(T x) {
+template <class T> BT_HD T sigmoid(T x) {
   const T one = T(1.0f), e = exp_(-abs_(x));
   return select(x < T(0.0f), e, one) / (one + e);
 }
 
-template <class S>
-struct Vec3 {
+template <class S> struct Vec3 {
   S x, y, z;
 };
-template <class S>
-BT_HD Vec3<S> operator+(Vec3<S> a, Vec3<S> b) {
-  return {a.x + b.x, a.y + b.y, a.z + b.z};
-}
-template <class S>
-BT_HD Vec3<S> operator-(Vec3<S> a, Vec3<S> b) {
-  return {a.x - b.x, a.y - b.y, a.z - b.z};
-}
-template <class S>
-BT_HD Vec3<S> operator*(S k, Vec3<S> a) {
-  return {k * a.x, k * a.y, k * a.z};
-}
-template <class S>
-BT_HD S dot(Vec3<S> a, Vec3<S> b) {
-  return a.x * b.x + a.y * b.y + a.z * b.z;
-}
-template <class S>
-BT_HD Vec3<S> cross(Vec3<S> a, Vec3<S> b) {
+template <class S> BT_HD Vec3<S> operator+(Vec3<S> a, Vec3<S> b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+template <class S> BT_HD Vec3<S> operator-(Vec3<S> a, Vec3<S> b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+template <class S> BT_HD Vec3<S> operator*(S k, Vec3<S> a) { return {k * a.x, k * a.y, k * a.z}; }
+template <class S> BT_HD S dot(Vec3<S> a, Vec3<S> b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+template <class S> BT_HD Vec3<S> cross(Vec3<S> a, Vec3<S> b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
-template <class S>
-BT_HD Vec3<S> load3(const S* p) {
-  return {p[0], p[1], p[2]};
-}
-template <class S>
-BT_HD void store3(S* p, Vec3<S> a) {
-  p[0] = a.x, p[1] = a.y, p[2] = a.z;
-}
+template <class S> BT_HD Vec3<S> load3(const S* p) { return {p[0], p[1], p[2]}; }
+template <class S> BT_HD void store3(S* p, Vec3<S> a) { p[0] = a.x, p[1] = a.y, p[2] = a.z; }
 
 // Unit vector of a; a vector shorter than the floor keeps its direction at reduced length, so that nothing divides by
 // 0.
-template <class S>
-struct Unit {
+template <class S> struct Unit {
   Vec3<S> n;
   S inv;      // 1 / max(|a|, floor)
   bool full;  // |a| above the floor
 };
-template <class S>
-BT_HD Unit<S> normalize(Vec3<S> a) {
+template <class S> BT_HD Unit<S> normalize(Vec3<S> a) {
   const S floor_len = S(1e-12);
   // scaled by the largest entry: |a|^2 neither overflows nor underflows
   const S big = max_(abs_(a.x), max_(abs_(a.y), abs_(a.z)));
@@ -136,8 +87,7 @@ BT_HD Unit<S> normalize(Vec3<S> a) {
   return {inv * b, inv / big, true};
 }
 // d loss / d a from d loss / d n
-template <class S>
-BT_HD Vec3<S> normalize_vjp(const Unit<S>& u, Vec3<S> dn) {
+template <class S> BT_HD Vec3<S> normalize_vjp(const Unit<S>& u, Vec3<S> dn) {
   if (!u.full) return u.inv * dn;
   return u.inv * (dn - dot(dn, u.n) * u.n);
 }

@@ -10,9 +10,8 @@ constexpr int kFeatures = 4;  // per level
 constexpr int kWidth = 16;    // of both hidden layers
 constexpr int kMaxLevels = 4;
 
-// The field as the kernels take it.
-template <class S>
-struct FieldArrays {
+// Parameters of the field.
+template <class S> struct FieldArrays {
   int levels, log2_size, min_resolution;
   bool contract;
   S mid[3], half;
@@ -24,14 +23,9 @@ struct FieldArrays {
   BT_HD uint32_t hash_mask() const { return (1u << log2_size) - 1u; }
   BT_HD S resolution(int level) const { return S(min_resolution << level); }  // cells along an edge
   // as in ops/arguments.h
-  template <class R>
-  void fields(R& r) {
-    r.number("levels", levels);
-    r.number("log2_size", log2_size);
-    r.number("min_resolution", min_resolution);
-    r.number("contract", contract);
-    r.number("mid", mid);
-    r.number("half", half);
+  template <class R> void fields(R& r) {
+    r.numbers("levels", levels, "log2_size", log2_size, "min_resolution", min_resolution, "contract", contract, "mid",
+              mid, "half", half);
     if (levels < 1 || levels > kMaxLevels || log2_size < 1 || log2_size > 28)
       r.refuse("a field has 1 to 4 levels and 2 to 2^28 entries per level");
     r.wide("table", table, table_size());
@@ -40,12 +34,10 @@ struct FieldArrays {
     r.array("w3", w3, kWidth * 3);
   }
 };
-template <class S>
-struct FieldGradients {
+template <class S> struct FieldGradients {
   S *table, *w1, *w2, *w3;
 
-  template <class R>
-  void fields(R& r, const FieldArrays<S>& field) {
+  template <class R> void fields(R& r, const FieldArrays<S>& field) {
     r.wide("dtable", table, field.table_size());
     r.array("dw1", w1, field.levels * kFeatures * kWidth);
     r.array("dw2", w2, kWidth * kWidth);
@@ -54,8 +46,7 @@ struct FieldGradients {
 };
 
 // Unsigned integers as wide as a real; hashing needs their low 32 bits only.
-template <class T>
-struct IndexOf {
+template <class T> struct IndexOf {
   using type = uint32_t;
 };
 BT_HD uint32_t to_index(float x) { return uint32_t(int32_t(x)); }
@@ -64,8 +55,7 @@ BT_HD uint32_t to_index(double x) { return uint32_t(int32_t(x)); }
 // Grid coordinate in [0, 1]^3 of a world position. With contraction p -> (2 - 1/|p|) p/|p| outside the unit ball
 // (mip-NeRF 360, Barron et al. 2022) and the ball of radius 2 fills the cube; without it the cube of half edge `half`
 // does, clamped.
-template <class S, class T>
-BT_HD Vec3<T> grid_coordinate(Vec3<T> x, Vec3<S> mid, S half, bool contract) {
+template <class S, class T> BT_HD Vec3<T> grid_coordinate(Vec3<T> x, Vec3<S> mid, S half, bool contract) {
   const T k = T(S(1) / half), one = T(S(1)), zero = T(S(0));
   const Vec3<T> p = {k * (x.x - T(mid.x)), k * (x.y - T(mid.y)), k * (x.z - T(mid.z))};
   const T h = T(S(0.5));
@@ -75,8 +65,7 @@ BT_HD Vec3<T> grid_coordinate(Vec3<T> x, Vec3<S> mid, S half, bool contract) {
   const T q = T(S(0.25)) * (T(S(2)) - ir) * ir;
   return {q * p.x + h, q * p.y + h, q * p.z + h};
 }
-template <class S>
-BT_HD Vec3<S> grid_coordinate_vjp(Vec3<S> x, Vec3<S> mid, S half, bool contract, Vec3<S> dc) {
+template <class S> BT_HD Vec3<S> grid_coordinate_vjp(Vec3<S> x, Vec3<S> mid, S half, bool contract, Vec3<S> dc) {
   const Vec3<S> p = (S(1) / half) * (x - mid);
   if (!contract) {
     const S k = S(0.5) / half;
@@ -94,15 +83,13 @@ BT_HD Vec3<S> grid_coordinate_vjp(Vec3<S> x, Vec3<S> mid, S half, bool contract,
 
 // Eight corners of a level's cell: entries of the hash table and trilinear weights. Corner c has bit 0 for x, 1 for y,
 // 2 for z. XOR of coordinate times prime with the standard primes.
-template <class T>
-struct Corners {
+template <class T> struct Corners {
   typename IndexOf<T>::type index[8];
   T weight[8];
   T fx, fy, fz;                       // position in the cell
   typename IndexOf<T>::type x, y, z;  // the cell's first corner, y and z times their primes
 };
-template <class T>
-BT_HD void corners(Vec3<T> c, T resolution, uint32_t mask, Corners<T>& r) {
+template <class T> BT_HD void corners(Vec3<T> c, T resolution, uint32_t mask, Corners<T>& r) {
   using U = typename IndexOf<T>::type;
   const T px = c.x * resolution, py = c.y * resolution, pz = c.z * resolution;
   const T bx = floor_(px), by = floor_(py), bz = floor_(pz), one = T(1.0f);
@@ -120,8 +107,7 @@ BT_HD void corners(Vec3<T> c, T resolution, uint32_t mask, Corners<T>& r) {
 }
 
 // d loss / d grid coordinate from d loss / d interpolated value of each corner.
-template <class S>
-BT_HD Vec3<S> cell_gradient(S fx, S fy, S fz, S resolution, const S* d) {
+template <class S> BT_HD Vec3<S> cell_gradient(S fx, S fy, S fz, S resolution, const S* d) {
   const S gx = S(1) - fx, gy = S(1) - fy, gz = S(1) - fz;
   return {resolution *
               (gy * gz * (d[1] - d[0]) + fy * gz * (d[3] - d[2]) + gy * fz * (d[5] - d[4]) + fy * fz * (d[7] - d[6])),
@@ -131,27 +117,23 @@ BT_HD Vec3<S> cell_gradient(S fx, S fy, S fz, S resolution, const S* d) {
               (gx * gy * (d[4] - d[0]) + fx * gy * (d[5] - d[1]) + gx * fy * (d[6] - d[2]) + fx * fy * (d[7] - d[3]))};
 }
 
-// The MLP on rows of kWidth values. `Row` is a pack of kWidth reals; weights are stored input-major, w3 output-major
+// The MLP on rows of kWidth values. `Row` is kWidth lanes; weights are stored input-major, w3 output-major
 // (three rows), and the transposes serve the backward pass. With fewer levels than kMaxLevels the rows of w1 that have
 // no input are 0, and so are those inputs.
 constexpr int kInputs = kMaxLevels * kFeatures;
 static_assert(kInputs == kWidth, "features and hidden layers share one type of row");
-template <class S, class Row>
-struct Mlp {
+template <class S, class Row> struct Mlp {
   Row w1[kInputs], w2[kWidth], w3[3], w1t[kWidth], w2t[kWidth];
 };
-template <class S, class Row>
-struct MlpState {
+template <class S, class Row> struct MlpState {
   Row h1, h2;
 };
 // Gradients before the two ReLUs.
-template <class Row>
-struct MlpGradient {
+template <class Row> struct MlpGradient {
   Row g1, g2;
 };
 // sum_i w_i in_i
-template <class S, class Row>
-BT_HD Row product(const Row* w, const S* in) {
+template <class S, class Row> BT_HD Row product(const Row* w, const S* in) {
   Row a = Row(S(0)), b = Row(S(0));  // two chains hide the latency of the multiply-add
   for (int i = 0; i < kWidth; i += 2) {
     a += w[i] * Row(in[i]);
@@ -159,8 +141,7 @@ BT_HD Row product(const Row* w, const S* in) {
   }
   return a + b;
 }
-template <class S, class Row>
-BT_HD Vec3<S> mlp(const Mlp<S, Row>& m, const S* features, MlpState<S, Row>& state) {
+template <class S, class Row> BT_HD Vec3<S> mlp(const Mlp<S, Row>& m, const S* features, MlpState<S, Row>& state) {
   S h[kWidth];
   state.h1 = relu(product(m.w1, features));
   store(h, state.h1);
@@ -179,8 +160,8 @@ BT_HD Row mlp_vjp(const Mlp<S, Row>& m, const MlpState<S, Row>& state, Vec3<S> d
   store(h, g.g1);
   return product(m.w1t, h);
 }
-// Adds the weights' gradients to w1, w2 and w3 of `sums`: outer products of what a layer was given and the gradient of
-// what it made of it.
+// Adds the weights' gradients to w1, w2 and w3 of `sums`: outer products of a layer's input and the gradient of its
+// output.
 template <class S, class Row>
 BT_HD void add_weight_gradient(const S* features, const MlpState<S, Row>& state, const MlpGradient<Row>& g, Vec3<S> d,
                                Mlp<S, Row>& sums) {
@@ -191,14 +172,12 @@ BT_HD void add_weight_gradient(const S* features, const MlpState<S, Row>& state,
   for (int i = 0; i < kInputs; ++i) sums.w1[i] += g.g1 * Row(features[i]);
 }
 
-// Where a fragment lies; frame: mean, s_u t_u, s_v t_v.
-template <class S>
-BT_HD Vec3<S> world_point(const S* frame, S u, S v) {
+// World position of a fragment; frame: mean, s_u t_u, s_v t_v.
+template <class S> BT_HD Vec3<S> world_point(const S* frame, S u, S v) {
   return load3(frame) + u * load3(frame + 3) + v * load3(frame + 6);
 }
 // Adds the gradient of the frame to dframe and writes those of u and v, from that of the point.
-template <class S>
-BT_HD void world_point_vjp(const S* frame, S u, S v, Vec3<S> dx, S& du, S& dv, S* dframe) {
+template <class S> BT_HD void world_point_vjp(const S* frame, S u, S v, Vec3<S> dx, S& du, S& dv, S* dframe) {
   du = dot(dx, load3(frame + 3)), dv = dot(dx, load3(frame + 6));
   store3(dframe, load3(dframe) + dx);
   store3(dframe + 3, load3(dframe + 3) + u * dx);

@@ -1,4 +1,4 @@
-// Where a pixel's ray meets a surfel, and how much of it the surfel covers: the Beta kernel of eq. (beta-kernel)
+// Intersection of a pixel's ray with a surfel, and its coverage: the Beta kernel of eq. (beta-kernel)
 // (Deformable Beta Splatting, Liu et al. 2025) with a screen-space low pass, as 2D Gaussian Splatting has one, sigma =
 // min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))); or PixelKernel, of which core/prefilter.h has the formulas.
 #pragma once
@@ -9,56 +9,41 @@
 
 namespace bt {
 
-// Whether the low pass may be drawn there.
-template <class T>
-BT_HD MaskOf<T> near_centre(T dx, T dy) {
+// True where the low pass may be drawn.
+template <class T> BT_HD MaskOf<T> near_centre(T dx, T dy) {
   return dx * dx + dy * dy < T(kLowPassReach * kLowPassReach);
 }
 
 // The planes U, V and W at a pixel. S: the surfel's scalars, T: a real for the pixels. dx, dy: pixels from the
 // projected centre.
-template <class T>
-struct Planes {
+template <class T> struct Planes {
   T U, V, W;
 };
-template <class S, class T>
-BT_HD Planes<T> planes(const S* g, T dx, T dy) {
+template <class S, class T> BT_HD Planes<T> planes(const S* g, T dx, T dy) {
   // the sum from left to right, as a chain of multiply-adds
   return {slope(g, kU1, dx, dy), slope(g, kV1, dx, dy), T(g[kW0]) + T(g[kW1]) * dx + T(g[kW2]) * dy};
 }
 // u^2 + v^2 < r2 without a division, on either side of the camera.
-template <class T>
-BT_HD MaskOf<T> within(const Planes<T>& p, T r2) {
-  return p.U * p.U + p.V * p.V < r2 * p.W * p.W;
-}
+template <class T> BT_HD MaskOf<T> within(const Planes<T>& p, T r2) { return p.U * p.U + p.V * p.V < r2 * p.W * p.W; }
 
 // The same, and in front of the camera.
-template <class T>
-BT_HD MaskOf<T> within_in_front(const Planes<T>& p, T r2) {
+template <class T> BT_HD MaskOf<T> within_in_front(const Planes<T>& p, T r2) {
   return p.U * p.U + p.V * p.V < r2 * p.W * abs_(p.W);
 }
 
-// Whether the kernel is above 0 there, in front of the camera or behind it.
-template <class T>
-BT_HD MaskOf<T> in_support(const Planes<T>& p) {
-  return within(p, T(kSupport2));
-}
+// True where the kernel is above 0, in front of the camera or behind it.
+template <class T> BT_HD MaskOf<T> in_support(const Planes<T>& p) { return within(p, T(kSupport2)); }
 
-// How far pixels lie from the middle of a cell of them, with what rounding may add; offsets of pixels are up to
+// Distance of pixels from the middle of their cell, with the error of rounding; offsets of pixels are up to
 // `largest`.
-template <class S>
-BT_HD S cell_half(S half, S centre, S largest) {
-  return half + S(1e-6) * (largest + abs_(centre));
-}
-// Whether a cell of an image has a pixel in the kernel's level set u^2 + v^2 < r2, and in that of the low pass, d^2 <
-// blur2. x, y: offset of its middle from the surfel's projected centre. Never one cell too few, few too many: within a
-// cell a plane differs from its value in the middle by no more than `spread`, and by what rounding may add.
-template <class T>
-struct Reached {
+template <class S> BT_HD S cell_half(S half, S centre, S largest) { return half + S(1e-6) * (largest + abs_(centre)); }
+// True where a cell of an image has a pixel in the kernel's level set u^2 + v^2 < r2, and in that of the low pass, d^2
+// < blur2. x, y: offset of its middle from the surfel's projected centre. Never one cell too few, few too many: within
+// a cell a plane differs from its value in the middle by no more than `spread`, and by what rounding may add.
+template <class T> struct Reached {
   MaskOf<T> support, centre;
 };
-template <class S, class T>
-BT_HD Reached<T> reached(const S* g, T x, T y, S half_x, S half_y, S r2, S blur2) {
+template <class S, class T> BT_HD Reached<T> reached(const S* g, T x, T y, S half_x, S half_y, S r2, S blur2) {
   const T zero = T(S(0));
   const auto spread = [&](GeomColumn first) { return abs_(g[first]) * half_x + abs_(g[first + 1]) * half_y; };
   const Planes<T> p = planes(g, x, y);
@@ -68,28 +53,22 @@ BT_HD Reached<T> reached(const S* g, T x, T y, S half_x, S half_y, S r2, S blur2
   return {within_in_front(nearest, T(r2 * S(1 + 1e-5))), dx * dx + dy * dy < T(blur2)};
 }
 
-// Whether the plane lies behind `near` there, where it is in front of the camera.
-template <class S, class T>
-BT_HD MaskOf<T> behind_near(const S* g, S near, T W) {
+// True where the plane lies behind `near`; for points in front of the camera.
+template <class S, class T> BT_HD MaskOf<T> behind_near(const S* g, S near, T W) {
   return T(g[kW0] * g[kZ]) > T(near) * W;
 }
 
-template <class T>
-BT_HD T inverse_(T x) {
-  return T(1.0f) / x;
-}
+template <class T> BT_HD T inverse_(T x) { return T(1.0f) / x; }
 
-// Where a ray meets a surfel's plane.
-template <class T>
-struct Hit {
+// Intersection of a ray with a surfel's plane.
+template <class T> struct Hit {
   MaskOf<T> ok;  // in front of the camera, behind `near`
   T inv;         // 1 / W; 1 without a hit
   T u, v;        // 0 without a hit
   T rest;        // 1 - (u^2 + v^2) / 9
 };
 // Without kMisses all but `ok` is anything where there is no hit, NaN too.
-template <bool kMisses = true, class S, class T>
-BT_HD Hit<T> hit(const S* g, S near, T dx, T dy) {
+template <bool kMisses = true, class S, class T> BT_HD Hit<T> hit(const S* g, S near, T dx, T dy) {
   const T zero = T(S(0)), one = T(S(1));
   const Planes<T> p = planes(g, dx, dy);
   Hit<T> h;
@@ -102,7 +81,7 @@ BT_HD Hit<T> hit(const S* g, S near, T dx, T dy) {
 }
 
 // Without kBlur the low pass is left out, for pixels that are not near the centre; where sigma is 0 the rest is then
-// anything. `sharp` here and below: 1 / squared radius of the low pass, which ResizedKernel alone looks at.
+// anything. `sharp` here and below: 1 / squared radius of the low pass, which ResizedKernel alone uses.
 template <class Kernel, bool kBlur = true, class S, class T>
 BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy, S sharp = S(1)) {
   const T zero = T(S(0)), one = T(S(1));
@@ -115,7 +94,7 @@ BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy, S sharp = S(1)) {
   if (kBlur) {
     T blur;
     if constexpr (Kernel::kResized)
-      blur = T(g[kArea]) * exp_(-(dx * dx + dy * dy) * T(sharp));
+      blur = T(g[kLowPassHeight]) * exp_(-(dx * dx + dy * dy) * T(sharp));
     else
       blur = exp_(-(dx * dx + dy * dy));
     const auto low = blur > kernel;
@@ -130,8 +109,7 @@ BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy, S sharp = S(1)) {
 }
 
 // `fragment` without the low pass, where it is known that the pixel lies within_in_front and behind_near.
-template <class S, class T>
-BT_HD Fragment<T> fragment_within(const S* g, const Planes<T>& p) {
+template <class S, class T> BT_HD Fragment<T> fragment_within(const S* g, const Planes<T>& p) {
   const T inv = inverse_(p.W);
   const T rest = T(S(1)) - (p.U * p.U + p.V * p.V) * (inv * inv) * T(S(1.0 / kSupport2));
   Fragment<T> f;
@@ -140,15 +118,14 @@ BT_HD Fragment<T> fragment_within(const S* g, const Planes<T>& p) {
   return f;
 }
 
-// `blur`: whether a pixel of those that are drawn together is near the centre.
+// `blur`: one of the pixels drawn together is near the centre.
 template <class Kernel, class S, class T>
 BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy, bool blur, S sharp = S(1)) {
   return blur ? fragment<Kernel, true>(g, near, dx, dy, sharp) : fragment<Kernel, false>(g, near, dx, dy, sharp);
 }
 
 // Sigma as a list of fragments holds it: negative in the low-pass branch.
-template <class T>
-BT_HD T listed_sigma(const Fragment<T>& f) {
+template <class T> BT_HD T listed_sigma(const Fragment<T>& f) {
   return select(f.low_pass > T(0.0f), -f.sigma, f.sigma);
 }
 

@@ -1,7 +1,7 @@
-// Which pixels a surfel can touch, like bounds.h, but in the reals of the fragments: for the baked renderer on devices
-// on which doubles are slow. It takes the image of the level set's disc (outline.h) instead of forming a conic. A box
-// and the crossings with a line then follow from sums of squares; no determinant of squared coefficients is taken, so
-// that a needle costs no digits.
+// Bounds of the pixels that a surfel can touch, like bounds.h, but in the reals of the fragments: for the baked
+// renderer on devices on which doubles are slow. It takes the image of the level set's disc (outline.h) instead of
+// forming a conic. A box and the crossings with a line then follow from sums of squares; no determinant of squared
+// coefficients is taken, so that a needle costs no digits.
 #pragma once
 
 #include "core/bounds.h"
@@ -9,18 +9,16 @@
 namespace bt {
 
 // The level set sigma = 1/255: u^2 + v^2 <= r2, or d^2 <= blur2; both a little wide.
-template <class S>
-struct LevelSet {
+template <class S> struct LevelSet {
   bool visible;
   S r2;
   S blur2;  // 0: the low pass cannot exceed the kernel anywhere
 };
 
-// The same of a row of ResizedKernel, whose low pass has the squared radius 1 / sharp and the height kArea.
-template <class S>
-BT_HD LevelSet<S> level_set(const S* g, S near, S sharp) {
+// The same of a row of ResizedKernel, whose low pass has the squared radius 1 / sharp and the height kLowPassHeight.
+template <class S> BT_HD LevelSet<S> level_set(const S* g, S near, S sharp) {
   LevelSet<S> l = {false, S(0), S(0)};
-  const S ratio = times_drawn(g[kOpacity]), blurred = ratio * g[kArea], almost = S(1) - S(1e-6);
+  const S ratio = times_drawn(g[kOpacity]), blurred = ratio * g[kLowPassHeight], almost = S(1) - S(1e-6);
   l.visible = max_(ratio, blurred) >= almost;
   if (!l.visible) return l;
   l.r2 = level_radius2(log_(max_(ratio, S(1))) + S(1e-5), g[kBeta], S(4e-6));
@@ -30,8 +28,7 @@ BT_HD LevelSet<S> level_set(const S* g, S near, S sharp) {
   return l;
 }
 
-template <class S>
-BT_HD LevelSet<S> level_set(const S* g, S near) {
+template <class S> BT_HD LevelSet<S> level_set(const S* g, S near) {
   LevelSet<S> l = {false, S(0), S(0)};
   const S ratio = times_drawn(g[kOpacity]);
   l.visible = ratio >= S(1) - S(1e-6);
@@ -42,12 +39,10 @@ BT_HD LevelSet<S> level_set(const S* g, S near) {
   return l;
 }
 
-template <class S>
-struct PlaneBounds : Outline<S>, DiscImage<S> {};
+template <class S> struct PlaneBounds : Outline<S>, DiscImage<S> {};
 
 // Box and outermost points from X, Y and C.
-template <class S>
-BT_HD void bounding_box(PlaneBounds<S>& e) {
+template <class S> BT_HD void bounding_box(PlaneBounds<S>& e) {
   const S cc = e.cu * e.cu + e.cv * e.cv, rest = S(1) - cc;
   const S xx = e.xu * e.xu + e.xv * e.xv, yy = e.yu * e.yu + e.yv * e.yv;
   e.whole = !(rest > S(1e-3) && xx < S(1e16) && yy < S(1e16));  // also for NaN
@@ -68,8 +63,7 @@ BT_HD void bounding_box(PlaneBounds<S>& e) {
 }
 
 // r2 and blur2 are those of level_set; of an image of that size.
-template <class S>
-BT_HD PlaneBounds<S> plane_bounds(const S* g, S r2, S blur2, int width, int height) {
+template <class S> BT_HD PlaneBounds<S> plane_bounds(const S* g, S r2, S blur2, int width, int height) {
   PlaneBounds<S> e = {};
   if (blur2 > S(0)) e.blur = low_pass_radius(blur2);
   if (!(g[kW0] > S(0))) return e;  // seen exactly edge-on: no ray hits it
@@ -82,13 +76,11 @@ BT_HD PlaneBounds<S> plane_bounds(const S* g, S r2, S blur2, int width, int heig
 }
 
 // Seen through a pixel: the ellipse of bounds.h, which has no perspective. It is rare, and evaluated in double.
-template <class S>
-struct FilteredBounds {
+template <class S> struct FilteredBounds {
   bool visible;
   PlaneBounds<S> bounds;
 };
-template <class S>
-BT_HD FilteredBounds<S> filtered_bounds(const S* geom) {
+template <class S> BT_HD FilteredBounds<S> filtered_bounds(const S* geom) {
   double g[kGeom];
   for (int i = 0; i < kGeom; ++i) g[i] = double(geom[i]);
   const Extent x = filtered_extent(g);
@@ -105,8 +97,7 @@ BT_HD FilteredBounds<S> filtered_bounds(const S* geom) {
 }
 
 // Adds where the line y crosses the ellipse.
-template <class S>
-BT_HD void add_crossings(const PlaneBounds<S>& e, S y, Interval<S>& r) {
+template <class S> BT_HD void add_crossings(const PlaneBounds<S>& e, S y, Interval<S>& r) {
   const S mu = e.yu - y * e.cu, mv = e.yv - y * e.cv, mm = mu * mu + mv * mv;
   if (!(mm > S(0)) || !(y * y <= mm)) return;
   const S k = S(1) / mm, at = y * k, half = sqrt_(max_(S(1) - y * at, S(0)) * k);

@@ -16,35 +16,28 @@ namespace bt {
 
 constexpr double kPixelVariance = 0.25;  // pixels^2, along each axis
 
-template <class T>
-struct Fragment {
+template <class T> struct Fragment {
   T u, v;      // surfel coordinates in scale units; clamped to the support in the low-pass branch, 0 without a hit
   T depth;     // camera z of the hit; of the centre in the low-pass branch
   T sigma;     // effective opacity
   T low_pass;  // 1 in the low-pass branch, else 0
 };
 
-template <class S>
-BT_HD S filter_variance(S beta) {
-  return S(kPixelVariance * 2 / kSupport2) * (beta + S(2));
-}
+template <class S> BT_HD S filter_variance(S beta) { return S(kPixelVariance * 2 / kSupport2) * (beta + S(2)); }
 // tr Sigma
-template <class S>
-BT_HD S filter_spread(const S* g) {
+template <class S> BT_HD S filter_spread(const S* g) {
   const S n = g[kArea], a = n * g[kU1], b = n * g[kU2], c = n * g[kV1], d = n * g[kV2];
   return a * a + b * b + c * c + d * d;
 }
 
-// What a pixel at (dx, dy) from the projected centre sees.
-template <class T>
-struct FilteredHit {
+// The filtered disc at a pixel (dx, dy) from the projected centre.
+template <class T> struct FilteredHit {
   T U, V, r;       // r = sqrt(U^2 + V^2)
   T omega;         // W / w0; outside the disc's image that of the rim in the pixel's direction, so that it is bounded
   T beyond;        // r - 3 (W - w0) outside, 0 inside
   T Un, Vn, D, q;  // n U, n V
 };
-template <class S, class T>
-BT_HD FilteredHit<T> filtered_hit(const S* g, T dx, T dy) {
+template <class S, class T> BT_HD FilteredHit<T> filtered_hit(const S* g, T dx, T dy) {
   FilteredHit<T> f;
   const T zero = T(S(0)), reach = T(S(kSupport)), w0 = T(g[kW0]), n = T(g[kArea]);
   const S c = filter_variance(g[kBeta]), spread = filter_spread(g);
@@ -60,13 +53,9 @@ BT_HD FilteredHit<T> filtered_hit(const S* g, T dx, T dy) {
   f.q = (w2 * (f.Un * f.Un + f.Vn * f.Vn) + T(c) * (dx * dx + dy * dy)) / f.D;
   return f;
 }
-// Whether the kernel is above 0 there.
-template <class T>
-BT_HD MaskOf<T> in_support(const FilteredHit<T>& at) {
-  return at.q < T(kSupport2);
-}
-template <class S, class T>
-BT_HD Fragment<T> filtered_fragment(const S* g, S near, const FilteredHit<T>& at) {
+// True where the kernel is above 0.
+template <class T> BT_HD MaskOf<T> in_support(const FilteredHit<T>& at) { return at.q < T(kSupport2); }
+template <class S, class T> BT_HD Fragment<T> filtered_fragment(const S* g, S near, const FilteredHit<T>& at) {
   const T zero = T(S(0)), one = T(S(1)), r = T(S(kSupport));
   const T rest = one - at.q * T(S(1.0 / kSupport2));
   const auto inside = (rest > zero) & (T(g[kZ]) > T(near) * at.omega);

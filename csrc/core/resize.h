@@ -2,7 +2,7 @@
 //
 // Let p be the side of a photograph's pixel in pixels of the view. What is to be seen is what the trained picture
 // shows, averaged over the view's pixels. Where p < 1 a pixel averages 1 / p^2 samples of it, which lie evenly in it:
-// of their places the variance along each axis is c = (1 - p^2) / 12 pixels^2. So (docs/numerics.md)
+// of their positions the variance along each axis is c = (1 - p^2) / 12 pixels^2. So (docs/numerics.md)
 //   the scale ellipse Sigma = M^-1 M^-T, with (u, v) = M (dx, dy) at the centre, becomes Sigma + c' with
 //   c' = c 2 (beta + 2) / 9, in the unit in which the kernel has the variance 1; its opacity times sqrt(det Sigma /
 //   det(Sigma + c')), which keeps the total;
@@ -14,9 +14,8 @@
 
 namespace bt {
 
-// What a view's surfels share.
-template <class S>
-struct Resize {
+// Parameters of a view.
+template <class S> struct Resize {
   S variance;  // c, pixels^2
   S sharp;     // 1 / squared radius of the low pass
   S share;     // of its height that is left
@@ -27,12 +26,11 @@ struct Resize {
         share(photo_pixel * photo_pixel * sharp) {}
 };
 
-// Changes a row of geom; kArea then holds by how much the low pass is higher than the kernel at the centre. False where
-// the row is no longer finite.
-template <class S, class T>
-BT_HD MaskOf<T> resize(const Resize<S>& to, T* g) {
+// Changes a row of geom; kLowPassHeight then holds by how much the low pass is higher than the kernel at the centre.
+// False where the row is no longer finite.
+template <class S, class T> BT_HD MaskOf<T> resize(const Resize<S>& to, T* g) {
   const T zero = T(0.0f), one = T(1.0f), two = T(2.0f);
-  g[kArea] = T(to.share);
+  g[kLowPassHeight] = T(to.share);
   const MaskOf<T> seen = g[kW0] > zero;
   if (to.variance == S(0)) return finite_(one);
   // M' = (1 + c' M M^T)^(-1/2) M: sums of positive terms
@@ -48,7 +46,7 @@ BT_HD MaskOf<T> resize(const Resize<S>& to, T* g) {
     g[kU1 + j] = select(seen, a * u + b * v, u), g[kV1 + j] = select(seen, b * u + d * v, v);
   }
   g[kOpacity] = select(seen, g[kOpacity] / root, g[kOpacity]);
-  g[kArea] = select(seen, g[kArea] * root, g[kArea]);
+  g[kLowPassHeight] = select(seen, g[kLowPassHeight] * root, g[kLowPassHeight]);
   return finite_(select(seen, abs_(a) + abs_(b) + abs_(d) + root, one));
 }
 

@@ -1,6 +1,6 @@
 // A surfel seen by a camera: everything that its fragments need, and the vector-Jacobian product of that.
 //
-// Given are the unit tangents a, b, the normal n = a x b and the centre p, all in the camera frame, and the ray
+// Let a, b be the unit tangents, n = a x b the normal and p the centre, all in the camera frame, and r the ray
 // r = (x, y, 1) of a pixel at (dx, dy) pixels from the projected centre. The ray meets the disc's plane at depth
 // n.p / n.r, and
 //   u = U / W,  v = V / W,  W = n.r = n.p/z + n.x dx/fx + n.y dy/fy,
@@ -24,16 +24,20 @@ constexpr double kBetaMax = 4.0;
 constexpr double kLogScaleMax = 30.0;  // log scales are clamped to +-30: their squares stay finite in float32
 
 // Columns of a row of `geom` [N, kGeom].
-enum GeomColumn { kCx, kCy, kU1, kU2, kV1, kV2, kW0, kW1, kW2, kZ, kOpacity, kBeta, kNx, kNy, kNz, kArea, kGeom = 16 };
-// kArea: 0, or where PixelKernel filters the surfel n = fx fy s_u s_v / z^2, for which n w0 is the area of the
-// projected scale ellipse over pi; with ResizedKernel the height of the low pass (core/resize.h). Columns of a row of
-// `frames` [N, kFrame]: mean, s_u t_u, s_v t_v, all in the world frame.
+enum GeomColumn { kCx, kCy, kU1, kU2, kV1, kV2, kW0, kW1, kW2, kZ, kOpacity, kBeta, kNx, kNy, kNz, kGeom = 16 };
+// The last column by kernel. PixelKernel: n = fx fy s_u s_v / z^2, for which n w0 is the area of the projected scale
+// ellipse over pi; 0 where it does not filter the surfel. ResizedKernel: height of the low pass over that of the kernel
+// (core/resize.h). LowPassKernel: 0.
+constexpr GeomColumn kArea = GeomColumn(kGeom - 1), kLowPassHeight = kArea;
+// Columns of a row of `frames` [N, kFrame]: mean, s_u t_u, s_v t_v, all in the world frame.
 constexpr int kFrame = 9;
 
-// How a launch draws surfels, known when its code is compiled. LowPassKernel: the maximum of the kernel and the low
-// pass (core/kernel.h). PixelKernel: seen through a pixel; rows without kArea are drawn as with LowPassKernel.
-// ResizedKernel: LowPassKernel in a view of another size than the photographs, for the baked renderers alone. Only
-// with_kernel chooses.
+// The option `prefilter`, a number in this list.
+constexpr const char* kPrefilters[] = {"low_pass", "pixel"};
+// The kernels that surfels are drawn with, chosen at compile time. LowPassKernel: the maximum of the kernel and the low
+// pass (core/kernel.h). PixelKernel: the prefilter of core/prefilter.h; rows with kArea 0 are drawn as with
+// LowPassKernel. ResizedKernel: LowPassKernel in a view of another size than the photographs, for the baked renderers
+// alone. Only with_kernel chooses.
 struct LowPassKernel {
   static constexpr bool kPixel = false, kResized = false;
 };
@@ -43,17 +47,14 @@ struct PixelKernel {
 struct ResizedKernel {
   static constexpr bool kPixel = false, kResized = true;
 };
-template <class F>
-void with_kernel(bool through_pixel, F&& launch) {
-  through_pixel ? launch(PixelKernel()) : launch(LowPassKernel());
+template <class F> void with_kernel(int prefilter, F&& launch) {
+  prefilter ? launch(PixelKernel()) : launch(LowPassKernel());
 }
 // photo_pixel: side of a photograph's pixel in pixels of the view.
-template <class F>
-void with_kernel(bool through_pixel, float photo_pixel, F&& launch) {
-  !through_pixel&& photo_pixel != 1 ? launch(ResizedKernel()) : with_kernel(through_pixel, launch);
+template <class F> void with_kernel(int prefilter, float photo_pixel, F&& launch) {
+  !prefilter&& photo_pixel != 1 ? launch(ResizedKernel()) : with_kernel(prefilter, launch);
 }
-template <class Kernel, class S>
-BT_HD bool filtered(const S* g) {
+template <class Kernel, class S> BT_HD bool filtered(const S* g) {
   if constexpr (Kernel::kPixel)
     return g[kArea] > S(0);
   else
@@ -62,14 +63,12 @@ BT_HD bool filtered(const S* g) {
 
 // The slope of a plane at (dx, dy) pixels from the projected centre: U is slope(g, kU1, ...), W is g[kW0] and that of
 // kW1.
-template <class S, class T>
-BT_HD T slope(const S* g, GeomColumn first, T dx, T dy) {
+template <class S, class T> BT_HD T slope(const S* g, GeomColumn first, T dx, T dy) {
   return T(g[first]) * dx + T(g[first + 1]) * dy;
 }
 
 // The geometry of n surfels: [n, 3], [n, 4] wxyz, [n, 2], [n], [n].
-template <class S>
-struct Surfels {
+template <class S> struct Surfels {
   int64_t n;
   const S *means, *quats, *log_scales, *opacity_logits, *beta_raw;
 
@@ -82,28 +81,23 @@ struct Surfels {
     r.array("beta_raw", beta_raw, n);
   }
 };
-template <class S>
-struct SurfelGradients {
+template <class S> struct SurfelGradients {
   S *means, *quats, *log_scales, *opacity_logits, *beta_raw;
 
-  template <class R>
-  void fields(R& r, int64_t n) {
+  template <class R> void fields(R& r, int64_t n) {
     r.array("dmeans", means, 3 * n);
     r.array("dquats", quats, 4 * n);
     r.array("dlog_scales", log_scales, 2 * n);
-    r.array("dopacity_logits", opacity_logits, n);
-    r.array("dbeta_raw", beta_raw, n);
+    r.arrays(n, "dopacity_logits", opacity_logits, "dbeta_raw", beta_raw);
   }
 };
 
-// One of them; with packs, one in each lane.
-template <class T>
-struct SurfelRow {
+// One of them; with Lanes, one in each lane.
+template <class T> struct SurfelRow {
   Vec3<T> mean;
   T quat[4], log_scale[2], opacity_logit, beta_raw;
 };
-template <class S>
-BT_HD SurfelRow<S> surfel_row(const Surfels<S>& in, int64_t i) {
+template <class S> BT_HD SurfelRow<S> surfel_row(const Surfels<S>& in, int64_t i) {
   const S *q = in.quats + 4 * i, *log_scale = in.log_scales + 2 * i;
   return {load3(in.means + 3 * i),
           {q[0], q[1], q[2], q[3]},
@@ -113,15 +107,13 @@ BT_HD SurfelRow<S> surfel_row(const Surfels<S>& in, int64_t i) {
 }
 
 // Rotation matrix columns of a quaternion wxyz of any length.
-template <class T>
-struct Rotation {
+template <class T> struct Rotation {
   Vec3<T> tu, tv, n;
   T w, x, y, z;  // the unit quaternion
   T inv;         // 1 / |q|
   MaskOf<T> ok;
 };
-template <class T>
-BT_HD Rotation<T> rotation(const T* q) {
+template <class T> BT_HD Rotation<T> rotation(const T* q) {
   const T zero = T(0.0f), one = T(1.0f), two = T(2.0f);
   Rotation<T> r;
   T big = zero;
@@ -139,8 +131,7 @@ BT_HD Rotation<T> rotation(const T* q) {
   r.n = {two * (x * z + w * y), two * (y * z - w * x), one - two * (x * x + y * y)};
   return r;
 }
-template <class S>
-BT_HD void rotation_vjp(const Rotation<S>& r, Vec3<S> du, Vec3<S> dv, Vec3<S> dn, S* dq) {
+template <class S> BT_HD void rotation_vjp(const Rotation<S>& r, Vec3<S> du, Vec3<S> dv, Vec3<S> dn, S* dq) {
   const S w = r.w, x = r.x, y = r.y, z = r.z, two = S(2);
   const S gw = two * (z * du.y - y * du.z - z * dv.x + x * dv.z + y * dn.x - x * dn.y);
   const S gx =
@@ -155,36 +146,30 @@ BT_HD void rotation_vjp(const Rotation<S>& r, Vec3<S> du, Vec3<S> dv, Vec3<S> dn
 }
 
 // s = exp of the clamped log scale; ds/dlog is s inside the range and 0 beyond.
-template <class T>
-BT_HD T surfel_scale(T log_scale) {
+template <class T> BT_HD T surfel_scale(T log_scale) {
   return exp_(clamp_(log_scale, T(-kLogScaleMax), T(kLogScaleMax)));
 }
-template <class S>
-BT_HD bool scale_moves(S log_scale) {
+template <class S> BT_HD bool scale_moves(S log_scale) {
   return log_scale > S(-kLogScaleMax) && log_scale < S(kLogScaleMax);
 }
 
 // A surfel in the world, its centre in the camera's frame.
-template <class T>
-struct WorldSurfel {
+template <class T> struct WorldSurfel {
   Rotation<T> rot;
   T su, sv;  // scales
   Vec3<T> p;
 };
-template <class S, class T>
-BT_HD WorldSurfel<T> world_surfel(const Pinhole<S>& cam, const SurfelRow<T>& in) {
+template <class S, class T> BT_HD WorldSurfel<T> world_surfel(const Pinhole<S>& cam, const SurfelRow<T>& in) {
   return {rotation(in.quat), surfel_scale(in.log_scale[0]), surfel_scale(in.log_scale[1]), to_camera(cam, in.mean)};
 }
 // And what else a camera sees of it: tangents, normal, n.p with its sign, and the reciprocals of p.z, fx, fy and
 // scales.
-template <class S, class T>
-struct CameraSurfel {
+template <class S, class T> struct CameraSurfel {
   Vec3<T> a, b, n;
   T np, sign, iz, isu, isv;
   S ifx, ify;
 };
-template <class S, class T>
-BT_HD CameraSurfel<S, T> camera_surfel(const Pinhole<S>& cam, const WorldSurfel<T>& at) {
+template <class S, class T> BT_HD CameraSurfel<S, T> camera_surfel(const Pinhole<S>& cam, const WorldSurfel<T>& at) {
   const T one = T(1.0f);
   CameraSurfel<S, T> s;
   s.a = rotate(cam.R, at.rot.tu), s.b = rotate(cam.R, at.rot.tv), s.n = rotate(cam.R, at.rot.n);

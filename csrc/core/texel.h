@@ -1,4 +1,4 @@
-// Where a surfel coordinate falls in its atlas tile: texel i of r has its centre at u = (i + 0.5) / r * 2 e - e,
+// Positions of surfel coordinates in an atlas tile: texel i of r has its centre at u = (i + 0.5) / r * 2 e - e,
 // with e the half side of the surfel's tile in scale units (eq. texel centres).
 #pragma once
 
@@ -10,15 +10,13 @@ namespace bt {
 
 // Position along one axis of a tile of r texels, clamped to the outer texel centres: texel floor(x), its neighbour
 // min(floor(x) + 1, r - 1), and the fraction is the neighbour's weight.
-template <class S, class T>
-BT_HD T texel_position(T u, int r, S extent) {
+template <class S, class T> BT_HD T texel_position(T u, int r, S extent) {
   const T x = (u + T(extent)) * T(S(r) / (S(2) * extent)) - T(S(0.5));
   return clamp_(x, T(S(0)), T(S(r - 1)));
 }
 
 // The same for a tile of span + 1 texels, with k = 1 / (2 extent) at hand.
-template <class S, class T>
-BT_HD T texel_position_scaled(T u, S span, S k) {
+template <class S, class T> BT_HD T texel_position_scaled(T u, S span, S k) {
   return clamp_(u * T((span + S(1)) * k) + T(S(0.5) * span), T(S(0)), T(span));
 }
 
@@ -30,8 +28,7 @@ BT_HD bool has_level(const int32_t* tile, int level) {  // x, y, page, r_u, r_v
 // The level of which a texel is about as large as a pixel, by a row of geom of core/surfel.h: the geometric mean along
 // the axes. Not coarser than a pixel of the view is than one of a photograph: nearer to its size the texels were
 // trained as they are. kTileLevels where nothing is left but a constant.
-template <class S>
-BT_HD int tile_level(const S* g, int r_u, int r_v, S extent, S photo_pixel) {
+template <class S> BT_HD int tile_level(const S* g, int r_u, int r_v, S extent, S photo_pixel) {
   const S k = S(0.5) / (extent * g[kW0]);  // texels per pixel along the gradient of u and v, squared
   const S u = g[kU1] * g[kU1] + g[kU2] * g[kU2], v = g[kV1] * g[kV1] + g[kV2] * g[kV2];
   const S area = sqrt_(u * v) * k * k * S(r_u) * S(r_v);  // texels per pixel, by area
@@ -43,21 +40,16 @@ BT_HD int tile_level(const S* g, int r_u, int r_v, S extent, S photo_pixel) {
 }
 
 // Surfel coordinate of the centre of texel i, eq. (texel centres), rounded as bake/texels.py does.
-template <class S>
-BT_HD S texel_centre(int i, int r, S extent) {
-  return extent * (S(2 * i + 1) / S(r) - S(1));
-}
+template <class S> BT_HD S texel_centre(int i, int r, S extent) { return extent * (S(2 * i + 1) / S(r) - S(1)); }
 
-// Between which texels a position along one axis lies: `first`, a whole number, and the next, which weighs `fraction`.
-// A tile of one texel has no next: `first` stands for it. Beyond the outer texel centres, not `inside`, the position
-// stands still.
-template <class T>
-struct TexelAxis {
+// The texels on both sides of a position along one axis: `first`, a whole number, and the next, which weighs
+// `fraction`. A tile of one texel has no next: `first` stands for it. Beyond the outer texel centres, not `inside`, the
+// position stands still.
+template <class T> struct TexelAxis {
   T first, fraction;
   MaskOf<T> inside;
 };
-template <class S, class T>
-BT_HD TexelAxis<T> texel_axis(T u, int r, S extent) {
+template <class S, class T> BT_HD TexelAxis<T> texel_axis(T u, int r, S extent) {
   const T x = texel_position(u, r, extent), first = min_(floor_(x), T(S(r > 1 ? r - 2 : 0)));
   const MaskOf<T> inside = (x > T(S(0))) & (x < T(S(r - 1)));
   return {first, x - first, inside};
@@ -70,39 +62,30 @@ struct TexelSteps {
 
 // The bilinear fetch from four texels t (three channels or a vector of the processor), rows along v, and the gradient
 // of it along each axis, per texel: it is linear between texel centres.
-template <class S>
-BT_HD void texel_weights(S fx, S fy, S* weight) {
+template <class S> BT_HD void texel_weights(S fx, S fy, S* weight) {
   weight[0] = (S(1) - fx) * (S(1) - fy), weight[1] = fx * (S(1) - fy), weight[2] = (S(1) - fx) * fy;
   weight[3] = fx * fy;
 }
-template <class V, class S>
-BT_HD V texel_mix(const V* t, const S* weight) {
+template <class V, class S> BT_HD V texel_mix(const V* t, const S* weight) {
   return (weight[0] * t[0] + weight[1] * t[1]) + (weight[2] * t[2] + weight[3] * t[3]);
 }
-template <class V, class S>
-BT_HD V texel_slope_u(const V* t, S fy) {
+template <class V, class S> BT_HD V texel_slope_u(const V* t, S fy) {
   return (S(1) - fy) * (t[1] - t[0]) + fy * (t[3] - t[2]);
 }
-template <class V, class S>
-BT_HD V texel_slope_v(const V* t, S fx) {
+template <class V, class S> BT_HD V texel_slope_v(const V* t, S fx) {
   return (S(1) - fx) * (t[2] - t[0]) + fx * (t[3] - t[1]);
 }
 // Texels per unit of u.
-template <class S>
-BT_HD S texel_density(int r, S extent) {
-  return S(r) / (S(2) * extent);
-}
+template <class S> BT_HD S texel_density(int r, S extent) { return S(r) / (S(2) * extent); }
 
 // The texels of one fetch, as offsets from the tile's first, and their weights.
-template <class S>
-struct TexelCorners {
+template <class S> struct TexelCorners {
   int32_t at[4];
   S weight[4];
   S fx, fy;
   bool inside_u, inside_v;
 };
-template <class S>
-BT_HD TexelCorners<S> texel_corners(S u, S v, const int32_t* size, S extent) {
+template <class S> BT_HD TexelCorners<S> texel_corners(S u, S v, const int32_t* size, S extent) {
   const TexelAxis<S> x = texel_axis(u, size[0], extent), y = texel_axis(v, size[1], extent);
   const TexelSteps next(size);
   TexelCorners<S> c;
@@ -114,19 +97,16 @@ BT_HD TexelCorners<S> texel_corners(S u, S v, const int32_t* size, S extent) {
 }
 
 // The texels there, and the vector-Jacobian product of the fetch.
-template <class S>
-BT_HD void load_corners(const S* tile, const TexelCorners<S>& c, Vec3<S>* t) {
+template <class S> BT_HD void load_corners(const S* tile, const TexelCorners<S>& c, Vec3<S>* t) {
   for (int k = 0; k < 4; ++k) t[k] = load3(tile + 3 * c.at[k]);
 }
 // add(k, gradient of corner k).
-template <class S, class F>
-BT_HD void texel_corner_gradients(const TexelCorners<S>& c, Vec3<S> g, F&& add) {
+template <class S, class F> BT_HD void texel_corner_gradients(const TexelCorners<S>& c, Vec3<S> g, F&& add) {
   for (int k = 0; k < 4; ++k) add(k, c.weight[k] * g);
 }
-// How the fetch changes with u and v, given its four texels: 0 from the outer texel centres on; at a centre between
+// Gradient of the fetch along u and v from its four texels: 0 from the outer texel centres on; at a centre between
 // them, where the slope jumps, that of the side of larger coordinates.
-template <class S>
-struct TexelSlopes {
+template <class S> struct TexelSlopes {
   Vec3<S> u, v;
 };
 template <class S>
@@ -137,9 +117,8 @@ BT_HD TexelSlopes<S> texel_slopes(const Vec3<S>* t, const TexelCorners<S>& c, co
   return s;
 }
 
-// Where a step takes a texel whose gradient is g.
-template <class S>
-BT_HD Vec3<S> texel_step(Vec3<S> texel, Vec3<S> g, S rate, S share) {
+// A texel after a step along its gradient g.
+template <class S> BT_HD Vec3<S> texel_step(Vec3<S> texel, Vec3<S> g, S rate, S share) {
   return texel + -rate * share * g;
 }
 

@@ -6,22 +6,20 @@
 
 namespace bt {
 
-// Direction from the camera's centre, given in double: far from the origin its rounding to float32 would turn the
+// Direction from the camera's centre, in double: far from the origin its rounding to float32 would turn the
 // direction, while the difference is as exact as the surfel's own position.
-template <class S>
-BT_HD Unit<S> view_direction(const S* mean, const double* center) {
+template <class S> BT_HD Unit<S> view_direction(const S* mean, const double* center) {
   return normalize(
       Vec3<S>{S(double(mean[0]) - center[0]), S(double(mean[1]) - center[1]), S(double(mean[2]) - center[2])});
 }
 
 constexpr const char* kViewColorNames[] = {SphericalVoronoi::kName, SphericalHarmonics::kName, SphericalBeta::kName,
                                            SphericalGaussians::kName};
-// What f gives for the struct of a kind, a number in that list.
+// Calls f with the struct of a kind, a number in that list.
 #if defined(__CUDACC__)
 #pragma nv_exec_check_disable  // f may be for one of host and device alone
 #endif
-template <class F>
-BT_HD auto for_view_color(int kind, F&& f) {
+template <class F> BT_HD auto for_view_color(int kind, F&& f) {
   switch (kind) {
     case 0:
       return f(SphericalVoronoi());
@@ -38,8 +36,7 @@ BT_HD ViewColorWidths view_color_widths(int kind, int K) {
 }
 
 // The parameters of all surfels. `terms` = sites, coefficients (with dc) or lobes.
-template <class S>
-struct ViewColorArrays {
+template <class S> struct ViewColorArrays {
   int kind, terms;
   S *a, *b, *c;
 
@@ -49,8 +46,7 @@ struct ViewColorArrays {
     r.number("terms", terms);
     arrays(r, n, "a", "b", "c");
   }
-  template <class R>
-  void arrays(R& r, int64_t n, const char* name_a, const char* name_b, const char* name_c) {
+  template <class R> void arrays(R& r, int64_t n, const char* name_a, const char* name_b, const char* name_c) {
     const int least = for_view_color(kind, [](auto view_color) { return view_color.kLeastTerms; });
     if (terms < least || terms > kMaxTerms) r.refuse("a view colour has 1 to 32 terms");
     const ViewColorWidths w = view_color_widths(kind, terms);
@@ -79,22 +75,19 @@ BT_HD int lean_width(int kind) {
   return for_view_color(kind, [](auto view_color) { return view_color.kLeanWidth; });
 }
 // View colours of which only what a surfel needs is left: a base colour, and as many terms as its span says.
-template <class S>
-struct LeanColors {
+template <class S> struct LeanColors {
   int kind;
   const S *base, *terms;  // [n, 3], [all terms, lean_width(kind)]
   const int32_t* span;    // [n, 2]: first term, how many
 
-  template <class R>
-  void fields(R& r, int64_t n, int64_t& count) {
+  template <class R> void fields(R& r, int64_t n, int64_t& count) {
     r.choice("kind", kind, kViewColorNames);
     r.array("base", base, 3 * n);
     r.array("span", span, 2 * n);
     r.rows("lean", terms, count, lean_width(kind));
   }
 };
-template <class S>
-BT_HD Vec3<S> view_color(const LeanColors<S>& p, int64_t i, Vec3<S> d) {
+template <class S> BT_HD Vec3<S> view_color(const LeanColors<S>& p, int64_t i, Vec3<S> d) {
   return for_view_color(p.kind, [&](auto view_color) {
     constexpr int kWidth = decltype(view_color)::kLeanWidth;
     return view_color.lean_color(p.span[2 * i + 1], p.base + 3 * i, p.terms + int64_t(p.span[2 * i]) * kWidth, d);

@@ -18,22 +18,18 @@ constexpr double kLogTauMax = 16;    // temperatures end at 9e6: finite in, fini
 constexpr double kLogPowerMax = 10;  // and the powers of Spherical Beta lobes at 9e4
 
 // The temperature of a site or the sharpness of a Gaussian lobe.
-template <class S>
-BT_HD S temperature(S log_tau) {
-  return exp_(min_(log_tau, S(kLogTauMax)));
-}
+template <class S> BT_HD S temperature(S log_tau) { return exp_(min_(log_tau, S(kLogTauMax))); }
 
 // Numbers per surfel of the parameters a, b and c.
 struct ViewColorWidths {
   int64_t a, b, c;
 };
 // Those of one surfel.
-template <class S>
-struct ViewColorRow {
+template <class S> struct ViewColorRow {
   S *a, *b, *c;
 };
 
-// What a kind's struct has: its name, the fewest terms, and those of its preset, for which kernels that unroll their
+// Members of a kind's struct: its name, the fewest terms, and those of its preset, for which kernels that unroll their
 // loops are compiled; the widths of its parameters; the colour, and its vector-Jacobian product, which writes the
 // gradients of the parameters and adds to that of d; and its lean form: terms of kLeanWidth numbers, and the colour of
 // a base and K of them.
@@ -45,8 +41,7 @@ struct SphericalVoronoi {
   BT_HD static ViewColorWidths widths(int K) { return {3 * K, K, 3 * K}; }
 
   // c = sum_k softmax_k(tau_k s_k . d) rgb_k; softmax by log-sum-exp, so that any temperature is safe.
-  template <class S>
-  BT_HD static Vec3<S> color(int K, ViewColorRow<const S> p, Vec3<S> d) {
+  template <class S> BT_HD static Vec3<S> color(int K, ViewColorRow<const S> p, Vec3<S> d) {
     const S *sites = p.a, *log_tau = p.b, *rgb = p.c;
     S logits[kMaxTerms], top = S(-1e30);
     for (int k = 0; k < K; ++k) {
@@ -64,8 +59,7 @@ struct SphericalVoronoi {
   }
   // The same relative to site 0, which then needs no direction: term k is b_k = tau_k s_k - tau_0 s_0 and rgb_k,
   // c = (base + sum_k exp(b_k . d) rgb_k) / (1 + sum_k exp(b_k . d)). Without terms this is one colour.
-  template <class S>
-  BT_HD static Vec3<S> lean_color(int K, const S* base, const S* terms, Vec3<S> d) {
+  template <class S> BT_HD static Vec3<S> lean_color(int K, const S* base, const S* terms, Vec3<S> d) {
     Vec3<S> c = load3(base);
     if (K == 0) return c;
     S top = S(0);
@@ -118,18 +112,15 @@ struct SphericalVoronoi {
 
 // The lean form of a kind whose terms are kept as they are. kInBase: how many of them the base is, as the coefficient
 // of degree 0 is of the spherical harmonics.
-template <class Kind, int kInBase = 0>
-struct StoredWhole {
-  template <class S>
-  BT_HD static Vec3<S> lean_color(int K, const S* base, const S* terms, Vec3<S> d) {
+template <class Kind, int kInBase = 0> struct StoredWhole {
+  template <class S> BT_HD static Vec3<S> lean_color(int K, const S* base, const S* terms, Vec3<S> d) {
     return Kind::color(K + kInBase, ViewColorRow<const S>{base, terms, nullptr}, d);
   }
 };
 
 // Real spherical harmonics up to degree 3 in the order and sign convention of 3DGS; out has 16 entries, `terms` are
 // set.
-template <class S>
-BT_HD void sh_basis(int terms, Vec3<S> d, S* out) {
+template <class S> BT_HD void sh_basis(int terms, Vec3<S> d, S* out) {
   const S x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
   out[0] = S(kShC0);
   if (terms > 1) {
@@ -150,8 +141,7 @@ BT_HD void sh_basis(int terms, Vec3<S> d, S* out) {
   }
 }
 // sum_k g_k d basis_k / d direction
-template <class S>
-BT_HD Vec3<S> sh_basis_vjp(int terms, Vec3<S> d, const S* g) {
+template <class S> BT_HD Vec3<S> sh_basis_vjp(int terms, Vec3<S> d, const S* g) {
   const S x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z, two = S(2), six = S(6);
   Vec3<S> r = {S(0), S(0), S(0)};
   if (terms > 1) {
@@ -182,8 +172,7 @@ struct SphericalHarmonics : StoredWhole<SphericalHarmonics, 1> {
   static constexpr int kLeastTerms = 1, kPresetTerms = 16, kLeanWidth = 3;
   BT_HD static ViewColorWidths widths(int terms) { return {3, 3 * (terms - 1), 0}; }
 
-  template <class S>
-  BT_HD static Vec3<S> color(int terms, ViewColorRow<const S> p, Vec3<S> d) {
+  template <class S> BT_HD static Vec3<S> color(int terms, ViewColorRow<const S> p, Vec3<S> d) {
     const S *dc = p.a, *rest = p.b;
     S basis[16];
     sh_basis(terms, d, basis);
@@ -210,21 +199,18 @@ struct SphericalHarmonics : StoredWhole<SphericalHarmonics, 1> {
 
 // softplus with slope 10 ln 2, which is 0.1 at 0 (Deformable Beta Splatting's lobe colours)
 constexpr double kLobeSlope = 6.931471805599453;
-template <class S>
-BT_HD S lobe_softplus(S x) {
+template <class S> BT_HD S lobe_softplus(S x) {
   const S a = S(kLobeSlope) * x;
   const S big = a > S(0) ? a : S(0);
   return (big + log_(S(1) + exp_(a > S(0) ? -a : a))) / S(kLobeSlope);
 }
 
 // softplus(rgb) max(0, d . mu)^(4 exp(b)); a lobe is r, g, b, theta, phi, b
-template <class S>
-struct BetaLobe {
+template <class S> struct BetaLobe {
   Vec3<S> mu, color;
   S st, ct, sp, cp, cosine, power, value;
 };
-template <class S>
-BT_HD BetaLobe<S> beta_lobe(const S* lobe, Vec3<S> d) {
+template <class S> BT_HD BetaLobe<S> beta_lobe(const S* lobe, Vec3<S> d) {
   BetaLobe<S> l;
   l.st = sin_(lobe[3]), l.ct = cos_(lobe[3]), l.sp = sin_(lobe[4]), l.cp = cos_(lobe[4]);
   l.mu = {l.st * l.cp, l.st * l.sp, l.ct};
@@ -240,8 +226,7 @@ struct SphericalBeta : StoredWhole<SphericalBeta> {
   static constexpr int kLeastTerms = 0, kPresetTerms = 2, kLeanWidth = 6;
   BT_HD static ViewColorWidths widths(int K) { return {3, 6 * K, 0}; }
 
-  template <class S>
-  BT_HD static Vec3<S> color(int K, ViewColorRow<const S> p, Vec3<S> d) {
+  template <class S> BT_HD static Vec3<S> color(int K, ViewColorRow<const S> p, Vec3<S> d) {
     const S *base = p.a, *lobes = p.b;
     Vec3<S> c = load3(base);
     for (int k = 0; k < K; ++k) {
@@ -282,8 +267,7 @@ struct SphericalGaussians : StoredWhole<SphericalGaussians> {
   static constexpr int kLeastTerms = 0, kPresetTerms = 2, kLeanWidth = 7;
   BT_HD static ViewColorWidths widths(int K) { return {3, 7 * K, 0}; }
 
-  template <class S>
-  BT_HD static Vec3<S> color(int K, ViewColorRow<const S> p, Vec3<S> d) {
+  template <class S> BT_HD static Vec3<S> color(int K, ViewColorRow<const S> p, Vec3<S> d) {
     const S *base = p.a, *lobes = p.b;
     Vec3<S> c = load3(base);
     for (int k = 0; k < K; ++k) {

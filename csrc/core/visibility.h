@@ -1,4 +1,4 @@
-// Which surfels a camera sees: projected, and with a box that meets the image.
+// Visibility of surfels: projected, and with a box that meets the image.
 #pragma once
 
 #include "core/bounds.h"
@@ -6,8 +6,7 @@
 
 namespace bt {
 
-template <class S>
-BT_HD bool surfel_finite(const Surfels<S>& in, int64_t i) {
+template <class S> BT_HD bool surfel_finite(const Surfels<S>& in, int64_t i) {
   bool finite = finite_(in.opacity_logits[i]) && finite_(in.beta_raw[i]);
   for (int k = 0; k < 3; ++k) finite &= finite_(in.means[3 * i + k]);
   for (int k = 0; k < 4; ++k) finite &= finite_(in.quats[4 * i + k]);
@@ -18,10 +17,9 @@ BT_HD bool surfel_finite(const Surfels<S>& in, int64_t i) {
 // Half extents of what has no box, in pixels, and the most that those of a box are.
 constexpr double kBoxless = 1e6;
 
-// What a camera sees of a surfel, or of one in each lane: rows of geom and frames, and half extents of the level set's
+// A surfel as a camera sees it, or one in each lane: rows of geom and frames, and half extents of the level set's
 // box in pixels. `projected`: it is finite and in front of the camera; `seen`: and its box meets the image.
-template <class T>
-struct Sight {
+template <class T> struct Sight {
   T geom[kGeom], frame[kFrame], radii[2];
   MaskOf<T> projected, seen;
 };

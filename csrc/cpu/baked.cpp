@@ -13,27 +13,24 @@ namespace bt {
 
 namespace {
 // Red, green and blue of a texel for each lane.
-template <class S>
-struct Texels {
-  Pack<S> rgb[3];
+template <class S> struct Texels {
+  Lanes<S> rgb[3];
 };
-// The texels at the lanes' places in a tile's texels, and their right neighbours.
-template <class S>
-struct TexelPairs {
+// The texels at the lanes' offsets in a tile's texels, and their right neighbours.
+template <class S> struct TexelPairs {
   Texels<S> left, right;
 };
 
-template <class S>
-inline Texels<S> texels_of(const Wide<uint32_t>& rgba) {
+template <class S> inline Texels<S> texels_of(const Wide<uint32_t>& rgba) {
   Texels<S> t;
   for (int c = 0; c < 3; ++c) t.rgb[c] = from_integers<S>(rgba >> 8 * c & 255u);
   return t;
 }
-// The texels at 16 places and their right neighbours, from 8 bytes for each, which hold both.
+// The texels at 16 offsets and their right neighbours, from 8 bytes for each, which hold both.
 inline void pairs_of(const uint8_t* patch, const int32_t* at, Wide<uint32_t>* left, Wide<uint32_t>* right) {
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
-  const auto eight = [&](const int32_t* places) {
-    const __m256i p = _mm256_loadu_si256((const __m256i*)places);
+  const auto eight = [&](const int32_t* offsets) {
+    const __m256i p = _mm256_loadu_si256((const __m256i*)offsets);
     return _mm512_mask_i32gather_epi64(_mm512_setzero_si512(), __mmask8(0xff), p, patch, 4);
   };
   const __m512i low = eight(at), high = eight(at + 8);
@@ -61,14 +58,12 @@ inline void pairs_of(const uint8_t* patch, const int32_t* at, Wide<uint32_t>* le
   }
 #endif
 }
-template <class S>
-inline TexelPairs<S> texel_pairs(const uint8_t* patch, const int32_t* at) {
+template <class S> inline TexelPairs<S> texel_pairs(const uint8_t* patch, const int32_t* at) {
   Wide<uint32_t> left, right;
   pairs_of(patch, at, &left, &right);
   return {texels_of<S>(left), texels_of<S>(right)};
 }
-template <class S>
-inline TexelPairs<S> texel_pairs(const float* patch, const int32_t* at) {
+template <class S> inline TexelPairs<S> texel_pairs(const float* patch, const int32_t* at) {
   TexelPairs<S> t;
   for (int i = 0; i < kLanes; ++i)
     for (int c = 0; c < 3; ++c) {
@@ -80,9 +75,8 @@ inline TexelPairs<S> texel_pairs(const float* patch, const int32_t* at) {
 
 // Residuals at the lanes' positions in a tile, bilinear. A position is clamped to the outer texel centres, so at a
 // tile's last column and row the neighbour has weight 0 and may be any texel.
-template <class S, class T>
-inline Texels<S> bilinear(const T* patch, int columns, Pack<S> x, Pack<S> y) {
-  using P = Pack<S>;
+template <class S, class T> inline Texels<S> bilinear(const T* patch, int columns, Lanes<S> x, Lanes<S> y) {
+  using P = Lanes<S>;
   const P x0 = floor_(x), y0 = floor_(y), fx = x - x0, fy = y - y0;
   int32_t at[kLanes];
   store_integers(at, y0 * P(S(columns)) + x0);  // exact: a tile has fewer than 2^24 texels
@@ -130,9 +124,8 @@ void gather_patches(int layers, int height, int width, const uint8_t* bytes, con
 }
 
 namespace {
-// What a surfel is drawn from besides its row of geom, in one place: in every tile that it touches it is looked up.
-template <class S>
-struct DrawnSurfel {
+// Parameters of a surfel besides its row of geom, next to each other: they are read in every tile that it touches.
+template <class S> struct DrawnSurfel {
   S view[3];             // its colour without a residual
   S bound;               // fragments of smaller weight have none
   S flat[3];             // the residual where there are no texels
@@ -143,8 +136,7 @@ struct DrawnSurfel {
 };
 
 // The level of a surfel's tile that a view shows; null: its mean alone.
-template <class S>
-const Patches* level_of(const BakedForward<S>& a, int64_t id, S extent) {
+template <class S> const Patches* level_of(const BakedForward<S>& a, int64_t id, S extent) {
   const int32_t* sides = a.patches->sides.data() + 2 * id;
   if (!sides[0]) return nullptr;
   if (!a.coarser[0]) return a.patches;
@@ -154,8 +146,7 @@ const Patches* level_of(const BakedForward<S>& a, int64_t id, S extent) {
   return level ? a.coarser[level - 1] : a.patches;
 }
 
-template <class S>
-DrawnSurfel<S> drawn_surfel(const BakedForward<S>& a, int64_t id) {
+template <class S> DrawnSurfel<S> drawn_surfel(const BakedForward<S>& a, int64_t id) {
   const BakedResidual& atlas = a.residual;
   const S extent = atlas.extent ? S(atlas.extent[id]) : S(kSupport);
   DrawnSurfel<S> d;
@@ -172,8 +163,8 @@ DrawnSurfel<S> drawn_surfel(const BakedForward<S>& a, int64_t id) {
 
 // Residuals of a surfel at surfel coordinates.
 template <class S>
-inline Texels<S> residual_of(const DrawnSurfel<S>& d, Pack<S> u, Pack<S> v, const BakedResidual& atlas) {
-  using P = Pack<S>;
+inline Texels<S> residual_of(const DrawnSurfel<S>& d, Lanes<S> u, Lanes<S> v, const BakedResidual& atlas) {
+  using P = Lanes<S>;
   if (!d.level) return {P(d.flat[0]), P(d.flat[1]), P(d.flat[2])};
   const P x = texel_position_scaled(u, S(d.sides[0] - 1), d.k), y = texel_position_scaled(v, S(d.sides[1] - 1), d.k);
   Texels<S> t = d.level->floats.empty() ? bilinear<S>(d.level->bytes.data() + d.first, d.sides[0], x, y)
@@ -182,17 +173,15 @@ inline Texels<S> residual_of(const DrawnSurfel<S>& d, Pack<S> u, Pack<S> v, cons
   return t;
 }
 
-// Asks for a surfel's first texels.
-template <class S>
-void prefetch_texels(const DrawnSurfel<S>& d) {
+// Prefetches a surfel's first texels.
+template <class S> void prefetch_texels(const DrawnSurfel<S>& d) {
   if (!d.level || d.level->bytes.empty()) return;
   const uint8_t* p = d.level->bytes.data() + d.first;
   for (int line = 0; line < 4; ++line) __builtin_prefetch(p + 64 * line);
 }
 
-template <class Kernel, bool kMaps, class S>
-void baked_forward(const BakedForward<S>& a) {
-  using P = Pack<S>;
+template <class Kernel, bool kMaps, class S> void baked_forward(const BakedForward<S>& a) {
+  using P = Lanes<S>;
   const int width = a.view.width, height = a.view.height;
   const Bins& bins = *a.bins;
   const BakedResidual& atlas = a.residual;
@@ -204,9 +193,9 @@ void baked_forward(const BakedForward<S>& a) {
   const auto draw = [&](int64_t tile) {
     const int tx = int(tile % bins.tiles_x), ty = int(tile / bins.tiles_x);
     TileState<S> state(tx, ty, width, height, S(atlas.transmittance_min));
-    P sums[kMapChannels + 1][kPacks];  // rgb, alpha, beta, depth, normal, overdraw
-    for (auto& row : sums) std::fill(row, row + kPacks, P(S(0)));
-    for (int64_t k = bins.start[tile]; k < bins.start[tile + 1] && state.open_packs; ++k) {
+    P sums[kMapChannels + 1][kBlocks];  // rgb, alpha, beta, depth, normal, overdraw
+    for (auto& row : sums) std::fill(row, row + kBlocks, P(S(0)));
+    for (int64_t k = bins.start[tile]; k < bins.start[tile + 1] && state.open_blocks; ++k) {
       const int64_t id = bins.surfels[k];
       if (k + kAhead < bins.start[tile + 1]) {
         prefetch(a.view, bins, bins.surfels[k + kAhead]);
@@ -216,7 +205,7 @@ void baked_forward(const BakedForward<S>& a) {
       const DrawnSurfel<S>& d = drawn[id];
       state.template blend<Kernel, kMaps>(
           a.view, bins, id,
-          [&](int pack, const typename P::M& taken, const Fragment<P>& f, P weight) {
+          [&](int block, const typename P::M& taken, const Fragment<P>& f, P weight) {
             const typename P::M textures = taken & (weight >= P(d.bound));
             const P w = select(taken, weight, P(S(0)));
             P colour[3] = {P(d.view[0]), P(d.view[1]), P(d.view[2])};
@@ -224,22 +213,22 @@ void baked_forward(const BakedForward<S>& a) {
               const Texels<S> residual = residual_of(d, f.u, f.v, atlas);
               for (int c = 0; c < 3; ++c) colour[c] = select(textures, shaded(colour[c], residual.rgb[c]), colour[c]);
             }
-            for (int c = 0; c < 3; ++c) sums[c][pack] += w * colour[c];
-            sums[3][pack] += w;
+            for (int c = 0; c < 3; ++c) sums[c][block] += w * colour[c];
+            sums[3][block] += w;
             if constexpr (kMaps) {
               const S* g = a.view.geom + id * kGeom;
-              sums[4][pack] += w * P(g[kBeta]);
-              sums[5][pack] += select(taken, w * f.depth, P(S(0)));
-              for (int c = 0; c < 3; ++c) sums[6 + c][pack] += w * P(g[kNx + c]);
+              sums[4][block] += w * P(g[kBeta]);
+              sums[5][block] += select(taken, w * f.depth, P(S(0)));
+              for (int c = 0; c < 3; ++c) sums[6 + c][block] += w * P(g[kNx + c]);
             }
-            if (overdraw) sums[kMapChannels][pack] += select(taken, P(S(1)), P(S(0)));
+            if (overdraw) sums[kMapChannels][block] += select(taken, P(S(1)), P(S(0)));
           },
           sharp);
     }
-    each_pixel(tile, width, height, [&](int64_t pixel, int pack, int lane) {
+    each_pixel(tile, width, height, [&](int64_t pixel, int block, int lane) {
       S* to = image + pixel * channels;
-      for (int c = 0; c < channels; ++c) to[c] = sums[c][pack][lane];
-      if (overdraw) overdraw[pixel] = int32_t(sums[kMapChannels][pack][lane]);
+      for (int c = 0; c < channels; ++c) to[c] = sums[c][block][lane];
+      if (overdraw) overdraw[pixel] = int32_t(sums[kMapChannels][block][lane]);
     });
   };
   const std::unique_ptr<Binner<S>> lists = binner(a.view, *a.bins);
@@ -255,9 +244,8 @@ void baked_forward(const BakedForward<S>& a) {
 }
 }  // namespace
 
-template <class S>
-void baked_forward(const BakedForward<S>& a) {
-  with_kernel(a.view.through_pixel, float(a.view.photo_pixel), [&](auto kernel) {
+template <class S> void baked_forward(const BakedForward<S>& a) {
+  with_kernel(a.view.prefilter, float(a.view.photo_pixel), [&](auto kernel) {
     using Kernel = decltype(kernel);
     a.maps ? baked_forward<Kernel, true>(a) : baked_forward<Kernel, false>(a);
   });

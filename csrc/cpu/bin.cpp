@@ -4,16 +4,14 @@
 
 #include "core/resize.h"
 #include "cpu/kernels.h"
-#include "cpu/pack_extent.h"
 #include "cpu/threads.h"
 #include "cpu/tiles.h"
 
 namespace bt {
 
 namespace {
-// The tile that holds the box of a surfel, as most of small ones: no row of it has to be looked at. -1: there are more.
-template <class S>
-int only_tile(const S* g, const S* radii, const Bins& bins) {
+// The tile that holds the box of a surfel, as most of small ones: none of its rows is intersected. -1: there are more.
+template <class S> int only_tile(const S* g, const S* radii, const Bins& bins) {
   const S x = g[kCx] - S(0.5), y = g[kCy] - S(0.5), side = S(kTile);
   const S column = floor_((x - radii[0]) / side), row = floor_((y - radii[1]) / side);
   if (!(column >= S(0) && row >= S(0) && column < S(bins.tiles_x) && row < S(bins.tiles_y))) return -1;
@@ -22,35 +20,32 @@ int only_tile(const S* g, const S* radii, const Bins& bins) {
 }
 
 // Sorted by depth; those of the same depth keep their order.
-template <class S>
-void sort_by_depth(std::vector<std::pair<S, int32_t>>& order) {
+template <class S> void sort_by_depth(std::vector<std::pair<S, int32_t>>& order) {
   std::sort(order.begin(), order.end());
 }
-// Depths in front of the camera are ordered as their bits are: three times into places by eleven of them.
+// Depths in front of the camera are ordered as their bits are: a radix sort in three rounds of eleven bits.
 void sort_by_depth(std::vector<std::pair<float, int32_t>>& order) {
-  constexpr int kBits = 11, kPlaces = 1 << kBits, kRounds = 3;
+  constexpr int kBits = 11, kBuckets = 1 << kBits, kRounds = 3;
   const auto digit = [](float depth, int round) {
     uint32_t bits;
     std::memcpy(&bits, &depth, sizeof bits);
-    return bits >> kBits * round & (kPlaces - 1);
+    return bits >> kBits * round & (kBuckets - 1);
   };
-  std::vector<uint32_t> next(kRounds * kPlaces, 0);
+  std::vector<uint32_t> next(kRounds * kBuckets, 0);
   for (const auto& [depth, surfel] : order)
-    for (int round = 0; round < kRounds; ++round) ++next[round * kPlaces + digit(depth, round)];
+    for (int round = 0; round < kRounds; ++round) ++next[round * kBuckets + digit(depth, round)];
   std::vector<std::pair<float, int32_t>> other(order.size());
   for (int round = 0; round < kRounds; ++round, order.swap(other)) {
-    uint32_t* to = next.data() + round * kPlaces;
-    std::exclusive_scan(to, to + kPlaces, to, uint32_t(0));
+    uint32_t* to = next.data() + round * kBuckets;
+    std::exclusive_scan(to, to + kBuckets, to, uint32_t(0));
     for (const auto& pair : order) other[to[digit(pair.first, round)]++] = pair;
   }
 }
 
-template <class S>
-using Order = std::pair<S, int32_t>;  // depth, surfel
+template <class S> using Order = std::pair<S, int32_t>;  // depth, surfel
 
-// The extents and level sets of surfels in an order, asked for one after the other.
-template <class Kernel, class S>
-class Extents {
+// The extents and level sets of surfels in an order, computed sixteen at a time.
+template <class Kernel, class S> class Extents {
  public:
   Extents(const View<S>& view, const Order<S>* order, int64_t begin, int64_t end, float* level)
       : geom_(view.geom),
@@ -64,38 +59,38 @@ class Extents {
         end_(end),
         level_(level) {}
   const Extent& of(int64_t k) {
-    if (k >= next_) look(k);
+    if (k >= next_) load(k);
     return found_[k - first_];
   }
 
  private:
-  using P = Pack<float>;
+  using P = Lanes<float>;
 
-  void look(int64_t k) {
+  void load(int64_t k) {
     first_ = k, next_ = std::min(k + kLanes, end_);
     for (int64_t after = next_; after < std::min(next_ + kLanes, end_); ++after) {
       __builtin_prefetch(geom_ + int64_t(order_[after].second) * kGeom);
       __builtin_prefetch(radii_ + 2 * int64_t(order_[after].second));
     }
     if constexpr (std::is_same_v<S, float> && !Kernel::kPixel)
-      look_at_pack();
+      load_lanes();
     else
       for (int lane = 0; lane < next_ - first_; ++lane) {
         const S* g = row(lane);
         found_[lane] = extent<Kernel>(g, width_, height_, sharp_);
         if (filtered<Kernel>(g)) continue;  // has no level set of its own
-        note(lane, reach_levels<Kernel>(g, near_, sharp_));
+        store_levels(lane, reach_levels<Kernel>(g, near_, sharp_));
       }
   }
-  void look_at_pack() {
+  void load_lanes() {
     float columns[kGeom][kLanes];
     for (int lane = 0; lane < kLanes; ++lane) {
       const S* g = row(lane);
       for (int c = 0; c < kGeom; ++c) columns[c][lane] = g[c];
     }
     P g[kGeom];
-    for (int c = 0; c < kGeom; ++c) g[c] = load(columns[c]);
-    auto [level, e] = pack_extent<Kernel>(g, width_, height_, sharp_);
+    for (int c = 0; c < kGeom; ++c) g[c] = bt::load(columns[c]);
+    auto [level, e] = level_extent<Kernel>(g, width_, height_, sharp_, kFloatRoom);
     find_outermost(e);
     const P blur = select(covers_low_pass(g, P(near_), P(1 / sharp_)), P(0.0f), level.blur);
     const uint32_t whole = bits(e.whole), ellipse = bits(e.ellipse), thin = bits(e.thin);
@@ -107,11 +102,11 @@ class Extents {
       to.y_left = e.y_left[lane], to.y_right = e.y_right[lane], to.blur = e.blur[lane];
       to.qa = e.qa[lane], to.qb = e.qb[lane], to.qc = e.qc[lane];
       to.qd = e.qd[lane], to.qe = e.qe[lane], to.qf = e.qf[lane];
-      note(lane, {level.r2[lane], blur[lane] * blur[lane]});
+      store_levels(lane, {level.r2[lane], blur[lane] * blur[lane]});
     }
   }
   const S* row(int lane) const { return geom_ + int64_t(order_[std::min(first_ + lane, end_ - 1)].second) * kGeom; }
-  void note(int lane, ReachLevels levels) {
+  void store_levels(int lane, ReachLevels levels) {
     float* to = level_ + 2 * int64_t(order_[first_ + lane].second);
     to[0] = levels.r2, to[1] = levels.blur2;
   }
@@ -125,13 +120,12 @@ class Extents {
   Extent found_[kLanes];
 };
 
-// The tiles of surfels row by row, sixteen rows at a time, of one surfel or of several.
+// The tiles of surfels row by row, sixteen rows at a time, of one surfel or more.
 class TileRows {
  public:
   explicit TileRows(int width) : width_(width) {}
-  // The rows of a surfel; put(k, row, first, last) for all of those that fill the pack, in the order of the surfels.
-  template <class S, class Put>
-  void add(int64_t k, const Extent& e, const S* g, int height, Put&& put) {
+  // The rows of a surfel; put(k, row, first, last) for all of those that fill the lanes, in the order of the surfels.
+  template <class S, class Put> void add(int64_t k, const Extent& e, const S* g, int height, Put&& put) {
     const TileSpan<double> rows = tile_rows(e, g, height);
     const double column[kColumns] = {double(e.whole),
                                      double(e.ellipse),
@@ -158,22 +152,21 @@ class TileRows {
     }
   }
   // The rest.
-  template <class Put>
-  void finish(Put&& put) {
-    const auto at = [&](int c) { return load(columns_[c]); };
+  template <class Put> void finish(Put&& put) {
+    const auto at = [&](int c) { return bt::load(columns_[c]); };
     const P zero = P(0.0);
     ExtentOf<P> e;
     e.whole = at(0) > zero, e.ellipse = at(1) > zero, e.thin = at(2) > zero;
     e.x0 = at(3), e.x1 = at(4), e.y0 = at(5), e.y1 = at(6), e.y_left = at(7), e.y_right = at(8), e.blur = at(9);
     e.qa = at(10), e.qb = at(11), e.qc = at(12), e.qd = at(13), e.qe = at(14), e.qf = at(15);
-    const TileSpan<P> span = tile_columns(e, at(16), at(17), load(row_), width_);
+    const TileSpan<P> span = tile_columns(e, at(16), at(17), bt::load(row_), width_);
     for (int lane = 0; lane < count_; ++lane)
       put(k_[lane], int(row_[lane]), int(span.first[lane]), int(span.last[lane]));
     count_ = 0;
   }
 
  private:
-  using P = Pack<double>;
+  using P = Lanes<double>;
   static constexpr int kColumns = 18;
   double columns_[kColumns][kLanes] = {}, row_[kLanes] = {};
   int64_t k_[kLanes];
@@ -181,9 +174,8 @@ class TileRows {
 };
 
 // fn(tile) for every tile that a disc may touch which comes near the camera's plane and has no box.
-template <class S, class F>
-void for_reached_tiles(const S* g, const float* level, const Bins& bins, F&& fn) {
-  using P = Pack<S>;
+template <class S, class F> void for_reached_tiles(const S* g, const float* level, const Bins& bins, F&& fn) {
+  using P = Lanes<S>;
   constexpr S kHalf = S(0.5 * (kTile - 1));
   const S half_x = cell_half(kHalf, g[kCx], S(bins.tiles_x * kTile));
   const S half_y = cell_half(kHalf, g[kCy], S(bins.tiles_y * kTile));
@@ -200,8 +192,7 @@ void for_reached_tiles(const S* g, const float* level, const Bins& bins, F&& fn)
 }
 
 // In phases. Each thread counts and later fills its own run of the order: the lists come out sorted.
-template <class Kernel, class S>
-class KernelBinner final : public Binner<S> {
+template <class Kernel, class S> class KernelBinner final : public Binner<S> {
  public:
   KernelBinner(const View<S>& view, Bins& bins) : view_(view), bins_(bins) {
     bins.tiles_x = tiles_across(view.width), bins.tiles_y = tiles_across(view.height);
@@ -217,7 +208,7 @@ class KernelBinner final : public Binner<S> {
     m.meet();
     count(m.index);
     m.meet();
-    if (m.index == 0) place();
+    if (m.index == 0) scan();
     m.meet();
     fill(m.index);
     m.meet();
@@ -287,8 +278,8 @@ class KernelBinner final : public Binner<S> {
     rows.finish(add_row);
   }
 
-  // From the numbers of a tile's surfels in each run to where these begin.
-  void place() {
+  // From the numbers of a tile's surfels in each run to their offsets.
+  void scan() {
     bins_.start.assign(tiles() + 1, 0);
     for (int64_t tile = 0; tile < tiles(); ++tile) {
       int64_t next = bins_.start[tile];
@@ -325,10 +316,9 @@ class KernelBinner final : public Binner<S> {
 };
 }  // namespace
 
-template <class S>
-std::unique_ptr<Binner<S>> binner(const View<S>& view, Bins& bins) {
+template <class S> std::unique_ptr<Binner<S>> binner(const View<S>& view, Bins& bins) {
   std::unique_ptr<Binner<S>> made;
-  with_kernel(view.through_pixel, float(view.photo_pixel),
+  with_kernel(view.prefilter, float(view.photo_pixel),
               [&](auto kernel) { made = std::make_unique<KernelBinner<decltype(kernel), S>>(view, bins); });
   return made;
 }

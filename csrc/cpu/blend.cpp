@@ -1,56 +1,50 @@
 // Shading and blending of surfels with or without texels in one pass over the fragments, and its backward pass: colours
-// and their gradients are never listed. A pack at a time; texels fragment by fragment.
+// and their gradients are never listed. A block at a time; texels fragment by fragment.
 #include "ops/blend.h"
 
 #include <numeric>
 #include <optional>
 
+#include "cpu/blocks.h"
 #include "cpu/kernels.h"
-#include "cpu/packs.h"
 #include "cpu/patch.h"
 #include "cpu/runs.h"
 
 namespace bt {
 
 namespace {
-// A view as the kernels of the CPU take it.
-template <class S>
-using Blended = BlendedSurfels<S, TilePacks>;
-template <class S>
-using Forward = BlendForward<S, TilePacks>;
-template <class S>
-using Backward = BlendBackward<S, TilePacks>;
+// Arguments with the layout of the CPU.
+template <class S> using Blended = BlendedSurfels<S, TileBlocks>;
+template <class S> using Forward = BlendForward<S, TileBlocks>;
+template <class S> using Backward = BlendBackward<S, TileBlocks>;
 
-template <bool kMaps>
-constexpr int kChannels = kMaps ? kMapChannels : kImageChannels;
+template <bool kMaps> constexpr int kChannels = kMaps ? kMapChannels : kImageChannels;
 
 // The fragments of a surfel in a tile, ready to be blended.
-template <class S>
-class SurfelRun {
+template <class S> class SurfelRun {
  public:
-  using P = Pack<S>;
-  const PackRun run;
+  using P = Lanes<S>;
+  const BlockRun run;
   const TexelPatch<S> patch;
   const P beta, normal[3];
 
-  // `ask`: for its texels at once, some time before they are wanted.
-  SurfelRun(const Blended<S>& of, const PackRun& run, bool ask)
-      : SurfelRun(of, run, ask, of.geom + int64_t(run.surfel) * kGeom) {}
+  // `prefetch`: its texels, some time before they are used.
+  SurfelRun(const Blended<S>& of, const BlockRun& run, bool prefetch)
+      : SurfelRun(of, run, prefetch, of.geom + int64_t(run.surfel) * kGeom) {}
   SurfelRun(const SurfelRun&) = delete;
 
   const PatchFragments<S>& few() const { return few_; }
-  // Those of pack k's fragments that show texels, by lane.
+  // Those of block k's fragments that show texels, by lane.
   BT_HD uint32_t textured(int64_t k) const { return patch.textured() ? textured_[k - run.first] : 0; }
-  // fn(lane, fragment of `few`) for some of pack k.
-  template <class F>
-  BT_HD void each_of(uint32_t lanes, int64_t k, F&& fn) const {
+  // fn(lane, fragment of `few`) for some of block k.
+  template <class F> BT_HD void each_of(uint32_t lanes, int64_t k, F&& fn) const {
     for (; lanes; lanes &= lanes - 1) {
       const int lane = __builtin_ctz(lanes);
       fn(lane, int(k - run.first) * kLanes + lane);
     }
   }
-  // The colours of pack k's fragments, 0 in other lanes: what is not finite shows where it is and nowhere else.
-  BT_HD void colors(const PackPart& part, int64_t k, P* to) const {
+  // The colours of block k's fragments, 0 in other lanes: what is not finite shows where it is and nowhere else.
+  BT_HD void colors(const BlockPart& part, int64_t k, P* to) const {
     const Four<S> view(patch.view, S(1));
     P r(view.v[0]), g(view.v[1]), b(view.v[2]);
     each_of(textured(k), k, [&](int lane, int j) {
@@ -64,7 +58,7 @@ class SurfelRun {
   }
 
  private:
-  SurfelRun(const Blended<S>& of, const PackRun& run, bool ask, const S* g)
+  SurfelRun(const Blended<S>& of, const BlockRun& run, bool prefetch, const S* g)
       : run(run),
         patch(of.table, run.surfel),
         beta(g[kBeta]),
@@ -72,21 +66,20 @@ class SurfelRun {
         few_(patch) {
     if (!patch.textured()) return;
     const FragmentArrays<S>& f = of.fragments.f;
-    each_pack(of.fragments.layout, run, [&](int64_t k, int64_t at, const PackPart& part) {
+    each_block(of.fragments.layout, run, [&](int64_t k, int64_t at, const BlockPart& part) {
       const uint32_t lanes = part.lanes & bits(expand(f.weight + at, part.lanes) >= P(of.bound));
       textured_[k - run.first] = lanes;
       if (!lanes) return;
-      few_.look(int(k - run.first) * kLanes, expand(f.uv + at, part.lanes), expand(f.uv + f.total + at, part.lanes));
-      if (ask) each_of(lanes, k, [&](int, int j) { few_.ask(j); });
+      few_.locate(int(k - run.first) * kLanes, expand(f.uv + at, part.lanes), expand(f.uv + f.total + at, part.lanes));
+      if (prefetch) each_of(lanes, k, [&](int, int j) { few_.prefetch(j); });
     });
   }
 
-  uint32_t textured_[kPacks];  // of each pack of the run; not written where the surfel has no texels
+  uint32_t textured_[kBlocks];  // of each block of the run; not written where the surfel has no texels
   PatchFragments<S> few_;
 };
-// Asks for what a SurfelRun reads of its surfel.
-template <class S>
-BT_HD void ask_for_surfel(const Blended<S>& of, int64_t id) {
+// Prefetches what a SurfelRun reads of its surfel.
+template <class S> BT_HD void prefetch_surfel(const Blended<S>& of, int64_t id) {
   const TexelTiles<S>& t = of.table;
   __builtin_prefetch(of.geom + id * kGeom), __builtin_prefetch(t.base + 3 * id), __builtin_prefetch(t.first + id);
   __builtin_prefetch(t.size + 2 * id), __builtin_prefetch(t.extent + id);
@@ -95,48 +88,46 @@ BT_HD void ask_for_surfel(const Blended<S>& of, int64_t id) {
 // fn(SurfelRun) for runs one after the other; each is looked up before the one in front of it is through, so that its
 // texels are on their way.
 template <class S, class F>
-BT_HD void each_surfel_run(const Blended<S>& of, const std::vector<PackRun>& runs, F&& fn) {
+BT_HD void each_surfel_run(const Blended<S>& of, const std::vector<BlockRun>& runs, F&& fn) {
   const int64_t n = int64_t(runs.size());
   std::optional<SurfelRun<S>> two[2];
   for (int64_t r = 0; r <= n; ++r) {
-    if (r + 4 < n) ask_for_surfel(of, runs[r + 4].surfel);
+    if (r + 4 < n) prefetch_surfel(of, runs[r + 4].surfel);
     if (r < n) two[r & 1].emplace(of, runs[r], true);
     if (r > 0) fn(*two[(r - 1) & 1]);
   }
 }
 
-template <bool kMaps, class S>
-void forward(const Forward<S>& a) {
-  using P = Pack<S>;
+template <bool kMaps, class S> void forward(const Forward<S>& a) {
+  using P = Lanes<S>;
   constexpr int channels = kChannels<kMaps>;
   const FragmentArrays<S>& f = a.of.fragments.f;
-  const TilePacks& layout = a.of.fragments.layout;
+  const TileBlocks& layout = a.of.fragments.layout;
   parallel_tiles(layout.start, layout.tiles, 1 << 20, [&](int, int64_t first, int64_t last) {
-    std::vector<PackRun> runs;
+    std::vector<BlockRun> runs;
     for (int64_t tile = first; tile < last; ++tile) {
-      P sums[kPacks][channels];
-      for (auto& pack : sums) std::fill(pack, pack + channels, P(S(0)));
+      P sums[kBlocks][channels];
+      for (auto& block : sums) std::fill(block, block + channels, P(S(0)));
       runs.clear();
-      each_run(layout, tile, [&](const PackRun& run) { runs.push_back(run); });
+      each_run(layout, tile, [&](const BlockRun& run) { runs.push_back(run); });
       each_surfel_run(a.of, runs, [&](const SurfelRun<S>& surfel) {
-        each_pack(layout, surfel.run, [&](int64_t k, int64_t at, const PackPart& part) {
+        each_block(layout, surfel.run, [&](int64_t k, int64_t at, const BlockPart& part) {
           const P weight = expand(f.weight + at, part.lanes);
           P colors[3];
           surfel.colors(part, k, colors);
           const P depth = kMaps ? expand(f.depth + at, part.lanes) : P(S(0));
-          add_blended<kMaps>(weight, colors, surfel.beta, depth, surfel.normal, sums[part.pack]);
+          add_blended<kMaps>(weight, colors, surfel.beta, depth, surfel.normal, sums[part.block]);
         });
       });
-      each_pixel(tile, a.of.width, a.of.height, [&](int64_t pixel, int pack, int lane) {
-        for (int c = 0; c < channels; ++c) a.image[pixel * channels + c] = sums[pack][c][lane];
+      each_pixel(tile, a.of.width, a.of.height, [&](int64_t pixel, int block, int lane) {
+        for (int c = 0; c < channels; ++c) a.image[pixel * channels + c] = sums[block][c][lane];
       });
     }
   });
 }
 
-// What fragments of a surfel add to its gradients: view colour and beta, and the normal with maps.
-template <class T>
-struct Sums {
+// Sums over fragments of a surfel for its gradients: view colour and beta, and the normal with maps.
+template <class T> struct Sums {
   T view[3], beta, normal[3];
   Sums() : beta(T(0.0f)) { std::fill(view, view + 3, beta), std::fill(normal, normal + 3, beta); }
 };
@@ -144,20 +135,20 @@ struct Sums {
 // The gradients of the fragments of a run. `rows`: gradients of the surfel's texels, rows of four; null: there are
 // none.
 template <bool kMaps, class S>
-void run_backward(const Backward<S>& a, const PackedPicture<S, kChannels<kMaps>>& dimage, const SurfelRun<S>& surfel,
-                  S* rows, Sums<Pack<S>>& sums) {
-  using P = Pack<S>;
+void run_backward(const Backward<S>& a, const BlockPicture<S, kChannels<kMaps>>& dimage, const SurfelRun<S>& surfel,
+                  S* rows, Sums<Lanes<S>>& sums) {
+  using P = Lanes<S>;
   constexpr int channels = kChannels<kMaps>;
   const FragmentArrays<S>& f = a.of.fragments.f;
   const P zero = P(S(0));
   const int64_t end = surfel.run.end;
-  each_pack(a.of.fragments.layout, surfel.run, [&](int64_t pack, int64_t at, const PackPart& part) {
+  each_block(a.of.fragments.layout, surfel.run, [&](int64_t block, int64_t at, const BlockPart& part) {
     const auto there = mask_of<S>(part.lanes);
     const P weight = expand(f.weight + at, part.lanes);
     P d[channels], colors[3], dcolors[3];
     for (int c = 0; c < channels; ++c)
-      d[c] = select(there, load(dimage.numbers(surfel.run.tile, part.pack) + c * kLanes), zero);
-    surfel.colors(part, pack, colors);
+      d[c] = select(there, load(dimage.numbers(surfel.run.tile, part.block) + c * kLanes), zero);
+    surfel.colors(part, block, colors);
     const P depth = kMaps ? expand(f.depth + at, part.lanes) : zero;
     if (a.dweight)
       compress_until(a.dweight + end, a.dweight + at,
@@ -172,10 +163,10 @@ void run_backward(const Backward<S>& a, const PackedPicture<S, kChannels<kMaps>>
       for (int k = 0; k < 3; ++k) sums.normal[k] += weight * d[6 + k];
     }
     S du[kLanes] = {}, dv[kLanes] = {};
-    if (const uint32_t textured = surfel.textured(pack)) {
+    if (const uint32_t textured = surfel.textured(block)) {
       S rgb[3][kLanes];
       for (int k = 0; k < 3; ++k) store(rgb[k], dcolors[k]);
-      surfel.each_of(textured, pack, [&](int lane, int j) {
+      surfel.each_of(textured, block, [&](int lane, int j) {
         const Four<S> dcolor(Vec3<S>{rgb[0][lane], rgb[1][lane], rgb[2][lane]}, S(0));
         if (rows) surfel.few().add_gradient(j, dcolor, rows);
         if (!a.duv) return;
@@ -192,8 +183,7 @@ void run_backward(const Backward<S>& a, const PackedPicture<S, kChannels<kMaps>>
 }
 
 // The lanes added up.
-template <bool kMaps, class S>
-Sums<S> total(const Sums<Pack<S>>& of) {
+template <bool kMaps, class S> Sums<S> total(const Sums<Lanes<S>>& of) {
   Sums<S> all;
   for (int k = 0; k < 3; ++k) {
     all.view[k] = sum(of.view[k]);
@@ -202,14 +192,12 @@ Sums<S> total(const Sums<Pack<S>>& of) {
   all.beta = sum(of.beta);
   return all;
 }
-template <class S>
-void add(const Sums<S>& one, Sums<S>& to) {
+template <class S> void add(const Sums<S>& one, Sums<S>& to) {
   for (int k = 0; k < 3; ++k) to.view[k] += one.view[k], to.normal[k] += one.normal[k];
   to.beta += one.beta;
 }
 // Writes the gradients of a surfel.
-template <class S>
-void surfel_backward(const Backward<S>& a, int64_t id, const Sums<S>& sums) {
+template <class S> void surfel_backward(const Backward<S>& a, int64_t id, const Sums<S>& sums) {
   store3(a.dbase + 3 * id, base_gradient(load3(a.of.table.base + 3 * id), load3(sums.view)));
   S* dgeom = a.dgeom + id * kGeom;
   dgeom[kBeta] = sums.beta;
@@ -219,30 +207,30 @@ void surfel_backward(const Backward<S>& a, int64_t id, const Sums<S>& sums) {
 // All runs of a list, in its order.
 class ListedRuns {
  public:
-  explicit ListedRuns(const TilePacks& layout) {
+  explicit ListedRuns(const TileBlocks& layout) {
     std::vector<int64_t> before(layout.tiles + 1, 0);  // runs of earlier tiles
     const auto each_tile = [&](auto&& fn) {
-      parallel_tiles(layout.pack_start, layout.tiles, 1 << 20, [&](int, int64_t first, int64_t last) {
+      parallel_tiles(layout.block_start, layout.tiles, 1 << 20, [&](int, int64_t first, int64_t last) {
         for (int64_t tile = first; tile < last; ++tile) fn(tile);
       });
     };
-    each_tile([&](int64_t tile) { each_run(layout, tile, [&](const PackRun&) { ++before[tile + 1]; }); });
+    each_tile([&](int64_t tile) { each_run(layout, tile, [&](const BlockRun&) { ++before[tile + 1]; }); });
     std::partial_sum(before.begin(), before.end(), before.begin());
     starts_.resize(before.back() + 1);
     each_tile([&](int64_t tile) {
       Start* to = starts_.data() + before[tile];
-      each_run(layout, tile, [&](const PackRun& run) { *to++ = {run.tile, run.surfel, run.begin, run.first}; });
+      each_run(layout, tile, [&](const BlockRun& run) { *to++ = {run.tile, run.surfel, run.begin, run.first}; });
     });
     starts_.back() = {0, 0, layout.fragments, layout.count};
   }
   int64_t count() const { return int64_t(starts_.size()) - 1; }
   int32_t surfel(int64_t r) const { return starts_[r].surfel; }
   int64_t length(int64_t r) const { return starts_[r + 1].begin - starts_[r].begin; }
-  PackRun run(int64_t r) const {
+  BlockRun run(int64_t r) const {
     const Start *s = &starts_[r], *next = s + 1;
     return {s->tile, s->surfel, s->begin, next->begin, s->first, next->first};
   }
-  BT_HD void ask(int64_t r) const { __builtin_prefetch(&starts_[r]); }
+  BT_HD void prefetch(int64_t r) const { __builtin_prefetch(&starts_[r]); }
 
  private:
   struct Start {
@@ -252,27 +240,27 @@ class ListedRuns {
   std::vector<Start> starts_;  // [runs + 1]
 };
 
-// Asks for what the runs after run k of `order` read: they lie all over the list, and waiting for them would take most
-// of the time. First for what they are, then for their fragments and pixels. Always inlined: GCC drops calls of a
+// Prefetches what the runs after run k of `order` read: they lie all over the list, and waiting for them would take
+// most of the time. First for what they are, then for their fragments and pixels. Always inlined: GCC drops calls of a
 // function that does nothing else.
 template <int channels, class S>
-BT_HD void ask_for_next(const Backward<S>& a, const PackedPicture<S, channels>& dimage, const ListedRuns& listed,
-                        const std::vector<int64_t>& order, int64_t k) {
+BT_HD void prefetch_next(const Backward<S>& a, const BlockPicture<S, channels>& dimage, const ListedRuns& listed,
+                         const std::vector<int64_t>& order, int64_t k) {
   const FragmentArrays<S>& f = a.of.fragments.f;
   constexpr int64_t line = 64 / sizeof(S);
   const auto ahead = [&](int64_t by) { return order[std::min(k + by, int64_t(order.size()) - 1)]; };
-  listed.ask(ahead(8));
-  const PackRun next = listed.run(ahead(3));
-  __builtin_prefetch(a.of.fragments.layout.packs + 2 * next.first);
+  listed.prefetch(ahead(8));
+  const BlockRun next = listed.run(ahead(3));
+  __builtin_prefetch(a.of.fragments.layout.blocks + 2 * next.first);
   for (int64_t i = next.begin; i < next.end + line - 1; i += line) {
     const int64_t j = std::min(i, next.end - 1);
     __builtin_prefetch(f.weight + j), __builtin_prefetch(f.uv + j), __builtin_prefetch(f.uv + f.total + j);
     if (a.dweight) __builtin_prefetch(a.dweight + j, 1);
     if (a.duv) __builtin_prefetch(a.duv + j, 1), __builtin_prefetch(a.duv + f.total + j, 1);
   }
-  const PackRun soon = listed.run(ahead(1));
+  const BlockRun soon = listed.run(ahead(1));
   for (int64_t p = soon.first; p < soon.last; ++p) {
-    const S* numbers = dimage.numbers(soon.tile, PackPart(a.of.fragments.layout, p).pack);
+    const S* numbers = dimage.numbers(soon.tile, BlockPart(a.of.fragments.layout, p).block);
     for (int64_t i = 0; i < channels * kLanes; i += line) __builtin_prefetch(numbers + i);
   }
 }
@@ -280,17 +268,17 @@ BT_HD void ask_for_next(const Backward<S>& a, const PackedPicture<S, channels>& 
 // Surfel after surfel: a thread adds to the texels of its own. Also where they do not learn, so that the gradients of
 // the surfels are the same.
 template <bool kMaps, class S>
-void backward_by_surfel(const Backward<S>& a, const PackedPicture<S, kChannels<kMaps>>& dimage,
-                        const ListedRuns& listed, const std::vector<int64_t>& order) {
+void backward_by_surfel(const Backward<S>& a, const BlockPicture<S, kChannels<kMaps>>& dimage, const ListedRuns& listed,
+                        const std::vector<int64_t>& order) {
   for_surfels(listed, order.data(), [&](int64_t first, int64_t last) {
     const int64_t id = listed.surfel(order[first]);
     const TexelPatch<S> patch(a.of.table, id);
     thread_local std::vector<S> own;  // gradients of the texels, rows of four
     const int64_t area = a.sums_texels() ? int64_t(patch.size[0]) * patch.size[1] : 0;
     own.assign(4 * area, S(0));
-    Sums<Pack<S>> sums;
+    Sums<Lanes<S>> sums;
     for (int64_t k = first; k < last; ++k) {
-      ask_for_next(a, dimage, listed, order, k);
+      prefetch_next(a, dimage, listed, order, k);
       const SurfelRun<S> surfel(a.of, listed.run(order[k]), false);
       run_backward<kMaps>(a, dimage, surfel, area ? own.data() : nullptr, sums);
     }
@@ -306,12 +294,12 @@ void backward_by_surfel(const Backward<S>& a, const PackedPicture<S, kChannels<k
 }
 // Run after run, which is faster where there are no texels: what a pass reads follows each other.
 template <bool kMaps, class S>
-void backward_by_run(const Backward<S>& a, const PackedPicture<S, kChannels<kMaps>>& dimage, const ListedRuns& listed,
+void backward_by_run(const Backward<S>& a, const BlockPicture<S, kChannels<kMaps>>& dimage, const ListedRuns& listed,
                      const std::vector<int64_t>& order) {
   std::vector<Sums<S>> of_run(listed.count());
   parallel_parts(listed.count(), 64, [&](int, int64_t begin, int64_t end) {
     for (int64_t r = begin; r < end; ++r) {
-      Sums<Pack<S>> sums;
+      Sums<Lanes<S>> sums;
       run_backward<kMaps, S>(a, dimage, SurfelRun<S>(a.of, listed.run(r), false), nullptr, sums);
       of_run[r] = total<kMaps>(sums);
     }
@@ -323,31 +311,28 @@ void backward_by_run(const Backward<S>& a, const PackedPicture<S, kChannels<kMap
   });
 }
 
-template <bool kMaps, class S>
-void backward(const Backward<S>& a) {
+template <bool kMaps, class S> void backward(const Backward<S>& a) {
   const TexelTiles<S>& table = a.of.table;
   std::fill(a.dgeom, a.dgeom + table.n * kGeom, S(0));
   std::fill(a.dbase, a.dbase + 3 * table.n, S(0));
   if (a.dtexels) std::fill(a.dtexels, a.dtexels + 3 * table.texels, S(0));
-  const PackedPicture<S, kChannels<kMaps>> dimage(a.dimage, a.of.width, a.of.height);
+  const BlockPicture<S, kChannels<kMaps>> dimage(a.dimage, a.of.width, a.of.height);
   const ListedRuns listed(a.of.fragments.layout);
   const std::vector<int64_t> order = by_surfel(listed, table.n);
   (table.texels ? backward_by_surfel<kMaps, S> : backward_by_run<kMaps, S>)(a, dimage, listed, order);
 }
 }  // namespace
 
-template <class S>
-void blend_forward(const BlendForward<S, TilePacks>& a) {
+template <class S> void blend_forward(const BlendForward<S, TileBlocks>& a) {
   a.of.maps ? forward<true>(a) : forward<false>(a);
 }
-template <class S>
-void blend_backward(const BlendBackward<S, TilePacks>& a) {
+template <class S> void blend_backward(const BlendBackward<S, TileBlocks>& a) {
   a.of.maps ? backward<true>(a) : backward<false>(a);
 }
 
-#define BT_INSTANTIATE(S)                                         \
-  template void blend_forward(const BlendForward<S, TilePacks>&); \
-  template void blend_backward(const BlendBackward<S, TilePacks>&);
+#define BT_INSTANTIATE(S)                                          \
+  template void blend_forward(const BlendForward<S, TileBlocks>&); \
+  template void blend_backward(const BlendBackward<S, TileBlocks>&);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

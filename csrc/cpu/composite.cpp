@@ -1,34 +1,32 @@
 // Weighted sums of the fragments per pixel, and their backward pass.
+#include "cpu/blocks.h"
 #include "cpu/kernels.h"
-#include "cpu/packs.h"
 #include "cpu/threads.h"
 
 namespace bt {
 
 namespace {
-template <bool kMaps, class S>
-void forward(const CompositeForward<S, TilePacks>& a) {
+template <bool kMaps, class S> void forward(const CompositeForward<S, TileBlocks>& a) {
   constexpr int channels = kMaps ? kMapChannels : kImageChannels;
   const S *geom = a.geom, *colors = a.colors;
-  const TilePacks& layout = a.fragments.layout;
+  const TileBlocks& layout = a.fragments.layout;
   const FragmentArrays<S>& f = a.fragments.f;
   S* image = a.image;
   std::fill(image, image + a.pixels() * channels, S(0));
   parallel_tiles(layout.start, layout.tiles, 1 << 20, [&](int, int64_t first, int64_t last) {
     for (int64_t tile = first; tile < last; ++tile)
-      each_fragment(layout, tile, a.width, [&](const PackRun& run, int64_t i, int64_t pixel) {
+      each_fragment(layout, tile, a.width, [&](const BlockRun& run, int64_t i, int64_t pixel) {
         const S* g = geom + int64_t(run.surfel) * kGeom;
         add_blended<kMaps>(f.weight[i], colors + 3 * i, g[kBeta], f.depth[i], g + kNx, image + pixel * channels);
       });
   });
 }
 
-template <bool kMaps, class S>
-void backward(const CompositeBackward<S, TilePacks>& a) {
+template <bool kMaps, class S> void backward(const CompositeBackward<S, TileBlocks>& a) {
   constexpr int channels = kMaps ? kMapChannels : kImageChannels;
   const S *geom = a.geom, *colors = a.colors, *dimage = a.dimage;
   const int64_t n = a.n;
-  const TilePacks& layout = a.fragments.layout;
+  const TileBlocks& layout = a.fragments.layout;
   const FragmentArrays<S>& f = a.fragments.f;
   S *dweight = a.dweight, *dcolors = a.dcolors, *ddepth = a.ddepth, *dgeom = a.dgeom;
   constexpr int kSums = 4;  // beta and the normal, per surfel
@@ -37,7 +35,7 @@ void backward(const CompositeBackward<S, TilePacks>& a) {
     std::vector<S>& sums = partial[part];
     sums.assign(n * kSums, S(0));
     for (int64_t tile = first; tile < last; ++tile)
-      each_fragment(layout, tile, a.width, [&](const PackRun& run, int64_t i, int64_t pixel) {
+      each_fragment(layout, tile, a.width, [&](const BlockRun& run, int64_t i, int64_t pixel) {
         const S w = f.weight[i], *g = geom + int64_t(run.surfel) * kGeom, *d = dimage + pixel * channels;
         S* to = sums.data() + int64_t(run.surfel) * kSums;
         dweight[i] = weight_gradient<kMaps>(d, colors + 3 * i, g[kBeta], f.depth[i], g + kNx);
@@ -59,18 +57,16 @@ void backward(const CompositeBackward<S, TilePacks>& a) {
 
 }  // namespace
 
-template <class S>
-void composite_forward(const CompositeForward<S, TilePacks>& a) {
+template <class S> void composite_forward(const CompositeForward<S, TileBlocks>& a) {
   a.maps ? forward<true>(a) : forward<false>(a);
 }
-template <class S>
-void composite_backward(const CompositeBackward<S, TilePacks>& a) {
+template <class S> void composite_backward(const CompositeBackward<S, TileBlocks>& a) {
   a.maps ? backward<true>(a) : backward<false>(a);
 }
 
-#define BT_INSTANTIATE(S)                                                 \
-  template void composite_forward(const CompositeForward<S, TilePacks>&); \
-  template void composite_backward(const CompositeBackward<S, TilePacks>&);
+#define BT_INSTANTIATE(S)                                                  \
+  template void composite_forward(const CompositeForward<S, TileBlocks>&); \
+  template void composite_backward(const CompositeBackward<S, TileBlocks>&);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

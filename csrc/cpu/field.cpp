@@ -6,18 +6,17 @@
 namespace bt {
 
 namespace {
-constexpr int64_t kBlock = 1 << 15;  // points whose table gradients are collected before they are added
+constexpr int64_t kChunk = 1 << 15;  // points whose table gradients are collected before they are added
 }
 
-template <class S>
-void field_forward(const FieldForward<S>& a) {
+template <class S> void field_forward(const FieldForward<S>& a) {
   const FieldArrays<S>& field = *a.field;
   const S* x = a.x;
   S* rho = a.rho;
   const auto m = load_mlp(field);
   parallel_parts(a.n, 256, [&](int, int64_t begin, int64_t end) {
     Encoder<S> enc;
-    MlpState<S, Pack<S>> state;
+    MlpState<S, Lanes<S>> state;
     for (int64_t i = begin; i < end; i += kBatch) {
       const int count = int(std::min<int64_t>(kBatch, end - i));
       for (int p = 0; p < count; ++p) enc.set(p, load3(x + 3 * (i + p)));
@@ -27,8 +26,7 @@ void field_forward(const FieldForward<S>& a) {
   });
 }
 
-template <class S>
-void field_backward(const FieldBackward<S>& a) {
+template <class S> void field_backward(const FieldBackward<S>& a) {
   const FieldArrays<S>& field = *a.field;
   const FieldGradients<S>& out = a.dfield;
   const S *x = a.x, *drho = a.drho;
@@ -36,32 +34,32 @@ void field_backward(const FieldBackward<S>& a) {
   S* dx = a.dx;
   const auto m = load_mlp(field);
   const int threads = std::max(num_threads(), 1);
-  std::vector<Mlp<S, Pack<S>>> sums(threads);
+  std::vector<Mlp<S, Lanes<S>>> sums(threads);
   for (auto& g : sums) clear(g);
   clear_gradients(field, out);
   TableScatter<S> scatter;
-  for (int64_t block = 0; block < n; block += kBlock) {
-    const int64_t size = std::min(kBlock, n - block);
+  for (int64_t chunk = 0; chunk < n; chunk += kChunk) {
+    const int64_t size = std::min(kChunk, n - chunk);
     scatter.resize(size, threads);
     parallel_parts(size, 256, [&](int part, int64_t begin, int64_t end) {
       Encoder<S> enc;
-      MlpState<S, Pack<S>> state;
-      MlpGradient<Pack<S>> gradient;
+      MlpState<S, Lanes<S>> state;
+      MlpGradient<Lanes<S>> gradient;
       S lanes[kWidth];
       int64_t slot = scatter.slot(part, begin);
       for (int64_t i = begin; i < end; i += kBatch) {
         const int count = int(std::min<int64_t>(kBatch, end - i));
-        for (int p = 0; p < count; ++p) enc.set(p, load3(x + 3 * (block + i + p)));
+        for (int p = 0; p < count; ++p) enc.set(p, load3(x + 3 * (chunk + i + p)));
         enc.encode(field, count);
         auto& batch = scatter.open(slot++, enc, field.levels, count);
         for (int p = 0; p < count; ++p) {
-          const Vec3<S> d = load3(drho + 3 * (block + i + p));
+          const Vec3<S> d = load3(drho + 3 * (chunk + i + p));
           mlp(m, enc.features[p], state);
           batch.dfeatures[p] = mlp_vjp(m, state, d, gradient);
           add_weight_gradient(enc.features[p], state, gradient, d, sums[part]);
           if (dx) {
             store(lanes, batch.dfeatures[p]);
-            store3(dx + 3 * (block + i + p), enc.position_gradient(field, p, lanes));
+            store3(dx + 3 * (chunk + i + p), enc.position_gradient(field, p, lanes));
           }
         }
       }
@@ -71,18 +69,17 @@ void field_backward(const FieldBackward<S>& a) {
   add_mlp_gradient(sums, threads, field.levels * kFeatures, out);
 }
 
-template <class S>
-void shade_forward(const ShadeForward<S>& a) {
+template <class S> void shade_forward(const ShadeForward<S>& a) {
   const FragmentArrays<S>& f = a.f;
   const FieldArrays<S>* field = a.field;
   const S *base = a.base, *frames = a.frames, bound = a.bound;
   const int64_t fragments = f.total;
   S* colors = a.colors;
-  Mlp<S, Pack<S>> m;
+  Mlp<S, Lanes<S>> m;
   if (field) m = load_mlp(*field);
   parallel_parts(fragments, 1024, [&](int, int64_t begin, int64_t end) {
     Encoder<S> enc;
-    MlpState<S, Pack<S>> state;
+    MlpState<S, Lanes<S>> state;
     int64_t who[kBatch];
     int count = 0;
     for (int64_t i = begin; i < end; ++i) {
@@ -103,8 +100,7 @@ void shade_forward(const ShadeForward<S>& a) {
   });
 }
 
-template <class S>
-void shade_backward(const ShadeBackward<S>& a) {
+template <class S> void shade_backward(const ShadeBackward<S>& a) {
   const FragmentArrays<S>& f = a.f;
   const FieldArrays<S>* field = a.field;
   const FieldGradients<S>* dfield = &a.dfield;
@@ -116,8 +112,8 @@ void shade_backward(const ShadeBackward<S>& a) {
   const int columns = geometry ? 3 + kFrame : 3;
   std::vector<std::vector<S>> partial(threads);
   for (auto& p : partial) p.assign(n * columns, S(0));
-  Mlp<S, Pack<S>> m;
-  std::vector<Mlp<S, Pack<S>>> sums;
+  Mlp<S, Lanes<S>> m;
+  std::vector<Mlp<S, Lanes<S>>> sums;
   TableScatter<S> scatter;
   const bool trains_field = a.trains_field();
   if (trains_field) {
@@ -127,21 +123,21 @@ void shade_backward(const ShadeBackward<S>& a) {
     clear_gradients(*field, *dfield);
   }
   if (geometry) std::fill(duv, duv + 2 * fragments, S(0));
-  for (int64_t block = 0; block < fragments; block += trains_field ? kBlock : fragments) {
-    const int64_t size = trains_field ? std::min(kBlock, fragments - block) : fragments;
+  for (int64_t chunk = 0; chunk < fragments; chunk += trains_field ? kChunk : fragments) {
+    const int64_t size = trains_field ? std::min(kChunk, fragments - chunk) : fragments;
     if (trains_field) scatter.resize(size, threads);
     parallel_parts(size, 256, [&](int part, int64_t begin, int64_t end) {
       std::vector<S>& own = partial[part];
       Encoder<S> enc;
-      MlpState<S, Pack<S>> state;
-      MlpGradient<Pack<S>> gradient;
+      MlpState<S, Lanes<S>> state;
+      MlpGradient<Lanes<S>> gradient;
       Vec3<S> drho[kBatch];
       int64_t who[kBatch];
       int count = 0;
       int64_t slot = scatter.slot(part, begin);
       S lanes[kWidth];
       for (int64_t k = begin; k < end; ++k) {
-        const int64_t i = block + k, id = f.surfel[i];
+        const int64_t i = chunk + k, id = f.surfel[i];
         const Vec3<S> g = residual_gradient(load3(colors + 3 * i), load3(dcolors + 3 * i));
         S* sum = own.data() + id * columns;
         store3(sum, load3(sum) + base_gradient(load3(base + 3 * id), g));

@@ -10,12 +10,11 @@ namespace bt {
 
 constexpr int kBatch = 16;  // points whose table entries are looked up together
 
-// The weights as packs, with the transposes of the backward pass.
-template <class S>
-Mlp<S, Pack<S>> load_mlp(const FieldArrays<S>& field) {
-  Mlp<S, Pack<S>> m;
+// The weights in lanes, with the transposes of the backward pass.
+template <class S> Mlp<S, Lanes<S>> load_mlp(const FieldArrays<S>& field) {
+  Mlp<S, Lanes<S>> m;
   const int inputs = field.levels * kFeatures;
-  for (int i = 0; i < kInputs; ++i) m.w1[i] = i < inputs ? load(field.w1 + i * kWidth) : Pack<S>(S(0));
+  for (int i = 0; i < kInputs; ++i) m.w1[i] = i < inputs ? load(field.w1 + i * kWidth) : Lanes<S>(S(0));
   for (int i = 0; i < kWidth; ++i) m.w2[i] = load(field.w2 + i * kWidth);
   for (int o = 0; o < kWidth; ++o)
     for (int i = 0; i < kWidth; ++i) {
@@ -26,18 +25,16 @@ Mlp<S, Pack<S>> load_mlp(const FieldArrays<S>& field) {
     for (int i = 0; i < kWidth; ++i) m.w3[c].set(i, field.w3[i * 3 + c]);
   return m;
 }
-template <class S>
-void clear(Mlp<S, Pack<S>>& m) {
-  std::fill(std::begin(m.w1), std::end(m.w1), Pack<S>(S(0)));
-  std::fill(std::begin(m.w2), std::end(m.w2), Pack<S>(S(0)));
-  std::fill(std::begin(m.w3), std::end(m.w3), Pack<S>(S(0)));
+template <class S> void clear(Mlp<S, Lanes<S>>& m) {
+  std::fill(std::begin(m.w1), std::end(m.w1), Lanes<S>(S(0)));
+  std::fill(std::begin(m.w2), std::end(m.w2), Lanes<S>(S(0)));
+  std::fill(std::begin(m.w3), std::end(m.w3), Lanes<S>(S(0)));
 }
 
 // Encodes a batch of kBatch points; the indices and weights stay for the backward pass. Points beyond the count repeat
 // whatever lies in x and are not looked up.
-template <class S>
-struct Encoder {
-  using P = Pack<S>;
+template <class S> struct Encoder {
+  using P = Lanes<S>;
   Corners<P> at[kMaxLevels];
   alignas(64) S features[kBatch][kInputs] = {};
   alignas(64) S x[3][kBatch] = {};
@@ -86,13 +83,12 @@ struct Encoder {
 
 // Collects what batches of points give to the table and adds it, level by level: no two threads write one level, and
 // every entry sums its points in their order.
-template <class S>
-struct TableScatter {
+template <class S> struct TableScatter {
   struct Batch {
     int count = 0;
-    typename IndexOf<Pack<S>>::type index[kMaxLevels][8];
-    Pack<S> weight[kMaxLevels][8];
-    Pack<S> dfeatures[kBatch];
+    typename IndexOf<Lanes<S>>::type index[kMaxLevels][8];
+    Lanes<S> weight[kMaxLevels][8];
+    Lanes<S> dfeatures[kBatch];
   };
   std::vector<Batch> batches;
   // room for n points in `parts` parts; part p, which begins at point b, uses batches from slot(p, b) on
@@ -132,7 +128,7 @@ struct TableScatter {
 };
 
 template <class S>
-void add_mlp_gradient(const std::vector<Mlp<S, Pack<S>>>& parts, int count, int inputs, const FieldGradients<S>& out) {
+void add_mlp_gradient(const std::vector<Mlp<S, Lanes<S>>>& parts, int count, int inputs, const FieldGradients<S>& out) {
   for (int p = 0; p < count; ++p) {
     for (int i = 0; i < inputs; ++i)
       for (int o = 0; o < kWidth; ++o) out.w1[i * kWidth + o] += parts[p].w1[i][o];
@@ -142,8 +138,7 @@ void add_mlp_gradient(const std::vector<Mlp<S, Pack<S>>>& parts, int count, int 
     }
   }
 }
-template <class S>
-void clear_gradients(const FieldArrays<S>& f, const FieldGradients<S>& out) {
+template <class S> void clear_gradients(const FieldArrays<S>& f, const FieldGradients<S>& out) {
   parallel_parts(f.table_size(), 1 << 16,
                  [&](int, int64_t b, int64_t e) { std::fill(out.table + b, out.table + e, S(0)); });
   std::fill(out.w1, out.w1 + f.levels * kFeatures * kWidth, S(0));

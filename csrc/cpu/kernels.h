@@ -12,7 +12,6 @@
 #include "cpu/memory.h"
 #include "cpu/threads.h"
 #include "ops/appearance.h"
-#include "ops/baked.h"
 #include "ops/blend.h"
 #include "ops/field.h"
 #include "ops/texel.h"
@@ -23,12 +22,10 @@ namespace bt {
 int num_threads();
 void set_num_threads(int n);
 
-template <class S>
-void project_forward(const ProjectForward<S>& a);
-template <class S>
-void project_backward(const ProjectBackward<S>& a);
+template <class S> void project_forward(const ProjectForward<S>& a);
+template <class S> void project_backward(const ProjectBackward<S>& a);
 
-// Per tile, the visible surfels front to back, and of each where it may be drawn: the squared radius of its kernel's
+// Per tile, the visible surfels front to back, and of each the squared radius of its kernel's
 // level set, in scale units, and that of the low pass's in pixels, 0 where that is nowhere above the kernel.
 struct Bins {
   Bins() = default;
@@ -39,152 +36,125 @@ struct Bins {
   std::vector<float> level;      // [n, 2], of the visible ones
 };
 // Fills them, by the threads of a team.
-template <class S>
-class Binner {
+template <class S> class Binner {
  public:
   using Aside = std::function<void(int64_t begin, int64_t end)>;
   virtual ~Binner() = default;
-  // All of them call it; the lists are there when it returns. aside(begin, end), if any, for all surfels: what threads
-  // do while one of them sorts.
+  // All of them call it; the lists are there when it returns. aside(begin, end), if any, for all surfels: work of the
+  // threads while one of them sorts.
   virtual void run(const Member& m, const Aside& aside) = 0;
 };
-template <class S>
-std::unique_ptr<Binner<S>> binner(const View<S>& view, Bins& bins);
+template <class S> std::unique_ptr<Binner<S>> binner(const View<S>& view, Bins& bins);
 
-// Fragments as they are found, ordered like FragmentArrays; whose they are and where, their packs say.
-template <class S>
-struct FoundFragments {
-  std::vector<int64_t> tile_start, pack_start;  // [tiles + 1]
-  int64_t total = 0, packs = 0;
-  // Filled by trace, read out by copy. Blocks are large, so that what is not written to takes no memory and what is
-  // freed goes back to the operating system. A tile's fragments lie in one block.
-  struct Block {
+// Fragments as they are found, ordered like FragmentArrays; their blocks have surfels and pixels.
+template <class S> struct FoundFragments {
+  std::vector<int64_t> tile_start, block_start;  // [tiles + 1]
+  int64_t total = 0, blocks = 0;
+  // Filled by trace, read out by copy. Chunks are large, so that what is not written to takes no memory and what is
+  // freed goes back to the operating system. A tile's fragments lie in one chunk.
+  struct Chunk {
     static constexpr int64_t kSize = int64_t(1) << 21;
-    explicit Block(bool first) : memory(allocate(kSize * (2 * sizeof(int32_t) + 5 * sizeof(S)), !first)) {}
-    Memory memory;  // small views, which use a part of the first block, do without large pages
-    int32_t* packs = reinterpret_cast<int32_t*>(memory.get());
-    S *weight = reinterpret_cast<S*>(packs + 2 * kSize), *u = weight + kSize, *v = u + kSize, *depth = v + kSize,
+    explicit Chunk(bool first) : memory(allocate(kSize * (2 * sizeof(int32_t) + 5 * sizeof(S)), !first)) {}
+    Memory memory;  // small views, which use a part of the first chunk, do without large pages
+    int32_t* blocks = reinterpret_cast<int32_t*>(memory.get());
+    S *weight = reinterpret_cast<S*>(blocks + 2 * kSize), *u = weight + kSize, *v = u + kSize, *depth = v + kSize,
       *sigma = depth + kSize;
-    int64_t used = 0, used_packs = 0;
+    int64_t used = 0, used_blocks = 0;
   };
-  std::vector<std::vector<Block>> blocks;  // per thread
+  std::vector<std::vector<Chunk>> chunks;  // per thread
   struct Piece {
-    int thread, block;
-    int64_t from, count, from_pack, packs;
+    int thread, chunk;
+    int64_t from, count, from_block, blocks;
   };
   std::vector<Piece> pieces;  // [tiles]
 };
-// What a tracer keeps of a view: tile lists and, until copied, the fragments.
-template <class S>
-struct Trace {
+// Memory of a tracer: tile lists and, until copied, the fragments.
+template <class S> struct Trace {
   Trace() = default;
   Trace(const Trace&) = delete;
   Bins bins;
   FoundFragments<S> list;
 };
-// Where there are more than `most` (0 = any number) they are only counted.
-template <class S>
-struct TraceForward {
+// More fragments than `most` (0 = any number) are only counted.
+template <class S> struct TraceForward {
   View<S> view;
   int64_t most;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     view.fields(r);
     r.number("most", most);
   }
 };
-template <class S>
-void trace_forward(const TraceForward<S>& a, Trace<S>& to);
-// Written: the list, and the arrays of its TilePacks.
-template <class S>
-struct TraceCopy {
-  int64_t starts, packs_listed;
-  int64_t *tile_start, *pack_start;
-  int32_t* packs;
+template <class S> void trace_forward(const TraceForward<S>& a, Trace<S>& to);
+// Written: the list, and the arrays of its TileBlocks.
+template <class S> struct TraceCopy {
+  int64_t starts, blocks_listed;
+  int64_t *tile_start, *block_start;
+  int32_t* blocks;
   FragmentArrays<S> out;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     r.rows("tile_start", tile_start, starts, 1);
-    r.array("pack_start", pack_start, starts);
-    r.rows("packs", packs, packs_listed, 2);
+    r.array("block_start", block_start, starts);
+    r.rows("blocks", blocks, blocks_listed, 2);
     out.fields(r, false);
   }
 };
-// Large lists give their memory back, a block of every thread at a time.
-template <class S>
-void trace_copy(const TraceCopy<S>& a, Trace<S>& from);
+// Large lists give their memory back, a chunk of every thread at a time.
+template <class S> void trace_copy(const TraceCopy<S>& a, Trace<S>& from);
 
-// surfel and pixel [F] are written: whose the fragments of a list are and where.
-struct ListedPlaces {
-  TilePacks layout;
+// Written: surfel and pixel [F] of the fragments of a list.
+struct ListedIds {
+  TileBlocks layout;
   int width, height;
   int64_t total;
   int32_t *surfel, *pixel;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     take(r, "layout", layout);
-    r.number("width", width);
-    r.number("height", height);
+    r.numbers("width", width, "height", height);
     r.rows("surfel", surfel, total, 1);
     r.array("pixel", pixel, total);
     if (layout.fragments != total || !layout.fits(0, width, height)) r.refuse("the layout is not that of such a list");
   }
 };
-void list_places(const ListedPlaces& a);
+void list_ids(const ListedIds& a);
 
-// The layout of the fragments whose keep [F] is not 0. Written: tile_start, pack_start, and as many rows of packs as
-// the last pack_start says.
-struct SelectPacks {
-  TilePacks layout;
+// The layout of the fragments whose keep [F] is not 0. Written: tile_start, block_start, and as many rows of blocks as
+// the last block_start says.
+struct SelectBlocks {
+  TileBlocks layout;
   const uint8_t* keep;
-  int64_t *tile_start, *pack_start;
-  int32_t* packs;
+  int64_t *tile_start, *block_start;
+  int32_t* blocks;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     take(r, "layout", layout);
     r.array("keep", keep, layout.fragments);
-    r.array("tile_start", tile_start, layout.tiles + 1);
-    r.array("pack_start", pack_start, layout.tiles + 1);
-    r.array("packs", packs, 2 * layout.count);
+    r.arrays(layout.tiles + 1, "tile_start", tile_start, "block_start", block_start);
+    r.array("blocks", blocks, 2 * layout.count);
   }
 };
-void select_fragments(const SelectPacks& a);
+void select_fragments(const SelectBlocks& a);
 
-template <class S>
-void trace_backward(const TraceBackward<S, TilePacks>& a);
-template <class S>
-void composite_forward(const CompositeForward<S, TilePacks>& a);
-template <class S>
-void composite_backward(const CompositeBackward<S, TilePacks>& a);
-void masked_counts(const MaskedCounts<TilePacks>& a);
+template <class S> void trace_backward(const TraceBackward<S, TileBlocks>& a);
+template <class S> void composite_forward(const CompositeForward<S, TileBlocks>& a);
+template <class S> void composite_backward(const CompositeBackward<S, TileBlocks>& a);
+void masked_counts(const MaskedCounts<TileBlocks>& a);
 
-template <class S>
-void view_color_forward(const ViewColorForward<S>& a);
-template <class S>
-void view_color_backward(const ViewColorBackward<S>& a);
+template <class S> void view_color_forward(const ViewColorForward<S>& a);
+template <class S> void view_color_backward(const ViewColorBackward<S>& a);
 // Throws std::invalid_argument for a surfel whose terms are not there.
-template <class S>
-void lean_color(const LeanColor<S>& a);
+template <class S> void lean_color(const LeanColor<S>& a);
 
-template <class S>
-void field_forward(const FieldForward<S>& a);
-template <class S>
-void field_backward(const FieldBackward<S>& a);
-template <class S>
-void shade_forward(const ShadeForward<S>& a);
-template <class S>
-void shade_backward(const ShadeBackward<S>& a);
+template <class S> void field_forward(const FieldForward<S>& a);
+template <class S> void field_backward(const FieldBackward<S>& a);
+template <class S> void shade_forward(const ShadeForward<S>& a);
+template <class S> void shade_backward(const ShadeBackward<S>& a);
 
-template <class S>
-void blend_forward(const BlendForward<S, TilePacks>& a);
-template <class S>
-void blend_backward(const BlendBackward<S, TilePacks>& a);
-template <class S>
-void ssim(const Ssim<S>& a);
+template <class S> void blend_forward(const BlendForward<S, TileBlocks>& a);
+template <class S> void blend_backward(const BlendBackward<S, TileBlocks>& a);
+template <class S> void ssim(const Ssim<S>& a);
 
 // An atlas as the renderer reads it: every surfel's tile in one run, row by row. In pages the rows of a tile lie far
 // apart, and each costs a line of the cache and an entry of the page table's.
@@ -200,8 +170,7 @@ void gather_patches(int layers, int height, int width, const uint8_t* bytes, con
                     const int32_t* tiles, Patches& out);
 // The forward-only renderer of a baked scene: image [height, width, channels] is written, overdraw [height, width]
 // int32 or null. `bins` is its working memory.
-template <class S>
-struct BakedForward {
+template <class S> struct BakedForward {
   View<S> view;
   const S* base;  // [n, 3] f_view
   BakedResidual residual;
@@ -212,8 +181,7 @@ struct BakedForward {
   S* image;
   int32_t* overdraw;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     view.fields(r);
     r.array("base", base, 3 * view.n);
     residual.fields(r, view.n);
@@ -229,7 +197,6 @@ struct BakedForward {
     r.maybe("overdraw", overdraw, pixels);
   }
 };
-template <class S>
-void baked_forward(const BakedForward<S>& a);
+template <class S> void baked_forward(const BakedForward<S>& a);
 
 }  // namespace bt

@@ -8,8 +8,7 @@
 namespace bt {
 
 // The mask of the lanes that have a bit in `lanes`.
-template <class M>
-BT_HD M mask_of_lanes(uint32_t lanes) {
+template <class M> BT_HD M mask_of_lanes(uint32_t lanes) {
   if constexpr (is_two<M>) {
     constexpr int n = sizeof(M::low) / sizeof(typename M::Lane);
     return {mask_of_lanes<decltype(M::low)>(lanes), mask_of_lanes<decltype(M::high)>(lanes >> n)};
@@ -21,10 +20,7 @@ BT_HD M mask_of_lanes(uint32_t lanes) {
 }
 
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
-template <>
-BT_HD MaskOfFloats mask_of_lanes(uint32_t lanes) {
-  return {__mmask16(lanes)};
-}
+template <> BT_HD MaskOfFloats mask_of_lanes(uint32_t lanes) { return {__mmask16(lanes)}; }
 BT_HD __mmask16 first_lanes(uint32_t lanes) { return __mmask16((1u << __builtin_popcount(lanes)) - 1u); }
 
 // The lanes named by `lanes`, next to each other; `to` has room for all lanes of `a`.
@@ -50,10 +46,7 @@ BT_HD __m256i mask_of_eight(uint32_t lanes) {
   const __m256i bit = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
   return _mm256_cmpeq_epi32(_mm256_and_si256(_mm256_set1_epi32(int(lanes)), bit), bit);
 }
-template <>
-BT_HD MaskOfFloats mask_of_lanes(uint32_t lanes) {
-  return (MaskOfFloats)mask_of_eight(lanes);
-}
+template <> BT_HD MaskOfFloats mask_of_lanes(uint32_t lanes) { return (MaskOfFloats)mask_of_eight(lanes); }
 BT_HD __m256i first_lanes(uint32_t lanes) { return mask_of_eight((1u << __builtin_popcount(lanes)) - 1u); }
 
 // For every set of eight lanes a byte for each lane: the numbers of those in the set, in order, and back: how many come
@@ -91,14 +84,12 @@ BT_HD void expand_lanes(const float* from, Vector<float>& to, uint32_t lanes) {
 #endif
 
 // fn(lanes of the lower half, of the upper half, how many the lower half has)
-template <class V, class F>
-BT_HD void by_halves(uint32_t lanes, F&& fn) {
+template <class V, class F> BT_HD void by_halves(uint32_t lanes, F&& fn) {
   constexpr int n = sizeof(V::low) / sizeof(typename V::Lane);
   const uint32_t low = lanes & ((1u << n) - 1u);
   fn(low, lanes >> n, __builtin_popcount(low));
 }
-template <class T, class V>
-BT_HD void compress_lanes_only(T* to, const V& a, uint32_t lanes) {
+template <class T, class V> BT_HD void compress_lanes_only(T* to, const V& a, uint32_t lanes) {
   if constexpr (is_two<V>) {
     by_halves<V>(lanes, [&](uint32_t low, uint32_t high, int n) {
       compress_lanes_only(to, a.low, low), compress_lanes_only(to + n, a.high, high);
@@ -107,8 +98,7 @@ BT_HD void compress_lanes_only(T* to, const V& a, uint32_t lanes) {
     for (uint32_t k = lanes; k; k &= k - 1) *to++ = a[__builtin_ctz(k)];
   }
 }
-template <class T, class V>
-BT_HD void compress_lanes(T* to, const V& a, uint32_t lanes) {
+template <class T, class V> BT_HD void compress_lanes(T* to, const V& a, uint32_t lanes) {
   if constexpr (is_two<V>)
     by_halves<V>(lanes, [&](uint32_t low, uint32_t high, int n) {
       compress_lanes(to, a.low, low), compress_lanes(to + n, a.high, high);
@@ -116,8 +106,7 @@ BT_HD void compress_lanes(T* to, const V& a, uint32_t lanes) {
   else
     compress_lanes_only(to, a, lanes);
 }
-template <class T, class V>
-BT_HD void expand_lanes(const T* from, V& to, uint32_t lanes) {
+template <class T, class V> BT_HD void expand_lanes(const T* from, V& to, uint32_t lanes) {
   if constexpr (is_two<V>) {
     by_halves<V>(lanes, [&](uint32_t low, uint32_t high, int n) {
       expand_lanes(from, to.low, low), expand_lanes(from + n, to.high, high);

@@ -1,15 +1,14 @@
-// The texels under fragments of one surfel: their places for many fragments at a time, their colours as vectors of
+// The texels under fragments of one surfel: their positions for many fragments at a time, their colours as vectors of
 // four.
 #pragma once
 
-#include "cpu/packs.h"
+#include "cpu/blocks.h"
 #include "ops/texel.h"
 
 namespace bt {
 
 // A colour and a fourth number, with the functions that core/ expects of a real.
-template <class S>
-struct Four {
+template <class S> struct Four {
   Quad<S> v;
   Four() = default;
   BT_HD Four(const Quad<S>& value) : v(value) {}
@@ -24,38 +23,23 @@ struct Four {
   }
   BT_HD void store(S* p) const { std::memcpy(p, &v, sizeof v); }
 };
-template <class S>
-BT_HD Four<S> operator+(Four<S> a, Four<S> b) {
-  return a.v + b.v;
-}
-template <class S>
-BT_HD Four<S> operator-(Four<S> a, Four<S> b) {
-  return a.v - b.v;
-}
-template <class S>
-BT_HD Four<S> operator*(S k, Four<S> a) {
-  return k * a.v;
-}
-template <class S>
-BT_HD auto operator<(Four<S> a, Four<S> b) {
-  return a.v < b.v;
-}
-template <class S>
-BT_HD Four<S> select(decltype(Quad<S>{} > Quad<S>{}) m, Four<S> yes, Four<S> no) {
+template <class S> BT_HD Four<S> operator+(Four<S> a, Four<S> b) { return a.v + b.v; }
+template <class S> BT_HD Four<S> operator-(Four<S> a, Four<S> b) { return a.v - b.v; }
+template <class S> BT_HD Four<S> operator*(S k, Four<S> a) { return k * a.v; }
+template <class S> BT_HD auto operator<(Four<S> a, Four<S> b) { return a.v < b.v; }
+template <class S> BT_HD Four<S> select(decltype(Quad<S>{} > Quad<S>{}) m, Four<S> yes, Four<S> no) {
   return m ? yes.v : no.v;
 }
-template <class S>
-BT_HD S dot(Four<S> a, Four<S> b) {
+template <class S> BT_HD S dot(Four<S> a, Four<S> b) {
   const Quad<S> p = a.v * b.v;
   return (p[0] + p[2]) + (p[1] + p[3]);
 }
 
-// Up to so many fragments: those of a surfel in the packs of a tile.
-constexpr int kFew = kPacks * kLanes;
+// Up to so many fragments: those of a surfel in the blocks of a tile.
+constexpr int kFew = kBlocks * kLanes;
 
 // Two texels side by side: their six numbers, or one's, and 0.
-template <class S>
-BT_HD Oct<S> load_two(const S* p, bool both) {
+template <class S> BT_HD Oct<S> load_two(const S* p, bool both) {
 #if defined(__AVX2__)
   if constexpr (std::is_same_v<S, float>) {
     const int right = both ? -1 : 0;
@@ -68,8 +52,7 @@ BT_HD Oct<S> load_two(const S* p, bool both) {
 }
 
 // Up to kFew fragments of a surfel that has texels.
-template <class S>
-class PatchFragments {
+template <class S> class PatchFragments {
  public:
   BT_HD explicit PatchFragments(const TexelPatch<S>& of)
       : of_(of),
@@ -77,15 +60,15 @@ class PatchFragments {
         per_u_(texel_density(of.size[0], of.extent)),
         per_v_(texel_density(of.size[1], of.extent)) {}
 
-  // Looks where the fragments of a pack lie, which are numbered from j on by lane.
-  BT_HD void look(int j, Pack<S> u, Pack<S> v) {
-    const TexelAxis<Pack<S>> x = texel_axis(u, of_.size[0], of_.extent), y = texel_axis(v, of_.size[1], of_.extent);
-    store_integers(first_ + j, y.first * Pack<S>(S(of_.size[0])) + x.first);
+  // Computes the texel positions of a block's fragments, numbered from j on by lane.
+  BT_HD void locate(int j, Lanes<S> u, Lanes<S> v) {
+    const TexelAxis<Lanes<S>> x = texel_axis(u, of_.size[0], of_.extent), y = texel_axis(v, of_.size[1], of_.extent);
+    store_integers(first_ + j, y.first * Lanes<S>(S(of_.size[0])) + x.first);
     store(fx_ + j, x.fraction), store(fy_ + j, y.fraction);
     inside_u_[j / kLanes] = bits(x.inside), inside_v_[j / kLanes] = bits(y.inside);
   }
-  // Asks for the texels of fragment j.
-  BT_HD void ask(int j) const {
+  // Prefetches the texels of fragment j.
+  BT_HD void prefetch(int j) const {
     const S* t = of_.tile + 3 * int64_t(first_[j]);
     __builtin_prefetch(t), __builtin_prefetch(t + 3 * next_.down);
   }
@@ -108,7 +91,7 @@ class PatchFragments {
     add(above - right, at), add(right, at + across);
     add(below - below_right, at + down), add(below_right, at + down + across);
   }
-  // Its texels, each beside a number that counts for nothing; of one column what would be to its right is 0.
+  // Its texels, each beside an unused number; of one column what would be to its right is 0.
   BT_HD void texels(int j, Four<S>* to) const {
     const S* t = of_.tile + 3 * int64_t(first_[j]);
     const Oct<S> above = load_two(t, next_.right), below = load_two(t + 3 * next_.down, next_.right);

@@ -1,9 +1,9 @@
-// Projection of all surfels, and the number of threads.
+// Projection of all surfels; the number of threads.
 #include <numeric>
 
 #include "core/visibility.h"
 #include "cpu/kernels.h"
-#include "cpu/pack_extent.h"
+#include "cpu/simd.h"
 #include "cpu/threads.h"
 
 namespace bt {
@@ -23,11 +23,11 @@ int num_threads() {
 void set_num_threads(int n) { g_threads = n; }
 
 namespace {
-using P = Pack<float>;
+using P = Lanes<float>;
 constexpr int kSurfelColumns = 11;
 
 // Surfels begin to begin + n, n <= kLanes; the last one stands for those that are missing.
-SurfelRow<P> surfel_pack(const Surfels<float>& in, int64_t begin, int n) {
+SurfelRow<P> surfel_lanes(const Surfels<float>& in, int64_t begin, int n) {
   float columns[kSurfelColumns][kLanes];
   for (int lane = 0; lane < kLanes; ++lane) {
     const int64_t i = begin + std::min(lane, n - 1);
@@ -47,28 +47,27 @@ Sight<P> sight(const Pinhole<float>& cam, int width, int height, const SurfelRow
   Sight<P> s;
   s.projected = project<Kernel>(cam, in, near, s.geom, s.frame);
   if constexpr (Kernel::kResized) s.projected = s.projected & resize(to, s.geom);
-  const PackExtent e = pack_extent<Kernel>(s.geom, width, height, double(to.sharp));
+  const LevelExtent<P> e = level_extent<Kernel>(s.geom, width, height, double(to.sharp), kFloatRoom);
   find_seen(e.level.visible, e.conic, width, height, s);
   return s;
 }
 
-// Rows of lanes from columns of packs, 0 where they are not seen.
-template <int columns>
-void store_rows(const P* from, uint32_t seen, int n, float* to) {
+// Rows of lanes from columns of lanes, 0 where they are not seen.
+template <int columns> void store_rows(const P* from, uint32_t seen, int n, float* to) {
   float all[columns][kLanes];
   for (int k = 0; k < columns; ++k) store(all[k], from[k]);
   for (int lane = 0; lane < n; ++lane)
     for (int k = 0; k < columns; ++k) to[lane * columns + k] = seen >> lane & 1 ? all[k][lane] : 0.0f;
 }
 
-// How many of the surfels are not finite.
+// Returns the number of surfels that are not finite.
 template <class Kernel>
-int64_t project_packs(const Pinhole<float>& cam, const ProjectForward<float>& a, const Resize<float>& to, int64_t begin,
+int64_t project_lanes(const Pinhole<float>& cam, const ProjectForward<float>& a, const Resize<float>& to, int64_t begin,
                       int64_t end) {
   int64_t broken = 0;
   for (int64_t i = begin; i < end; i += kLanes) {
     const int n = int(std::min<int64_t>(kLanes, end - i));
-    const Sight<P> s = sight<Kernel>(cam, a.width, a.height, surfel_pack(a.surfels, i, n), a.near, to);
+    const Sight<P> s = sight<Kernel>(cam, a.width, a.height, surfel_lanes(a.surfels, i, n), a.near, to);
     const uint32_t seen = bits(s.seen), projected = bits(s.projected);
     store_rows<kGeom>(s.geom, seen, n, a.geom + i * kGeom);
     store_rows<kFrame>(s.frame, seen, n, a.frames + i * kFrame);
@@ -79,16 +78,15 @@ int64_t project_packs(const Pinhole<float>& cam, const ProjectForward<float>& a,
 }
 }  // namespace
 
-template <class S>
-void project_forward(const ProjectForward<S>& a) {
+template <class S> void project_forward(const ProjectForward<S>& a) {
   const Pinhole<S> cam = pinhole(a.viewmat, a.K);
   std::vector<int64_t> broken(num_threads(), 0);
   const Resize<S> to{a.photo_pixel};
-  with_kernel(a.through_pixel, float(a.photo_pixel), [&](auto kernel) {
+  with_kernel(a.prefilter, float(a.photo_pixel), [&](auto kernel) {
     parallel_parts(a.surfels.n, 1024, [&](int thread, int64_t begin, int64_t end) {
       using Kernel = decltype(kernel);
       if constexpr (std::is_same_v<S, float> && !Kernel::kPixel)
-        broken[thread] += project_packs<Kernel>(cam, a, to, begin, end);
+        broken[thread] += project_lanes<Kernel>(cam, a, to, begin, end);
       else
         for (int64_t i = begin; i < end; ++i)
           broken[thread] +=
@@ -98,8 +96,7 @@ void project_forward(const ProjectForward<S>& a) {
   *a.broken += int32_t(std::accumulate(broken.begin(), broken.end(), int64_t(0)));
 }
 
-template <class S>
-void project_backward(const ProjectBackward<S>& a) {
+template <class S> void project_backward(const ProjectBackward<S>& a) {
   const Pinhole<S> cam = pinhole(a.viewmat, a.K);
   parallel_parts(a.surfels.n, 1024, [&](int, int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i)

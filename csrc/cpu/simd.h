@@ -1,4 +1,4 @@
-// Packs of 16 lanes on the compiler's vector extensions, with the functions that core/ expects of a real.
+// 16 lanes on the compiler's vector extensions, with the functions that core/ expects of a real.
 #pragma once
 
 #include <cstring>
@@ -12,125 +12,83 @@
 
 namespace bt {
 
-template <class S>
-struct Pack;
+template <class S> struct Lanes;
 
 // Spelt out for each scalar: the compiler drops the vector attribute of a dependent type.
-template <class S>
-struct LaneTypes;
-template <>
-struct LaneTypes<float> {
+template <class S> struct LaneTypes;
+template <> struct LaneTypes<float> {
   using M = decltype(above(Wide<float>{}, Wide<float>{}));
   using I = Wide<int32_t>;
   using U = Wide<uint32_t>;
   typedef float O __attribute__((vector_size(32)));
   typedef float Q __attribute__((vector_size(16)));
 };
-template <>
-struct LaneTypes<double> {
+template <> struct LaneTypes<double> {
   using M = decltype(above(Wide<double>{}, Wide<double>{}));
   using I = Wide<int64_t>;
   using U = Wide<uint64_t>;
   typedef double O __attribute__((vector_size(64)));
   typedef double Q __attribute__((vector_size(32)));
 };
-template <class S>
-using Quad = typename LaneTypes<S>::Q;  // four lanes: a table entry
-template <class S>
-using Oct = typename LaneTypes<S>::O;  // eight
+template <class S> using Quad = typename LaneTypes<S>::Q;  // four lanes: a table entry
+template <class S> using Oct = typename LaneTypes<S>::O;   // eight
 
-template <class S>
-struct IndexOf<Pack<S>> {
+template <class S> struct IndexOf<Lanes<S>> {
   using type = typename LaneTypes<S>::U;
 };
 
-template <class S>
-struct Pack {
+template <class S> struct Lanes {
   using V = Wide<S>;
   using M = typename LaneTypes<S>::M;  // a mask
   using I = typename LaneTypes<S>::I;  // whole numbers
   V v;
-  Pack() = default;
-  BT_HD Pack(const V& value) : v(value) {}
-  BT_HD explicit Pack(S value) : v(all_lanes<V>(value)) {}
+  Lanes() = default;
+  BT_HD Lanes(const V& value) : v(value) {}
+  BT_HD explicit Lanes(S value) : v(all_lanes<V>(value)) {}
   template <class F, class = std::enable_if_t<std::is_floating_point_v<F> && !std::is_same_v<F, S>>>
-  BT_HD explicit Pack(F value) : Pack(S(value)) {}
+  BT_HD explicit Lanes(F value) : Lanes(S(value)) {}
   BT_HD S operator[](int i) const { return v[i]; }
   BT_HD void set(int i, S value) { set_lane(v, i, value); }
 };
 
-template <class S>
-BT_HD Pack<S> operator+(Pack<S> a, Pack<S> b) {
-  return a.v + b.v;
-}
-template <class S>
-BT_HD Pack<S> operator-(Pack<S> a, Pack<S> b) {
-  return a.v - b.v;
-}
-template <class S>
-BT_HD Pack<S> operator-(Pack<S> a) {
-  return -a.v;
-}
-template <class S>
-BT_HD Pack<S> operator*(Pack<S> a, Pack<S> b) {
-  return a.v * b.v;
-}
-template <class S>
-BT_HD Pack<S> operator/(Pack<S> a, Pack<S> b) {
-  return a.v / b.v;
-}
-template <class S>
-BT_HD Pack<S>& operator+=(Pack<S>& a, Pack<S> b) {
+template <class S> BT_HD Lanes<S> operator+(Lanes<S> a, Lanes<S> b) { return a.v + b.v; }
+template <class S> BT_HD Lanes<S> operator-(Lanes<S> a, Lanes<S> b) { return a.v - b.v; }
+template <class S> BT_HD Lanes<S> operator-(Lanes<S> a) { return -a.v; }
+template <class S> BT_HD Lanes<S> operator*(Lanes<S> a, Lanes<S> b) { return a.v * b.v; }
+template <class S> BT_HD Lanes<S> operator/(Lanes<S> a, Lanes<S> b) { return a.v / b.v; }
+template <class S> BT_HD Lanes<S>& operator+=(Lanes<S>& a, Lanes<S> b) {
   a.v = a.v + b.v;
   return a;
 }
-template <class S>
-BT_HD Pack<S>& operator-=(Pack<S>& a, Pack<S> b) {
+template <class S> BT_HD Lanes<S>& operator-=(Lanes<S>& a, Lanes<S> b) {
   a.v = a.v - b.v;
   return a;
 }
 // Comparisons give masks, which combine with & | ~.
-template <class S>
-BT_HD typename Pack<S>::M operator>(Pack<S> a, Pack<S> b) {
-  return above(a.v, b.v);
-}
-template <class S>
-BT_HD typename Pack<S>::M operator<(Pack<S> a, Pack<S> b) {
-  return above(b.v, a.v);
-}
-template <class S>
-BT_HD typename Pack<S>::M operator>=(Pack<S> a, Pack<S> b) {
-  return at_least(a.v, b.v);
-}
+template <class S> BT_HD typename Lanes<S>::M operator>(Lanes<S> a, Lanes<S> b) { return above(a.v, b.v); }
+template <class S> BT_HD typename Lanes<S>::M operator<(Lanes<S> a, Lanes<S> b) { return above(b.v, a.v); }
+template <class S> BT_HD typename Lanes<S>::M operator>=(Lanes<S> a, Lanes<S> b) { return at_least(a.v, b.v); }
 BT_HD LaneTypes<float>::M not_(const LaneTypes<float>::M& m) { return ~m; }
 BT_HD LaneTypes<double>::M not_(const LaneTypes<double>::M& m) { return ~m; }
 BT_HD bool any_(const LaneTypes<float>::M& m) { return bits(m) != 0; }
 BT_HD bool any_(const LaneTypes<double>::M& m) { return bits(m) != 0; }
-template <class S>
-BT_HD Pack<S> select(typename Pack<S>::M m, Pack<S> yes, Pack<S> no) {
+template <class S> BT_HD Lanes<S> select(typename Lanes<S>::M m, Lanes<S> yes, Lanes<S> no) {
   return choose(m, yes.v, no.v);
 }
-template <class S>
-BT_HD Pack<S> max_(Pack<S> a, Pack<S> b) {
-  return larger(a.v, b.v);
-}
-template <class S>
-BT_HD Pack<S> min_(Pack<S> a, Pack<S> b) {
-  return smaller(a.v, b.v);
-}
+template <class S> BT_HD Lanes<S> max_(Lanes<S> a, Lanes<S> b) { return larger(a.v, b.v); }
+template <class S> BT_HD Lanes<S> min_(Lanes<S> a, Lanes<S> b) { return smaller(a.v, b.v); }
 
-template <class S>
-BT_HD Pack<S> relu(Pack<S> a) {
-  return larger(Pack<S>(S(0)).v, a.v);  // NaN stays NaN
+template <class S> BT_HD Lanes<S> relu(Lanes<S> a) {
+  return larger(Lanes<S>(S(0)).v, a.v);  // NaN stays NaN
 }
 
 // exp and log of floats, below 2 ulp over the normal range: Cody-Waite reduction and a minimax polynomial in pairs, so
 // that few operations wait for one another.
-BT_HD Pack<float> exp_(Pack<float> x) {
-  using V = Pack<float>::V;
-  using I = Pack<float>::I;
-  V a = min_(max_(x, Pack<float>(-87.0f)), Pack<float>(88.0f)).v;
-  const V magic = Pack<float>(12582912.0f).v;  // 1.5 * 2^23: adding it rounds to an integer
+BT_HD Lanes<float> exp_(Lanes<float> x) {
+  using V = Lanes<float>::V;
+  using I = Lanes<float>::I;
+  V a = min_(max_(x, Lanes<float>(-87.0f)), Lanes<float>(88.0f)).v;
+  const V magic = Lanes<float>(12582912.0f).v;  // 1.5 * 2^23: adding it rounds to an integer
   const V n = (a * 1.44269504f + magic) - magic;
   const V f = (a - n * 0.693145752f) - n * 1.42860677e-6f, f2 = f * f;
   // exp(f) = 1 + f + f^2 q
@@ -139,9 +97,9 @@ BT_HD Pack<float> exp_(Pack<float> x) {
   const V two_n = same_bits<V>((convert<I>(n) + 127) << 23);
   return choose(x.v < -87.0f, V{}, p * two_n);
 }
-BT_HD Pack<float> log_(Pack<float> x) {
-  using V = Pack<float>::V;
-  using I = Pack<float>::I;
+BT_HD Lanes<float> log_(Lanes<float> x) {
+  using V = Lanes<float>::V;
+  using I = Lanes<float>::I;
   const I bits = same_bits<I>(x.v);
   // mantissa in [sqrt(1/2), sqrt(2)), so that the logarithm keeps its relative accuracy near 1
   const I shifted = bits - 0x3f3504f3;
@@ -166,16 +124,16 @@ alignas(64) inline constexpr float kInverse[16] = {
 alignas(64) inline constexpr float kLogarithm[16] = {
     0.0443940759f, 0.129283011f, 0.209453329f, 0.285402209f, 0.357552052f, 0.426264763f, 0.491853058f, 0.554588914f,
     0.614709854f,  0.67242527f,  0.727920413f, 0.781359732f, 0.832889974f, 0.882643044f, 0.930737436f, 0.977279842f};
-BT_HD Pack<float> power_(Pack<float> x, Pack<float> y) {
+BT_HD Lanes<float> power_(Lanes<float> x, Lanes<float> y) {
   constexpr __mmask16 kAll = 0xffff;
-  using V = Pack<float>::V;
+  using V = Lanes<float>::V;
   const __m512 m = _mm512_maskz_getmant_ps(kAll, (__m512)x.v, _MM_MANT_NORM_1_2, _MM_MANT_SIGN_src);
   const __m512i part = _mm512_maskz_srli_epi32(kAll, (__m512i)m, 19);  // of which four bits count below
   const V c = (V)_mm512_maskz_permutexvar_ps(kAll, part, _mm512_load_ps(kInverse));
   const V l = (V)_mm512_maskz_permutexvar_ps(kAll, part, _mm512_load_ps(kLogarithm));
   const V r = (V)m * c - 1.0f;
   const V q = (0.481303573f * r - 0.721644163f) * r + 1.4426949f;
-  const V a = larger(y.v * ((V)_mm512_maskz_getexp_ps(kAll, (__m512)x.v) + (r * q + l)), Pack<float>(-126.0f).v);
+  const V a = larger(y.v * ((V)_mm512_maskz_getexp_ps(kAll, (__m512)x.v) + (r * q + l)), Lanes<float>(-126.0f).v);
   const V n = (V)_mm512_maskz_roundscale_ps(kAll, (__m512)a, _MM_FROUND_TO_NEAREST_INT);
   const V f = a - n, f2 = f * f;
   const V p = (0.693147004f + 0.240222424f * f) + f2 * ((5.55073358e-2f + 9.67151299e-3f * f) + f2 * 1.32647273e-3f);
@@ -183,8 +141,7 @@ BT_HD Pack<float> power_(Pack<float> x, Pack<float> y) {
 }
 #else
 // Half by half: both at once would not fit the registers.
-template <class V>
-BT_HD V power_of(const V& x, const V& y) {
+template <class V> BT_HD V power_of(const V& x, const V& y) {
   if constexpr (is_two<V>) {
     return {power_of(x.low, y.low), power_of(x.high, y.high)};
   } else {
@@ -201,90 +158,64 @@ BT_HD V power_of(const V& x, const V& y) {
     return same_bits<V>(same_bits<I>(f * p + 1.0f) + (same_bits<I>(moved) << 23));
   }
 }
-BT_HD Pack<float> power_(Pack<float> x, Pack<float> y) { return power_of(x.v, y.v); }
+BT_HD Lanes<float> power_(Lanes<float> x, Lanes<float> y) { return power_of(x.v, y.v); }
 #endif
-BT_HD Pack<double> exp_(Pack<double> x) {
-  Pack<double> r;
+BT_HD Lanes<double> exp_(Lanes<double> x) {
+  Lanes<double> r;
   for (int i = 0; i < kLanes; ++i) r.set(i, std::exp(x[i]));
   return r;
 }
-BT_HD Pack<double> log_(Pack<double> x) {
-  Pack<double> r;
+BT_HD Lanes<double> log_(Lanes<double> x) {
+  Lanes<double> r;
   for (int i = 0; i < kLanes; ++i) r.set(i, std::log(x[i]));
   return r;
 }
 
-BT_HD Pack<double> widened(Pack<float> a) { return all_widened(a.v); }
-BT_HD Pack<double> widened(Pack<double> a) { return a; }
-template <class T>
-BT_HD T narrowed(Pack<double> a) {
-  if constexpr (std::is_same_v<T, Pack<float>>)
+BT_HD Lanes<double> widened(Lanes<float> a) { return all_widened(a.v); }
+BT_HD Lanes<double> widened(Lanes<double> a) { return a; }
+template <class T> BT_HD T narrowed(Lanes<double> a) {
+  if constexpr (std::is_same_v<T, Lanes<float>>)
     return all_narrowed(a.v);
   else
     return a;
 }
-template <class S>
-BT_HD typename Pack<S>::M finite_(Pack<S> a) {
-  return abs_(a) < Pack<S>(std::numeric_limits<S>::infinity());  // not for NaN
+template <class S> BT_HD typename Lanes<S>::M finite_(Lanes<S> a) {
+  return abs_(a) < Lanes<S>(std::numeric_limits<S>::infinity());  // not for NaN
 }
 
 // Some lanes: their mask, and to and from memory, next to each other (cpu/lanes.h).
-template <class S>
-BT_HD typename Pack<S>::M mask_of(uint32_t lanes) {
-  return mask_of_lanes<typename Pack<S>::M>(lanes);
+template <class S> BT_HD typename Lanes<S>::M mask_of(uint32_t lanes) {
+  return mask_of_lanes<typename Lanes<S>::M>(lanes);
 }
-template <class S>
-BT_HD void compress(S* to, Pack<S> a, uint32_t lanes) {
-  compress_lanes(to, a.v, lanes);
-}
+template <class S> BT_HD void compress(S* to, Lanes<S> a, uint32_t lanes) { compress_lanes(to, a.v, lanes); }
 BT_HD void compress(int32_t* to, const Wide<int32_t>& a, uint32_t lanes) { compress_lanes(to, a, lanes); }
-template <class S>
-BT_HD void compress_only(S* to, Pack<S> a, uint32_t lanes) {
-  compress_lanes_only(to, a.v, lanes);
-}
+template <class S> BT_HD void compress_only(S* to, Lanes<S> a, uint32_t lanes) { compress_lanes_only(to, a.v, lanes); }
 BT_HD void compress_only(int32_t* to, const Wide<int32_t>& a, uint32_t lanes) { compress_lanes_only(to, a, lanes); }
 // The same where what lies up to `end` is written later: a masked store costs AMD's processors dozens of operations.
-template <class T, class V>
-BT_HD void compress_until(T* end, T* to, const V& a, uint32_t lanes) {
+template <class T, class V> BT_HD void compress_until(T* end, T* to, const V& a, uint32_t lanes) {
   end - to >= kLanes ? compress(to, a, lanes) : compress_only(to, a, lanes);
 }
-template <class S>
-BT_HD Pack<S> expand(const S* from, uint32_t lanes) {
-  Pack<S> r;
+template <class S> BT_HD Lanes<S> expand(const S* from, uint32_t lanes) {
+  Lanes<S> r;
   expand_lanes(from, r.v, lanes);
   return r;
 }
 
-template <class S>
-BT_HD Pack<S> load(const S* p) {
-  return load_vector<typename Pack<S>::V>(p);
-}
-template <class S>
-BT_HD void store(S* p, Pack<S> a) {
-  store_vector(p, a.v);
-}
-template <class S>
-BT_HD Pack<S> sqrt_(Pack<S> a) {
-  return square_root(a.v);
-}
-template <class S>
-BT_HD Pack<S> floor_(Pack<S> a) {
-  return round_down(a.v);
-}
-template <class S>
-BT_HD typename IndexOf<Pack<S>>::type to_index(Pack<S> a) {
-  return same_bits<typename IndexOf<Pack<S>>::type>(convert<typename Pack<S>::I>(a.v));
+template <class S> BT_HD Lanes<S> load(const S* p) { return load_vector<typename Lanes<S>::V>(p); }
+template <class S> BT_HD void store(S* p, Lanes<S> a) { store_vector(p, a.v); }
+template <class S> BT_HD Lanes<S> sqrt_(Lanes<S> a) { return square_root(a.v); }
+template <class S> BT_HD Lanes<S> floor_(Lanes<S> a) { return round_down(a.v); }
+template <class S> BT_HD typename IndexOf<Lanes<S>>::type to_index(Lanes<S> a) {
+  return same_bits<typename IndexOf<Lanes<S>>::type>(convert<typename Lanes<S>::I>(a.v));
 }
 // Lanes of integers below 2^24, and such lanes as integers.
-template <class S>
-BT_HD Pack<S> from_integers(const Wide<uint32_t>& a) {
+template <class S> BT_HD Lanes<S> from_integers(const Wide<uint32_t>& a) {
   if constexpr (std::is_same_v<S, float>) return convert<Wide<float>>(same_bits<Wide<int32_t>>(a));
-  Pack<S> r;
+  Lanes<S> r;
   for (int i = 0; i < kLanes; ++i) r.set(i, S(a[i]));
   return r;
 }
-template <class S>
-BT_HD void store_integers(int32_t* to, Pack<S> a) {
+template <class S> BT_HD void store_integers(int32_t* to, Lanes<S> a) {
   const auto whole = to_index(a);
   if constexpr (std::is_same_v<S, float>)
     std::memcpy(to, &whole, sizeof whole);
@@ -292,8 +223,7 @@ BT_HD void store_integers(int32_t* to, Pack<S> a) {
     for (int i = 0; i < kLanes; ++i) to[i] = int32_t(whole[i]);
 }
 // Half of a vector: the lower one (0) or the upper one (1). GCC has the shuffle from version 12 on.
-template <int which, class Half, class V>
-BT_HD Half half(V v) {
+template <int which, class Half, class V> BT_HD Half half(V v) {
   static_assert(sizeof(V) == 2 * sizeof(Half));
 #if __has_builtin(__builtin_shufflevector)
   constexpr int n = sizeof(Half) / sizeof(v[0]), i = which * n;
@@ -308,8 +238,7 @@ BT_HD Half half(V v) {
 #endif
 }
 // Lanes 3 to 6 of eight.
-template <class S>
-BT_HD Quad<S> from_third(Oct<S> v) {
+template <class S> BT_HD Quad<S> from_third(Oct<S> v) {
 #if __has_builtin(__builtin_shufflevector)
   return __builtin_shufflevector(v, v, 3, 4, 5, 6);
 #else
@@ -317,8 +246,7 @@ BT_HD Quad<S> from_third(Oct<S> v) {
 #endif
 }
 // The lanes added to four: halves to halves.
-template <class S, class V>
-BT_HD Quad<S> folded(const V& v) {
+template <class S, class V> BT_HD Quad<S> folded(const V& v) {
   if constexpr (std::is_same_v<V, Quad<S>>)
     return v;
   else if constexpr (is_two<V>)
@@ -328,8 +256,7 @@ BT_HD Quad<S> folded(const V& v) {
   else
     return folded<S>(half<0, Oct<S>>(v) + half<1, Oct<S>>(v));
 }
-template <class S>
-BT_HD S sum(Pack<S> a) {
+template <class S> BT_HD S sum(Lanes<S> a) {
   const Quad<S> q = folded<S>(a.v);
   return (q[0] + q[2]) + (q[1] + q[3]);
 }

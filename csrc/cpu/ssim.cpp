@@ -11,11 +11,10 @@ namespace {
 constexpr int kTaps = kSsimTaps;
 constexpr int kMoments = 5, kSlopes = 3;  // means of a window, and derivatives towards three of them
 
-inline int whole_packs(int n) { return (n + kLanes - 1) / kLanes * kLanes; }
+inline int whole_vectors(int n) { return (n + kLanes - 1) / kLanes * kLanes; }
 
 // Rows of numbers, the last kTaps of them, each of some columns; rows that were never written are 0.
-template <class S>
-class LastRows {
+template <class S> class LastRows {
  public:
   LastRows(int columns, int length)
       : columns_(columns), length_(length), numbers_(size_t(kTaps) * columns * length, S(0)) {}
@@ -29,10 +28,9 @@ class LastRows {
   std::vector<S> numbers_;
 };
 
-// What a thread works with: of rows `from` to `to` the windows that begin there, and the gradient.
-template <class S>
-class Band {
-  using P = Pack<S>;
+// Working memory of a thread: of rows `from` to `to` the windows that begin there, and the gradient.
+template <class S> class Band {
+  using P = Lanes<S>;
 
  public:
   explicit Band(const Ssim<S>& images)
@@ -43,13 +41,13 @@ class Band {
         line_(images.width * images.channels),
         rows_(images.height - kTaps + 1),
         n_((images.width - kTaps + 1) * images.channels),
-        length_(whole_packs(n_)),
+        length_(whole_vectors(n_)),
         pad_((kTaps - 1) * images.channels),
         share_(S(1) / (S(rows_) * S(n_))),
         products_(kMoments * (length_ + pad_), S(0)),
         moments_(kMoments, length_),
         slopes_(kSlopes, length_),
-        wide_(kSlopes * (whole_packs(line_) + pad_), S(0)) {
+        wide_(kSlopes * (whole_vectors(line_) + pad_), S(0)) {
     const SsimWindow<S> window;
     for (int t = 0; t < kTaps; ++t) k_[t] = P(window.k[t]);
   }
@@ -113,7 +111,7 @@ class Band {
 
   // The transpose of the filter: first down the columns, then along the row.
   void gradient_row(int64_t y) {
-    const int stride = whole_packs(line_) + pad_;
+    const int stride = whole_vectors(line_) + pad_;
     for (int j = 0; j < kSlopes; ++j)
       for (int x = 0; x < length_; x += kLanes) {
         P m = k_[0] * load(slopes_.row(y, j) + x);
@@ -152,8 +150,7 @@ class Band {
   std::vector<S> wide_;
 };
 
-template <class S>
-S mean_ssim(const Ssim<S>& images) {
+template <class S> S mean_ssim(const Ssim<S>& images) {
   const int height = images.height, rows = height - kTaps + 1, columns = images.width - kTaps + 1;
   if (images.da) std::fill_n(images.da, int64_t(height) * images.width * images.channels, S(0));
   if (rows < 1 || columns < 1 || images.channels < 1) return S(1);
@@ -167,10 +164,7 @@ S mean_ssim(const Ssim<S>& images) {
 
 }  // namespace
 
-template <class S>
-void ssim(const Ssim<S>& a) {
-  *a.value = mean_ssim(a);
-}
+template <class S> void ssim(const Ssim<S>& a) { *a.value = mean_ssim(a); }
 
 template void ssim(const Ssim<float>&);
 template void ssim(const Ssim<double>&);

@@ -1,4 +1,4 @@
-// How OpenMP's threads wait.
+// Waiting of OpenMP's threads.
 #include "cpu/threads.h"
 
 #if defined(_OPENMP)

@@ -20,14 +20,13 @@ int num_threads();
 void wait_without_spinning();
 
 // fn(thread, begin, end) over n items in equal, fixed parts.
-template <class F>
-void parallel_parts(int64_t n, int64_t least, F&& fn) {
+template <class F> void parallel_parts(int64_t n, int64_t least, F&& fn) {
   const int parts = int(std::max<int64_t>(1, std::min<int64_t>(num_threads(), n / std::max<int64_t>(least, 1))));
 #pragma omp parallel for num_threads(parts) schedule(static, 1)
   for (int t = 0; t < parts; ++t) fn(t, n * t / parts, n * (t + 1) / parts);
 }
 
-// Boundaries that cut items of given running cost (start[i+1] - start[i]) into `parts` of about equal cost. They depend
+// Boundaries that cut items of running cost (start[i+1] - start[i]) into `parts` of about equal cost. They depend
 // on the input alone, so that sums over the parts come out the same however the threads are scheduled.
 inline std::vector<int64_t> balanced_parts(const int64_t* start, int64_t items, int parts) {
   std::vector<int64_t> cut(parts + 1, items);
@@ -41,8 +40,7 @@ inline std::vector<int64_t> balanced_parts(const int64_t* start, int64_t items, 
 }
 
 // fn(thread, begin, end) over tiles, balanced by their fragments.
-template <class F>
-int parallel_tiles(const int64_t* tile_start, int64_t tiles, int most, F&& fn) {
+template <class F> int parallel_tiles(const int64_t* tile_start, int64_t tiles, int most, F&& fn) {
   const int parts = int(std::max<int64_t>(1, std::min<int64_t>(std::min(num_threads(), most), tiles)));
   const std::vector<int64_t> cut = balanced_parts(tile_start, tiles, parts);
 #pragma omp parallel for num_threads(parts) schedule(static, 1)
@@ -63,19 +61,19 @@ class Team {
       turn_.fetch_add(1, std::memory_order_release);
       return;
     }
-    for (int looks = 0; turn_.load(std::memory_order_acquire) == turn; ++looks)
-      if (looks < kLooks)
+    for (int spins = 0; turn_.load(std::memory_order_acquire) == turn; ++spins)
+      if (spins < kSpins)
         pause();
-      else if (looks < 2 * kLooks)
+      else if (spins < 2 * kSpins)
         std::this_thread::yield();
       else
         std::this_thread::sleep_for(std::chrono::microseconds(20));
   }
-  // Where the next `count` of the phase's items begin.
+  // Takes the next `count` of the phase's items; returns the first.
   int64_t take(int64_t count) { return taken_.fetch_add(count, std::memory_order_relaxed); }
 
  private:
-  static constexpr int kLooks = 2000;  // some tens of microseconds
+  static constexpr int kSpins = 2000;  // some tens of microseconds
   static void pause() {
 #if defined(__x86_64__) || defined(__i386__)
     __builtin_ia32_pause();
@@ -93,14 +91,12 @@ struct Member {
   // The end of a phase: what the others wrote in it is there.
   void meet() const { team.meet(size); }
   // fn(begin, end) over n items, `step` at a time, by whoever comes first. Once in a phase.
-  template <class F>
-  void each(int64_t n, int64_t step, F&& fn) const {
+  template <class F> void each(int64_t n, int64_t step, F&& fn) const {
     for (int64_t begin; (begin = team.take(step)) < n;) fn(begin, std::min(begin + step, n));
   }
 };
 // fn(member) by every thread.
-template <class F>
-void run_together(F&& fn) {
+template <class F> void run_together(F&& fn) {
   Team team;
 #if defined(_OPENMP)
 #pragma omp parallel num_threads(num_threads())

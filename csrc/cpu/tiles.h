@@ -3,15 +3,14 @@
 
 #include "core/kernel.h"
 #include "core/visibility.h"
+#include "cpu/blocks.h"
 #include "cpu/kernels.h"
-#include "cpu/packs.h"
 
 namespace bt {
 
-// Asks for what a surfel that comes soon is found by: a tile's list names surfels from all over the memory.
+// Prefetches the row of a surfel that comes soon: a tile's list names surfels from all over the memory.
 constexpr int kAhead = 3;
-template <class S>
-BT_HD void prefetch(const View<S>& view, const Bins& bins, int64_t id) {
+template <class S> BT_HD void prefetch(const View<S>& view, const Bins& bins, int64_t id) {
   __builtin_prefetch(view.geom + id * kGeom);
   __builtin_prefetch(view.radii + 2 * id);
   __builtin_prefetch(bins.level.data() + 2 * id);
@@ -22,81 +21,79 @@ struct ReachedCells {
   uint32_t support, centre;
 };
 template <class S>
-BT_HD ReachedCells reached_cells(const S* g, Pack<S> x, Pack<S> y, S half_x, S half_y, const float* level) {
-  const Reached<Pack<S>> r = reached(g, x, y, half_x, half_y, S(level[0]), S(level[1]));
+BT_HD ReachedCells reached_cells(const S* g, Lanes<S> x, Lanes<S> y, S half_x, S half_y, const float* level) {
+  const Reached<Lanes<S>> r = reached(g, x, y, half_x, half_y, S(level[0]), S(level[1]));
   return {bits(r.support), bits(r.centre)};
 }
 
 // A tile's transmittance while its surfels are drawn front to back.
-template <class S>
-struct TileState {
-  using P = Pack<S>;
+template <class S> struct TileState {
+  using P = Lanes<S>;
   using M = typename P::M;
-  P transmittance[kPacks];
-  M open[kPacks];           // pixels inside the image that still take light
-  uint32_t open_packs = 0;  // a bit for each pack that has such pixels
-  S x0, y0;                 // the tile's first pixel
-  S stop;                   // transmittance at which a pixel takes no more light
-  P lane_x, lane_y;         // pixel centres of a pack
-  P middle_x, middle_y;     // middles of the packs, from the tile's corner
+  P transmittance[kBlocks];
+  M open[kBlocks];           // pixels inside the image that still take light
+  uint32_t open_blocks = 0;  // a bit for each block that has such pixels
+  S x0, y0;                  // the tile's first pixel
+  S stop;                    // transmittance at which a pixel takes no more light
+  P lane_x, lane_y;          // pixel centres of a block
+  P middle_x, middle_y;      // middles of the blocks, from the tile's corner
 
   TileState(int tile_x, int tile_y, int width, int height, S stop = S(kTransmittanceMin)) : stop(stop) {
     x0 = S(tile_x * kTile), y0 = S(tile_y * kTile);
-    const PackCentres<S> centres;
+    const BlockCentres<S> centres;
     lane_x = centres.x, lane_y = centres.y;
-    for (int p = 0; p < kPacks; ++p) {
+    for (int p = 0; p < kBlocks; ++p) {
       transmittance[p] = P(S(1));
-      const S column = kPackOffsets<S>.column[p], row = kPackOffsets<S>.row[p];
+      const S column = kBlockOffsets<S>.column[p], row = kBlockOffsets<S>.row[p];
       const P px = P(x0 + column) + lane_x, py = P(y0 + row) + lane_y;
       open[p] = (px < P(S(width))) & (py < P(S(height)));
-      open_packs |= uint32_t(bits(open[p]) != 0) << p;
-      middle_x.set(p, column + S(0.5 * kPackSide)), middle_y.set(p, row + S(0.5 * kPackSide));
+      open_blocks |= uint32_t(bits(open[p]) != 0) << p;
+      middle_x.set(p, column + S(0.5 * kBlockSide)), middle_y.set(p, row + S(0.5 * kBlockSide));
     }
   }
 
-  // Blends surfel `id`: fn(pack, mask of its pixels, fragment, weight) for every pack in which some pixel takes it.
+  // Blends surfel `id`: fn(block, mask of its pixels, fragment, weight) for every block in which some pixel takes it.
   // Without kAll the fragment has no depth and does not tell whether the low pass is drawn.
   template <class Kernel, bool kAll, class F>
   void blend(const View<S>& view, const Bins& bins, int64_t id, F&& fn, S sharp = S(1)) {
     const S *g = view.geom + id * kGeom, cx = g[kCx] - x0, cy = g[kCy] - y0;
     const ReachedCells r = reached_in_tile<Kernel>(g, cx, cy, view.radii + 2 * id, bins.level.data() + 2 * id);
-    uint32_t packs = open_packs & (r.support | r.centre);
+    uint32_t blocks = open_blocks & (r.support | r.centre);
     // all fragments first: what a branch on one of them waits for is then known
-    Fragment<P> found[kPacks];
-    int at[kPacks], n = 0;
-    for (; packs; packs &= packs - 1) {
-      const int pack = __builtin_ctz(packs);
-      const P dx = lane_x + P(kPackOffsets<S>.column[pack] - cx), dy = lane_y + P(kPackOffsets<S>.row[pack] - cy);
+    Fragment<P> found[kBlocks];
+    int at[kBlocks], n = 0;
+    for (; blocks; blocks &= blocks - 1) {
+      const int block = __builtin_ctz(blocks);
+      const P dx = lane_x + P(kBlockOffsets<S>.column[block] - cx), dy = lane_y + P(kBlockOffsets<S>.row[block] - cy);
       Fragment<P> f;
       if (filtered<Kernel>(g)) {
         const FilteredHit<P> hit = filtered_hit<S, P>(g, dx, dy);
-        if (!bits(open[pack] & in_support(hit))) continue;
+        if (!bits(open[block] & in_support(hit))) continue;
         f = filtered_fragment<S, P>(g, view.near, hit);
       } else {
-        f = fragment<Kernel>(g, view.near, dx, dy, r.centre >> pack & 1, sharp);
+        f = fragment<Kernel>(g, view.near, dx, dy, r.centre >> block & 1, sharp);
       }
       Fragment<P>& to = found[n];
       to.u = f.u, to.v = f.v, to.sigma = f.sigma;
       if constexpr (kAll) to.depth = f.depth, to.low_pass = f.low_pass;
-      at[n++] = pack;
+      at[n++] = block;
     }
     for (int i = 0; i < n; ++i) take_fragment(at[i], found[i], fn);
   }
 
  private:
-  template <class F>
-  void take_fragment(int pack, const Fragment<P>& f, F& fn) {
-    const Blend<P> b = bt::blend(f.sigma, transmittance[pack]);
-    const BlendTest<P> v = blend_test(open[pack], f.sigma, b.behind, P(stop));
+  template <class F> void take_fragment(int block, const Fragment<P>& f, F& fn) {
+    const Blend<P> b = bt::blend(f.sigma, transmittance[block]);
+    const BlendTest<P> v = blend_test(open[block], f.sigma, b.behind, P(stop));
     if (!bits(v.takes | v.ends)) return;
-    open[pack] = open[pack] & ~v.ends;
-    transmittance[pack] = select(v.takes, b.behind, transmittance[pack]);
-    if (bits(v.takes)) fn(pack, v.takes, f, b.weight);
-    if (!bits(open[pack])) open_packs &= ~(1u << pack);
+    open[block] = open[block] & ~v.ends;
+    transmittance[block] = select(v.takes, b.behind, transmittance[block]);
+    if (bits(v.takes)) fn(block, v.takes, f, b.weight);
+    if (!bits(open[block])) open_blocks &= ~(1u << block);
   }
   template <class Kernel>
   ReachedCells reached_in_tile(const S* g, S cx, S cy, const S* radius, const float* level) const {
-    constexpr S kHalf = S(0.5 * (kPackSide - 1));
+    constexpr S kHalf = S(0.5 * (kBlockSide - 1));
     const P x = middle_x - P(cx), y = middle_y - P(cy);
     const S half_x = cell_half(kHalf, cx, S(kTile)), half_y = cell_half(kHalf, cy, S(kTile));
     // the centre of a disc without a box may lie further away than its radii say

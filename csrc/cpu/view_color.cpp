@@ -9,8 +9,7 @@
 
 namespace bt {
 
-template <class S>
-void view_color_forward(const ViewColorForward<S>& a) {
+template <class S> void view_color_forward(const ViewColorForward<S>& a) {
   const ViewColorArrays<const S>& p = a.colors;
   for_view_color(p.kind, [&](auto kind) {
     parallel_parts(a.to.n, 256, [&](int, int64_t begin, int64_t end) {
@@ -24,8 +23,7 @@ void view_color_forward(const ViewColorForward<S>& a) {
   });
 }
 
-template <class S>
-void lean_color(const LeanColor<S>& a) {
+template <class S> void lean_color(const LeanColor<S>& a) {
   for (int64_t i = 0; i < a.to.n; ++i) {
     const int64_t first = a.colors.span[2 * i], count = a.colors.span[2 * i + 1];
     if (first < 0 || count < 0 || count > kMaxTerms || first + count > a.terms)
@@ -40,8 +38,7 @@ void lean_color(const LeanColor<S>& a) {
   });
 }
 
-template <class S>
-void view_color_backward(const ViewColorBackward<S>& a) {
+template <class S> void view_color_backward(const ViewColorBackward<S>& a) {
   const ViewColorArrays<const S>& p = a.colors;
   const ViewColorArrays<S>& dp = a.dcolors;
   for_view_color(p.kind, [&](auto kind) {

@@ -23,11 +23,9 @@ constexpr int kVectorBytes = 32;
 #endif
 
 // Spelt out for each scalar: the compiler drops the vector attribute of a dependent type.
-template <class T>
-struct VectorOf;
+template <class T> struct VectorOf;
 #define BT_VECTOR(T)                                           \
-  template <>                                                  \
-  struct VectorOf<T> {                                         \
+  template <> struct VectorOf<T> {                             \
     typedef T type __attribute__((vector_size(kVectorBytes))); \
   };
 BT_VECTOR(float)
@@ -37,8 +35,7 @@ BT_VECTOR(int64_t)
 BT_VECTOR(uint32_t)
 BT_VECTOR(uint64_t)
 #undef BT_VECTOR
-template <class T>
-using Vector = typename VectorOf<T>::type;
+template <class T> using Vector = typename VectorOf<T>::type;
 
 // Masks are lanes of 0 or -1, as the compiler makes them: which of its 64-bit integers they are differs. AVX-512 has
 // registers with a bit for each lane, between which and such lanes the compiler goes to and fro: there the mask of
@@ -56,8 +53,7 @@ using MaskOfFloats = decltype(Vector<float>{} > Vector<float>{});
 using MaskOfDoubles = decltype(Vector<double>{} > Vector<double>{});
 
 // Two of them, or two pairs; lanes lie in memory as in one vector.
-template <class H>
-struct Two {
+template <class H> struct Two {
   H low, high;
   Two() = default;
   BT_HD Two(const H& low, const H& high) : low(low), high(high) {}
@@ -75,25 +71,19 @@ struct Two {
     return r;
   }
 };
-template <class V>
-constexpr bool is_two = false;
-template <class H>
-constexpr bool is_two<Two<H>> = true;
+template <class V> constexpr bool is_two = false;
+template <class H> constexpr bool is_two<Two<H>> = true;
 
-template <class T, int bytes>
-struct WideOf {
+template <class T, int bytes> struct WideOf {
   using type = Two<typename WideOf<T, bytes / 2>::type>;
 };
-template <class T>
-struct WideOf<T, kVectorBytes> {
+template <class T> struct WideOf<T, kVectorBytes> {
   using type = Vector<T>;
 };
-template <class T>
-using Wide = typename WideOf<T, kLanes* int(sizeof(T))>::type;
+template <class T> using Wide = typename WideOf<T, kLanes* int(sizeof(T))>::type;
 
 #define BT_BINARY(op)                                                            \
-  template <class H>                                                             \
-  BT_HD auto operator op(const Two<H>& a, const Two<H>& b) {                     \
+  template <class H> BT_HD auto operator op(const Two<H>& a, const Two<H>& b) {  \
     return Two<decltype(a.low op b.low)>{a.low op b.low, a.high op b.high};      \
   }                                                                              \
   template <class H, class A, class = std::enable_if_t<std::is_arithmetic_v<A>>> \
@@ -118,32 +108,19 @@ BT_BINARY(>)
 BT_BINARY(>=)
 BT_BINARY(!=)
 #undef BT_BINARY
-template <class H>
-BT_HD Two<H> operator-(const Two<H>& a) {
-  return {-a.low, -a.high};
-}
-template <class H>
-BT_HD Two<H> operator~(const Two<H>& a) {
-  return {~a.low, ~a.high};
-}
+template <class H> BT_HD Two<H> operator-(const Two<H>& a) { return {-a.low, -a.high}; }
+template <class H> BT_HD Two<H> operator~(const Two<H>& a) { return {~a.low, ~a.high}; }
 
 // Lane by lane: yes where the mask is set, else no.
-template <class M, class V>
-BT_HD V choose(const M& m, const V& yes, const V& no) {
+template <class M, class V> BT_HD V choose(const M& m, const V& yes, const V& no) {
   if constexpr (is_two<V>)
     return {choose(m.low, yes.low, no.low), choose(m.high, yes.high, no.high)};
   else
     return m ? yes : no;
 }
 // Masks of comparisons.
-template <class V>
-BT_HD auto above(const V& a, const V& b) {
-  return a > b;
-}
-template <class V>
-BT_HD auto at_least(const V& a, const V& b) {
-  return a >= b;
-}
+template <class V> BT_HD auto above(const V& a, const V& b) { return a > b; }
+template <class V> BT_HD auto at_least(const V& a, const V& b) { return a >= b; }
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
 BT_HD MaskOfFloats above(const Vector<float>& a, const Vector<float>& b) {
   return {_mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GT_OQ)};
@@ -156,49 +133,41 @@ BT_HD Vector<float> choose(MaskOfFloats m, const Vector<float>& yes, const Vecto
 }
 #endif
 // a > b ? a : b and a < b ? a : b, for which processors have one instruction that the compiler does not find.
-template <class V>
-BT_HD V larger(const V& a, const V& b) {
+template <class V> BT_HD V larger(const V& a, const V& b) {
   if constexpr (is_two<V>)
     return {larger(a.low, b.low), larger(a.high, b.high)};
   else
     return choose(a > b, a, b);
 }
-template <class V>
-BT_HD V smaller(const V& a, const V& b) {
+template <class V> BT_HD V smaller(const V& a, const V& b) {
   if constexpr (is_two<V>)
     return {smaller(a.low, b.low), smaller(a.high, b.high)};
   else
     return choose(a < b, a, b);
 }
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
-template <>
-BT_HD Vector<float> larger(const Vector<float>& a, const Vector<float>& b) {
+template <> BT_HD Vector<float> larger(const Vector<float>& a, const Vector<float>& b) {
   return (Vector<float>)_mm512_maskz_max_ps(__mmask16(0xffff), (__m512)a, (__m512)b);
 }
-template <>
-BT_HD Vector<float> smaller(const Vector<float>& a, const Vector<float>& b) {
+template <> BT_HD Vector<float> smaller(const Vector<float>& a, const Vector<float>& b) {
   return (Vector<float>)_mm512_maskz_min_ps(__mmask16(0xffff), (__m512)a, (__m512)b);
 }
 #elif defined(__AVX2__)
-template <>
-BT_HD Vector<float> larger(const Vector<float>& a, const Vector<float>& b) {
+template <> BT_HD Vector<float> larger(const Vector<float>& a, const Vector<float>& b) {
   return (Vector<float>)_mm256_max_ps((__m256)a, (__m256)b);
 }
-template <>
-BT_HD Vector<float> smaller(const Vector<float>& a, const Vector<float>& b) {
+template <> BT_HD Vector<float> smaller(const Vector<float>& a, const Vector<float>& b) {
   return (Vector<float>)_mm256_min_ps((__m256)a, (__m256)b);
 }
 #endif
 // Numbers to numbers of another type, as wide.
-template <class To, class V>
-BT_HD To convert(const V& v) {
+template <class To, class V> BT_HD To convert(const V& v) {
   if constexpr (is_two<V>)
     return {convert<decltype(To::low)>(v.low), convert<decltype(To::high)>(v.high)};
   else
     return __builtin_convertvector(v, To);
 }
-template <class To, class V>
-BT_HD To same_bits(const V& v) {
+template <class To, class V> BT_HD To same_bits(const V& v) {
   static_assert(sizeof(To) == sizeof(V));
   if constexpr (is_two<V>) {
     return {same_bits<decltype(To::low)>(v.low), same_bits<decltype(To::high)>(v.high)};
@@ -208,8 +177,7 @@ BT_HD To same_bits(const V& v) {
     return r;
   }
 }
-template <class V, class T>
-BT_HD V all_lanes(T value) {
+template <class V, class T> BT_HD V all_lanes(T value) {
   if constexpr (is_two<V>) {
     const auto half = all_lanes<decltype(V::low)>(value);
     return {half, half};
@@ -218,8 +186,7 @@ BT_HD V all_lanes(T value) {
   }
 }
 // From and to memory; the halves one by one, which the compiler would else copy through the stack.
-template <class V, class T>
-BT_HD V load_vector(const T* p) {
+template <class V, class T> BT_HD V load_vector(const T* p) {
   if constexpr (is_two<V>) {
     using Half = decltype(V::low);
     return {load_vector<Half>(p), load_vector<Half>(p + sizeof(Half) / sizeof(T))};
@@ -229,15 +196,13 @@ BT_HD V load_vector(const T* p) {
     return r;
   }
 }
-template <class V, class T>
-BT_HD void store_vector(T* p, const V& v) {
+template <class V, class T> BT_HD void store_vector(T* p, const V& v) {
   if constexpr (is_two<V>)
     store_vector(p, v.low), store_vector(p + sizeof(v.low) / sizeof(T), v.high);
   else
     std::memcpy(p, &v, sizeof v);
 }
-template <class V, class T>
-BT_HD void set_lane(V& v, int i, T value) {
+template <class V, class T> BT_HD void set_lane(V& v, int i, T value) {
   if constexpr (is_two<V>)
     std::memcpy(reinterpret_cast<char*>(&v) + i * sizeof value, &value, sizeof value);
   else
@@ -274,15 +239,13 @@ BT_HD Vector<float> narrowed_vector(const Two<Vector<double>>& a) {
   return r;
 #endif
 }
-template <class V>
-BT_HD auto all_widened(const V& a) {
+template <class V> BT_HD auto all_widened(const V& a) {
   if constexpr (is_two<V>)
     return Wide<double>{widened_vector(a.low), widened_vector(a.high)};
   else
     return widened_vector(a);
 }
-template <class V>
-BT_HD Wide<float> all_narrowed(const V& a) {
+template <class V> BT_HD Wide<float> all_narrowed(const V& a) {
   if constexpr (is_two<std::remove_const_t<decltype(a.low)>>)
     return {narrowed_vector(a.low), narrowed_vector(a.high)};
   else
@@ -306,14 +269,12 @@ BT_HD uint32_t bits(const MaskOfDoubles& m) {
   for (int i = 0; i < kVectorBytes / 8; ++i) r |= uint32_t(m[i] & 1) << i;
   return r;
 }
-template <class H>
-BT_HD uint32_t bits(const Two<H>& m) {
+template <class H> BT_HD uint32_t bits(const Two<H>& m) {
   return bits(m.low) | bits(m.high) << (sizeof(H) / sizeof(m[0]));
 }
 
 // The largest whole numbers that are no larger.
-template <class V>
-BT_HD V round_down(const V& a) {
+template <class V> BT_HD V round_down(const V& a) {
   if constexpr (is_two<V>) {
     return {round_down(a.low), round_down(a.high)};
   } else {
@@ -323,15 +284,11 @@ BT_HD V round_down(const V& a) {
   }
 }
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
-template <>
-BT_HD Vector<float> round_down(const Vector<float>& a) {
+template <> BT_HD Vector<float> round_down(const Vector<float>& a) {
   return (Vector<float>)_mm512_maskz_roundscale_ps(__mmask16(0xffff), (__m512)a, _MM_FROUND_TO_NEG_INF);
 }
 #elif defined(__AVX2__)
-template <>
-BT_HD Vector<float> round_down(const Vector<float>& a) {
-  return (Vector<float>)_mm256_floor_ps((__m256)a);
-}
+template <> BT_HD Vector<float> round_down(const Vector<float>& a) { return (Vector<float>)_mm256_floor_ps((__m256)a); }
 #endif
 
 BT_HD Vector<float> square_root(const Vector<float>& a) {
@@ -350,9 +307,6 @@ BT_HD Vector<double> square_root(const Vector<double>& a) {
   for (int i = 0; i < kVectorBytes / 8; ++i) r[i] = sqrt_(a[i]);
   return r;
 }
-template <class H>
-BT_HD Two<H> square_root(const Two<H>& a) {
-  return {square_root(a.low), square_root(a.high)};
-}
+template <class H> BT_HD Two<H> square_root(const Two<H>& a) { return {square_root(a.low), square_root(a.high)}; }
 
 }  // namespace bt

@@ -10,7 +10,7 @@ namespace bt::cuda {
 
 enum class TexelFormat { kBc7, kUint8, kHalf };
 
-// Whether the current device draws BC7 blocks, found out by drawing some. The first call waits for the device.
+// True where the current device draws BC7 blocks; tested by drawing some. The first call waits for the device.
 bool draws_bc7();
 
 // Of a texture, on every card that the kernels are built for.

@@ -6,7 +6,7 @@
 //             or to a list of all tiles where it has no slot.
 //   draw      a block per tile of 16 x 16 pixels sorts the tile's list front to back (ties by the surfel's number);
 //             then one warp per 8 x 8 pixels, two per thread. A pair carries the mask of the 8 x 4 parts of the tile
-//             that its surfel reaches, so a warp looks at those alone.
+//             that its surfel reaches, so a warp reads those alone.
 //
 // Nothing is allocated and nothing waits: counts stay on the device. Pairs without room are counted; the image then
 // lacks surfels and the frame is to be drawn again with more capacity.
@@ -19,7 +19,7 @@
 #include "core/texel.h"
 #include "core/view_color.h"
 #include "cuda/device.h"
-#include "ops/baked.h"
+#include "ops/texel.h"
 
 namespace bt::cuda {
 
@@ -37,13 +37,13 @@ struct BakedScene : BakedResidual {
   const AtlasTexture* levels[kTileLevels];
   int pages_down, page_width, page_height;  // pages lie below each other, so many of them, then beside
   float near;
-  bool through_pixel;  // chooses between the kernels of core/surfel.h
+  int prefilter;  // chooses between the kernels of core/surfel.h
 
   template <class R>  // as in ops/arguments.h
   void fields(R& r) {
     geometry.fields(r);
     const int64_t n = geometry.n;
-    if (r.given("lean"))
+    if (r.has("lean"))
       lean.fields(r, n, lean_terms);
     else
       colors.fields(r, n);
@@ -53,13 +53,11 @@ struct BakedScene : BakedResidual {
     r.maybe_object("quarter", levels[2]);
     pages_down = 1, page_width = page_height = 0;
     if (levels[0]) {
-      r.number("pages_down", pages_down);
-      r.number("page_width", page_width);
-      r.number("page_height", page_height);
+      r.numbers("pages_down", pages_down, "page_width", page_width, "page_height", page_height);
     }
     BakedResidual::fields(r, n);
     r.number("near", near);
-    r.number("through_pixel", through_pixel);
+    r.choice("prefilter", prefilter, kPrefilters);
   }
 };
 
@@ -68,7 +66,7 @@ struct BakedViews {
   const float *viewmats, *Ks;  // [count, 16], [count, 9]
 };
 
-// What is drawn, [count, height, width, channels]; null: not wanted.
+// Images [count, height, width, channels]; null: not drawn.
 struct BakedImages {
   float *rgb, *alpha;            // 3 channels over the background, 1
   uint32_t* packed;              // the same as 8 bits per channel, red in the lowest byte
@@ -76,13 +74,9 @@ struct BakedImages {
   int32_t* overdraw;             // blended surfels
   const float* background;       // [3], null: black
 
-  template <class R>
-  void fields(R& r, int64_t pixels) {
+  template <class R> void fields(R& r, int64_t pixels) {
     r.maybe("rgb", rgb, 3 * pixels);
-    r.maybe("alpha", alpha, pixels);
-    r.maybe("packed", packed, pixels);
-    r.maybe("beta", beta, pixels);
-    r.maybe("depth", depth, pixels);
+    r.maybes(pixels, "alpha", alpha, "packed", packed, "beta", beta, "depth", depth);
     r.maybe("normal", normal, 3 * pixels);
     r.maybe("overdraw", overdraw, pixels);
     r.maybe("background", background, 3);
@@ -109,21 +103,17 @@ struct BakedDraw {
   int slots;         // of a screen tile, for pairs; a multiple of 32
   int64_t capacity;  // pairs that find no slot and fit
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     r.object("scene", scene);
     int64_t count;
     r.rows("viewmats", views.viewmats, count, 16);
     views.count = int(count);
     r.array("Ks", views.Ks, 9 * count);
-    r.number("width", views.width);
-    r.number("height", views.height);
+    r.numbers("width", views.width, "height", views.height);
     images.fields(r, count * views.width * views.height);
-    r.number("stages", stages);
-    r.number("photo_pixel", photo_pixel);
+    r.numbers("stages", stages, "photo_pixel", photo_pixel);
     r.memory("memory", memory);
-    r.number("slots", slots);
-    r.number("capacity", capacity);
+    r.numbers("slots", slots, "capacity", capacity);
   }
 };
 void baked_frame(const BakedDraw& a, Stream stream);

@@ -4,7 +4,7 @@
 // One thread per surfel, 44 bytes in and 100 out where it is visible. A block then lists the pairs of its surfels from
 // their footprints in shared memory. View colours (196 bytes of parameters per surfel
 // with seven sites, 20 + 24 per term of lean ones) are computed for the visible ones alone, by threads that stand next
-// to each other: a block packs them.
+// to each other: a block compacts them.
 #include "core/shading.h"
 #include "core/view_color.h"
 #include "cuda/baked_pairs.h"
@@ -37,22 +37,22 @@ __device__ void write_texture(const BakedScene& s, int64_t i, Vec3<float> color,
     if (level == kTileLevels && !s.mean_residual) level = 0;
     while (level && level < kTileLevels && !(s.levels[level] && has_level(tile, level))) --level;
   }
-  float scale = 0, place[4] = {0, 0, 0, 0};
+  float scale = 0, texture[4] = {0, 0, 0, 0};
   if (s.levels[0] && tile[3] != 0 && level < kTileLevels) {
     scale = 0.5f / (s.extent ? s.extent[i] : float(kSupport));
     const int x = tile[0] + tile[2] / s.pages_down * s.page_width, y = tile[1] + tile[2] % s.pages_down * s.page_height;
-    place[0] = float(x >> level) + 0.5f, place[1] = float(y >> level) + 0.5f;
-    place[2] = float((tile[3] >> level) - 1), place[3] = float((tile[4] >> level) - 1);
+    texture[0] = float(x >> level) + 0.5f, texture[1] = float(y >> level) + 0.5f;
+    texture[2] = float((tile[3] >> level) - 1), texture[3] = float((tile[4] >> level) - 1);
   } else if (s.mean_residual) {
     const Vec3<float> flat = load3(s.mean_residual + 3 * i);
     if (flat.x != 0 || flat.y != 0 || flat.z != 0) {
       scale = -1;
-      store3(place, shaded(color, flat));
+      store3(texture, shaded(color, flat));
     }
   }
   row[kTexelScale] = scale;
   row[kLevel] = float(level), row[kLevel + 1] = 0;
-  for (int k = 0; k < 4; ++k) row[kTileX + k] = place[k];
+  for (int k = 0; k < 4; ++k) row[kTileX + k] = texture[k];
 }
 
 // A block takes `owned` surfels. Those of many tiles, or without a box, are only noted: the block with most of them
@@ -129,8 +129,7 @@ __global__ void __launch_bounds__(kListThreads, Kernel::kPixel ? 1 : bounded_blo
 }
 
 // Lists a row of tiles of a surfel without a box, of which lanes take a tile each. Returns how many.
-template <class Kernel>
-__device__ int list_reached(const BakedFrame& f, uint32_t r, int ty, int lane) {
+template <class Kernel> __device__ int list_reached(const BakedFrame& f, uint32_t r, int ty, int lane) {
   const float* row = f.memory.rows + int64_t(r) * kRow;
   const uint32_t tile = first_tile(f, r, ty);
   int listed = 0;
@@ -144,8 +143,7 @@ __device__ int list_reached(const BakedFrame& f, uint32_t r, int ty, int lane) {
 }
 
 // The surfels of many tiles and those without a box, a warp to a share of the rows of tiles of one.
-template <class Kernel>
-__global__ void __launch_bounds__(kListThreads, 4) large_pairs_kernel(BakedFrame f) {
+template <class Kernel> __global__ void __launch_bounds__(kListThreads, 4) large_pairs_kernel(BakedFrame f) {
   const BakedMemory& m = f.memory;
   const int lane = threadIdx.x % kWarp, warps = int(gridDim.x) * kListWarps;
   const int64_t shares = int64_t(*m.large_count) * kLargeParts;
@@ -176,11 +174,11 @@ void baked_list(const BakedScene& s, const BakedViews& v, const BakedFrame& f, S
   int owned = kListThreads;
   while (owned > kLeastOwned && ceil_div(f.rows, owned / 2) <= kMostBlocks) owned /= 2;
   const dim3 blocks(unsigned(ceil_div(f.n, owned)), unsigned(v.count));
-  with_kernel(f.through_pixel, f.photo_pixel, [&](auto kernel) {
+  with_kernel(f.prefilter, f.photo_pixel, [&](auto kernel) {
     BT_LAUNCH(list_kernel<decltype(kernel)>, blocks, dim3(kListThreads), 0, stream, s, v, f, owned);
   });
   const dim3 large(unsigned(min_<int64_t>(kLargeBlocks, ceil_div(f.rows * kLargeParts, kListWarps))));
-  with_kernel(f.through_pixel, [&](auto kernel) {
+  with_kernel(f.prefilter, [&](auto kernel) {
     BT_LAUNCH(large_pairs_kernel<decltype(kernel)>, large, dim3(kListThreads), 0, stream, f);
   });
 }

@@ -26,7 +26,7 @@ constexpr int kPixels = 2;  // per thread; with one, frames of bundles take 6 to
 constexpr int kWarps = 2 * kBands / kPixels, kThreads = kWarps * kWarp;
 static_assert(kThreads == kDrawThreads);
 constexpr int kRowQuads = kRow / 4;  // float4s of a row
-constexpr int kLook = 8;             // rows between looks whether all pixels are done
+constexpr int kCheckEvery = 8;       // rows after which finished pixels are checked
 
 struct DrawArgs {
   BakedFrame frame;
@@ -158,8 +158,7 @@ __device__ uint32_t to_byte(float x) {
 #endif
 }
 
-template <bool kMaps>
-__device__ void write(const DrawArgs& a, const Pixel& p, int64_t at) {
+template <bool kMaps> __device__ void write(const DrawArgs& a, const Pixel& p, int64_t at) {
   const BakedImages& to = a.images;
   const float t = p.transmittance < 0 ? -p.transmittance : p.transmittance;
   float red = p.red, green = p.green, blue = p.blue;
@@ -175,9 +174,8 @@ __device__ void write(const DrawArgs& a, const Pixel& p, int64_t at) {
   }
 }
 
-// How a kernel draws the rows that it does not filter.
-template <class Kernel>
-using Unfiltered = std::conditional_t<Kernel::kResized, ResizedKernel, LowPassKernel>;
+// The kernel for the rows that a kernel does not filter.
+template <class Kernel> using Unfiltered = std::conditional_t<Kernel::kResized, ResizedKernel, LowPassKernel>;
 
 // Tiles of long lists are drawn first, so that none of them is left when all others are done. The block of such a tile
 // draws the tile of a block that draws one of them.
@@ -242,11 +240,11 @@ __global__ void __launch_bounds__(kThreads, kBlocks<kMaps, Kernel>) draw_kernel(
     }
     __syncwarp();
     const float4* q = stage;
-    for (int look = 0; look < in_hand; look += kLook) {
+    for (int begin = 0; begin < in_hand; begin += kCheckEvery) {
       bool open = false;
       for (int j = 0; j < kPixels; ++j) open |= p[j].transmittance > 0;
       if (!__any_sync(kFullMask, open)) break;
-      for (int k = look; k < min_(look + kLook, in_hand); ++k, q += kRowQuads) {
+      for (int k = begin; k < min_(begin + kCheckEvery, in_hand); ++k, q += kRowQuads) {
         const float4 q0 = q[0], q1 = q[1], q2 = q[2], q3 = q[3];
         float area = Kernel::kPixel && q3.y < 0 ? -q3.y : 0.0f;
         if (Kernel::kResized && q3.y > 0)
@@ -297,7 +295,7 @@ void baked_draw(const BakedScene& s, const BakedImages& images, const BakedFrame
                       images};
   const dim3 grid(static_cast<unsigned>(f.tiles));
   const bool maps = images.beta || images.depth || images.normal || images.overdraw;
-  with_kernel(f.through_pixel, f.photo_pixel, [&](auto kernel) {
+  with_kernel(f.prefilter, f.photo_pixel, [&](auto kernel) {
     if (maps)
       BT_LAUNCH((draw_kernel<true, decltype(kernel)>), grid, dim3(kThreads), 0, stream, a);
     else

@@ -1,10 +1,10 @@
-// A screen tile's list front to back: what the block that draws it does first.
+// A screen tile's list front to back: sorted by the block that draws it.
 //
 // A warp collects what the tile's slots had no room for. Then each warp sorts a part of the list in registers (a
-// bitonic network), the parts meet in shared memory, and every key finds its place as its number in its own part and
-// how many keys of the others are below it. Lists longer than that room are sorted in runs, which are then merged two
-// by two where they stand. Keys hold the depth and the surfel's row, so no two are alike and the order does not depend
-// on who wrote first.
+// bitonic network), the parts meet in shared memory, and the position of a key is its number in its own part
+// and the number of smaller keys in the others. Lists longer than that room are sorted in runs, which are then merged
+// two by two where they stand. Keys hold the depth and the surfel's row, so no two are alike and the order does not
+// depend on who wrote first.
 #pragma once
 
 #include "cuda/baked_stages.h"
@@ -23,8 +23,7 @@ using Key = uint64_t;  // depth << 32 | pair
 constexpr Key kNone = ~Key(0);
 
 // Sorts the warp's keys: the one numbered lane * K + k is in key[k].
-template <int K>
-__device__ void sort_warp(Key (&key)[K], int lane) {
+template <int K> __device__ void sort_warp(Key (&key)[K], int lane) {
   for (int size = 2; size <= kWarp * K; size *= 2) {  // parts of so many keys, rising and falling in turn, are merged
     for (int by = size / 2; by >= K; by /= 2) {
       const bool rising = !(lane * K & size), keep_low = !(lane * K & by) == rising;
@@ -49,7 +48,7 @@ __device__ void sort_warp(Key (&key)[K], int lane) {
   }
 }
 
-// How many of `count` ascending keys are below `key`.
+// Number of `count` ascending keys that are below `key`.
 __device__ int below(const Key* keys, int count, Key key) {
   int low = 0;
   for (int high = count; low < high;) {
@@ -63,9 +62,8 @@ __device__ int below(const Key* keys, int count, Key key) {
 }
 
 // Sorts n <= kDrawThreads * K keys through `shared`, which has room for so many: get(i) gives one, put(i, key) takes it
-// at its place. All threads of the block take part.
-template <int K, class Get, class Put>
-__device__ void sort_run(int n, Key* shared, Get get, Put put) {
+// at its position. All threads of the block take part.
+template <int K, class Get, class Put> __device__ void sort_run(int n, Key* shared, Get get, Put put) {
   constexpr int kPart = kWarp * K;
   const int lane = threadIdx.x % kWarp, from = int(threadIdx.x) / kWarp * kPart;
   if (from < n) {
@@ -88,8 +86,7 @@ __device__ void sort_run(int n, Key* shared, Get get, Put put) {
     put(at, key);
   }
 }
-template <class Get, class Put>
-__device__ void sort_run(int n, Key* shared, Get get, Put put) {
+template <class Get, class Put> __device__ void sort_run(int n, Key* shared, Get get, Put put) {
   if (n <= kDrawThreads)
     sort_run<1>(n, shared, get, put);
   else if (n <= 2 * kDrawThreads)

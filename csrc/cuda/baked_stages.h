@@ -1,4 +1,4 @@
-// What the stages of the baked renderer share: working memory, a surfel's row, and the tiles it touches.
+// Shared by the stages of the baked renderer: working memory, a surfel's row, and the tiles it touches.
 #pragma once
 
 #include "core/kernel.h"
@@ -64,9 +64,9 @@ struct BakedFrame {
   int slots;                  // of a tile
   int long_from;              // pairs beyond which its list is long
   int width, height, tiles_x, tiles_y;
-  int64_t tiles;       // of all views
-  bool through_pixel;  // as in BakedScene
-  float photo_pixel;   // as in BakedDraw
+  int64_t tiles;      // of all views
+  int prefilter;      // as in BakedScene
+  float photo_pixel;  // as in BakedDraw
   BakedMemory memory;
 };
 
@@ -96,8 +96,7 @@ BT_HD void geom_of(const float* row, float* geom) {
   for (int k = 0; k < kGeom; ++k) geom[k] = k <= kBeta ? row[k] : 0.0f;
   geom[kArea] = row[kBlur2] < 0 ? -row[kBlur2] : 0.0f;
 }
-template <class Kernel>
-BT_HD Footprint footprint(const float* row, int width, int height) {
+template <class Kernel> BT_HD Footprint footprint(const float* row, int width, int height) {
   Footprint f;
   if (Kernel::kPixel && row[kBlur2] < 0) {
     float geom[kGeom];
@@ -119,7 +118,7 @@ BT_HD Footprint footprint(const float* row, int width, int height) {
   return f;
 }
 
-// From where to where the pixels lie that it can touch; of a footprint that is not everywhere.
+// Interval of the pixels that it can touch; of a footprint that is not everywhere.
 BT_HD Interval<float> columns_of(const Footprint& f) {
   const Interval<float> x = columns_of(f.bounds);
   const float pad = f.bounds.ellipse ? f.pad : 0;
@@ -170,8 +169,7 @@ BT_HD uint32_t part_mask(const TileRow& r, int tx) {
 }
 // The same for a disc without a box that crosses the camera's plane: the parts that its level set or its low pass
 // reaches. All of those of a disc seen through a pixel.
-template <class Kernel>
-BT_HD uint32_t reached_parts(const float* row, int tx, int ty) {
+template <class Kernel> BT_HD uint32_t reached_parts(const float* row, int tx, int ty) {
   if (Kernel::kPixel && row[kBlur2] < 0) return (1u << 2 * kBands) - 1;
   constexpr float kPartWidth = kTile / 2;
   const float x = tx * kTile - row[kCx], y = ty * kTile - row[kCy];

@@ -1,4 +1,4 @@
-// Tile lists: which surfels may touch which tiles, front to back.
+// Tile lists: of every tile the surfels that may touch it, front to back.
 //
 // Two sorts instead of one by a joint key of tile and depth: the n surfels by depth, then, written out in that order,
 // the pairs by tile alone. Both are stable, so a tile's pairs end front to back and equal depths keep the surfels'
@@ -8,7 +8,6 @@
 #include "cuda/kernels.h"
 #include "cuda/primitives.h"
 #include "cuda/warp.h"
-#include "cuda/workspace.h"
 
 namespace bt::cuda {
 
@@ -16,8 +15,7 @@ namespace {
 constexpr int kThreads = 128;
 constexpr int kAlone = 64;  // tiles that a thread lists by itself; beyond that its warp helps
 
-template <class S>
-struct CountSpace {
+template <class S> struct CountSpace {
   using Key = typename SortKey<S>::type;
   static constexpr int kBits = 8 * sizeof(Key);
   Key *keys, *sorted;
@@ -56,9 +54,8 @@ struct FillSpace {
         temp(arena.take<char>(temp_size)) {}
 };
 
-// Whether a disc crosses the camera's plane, so that it has no box whose tiles could be listed.
-template <class Kernel, class S>
-__device__ bool boxless(const Extent& e, const S* g) {
+// True for a disc that crosses the camera's plane, which has no box whose tiles could be listed.
+template <class Kernel, class S> __device__ bool boxless(const Extent& e, const S* g) {
   return e.whole && !filtered<Kernel>(g);
 }
 // fn(votes, tile) by all lanes of a warp for the tiles that such a disc reaches: lanes take a tile each, those with a
@@ -78,8 +75,7 @@ __device__ void for_reached_tiles(const S* g, S near, int width, int height, int
   }
 }
 
-template <class Kernel, class S>
-__global__ void __launch_bounds__(kThreads) count_kernel(View<S> v, CountSpace<S> w) {
+template <class Kernel, class S> __global__ void __launch_bounds__(kThreads) count_kernel(View<S> v, CountSpace<S> w) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int lane = int(threadIdx.x) % kWarp;
   const bool visible = i < v.n && v.radii[2 * i] > S(0);
@@ -194,8 +190,7 @@ __global__ void __launch_bounds__(kThreads)
 dim3 blocks(int64_t threads) { return dim3(unsigned(ceil_div(threads, kThreads))); }
 }  // namespace
 
-template <class S>
-int64_t bin_count_workspace(int64_t n) {
+template <class S> int64_t bin_count_workspace(int64_t n) {
   Arena arena(nullptr);
   const CountSpace<S> w(arena, n);
   return arena.used();
@@ -206,14 +201,13 @@ int64_t bin_fill_workspace(int64_t pairs, int width, int height) {
   return arena.used();
 }
 
-template <class S>
-void bin_count(const BinCount<S>& a, Stream stream) {
+template <class S> void bin_count(const BinCount<S>& a, Stream stream) {
   const View<S>& v = a.view;
   const int64_t n = v.n;
   Arena arena(a.workspace.of(bin_count_workspace<S>(n)));
   const CountSpace<S> w(arena, n);
   if (n)
-    with_kernel(v.through_pixel, [&](auto kernel) {
+    with_kernel(v.prefilter, [&](auto kernel) {
       BT_LAUNCH((count_kernel<decltype(kernel), S>), blocks(n), dim3(kThreads), 0, stream, v, w);
     });
   sort_pairs(w.keys, w.sorted, w.rows, a.order, n, CountSpace<S>::kBits, w.temp, w.temp_size, stream);
@@ -221,15 +215,14 @@ void bin_count(const BinCount<S>& a, Stream stream) {
   exclusive_sum(w.ranked, a.slot_start, n + 1, w.temp, w.temp_size, stream);
 }
 
-template <class S>
-void bin_fill(const BinFill<S>& a, Stream stream) {
+template <class S> void bin_fill(const BinFill<S>& a, Stream stream) {
   const View<S>& v = a.view;
   const int64_t pairs = a.pairs, tiles = tiles_of(v.width, v.height);
   Arena arena(a.workspace.of(bin_fill_workspace(pairs, v.width, v.height)));
   const FillSpace w(arena, pairs, tiles);
   fill_zero(a.differing, 1, stream);
   if (pairs) {
-    with_kernel(v.through_pixel, [&](auto kernel) {
+    with_kernel(v.prefilter, [&](auto kernel) {
       BT_LAUNCH((list_kernel<decltype(kernel), S>), blocks(v.n), dim3(kThreads), 0, stream, v, a.order, a.slot_start, w,
                 a.differing);
     });

@@ -74,9 +74,8 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
   for (int c = 0; c < kChannels; ++c) to[c] = sum[c];
 }
 
-// Where the backward kernel writes; null is what is not asked for.
-template <class S>
-struct Gradients {
+// Outputs of the backward kernel; null: not requested.
+template <class S> struct Gradients {
   S *weight, *uv, *depth, *partial;
   S* texels;  // sums, where they are not exact
   bool sums_texels;
@@ -84,8 +83,7 @@ struct Gradients {
 
 // Blocks at a time on a multiprocessor, as many as there are registers for: the look-up of texels and the sums of its
 // gradients take 80 in single precision.
-template <class S, bool kMaps, bool kTexels>
-constexpr int resident() {
+template <class S, bool kMaps, bool kTexels> constexpr int resident() {
   if (sizeof(S) == 8) return 1;
   return kTexels ? (kMaps ? 2 : 3) : (kMaps ? 4 : 5);
 }
@@ -167,8 +165,7 @@ __global__ void __launch_bounds__(kTileThreads, resident<S, kMaps, kTexels>())
   }
 }
 
-template <class S>
-struct StoreSurfelGradient {
+template <class S> struct StoreSurfelGradient {
   const S* base;
   S *dgeom, *dbase;
   __device__ void operator()(int64_t surfel, int column, S sum) const {
@@ -194,8 +191,7 @@ void run_backward(const BlendBackward<S, Pairs>& a, const ExactSums& exact, Stre
 }
 }  // namespace
 
-template <class S>
-void blend_forward(const BlendForward<S, Pairs>& a, Stream stream) {
+template <class S> void blend_forward(const BlendForward<S, Pairs>& a, Stream stream) {
   const dim3 tiles(unsigned(a.of.fragments.layout.tiles())), threads(kTileThreads);
   if (a.of.maps)
     BT_LAUNCH((forward_kernel<S, true>), tiles, threads, 0, stream, a.of, a.image);
@@ -203,8 +199,7 @@ void blend_forward(const BlendForward<S, Pairs>& a, Stream stream) {
     BT_LAUNCH((forward_kernel<S, false>), tiles, threads, 0, stream, a.of, a.image);
 }
 
-template <class S>
-void blend_backward(const BlendBackward<S, Pairs>& a, Stream stream) {
+template <class S> void blend_backward(const BlendBackward<S, Pairs>& a, Stream stream) {
   const int64_t entries = a.sums_texels() ? 4 * a.of.table.texels : 0;
   const bool maps = a.of.maps;
   if (a.work.exact && entries) {

@@ -5,8 +5,7 @@
 namespace bt::cuda {
 
 namespace {
-template <class S>
-struct BlendInput {
+template <class S> struct BlendInput {
   S weight, color[3], beta;
   S depth, normal[3];  // with maps
 };
@@ -109,14 +108,12 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 4 && !kMaps ? 6 : 1
 }
 
 // Columns beta and normal of a row that is 0 elsewhere.
-template <class S>
-struct StoreGeomGradient {
+template <class S> struct StoreGeomGradient {
   S* dgeom;
   __device__ void operator()(int64_t surfel, int column, S sum) const { dgeom[surfel * kGeom + kBeta + column] = sum; }
 };
 
-template <class S, bool kMaps>
-void backward(const CompositeBackward<S, Pairs>& a, Stream stream) {
+template <class S, bool kMaps> void backward(const CompositeBackward<S, Pairs>& a, Stream stream) {
   const Pairs& p = a.fragments.layout;
   if (p.pairs)
     BT_LAUNCH((backward_kernel<S, kMaps>), dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, a.geom, p,
@@ -126,8 +123,7 @@ void backward(const CompositeBackward<S, Pairs>& a, Stream stream) {
 }
 }  // namespace
 
-template <class S>
-void composite_forward(const CompositeForward<S, Pairs>& a, Stream stream) {
+template <class S> void composite_forward(const CompositeForward<S, Pairs>& a, Stream stream) {
   const Pairs& p = a.fragments.layout;
   const FragmentArrays<S>& f = a.fragments.f;
   const dim3 tiles(unsigned(p.tiles())), threads(kTileThreads);
@@ -136,8 +132,7 @@ void composite_forward(const CompositeForward<S, Pairs>& a, Stream stream) {
   else
     BT_LAUNCH((forward_kernel<S, false>), tiles, threads, 0, stream, a.geom, p, f, a.colors, a.image);
 }
-template <class S>
-void composite_backward(const CompositeBackward<S, Pairs>& a, Stream stream) {
+template <class S> void composite_backward(const CompositeBackward<S, Pairs>& a, Stream stream) {
   a.maps ? backward<S, true>(a, stream) : backward<S, false>(a, stream);
 }
 

@@ -1,4 +1,4 @@
-// What a kernel's source may use. Compiled by nvcc it is CUDA; compiled by a C++ compiler the same source runs on the
+// The language of kernels. Compiled by nvcc a source is CUDA; compiled by a C++ compiler the same source runs on the
 // host, thread by thread (emulator.h), so that indexing, barriers and warp steps are tested on machines without a card.
 #pragma once
 
@@ -81,8 +81,7 @@ constexpr int bounded_blocks(int blocks, int threads) {
 }
 
 // Sets memory to zero bytes, which are zeros of every number type.
-template <class T>
-void fill_zero(T* to, int64_t count, Stream stream) {
+template <class T> void fill_zero(T* to, int64_t count, Stream stream) {
   if (count <= 0) return;
 #if defined(__CUDACC__)
   check(cudaMemsetAsync(to, 0, size_t(count) * sizeof(T), static_cast<cudaStream_t>(stream)), "clear memory");
@@ -93,5 +92,23 @@ void fill_zero(T* to, int64_t count, Stream stream) {
 }
 
 constexpr int64_t ceil_div(int64_t a, int64_t b) { return (a + b - 1) / b; }
+
+// Working memory, one block from which a kernel's function cuts arrays. Run with a null block it counts the bytes, with
+// a block it hands out addresses: one description serves both.
+class Arena {
+ public:
+  explicit Arena(void* block) : base_(reinterpret_cast<uintptr_t>(block)) {}
+  template <class T> T* take(int64_t count) {
+    const uintptr_t at = base_ + uintptr_t(used_);
+    used_ += (count * int64_t(sizeof(T)) + kAlign - 1) / kAlign * kAlign;
+    return reinterpret_cast<T*>(at);
+  }
+  int64_t used() const { return used_; }
+
+ private:
+  static constexpr int64_t kAlign = 256;  // what cudaMalloc gives
+  uintptr_t base_;
+  int64_t used_ = 0;
+};
 
 }  // namespace bt::cuda

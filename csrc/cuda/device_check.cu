@@ -1,6 +1,5 @@
-// What a kernel without work tells about the device.
-#include "cuda/device.h"
-#include "cuda/device_check.h"
+// The check of a device, by a kernel without work.
+#include "cuda/kernels.h"
 
 namespace bt::cuda {
 

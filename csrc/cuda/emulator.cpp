@@ -27,7 +27,7 @@ enum class State { kReady, kAtBlock, kAtWarp, kDone };
 
 struct Fiber {
   ucontext_t context;  // where it begins
-  jmp_buf place;       // where it left
+  jmp_buf resume;      // where it left
   bool begun = false;
   std::unique_ptr<char[]> stack{new char[kStack]};  // pages are touched only as deep as a kernel goes
   State state;
@@ -50,14 +50,14 @@ std::string fault;    // of a thread that had to stop
 __attribute__((noinline)) void enter(Fiber& f) {
   if (_setjmp(scheduler)) return;
   inside = true;
-  if (f.begun) _longjmp(f.place, 1);
+  if (f.begun) _longjmp(f.resume, 1);
   f.begun = true;
   setcontext(&f.context);
 }
 __attribute__((noinline)) void leave(Fiber& f, State state) {
   f.state = state;
   inside = false;
-  if (!_setjmp(f.place)) _longjmp(scheduler, 1);
+  if (!_setjmp(f.resume)) _longjmp(scheduler, 1);
 }
 
 void run_threads() {  // of block after block
@@ -80,7 +80,7 @@ struct Range {
   size_t bytes = 0;
 };
 thread_local int mine = 0;  // so that there is such storage
-int look(dl_phdr_info* library, size_t, void* found) {
+int visit(dl_phdr_info* library, size_t, void* found) {
   const auto* at = reinterpret_cast<const char*>(&mine);
   for (int i = 0; i < library->dlpi_phnum; ++i) {
     const auto& segment = library->dlpi_phdr[i];
@@ -94,7 +94,7 @@ int look(dl_phdr_info* library, size_t, void* found) {
 Range shared_of_kernels() {
   Range found;
   ++mine;
-  dl_iterate_phdr(look, &found);
+  dl_iterate_phdr(visit, &found);
   if (!found.begin) throw std::runtime_error("the emulator cannot find the shared memory of kernels");
   return found;
 }

@@ -31,6 +31,11 @@ extern dim3 grid_size;
 // Throws std::runtime_error when threads wait at barriers that can never open.
 void launch(const char* kernel, dim3 grid, dim3 block, size_t shared, const std::function<void()>& thread);
 void set_seed(unsigned seed);
+
+// Kernels with a fault that the emulator must find (emulator_probe.cpp).
+int stale_numbers();            // number of threads that read what a block before theirs left in shared memory
+void open_barrier();            // threads wait for one that does not come
+float read_float4(int offset);  // the second of four floats that begin so many floats behind a multiple of 16 bytes
 void* dynamic_shared();
 
 void block_barrier();
@@ -39,15 +44,13 @@ const uint64_t* warp_exchange(unsigned mask, uint64_t value);
 int lane();
 void misaligned(const char* file, unsigned line);  // ends the thread, and the kernel with an error
 
-template <class T>
-uint64_t to_bits(T value) {
+template <class T> uint64_t to_bits(T value) {
   static_assert(sizeof(T) <= 8);
   uint64_t bits = 0;
   std::memcpy(&bits, &value, sizeof value);
   return bits;
 }
-template <class T>
-T from_bits(uint64_t bits) {
+template <class T> T from_bits(uint64_t bits) {
   T value;
   std::memcpy(&value, &bits, sizeof value);
   return value;
@@ -75,19 +78,16 @@ inline unsigned __ballot_sync(unsigned mask, bool predicate) {
   return result & mask;
 }
 inline bool __any_sync(unsigned mask, bool predicate) { return __ballot_sync(mask, predicate) != 0; }
-template <class T>
-T __shfl_sync(unsigned mask, T value, int source) {
+template <class T> T __shfl_sync(unsigned mask, T value, int source) {
   const uint64_t* values = bt::emulator::warp_exchange(mask, bt::emulator::to_bits(value));
   return bt::emulator::from_bits<T>(values[source & 31]);
 }
-template <class T>
-T __shfl_xor_sync(unsigned mask, T value, int with) {
+template <class T> T __shfl_xor_sync(unsigned mask, T value, int with) {
   const int lane = bt::emulator::lane();
   const uint64_t* values = bt::emulator::warp_exchange(mask, bt::emulator::to_bits(value));
   return bt::emulator::from_bits<T>(values[(lane ^ with) & 31]);
 }
-template <class T>
-T __shfl_up_sync(unsigned mask, T value, unsigned by) {
+template <class T> T __shfl_up_sync(unsigned mask, T value, unsigned by) {
   const unsigned lane = unsigned(bt::emulator::lane());
   const uint64_t* values = bt::emulator::warp_exchange(mask, bt::emulator::to_bits(value));
   return lane >= by ? bt::emulator::from_bits<T>(values[lane - by]) : value;
@@ -96,26 +96,20 @@ inline int __popc(unsigned x) { return __builtin_popcount(x); }
 inline int __ffs(int x) { return __builtin_ffs(x); }
 inline long long __double2ll_rn(double x) { return std::fabs(x) < 9e18 ? std::llrint(x) : 0; }
 inline int __clz(int x) { return x ? __builtin_clz(unsigned(x)) : 32; }
-template <class T>
-T __ldg(const T* p) {
-  return *p;
-}
+template <class T> T __ldg(const T* p) { return *p; }
 
 // blocks and threads take turns: plain read-modify-write is atomic
-template <class T>
-T atomicAdd(T* to, T value) {
+template <class T> T atomicAdd(T* to, T value) {
   const T old = *to;
   *to = old + value;
   return old;
 }
-template <class T>
-T atomicExch(T* to, T value) {
+template <class T> T atomicExch(T* to, T value) {
   const T old = *to;
   *to = value;
   return old;
 }
-template <class T>
-T atomicMax(T* to, T value) {
+template <class T> T atomicMax(T* to, T value) {
   const T old = *to;
   if (value > old) *to = value;
   return old;

@@ -1,6 +1,4 @@
 // Kernels with a fault that the emulator must find: a test that finds nothing has to be one that can.
-#include "cuda/emulator_probe.h"
-
 #include "cuda/device.h"
 
 namespace bt::emulator {

@@ -77,8 +77,7 @@ inline FastFloat power_(FastFloat x, FastFloat y) { return FastFloat(exp2f(y.v *
 #endif
 
 // The real of a training kernel's pixels: doubles stay exact.
-template <class S>
-using FastFloatOr = std::conditional_t<std::is_same_v<S, float>, FastFloat, S>;
+template <class S> using FastFloatOr = std::conditional_t<std::is_same_v<S, float>, FastFloat, S>;
 BT_HD float plain(FastFloat x) { return x.v; }
 BT_HD double plain(double x) { return x; }
 

@@ -82,15 +82,13 @@ __global__ void __launch_bounds__(kThreads)
 }
 }  // namespace
 
-template <class S>
-void field_forward(const FieldForward<S>& a, Stream stream) {
+template <class S> void field_forward(const FieldForward<S>& a, Stream stream) {
   if (!a.n) return;
   BT_LAUNCH(field_forward_kernel<S>, dim3(unsigned(ceil_div(a.n, kThreads))), dim3(kThreads), 0, stream, a.n, *a.field,
             a.x, a.rho);
 }
 
-template <class S>
-void field_backward(const FieldBackward<S>& a, Stream stream) {
+template <class S> void field_backward(const FieldBackward<S>& a, Stream stream) {
   const FieldArrays<S>& field = *a.field;
   const FieldGradients<S>& out = a.dfield;
   const FieldWork<S>& work = a.work;
@@ -112,8 +110,7 @@ void field_backward(const FieldBackward<S>& a, Stream stream) {
   sum_weights(work.mlp, blocks, field.levels, out, stream);
 }
 
-template <class S>
-void field_tiles(const FieldTiles<S>& a, Stream stream) {
+template <class S> void field_tiles(const FieldTiles<S>& a, Stream stream) {
   if (!a.warps) return;
   BT_LAUNCH(bake_kernel<S>, dim3(unsigned(ceil_div(a.warps * kWarp, kThreads))), dim3(kThreads), 0, stream, a.n,
             a.warps, *a.field, a.frames, a.extent, a.tiles, a.first, a.width, a.height, a.pages, a.bad);

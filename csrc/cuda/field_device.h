@@ -15,24 +15,20 @@
 
 namespace bt::cuda {
 
-template <class S>
-struct alignas(16) Entry {
+template <class S> struct alignas(16) Entry {
   S v[kFeatures];
 };
-template <class S>
-__device__ Entry<S> entry(const FieldArrays<S>& f, int level, uint32_t index) {
+template <class S> __device__ Entry<S> entry(const FieldArrays<S>& f, int level, uint32_t index) {
   return reinterpret_cast<const Entry<S>*>(f.table)[f.first_entry(level) + index];
 }
-template <class S>
-__device__ Vec3<S> grid_position(const FieldArrays<S>& f, Vec3<S> x) {
+template <class S> __device__ Vec3<S> grid_position(const FieldArrays<S>& f, Vec3<S> x) {
   return grid_coordinate(x, load3(f.mid), f.half, f.contract);
 }
 
 // Interpolated features at a grid position, to memory; those of missing levels and of look-ups that are not active are
 // 0. All entries of a level are asked for before the first is waited for, and a level's features leave the registers at
 // once.
-template <class S>
-__device__ void encode(const FieldArrays<S>& f, Vec3<S> c, bool active, S* to) {
+template <class S> __device__ void encode(const FieldArrays<S>& f, Vec3<S> c, bool active, S* to) {
   const uint32_t mask = f.hash_mask();
   BT_UNROLL
   for (int l = 0; l < kMaxLevels; ++l) {
@@ -55,8 +51,7 @@ __device__ void encode(const FieldArrays<S>& f, Vec3<S> c, bool active, S* to) {
 
 // Memory of a warp for 32 values of the field. With rows 24 numbers apart the pairs that lanes read as a first factor
 // lie in different banks.
-template <class S>
-struct ForwardStage {
+template <class S> struct ForwardStage {
   enum { kX = 0, kOut = 16, kColumns = 24 };
   alignas(16) S number[kWarp * kColumns];
 };
@@ -89,8 +84,7 @@ __device__ Vec3<S> evaluate(const FieldArrays<S>& f, const ForwardMlp<S>& m, Vec
 // and rows 72 apart, so that a factor's numbers lie in different banks along rows and along columns. Later, in the same
 // place, the gradients of the features, and weights and entries of the corners of a level (two levels take turns).
 // There look-ups 0, 8, 16 and 24 are read together, and every eight of them begin at another bank.
-template <class S>
-struct Stage {
+template <class S> struct Stage {
   enum { kX = 0, kH1 = 16, kG1 = 32, kG2 = 48, kD = 64, kPoint = 68, kColumns = 72 };
   enum { kFeatureRows = 648, kCornerRows = 280 };
   alignas(16) S number[kWarp * kColumns];
@@ -229,17 +223,14 @@ __device__ Vec3<S> field_vjp(const FieldArrays<S>& f, const WarpMlp<S>& m, Vec3<
 
 // ---- blocks of a backward pass
 
-template <class S>
-constexpr int kBackwardWarps = sizeof(S) == 4 ? 4 : 2;  // a warp's stage is 9 KB, or 18 KB in double
-template <class S>
-constexpr int kBackwardResident = sizeof(S) == 4 ? 4 : 2;  // blocks at a time on a multiprocessor
+template <class S> constexpr int kBackwardWarps = sizeof(S) == 4 ? 4 : 2;  // a warp's stage is 9 KB, or 18 KB in double
+template <class S> constexpr int kBackwardResident = sizeof(S) == 4 ? 4 : 2;  // blocks at a time on a multiprocessor
 
 constexpr int kChunk = 8 * kWarp;  // consecutive items that a warp takes at a time
 constexpr int kStep = 2 * kWarp;   // and asks memory for at a time
 constexpr int kQueue = kWarp + kStep;
 
-template <class S>
-struct BackwardShared {
+template <class S> struct BackwardShared {
   WarpMlp<S> mlp;
   Stage<S> stage[kBackwardWarps<S>];
   uint32_t queue[kBackwardWarps<S>][kQueue];
@@ -250,7 +241,7 @@ struct BackwardShared {
 template <class S>
 __device__ void store_weight_sums(BackwardShared<S>& shared, WeightSums<S>& weights, int warp, int lane, S* out) {
   constexpr int kThreads = kBackwardWarps<S> * kWarp;
-  static_assert(kMlpWeights <= kWarp * Stage<S>::kColumns, "the sums take the place of the first warp's stage");
+  static_assert(kMlpWeights <= kWarp * Stage<S>::kColumns, "the sums reuse the first warp's stage");
   S* sums = shared.stage[0].number;
   __syncthreads();
   for (int k = threadIdx.x; k < kMlpWeights; k += kThreads) sums[k] = S(0);
@@ -263,8 +254,7 @@ __device__ void store_weight_sums(BackwardShared<S>& shared, WeightSums<S>& weig
 }
 
 // Blocks of a backward pass over n items. A function of n alone: with it the order of all sums is fixed.
-template <class S>
-int backward_blocks(int64_t n, int most = kMostBlocks) {
+template <class S> int backward_blocks(int64_t n, int most = kMostBlocks) {
   const int64_t blocks = ceil_div(n, int64_t(kChunk) * kBackwardWarps<S>);
   return int(blocks < 1 ? 1 : blocks > most ? most : blocks);
 }
@@ -284,13 +274,13 @@ struct ExactSums {
   ExactRange* range = nullptr;
 };
 // Clears the exact sums in memory of exact_size(entries, surfels, frames) and finds their units, such that no sum of
-// `count` gradients can overflow, of which none is larger than the largest of `numbers` given. The entries are those of
+// `count` gradients can overflow, none of them larger than the largest of `numbers`. The entries are those of
 // the field's table; without a field, sums of shares of the gradients, of at most 1 each in all. frames tells whether
 // those of the surfels are summed.
 template <class S>
 ExactSums begin_exact(int64_t* memory, int64_t entries, const FieldArrays<S>* field, int64_t surfels, bool frames,
                       int64_t count, int64_t numbers, const S* gradients, Stream stream);
-// Writes the exact sums as numbers: where not null, dtable (of a given field), dbase and dframes.
+// Writes the exact sums as numbers: where not null, dtable (of a field), dbase and dframes.
 template <class S>
 void end_exact(const ExactSums& exact, const FieldArrays<S>* field, int64_t surfels, S* dtable, S* dbase, S* dframes,
                Stream stream);

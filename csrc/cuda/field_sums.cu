@@ -45,8 +45,7 @@ __global__ void __launch_bounds__(kThreads) largest_kernel(int64_t n, const S* v
   }
   if (threadIdx.x % kWarp == 0 && most) atomicMax(bits, most);
 }
-template <class S>
-void largest(int64_t n, const S* values, unsigned long long* bits, Stream stream) {
+template <class S> void largest(int64_t n, const S* values, unsigned long long* bits, Stream stream) {
   if (!n) return;
   const int64_t blocks = ceil_div(n, 4 * kThreads);
   BT_LAUNCH(largest_kernel<S>, dim3(unsigned(blocks < kMostBlocks ? blocks : kMostBlocks)), dim3(kThreads), 0, stream,
@@ -64,8 +63,7 @@ __device__ double scale_for(double most, int64_t count) {
 }
 
 // Bounds of all sums from the largest gradient and entry and the weights.
-template <class S>
-__global__ void range_kernel(FieldArrays<S> f, int64_t count, ExactRange* range) {
+template <class S> __global__ void range_kernel(FieldArrays<S> f, int64_t count, ExactRange* range) {
   double most, entry;
   memcpy(&most, &range->gradient, sizeof most);
   memcpy(&entry, &range->entry, sizeof entry);
@@ -102,8 +100,7 @@ __global__ void __launch_bounds__(kThreads)
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i < n) to[i] = exact_value<S>(from[i], *scale);
 }
-template <class S>
-void convert(int64_t n, const unsigned long long* from, const double* scale, S* to, Stream stream) {
+template <class S> void convert(int64_t n, const unsigned long long* from, const double* scale, S* to, Stream stream) {
   if (n)
     BT_LAUNCH(convert_kernel<S>, dim3(unsigned(ceil_div(n, kThreads))), dim3(kThreads), 0, stream, n, from, scale, to);
 }

@@ -2,6 +2,8 @@
 // allocates, waits for the device or knows Python; the caller gives all memory, also the working memory.
 #pragma once
 
+#include <string>
+
 #include "cuda/device.h"
 #include "cuda/pairs.h"
 #include "ops/appearance.h"
@@ -10,41 +12,37 @@
 
 namespace bt::cuda {
 
-template <class S>
-void project_forward(const ProjectForward<S>& a, Stream stream);
-template <class S>
-void project_backward(const ProjectBackward<S>& a, Stream stream);
+// Reason why the kernels cannot run on CUDA device number `device`, and the remedy; empty when they can. Runs nothing.
+std::string device_problem(int device);
+
+template <class S> void project_forward(const ProjectForward<S>& a, Stream stream);
+template <class S> void project_backward(const ProjectBackward<S>& a, Stream stream);
 
 // Visibility: nothing waits. Where a count decides an allocation, the caller reads the last entry of slot_start or
 // offsets, allocates, and calls the next function.
 
 // Orders the surfels front to back and counts their tiles: order [n] and slot_start [n + 1] are written; the number of
 // pairs is slot_start[n].
-template <class S>
-struct BinCount {
+template <class S> struct BinCount {
   View<S> view;
   int32_t* order;
   int64_t* slot_start;
   Workspace workspace;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     view.fields(r);
     r.array("order", order, view.n);
     r.array("slot_start", slot_start, view.n + 1);
     r.memory("workspace", workspace);
   }
 };
-template <class S>
-int64_t bin_count_workspace(int64_t n);
-template <class S>
-void bin_count(const BinCount<S>& a, Stream stream);
+template <class S> int64_t bin_count_workspace(int64_t n);
+template <class S> void bin_count(const BinCount<S>& a, Stream stream);
 
 // Lists the pairs (below 2^31): slot [pairs], surfel [pairs] and tile_pairs [tiles + 1] are written, and differing [1]:
 // by how many pairs the lists differ from the counts, 0 unless a compiler rounds one formula in two ways. A pair that
 // was counted and is not there stands behind those of the tiles.
-template <class S>
-struct BinFill {
+template <class S> struct BinFill {
   View<S> view;
   const int32_t* order;
   const int64_t* slot_start;
@@ -54,8 +52,7 @@ struct BinFill {
   int32_t* differing;
   Workspace workspace;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     view.fields(r);
     r.array("order", order, view.n);
     r.array("slot_start", slot_start, view.n + 1);
@@ -68,13 +65,11 @@ struct BinFill {
   }
 };
 int64_t bin_fill_workspace(int64_t pairs, int width, int height);
-template <class S>
-void bin_fill(const BinFill<S>& a, Stream stream);
+template <class S> void bin_fill(const BinFill<S>& a, Stream stream);
 
 // Finds which pixels blend which pairs: masks [kTileWarps, pairs] and offsets [pairs + 1] are written; the number
 // of fragments is offsets[pairs].
-template <class S>
-struct TraceMark {
+template <class S> struct TraceMark {
   View<S> view;
   int64_t pairs;
   const int32_t* surfel;
@@ -83,8 +78,7 @@ struct TraceMark {
   int64_t* offsets;
   Workspace workspace;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     view.fields(r);
     r.rows("surfel", surfel, pairs, 1);
     check_pairs(r, pairs);
@@ -96,34 +90,25 @@ struct TraceMark {
   }
 };
 int64_t trace_mark_workspace(int64_t pairs);
-template <class S>
-void trace_mark(const TraceMark<S>& a, Stream stream);
+template <class S> void trace_mark(const TraceMark<S>& a, Stream stream);
 
 // Writes the fragments.
-template <class S>
-struct TraceFill {
+template <class S> struct TraceFill {
   View<S> view;
   Fragments<S, Pairs> fragments;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     view.fields(r);
     fragments.fields(r, view.n, view.width, view.height);
   }
 };
-template <class S>
-void trace_fill(const TraceFill<S>& a, Stream stream);
+template <class S> void trace_fill(const TraceFill<S>& a, Stream stream);
 
-template <class S>
-void trace_backward(const TraceBackward<S, Pairs>& a, Stream stream);
-template <class S>
-void composite_forward(const CompositeForward<S, Pairs>& a, Stream stream);
-template <class S>
-void composite_backward(const CompositeBackward<S, Pairs>& a, Stream stream);
-template <class S>
-void blend_forward(const BlendForward<S, Pairs>& a, Stream stream);
-template <class S>
-void blend_backward(const BlendBackward<S, Pairs>& a, Stream stream);
+template <class S> void trace_backward(const TraceBackward<S, Pairs>& a, Stream stream);
+template <class S> void composite_forward(const CompositeForward<S, Pairs>& a, Stream stream);
+template <class S> void composite_backward(const CompositeBackward<S, Pairs>& a, Stream stream);
+template <class S> void blend_forward(const BlendForward<S, Pairs>& a, Stream stream);
+template <class S> void blend_backward(const BlendBackward<S, Pairs>& a, Stream stream);
 void masked_counts(const MaskedCounts<Pairs>& a, Stream stream);
 // The layout of the fragments whose keep [F] is not 0. Written: masks, and how many fragments each pair then has.
 struct SelectPairs {
@@ -132,8 +117,7 @@ struct SelectPairs {
   uint32_t* masks;
   int64_t* counts;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     take(r, "layout", layout);
     r.array("keep", keep, layout.fragments);
     r.array("masks", masks, kTileWarps * layout.pairs);
@@ -142,27 +126,17 @@ struct SelectPairs {
 };
 void select_fragments(const SelectPairs& a, Stream stream);
 
-template <class S>
-void view_color_forward(const ViewColorForward<S>& a, Stream stream);
-template <class S>
-void view_color_backward(const ViewColorBackward<S>& a, Stream stream);
-template <class S>
-void lean_color(const LeanColor<S>& a, Stream stream);
+template <class S> void view_color_forward(const ViewColorForward<S>& a, Stream stream);
+template <class S> void view_color_backward(const ViewColorBackward<S>& a, Stream stream);
+template <class S> void lean_color(const LeanColor<S>& a, Stream stream);
 
-template <class S>
-int64_t ssim_workspace(int height, int width, int channels, bool gradient);
-template <class S>
-void ssim(const Ssim<S>& a, Stream stream);
+template <class S> int64_t ssim_workspace(int height, int width, int channels, bool gradient);
+template <class S> void ssim(const Ssim<S>& a, Stream stream);
 
-template <class S>
-void field_forward(const FieldForward<S>& a, Stream stream);
-template <class S>
-void field_backward(const FieldBackward<S>& a, Stream stream);
-template <class S>
-void shade_forward(const ShadeForward<S>& a, Stream stream);
-template <class S>
-void shade_backward(const ShadeBackward<S>& a, Stream stream);
-template <class S>
-void field_tiles(const FieldTiles<S>& a, Stream stream);
+template <class S> void field_forward(const FieldForward<S>& a, Stream stream);
+template <class S> void field_backward(const FieldBackward<S>& a, Stream stream);
+template <class S> void shade_forward(const ShadeForward<S>& a, Stream stream);
+template <class S> void shade_backward(const ShadeBackward<S>& a, Stream stream);
+template <class S> void field_tiles(const FieldTiles<S>& a, Stream stream);
 
 }  // namespace bt::cuda

@@ -9,7 +9,7 @@
 //               slot, and sum_slots adds a surfel's slots in order: no atomics, and the same bits every time.
 //
 // A tile is a block of 8 warps, one warp per 8 x 4 pixels, one lane per pixel. masks[warp][k] has a bit for every pixel
-// of the warp that blends pair k; a run has the fragments of warp 0 first, in a warp by lane. So a fragment's place is
+// of the warp that blends pair k; a run has the fragments of warp 0 first, in a warp by lane. So a fragment's offset is
 // offsets[k] + the bits of lower warps + the bits of lower lanes, and no kernel has to search.
 #pragma once
 
@@ -23,8 +23,7 @@ constexpr int kTileThreads = kTile * kTile, kTileWarps = kTileThreads / kWarp;
 constexpr int kWarpWidth = 8, kWarpHeight = 4;
 
 // Pairs are counted in 32 bits.
-template <class R>
-void check_pairs(R& r, int64_t pairs) {
+template <class R> void check_pairs(R& r, int64_t pairs) {
   if (pairs > INT32_MAX) r.refuse("more than 2^31 pairs of surfel and tile");
 }
 
@@ -39,15 +38,13 @@ struct Pairs {
   const int32_t* order;       // [surfels] front to back
   const int64_t* slot_start;  // [surfels + 1]
   int64_t fragments;
-  static constexpr bool kPlaces = false;  // kernels read them from the list
+  static constexpr bool kHasIds = false;  // kernels read them from the list
   int64_t tiles() const { return tiles_of(width, height); }
   bool fits(int64_t n, int wide, int high) const { return n == surfels && wide == width && high == height; }
 
   template <class R>  // as in ops/arguments.h
   void fields(R& r) {
-    r.number("width", width);
-    r.number("height", height);
-    r.number("fragments", fragments);
+    r.numbers("width", width, "height", height, "fragments", fragments);
     r.rows("surfel", surfel, pairs, 1);
     check_pairs(r, pairs);
     r.array("slot", slot, pairs);
@@ -59,7 +56,7 @@ struct Pairs {
   }
 };
 
-// Where a thread of a tile's block stands.
+// Position of a thread of a tile's block.
 struct TileThread {
   int warp, lane;
   int left, top;  // first pixel of the warp
@@ -77,8 +74,7 @@ __device__ inline TileThread tile_thread(int width) {
 
 // The first 12 columns of a row of geom, by the widest loads: all lanes of a warp read the same row.
 constexpr int kShape = kBeta + 1;
-template <class S>
-__device__ inline void load_shape(const S* row, S* g) {
+template <class S> __device__ inline void load_shape(const S* row, S* g) {
 #if defined(__CUDACC__)
   constexpr int kWide = 16 / sizeof(S);
   struct alignas(16) Wide {
@@ -98,8 +94,9 @@ __device__ inline void load_shape(const S* row, S* g) {
 
 // Visits the pairs of a tile that have a fragment in the calling warp, front to back or back to front. Every lane calls
 // load(k, surfel, mine, i) and later use(what load gave): `mine` says whether the lane's pixel has a fragment of pair
-// k, i is its place in the list. kAhead loads are under way before the first is used: a warp has about ten fragments of
-// a pair, far too few bytes to keep the memory busy one at a time. Warps go their own way: nothing waits for the block.
+// k, i is its offset in the list. kAhead loads are under way before the first is used: a warp has about ten fragments
+// of a pair, far too few bytes to keep the memory busy one at a time. Warps go their own way: nothing waits for the
+// block.
 template <int kAhead, bool kBack, class Load, class Use>
 __device__ inline void for_each_fragment(const Pairs& p, const TileThread& s, Load&& load, Use&& use) {
   const int64_t begin = p.tile_pairs[blockIdx.x], end = p.tile_pairs[blockIdx.x + 1];
@@ -136,8 +133,7 @@ __device__ inline void for_each_fragment(const Pairs& p, const TileThread& s, Lo
 // A stretch of the list that a tile's block takes through shared memory: the next pairs, 32 at most, whose fragments
 // are no more than kHeld. A warp has about ten fragments of a pair, the block some hundreds of a stretch: all of its
 // threads read, work out or write them one after the other, and lanes find those of their pixels by the masks.
-template <int kHeld>
-class Stretch {
+template <int kHeld> class Stretch {
   static_assert(kHeld >= kTileThreads, "no pair has more than a tile's pixels");
 
  public:
@@ -158,15 +154,14 @@ class Stretch {
     if (s.lane >= pairs) mark_ = 0;
     bits[s.warp][s.lane] = __popc(mark_);
   }
-  // Where the warp's own fragments of each pair begin.
+  // Offsets of the warp's own fragments of each pair.
   __device__ void find_own(const TileThread& s) {
     BT_UNROLL
     for (int w = 0; w < kTileWarps - 1; ++w) from_ += w < s.warp ? bits_[w][s.lane] : 0;
   }
   // After it: use(j, i, mine) for the pairs first + j that have a fragment in the calling warp, front to back: fragment
   // base + i is that of the lane's pixel, if it is `mine`.
-  template <class Use>
-  __device__ void each_pair(const TileThread& s, Use&& use) const {
+  template <class Use> __device__ void each_pair(const TileThread& s, Use&& use) const {
     const unsigned below = (1u << s.lane) - 1;
     unsigned todo = __ballot_sync(kFullMask, mark_ != 0);
     while (todo) {
@@ -178,8 +173,7 @@ class Stretch {
   }
   // each(i, base + i) by all threads; a warp begins at a multiple of 32 of the list, so that it reads and writes whole
   // sectors.
-  template <class Each>
-  __device__ void each_fragment(Each&& each) const {
+  template <class Each> __device__ void each_fragment(Each&& each) const {
     BT_UNROLL_BY(1)
     for (int i = int(threadIdx.x) - int(base % kWarp); i < count; i += kTileThreads)
       if (i >= 0) each(i, base + i);
@@ -226,15 +220,14 @@ class TilePart {
         rows_(min_(kTile, p.height - top_)),
         row_of_(p.width) {}
   // By all threads of the block; a barrier has to follow.
-  template <int kChannels, class S>
-  __device__ void load(const S* image, S* to) const {
+  template <int kChannels, class S> __device__ void load(const S* image, S* to) const {
     for (int j = int(threadIdx.x); j < kTileThreads * kChannels; j += kTileThreads) {
       const int row = j / (kTile * kChannels), column = j - row * (kTile * kChannels);
       if (row < rows_ && column < columns_ * kChannels)
         to[j] = image[(int64_t(top_ + row) * width_ + left_) * kChannels + column];
     }
   }
-  // Where a pixel of the image lies in it.
+  // Offset of a pixel of the image in it.
   __device__ int at(int32_t pixel) const {
     const int row = row_of_(pixel);
     return (row - top_) * kTile + (pixel - row * width_ - left_);
@@ -265,9 +258,8 @@ inline dim3 run_blocks(const Pairs& p) { return dim3(unsigned(ceil_div(p.pairs, 
 
 // Sums of kColumns values each over the lanes of a run: lane c % kColumns gets that of column c. Each step halves both
 // the lanes that differ and the columns that a lane still keeps: 15 shuffles for 16 columns instead of 64. By
-// recursion: nvcc does not unroll the loop whose bounds halve, and then looks for the columns among its registers.
-template <int kStep, class S, int kColumns>
-__device__ __forceinline__ void fold_columns(S (&v)[kColumns], int lane) {
+// recursion: nvcc does not unroll a loop whose bounds halve, and indexes its registers.
+template <int kStep, class S, int kColumns> __device__ __forceinline__ void fold_columns(S (&v)[kColumns], int lane) {
   const bool upper = lane & kStep;
   BT_UNROLL
   for (int c = 0; c < kStep; ++c) {
@@ -276,8 +268,7 @@ __device__ __forceinline__ void fold_columns(S (&v)[kColumns], int lane) {
   }
   if constexpr (kStep > 1) fold_columns<kStep / 2>(v, lane);
 }
-template <int kColumns, class S>
-__device__ __forceinline__ S sum_over_run(S (&v)[kColumns], int lane) {
+template <int kColumns, class S> __device__ __forceinline__ S sum_over_run(S (&v)[kColumns], int lane) {
   static_assert((kColumns & (kColumns - 1)) == 0 && kColumns <= kRunLanes);
   BT_UNROLL
   for (int step = kRunLanes / 2; step >= kColumns; step /= 2) {
@@ -329,8 +320,7 @@ __global__ void __launch_bounds__(kSlotThreads) sum_slots_kernel(Pairs p, const 
     __syncthreads();  // before the next surfel's shares
   }
 }
-template <int kColumns, class S, class Put>
-void sum_slots(const Pairs& p, const S* partial, Put put, Stream stream) {
+template <int kColumns, class S, class Put> void sum_slots(const Pairs& p, const S* partial, Put put, Stream stream) {
   static_assert((kColumns & (kColumns - 1)) == 0 && kColumns <= kWarp);
   if (!p.surfels) return;
   BT_LAUNCH((sum_slots_kernel<kColumns, S, Put>), dim3(unsigned(ceil_div(p.surfels, kSlotWarps))), dim3(kSlotThreads),

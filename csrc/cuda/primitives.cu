@@ -19,8 +19,7 @@ struct Add {
 };
 }  // namespace
 
-template <class Key>
-int64_t sort_workspace(int64_t n, int bits) {
+template <class Key> int64_t sort_workspace(int64_t n, int bits) {
   size_t size = 0;
   const Key* in = nullptr;
   const int32_t* values = nullptr;
@@ -56,10 +55,7 @@ void exclusive_sum(const int32_t* in, int64_t* out, int64_t n, void* workspace, 
 
 #else
 
-template <class Key>
-int64_t sort_workspace(int64_t, int) {
-  return 1;
-}
+template <class Key> int64_t sort_workspace(int64_t, int) { return 1; }
 template <class Key>
 void sort_pairs(const Key* keys, Key* keys_out, const int32_t* values, int32_t* values_out, int64_t n, int bits, void*,
                 int64_t, Stream) {

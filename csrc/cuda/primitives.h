@@ -10,18 +10,14 @@
 namespace bt::cuda {
 
 // Unsigned integers in the order of the reals; the largest is no real's.
-template <class S>
-struct SortKey;
-template <>
-struct SortKey<float> {
+template <class S> struct SortKey;
+template <> struct SortKey<float> {
   using type = uint32_t;
 };
-template <>
-struct SortKey<double> {
+template <> struct SortKey<double> {
   using type = uint64_t;
 };
-template <class S>
-BT_HD typename SortKey<S>::type sort_key(S x) {
+template <class S> BT_HD typename SortKey<S>::type sort_key(S x) {
   using Key = typename SortKey<S>::type;
   constexpr Key top = Key(1) << (8 * sizeof(Key) - 1);
   Key bits;
@@ -31,8 +27,7 @@ BT_HD typename SortKey<S>::type sort_key(S x) {
 
 // Stable sort of (key, value) pairs by the low `bits` bits of the keys. Key: uint16_t, uint32_t or uint64_t; n below
 // 2^31.
-template <class Key>
-int64_t sort_workspace(int64_t n, int bits);
+template <class Key> int64_t sort_workspace(int64_t n, int bits);
 template <class Key>
 void sort_pairs(const Key* keys, Key* keys_out, const int32_t* values, int32_t* values_out, int64_t n, int bits,
                 void* workspace, int64_t workspace_size, Stream stream);

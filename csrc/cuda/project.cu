@@ -7,8 +7,7 @@ namespace bt::cuda {
 namespace {
 constexpr int kThreads = 128;
 
-template <class Kernel, class S>
-__global__ void __launch_bounds__(kThreads) forward_kernel(ProjectForward<S> a) {
+template <class Kernel, class S> __global__ void __launch_bounds__(kThreads) forward_kernel(ProjectForward<S> a) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= a.surfels.n) return;
   const Pinhole<S> cam = pinhole(a.viewmat, a.K);
@@ -17,8 +16,7 @@ __global__ void __launch_bounds__(kThreads) forward_kernel(ProjectForward<S> a) 
   if (!fine) atomicAdd(a.broken, 1);
 }
 
-template <class S>
-__global__ void __launch_bounds__(kThreads) backward_kernel(ProjectBackward<S> a) {
+template <class S> __global__ void __launch_bounds__(kThreads) backward_kernel(ProjectBackward<S> a) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= a.surfels.n) return;
   const Pinhole<S> cam = pinhole(a.viewmat, a.K);
@@ -27,17 +25,15 @@ __global__ void __launch_bounds__(kThreads) backward_kernel(ProjectBackward<S> a
 }
 }  // namespace
 
-template <class S>
-void project_forward(const ProjectForward<S>& a, Stream stream) {
+template <class S> void project_forward(const ProjectForward<S>& a, Stream stream) {
   const int64_t n = a.surfels.n;
   if (!n) return;
-  with_kernel(a.through_pixel, [&](auto kernel) {
+  with_kernel(a.prefilter, [&](auto kernel) {
     BT_LAUNCH((forward_kernel<decltype(kernel), S>), dim3(unsigned(ceil_div(n, kThreads))), dim3(kThreads), 0, stream,
               a);
   });
 }
-template <class S>
-void project_backward(const ProjectBackward<S>& a, Stream stream) {
+template <class S> void project_backward(const ProjectBackward<S>& a, Stream stream) {
   const int64_t n = a.surfels.n;
   if (!n) return;
   BT_LAUNCH(backward_kernel<S>, dim3(unsigned(ceil_div(n, kThreads))), dim3(kThreads), 0, stream, a);

@@ -7,22 +7,19 @@
 
 namespace bt::cuda {
 
-// Where the backward kernel writes.
-template <class S>
-struct ShadeGradients {
+// Outputs of the backward kernel.
+template <class S> struct ShadeGradients {
   S *base, *table, *uv, *frames;
   S* partial;  // of the MLP's weights
 };
 
 namespace {
 constexpr int kForwardWarps = 4;
-template <class S>
-constexpr int kForwardResident = sizeof(S) == 4 ? 8 : 2;  // blocks at a time on a multiprocessor
-constexpr int64_t kMostForwardBlocks = 8 * 132;           // one round of them on an H100
+template <class S> constexpr int kForwardResident = sizeof(S) == 4 ? 8 : 2;  // blocks at a time on a multiprocessor
+constexpr int64_t kMostForwardBlocks = 8 * 132;                              // one round of them on an H100
 
 // A block's items by number, which 32 bits hold: those of kWarps neighbouring chunks, then those a grid further on.
-template <int kWarps>
-__device__ int64_t item(uint32_t number) {
+template <int kWarps> __device__ int64_t item(uint32_t number) {
   const uint32_t chunk = number / kChunk;
   return ((int64_t(chunk / kWarps) * gridDim.x + blockIdx.x) * kWarps + chunk % kWarps) * kChunk + number % kChunk;
 }
@@ -49,13 +46,11 @@ __device__ void drop(uint32_t* queue, int& count, int looked_up, int lane) {
   count = rest;
 }
 
-template <class S>
-__device__ Vec3<S> fragment_point(const FragmentArrays<S>& f, const S* frames, int64_t i) {
+template <class S> __device__ Vec3<S> fragment_point(const FragmentArrays<S>& f, const S* frames, int64_t i) {
   return world_point(frames + int64_t(f.surfel[i]) * kFrame, f.uv[i], f.uv[f.total + i]);
 }
 
-template <class S>
-struct ForwardShared {
+template <class S> struct ForwardShared {
   ForwardMlp<S> mlp;
   ForwardStage<S> stage[kForwardWarps];
   uint32_t queue[kForwardWarps][kQueue];
@@ -219,8 +214,7 @@ __global__ void __launch_bounds__(kBackwardWarps<S>* kWarp, kBackwardResident<S>
 }
 }  // namespace
 
-template <class S>
-void shade_forward(const ShadeForward<S>& a, Stream stream) {
+template <class S> void shade_forward(const ShadeForward<S>& a, Stream stream) {
   if (!a.f.total) return;
   FieldArrays<S> none = {};
   const int64_t blocks = ceil_div(a.f.total, kChunk * kForwardWarps);
@@ -229,8 +223,7 @@ void shade_forward(const ShadeForward<S>& a, Stream stream) {
             a.colors);
 }
 
-template <class S>
-void shade_backward(const ShadeBackward<S>& a, Stream stream) {
+template <class S> void shade_backward(const ShadeBackward<S>& a, Stream stream) {
   const bool trains_field = a.trains_field();
   const FieldArrays<S>* learned = trains_field ? a.field : nullptr;
   FieldArrays<S> arrays = {};

@@ -4,20 +4,16 @@
 // H200; what is read twice, at the rims of tiles, comes from the L2.
 #include "core/ssim.h"
 #include "cuda/kernels.h"
-#include "cuda/workspace.h"
 
 namespace bt::cuda {
 
 namespace {
 constexpr int kTaps = kSsimTaps, kRim = kTaps - 1;
 constexpr int kWide = 32, kRows = 4;  // a tile is 32 columns; a thread takes 4 rows of one
-template <class S>
-constexpr int kThreads = sizeof(S) == 4 ? 128 : 64;  // as many as the shared memory of 48 KB allows
-template <class S>
-constexpr int kHigh = kThreads<S> / kWide * kRows;
+template <class S> constexpr int kThreads = sizeof(S) == 4 ? 128 : 64;  // as many as the shared memory of 48 KB allows
+template <class S> constexpr int kHigh = kThreads<S> / kWide * kRows;
 
-template <class S>
-struct Moments {
+template <class S> struct Moments {
   S image[2][kHigh<S> + kRim][kWide + kRim];
   S row[5][kHigh<S> + kRim][kWide];
 };
@@ -96,8 +92,7 @@ __global__ void __launch_bounds__(kSumThreads) mean_kernel(int64_t n, const doub
   if (thread == 0) *value = count > 0 ? S(total[0] / count) : S(1);
 }
 
-template <class S>
-struct Parts {
+template <class S> struct Parts {
   S window[3][kHigh<S> + kRim][kWide + kRim];
   S row[3][kHigh<S> + kRim][kWide];
 };
@@ -152,9 +147,8 @@ __global__ void __launch_bounds__(kThreads<S>)
 }  // namespace
 
 namespace {
-// What a call works with: its tiles, and the memory they need.
-template <class S>
-struct Plan {
+// Tiles and working memory of a call.
+template <class S> struct Plan {
   int64_t rows, columns;  // of windows
   dim3 windows, pixels;   // blocks
   double* sums;           // [blocks of windows]
@@ -177,13 +171,11 @@ struct Plan {
 };
 }  // namespace
 
-template <class S>
-int64_t ssim_workspace(int height, int width, int channels, bool gradient) {
+template <class S> int64_t ssim_workspace(int height, int width, int channels, bool gradient) {
   return Plan<S>(height, width, channels, gradient, nullptr).bytes;
 }
 
-template <class S>
-void ssim(const Ssim<S>& images, Stream stream) {
+template <class S> void ssim(const Ssim<S>& images, Stream stream) {
   const int height = images.height, width = images.width, channels = images.channels;
   const S *a = images.a, *b = images.b;
   S* da = images.da;

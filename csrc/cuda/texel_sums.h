@@ -8,8 +8,7 @@
 
 namespace bt::cuda {
 
-template <bool kExact, class S>
-__device__ Adder<S, kExact> texel_adder(S* sums, const ExactSums& exact) {
+template <bool kExact, class S> __device__ Adder<S, kExact> texel_adder(S* sums, const ExactSums& exact) {
   if constexpr (kExact)
     return {exact.table, exact.range->table};
   else
@@ -33,7 +32,7 @@ __device__ void add_to_texels(int64_t row, const TexelCorners<S>& at, Vec3<S> g,
 }
 
 constexpr int kFinishThreads = 256;
-// What becomes of the sums: the gradient, or a step of the texels.
+// Use of the sums: the gradient, or a step of the texels.
 template <class S, bool kExact>
 __global__ void __launch_bounds__(kFinishThreads)
     finish_texels_kernel(int64_t texels, S* sums, ExactSums exact, const S* __restrict__ share, S rate,

@@ -2,7 +2,7 @@
 // other.
 //
 // The weights decide which pairs are blended, so the list's length is known only after all sigma are: trace_mark finds
-// the masks, a scan gives every fragment its place, trace_fill writes the fragments there. The second pass evaluates
+// the masks, a scan gives every fragment its offset, trace_fill writes the fragments there. The second pass evaluates
 // marked pairs alone. trace_mark is bound by arithmetic (about 100 operations per lane and pair, a third of the lanes
 // with a fragment), trace_fill also by the 28 bytes per fragment that it writes.
 #include "core/kernel.h"
@@ -10,7 +10,6 @@
 #include "cuda/fast.h"
 #include "cuda/kernels.h"
 #include "cuda/primitives.h"
-#include "cuda/workspace.h"
 
 namespace bt::cuda {
 
@@ -27,9 +26,8 @@ struct MarkSpace {
         temp(arena.take<char>(temp_size)) {}
 };
 
-// Whether the support or the low pass of a surfel without a box may reach the warp's pixels.
-template <class Kernel, class S>
-__device__ bool reached_by_warp(const S* g, const TileThread& s) {
+// True where the support or the low pass of a surfel without a box may reach the warp's pixels.
+template <class Kernel, class S> __device__ bool reached_by_warp(const S* g, const TileThread& s) {
   if (filtered<Kernel>(g)) return true;
   const S x = S(s.left) + S(0.5 * kWarpWidth) - g[kCx], y = S(s.top) + S(0.5 * kWarpHeight) - g[kCy];
   const Reached<S> r = reached(g, x, y, cell_half(S(0.5 * (kWarpWidth - 1)), g[kCx], abs_(x) + S(kTile)),
@@ -74,7 +72,7 @@ __global__ void __launch_bounds__(kTileThreads)
       S g[kGeom];
       load_shape(geom + int64_t(__shfl_sync(kFullMask, id, j)) * kGeom, g);
       const T dx = T(x - g[kCx]), dy = T(y - g[kCy]);
-      // a cheap look first: does any open pixel lie in the support or near the centre?
+      // a cheap test first: an open pixel in the support or near the centre
       const bool close = near_centre(dx, dy);
       const bool reached = filtered<Kernel>(g) ? in_support(filtered_hit<S, T>(g, dx, dy))
                                                : close || in_support(planes<S, T>(g, dx, dy));
@@ -167,7 +165,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 4 ? 6 : 1)
   }
 }
 
-// Which of a surfel's fragments lie on masked pixels is known from the marks: the list itself is not read.
+// The marks tell which of a surfel's fragments lie on masked pixels: the list itself is not read.
 __global__ void __launch_bounds__(kTileThreads) counts_kernel(Pairs p, const uint8_t* mask, int32_t* counts) {
   const TileThread s = tile_thread(p.width);
   const bool on = s.x < p.width && s.y < p.height && mask[int64_t(s.y) * p.width + s.x];
@@ -204,14 +202,13 @@ int64_t trace_mark_workspace(int64_t pairs) {
   return arena.used();
 }
 
-template <class S>
-void trace_mark(const TraceMark<S>& a, Stream stream) {
+template <class S> void trace_mark(const TraceMark<S>& a, Stream stream) {
   const View<S>& v = a.view;
   const int64_t pairs = a.pairs, tiles = tiles_of(v.width, v.height);
   Arena arena(a.workspace.of(trace_mark_workspace(pairs)));
   const MarkSpace w(arena, pairs);
   if (pairs)
-    with_kernel(v.through_pixel, [&](auto kernel) {
+    with_kernel(v.prefilter, [&](auto kernel) {
       BT_LAUNCH((mark_kernel<decltype(kernel), S>), dim3(unsigned(tiles)), dim3(kTileThreads), 0, stream, v.geom,
                 v.radii, v.near, v.width, v.height, pairs, a.surfel, a.tile_pairs, a.masks);
     });
@@ -220,11 +217,10 @@ void trace_mark(const TraceMark<S>& a, Stream stream) {
   exclusive_sum(w.counts, a.offsets, pairs + 1, w.temp, w.temp_size, stream);
 }
 
-template <class S>
-void trace_fill(const TraceFill<S>& a, Stream stream) {
+template <class S> void trace_fill(const TraceFill<S>& a, Stream stream) {
   const Pairs& p = a.fragments.layout;
   if (!p.fragments) return;
-  with_kernel(a.view.through_pixel, [&](auto kernel) {
+  with_kernel(a.view.prefilter, [&](auto kernel) {
     BT_LAUNCH((fill_kernel<decltype(kernel), S>), dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, a.view.geom,
               a.view.near, p, a.fragments.f);
   });

@@ -11,8 +11,7 @@ namespace bt::cuda {
 
 namespace {
 
-template <class S>
-struct Step {
+template <class S> struct Step {
   bool mine;
   int64_t i;
   S weight, sigma, dweight;
@@ -77,8 +76,7 @@ __global__ void __launch_bounds__(kRunThreads)
   if (r.some) partial[int64_t(p.slot[r.k]) * kTraceSums + r.lane] = sum;
 }
 
-template <class S>
-struct StoreGeomGradient {
+template <class S> struct StoreGeomGradient {
   S *dgeom, *absgrad;
   __device__ void operator()(int64_t surfel, int column, S sum) const {
     dgeom[surfel * kGeom + column] = column < kShape || column == kArea ? sum : S(0);
@@ -87,17 +85,16 @@ struct StoreGeomGradient {
 };
 }  // namespace
 
-template <class S>
-void trace_backward(const TraceBackward<S, Pairs>& a, Stream stream) {
+template <class S> void trace_backward(const TraceBackward<S, Pairs>& a, Stream stream) {
   const Pairs& p = a.fragments.layout;
   const FragmentArrays<S>& f = a.fragments.f;
   if (a.dweight && f.total)
     BT_LAUNCH(dsigma_kernel<S>, dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, p, f, a.dweight, a.dsigma);
-  const S* given = a.dweight ? a.dsigma : nullptr;
+  const S* dsigma = a.dweight ? a.dsigma : nullptr;
   if (p.pairs)
-    with_kernel(a.view.through_pixel, [&](auto kernel) {
+    with_kernel(a.view.prefilter, [&](auto kernel) {
       BT_LAUNCH((surfel_kernel<decltype(kernel), S>), run_blocks(p), dim3(kRunThreads), 0, stream, a.view.geom,
-                a.view.near, a.rim, p, f, given, a.duv, a.ddepth, a.partial);
+                a.view.near, a.rim, p, f, dsigma, a.duv, a.ddepth, a.partial);
     });
   sum_slots<kTraceSums>(p, static_cast<const S*>(a.partial), StoreGeomGradient<S>{a.dgeom, a.absgrad}, stream);
 }

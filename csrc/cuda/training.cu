@@ -9,17 +9,14 @@ namespace bt::cuda {
 namespace {
 constexpr int kThreads = 256;
 
-template <class S>
-BT_HD S sign_(S x) {
+template <class S> BT_HD S sign_(S x) {
   return x > S(0) ? S(1) : x < S(0) ? S(-1) : x;  // 0 and NaN stay
 }
 
-template <class S>
-struct Error {
+template <class S> struct Error {
   S d[3], l1, omega;
 };
-template <class S>
-BT_HD Error<S> error_at(const Picture<S>& p, int64_t i) {
+template <class S> BT_HD Error<S> error_at(const Picture<S>& p, int64_t i) {
   Error<S> e;
   S squares = S(0);
   e.l1 = S(0);
@@ -33,8 +30,7 @@ BT_HD Error<S> error_at(const Picture<S>& p, int64_t i) {
 }
 
 // In an order that depends on the numbers of threads and blocks alone. Thread 0 has the sums.
-template <int kSums>
-__device__ void add_up(double (&own)[kSums], double (*total)[kThreads]) {
+template <int kSums> __device__ void add_up(double (&own)[kSums], double (*total)[kThreads]) {
   const int thread = int(threadIdx.x);
   for (int k = 0; k < kSums; ++k) total[k][thread] = own[k];
   for (int half = kThreads / 2; half; half /= 2) {
@@ -46,8 +42,7 @@ __device__ void add_up(double (&own)[kSums], double (*total)[kThreads]) {
     for (int k = 0; k < kSums; ++k) own[k] = total[k][0];
 }
 
-template <class S>
-__global__ void __launch_bounds__(kThreads) sums_kernel(Picture<S> p, double* sums) {
+template <class S> __global__ void __launch_bounds__(kThreads) sums_kernel(Picture<S> p, double* sums) {
   __shared__ double total[2][kThreads];
   double own[2] = {0, 0};
   const int64_t step = int64_t(gridDim.x) * kThreads;
@@ -87,14 +82,12 @@ __global__ void __launch_bounds__(kThreads)
   to[4] = *dfalloff * weight / S(p.pixels) * e.omega;
 }
 
-template <class S>
-BT_HD float length_(S x, S y) {
+template <class S> BT_HD float length_(S x, S y) {
   const S size = hypot(x, y);
   return finite_(size) ? float(size) : 0.0f;
 }
 
-template <class S>
-__global__ void __launch_bounds__(kThreads) note_kernel(NoteCenters<S> a) {
+template <class S> __global__ void __launch_bounds__(kThreads) note_kernel(NoteCenters<S> a) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= a.n || !(a.radii[2 * i] > S(0))) return;
   const S x = S(0.5) * S(a.width), y = S(0.5) * S(a.height);
@@ -109,8 +102,7 @@ __global__ void __launch_bounds__(kThreads) note_kernel(NoteCenters<S> a) {
 dim3 blocks_for(int64_t n) { return dim3(unsigned(ceil_div(n, kThreads))); }
 }  // namespace
 
-template <class S>
-void picture_loss(const PictureLoss<S>& a, Stream stream) {
+template <class S> void picture_loss(const PictureLoss<S>& a, Stream stream) {
   const int64_t wanted = ceil_div(a.picture.pixels, kThreads);
   const int blocks = int(wanted < kMostSums ? wanted : kMostSums);
   if (blocks) BT_LAUNCH(sums_kernel<S>, dim3(unsigned(blocks)), dim3(kThreads), 0, stream, a.picture, a.sums);
@@ -118,15 +110,13 @@ void picture_loss(const PictureLoss<S>& a, Stream stream) {
             a.similarity, a.photometric, a.falloff);
 }
 
-template <class S>
-void picture_loss_backward(const PictureLossBackward<S>& a, Stream stream) {
+template <class S> void picture_loss_backward(const PictureLossBackward<S>& a, Stream stream) {
   if (!a.picture.pixels) return;
   BT_LAUNCH(gradient_kernel<S>, blocks_for(a.picture.pixels), dim3(kThreads), 0, stream, a.picture, a.share, a.weight,
             a.dsimilarity, a.dphotometric, a.dfalloff, a.dimage);
 }
 
-template <class S>
-void note_centers(const NoteCenters<S>& a, Stream stream) {
+template <class S> void note_centers(const NoteCenters<S>& a, Stream stream) {
   if (a.n) BT_LAUNCH(note_kernel<S>, blocks_for(a.n), dim3(kThreads), 0, stream, a);
 }
 

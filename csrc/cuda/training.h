@@ -1,5 +1,5 @@
-// What a training step does beside drawing, for the scene's surfels and the picture's pixels at once: done by torch it
-// is some fifty small operations, whose launches take the host longer than all of them take the card.
+// Losses and statistics of a training step, for all surfels and pixels at once: by torch they are some fifty small
+// operations, whose launches take the host longer than all of them take the card.
 #pragma once
 
 #include "core/blend.h"
@@ -11,93 +11,73 @@ namespace bt::cuda {
 // image [pixels, kImageChannels]: rgb, alpha and beta; target [pixels, 3]. The losses that `train.losses.objective`
 // describes: l1 is the mean of |rgb - target|, right that of omega beta, omega = exp(-gamma e), e = |rgb - target|
 // summed over rgb, or with `squared` the mean of the squares.
-template <class S>
-struct Picture {
+template <class S> struct Picture {
   int64_t pixels;
   const S *image, *target;
   S gamma;
   bool squared;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     r.rows("image", image, pixels, kImageChannels);
     r.array("target", target, 3 * pixels);
-    r.number("gamma", gamma);
-    r.number("squared", squared);
+    r.numbers("gamma", gamma, "squared", squared);
   }
 };
 
 // Writes photometric = (1 - share) l1 + share (1 - similarity) and falloff = weight right, [1] each. sums is working
 // memory.
 constexpr int kMostSums = 1024;  // blocks
-template <class S>
-struct PictureLoss {
+template <class S> struct PictureLoss {
   Picture<S> picture;
   S share, weight;
   const S* similarity;  // [1]
   double* sums;         // [kMostSums, 2]
   S *photometric, *falloff;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     picture.fields(r);
-    r.number("share", share);
-    r.number("weight", weight);
+    r.numbers("share", share, "weight", weight);
     r.array("similarity", similarity, 1);
     r.array("sums", sums, 2 * kMostSums);
-    r.array("photometric", photometric, 1);
-    r.array("falloff", falloff, 1);
+    r.arrays(1, "photometric", photometric, "falloff", falloff);
   }
 };
-template <class S>
-void picture_loss(const PictureLoss<S>& a, Stream stream);
+template <class S> void picture_loss(const PictureLoss<S>& a, Stream stream);
 
-// dimage is written, given the gradients of both losses [1] and that of the similarity with respect to rgb [pixels, 3].
+// Writes dimage from the gradients of both losses [1] and that of the similarity with respect to rgb [pixels, 3].
 // omega has no gradient.
-template <class S>
-struct PictureLossBackward {
+template <class S> struct PictureLossBackward {
   Picture<S> picture;
   S share, weight;
   const S *dsimilarity, *dphotometric, *dfalloff;
   S* dimage;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     picture.fields(r);
-    r.number("share", share);
-    r.number("weight", weight);
+    r.numbers("share", share, "weight", weight);
     r.array("dsimilarity", dsimilarity, 3 * picture.pixels);
-    r.array("dphotometric", dphotometric, 1);
-    r.array("dfalloff", dfalloff, 1);
+    r.arrays(1, "dphotometric", dphotometric, "dfalloff", dfalloff);
     r.array("dimage", dimage, picture.pixels * kImageChannels);
   }
 };
-template <class S>
-void picture_loss_backward(const PictureLossBackward<S>& a, Stream stream);
+template <class S> void picture_loss_backward(const PictureLossBackward<S>& a, Stream stream);
 
-// What densification keeps of a view, `train.strategy.Strategy.accumulate`: the four statistics [n] are changed. grad
-// and absgrad [n, 2] are null where nothing was seen.
-template <class S>
-struct NoteCenters {
+// Statistics of a view for densification, `train.strategy.Strategy.accumulate`: the four statistics [n] are changed.
+// grad and absgrad [n, 2] are null where nothing was seen.
+template <class S> struct NoteCenters {
   int64_t n;
   const S *radii, *grad, *absgrad;
   int width, height;
   float *grad_sum, *abs_grad_sum, *visible_count, *max_radius;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     r.rows("radii", radii, n, 2);
-    r.maybe("grad", grad, 2 * n);
-    r.maybe("absgrad", absgrad, 2 * n);
-    r.number("width", width);
-    r.number("height", height);
-    r.array("grad_sum", grad_sum, n);
-    r.array("abs_grad_sum", abs_grad_sum, n);
-    r.array("visible_count", visible_count, n);
-    r.array("max_radius", max_radius, n);
+    r.maybes(2 * n, "grad", grad, "absgrad", absgrad);
+    r.numbers("width", width, "height", height);
+    r.arrays(n, "grad_sum", grad_sum, "abs_grad_sum", abs_grad_sum, "visible_count", visible_count, "max_radius",
+             max_radius);
   }
 };
-template <class S>
-void note_centers(const NoteCenters<S>& a, Stream stream);
+template <class S> void note_centers(const NoteCenters<S>& a, Stream stream);
 
 }  // namespace bt::cuda

@@ -56,8 +56,7 @@ __global__ void __launch_bounds__(kThreads)
 
 // Calls f with the kind's struct, and with its preset's number of terms, for which the compiler unrolls, or 0 for any
 // other.
-template <class F>
-void dispatch(int kind, int terms, F&& f) {
+template <class F> void dispatch(int kind, int terms, F&& f) {
   for_view_color(kind, [&](auto view_color) {
     constexpr int kPreset = decltype(view_color)::kPresetTerms;
     if (terms == kPreset)
@@ -68,8 +67,7 @@ void dispatch(int kind, int terms, F&& f) {
 }
 }  // namespace
 
-template <class S>
-void view_color_forward(const ViewColorForward<S>& a, Stream stream) {
+template <class S> void view_color_forward(const ViewColorForward<S>& a, Stream stream) {
   const Directions<S>& to = a.to;
   if (!to.n) return;
   dispatch(a.colors.kind, a.colors.terms, [&](auto kind, auto terms) {
@@ -79,8 +77,7 @@ void view_color_forward(const ViewColorForward<S>& a, Stream stream) {
   });
 }
 
-template <class S>
-void lean_color(const LeanColor<S>& a, Stream stream) {
+template <class S> void lean_color(const LeanColor<S>& a, Stream stream) {
   const Directions<S>& to = a.to;
   if (!to.n) return;
   const auto kernel = lean_kernel<S>;
@@ -88,8 +85,7 @@ void lean_color(const LeanColor<S>& a, Stream stream) {
             to.center, to.active, a.out);
 }
 
-template <class S>
-void view_color_backward(const ViewColorBackward<S>& a, Stream stream) {
+template <class S> void view_color_backward(const ViewColorBackward<S>& a, Stream stream) {
   const Directions<S>& to = a.to;
   if (!to.n) return;
   dispatch(a.colors.kind, a.colors.terms, [&](auto kind, auto terms) {

@@ -10,8 +10,7 @@ namespace bt::cuda {
 __device__ inline int count_below(unsigned in, int lane) { return __popc(in & ((1u << lane) - 1u)); }
 
 // The lanes of my run: neighbours with my key. All 32 lanes take part.
-template <class Key>
-__device__ unsigned run_of(Key key, int lane) {
+template <class Key> __device__ unsigned run_of(Key key, int lane) {
   const Key before = __shfl_up_sync(kFullMask, key, 1);
   const unsigned heads = __ballot_sync(kFullMask, lane == 0 || key != before);
   const unsigned upto = heads & (0xffffffffu >> (kWarp - 1 - lane));  // has bit 0: lane 0 is a head
@@ -23,8 +22,7 @@ __device__ unsigned run_of(Key key, int lane) {
 
 // Sums M values over the lanes of each run; the first lane of a run gets the sum, always in the same order. Takes
 // log2(longest run) steps of M shuffles.
-template <int M, class S>
-__device__ void sum_over_run(unsigned run, int lane, S (&value)[M]) {
+template <int M, class S> __device__ void sum_over_run(unsigned run, int lane, S (&value)[M]) {
   const int above = kWarp - 1 - __clz(int(run)) - lane;  // lanes of my run after me
   for (int step = 1; __any_sync(kFullMask, above >= step); step *= 2) {
     BT_UNROLL
@@ -36,17 +34,14 @@ __device__ void sum_over_run(unsigned run, int lane, S (&value)[M]) {
 }
 
 // The sum of integers in units of 1 / scale as a number.
-template <class S>
-__device__ S exact_value(unsigned long long sum, double scale) {
+template <class S> __device__ S exact_value(unsigned long long sum, double scale) {
   return S(double(static_cast<long long>(sum)) / scale);
 }
 
 // Adds to memory that all blocks share. Sums of floating-point numbers depend on the order in which the blocks come;
 // for a result that does not, values are added as integers in units of 1 / scale.
-template <class S, bool kExact>
-struct Adder;
-template <class S>
-struct Adder<S, false> {
+template <class S, bool kExact> struct Adder;
+template <class S> struct Adder<S, false> {
   S* to;
   __device__ void add(int64_t at, S value) const { atomicAdd(to + at, value); }
   // four neighbours, `at` a multiple of 4
@@ -56,8 +51,7 @@ struct Adder<S, false> {
   // once all have been added
   __device__ S sum(int64_t at) const { return to[at]; }
 };
-template <>
-__device__ inline void Adder<float, false>::add4(int64_t at, const float* v) const {
+template <> __device__ inline void Adder<float, false>::add4(int64_t at, const float* v) const {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900 && (__CUDACC_VER_MAJOR__ > 12 || __CUDACC_VER_MINOR__ >= 1)
   // one request of 16 bytes to the L2 instead of four of 4
   asm volatile("red.global.add.v4.f32 [%0], {%1, %2, %3, %4};" ::"l"(__cvta_generic_to_global(to + at)), "f"(v[0]),
@@ -67,8 +61,7 @@ __device__ inline void Adder<float, false>::add4(int64_t at, const float* v) con
   for (int j = 0; j < 4; ++j) atomicAdd(to + at + j, v[j]);
 #endif
 }
-template <class S>
-struct Adder<S, true> {
+template <class S> struct Adder<S, true> {
   unsigned long long* to;  // two's complement
   double scale;
   __device__ void add(int64_t at, S value) const {

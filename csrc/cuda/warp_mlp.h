@@ -18,21 +18,17 @@
 namespace bt::cuda {
 
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
-template <class S>
-constexpr bool kTensorCores = std::is_same_v<S, float>;
+template <class S> constexpr bool kTensorCores = std::is_same_v<S, float>;
 #else
-template <class S>
-constexpr bool kTensorCores = false;
+template <class S> constexpr bool kTensorCores = false;
 #endif
 
 // A lane's N numbers of a factor. Tensor cores take the first 11 bits of a float: each number is high + low, where high
 // has 11 bits and low, again cut to 11 bits, misses the number by at most 2^-20 of it.
-template <class S, int N>
-struct alignas(16) Factor {
+template <class S, int N> struct alignas(16) Factor {
   S high[N], low[N];
 };
-template <class S, int N>
-__device__ Factor<S, N> factor(const S (&v)[N]) {
+template <class S, int N> __device__ Factor<S, N> factor(const S (&v)[N]) {
   Factor<S, N> f;
   BT_UNROLL
   for (int i = 0; i < N; ++i) {
@@ -60,8 +56,7 @@ __device__ inline void tensor_step(float (&c)[4], const float (&a)[4], const flo
 
 // c += a b, all as above. In float on tensor cores by three products, small ones first (low low is below what low
 // misses); in double, on older cards and in the emulator by shuffles.
-template <class S>
-__device__ void multiply_add(S (&c)[4], const Factor<S, 4>& a, const Factor<S, 2>& b, int lane) {
+template <class S> __device__ void multiply_add(S (&c)[4], const Factor<S, 4>& a, const Factor<S, 2>& b, int lane) {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
   if constexpr (kTensorCores<S>) {
     tensor_step(c, a.low, b.high);
@@ -82,12 +77,10 @@ __device__ void multiply_add(S (&c)[4], const Factor<S, 4>& a, const Factor<S, 2
 }
 
 // 32 x 16 numbers, a row per look-up, as products lie: v[m][n] of the rows from 16 m and the columns from 8 n.
-template <class S>
-struct Rows {
+template <class S> struct Rows {
   S v[2][2][4];
   // Calls take(look-up, column, two neighbours) for each of the lane's pairs.
-  template <class F>
-  __device__ void pairs(int lane, const F& take) {
+  template <class F> __device__ void pairs(int lane, const F& take) {
     BT_UNROLL
     for (int m = 0; m < 2; ++m) {
       BT_UNROLL
@@ -98,19 +91,16 @@ struct Rows {
       }
     }
   }
-  template <class F>
-  __device__ void each(const F& change) {
+  template <class F> __device__ void each(const F& change) {
     BT_UNROLL
     for (int i = 0; i < 16; ++i) change(v[i / 8][i / 4 % 2][i % 4], i);
   }
 };
-template <class S>
-struct alignas(2 * sizeof(S)) Pair {
+template <class S> struct alignas(2 * sizeof(S)) Pair {
   S v[2];
 };
 // From and to memory where row(p) is that of look-up p.
-template <class S, class Row>
-__device__ Rows<S> load_rows(int lane, const Row& row) {
+template <class S, class Row> __device__ Rows<S> load_rows(int lane, const Row& row) {
   Rows<S> r;
   r.pairs(lane, [&](int p, int column, S* v) {
     const Pair<S> pair = *reinterpret_cast<const Pair<S>*>(row(p) + column);
@@ -118,42 +108,35 @@ __device__ Rows<S> load_rows(int lane, const Row& row) {
   });
   return r;
 }
-template <class S, class Row>
-__device__ void store_rows(Rows<S> r, int lane, const Row& row) {
+template <class S, class Row> __device__ void store_rows(Rows<S> r, int lane, const Row& row) {
   r.pairs(lane, [&](int p, int column, const S* v) { *reinterpret_cast<Pair<S>*>(row(p) + column) = {{v[0], v[1]}}; });
 }
-template <class S>
-__device__ Rows<S> rectified(Rows<S> r) {
+template <class S> __device__ Rows<S> rectified(Rows<S> r) {
   r.each([](S& v, int) { v = relu(v); });
   return r;
 }
 // r where a layer's output is above 0, else 0.
-template <class S>
-__device__ Rows<S> where_open(Rows<S> r, const Rows<S>& output) {
+template <class S> __device__ Rows<S> where_open(Rows<S> r, const Rows<S>& output) {
   r.each([&](S& v, int i) { v = output.v[i / 8][i / 4 % 2][i % 4] > S(0) ? v : S(0); });
   return r;
 }
 
 // N / 8 tiles of columns of a matrix with 16 rows, as second factors: tile[j][n] of the rows from 8 j.
-template <class S, int kTiles>
-struct Weights {
+template <class S, int kTiles> struct Weights {
   Factor<S, 2> tile[2][kTiles][kWarp];
 };
 // The weights in shared memory; for gradients their transposes, and of w3 the plain numbers, too.
-template <class S>
-struct ForwardMlp {
+template <class S> struct ForwardMlp {
   Weights<S, 2> w1, w2;
   Weights<S, 1> w3;
 };
-template <class S>
-struct WarpMlp : ForwardMlp<S> {
+template <class S> struct WarpMlp : ForwardMlp<S> {
   Weights<S, 2> w1t, w2t;
   alignas(16) S output[kWidth][4];
 };
 
 // All threads of the block; ends with a barrier. M: one of the two above.
-template <class S, class M>
-__device__ void load_mlp(const FieldArrays<S>& f, int thread, int threads, M& m) {
+template <class S, class M> __device__ void load_mlp(const FieldArrays<S>& f, int thread, int threads, M& m) {
   constexpr bool kGradients = std::is_same_v<M, WarpMlp<S>>;
   const int inputs = f.levels * kFeatures;
   for (int k = thread; k < 2 * 2 * kWarp; k += threads) {
@@ -204,8 +187,7 @@ __device__ void product(const Rows<S>& in, const Weights<S, kTiles>& w, int lane
     }
   }
 }
-template <class S>
-__device__ Rows<S> layer(const Rows<S>& in, const Weights<S, 2>& w, int lane) {
+template <class S> __device__ Rows<S> layer(const Rows<S>& in, const Weights<S, 2>& w, int lane) {
   Rows<S> out;
   product(in, w, lane, out.v);
   return out;
@@ -213,8 +195,7 @@ __device__ Rows<S> layer(const Rows<S>& in, const Weights<S, 2>& w, int lane) {
 
 // A lane's share of the weights' gradients: its numbers of the products that give those of w1 and w2, and for w3 its
 // look-ups' share of its four rows.
-template <class S>
-struct WeightSums {
+template <class S> struct WeightSums {
   S w1[2][4], w2[2][4], w3[4][3];
   __device__ WeightSums() {
     BT_UNROLL
@@ -224,7 +205,7 @@ struct WeightSums {
   }
 
   // Adds in^T out of 32 look-ups, both [32, 16] in memory, rows `stride` numbers apart. Tensor cores cut what they add
-  // up, so each sum of 32 begins anew and is added here.
+  // up, so each sum of 32 starts at 0 and is added here.
   __device__ static void add_outer(S (&sums)[2][4], const S* in, const S* out, int stride, int lane) {
     const int g = lane / 4, t = lane % 4;
     S c[2][4] = {};

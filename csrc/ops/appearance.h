@@ -7,45 +7,39 @@
 namespace bt {
 
 // Directions from center [3], the camera's, to means [n, 3]. Rows where active [n] is 0 give 0 and get gradient 0.
-template <class S>
-struct Directions {
+template <class S> struct Directions {
   int64_t n;
   const S* means;
   const double* center;
   const uint8_t* active;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     r.rows("active", active, n, 1);
     r.array("means", means, 3 * n);
     r.array("center", center, 3);
   }
 };
 
-template <class S>
-struct ViewColorForward {
+template <class S> struct ViewColorForward {
   Directions<S> to;
   ViewColorArrays<const S> colors;
   S* out;  // [n, 3]
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     to.fields(r);
     colors.fields(r, to.n);
     r.array("out", out, 3 * to.n);
   }
 };
 
-template <class S>
-struct ViewColorBackward {
+template <class S> struct ViewColorBackward {
   Directions<S> to;
   ViewColorArrays<const S> colors;
   const S* dout;
   ViewColorArrays<S> dcolors;
   S* dmeans;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     to.fields(r);
     colors.fields(r, to.n);
     r.array("dout", dout, 3 * to.n);
@@ -55,15 +49,13 @@ struct ViewColorBackward {
   }
 };
 
-template <class S>
-struct LeanColor {
+template <class S> struct LeanColor {
   Directions<S> to;
   LeanColors<S> colors;
   int64_t terms;  // of all surfels
   S* out;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     to.fields(r);
     colors.fields(r, to.n, terms);
     r.array("out", out, 3 * to.n);
@@ -71,21 +63,16 @@ struct LeanColor {
 };
 
 // Images [height, width, channels]; value [1] and, when not null, da are written.
-template <class S>
-struct Ssim {
+template <class S> struct Ssim {
   int height, width, channels;
   const S *a, *b;
   S *value, *da;
   Workspace workspace;
 
-  template <class R>
-  void fields(R& r) {
-    r.number("height", height);
-    r.number("width", width);
-    r.number("channels", channels);
+  template <class R> void fields(R& r) {
+    r.numbers("height", height, "width", width, "channels", channels);
     const int64_t size = int64_t(height) * width * channels;
-    r.array("a", a, size);
-    r.array("b", b, size);
+    r.arrays(size, "a", a, "b", b);
     r.array("value", value, 1);
     r.maybe("da", da, size);
     r.memory("workspace", workspace);

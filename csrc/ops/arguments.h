@@ -1,15 +1,16 @@
-// What an operation takes is one struct, the same for its kernels on the CPU and on CUDA. The struct's `fields` names
-// each argument once, with its size, to a reader that fills it (bindings/reader.h): it knows nothing of Python.
+// The arguments of an operation are one struct, the same for its kernels on the CPU and on CUDA. The struct's `fields`
+// names each argument once, with its size, to a reader that fills it (bindings/reader.h): it knows nothing of Python.
 //
 //   r.array(name, pointer, count)      `count` numbers; input where the pointer is to const
 //   r.wide(name, pointer, count)       likewise; CUDA kernels read it 16 bytes at a time
-//   r.maybe(name, pointer, count)      likewise; null where it was not given
+//   r.maybe(name, pointer, count)      likewise; null where it is absent
 //   r.rows(name, pointer, n, width)    any number n of rows of `width` numbers: n is written
 //   r.work(name, pointer, count)       working memory of CUDA kernels; null on the CPU
 //   r.memory(name, workspace)          the same as bytes, of which the kernel says how many it needs
 //   r.number(name, x), r.choice(name, index, names)
-//   r.object(name, pointer), r.maybe_object(name, pointer)    what has a class of its own in Python
-//   r.given(name)                      whether the caller gave it
+//   r.numbers(name, x, ...), r.arrays(count, name, pointer, ...), r.maybes(count, name, pointer, ...)
+//   r.object(name, pointer), r.maybe_object(name, pointer)    a class of its own in Python
+//   r.has(name)                        true where the caller passed it
 //   r.refuse(why)                      ends the call
 #pragma once
 
@@ -20,7 +21,7 @@
 
 namespace bt {
 
-// Working memory that the caller gives in one block.
+// Working memory, one block allocated by the caller.
 struct Workspace {
   void* at;
   int64_t bytes;
@@ -31,80 +32,71 @@ struct Workspace {
 };
 
 // The fragments of a view, ordered by tile, then front to back by surfel, then as the layout says.
-template <class S>
-struct FragmentArrays {
+template <class S> struct FragmentArrays {
   int64_t total;
   int32_t *surfel, *pixel;
   S *weight, *uv, *depth, *sigma;  // uv [2, total]; sigma is negative in the low-pass branch
 
-  // Without `places` surfel and pixel are null: a layout says them.
-  template <class R>
-  void fields(R& r, bool places = true) {
+  // Without `ids` surfel and pixel are null: the layout has them.
+  template <class R> void fields(R& r, bool ids = true) {
     r.rows("weight", weight, total, 1);
     r.array("uv", uv, 2 * total);
-    r.array("depth", depth, total);
-    r.array("sigma", sigma, total);
+    r.arrays(total, "depth", depth, "sigma", sigma);
     surfel = pixel = nullptr;
-    if (!places) return;
-    r.array("surfel", surfel, total);
-    r.array("pixel", pixel, total);
+    if (!ids) return;
+    r.arrays(total, "surfel", surfel, "pixel", pixel);
   }
 };
 
 inline int64_t tiles_of(int width, int height) { return int64_t(tiles_across(width)) * tiles_across(height); }
 
-// Where the parts of a list begin.
+// Offsets of the tiles in a list.
 struct TileStarts {
   const int64_t* start;  // [tiles + 1]
   int64_t tiles, fragments;
 };
-template <class R>
-void take(R& r, const char* name, TileStarts& to) {
+template <class R> void take(R& r, const char* name, TileStarts& to) {
   r.rows(name, to.start, to.tiles, 1);
   if (--to.tiles < 0 || to.start[0] != 0) r.refuse("the tiles' starts begin with 0");
   to.fragments = to.start[to.tiles];
 }
 
-// How kernels of the CPU find their way in a fragment list: those of a surfel in a tile are ordered by packs of 4 x 4
-// pixels (cpu/packs.h). Made by trace alone: that packs and fragments belong together is not looked at. CUDA's kernels
-// have `Pairs`.
-struct TilePacks {
-  const int64_t* start;       // [tiles + 1] where each tile's fragments begin
-  const int64_t* pack_start;  // [tiles + 1] and where its packs do
-  const int32_t* packs;       // [count, 2] what a pack has of a surfel, see PackPart
+// Index of a fragment list on the CPU: the fragments of a surfel in a tile are ordered by blocks of 4 x 4 pixels
+// (cpu/blocks.h). Made by trace alone: that blocks and fragments belong together is not checked. CUDA's kernels have
+// `Pairs`.
+struct TileBlocks {
+  const int64_t* start;        // [tiles + 1] where each tile's fragments begin
+  const int64_t* block_start;  // [tiles + 1] and where its blocks do
+  const int32_t* blocks;       // [count, 2] the pixels of a surfel in a block, see BlockPart
   int64_t tiles, count, fragments;
   static constexpr int64_t pairs = 0;    // of surfel and tile: not kept
-  static constexpr bool kPlaces = true;  // whose all fragments are and where
+  static constexpr bool kHasIds = true;  // has surfel and pixel of all fragments
   bool fits(int64_t, int width, int height) const { return tiles == tiles_of(width, height); }
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     TileStarts of = {};
     take(r, "tile_start", of);
     start = of.start, tiles = of.tiles, fragments = of.fragments;
-    r.array("pack_start", pack_start, tiles + 1);
-    r.rows("packs", packs, count, 2);
-    if (pack_start[0] != 0 || pack_start[tiles] != count) r.refuse("the packs do not belong to these tiles");
+    r.array("block_start", block_start, tiles + 1);
+    r.rows("blocks", blocks, count, 2);
+    if (block_start[0] != 0 || block_start[tiles] != count) r.refuse("the blocks do not belong to these tiles");
   }
 };
 // A layout that is an object of Python.
-template <class R, class Layout>
-void take(R& r, const char* name, Layout& to) {
-  const Layout* given = nullptr;
-  r.object(name, given);
-  to = *given;
+template <class R, class Layout> void take(R& r, const char* name, Layout& to) {
+  const Layout* layout = nullptr;
+  r.object(name, layout);
+  to = *layout;
 }
 
-// A fragment list with what finds its way in it.
-template <class S, class Layout>
-struct Fragments {
+// A fragment list with its index.
+template <class S, class Layout> struct Fragments {
   Layout layout;
   FragmentArrays<S> f;
 
-  template <class R>
-  void fields(R& r, int64_t surfels, int width, int height) {
+  template <class R> void fields(R& r, int64_t surfels, int width, int height) {
     take(r, "layout", layout);
-    f.fields(r, !Layout::kPlaces);
+    f.fields(r, !Layout::kHasIds);
     if (layout.fragments != f.total || !layout.fits(surfels, width, height))
       r.refuse("the layout does not belong to these fragments");
   }

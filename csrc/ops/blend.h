@@ -7,8 +7,7 @@
 namespace bt {
 
 // Surfels with texels, or without any (sizes 0, 0), as a view shows them.
-template <class S, class Layout>
-struct BlendedSurfels {
+template <class S, class Layout> struct BlendedSurfels {
   bool maps;
   const S* geom;  // [n, kGeom]
   int width, height;
@@ -17,12 +16,8 @@ struct BlendedSurfels {
   TexelTiles<S> table;
 
   int64_t numbers() const { return int64_t(width) * height * (maps ? kMapChannels : kImageChannels); }
-  template <class R>
-  void fields(R& r) {
-    r.number("maps", maps);
-    r.number("width", width);
-    r.number("height", height);
-    r.number("bound", bound);
+  template <class R> void fields(R& r) {
+    r.numbers("maps", maps, "width", width, "height", height, "bound", bound);
     table.fields(r);
     r.array("geom", geom, table.n * kGeom);
     fragments.fields(r, table.n, width, height);
@@ -31,26 +26,23 @@ struct BlendedSurfels {
 
 // image [height, width, channels]: the sums of core/blend.h of the colours relu(relu(base + 0.5) + texel(u, v)), below
 // `bound` and without a tile relu(base + 0.5). Written.
-template <class S, class Layout>
-struct BlendForward {
+template <class S, class Layout> struct BlendForward {
   BlendedSurfels<S, Layout> of;
   S* image;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     of.fields(r);
     r.array("image", image, of.numbers());
   }
 };
 
-// What a pair of surfel and tile adds to its surfel: beta and the colour, with maps also the normal and one unused.
+// Sums of a pair of surfel and tile for its surfel: beta and the colour, with maps also the normal and one unused.
 constexpr int blend_sums(bool maps) { return maps ? 8 : 4; }
 
-// ddepth [F] (maps only), dgeom [n, kGeom] (beta and normal columns) and dbase [n, 3] are written, and what is given of
+// ddepth [F] (maps only), dgeom [n, kGeom] (beta and normal columns) and dbase [n, 3] are written, and, where not null,
 // dweight [F], duv [2, F] and dtexels [texels, 3]. With `moved` [texels, 3] the texels' gradient g is not kept: texel t
 // of `moved` moves by -rate share[t] g. partial [pairs, blend_sums] and work are working memory.
-template <class S, class Layout>
-struct BlendBackward {
+template <class S, class Layout> struct BlendBackward {
   BlendedSurfels<S, Layout> of;
   const S *dimage, *share;
   S rate;
@@ -58,8 +50,7 @@ struct BlendBackward {
   TexelWork<S> work;
 
   bool sums_texels() const { return dtexels || moved; }
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     of.fields(r);
     const int64_t total = of.fragments.f.total, n = of.table.n;
     r.array("dimage", dimage, of.numbers());
@@ -68,12 +59,11 @@ struct BlendBackward {
     of.maps ? r.array("ddepth", ddepth, total) : r.maybe("ddepth", ddepth, total);
     r.array("dgeom", dgeom, n * kGeom);
     r.array("dbase", dbase, 3 * n);
-    r.maybe("dtexels", dtexels, 3 * of.table.texels);
-    r.maybe("moved", moved, 3 * of.table.texels);
+    r.maybes(3 * of.table.texels, "dtexels", dtexels, "moved", moved);
     r.maybe("share", share, of.table.texels);
     r.number("rate", rate);
     r.work("partial", partial, of.fragments.layout.pairs * blend_sums(of.maps));
-    work.fields(r, sums_texels() ? of.table.texels : 0, 0);
+    work.fields(r, sums_texels() ? of.table.texels : 0);
     check_moved(r, moved, share, dtexels);
   }
 };

@@ -9,8 +9,7 @@
 namespace bt {
 
 // Texels of all tiles in one list, rows along v: tile i of r_u x r_v texels begins at first[i]; 0, 0 = no tile.
-template <class S>
-struct TexelTiles {
+template <class S> struct TexelTiles {
   int64_t n, texels;
   const int64_t* first;  // [n], in texels
   const int32_t* size;   // [n, 2]
@@ -18,8 +17,7 @@ struct TexelTiles {
   const S* base;         // [n, 3] f_view
   const S* values;       // [texels, 3]
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     r.rows("first", first, n, 1);
     r.array("size", size, 2 * n);
     r.array("extent", extent, n);
@@ -29,13 +27,11 @@ struct TexelTiles {
 };
 // A backward pass that moves texels, those that it reads or others in their stead, moves them by a share of each and
 // keeps no gradient of them.
-template <class R, class S>
-void check_moved(R& r, const S* moved, const S* share, const S* dtexels) {
+template <class R, class S> void check_moved(R& r, const S* moved, const S* share, const S* dtexels) {
   if (moved && (!share || dtexels)) r.refuse("texels move by a share of each, and their gradient is not kept");
 }
-// What the fragments of one surfel share.
-template <class S>
-struct TexelPatch {
+// The texels of one surfel.
+template <class S> struct TexelPatch {
   const int32_t* size;  // r_u, r_v; 0, 0 = no tile
   const S* tile;        // its texels
   int64_t first;        // of them
@@ -57,18 +53,36 @@ struct TexelPatch {
   }
 };
 // Working memory of the backward pass on CUDA: where the texels' gradients are added up, rows of four, the last 0.
-template <class S>
-struct TexelWork {
+template <class S> struct TexelWork {
   S* sums;         // [texels, 4]
-  int64_t* exact;  // null, or in its place for sums that do not depend on the order: [exact_size(...)]
+  int64_t* exact;  // null, or instead of `sums` for sums that do not depend on the order: [exact_size(...)]
 
-  template <class R>
-  void fields(R& r, int64_t texels, int64_t surfels) {
+  template <class R> void fields(R& r, int64_t texels) {
     sums = nullptr, exact = nullptr;
-    if (r.given("exact_work"))
-      r.work("exact_work", exact, exact_size(4 * texels, surfels, false));
+    if (r.has("exact_work"))
+      r.work("exact_work", exact, exact_size(4 * texels, 0, false));
     else if (texels)
       r.work("texel_work", sums, 4 * texels);
   }
 };
+
+// Channels of a baked image of the CPU: rgb, alpha; with maps those of CompositeForward.
+constexpr int kBakedChannels = 4;
+
+// Texels of n surfels.
+struct BakedResidual {
+  float offset, scale;         // residual = offset + scale * stored
+  const float* extent;         // [n] half side of the tile, scale units; null: kSupport everywhere
+  const float* mean_residual;  // [n, 3], the residual of a surfel without a tile; null: 0
+  float weight_bound;          // fragments of smaller weight get no residual
+  float transmittance_min;     // a surfel that would leave a pixel less ends it, see blend_test; 0: none does
+
+  template <class R> void fields(R& r, int64_t n) {
+    r.numbers("offset", offset, "scale", scale);
+    r.maybe("extent", extent, n);
+    r.maybe("mean_residual", mean_residual, 3 * n);
+    r.numbers("weight_bound", weight_bound, "transmittance_min", transmittance_min);
+  }
+};
+
 }  // namespace bt

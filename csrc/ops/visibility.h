@@ -9,29 +9,25 @@ namespace bt {
 
 // viewmat [4, 4] and K [3, 3] lie where the surfels do. Written: geom [n, kGeom], frames [n, kFrame] and radii [n, 2]
 // (half extents of the level-set box in pixels, 0 where not visible); rows of surfels that are not visible are zero.
-// broken [1] is raised by the number of rows that are not finite. `through_pixel` and `photo_pixel` choose between the
+// broken [1] is raised by the number of rows that are not finite. `prefilter` and `photo_pixel` choose between the
 // kernels of core/surfel.h, and have to be the same wherever a view's rows go; with another photo_pixel than 1 that is
 // the baked renderer alone.
-template <class S>
-struct ProjectForward {
+template <class S> struct ProjectForward {
   Surfels<S> surfels;
   const S *viewmat, *K;
   int width, height;
   S near;
-  bool through_pixel;
+  int prefilter;
   S photo_pixel;  // side of a photograph's pixel in pixels of the view
   S *geom, *frames, *radii;
   int32_t* broken;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     surfels.fields(r);
     r.array("viewmat", viewmat, 16);
     r.array("K", K, 9);
-    r.number("width", width);
-    r.number("height", height);
-    r.number("near", near);
-    r.number("through_pixel", through_pixel);
+    r.numbers("width", width, "height", height, "near", near);
+    r.choice("prefilter", prefilter, kPrefilters);
     r.number("photo_pixel", photo_pixel);
     r.array("geom", geom, surfels.n * kGeom);
     r.array("frames", frames, surfels.n * kFrame);
@@ -41,43 +37,36 @@ struct ProjectForward {
 };
 
 // dframes may be null (zero). The surfels' gradients are written.
-template <class S>
-struct ProjectBackward {
+template <class S> struct ProjectBackward {
   Surfels<S> surfels;
   const S *viewmat, *K;
   const S *geom, *dgeom, *dframes;
   SurfelGradients<S> out;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     surfels.fields(r);
     r.array("viewmat", viewmat, 16);
     r.array("K", K, 9);
-    r.array("geom", geom, surfels.n * kGeom);
-    r.array("dgeom", dgeom, surfels.n * kGeom);
+    r.arrays(surfels.n * kGeom, "geom", geom, "dgeom", dgeom);
     r.maybe("dframes", dframes, surfels.n * kFrame);
     out.fields(r, surfels.n);
   }
 };
 
-// What a camera sees of n surfels, as projection left it.
-template <class S>
-struct View {
+// The rows of a projection.
+template <class S> struct View {
   int64_t n;
   const S *geom, *radii;
   int width, height;
   S near;
-  bool through_pixel;
+  int prefilter;
   S photo_pixel;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     r.rows("radii", radii, n, 2);
     r.wide("geom", geom, n * kGeom);
-    r.number("width", width);
-    r.number("height", height);
-    r.number("near", near);
-    r.number("through_pixel", through_pixel);
+    r.numbers("width", width, "height", height, "near", near);
+    r.choice("prefilter", prefilter, kPrefilters);
     r.number("photo_pixel", photo_pixel);
   }
 };
@@ -85,8 +74,7 @@ struct View {
 // dgeom [n, kGeom] and absgrad [n, 2] are written. dweight, duv, ddepth may be null (zero). dsigma and partial are
 // working memory; the sums of a pair: columns 0 to kBeta of geom, two absolute gradients, one unused, kArea.
 constexpr int kTraceSums = 16;
-template <class S, class Layout>
-struct TraceBackward {
+template <class S, class Layout> struct TraceBackward {
   View<S> view;
   S rim;
   Fragments<S, Layout> fragments;
@@ -94,8 +82,7 @@ struct TraceBackward {
   S *dsigma, *partial;
   S *dgeom, *absgrad;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     view.fields(r);
     r.number("rim", rim);
     fragments.fields(r, view.n, view.width, view.height);
@@ -110,77 +97,66 @@ struct TraceBackward {
   }
 };
 
-// image [height, width, channels]: the sums of core/blend.h, kMapChannels with maps, else kImageChannels. Written.
-template <class S, class Layout>
-struct CompositeForward {
+// The fragments of a view with their colours.
+template <class S, class Layout> struct ColoredFragments {
   bool maps;
   int64_t n;
   const S* geom;
   int width, height;
   Fragments<S, Layout> fragments;
   const S* colors;  // [F, 3]
-  S* image;
 
   int channels() const { return maps ? kMapChannels : kImageChannels; }
   int64_t pixels() const { return int64_t(width) * height; }
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     r.number("maps", maps);
     r.rows("geom", geom, n, kGeom);
-    r.number("width", width);
-    r.number("height", height);
+    r.numbers("width", width, "height", height);
     fragments.fields(r, n, width, height);
     r.array("colors", colors, 3 * fragments.f.total);
-    r.array("image", image, pixels() * channels());
+  }
+};
+
+// image [height, width, channels]: the sums of core/blend.h, kMapChannels with maps, else kImageChannels. Written.
+template <class S, class Layout> struct CompositeForward : ColoredFragments<S, Layout> {
+  S* image;
+
+  template <class R> void fields(R& r) {
+    ColoredFragments<S, Layout>::fields(r);
+    r.array("image", image, this->pixels() * this->channels());
   }
 };
 
 // dweight [F], dcolors [F, 3], ddepth [F] (maps only) and dgeom [n, kGeom] (beta and normal columns) are written;
 // partial is working memory.
-template <class S, class Layout>
-struct CompositeBackward {
-  bool maps;
-  int64_t n;
-  const S* geom;
-  int width, height;
-  Fragments<S, Layout> fragments;
-  const S *colors, *dimage;
+template <class S, class Layout> struct CompositeBackward : ColoredFragments<S, Layout> {
+  const S* dimage;
   S *partial, *dweight, *dcolors, *ddepth, *dgeom;
 
-  int channels() const { return maps ? kMapChannels : kImageChannels; }
-  int64_t pixels() const { return int64_t(width) * height; }
-  template <class R>
-  void fields(R& r) {
-    r.number("maps", maps);
-    r.rows("geom", geom, n, kGeom);
-    r.number("width", width);
-    r.number("height", height);
-    fragments.fields(r, n, width, height);
-    const int64_t total = fragments.f.total;
-    r.array("colors", colors, 3 * total);
-    r.array("dimage", dimage, pixels() * channels());
-    r.work("partial", partial, fragments.layout.pairs * (maps ? 4 : 1));
+  template <class R> void fields(R& r) {
+    ColoredFragments<S, Layout>::fields(r);
+    const int64_t total = this->fragments.f.total;
+    const bool maps = this->maps;
+    r.array("dimage", dimage, this->pixels() * this->channels());
+    r.work("partial", partial, this->fragments.layout.pairs * (maps ? 4 : 1));
     r.array("dweight", dweight, total);
     r.array("dcolors", dcolors, 3 * total);
     maps ? r.array("ddepth", ddepth, total) : r.maybe("ddepth", ddepth, total);
-    r.array("dgeom", dgeom, n * kGeom);
+    r.array("dgeom", dgeom, this->n * kGeom);
   }
 };
 
 // counts [n] is raised by the fragments of each surfel on pixels where mask [height, width] is not 0.
-template <class Layout>
-struct MaskedCounts {
+template <class Layout> struct MaskedCounts {
   Layout layout;
   int width, height;
   int64_t n;
   const uint8_t* mask;
   int32_t* counts;
 
-  template <class R>
-  void fields(R& r) {
+  template <class R> void fields(R& r) {
     take(r, "layout", layout);
-    r.number("width", width);
-    r.number("height", height);
+    r.numbers("width", width, "height", height);
     r.array("mask", mask, int64_t(width) * height);
     r.rows("counts", counts, n, 1);
     if (!layout.fits(n, width, height)) r.refuse("the layout is not that of such a view");

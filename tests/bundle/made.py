@@ -10,20 +10,15 @@ from tests.bake.scenes import write
 from tests.ops.test_view_color import lean_parameters
 
 
-def make(surfels, folder, kind="sv", format="uint8", count=6, **kwargs):
+def make(surfels, folder, kind="sv", format="uint8", count=6, lean=False, **kwargs):
     """A bundle of a few surfels and random texels; returns what went in."""
     params = surfels(count, kind)
+    if lean:
+        params = {k: v for k, v in params.items() if k not in VIEW_COLORS[kind].names}
+        params |= lean_parameters(kind, count, torch.float32)
     packing = pack([[8, 4]] * count)
     texels = np.random.default_rng(0).random((packing.layers, packing.height, packing.width, 3)).astype(np.float32)
     atlas = None if format is None else encode(texels, packing, format, Range(-0.5, 2.0, "test"))
     tiles = packing.tiles if atlas else np.zeros_like(packing.tiles)
-    write(folder, params, tiles, atlas, **kwargs)
+    write(folder, params, tiles, atlas, kind=kind, **kwargs)
     return params, tiles, texels, atlas
-
-
-def make_lean(surfels, folder, kind="sv", count=6):
-    """A bundle with lean view colours and without texture; returns its surfels."""
-    params = {k: v for k, v in surfels(count, kind).items() if k not in VIEW_COLORS[kind].names}
-    params |= lean_parameters(kind, count, torch.float32)
-    write(folder, params, np.zeros((count, 5), dtype=np.int32), None, kind=kind)
-    return params

@@ -17,27 +17,17 @@ from bitymi_ns.bundle import read as bundle_read
 from bitymi_ns.bundle.manifest import BundleError
 from bitymi_ns.bundle.parts import parts_of
 from bitymi_ns.cli import main
-from bitymi_ns.codec.packing import pack
-from bitymi_ns.codec.quantise import encode
-from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from tests.bake.scenes import write
+from tests.bundle import made
 from tests.bundle.damage import amend, change_columns, signed
-from tests.ops.test_view_color import lean_parameters
 
 COUNT = 6
 
 
-def make(surfels, folder: Path, kind: str = "sv", format: str = "uint8", lean: bool = False, **kwargs) -> Path:
-    """A bundle of a few surfels and random texels."""
-    params = surfels(COUNT, kind)
-    if lean:
-        params = {k: v for k, v in params.items() if k not in VIEW_COLORS[kind].names}
-        params |= lean_parameters(kind, COUNT, torch.float32)
-    packing = pack([[8, 4]] * COUNT)
-    texels = np.random.default_rng(0).random((packing.layers, packing.height, packing.width, 3)).astype(np.float32)
-    atlas = encode(texels, packing, format)
-    more = {"extent": torch.full((COUNT,), 2.0), "mean_residual": torch.zeros(COUNT, 3), **kwargs}
-    return write(folder, params, packing.tiles, atlas, kind=kind, **more)
+def make(surfels, folder: Path, kind: str = "sv", **options) -> Path:
+    """A bundle with tiles that end within the disc, and with mean residuals."""
+    made.make(surfels, folder, kind, extent=torch.full((COUNT,), 2.0), mean_residual=torch.zeros(COUNT, 3), **options)
+    return folder
 
 
 def sparse(folder: Path, name: str, size: int) -> None:

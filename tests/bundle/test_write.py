@@ -13,7 +13,7 @@ from bitymi_ns.bundle import write as bundle_module
 from bitymi_ns.ops.reference import view_color as reference
 from tests.bake.scenes import write
 from tests.bundle.damage import amend
-from tests.bundle.made import make, make_lean
+from tests.bundle.made import make
 
 
 def names_beside(folder):
@@ -58,7 +58,7 @@ def test_what_is_written_is_read(surfels, tmp_path, kind, format):
 
 @pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
 def test_lean_view_colours_are_read_as_they_were_written(surfels, tmp_path, kind):
-    params = make_lean(surfels, tmp_path / "b", kind)
+    params, *_ = make(surfels, tmp_path / "b", kind, None, lean=True)
     loaded = read_bundle(tmp_path / "b")
     assert loaded.scene.view_color == kind and loaded.info.version == "2.3"
     assert set(loaded.scene.surfels) == set(params)
@@ -70,7 +70,7 @@ def test_lean_view_colours_are_read_as_they_were_written(surfels, tmp_path, kind
 
 def test_lean_view_colours_that_do_not_fit_are_refused(surfels, tmp_path):
     target = tmp_path / "b"
-    params = make_lean(surfels, target)
+    params, *_ = make(surfels, target, format=None, lean=True)
     with pytest.raises(BundleError, match="surfel 2"):
         bad = {**params, "view_span": params["view_span"].clone()}
         bad["view_span"][2, 1] = 99

@@ -1,7 +1,5 @@
 """Scenes and bounds of the tests of the baked renderer."""
 
-from __future__ import annotations
-
 import torch
 
 from bitymi_ns.scene import Camera

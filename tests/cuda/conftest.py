@@ -1,7 +1,5 @@
 """Run every test on the CUDA kernels: thread by thread on the host, and on a card where there is one."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

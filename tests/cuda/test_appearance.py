@@ -1,7 +1,5 @@
 """View colours and SSIM by the CUDA kernels."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

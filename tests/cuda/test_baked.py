@@ -4,8 +4,6 @@ Colours of textured fragments differ by the texture unit's weights, which have 8
 rounds them alike): 1.2e-3 was the largest difference seen.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 import warnings
@@ -100,13 +98,9 @@ def test_textures_extents_and_constant_residuals(dtype: torch.dtype, device: tor
 
 
 @pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
-def test_view_colours(kind: str, device: torch.device, cpu) -> None:
-    check(textured(40, 1, kind=kind), front(), device, cpu)
-
-
-@pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
-def test_lean_view_colours(kind: str, device: torch.device, cpu) -> None:
+def test_view_colours_full_and_lean(kind: str, device: torch.device, cpu) -> None:
     scene = textured(40, 1, kind=kind)
+    check(scene, front(), device, cpu)
     geometry = {k: v for k, v in scene.surfels.items() if k not in VIEW_COLORS[kind].names}
     scene.surfels = geometry | lean_parameters(kind, 40, torch.float32)
     check(scene, front(), device, cpu)
@@ -212,22 +206,15 @@ def test_views_drawn_together(device: torch.device) -> None:
             assert torch.equal(together[name][i], getattr(alone, name)), name
 
 
-def test_all_surfels_are_blended_without_a_least_transmittance(device: torch.device, cpu) -> None:
+@pytest.mark.parametrize("least, share", [(0.0, (1.5, 1e9)), (FAST, (0.0, 1.0))])
+def test_pixels_end_at_the_least_transmittance(least: float, share: tuple, device: torch.device, cpu) -> None:
+    """All surfels are blended without one; with a large one pixels end early."""
     case = random_scene(200, 10, width=20, height=16)
     case.params["opacity_logits"] += 4.0
-    scene, camera = scene_of(case, transmittance_min=0.0), camera_of(case)
+    scene, camera = scene_of(case, transmittance_min=least), camera_of(case)
     check(scene, camera, device, cpu)
-    deep = scene.to(device).render(camera, maps=True).overdraw
-    assert deep.sum() > 1.5 * scene_of(case).to(device).render(camera, maps=True).overdraw.sum()
-
-
-def test_pixels_that_end_early(device: torch.device, cpu) -> None:
-    case = random_scene(200, 10, width=20, height=16)
-    case.params["opacity_logits"] += 4.0
-    scene, camera = scene_of(case, transmittance_min=FAST), camera_of(case)
-    check(scene, camera, device, cpu)
-    ended = scene.to(device).render(camera, maps=True).overdraw
-    assert ended.sum() < scene_of(case).to(device).render(camera, maps=True).overdraw.sum()
+    blended, usual = (each.to(device).render(camera, maps=True).overdraw.sum() for each in (scene, scene_of(case)))
+    assert share[0] * usual < blended < share[1] * usual
 
 
 def test_packed_image(device: torch.device) -> None:
@@ -341,29 +328,26 @@ def test_errors(device: torch.device, cpu) -> None:
     double = BakedScene({name: v.double() for name, v in scene.surfels.items()}, "sv", scene.tiles, None)
     with pytest.raises(TypeError, match="float32 surfels, but means is torch.float64"):
         double.render(front(8, 8))
-    with pytest.raises(ValueError, match="one size"):
-        scene.render_views([front(8, 8), front(8, 9)])
-    with pytest.raises(ValueError, match="one size"):
-        scene.render_views([])
-    skewed = front(8, 8)
+    skewed, memory = front(8, 8), module(device).baked_memory
     skewed.K[0, 1] = 1.0
-    with pytest.raises(ValueError, match="skew"):
-        scene.render(skewed)
-    with pytest.raises(ValueError, match="no image 'colour'"):
-        scene.render_views([front(8, 8)], None, ("colour",))
-    with pytest.raises(ValueError, match="draws .1, 8, 8."):
-        BakedRenderer(scene, 8, 8).draw([front(8, 9)])
-    with pytest.raises(ValueError, match="16777217, at most 16777216"):
-        module(device).baked_memory(2**24 + 1, 1, 8, 8, 32, 1, False)
-    with pytest.raises(ValueError, match="has 33 slots, it needs a multiple of 32"):
-        module(device).baked_memory(1, 1, 8, 8, 33, 1, False)
-    with pytest.raises(ValueError, match="too many views, pixels or pairs"):
-        module(device).baked_memory(1, 1, 2**20, 2**20, 32, 1, False)
+    wide = torch.zeros(1, 4, 131076, 4, dtype=torch.uint8)
+    for match, call in {
+        "one size, not .*8.*9": lambda: scene.render_views([front(8, 8), front(8, 9)]),
+        "one size, not ..$": lambda: scene.render_views([]),
+        "skew": lambda: scene.render(skewed),
+        "no image 'colour'": lambda: scene.render_views([front(8, 8)], None, ("colour",)),
+        "draws .1, 8, 8.": lambda: BakedRenderer(scene, 8, 8).draw([front(8, 9)]),
+        "16777217, at most 16777216": lambda: memory(2**24 + 1, 1, 8, 8, 32, 1, False),
+        "has 33 slots, it needs a multiple of 32": lambda: memory(1, 1, 8, 8, 33, 1, False),
+        "too many views, pixels or pairs": lambda: memory(1, 1, 2**20, 2**20, 32, 1, False),
+        "come to 131076 x 4 texels, a texture has 131072 x 65536 at most: bake fewer": lambda: baked_cuda.AtlasTexture(
+            wide, False, device
+        ),
+        "a frame can have": lambda: BakedRenderer(scene, 8, 8)._resize(2**40),
+    }.items():
+        with pytest.raises(ValueError, match=match):
+            call()
     assert Sheet.of(9, 8192, 4096) == (2, 4096, 8192)
-    with pytest.raises(ValueError, match="come to 131076 x 4 texels, a texture has 131072 x 65536 at most: bake fewer"):
-        baked_cuda.AtlasTexture(torch.zeros(1, 4, 131076, 4, dtype=torch.uint8), False, device)
-    with pytest.raises(ValueError, match="a frame can have"):
-        BakedRenderer(scene, 8, 8)._resize(2**40)
     if device.type == "cpu":
         with cpu():
             with pytest.raises(RuntimeError, match="move the scene"):

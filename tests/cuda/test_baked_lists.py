@@ -1,7 +1,5 @@
 """The baked renderer on CUDA: which surfels each tile lists, in which order, and what does not fit."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Views drawn in bands on the CUDA kernels."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Shading and blending in one pass by the CUDA kernels: against the CPU's, in any order of threads."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 
@@ -65,7 +63,7 @@ def test_a_view_that_shows_nothing(textured: bool, device: torch.device) -> None
 
 
 def moved(case: SceneCase, device: torch.device, dtype: torch.dtype) -> list[Tensor]:
-    """What a descent leaves of the texels, and all gradients; on the CPU."""
+    """Texels after a descent, and all gradients; on the CPU."""
     view = View(case, dtype, True, learns=False, device=device)
     share = torch.linspace(0.1, 2.0, len(view.given["texels"]), dtype=dtype, device=device)
     gradients = view.gradients(view.image(descent=ops.TexelDescent(share, 0.3)))

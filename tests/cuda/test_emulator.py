@@ -1,7 +1,5 @@
 """The emulator finds faults of kernels: each is made on purpose here."""
 
-from __future__ import annotations
-
 from types import ModuleType
 
 import pytest

@@ -1,7 +1,5 @@
 """The learning of an export, on the device of the scene: coverage, rate-distortion search, polish and fine-tuning."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 
@@ -24,7 +22,7 @@ BACKGROUND = torch.tensor([0.2, 0.4, 0.6])
 
 @pytest.fixture
 def learned_on() -> Iterator[set[bool]]:
-    """Whether the kernels that move texels ran on CUDA, or its emulation."""
+    """Record the backends of the kernels that move texels: True = CUDA or its emulation."""
     found: set[bool] = set()
     plain = backend.function
 

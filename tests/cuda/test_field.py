@@ -1,7 +1,5 @@
 """The residual field by the CUDA kernels: at points, at fragments and at texels."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

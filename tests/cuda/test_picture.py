@@ -1,6 +1,4 @@
-"""What a training step does beside drawing, by the CUDA kernels, against torch."""
-
-from __future__ import annotations
+"""Losses and statistics of a training step by the CUDA kernels, against torch."""
 
 import math
 

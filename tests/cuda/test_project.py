@@ -1,7 +1,5 @@
 """Projection by the CUDA kernels against the CPU kernels, which are held against the float64 references."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Whole views and their gradients on the CUDA kernels against the CPU kernels: every operation of a training step."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Texels of surfels by the CUDA kernels: any tile, any number of fragments, lists of a part of them, coverage."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 

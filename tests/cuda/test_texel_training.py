@@ -1,7 +1,5 @@
 """Scenes of texels on the device: pictures, tiles and whole runs as on the CPU, and what changes their number."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from contextlib import AbstractContextManager

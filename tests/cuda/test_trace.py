@@ -1,7 +1,5 @@
 """Visibility and compositing by the CUDA kernels against the CPU kernels."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
@@ -23,13 +21,16 @@ from tests.ops.golden import (
     SURFEL_KEYS,
     SV_KEYS,
     SceneCase,
+    camera_of,
     crossing_scene,
     extreme_scenes,
     far_floor,
     load_golden,
     random_scene,
     reference,
+    relative,
     tiles_reached,
+    values_of,
 )
 
 CpuContext = Callable[[], AbstractContextManager[None]]
@@ -38,7 +39,7 @@ EXACT_RIM = 1e-12  # the references bound nothing
 
 @dataclass
 class Rendered:
-    """What is compared; all on the CPU, in double."""
+    """Results that are compared; all on the CPU, in double."""
 
     fragments: ops.Fragments
     image: Tensor
@@ -52,11 +53,11 @@ def render(
     device: torch.device,
     rim: float = EXACT_RIM,
     maps: bool = True,
-    prefilter: bool = False,
+    prefilter: str = "low_pass",
 ) -> Rendered:
     """Render a view, and its gradients along fixed directions for the image and for uv and depth of fragments."""
     leaves = {key: value.to(device, dtype).clone().requires_grad_() for key, value in case.params.items()}
-    camera = Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height)
+    camera = camera_of(case, dtype)
     projection = ops.project(*(leaves[key] for key in SURFEL_KEYS), camera, prefilter=prefilter)
     fragments = ops.trace(projection, rim)
     directions = reference_render.view_directions(leaves["means"], camera.viewmat.to(device))
@@ -81,14 +82,6 @@ def by_pixel_and_surfel(fragments: ops.Fragments) -> list[Tensor]:
     return [key[order], *(value.detach().cpu().double()[order] for value in values)]
 
 
-def relative(a: Tensor, b: Tensor) -> float:
-    """Largest error over the largest value; absolute where all values are 0."""
-    if not b.numel():
-        return 0.0
-    error, scale = (a - b).abs().max().item(), b.abs().max().item()
-    return error / scale if scale > 0 else error
-
-
 def compare(got: Rendered, want: Rendered, image: float = 1e-12, gradient: float = 1e-10) -> None:
     """The same fragments with the same numbers, the same images and gradients."""
     for a, b in zip(by_pixel_and_surfel(got.fragments), by_pixel_and_surfel(want.fragments), strict=True):
@@ -102,7 +95,7 @@ def compare(got: Rendered, want: Rendered, image: float = 1e-12, gradient: float
 
 
 def check_order(fragments: ops.Fragments) -> None:
-    """By tile, in a tile one run a surfel, and the tiles' places in the list are right."""
+    """By tile, in a tile one run a surfel, and the tiles' offsets in the list are right."""
     x, y = fragments.pixel.cpu() % fragments.width, fragments.pixel.cpu() // fragments.width
     across = -(-fragments.width // 16)
     tile = (y // 16) * across + x // 16
@@ -126,7 +119,7 @@ def scenes() -> Iterator[Any]:
     yield pytest.param(random_scene(3, 0, 300, 80, scale=30.0), {}, {}, id="whole screen")
     for scale in (0.5, 0.01):
         case = random_scene(30, 4, 40, 24, scale=scale)
-        yield pytest.param(case, {"prefilter": True}, {"image": 1e-9, "gradient": 1e-9}, id=f"prefilter {scale}")
+        yield pytest.param(case, {"prefilter": "pixel"}, {"image": 1e-9, "gradient": 1e-9}, id=f"prefilter {scale}")
     for case in extreme_scenes():
         case = replace(
             case, params={key: value[:400] for key, value in case.params.items()}
@@ -193,9 +186,7 @@ def test_equal_depths_keep_the_order_of_the_surfels(device: torch.device) -> Non
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
 def test_all_tiles_that_were_counted_are_listed(name: str, dtype: torch.dtype, device: torch.device) -> None:
     case = load_golden(name)
-    leaves = [case.params[key].to(device, dtype) for key in SURFEL_KEYS]
-    camera = Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height)
-    projection = ops.project(*leaves, camera)
+    projection = ops.project(*values_of(case, dtype, device), camera_of(case, dtype))
     bins = trace_cuda.tile_lists(projection.geom, projection)
     assert int(bins.differing) == 0 and len(bins.slot) == bins.tile_pairs[-1] > 0
 
@@ -206,9 +197,8 @@ def test_lists_that_differ_from_the_counts_stay_in_their_slots(fewer: str, devic
     case = random_scene(30, 4, 160, 160)
     case.params["log_scales"][:4] += 3.0  # more tiles than a thread lists by itself
     case.params["opacity_logits"] -= 3.0
-    leaves = [case.params[key].to(device) for key in SURFEL_KEYS]
     large, small = (Camera(case.viewmat, case.K, size, size) for size in (160, 145))
-    projection = ops.project(*leaves, large)  # the rows of both
+    projection = ops.project(*values_of(case, device=device), large)  # the rows of both
     geom, views = projection.geom, [projection, replace(projection, camera=small)]
     counted, listed = views if fewer == "listed" else reversed(views)
     bins, want = trace_cuda.tile_lists(geom, counted), trace_cuda.tile_lists(geom, listed)
@@ -256,9 +246,8 @@ def test_gradients_of_weight_uv_and_depth_alone(device: torch.device, cpu: CpuCo
     def run(where: torch.device) -> list[Tensor]:
         result = []
         for part in ("weight", "uv", "depth"):
-            leaves = [case.params[key].to(where).clone().requires_grad_() for key in SURFEL_KEYS]
-            camera = Camera(case.viewmat, case.K, case.width, case.height)
-            fragments = ops.trace(ops.project(*leaves, camera))
+            leaves = values_of(case, device=where, grad=True)
+            fragments = ops.trace(ops.project(*leaves, camera_of(case)))
             direction = torch.sin(fragments.pixel.double() * 0.7 + fragments.surfel.double() * 1.3).double()
             (getattr(fragments, part) * direction).sum().backward()
             result += [leaf.grad.cpu() for leaf in leaves]
@@ -284,30 +273,29 @@ def test_masked_counts(device: torch.device) -> None:
 
 def test_wrong_arrays_are_refused(device: torch.device) -> None:
     case = random_scene(10, 0, 20, 20)
-    leaves = [case.params[key].to(device) for key in SURFEL_KEYS]
-    projection = ops.project(*leaves, Camera(case.viewmat, case.K, 20, 20))
+    leaves = values_of(case, device=device)
+    projection = ops.project(*leaves, camera_of(case))
     fragments = ops.trace(projection)
-    with pytest.raises(ValueError, match="colors must have shape"):
-        ops.composite_image(fragments, projection, torch.zeros(3, 3, device=device).double())
-    elsewhere = torch.zeros(len(fragments), 3, device="meta")
-    with pytest.raises(ValueError, match="colors is on device 'meta'"):
-        ops.composite_image(fragments, projection, elsewhere)
-    with pytest.raises(ValueError, match="mask is on device 'meta'"):
-        ops.masked_counts(fragments, torch.ones(400, dtype=torch.bool, device="meta"), 10)
-    with pytest.raises(ValueError, match="log_scales is on device 'meta', what goes with it is on"):
-        ops.project(*(leaf.to("meta") if i == 2 else leaf for i, leaf in enumerate(leaves)), projection.camera)
-    with pytest.raises(ValueError, match="frames is on device 'meta'"):
-        ops.shade(fragments, projection.frames[:, :3], projection.frames.to("meta"))
+    far = torch.zeros(len(fragments), 3, device="meta")
+    moved = [leaf.to("meta") if i == 2 else leaf for i, leaf in enumerate(leaves)]
     sites = {key: case.params[key].to("meta" if key == "sv_rgb" else device) for key in SV_KEYS}
-    with pytest.raises(ValueError, match="sv_rgb is on device 'meta'"):
-        ops.view_color("sv", sites, leaves[0], projection.camera.exact_center)
-    with pytest.raises(ValueError, match="values is on device 'meta'"):
-        ops.composite(fragments, elsewhere)
-    with pytest.raises(TypeError, match="float32 or float64 tensors, not torch.float16"):
-        ops.project(*(leaf.half() for leaf in leaves), projection.camera)
     shifted = torch.zeros(10 * 16 + 1, device=device, dtype=torch.float64)[1:].view(10, 16)
-    with pytest.raises(ValueError, match="16 bytes"):
-        ops.trace(replace(projection, geom=shifted))
+    few, mask = torch.zeros(3, 3, device=device).double(), torch.ones(400, dtype=torch.bool, device="meta")
+    camera, frames = projection.camera, projection.frames
+    for match, call in {
+        "colors must have shape": lambda: ops.composite_image(fragments, projection, few),
+        "colors is on device 'meta'": lambda: ops.composite_image(fragments, projection, far),
+        "mask is on device 'meta'": lambda: ops.masked_counts(fragments, mask, 10),
+        "log_scales is on device 'meta', it must be on": lambda: ops.project(*moved, camera),
+        "frames is on device 'meta'": lambda: ops.shade(fragments, frames[:, :3], frames.to("meta")),
+        "sv_rgb is on device 'meta'": lambda: ops.view_color("sv", sites, leaves[0], camera.exact_center),
+        "values is on device 'meta'": lambda: ops.composite(fragments, far),
+        "16 bytes": lambda: ops.trace(replace(projection, geom=shifted)),
+    }.items():
+        with pytest.raises(ValueError, match=match):
+            call()
+    with pytest.raises(TypeError, match="float32 or float64 tensors, not torch.float16"):
+        ops.project(*(leaf.half() for leaf in leaves), camera)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -316,10 +304,9 @@ def test_discs_across_the_camera_plane_are_listed_where_they_show(
     seed: int, dtype: torch.dtype, device: torch.device, cpu: CpuContext
 ) -> None:
     case = crossing_scene(60, seed, 300, 200)
-    values = [case.params[name].to(device, dtype) for name in SURFEL_KEYS]
-    projection = ops.project(*values, Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height))
+    projection = ops.project(*values_of(case, dtype, device), camera_of(case, dtype))
     fragments = ops.trace(projection, EXACT_RIM)
-    weights = reference(case, [case.params[name] for name in SURFEL_KEYS]).weight
+    weights = reference(case, values_of(case)).weight
     shown = tiles_reached(weights, case.width, case.height)
     seen = projection.radii[:, 0].cpu() > 0
     assert not ((shown > 0) & ~seen).any() and (seen & (shown == 0)).sum() <= 10
@@ -350,7 +337,6 @@ def test_free_memory_is_looked_up_for_longer_lists_and_now_and_then(monkeypatch:
 
 def test_a_disc_whose_centre_is_a_million_pixels_away(device: torch.device) -> None:
     case = far_floor()
-    values = [case.params[name].to(device) for name in SURFEL_KEYS]
-    fragments = ops.trace(ops.project(*values, Camera(case.viewmat, case.K, case.width, case.height)), EXACT_RIM)
-    want = reference(case, [case.params[name] for name in SURFEL_KEYS]).weight
+    fragments = ops.trace(ops.project(*values_of(case, device=device), camera_of(case)), EXACT_RIM)
+    want = reference(case, values_of(case)).weight
     assert fragments.surfel.shape[0] == int((want > 0).sum()) > 300

@@ -1,7 +1,5 @@
 """Whole training steps on the device: the same loss and parameters as on the CPU."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -22,9 +22,14 @@ def a_run_of(trained: BitymiTrainerConfig, folder: Path) -> Path:
     return Path(shutil.copytree(trained.get_base_dir(), folder / "run"))
 
 
+def config_of(folder: Path) -> BitymiTrainerConfig:
+    """The config.yml of a run."""
+    return yaml.load((folder / "config.yml").read_text(), Loader=yaml.Loader)
+
+
 def rewrite(folder: Path, change: Callable[[BitymiTrainerConfig], None]) -> None:
     """Apply `change` to the config.yml of a run."""
-    config = yaml.load((folder / "config.yml").read_text(), Loader=yaml.Loader)
+    config = config_of(folder)
     change(config)
     (folder / "config.yml").write_text(yaml.dump(config))
 

@@ -2,13 +2,11 @@
 
 import json
 import math
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-import yaml
 from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils.eval_utils import eval_setup
 
@@ -24,6 +22,7 @@ from bitymi_ns.plugin.run.bundle_model import RENDERER
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from bitymi_ns.scene.baked import FAST
 from tests.e2e.exports import TOLERANCE, evaluate, run_export
+from tests.e2e.runs import a_run_of, rewrite
 
 
 def test_a_bundle_has_its_files_and_states_what_the_bake_cost(bundle: Path) -> None:
@@ -61,9 +60,7 @@ def test_stock_evaluation_of_checkpoint_and_bundle_agree(
 def test_a_bundle_needs_neither_checkpoint_nor_its_old_place(
     bundle: Path, copied: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = yaml.load((copied / "config.yml").read_text(), Loader=yaml.Loader)
-    config.pipeline.model.bundle = Path("/no/longer/there")
-    (copied / "config.yml").write_text(yaml.dump(config))
+    rewrite(copied, lambda config: setattr(config.pipeline.model, "bundle", Path("/no/longer/there")))
     monkeypatch.chdir(tmp_path)
     _, pipeline, path, _ = eval_setup(Path("elsewhere") / "config.yml")
     assert pipeline.model.config.bundle == copied
@@ -169,12 +166,11 @@ def test_verify_compares_a_bundle_with_its_run(trained: BitymiTrainerConfig, cop
 def test_a_run_is_found_beside_its_configuration(
     trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = Path(shutil.copytree(trained.get_base_dir(), tmp_path / "moved"))
-    config = yaml.load((folder / "config.yml").read_text(), Loader=yaml.Loader)
-    config.output_dir = Path("outputs")  # as recorded by default: relative to the folder of the training
-    (folder / "config.yml").write_text(yaml.dump(config))
+    folder = a_run_of(trained, tmp_path)
+    # as recorded by default: relative to the folder of the training
+    rewrite(folder, lambda config: setattr(config, "output_dir", Path("outputs")))
     monkeypatch.chdir(tmp_path)
-    _, _, path, step = eval_setup(Path("moved/config.yml"))
+    _, _, path, step = eval_setup(Path("run/config.yml"))
     assert path.parent == folder / "nerfstudio_models" and step == 59
 
 

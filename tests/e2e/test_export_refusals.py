@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from nerfstudio.utils.eval_utils import eval_setup
 
 from bitymi_ns.plugin.console import InputError
@@ -16,6 +15,7 @@ from bitymi_ns.plugin.export import command, target
 from bitymi_ns.plugin.export.command import ExportAtlas
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from tests.e2e.exports import run_export
+from tests.e2e.runs import rewrite
 
 
 def test_an_existing_bundle_is_replaced_only_on_request(trained: BitymiTrainerConfig, copied: Path) -> None:
@@ -104,9 +104,7 @@ def test_a_configuration_that_is_not_there_or_not_one(tmp_path: Path) -> None:
 
 def test_a_damaged_checkpoint(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(trained.get_base_dir(), tmp_path / "outputs/room/bitymi/run"))
-    config = yaml.load((folder / "config.yml").read_text(), Loader=yaml.Loader)
-    config.output_dir = tmp_path / "outputs"
-    (folder / "config.yml").write_text(yaml.dump(config))
+    rewrite(folder, lambda config: setattr(config, "output_dir", tmp_path / "outputs"))
     path = folder / "nerfstudio_models" / "step-000000059.ckpt"
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(InputError, match="damaged"):
@@ -141,10 +139,8 @@ def test_a_bundle_of_a_newer_version_is_refused(copied: Path) -> None:
 
 
 def test_a_configuration_without_its_bundle(copied: Path, tmp_path: Path) -> None:
-    alone = tmp_path / "alone"
-    alone.mkdir()
-    config = yaml.load((copied / "config.yml").read_text(), Loader=yaml.Loader)
-    config.pipeline.model.bundle = tmp_path / "gone"
-    (alone / "config.yml").write_text(yaml.dump(config))
+    (tmp_path / "alone").mkdir()
+    shutil.copy(copied / "config.yml", tmp_path / "alone")
+    rewrite(tmp_path / "alone", lambda config: setattr(config.pipeline.model, "bundle", tmp_path / "gone"))
     with pytest.raises(InputError, match="no bundle found"):
-        eval_setup(alone / "config.yml")
+        eval_setup(tmp_path / "alone" / "config.yml")

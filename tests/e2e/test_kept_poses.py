@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import yaml
 from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
@@ -27,7 +26,7 @@ from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from bitymi_ns.plugin.run.run_folder import POSES
 from tests.e2e.conftest import small_run
 from tests.e2e.exports import run_export
-from tests.e2e.runs import a_run_of, checkpoint, different, rewrite
+from tests.e2e.runs import a_run_of, checkpoint, config_of, different, rewrite
 from tests.plugin.data.captures import colmap_model, printed
 
 STEPS = 4
@@ -218,7 +217,7 @@ def test_a_run_that_goes_on_in_its_own_folder(shoot: Callable[..., Shot]) -> Non
     shot = shoot(upright=True)
     shot.spoil()
     kept = sorted(path for path in (shot.run / POSES).rglob("*"))
-    config = yaml.load((shot.run / "config.yml").read_text(), Loader=yaml.Loader)
+    config = config_of(shot.run)
     config.load_dir, config.max_num_iterations = shot.config.get_checkpoint_dir(), STEPS + 2
     ns_train.main(config)
     assert sorted(path for path in (shot.run / POSES).rglob("*")) == kept
@@ -227,7 +226,7 @@ def test_a_run_that_goes_on_in_its_own_folder(shoot: Callable[..., Shot]) -> Non
 
 def test_a_new_run_finds_its_own(shoot: Callable[..., Shot], monkeypatch: pytest.MonkeyPatch) -> None:
     shot = shoot()
-    config = yaml.load((shot.run / "config.yml").read_text(), Loader=yaml.Loader)
+    config = config_of(shot.run)
     config.pipeline.datamanager.dataparser.poses = shot.run / POSES  # as that of a resumed run states
     config.timestamp = "new"
     with pytest.raises(pytest.fail.Exception, match="poses are found anew"):

@@ -4,12 +4,12 @@ import hashlib
 import json
 import shutil
 from concurrent.futures import ThreadPoolExecutor
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-import yaml
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.scripts import exporter, render
@@ -22,14 +22,15 @@ from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run.commands import REFUSED
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from tests.e2e.exports import evaluate
+from tests.e2e.runs import a_run_of, rewrite
 
 
 @pytest.fixture
 def alone(copied: Path) -> Path:
     """A bundle whose capture is gone."""
-    config = yaml.load((copied / "config.yml").read_text(), Loader=yaml.Loader)
-    config.pipeline.datamanager.data = config.pipeline.datamanager.dataparser.data = Path("/no/longer/there")
-    (copied / "config.yml").write_text(yaml.dump(config))
+    for part in ("datamanager", "datamanager.dataparser"):
+        of = attrgetter(f"pipeline.{part}")
+        rewrite(copied, lambda config, of=of: setattr(of(config), "data", Path("/no/longer/there")))
     return copied
 
 
@@ -97,11 +98,9 @@ def test_what_needs_photographs_says_how_to_name_them(
 def test_a_run_whose_capture_was_moved(
     trained: BitymiTrainerConfig, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = Path(shutil.copytree(trained.get_base_dir(), tmp_path / "run"))
-    config = yaml.load((run / "config.yml").read_text(), Loader=yaml.Loader)
-    config.pipeline.datamanager.data = Path("/no/longer/there")
-    config.output_dir = Path("outputs")  # seen from where it was trained
-    (run / "config.yml").write_text(yaml.dump(config))
+    run = a_run_of(trained, tmp_path)
+    rewrite(run, lambda config: setattr(config.pipeline.datamanager, "data", Path("/no/longer/there")))
+    rewrite(run, lambda config: setattr(config, "output_dir", Path("outputs")))  # seen from where it was trained
     with pytest.raises(InputError) as refused:
         eval_setup(run / "config.yml")
     assert "/no/longer/there does not exist. If it was moved, say where it is now: `BITYMI_DATA" in str(refused.value)

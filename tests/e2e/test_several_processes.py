@@ -15,12 +15,15 @@ from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run.callbacks import FILE
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from bitymi_ns.plugin.run.trainer import BitymiTrainer
-from tests.e2e.conftest import STEPS, small_run
+from tests.e2e.conftest import small_run
 from tests.e2e.runs import Start, checkpoint, different
+
+STEPS = 30
 
 
 def two(config: BitymiTrainerConfig) -> BitymiTrainerConfig:
-    config.machine.num_devices = 2
+    """The run by two processes, with a third of its steps between two checkpoints."""
+    config.machine.num_devices, config.max_num_iterations, config.steps_per_save = 2, STEPS, STEPS // 3
     return config
 
 
@@ -52,7 +55,7 @@ def test_two_processes_leave_the_run_of_one(pair: BitymiTrainerConfig) -> None:
         "config.yml", "dataparser_transforms.json", "nerfstudio_models", FILE
     ]  # fmt: skip
     points = [json.loads(line) for line in (folder / FILE).read_text().splitlines()]
-    assert [p["step"] for p in points] == [20, 40, STEPS]
+    assert [p["step"] for p in points] == [10, 20, STEPS]
     config, pipeline, _, step = eval_setup(folder / "config.yml")
     assert step == STEPS - 1 and config.machine.num_devices == 2
     metrics = pipeline.get_average_eval_image_metrics()
@@ -64,7 +67,7 @@ def test_ctrl_c_stops_both_and_the_resumed_run_ends_bit_for_bit_alike(
     pair: BitymiTrainerConfig, start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = two(start(name="interrupted"))
-    at_step(monkeypatch, 44, lambda trainer: os.kill(os.getpid(), signal.SIGINT))
+    at_step(monkeypatch, 24, lambda trainer: os.kill(os.getpid(), signal.SIGINT))
     with pytest.raises(SystemExit) as stopped:
         ns_train.main(config)
     assert stopped.value.code == 130
@@ -78,10 +81,10 @@ def test_ctrl_c_stops_both_and_the_resumed_run_ends_bit_for_bit_alike(
 @pytest.mark.slow
 def test_a_process_that_ends_ends_the_run_with_a_message(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     config = two(start(name="killed"))
-    at_step(monkeypatch, 25, lambda trainer: trainer._workers._processes[0].kill())
+    at_step(monkeypatch, 15, lambda trainer: trainer._workers._processes[0].kill())
     with pytest.raises(InputError, match="process 2 of the 2 of this run has ended: exit status -9"):
         ns_train.main(config)
-    assert [p.name for p in config.get_checkpoint_dir().iterdir()] == ["step-000000020.ckpt"]
+    assert [p.name for p in config.get_checkpoint_dir().iterdir()] == ["step-000000010.ckpt"]
     assert not dist.is_initialized()
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils.eval_utils import eval_setup
 
@@ -15,12 +14,12 @@ from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run.callbacks import FILE
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from bitymi_ns.train import init
-from tests.e2e.runs import Start, checkpoint
+from tests.e2e.runs import Start, checkpoint, config_of
 
 
 def test_a_run_leaves_a_configuration_checkpoints_and_a_curve(trained: BitymiTrainerConfig) -> None:
     folder = trained.get_base_dir()
-    assert yaml.load((folder / "config.yml").read_text(), Loader=yaml.Loader).max_num_iterations == 60
+    assert config_of(folder).max_num_iterations == 60
     saved = sorted(p.name for p in trained.get_checkpoint_dir().iterdir())
     assert saved == ["step-000000020.ckpt", "step-000000040.ckpt", "step-000000059.ckpt"]
     points = [json.loads(line) for line in (folder / FILE).read_text().splitlines()]

@@ -1,7 +1,5 @@
 """The golden renders and how a case is drawn; scenes that other tests use, too, are in bitymi_ns.measure.stability."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -40,8 +38,10 @@ __all__ = [
     "load_golden",
     "random_scene",
     "reference",
+    "relative",
     "tiles_reached",
     "traced",
+    "values_of",
 ]
 
 GOLDEN = Path(__file__).resolve().parent.parent / "golden"
@@ -106,13 +106,30 @@ def camera_of(case: SceneCase, dtype: torch.dtype = torch.float64) -> Camera:
     return Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height)
 
 
-def traced(case: SceneCase, values: Sequence[Tensor], prefilter: bool = False) -> tuple[ops.Fragments, ops.Projection]:
+def values_of(
+    case: SceneCase, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu", grad: bool = False
+) -> list[Tensor]:
+    """The values of SURFEL_KEYS; grad: leaves of their own."""
+    values = [case.params[key].to(device, dtype) for key in SURFEL_KEYS]
+    return [value.clone().requires_grad_() for value in values] if grad else values
+
+
+def relative(a: Tensor, b: Tensor) -> float:
+    """Largest error over the largest value; absolute where all values are 0."""
+    scale = b.abs().max().item() if b.numel() else 0.0
+    error = (a.double() - b.double()).abs().max().item() if b.numel() else 0.0
+    return error / scale if scale > 0 else error
+
+
+def traced(
+    case: SceneCase, values: Sequence[Tensor], prefilter: str = "low_pass"
+) -> tuple[ops.Fragments, ops.Projection]:
     """The kernels' fragments of a case; values: those of SURFEL_KEYS."""
     projection = ops.project(*values, camera_of(case, values[0].dtype), prefilter=prefilter)
     return ops.trace(projection, 0.0), projection
 
 
-def reference(case: SceneCase, values: Sequence[Tensor], prefilter: bool = False) -> reference_trace.Trace:
+def reference(case: SceneCase, values: Sequence[Tensor], prefilter: str = "low_pass") -> reference_trace.Trace:
     """Every surfel at every pixel of a case; values: those of SURFEL_KEYS."""
     projected = reference_project.project(*values, case.viewmat, case.K)
     return reference_trace.trace(projected, case.width, case.height, prefilter=prefilter)

@@ -1,7 +1,5 @@
 """The CPU kernels that are loaded are the best that this CPU can run, and none where it can run none."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -33,7 +31,7 @@ print([name for name in sys.modules if name.startswith("bitymi_ns._cpu")])
 
 @pytest.fixture
 def cpuinfo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """What stands for /proc/cpuinfo; the modules are those of a wheel."""
+    """Stand-in for /proc/cpuinfo; the modules are those of a wheel."""
     monkeypatch.setattr(backend, "CPUINFO", tmp_path / "cpuinfo")
     monkeypatch.setattr(_cpu_features, "FEATURES", BUILT)
     backend.cpu_module.cache_clear()

@@ -1,7 +1,5 @@
 """Shading and blending in one pass: against the operations it stands for, finite differences and the golden render."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Numbers of the formulas: stated once in csrc, read from there, and the same in the float64 twins."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

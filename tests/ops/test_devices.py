@@ -1,7 +1,5 @@
 """Operations that one kind of device has no kernel for say so."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest

@@ -1,7 +1,5 @@
 """The compiled kernels against the golden renders, the float64 references and finite differences."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor
@@ -11,9 +9,21 @@ from bitymi_ns.ops import backend
 from bitymi_ns.ops.reference import field as reference_field
 from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color
+from bitymi_ns.ops.reference.ssim import ssim as reference_ssim
 from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig
 from bitymi_ns.scene.baked import BakedScene
-from tests.ops.golden import GOLDEN_NAMES, SV_KEYS, SceneCase, atlas_of, load_golden, random_scene
+from tests.ops.golden import (
+    GOLDEN_NAMES,
+    SURFEL_KEYS,
+    SV_KEYS,
+    SceneCase,
+    atlas_of,
+    camera_of,
+    load_golden,
+    random_scene,
+    relative,
+    values_of,
+)
 
 EXACT_RIM = 1e-12  # the references bound nothing
 OUTPUTS = {"rgb": "rgb", "alpha": "alpha", "depth": "depth", "beta_map": "beta"}
@@ -22,18 +32,11 @@ OUTPUTS = {"rgb": "rgb", "alpha": "alpha", "depth": "depth", "beta_map": "beta"}
 def scene_of(case: SceneCase, dtype: torch.dtype, rim: float = EXACT_RIM) -> tuple[Scene, Camera]:
     params = {key: value.to(dtype) for key, value in case.params.items()}
     scene = Scene(SceneConfig(texture="none", rim=rim, near=0.2), params, None)
-    return scene, Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height)
+    return scene, camera_of(case, dtype)
 
 
 def images(output) -> dict[str, Tensor]:
     return {name: getattr(output, attribute).squeeze(-1) for name, attribute in OUTPUTS.items()}
-
-
-def relative(a: Tensor, b: Tensor) -> float:
-    """Largest error over the largest value; absolute where all values are 0."""
-    scale = b.abs().max().item() if b.numel() else 0.0
-    error = (a.double() - b.double()).abs().max().item() if b.numel() else 0.0
-    return error / scale if scale > 0 else error
 
 
 def check_gradient(got: Tensor, want: Tensor, name: str) -> None:
@@ -84,8 +87,7 @@ def test_golden_textured_scene_through_the_baked_renderer(dtype: torch.dtype) ->
     golden = load_golden("textured")
     params = {key: value.to(dtype) for key, value in golden.params.items()}
     scene = BakedScene(params, "sv", *atlas_of(golden), weight_bound=0.0)
-    camera = Camera(golden.viewmat.to(dtype), golden.K.to(dtype), golden.width, golden.height)
-    output = scene.render(camera, golden.background.to(dtype), maps=True)
+    output = scene.render(camera_of(golden, dtype), golden.background.to(dtype), maps=True)
     for key, image in images(output).items():
         # texels are single precision in either case
         assert relative(image, golden.outputs[key]) < (3e-8 if dtype == torch.float64 else 1e-4), key
@@ -95,7 +97,7 @@ def test_golden_textured_scene_through_the_baked_renderer(dtype: torch.dtype) ->
 def test_a_surfel_without_a_tile_has_its_mean_residual_where_a_tile_would_count() -> None:
     case = random_scene(80, 4, width=70, height=50)
     params = {key: value.float() for key, value in case.params.items()}
-    camera = Camera(case.viewmat.float(), case.K.float(), case.width, case.height)
+    camera = camera_of(case, torch.float32)
     residual = torch.rand(80, 3, generator=torch.Generator().manual_seed(0)) - 0.5
     atlas = torch.zeros(1, 4, 4 * 80, 4)
     atlas[0, :, :, :3] = residual.repeat_interleave(4, dim=0)
@@ -143,11 +145,10 @@ def test_random_scenes_in_single_precision(seed: int) -> None:
     case = random_scene(80, seed, width=70, height=50)
     scene, camera = scene_of(case, torch.float32)
     output = scene.render(camera, case.background.float(), maps=True)
-    directions = reference_render.view_directions(case.params["means"], case.viewmat)
     leaves = {key: value.clone().requires_grad_() for key, value in case.params.items()}
     directions = reference_render.view_directions(leaves["means"], case.viewmat)
     colors = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions)
-    geometry = [leaves[key] for key in ("means", "quats", "log_scales", "opacity_logits", "beta_raw")]
+    geometry = [leaves[key] for key in SURFEL_KEYS]
     want = reference_render.render(geometry, colors, case, case.background)
     generator = torch.Generator().manual_seed(seed)
     loss, reference_loss = 0.0, 0.0
@@ -167,9 +168,7 @@ def test_random_scenes_in_single_precision(seed: int) -> None:
 
 def test_depth_and_uv_gradients_of_the_trace_by_finite_differences() -> None:
     case = random_scene(6, 3, width=9, height=7, scale=0.5)
-    camera = Camera(case.viewmat, case.K, case.width, case.height)
-    names = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
-    values = [case.params[name].clone().requires_grad_() for name in names]
+    camera, values = camera_of(case), values_of(case, grad=True)
     g = torch.Generator().manual_seed(0)
     count = len(ops.trace(ops.project(*values, camera)))
     weights = [torch.rand(k, count, generator=g, dtype=torch.float64) for k in (1, 2, 1)]
@@ -245,12 +244,11 @@ def test_field_at_cell_boundaries_and_far_away_is_finite() -> None:
 @pytest.mark.parametrize("move", [False, True])
 def test_shading_equals_the_field_module_fragment_by_fragment(move: bool) -> None:
     case = random_scene(25, 11, width=20, height=18, scale=0.4)
-    camera = Camera(case.viewmat, case.K, case.width, case.height)
-    names = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
+    camera = camera_of(case)
     field = make_field(True, torch.float64, log2=6)
 
     def render(fused: bool) -> list[Tensor]:
-        leaves = [case.params[name].clone().requires_grad_() for name in names]
+        leaves = values_of(case, grad=True)
         base = (torch.linspace(-0.8, 0.8, 75, dtype=torch.float64).view(25, 3)).requires_grad_()
         field.zero_grad()
         projection = ops.project(*leaves, camera)
@@ -297,15 +295,13 @@ def test_masked_counts_count_blended_fragments_on_masked_pixels() -> None:
 
 @pytest.mark.parametrize("size", [(11, 11, 3), (20, 31, 3), (40, 17, 1), (10, 30, 3)])
 def test_ssim_and_its_gradient(size: tuple[int, int, int]) -> None:
-    from bitymi_ns.ops.reference.ssim import ssim as reference
-
     g = torch.Generator().manual_seed(1)
     a, b = (torch.rand(size, generator=g, dtype=torch.float64) for _ in range(2))
     if size[0] < 11:
         assert ops.ssim(a, b) == 1.0
         return
     p, q = a.clone().requires_grad_(), a.clone().requires_grad_()
-    got, want = ops.ssim(p, b), reference(q, b)
+    got, want = ops.ssim(p, b), reference_ssim(q, b)
     got.backward()
     want.backward()
     torch.testing.assert_close(got, want, rtol=1e-12, atol=1e-12)
@@ -341,7 +337,7 @@ def test_results_do_not_depend_on_the_number_of_threads_beyond_rounding() -> Non
 def test_wrong_inputs_are_refused() -> None:
     case = random_scene(4, 0)
     scene, camera = scene_of(case, torch.float32)
-    p = {key: scene.surfels[key].detach() for key in ("means", "quats", "log_scales", "opacity_logits", "beta_raw")}
+    p = {key: scene.surfels[key].detach() for key in SURFEL_KEYS}
     with pytest.raises(ValueError, match="quats must have shape"):
         ops.project(**{**p, "quats": p["quats"][:, :3]}, camera=camera)
     with pytest.raises(TypeError, match="float32 or float64"):

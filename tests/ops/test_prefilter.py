@@ -1,7 +1,5 @@
 """The kernel seen through a pixel: against the reference, its moments, no holes, no jumps."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +22,7 @@ def test_the_launch_chooses_the_kernel_and_not_the_row() -> None:
     case = random_scene(40, 3, scale=0.25)
     values = [case.params[name].double() for name in SURFEL_KEYS]
     wanted, plain = traced(case, values)
-    _, filtered = traced(case, values, prefilter=True)
+    _, filtered = traced(case, values, prefilter="pixel")
     assert (filtered.geom[:, 15] > 0).any() and not (plain.geom[:, 15] > 0).any()
     got = ops.trace(replace(plain, geom=filtered.geom), 0.0)
     assert torch.equal(got.weight, wanted.weight) and torch.equal(got.sigma, wanted.sigma)
@@ -35,9 +33,9 @@ def test_the_launch_chooses_the_kernel_and_not_the_row() -> None:
 def test_fragments_and_gradients_agree_with_the_reference(scale: float, dtype: torch.dtype) -> None:
     case = random_scene(40, 3, scale=scale)
     values = [case.params[name].to(dtype).requires_grad_() for name in SURFEL_KEYS]
-    fragments, _ = traced(case, values, prefilter=True)
+    fragments, _ = traced(case, values, prefilter="pixel")
     exact = [value.detach().double().requires_grad_() for value in values]
-    want = reference(case, exact, prefilter=True)
+    want = reference(case, exact, prefilter="pixel")
     generator = torch.Generator().manual_seed(1)
     loss, wanted = 0.0, 0.0
     kept = want.blended & (dense(fragments, torch.ones(len(fragments)), 40) > 0)
@@ -99,7 +97,7 @@ def test_small_discs_cover_their_area_wherever_they_lie(size: float, beta: float
 def test_large_discs_are_as_without_the_filter() -> None:
     case, values = disc((0.8, 0.5), 0.7, 2.0, (16.2, 15.7))
     plain = ops.trace(ops.project(*values, camera_of(case)))
-    fragments, _ = traced(case, values, prefilter=True)
+    fragments, _ = traced(case, values, prefilter="pixel")
     a, b = dense(plain, plain.weight, 1), dense(fragments, fragments.weight, 1)
     assert (a - b).abs().max() < 0.02
     inside = (a > 0.05) & (b > 0.05)
@@ -114,7 +112,7 @@ def test_discs_that_turn_edge_on_fade_with_the_cosine() -> None:
     covered, blob = [], []
     for degrees in angles:
         case, values = disc((0.5, 0.5), math.radians(degrees), 2.0, (16.0, 16.0))
-        covered.append(float(traced(case, values, prefilter=True)[0].weight.sum()) / math.cos(math.radians(degrees)))
+        covered.append(float(traced(case, values, prefilter="pixel")[0].weight.sum()) / math.cos(math.radians(degrees)))
         blob.append(float(ops.trace(ops.project(*values, camera_of(case))).weight.sum()))
     assert covered[0] == pytest.approx(9 * math.pi * 25 / 3, rel=0.03)
     assert max(covered[:4]) < 1.1 * covered[0] and min(covered[:4]) > 0.8 * covered[0]
@@ -128,8 +126,8 @@ def test_thin_needles_stay_well_conditioned() -> None:
         sweep = next(sweep for sweep in SWEEPS if sweep.name == name)
         case = sweep.make(value)
         single = [case.params[key].float() for key in SURFEL_KEYS]
-        fragments, _ = traced(case, single, prefilter=True)
-        want = reference(case, [value.double() for value in single], prefilter=True)
+        fragments, _ = traced(case, single, prefilter="pixel")
+        want = reference(case, [value.double() for value in single], prefilter="pixel")
         n = len(single[0])
         error = (dense(fragments, fragments.weight.double(), n) - want.weight).abs()
         assert error.max() < 2e-5 + 1.01 / 255 * (~want.blended).any(), (name, error.max())

@@ -1,7 +1,5 @@
 """Kernels take their arguments by keyword, and name the one that is wrong."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

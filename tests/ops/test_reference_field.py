@@ -1,7 +1,5 @@
 """The residual field's float64 reference against nerfstudio's hash encoding and closed forms."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The brute-force float64 renderer against the golden renders, against gsplat, and on numbers that misbehave."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest

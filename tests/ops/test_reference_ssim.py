@@ -1,7 +1,5 @@
 """The SSIM float64 reference against torchmetrics."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """The bilinear tile fetch's float64 reference."""
 
-from __future__ import annotations
-
 import torch
 
 from bitymi_ns.ops.reference.texel import texel, texel_centers

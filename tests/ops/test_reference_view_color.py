@@ -1,7 +1,5 @@
 """The view colours' float64 references against other implementations and closed forms."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

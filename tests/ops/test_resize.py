@@ -1,7 +1,5 @@
 """Surfels in views of another size than the photographs: against the reference, and what a pixel averages."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -12,10 +10,10 @@ from hypothesis import strategies as st
 from bitymi_ns import ops
 from bitymi_ns.measure.stability.scenes import SURFEL_KEYS, SceneCase, random_scene
 from bitymi_ns.ops import baked_cpu
+from bitymi_ns.ops.baked_scene import halved, tile_levels
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.ops.reference import project as reference_project
 from bitymi_ns.ops.reference import trace as reference_trace
-from bitymi_ns.ops.tile_levels import halved, tile_levels
 from bitymi_ns.scene.baked import BakedScene
 from tests.cuda.baked_scenes import scene_of
 from tests.ops.golden import camera_of

@@ -1,8 +1,6 @@
 """Texels of surfels: against the float64 reference, finite differences and the baked renderer; lists of a part of the
 fragments, and coverage."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Idle threads sleep: between parallel regions no processor time passes."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

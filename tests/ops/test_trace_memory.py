@@ -1,6 +1,4 @@
-"""What the CPU kernels hold of a long fragment list, in a process of its own."""
-
-from __future__ import annotations
+"""Memory of the CPU kernels for a long fragment list, in a process of its own."""
 
 import os
 import subprocess
@@ -23,8 +21,8 @@ means[:, 2] = torch.linspace(3, 4, N)
 quats = torch.tensor([1.0, 0, 0, 0]).repeat(N, 1)
 surfels = (means, quats, torch.full((N, 2), 2.0), torch.full((N,), -3.0), torch.zeros(N))
 camera = Camera(torch.eye(4), torch.tensor([[512.0, 0, 256], [0, 512, 256], [0, 0, 1]]), SIZE, SIZE)
-projection = project(*surfels, camera, 0.2, False)
-trace(project(*surfels, Camera(camera.viewmat, camera.K, 64, 64), 0.2, False))
+projection = project(*surfels, camera, 0.2)
+trace(project(*surfels, Camera(camera.viewmat, camera.K, 64, 64), 0.2))
 start = megabytes("VmRSS")
 try:
     trace(projection, most=1000)

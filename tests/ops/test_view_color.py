@@ -1,7 +1,5 @@
 """View colours, all or lean, against the float64 references."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

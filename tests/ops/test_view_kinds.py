@@ -1,8 +1,6 @@
 """The entries of `VIEW_COLORS`: each agrees with itself, the kernels and the float64 twin, and is the only place that
 knows its kind."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from pathlib import Path

@@ -58,8 +58,13 @@ def cameras(draw: st.DrawFn) -> Camera:
 
 
 @fuzz(120)
-@given(params=surfels(broken=True), camera=cameras(), prefilter=st.booleans(), near=st.sampled_from((1e-6, 0.2, 5.0)))
-def test_rendering_any_numbers(params: dict[str, Tensor], camera: Camera, prefilter: bool, near: float) -> None:
+@given(
+    params=surfels(broken=True),
+    camera=cameras(),
+    prefilter=st.sampled_from(("low_pass", "pixel")),
+    near=st.sampled_from((1e-6, 0.2, 5.0)),
+)
+def test_rendering_any_numbers(params: dict[str, Tensor], camera: Camera, prefilter: str, near: float) -> None:
     """Images and gradients are finite whatever the surfels are, as long as their colours are."""
     finite = {key: bool(value.isfinite().all()) for key, value in params.items()}
     leaves = {key: value.clone().requires_grad_() for key, value in params.items()}

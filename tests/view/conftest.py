@@ -3,13 +3,14 @@
 import io
 import json
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import pytest
 import torch
 from PIL import Image
 
-from bitymi_ns.bake import bake
+from bitymi_ns.bake import Baked, bake
 from bitymi_ns.bake.compact import compacted, with_coded_texels
 from bitymi_ns.bundle import export
 from bitymi_ns.bundle.bake_options import BakeOptions
@@ -26,6 +27,25 @@ def view() -> Camera:
     return front(WIDTH, HEIGHT, 3.0)
 
 
+@lru_cache
+@torch.no_grad()
+def baked_scene(
+    format: str,
+    count: int,
+    compact: bool,
+    seen: bool,
+    kind: str,
+    larger: float,
+    options: tuple[tuple[str, object], ...],
+) -> Baked:
+    """The bake's test scene; `compact`: for version 3; `seen`: photographed by the camera, so that it is drawn for the
+    size of a view; `larger`: added to the logarithms of the scales."""
+    made = real_scene(make_surfels, count=count, kind=kind)
+    made.surfels["log_scales"] += larger
+    baked = bake(made, [view()] if seen else [], options=BakeOptions(format=format, **dict(options)))
+    return with_coded_texels(*compacted(baked, [], torch.zeros(3))) if compact else baked
+
+
 def write(
     folder: Path,
     format: str = "bc7",
@@ -39,10 +59,7 @@ def write(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     **options: object,
 ) -> Path:
-    """A bundle of the bake's test scene, with a camera and its photograph; `compact`: of version 3;
-    `seen`: photographed by this camera, so that it is drawn for the size of a view; `poster`: with a poster;
-    `larger`: what the logarithms of the scales are more."""
-    made = real_scene(make_surfels, count=count, kind=kind)
+    """Write a bundle of `baked_scene`, with a camera and its photograph; `poster`: with a poster."""
     camera = view()
     picture = io.BytesIO()
     Image.new("RGB", (WIDTH, HEIGHT), (200, 80, 40)).save(picture, "JPEG")
@@ -60,14 +77,10 @@ def write(
         "cameras.json": json.dumps({"cameras": [row, other]}).encode(),
         "photograph-0001.jpg": picture.getvalue(),
     }
-    with torch.no_grad():
-        made.surfels["log_scales"] += larger
-        baked = bake(made, [camera] if seen else [], options=BakeOptions(format=format, **options))
-        if compact:
-            baked = with_coded_texels(*compacted(baked, [], torch.zeros(3)))
-        if near is not None:
-            baked = replace(baked, scene=replace(baked.scene, near=near))
-        export(baked, folder, background=background, extra_files=extra, first=camera if poster else None)
+    baked = baked_scene(format, count, compact, seen, kind, larger, tuple(options.items()))
+    if near is not None:
+        baked = replace(baked, scene=replace(baked.scene, near=near))
+    export(baked, folder, background=background, extra_files=extra, first=camera if poster else None)
     return folder
 
 

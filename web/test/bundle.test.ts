@@ -77,7 +77,7 @@ describe('bundle.json', () => {
   it('is read', () => {
     const info = parseManifest(manifest());
     expect(info.count).toBe(2);
-    expect(info.throughPixel).toBe(false);
+    expect(info.prefilter).toBe('low_pass');
     expect(info.files.get('surfels.ply')?.bytes).toBe(1);
   });
   it('of a newer major version is refused, with what to do', () => {

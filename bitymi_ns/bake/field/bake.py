@@ -1,7 +1,5 @@
 """The bake of a residual field (paper, section Texture Baking), exact or within a tolerance."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -100,7 +98,7 @@ def bake(
 def _inputs(scene: BakeableScene, rows: Tensor, cameras: Sequence[Camera]) -> BakeInput:
     surfels = {name: value.detach()[rows].float() for name, value in scene.surfels.items()}
     weight_bound = float(getattr(scene.config, "weight_bound", 0.0))
-    return BakeInput(surfels, cameras, scene.near, weight_bound, getattr(scene.config, "through_pixel", False))
+    return BakeInput(surfels, cameras, scene.near, weight_bound, getattr(scene.config, "prefilter", "low_pass"))
 
 
 def plan_of(field: Field, inputs: BakeInput, options: BakeOptions) -> Plan:

@@ -1,7 +1,5 @@
 """Errors of stored tiles against the field."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy.typing as npt

@@ -1,7 +1,5 @@
 """Removal of the levels of a field that a scene does not need."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import torch

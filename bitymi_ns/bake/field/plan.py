@@ -1,7 +1,5 @@
 """Plan of the tiles of a field: extents, weights of errors, and the finest useful grids."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol

@@ -1,7 +1,5 @@
 """Polish of a bake: texels, geometry, opacities and view colours are optimised together, without the network."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Sequence

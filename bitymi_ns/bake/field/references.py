@@ -1,7 +1,5 @@
 """The residual field on the grids of a plan."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import torch

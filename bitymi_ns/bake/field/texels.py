@@ -1,7 +1,5 @@
 """The residual field at the texel centres of every tile: the paper's bake."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

@@ -1,7 +1,5 @@
 """Reasons why photographs have no pose, with advice on what to photograph differently."""
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from dataclasses import dataclass
 from pathlib import Path

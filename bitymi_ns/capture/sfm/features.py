@@ -1,7 +1,5 @@
 """SIFT features of all photographs, in COLMAP's database."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pycolmap

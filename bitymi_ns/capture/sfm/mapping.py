@@ -1,7 +1,5 @@
 """Camera poses from compared photographs: all at once first, one after the other where that falls short."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

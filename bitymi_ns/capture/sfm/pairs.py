@@ -1,7 +1,5 @@
 """Selection and matching of pairs of photographs."""
 
-from __future__ import annotations
-
 from itertools import combinations
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """COLMAP in a process of its own: Ctrl-C ends it at once, and where it aborts, which its library does, only it does."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

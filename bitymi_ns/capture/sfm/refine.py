@@ -1,7 +1,5 @@
 """The last bundle adjustment of a model, and the camera model that suits it."""
 
-from __future__ import annotations
-
 import copy
 
 import pycolmap

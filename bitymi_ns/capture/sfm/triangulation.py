@@ -1,7 +1,5 @@
 """Points for photographs whose cameras are known."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

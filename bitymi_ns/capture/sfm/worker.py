@@ -4,8 +4,6 @@ A line is {"stage", "done", "total", "counts"}, or at the end {"result"} or {"fa
 does, so that nothing goes on after whoever started it was killed. What COLMAP has to say goes to stderr.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

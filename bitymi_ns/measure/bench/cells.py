@@ -4,8 +4,6 @@ A line has `key` (every setting that decides the result), `value` (the figures; 
 and `made` (time, machine, versions, command).
 """
 
-from __future__ import annotations
-
 import datetime
 import fcntl
 import json

@@ -1,7 +1,5 @@
 """Command line of a matrix: `bitymi bench local`, `bitymi bench mipnerf360`, ..."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import sys

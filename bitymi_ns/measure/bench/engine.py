@@ -4,8 +4,6 @@ Several processes may work on the same folder, each on another GPU or machine: a
 to it.
 """
 
-from __future__ import annotations
-
 import shutil
 import statistics
 import time

@@ -1,7 +1,5 @@
 """Describe what is measured: scenes x rows x seeds, the cells of each run; standard data sets and plans by name."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Run commands as measured subprocesses."""
 
-from __future__ import annotations
-
 import datetime
 import os
 import shlex

@@ -1,7 +1,5 @@
 """Put a report together and write it as one self-contained HTML page."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Sequence

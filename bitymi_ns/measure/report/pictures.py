@@ -5,8 +5,6 @@ with the lowest, the median and the highest PSNR are shown. Folders of the same 
 its bundle) are compared view by view.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import math

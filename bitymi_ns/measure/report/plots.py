@@ -1,7 +1,5 @@
 """Draw the plots of a report: training curves, and quality against cost with Pareto fronts; one panel per scene."""
 
-from __future__ import annotations
-
 import io
 import math
 from collections import Counter

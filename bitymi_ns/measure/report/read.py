@@ -1,8 +1,6 @@
 """Read the inputs of a report: ns-eval files, training curves, cells, knobs, pictures and found poses, and folders that
 are searched for these."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """Records of a report and how they relate: evaluations, training curves, knob settings, worst views, found poses."""
 
-from __future__ import annotations
-
 import math
 import re
 import statistics

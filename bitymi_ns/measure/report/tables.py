@@ -1,7 +1,5 @@
 """Build the tables of a report; their HTML is in templates/report.html.j2."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar

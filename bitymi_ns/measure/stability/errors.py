@@ -188,7 +188,7 @@ def _by_kernels(
     rim = way.rim if rim is None else rim
     leaves = {key: value.to(device, dtype).clone().requires_grad_() for key, value in case.params.items()}
     camera = Camera(case.viewmat.to(device, dtype), case.K.to(device, dtype), case.width, case.height)
-    projection = ops.project(*(leaves[key] for key in SURFEL_KEYS), camera, near, way.through_pixel)
+    projection = ops.project(*(leaves[key] for key in SURFEL_KEYS), camera, near, way.prefilter)
     fragments = ops.trace(projection, rim)
     base = ops.view_color("sv", leaves, leaves["means"], camera.exact_center, projection.visible)
     textured = {"texels": leaves[TEXELS], "tiles": tiles_of(leaves[TEXELS])} if way.texels else {}
@@ -212,9 +212,7 @@ def _by_reference(case: SceneCase, near: float, rim: float | None = None, way: W
     colors = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions)
     geometry = [leaves[key] for key in SURFEL_KEYS]
     tiles = tile_images(leaves[TEXELS]) if way.texels else None
-    result = reference_render.render(
-        geometry, colors, case, tiles=tiles, near=near, rim=rim, prefilter=way.through_pixel
-    )
+    result = reference_render.render(geometry, colors, case, tiles=tiles, near=near, rim=rim, prefilter=way.prefilter)
     images = {key: getattr(result, key).reshape(case.width * case.height, -1) for key in IMAGES}
     trace = result.trace
     return _Result(images, trace.blended, trace.low_pass, leaves, cells(trace.uv) if way.texels else None)

@@ -1,7 +1,5 @@
 """Write docs/stability.md: errors of float32, case by case and along each kind of stiffness."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,8 +1,6 @@
 """Build small float64 scenes for tests and measurements: random ones, numerically extreme ones, and sweeps along one
 kind of stiffness."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -10,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops import VIEW_COLORS, TexelTiles
+from bitymi_ns.ops import VIEW_COLORS, Prefilter, TexelTiles
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.scene import GEOMETRY
 
@@ -282,14 +280,14 @@ class Way:
     Attributes:
         name: short, for tables and tests.
         texels: every surfel has a tile of random texels; the gradient reaches them and, through the fetch, u and v.
-        through_pixel: the kernel is averaged over a pixel (`prefilter: pixel`).
+        prefilter: as in `ops.project`.
         rim: bound of the derivative at the rim on both sides, `Scene.rim`. Through a pixel the bound is another
             one, that of the kernel averaged over the pixel, which the reference does not have: 0 turns it off.
     """
 
     name: str
     texels: bool = False
-    through_pixel: bool = False
+    prefilter: Prefilter = "low_pass"
     rim: float = RIM
 
     def of(self, case: SceneCase) -> SceneCase:
@@ -302,7 +300,7 @@ class Way:
 
 
 PLAIN = Way("plain")
-WAYS = (Way(TEXELS, texels=True), Way("pixel", through_pixel=True, rim=0.0))  # the modes beside the plain one
+WAYS = (Way(TEXELS, texels=True), Way("pixel", prefilter="pixel", rim=0.0))  # the modes beside the plain one
 
 
 def tiles_of(texels: Tensor) -> TexelTiles:

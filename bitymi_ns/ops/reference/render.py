@@ -50,7 +50,7 @@ def render(
     residual: Callable[[Tensor], Tensor] | None = None,
     near: float = 0.2,
     rim: float = 0.0,
-    prefilter: bool = False,
+    prefilter: str = "low_pass",
 ) -> Render:
     """Render surfels; colour of a fragment: ReLU(f_view + 0.5), then ReLU(that + texture) where there is a texture.
 
@@ -58,7 +58,7 @@ def render(
         geometry: means, quats, log_scales, opacity_logits, beta_raw, see `project`.
         colors: [N, 3] view-dependent colour f_view(d) of each surfel, without the 0.5.
         camera: viewmat, K, see `project`, and the size of the image in pixels.
-        background: [3], black if not given.
+        background: [3], None = black.
         tiles: one texture tile [r_v, r_u, 3] per surfel.
         residual: residual colour field, world positions [M, 3] to colours [M, 3]; instead of `tiles`.
         near: see `project`.
@@ -70,11 +70,13 @@ def render(
     base = torch.relu(colors + 0.5)  # [N, 3]
     color = base.expand(width * height, -1, -1)  # [P, N, 3]
     if tiles is not None:
-        surfel, pixel = t.blended.T.nonzero(as_tuple=True)  # surfel by surfel
-        counts = t.blended.sum(0).tolist()
-        parts = zip(tiles, t.uv[pixel, surfel].split(counts), strict=True)
-        fetched = torch.cat([texel(tile, uv) for tile, uv in parts]) if counts else color.new_zeros(0, 3)
-        color = torch.relu(color + torch.zeros_like(color).index_put((pixel, surfel), fetched))
+        texture = torch.zeros_like(color)
+        for size in {tile.shape for tile in tiles}:  # tiles of one size at once
+            of = torch.tensor([i for i, tile in enumerate(tiles) if tile.shape == size])
+            pixel, row = t.blended[:, of].nonzero(as_tuple=True)
+            fetched = texel(torch.stack([tiles[i] for i in of.tolist()]), t.uv[pixel, of[row]], row)
+            texture = texture.index_put((pixel, of[row]), fetched)
+        color = torch.relu(color + texture)
     if residual is not None:
         pixel, surfel = t.blended.nonzero(as_tuple=True)
         u, v = t.uv[pixel, surfel, :, None].unbind(1)  # [F, 1]

@@ -1,4 +1,4 @@
-"""Which surfels cover which pixels, with what weight: every pixel against every surfel, in float64."""
+"""Weights of surfels at pixels: every pixel against every surfel, in float64."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def _filtered(projection: Projection, pixels: Tensor, near: float) -> tuple[Tens
 
 
 def _resized(projection: Projection, photo_pixel: float) -> tuple[Tensor, Tensor, float, float]:
-    """How surfels are drawn where a photograph's pixel has the side `photo_pixel` (docs/numerics.md).
+    """Resize surfels for a view in which a photograph's pixel has the side `photo_pixel` (docs/numerics.md).
 
     With J = d pixel / d (u, v) at the centre, what (u, v) is multiplied by [N, 2, 2], (1 + c' J^-1 J^-T)^(-1/2), and
     the share of the kernel's height that is left [N]; the low pass's squared radius, and its share.
@@ -107,7 +107,7 @@ def trace(
     height: int,
     near: float = 0.2,
     rim: float = 0.0,
-    prefilter: bool = False,
+    prefilter: str = "low_pass",
     photo_pixel: float = 1.0,
 ) -> Trace:
     """Intersections, effective opacities and front-to-back weights of all surfels in all pixels.
@@ -119,8 +119,8 @@ def trace(
     A fragment is skipped when sigma < 1/255 or its surfel is not valid. Surfels are blended in the order of their
     centres' depths (equal depths: by index); the one that would take the transmittance below 1e-4 is not blended, and
     ends the pixel. `rim` bounds 1 - x from below in the kernel's derivative, as the kernels do; values do not change.
-    With `prefilter`, G is the kernel seen through a pixel instead (`_filtered`), without a bound at the rim. Without
-    it, `photo_pixel` is the side of a photograph's pixel in pixels of the view (`_resized`).
+    With the prefilter `pixel`, G is the kernel averaged over a pixel instead (`_filtered`), without a bound at the rim.
+    Without it, `photo_pixel` is the side of a photograph's pixel in pixels of the view (`_resized`).
     """
     pixels = pixel_centers(width, height)  # [P, 2]
     M = projection.M
@@ -143,7 +143,7 @@ def trace(
     if photo_pixel != 1:
         kernel, blur = share * kernel, blur_share * blur ** (1 / radius2)
     low_pass = blur > kernel
-    if prefilter:
+    if prefilter == "pixel":
         kernel, uv, depth = _filtered(projection, pixels, near)
         low_pass = torch.zeros_like(low_pass)
     sigma = (projection.opacity * torch.where(low_pass, blur, kernel)).clamp(max=ALPHA_MAX)

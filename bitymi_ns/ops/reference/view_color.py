@@ -65,7 +65,7 @@ def sh_basis(degree: int, dirs: Tensor) -> Tensor:
 
 def sh(dc: Tensor, rest: Tensor, dirs: Tensor, degree: int | None = None) -> Tensor:
     """Spherical harmonics colour [N, 3] from dc [N, 3] and rest [N, >= (degree + 1)^2 - 1, 3] at unit dirs [N, 3]; the
-    degree is that of all coefficients, where it is not given."""
+    degree is that of all coefficients, without it."""
     if degree is None:
         degree = round((rest.shape[1] + 1) ** 0.5) - 1
     coefficients = torch.cat([dc[:, None], rest[:, : (degree + 1) ** 2 - 1]], dim=1)

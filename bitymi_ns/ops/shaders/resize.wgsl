@@ -2,7 +2,7 @@
 
 // Side of a photograph's pixel, for the kernels. One that is seen through a pixel is so through any.
 fn kernel_pixel() -> f32 {
-  return select(frame.photo_pixel, 1.0, frame.through_pixel != 0);
+  return select(frame.photo_pixel, 1.0, frame.prefilter != 0);
 }
 // Variance that a pixel adds along each axis, pixels^2.
 fn pixel_variance() -> f32 {

@@ -63,7 +63,7 @@ struct Frame {
   atlas: vec2f,  // size of a page, texels
   surfels: u32,
   kind: u32,  // of the view colours, VIEW_*
-  through_pixel: u32,
+  prefilter: u32,
   layers: u32,  // batches of surfels that are drawn one after the other
   show: u32,  // SHOW_*
   residuals: u32,  // whether they are added

@@ -31,13 +31,13 @@ SURFEL = np.dtype(
 
 @dataclass
 class Arrays:
-    """What the shaders read of a scene.
+    """Arrays of a scene that the shaders read.
 
     Attributes:
         surfels: [N] of `SURFEL`.
         terms: of the view colours, [.] float32.
         kind: a number of `KINDS`.
-        origin: [3] float64, which is taken off positions: far from the world's origin float32 would not place them.
+        origin: [3] float64, which is taken off positions: far from the world's origin float32 would not resolve them.
     """
 
     surfels: npt.NDArray
@@ -104,12 +104,12 @@ def _view_colors(kind: str, p: dict[str, Tensor], n: int) -> tuple[str, Tensor, 
         first, count = span.long().unbind(1)
         return kind, base, torch.stack([first * terms.shape[1], count], dim=1), terms
     check_view_color(kind, p, n)
-    given = VIEW_COLORS[kind].of(p)
+    values = VIEW_COLORS[kind].of(p)
     whole = VIEW_COLORS[kind].sites is not None
     if whole:
-        base, terms = torch.zeros(n, 3), torch.cat([given[0], given[1][..., None], given[2]], dim=2)
+        base, terms = torch.zeros(n, 3), torch.cat([values[0], values[1][..., None], values[2]], dim=2)
     else:
-        base, terms = given
+        base, terms = values
     count = torch.full((n,), terms.shape[1])
     first = torch.arange(n) * (terms.shape[1] * terms.shape[2])
     return kind + (WHOLE if whole else ""), base, torch.stack([first, count], dim=1), terms.contiguous()

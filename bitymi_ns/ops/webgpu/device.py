@@ -34,7 +34,7 @@ def library() -> ModuleType:
 
 
 def adapters() -> list[str]:
-    """What could draw here, the first being what `device` takes; empty where there is nothing."""
+    """List the adapters that can draw here, first the one that `device` takes; empty if there is none."""
     return [f"{a.info['device']} ({a.info['backend_type']})" for a in _usable()]
 
 
@@ -95,7 +95,7 @@ def check_room(array_bytes: int, groups: int, size: tuple[int, int], layers: int
 
 
 def in_software() -> bool:
-    """Whether the processor draws, which decodes a block of texels for each that it fetches.
+    """Return True if the processor draws, which decodes a block of texels for each that it fetches.
 
     Raises:
         WebGpuUnavailable: nothing draws.

@@ -41,7 +41,7 @@ def draw(
         raise ValueError("the image 'packed' is drawn on a CUDA device only: draw rgb and alpha")
     common_size(cameras)
     sources = (*scene.surfels.values(), scene.tiles, scene.atlas, scene.blocks, scene.extent, scene.mean_residual)
-    numbers = f"webgpu {scene.near} {scene.weight_bound} {scene.offset} {scene.scale} {scene.through_pixel}"
+    numbers = f"webgpu {scene.near} {scene.weight_bound} {scene.offset} {scene.scale} {scene.prefilter}"
     there = scene.cache.atlas(lambda: SceneOnDevice(scene), *sources, numbers)
     drawn: dict[str, list[Tensor]] = {name: [] for name in images}
     for camera in cameras:

@@ -38,7 +38,7 @@ def programs() -> Programs:
 
 @dataclass
 class _Target:
-    """What is drawn to, for images of one size."""
+    """Render targets for images of one size."""
 
     size: tuple[int, int]
     sums: Any
@@ -65,7 +65,7 @@ class SceneOnDevice:
         self.count = len(packed.surfels)
         check_room(max(packed.surfels.nbytes, packed.terms.nbytes), -(-self.count // 64), (1, 1))
         self._near, self._bound = scene.near, scene.weight_bound
-        self._through_pixel = scene.through_pixel
+        self._prefilter = scene.prefilter == "pixel"
         self._offset, self._scale = scene.offset, scene.scale
         flags = library().BufferUsage
         storage, n = flags.STORAGE, max(1, self.count)
@@ -155,13 +155,13 @@ class SceneOnDevice:
             numbers = np.array([self.count, blocks, 4 * k, 0], np.uint32)
             uniform = self._upload(numbers, flags.UNIFORM)
             source, to = k % 2, 1 - k % 2
-            given = (uniform, self._keys[source], self._order[source], self._keys[to], self._order[to], table)
+            buffers = (uniform, self._keys[source], self._order[source], self._keys[to], self._order[to], table)
             used = {"count": (0, 1, 5), "scan": (0, 5), "scatter": (0, 1, 2, 3, 4, 5)}
             self._rounds.append(
                 {
                     entry: self._group(
                         p.sort[entry].get_bind_group_layout(0),
-                        *(r if i in used[entry] else None for i, r in enumerate(given)),
+                        *(r if i in used[entry] else None for i, r in enumerate(buffers)),
                     )
                     for entry in used
                 }
@@ -239,7 +239,7 @@ class SceneOnDevice:
             *(K[0, 0], K[1, 1], K[0, 2], K[1, 2]),
             *(camera.width, camera.height, self._near, self._bound),
             *(self._offset, self._scale, *self._atlas_size),
-            *(self.count, self._kind, int(self._through_pixel), layers),
+            *(self.count, self._kind, int(self._prefilter), layers),
             *(SHOW[show], 1, photo_pixel, self._detail),
         )
         self._device.queue.write_buffer(self._frame, 0, data)
@@ -282,8 +282,8 @@ class SceneOnDevice:
         return target
 
     def rectangles(self) -> npt.NDArray[np.float32]:
-        """What the latest view drew, front to back: [M, 6] a rectangle for each surfel, its axis (a unit vector on the
-        screen), its middle, and half its size along the axis and across, in pixels."""
+        """Read the rectangles of the latest view's surfels, front to back: [M, 6] axis (a unit vector on the screen),
+        middle, and half the size along the axis and across, in pixels."""
         queue = self._device.queue
         count = int(np.frombuffer(queue.read_buffer(self._visible), np.uint32)[0])
         order = np.frombuffer(queue.read_buffer(self._order[0]), np.uint32)[:count]

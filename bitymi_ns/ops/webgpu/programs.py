@@ -103,7 +103,7 @@ class Programs:
 
     @property
     def filters_floats(self) -> bool:
-        """Whether the target's format can be filtered, which its binding has to say."""
+        """Return True if the target's format can be filtered, which its binding declares."""
         return self.format != "rgba32float" or "float32-filterable" in self.device.features
 
     def _draw(self, color: dict[str, str]) -> Any:

@@ -117,7 +117,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         outputs = self.train_dataparser_outputs
         color = outputs.alpha_color
         self.train_dataset.metadata["alpha_color"] = None if color is None else torch.as_tensor(color).float()
-        files = outputs.image_filenames
+        files = self.train_dataset.files
         self.train_dataset.metadata["has_alpha"] = bool(files) and images.file_has_transparency(files[0])
         # whether a run trains with a background; photographs may be missing where no run is trained
         self.train_dataset.metadata["transparent"] = self._has_photos(test_mode) and any(
@@ -162,13 +162,14 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         count, datasets = len(self.train_dataset), (self.train_dataset, self.eval_dataset)
         train, held_out = (dataset.image_filenames for dataset in datasets)
         names = [*train, *held_out]
+        files = [dataset.files for dataset in datasets]
         check_cameras([dataset.cameras for dataset in datasets], names)
         poses = torch.cat([dataset.cameras.camera_to_worlds for dataset in datasets]).double().numpy()
         warn_of_mirrored(poses[:, :, :3], names)
         check_outliers(poses[:, :, 3], names)
-        check_images(names)
-        images.check_orientation(list(dict.fromkeys(names)))
-        self._duplicates = images.duplicate_files(train, held_out)
+        check_images([*files[0], *files[1]])
+        images.check_orientation(list(dict.fromkeys([*files[0], *files[1]])))
+        self._duplicates = images.duplicate_files(*files)
         images.warn_of_duplicates(self._duplicates, train, held_out)
         if count == 1 and test_mode == "val":
             fail(
@@ -223,7 +224,8 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         for reason, paths in empty.items():
             warn(f"Of {len(train)} training photographs {len(paths)} show nothing, {reason}: {listed(paths)}.")
         reported = {j for _, j in self._duplicates}
-        fingerprints = [[d.summary(i).fingerprint for i in range(len(d))] for d in (train, held_out)]
+        summaries = [[d.summary(i) for i in range(len(d))] for d in (train, held_out)]
+        fingerprints = [[None if each.empty else each.fingerprint for each in some] for some in summaries]
         pairs = [pair for pair in images.duplicates(*fingerprints) if pair[1] not in reported]
         images.warn_of_duplicates(pairs, train.image_filenames, held_out.image_filenames)
 

@@ -43,7 +43,16 @@ from bitymi_ns.plugin.data.sfm_poses import KeptPoses, find_sfm_source, kept_sou
 from bitymi_ns.plugin.data.splits import NameLists
 from bitymi_ns.plugin.data.transforms import colmap_points
 from bitymi_ns.plugin.data.transforms_views import Transforms, check_photographs_exist, read_transforms
-from bitymi_ns.plugin.data.views import FrameOptions, Photograph, Pose, Views, fit_scale, make_views, select_views
+from bitymi_ns.plugin.data.views import (
+    FrameOptions,
+    Photograph,
+    Pose,
+    Views,
+    fit_scale,
+    make_views,
+    photograph_files,
+    select_views,
+)
 
 WITH_MODEL = ("colmap", "photographs", "video")
 """Formats that are read as a COLMAP model."""
@@ -206,7 +215,10 @@ class BitymiDataParser(DataParser):
         return self._split(views, lists)
 
     def _split(self, views: DataparserOutputs, lists: NameLists) -> dict[str, DataparserOutputs]:
-        config, names = self.config, views.image_filenames
+        config = self.config
+        photographs: list[int] = views.metadata["photographs"]
+        by_number = dict(zip(photographs, photograph_files(views), strict=True))
+        names = list(by_number.values())
         if config.eval_names:
             split = splits.by_names(names, config.eval_names, "--eval-names")
         elif lists:
@@ -214,8 +226,8 @@ class BitymiDataParser(DataParser):
         else:
             split = splits.by_mode(names, config.eval_mode, config.eval_interval, config.train_split_fraction)
         say(split.describe(names))
-        held_out = select_views(views, split.held_out)
-        return {"train": select_views(views, split.train), "val": held_out, "test": held_out}
+        train, held_out = (select_views(views, some) for some in splits.of_views(split, photographs))
+        return {"train": train, "val": held_out, "test": held_out}
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs: Any) -> DataparserOutputs:
         return self.outputs[split]
@@ -325,7 +337,10 @@ class BitymiDataParser(DataParser):
         )
         selected, start = {}, 0
         for name, part in parts.items():
-            selected[name] = select_views(views, range(start, start + len(part)))
+            of_part = range(start, start + len(part))
+            selected[name] = select_views(
+                views, [i for i, n in enumerate(views.metadata["photographs"]) if n in of_part]
+            )
             start += len(part)
         if not there:
             return self._split(selected["train"], {})

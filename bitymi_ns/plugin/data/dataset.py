@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -18,10 +19,10 @@ from rich.progress import track
 from torch import Tensor
 
 from bitymi_ns.plugin.console import fail, listed, warn
-from bitymi_ns.plugin.data.images import ImageSummary, blank_masks, read_image, read_mask, summarize, wrong_size
+from bitymi_ns.plugin.data.images import THREADS, ImageSummary, read_image, read_mask, summarize, wrong_size
 from bitymi_ns.plugin.data.lens import Lens
 from bitymi_ns.plugin.data.pose_checks import rotations
-from bitymi_ns.plugin.data.views import NO_PHOTOS, select_views
+from bitymi_ns.plugin.data.views import NO_PHOTOS, photograph_files, select_views
 from bitymi_ns.plugin.run.commands import MOVED
 from bitymi_ns.train.views import MemoryBudget, over_background
 
@@ -50,10 +51,22 @@ class BitymiDataset(InputDataset):
         super().__init__(dataparser_outputs, scale_factor)
         self._summaries: dict[int, ImageSummary] = {}
         self.gray_images = False
+        self._read_shared = lru_cache(maxsize=RECENT)(read_image)  # the views of one photograph follow each other
+
+    @property
+    def files(self) -> list[Path]:
+        """Photograph of each view."""
+        return photograph_files(self._dataparser_outputs)
+
+    @property
+    def photographs(self) -> list[int]:
+        """Number of the photograph of each view, from 0 on."""
+        numbers = {file: i for i, file in enumerate(dict.fromkeys(self.files))}
+        return [numbers[file] for file in self.files]
 
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
         """Read image [H, W, 3 or 4]."""
-        path = self._dataparser_outputs.image_filenames[image_idx]
+        path = self.files[image_idx]
         camera = self.cameras[image_idx].reshape(())
         declared = (int(camera.width), int(camera.height))
         if NO_PHOTOS in self._dataparser_outputs.metadata:
@@ -61,7 +74,8 @@ class BitymiDataset(InputDataset):
                 fail(f"the photograph {path} is needed, and the capture is gone. {MOVED}")
             return np.full((*declared[::-1], 3), 128, np.uint8)
         lens = self._lens(image_idx)
-        image = lens.undistort(read_image(path, lens.stored, lens.size))
+        read = self._read_shared if lens.face else read_image
+        image = lens.undistort(read(path, lens.stored, lens.size))
         image = self._scaled(image, Image.Resampling.BILINEAR)
         if image.size != declared:
             fail(wrong_size(path, image.size, declared))
@@ -97,8 +111,8 @@ class BitymiDataset(InputDataset):
         read = self.get_image_float32 if image_type == "float32" else self.get_image_uint8
         data: dict[str, Any] = {"image_idx": image_idx, "image": read(image_idx)}
         masks = self._dataparser_outputs.mask_filenames
-        if masks is not None:
-            mask = self._lens(image_idx).undistort_mask(read_mask(masks[image_idx]), masks[image_idx])
+        if masks is not None or not self._whole(image_idx):
+            mask = view_mask(self._dataparser_outputs, image_idx)
             mask = self._scaled(mask, Image.Resampling.NEAREST)
             data["mask"] = torch.from_numpy(np.array(mask, dtype=bool))[..., None]
             if self.mask_color:
@@ -109,11 +123,20 @@ class BitymiDataset(InputDataset):
     def _lens(self, image_idx: int) -> Lens:
         return self._dataparser_outputs.metadata["lenses"][image_idx]
 
+    def _whole(self, image_idx: int) -> bool:
+        return NO_PHOTOS in self._dataparser_outputs.metadata or self._lens(image_idx).whole
+
     def _scaled(self, image: Image.Image, resample: Image.Resampling) -> Image.Image:
         if self.scale_factor == 1.0:
             return image
         size = (int(image.width * self.scale_factor), int(image.height * self.scale_factor))
         return image.resize(size, resample=resample)
+
+
+def view_mask(outputs: DataparserOutputs, index: int) -> Image.Image:
+    """Read the mask of a view whose photograph has one, or does not cover it."""
+    path = None if outputs.mask_filenames is None else outputs.mask_filenames[index]
+    return outputs.metadata["lenses"][index].undistort_mask(None if path is None else read_mask(path), path)
 
 
 def _fill(image: Tensor, mask: Tensor, color: tuple[float, float, float]) -> Tensor:
@@ -170,10 +193,14 @@ def drop_blank_views(outputs: DataparserOutputs, split: str) -> DataparserOutput
         InputError: no training view is left.
     """
     masks = outputs.mask_filenames
-    blank = set(blank_masks(masks)) if masks else set()
+    if not masks:
+        return outputs
+    with ThreadPoolExecutor(THREADS) as pool:
+        boxes = list(pool.map(lambda i: view_mask(outputs, i).getbbox(), range(len(masks))))
+    blank = [i for i, box in enumerate(boxes) if box is None]
     if not blank:
         return outputs
-    named = listed([masks[i] for i in sorted(blank)])
+    named = listed([outputs.image_filenames[i] for i in blank])
     if split == "training" and len(blank) == len(masks):
         fail(
             f"the masks of all {len(masks)} {split} photographs exclude every pixel: {named}. Pixels count where the "

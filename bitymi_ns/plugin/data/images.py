@@ -163,12 +163,6 @@ def read_mask(path: Path) -> Image.Image:
         fail(f"the mask {path} cannot be read: {error}. Replace it, or remove the masks from the capture.", error)
 
 
-def blank_masks(paths: Sequence[Path]) -> list[int]:
-    """Indices of the masks that exclude every pixel."""
-    with ThreadPoolExecutor(THREADS) as pool:
-        return [i for i, box in enumerate(pool.map(lambda path: read_mask(path).getbbox(), paths)) if box is None]
-
-
 def wrong_size(path: Path, size: tuple[int, int], declared: tuple[int, int]) -> str:
     """Message for an image whose `size` (width, height) is not the one `declared` by its camera."""
     shown = f"{size[0]} x {size[1]} pixels, but its camera is for {declared[0]} x {declared[1]}"

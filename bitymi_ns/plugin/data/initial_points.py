@@ -165,11 +165,11 @@ def sample_colors(
     camera = photograph.camera
     colors = np.full((len(xyz), 3), np.nan, np.float32)
     local = (xyz - photograph.pose[:3, 3]) @ photograph.pose[:3, :3] * [1.0, -1.0, -1.0]
-    front = np.flatnonzero(local[:, 2] > 0.0)
+    lens = pycolmap.Camera(model=camera.model, width=camera.width, height=camera.height, params=list(camera.params))
+    front = np.flatnonzero(lens.is_spherical() | (local[:, 2] > 0.0))
     if not len(front):
         return colors
-    lens = pycolmap.Camera(model=camera.model, width=camera.width, height=camera.height, params=list(camera.params))
-    pixels = lens.img_from_cam(local[front] / local[front, 2:])
+    pixels = lens.img_from_cam(local[front] / np.abs(local[front, 2:]).clip(min=1e-12))
     height, width = image.shape[:2]
     pixels = np.nan_to_num(pixels * [width / camera.width, height / camera.height], nan=-1.0, posinf=-1.0, neginf=-1.0)
     inside = ((pixels >= 0.0) & (pixels < (width, height))).all(1)

@@ -1,10 +1,10 @@
-"""Lens distortion: turn photographs of any COLMAP or nerfstudio camera model into pictures of a pinhole camera."""
+"""Lenses: turn photographs of any COLMAP or nerfstudio camera model into pictures of pinhole cameras."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -16,13 +16,17 @@ from nerfstudio.cameras.cameras import CameraType
 from PIL import Image
 
 from bitymi_ns.capture.masks import in_proportion
-from bitymi_ns.capture.panorama import PANORAMAS
 from bitymi_ns.plugin.console import fail, warn
 from bitymi_ns.plugin.data.images import wrong_size
+from bitymi_ns.plugin.data.wide import FACES, covered, resample, windows
 
 MAX_VIEW_ANGLE = 110.0
 """Largest horizontal and vertical view angle of a pinhole picture, degrees. Wider pictures spend ever more pixels on
-ever less of the photograph."""
+ever less of the photograph: wider cameras become faces of a cube."""
+SPHERICAL = "EQUIRECTANGULAR"
+"""COLMAP camera model of pictures of all directions; its parameters are width and height."""
+ROUNDING = 0.01
+"""Relative difference of their aspect ratio from 2 that is rounding."""
 NODE_STEP = 4
 """Pixels between the nodes at which the distortion is evaluated; linear interpolation between them is accurate to far
 less than a pixel."""
@@ -57,7 +61,7 @@ class Pinhole:
 
 @dataclass(frozen=True)
 class Lens:
-    """Maps a photograph to the picture of a pinhole camera.
+    """Maps a photograph, or a face of the cube around a wide camera, to the picture of a pinhole camera.
 
     Attributes:
         model: COLMAP camera model.
@@ -65,6 +69,8 @@ class Lens:
         size: width and height to which a photograph is downscaled first.
         stored: width and height of the image file.
         pinhole: camera of the result.
+        face: of the cube; empty = the photograph is one picture.
+        whole: the photograph covers all of the result; else `coverage` is its mask.
     """
 
     model: str
@@ -72,11 +78,29 @@ class Lens:
     size: tuple[int, int]
     stored: tuple[int, int]
     pinhole: Pinhole
+    face: str = ""
+    whole: bool = True
 
     @property
     def distorts(self) -> bool:
         """True if undistorting moves pixels."""
-        return _distorts(_camera(self))
+        return bool(self.face) or _distorts(_camera(self))
+
+    @property
+    def turn(self) -> npt.NDArray[np.float64]:
+        """[4, 4] rotation of the result's camera axes to the photograph's, both OpenCV's."""
+        turn = np.eye(4)
+        if self.face:
+            turn[:3, :3] = np.array(FACES[self.face]).T
+        return turn
+
+    @property
+    def coverage(self) -> npt.NDArray[np.bool_]:
+        """Pixels [h, w] of the result that the photograph shows."""
+        to = self.pinhole
+        x, y = (np.arange(to.width) + 0.5 - to.cx) / to.fx, (np.arange(to.height) + 0.5 - to.cy) / to.fy
+        rays = np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), -1)
+        return covered(self.model, self.params, self.size, self.face, rays)
 
     def undistort(self, image: Image.Image) -> Image.Image:
         """Undistort an 8-bit image of any mode, decoded at `stored` or less, but not below `size`."""
@@ -84,30 +108,44 @@ class Lens:
             image = image.resize(self.size, Image.Resampling.BOX)
         if not self.distorts:
             return image
-        pixels = cv2.remap(np.asarray(image), *_maps(self), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return Image.fromarray(pixels, image.mode)
+        return Image.fromarray(self._moved(np.asarray(image), cv2.INTER_LINEAR), image.mode)
 
-    def undistort_mask(self, mask: Image.Image, path: Path) -> Image.Image:
-        """Undistort a mask by nearest neighbors. It may have another size than the photograph, but not another aspect
-        ratio; `path` is for the message."""
+    def undistort_mask(self, mask: Image.Image | None, path: Path | None) -> Image.Image:
+        """Undistort a mask by nearest neighbors, False where the photograph shows nothing. It may have another size
+        than the photograph, but not another aspect ratio; `path` is for the message. None = all of it counts."""
+        if mask is None:
+            return Image.fromarray(self.coverage)
         if not in_proportion(mask.size, self.stored):
             fail(wrong_size(path, mask.size, self.stored))
         pixels = np.asarray(mask.resize(self.size, Image.Resampling.NEAREST)).astype(np.uint8)
         if self.distorts:
-            pixels = cv2.remap(pixels, *_maps(self), cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
-        return Image.fromarray(pixels.astype(bool))
+            pixels = self._moved(pixels, cv2.INTER_NEAREST)
+        return Image.fromarray(pixels.astype(bool) & (True if self.whole else self.coverage))
+
+    def _moved(self, pixels: npt.NDArray[np.uint8], interpolation: int) -> npt.NDArray[np.uint8]:
+        if self.face:
+            nearest = interpolation == cv2.INTER_NEAREST
+            return resample(pixels, self.model, self.params, self.face, astuple(self.pinhole), nearest)
+        return cv2.remap(pixels, *_maps(self), interpolation, borderMode=cv2.BORDER_REPLICATE)
 
     def downscaled(self, factor: float) -> Lens:
         """Return the same lens for pictures scaled by `factor`."""
-        width, height = (max(1, round(side * factor)) for side in self.size)
-        params = rescaled(self.model, self.params, self.size, (width, height))
-        return make_lens(self.model, params, width, height, self.stored, "")[0]
+        size = (max(1, round(self.size[0] * factor)), max(1, round(self.size[1] * factor)))
+        of = self.pinhole
+        width, height = max(1, round(of.width * factor)), max(1, round(of.height * factor))
+        x, y = width / of.width, height / of.height
+        return replace(
+            self,
+            params=rescaled(self.model, self.params, self.size, size),
+            size=size,
+            pinhole=Pinhole(of.fx * x, of.fy * y, of.cx * x, of.cy * y, width, height),
+        )
 
 
-def make_lens(
+def lenses_of(
     model: str, params: tuple[float, ...], width: int, height: int, stored: tuple[int, int], label: str
-) -> tuple[Lens, list[str]]:
-    """Choose the pinhole camera for a camera model.
+) -> tuple[list[Lens], list[str]]:
+    """Choose the pinhole cameras for a camera model: one, or for cameras of more than MAX_VIEW_ANGLE faces of a cube.
 
     Args:
         model: COLMAP camera model.
@@ -116,14 +154,19 @@ def make_lens(
         label: names the camera in messages.
 
     Returns:
-        the lens, and messages on what is lost with it.
+        the lenses, and messages on what becomes of the photographs.
 
     Raises:
         InputError: the camera cannot be used.
     """
     camera = pycolmap.Camera(model=model, width=width, height=height, params=list(params))
     if camera.is_spherical():
-        fail(f"{label} is {model}. {PANORAMAS}")
+        if abs(width / (2.0 * height) - 1.0) > ROUNDING:
+            fail(
+                f"{label} is {model}, but its photographs have {width} x {height} pixels: pictures of all directions "
+                "are twice as wide as high. Correct the camera model, or pad the photographs to that shape."
+            )
+        return _faces(model, params, (width, height), stored, label)
     focal = (camera.focal_length_x, camera.focal_length_y)
     if not np.isfinite(params).all() or min(focal) <= 0.0 or min(width, height) < 1:
         fail(
@@ -133,7 +176,7 @@ def make_lens(
     center = (camera.principal_point_x, camera.principal_point_y)
     if not _distorts(camera):
         pinhole = Pinhole(*focal, *center, width, height)
-        return Lens(model, params, (width, height), stored, pinhole), []
+        return [Lens(model, params, (width, height), stored, pinhole)], []
     left, right, top, bottom = _window(camera)
     w, h = int((left + right) * focal[0]), int((top + bottom) * focal[1])
     share = w * h / (width * height)
@@ -146,30 +189,50 @@ def make_lens(
     if share < DOUBTFUL_AREA:
         warn(f"Undistorting leaves only {100.0 * share:.2g} % of {label}. The lens distortion may be wrong.")
     pinhole = Pinhole(*focal, left * focal[0], top * focal[1], w, h)
+    across, down = pinhole.view
+    if max(across, down) > MAX_VIEW_ANGLE - 0.5:
+        return _faces(model, params, (width, height), stored, label)
     messages = []
-    if camera.is_perspective_fisheye() or max(pinhole.view) > MAX_VIEW_ANGLE - 0.5:
-        across, down = pinhole.view
+    if camera.is_perspective_fisheye():
         messages.append(
             f"{label} is {model}: its photographs are used as pinhole pictures of {across:.0f} x {down:.0f} degrees "
             f"({w} x {h} pixels); what they show beyond is not used."
         )
-    return Lens(model, params, (width, height), stored, pinhole), messages
+    return [Lens(model, params, (width, height), stored, pinhole)], messages
+
+
+def _faces(
+    model: str, params: tuple[float, ...], size: tuple[int, int], stored: tuple[int, int], label: str
+) -> tuple[list[Lens], list[str]]:
+    """Lenses of the faces of the cube that a wide camera covers, with its focal length; see `lenses_of`."""
+    camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=list(params))
+    around = size[0] / (2.0 * math.pi)
+    fx, fy = (around, around) if camera.is_spherical() else (camera.focal_length_x, camera.focal_length_y)
+    lenses = []
+    for face, window in windows(model, params, size).items():
+        left, right, top, bottom, whole = window
+        w, h = max(1, round((right - left) * fx)), max(1, round((bottom - top) * fy))
+        u, v = w / (right - left), h / (bottom - top)
+        lenses.append(Lens(model, params, size, stored, Pinhole(u, v, -left * u, -top * v, w, h), face, whole))
+    named = ", ".join(f"{lens.face} {lens.pinhole.width} x {lens.pinhole.height}" for lens in lenses)
+    return lenses, [f"{label} is {model}: each of its photographs becomes {len(lenses)} pinhole pictures ({named})."]
 
 
 def colmap_distortion(kind: CameraType, values: Sequence[float], label: str) -> tuple[str, tuple[float, ...]]:
     """Convert nerfstudio's camera type and distortion_params (k1, k2, k3, k4, p1, p2; FISHEYE624: 12) to COLMAP's.
 
     Returns:
-        COLMAP camera model with separate focal lengths, and its parameters after fx, fy, cx, cy.
+        COLMAP camera model with separate focal lengths, and its parameters after fx, fy, cx, cy; SPHERICAL, and none.
 
     Raises:
         InputError: there is no such COLMAP camera.
     """
+    if kind == CameraType.EQUIRECTANGULAR:
+        return SPHERICAL, ()
     if kind not in (CameraType.PERSPECTIVE, CameraType.FISHEYE, CameraType.FISHEYE624):
-        hint = PANORAMAS if kind == CameraType.EQUIRECTANGULAR else "Correct the capture."
         fail(
-            f"the camera {label} cannot be used: it is neither a perspective nor a fisheye camera, which are the kinds "
-            f"that can be trained on, but {kind.name}. {hint}"
+            f"the camera {label} cannot be used: it is neither a perspective, a fisheye nor an equirectangular camera, "
+            f"which are the kinds that can be trained on, but {kind.name}. Correct the capture."
         )
     counts, needs = {
         CameraType.PERSPECTIVE: ((6,), "perspective cameras need six: k1, k2, k3, k4, p1, p2"),
@@ -198,6 +261,8 @@ def rescaled(model: str, params: Sequence[float], size: tuple[int, int], new: tu
     """Rescale the parameters of a COLMAP camera from pictures of `size` (width, height) to pictures of `new`."""
     if new == size:
         return tuple(params)
+    if model == SPHERICAL:
+        return tuple(map(float, new))
     camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=list(params))
     camera.rescale(*new)
     return tuple(camera.params)

@@ -37,6 +37,13 @@ class Split(NamedTuple):
         return f"Held out for evaluation: {len(self.held_out)} of {len(names)} photographs, {self.rule} ({shown})."
 
 
+def of_views(split: Split, photographs: Sequence[int]) -> tuple[list[int], list[int]]:
+    """Return the training and the held-out views, by the number of the photograph of each."""
+    sides = [set(side) for side in (split.train, split.held_out)]
+    train, held_out = ([i for i, photograph in enumerate(photographs) if photograph in side] for side in sides)
+    return train, held_out
+
+
 def ordinal(number: int) -> str:
     """Format 1st, 2nd, 3rd, 4th and so on."""
     suffix = "th" if number % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(number % 10, "th")

@@ -19,6 +19,8 @@ HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data 
 HOW_TO_MEND = "Correct it there (JSON has neither comments nor a comma behind the last entry), or write the file anew."
 INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
 FILE_KEYS = ("file_path", "mask_path", "depth_file_path")
+LATLONG = ("latlong", "is_latlong")
+"""Entries of instant-ngp's for pictures of all directions with latitude and longitude along their sides."""
 MAX_SIDE = 1 << 20
 """Largest plausible width or height of a picture, pixels."""
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -104,10 +106,29 @@ def _check_intrinsics(path: Path, meta: dict[str, Any]) -> None:
             keys = FOCALS["x"]
         elif key == "fl_y":
             keys = (*FOCALS["y"], *FOCALS["x"][1:])  # an angle of one side is that of square pixels
-        lacking = [frame["file_path"] for frame in frames if not any(key in meta or key in frame for key in keys)]
+        lacking = [frame["file_path"] for frame in frames if not any(key in meta or key in frame for key in keys)
+                   and (key in ("w", "h") or not is_equirectangular(meta, frame))]  # fmt: skip
         if lacking:
             add = f"Add it once at the top of the file{'' if len(lacking) == len(frames) else ', or to each frame'}"
             fail(f"{path} gives no {key} for {listed(lacking)}: it is neither in the frame nor at the top. {add}.")
+
+
+def is_equirectangular(meta: dict[str, Any], frame: dict[str, Any]) -> bool:
+    """Test if a frame is a picture of all directions, which has no focal length: so stated in nerfstudio's words, or by
+    an entry of instant-ngp's."""
+    return stated_model(meta, frame) == "EQUIRECTANGULAR"
+
+
+def stated_model(meta: dict[str, Any], frame: dict[str, Any]) -> Any:
+    """Return nerfstudio's name of the camera model of a frame, whose entries go before those of the file."""
+    for holder in (frame, meta):
+        if "camera_model" in holder:
+            return holder["camera_model"]
+        if any(holder.get(key) for key in LATLONG):
+            return "EQUIRECTANGULAR"
+        if any(key in holder for key in ("is_fisheye", "fisheye")):
+            return "OPENCV_FISHEYE" if holder.get("is_fisheye") or holder.get("fisheye") else "OPENCV"
+    return "OPENCV"
 
 
 def _warn_of_contradictions(path: Path, meta: dict[str, Any]) -> None:

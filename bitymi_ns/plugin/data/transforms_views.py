@@ -16,11 +16,10 @@ from typing import Any
 import numpy as np
 from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 
-from bitymi_ns.capture.panorama import PANORAMAS
 from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data.colmap_model import ModelCamera
 from bitymi_ns.plugin.data.images import image_size
-from bitymi_ns.plugin.data.lens import colmap_distortion
+from bitymi_ns.plugin.data.lens import SPHERICAL, colmap_distortion
 from bitymi_ns.plugin.data.names import FileFinder, renamed_message
 from bitymi_ns.plugin.data.splits import NameLists
 from bitymi_ns.plugin.data.transforms import (
@@ -28,20 +27,24 @@ from bitymi_ns.plugin.data.transforms import (
     DISTORTION,
     FOCALS,
     INTRINSICS,
+    LATLONG,
     check_number,
+    is_equirectangular,
     load_transforms,
+    stated_model,
     take_lists,
 )
 from bitymi_ns.plugin.data.views import Photograph
 
+EQUAL_AREA = ("equirectangular", "is_equirectangular")
+"""Entries of instant-ngp's for pictures of all directions of which rows show equal areas."""
 USED = {
     "frames", "file_path", "mask_path", "transform_matrix", "camera_model", "is_fisheye", "fisheye", "ply_file_path",
-    "applied_transform", "applied_scale", "orientation_override", "aabb_scale",
+    *LATLONG, *EQUAL_AREA, "applied_transform", "applied_scale", "orientation_override", "aabb_scale",
     *INTRINSICS, *DISTORTION, *FOCALS["x"], *FOCALS["y"],
 }  # fmt: skip
 IRRELEVANT = {"rotation", "sharpness", "colmap_im_id", "made_by"}
 """Unused entries that are not reported: turntable step, sharpness, number in another file, program."""
-PANORAMIC = ("equirectangular", "is_equirectangular", "latlong", "is_latlong")
 UNKNOWN_SIZE = 800
 """Pixels along a side of a picture whose size is not stated and that is missing, where none is needed."""
 
@@ -81,9 +84,12 @@ def read_transforms(
     meta = load_transforms(path, own_format, verbose)
     frames = meta["frames"]
     for holder in (meta, *frames):
-        for key in PANORAMIC:
-            if holder.get(key):
-                fail(f"{path}: {key} is set. {PANORAMAS}")
+        for key in EQUAL_AREA:
+            if holder.get(key) and "camera_model" not in holder:
+                fail(
+                    f"{path}: {key} is set, by which instant-ngp means pictures whose rows show equal areas, which "
+                    'cannot be read. For rows of equal angles write "camera_model": "EQUIRECTANGULAR" instead.'
+                )
     lists = take_lists(meta)
     names = [frame["file_path"] for frame in frames]
     files = _find_photographs(path, names, need_photos)
@@ -244,6 +250,14 @@ def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path)
             width, height = width or size[0], height or size[1]
         else:  # reported where it is read; and what opens no photograph needs some size
             width, height = width or height or UNKNOWN_SIZE, height or width or UNKNOWN_SIZE
+    if is_equirectangular(meta, frame):
+        middle = (width / 2.0 if cx is None else cx, height / 2.0 if cy is None else cy)
+        if max(abs(middle[0] - width / 2.0), abs(middle[1] - height / 2.0)) > 1.0:
+            fail(
+                f"{path}: {name} is EQUIRECTANGULAR, but its cx and cy are {middle[0]:g} and {middle[1]:g}, not the "
+                f"middle of its {width} x {height} pixels. Remove them, or shift the picture and turn the pose."
+            )
+        return ModelCamera(SPHERICAL, int(width), int(height), (float(width), float(height)))
     sides = {"x": width, "y": height}
     focal: dict[str, float] = {}
     for axis, keys in FOCALS.items():
@@ -275,10 +289,7 @@ def _focal_length(path: Path, key: str, value: float, side: float) -> float:
 def _distortion(path: Path, meta: dict[str, Any], frame: dict[str, Any]) -> tuple[str, tuple[float, ...]]:
     """Convert camera model and distortion of a frame; see `colmap_distortion`."""
     label = f"of {frame['file_path']}"
-    model = frame.get("camera_model", meta.get("camera_model"))
-    if model is None:
-        fisheye = any(frame.get(key, meta.get(key)) for key in ("is_fisheye", "fisheye"))
-        model = "OPENCV_FISHEYE" if fisheye else "OPENCV"
+    model = stated_model(meta, frame)
     if model not in CAMERA_MODEL_TO_TYPE:
         fail(
             f"{path}: the camera_model {model!r} {label} is unknown. nerfstudio knows "

@@ -1,4 +1,5 @@
-"""Views of a capture for training: photographs with cameras and poses become pinhole pictures in nerfstudio's frame."""
+"""Views of a capture for training: photographs with cameras and poses become pinhole pictures in nerfstudio's frame,
+those of wide cameras several."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ from nerfstudio.data.scene_box import SceneBox
 from bitymi_ns.plugin.console import fail, say
 from bitymi_ns.plugin.data.colmap_model import ModelCamera
 from bitymi_ns.plugin.data.images import THREADS, image_size
-from bitymi_ns.plugin.data.lens import Lens, Pinhole, colmap_distortion, make_lens, rescaled
+from bitymi_ns.plugin.data.lens import SPHERICAL, Lens, Pinhole, colmap_distortion, lenses_of, rescaled
 from bitymi_ns.plugin.data.point_files import Points
 from bitymi_ns.plugin.data.pose_checks import check_spread, far_from_origin, orient
 
@@ -110,7 +111,8 @@ def make_views(
     applied_scale: float = 1.0,
     alpha_color: torch.Tensor | None = None,
 ) -> Views:
-    """Build the views of a capture, in the order of the photographs; metadata["lenses"] has a `Lens` per view.
+    """Build the views of a capture, in the order of the photographs. metadata has for each view its `Lens` ("lenses"),
+    photograph ("files"), and the number of the photograph ("photographs"), which views of one share.
 
     Args:
         photographs: at least two.
@@ -128,22 +130,24 @@ def make_views(
     """
     if len(photographs) == 1:
         fail(f"{source} has one image only. A scene cannot be learned from one view: add photographs.")
-    lenses = make_lenses(photographs, downscale, need_photos)
+    parts = make_lenses(photographs, downscale, need_photos)
     poses = np.stack([photograph.pose for photograph in photographs])
     if frame.auto_scale_poses:
         check_spread(poses[:, :3, 3], source)
     transform, scale = training_frame(poses, frame, source)
     moved = transform @ poses
     moved[:, :3, 3] *= scale
-    metadata: dict[str, Any] = {"lenses": lenses}
+    lenses, of, moved = _split(parts, moved)
+    files = [photographs[i].file for i in of]
+    metadata: dict[str, Any] = {"lenses": lenses, "files": files, "photographs": of}
     if points is not None and len(points.xyz):
         xyz = (points.xyz @ transform[:, :3].T + transform[:, 3]) * scale * applied_scale
         metadata["points3D_xyz"] = torch.from_numpy(xyz.astype(np.float32))
         metadata["points3D_rgb"] = torch.from_numpy(points.rgb)
-    masks = [photograph.mask for photograph in photographs if photograph.mask is not None]
+    masks = [mask for i in of if (mask := photographs[i].mask) is not None]
     side = frame.scene_scale
     return Views(
-        image_filenames=[photograph.file for photograph in photographs],
+        image_filenames=view_names(files, lenses),
         cameras=pinhole_cameras([each.pinhole for each in lenses], torch.from_numpy(moved.astype(np.float32))),
         alpha_color=alpha_color,
         scene_box=SceneBox(aabb=torch.tensor([[-side] * 3, [side] * 3], dtype=torch.float32)),
@@ -152,6 +156,33 @@ def make_views(
         dataparser_transform=torch.from_numpy(transform if applied is None else transform @ applied),
         metadata=metadata,
     )
+
+
+def _split(parts: Sequence[Sequence[Lens]], poses: Pose) -> tuple[list[Lens], list[int], Pose]:
+    """Split photographs into the views of their lenses.
+
+    Args:
+        parts: lenses of each photograph.
+        poses: [N, 3 or 4, 4] camera to world in nerfstudio's axes.
+
+    Returns:
+        lens, number of the photograph and pose of each view.
+    """
+    lenses = [lens for some in parts for lens in some]
+    of = [i for i, some in enumerate(parts) for _ in some]
+    turns = np.stack([OPENCV_AXES @ lens.turn @ OPENCV_AXES for lens in lenses])
+    return lenses, of, poses[of] @ turns
+
+
+def view_names(files: Sequence[Path], lenses: Sequence[Lens]) -> list[Path]:
+    """Name views: by their photograph, and the face of the cube where it is split."""
+    return [file.with_name(f"{file.stem}-{lens.face}{file.suffix}") if lens.face else file
+            for file, lens in zip(files, lenses, strict=True)]  # fmt: skip
+
+
+def photograph_files(outputs: DataparserOutputs) -> list[Path]:
+    """Return the photograph of each view."""
+    return outputs.metadata.get("files", outputs.image_filenames)
 
 
 def training_frame(poses: Pose, frame: FrameOptions, source: str) -> tuple[Pose, float]:
@@ -200,15 +231,15 @@ def pinhole_cameras(pinholes: Sequence[Pinhole], poses: torch.Tensor) -> Cameras
     )
 
 
-def make_lenses(photographs: Sequence[Photograph], downscale: int = 1, need_photos: bool = True) -> list[Lens]:
-    """Make the lens of each photograph, equal ones once; see `make_views`."""
+def make_lenses(photographs: Sequence[Photograph], downscale: int = 1, need_photos: bool = True) -> list[list[Lens]]:
+    """Make the lenses of each photograph, equal ones once; see `make_views`."""
     sizes: list[tuple[int, int] | None] = [None] * len(photographs)
     copies = [i for i, photograph in enumerate(photographs) if photograph.downscaled]
     if copies and need_photos:
         with ThreadPoolExecutor(THREADS) as pool:
             for i, size in zip(copies, pool.map(image_size, [photographs[i].file for i in copies]), strict=True):
                 sizes[i] = size
-    made: dict[tuple[Any, ...], Lens] = {}
+    made: dict[tuple[Any, ...], list[Lens]] = {}
     lenses, messages = [], []
     for photograph, size in zip(photographs, sizes, strict=True):
         camera = photograph.camera
@@ -225,7 +256,7 @@ def make_lenses(photographs: Sequence[Photograph], downscale: int = 1, need_phot
         if key not in made:
             stored = used if photograph.downscaled else full
             params = rescaled(camera.model, camera.params, full, used)
-            made[key], lost = make_lens(camera.model, params, *used, stored, photograph.label)
+            made[key], lost = lenses_of(camera.model, params, *used, stored, photograph.label)
             messages += lost
         lenses.append(made[key])
     for message in messages[:3]:
@@ -251,13 +282,17 @@ def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
         values = [0.0] * 6 if distortion is None else distortion[i].tolist()
         model, coefficients = colmap_distortion(CameraType(int(cameras.camera_type[i])), values, f"of {file}")
         pinhole = [float(getattr(cameras, name)[i]) for name in ("fx", "fy", "cx", "cy")]
-        camera = ModelCamera(model, int(cameras.width[i]), int(cameras.height[i]), (*pinhole, *coefficients))
+        size = (int(cameras.width[i]), int(cameras.height[i]))
+        camera = ModelCamera(model, *size, size if model == SPHERICAL else (*pinhole, *coefficients))
         photographs.append(Photograph(file, camera, np.eye(4), f"the camera of {file}"))
-    lenses = make_lenses(photographs)
+    lenses, of, poses = _split(make_lenses(photographs), cameras.camera_to_worlds.double().numpy())
+    outputs = select_views(outputs, of)
+    files = outputs.image_filenames
     return dataclasses.replace(
         outputs,
-        cameras=pinhole_cameras([lens.pinhole for lens in lenses], cameras.camera_to_worlds),
-        metadata={**outputs.metadata, "lenses": lenses},
+        image_filenames=view_names(files, lenses),
+        cameras=pinhole_cameras([lens.pinhole for lens in lenses], torch.from_numpy(poses).float()),
+        metadata={**outputs.metadata, "lenses": lenses, "files": files, "photographs": of},
     )
 
 

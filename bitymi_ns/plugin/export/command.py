@@ -169,7 +169,9 @@ class ExportAtlas(BakeOptions, CompactOptions):
                 background = model.background.cpu()
                 photographs = datamanager.train_views
                 if polish or tune or learning.compact:
-                    photographs = corrected(photographs, model.resume_state.get("exposure"))
+                    photographs = corrected(
+                        photographs, model.resume_state.get("exposure"), datamanager.train_dataset.photographs
+                    )
                 baked = bake_and_learn(
                     model.scene, views, photographs, background, options, learning, progress, held_out
                 )

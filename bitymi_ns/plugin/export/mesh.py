@@ -21,6 +21,7 @@ from bitymi_ns.interchange import Frame
 from bitymi_ns.interchange.bundle_cameras import named_cameras
 from bitymi_ns.interchange.frame import to_capture
 from bitymi_ns.interchange.surface import NoSurface, SurfaceOptions, extract_surface
+from bitymi_ns.ops import Prefilter
 from bitymi_ns.plugin.console import fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.export.trained import load_trained, world_of
@@ -41,7 +42,7 @@ class Source:
         render: [H, W, 3] colors of a view.
         cameras: of the training views, on that device.
         near: nearest depth that is drawn, camera z.
-        through_pixel: as in `ops.project`.
+        prefilter: as in `ops.project`.
         world: how the scene lies in the capture.
     """
 
@@ -49,7 +50,7 @@ class Source:
     render: Callable[[Camera], Tensor]
     cameras: Sequence[Camera]
     near: float
-    through_pixel: bool
+    prefilter: Prefilter
     world: WorldFrame
 
 
@@ -127,7 +128,7 @@ class ExportMesh:
                 cameras,
                 source.near,
                 options,
-                source.through_pixel,
+                source.prefilter,
                 progress,
             )
         if to is not None:
@@ -154,7 +155,7 @@ def from_run(load_config: Path) -> Source:
         lambda camera: model.render(camera, model.background, maps=False).rgb,
         cameras,
         scene.near,
-        scene.config.through_pixel,
+        scene.config.prefilter,
         WorldFrame.model_validate_json(json.dumps(plain(world_of(datamanager).described()))),
     )
 
@@ -170,7 +171,7 @@ def from_bundle(folder: Path) -> Source:
         lambda camera: bundle.render(camera).rgb,
         cameras,
         scene.near,
-        scene.through_pixel,
+        scene.prefilter,
         bundle.info.world,
     )
 

@@ -65,7 +65,8 @@ class TrainingRun:
             metadata["train_pixels"],
             metadata["first_surfels"],
             covered_share(self.datamanager.train_views),
-            exposure_stops(self.datamanager.train_dataset.image_filenames),
+            exposure_stops(self.datamanager.train_dataset.files),
+            self.datamanager.train_dataset.photographs,
         )
         optimizers = attributes.optimizers.optimizers
         try:

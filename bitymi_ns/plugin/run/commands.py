@@ -17,7 +17,10 @@ from bitymi_ns.plugin.console import fail
 DATA = "BITYMI_DATA"
 """Environment variable: where a capture is now; most of nerfstudio's commands that read a run have no option for it."""
 MOVED = f"If it was moved, say where it is now: `{DATA}=/where/it/is` before the command."
-_MESH = "For the surface as a mesh run `ns-export bitymi-mesh`, for Gaussian splats of a bundle `bitymi extras`."
+_MESH = (
+    "`ns-export bitymi-mesh` writes the surface, a mesh whose vertices are points with colors; `bitymi extras BUNDLE` "
+    "Gaussian splats."
+)
 REFUSED = {
     "ExportPointCloud": f"ns-export pointcloud needs rays, and surfels are drawn as whole pictures. {_MESH}",
     "ExportTSDFMesh": f"ns-export tsdf needs rays, and surfels are drawn as whole pictures. {_MESH}",

@@ -33,6 +33,8 @@ from bitymi_ns.train.views import spread
 
 TRAJECTORIES = ("RenderCameraPath", "RenderInterpolated", "SpiralRender")
 """Classes of nerfstudio's script that render along a path."""
+OUTPUTS = ("rgb", "rgba", "accumulation", "depth", "normal", "beta", "overdraw")
+"""Outputs of all our scenes."""
 WITHOUT_MAPS = {"rgb", "rgba", "accumulation"}
 """Outputs for which no maps need to be drawn."""
 DEPTH_VIEWS, DEPTH_SIDE, DEPTH_SHARE = 16, 160, 0.01
@@ -53,12 +55,12 @@ def adopt_render() -> None:
         return
     command, script = found
     kind = type(command).__name__
+    if kind in (*TRAJECTORIES, "DatasetRender"):
+        _check(command)
     if kind == "DatasetRender":
-        _check_outputs(command, command.image_format == "png")
         script["media"], script["gzip"] = SimpleNamespace(write_image=write_image), SimpleNamespace(open=open_gzip)
     if kind not in TRAJECTORIES:
         return
-    _check(command)
     trajectory = script["_render_trajectory_video"]
     stock = getattr(trajectory, "stock", {name: script[name] for name in _REPLACED})
 
@@ -98,16 +100,18 @@ def _spiral_frames(command: Any) -> int:
 
 
 def target_of(command: Any) -> Path:
-    """The file or folder that a command writes: a film without an ending gets .mp4, frames nerfstudio's name."""
+    """The file or folder that a command writes: a film without an ending gets .mp4, folders nerfstudio's names."""
     path = Path(command.output_path)
+    if not hasattr(command, "output_format"):
+        return path / command.split
     if command.output_format == "images":
         return path.parent / path.stem
     return path if path.suffix else path.with_suffix(".mp4")
 
 
 def _check(command: Any) -> None:
-    """Stop where options of a command along a path cannot be used."""
-    images = command.output_format == "images"
+    """Stop where options of a command cannot be used."""
+    as_film = getattr(command, "output_format", "images") == "video"
     for name, low, high in (
         ("downscale_factor", 1 / MOST_PIXELS, MOST_PIXELS),
         ("jpeg_quality", 1, 100),
@@ -116,8 +120,8 @@ def _check(command: Any) -> None:
         ("seconds", 1 / RATES[1], math.inf),
         ("radius", 0, math.inf),
     ):
-        value = getattr(command, name, low)
-        if not low <= value <= high:
+        value = getattr(command, name, None)
+        if value is not None and not low <= value <= high:
             between = f"from {low:g} to {high:,}" if high < math.inf else f"at least {low:g}"
             fail(f"--{name.replace('_', '-')} must be {between}, not {value}.")
     if command.render_nearest_camera or command.check_occlusions:
@@ -125,21 +129,21 @@ def _check(command: Any) -> None:
             "--render-nearest-camera and --check-occlusions need rays, and surfels are drawn as whole pictures: leave "
             "them out. `ns-render dataset` writes photographs beside renders."
         )
-    _check_outputs(command, images and command.image_format == "png")
+    _check_outputs(command, not as_film and command.image_format == "png")
     path = target_of(command)
-    if not images and path.suffix.lower() != ".mp4":
+    if as_film and path.suffix.lower() != ".mp4":
         fail(f"films are MP4: --output-path must end in .mp4, {path} does not. Frames: --output-format images.")
     try:
         check_writable(path)
     except OSError as error:
         fail(f"{path} cannot be written: {reason(error, path)} (--output-path).", error)
-    if images:
-        check_frames(path)
-    elif path.is_dir():
+    if as_film and path.is_dir():
         fail(f"{path} is a folder: choose another --output-path.")
+    if not as_film and hasattr(command, "output_format"):
+        check_frames(path)
     if hasattr(command, "camera_path_filename"):
         rate = check_camera_path(Path(command.camera_path_filename))
-        if not images and not RATES[0] <= rate <= RATES[1]:
+        if as_film and not RATES[0] <= rate <= RATES[1]:
             fail(f"{command.camera_path_filename} makes {rate:g} frames per second: correct its seconds.")
     elif getattr(command, "seconds", None) is not None and _spiral_frames(command) < 1:
         fail(f"{command.seconds} seconds have no frame at --frame-rate {command.frame_rate}: give more.")
@@ -150,11 +154,17 @@ def _check_outputs(command: Any, transparency: bool) -> None:
     names = command.rendered_output_names
     if names is None:  # of a dataset: all of them
         return
+    dataset = not hasattr(command, "output_format")
+    more = "; with raw- before it for raw values; gt-rgb" if dataset else ""
     if not names:
         fail("--rendered-output-names names nothing: give rgb, depth or another output.")
+    for name in names:
+        output = name.removeprefix("raw-") if dataset else name
+        if output not in OUTPUTS and not (dataset and output.startswith("gt-")):
+            fail(f"there is no output {name}: --rendered-output-names may be {', '.join(OUTPUTS)}{more}.")
     if "rgba" in names and not transparency:
         fail("rgba has transparency, which JPEG and films have not: add --image-format png (and frames, not a film).")
-    if "rgba" in names and len(names) > 1 and hasattr(command, "output_format"):
+    if "rgba" in names and len(names) > 1 and not dataset:
         fail("rgba cannot stand beside other outputs in a frame: name it alone in --rendered-output-names.")
 
 
@@ -214,7 +224,7 @@ def write_trajectory(model: SurfelModel, cameras: Cameras, command: Any, fps: fl
         fps: frames per second of a film.
 
     Raises:
-        InputError: an output that the scene has not, or the target cannot be written.
+        InputError: the target cannot be written.
     """
     target, names = target_of(command), command.rendered_output_names
     images, started = command.output_format == "images", time.monotonic()
@@ -225,7 +235,7 @@ def write_trajectory(model: SurfelModel, cameras: Cameras, command: Any, fps: fl
         say(f"H.264 needs even sizes: of {width} x {height} pixels the last row or column is left out.")
     if not images and min(width, height) < 2:
         fail(f"a film of {width} x {height} pixels cannot be written: give a smaller --downscale-factor.")
-    planes = _depth_planes(model, views, command) if any("depth" in name for name in names) else {}
+    planes = _depth_planes(model, views, command) if "depth" in names else {}
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         output = frames(target, command.image_format, command.jpeg_quality) if images else film(target, fps)
@@ -252,10 +262,8 @@ def _picture(
     outputs["rgba"] = model.get_rgba_image(outputs)
     parts = []
     for name in names:
-        if name not in outputs:
-            fail(f"there is no output {name}: --rendered-output-names may be {', '.join(outputs)}.")
         image: Tensor = outputs[name]
-        if "depth" in name:
+        if name == "depth":
             image = colormaps.apply_depth_colormap(image, outputs["accumulation"], colormap_options=options, **planes)
         elif name != "rgba":
             image = colormaps.apply_colormap(image, options)

@@ -1,7 +1,5 @@
 """A graphics device that draws, be it one in software."""
 
-from __future__ import annotations
-
 import pytest
 
 from bitymi_ns.ops import webgpu

@@ -5,8 +5,6 @@ card room for its exponentials. Where a weight bound is set, the weight is judge
 that residuals are added which are not in the picture of the CPU: by at most the bound times the residual.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace

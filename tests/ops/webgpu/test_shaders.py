@@ -1,7 +1,5 @@
 """The numbers that the shaders state are those that csrc states."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

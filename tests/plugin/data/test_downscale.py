@@ -15,7 +15,7 @@ pytest.importorskip("nerfstudio")
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.data.images import read_image
-from bitymi_ns.plugin.data.lens import make_lens
+from bitymi_ns.plugin.data.lens import lenses_of
 from tests.plugin.conftest import edit_transforms
 from tests.plugin.data.captures import expect
 
@@ -96,7 +96,7 @@ def test_a_negative_side_is_refused(capture: Path) -> None:
 
 
 def test_a_lens_is_reduced_with_its_photographs() -> None:
-    whole, _ = make_lens("SIMPLE_RADIAL", (800.0, 480.0, 360.0, 0.1), 960, 720, (960, 720), "camera 1")
+    (whole,), _ = lenses_of("SIMPLE_RADIAL", (800.0, 480.0, 360.0, 0.1), 960, 720, (960, 720), "camera 1")
     half = whole.downscaled(0.5)
     assert half.size == (480, 360) and half.stored == (960, 720)
     assert half.pinhole.view == pytest.approx(whole.pinhole.view, abs=0.2)

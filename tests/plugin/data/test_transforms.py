@@ -93,7 +93,11 @@ def set_value(key: str, value: Any) -> Any:
         (set_value("cx", 5e5), "frame_00002.png cannot be used: its principal point is so far .* 80 degrees off"),
         (set_value("k4", 0.1), "camera of images/frame_00001.png .*cannot be used: its k4 is 0.1.*image_undistorter"),
         (set_value("distortion_params", [0.1, 0.0]), "has 2 distortion_params; perspective cameras need six"),
-        (set_value("camera_model", "EQUIRECTANGULAR"), "neither a perspective nor a fisheye camera"),
+        (
+            set_value("camera_model", "EQUIRECTANGULAR"),
+            "EQUIRECTANGULAR, but .*: pictures of all directions are twice as wide",
+        ),
+        (set_value("camera_model", "ORTHOPHOTO"), "neither a perspective, a fisheye nor an equirectangular camera"),
         (set_value("fl_x", -30.0), "camera of images/frame_00001.png .* cannot be used: its size and focal"),
         (set_value("fl_y", float("inf")), "cannot be used: its size and focal lengths have to be positive and all"),
         (set_value("cx", float("nan")), "cannot be used: .* all parameters finite"),

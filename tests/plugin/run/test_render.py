@@ -254,6 +254,13 @@ def test_files_that_are_no_camera_path(wall: Wall, camera_path: Any, tmp_path: P
         ("RenderInterpolated", {"rendered_output_names": ["rgba"]}, "rgba has transparency"),
         ("RenderInterpolated", {"rendered_output_names": []}, "--rendered-output-names names nothing"),
         ("RenderInterpolated", {"rendered_output_names": ["rgb", "deep"]}, "there is no output deep: .* may be rgb,"),
+        (
+            "DatasetRender",
+            {"rendered_output_names": ["raw-deep"]},
+            "there is no output raw-deep: .*; with raw-",
+        ),
+        ("DatasetRender", {"downscale_factor": -1.0}, "--downscale-factor must be from"),
+        ("DatasetRender", {"output_path": Path("/proc/maps")}, "/proc/maps/test cannot be written"),
         ("SpiralRender", {"seconds": 0.0}, "--seconds must be at least 0.001, not 0.0"),
         ("SpiralRender", {"seconds": 0.01}, "0.01 seconds have no frame at --frame-rate 24"),
         ("SpiralRender", {"radius": -1.0}, "--radius must be at least 0, not -1.0"),

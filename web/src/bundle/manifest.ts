@@ -45,7 +45,7 @@ export interface Manifest {
   atlas: Atlas | null;
   near: number;
   weightBound: number;
-  throughPixel: boolean;
+  prefilter: 'low_pass' | 'pixel';
   photographed: Float32Array | null; // rows x, y, z, pixels per unit of length
   background: Vec3;
   bounds: { min: Vec3; max: Vec3 };
@@ -236,7 +236,7 @@ export function parseManifest(text: string): Manifest {
     atlas: root.has('atlas') ? atlas(root.part('atlas'), isCompact, files.get('surfels.bin')?.bytes ?? 0) : null,
     near: render.number('near', 1e-9, 1e6),
     weightBound: render.number('weight_bound', 0, 1),
-    throughPixel: render.has('prefilter') && render.choice('prefilter', ['low_pass', 'pixel']) === 'pixel',
+    prefilter: render.has('prefilter') ? render.choice('prefilter', ['low_pass', 'pixel']) : 'low_pass',
     photographed: render.has('photographed') ? points(render) : null,
     background: render.point('background', 1),
     bounds: { min: bounds.point('min', 1e9), max: bounds.point('max', 1e9) },

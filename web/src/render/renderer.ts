@@ -91,7 +91,7 @@ export class Renderer {
     f.set([view.fx, view.fy, view.cx, view.cy], 20);
     f.set([width, height, info.near, info.weightBound], 24);
     f.set([info.atlas?.offset ?? 0, info.atlas?.scale ?? 1, ...atlasSize], 28);
-    u.set([count, surfels.kind, info.throughPixel ? 1 : 0, look.layers], 32);
+    u.set([count, surfels.kind, info.prefilter === 'pixel' ? 1 : 0, look.layers], 32);
     u.set([SHOW[look.show], look.residuals ? 1 : 0], 36);
     f[38] = photoPixel;
     u[39] = this.scene.detail;

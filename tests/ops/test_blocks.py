@@ -1,6 +1,4 @@
-"""What a list of the CPU kernels says of packs of 4 x 4 pixels."""
-
-from __future__ import annotations
+"""Fragment lists of the CPU kernels by blocks of 4 x 4 pixels."""
 
 import pytest
 import torch
@@ -13,46 +11,46 @@ from bitymi_ns.ops.fragment_list import empty_ids, empty_list
 from tests.ops.golden import SURFEL_KEYS, camera_of, random_scene
 
 
-def packs_of(projection: ops.Projection) -> dict[str, torch.Tensor]:
+def blocks_of(projection: ops.Projection) -> dict[str, torch.Tensor]:
     """The list of a view and the arrays of its layout, by name."""
     geom = projection.geom
     tracer = kernel_class("Trace", geom)()
     n = tracer.run(**projection.view(geom), most=0)
     found = empty_list(geom, n)
-    starts = {name: torch.empty(tracer.tiles + 1, dtype=torch.int64) for name in ("tile_start", "pack_start")}
-    packs = torch.empty(tracer.packs, 2, dtype=torch.int32)
-    tracer.copy(**found, **starts, packs=packs)
-    return {**found, **starts, "packs": packs}
+    starts = {name: torch.empty(tracer.tiles + 1, dtype=torch.int64) for name in ("tile_start", "block_start")}
+    blocks = torch.empty(tracer.blocks, 2, dtype=torch.int32)
+    tracer.copy(**found, **starts, blocks=blocks)
+    return {**found, **starts, "blocks": blocks}
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(("width", "height", "surfels", "seed"), [(64, 48, 80, 1), (83, 37, 200, 2), (5, 3, 9, 3)])
-def test_packs_say_whose_fragments_are_and_where(
+def test_blocks_have_the_surfels_and_pixels_of_the_fragments(
     width: int, height: int, surfels: int, seed: int, dtype: torch.dtype
 ) -> None:
     case = random_scene(surfels, seed, width=width, height=height)
     camera = camera_of(case, dtype)
     case.params["log_scales"][::3, 0] -= 3  # needles
     projection = ops.project(*(case.params[key].to(dtype) for key in SURFEL_KEYS), camera)
-    found = packs_of(projection)
+    found = blocks_of(projection)
     across = -(-width // TILE)
-    surfel, pixel, packs_before = [], [], set()
-    for tile, (first, last) in enumerate(zip(found["pack_start"][:-1], found["pack_start"][1:], strict=True)):
+    surfel, pixel, blocks_before = [], [], set()
+    for tile, (first, last) in enumerate(zip(found["block_start"][:-1], found["block_start"][1:], strict=True)):
         assert len(surfel) == found["tile_start"][tile]
-        packs_before.clear()
-        for code, owner in found["packs"][first:last].tolist():
-            lanes, pack = code & 0xFFFF, code >> 16
-            assert lanes and 0 <= pack < 16 and (owner, pack) not in packs_before
-            packs_before.add((owner, pack))
+        blocks_before.clear()
+        for code, owner in found["blocks"][first:last].tolist():
+            lanes, block = code & 0xFFFF, code >> 16
+            assert lanes and 0 <= block < 16 and (owner, block) not in blocks_before
+            blocks_before.add((owner, block))
             for lane in range(16):
                 if not lanes >> lane & 1:
                     continue
-                x = tile % across * TILE + pack % 4 * 4 + lane % 4
-                y = tile // across * TILE + pack // 4 * 4 + lane // 4
+                x = tile % across * TILE + block % 4 * 4 + lane % 4
+                y = tile // across * TILE + block // 4 * 4 + lane // 4
                 assert x < width and y < height
                 surfel.append(owner)
                 pixel.append(y * width + x)
-        owners = [owner for _, owner in found["packs"][first:last].tolist()]
+        owners = [owner for _, owner in found["blocks"][first:last].tolist()]
         runs = [owner for k, owner in enumerate(owners) if k == 0 or owners[k - 1] != owner]
         assert len(runs) == len(set(runs))
     assert len(surfel) == found["tile_start"][-1] > 0
@@ -78,21 +76,21 @@ def test_places_are_listed_when_they_are_asked_for(monkeypatch: pytest.MonkeyPat
     assert fragments.surfel is fragments.surfel and len(fragments.pixel) == len(fragments) and len(made) == 1
     listed = {"surfel": fragments.surfel, "pixel": fragments.pixel[1:]}
     with pytest.raises(ValueError, match="pixel has"):
-        function("list_places", torch.device("cpu"))(layout=fragments.layout.handle, width=64, height=48, **listed)
+        function("list_ids", torch.device("cpu"))(layout=fragments.layout.handle, width=64, height=48, **listed)
     with pytest.raises(ValueError, match="not that of such a list"):
-        function("list_places", torch.device("cpu"))(
+        function("list_ids", torch.device("cpu"))(
             layout=fragments.layout.handle, width=65, height=48, **fragments.layout.ids()
         )
 
 
 def test_a_layout_that_does_not_fit_is_refused() -> None:
-    make = module(torch.device("cpu")).TilePacks
-    starts, packs = torch.tensor([0, 3, 4]), torch.tensor([[0b111, 0], [1, 1]], dtype=torch.int32)
-    pack_starts = torch.tensor([0, 1, 2])
-    make(tile_start=starts, pack_start=pack_starts, packs=packs)
+    make = module(torch.device("cpu")).TileBlocks
+    starts, blocks = torch.tensor([0, 3, 4]), torch.tensor([[0b111, 0], [1, 1]], dtype=torch.int32)
+    block_starts = torch.tensor([0, 1, 2])
+    make(tile_start=starts, block_start=block_starts, blocks=blocks)
     with pytest.raises(ValueError, match="begin with 0"):
-        make(tile_start=starts + 1, pack_start=pack_starts, packs=packs)
+        make(tile_start=starts + 1, block_start=block_starts, blocks=blocks)
     with pytest.raises(ValueError, match="do not belong"):
-        make(tile_start=starts, pack_start=pack_starts, packs=packs[:1])
-    with pytest.raises(ValueError, match="pack_start has 2 elements"):
-        make(tile_start=starts, pack_start=pack_starts[:2], packs=packs)
+        make(tile_start=starts, block_start=block_starts, blocks=blocks[:1])
+    with pytest.raises(ValueError, match="block_start has 2 elements"):
+        make(tile_start=starts, block_start=block_starts[:2], blocks=blocks)

@@ -1,0 +1,120 @@
+"""Photographs of wide cameras as faces of a cube."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from PIL import Image
+
+from bitymi_ns.plugin.data.lens import Lens, lenses_of
+from bitymi_ns.plugin.data.wide import FACES
+
+PANORAMA = ("EQUIRECTANGULAR", (256.0, 128.0), 256, 128, (256, 128))
+RADIUS = 100.0
+FISHEYE = (
+    "OPENCV_FISHEYE",
+    (RADIUS / (0.5 * math.pi),) * 2 + (RADIUS, RADIUS, 0.0, 0.0, 0.0, 0.0),
+    200,
+    200,
+    (200, 200),
+)
+
+
+def rays_of(lens: Lens) -> np.ndarray:
+    """Unit rays [h, w, 3] of the pixels of a view in the axes of the photograph's camera."""
+    to = lens.pinhole
+    x, y = np.meshgrid((np.arange(to.width) + 0.5 - to.cx) / to.fx, (np.arange(to.height) + 0.5 - to.cy) / to.fy)
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ lens.turn[:3, :3].T
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+def directions(lens: Lens, width: int, height: int) -> np.ndarray:
+    """Photograph of a scene whose color is the direction, [height, width, 3]."""
+    camera = pycolmap.Camera(model=lens.model, width=width, height=height, params=list(lens.params))
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = camera.cam_ray_from_img(np.stack([x, y], -1).reshape(-1, 2)).reshape(height, width, 3)
+    return np.nan_to_num((rays * 0.5 + 0.5) * 255.0).round().clip(0, 255).astype(np.uint8)
+
+
+def test_a_panorama_becomes_six_faces_that_show_each_direction_once() -> None:
+    lenses, told = lenses_of(*PANORAMA, "camera 1")
+    assert [lens.face for lens in lenses] == list(FACES) and all(lens.whole for lens in lenses)
+    assert "camera 1 is EQUIRECTANGULAR: each of its photographs becomes 6 pinhole pictures (front 81 x 81" in told[0]
+    solid = 0.0
+    for lens in lenses:
+        rays = rays_of(lens)
+        cosine = rays @ lens.turn[:3, 2]
+        solid += float((cosine**3 / (lens.pinhole.fx * lens.pinhole.fy)).sum())
+        got = np.asarray(lens.undistort(Image.fromarray(directions(lens, 256, 128)))).astype(float)
+        assert np.abs(got - (rays * 0.5 + 0.5) * 255.0).max() < 4.0  # at the seam and at the poles, too
+    assert solid == pytest.approx(4.0 * math.pi, rel=1e-3)
+
+
+def test_directions_are_those_of_nerfstudios_equirectangular_camera() -> None:
+    pose = torch.eye(4)[None, :3]
+    cameras = Cameras(pose, 128.0, 128.0, 128.0, 64.0, 256, 128, camera_type=CameraType.EQUIRECTANGULAR)
+    theirs = cameras.generate_rays(0).directions.numpy() * [1.0, -1.0, -1.0]
+    camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=256, height=128, params=[256.0, 128.0])
+    pixels = camera.img_from_cam(theirs.reshape(-1, 3).astype(float)).reshape(128, 256, 2)
+    x, y = np.meshgrid(np.arange(256) + 0.5, np.arange(128) + 0.5)
+    assert np.abs(pixels - np.stack([x, y], -1)).max() < 0.01
+
+
+def test_a_fisheye_of_180_degrees_is_used_to_more_than_nine_tenths() -> None:
+    lenses, _ = lenses_of(*FISHEYE, "camera 1")
+    assert [lens.face for lens in lenses] == ["front", "right", "left", "up", "down"]
+    camera = pycolmap.Camera(model=FISHEYE[0], width=200, height=200, params=list(FISHEYE[1]))
+    x, y = np.meshgrid(np.arange(200) + 0.5, np.arange(200) + 0.5)
+    circle = np.hypot(x - 100.0, y - 100.0) < RADIUS
+    used = np.zeros((200, 200), bool)
+    rays = camera.cam_ray_from_img(np.stack([x, y], -1)[circle])
+    for lens in lenses:
+        local = rays @ lens.turn[:3, :3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = lens.pinhole.fx * local[:, 0] / local[:, 2] + lens.pinhole.cx
+            v = lens.pinhole.fy * local[:, 1] / local[:, 2] + lens.pinhole.cy
+        inside = (local[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < lens.pinhole.width) & (v < lens.pinhole.height)
+        covered = np.zeros_like(inside)
+        mask = np.asarray(lens.undistort_mask(None, None))
+        covered[inside] = mask[v[inside].astype(int), u[inside].astype(int)]
+        used[circle] |= covered
+        got = np.asarray(lens.undistort(Image.fromarray(directions(lens, 200, 200)))).astype(float)
+        error = np.abs(got - (rays_of(lens) * 0.5 + 0.5) * 255.0).max(-1)[mask]
+        assert np.quantile(error, 0.97) < 4.0
+    assert used[circle].mean() > 0.98
+
+
+def test_faces_that_the_photograph_covers_in_part_have_a_mask() -> None:
+    wide = ("OPENCV_FISHEYE", (65.0, 65.0, 100.0, 50.0, 0.0, 0.0, 0.0, 0.0), 200, 100, (200, 100))
+    lenses, _ = lenses_of(*wide, "camera 1")
+    assert [lens.face for lens in lenses] == ["front", "right", "left"]
+    front = lenses[0]
+    assert not front.whole and 0.8 < front.coverage.mean() < 1.0
+    white = Image.new("1", (200, 100), 1)
+    assert (np.asarray(front.undistort_mask(white, Path("m.png"))) == front.coverage).all()
+    left_half = np.zeros((100, 200), bool)
+    left_half[:, :100] = True
+    masks = {lens.face: np.asarray(lens.undistort_mask(Image.fromarray(left_half), Path("m.png"))) for lens in lenses}
+    assert masks["left"].any() and not masks["right"].any()
+
+
+def test_a_face_is_the_same_one_in_a_smaller_photograph() -> None:
+    for lens in lenses_of(*PANORAMA, "camera 1")[0] + lenses_of(*FISHEYE, "camera 1")[0]:
+        small = lens.downscaled(0.5)
+        assert small.face == lens.face and small.stored == lens.stored
+        assert small.size == (lens.size[0] // 2, lens.size[1] // 2)
+        assert small.pinhole.view == pytest.approx(lens.pinhole.view, abs=0.5)
+
+
+def test_where_the_distortion_folds_the_picture_nothing_is_used() -> None:
+    folding = ("OPENCV_FISHEYE", (60.0, 60.0, 100.0, 100.0, -0.2, 0.0, 0.0, 0.0), 200, 200, (200, 200))
+    angle = 1.0 / math.sqrt(0.6)  # at which theta - 0.2 theta^3 is largest
+    for lens in lenses_of(*folding, "camera 1")[0]:
+        mask = lens.coverage
+        assert (np.arccos(rays_of(lens)[..., 2])[mask] <= angle).all() and mask.mean() > 0.3

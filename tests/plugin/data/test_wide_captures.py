@@ -1,0 +1,129 @@
+"""Captures with photographs of wide cameras, some or all of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from PIL import Image
+
+from bitymi_ns.plugin.data.views import photograph_files, with_lenses
+from bitymi_ns.plugin.data.wide import FACES
+from tests.plugin.data.captures import colmap_model, expect, images_of, load_any, printed
+
+SIZE = (96, 48)
+
+
+def panoramas(capture: Path, edit: Any, count: int) -> list[str]:
+    """Make the first photographs pictures of all directions; their names."""
+    files = images_of(capture)[:count]
+    for i, file in enumerate(files):
+        Image.fromarray(np.random.default_rng(i).integers(0, 255, (*SIZE[::-1], 3), np.uint8)).save(file)
+
+    def change(meta: Any) -> None:
+        for frame in meta["frames"]:
+            if Path(frame["file_path"]).name in {file.name for file in files}:
+                frame.update(camera_model="EQUIRECTANGULAR", w=SIZE[0], h=SIZE[1], cx=SIZE[0] / 2, cy=SIZE[1] / 2)
+
+    edit(capture, change)
+    return [file.name for file in files]
+
+
+def test_a_capture_of_both_kinds(capture: Path, edit: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    names = panoramas(capture, edit, 3)
+    manager = load_any(capture, eval_interval=2)
+    said = printed(capsys)
+    assert "is EQUIRECTANGULAR: each of its photographs becomes 6 pinhole pictures (front 31 x 31" in said
+    count = len(images_of(capture))
+    assert f"Held out for evaluation: {(count + 1) // 2} of {count} photographs" in said
+    held_out, train = manager.eval_dataset, manager.train_dataset
+    stem = Path(names[0]).stem
+    assert [path.name for path in held_out.image_filenames[:6]] == [f"{stem}-{face}.png" for face in FACES]
+    assert not set(held_out.files) & set(train.files)
+    assert {path.name for path in train.files} & set(names) == {names[1]}
+    assert train.photographs[:7] == [0] * 6 + [1]
+    assert len(held_out) == (count + 1) // 2 + 10 and manager.eval_view(0)[1]["image"].shape == (31, 31, 3)
+    poses = held_out.cameras.camera_to_worlds[:6]
+    assert torch.allclose(poses[:, :, 3], poses[:1, :, 3].expand(6, 3))
+    assert torch.allclose(poses[0, :, 2], -poses[2, :, 2], atol=1e-6)  # front and back
+
+
+def test_only_panoramas_need_no_focal_length(capture: Path, edit: Any) -> None:
+    panoramas(capture, edit, len(images_of(capture)))
+    edit(capture, lambda meta: [meta.pop(key, None) for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")])
+    manager = load_any(capture)
+    assert len(manager.eval_dataset) == 6 * ((len(images_of(capture)) + 7) // 8)
+
+
+def test_a_mask_goes_with_each_face_and_a_face_without_pixels_is_left_out(
+    capture: Path, edit: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    count = len(images_of(capture))
+    panoramas(capture, edit, count)
+    mask = np.full(SIZE[::-1], 255, np.uint8)
+    mask[30:] = 0  # all of the face down, and parts of those around it
+    Image.fromarray(mask).save(capture / "mask.png")
+    edit(capture, lambda meta: [frame.update(mask_path="mask.png") for frame in meta["frames"]])
+    manager = load_any(capture)
+    assert "These views are left out" in printed(capsys)
+    assert len(manager.train_dataset) == 5 * (count - 2) and manager.train_dataset.photographs[-1] == count - 3
+    assert not any(path.stem.endswith("down") for path in manager.train_dataset.image_filenames)
+    front = manager.train_view(0)[1]["mask"][..., 0]
+    assert front[: len(front) // 2].all() and not front[-5:].any()
+
+
+def test_a_wide_fisheye_among_others(capture: Path, edit: Any) -> None:
+    first = images_of(capture)[1]
+    Image.new("RGB", (60, 60), (200, 50, 20)).save(first)
+    camera = dict(camera_model="OPENCV_FISHEYE", w=60, h=60, fl_x=19.0, fl_y=19.0, cx=30.0, cy=30.0)
+
+    def change(meta: Any) -> None:
+        next(f for f in meta["frames"] if Path(f["file_path"]).name == first.name).update(camera)
+
+    edit(capture, change)
+    manager = load_any(capture)
+    names = [path.name for path in manager.train_dataset.image_filenames[:6]]
+    assert names[:5] == [f"{first.stem}-{face}.png" for face in ("front", "right", "left", "up", "down")]
+    assert "mask" not in manager.train_view(5)[1]
+    assert all(manager.train_view(i)[1]["image"].float().std((0, 1)).max() == 0 for i in range(5))
+
+
+def test_a_colmap_model_of_panoramas(capture: Path) -> None:
+    for file in images_of(capture):
+        Image.new("RGB", SIZE).save(file)
+    colmap_model(capture, capture / "sparse/0")
+    (capture / "sparse/0/cameras.txt").write_text("1 EQUIRECTANGULAR 96 48 96 48\n")
+    (capture / "transforms.json").unlink()
+    manager = load_any(capture)
+    assert len(manager.eval_dataset) == 6 * ((len(images_of(capture)) + 7) // 8)
+
+
+def test_views_of_another_parser_are_split_too(capture: Path, edit: Any) -> None:
+    panoramas(capture, edit, len(images_of(capture)))
+    pixels = {"w": SIZE[0], "h": SIZE[1], "fl_x": SIZE[0] / 2, "fl_y": SIZE[1], "cx": SIZE[0] / 2, "cy": SIZE[1] / 2}
+    edit(capture, lambda meta: meta.update(pixels, camera_model="EQUIRECTANGULAR"))
+    stock = NerfstudioDataParserConfig(data=capture).setup().get_dataparser_outputs("train")
+    outputs = with_lenses(stock)
+    assert len(outputs.image_filenames) == 6 * len(stock.image_filenames) == len(outputs.cameras)
+    assert photograph_files(outputs)[:6] == [stock.image_filenames[0]] * 6
+    assert torch.allclose(outputs.cameras.camera_to_worlds[0], stock.cameras.camera_to_worlds[0])
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"w": 90, "cx": 45.0}, "EQUIRECTANGULAR, but its photographs have 90 x 48 pixels: .*twice as wide as high"),
+        ({"cx": 10.0}, "is EQUIRECTANGULAR, but its cx and cy are 10 and 24, not the middle of its 96 x 48 pixels"),
+        ({"w": 192, "h": 96, "cx": 96.0, "cy": 48.0}, "has 96 x 48 pixels, but its camera is for 192 x 96"),
+    ],
+)
+def test_panoramas_that_cannot_be_used(capture: Path, edit: Any, entries: dict[str, Any], message: str) -> None:
+    panoramas(capture, edit, 3)
+    edit(capture, lambda meta: meta["frames"][1].update(entries))
+    edit(capture, lambda meta: meta["frames"][1].setdefault("cy", 24.0))
+    with expect(message):
+        _ = load_any(capture).cached_train

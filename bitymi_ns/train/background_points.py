@@ -14,6 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import View, as_float, downscale_image, downscale_mask, spread
 
 CELLS = 24
@@ -28,6 +29,10 @@ RADIUS = 0.5
 """Largest first scale, in cells."""
 OPAQUE = 0.5
 """Share of a cell that must show something."""
+SUPPORT = 8
+"""Fewest photographs that have a point in an empty cell: 17 photographs overfit points of fewer."""
+IN_FRONT = 0.2
+"""Most photographs that have it in front of the points of a cell, as a share of those."""
 
 
 class BackgroundPoints(NamedTuple):
@@ -46,15 +51,16 @@ class BackgroundPoints(NamedTuple):
 
 @torch.no_grad()
 def background_points(points: Tensor, views: Sequence[View], seed: int) -> BackgroundPoints:
-    """Place a point behind every cell of a photograph that no sparse point projects to.
+    """Place points behind the cells of the photographs that no sparse point projects to.
 
     A cell's point lies on the ray of a random pixel of it, at a depth that is log-uniform between `NEAREST` and
-    `FARTHEST` times the median depth of the points that the photograph sees: between a wall and the sky. Cells that are
-    masked out or transparent get none.
+    `FARTHEST` times the median depth of the points that the photograph sees: between a wall and the sky. Masked and
+    transparent cells get none. A point stays if at least `SUPPORT` photographs have it in an empty cell, so that
+    training can find its depth, and few in front of the points of a cell.
 
     Args:
         points: [M, 3] world positions; those that are not finite do not count.
-        views: training photographs at full size, on the CPU.
+        views: training photographs at full size.
         seed: of the random pixels, depths and order.
 
     Returns:
@@ -63,54 +69,83 @@ def background_points(points: Tensor, views: Sequence[View], seed: int) -> Backg
     generator = torch.Generator().manual_seed(seed)
     points = points.detach().reshape(-1, 3).float().cpu()
     points = points[points.isfinite().all(-1)]
-    chosen = spread(len(views), MOST_VIEWS)
-    seen = [_projected(points, views[i]) for i in chosen]
-    medians = {i: z.median() for i, (z, _, _) in zip(chosen, seen, strict=True) if len(z) >= FEW}
+    chosen = [views[i] for i in spread(len(views), MOST_VIEWS)]
+    cameras = [view.camera.to("cpu") for view in chosen]
+    cells = [_Cells.of(camera, points) for camera in cameras]
+    medians = [each.median for each in cells if each.median is not None]
     if not medians:
         return BackgroundPoints(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
-    usual = torch.stack(list(medians.values())).median()
-    found = [
-        _behind_empty_cells(views[i], *pixels, medians.get(i, usual), generator)
-        for i, (_, *pixels) in zip(chosen, seen, strict=True)
-    ]
+    usual = float(torch.tensor(medians).median())
+    found = [_behind(*each, usual, generator) for each in zip(chosen, cameras, cells, strict=True)]
     joined = BackgroundPoints(*map(torch.cat, zip(*found, strict=True)))
-    order = torch.randperm(len(joined.xyz), generator=generator)
+    empty, before = torch.zeros(2, len(joined.xyz))
+    for camera, grid in zip(cameras, cells, strict=True):
+        z, row, column, inside = _cells_of(camera, joined.xyz)
+        nearest = grid.nearest[row, column]
+        empty[inside] += nearest.isinf()
+        before[inside] += nearest.isfinite() & (z < nearest)
+    kept = ((empty >= SUPPORT) & (before <= IN_FRONT * empty)).nonzero().flatten()
+    order = kept[torch.randperm(len(kept), generator=generator)]
     return BackgroundPoints(*(values[order] for values in joined))
 
 
-def _projected(points: Tensor, view: View) -> tuple[Tensor, Tensor, Tensor]:
-    """Depths and pixel coordinates x, y of the points within the picture, each [V]."""
-    camera = view.camera.to("cpu")
+class _Cells(NamedTuple):
+    """Cells of a view.
+
+    Attributes:
+        nearest: [rows, columns] camera z of the nearest sparse point; infinite in empty cells.
+        median: camera z of the points in the view; None where they are few.
+    """
+
+    nearest: Tensor
+    median: float | None
+
+    @classmethod
+    def of(cls, camera: Camera, points: Tensor) -> _Cells:
+        z, row, column, _ = _cells_of(camera, points)
+        rows, columns = grid_size(camera)
+        nearest = torch.full((rows * columns,), math.inf)
+        nearest.scatter_reduce_(0, row * columns + column, z, "amin")
+        return cls(nearest.view(rows, columns), float(z.median()) if len(z) >= FEW else None)
+
+
+def grid_size(camera: Camera) -> tuple[int, int]:
+    """Rows and columns of the cells of a view."""
+    side = max(camera.width, camera.height) / CELLS
+    return math.ceil(camera.height / side), math.ceil(camera.width / side)
+
+
+def _cells_of(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Camera z, row and column, each [V], of those of the points [M, 3] that lie within the picture; which: [M]."""
     x, y, z = (points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).unbind(-1)
     x, y = camera.K[0, 0] * x / z + camera.K[0, 2], camera.K[1, 1] * y / z + camera.K[1, 2]
     inside = (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    return z[inside], x[inside], y[inside]
+    rows, columns = grid_size(camera)
+    row, column = (y[inside] * (rows / camera.height)).long(), (x[inside] * (columns / camera.width)).long()
+    return z[inside], row.clamp(max=rows - 1), column.clamp(max=columns - 1), inside
 
 
-def _behind_empty_cells(
-    view: View, x: Tensor, y: Tensor, depth: Tensor, generator: torch.Generator
-) -> BackgroundPoints:
-    """The points of one view.
+def _behind(view: View, camera: Camera, cells: _Cells, usual: float, generator: torch.Generator) -> BackgroundPoints:
+    """A point behind each empty cell of a view.
 
     Args:
-        x, y: [V] pixel coordinates of the sparse points in it.
-        depth: median depth, camera z.
+        camera: of the view, on the CPU.
+        usual: median depth in the other views.
     """
-    camera, K = view.camera.to("cpu"), view.camera.K.cpu()
-    side = max(camera.width, camera.height) / CELLS
-    columns, rows = math.ceil(camera.width / side), math.ceil(camera.height / side)
+    (rows, columns), K = grid_size(camera), camera.K
     small = downscale_image(as_float(view.image.cpu()), columns, rows)  # [rows, columns, C]
-    empty = torch.ones(rows, columns, dtype=torch.bool)
-    empty[(y * (rows / camera.height)).long(), (x * (columns / camera.width)).long()] = False
+    empty = cells.nearest.isinf()
     if small.shape[-1] == 4:
         empty &= small[..., 3] > OPAQUE
     if view.mask is not None:
         empty &= downscale_mask(view.mask.cpu(), columns, rows)[..., 0]
     row, column = empty.nonzero().unbind(-1)
     random = torch.rand(len(row), 3, generator=generator)
-    z = depth * NEAREST * torch.exp(random[:, 2] * math.log(FARTHEST / NEAREST))
+    depth = NEAREST * (usual if cells.median is None else cells.median)
+    z = depth * torch.exp(random[:, 2] * math.log(FARTHEST / NEAREST))
     across = ((column + random[:, 0]) * (camera.width / columns) - K[0, 2]) / K[0, 0]
     down = ((row + random[:, 1]) * (camera.height / rows) - K[1, 2]) / K[1, 1]
     local = torch.stack([across * z, down * z, z], -1)
     xyz = (local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+    side = max(camera.width, camera.height) / CELLS
     return BackgroundPoints(xyz, small[row, column, :3], RADIUS * side * z / K[0, 0])

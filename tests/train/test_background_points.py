@@ -7,7 +7,7 @@ import torch
 
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
-from bitymi_ns.train.background_points import CELLS, FARTHEST, NEAREST, RADIUS, background_points
+from bitymi_ns.train.background_points import CELLS, FARTHEST, NEAREST, RADIUS, SUPPORT, background_points
 from bitymi_ns.train.config import DensifyConfig, TrainConfig
 from bitymi_ns.train.domain import scene_for_views
 from bitymi_ns.train.init import surfels_from_points
@@ -59,11 +59,11 @@ def left(camera: Camera) -> torch.Tensor:
 def test_empty_cells_get_a_point_on_their_ray(camera: Camera, left: torch.Tensor) -> None:
     image = torch.zeros(H, W, 3)
     image[..., 0] = (torch.arange(W) / W)[None]
-    found = background_points(left, [View(camera, image)], seed=3)
+    found = background_points(left, [View(camera, image)] * SUPPORT, seed=3)
     pixels, depth = projected(camera, found.xyz)
     side = W / CELLS
     cells = (pixels / side).floor()
-    assert len({tuple(cell) for cell in cells.tolist()}) == len(cells) == CELLS // 2 * round(H / side)
+    assert len(cells) == SUPPORT * len({tuple(cell) for cell in cells.tolist()}) == SUPPORT * 12 * 12
     assert bool((cells[:, 0] >= CELLS // 2).all())
     assert bool(((depth > NEAREST * DEPTH * 0.999) & (depth < FARTHEST * DEPTH * 1.001)).all())
     assert float(depth.log().std()) > 0.2 * math.log(FARTHEST / NEAREST)
@@ -75,23 +75,38 @@ def test_masked_and_transparent_cells_get_none(camera: Camera, left: torch.Tenso
     image, mask = torch.full((H, W, 4), 200, dtype=torch.uint8), torch.ones(H, W, dtype=torch.bool)
     image[: H // 2, :, 3] = 0
     mask[:, 3 * W // 4 :] = False
-    pixels, _ = projected(camera, background_points(left, [View(camera, image, mask)], 0).xyz)
+    pixels, _ = projected(camera, background_points(left, [View(camera, image, mask)] * SUPPORT, 0).xyz)
     assert len(pixels) and bool((pixels[:, 1] >= H // 2).all()) and bool((pixels[:, 0] < 3 * W // 4).all())
 
 
 def test_a_view_without_points_takes_the_depth_of_the_others(camera: Camera, left: torch.Tensor) -> None:
     away = turned(200.0)
     image = torch.rand(H, W, 3)
-    both = background_points(left, [View(camera, image), View(away, image)], 0)
-    _, depth = projected(away, both.xyz)
-    assert int((depth > 0).sum()) == CELLS * round(H / W * CELLS)
-    assert bool((depth[depth > 0] > NEAREST * DEPTH * 0.999).all())
-    assert len(background_points(left, [View(away, image)], 0).xyz) == 0
-    assert len(background_points(torch.full((5, 3), math.nan), [View(camera, image)], 0).xyz) == 0
+    both = background_points(left, [View(camera, image), *[View(away, image)] * SUPPORT], 0)
+    _, depth = projected(away, both.xyz)  # one view has the empty cells of the first: too few
+    assert len(depth) == SUPPORT * CELLS * 12 and bool((depth > NEAREST * DEPTH * 0.999).all())
+    assert len(background_points(left, [View(away, image)] * SUPPORT, 0).xyz) == 0
+    assert len(background_points(torch.full((5, 3), math.nan), [View(camera, image)] * SUPPORT, 0).xyz) == 0
+
+
+def test_points_that_few_views_show_or_that_hide_others_go(camera: Camera, left: torch.Tensor) -> None:
+    image = torch.rand(H, W, 3)
+    assert len(background_points(left, [View(camera, image)] * (SUPPORT - 1), 0).xyz) == 0
+    ahead = turned(0.0)
+    points = world(ahead, projected(camera, left)[0], torch.full((len(left),), DEPTH))
+    assert len(background_points(points, [View(ahead, image)] * SUPPORT, 0).xyz) == SUPPORT * 144
+    viewmat = torch.eye(4)  # to the right of what is empty, looking left
+    viewmat[:3, :3] = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ (EYE + torch.tensor([10.0, 0.0, 4.0]))
+    side = Camera(viewmat, torch.tensor([[15.0, 0.0, 48.0], [0.0, 15.0, 24.0], [0.0, 0.0, 1.0]]), W, H)
+    pixels = (torch.cartesian_prod(torch.arange(CELLS), torch.arange(12)) + 0.5) * (W / CELLS)
+    wall = world(side, pixels, torch.full((len(pixels),), 40.0))
+    views = [View(ahead, image)] * SUPPORT + [View(side, image)] * 3
+    assert len(background_points(torch.cat([points, wall]), views, 0).xyz) == 0
 
 
 def test_surfels_start_there_within_the_bounds(camera: Camera, left: torch.Tensor) -> None:
-    views = [View(camera, torch.rand(H, W, 3))]
+    views = [View(camera, torch.rand(H, W, 3))] * SUPPORT
     found = background_points(left, views, 0)
 
     def first(**options: object) -> tuple[dict[str, torch.Tensor], int]:

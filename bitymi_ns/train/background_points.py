@@ -18,7 +18,9 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import View, as_float, downscale_image, downscale_mask, spread
 
 CELLS = 24
-"""Cells along the longer side of a photograph."""
+"""Most cells along the longer side of a photograph."""
+POINTS_PER_CELL = 4
+"""Fewest points for each cell of a photograph, on average: else empty cells say nothing."""
 MOST_VIEWS = 100
 """Photographs, spread over all, that are searched for empty cells."""
 NEAREST, FARTHEST = 1.2, 5.0
@@ -71,17 +73,22 @@ def background_points(points: Tensor, views: Sequence[View], seed: int) -> Backg
     points = points[points.isfinite().all(-1)]
     chosen = [views[i] for i in spread(len(views), MOST_VIEWS)]
     cameras = [view.camera.to("cpu") for view in chosen]
-    cells = [_Cells.of(camera, points) for camera in cameras]
-    medians = [each.median for each in cells if each.median is not None]
-    if not medians:
+    depths = [_projected(camera, points)[0] for camera in cameras]
+    medians = torch.stack([z.median() if len(z) >= FEW else torch.tensor(math.nan) for z in depths])
+    counts = torch.tensor([float(len(z)) for z in depths])[medians.isfinite()]
+    if len(counts) == 0:
         return BackgroundPoints(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
-    usual = float(torch.tensor(medians).median())
-    found = [_behind(*each, usual, generator) for each in zip(chosen, cameras, cells, strict=True)]
+    medians = medians.nan_to_num(float(medians.nanmedian()))
+    grids = [_Grid.of(camera, points, float(counts.median())) for camera in cameras]
+    found = [
+        _behind(view, camera, grid, float(median), generator)
+        for view, camera, grid, median in zip(chosen, cameras, grids, medians, strict=True)
+    ]
     joined = BackgroundPoints(*map(torch.cat, zip(*found, strict=True)))
     empty, before = torch.zeros(2, len(joined.xyz))
-    for camera, grid in zip(cameras, cells, strict=True):
-        z, row, column, inside = _cells_of(camera, joined.xyz)
-        nearest = grid.nearest[row, column]
+    for camera, grid in zip(cameras, grids, strict=True):
+        z, x, y, inside = _projected(camera, joined.xyz)
+        nearest = grid.at(x, y)
         empty[inside] += nearest.isinf()
         before[inside] += nearest.isfinite() & (z < nearest)
     kept = ((empty >= SUPPORT) & (before <= IN_FRONT * empty)).nonzero().flatten()
@@ -89,63 +96,70 @@ def background_points(points: Tensor, views: Sequence[View], seed: int) -> Backg
     return BackgroundPoints(*(values[order] for values in joined))
 
 
-class _Cells(NamedTuple):
+class _Grid(NamedTuple):
     """Cells of a view.
 
     Attributes:
         nearest: [rows, columns] camera z of the nearest sparse point; infinite in empty cells.
-        median: camera z of the points in the view; None where they are few.
+        width, height: of a cell, pixels.
     """
 
     nearest: Tensor
-    median: float | None
+    width: float
+    height: float
 
     @classmethod
-    def of(cls, camera: Camera, points: Tensor) -> _Cells:
-        z, row, column, _ = _cells_of(camera, points)
-        rows, columns = grid_size(camera)
-        nearest = torch.full((rows * columns,), math.inf)
-        nearest.scatter_reduce_(0, row * columns + column, z, "amin")
-        return cls(nearest.view(rows, columns), float(z.median()) if len(z) >= FEW else None)
+    def of(cls, camera: Camera, points: Tensor, count: float) -> _Grid:
+        """Sort the points into cells of about equal sides.
+
+        Args:
+            count: points in a usual view.
+        """
+        longer, shorter = max(camera.width, camera.height), min(camera.width, camera.height)
+        side = longer / min(CELLS, max(1.0, math.sqrt(count / POINTS_PER_CELL * longer / shorter)))
+        rows, columns = math.ceil(camera.height / side), math.ceil(camera.width / side)
+        grid = cls(torch.full((rows, columns), math.inf), camera.width / columns, camera.height / rows)
+        z, x, y, _ = _projected(camera, points)
+        grid.nearest.view(-1).scatter_reduce_(0, grid._index(x, y), z, "amin")
+        return grid
+
+    def _index(self, x: Tensor, y: Tensor) -> Tensor:
+        rows, columns = self.nearest.shape
+        row, column = (y / self.height).long().clamp(max=rows - 1), (x / self.width).long().clamp(max=columns - 1)
+        return row * columns + column
+
+    def at(self, x: Tensor, y: Tensor) -> Tensor:
+        """`nearest` at pixels [V] within the picture."""
+        return self.nearest.view(-1)[self._index(x, y)]
 
 
-def grid_size(camera: Camera) -> tuple[int, int]:
-    """Rows and columns of the cells of a view."""
-    side = max(camera.width, camera.height) / CELLS
-    return math.ceil(camera.height / side), math.ceil(camera.width / side)
-
-
-def _cells_of(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Camera z, row and column, each [V], of those of the points [M, 3] that lie within the picture; which: [M]."""
+def _projected(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Camera z and pixel coordinates x, y, each [V], of those of the points [M, 3] within the picture; which: [M]."""
     x, y, z = (points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).unbind(-1)
     x, y = camera.K[0, 0] * x / z + camera.K[0, 2], camera.K[1, 1] * y / z + camera.K[1, 2]
     inside = (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    rows, columns = grid_size(camera)
-    row, column = (y[inside] * (rows / camera.height)).long(), (x[inside] * (columns / camera.width)).long()
-    return z[inside], row.clamp(max=rows - 1), column.clamp(max=columns - 1), inside
+    return z[inside], x[inside], y[inside], inside
 
 
-def _behind(view: View, camera: Camera, cells: _Cells, usual: float, generator: torch.Generator) -> BackgroundPoints:
-    """A point behind each empty cell of a view.
+def _behind(view: View, camera: Camera, grid: _Grid, median: float, generator: torch.Generator) -> BackgroundPoints:
+    """Place a point behind each empty cell of a view.
 
     Args:
         camera: of the view, on the CPU.
-        usual: median depth in the other views.
+        median: depth of its points, camera z.
     """
-    (rows, columns), K = grid_size(camera), camera.K
+    (rows, columns), K = grid.nearest.shape, camera.K
     small = downscale_image(as_float(view.image.cpu()), columns, rows)  # [rows, columns, C]
-    empty = cells.nearest.isinf()
+    empty = grid.nearest.isinf()
     if small.shape[-1] == 4:
         empty &= small[..., 3] > OPAQUE
     if view.mask is not None:
         empty &= downscale_mask(view.mask.cpu(), columns, rows)[..., 0]
     row, column = empty.nonzero().unbind(-1)
     random = torch.rand(len(row), 3, generator=generator)
-    depth = NEAREST * (usual if cells.median is None else cells.median)
-    z = depth * torch.exp(random[:, 2] * math.log(FARTHEST / NEAREST))
-    across = ((column + random[:, 0]) * (camera.width / columns) - K[0, 2]) / K[0, 0]
-    down = ((row + random[:, 1]) * (camera.height / rows) - K[1, 2]) / K[1, 1]
+    z = median * NEAREST * torch.exp(random[:, 2] * math.log(FARTHEST / NEAREST))
+    across = ((column + random[:, 0]) * grid.width - K[0, 2]) / K[0, 0]
+    down = ((row + random[:, 1]) * grid.height - K[1, 2]) / K[1, 1]
     local = torch.stack([across * z, down * z, z], -1)
     xyz = (local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
-    side = max(camera.width, camera.height) / CELLS
-    return BackgroundPoints(xyz, small[row, column, :3], RADIUS * side * z / K[0, 0])
+    return BackgroundPoints(xyz, small[row, column, :3], RADIUS * grid.width * z / K[0, 0])

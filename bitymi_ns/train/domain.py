@@ -55,7 +55,7 @@ def build_scene(
     """
     check_representation(scene_config)
     surfels, report = surfels_from_points(points, colours, camera_centers, train_config, scene_config, box, background)
-    means = surfels["means"]
+    means = surfels["means"][: len(surfels["means"]) - report.background]  # the others would make the field coarse
     near = NEAR * scene_extent(camera_centers, means)
     if scene_config.texture != "hash":  # texels are added once the geometry has settled
         return Scene(scene_config, surfels, None, near), report

@@ -7,7 +7,15 @@ import torch
 
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
-from bitymi_ns.train.background_points import CELLS, FARTHEST, NEAREST, RADIUS, SUPPORT, background_points
+from bitymi_ns.train.background_points import (
+    CELLS,
+    FARTHEST,
+    NEAREST,
+    POINTS_PER_CELL,
+    RADIUS,
+    SUPPORT,
+    background_points,
+)
 from bitymi_ns.train.config import DensifyConfig, TrainConfig
 from bitymi_ns.train.domain import scene_for_views
 from bitymi_ns.train.init import surfels_from_points
@@ -52,8 +60,8 @@ def projected(camera: Camera, points: torch.Tensor) -> tuple[torch.Tensor, torch
 def left(camera: Camera) -> torch.Tensor:
     """Points in every cell of the left half."""
     side = W / CELLS
-    cells = torch.cartesian_prod(torch.arange(CELLS // 2), torch.arange(int(H / side)))
-    return world(camera, (cells + 0.5) * side, torch.full((len(cells),), DEPTH))
+    cells = torch.cartesian_prod(torch.arange(CELLS // 2), torch.arange(int(H / side))).repeat(2 * POINTS_PER_CELL, 1)
+    return world(camera, (cells + 0.5) * side, DEPTH * torch.linspace(0.9999, 1.0001, len(cells)))
 
 
 def test_empty_cells_get_a_point_on_their_ray(camera: Camera, left: torch.Tensor) -> None:
@@ -100,9 +108,18 @@ def test_points_that_few_views_show_or_that_hide_others_go(camera: Camera, left:
     viewmat[:3, 3] = -viewmat[:3, :3] @ (EYE + torch.tensor([10.0, 0.0, 4.0]))
     side = Camera(viewmat, torch.tensor([[15.0, 0.0, 48.0], [0.0, 15.0, 24.0], [0.0, 0.0, 1.0]]), W, H)
     pixels = (torch.cartesian_prod(torch.arange(CELLS), torch.arange(12)) + 0.5) * (W / CELLS)
+    pixels = pixels.repeat(POINTS_PER_CELL, 1)
     wall = world(side, pixels, torch.full((len(pixels),), 40.0))
     views = [View(ahead, image)] * SUPPORT + [View(side, image)] * 3
     assert len(background_points(torch.cat([points, wall]), views, 0).xyz) == 0
+
+
+def test_sparse_points_make_large_cells(camera: Camera, left: torch.Tensor) -> None:
+    views = [View(camera, torch.rand(H, W, 3))] * SUPPORT
+    few = left[torch.randperm(len(left), generator=torch.Generator().manual_seed(0))[: 18 * POINTS_PER_CELL]]
+    found = background_points(few, views, 0)
+    assert SUPPORT * 9 <= len(found.xyz) <= SUPPORT * 12  # the right half of about 6 x 3 cells
+    assert bool((projected(camera, found.xyz)[0][:, 0] > W / 2 - W / 6).all())
 
 
 def test_surfels_start_there_within_the_bounds(camera: Camera, left: torch.Tensor) -> None:

@@ -41,6 +41,9 @@ const actionsOf = (context, page) => ({
   first: () => page.waitForFunction(() => document.documentElement.dataset.frame === 'first', null, { polling: 100 }),
   // until the poster is shown
   poster: () => page.waitForFunction(() => !document.querySelector('#poster').hidden, null, { polling: 50 }),
+  until: async ([expression]) => {
+    while (!(await page.evaluate(expression))) await page.waitForTimeout(50);
+  },
   loaded: ([selector]) => page.waitForFunction((s) => document.querySelector(s).naturalWidth > 0, selector),
   click: ([selector]) => page.click(selector),
   press: ([selector]) => page.evaluate(press, selector), // also where the screen is too small to show it
@@ -48,6 +51,12 @@ const actionsOf = (context, page) => ({
   hold: ([key]) => page.keyboard.down(key),
   release: ([key]) => page.keyboard.up(key),
   select: ([selector, value]) => page.selectOption(selector, value),
+  // types into a field, as a person does
+  fill: async ([selector, text]) => {
+    await page.click(selector, { clickCount: 3 });
+    await page.keyboard.type(text);
+    await page.keyboard.press('Tab');
+  },
   wheel: async ([at, by]) => {
     await page.mouse.move(...at);
     await page.mouse.wheel(0, by);

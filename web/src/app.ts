@@ -4,14 +4,16 @@ import type { Vec3 } from './bundle/manifest';
 import type { Look, Renderer } from './render/renderer';
 import type { Show } from './render/programs';
 import type { Screen } from './render/screen';
-import { element, press, pressed } from './ui/dom';
+import { download, element, press, pressed, typing } from './ui/dom';
 import { notify, showError, stopped } from './ui/pages';
+import { PathPanel } from './ui/path_panel';
 import { endPoster } from './ui/poster';
+import type { Stage } from './ui/stage';
 import { type CaptureCamera, commonTarget, parseCameras } from './view/cameras';
 import { Controls, type Mode } from './view/controls';
 import { Pace } from './view/pace';
 import { DEFAULT_LENS, type Lens, type Pose, View, moved } from './view/pose';
-import { fromHash, toHash } from './view/share';
+import { type Shared, fromHash, toHash } from './view/share';
 import { extentOf, firstPose } from './view/start';
 import { length, subtract } from './view/vector';
 
@@ -19,10 +21,12 @@ const MOVING_LAYERS = 4; // batches while the camera moves, and of a picture tha
 const STILL_LAYERS = 16;
 const STILL_AFTER = 250; // milliseconds
 
+const onPhone = (): boolean => matchMedia('(width <= 720px)').matches; // style.css
 const unsaved = (): void => notify('This view cannot be saved: there is not enough memory for it.');
 
-export class App {
+export class App implements Stage {
   private readonly controls: Controls;
+  private readonly path: PathPanel;
   private readonly cameras: CaptureCamera[];
   private readonly pace = new Pace();
   private readonly size: number;
@@ -52,7 +56,11 @@ export class App {
       const start = this.cameras.find((camera) => camera.heldOut) ?? this.cameras[0];
       this.first = { pose: start.pose, target: this.targetOf(start.pose), lens: start.lens };
     }
-    this.controls = new Controls(canvas, this.first.pose, this.first.target, up, size, () => this.touch());
+    this.controls = new Controls(canvas, this.first.pose, this.first.target, up, size, () => {
+      this.path.stop();
+      this.touch();
+    });
+    this.path = new PathPanel(this, canvas);
     this.lens = this.first.lens;
     this.bind();
   }
@@ -80,13 +88,31 @@ export class App {
     return moved(pose, 0, 0, ahead).position;
   }
 
-  private apply(shared: ReturnType<typeof fromHash> & object): void {
-    this.controls.pose = shared.pose;
-    this.controls.target = shared.target;
-    this.lens = shared.lens;
+  shared(): Shared {
+    const { pose, target } = this.controls;
+    return { pose, target, lens: this.lens, show: this.show, residuals: pressed(element('texture')) };
+  }
+
+  go(pose: Pose, lens: Lens, target?: Vec3): void {
+    this.path.stop();
+    this.place(pose, lens, target);
+  }
+
+  private place(pose: Pose, lens: Lens, target = this.targetOf(pose)): void {
+    this.controls.pose = pose;
+    this.controls.target = target;
+    this.lens = lens;
+    this.touch();
+  }
+
+  fileName(ending: string): string {
+    return `${document.title || 'scene'}.${ending}`;
+  }
+
+  private apply(shared: Shared): void {
     this.setShow(shared.show);
     press(element('texture'), shared.residuals);
-    this.touch();
+    this.go(shared.pose, shared.lens, shared.target);
   }
 
   private touch(): void {
@@ -116,13 +142,15 @@ export class App {
     if (stopped()) return;
     requestAnimationFrame((next) => this.tick(next));
     this.controls.advance(now);
+    const played = this.path.advance(now);
+    if (played) this.place(played.pose, played);
     if (this.drawing) return;
     if (this.dirty) void this.frame(false);
     else if (!this.still && now - this.movedAt > STILL_AFTER) void this.frame(true);
   }
 
   // Width and height of the canvas on the screen, as far as the device draws so many.
-  private pixels(): [number, number] {
+  pixels(): [number, number] {
     const { clientWidth, clientHeight } = this.canvas;
     const most = this.renderer.largestSide / Math.max(clientWidth, clientHeight, 1);
     const ratio = Math.min(devicePixelRatio, 2, most);
@@ -135,10 +163,11 @@ export class App {
     const [width, height] = this.pixels();
     if (width > 0 && height > 0) {
       const chosen = element<HTMLSelectElement>('resolution').value;
-      const scale = chosen !== 'auto' ? Number(chosen) : still ? 1 : this.pace.scale;
+      // of a film all pictures have one size
+      const scale = chosen !== 'auto' ? Number(chosen) : still || this.path.filming ? 1 : this.pace.scale;
       const begin = performance.now();
+      const view = View.contain(this.controls.pose, this.lens, width, height);
       try {
-        const view = View.contain(this.controls.pose, this.lens, width, height);
         await this.screen.draw(view, scale, this.look(still), this.farthest());
       } catch (error) {
         showError(error);
@@ -146,6 +175,7 @@ export class App {
       }
       const took = performance.now() - begin;
       endPoster();
+      this.path.drawn(view.pose);
       if (!still && chosen === 'auto') this.pace.took(took);
       this.still = still && !this.dirty;
       this.report(took, scale);
@@ -177,9 +207,11 @@ export class App {
     on('screenshot', () => void this.screenshot().catch(unsaved));
     on('share', () => void this.share());
     on('theme', () => this.turnTheme());
-    on('menu', () => {
-      const open = element('panel').classList.toggle('open');
-      element('menu').setAttribute('aria-expanded', String(open));
+    on('menu', () => this.open('panel', !element('panel').classList.contains('open')));
+    on('tools', () => this.open('aside', element('aside').hidden));
+    on('close', () => {
+      this.open('aside', false);
+      this.canvas.focus();
     });
     element('resolution').addEventListener('change', () => this.touch());
     element('show').addEventListener('change', (e) => this.setShow((e.target as HTMLSelectElement).value as Show));
@@ -188,15 +220,23 @@ export class App {
     this.fillCameras();
   }
 
+  // Opens or closes one of the panels; on a phone there is room for one.
+  private open(panel: 'panel' | 'aside', open: boolean): void {
+    element('panel').classList.toggle('open', panel === 'panel' && open);
+    element('aside').hidden = panel === 'aside' ? !open : element('aside').hidden || (open && onPhone());
+    element('menu').setAttribute('aria-expanded', String(panel === 'panel' && open));
+    press(element('tools'), !element('aside').hidden);
+  }
+
   private shortcut(e: KeyboardEvent): void {
-    if (e.target instanceof HTMLSelectElement) return;
+    if (typing(e.target)) return;
     if ((e.ctrlKey || e.metaKey) && e.code === 'KeyS') {
       e.preventDefault();
       void this.screenshot().catch(unsaved);
     }
     if (e.ctrlKey || e.metaKey || e.altKey) return;
     const id = { o: 'orbit', f: 'fly', h: 'home', ',': 'previous', '.': 'next', p: 'beside', t: 'texture' }[e.key];
-    const other = { c: 'colors', l: 'share' }[e.key];
+    const other = { c: 'colors', l: 'share', n: 'tools', k: 'add-keyframe', v: 'play' }[e.key];
     const found = id ?? other;
     if (found && !element(found).hidden) element(found).click();
   }
@@ -222,10 +262,7 @@ export class App {
   }
 
   private goHome(): void {
-    this.controls.pose = this.first.pose;
-    this.controls.target = this.first.target;
-    this.lens = this.first.lens;
-    this.touch();
+    this.go(this.first.pose, this.first.lens, this.first.target);
   }
 
   private fillCameras(): void {
@@ -248,11 +285,8 @@ export class App {
 
   private jump(k: number): void {
     const camera = this.cameras[k];
-    this.controls.pose = camera.pose;
-    this.controls.target = this.targetOf(camera.pose);
-    this.lens = camera.lens;
+    this.go(camera.pose, camera.lens);
     this.setPhotograph();
-    this.touch();
   }
 
   private toggleBeside(): void {
@@ -300,18 +334,12 @@ export class App {
     const image = await this.renderer.read(view, this.look(true), this.farthest());
     const canvas = new OffscreenCanvas(width, height);
     canvas.getContext('2d')?.putImageData(image, 0, 0);
-    const link = document.createElement('a');
-    link.href = URL.createObjectURL(await canvas.convertToBlob({ type: 'image/png' }));
-    link.download = `${document.title || 'scene'}.png`;
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
+    download(this.fileName('png'), await canvas.convertToBlob({ type: 'image/png' }));
     this.touch();
   }
 
   private async share(): Promise<void> {
-    const { pose, target } = this.controls;
-    const residuals = pressed(element('texture'));
-    history.replaceState(null, '', toHash({ pose, target, lens: this.lens, show: this.show, residuals }));
+    history.replaceState(null, '', toHash(this.shared()));
     try {
       await navigator.clipboard.writeText(location.href);
       notify('The link to this view was copied.');

@@ -7,3 +7,25 @@ export function element<T extends HTMLElement = HTMLElement>(id: string): T {
 
 export const press = (button: HTMLElement, on: boolean): void => button.setAttribute('aria-pressed', String(on));
 export const pressed = (button: HTMLElement): boolean => button.getAttribute('aria-pressed') === 'true';
+
+// A new element, with properties and attributes of the same name, and what it holds.
+export function make<K extends keyof HTMLElementTagNameMap>(
+  tag: K,
+  properties: Partial<HTMLElementTagNameMap[K]>,
+  ...children: (Node | string)[]
+): HTMLElementTagNameMap[K] {
+  const made = Object.assign(document.createElement(tag), properties);
+  made.append(...children);
+  return made;
+}
+
+// Whether keys go to an element, and not to the scene.
+export const typing = (target: EventTarget | null): boolean =>
+  target instanceof HTMLSelectElement || target instanceof HTMLInputElement;
+
+// Gives the reader a file.
+export function download(name: string, data: Blob): void {
+  const link = make('a', { href: URL.createObjectURL(data), download: name });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
+}

@@ -1,5 +1,6 @@
 // Mouse, touch and keys, as movements of a camera.
 import type { Vec3 } from '../bundle/manifest';
+import { typing } from '../ui/dom';
 import { type Pose, look, moved, orbit, rolled } from './pose';
 import { add, length, subtract } from './vector';
 
@@ -39,8 +40,7 @@ export class Controls {
       { passive: false },
     );
     addEventListener('keydown', (e) => {
-      const choosing = e.target instanceof HTMLSelectElement;
-      if (choosing || e.ctrlKey || e.metaKey || e.altKey || !MOVES[e.code]) return;
+      if (typing(e.target) || e.ctrlKey || e.metaKey || e.altKey || !MOVES[e.code]) return;
       e.preventDefault();
       if (this.held.has(e.code)) return;
       this.held.add(e.code);

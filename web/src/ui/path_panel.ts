@@ -1,0 +1,150 @@
+// The path of the camera: its keyframes in a list, playing it, and saving it.
+import { CameraPath, LONGEST, SHORTEST } from '../view/path';
+import type { Pose, View } from '../view/pose';
+import { download, element, make, press, pressed } from './dom';
+import { Film, filmable } from './film';
+import type { Stage } from './stage';
+
+const SECONDS = 2; // of a new segment
+
+interface Playing {
+  record: boolean;
+  film: Film | null; // from when the first view is drawn
+  since: number; // time, ms, of the first view
+  wanted: View | null; // the first view, and the last, until they are drawn
+}
+
+export class PathPanel {
+  private readonly path = new CameraPath();
+  private playing: Playing | null = null;
+
+  constructor(
+    private readonly stage: Stage,
+    private readonly canvas: HTMLCanvasElement,
+  ) {
+    const on = (id: string, run: () => void): void => element(id).addEventListener('click', run);
+    on('add-keyframe', () => this.add());
+    on('smooth', () => this.toggle('smooth'));
+    on('loop', () => this.toggle('loop'));
+    on('play', () => (this.playing ? this.stop() : this.play(false)));
+    on('save-path', () => this.save());
+    on('record', () => (this.playing ? this.stop() : this.play(true)));
+    element('seconds').addEventListener('change', ({ target }) => {
+      const { valueAsNumber: seconds } = target as HTMLInputElement;
+      if (seconds > 0) this.path.seconds = seconds;
+      this.show();
+    });
+    element('record').hidden = !filmable();
+    this.show();
+  }
+
+  // The view that the path shows now, while it plays.
+  advance(now: number): View | null {
+    const { playing, path } = this;
+    if (!playing || playing.wanted) return playing?.wanted ?? null;
+    const time = (now - playing.since) / 1000;
+    if (time < path.seconds) return this.view(time);
+    const last = this.view(path.seconds);
+    if (path.loop && !playing.record) playing.since = now;
+    else playing.wanted = last;
+    return last;
+  }
+
+  // What is on the canvas now.
+  drawn(pose: Pose): void {
+    const { playing } = this;
+    if (!playing || pose !== playing.wanted?.pose) return;
+    if (playing.since) {
+      this.stop();
+      return;
+    }
+    playing.since = performance.now();
+    playing.wanted = null;
+    if (playing.record) playing.film = new Film(this.canvas);
+  }
+
+  // Ends it, as where the reader moves the camera.
+  stop(): void {
+    if (!this.playing) return;
+    const { film } = this.playing;
+    this.playing = null;
+    this.show();
+    void film?.end().then((data) => download(this.stage.fileName('webm'), data));
+  }
+
+  get filming(): boolean {
+    return this.playing?.record === true;
+  }
+
+  private view(time: number): View {
+    return this.path.at(time, ...this.stage.pixels());
+  }
+
+  private play(record: boolean): void {
+    this.stop();
+    this.playing = { record, film: null, since: 0, wanted: this.view(0) };
+    this.show();
+  }
+
+  private add(): void {
+    const { pose, lens } = this.stage.shared();
+    this.path.keyframes.push({ pose, lens, seconds: SECONDS });
+    this.stop();
+    this.show();
+  }
+
+  private toggle(what: 'smooth' | 'loop'): void {
+    this.path[what] = !pressed(element(what));
+    press(element(what), this.path[what]);
+    this.show();
+  }
+
+  private save(): void {
+    const size = element<HTMLSelectElement>('path-size').value;
+    const [width, height] = size ? size.split('x').map(Number) : this.stage.pixels().map((side) => side - (side % 2));
+    const file = this.path.file(width, height);
+    download('camera_path.json', new Blob([file], { type: 'application/json' }));
+  }
+
+  private show(): void {
+    const { keyframes, loop, seconds } = this.path;
+    const list = element('keyframes');
+    list.replaceChildren(
+      ...keyframes.map((keyframe, k) => {
+        const go = make('button', { type: 'button', className: 'name', title: 'Go there' }, `Keyframe ${k + 1}`);
+        go.onclick = () => this.stage.go(keyframe.pose, keyframe.lens);
+        const remove = make('button', { type: 'button', ariaLabel: `Remove keyframe ${k + 1}`, title: 'Remove' }, '×');
+        remove.onclick = () => {
+          this.stop();
+          keyframes.splice(k, 1);
+          this.show();
+        };
+        const to = (k + 1) % keyframes.length;
+        const row = make('li', {}, go);
+        if (keyframes.length > 1 && (to || loop)) row.append(secondsOf(k + 1, to + 1, keyframe, () => this.show()));
+        row.append(remove);
+        return row;
+      }),
+    );
+    element<HTMLInputElement>('seconds').value = seconds ? String(Number(seconds.toFixed(2))) : '';
+    for (const id of ['seconds', 'play', 'save-path', 'record', 'smooth', 'loop', 'path-size']) {
+      element<HTMLButtonElement>(id).disabled = keyframes.length < 2;
+    }
+    element('play').textContent = this.playing && !this.filming ? 'Stop' : 'Play';
+    element('record').textContent = this.filming ? 'Stop' : 'Record';
+  }
+}
+
+// How long a segment takes.
+function secondsOf(from: number, to: number, keyframe: { seconds: number }, changed: () => void): HTMLElement {
+  const ariaLabel = `Seconds from keyframe ${from} to ${to}`;
+  const limits = { min: `${SHORTEST}`, max: `${LONGEST}`, step: 'any' };
+  const input = make('input', { type: 'number', ...limits, ariaLabel });
+  input.value = String(Number(keyframe.seconds.toFixed(2)));
+  input.onchange = () => {
+    const wanted = input.valueAsNumber;
+    if (wanted > 0) keyframe.seconds = Math.min(LONGEST, Math.max(SHORTEST, wanted));
+    changed();
+  };
+  return make('label', { className: 'seconds' }, input, ' s');
+}

@@ -1,0 +1,120 @@
+// A path of the camera through keyframes, and its file for `ns-render camera-path`.
+import type { Vec3 } from '../bundle/manifest';
+import { type Lens, type Pose, View } from './pose';
+import { type Quat, difference, exponential, poseOf, product, quatOf, slerp } from './rotation';
+import { add, length, subtract, times } from './vector';
+
+export interface Keyframe {
+  pose: Pose;
+  lens: Lens;
+  seconds: number; // to the next keyframe
+}
+
+export const SHORTEST = 0.1; // seconds of a segment
+export const LONGEST = 600;
+export const RATE = 30; // frames per second of the file
+const MOST_FRAMES = 36_000; // of the file: 20 minutes
+const STEEPEST = 3; // times the slower of two segments: a tangent beyond overshoots
+
+export class CameraPath {
+  keyframes: Keyframe[] = [];
+  smooth = true;
+  loop = false;
+
+  private get segments(): number {
+    return this.keyframes.length < 2 ? 0 : this.keyframes.length - (this.loop ? 0 : 1);
+  }
+  get seconds(): number {
+    return this.keyframes.slice(0, this.segments).reduce((sum, { seconds }) => sum + seconds, 0);
+  }
+  // Changes the speed of all segments alike.
+  set seconds(wanted: number) {
+    const k = wanted / this.seconds;
+    for (const each of this.keyframes) each.seconds = Math.min(LONGEST, Math.max(SHORTEST, k * each.seconds));
+  }
+
+  // The view at a time, of a picture of so many pixels; there are at least two keyframes.
+  at(time: number, width: number, height: number): View {
+    let [segment, rest] = [0, Math.min(Math.max(time, 0), this.seconds)];
+    while (segment + 1 < this.segments && rest >= this.keyframes[segment].seconds) {
+      rest -= this.keyframes[segment++].seconds;
+    }
+    const last = this.keyframes.length;
+    const [from, to] = [this.keyframes[segment], this.keyframes[(segment + 1) % last]];
+    const h = from.seconds;
+    const t = rest / h;
+    const focal = ({ pose, lens }: Keyframe): Vec3 => [Math.log(View.contain(pose, lens, width, height).fy), 0, 0];
+    const place = ({ pose }: Keyframe): Vec3 => pose.position;
+    const along = (value: (k: Keyframe) => Vec3): Vec3 => {
+      const speeds = this.speeds(segment, (a, b) => subtract(value(b), value(a)));
+      return hermite(value(from), value(to), times(h, speeds[0]), times(h, speeds[1]), t);
+    };
+    const turns = this.speeds(segment, (a, b) => difference(quatOf(a.pose), quatOf(b.pose)));
+    const rotation = bezier(quatOf(from.pose), quatOf(to.pose), times(h, turns[0]), times(h, turns[1]), t);
+    const f = Math.exp(along(focal)[0]);
+    return new View(poseOf(along(place), rotation), f, f, width / 2, height / 2, width, height);
+  }
+
+  // How fast what `step` measures between keyframes changes at the ends of a segment, per second.
+  private speeds(segment: number, step: (a: Keyframe, b: Keyframe) => Vec3): [Vec3, Vec3] {
+    const count = this.keyframes.length;
+    const speed = (k: number): Vec3 | null => {
+      const i = this.loop ? (k + count) % count : k;
+      if (i < 0 || i >= this.segments) return null;
+      return times(1 / this.keyframes[i].seconds, step(this.keyframes[i], this.keyframes[(i + 1) % count]));
+    };
+    const own = speed(segment)!;
+    const joined = (k: number): Vec3 => {
+      const [a, b] = [speed(k - 1), speed(k)];
+      if (!this.smooth || !a || !b) return own;
+      const [before, after] = [this.keyframes[(k - 1 + count) % count].seconds, this.keyframes[k % count].seconds];
+      const mean = times(1 / (before + after), add(times(after, a), times(before, b)));
+      const most = STEEPEST * Math.min(length(a), length(b));
+      return times(Math.min(1, most / Math.max(length(mean), 1e-12)), mean);
+    };
+    return [joined(segment), joined(segment + 1)];
+  }
+
+  // The file that `ns-render camera-path` takes, for pictures of a size. Frame: the scene's, OpenGL's axes.
+  file(width: number, height: number): string {
+    const { seconds } = this;
+    const count = Math.min(MOST_FRAMES, Math.max(2, Math.round(RATE * seconds)));
+    const step = seconds / (this.loop ? count : count - 1);
+    const frames = Array.from({ length: count }, (_, k) => {
+      const { pose, fy } = this.at(k * step, width, height);
+      const fov = (360 / Math.PI) * Math.atan(height / 2 / fy); // vertical, degrees
+      return { camera_to_world: cameraToWorld(pose), fov, aspect: width / height };
+    });
+    return JSON.stringify({
+      camera_type: 'perspective',
+      render_height: height,
+      render_width: width,
+      camera_path: frames,
+      fps: count / seconds,
+      seconds,
+      smoothness_value: this.smooth ? 0 : 1, // nerfstudio's tension
+      is_cycle: this.loop,
+      crop: null,
+    });
+  }
+}
+
+// By rows; x right, y up, z backward.
+function cameraToWorld({ position, right, down, forward }: Pose): number[] {
+  const row = (c: number): number[] => [right[c], -down[c], -forward[c], position[c]];
+  return [...[0, 1, 2].flatMap(row), 0, 0, 0, 1];
+}
+
+// Cubic from a to b with the derivatives m and n there.
+function hermite(a: Vec3, b: Vec3, m: Vec3, n: Vec3, t: number): Vec3 {
+  const s = 1 - t;
+  const ends = add(times(s * s * (1 + 2 * t), a), times(t * t * (1 + 2 * s), b));
+  return add(ends, add(times(s * s * t, m), times(-s * t * t, n)));
+}
+
+// The same for rotations: Shoemake's Bezier curve, with the derivatives in the frames of its ends.
+function bezier(a: Quat, b: Quat, m: Vec3, n: Vec3, t: number): Quat {
+  let points = [a, product(a, exponential(times(1 / 3, m))), product(b, exponential(times(-1 / 3, n))), b];
+  while (points.length > 1) points = points.slice(1).map((q, k) => slerp(points[k], q, t));
+  return points[0];
+}

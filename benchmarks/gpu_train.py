@@ -5,7 +5,6 @@ held-out PSNR against seconds of training, peak memory, bytes of the atlas, fram
 `--device cpu` runs the same on the CPU, to try the script: take few steps and a --downscale.
 """
 
-import argparse
 import math
 import sys
 import tempfile
@@ -17,7 +16,7 @@ from typing import Any
 
 import torch
 import yaml
-from common import number, page, publish, say, table
+from common import arguments_of, number, page, publish, say, table
 from harness import Options, milliseconds
 from plain_capture import Capture, load_capture
 
@@ -121,9 +120,7 @@ def _psnr(baked: BakedScene, capture: Capture, preset: Preset, device: torch.dev
 
 def main() -> int:
     """Command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
+    parser = arguments_of(__doc__)
     parser.add_argument("data", type=Path, help="folder of an undistorted capture with transforms.json")
     parser.add_argument("--preset", default="bitymi", help="of method_configs (%(default)s)")
     parser.add_argument(

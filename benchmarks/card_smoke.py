@@ -5,13 +5,13 @@
 --profile-from-start off), `--times` prints the device's time by kernel over a number of runs.
 """
 
-import argparse
 import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import torch
+from common import arguments_of
 from gpu_baked import around, textured
 from harness import deterministic, photo_loss, trained_like, training_step, with_texels
 
@@ -67,9 +67,7 @@ SECTIONS = {"baked": baked, "images": images, "training": training, "texels": te
 
 def main() -> int:
     """Command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
+    parser = arguments_of(__doc__)
     parser.add_argument("--surfels", type=int, default=300)
     parser.add_argument("--size", default="96x64", metavar="WxH", help="image size (%(default)s)")
     parser.add_argument("--sections", nargs="*", choices=list(SECTIONS), default=list(SECTIONS))

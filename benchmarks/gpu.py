@@ -6,7 +6,6 @@ imported. `--emulated` runs the host's emulation of the kernels on tiny scenes, 
 times mean nothing.
 """
 
-import argparse
 import subprocess
 import sys
 from contextlib import nullcontext
@@ -15,7 +14,7 @@ from pathlib import Path
 import gpu_baked
 import gpu_operations
 import torch
-from common import number, page, publish
+from common import arguments_of, number, page, publish
 from harness import Options, copy_bandwidth
 
 from bitymi_ns.ops.backend import emulated_cuda
@@ -43,9 +42,7 @@ def card(device: torch.device) -> list[str]:
 
 def main() -> int:
     """Command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
+    parser = arguments_of(__doc__)
     parser.add_argument("--surfels", nargs="+", type=int, default=[50_000, 150_000, 500_000], help="of the scenes")
     parser.add_argument("--sizes", nargs="+", default=["1297x840", "1920x1080"], metavar="WxH", help="(%(default)s)")
     parser.add_argument("--bundles", nargs="+", type=Path, default=[], help="baked scenes to draw as well")

@@ -8,7 +8,6 @@ gsplat's own example (positions 1.6e-4 times the extent of the cameras, falling 
 (1 - SSIM) with the weights of 0.01 on opacities and scales that the strategy asks for.
 """
 
-import argparse
 import math
 import sys
 import time
@@ -19,7 +18,7 @@ from statistics import fmean
 from typing import Any
 
 import torch
-from common import number, page, publish, say, table
+from common import arguments_of, number, page, publish, say, table
 from gpu_baked import measured
 from gpu_gsplat import RENDERERS, Frames, load
 from harness import Options, attempt, milliseconds
@@ -200,9 +199,7 @@ def report(rows: Sequence[Row], capture: Capture, times: Sequence[int]) -> str:
 
 def main() -> int:
     """Command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
+    parser = arguments_of(__doc__)
     parser.add_argument("data", type=Path, help="folder of an undistorted capture with transforms.json")
     parser.add_argument("--train", nargs="+", type=int, metavar="COUNT", help="train so many Gaussians, draw nothing")
     parser.add_argument("--steps", type=int, default=20_000, help="of training Gaussians (%(default)s)")

@@ -7,7 +7,6 @@ waiting is measured; its sums have the precision that the device blends in. The 
 8 bits per channel. `--layers` are the batches in which surfels are drawn (docs/viewer.md).
 """
 
-import argparse
 import statistics
 import sys
 import time
@@ -15,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from common import number, page, publish, say, table
+from common import arguments_of, number, page, publish, say, table
 from gpu_baked import around, measured
 from harness import Options
 
@@ -45,9 +44,7 @@ def webgpu_milliseconds(scene: SceneOnDevice, camera: Camera, layers: int, runs:
 
 def main() -> int:
     """Command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
+    parser = arguments_of(__doc__)
     parser.add_argument("bundles", nargs="+", type=Path)
     parser.add_argument("--sizes", nargs="+", default=["1297x840", "3840x2160"], metavar="WxH")
     parser.add_argument("--layers", nargs="+", type=int, default=[1, 16])

@@ -18,7 +18,6 @@ The formulas are in `cases`, with n surfels of which v are visible, p pixels, f 
 - blend, texels: neighbouring texels are gathered from the cache, so their loads are not counted.
 """
 
-import argparse
 import math
 import os
 import statistics
@@ -32,7 +31,7 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch loads OpenMP
 
 import torch
-from common import number, page, publish, say, table
+from common import arguments_of, number, page, publish, say, table
 from gpu_baked import textured
 from harness import LOG2_TABLE, SITES, backward, trained_like, without_graph
 
@@ -161,9 +160,7 @@ def cases(n: int, width: int, height: int) -> tuple[str, list[Case]]:
 
 def main() -> int:
     """Command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
+    parser = arguments_of(__doc__)
     parser.add_argument("--surfels", nargs="+", type=int, default=[5_000, 20_000], help="sizes of the scene")
     parser.add_argument("--width", type=int, default=270)
     parser.add_argument("--height", type=int, default=480)

@@ -11,7 +11,6 @@ compact` does; `--keep` stores that in a file, from which the command continues 
   tuned       dB of the held-out views after it (--tune)
 """
 
-import argparse
 import os
 import sys
 from pathlib import Path
@@ -21,7 +20,7 @@ from typing import Any
 os.environ.setdefault("BITYMI_NO_DOWNLOAD", "1")
 
 import torch
-from common import number, page, publish, say, table
+from common import arguments_of, number, page, publish, say, table
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -74,9 +73,7 @@ def plot(points: list[tuple[float, float]], name: str, path: Path) -> None:
 
 def main() -> int:
     """Command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
+    parser = arguments_of(__doc__)
     parser.add_argument("--load-config", type=Path, help="config.yml of a run")
     parser.add_argument("--keep", type=Path, help="file of the polished bake; read where it is there, else written")
     parser.add_argument("--lambdas", nargs="+", type=float, default=[2.0, 6.0, 18.0, 54.0], help="(%(default)s)")

@@ -135,19 +135,15 @@ class Surfels(Part):
     file: Literal["surfels.ply", "surfels.bin"] = SURFELS
     count: Whole
     frame: PositionFrame | None = None
-    columns: Annotated[list[Column], Field(max_length=64)] | None = None
-    """Columns of surfels.bin, in their order."""
+    columns: Annotated[list[Column], Field(max_length=64)] | None = None  # columns of surfels.bin, in their order
     view_color: Kind
     kernel: str = "min(alpha_max, opacity * max((1 - (u^2 + v^2) / support^2)+ ^ beta, exp(-low_pass * d^2)))"
     support: _only(SUPPORT) = SUPPORT  # type: ignore[valid-type]
     residual: str = "of a surfel without a tile: residual_0..2, at weights of at least render.weight_bound"
     activations: dict[str, str] = ACTIVATIONS
-    sites: Whole | None = None
-    """Spherical Voronoi sites per surfel, where all are kept."""
-    terms: Whole | None = None
-    """Terms of all lean view colours together; None = view colours are complete."""
-    view_terms: str | None = None
-    """Formula of a lean view colour."""
+    sites: Whole | None = None  # Spherical Voronoi sites per surfel, where all are kept
+    terms: Whole | None = None  # terms of all lean view colours together; None = view colours are complete
+    view_terms: str | None = None  # formula of a lean view colour
 
 
 class Atlas(Part):
@@ -156,15 +152,12 @@ class Atlas(Part):
 
     file: Literal["atlas.ktx2", "texels.bin"] = ATLAS
     format: Literal["bc7", "uint8", "fp16", "dct"]
-    texels: Whole | None = None
-    """Texels of all tiles, in texels.bin."""
-    step: Annotated[float, Field(ge=1e-6, le=100)] | None = None
-    """Step of coefficients of grade 0, in texels.bin."""
+    texels: Whole | None = None  # texels of all tiles, in texels.bin
+    step: Annotated[float, Field(ge=1e-6, le=100)] | None = None  # step of coefficients of grade 0, in texels.bin
     page_width: Side | None = None
     page_rows: Side | None = None
     """Arguments of `codec.packing.pack`, by which the packing follows from the sizes of the tiles."""
-    columns: Annotated[list[Column], Field(max_length=64)] | None = None
-    """Columns of texels.bin, in their order."""
+    columns: Annotated[list[Column], Field(max_length=64)] | None = None  # columns of texels.bin, in their order
     width: Side
     height: Side
     layers: Side
@@ -215,12 +208,10 @@ class WorldFrame(Part):
 
     transform: tuple[Row, Row, Row]
     scale: Positive
-    up: tuple[Cosine, Cosine, Cosine] | None = None
-    """Unit vector of the scene that points away from the ground."""
+    up: tuple[Cosine, Cosine, Cosine] | None = None  # unit vector of the scene that points away from the ground
     up_from: Annotated[str, Field(pattern=r"^[a-z][a-z_-]{0,39}$")] | None = None
     """Source of `up`: gps, gravity, or cameras (upright as a rule)."""
-    metres_per_unit: Positive | None = None
-    """Length of a unit of the scene."""
+    metres_per_unit: Positive | None = None  # length of a unit of the scene
 
     @model_validator(mode="after")
     def _up_is_a_direction(self) -> WorldFrame:
@@ -259,8 +250,7 @@ class Manifest(Part):
     bounds: Bounds
     statistics: Statistics
     files: Annotated[dict[str, FileEntry], Field(max_length=1 << 14)]
-    digest: str | None = None
-    """SHA-256 of the canonical JSON of everything else."""
+    digest: str | None = None  # SHA-256 of the canonical JSON of everything else
 
     @model_validator(mode="after")
     def _files_fit(self) -> Manifest:

@@ -40,6 +40,7 @@ def _number(value: Any) -> Any:
 Whole = Annotated[int, Field(ge=0, le=2**31 - 1)]
 Count = Annotated[int, Field(ge=0, le=2**60)]
 NotNegative = Annotated[float, Field(ge=0, le=_LARGEST)]
+Measured = Annotated[NotNegative | None, BeforeValidator(_number)]  # None = not a number
 Share = Annotated[float, Field(ge=0, le=1)]
 Decibels = Annotated[Annotated[float, Field(ge=-1e3, le=1e3)] | None, BeforeValidator(_number)]
 """None = not a number: the pictures are equal, or no pixel counts."""
@@ -74,14 +75,12 @@ class Certificate(Part):
     """Counts of surfels whose stored residual is within the tolerance, as the closest training view shows it: weighted
     by the blending weight, averaged over a pixel, root mean square over the tile."""
 
-    against: Literal["field", "texels"]
-    """Reference: the field, or the trained texels before quantisation."""
+    against: Literal["field", "texels"]  # reference: the field, or the trained texels before quantisation
     tolerance: NotNegative
     within: Whole
     beyond: Whole
-    worst: Annotated[NotNegative | None, BeforeValidator(_number)] = None
-    """8-bit steps."""
-    texel_rms: Annotated[NotNegative | None, BeforeValidator(_number)] = None
+    worst: Measured = None  # 8-bit steps
+    texel_rms: Measured = None
     """Root mean square of the texels themselves, wherever they are seen, 8-bit steps."""
     marks: Annotated[str, Field(min_length=1368, max_length=1368, pattern=r"^[A-Za-z0-9+/]{1366}==$")] | None = None
     """Count sketches, 2 x 128 sums, before quantisation and as stored (`sketch.sketches_text`)."""
@@ -119,13 +118,10 @@ class KeptTexels(Part):
     nyquist: Count | None = None
     after_cap_by_views: Count | None = None
     within_visible_part: Count | None = None
-    polished: Count | None = None
-    """Texels of the tiles that a polish started from."""
-    learned: Count | None = None
-    """Texels of the tiles that were trained."""
+    polished: Count | None = None  # texels of the tiles that a polish started from
+    learned: Count | None = None  # texels of the tiles that were trained
     kept: Count | None = None
-    not_finite: Count | None = None
-    """Points at which the field was not finite."""
+    not_finite: Count | None = None  # points at which the field was not finite
 
 
 class FieldLevels(Part):
@@ -133,13 +129,9 @@ class FieldLevels(Part):
 
     unit: str | None = None
     levels: Whole | None = None
-    kept: tuple[Whole, Annotated[int, Field(ge=1, le=64)]]
-    """The first one and how many."""
-    change_of_each: (
-        Annotated[list[Annotated[NotNegative | None, BeforeValidator(_number)]], Field(max_length=64)] | None
-    ) = None
-    change: Annotated[NotNegative | None, BeforeValidator(_number)] = None
-    """Change without all that are left out."""
+    kept: tuple[Whole, Annotated[int, Field(ge=1, le=64)]]  # the first one and how many
+    change_of_each: Annotated[list[Measured], Field(max_length=64)] | None = None
+    change: Measured = None  # change without all that are left out
     tolerance: NotNegative | None = None
 
 
@@ -147,8 +139,7 @@ class AtlasCost(Part):
     """Bytes of the atlas and error of the quantisation."""
 
     bytes: Count | None = None
-    pages: tuple[Whole, Whole, Whole] | None = None
-    """Layers, height, width in texels."""
+    pages: tuple[Whole, Whole, Whole] | None = None  # layers, height, width in texels
     occupancy: Share | None = None
     psnr: Decibels = None
     clipped_fraction: Share | None = None
@@ -183,18 +174,16 @@ class Gain(Part):
 class Rounding(Part):
     """Rounding of the surfels of a compact bundle."""
 
-    mse: Annotated[NotNegative | None, BeforeValidator(_number)] = None
+    mse: Measured = None
     """Mean square error that it made in the training views before the texels were tuned, colours from 0 to 1."""
-    steps: dict[str, NotNegative] = {}
-    """By column, as in `surfel_codes.REFERENCE`."""
+    steps: dict[str, NotNegative] = {}  # by column, as in `surfel_codes.REFERENCE`
 
 
 class FineTuning(Part):
     """Fine-tuning or polish; no steps where there were too few views."""
 
     views: Whole | None = None
-    held_in_views: Whole | None = None
-    """Validation views."""
+    held_in_views: Whole | None = None  # validation views
     steps: Whole | None = None
     steps_asked: Whole | None = None
     best_step: Whole | None = None
@@ -204,8 +193,7 @@ class FineTuning(Part):
     """Steps and dB over the validation views."""
     seconds: NotNegative | None = None
     cpu_seconds: NotNegative | None = None
-    error_before: TileError | None = None
-    """Error of the texels as baked from the field."""
+    error_before: TileError | None = None  # error of the texels as baked from the field
 
 
 class HeldOut(Part):
@@ -215,8 +203,7 @@ class HeldOut(Part):
     psnr_baked_against_neural: Decibels = None
     psnr_neural_against_photos: Decibels = None
     psnr_baked_against_photos: Decibels = None
-    cc_psnr_neural_against_photos: Decibels = None
-    """After the affine fit of each view's colours to its photograph."""
+    cc_psnr_neural_against_photos: Decibels = None  # after the affine fit of each view's colours to its photograph
     cc_psnr_baked_against_photos: Decibels = None
     psnr_baked_against_neural_worst: Decibels = None
 
@@ -226,19 +213,15 @@ class Statistics(Part):
 
     surfels: KeptSurfels | None = None
     texels: KeptTexels | None = None
-    error: TileError | None = None
-    """None: nothing was textured, or the texels were changed after the bake."""
-    certificate: Certificate | None = None
-    """None: nothing was textured, or there is no tolerance."""
-    view_color: ViewColorError | None = None
-    """None: all of the view colours is kept."""
+    error: TileError | None = None  # None: nothing was textured, or the texels were changed after the bake
+    certificate: Certificate | None = None  # None: nothing was textured, or there is no tolerance
+    view_color: ViewColorError | None = None  # None: all of the view colours is kept
     field: FieldLevels | None = None
     atlas: AtlasCost | None = None
     polish: FineTuning | None = None
     rounding: Rounding | None = None
     finetune: FineTuning | None = None
-    seconds: NotNegative | None = None
-    """Seconds of the bake, without the fine-tuning."""
+    seconds: NotNegative | None = None  # seconds of the bake, without the fine-tuning
     options: BakeOptions | None = None
     method: str | None = None
     held_out: HeldOut | None = None

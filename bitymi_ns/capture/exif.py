@@ -20,14 +20,10 @@ class Exif:
 
     camera: str = ""
     """Make, model, lens and focal length; photographs with the same one and the same size share a camera."""
-    focal_length: float | None = None
-    """In pixels of the photograph; None where there is no plausible one."""
-    doubt: str = ""
-    """Why a stated focal length is not used."""
-    position: tuple[float, float, float] | None = None
-    """Latitude and longitude in degrees, altitude in metres."""
-    time: str = ""
-    """Sortable time of the photograph; empty where unknown."""
+    focal_length: float | None = None  # in pixels of the photograph; None where there is no plausible one
+    doubt: str = ""  # why a stated focal length is not used
+    position: tuple[float, float, float] | None = None  # latitude and longitude in degrees, altitude in metres
+    time: str = ""  # sortable time of the photograph; empty where unknown
     up: tuple[float, float, float] | None = None
     """Unit vector away from the ground, in the upright photograph's axes (x right, y down, z forward)."""
 

@@ -31,18 +31,13 @@ STEEPEST = np.cos(np.radians(45.0))
 class WorldFrame:
     """Relation of a model's world to the real one."""
 
-    up: str
-    """Source of up (+z), one of SOURCES."""
-    metres_per_unit: float | None
-    """1 with scale by GPS; None = unknown."""
+    up: str  # source of up (+z), one of SOURCES
+    metres_per_unit: float | None  # 1 with scale by GPS; None = unknown
     gps_origin: tuple[float, float, float] | None
     """Latitude, longitude (degrees) and altitude (metres) of the world's origin, x east and y north there."""
-    gps_error: float | None
-    """Median distance in metres between the cameras and their GPS positions."""
-    gps_positions: int
-    """Number of photographs with a position."""
-    transform: list[list[float]]
-    """[3, 4] from COLMAP's world to this one, scale included."""
+    gps_error: float | None  # median distance in metres between the cameras and their GPS positions
+    gps_positions: int  # number of photographs with a position
+    transform: list[list[float]]  # [3, 4] from COLMAP's world to this one, scale included
 
 
 def write_frame(folder: Path, frame: WorldFrame) -> None:

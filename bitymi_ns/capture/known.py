@@ -32,16 +32,12 @@ class KnownView:
     """A photograph whose camera is known."""
 
     file: Path
-    model: str
-    """COLMAP's camera model."""
+    model: str  # COLMAP's camera model
     width: int
     height: int
-    params: tuple[float, ...]
-    """Parameters of the camera model, in pixels of the file."""
-    world_to_camera: np.ndarray
-    """[3,4] rotation and translation, OpenCV axes (x right, y down, z forward)."""
-    mask: Path | None = None
-    """Picture that is black where no point is to be found; see `masks.mask_pixels`."""
+    params: tuple[float, ...]  # parameters of the camera model, in pixels of the file
+    world_to_camera: np.ndarray  # [3,4] rotation and translation, OpenCV axes (x right, y down, z forward)
+    mask: Path | None = None  # picture that is black where no point is to be found; see `masks.mask_pixels`
 
     @property
     def camera(self) -> tuple[str, int, int, tuple[float, ...]]:

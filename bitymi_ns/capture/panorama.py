@@ -7,10 +7,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-PANORAMAS = (
-    "360-degree pictures cannot be trained on as they are. Cut them into perspective views with "
-    "`ns-process-data images --camera-type equirectangular`, which finds their poses anew."
-)
+SPHERICAL_MODEL = "EQUIRECTANGULAR"
+"""COLMAP camera model of 360-degree pictures; its parameters are width and height."""
 HEADER = 1 << 17  # bytes at the start of a file that are searched for metadata
 SPHERICAL = re.compile(rb"GPano:ProjectionType|ProjectionType[^a-z]{1,8}(equirectangular|cylindrical)", re.IGNORECASE)
 """XMP entries of panoramas (Google Photo Sphere)."""
@@ -31,6 +29,11 @@ def has_panorama_metadata(path: Path) -> bool:
         return False
 
 
+def is_full_sphere(width: float, height: float) -> bool:
+    """Test the shape of a picture of all directions, but for rounding."""
+    return abs(width / (2.0 * height) - 1.0) <= ASPECT + 1.0 / height
+
+
 def looks_panoramic(grey: npt.NDArray[np.float32]) -> bool:
     """Test if left and right edge continue each other, and the first and last row are constant.
 
@@ -38,7 +41,7 @@ def looks_panoramic(grey: npt.NDArray[np.float32]) -> bool:
         grey: [h, w] grey levels to 255 of the whole picture, reduced to some hundreds of pixels.
     """
     height, width = grey.shape
-    if height < 32 or abs(width / (2.0 * height) - 1.0) > ASPECT + 1.0 / height:
+    if height < 32 or not is_full_sphere(width, height):
         return False
     if max(grey[0].std(), grey[-1].std()) > POLE * grey.std():
         return False

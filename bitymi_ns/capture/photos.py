@@ -36,21 +36,15 @@ DUPLICATE_SHIFT = 0.1
 class Photo:
     """A readable photograph."""
 
-    name: str
-    """Path relative to the folder, with slashes."""
+    name: str  # path relative to the folder, with slashes
     path: Path
-    width: int
-    """Width of the upright image, as the height."""
+    width: int  # width of the upright image, as the height
     height: int
     exif: Exif
-    plain: bool
-    """True if it can be used as it is: upright, in a format that everything reads."""
-    thumb: np.ndarray
-    """[h,w] float32 grey levels, longer side THUMB."""
-    sharpness: float
-    """Share of the fine detail in all detail; see `sharpness`."""
-    panorama: bool = False
-    """True for 360-degree pictures."""
+    plain: bool  # True if it can be used as it is: upright, in a format that everything reads
+    thumb: np.ndarray  # [h,w] float32 grey levels, longer side THUMB
+    sharpness: float  # share of the fine detail in all detail; see `sharpness`
+    panorama: bool = False  # True for 360-degree pictures
 
 
 def natural(name: str) -> list[tuple[int, int, str]]:

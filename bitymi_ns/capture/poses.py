@@ -7,7 +7,7 @@ import time
 import warnings
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pycolmap
@@ -17,7 +17,7 @@ from bitymi_ns.capture import prepare
 from bitymi_ns.capture.cache import content_key, replace_stale, work_folder
 from bitymi_ns.capture.frame import local_positions, move_to_world, write_frame
 from bitymi_ns.capture.masks import mask_folder
-from bitymi_ns.capture.panorama import PANORAMAS
+from bitymi_ns.capture.panorama import SPHERICAL_MODEL, is_full_sphere
 from bitymi_ns.capture.photos import (
     Photo,
     blurred,
@@ -117,8 +117,7 @@ def _few(count: int) -> str:
 class _Kept(BaseModel, extra="forbid"):
     """Content of poses.json, which marks a result as complete."""
 
-    made: bool
-    """The photographs of the model are copies or frames in the work folder."""
+    made: bool  # the photographs of the model are copies or frames in the work folder
     left_out: dict[str, str]
     registered: int
     given: int
@@ -154,7 +153,7 @@ def _find(
     given = len(names)
     read = time.monotonic()
     photos, left_out = read_photos(folder, names, tell)
-    photos = _without_panoramas(source, photos, left_out)
+    photos = _with_panoramas(source, photos, left_out, options.camera_model == SPHERICAL_MODEL)
     twins = duplicates(photos)
     left_out |= {name: f"the same as {twin}" for name, twin in twins.items()}
     photos = [photo for photo in photos if photo.name not in twins]
@@ -176,21 +175,23 @@ def _find(
     return _write(work, images, {**values, **result}, photos, job)
 
 
-def _without_panoramas(source: Path, photos: list[Photo], left_out: dict[str, str]) -> list[Photo]:
-    """Leave out 360-degree pictures, or fail where they are the most. One that was not detected is recognized by others
-    of its size."""
+def _with_panoramas(source: Path, photos: list[Photo], left_out: dict[str, str], every: bool) -> list[Photo]:
+    """Mark 360-degree pictures, one that was not detected by others of its size, or `every` one. Panoramas of another
+    shape do not show all directions: they are left out, and it fails where they are the most."""
     groups: dict[tuple[int, int], list[Photo]] = defaultdict(list)
     for photo in photos:
         groups[photo.width, photo.height].append(photo)
     panoramic = {size for size, of_size in groups.items() if sum(p.panorama for p in of_size) >= TELLING * len(of_size)}
-    all_round = [photo.name for photo in photos if (photo.width, photo.height) in panoramic or photo.panorama]
-    if len(all_round) > len(photos) / 2:
-        some = ", ".join(all_round[:3])
+    photos = [
+        replace(photo, panorama=every or photo.panorama or (photo.width, photo.height) in panoramic) for photo in photos
+    ]
+    partial = [photo.name for photo in photos if photo.panorama and not is_full_sphere(photo.width, photo.height)]
+    if len(partial) > len(photos) / 2:
         raise CaptureError(
-            f"{len(all_round)} of {len(photos)} photographs of {source} show all directions at once ({some}). "
-            f"{PANORAMAS}"
+            f"{len(partial)} of {len(photos)} photographs of {source} are panoramas ({', '.join(partial[:3])}), which "
+            "can be used only if they show all directions, twice as wide as high. Take single photographs instead."
         )
-    left_out |= dict.fromkeys(all_round, "it shows all directions at once (360 degrees)")
+    left_out |= dict.fromkeys(partial, "a panorama, but not of all directions (twice as wide as high)")
     return [photo for photo in photos if photo.name not in left_out]
 
 
@@ -268,16 +269,18 @@ def make_job(
 
 
 def by_camera(photos: Sequence[Photo]) -> list[list[Photo]]:
-    """Group photographs by size and EXIF camera and focal length."""
+    """Group photographs by kind, size and EXIF camera and focal length."""
     groups: dict[tuple[object, ...], list[Photo]] = defaultdict(list)
     for photo in photos:
-        groups[photo.exif.camera, photo.width, photo.height].append(photo)
+        groups[photo.panorama, photo.exif.camera, photo.width, photo.height].append(photo)
     return list(groups.values())
 
 
 def camera_group(photos: Sequence[Photo], names: list[str], options: SfmOptions) -> CameraGroup:
     """Initial camera of these photographs."""
     width, height = photos[0].width, photos[0].height
+    if photos[0].panorama:
+        return CameraGroup(SPHERICAL_MODEL, width, height, [float(width), float(height)], True, names)
     stated = [photo.exif.focal_length for photo in photos]
     focal = options.focal_length or (statistics.median(stated) if all(stated) else None)
     model = "SIMPLE_RADIAL" if options.camera_model == "auto" else options.camera_model

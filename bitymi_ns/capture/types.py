@@ -18,8 +18,11 @@ class SfmSettings:
     positions (auto)."""
     mapper: Literal["auto", "global", "incremental"] = "auto"
     """Register all cameras at once, one after the other, or the former with the latter as fallback."""
-    camera_model: Literal["auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"] = "auto"
-    """Camera model of COLMAP; auto = SIMPLE_RADIAL, and OPENCV where that lowers the reprojection error."""
+    camera_model: Literal[
+        "auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "EQUIRECTANGULAR"
+    ] = "auto"
+    """Camera model of COLMAP; auto = SIMPLE_RADIAL, and OPENCV where that lowers the reprojection error, and
+    EQUIRECTANGULAR for pictures that are recognized as 360-degree ones."""
     focal_length: float | None = None
     """Focal length of all photographs in pixels; None = from EXIF or estimated."""
     max_image_size: int = 1600

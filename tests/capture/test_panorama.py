@@ -5,11 +5,12 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
 
-from bitymi_ns.capture import CaptureError, find_poses
-from bitymi_ns.capture.panorama import has_panorama_metadata, looks_panoramic
+from bitymi_ns.capture import CaptureError, KnownView, SfmOptions, find_poses, triangulate
+from bitymi_ns.capture.panorama import SPHERICAL_MODEL, has_panorama_metadata, looks_panoramic
 from bitymi_ns.sample.room import Room
 
 XMP = (
@@ -92,12 +93,50 @@ def test_what_metadata_say(tmp_path: Path, suffix: str) -> None:
     )
 
 
-def test_they_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_they_get_poses_as_pictures_of_all_directions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    (tmp_path / "walk").mkdir()
+    centres = [(-1.0 + 0.4 * i, -1.3 + 0.1 * i * i, 1.3 + 0.1 * (i % 2)) for i in range(5)]
+    for i, centre in enumerate(centres):
+        Image.fromarray(panorama(0.3 * i, 512, centre)).save(tmp_path / f"walk/{i}.png")
+    found = find_poses(tmp_path / "walk")
+    model = pycolmap.Reconstruction(found.model)
+    assert found.registered == 5 and [c.model_name for c in model.cameras.values()] == [SPHERICAL_MODEL]
+    at = {int(Path(image.name).stem): image.projection_center() for image in model.images.values()}
+    ours, true = (np.linalg.norm(np.diff(np.array(x), axis=0), axis=1) for x in ([at[i] for i in range(5)], centres))
+    assert np.abs(ours / ours.mean() - true / true.mean()).max() < 0.03
+
+
+def test_those_of_less_than_all_directions_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     (tmp_path / "walk").mkdir()
     for i in range(4):
-        Image.fromarray(panorama(0.3 * i, 128 if i else 256, centre=(0.5 + 0.1 * i, -0.4, 1.3))).save(
-            tmp_path / f"walk/{i}.png"
-        )
-    with pytest.raises(CaptureError, match="4 of 4 photographs .* show all directions at once .*Cut them into"):
-        find_poses(tmp_path / "walk")
+        Image.fromarray(panorama(0.3 * i, 64)[:, : 128 - 40]).save(tmp_path / f"walk/{i}.png")
+    with pytest.raises(
+        CaptureError, match="4 of 4 photographs .* are panoramas .* all directions, twice as wide as high"
+    ):
+        find_poses(tmp_path / "walk", SfmOptions(camera_model="EQUIRECTANGULAR"))
+
+
+def test_one_spot_is_told_from_a_walk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    (tmp_path / "spot").mkdir()
+    for i in range(4):
+        Image.fromarray(panorama(0.7 * i, 256, centre=(0.5, -0.4, 1.3))).save(tmp_path / f"spot/{i}.png")
+    with pytest.raises(CaptureError, match="taken from one spot"):
+        find_poses(tmp_path / "spot")
+
+
+def test_points_are_triangulated_from_panoramas_with_poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    axes = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])  # the middle column looks along -x
+    views = []
+    for i in range(4):
+        centre = np.array([-1.0 + 0.4 * i, -1.3 + 0.1 * i * i, 1.3])
+        Image.fromarray(panorama(0.0, 512, tuple(centre.tolist()))[:, ::-1]).save(tmp_path / f"{i}.png")
+        pose = np.column_stack([axes, -axes @ centre])
+        views.append(KnownView(tmp_path / f"{i}.png", SPHERICAL_MODEL, 1024, 512, (1024.0, 512.0), pose))
+    model = pycolmap.Reconstruction(triangulate(tmp_path, views))
+    xyz = np.array([point.xyz for point in model.points3D.values()])
+    inside = ((xyz > np.array([-3.05, -2.55, -0.05])) & (xyz < np.array([3.05, 2.55, 2.65]))).all(1)
+    assert len(xyz) > 50 and inside.mean() > 0.9

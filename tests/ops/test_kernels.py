@@ -1,5 +1,7 @@
 """The compiled kernels against the golden renders, the float64 references and finite differences."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -12,6 +14,7 @@ from bitymi_ns.ops.reference import view_color as reference_view_color
 from bitymi_ns.ops.reference.ssim import ssim as reference_ssim
 from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig
 from bitymi_ns.scene.baked import BakedScene
+from tests.cuda.baked_scenes import front, textured
 from tests.ops.golden import (
     GOLDEN_NAMES,
     SURFEL_KEYS,
@@ -109,6 +112,12 @@ def test_a_surfel_without_a_tile_has_its_mean_residual_where_a_tile_would_count(
     for few, texels in ((some, atlas), (none, None)):
         scene = BakedScene(params, "sv", few, texels, weight_bound=0.05, mean_residual=residual)
         torch.testing.assert_close(scene.render(camera).rgb, tiled, atol=1e-5, rtol=0)
+
+
+def test_texels_of_bytes_are_those_of_floats() -> None:
+    scene = textured(60, 0)
+    whole = replace(scene, atlas=scene.atlas.float() / 255)
+    torch.testing.assert_close(scene.render(front()).rgb, whole.render(front()).rgb, atol=1e-5, rtol=0)
 
 
 def test_every_tile_has_its_own_extent() -> None:

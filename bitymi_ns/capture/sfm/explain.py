@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from bitymi_ns.capture.sfm.job import Job, NoPoses
+from bitymi_ns.capture.panorama import SPHERICAL_MODEL
+from bitymi_ns.capture.sfm.job import CameraGroup, Job, NoPoses
 
 FEW_FEATURES = 60  # a photograph with fewer features shows hardly any detail
 PARALLAX = 1.0  # degrees; if the rays to the points differ by less, the photographs were taken from one spot
@@ -30,10 +31,8 @@ SHOOT = (
 class ViewGraph:
     """Matches between photographs."""
 
-    features: dict[str, int]
-    """Per photograph."""
-    inliers: dict[tuple[str, str], int]
-    """Matches per pair that fit a common geometry; pairs without are missing."""
+    features: dict[str, int]  # per photograph
+    inliers: dict[tuple[str, str], int]  # matches per pair that fit a common geometry; pairs without are missing
 
     def components(self) -> list[set[str]]:
         """Sets of photographs that hang together, the largest first; those alone are not among them."""
@@ -150,27 +149,37 @@ def only_turned(job: Job, database: Path) -> bool:
     for pair, geometry in tried:
         matches = np.asarray(geometry.inlier_matches)
         first, second = pycolmap.pair_id_to_image_pair(pair)
-        group = groups[images[first].name]
-        long = max(group.width, group.height)
-        center = np.array([group.width, group.height]) / 2
-        rays = (points[first][matches[:, 0]] - center, points[second][matches[:, 1]] - center)
-        limit = ROTATED * max(1.0, long / job.max_image_size)
-        focals = [group.params[0]] if group.prior else [long * f for f in GUESSES]
-        turned += any(np.mean(_turn_errors(*rays, focal) < limit) > MOST for focal in focals)
+        pair_of = [
+            (groups[images[i].name], points[i][column]) for i, column in zip((first, second), matches.T, strict=True)
+        ]
+        group = pair_of[0][0]
+        limit = ROTATED * max(1.0, max(group.width, group.height) / job.max_image_size)
+        for guess in GUESSES[: 1 if all(each.prior for each, _ in pair_of) else None]:
+            (a, focal), (b, _) = (_rays(*each, guess) for each in pair_of)
+            if np.mean(_turn_errors(a, b, focal) < limit) > MOST:
+                turned += 1
+                break
     return len(tried) > 0 and turned > MOST * len(tried)
 
 
-def _turn_errors(first: np.ndarray, second: np.ndarray, focal: float) -> np.ndarray:
+def _rays(group: CameraGroup, points: np.ndarray, guess: float) -> tuple[np.ndarray, float]:
+    """Unit rays [n,3] of points [n,2] in pixels, and pixels per radian; `guess` of the focal length, in units of the
+    longer side, where it is not known."""
+    if group.model == SPHERICAL_MODEL:
+        camera = pycolmap.Camera(model=group.model, width=group.width, height=group.height, params=group.params)
+        return camera.cam_ray_from_img(points.astype(float)), group.width / (2.0 * np.pi)
+    focal = group.params[0] if group.prior else guess * max(group.width, group.height)
+    rays = np.column_stack([(points - np.array([group.width, group.height]) / 2) / focal, np.ones(len(points))])
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True), focal
+
+
+def _turn_errors(a: np.ndarray, b: np.ndarray, focal: float) -> np.ndarray:
     """Distances [n] in pixels between points and those that the best turn takes to them.
 
     Args:
-        first, second: [n,2] pixels from the principal point.
-        focal: pixels.
+        a, b: [n,3] unit rays.
+        focal: pixels per radian.
     """
-    a = np.column_stack([first / focal, np.ones(len(first))])
-    b = np.column_stack([second / focal, np.ones(len(second))])
-    a /= np.linalg.norm(a, axis=1, keepdims=True)
-    b /= np.linalg.norm(b, axis=1, keepdims=True)
     keep = np.ones(len(a), bool)
     for _ in range(3):  # least squares, then without the worst half, in which the wrong matches are
         u, _, vt = np.linalg.svd(b[keep].T @ a[keep])

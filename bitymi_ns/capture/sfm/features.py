@@ -4,10 +4,15 @@ from pathlib import Path
 
 import pycolmap
 
+from bitymi_ns.capture.panorama import SPHERICAL_MODEL
 from bitymi_ns.capture.sfm.job import CameraGroup, Job, StageProgress
 
 SMALL = 1000
 """Photographs whose longer side has fewer pixels are doubled before features are found; larger ones have enough."""
+
+SPHERICAL_SCALE = 2
+"""Factor on these sizes for 360-degree pictures, whose details are small: with half as many features, their places were
+wrong by a metre where perspective photographs were among them."""
 
 
 def extract(job: Job, database: Path, tell: StageProgress) -> None:
@@ -61,7 +66,9 @@ def _reader(job: Job, group: CameraGroup, camera_id: int) -> pycolmap.ImageReade
 
 def _extraction(job: Job, group: CameraGroup) -> pycolmap.FeatureExtractionOptions:
     options = pycolmap.FeatureExtractionOptions()
-    options.max_image_size = job.max_image_size
+    scale = SPHERICAL_SCALE if group.model == SPHERICAL_MODEL else 1
+    options.max_image_size = job.max_image_size * scale
     options.sift.max_num_features = job.max_features
-    options.sift.first_octave = -1 if min(max(group.width, group.height), job.max_image_size) < SMALL else 0
+    side = min(max(group.width, group.height), options.max_image_size)
+    options.sift.first_octave = -1 if side < SMALL * scale else 0
     return options

@@ -27,34 +27,25 @@ class CameraGroup:
     model: str
     width: int
     height: int
-    params: list[float]
-    """In COLMAP's order, pixels of the photographs."""
-    prior: bool
-    """True if the focal length is known, and not just an initial guess."""
-    names: list[str]
-    """Photographs, relative to the folder of images."""
+    params: list[float]  # in COLMAP's order, pixels of the photographs
+    prior: bool  # True if the focal length is known, and not just an initial guess
+    names: list[str]  # photographs, relative to the folder of images
 
 
 @dataclass(frozen=True)
 class Job:
     """Input of the process, in plain values for JSON."""
 
-    work: str
-    """Folder for the database and the model."""
+    work: str  # folder for the database and the model
     images: str
     """Folder of the photographs, or of links to them, with names without spaces, which separate entries of COLMAP's
     lists."""
-    masks: str | None
-    """Folder of masks named as COLMAP has it, of the size of the photographs."""
+    masks: str | None  # folder of masks named as COLMAP has it, of the size of the photographs
     cameras: list[CameraGroup]
-    order: list[str]
-    """All photographs in the order of their times or names."""
-    names: dict[str, str]
-    """Names of the photographs in the resulting model."""
-    sequence: bool
-    """True if neighbors in that order overlap, as frames of a video do."""
-    positions: dict[str, list[float]]
-    """East, north and up in metres of photographs with GPS."""
+    order: list[str]  # all photographs in the order of their times or names
+    names: dict[str, str]  # names of the photographs in the resulting model
+    sequence: bool  # True if neighbors in that order overlap, as frames of a video do
+    positions: dict[str, list[float]]  # east, north and up in metres of photographs with GPS
     matching: str = "auto"
     mapper: str = "auto"
     opencv_if_better: bool = True

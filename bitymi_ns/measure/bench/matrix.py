@@ -108,8 +108,7 @@ class Stage:
     run: Run
     kind: Kind
     bundle: Bundle | None = None
-    count: int = 0
-    """pictures: number of views."""
+    count: int = 0  # pictures: number of views
 
     @property
     def key(self) -> dict[str, Any]:

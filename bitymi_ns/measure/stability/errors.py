@@ -92,22 +92,15 @@ class Errors:
     add up different terms. `flipped` is the share of these pixels.
     """
 
-    forward: float
-    """Largest error of rgb, alpha, depth, normal and Beta map."""
-    gradient: float
-    """Largest error of the gradients of a random linear loss of these images."""
-    worst: str
-    """The parameter with that error."""
-    flipped: float
-    """Share of the pixels that are not compared."""
+    forward: float  # largest error of rgb, alpha, depth, normal and Beta map
+    gradient: float  # largest error of the gradients of a random linear loss of these images
+    worst: str  # the parameter with that error
+    flipped: float  # share of the pixels that are not compared
     input_forward: float
     """Change of the reference's images when each input is moved by up to half a unit in its last place."""
-    input_gradient: float
-    """The same of its gradients."""
-    drawn: int
-    """Blended fragments of the reference."""
-    finite: bool
-    """True if every image and gradient of the backend is finite, over all pixels."""
+    input_gradient: float  # the same of its gradients
+    drawn: int  # blended fragments of the reference
+    finite: bool  # True if every image and gradient of the backend is finite, over all pixels
 
 
 @dataclass

@@ -25,6 +25,7 @@ from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.data.point_files import color_bytes, ply_fault, read_points
 
 FORMS = (".txt", ".bin")
+CAMERA_SENSOR = int(pycolmap.SensorType.CAMERA)
 
 
 class ModelCamera(NamedTuple):
@@ -37,12 +38,14 @@ class ModelCamera(NamedTuple):
 
 
 class ModelImage(NamedTuple):
-    """Photograph: name, camera, and world to camera as quaternion (wxyz) and translation."""
+    """Photograph: name, camera, world to camera as quaternion (wxyz) and translation, and the rig's frame that it is
+    part of; None = it stands alone."""
 
     name: str
     camera_id: int
     qvec: npt.NDArray[np.float64]
     tvec: npt.NDArray[np.float64]
+    frame: int | None = None
 
 
 class Model(NamedTuple):
@@ -70,7 +73,7 @@ def read_model(folder: Path) -> Model:
     Raises:
         InputError: it cannot be used; names file and entry.
     """
-    names = [f"{name}{form}" for name in ("cameras", "images", "points3D") for form in FORMS]
+    names = [f"{name}{form}" for name in ("cameras", "images", "frames", "points3D") for form in FORMS]
     files = [*(folder / name for name in names), folder / "points3D.ply"]
     stamps = tuple((file, file.stat().st_mtime_ns, file.stat().st_size) for file in files if file.is_file())
     return _read_model(folder, stamps)
@@ -86,6 +89,11 @@ def _read_model(folder: Path, stamps: tuple[Any, ...]) -> Model:
     with _naming_file(path):
         images = dict(_images_text(path) if path.suffix == ".txt" else _images_binary(path))
     _check_images(path, images, cameras)
+    path = path.with_stem("frames")
+    if path.is_file():  # of COLMAP 4, whose images keep poses of their own
+        with _naming_file(path):
+            frames = dict(_frames_text(path) if path.suffix == ".txt" else _frames_binary(path))
+        images = {number: image._replace(frame=frames.get(number)) for number, image in images.items()}
     _warn_of_other_form(folder, cameras, len(images))
     path = _file(folder, "points3D")
     xyz, rgb, without_colors = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), ""
@@ -255,6 +263,18 @@ def _images_binary(path: Path) -> Iterator[tuple[int, ModelImage]]:
     file.end()
 
 
+def _frames_binary(path: Path) -> Iterator[tuple[int, int]]:
+    """Image and frame of the images that the cameras of a rig took together."""
+    file = _Binary(path)
+    for _ in range(file.take("Q")[0]):
+        frame, *_, count = file.take("II7dI")  # with rig and pose
+        for _ in range(count):
+            sensor, _, number = file.take("iIQ")
+            if sensor == CAMERA_SENSOR:
+                yield number, frame
+    file.end()
+
+
 def _points_binary(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
     file = _Binary(path)
     starts = []
@@ -295,6 +315,16 @@ def _images_text(path: Path) -> Iterator[tuple[int, ModelImage]]:
             number, *pose, camera, name = words
             numbers = np.array(list(map(float, pose)))
             yield int(number), ModelImage(name, int(camera), numbers[:4], numbers[4:])
+
+
+def _frames_text(path: Path) -> Iterator[tuple[int, int]]:
+    for line in filter(None, _lines(path)):
+        words = line.split()
+        frame, count, data = int(words[0]), int(words[9]), words[10:]
+        if len(data) != 3 * count:
+            raise ValueError(f"frame {frame} states {count} images and lists {len(data) / 3:g}")
+        yield from ((int(number), frame) for sensor, number in zip(data[::3], data[2::3], strict=True)
+                    if sensor == "CAMERA")  # fmt: skip
 
 
 def _are_observations(line: str) -> bool:

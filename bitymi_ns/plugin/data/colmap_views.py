@@ -264,6 +264,7 @@ def model_photographs(source: Source, need_photos: bool) -> list[Photograph]:
             label=f"camera {image.camera_id} of {source.folder}",
             mask=None if masks is None else masks[i],
             downscaled=source.copies is not None,
+            frame=image.frame,
         )
         for i, (image, file) in enumerate(zip(model.images, files, strict=True))
     ]

@@ -40,7 +40,7 @@ from bitymi_ns.plugin.data.initial_points import (
 )
 from bitymi_ns.plugin.data.scanner_views import scanner_photographs
 from bitymi_ns.plugin.data.sfm_poses import KeptPoses, find_sfm_source, kept_source, read_kept_poses
-from bitymi_ns.plugin.data.splits import NameLists
+from bitymi_ns.plugin.data.splits import NameLists, Split
 from bitymi_ns.plugin.data.transforms import colmap_points
 from bitymi_ns.plugin.data.transforms_views import Transforms, check_photographs_exist, read_transforms
 from bitymi_ns.plugin.data.views import (
@@ -217,16 +217,23 @@ class BitymiDataParser(DataParser):
     def _split(self, views: DataparserOutputs, lists: NameLists) -> dict[str, DataparserOutputs]:
         config = self.config
         photographs: list[int] = views.metadata["photographs"]
-        by_number = dict(zip(photographs, photograph_files(views), strict=True))
-        names = list(by_number.values())
+        names = list(dict(zip(photographs, photograph_files(views), strict=True)).values())
+        frames = list(dict(zip(photographs, views.metadata["frames"], strict=True)).values())
         if config.eval_names:
             split = splits.by_names(names, config.eval_names, "--eval-names")
+            held = {frames[i] for i in split.held_out}
+            split = splits.of_members(Split(sorted(set(frames) - held), sorted(held), split.rule), frames)
         elif lists:
             split = splits.by_lists(names, lists)
         else:
-            split = splits.by_mode(names, config.eval_mode, config.eval_interval, config.train_split_fraction)
+            first = sorted(set(frames))
+            of_first = [names[i] for i in first]
+            split = splits.by_mode(of_first, config.eval_mode, config.eval_interval, config.train_split_fraction)
+            sides = ([first[i] for i in side] for side in (split.train, split.held_out))
+            split = splits.of_members(Split(*sides, split.rule), frames)
         say(split.describe(names))
-        train, held_out = (select_views(views, some) for some in splits.of_views(split, photographs))
+        of_views = splits.of_members(split, photographs)
+        train, held_out = (select_views(views, some) for some in (of_views.train, of_views.held_out))
         return {"train": train, "val": held_out, "test": held_out}
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs: Any) -> DataparserOutputs:

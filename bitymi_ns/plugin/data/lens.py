@@ -16,6 +16,7 @@ from nerfstudio.cameras.cameras import CameraType
 from PIL import Image
 
 from bitymi_ns.capture.masks import in_proportion
+from bitymi_ns.capture.panorama import SPHERICAL_MODEL, is_full_sphere
 from bitymi_ns.plugin.console import fail, warn
 from bitymi_ns.plugin.data.images import wrong_size
 from bitymi_ns.plugin.data.wide import FACES, covered, resample, windows
@@ -23,10 +24,6 @@ from bitymi_ns.plugin.data.wide import FACES, covered, resample, windows
 MAX_VIEW_ANGLE = 110.0
 """Largest horizontal and vertical view angle of a pinhole picture, degrees. Wider pictures spend ever more pixels on
 ever less of the photograph: wider cameras become faces of a cube."""
-SPHERICAL = "EQUIRECTANGULAR"
-"""COLMAP camera model of pictures of all directions; its parameters are width and height."""
-ROUNDING = 0.01
-"""Relative difference of their aspect ratio from 2 that is rounding."""
 NODE_STEP = 4
 """Pixels between the nodes at which the distortion is evaluated; linear interpolation between them is accurate to far
 less than a pixel."""
@@ -161,7 +158,7 @@ def lenses_of(
     """
     camera = pycolmap.Camera(model=model, width=width, height=height, params=list(params))
     if camera.is_spherical():
-        if abs(width / (2.0 * height) - 1.0) > ROUNDING:
+        if not is_full_sphere(width, height):
             fail(
                 f"{label} is {model}, but its photographs have {width} x {height} pixels: pictures of all directions "
                 "are twice as wide as high. Correct the camera model, or pad the photographs to that shape."
@@ -222,13 +219,14 @@ def colmap_distortion(kind: CameraType, values: Sequence[float], label: str) -> 
     """Convert nerfstudio's camera type and distortion_params (k1, k2, k3, k4, p1, p2; FISHEYE624: 12) to COLMAP's.
 
     Returns:
-        COLMAP camera model with separate focal lengths, and its parameters after fx, fy, cx, cy; SPHERICAL, and none.
+        COLMAP camera model with separate focal lengths, and its parameters after fx, fy, cx, cy; for
+        equirectangular ones SPHERICAL_MODEL and none.
 
     Raises:
         InputError: there is no such COLMAP camera.
     """
     if kind == CameraType.EQUIRECTANGULAR:
-        return SPHERICAL, ()
+        return SPHERICAL_MODEL, ()
     if kind not in (CameraType.PERSPECTIVE, CameraType.FISHEYE, CameraType.FISHEYE624):
         fail(
             f"the camera {label} cannot be used: it is neither a perspective, a fisheye nor an equirectangular camera, "
@@ -261,7 +259,7 @@ def rescaled(model: str, params: Sequence[float], size: tuple[int, int], new: tu
     """Rescale the parameters of a COLMAP camera from pictures of `size` (width, height) to pictures of `new`."""
     if new == size:
         return tuple(params)
-    if model == SPHERICAL:
+    if model == SPHERICAL_MODEL:
         return tuple(map(float, new))
     camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=list(params))
     camera.rescale(*new)

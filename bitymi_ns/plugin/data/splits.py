@@ -37,11 +37,12 @@ class Split(NamedTuple):
         return f"Held out for evaluation: {len(self.held_out)} of {len(names)} photographs, {self.rule} ({shown})."
 
 
-def of_views(split: Split, photographs: Sequence[int]) -> tuple[list[int], list[int]]:
-    """Return the training and the held-out views, by the number of the photograph of each."""
+def of_members(split: Split, groups: Sequence[int]) -> Split:
+    """Split members as their groups are, by the number of the group of each: views by photographs, and photographs by
+    the frames of a rig."""
     sides = [set(side) for side in (split.train, split.held_out)]
-    train, held_out = ([i for i, photograph in enumerate(photographs) if photograph in side] for side in sides)
-    return train, held_out
+    train, held_out = ([i for i, group in enumerate(groups) if group in side] for side in sides)
+    return Split(train, held_out, split.rule)
 
 
 def ordinal(number: int) -> str:

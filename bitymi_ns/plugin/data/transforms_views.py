@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 
+from bitymi_ns.capture.panorama import SPHERICAL_MODEL
 from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data.colmap_model import ModelCamera
 from bitymi_ns.plugin.data.images import image_size
-from bitymi_ns.plugin.data.lens import SPHERICAL, colmap_distortion
+from bitymi_ns.plugin.data.lens import colmap_distortion
 from bitymi_ns.plugin.data.names import FileFinder, renamed_message
 from bitymi_ns.plugin.data.splits import NameLists
 from bitymi_ns.plugin.data.transforms import (
@@ -257,7 +258,7 @@ def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path)
                 f"{path}: {name} is EQUIRECTANGULAR, but its cx and cy are {middle[0]:g} and {middle[1]:g}, not the "
                 f"middle of its {width} x {height} pixels. Remove them, or shift the picture and turn the pose."
             )
-        return ModelCamera(SPHERICAL, int(width), int(height), (float(width), float(height)))
+        return ModelCamera(SPHERICAL_MODEL, int(width), int(height), (float(width), float(height)))
     sides = {"x": width, "y": height}
     focal: dict[str, float] = {}
     for axis, keys in FOCALS.items():

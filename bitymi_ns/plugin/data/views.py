@@ -17,10 +17,11 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 
+from bitymi_ns.capture.panorama import SPHERICAL_MODEL
 from bitymi_ns.plugin.console import fail, say
 from bitymi_ns.plugin.data.colmap_model import ModelCamera
 from bitymi_ns.plugin.data.images import THREADS, image_size
-from bitymi_ns.plugin.data.lens import SPHERICAL, Lens, Pinhole, colmap_distortion, lenses_of, rescaled
+from bitymi_ns.plugin.data.lens import Lens, Pinhole, colmap_distortion, lenses_of, rescaled
 from bitymi_ns.plugin.data.point_files import Points
 from bitymi_ns.plugin.data.pose_checks import check_spread, far_from_origin, orient
 
@@ -47,6 +48,7 @@ class Photograph:
         label: names the camera in messages.
         mask: mask file; None = none.
         downscaled: `file` is a copy that is downscaled already.
+        frame: number that photographs share which a rig took together; None = it stands alone.
     """
 
     file: Path
@@ -55,6 +57,7 @@ class Photograph:
     label: str
     mask: Path | None = None
     downscaled: bool = False
+    frame: int | None = None
 
 
 @dataclass(frozen=True)
@@ -112,7 +115,8 @@ def make_views(
     alpha_color: torch.Tensor | None = None,
 ) -> Views:
     """Build the views of a capture, in the order of the photographs. metadata has for each view its `Lens` ("lenses"),
-    photograph ("files"), and the number of the photograph ("photographs"), which views of one share.
+    photograph ("files"), the number of the photograph ("photographs"), which views of one share, and that of the first
+    photograph of the rig's frame ("frames").
 
     Args:
         photographs: at least two.
@@ -139,7 +143,10 @@ def make_views(
     moved[:, :3, 3] *= scale
     lenses, of, moved = _split(parts, moved)
     files = [photographs[i].file for i in of]
-    metadata: dict[str, Any] = {"lenses": lenses, "files": files, "photographs": of}
+    first: dict[Any, int] = {}
+    frames = [first.setdefault(i if each.frame is None else ("frame", each.frame), i)
+              for i, each in enumerate(photographs)]  # fmt: skip
+    metadata: dict[str, Any] = {"lenses": lenses, "files": files, "photographs": of, "frames": [frames[i] for i in of]}
     if points is not None and len(points.xyz):
         xyz = (points.xyz @ transform[:, :3].T + transform[:, 3]) * scale * applied_scale
         metadata["points3D_xyz"] = torch.from_numpy(xyz.astype(np.float32))
@@ -283,7 +290,7 @@ def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
         model, coefficients = colmap_distortion(CameraType(int(cameras.camera_type[i])), values, f"of {file}")
         pinhole = [float(getattr(cameras, name)[i]) for name in ("fx", "fy", "cx", "cy")]
         size = (int(cameras.width[i]), int(cameras.height[i]))
-        camera = ModelCamera(model, *size, size if model == SPHERICAL else (*pinhole, *coefficients))
+        camera = ModelCamera(model, *size, size if model == SPHERICAL_MODEL else (*pinhole, *coefficients))
         photographs.append(Photograph(file, camera, np.eye(4), f"the camera of {file}"))
     lenses, of, poses = _split(make_lenses(photographs), cameras.camera_to_worlds.double().numpy())
     outputs = select_views(outputs, of)

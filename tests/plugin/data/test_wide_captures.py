@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from PIL import Image
 
 from bitymi_ns.plugin.data.views import photograph_files, with_lenses
 from bitymi_ns.plugin.data.wide import FACES
-from tests.plugin.data.captures import colmap_model, expect, images_of, load_any, printed
+from tests.plugin.data.captures import as_binary, colmap_model, expect, images_of, load_any, printed
 
 SIZE = (96, 48)
 
@@ -127,3 +128,49 @@ def test_panoramas_that_cannot_be_used(capture: Path, edit: Any, entries: dict[s
     edit(capture, lambda meta: meta["frames"][1].setdefault("cy", 24.0))
     with expect(message):
         _ = load_any(capture).cached_train
+
+
+def rig_of_two(project: Path, form: str) -> None:
+    """State that photographs 1 and 2 of a COLMAP project, 3 and 4, and so on were taken together."""
+    count = len(images_of(project))
+    model = project / "sparse/0"
+    if form == "txt":
+        rows = [f"{i + 1} 1 1 0 0 0 0 0 0 2 CAMERA 1 {2 * i + 1} CAMERA 2 {2 * i + 2}\n" for i in range(count // 2)]
+        (model / "frames.txt").write_text("# frames\n" + "".join(rows))
+        return
+    as_binary(model)
+    data = struct.pack("<Q", count // 2)
+    for i in range(count // 2):
+        data += struct.pack("<II7dI", i + 1, 1, 1.0, *[0.0] * 6, 2)
+        data += struct.pack("<iIQiIQ", 0, 1, 2 * i + 1, 0, 2, 2 * i + 2)
+    (model / "frames.bin").write_bytes(data)
+
+
+@pytest.mark.parametrize("form", ["txt", "bin"])
+def test_what_a_rig_took_together_is_held_out_together(
+    project: Path, form: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig_of_two(project, form)
+    names = [path.name for path in images_of(project)]
+    manager = load_any(project, eval_interval=4)
+    assert [path.name for path in manager.eval_dataset.image_filenames] == names[0:2] + names[8:10]
+    assert f"Held out for evaluation: 4 of {len(names)} photographs" in printed(capsys)
+    manager = load_any(project, eval_names=(names[3],))
+    assert [path.name for path in manager.eval_dataset.image_filenames] == names[2:4]
+    assert len(manager.train_dataset) == len(names) - 2
+    manager = load_any(project, eval_mode="all")
+    assert len(manager.train_dataset) == len(manager.eval_dataset) == len(names)
+
+
+def test_damaged_frames_are_named(project: Path) -> None:
+    rig_of_two(project, "txt")
+    path = project / "sparse/0/frames.txt"
+    path.write_text(path.read_text().replace("CAMERA 2 2", "CAMERA 2"))
+    with expect("frames.txt has a line that cannot be read .frame 1 states 2 images"):
+        load_any(project)
+    path.unlink()
+    rig_of_two(project, "bin")
+    path = path.with_suffix(".bin")
+    path.write_bytes(path.read_bytes()[:-4])
+    with expect("frames.bin is cut off or damaged"):
+        load_any(project)

@@ -144,18 +144,14 @@ def run_seed(capture: Capture, seed: int, settings: Settings, calibration: Calib
     from bitymi_ns.bundle import export, read_bundle
     from bitymi_ns.scene.config import SceneConfig
     from bitymi_ns.train.config import TrainConfig
-    from bitymi_ns.train.domain import build_scene
+    from bitymi_ns.train.domain import scene_for_views
     from bitymi_ns.train.evaluate import evaluate
     from bitymi_ns.train.fit import fit
     from bitymi_ns.train.losses import psnr
 
     config, background = TrainConfig(seed=seed), torch.zeros(3)
     cameras = [view.camera for view in capture.train]
-    centers = torch.stack([camera.center for camera in cameras])
-    pixels = sum(camera.width * camera.height for camera in cameras)
-    scene, _ = build_scene(
-        capture.points, capture.colours, centers, SceneConfig(texture="texels"), config, False, pixels
-    )
+    scene = scene_for_views(capture.train, capture.points, capture.colours, SceneConfig(texture="texels"), config)
     aside = calibration.every(10)
     _, train = calibration.timed(lambda: fit(scene, capture.train, [], config, settings.steps, callback=aside))
     trained, fragments, _ = evaluate(scene, capture.views, config)

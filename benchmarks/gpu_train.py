@@ -25,7 +25,7 @@ from bitymi_ns.bake import BakeOptions, Learning, bake_and_learn
 from bitymi_ns.plugin.run.preset import Preset, load_preset
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.train.config import REFERENCE_STEPS
-from bitymi_ns.train.domain import build_scene
+from bitymi_ns.train.domain import scene_for_views
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.losses import mean_psnr, psnr
@@ -70,11 +70,7 @@ def run(
 ) -> tuple[list[list[str]], list[str]]:
     """Train, bake into the folder `target` and draw; returns the rows of the curve, and FIGURES."""
     device, cuda = options.device, options.device.type == "cuda"
-    centers = torch.stack([view.camera.center for view in capture.train])
-    pixels = sum(view.camera.width * view.camera.height for view in capture.train)
-    bounded = capture.train[0].image.shape[-1] == 4
-    start_of = (capture.points, capture.colours, centers, preset.scene, preset.train, bounded)
-    scene = build_scene(*start_of, image_pixels=pixels)[0].to(device)
+    scene = scene_for_views(capture.train, capture.points, capture.colours, preset.scene, preset.train).to(device)
     trainer = Trainer(scene, capture.train, preset.train, steps)
     due = {math.ceil(steps * (i + 1) / points) for i in range(points)}
     if cuda:

@@ -19,7 +19,7 @@ from bitymi_ns.plugin.export.cameras import camera_row
 from bitymi_ns.plugin.run.preset import load_preset
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import NEAR, RenderOutput, Scene
-from bitymi_ns.train.domain import build_scene
+from bitymi_ns.train.domain import scene_for_views
 from bitymi_ns.train.fit import TrainLog, fit
 from bitymi_ns.train.views import View
 
@@ -105,10 +105,7 @@ def train_scene(
     """
     preset = load_preset(method)
     config = replace(copy.deepcopy(preset.train), seed=seed)
-    centers = torch.stack([view.camera.center.cpu() for view in views]) if views else torch.zeros(0, 3)
-    pixels = sum(view.camera.width * view.camera.height for view in views)
-    bounded = any(view.image.shape[-1] == 4 for view in views)
-    scene, _ = build_scene(points.cpu(), colors.cpu(), centers, preset.scene, config, bounded, pixels)
+    scene = scene_for_views(views, points, colors, preset.scene, config)
     scene, views = scene.to(device), [view.to(device) for view in views]
     step_done = None if callback is None else lambda trainer, *_: callback(trainer.step, trainer.loss)
     return scene, fit(scene, views, [view.to(device) for view in eval_views], config, steps, step_done)

@@ -236,6 +236,8 @@ class TrainConfig:
     first_surfels: int | None = None
     """Most surfels that training starts with; excess points are dropped at random. Not given: in ns-train one for every
     1,000 pixels that the run renders; else all points."""
+    background_points: NonNegative = 0.15
+    """Most further first surfels where parts of the photographs show no point, as a share of the others; 0 = none."""
     random_points: PositiveCount = 20_000
     """Surfels placed at random in the scene box when the capture has no sparse points."""
     exposure: ExposureKind = "off"

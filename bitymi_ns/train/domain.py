@@ -14,8 +14,10 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.scene import NEAR, Scene
+from bitymi_ns.train.background_points import BackgroundPoints, background_points
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.init import PointReport, scene_extent, surfels_from_points
+from bitymi_ns.train.views import View
 
 
 def build_scene(
@@ -28,6 +30,7 @@ def build_scene(
     image_pixels: int,
     box: Tensor | None = None,
     declared: Tensor | None = None,
+    background: BackgroundPoints | None = None,
 ) -> tuple[Scene, PointReport]:
     """Surfels at the points, or at random in the box, and an empty texture field around them.
 
@@ -42,6 +45,7 @@ def build_scene(
         image_pixels: of all training images together; decides the size of the hash table where none is given.
         box: [2, 3] corners for random surfels; default: the cube of the scene extent about the cameras.
         declared: [2, 3] corners of the box that the capture declares to hold its scene, if it does.
+        background: further points, in parts of the photographs that show none.
 
     Returns:
         The scene on the CPU, and what became of the points.
@@ -50,8 +54,8 @@ def build_scene(
         ValueError: an option is out of range, or there is nothing to start from.
     """
     check_representation(scene_config)
-    surfels, report = surfels_from_points(points, colours, camera_centers, train_config, scene_config, box)
-    means = surfels["means"]
+    surfels, report = surfels_from_points(points, colours, camera_centers, train_config, scene_config, box, background)
+    means = surfels["means"][: len(surfels["means"]) - report.background]  # the others would make the field coarse
     near = NEAR * scene_extent(camera_centers, means)
     if scene_config.texture != "hash":  # texels are added once the geometry has settled
         return Scene(scene_config, surfels, None, near), report
@@ -64,6 +68,25 @@ def build_scene(
     generator = torch.Generator().manual_seed(train_config.seed)
     field = HashField(scene_config, mid, half, contract, log2_size, generator)
     return Scene(scene_config, surfels, field, near), report
+
+
+def scene_for_views(
+    views: Sequence[View], points: Tensor, colors: Tensor, scene_config: SceneConfig, train_config: TrainConfig
+) -> Scene:
+    """`build_scene` for photographs that are in memory.
+
+    Args:
+        views: training photographs at full size.
+        points: [M, 3] world positions; M may be 0.
+        colors: [M, 3] in [0, 1].
+        scene_config, train_config: the representation, and training options.
+    """
+    centers = torch.stack([view.camera.center.cpu() for view in views]) if views else torch.zeros(0, 3)
+    pixels = sum(view.camera.width * view.camera.height for view in views)
+    bounded = any(view.image.shape[-1] == 4 for view in views)
+    points, colors = points.cpu(), colors.cpu()
+    background = background_points(points, views, train_config.seed) if train_config.background_points else None
+    return build_scene(points, colors, centers, scene_config, train_config, bounded, pixels, background=background)[0]
 
 
 def check_representation(config: SceneConfig) -> None:

@@ -12,6 +12,7 @@ from torch import Tensor
 from bitymi_ns.ops.constants import COLOR_BIAS
 from bitymi_ns.ops.view_kinds import entry_of
 from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.train.background_points import BackgroundPoints
 from bitymi_ns.train.config import TrainConfig
 
 BETA_RAW = 2.0
@@ -36,6 +37,8 @@ class PointReport:
     over_cap: int = 0
     random: int = 0
     """Surfels placed at random because no point was usable."""
+    background: int = 0
+    """Surfels placed where the photographs show no point (`background_points`)."""
 
 
 def first_surfels_for(steps: int, pixels: float) -> int:
@@ -79,6 +82,7 @@ def surfels_from_points(
     config: TrainConfig,
     scene_config: SceneConfig,
     box: Tensor | None = None,
+    background: BackgroundPoints | None = None,
 ) -> tuple[dict[str, Tensor], PointReport]:
     """Surfel parameters from sparse points.
 
@@ -86,7 +90,8 @@ def surfels_from_points(
     camera with a random turn in its plane, the colour is the point's from every direction. Points that are not finite
     and repeated positions are dropped and counted. With no usable point, `config.random_points` surfels are placed at
     random in `box`. `config.densify.max_surfels` and `config.first_surfels` hold from the start: more points than that
-    are thinned at random.
+    are thinned at random. As many of the background points follow as `config.background_points` and
+    `config.densify.max_surfels` allow.
 
     Args:
         xyz: [M, 3] world positions; M may be 0.
@@ -95,6 +100,7 @@ def surfels_from_points(
         config: training options (opacity, seed, cap).
         scene_config: decides the parameters of the view colour.
         box: [2, 3] lower and upper corner for random surfels; default: the cube of the scene extent about the cameras.
+        background: points in parts of the photographs that no point of `xyz` projects to.
 
     Returns:
         The parameters by name, float32, on the CPU (table in docs/overview.md), and what became of the points.
@@ -119,10 +125,19 @@ def surfels_from_points(
         report.over_cap = len(xyz) - cap
         keep = torch.randperm(len(xyz), generator=generator)[:cap].sort().values
         xyz, rgb = xyz[keep], rgb[keep]
-    n = len(xyz)
     extent = scene_extent(centers, xyz)
+    first = len(xyz)
+    if background is not None and report.random == 0:
+        report.background = min(len(background.xyz), int(config.background_points * first))
+        if config.densify.max_surfels > 0:
+            report.background = min(report.background, config.densify.max_surfels - first)
+        xyz = torch.cat([xyz, background.xyz[: report.background]])
+        rgb = torch.cat([rgb, background.rgb[: report.background]])
+    n = len(xyz)
     to_camera, camera_distance = _nearest_camera(xyz, centers)
     largest = MAX_SCALE * torch.clamp(camera_distance, min=extent)
+    if report.background:
+        largest[first:] = torch.minimum(largest[first:], background.scales[: report.background])
     scales = torch.minimum(neighbour_distance(xyz, extent), largest).clamp(min=MIN_SCALE * extent)
     logit = math.log(config.init_opacity / (1.0 - config.init_opacity))
     surfels = {

@@ -42,7 +42,11 @@ const actionsOf = (context, page) => ({
   // until the poster is shown
   poster: () => page.waitForFunction(() => !document.querySelector('#poster').hidden, null, { polling: 50 }),
   until: async ([expression]) => {
-    while (!(await page.evaluate(expression))) await page.waitForTimeout(50);
+    const end = Date.now() + 45_000;
+    while (!(await page.evaluate(expression))) {
+      if (Date.now() > end) throw new Error(`${expression}: ${await page.evaluate('JSON.stringify(window.got ?? "")')}`);
+      await page.waitForTimeout(50);
+    }
   },
   loaded: ([selector]) => page.waitForFunction((s) => document.querySelector(s).naturalWidth > 0, selector),
   click: ([selector]) => page.click(selector),

@@ -45,6 +45,7 @@ export class App implements Stage {
     private readonly screen: Screen,
     private readonly renderer: Renderer,
     private readonly bundle: Bundle,
+    private readonly shown: () => void, // after a picture
   ) {
     const { info, surfels } = bundle;
     const { middle, size } = extentOf(surfels);
@@ -109,7 +110,7 @@ export class App implements Stage {
     return `${document.title || 'scene'}.${ending}`;
   }
 
-  private apply(shared: Shared): void {
+  apply(shared: Shared): void {
     this.setShow(shared.show);
     press(element('texture'), shared.residuals);
     this.go(shared.pose, shared.lens, shared.target);
@@ -176,6 +177,7 @@ export class App implements Stage {
       const took = performance.now() - begin;
       endPoster();
       this.path.drawn(view.pose);
+      this.shown();
       if (!still && chosen === 'auto') this.pace.took(took);
       this.still = still && !this.dirty;
       this.report(took, scale);

@@ -3,7 +3,8 @@ import './ui/style.css';
 import { App } from './app';
 import { type Bundle, loadBundle, loadManifest } from './bundle/load';
 import { loadPoster } from './bundle/poster';
-import { Folder, SingleFile, type Source } from './bundle/source';
+import { BESIDE, Folder, SingleFile, type Source } from './bundle/source';
+import { Embed } from './embed';
 import { ViewerError } from './errors';
 import { type Graphics, openDevice, watch } from './render/device';
 import { checkRoom } from './render/limits';
@@ -12,7 +13,7 @@ import { Renderer } from './render/renderer';
 import { SceneOnDevice } from './render/scene';
 import { screenOf } from './render/screen';
 import { element } from './ui/dom';
-import { notify, showError, showProgress, showScene } from './ui/pages';
+import { notify, onError, showError, showProgress, showScene } from './ui/pages';
 import { showPoster } from './ui/poster';
 import { fromHash } from './view/share';
 
@@ -21,7 +22,7 @@ async function source(): Promise<Source> {
   const asked = new URLSearchParams(location.search).get('file');
   const file = asked ?? document.querySelector<HTMLMetaElement>('meta[name=bundle]')?.content ?? '';
   if (!file) return new Folder('bundle/');
-  if (!/^[A-Za-z0-9][A-Za-z0-9._-]{0,99}\.bitymi$/.test(file)) {
+  if (!BESIDE.test(file)) {
     const what = 'It must lie beside the page, and have letters, digits, dots and dashes before .bitymi.';
     throw new ViewerError('This is not the name of a bundle in one file', what, 'Change the address.');
   }
@@ -65,18 +66,21 @@ async function main(): Promise<void> {
   document.title = element('title').textContent = await title();
   showScene();
   const renderer = new Renderer(graphics, programs, scene);
-  const app = new App(canvas, screenOf(canvas, renderer, graphics), renderer, bundle);
+  const app = new App(canvas, screenOf(canvas, renderer, graphics), renderer, bundle, () => embed.shown());
   if (graphics.software) notify('No graphics card draws here: the processor does, slowly.');
   if (scene.decoded) {
     notify('This device draws no BC7 textures: the texture was decoded, at four times the graphics memory.');
   }
   app.start();
+  embed.ready(app, document.title);
   if (bundle.later) {
     scene.setTexels(await bundle.later());
     app.changed();
   }
 }
 
+const embed = new Embed();
+onError((title, message) => embed.failed(title, message));
 document.documentElement.dataset.state = 'loading';
 addEventListener('unhandledrejection', ({ reason }) => showError(reason));
 addEventListener('error', ({ error }) => error && showError(error)); // notes of the browser have none

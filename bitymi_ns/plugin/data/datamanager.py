@@ -31,6 +31,7 @@ from bitymi_ns.plugin.data.initial_points import reading_points
 from bitymi_ns.plugin.data.point_files import reporting_time
 from bitymi_ns.plugin.data.pose_checks import check_outliers, check_point_unit, warn_of_mirrored
 from bitymi_ns.plugin.data.views import LONGEST_SIDE, NO_PHOTOS, limit_size, with_lenses
+from bitymi_ns.train.background_points import background_points
 from bitymi_ns.train.processes import Processes
 from bitymi_ns.train.views import MemoryBudget, OnDemand, View, spread, training_order
 
@@ -128,6 +129,10 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         cameras = outputs.cameras
         self.train_dataset.metadata["train_pixels"] = int((cameras.width.long() * cameras.height.long()).sum())
         self.train_dataset.metadata["camera_centers"] = outputs.cameras.camera_to_worlds[..., :3, 3].reshape(-1, 3)
+        points = outputs.metadata.get("points3D_xyz")
+        if test_mode == "val" and points is not None and len(points):
+            found = background_points(points, self.train_views, config.train_cameras_sampling_seed)
+            self.train_dataset.metadata["background_points"] = found
 
     def _has_photos(self, test_mode: str) -> bool:
         return test_mode != "inference" and NO_PHOTOS not in self.train_dataparser_outputs.metadata
@@ -249,8 +254,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
 
     @property
     def eval_dataloader(self) -> SimpleNamespace:
-        """What ns-render spiral asks for its first camera: that of a held-out view, or of training where there is
-        none."""
+        """Serve ns-render spiral its first camera: that of a held-out view, or of training where there is none."""
         cameras = (self.eval_dataset if len(self.eval_dataset) else self.train_dataset).cameras
         return SimpleNamespace(get_camera=lambda image_idx: (cameras[image_idx : image_idx + 1], {}))
 

@@ -34,7 +34,7 @@ class CompactOptions:
     everything becomes as coarse as it may. Held-out views are shown less well than these."""
 
     def check_compact(self, form: BundleFormat, tolerance: float, bc7_profile: str) -> None:
-        """Stops where an option is out of its range, or is for another format than that of the bundle.
+        """Stop where an option is out of its range, or is for another format than that of the bundle.
 
         Args:
             form: format of the bundle.

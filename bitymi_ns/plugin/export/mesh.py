@@ -35,7 +35,7 @@ MOST_VIEWS = 400
 
 @dataclass(frozen=True)
 class Source:
-    """What a mesh is made of.
+    """Scene that a mesh is made of.
 
     Attributes:
         surfels: geometry by name, on the device where it is drawn.

@@ -114,7 +114,7 @@ def held_out_psnr(
 
 
 def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
-    """Checks a bundle against the run it was baked from.
+    """Check a bundle against the run it was baked from.
 
     Args:
         bundle: what was read.

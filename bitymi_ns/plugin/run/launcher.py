@@ -55,7 +55,7 @@ class Workers:
         atexit.register(self.end)
 
     def start(self) -> None:
-        """Starts them and waits until they are there.
+        """Start them and wait until they are there.
 
         Raises:
             InputError: one has ended already.
@@ -82,7 +82,7 @@ class Workers:
         return own
 
     def explain(self) -> NoReturn:
-        """Ends the run with what the process said that was lost.
+        """End the run with what the process said that was lost.
 
         Raises:
             InputError: always.
@@ -100,7 +100,7 @@ class Workers:
             time.sleep(0.05)
 
     def end(self, orderly: bool = False) -> None:
-        """Ends the other processes; a second call changes nothing.
+        """End the other processes; a second call changes nothing.
 
         Args:
             orderly: the run is over for all of them: let them end themselves.
@@ -128,7 +128,7 @@ def _why(rank: int) -> str:
 
 
 def _join(store: dist.Store, rank: int, count: int, cards: bool) -> None:
-    """Enters torch.distributed's default group: gloo for what decides, and nccl for what lies on cards."""
+    """Enter torch.distributed's default group: gloo for what decides, and nccl for what lies on cards."""
     backend = "gloo"
     if cards:
         torch.cuda.set_device(rank)

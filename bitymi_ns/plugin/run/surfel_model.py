@@ -61,7 +61,7 @@ class SurfelModel(Model):
         return {"surfels": float(self.surfel_count())}
 
     def to(self, *args: Any, **kwargs: Any) -> SurfelModel:
-        """Moves the model, except to a device that this installation has no kernels for: there it stays on the CPU.
+        """Move the model, except to a device that this installation has no kernels for: there it stays on the CPU.
 
         nerfstudio's tools use a GPU whenever they see one.
         """

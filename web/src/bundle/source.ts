@@ -5,6 +5,8 @@ import { type Entry, TAIL, entriesOf, partOf, placeOf } from './archive';
 export type Came = (bytes: number) => void;
 const nothing: Came = () => undefined;
 const MANIFEST = 'bundle.json';
+// Names of bundles in one file that the page may be asked to show: they lie beside it.
+export const BESIDE = /^[A-Za-z0-9][A-Za-z0-9._-]{0,99}\.bitymi$/;
 const MOST_MANIFEST = 1 << 22; // bytes
 
 export interface Source {

@@ -13,6 +13,9 @@ export function showProgress(done: number, total: number): void {
 
 export const stopped = (): boolean => document.documentElement.dataset.state === 'error';
 
+let told: (title: string, message: string) => void = () => undefined;
+export const onError = (tell: typeof told): void => void (told = tell);
+
 // The first error is the one that is shown: those that follow mostly follow from it.
 export function showError(error: unknown): void {
   if (stopped()) return;
@@ -25,6 +28,7 @@ export function showError(error: unknown): void {
   element('page').hidden = false;
   endPoster();
   document.documentElement.dataset.state = 'error';
+  told(title, message);
 }
 
 export function showScene(): void {

@@ -31,23 +31,58 @@ export function toHash({ pose, lens, target, show, residuals }: Shared): string 
   return `#${parts.join('&')}`;
 }
 
-export function fromHash(hash: string): Shared | null {
-  const given = new URLSearchParams(hash.replace(/^#/, ''));
-  const position = numbers(given.get('p'), 3);
-  const axes = numbers(given.get('r'), 6);
-  const target = numbers(given.get('t'), 3);
-  const l = numbers(given.get('l'), 6);
-  if (!position || !axes || !target || !l || !l.every((x, k) => k === 2 || k === 3 || x > 0)) return null;
-  const [right, forward] = [axes.slice(0, 3) as Vec3, axes.slice(3) as Vec3];
-  const square = Math.abs(length(right) - 1) < 1e-3 && Math.abs(length(forward) - 1) < 1e-3;
-  if (!square || Math.abs(dot(right, forward)) > 1e-3) return null;
-  const show = given.get('show') ?? 'color';
-  const [fx, fy, cx, cy, width, height] = l;
+// A camera as messages hold it; lens: fx, fy, cx, cy, width, height.
+export interface Camera {
+  position: number[];
+  right: number[];
+  forward: number[];
+  target: number[];
+  lens: number[];
+}
+
+export const cameraOf = ({ pose, lens: l, target }: Shared): Camera => ({
+  position: pose.position,
+  right: pose.right,
+  forward: pose.forward,
+  target,
+  lens: [l.fx, l.fy, l.cx, l.cy, l.width, l.height],
+});
+
+const FARTHEST = 1e9;
+
+// The view of a camera from elsewhere, or null where it is none.
+export function sharedOf(camera: unknown): Pick<Shared, 'pose' | 'lens' | 'target'> | null {
+  const given = (camera ?? {}) as Partial<Record<keyof Camera, unknown>>;
+  const good = (list: unknown, count: number): list is number[] =>
+    Array.isArray(list) && list.length === count && list.every((x) => Number.isFinite(x) && Math.abs(x) <= FARTHEST);
+  const { position, right, forward, target, lens } = given;
+  if (![position, right, forward, target].every((list) => good(list, 3)) || !good(lens, 6)) return null;
+  if (!lens.every((x, k) => k === 2 || k === 3 || x > 0)) return null;
+  const [x, z] = [right as Vec3, forward as Vec3];
+  const square = Math.abs(length(x) - 1) < 1e-3 && Math.abs(length(z) - 1) < 1e-3;
+  if (!square || Math.abs(dot(x, z)) > 1e-3) return null;
+  const [fx, fy, cx, cy, width, height] = lens;
   return {
-    pose: { position: position as Vec3, right, down: cross(forward, right), forward },
+    pose: { position: position as Vec3, right: x, down: cross(z, x), forward: z },
     lens: { fx, fy, cx, cy, width, height },
     target: target as Vec3,
-    show: show in SHOW ? (show as Show) : 'color',
-    residuals: given.get('texture') !== 'off',
   };
+}
+
+export function fromHash(hash: string): Shared | null {
+  const given = new URLSearchParams(hash.replace(/^#/, ''));
+  const [position, axes] = [numbers(given.get('p'), 3), numbers(given.get('r'), 6)];
+  const [right, forward] = [axes?.slice(0, 3), axes?.slice(3)];
+  const found = sharedOf({
+    ...{ position, right, forward },
+    ...{ target: numbers(given.get('t'), 3), lens: numbers(given.get('l'), 6) },
+  });
+  const show = given.get('show') ?? 'color';
+  return (
+    found && {
+      ...found,
+      show: show in SHOW ? (show as Show) : 'color',
+      residuals: given.get('texture') !== 'off',
+    }
+  );
 }

@@ -1,0 +1,165 @@
+"""Further first points, where the sparse points of a capture leave parts of its photographs empty.
+
+Structure from motion finds few points on what is smooth or seen by few photographs: walls, the sky, a room behind the
+subject. Densification can only halve the few large surfels there, too seldom in a short run, so such parts stay blurred
+(docs/benchmarks/training.md, Background points).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.train.views import View, as_float, downscale_image, downscale_mask, spread
+
+CELLS = 24
+"""Most cells along the longer side of a photograph."""
+POINTS_PER_CELL = 4
+"""Fewest points for each cell of a photograph, on average: else empty cells say nothing."""
+MOST_VIEWS = 100
+"""Photographs, spread over all, that are searched for empty cells."""
+NEAREST, FARTHEST = 1.2, 5.0
+"""Depths of the new points, in multiples of the median depth of the points that the photograph sees."""
+FEW = 10
+"""Points in a photograph below which its median depth is that of the others."""
+RADIUS = 0.5
+"""Largest first scale, in cells."""
+OPAQUE = 0.5
+"""Share of a cell that must show something."""
+SUPPORT = 8
+"""Fewest photographs that have a point in an empty cell: 17 photographs overfit points of fewer."""
+IN_FRONT = 0.2
+"""Most photographs that have it in front of the points of a cell, as a share of those."""
+
+
+class BackgroundPoints(NamedTuple):
+    """Points in empty cells, in random order.
+
+    Attributes:
+        xyz: [B, 3] world positions.
+        rgb: [B, 3] mean colours of their cells, in [0, 1].
+        scales: [B] largest first scales of their surfels, world units.
+    """
+
+    xyz: Tensor
+    rgb: Tensor
+    scales: Tensor
+
+
+@torch.no_grad()
+def background_points(points: Tensor, views: Sequence[View], seed: int) -> BackgroundPoints:
+    """Place points behind the cells of the photographs that no sparse point projects to.
+
+    A cell's point lies on the ray of a random pixel of it, at a depth that is log-uniform between `NEAREST` and
+    `FARTHEST` times the median depth of the points that the photograph sees: between a wall and the sky. Masked and
+    transparent cells get none. A point stays if at least `SUPPORT` photographs have it in an empty cell, so that
+    training can find its depth, and few in front of the points of a cell.
+
+    Args:
+        points: [M, 3] world positions; those that are not finite do not count.
+        views: training photographs at full size.
+        seed: of the random pixels, depths and order.
+
+    Returns:
+        float32 on the CPU; no point where no photograph sees a point.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    points = points.detach().reshape(-1, 3).float().cpu()
+    points = points[points.isfinite().all(-1)]
+    chosen = [views[i] for i in spread(len(views), MOST_VIEWS)]
+    cameras = [view.camera.to("cpu") for view in chosen]
+    depths = [_projected(camera, points)[0] for camera in cameras]
+    medians = torch.stack([z.median() if len(z) >= FEW else torch.tensor(math.nan) for z in depths])
+    counts = torch.tensor([float(len(z)) for z in depths])[medians.isfinite()]
+    if len(counts) == 0:
+        return BackgroundPoints(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
+    medians = medians.nan_to_num(float(medians.nanmedian()))
+    grids = [_Grid.of(camera, points, float(counts.median())) for camera in cameras]
+    found = [
+        _behind(view, camera, grid, float(median), generator)
+        for view, camera, grid, median in zip(chosen, cameras, grids, medians, strict=True)
+    ]
+    joined = BackgroundPoints(*map(torch.cat, zip(*found, strict=True)))
+    empty, before = torch.zeros(2, len(joined.xyz))
+    for camera, grid in zip(cameras, grids, strict=True):
+        z, x, y, inside = _projected(camera, joined.xyz)
+        nearest = grid.at(x, y)
+        empty[inside] += nearest.isinf()
+        before[inside] += nearest.isfinite() & (z < nearest)
+    kept = ((empty >= SUPPORT) & (before <= IN_FRONT * empty)).nonzero().flatten()
+    order = kept[torch.randperm(len(kept), generator=generator)]
+    return BackgroundPoints(*(values[order] for values in joined))
+
+
+class _Grid(NamedTuple):
+    """Cells of a view.
+
+    Attributes:
+        nearest: [rows, columns] camera z of the nearest sparse point; infinite in empty cells.
+        width, height: of a cell, pixels.
+    """
+
+    nearest: Tensor
+    width: float
+    height: float
+
+    @classmethod
+    def of(cls, camera: Camera, points: Tensor, count: float) -> _Grid:
+        """Sort the points into cells of about equal sides.
+
+        Args:
+            count: points in a usual view.
+        """
+        longer, shorter = max(camera.width, camera.height), min(camera.width, camera.height)
+        side = longer / min(CELLS, max(1.0, math.sqrt(count / POINTS_PER_CELL * longer / shorter)))
+        rows, columns = math.ceil(camera.height / side), math.ceil(camera.width / side)
+        grid = cls(torch.full((rows, columns), math.inf), camera.width / columns, camera.height / rows)
+        z, x, y, _ = _projected(camera, points)
+        grid.nearest.view(-1).scatter_reduce_(0, grid._index(x, y), z, "amin")
+        return grid
+
+    def _index(self, x: Tensor, y: Tensor) -> Tensor:
+        rows, columns = self.nearest.shape
+        row, column = (y / self.height).long().clamp(max=rows - 1), (x / self.width).long().clamp(max=columns - 1)
+        return row * columns + column
+
+    def at(self, x: Tensor, y: Tensor) -> Tensor:
+        """`nearest` at pixels [V] within the picture."""
+        return self.nearest.view(-1)[self._index(x, y)]
+
+
+def _projected(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Camera z and pixel coordinates x, y, each [V], of those of the points [M, 3] within the picture; which: [M]."""
+    x, y, z = (points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).unbind(-1)
+    x, y = camera.K[0, 0] * x / z + camera.K[0, 2], camera.K[1, 1] * y / z + camera.K[1, 2]
+    inside = (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    return z[inside], x[inside], y[inside], inside
+
+
+def _behind(view: View, camera: Camera, grid: _Grid, median: float, generator: torch.Generator) -> BackgroundPoints:
+    """Place a point behind each empty cell of a view.
+
+    Args:
+        camera: of the view, on the CPU.
+        median: depth of its points, camera z.
+    """
+    (rows, columns), K = grid.nearest.shape, camera.K
+    small = downscale_image(as_float(view.image.cpu()), columns, rows)  # [rows, columns, C]
+    empty = grid.nearest.isinf()
+    if small.shape[-1] == 4:
+        empty &= small[..., 3] > OPAQUE
+    if view.mask is not None:
+        empty &= downscale_mask(view.mask.cpu(), columns, rows)[..., 0]
+    row, column = empty.nonzero().unbind(-1)
+    random = torch.rand(len(row), 3, generator=generator)
+    z = median * NEAREST * torch.exp(random[:, 2] * math.log(FARTHEST / NEAREST))
+    across = ((column + random[:, 0]) * grid.width - K[0, 2]) / K[0, 0]
+    down = ((row + random[:, 1]) * grid.height - K[1, 2]) / K[1, 1]
+    local = torch.stack([across * z, down * z, z], -1)
+    xyz = (local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+    return BackgroundPoints(xyz, small[row, column, :3], RADIUS * grid.width * z / K[0, 0])

@@ -1,0 +1,89 @@
+// The page in the frame of another page, and the messages between them: docs/viewer.md describes them.
+import { BESIDE } from './bundle/source';
+import { type Camera, type Shared, cameraOf, sharedOf } from './view/share';
+
+const PREFIX = 'bitymi/1/';
+
+// What messages see and change of the viewer.
+export interface Embedded {
+  shared(): Shared;
+  apply(shared: Shared): void;
+}
+
+// The origin of the page around: of the browser, of this page before it loaded another bundle, or of the referrer.
+function around(): string {
+  const { ancestorOrigins } = location as { ancestorOrigins?: DOMStringList }; // which not all browsers tell
+  const kept = new URLSearchParams(location.hash.slice(1)).get('embedder');
+  const referrer = URL.canParse(document.referrer) ? new URL(document.referrer).origin : '';
+  return ancestorOrigins?.[0] ?? kept ?? referrer;
+}
+
+export class Embed {
+  private readonly origins: Set<string>; // that may send messages, and get any
+  private readonly parent: string | null; // origin of the page around, where it may
+  private viewer: Embedded | null = null;
+  private last = '';
+
+  constructor() {
+    const named = document.querySelector<HTMLMetaElement>('meta[name=embedders]')?.content ?? '';
+    this.origins = new Set([location.origin, ...named.split(/\s+/).filter(Boolean)]);
+    this.parent = parent !== window && this.origins.has(around()) ? around() : null;
+    if (!this.parent) return;
+    addEventListener('message', ({ source, origin, data }) => {
+      if (source === parent && origin === this.parent) this.heed(data);
+    });
+  }
+
+  // The bundle is shown.
+  ready(viewer: Embedded, title: string): void {
+    this.viewer = viewer;
+    this.send('ready', { title, camera: cameraOf(viewer.shared()) });
+  }
+
+  // A picture is shown; the camera is told where it is another one.
+  shown(): void {
+    if (!this.parent || !this.viewer) return;
+    const camera = cameraOf(this.viewer.shared());
+    const text = JSON.stringify(camera);
+    if (text === this.last) return;
+    this.last = text;
+    this.send('camera', { camera });
+  }
+
+  failed(title: string, message: string): void {
+    this.send('error', { title, message });
+  }
+
+  private send(event: string, content: object): void {
+    if (this.parent) parent.postMessage({ type: PREFIX + event, ...content }, this.parent);
+  }
+
+  private heed(data: unknown): void {
+    if (typeof data !== 'object' || data === null) return;
+    const { type, id, camera, file } = data as Record<string, unknown>;
+    if (typeof type !== 'string' || !type.startsWith(PREFIX)) return;
+    const refuse = (message: string): void => this.send('error', { id, title: 'The message is refused', message });
+    if (type === `${PREFIX}load`) {
+      if (file !== '' && !(typeof file === 'string' && BESIDE.test(file))) {
+        refuse('file must be the name of a .bitymi file beside the page, or empty.');
+        return;
+      }
+      const address = new URL(file ? `?file=${encodeURIComponent(file)}` : location.pathname, location.href);
+      address.hash = `embedder=${encodeURIComponent(this.parent!)}`;
+      // where the bundle is the same, the fragment alone would change
+      const same = address.search === location.search;
+      location.replace(address);
+      if (same) location.reload();
+    } else if (!this.viewer) {
+      refuse('The scene is not shown yet: wait for ready.');
+    } else if (type === `${PREFIX}get-camera`) {
+      this.send('camera', { id, camera: cameraOf(this.viewer.shared()) });
+    } else if (type === `${PREFIX}set-camera`) {
+      const found = sharedOf(camera as Camera);
+      if (found) this.viewer.apply({ ...this.viewer.shared(), ...found });
+      else refuse('camera must have position, right, forward, target and lens.');
+    } else {
+      refuse('There is no such message.');
+    }
+  }
+}

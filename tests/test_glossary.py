@@ -26,7 +26,7 @@ def defines(file: str, text: str, name: str) -> bool:
         return re.search(rf"^def {name}\(", text, re.MULTILINE) is not None
     if re.search(rf"^constexpr double {name} =", text, re.MULTILINE):
         return True
-    start = rf"^ *(?:BT_HD|__device__|__global__|void)\b[^;\n]*\b{name}\([^;]*?\{{"
+    start = rf"^ *(?:template <[^>]*> )?(?:BT_HD|__device__|__global__|void)\b[^;\n]*\b{name}\([^;]*?\{{"
     return re.search(start, text, re.MULTILINE) is not None
 
 

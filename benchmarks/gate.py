@@ -136,7 +136,7 @@ class Calibration:
         return result, seconds / statistics.median(self.seconds)
 
 
-def run_seed(capture: Capture, seed: int, settings: Settings, calibration: Calibration) -> dict[str, float]:
+def run_seed(capture: "Capture", seed: int, settings: Settings, calibration: Calibration) -> dict[str, float]:
     """The figures of one scene and seed."""
     import torch
 

@@ -35,7 +35,7 @@ def test_scores_count_fragments_on_bad_pixels(make_scene, views):
     scores = multi_view_scores(scene, chosen, config)
     counts = torch.zeros(3, len(scene), dtype=torch.int64)
     losses = []
-    for j, (camera, image, mask, _) in enumerate(chosen):
+    for j, (camera, image, mask, *_) in enumerate(chosen):
         with torch.no_grad():
             output = scene.render(camera)
         bad = bad_pixels(output.rgb, image, 0.1, mask).flatten()

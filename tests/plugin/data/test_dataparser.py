@@ -377,7 +377,12 @@ def test_nerfstudios_own_parsers_can_still_be_named() -> None:
 def test_nerfstudios_parsers_are_read_by_ours(blender: Path) -> None:
     options = bitymi_parser(NerfstudioDataParserConfig(data=blender, eval_mode="all", scale_factor=2.0))
     assert options == BitymiDataParserConfig(
-        data=blender, format="nerfstudio", eval_mode="all", scale_factor=2.0, points="random"
+        data=blender,
+        format="nerfstudio",
+        eval_mode="all",
+        scale_factor=2.0,
+        points="random",
+        depth_unit_scale_factor=1e-3,  # nerfstudio's own
     )
     ngp = bitymi_parser(InstantNGPDataParserConfig(data=blender, eval_mode="interval"))
     assert ngp == BitymiDataParserConfig(data=blender, format="instant-ngp", points="random")

@@ -2,9 +2,10 @@
 
 from dataclasses import dataclass
 
+from bitymi_ns.codec.bc7_encode import Profile, bc7_encoder
 from bitymi_ns.codec.limits import EXTENTS
 from bitymi_ns.codec.packing import check_page
-from bitymi_ns.codec.quantise import BYTES_PER_TEXEL, STEPS, Format, Profile, RangeRule, bc7_encoder
+from bitymi_ns.codec.quantise import BYTES_PER_TEXEL, STEPS, Format, RangeRule
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.tile_sizes import check_sides
 

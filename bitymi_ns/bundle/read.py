@@ -27,10 +27,11 @@ from bitymi_ns.bundle.manifest import (
 from bitymi_ns.bundle.parts import MANIFEST_LIMIT, MissingPart, Parts, parts_of
 from bitymi_ns.bundle.sizes import HEAD, SCENE_FILES, check_head, check_memory, enough_memory
 from bitymi_ns.bundle.surfel_table import TERMS, from_columns, mean_residuals, tile_extents
+from bitymi_ns.codec.bc7_encode import Profile, bc7_blocks
 from bitymi_ns.codec.limits import RESIDUAL_LIMIT
 from bitymi_ns.codec.packing import Packing
 from bitymi_ns.codec.pages import paged_texels
-from bitymi_ns.codec.quantise import Profile, Range, bc7_blocks, decode_pages
+from bitymi_ns.codec.quantise import Range, decode_pages
 from bitymi_ns.codec.streams import StreamError
 from bitymi_ns.codec.texel_codes import constants
 from bitymi_ns.ops.constants import SUPPORT

@@ -1,7 +1,7 @@
 """Quantisation of the atlas: one global range, and the three texel formats."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal
@@ -9,19 +9,18 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from bitymi_ns.codec.bc7_encode import STRIP, Profile, bc7_encoder
 from bitymi_ns.codec.limits import RESIDUAL_LIMIT
 from bitymi_ns.codec.packing import Packing
 from bitymi_ns.codec.pages import covered_blocks
-from bitymi_ns.ops.bc7 import decode_bc7
+from bitymi_ns.ops.bc7_decode import decode_bc7
 from bitymi_ns.progress import Progress, no_progress
 
 Format = Literal["bc7", "uint8", "fp16"]
 RangeRule = Literal["sigma6", "minmax", "auto"]
-Profile = Literal["slow", "basic", "fast", "veryfast", "ultrafast"]
 
 STEPS = 255.0  # 8-bit steps in a colour of 1: the unit of errors and of the tolerance
 BYTES_PER_TEXEL: dict[str, int] = {"bc7": 1, "uint8": 4, "fp16": 8}
-_STRIP = 64  # rows encoded at once: small enough to share among threads and to report progress
 _SMALLEST_SPAN = 1e-6
 
 
@@ -166,7 +165,7 @@ def encode(
     encoder = bc7_encoder(profile) if format == "bc7" else None
 
     def strip(layer: int, top: int) -> tuple[bytes, int, float]:
-        values = texels[layer, top : top + _STRIP]  # [h, width, 3]
+        values = texels[layer, top : top + STRIP]  # [h, width, 3]
         mask = owned[layer, top // 4 : (top + len(values)) // 4].repeat(4, axis=0).repeat(4, axis=1)
         rgba = _quantised(values, format, value_range)
         data = encoder(rgba) if encoder else rgba.tobytes()
@@ -180,7 +179,7 @@ def encode(
         clipped = int(((inside < low - slack) | (inside > high + slack)).sum())
         return data, clipped, float(np.square(decoded[mask].astype(np.float64) - inside).sum())
 
-    strips = [(layer, top) for layer in range(layers) for top in range(0, height, _STRIP)]
+    strips = [(layer, top) for layer in range(layers) for top in range(0, height, STRIP)]
     pages: list[list[bytes]] = [[] for _ in texels]
     clipped, squares = 0, 0.0
     with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
@@ -240,50 +239,6 @@ def _quantised(values: npt.NDArray[np.float32], format: Format, value_range: Ran
     rgba = np.full((*values.shape[:2], 4), 255, dtype=np.uint8)
     rgba[..., :3] = value_range.to_unorm8(values)
     return rgba
-
-
-def bc7_encoder(profile: Profile) -> Callable[[npt.NDArray[np.uint8]], bytes]:
-    """A function from RGBA texels [h, w, 4] (sides multiples of 4) to BC7 blocks, rows of blocks from the top.
-
-    Raises:
-        RuntimeError: the encoder is not installed.
-        ValueError: there is no such profile.
-    """
-    try:
-        import ispc_texcomp
-    except ImportError as error:
-        raise RuntimeError(
-            "BC7 needs the encoder ispc_texcomp: `pip install ispc_texcomp`, or choose the format uint8 or fp16"
-        ) from error
-    if profile not in ("slow", "basic", "fast", "veryfast", "ultrafast"):
-        raise ValueError(f"the BC7 profile must be slow, basic, fast, veryfast or ultrafast, not {profile!r}")
-    settings = ispc_texcomp.BC7EncSettings.from_profile(profile)
-
-    def compress(rgba: npt.NDArray[np.uint8]) -> bytes:
-        height, width = rgba.shape[:2]
-        surface = ispc_texcomp.RGBASurface(rgba.tobytes(), width, height)
-        return bytes(ispc_texcomp.compress_blocks_bc7(surface, settings))
-
-    return compress
-
-
-def bc7_blocks(pages: npt.NDArray[np.uint8], profile: Profile, threads: int | None = None) -> npt.NDArray[np.uint8]:
-    """The BC7 blocks of texels [layers, height, width, 4], sides multiples of 4: [layers, height / 4, width / 4, 16].
-
-    Args:
-        pages: RGBA texels.
-        profile: effort of the encoder.
-        threads: of the encoder; not given: one per processor. The result does not depend on it.
-
-    Raises:
-        RuntimeError: the encoder is not installed.
-    """
-    compress = bc7_encoder(profile)
-    layers, height, width, _ = pages.shape
-    strips = [page[top : top + _STRIP] for page in pages for top in range(0, height, _STRIP)]
-    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
-        blocks = bytearray().join(pool.map(compress, strips))
-    return np.frombuffer(blocks, np.uint8).reshape(layers, height // 4, width // 4, 16)
 
 
 def _extremes(texels: npt.NDArray[np.float32], packing: Packing) -> tuple[float, float]:

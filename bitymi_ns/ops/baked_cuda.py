@@ -13,7 +13,7 @@ from torch import Tensor
 
 from .backend import function, module, on_device, require
 from .baked_scene import IMAGES, BakedScene, check_images, common_size, residual, tile_levels
-from .bc7 import decode_bc7
+from .bc7_decode import decode_bc7
 from .constants import TILE
 from .project import GEOMETRY, Camera
 from .view_color import LEAN, check_lean, check_view_color, lettered

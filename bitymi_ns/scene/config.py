@@ -23,7 +23,7 @@ class SceneConfig:
     """Number of lobes per surfel of the Spherical Beta and spherical Gaussian colours, 1 to 32."""
     texture: Texture = "hash"
     """Residual colours: hash = a field in space, multiresolution hash grid and MLP; texels = texels on every surfel,
-    which learn in the last part of the run; none = surfels alone."""
+    which learn in the last part of the run (train.texels); none = surfels alone."""
     levels: int = 4
     """Hash grid levels, 1 to 4, with resolutions min_resolution * 2^level; the paper's 4."""
     min_resolution: int = 256

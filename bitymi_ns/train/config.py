@@ -183,9 +183,11 @@ class TexelConfig(TexelSteps):
     surfel_rates: NonNegative = 0.4
     """Rates of the surfels in that part, as a share of those of a run as long as it; they fall to 0 as a cosine."""
     pixels_per_texel: Positive = 0.25
-    """A tile has at most a texel for so many pixels that its surfel makes up of the view that shows most of it."""
+    """A tile has at most one texel per this many pixels of its surfel (summed blending weight), in the view that shows
+    most of it."""
     rendered_pixels_per_texel: Positive = 32.0
-    """Beyond 8 million texels, at most one for so many pixels that the steps of that part render; saves memory."""
+    """Limit on the texels of all tiles: one per this many pixels rendered in that part, but not below 8 million. Saves
+    memory."""
     largest: Annotated[int, Field(ge=4, le=4096)] = 64
     """Largest side of a tile, texels, a power of two."""
     views: NonNegative = 0.25
@@ -199,7 +201,8 @@ class GuardConfig:
     rollbacks: Count = 5
     """Most rollbacks to the last good state; 0 = a loss that is not finite ends the run."""
     rates: PositiveShare = 0.3
-    """Factor of all learning rates when it does; its square, cube, ... when that was not enough."""
+    """All learning rates are multiplied by this at a rollback; by its square, cube, ... at further ones without a good
+    window between."""
     window: PositiveCount = 300
     """Steps over which the loss is judged."""
     min_window: PositiveCount = 20
@@ -225,10 +228,10 @@ class TrainConfig:
     """Steps over which the learning rate of the texture field rises to its full value."""
     resolution_schedule: Count = 3000
     """Training starts at a lower image resolution and doubles it every this many steps; 0 = full size throughout. Where
-    texels learn in the last part, runs of fewer than 3,000 steps wait longer, at most until then."""
+    texels learn in the last part, runs of fewer than 3,000 steps use a longer interval, but reach full size by then."""
     small_photograph: PositiveCount = 10_000
-    """Pixels of a photograph, of those that show something, with which they do not wait longer; with n times as many,
-    by at most sqrt(n)."""
+    """Photographs with at most this many pixels that show something do not stretch that interval; n times as many
+    stretch it by at most sqrt(n)."""
     num_downscales: Annotated[int, Field(ge=0, le=16)] = 2
     """Halvings of the image size at the start."""
     init_opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1

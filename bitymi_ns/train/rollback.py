@@ -14,8 +14,8 @@ What counts as divergence:
 After an opacity reset nothing is judged until half of the time to the next reset has passed: by then opacities can have
 risen again (`Schedule.reset_opacity`). The last window ends with the run.
 
-Going back restores parameters, optimisers and the strategy's statistics as they were a whole window before the last
-good one ended; the step count goes on. All learning rates are then multiplied by `guard.rates`, and by a higher power
+Going back restores parameters, optimisers and the strategy's statistics as they were at the start of the last good
+window; the step count goes on. All learning rates are then multiplied by `guard.rates`, and by a higher power
 of it each time that the run goes back again without a good window between.
 """
 

@@ -1,4 +1,5 @@
-"""FastGS densification and pruning: multi-view scores decide which surfels multiply and which go.
+"""FastGS densification and pruning: multi-view scores decide which surfels multiply and which go. The
+thresholds are those of `config.DensifyConfig`.
 
 At each densification, in this order:
 - surfels that can never be seen again are removed (a value that is not finite, or an opacity of 1/255 or less);

@@ -19,8 +19,8 @@ from PIL import Image
 from bitymi_ns.capture.masks import in_proportion
 from bitymi_ns.capture.panorama import SPHERICAL_MODEL, is_full_sphere
 from bitymi_ns.plugin.console import fail, warn
+from bitymi_ns.plugin.data.cube_faces import FACES, covered, resample, windows
 from bitymi_ns.plugin.data.images import wrong_size
-from bitymi_ns.plugin.data.wide import FACES, covered, resample, windows
 
 MAX_VIEW_ANGLE = 110.0
 """Largest horizontal and vertical view angle of a pinhole picture, degrees. Wider pictures spend ever more pixels on

@@ -74,7 +74,8 @@ def film(path: Path, fps: float) -> Iterator[Add]:
 
 @contextmanager
 def frames(folder: Path, form: str, quality: int) -> Iterator[Add]:
-    """Open a folder of pictures 00000.jpg, 00001.jpg and so on, or .png; one of earlier frames is replaced at the end.
+    """Open a folder of pictures 00000.jpg, 00001.jpg and so on, or .png. An existing folder that holds
+    only frames is replaced once all new ones are written.
 
     Raises:
         InputError: the folder holds anything else.

@@ -12,8 +12,8 @@ import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
+from bitymi_ns.plugin.data.cube_faces import FACES
 from bitymi_ns.plugin.data.views import photograph_files, with_lenses
-from bitymi_ns.plugin.data.wide import FACES
 from tests.plugin.data.captures import as_binary, colmap_model, expect, images_of, load_any, printed
 
 SIZE = (96, 48)

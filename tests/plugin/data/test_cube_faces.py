@@ -12,8 +12,8 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from PIL import Image
 
+from bitymi_ns.plugin.data.cube_faces import FACES
 from bitymi_ns.plugin.data.lens import Lens, lenses_of
-from bitymi_ns.plugin.data.wide import FACES
 
 PANORAMA = ("EQUIRECTANGULAR", (256.0, 128.0), 256, 128, (256, 128))
 RADIUS = 100.0

@@ -1,0 +1,57 @@
+"""The BC7 encoder of atlas pages (ispc_texcomp); `ops.bc7_decode` reads its blocks."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+Profile = Literal["slow", "basic", "fast", "veryfast", "ultrafast"]
+
+STRIP = 64  # rows encoded at once: small enough to share among threads and to report progress
+
+
+def bc7_encoder(profile: Profile) -> Callable[[npt.NDArray[np.uint8]], bytes]:
+    """A function from RGBA texels [h, w, 4] (sides multiples of 4) to BC7 blocks, rows of blocks from the top.
+
+    Raises:
+        RuntimeError: the encoder is not installed.
+        ValueError: there is no such profile.
+    """
+    try:
+        import ispc_texcomp
+    except ImportError as error:
+        raise RuntimeError(
+            "BC7 needs the encoder ispc_texcomp: `pip install ispc_texcomp`, or choose the format uint8 or fp16"
+        ) from error
+    if profile not in ("slow", "basic", "fast", "veryfast", "ultrafast"):
+        raise ValueError(f"the BC7 profile must be slow, basic, fast, veryfast or ultrafast, not {profile!r}")
+    settings = ispc_texcomp.BC7EncSettings.from_profile(profile)
+
+    def compress(rgba: npt.NDArray[np.uint8]) -> bytes:
+        height, width = rgba.shape[:2]
+        surface = ispc_texcomp.RGBASurface(rgba.tobytes(), width, height)
+        return bytes(ispc_texcomp.compress_blocks_bc7(surface, settings))
+
+    return compress
+
+
+def bc7_blocks(pages: npt.NDArray[np.uint8], profile: Profile, threads: int | None = None) -> npt.NDArray[np.uint8]:
+    """The BC7 blocks of texels [layers, height, width, 4], sides multiples of 4: [layers, height / 4, width / 4, 16].
+
+    Args:
+        pages: RGBA texels.
+        profile: effort of the encoder.
+        threads: of the encoder; not given: one per processor. The result does not depend on it.
+
+    Raises:
+        RuntimeError: the encoder is not installed.
+    """
+    compress = bc7_encoder(profile)
+    layers, height, width, _ = pages.shape
+    strips = [page[top : top + STRIP] for page in pages for top in range(0, height, STRIP)]
+    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+        blocks = bytearray().join(pool.map(compress, strips))
+    return np.frombuffer(blocks, np.uint8).reshape(layers, height // 4, width // 4, 16)

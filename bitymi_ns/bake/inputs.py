@@ -107,15 +107,9 @@ def photo_resolution(inputs: BakeInput) -> Tensor | None:
     means = inputs.surfels["means"].double().cpu()
     logs, views = torch.zeros(len(means), dtype=torch.float64), torch.zeros(len(means), dtype=torch.float64)
     for i, camera in enumerate(inputs.cameras):
-        viewmat, K = camera.viewmat.double().cpu(), camera.K.double().cpu()
-        x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(1)
-        shown = z > inputs.near
-        if inputs.views is not None:
-            shown &= inputs.views.seen[i].cpu()
-        else:
-            depth = z.clamp(min=inputs.near)
-            column, row = K[0, 0] * x / depth + K[0, 2], K[1, 1] * y / depth + K[1, 2]
-            shown &= (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        _, _, z, inside = camera.to("cpu").project(means, inputs.near)
+        shown = inside if inputs.views is None else (z > inputs.near) & inputs.views.seen[i].cpu()
+        K = camera.K.double().cpu()
         rate = torch.sqrt(K[0, 0] * K[1, 1]) / z.clamp(min=inputs.near)
         logs += torch.where(shown, rate.log(), 0.0)
         views += shown

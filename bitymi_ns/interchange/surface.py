@@ -125,11 +125,7 @@ def observed_box(depths: Sequence[Tensor], cameras: Sequence[Camera]) -> Tensor:
 def _points(depth: Tensor, camera: Camera) -> Tensor:
     """[M, 3] world points of the pixels [H, W] whose depth is known."""
     y, x = (depth > 0).nonzero(as_tuple=True)
-    z, K = depth[y, x].cpu().double(), camera.K.cpu().double()
-    x, y = x.cpu(), y.cpu()
-    local = torch.stack([(x + 0.5 - K[0, 2]) / K[0, 0] * z, (y + 0.5 - K[1, 2]) / K[1, 1] * z, z], 1)
-    viewmat = camera.viewmat.cpu().double()
-    return (local - viewmat[:3, 3]) @ viewmat[:3, :3]
+    return camera.to("cpu").unproject(x.cpu() + 0.5, y.cpu() + 0.5, depth[y, x].cpu().double())
 
 
 def extract_surface(

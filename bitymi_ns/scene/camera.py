@@ -66,6 +66,29 @@ class Camera:
             return self  # with what it has computed
         return self._with(viewmat=viewmat, K=K)
 
+    def local(self, points: Tensor) -> Tensor:
+        """[M, 3] world points in the camera frame. `viewmat` and `points` lie on one device."""
+        # no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic algorithms
+        viewmat = self.viewmat.to(points.dtype)
+        return (points[:, None] * viewmat[:3, :3]).sum(-1) + viewmat[:3, 3]
+
+    def project(self, points: Tensor, near: float = 0.0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Pixel coordinates x, y and camera z of world points [M, 3], each [M], and which lie in the picture, [M] bool.
+
+        Args:
+            near: points in the picture have a larger z; others are projected as if they had this one.
+        """
+        x, y, z = self.local(points).unbind(-1)
+        depth, K = z.clamp(min=near), self.K.to(points.dtype)
+        x, y = K[0, 0] * x / depth + K[0, 2], K[1, 1] * y / depth + K[1, 2]
+        return x, y, z, (z > near) & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+
+    def unproject(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+        """[M, 3] world points at pixel coordinates [M] with camera z [M], in the dtype of z."""
+        viewmat, K = self.viewmat.to(z.dtype), self.K.to(z.dtype)
+        local = torch.stack([(x - K[0, 2]) / K[0, 0] * z, (y - K[1, 2]) / K[1, 1] * z, z], -1)
+        return (local - viewmat[:3, 3]) @ viewmat[:3, :3]
+
     def rows(self, top: int, bottom: int) -> Camera:
         """The camera of the image's rows from `top` to `bottom` (exclusive)."""
         shift = torch.zeros_like(self.K)

@@ -73,13 +73,14 @@ def background_points(points: Tensor, views: Sequence[View], seed: int) -> Backg
     points = points[points.isfinite().all(-1)]
     chosen = [views[i] for i in spread(len(views), MOST_VIEWS)]
     cameras = [view.camera.to("cpu") for view in chosen]
-    depths = [_projected(camera, points)[0] for camera in cameras]
-    medians = torch.stack([z.median() if len(z) >= FEW else torch.tensor(math.nan) for z in depths])
-    counts = torch.tensor([float(len(z)) for z in depths])[medians.isfinite()]
+    seen = [_in_picture(camera, points) for camera in cameras]
+    medians = torch.stack([z.median() if len(z) >= FEW else torch.tensor(math.nan) for _, _, z in seen])
+    counts = torch.tensor([float(len(z)) for _, _, z in seen])[medians.isfinite()]
     if len(counts) == 0:
         return BackgroundPoints(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
     medians = medians.nan_to_num(float(medians.nanmedian()))
-    grids = [_Grid.of(camera, points, float(counts.median())) for camera in cameras]
+    usual = float(counts.median())
+    grids = [_Grid.of(camera, *each, usual) for camera, each in zip(cameras, seen, strict=True)]
     found = [
         _behind(view, camera, grid, float(median), generator)
         for view, camera, grid, median in zip(chosen, cameras, grids, medians, strict=True)
@@ -87,10 +88,10 @@ def background_points(points: Tensor, views: Sequence[View], seed: int) -> Backg
     joined = BackgroundPoints(*map(torch.cat, zip(*found, strict=True)))
     empty, before = torch.zeros(2, len(joined.xyz))
     for camera, grid in zip(cameras, grids, strict=True):
-        z, x, y, inside = _projected(camera, joined.xyz)
-        nearest = grid.at(x, y)
+        x, y, z, inside = camera.project(joined.xyz)
+        nearest = grid.at(x[inside], y[inside])
         empty[inside] += nearest.isinf()
-        before[inside] += nearest.isfinite() & (z < nearest)
+        before[inside] += nearest.isfinite() & (z[inside] < nearest)
     kept = ((empty >= SUPPORT) & (before <= IN_FRONT * empty)).nonzero().flatten()
     order = kept[torch.randperm(len(kept), generator=generator)]
     return BackgroundPoints(*(values[order] for values in joined))
@@ -109,17 +110,17 @@ class _Grid(NamedTuple):
     height: float
 
     @classmethod
-    def of(cls, camera: Camera, points: Tensor, count: float) -> _Grid:
-        """Sort the points into cells of about equal sides.
+    def of(cls, camera: Camera, x: Tensor, y: Tensor, z: Tensor, count: float) -> _Grid:
+        """Sort the points of a view into cells of about equal sides.
 
         Args:
+            x, y, z: [V] pixel coordinates and camera z.
             count: points in a usual view.
         """
         longer, shorter = max(camera.width, camera.height), min(camera.width, camera.height)
         side = longer / min(CELLS, max(1.0, math.sqrt(count / POINTS_PER_CELL * longer / shorter)))
         rows, columns = math.ceil(camera.height / side), math.ceil(camera.width / side)
         grid = cls(torch.full((rows, columns), math.inf), camera.width / columns, camera.height / rows)
-        z, x, y, _ = _projected(camera, points)
         grid.nearest.view(-1).scatter_reduce_(0, grid._index(x, y), z, "amin")
         return grid
 
@@ -133,12 +134,10 @@ class _Grid(NamedTuple):
         return self.nearest.view(-1)[self._index(x, y)]
 
 
-def _projected(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Camera z and pixel coordinates x, y, each [V], of those of the points [M, 3] within the picture; which: [M]."""
-    x, y, z = (points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).unbind(-1)
-    x, y = camera.K[0, 0] * x / z + camera.K[0, 2], camera.K[1, 1] * y / z + camera.K[1, 2]
-    inside = (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    return z[inside], x[inside], y[inside], inside
+def _in_picture(camera: Camera, points: Tensor) -> list[Tensor]:
+    """Pixel coordinates x, y and camera z, each [V], of those of the points [M, 3] that lie in the picture."""
+    *projected, inside = camera.project(points)
+    return [values[inside] for values in projected]
 
 
 def _behind(view: View, camera: Camera, grid: _Grid, median: float, generator: torch.Generator) -> BackgroundPoints:
@@ -148,7 +147,7 @@ def _behind(view: View, camera: Camera, grid: _Grid, median: float, generator: t
         camera: of the view, on the CPU.
         median: depth of its points, camera z.
     """
-    (rows, columns), K = grid.nearest.shape, camera.K
+    rows, columns = grid.nearest.shape
     small = downscale_image(as_float(view.image.cpu()), columns, rows)  # [rows, columns, C]
     empty = grid.nearest.isinf()
     if small.shape[-1] == 4:
@@ -158,8 +157,5 @@ def _behind(view: View, camera: Camera, grid: _Grid, median: float, generator: t
     row, column = empty.nonzero().unbind(-1)
     random = torch.rand(len(row), 3, generator=generator)
     z = median * NEAREST * torch.exp(random[:, 2] * math.log(FARTHEST / NEAREST))
-    across = ((column + random[:, 0]) * grid.width - K[0, 2]) / K[0, 0]
-    down = ((row + random[:, 1]) * grid.height - K[1, 2]) / K[1, 1]
-    local = torch.stack([across * z, down * z, z], -1)
-    xyz = (local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
-    return BackgroundPoints(xyz, small[row, column, :3], RADIUS * grid.width * z / K[0, 0])
+    xyz = camera.unproject((column + random[:, 0]) * grid.width, (row + random[:, 1]) * grid.height, z)
+    return BackgroundPoints(xyz, small[row, column, :3], RADIUS * grid.width * z / camera.K[0, 0])

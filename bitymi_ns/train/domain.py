@@ -174,8 +174,7 @@ def views_without_surfels(scene: Scene, cameras: Sequence[Camera]) -> list[int]:
 
 def _sees(camera: Camera, means: Tensor, radii: Tensor, near: float) -> bool:
     camera = camera.to(means.device)
-    # no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic algorithms
-    x, y, z = ((means[:, None] * camera.viewmat[:3, :3]).sum(-1) + camera.viewmat[:3, 3]).unbind(-1)
+    x, y, z = camera.local(means).unbind(-1)
     K = camera.K
     depth = z.clamp(min=near)
     seen = z > near - radii

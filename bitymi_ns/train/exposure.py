@@ -92,14 +92,16 @@ class Exposure:
             self.reason = "as asked for"
         points_seen = agreement.points.float()
         log_gains = self._pooled(agreement.log_gains, points_seen)
-        seen = points_seen[:, None] if self._photographs is None else self._summed(points_seen[:, None])
+        seen = self._summed(points_seen[:, None])
         gains = (seen * log_gains + PRIOR_POINTS * prior) / (seen + PRIOR_POINTS)
         self._begin(gains.to(points.device), affine=self.kind == "affine")
 
     def _summed(self, values: Tensor) -> Tensor:
         """Sum values [V, C] of the views of each photograph."""
+        if self._photographs is None:
+            return values
         rows = torch.tensor(self._photographs)
-        return values.new_zeros(self._count(len(values)), values.shape[1]).index_add_(0, rows, values)
+        return values.new_zeros(self.count(len(values)), values.shape[1]).index_add_(0, rows, values)
 
     def _pooled(self, values: Tensor, weights: Tensor) -> Tensor:
         """Average values [V, C] of the views of each photograph by weights [V]; 0 where these are 0."""
@@ -108,7 +110,8 @@ class Exposure:
         weights = weights[:, None]
         return self._summed(values * weights) / self._summed(weights).clamp(min=1e-6)
 
-    def _count(self, views: int) -> int:
+    def count(self, views: int) -> int:
+        """Photographs of so many views."""
         return views if self._photographs is None else max(self._photographs, default=-1) + 1
 
     def _begin(self, log_gains: Tensor, affine: bool) -> None:
@@ -201,7 +204,7 @@ class Exposure:
             self.decided = self.kind in ("off", "auto")
             return
         table = state["table"]
-        if state["kind"] != self.kind or (table is not None and len(table) != self._count(count)):
+        if state["kind"] != self.kind or (table is not None and len(table) != self.count(count)):
             return
         self.decided, self.reason = bool(state["decided"]), str(state["finding"])
         if table is None:
@@ -229,7 +232,7 @@ def corrected(
     if state is None or state["table"] is None:
         return views
     exposure = Exposure(state["kind"], photographs=photographs)
-    count = exposure._count(len(views))
+    count = exposure.count(len(views))
     if len(state["table"]) != count:
         raise ValueError(
             f"training learned the exposure of {len(state['table'])} photographs, and now there are {count}: restore "

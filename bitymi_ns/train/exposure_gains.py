@@ -91,11 +91,7 @@ def _log_colors(view: View, points: Tensor, count: int, near: float) -> Tensor:
     """[C, 3] logarithm of the colour at the pixel of each of the first points; NaN where it is hidden or does not
     count. All points may hide them."""
     camera = view.camera.to(points.device)
-    # no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic algorithms
-    x, y, z = ((points[:, None] * camera.viewmat[:3, :3]).sum(-1) + camera.viewmat[:3, 3]).unbind(-1)
-    depth = z.clamp(min=near)
-    x, y = camera.K[0, 0] * x / depth + camera.K[0, 2], camera.K[1, 1] * y / depth + camera.K[1, 2]
-    inside = (z > near) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    x, y, z, inside = camera.project(points, near)
     side = max(2.0, CELL * math.sqrt(camera.width * camera.height / max(1, int(inside.sum()))))
     columns, rows = math.ceil(camera.width / side), math.ceil(camera.height / side)
     cell = (y / side).long().clamp(0, rows - 1) * columns + (x / side).long().clamp(0, columns - 1)

@@ -21,7 +21,8 @@ from bitymi_ns.measure.stability.scenes import (
 from bitymi_ns.ops.fragment_list import Layout
 from bitymi_ns.ops.reference import project as reference_project
 from bitymi_ns.ops.reference import trace as reference_trace
-from bitymi_ns.ops.reference.texel import texel_colors
+from bitymi_ns.ops.reference.texel import texel
+from bitymi_ns.ops.reference.trace import SUPPORT
 from bitymi_ns.scene import Camera
 
 __all__ = [
@@ -184,8 +185,15 @@ def changed(layout: Layout, change: Callable[[Tensor], Tensor]) -> Layout:
 def reference_colors(
     fragments: ops.Fragments, base: Tensor, texels: Tensor, tiles: ops.TexelTiles, bound: float
 ) -> Tensor:
-    """[F, 3] colours of fragments by `reference.texel`, in the dtype of their weights."""
-    rows = zip(tiles.first.tolist(), tiles.size.tolist(), strict=True)
-    listed = [texels[first : first + r_u * r_v].view(r_v, r_u, 3) for first, (r_u, r_v) in rows]
-    f = fragments
-    return texel_colors(f.weight.detach(), f.uv, f.surfel, base, listed, tiles.extent, bound)
+    """[F, 3] colours ReLU(ReLU(base + 0.5) + texel(u, v)) of fragments by `reference.texel`, in the dtype of their
+    weights; those of smaller weight than the bound have no residual."""
+    weight = fragments.weight.detach()
+    color = torch.relu(base + 0.5)[fragments.surfel.long()]
+    residual = torch.zeros_like(color)
+    for i, (first, (r_u, r_v)) in enumerate(zip(tiles.first.tolist(), tiles.size.tolist(), strict=True)):
+        if r_u * r_v:
+            tile = texels[first : first + r_u * r_v].view(r_v, r_u, 3)
+            rows = torch.nonzero((fragments.surfel == i) & (weight >= bound)).squeeze(1)
+            at = fragments.uv[:, rows].T * (SUPPORT / tiles.extent[i])
+            residual = residual.index_put((rows,), texel(tile, at))
+    return torch.relu(color + residual)

@@ -55,3 +55,18 @@ def test_a_pixel_is_shared_among_its_layers_by_weight(surfels, camera):
     expected = [float(fragments.weight[fragments.surfel == i].sum()) for i in range(2)]
     assert visibility(params, [view], 0.2).pixels.tolist() == pytest.approx(expected, rel=1e-5)
     assert min(expected) > 5
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_projected_points_come_back(camera, dtype):
+    view = camera(6.0)
+    points = torch.rand(200, 3, dtype=dtype, generator=torch.Generator().manual_seed(0)) * 10 - 5
+    x, y, z, inside = view.project(points)
+    assert x.dtype == dtype and bool((z > 0).all()) and 0 < int(inside.sum()) < 200
+    assert inside.tolist() == ((x >= 0) & (x < view.width) & (y >= 0) & (y < view.height)).tolist()
+    torch.testing.assert_close(view.unproject(x, y, z), points, rtol=1e-5, atol=1e-5)
+    homogeneous = view.viewmat.double() @ torch.cat([points.double(), torch.ones(200, 1).double()], 1).T
+    pixels = view.K.double() @ homogeneous[:3]
+    torch.testing.assert_close(torch.stack([x, y]).double(), pixels[:2] / pixels[2], rtol=1e-4, atol=1e-3)
+    near = float(z.median())
+    assert view.project(points, near)[3].tolist() == (inside & (z > near)).tolist()

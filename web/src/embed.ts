@@ -40,7 +40,7 @@ export class Embed {
     this.send('ready', { title, camera: cameraOf(viewer.shared()) });
   }
 
-  // A picture is shown; the camera is told where it is another one.
+  // After each frame: report the camera if it has moved.
   shown(): void {
     if (!this.parent || !this.viewer) return;
     const camera = cameraOf(this.viewer.shared());

@@ -11,8 +11,8 @@ SMALL = 1000
 """Photographs whose longer side has fewer pixels are doubled before features are found; larger ones have enough."""
 
 SPHERICAL_SCALE = 2
-"""Factor on these sizes for 360-degree pictures, whose details are small: with half as many features, their places were
-wrong by a metre where perspective photographs were among them."""
+"""Factor on these sizes for 360-degree pictures, whose details are small: with half as many features, their positions
+were wrong by a metre where perspective photographs were among them."""
 
 
 def extract(job: Job, database: Path, tell: StageProgress) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
@@ -37,24 +35,3 @@ def texel(tile: Tensor, uv: Tensor, of: Tensor | None = None) -> Tensor:
     top = tile[(*at, low[:, 1], low[:, 0])] * (1 - fu) + tile[(*at, low[:, 1], high[:, 0])] * fu
     bottom = tile[(*at, high[:, 1], low[:, 0])] * (1 - fu) + tile[(*at, high[:, 1], high[:, 0])] * fu
     return top * (1 - fv) + bottom * fv
-
-
-def texel_colors(
-    weight: Tensor, uv: Tensor, surfel: Tensor, base: Tensor, tiles: Sequence[Tensor], extent: Tensor, bound: float
-) -> Tensor:
-    """Colours ReLU(ReLU(base + 0.5) + texel(u, v)) of fragments, [F, 3].
-
-    Args:
-        weight, uv, surfel: [F], [2, F] in scale units, [F] of the fragments.
-        base: [N, 3] view-dependent colours without the 0.5.
-        tiles: N tiles [r_v, r_u, 3]; one without texels is no tile.
-        extent: [N] half side of each tile, scale units.
-        bound: fragments of smaller weight have no residual.
-    """
-    color = torch.relu(base + 0.5)[surfel.long()]
-    residual = torch.zeros_like(color)
-    for i, tile in enumerate(tiles):
-        if tile.numel():
-            rows = torch.nonzero((surfel == i) & (weight >= bound)).squeeze(1)
-            residual = residual.index_put((rows,), texel(tile, uv[:, rows].T * (SUPPORT / extent[i])))
-    return torch.relu(color + residual)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -37,6 +38,11 @@ PAD = 2
 """Columns of the other edge that continue a picture of all directions."""
 
 
+def colmap_camera(model: str, params: Sequence[float], size: tuple[int, int]) -> pycolmap.Camera:
+    """Camera of COLMAP; `size` is width and height in pixels."""
+    return pycolmap.Camera(model=model, width=size[0], height=size[1], params=list(params))
+
+
 class Window(NamedTuple):
     """Part of a face, left to right and top to bottom in focal lengths, within -1 to 1."""
 
@@ -68,7 +74,7 @@ def covered(
     model: str, params: tuple[float, ...], size: tuple[int, int], face: str, rays: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.bool_]:
     """Test which rays [..., 3] of a face a photograph shows, where the model does not fold it."""
-    camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=list(params))
+    camera = colmap_camera(model, params, size)
     if camera.is_spherical():
         return np.ones(rays.shape[:-1], bool)
     directions = (rays @ FACES[face]).reshape(-1, 3)
@@ -82,7 +88,7 @@ def covered(
 @lru_cache(maxsize=64)
 def _field(model: str, params: tuple[float, ...], size: tuple[int, int]) -> float:
     """Largest angle to the axis up to which pixels move outwards with it, radians."""
-    camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=list(params))
+    camera = colmap_camera(model, params, size)
     angles = np.linspace(0.0, MAX_ANGLE, ANGLES + 1)[1:]
     azimuths = np.linspace(0.0, 2.0 * np.pi, AZIMUTHS, endpoint=False)
     angle, azimuth = np.meshgrid(angles, azimuths, indexing="ij")
@@ -111,7 +117,7 @@ def resample(
         nearest: take the nearest pixel, for masks.
     """
     size = pixels.shape[1::-1]
-    camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=list(params))
+    camera = colmap_camera(model, params, size)
     fx, fy, cx, cy, width, height = pinhole
     samples = 1 if nearest else SAMPLES
     pad = PAD if camera.is_spherical() else 0

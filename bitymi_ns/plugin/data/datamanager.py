@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal
@@ -131,8 +132,11 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         self.train_dataset.metadata["camera_centers"] = outputs.cameras.camera_to_worlds[..., :3, 3].reshape(-1, 3)
         points = outputs.metadata.get("points3D_xyz")
         if test_mode == "val" and points is not None and len(points):
-            found = background_points(points, self.train_views, config.train_cameras_sampling_seed)
-            self.train_dataset.metadata["background_points"] = found
+            seed = config.train_cameras_sampling_seed
+            # called where a scene starts with such points: it reads the photographs
+            self.train_dataset.metadata["background_points"] = partial(
+                background_points, points, self.train_views, seed
+            )
 
     def _has_photos(self, test_mode: str) -> bool:
         return test_mode != "inference" and NO_PHOTOS not in self.train_dataparser_outputs.metadata

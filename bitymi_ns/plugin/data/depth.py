@@ -139,13 +139,17 @@ def with_depth(
 def _read_maps(outputs: DataparserOutputs, rows: Sequence[int], unit: float | None) -> list[_Seen]:
     """Read the depth of views at small size."""
     lenses, maps = outputs.metadata["lenses"], outputs.metadata[MAPS]
-    small = {lens: lens.downscaled(min(1.0, SIDE / max(lens.pinhole.width, lens.pinhole.height)))
-             for lens in dict.fromkeys(lenses[i] for i in rows)}  # fmt: skip
+    small = {
+        lens: lens.downscaled(min(1.0, SIDE / max(lens.pinhole.width, lens.pinhole.height)))
+        for lens in dict.fromkeys(lenses[i] for i in rows)
+    }
     with ThreadPoolExecutor(THREADS) as pool:
         values = list(pool.map(lambda i: read_depth(maps[i], small[lenses[i]], unit), rows))
     poses = outputs.cameras.camera_to_worlds.double().numpy()
-    return [_Seen(each, small[lenses[i]], poses[i, :, 3], poses[i, :, :3] * (1.0, -1.0, -1.0))
-            for i, each in zip(rows, values, strict=True)]  # fmt: skip
+    return [
+        _Seen(each, small[lenses[i]], poses[i, :, 3], poses[i, :, :3] * (1.0, -1.0, -1.0))
+        for i, each in zip(rows, values, strict=True)
+    ]
 
 
 def _check_normals(outputs: DataparserOutputs, maps: Sequence[MapFiles]) -> None:

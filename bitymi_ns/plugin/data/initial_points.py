@@ -12,12 +12,12 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import pycolmap
 from scipy.spatial.transform import Rotation
 
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.plugin.console import fail, say, warn
 from bitymi_ns.plugin.data.colmap_model import read_model
+from bitymi_ns.plugin.data.cube_faces import colmap_camera
 from bitymi_ns.plugin.data.images import image_size, read_image
 from bitymi_ns.plugin.data.lens import rescaled
 from bitymi_ns.plugin.data.point_files import Points, read_points
@@ -165,7 +165,7 @@ def sample_colors(
     camera = photograph.camera
     colors = np.full((len(xyz), 3), np.nan, np.float32)
     local = (xyz - photograph.pose[:3, 3]) @ photograph.pose[:3, :3] * [1.0, -1.0, -1.0]
-    lens = pycolmap.Camera(model=camera.model, width=camera.width, height=camera.height, params=list(camera.params))
+    lens = colmap_camera(camera.model, camera.params, (camera.width, camera.height))
     front = np.flatnonzero(lens.is_spherical() | (local[:, 2] > 0.0))
     if not len(front):
         return colors

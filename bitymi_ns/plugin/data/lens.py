@@ -19,7 +19,7 @@ from PIL import Image
 from bitymi_ns.capture.masks import in_proportion
 from bitymi_ns.capture.panorama import SPHERICAL_MODEL, is_full_sphere
 from bitymi_ns.plugin.console import fail, warn
-from bitymi_ns.plugin.data.cube_faces import FACES, covered, resample, windows
+from bitymi_ns.plugin.data.cube_faces import FACES, colmap_camera, covered, resample, windows
 from bitymi_ns.plugin.data.images import wrong_size
 
 MAX_VIEW_ANGLE = 110.0
@@ -164,7 +164,7 @@ def lenses_of(
     Raises:
         InputError: the camera cannot be used.
     """
-    camera = pycolmap.Camera(model=model, width=width, height=height, params=list(params))
+    camera = colmap_camera(model, params, (width, height))
     if camera.is_spherical():
         if not is_full_sphere(width, height):
             fail(
@@ -210,7 +210,7 @@ def _faces(
     model: str, params: tuple[float, ...], size: tuple[int, int], stored: tuple[int, int], label: str
 ) -> tuple[list[Lens], list[str]]:
     """Lenses of the faces of the cube that a wide camera covers, with its focal length; see `lenses_of`."""
-    camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=list(params))
+    camera = colmap_camera(model, params, size)
     around = size[0] / (2.0 * math.pi)
     fx, fy = (around, around) if camera.is_spherical() else (camera.focal_length_x, camera.focal_length_y)
     lenses = []
@@ -269,13 +269,13 @@ def rescaled(model: str, params: Sequence[float], size: tuple[int, int], new: tu
         return tuple(params)
     if model == SPHERICAL_MODEL:
         return tuple(map(float, new))
-    camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=list(params))
+    camera = colmap_camera(model, params, size)
     camera.rescale(*new)
     return tuple(camera.params)
 
 
 def _camera(lens: Lens) -> pycolmap.Camera:
-    return pycolmap.Camera(model=lens.model, width=lens.size[0], height=lens.size[1], params=list(lens.params))
+    return colmap_camera(lens.model, lens.params, lens.size)
 
 
 def _distorts(camera: pycolmap.Camera) -> bool:

@@ -147,8 +147,9 @@ def make_views(
     lenses, of, moved = _split(parts, moved)
     files = [photographs[i].file for i in of]
     first: dict[Any, int] = {}
-    frames = [first.setdefault(i if each.frame is None else ("frame", each.frame), i)
-              for i, each in enumerate(photographs)]  # fmt: skip
+    frames = [
+        first.setdefault(i if each.frame is None else ("frame", each.frame), i) for i, each in enumerate(photographs)
+    ]
     metadata: dict[str, Any] = {"lenses": lenses, "files": files, "photographs": of, "frames": [frames[i] for i in of]}
     maps = [MapFiles() if lens.face else photographs[i].maps for i, lens in zip(of, lenses, strict=True)]
     if any(each != MapFiles() for each in maps):
@@ -192,8 +193,10 @@ def _split(parts: Sequence[Sequence[Lens]], poses: Pose) -> tuple[list[Lens], li
 
 def view_names(files: Sequence[Path], lenses: Sequence[Lens]) -> list[Path]:
     """Name views: by their photograph, and the face of the cube where it is split."""
-    return [file.with_name(f"{file.stem}-{lens.face}{file.suffix}") if lens.face else file
-            for file, lens in zip(files, lenses, strict=True)]  # fmt: skip
+    return [
+        file.with_name(f"{file.stem}-{lens.face}{file.suffix}") if lens.face else file
+        for file, lens in zip(files, lenses, strict=True)
+    ]
 
 
 def photograph_files(outputs: DataparserOutputs) -> list[Path]:
@@ -328,8 +331,10 @@ def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> Datap
     large = [size for size in sizes if longest and max(size) > longest]
     if not large:
         return outputs
-    small = {lens: lens.downscaled(longest / max(size)) if longest < max(size) else lens
-             for lens, size in dict(zip(lenses, sizes, strict=True)).items()}  # fmt: skip
+    small = {
+        lens: lens.downscaled(longest / max(size)) if longest < max(size) else lens
+        for lens, size in dict(zip(lenses, sizes, strict=True)).items()
+    }
     lenses = [small[lens] for lens in lenses]
     if verbose:
         width, height = max(large, key=max)

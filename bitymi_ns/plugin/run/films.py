@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+import torch
 from PIL import Image
 
 from bitymi_ns.files import complete_file, complete_folder
 from bitymi_ns.plugin.console import fail
+from bitymi_ns.scene.baked import as_bytes
 
 RATES = (0.01, 1000.0)
 """Frames per second of a film."""
@@ -102,7 +104,7 @@ def check_frames(folder: Path) -> None:
 def write_image(path: Path, image: np.ndarray, *, fmt: str, quality: int = 100) -> None:
     """Write a picture [H, W, 3 or 4], float in [0, 1] or uint8, whole or not at all; stands for mediapy's function."""
     if image.dtype != np.uint8:
-        image = (np.clip(image, 0.0, 1.0) * 255.0).round().astype(np.uint8)
+        image = as_bytes(torch.from_numpy(image)).numpy()
     with complete_file(Path(path)) as file:
         _save(file, image, fmt, quality)
 

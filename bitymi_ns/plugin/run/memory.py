@@ -40,6 +40,8 @@ PER_FRAGMENT = 36
 """Bytes: the list, the gradients of weights and coordinates, and the order in which the backward pass takes it."""
 PER_SHADED_FRAGMENT = 32
 """Bytes more where a field in space shades: whose fragments are and where, colours, and their gradients."""
+PER_CARD_FRAGMENT = 4 * NUMBERS
+"""Bytes of a fragment on a card, where textures of both kinds take as much."""
 PER_PIXEL = 400
 """Bytes: pictures, gradients and maps of a view, and the ten views of the multi-view scores."""
 PER_SURFEL = 3000
@@ -72,7 +74,7 @@ def most_fragments(scene: Scene, cameras: Sequence[Camera], bound: int = 0) -> i
         geometry = (p[name].cpu() for name in GEOMETRY)
         most = max(most, count(project(*geometry, camera, scene.near, scene.config.prefilter)))
     device = p["means"].device
-    capacity = int(free_memory(device)) // (4 * NUMBERS) if device.type == "cuda" else MOST
+    capacity = int(free_memory(device)) // PER_CARD_FRAGMENT if device.type == "cuda" else MOST
     return min(int(MARGIN * most), bound or capacity)
 
 
@@ -98,11 +100,10 @@ def state_training(
     card = device.type == "cuda"
     fragments = most_fragments(scene, cameras, scene.config.max_fragments)
     if card:
-        kept = min(photograph_budget(device), 3 * total + 6 * total)
-        needed = kept + PER_PIXEL * pixels + 4 * NUMBERS * fragments
+        kept = min(photograph_budget(device), 9 * total)
     else:
-        kept = min(PHOTOGRAPH_BYTES, 3 * total) + min(DOWNSCALED_BYTES, 6 * total)
-        needed = PROGRAM + kept + PER_PIXEL * pixels + _per_fragment(scene) * fragments
+        kept = PROGRAM + min(PHOTOGRAPH_BYTES, 3 * total) + min(DOWNSCALED_BYTES, 6 * total)
+    needed = kept + PER_PIXEL * pixels + _per_fragment(scene) * fragments
     surfels = max(len(scene), most_surfels)
     needed += PER_SURFEL * surfels
     if texels is not None:
@@ -131,8 +132,7 @@ def state_export(
     if finetune_bytes < LEAST_KEPT * len(cameras) * (PER_KEPT_FRAGMENT * fragments + PER_KEPT_PIXEL * pixels):
         finetune_bytes = 0  # too few views would fit
     device = scene.surfels["means"].device
-    per_fragment = 4 * NUMBERS if device.type == "cuda" else _per_fragment(scene)
-    needed = PROGRAM * (device.type != "cuda") + kept + PER_PIXEL * pixels + per_fragment * fragments
+    needed = PROGRAM * (device.type != "cuda") + kept + PER_PIXEL * pixels + _per_fragment(scene) * fragments
     kind = scene.config.view_color
     entry = VIEW_COLORS[kind]
     terms = scene.surfels[entry.parameters[1].name].shape[1] - entry.base_terms
@@ -168,6 +168,8 @@ def memory_limit(mount: Path = Path("/sys/fs/cgroup"), cgroups: Path = Path("/pr
 
 
 def _per_fragment(scene: Scene) -> float:
+    if scene.surfels["means"].device.type == "cuda":
+        return PER_CARD_FRAGMENT
     return PER_FRAGMENT + PER_SHADED_FRAGMENT * (scene.config.texture == "hash")
 
 

@@ -210,6 +210,7 @@ def new_scene(
     if train.first_surfels is None and steps is not None and len(centers):
         train = replace(train, first_surfels=first_surfels_for(steps, pixels / len(centers)))
     xyz, rgb = _points(points)
+    find_background = metadata.get("background_points")
     declared = _corners(scene_box) if metadata.get("declares_box") else None
     box = None
     if not bool(torch.isfinite(xyz).all(1).any()):
@@ -226,7 +227,7 @@ def new_scene(
                 image_pixels=pixels,
                 box=box,
                 declared=declared,
-                background=metadata.get("background_points"),
+                background=find_background() if find_background and train.background_points else None,
             )
     except ValueError as error:
         fail(str(error), error)

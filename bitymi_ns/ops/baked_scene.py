@@ -1,7 +1,5 @@
 """Images of a baked scene, and the parts of its renderers that all devices share."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol

@@ -3,8 +3,6 @@
 The float64 twins in `ops.reference` state those of the formulas again: they are what the kernels are held against.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from bitymi_ns import KernelsUnavailable

@@ -1,7 +1,5 @@
 """The residual colour field rho(x) = f_phi(E_theta(x)): contraction, hash grid, MLP."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

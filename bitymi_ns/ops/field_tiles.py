@@ -1,7 +1,5 @@
 """The residual field at the texel centres of an atlas, by the CUDA kernels."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

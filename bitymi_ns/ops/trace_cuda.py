@@ -4,8 +4,6 @@ Two numbers decide how much memory is needed, so the host waits for the device t
 of surfel and tile, and for the number of fragments.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -4,8 +4,6 @@ csrc/core/view_kinds.h computes the colour in a direction, in float64 `ops.refer
 depends on the kind is in its entry here.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The scene that training starts from: its surfels, and where in space the texture field lies."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

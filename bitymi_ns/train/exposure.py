@@ -5,8 +5,6 @@ relative to the mean photograph: the logarithms of the gains, and what else ther
 after every step, so that they tint nothing. They are no part of the scene: held-out views have none, bundles neither.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Mapping, Sequence

@@ -7,8 +7,6 @@ only those count that no other point hides: else what is seen of an object from 
 change of exposure.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The first surfels of a scene, from the sparse points of the capture."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Schedules of a run: events, learning rates, resolution."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Files that the viewer serves: the built page and the files of a bundle; and their export as a folder."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence

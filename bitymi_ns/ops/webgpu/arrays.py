@@ -1,7 +1,5 @@
 """A baked scene as the arrays that the shaders read (shaders/scene.wgsl)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Drawing a baked scene through WebGPU, as the kernels draw it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """A scene in the memory of a graphics device, and drawing it there."""
 
-from __future__ import annotations
-
 import functools
 import struct
 import warnings

@@ -1,8 +1,6 @@
 """Conversion of nerfstudio's cameras to those of the renderer, checks of a capture's cameras, and depth and normal
 outputs for nerfstudio's tools."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

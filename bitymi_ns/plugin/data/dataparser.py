@@ -1,8 +1,6 @@
 """`bitymi-data`, the methods' default parser: recognizes the format of a folder or file, reads it as photographs with
 cameras and poses, and splits these by one rule for all formats."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Dataset of a capture: undistorted images with alpha and masks, cached in memory up to a budget."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor

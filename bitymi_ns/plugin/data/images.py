@@ -1,8 +1,6 @@
 """Image files of a capture: photographs and masks by their bit depth, sizes and EXIF from headers, blank and duplicate
 photographs."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections import Counter

@@ -1,8 +1,6 @@
 """Initial points of training: those of the capture, triangulated ones, or random ones; colored by the photographs where
 they have no colors, and projected into these to detect poses in another convention."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar

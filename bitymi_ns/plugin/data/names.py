@@ -1,7 +1,5 @@
 """Find files by the names in a capture's metadata, also where these were written on another machine."""
 
-from __future__ import annotations
-
 import difflib
 import os
 import re

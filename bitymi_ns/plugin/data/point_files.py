@@ -4,8 +4,6 @@ The PLY reader that nerfstudio uses returns uninitialized memory for points that
 by 255, also those in [0, 1].
 """
 
-from __future__ import annotations
-
 import re
 import struct
 import time

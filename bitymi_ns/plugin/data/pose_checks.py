@@ -1,8 +1,6 @@
 """Checks of a capture's poses: rotations (or mirrored ones), positions that belong together, and points in their unit;
 and the rotation and translation that orient a capture."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

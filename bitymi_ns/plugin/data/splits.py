@@ -1,7 +1,5 @@
 """Splits of a capture into training and held-out photographs: by rule, or by names."""
 
-from __future__ import annotations
-
 import os
 from collections import defaultdict
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Load and check the JSON files of nerfstudio, instant-ngp and Blender captures."""
 
-from __future__ import annotations
-
 import math
 import os
 from pathlib import Path

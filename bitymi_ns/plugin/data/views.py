@@ -1,8 +1,6 @@
 """Views of a capture for training: photographs with cameras and poses become pinhole pictures in nerfstudio's frame,
 those of wide cameras several."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor

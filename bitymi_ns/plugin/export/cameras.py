@@ -1,7 +1,5 @@
 """The capture's cameras as a file of the bundle, for viewers; and held-out photographs, if they may be given away."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Options of the export that say what a bundle is stored as."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """`ns-export bitymi-mesh`: the surface of a trained scene or of a bundle as a triangle mesh."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

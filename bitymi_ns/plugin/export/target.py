@@ -1,7 +1,5 @@
 """Checks of the output folder before the work: writable, free, with enough disk space."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Check of the camera paths that `ns-render camera-path` reads, before the scene is loaded."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Annotated, Any

@@ -1,7 +1,5 @@
 """Checkpoint files: written whole or not at all, read with errors that say what to do."""
 
-from __future__ import annotations
-
 import dataclasses
 import errno
 import json

@@ -1,7 +1,5 @@
 """nerfstudio configurations of the registered methods, made from the presets."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path

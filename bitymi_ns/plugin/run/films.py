@@ -1,7 +1,5 @@
 """Films as H.264 in MP4, encoded by PyAV, and pictures as files, all of them written whole or not at all."""
 
-from __future__ import annotations
-
 import gzip
 import os
 import re

@@ -5,8 +5,6 @@ are enough to have them. Its SHA-256 is pinned. They are read without running an
 .npz in the user's cache folder.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import pickle

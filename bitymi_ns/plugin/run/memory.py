@@ -5,8 +5,6 @@ a few views. The other numbers are measured on the CPU and belong to the default
 from its arrays.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from contextlib import suppress

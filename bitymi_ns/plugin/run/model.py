@@ -1,7 +1,5 @@
 """The scene in training as a nerfstudio model."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Mapping

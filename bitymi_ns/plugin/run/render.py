@@ -4,8 +4,6 @@ nerfstudio's script reads a camera path, or makes one of the capture's cameras, 
 and writes. `adopt_render` puts functions of this module into the script.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The folder of a training run: one process at a time trains into it, and it keeps how the poses were found."""
 
-from __future__ import annotations
-
 import atexit
 import shutil
 from pathlib import Path

@@ -117,8 +117,7 @@ def common_size(cameras: Sequence[Camera]) -> tuple[int, int]:
     return sizes.pop()
 
 
-LEVELS = ("half", "quarter")
-"""Names of the levels: what is left of a side."""
+LEVELS = ("half", "quarter")  # names of the levels: what is left of a side
 
 
 def halved(atlas: Tensor) -> Tensor:

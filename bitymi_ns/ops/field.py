@@ -9,8 +9,7 @@ from torch import Tensor
 from .backend import check_shapes, cuda_backend, dense, kernel, kernel_class, module, on_device, on_same_device
 from .constants import FEATURES, WIDTH
 
-WEIGHTS = ("table", "w1", "w2", "w3")
-"""The kernels' names of the field's parameters."""
+WEIGHTS = ("table", "w1", "w2", "w3")  # the kernels' names of the field's parameters
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,7 @@ from .backend import check_shapes, dense, kernel, require
 from .constants import FRAME
 from .field import FieldGeometry, kernel_field
 
-WARP = 32
-"""Texels that are evaluated together."""
+WARP = 32  # texels that are evaluated together
 
 
 @torch.no_grad()

@@ -27,8 +27,7 @@ from bitymi_ns.progress import rich_progress
 from bitymi_ns.scene.camera import Camera
 
 NAME = "mesh"
-MOST_VIEWS = 400
-"""Training views that are fused at most, evenly spaced."""
+MOST_VIEWS = 400  # training views that are fused at most, evenly spaced
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,8 @@ from bitymi_ns.codec.quantise import BYTES_PER_TEXEL
 from bitymi_ns.files import check_writable, free_bytes, reason, reserved, size_text, write_file
 from bitymi_ns.plugin.console import fail, warn
 
-SURFEL_BYTES = 60 * 4
-"""Bytes of a surfel's parameters. A checkpoint holds them three times, with Adam's two moments."""
-TYPICAL_SIDE = 32
-"""Side of a texture tile in texels, estimated generously: within a tolerance most are far smaller."""
+SURFEL_BYTES = 60 * 4  # bytes of a surfel's parameters. A checkpoint holds them three times, with Adam's two moments.
+TYPICAL_SIDE = 32  # side of a texture tile in texels, estimated generously: within a tolerance most are far smaller
 
 
 def require_writable(path: Path) -> None:

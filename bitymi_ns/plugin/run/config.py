@@ -30,8 +30,7 @@ from bitymi_ns.plugin.run.render import adopt_render
 from bitymi_ns.plugin.run.trainer import BitymiPipelineConfig, BitymiTrainer
 from bitymi_ns.train.config import AdamConfig
 
-SEEDS = 1 << 32
-"""End of the range of seeds that numpy takes."""
+SEEDS = 1 << 32  # end of the range of seeds that numpy takes
 
 
 @dataclass

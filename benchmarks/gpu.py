@@ -1,9 +1,8 @@
 #!/usr/bin/env python
 """Time baked frames and training steps on a card (median after a warm-up) and print tables.
 
-Needs the core packages alone (torch, numpy); nerfstudio is not used. gsplat is timed beside ours where it can be
-imported. `--emulated` runs the host's emulation of the kernels on tiny scenes, to try the script without a card; its
-times mean nothing.
+Needs the core packages alone (torch, numpy). `--emulated` runs the host's emulation of the kernels on tiny scenes, to
+try the script without a card; its times mean nothing.
 """
 
 import subprocess
@@ -14,7 +13,6 @@ from functools import partial
 from pathlib import Path
 
 import gpu_baked
-import gpu_gsplat
 import torch
 from common import arguments_of, number, page, publish, say, table
 from harness import (
@@ -52,15 +50,14 @@ def steps(options: Options) -> str:
                 rows.append([name, number(ms, 3), number(pairs, 0), number(memory, 0)])
             header = ("step", "ms", "pairs of surfel and tile", "peak MB")
             parts.append(f"#### {n:,} surfels at {width} x {height}\n\n" + table(header, rows))
-    note = f"Loss: 0.8 L1 + 0.2 (1 - SSIM). {gpu_gsplat.NOTE} Its pairs are its own count."
-    return "### Training steps\n\n" + "\n\n".join(parts) + "\n\n" + note + failures()
+    return "### Training steps\n\n" + "\n\n".join(parts) + failures()
 
 
 def _steps(
     n: int, width: int, height: int, photo: Tensor, options: Options
-) -> list[tuple[str, Callable[[], object], int | None]]:
+) -> list[tuple[str, Callable[[], object], int]]:
     device, loss = options.device, photo_loss(photo)
-    cases: list[tuple[str, Callable[[], object], int | None]] = []
+    cases: list[tuple[str, Callable[[], object], int]] = []
     for name, mode in (
         ("bitymi, field training", "train"),
         ("bitymi, field frozen", "frozen"),
@@ -80,7 +77,7 @@ def _steps(
 
         pairs = scene.render(camera, field_mode="off").fragments.layout.handle.pairs
         cases.append((name, training_step(render, loss, parameters), pairs))
-    return cases + (gpu_gsplat.steps(n, width, height, loss, training_step, device) if options.peers else [])
+    return cases
 
 
 SECTIONS = {"baked": gpu_baked.frames, "steps": steps}
@@ -113,7 +110,6 @@ def main() -> int:
     parser.add_argument("--warm-up", type=int, default=10)
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--sections", nargs="+", choices=list(SECTIONS), default=list(SECTIONS))
-    parser.add_argument("--no-peers", action="store_true", help="leave gsplat out")
     parser.add_argument("--emulated", action="store_true", help="try the script without a card")
     parser.add_argument("--output", type=Path, help="also write the Markdown to this file, anew as each section ends")
     arguments = parser.parse_args()
@@ -133,7 +129,7 @@ def main() -> int:
             f"Times: medians of about {runs} calls after {warm_up}, queued so that the host does not hold the device "
             "up, unless a column says otherwise.",
         ]
-        options = Options(device, warm_up, runs, surfels, sizes, bandwidth, arguments.bundles, not arguments.no_peers)
+        options = Options(device, warm_up, runs, surfels, sizes, bandwidth, arguments.bundles)
         for name in arguments.sections:
             parts.append(SECTIONS[name](options))
             publish(page("CUDA kernels", "\n\n".join(parts), notes), arguments.output, name != arguments.sections[-1])

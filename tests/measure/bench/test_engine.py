@@ -141,11 +141,11 @@ def test_a_failure_is_told_and_the_rest_goes_on(fakes, matrix: Matrix, tmp_path:
     assert "fox, bitymi, seed 0: training failed" in failures[0] and "status 3" in failures[0]
     assert "something is wrong with the capture" in failures[0]
     assert "export (bc7) failed" in failures[2]
-    assert len(lines(work)) == 6 + 4  # the second lego run has no export and no evaluation of it
+    assert len(lines(work)) == 5 + 3  # the second lego run has no export and no evaluation of it
     fakes.fail()
     fakes.calls()
     assert run_chains(work, matrix.chains()) == []
-    assert len(fakes.calls()) == 12 + 2
+    assert len(fakes.calls()) == 10 + 2
 
 
 def test_a_command_that_leaves_nothing_is_a_failure(fakes, matrix: Matrix, tmp_path: Path) -> None:

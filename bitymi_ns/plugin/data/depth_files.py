@@ -1,7 +1,5 @@
 """Depth maps, their confidence, and normal maps in files, as programs and scanners write them."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from pathlib import Path

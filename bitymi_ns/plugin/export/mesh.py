@@ -32,23 +32,14 @@ MOST_VIEWS = 400  # training views that are fused at most, evenly spaced
 
 @dataclass(frozen=True)
 class Source:
-    """Scene that a mesh is made of.
+    """Scene that a mesh is made of."""
 
-    Attributes:
-        surfels: geometry by name, on the device where it is drawn.
-        render: [H, W, 3] colors of a view.
-        cameras: of the training views, on that device.
-        near: nearest depth that is drawn, camera z.
-        prefilter: as in `ops.project`.
-        world: how the scene lies in the capture.
-    """
-
-    surfels: Mapping[str, Tensor]
-    render: Callable[[Camera], Tensor]
-    cameras: Sequence[Camera]
-    near: float
-    prefilter: Prefilter
-    world: WorldFrame
+    surfels: Mapping[str, Tensor]  # geometry by name, on the device where it is drawn
+    render: Callable[[Camera], Tensor]  # [H, W, 3] colors of a view
+    cameras: Sequence[Camera]  # of the training views, on that device
+    near: float  # nearest depth that is drawn, camera z
+    prefilter: Prefilter  # as in `ops.project`
+    world: WorldFrame  # how the scene lies in the capture
 
 
 @dataclass(kw_only=True)

@@ -24,6 +24,7 @@ from bitymi_ns.plugin.console import fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.export.trained import load_trained, world_of
 from bitymi_ns.progress import rich_progress
+from bitymi_ns.ranges import check_ranges
 from bitymi_ns.scene.camera import Camera
 
 NAME = "mesh"
@@ -70,7 +71,7 @@ class ExportMesh:
         options = SurfaceOptions(self.resolution, self.triangles, self.watertight)
         path = self.output_dir / f"{NAME}.{self.format}"
         try:
-            options.check()
+            check_ranges(options)
         except ValueError as error:
             fail(f"--{error}.", error)
         try:

@@ -42,7 +42,6 @@ class Options:
         sizes: image sizes, width and height.
         copy_bytes: bytes per second of a device-to-device copy, read and written bytes counted.
         bundles: folders of baked scenes to draw as well.
-        peers: time gsplat, too.
     """
 
     device: torch.device
@@ -52,7 +51,6 @@ class Options:
     sizes: Sequence[tuple[int, int]] = ()
     copy_bytes: float = 0.0
     bundles: Sequence[Path] = ()
-    peers: bool = True
 
 
 def attempt(what: str, run: Callable[[], T]) -> T | None:

@@ -4,8 +4,6 @@ A band is the same projection with the image's rows above it cut off. Its fragme
 more in its backward pass; nothing of it is kept in between but its part of the image.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import TypeVar

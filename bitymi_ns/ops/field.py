@@ -1,7 +1,5 @@
 """The residual colour field rho(x) = f_phi(E_theta(x)): contraction, hash grid, MLP."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,8 +9,7 @@ from torch import Tensor
 from .backend import check_shapes, cuda_backend, dense, kernel, kernel_class, module, on_device, on_same_device
 from .constants import FEATURES, WIDTH
 
-WEIGHTS = ("table", "w1", "w2", "w3")
-"""The kernels' names of the field's parameters."""
+WEIGHTS = ("table", "w1", "w2", "w3")  # the kernels' names of the field's parameters
 
 
 @dataclass(frozen=True)

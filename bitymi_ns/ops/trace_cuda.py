@@ -4,8 +4,6 @@ Two numbers decide how much memory is needed, so the host waits for the device t
 of surfel and tile, and for the number of fragments.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -18,8 +16,7 @@ from .project import Projection
 
 NUMBERS = 24
 """That a fragment takes in a training step: 7 in the list, 3 of its colour, 8 of their gradients; the rest is slack."""
-FEW = 1 << 23
-"""Fragments for which there is always room, so that nobody asks the device for its free memory."""
+FEW = 1 << 23  # fragments for which there is always room, so that nobody asks the device for its free memory
 LISTS_PER_CHECK = 100
 """Lists after which the device is asked again. Asking takes as long as a tenth of a training step, and between steps
 only other programs change the answer: torch keeps the memory of a list for the next one."""

@@ -4,8 +4,6 @@ csrc/core/view_kinds.h computes the colour in a direction, in float64 `ops.refer
 depends on the kind is in its entry here.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
@@ -21,14 +19,10 @@ from .sphere import fibonacci_sphere
 
 Limit = tuple[float, ...]
 """Largest absolute value of a parameter, one for all its numbers or one for each along its last axis."""
-COLOR_LIMIT = 256.0
-"""Largest absolute value of a colour, a coefficient or the colour of a lobe, 1 = white."""
-SHAPE_LIMIT = 1e4
-"""Of logits, angles and logarithms of sharpness: sigmoid and exp have long reached their ends."""
-DIRECTION_LIMIT = 1e6
-"""Of directions of any length: the renderers normalise."""
-VECTOR_LIMIT = 2e7
-"""Of differences of two temperatures of at most exp(16) times a direction."""
+COLOR_LIMIT = 256.0  # largest absolute value of a colour, a coefficient or the colour of a lobe, 1 = white
+SHAPE_LIMIT = 1e4  # of logits, angles and logarithms of sharpness: sigmoid and exp have long reached their ends
+DIRECTION_LIMIT = 1e6  # of directions of any length: the renderers normalise
+VECTOR_LIMIT = 2e7  # of differences of two temperatures of at most exp(16) times a direction
 
 
 @dataclass(frozen=True)

@@ -7,14 +7,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError
 
-REFERENCE_STEPS = 30_000
-"""Run length that every step count below is stated for."""
-ExposureKind = Literal["auto", "off", "gain", "affine"]
-"""Colour corrections of the photographs."""
-Background = Literal["auto", "black", "white", "random"]
-"""Colours behind the scene."""
-MOST = 10**9
-"""Largest value of a count, and of a weight."""
+REFERENCE_STEPS = 30_000  # run length that every step count below is stated for
+ExposureKind = Literal["auto", "off", "gain", "affine"]  # colour corrections of the photographs
+Background = Literal["auto", "black", "white", "random"]  # colours behind the scene
+MOST = 10**9  # largest value of a count, and of a weight
 Share = Annotated[float, Field(ge=0, le=1)]
 PositiveShare = Annotated[float, Field(gt=0, le=1)]
 NonNegative = Annotated[float, Field(ge=0, le=MOST)]

@@ -1,7 +1,5 @@
 """Files that the viewer serves: the built page and the files of a bundle; and their export as a folder."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -34,8 +32,7 @@ POLICY = (
 )
 """Nothing of a bundle runs: scripts come from the page alone, and a bundle's files are never sent as such."""
 BUNDLE = "bundle/"
-SINGLE = "scene.bitymi"
-"""Name of the one file beside an exported page."""
+SINGLE = "scene.bitymi"  # name of the one file beside an exported page
 _ASKS = '<meta name="bundle" content="{}" />'
 """Tag that names the bundle file of the page; empty = the folder beside it."""
 

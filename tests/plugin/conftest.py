@@ -1,7 +1,5 @@
 """Small captures in nerfstudio's format."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Building a scene without nerfstudio."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Colour corrections of the photographs: the formula, what is kept of them, when there are any, and resuming."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Training with the real renderer, small and short."""
 
-from __future__ import annotations
-
 import ast
 import math
 from pathlib import Path

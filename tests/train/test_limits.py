@@ -1,7 +1,5 @@
 """No bound is met in silence."""
 
-from __future__ import annotations
-
 import pytest
 
 from bitymi_ns.scene.config import SceneConfig

@@ -1,7 +1,5 @@
 """Optimisers that step together do what each does alone, to the last bit."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch.nn import Parameter

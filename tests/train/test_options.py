@@ -1,7 +1,5 @@
 """Ranges of the training options."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, get_type_hints

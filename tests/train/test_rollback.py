@@ -1,7 +1,5 @@
 """Runs that diverge: they recover or say why, and never end with a scene that is not finite."""
 
-from __future__ import annotations
-
 import math
 import warnings
 

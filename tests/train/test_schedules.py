@@ -1,7 +1,5 @@
 """Short runs are proper runs: the same events, as often, at the same share of the run."""
 
-from __future__ import annotations
-
 import itertools
 
 import pytest

@@ -1,7 +1,5 @@
 """Rules of densification and pruning, with the multi-view scores given."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

@@ -16,7 +16,7 @@ from bitymi_ns.measure.bench.process import BenchError
 from bitymi_ns.presets import preset_names
 from bitymi_ns.trust import inside
 
-Kind = Literal["train", "eval", "export", "pictures", "knobs"]
+Kind = Literal["train", "eval", "export", "pictures"]
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class Run:
 
     @property
     def folder(self) -> str:
-        """Its path below runs/, bundles/, evals/, pictures/, knobs/ and logs/."""
+        """Its path below runs/, bundles/, evals/, pictures/ and logs/."""
         return f"{self.scene.name}/{self.row.method}/{self.name}"
 
     def __str__(self) -> str:
@@ -138,7 +138,6 @@ class Matrix:
         seeds: empty = once, with the method's own seed.
         steps: length of a run; None = the method's own for this machine.
         pictures: number of worst held-out views that are drawn with their decomposition.
-        knobs: measure the quality knobs of each run.
     """
 
     scenes: Sequence[SceneSpec]
@@ -147,7 +146,6 @@ class Matrix:
     steps: int | None = None
     bundles: Sequence[Bundle] = field(default_factory=tuple)
     pictures: int = 0
-    knobs: bool = False
 
     def runs(self) -> list[Run]:
         """All trainings, the seeds of a row one after another."""
@@ -163,8 +161,6 @@ class Matrix:
             stages += [Stage(run, "export", bundle), Stage(run, "eval", bundle)]
         if self.pictures:
             stages.append(Stage(run, "pictures", count=self.pictures))
-        if self.knobs:
-            stages.append(Stage(run, "knobs"))
         return stages
 
     def chains(self) -> list[list[Stage]]:

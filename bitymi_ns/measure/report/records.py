@@ -1,4 +1,4 @@
-"""Records of a report and how they relate: evaluations, training curves, knob settings, worst views, found poses."""
+"""Records of a report and how they relate: evaluations, training curves, worst views, found poses."""
 
 import math
 import re
@@ -78,7 +78,6 @@ class Records:
 
     Attributes:
         images: photographs beside renders, as ns-eval writes them.
-        knobs: lines of `bitymi bench knobs`, with `scene` and `run`.
         worst: title of a view -> its pictures, (caption, file).
         poses: report.json of found poses -> its content; a picture of the cameras lies beside it.
     """
@@ -86,7 +85,6 @@ class Records:
     evaluations: list[Evaluation] = field(default_factory=list)
     curves: list[Curve] = field(default_factory=list)
     images: list[Path] = field(default_factory=list)
-    knobs: list[dict[str, Any]] = field(default_factory=list)
     worst: dict[str, list[tuple[str, Path]]] = field(default_factory=dict)
     poses: dict[Path, dict[str, Any]] = field(default_factory=dict)
     machines: list[str] = field(default_factory=list)

@@ -1,7 +1,5 @@
 """A baked scene as the arrays that the shaders read (shaders/scene.wgsl)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,8 +12,7 @@ from ..constants import SUPPORT
 from ..view_color import LEAN, check_lean, check_view_color
 from ..view_kinds import VIEW_COLORS
 
-WHOLE = " sites"
-"""What a form is called, behind its kind, that holds sites and no base."""
+WHOLE = " sites"  # what a form is called, behind its kind, that holds sites and no base
 FORMS = [kind + end for kind, entry in VIEW_COLORS.items() for end in (("", WHOLE) if entry.sites else ("",))]
 KINDS = {name: number for number, name in enumerate(FORMS)}
 """Forms of view colours, by their numbers in view_color.wgsl."""

@@ -1,7 +1,5 @@
 """The shaders, put together and compiled for a device."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources

@@ -4,8 +4,6 @@ pycolmap's reader accepts truncated files, ends photograph names in text files a
 without points. So files are parsed here; camera models and their geometry are pycolmap's (`plugin/data/lens.py`).
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import os

@@ -1,7 +1,5 @@
 """Photographs of a COLMAP model: find the image and mask files, and convert poses and points to nerfstudio's frame."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Depth maps, their confidence, and normal maps in files, as programs and scanners write them."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass

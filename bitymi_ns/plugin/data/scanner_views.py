@@ -1,8 +1,6 @@
 """Photographs of scanning programs and RGB-D sets: Polycam's raw folder, Record3D's, and folders of color images with a
 text file per pose (ScanNet, 7-Scenes)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,8 +1,6 @@
 """Poses of photographs and videos by structure from motion, and the copy of them that a training run keeps: whatever
 becomes of the photographs, the run goes on with the poses it was trained with."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

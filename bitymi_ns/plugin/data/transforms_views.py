@@ -4,8 +4,6 @@ The three differ in how they state a focal length and where photographs lie; eve
 a frame before the top of the file. Entries that nothing reads are reported.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Iterable, Sequence

@@ -1,8 +1,6 @@
 """Views of a capture for training: photographs with cameras and poses become pinhole pictures in nerfstudio's frame,
 those of wide cameras several."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -32,10 +30,8 @@ OPENCV_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 USUAL_SPREAD, MAX_SPREAD = 2.5, 25.0
 """Median distance of cameras from their middle, in half sides of the scene box: of NeRF-Synthetic, and from which on a
 capture is taken to be in another unit."""
-NO_PHOTOS = "without photographs"
-"""Metadata key of views whose photographs are gone."""
-LONGEST_SIDE = 1600
-"""Default longest side of a training photograph, pixels; as in papers on such captures."""
+NO_PHOTOS = "without photographs"  # metadata key of views whose photographs are gone
+LONGEST_SIDE = 1600  # default longest side of a training photograph, pixels; as in papers on such captures
 
 
 @dataclass(frozen=True)

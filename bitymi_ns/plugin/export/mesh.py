@@ -1,7 +1,5 @@
 """`ns-export bitymi-mesh`: the surface of a trained scene or of a bundle as a triangle mesh."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -29,8 +27,7 @@ from bitymi_ns.progress import rich_progress
 from bitymi_ns.scene.camera import Camera
 
 NAME = "mesh"
-MOST_VIEWS = 400
-"""Training views that are fused at most, evenly spaced."""
+MOST_VIEWS = 400  # training views that are fused at most, evenly spaced
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,7 @@ from dataclasses import dataclass, field
 
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 
-INTERRUPTED = 130
-"""Exit status after Ctrl-C, by the convention of shells."""
+INTERRUPTED = 130  # exit status after Ctrl-C, by the convention of shells
 
 
 class _StopAfterStep(Exception):

@@ -1,7 +1,5 @@
 """How tests read a capture."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What the data manager makes of captures, good and bad."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Models as other programs and editors write them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

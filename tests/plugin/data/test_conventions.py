@@ -1,7 +1,5 @@
 """Poses in another convention than that of their file, told by the capture's points."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

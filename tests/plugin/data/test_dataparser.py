@@ -1,7 +1,5 @@
 """The presets' parser: what it makes of captures with a transforms.json, of Blender's and of instant-ngp's."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The presets' parser: what it makes of COLMAP models."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The presets' parser: what it makes of photographs and videos, whose poses are found first."""
 
-from __future__ import annotations
-
 import sys
 import types
 from contextlib import nullcontext

@@ -1,7 +1,5 @@
 """Depth and normals of a capture: files, units, fits, initial points, and what is wrong with them."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

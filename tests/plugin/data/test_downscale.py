@@ -1,7 +1,5 @@
 """Large photographs are reduced as they are read: cameras, pictures, masks and messages go with it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

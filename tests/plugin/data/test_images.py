@@ -1,7 +1,5 @@
 """Photographs and masks of all kinds, and which of them there is anything to learn from."""
 
-from __future__ import annotations
-
 import shutil
 import struct
 import zlib

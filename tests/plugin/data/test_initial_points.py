@@ -1,7 +1,5 @@
 """What training starts from: the points of a capture, triangulated ones, or random ones."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Photographs beyond what may be kept are read anew: the same pixels, and only so many at once."""
 
-from __future__ import annotations
-
 import weakref
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Point clouds that are cut off, whatever their format."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

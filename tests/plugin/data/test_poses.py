@@ -1,7 +1,5 @@
 """Poses that are no rotations, and cameras that are somewhere else."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Up and metres of a capture whose poses were found here, from its reader to the bundle."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import types

@@ -1,7 +1,5 @@
 """What stands in transforms.json beside poses, well meant or not."""
 
-from __future__ import annotations
-
 import json
 import math
 import struct

@@ -1,8 +1,6 @@
 """Captures that other programs are known to read as another scene than they show, or not at all; each case by what is
 special about it, in every format that can have it."""
 
-from __future__ import annotations
-
 import json
 import unicodedata
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Captures with photographs of wide cameras, some or all of them."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 from typing import Any

@@ -78,6 +78,8 @@ def find_sfm_source(found: Found, masks_path: Path | None, downscale: int, setti
         f"Poses of {poses.registered} of {poses.given} photographs of {found.path}, to {poses.reprojection_error:.2f} "
         f"pixels; how they were found is in {poses.report}."
     )
+    if poses.doubt:
+        warn(poses.doubt)
     masks = _masks(found, masks_path, downscale)
     source = make_source(poses.model, poses.images, masks, downscale, poses.left_out)
     made = poses.images.is_relative_to(poses.report.parent)  # upright copies and frames lie in the work folder

@@ -29,17 +29,11 @@ TOOLS = ("scikit-build-core", "nanobind", "cmake", "ninja", "numpy")
 
 @dataclass(frozen=True)
 class Step:
-    """A process.
+    """A process."""
 
-    Attributes:
-        name: in the summary.
-        commands: one, or several that run at the same time.
-        limit: seconds.
-    """
-
-    name: str
-    commands: Sequence[Sequence[str]]
-    limit: float
+    name: str  # in the summary
+    commands: Sequence[Sequence[str]]  # one, or several that run at the same time
+    limit: float  # seconds
 
 
 def python(script: str, *words: str) -> list[str]:

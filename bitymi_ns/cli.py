@@ -82,6 +82,8 @@ class Sfm:
             f"{poses.registered} of {poses.given} photographs have a pose; mean reprojection error "
             f"{poses.reprojection_error:.2f} pixels. Report: {(self.output or poses.report) / 'report.md'}"
         )
+        if poses.doubt:
+            say(poses.doubt, sys.stderr)
         say(f"Wrote {self.output}" if self.output else f"COLMAP model: {poses.model}")
 
 

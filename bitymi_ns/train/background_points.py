@@ -30,17 +30,11 @@ IN_FRONT = 0.2  # most photographs that have it in front of the points of a cell
 
 
 class BackgroundPoints(NamedTuple):
-    """Points in empty cells, in random order.
+    """Points in empty cells, in random order."""
 
-    Attributes:
-        xyz: [B, 3] world positions.
-        rgb: [B, 3] mean colours of their cells, in [0, 1].
-        scales: [B] largest first scales of their surfels, world units.
-    """
-
-    xyz: Tensor
-    rgb: Tensor
-    scales: Tensor
+    xyz: Tensor  # [B, 3] world positions
+    rgb: Tensor  # [B, 3] mean colours of their cells, in [0, 1]
+    scales: Tensor  # [B] largest first scales of their surfels, world units
 
 
 @torch.no_grad()
@@ -90,14 +84,10 @@ def background_points(points: Tensor, views: Sequence[View], seed: int) -> Backg
 
 
 class _Grid(NamedTuple):
-    """Cells of a view.
+    """Cells of a view."""
 
-    Attributes:
-        nearest: [rows, columns] camera z of the nearest sparse point; infinite in empty cells.
-        width, height: of a cell, pixels.
-    """
-
-    nearest: Tensor
+    nearest: Tensor  # [rows, columns] camera z of the nearest sparse point; infinite in empty cells
+    # width, height: of a cell, pixels
     width: float
     height: float
 

@@ -30,20 +30,14 @@ FEWEST_TESTED = 1000  # fewest observations for a test on the other half of the 
 
 
 class ExposureGains(NamedTuple):
-    """Gains of the photographs, and how well they explain the differences of colours.
+    """Gains of the photographs, and how well they explain the differences of colours."""
 
-    Attributes:
-        log_gains: [V, 3] float32 natural logarithm of each photograph's gain per channel; each channel has mean 0.
-        points: [V] int64, how many points each photograph was judged by.
-        before: median over the observations of one half of the points of how far they are from their point's colour, in
-            natural logarithms; NaN where there were too few.
-        after: the same once the gains found on the other half of the points are taken out.
-    """
-
-    log_gains: Tensor
-    points: Tensor
+    log_gains: Tensor  # [V, 3] float32 natural logarithm of each photograph's gain per channel; each channel has mean 0
+    points: Tensor  # [V] int64, how many points each photograph was judged by
+    # median over the observations of one half of the points of how far they are from their point's colour, in natural
+    # logarithms; NaN where there were too few
     before: float
-    after: float
+    after: float  # the same once the gains found on the other half of the points are taken out
 
     @property
     def explained(self) -> float:

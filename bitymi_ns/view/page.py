@@ -43,17 +43,12 @@ class PageError(ValueError):
 
 @dataclass(frozen=True)
 class Site:
-    """Files served.
+    """Files served."""
 
-    Attributes:
-        files: path on the server, without the first slash, to the file.
-        made: the same for what is checked when it is asked for, or lies in no file: to what gives its contents.
-        left_out: files that the bundle lists, and that are not served.
-    """
-
-    files: Mapping[str, Path]
+    files: Mapping[str, Path]  # path on the server, without the first slash, to the file
+    # the same for what is checked when it is asked for, or lies in no file: to what gives its contents
     made: Mapping[str, Callable[[], bytes | bytearray]]
-    left_out: Sequence[str] = ()
+    left_out: Sequence[str] = ()  # files that the bundle lists, and that are not served
 
     def __contains__(self, path: str) -> bool:
         return path in self.made or path in self.files

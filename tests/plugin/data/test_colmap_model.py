@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 
 from bitymi_ns.plugin.data.colmap_model import read_model
@@ -93,3 +94,24 @@ def test_a_single_file_in_text_is_of_another_model(project: Path) -> None:
     as_binary(folder)
     (folder / "cameras.txt").write_text("1 PINHOLE 48 36 20 20 24 18\n")
     assert read_model(folder).cameras[1].params[0] == 40.0
+
+
+@pytest.mark.parametrize("form", ["txt", "bin"])
+def test_every_camera_of_a_rig_has_its_own_pose_in_a_model(tmp_path: Path, form: str) -> None:
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_cameras_per_rig=2, num_frames_per_rig=3, num_points3D=20, sensor_from_rig_rotation_stddev=20.0
+    )
+    written = pycolmap.synthesize_dataset(options)
+    (written.write_text if form == "txt" else written.write_binary)(tmp_path)
+    by_name = {image.name: image for image in written.images.values()}
+    images = read_model(tmp_path).images
+    assert len(images) == len(by_name) == 6
+    for image in images:
+        other = by_name[image.name]
+        x, y, z, w = other.cam_from_world().rotation.quat
+        np.testing.assert_allclose(image.qvec, [w, x, y, z], atol=1e-12)
+        np.testing.assert_allclose(image.tvec, other.cam_from_world().translation, atol=1e-12)
+        assert (image.camera_id, image.frame) == (other.camera_id, other.frame_id)
+    (turn,) = {round(image.cam_from_world().rotation.angle_to(image.frame.rig_from_world.rotation), 9)
+               for image in by_name.values() if image.camera_id == 2}  # fmt: skip
+    assert turn > 0.01  # else the poses would say nothing

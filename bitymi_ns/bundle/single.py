@@ -19,17 +19,11 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 
 @dataclass(frozen=True)
 class Written:
-    """Sizes of a written file.
+    """Sizes of a written file."""
 
-    Attributes:
-        first: bytes from the start to the end of the surfels.
-        bytes: of the file.
-        left_out: files that the bundle lists and the format does not name, which the file does not have.
-    """
-
-    first: int
-    bytes: int
-    left_out: list[str]
+    first: int  # bytes from the start to the end of the surfels
+    bytes: int  # of the file
+    left_out: list[str]  # files that the bundle lists and the format does not name, which the file does not have
 
 
 def write_single(bundle: str | Path, path: str | Path) -> Written:

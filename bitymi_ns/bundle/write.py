@@ -57,21 +57,14 @@ _CHUNK = 1 << 22
 
 @dataclass(frozen=True)
 class World:
-    """Frame of the scene in the capture's own, x_scene = scale * (transform @ [x_capture, 1]), and in the real world.
+    """Frame of the scene in the capture's, x_scene = scale * (transform @ [x_capture, 1]), and in the real world."""
 
-    Attributes:
-        transform: [3, 4] (the dataparser's transform).
-        scale: the dataparser's scale.
-        up: [3] direction of the capture's own frame that points away from the ground; None = it is not known.
-        up_from: where `up` comes from, a word.
-        metres_per_unit: length of a unit of the capture's own frame; None = it is not known.
-    """
-
-    transform: npt.ArrayLike = field(default_factory=lambda: np.eye(4)[:3])
-    scale: float = 1.0
+    transform: npt.ArrayLike = field(default_factory=lambda: np.eye(4)[:3])  # [3, 4] (the dataparser's transform)
+    scale: float = 1.0  # the dataparser's scale
+    # [3] direction of the capture's own frame that points away from the ground; None = it is not known
     up: npt.ArrayLike | None = None
-    up_from: str = ""
-    metres_per_unit: float | None = None
+    up_from: str = ""  # where `up` comes from, a word
+    metres_per_unit: float | None = None  # length of a unit of the capture's own frame; None = it is not known
 
     def described(self) -> dict[str, Any]:
         """`manifest.WorldFrame`: up and length in the scene's own frame."""

@@ -1,7 +1,5 @@
 """Files that the viewer serves: the built page and the files of a bundle; and their export as a folder."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -36,8 +34,7 @@ POLICY = (
 """Nothing of a bundle runs: scripts come from the page alone, and a bundle's files are never sent as such."""
 BUNDLE = "bundle/"
 _NOTES = f"{BUNDLE}{NOTES}"
-SINGLE = "scene.bitymi"
-"""Name of the one file beside an exported page."""
+SINGLE = "scene.bitymi"  # name of the one file beside an exported page
 _ASKS = '<meta name="bundle" content="{}" />'
 """Tag that names the bundle file of the page; empty = the folder beside it."""
 
@@ -48,19 +45,13 @@ class PageError(ValueError):
 
 @dataclass(frozen=True)
 class Site:
-    """Files served.
+    """Files served."""
 
-    Attributes:
-        files: path on the server, without the first slash, to the file.
-        made: the same for what is checked when it is asked for, or lies in no file: to what gives its contents.
-        left_out: files that the bundle lists, and that are not served.
-        notes: gives the contents of the bundle's notes.json, which comes and goes; None = there is none.
-    """
-
-    files: Mapping[str, Path]
+    files: Mapping[str, Path]  # path on the server, without the first slash, to the file
+    # the same for what is checked when it is asked for, or lies in no file: to what gives its contents
     made: Mapping[str, Callable[[], bytes | bytearray]]
-    left_out: Sequence[str] = ()
-    notes: Callable[[], bytes | None] = lambda: None
+    left_out: Sequence[str] = ()  # files that the bundle lists, and that are not served
+    notes: Callable[[], bytes | None] = lambda: None  # the bundle's notes.json, which comes and goes; None without
 
     def __contains__(self, path: str) -> bool:
         return path in self.made or path in self.files or path == _NOTES

@@ -1,7 +1,5 @@
 """The page in the frame of a page of another origin: messages (`docs/viewer.md`), and which are heeded."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

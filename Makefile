@@ -155,7 +155,7 @@ MATRIX = $(BIN)/bitymi bench local --data $(WORK)/captures/demo $(DATA) --work $
 
 bench: setup $(WORK)/captures/demo/transforms.json
 	@failed=0; trap 'exit 130' INT; set -x; \
-	$(MATRIX) --methods $(METHODS) --knobs --output $(WORK)/captures.md || failed=1; \
+	$(MATRIX) --methods $(METHODS) --output $(WORK)/captures.md || failed=1; \
 	for plan in $(PLANS); do $(MATRIX) --plan $$plan --output $(WORK)/$$plan.md || failed=1; done; \
 	$(BIN)/bitymi stability --output $(WORK)/stability.md || failed=1; \
 	$(BIN)/bitymi report $(WORK) --output-dir $(WORK)/report --title "bitymi bench" || failed=1; \

@@ -29,17 +29,11 @@ TOOLS = ("scikit-build-core", "nanobind", "cmake", "ninja", "numpy")
 
 @dataclass(frozen=True)
 class Step:
-    """A process.
+    """A process."""
 
-    Attributes:
-        name: in the summary.
-        commands: one, or several that run at the same time.
-        limit: seconds.
-    """
-
-    name: str
-    commands: Sequence[Sequence[str]]
-    limit: float
+    name: str  # in the summary
+    commands: Sequence[Sequence[str]]  # one, or several that run at the same time
+    limit: float  # seconds
 
 
 def python(script: str, *words: str) -> list[str]:
@@ -55,7 +49,7 @@ def sanitizer(tool: str, *sections: str) -> list[str]:
 
 def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | None = None) -> dict[str, list[Step]]:
     """Steps of every order, by name. `fox` needs that capture in `data`; `train`, `gaussians` and `peers` take every
-    other one. `peers`, `kernels` and `webgpu` draw the bundles that orders before them left, `peers` the Gaussians of
+    other one. `peers` and `kernels` draw the bundles that orders before them left, `peers` the Gaussians of
     `gaussians`, too.
 
     Args:
@@ -89,7 +83,7 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
         ],
         "tables": [
             Step(name, [page(f"{name}.md", "gpu.py", "--runs", "100", "--sections", name, "--surfels", *surfels)], 120)
-            for name in ("baked", "operations", "steps")
+            for name in ("baked", "steps")
         ],
         "fox": [
             Step(
@@ -135,10 +129,7 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
             )
             for size in ("1297x840", "3840x2160")
         ],
-        "webgpu": [
-            Step("webgpu tests", [[*pytest, "--timeout=60", "tests/ops/webgpu"]], 60),
-            Step("webgpu", [page("webgpu.md", "gpu_webgpu.py", *sorted(bundles.glob("bitymi*")))], 90),
-        ],
+        "webgpu": [Step("webgpu tests", [[*pytest, "--timeout=60", "tests/ops/webgpu"]], 60)],
     }
 
 

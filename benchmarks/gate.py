@@ -43,21 +43,13 @@ class Settings:
 
 @dataclass(frozen=True)
 class Limit:
-    """Tolerance of a figure against the baseline.
+    """Tolerance of a figure against the baseline."""
 
-    Attributes:
-        better: whether "more" or "less" of it is better.
-        by: the largest step in the wrong direction.
-        relative: `by` is a share of the baseline and not a difference.
-        digits: that are shown.
-        timed: depends on the kind of processor; judged only where it is that of the baseline.
-    """
-
-    better: str
-    by: float
-    relative: bool = True
-    digits: int = 0
-    timed: bool = False
+    better: str  # whether "more" or "less" of it is better
+    by: float  # the largest step in the wrong direction
+    relative: bool = True  # `by` is a share of the baseline and not a difference
+    digits: int = 0  # that are shown
+    timed: bool = False  # depends on the kind of processor; judged only where it is that of the baseline
 
     def worse(self, value: float, baseline: float, slack: float = 1.0) -> bool:
         """True if the figure is worse than the baseline by more than `slack` times its limit."""
@@ -212,17 +204,13 @@ def in_a_process(data: Path, downscale: int, settings: Settings) -> dict[str, fl
 
 @dataclass(frozen=True)
 class Line:
-    """One figure of one scene beside its baseline.
-
-    Attributes:
-        verdict: "ok", "WORSE", "new" (no baseline) or "not judged" (a time on another kind of processor).
-    """
+    """One figure of one scene beside its baseline."""
 
     scene: str
     figure: str
     before: float | None
     now: float
-    verdict: str
+    verdict: str  # "ok", "WORSE", "new" (no baseline) or "not judged" (a time on another kind of processor)
 
     def cells(self) -> list[str]:
         """For the table."""

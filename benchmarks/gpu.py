@@ -1,25 +1,86 @@
 #!/usr/bin/env python
-"""Time the CUDA kernels on a card, section by section (median after a warm-up), and print tables.
+"""Time baked frames and training steps on a card (median after a warm-up) and print tables.
 
-Needs the core packages alone (torch, numpy); nerfstudio is not used. gsplat is timed beside ours where it can be
-imported. `--emulated` runs the host's emulation of the kernels on tiny scenes, to try the script without a card; its
-times mean nothing.
+Needs the core packages alone (torch, numpy). `--emulated` runs the host's emulation of the kernels on tiny scenes, to
+try the script without a card; its times mean nothing.
 """
 
 import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 
 import gpu_baked
-import gpu_operations
 import torch
-from common import arguments_of, number, page, publish
-from harness import Options, copy_bandwidth
+from common import arguments_of, number, page, publish, say, table
+from harness import (
+    Options,
+    attempt,
+    copy_bandwidth,
+    failures,
+    milliseconds,
+    peak_memory,
+    photo_loss,
+    trained_like,
+    training_step,
+    with_texels,
+)
+from torch import Tensor
 
 from bitymi_ns.ops.backend import emulated_cuda
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.scene import Scene
 
-SECTIONS = {"baked": gpu_baked.frames, "operations": gpu_operations.operations, "steps": gpu_operations.steps}
+
+def steps(options: Options) -> str:
+    """Whole training steps: rendering, 0.8 L1 + 0.2 (1 - SSIM), backward, Adam."""
+    parts = []
+    for width, height in options.sizes:
+        photo = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(1)).to(options.device)
+        for n in options.surfels:
+            rows, where = [], f"{n:,} surfels, {width} x {height}"
+            for name, run, pairs in attempt(where, partial(_steps, n, width, height, photo, options)) or ():
+                ms = attempt(f"{where}, {name}", partial(milliseconds, run, options))
+                if ms is None:
+                    continue
+                say(f"{where}, step of {name}: {ms:.3f} ms")
+                memory = peak_memory(run, options.device) / 1e6
+                rows.append([name, number(ms, 3), number(pairs, 0), number(memory, 0)])
+            header = ("step", "ms", "pairs of surfel and tile", "peak MB")
+            parts.append(f"#### {n:,} surfels at {width} x {height}\n\n" + table(header, rows))
+    return "### Training steps\n\n" + "\n\n".join(parts) + failures()
+
+
+def _steps(
+    n: int, width: int, height: int, photo: Tensor, options: Options
+) -> list[tuple[str, Callable[[], object], int]]:
+    device, loss = options.device, photo_loss(photo)
+    cases: list[tuple[str, Callable[[], object], int]] = []
+    for name, mode in (
+        ("bitymi, field training", "train"),
+        ("bitymi, field frozen", "frozen"),
+        ("bitymi, sv", "off"),
+        ("bitymi, texels training", "train"),
+    ):
+        if "texels" in name:
+            scene, camera = with_texels(n, width, height, device)
+        else:
+            scene, camera = trained_like(n, width, height, device, texture=mode != "off")
+        # texels have no optimiser: the backward pass moves them
+        whole = mode == "train" and "texels" not in name
+        parameters = list(scene.parameters() if whole else scene.surfels.parameters())
+
+        def render(scene: Scene = scene, camera: Camera = camera, mode: str = mode) -> Tensor:
+            return scene.render(camera, field_mode=mode).rgb
+
+        pairs = scene.render(camera, field_mode="off").fragments.layout.handle.pairs
+        cases.append((name, training_step(render, loss, parameters), pairs))
+    return cases
+
+
+SECTIONS = {"baked": gpu_baked.frames, "steps": steps}
 
 
 def card(device: torch.device) -> list[str]:
@@ -49,7 +110,6 @@ def main() -> int:
     parser.add_argument("--warm-up", type=int, default=10)
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--sections", nargs="+", choices=list(SECTIONS), default=list(SECTIONS))
-    parser.add_argument("--no-peers", action="store_true", help="leave gsplat out")
     parser.add_argument("--emulated", action="store_true", help="try the script without a card")
     parser.add_argument("--output", type=Path, help="also write the Markdown to this file, anew as each section ends")
     arguments = parser.parse_args()
@@ -69,7 +129,7 @@ def main() -> int:
             f"Times: medians of about {runs} calls after {warm_up}, queued so that the host does not hold the device "
             "up, unless a column says otherwise.",
         ]
-        options = Options(device, warm_up, runs, surfels, sizes, bandwidth, arguments.bundles, not arguments.no_peers)
+        options = Options(device, warm_up, runs, surfels, sizes, bandwidth, arguments.bundles)
         for name in arguments.sections:
             parts.append(SECTIONS[name](options))
             publish(page("CUDA kernels", "\n\n".join(parts), notes), arguments.output, name != arguments.sections[-1])

@@ -1,4 +1,4 @@
-"""Section of gpu.py: frames of the baked renderer, stage by stage, beside gsplat's.
+"""Section of gpu.py: frames of the baked renderer, stage by stage.
 
 The scene of `harness.trained_like` with BC7 tiles of random texels, as large as the surfels are on screen, and the
 weight bound of the presets; or bundles (--bundles), seen by three cameras around their middle. What a stage cannot do
@@ -21,7 +21,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import gpu_gsplat
 import torch
 from common import number, say, table
 from harness import (
@@ -55,30 +54,26 @@ HEADER = (
 
 
 def frames(options: Options) -> str:
-    """Every scene at every size, then gsplat at the same sizes."""
+    """Every scene at every size."""
     rate = arithmetic_rate(options)
-    rows, graphs = [], {}
+    rows = []
     sizes = [*options.sizes, *([LARGE] if options.device.type == "cuda" and LARGE not in options.sizes else [])]
+    how = (options, rate)
     for width, height in sizes:
         for n in options.surfels:
-            if made := attempt(
-                f"{n:,} surfels, {width} x {height}", partial(_synthetic, n, width, height, options, rate)
-            ):
-                rows.append(made[0])
-                graphs[n, width, height] = made[1]
+            rows.append(attempt(f"{n:,} surfels, {width} x {height}", partial(_synthetic, n, width, height, *how)))
         for folder in options.bundles:
-            if made := attempt(f"{folder}, {width} x {height}", partial(_bundle, folder, width, height, options, rate)):
-                rows.append(made[0])
+            rows.append(attempt(f"{folder}, {width} x {height}", partial(_bundle, folder, width, height, *how)))
     text = f"### Baked renderer\n\nfp32, measured by a product of matrices: {number(rate / 1e12, 1)} TFLOP/s.\n\n"
-    return text + table(HEADER, rows) + (gpu_gsplat.frames(options, graphs) if options.peers else "") + failures()
+    return text + table(HEADER, list(filter(None, rows))) + failures()
 
 
-def _synthetic(n: int, width: int, height: int, options: Options, rate: float) -> tuple[list[str], float]:
+def _synthetic(n: int, width: int, height: int, options: Options, rate: float) -> list[str]:
     scene, camera = textured(n, width, height, options.device)
     return _row(f"synthetic, {n:,}", scene, [camera], options, rate)
 
 
-def _bundle(folder: Path, width: int, height: int, options: Options, rate: float) -> tuple[list[str], float]:
+def _bundle(folder: Path, width: int, height: int, options: Options, rate: float) -> list[str]:
     bundle = read_bundle(folder, decode=options.device.type != "cuda")
     scene = bundle.scene.to(options.device)
     return _row(f"{Path(folder).name}, {len(bundle):,}", scene, around(bundle, width, height), options, rate)
@@ -172,12 +167,11 @@ def measured(scene: BakedScene, cameras: Sequence[Camera], options: Options) -> 
     return {key: value / len(cameras) for key, value in sums.items()} | {"steps": steps}
 
 
-def _row(name: str, scene: BakedScene, cameras: list[Camera], options: Options, rate: float) -> tuple[list[str], float]:
-    """A line of the table; and the milliseconds of the recorded, packed frame."""
+def _row(name: str, scene: BakedScene, cameras: list[Camera], options: Options, rate: float) -> list[str]:
     width, height, mean = cameras[0].width, cameras[0].height, measured(scene, cameras, options)
     say(f"baked, {name} surfels, {width} x {height}: {mean['graph']:.3f} ms")
     pixels, draw = width * height, 1e-3 * mean["draw"]
-    row = [
+    return [
         name,
         f"{width} x {height}",
         number(mean["pairs"] / 1e6, 2),
@@ -191,7 +185,6 @@ def _row(name: str, scene: BakedScene, cameras: list[Camera], options: Options, 
         f"{100 * 60 * mean['fragments'] / draw / rate:.0f} %",
         f"{100 * (100 * mean['pairs'] + 12 * pixels) / draw / options.copy_bytes:.0f} %",
     ]
-    return row, mean["packed"]
 
 
 def around(bundle, width: int, height: int) -> list[Camera]:

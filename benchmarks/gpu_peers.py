@@ -20,7 +20,6 @@ from typing import Any
 import torch
 from common import arguments_of, number, page, publish, say, table
 from gpu_baked import measured
-from gpu_gsplat import RENDERERS, Frames, load
 from harness import Options, attempt, milliseconds
 from plain_capture import Capture, load_capture
 from torch import Tensor
@@ -37,6 +36,44 @@ from bitymi_ns.train.losses import cc_psnr, photometric, psnr
 from bitymi_ns.train.views import View, training_order
 
 RATES = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}
+
+Frames = Callable[[Camera], Callable[[], Tensor]]  # makes for a camera a function that draws its view, [H, W, 3]
+
+
+def rasterized(gsplat: Any, g: dict[str, Tensor]) -> Frames:
+    """Frames by gsplat's rasterization, of Gaussians as in `Gaussians.finished`."""
+
+    def make(camera: Camera) -> Callable[[], Tensor]:
+        view = (camera.viewmat[None], camera.K[None], camera.width, camera.height)
+        return torch.no_grad()(lambda: gsplat.rasterization(*g.values(), *view, sh_degree=3, packed=False)[0][0])
+
+    return make
+
+
+def inferred(gsplat: Any, g: dict[str, Tensor]) -> Frames:
+    """Frames by its inference renderer, of a scene that is packed to half precision beforehand."""
+    from gsplat.experimental import GaussianInferenceRenderer, GaussianInferenceScene
+
+    scene = GaussianInferenceScene.from_gaussian_tensors(
+        *g.values(), sh_degree=3, sh_compression="none", id=f"none{len(g['means'])}"
+    )
+    renderer = GaussianInferenceRenderer(scene)
+
+    def make(camera: Camera) -> Callable[[], Tensor]:
+        view = {"viewmat": camera.viewmat, "K": camera.K, "width": camera.width, "height": camera.height}
+        return torch.inference_mode()(lambda: renderer.render(**view).frame[0, ..., :3])
+
+    return make
+
+
+def load() -> tuple[Any, str]:
+    """Import gsplat: the module and, where it is missing, the reason."""
+    try:
+        import gsplat
+        import gsplat.cuda._backend  # compiles the kernels where that was not done
+    except (ImportError, RuntimeError, OSError) as error:
+        return None, f"gsplat cannot be timed here: {error}"
+    return gsplat, ""
 
 
 @dataclass
@@ -242,11 +279,10 @@ def main() -> int:
         write()
     for file in sorted(arguments.gaussians.glob("*.pt")) if gsplat is not None else []:
         g, seconds = torch.load(file, map_location=device, weights_only=True)
-        for name in ("rasterization", "inference renderer"):
+        for name, renderer in {"rasterization": rasterized, "inference renderer": inferred}.items():
 
-            def drawn(name: str = name, g: dict = g, s: float = seconds) -> Row:
-                made = RENDERERS[name](gsplat, g)
-                return row(f"gsplat {name}", len(g["means"]), s, made, capture, cameras, times, options)
+            def drawn(name: str = name, make: Callable = renderer, g: dict = g, s: float = seconds) -> Row:
+                return row(f"gsplat {name}", len(g["means"]), s, make(gsplat, g), capture, cameras, times, options)
 
             if found := attempt(f"{name}, {file.stem}", drawn):
                 rows.append(found)

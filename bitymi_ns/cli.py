@@ -82,6 +82,8 @@ class Sfm:
             f"{poses.registered} of {poses.given} photographs have a pose; mean reprojection error "
             f"{poses.reprojection_error:.2f} pixels. Report: {(self.output or poses.report) / 'report.md'}"
         )
+        if poses.doubt:
+            say(poses.doubt, sys.stderr)
         say(f"Wrote {self.output}" if self.output else f"COLMAP model: {poses.model}")
 
 
@@ -90,7 +92,7 @@ class Report:
     """Turn ns-eval results and training logs into one page: tables and plots of error against time."""
 
     inputs: tyro.conf.Positional[tuple[Path, ...]]
-    """JSON files that ns-eval wrote, cells and knobs of `bitymi bench`, training curves, images, and folders to search
+    """JSON files that ns-eval wrote, cells of `bitymi bench`, training curves, images, and folders to search
     for these."""
     output_dir: Path = Path("report")
     """Folder to write the page to."""
@@ -133,27 +135,6 @@ class Stability:
 
 
 @dataclass
-class BenchKnobs:
-    """Measure what each quality knob of rendering and baking costs in error and saves in time or bytes."""
-
-    load_config: Path
-    """config.yml of a trained run."""
-    output: Path = Path("knobs.jsonl")
-    """File of JSON lines to write, one per knob and setting."""
-    knobs: tuple[str, ...] = ()
-    """Only these: weight_bound, transmittance, r_max, tolerance, format, resolution; none = all."""
-    views: int = 4
-    """Held-out views, evenly spaced; 0 = all."""
-    repeats: int = 3
-    """Timed renderings of each view; the median counts."""
-
-    def run(self) -> None:
-        from bitymi_ns.measure.knobs import measure_to_file
-
-        measure_to_file(self.load_config, self.output, self.knobs, self.views, self.repeats)
-
-
-@dataclass
 class BenchPictures:
     """Draw the worst held-out views of a run: photograph, render, error, f_view alone, residual, overdraw."""
 
@@ -179,14 +160,13 @@ Which = (
     | Annotated[BenchRun, _suite("mipnerf360", "Mip-NeRF 360: images_4 outdoors, images_2 indoors.")]
     | Annotated[BenchRun, _suite("tanksandtemples", "Tanks and Temples: train and truck.")]
     | Annotated[BenchRun, _suite("nerf-synthetic", "NeRF-Synthetic: eight objects on white.")]
-    | Annotated[BenchKnobs, tyro.conf.subcommand("knobs")]
     | Annotated[BenchPictures, tyro.conf.subcommand("pictures")]
 )
 
 
 @dataclass
 class Bench:
-    """Benchmarks: a matrix of scenes, methods and seeds; quality knobs; pictures of a run."""
+    """Benchmarks: a matrix of scenes, methods and seeds; pictures of a run."""
 
     what: Which
 

@@ -38,34 +38,21 @@ class PlyError(ValueError):
 
 @dataclass(frozen=True)
 class Element:
-    """Element of a PLY file.
+    """Element of a PLY file."""
 
-    Attributes:
-        count: of its rows.
-        names: of its properties.
-        row: type of a row, a field per property; None where a property is a list.
-    """
-
-    count: int
-    names: tuple[str, ...]
-    row: np.dtype | None
+    count: int  # of its rows
+    names: tuple[str, ...]  # of its properties
+    row: np.dtype | None  # type of a row, a field per property; None where a property is a list
 
 
 @dataclass(frozen=True)
 class Header:
-    """Header of a PLY file.
+    """Header of a PLY file."""
 
-    Attributes:
-        order: of the bytes, < or >; "" in a text file.
-        elements: by name, in the file's order.
-        start: where the rows begin, bytes.
-        lines: of the header.
-    """
-
-    order: str
-    elements: dict[str, Element]
-    start: int
-    lines: int
+    order: str  # of the bytes, < or >; "" in a text file
+    elements: dict[str, Element]  # by name, in the file's order
+    start: int  # where the rows begin, bytes
+    lines: int  # of the header
 
     def ahead(self, name: str) -> int | None:
         """Count lines of a text file, else bytes, between the header and an element's rows; None where lists hide

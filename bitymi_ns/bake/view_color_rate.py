@@ -32,18 +32,12 @@ BLIND_SHARE = 0.1
 
 @dataclass(frozen=True)
 class ColorChoices:
-    """Errors and parameters of the colours of N surfels for every number of terms.
+    """Errors and parameters of the colours of N surfels for every number of terms."""
 
-    Attributes:
-        error: [N, most + 1] squared error in the views, summed over pixels and channels; infinite where that number is
-            no choice.
-        base: [N, most + 1, 3].
-        terms: [N, number, width] for every number that is a choice for any surfel.
-    """
-
+    # [N, most + 1] squared error in the views, summed over pixels and channels; infinite where that number is no choice
     error: Tensor
-    base: Tensor
-    terms: Mapping[int, Tensor]
+    base: Tensor  # [N, most + 1, 3]
+    terms: Mapping[int, Tensor]  # [N, number, width] for every number that is a choice for any surfel
 
     def at(self, lmbda: float) -> dict[str, Tensor]:
         """Lean view colours of the least error + lambda bits.

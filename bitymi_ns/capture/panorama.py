@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-SPHERICAL_MODEL = "EQUIRECTANGULAR"
-"""COLMAP camera model of 360-degree pictures; its parameters are width and height."""
+SPHERICAL_MODEL = "EQUIRECTANGULAR"  # COLMAP camera model of 360-degree pictures; its parameters are width and height
 HEADER = 1 << 17  # bytes at the start of a file that are searched for metadata
 SPHERICAL = re.compile(rb"GPano:ProjectionType|ProjectionType[^a-z]{1,8}(equirectangular|cylindrical)", re.IGNORECASE)
 """XMP entries of panoramas (Google Photo Sphere)."""

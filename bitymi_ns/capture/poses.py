@@ -124,6 +124,7 @@ class _Kept(BaseModel, extra="forbid"):
     reprojection_error: float
     track_length: float
     seconds: dict[str, float]
+    contradicted: float = 0.0  # results of earlier versions have none
 
 
 def _finished(work: Path, folder: Path) -> Poses | None:
@@ -312,7 +313,7 @@ def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence
         }
         for c in model.cameras.values()
     ]
-    keys = ("left_out", "registered", "given", "reprojection_error", "track_length", "seconds")
+    keys = ("left_out", "registered", "given", "reprojection_error", "track_length", "seconds", "contradicted")
     with complete_folder(work / "result") as result:
         sparse = result / SPARSE
         sparse.mkdir(parents=True)

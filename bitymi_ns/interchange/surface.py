@@ -8,14 +8,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from bitymi_ns.ops import Prefilter, fitting_lists, project
 from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.ranges import check_ranges
 from bitymi_ns.scene.baked import as_bytes
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import GEOMETRY
@@ -49,22 +51,9 @@ class SurfaceOptions:
         watertight: close the mesh by a Poisson reconstruction from its vertices and normals.
     """
 
-    resolution: int = 256
-    triangles: int = 500_000
+    resolution: Annotated[int, Field(ge=16, le=4096)] = 256
+    triangles: Annotated[int, Field(ge=0, le=10**8)] = 500_000
     watertight: bool = False
-
-    def check(self) -> None:
-        """Refuse values out of range.
-
-        Raises:
-            ValueError: naming the option and its range.
-        """
-        for name, value, low, high in (
-            ("resolution", self.resolution, 16, 4096),
-            ("triangles", self.triangles, 0, 10**8),
-        ):
-            if not low <= value <= high:
-                raise ValueError(f"{name} must be from {low} to {high:,}, not {value}")
 
 
 @torch.no_grad()
@@ -154,7 +143,7 @@ def extract_surface(
     """
     import open3d
 
-    options.check()
+    check_ranges(options)
     small = [camera.within(BOX_SIDE) for camera in cameras]
     depths = []
     for i, camera in enumerate(small):

@@ -1,1 +1,1 @@
-"""Measuring: benchmarks and reports, stability, quality knobs, pictures of a run. Nothing of the method needs it."""
+"""Measuring: benchmarks and reports, stability, pictures of a run. Nothing of the method needs it."""

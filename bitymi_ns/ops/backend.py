@@ -1,7 +1,5 @@
 """Chooses the compiled kernel for a tensor: by its device, then by its dtype."""
 
-from __future__ import annotations
-
 import functools
 import importlib
 from collections.abc import Callable, Iterator, Sequence

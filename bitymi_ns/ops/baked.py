@@ -1,7 +1,5 @@
 """Drawing a baked scene: forward only, texels in place of the field."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """Drawing a baked scene with the CPU kernels: no fragment list."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from typing import Any

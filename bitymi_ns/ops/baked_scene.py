@@ -1,7 +1,5 @@
 """Images of a baked scene, and the parts of its renderers that all devices share."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
@@ -119,8 +117,7 @@ def common_size(cameras: Sequence[Camera]) -> tuple[int, int]:
     return sizes.pop()
 
 
-LEVELS = ("half", "quarter")
-"""Names of the levels: what is left of a side."""
+LEVELS = ("half", "quarter")  # names of the levels: what is left of a side
 
 
 def halved(atlas: Tensor) -> Tensor:

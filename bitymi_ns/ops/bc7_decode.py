@@ -1,7 +1,5 @@
 """Blocks of BC7, 4 x 4 texels in 16 bytes each, where no texture unit decodes them."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 from PIL import Image

@@ -1,7 +1,5 @@
 """Shading and compositing in one: the image of surfels with texels, or with their view colours alone."""
 
-from __future__ import annotations
-
 import functools
 
 import torch

@@ -1,7 +1,5 @@
 """Compositing: weighted sums of the fragments per pixel."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -1,7 +1,5 @@
 """Coverage: pixels of a view that every texel makes up, the weights of its step."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import torch

@@ -1,7 +1,5 @@
 """The residual colour field rho(x) = f_phi(E_theta(x)): contraction, hash grid, MLP."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,26 +9,19 @@ from torch import Tensor
 from .backend import check_shapes, cuda_backend, dense, kernel, kernel_class, module, on_device, on_same_device
 from .constants import FEATURES, WIDTH
 
-WEIGHTS = ("table", "w1", "w2", "w3")
-"""The kernels' names of the field's parameters."""
+WEIGHTS = ("table", "w1", "w2", "w3")  # the kernels' names of the field's parameters
 
 
 @dataclass(frozen=True)
 class FieldGeometry:
-    """Position of the hash grid in the world.
+    """Position of the hash grid in the world."""
 
-    Attributes:
-        min_resolution: cells along an edge of the coarsest level; each level doubles it.
-        contract: mip-NeRF 360 contraction: the unit ball around `mid` of radius `half` is kept, all space outside maps
-            into the shell up to radius 2. Without it, the cube of half edge `half` is the domain; positions are clamped
-        mid: centre, world units.
-        half: radius or half edge, world units.
-    """
-
-    min_resolution: int
+    min_resolution: int  # cells along an edge of the coarsest level; each level doubles it
+    # mip-NeRF 360 contraction: the unit ball around `mid` of radius `half` is kept, all space outside maps into the
+    # shell up to radius 2. Without it, the cube of half edge `half` is the domain; positions are clamped
     contract: bool
-    mid: tuple[float, float, float]
-    half: float
+    mid: tuple[float, float, float]  # centre, world units
+    half: float  # radius or half edge, world units
 
 
 def kernel_field(geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Tensor, w3: Tensor):

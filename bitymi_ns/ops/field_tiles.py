@@ -1,7 +1,5 @@
 """The residual field at the texel centres of an atlas, by the CUDA kernels."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 
@@ -9,8 +7,7 @@ from .backend import check_shapes, dense, kernel, require
 from .constants import FRAME
 from .field import FieldGeometry, kernel_field
 
-WARP = 32
-"""Texels that are evaluated together."""
+WARP = 32  # texels that are evaluated together
 
 
 @torch.no_grad()

@@ -1,7 +1,5 @@
 """Parts of a fragment list that the CPU and a CUDA device have in common."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -3,8 +3,6 @@
 torch would do it in some fifty small operations, whose launches take the host longer than all of them take the card.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Objects that keep their memory from use to use."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

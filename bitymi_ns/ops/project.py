@@ -12,8 +12,7 @@ from torch import Tensor
 from .backend import check_shapes, cuda_backend, dense, kernel, on_same_device
 from .constants import FRAME, GEOM
 
-Prefilter = Literal["low_pass", "pixel"]
-"""How surfels smaller than a pixel are drawn, see `project`."""
+Prefilter = Literal["low_pass", "pixel"]  # how surfels smaller than a pixel are drawn, see `project`
 
 
 class Camera(Protocol):

@@ -1,7 +1,5 @@
 """Shading: the colour of every fragment, eq. (color)."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Directions over the sphere."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """The fragment list by the CPU kernels."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

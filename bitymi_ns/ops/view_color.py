@@ -1,7 +1,5 @@
 """View-dependent surfel colour f_view(d), of the kinds that `view_kinds` lists."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import torch

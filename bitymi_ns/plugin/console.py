@@ -1,7 +1,5 @@
 """Console messages: errors without a traceback, warnings, a step bar; filtering of nerfstudio's own lines."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence

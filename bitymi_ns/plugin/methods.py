@@ -5,8 +5,6 @@ its methods down. So nothing here raises; a method that cannot be set up is regi
 it is used.
 """
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 

@@ -17,38 +17,24 @@ from torch import Tensor
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import View, as_float, downscale_image, downscale_mask, spread
 
-CELLS = 24
-"""Most cells along the longer side of a photograph."""
-POINTS_PER_CELL = 4
-"""Fewest points for each cell of a photograph, on average: else empty cells say nothing."""
-MOST_VIEWS = 100
-"""Photographs, spread over all, that are searched for empty cells."""
+CELLS = 24  # most cells along the longer side of a photograph
+POINTS_PER_CELL = 4  # fewest points for each cell of a photograph, on average: else empty cells say nothing
+MOST_VIEWS = 100  # photographs, spread over all, that are searched for empty cells
 NEAREST, FARTHEST = 1.2, 5.0
 """Depths of the new points, in multiples of the median depth of the points that the photograph sees."""
-FEW = 10
-"""Points in a photograph below which its median depth is that of the others."""
-RADIUS = 0.5
-"""Largest first scale, in cells."""
-OPAQUE = 0.5
-"""Share of a cell that must show something."""
-SUPPORT = 8
-"""Fewest photographs that have a point in an empty cell: 17 photographs overfit points of fewer."""
-IN_FRONT = 0.2
-"""Most photographs that have it in front of the points of a cell, as a share of those."""
+FEW = 10  # points in a photograph below which its median depth is that of the others
+RADIUS = 0.5  # largest first scale, in cells
+OPAQUE = 0.5  # share of a cell that must show something
+SUPPORT = 8  # fewest photographs that have a point in an empty cell: 17 photographs overfit points of fewer
+IN_FRONT = 0.2  # most photographs that have it in front of the points of a cell, as a share of those
 
 
 class BackgroundPoints(NamedTuple):
-    """Points in empty cells, in random order.
+    """Points in empty cells, in random order."""
 
-    Attributes:
-        xyz: [B, 3] world positions.
-        rgb: [B, 3] mean colours of their cells, in [0, 1].
-        scales: [B] largest first scales of their surfels, world units.
-    """
-
-    xyz: Tensor
-    rgb: Tensor
-    scales: Tensor
+    xyz: Tensor  # [B, 3] world positions
+    rgb: Tensor  # [B, 3] mean colours of their cells, in [0, 1]
+    scales: Tensor  # [B] largest first scales of their surfels, world units
 
 
 @torch.no_grad()
@@ -98,14 +84,10 @@ def background_points(points: Tensor, views: Sequence[View], seed: int) -> Backg
 
 
 class _Grid(NamedTuple):
-    """Cells of a view.
+    """Cells of a view."""
 
-    Attributes:
-        nearest: [rows, columns] camera z of the nearest sparse point; infinite in empty cells.
-        width, height: of a cell, pixels.
-    """
-
-    nearest: Tensor
+    nearest: Tensor  # [rows, columns] camera z of the nearest sparse point; infinite in empty cells
+    # width, height: of a cell, pixels
     width: float
     height: float
 

@@ -13,8 +13,7 @@ if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
 from torch import nn
 
-TOGETHER = 4
-"""Steps whose losses are sent to the host together."""
+TOGETHER = 4  # steps whose losses are sent to the host together
 
 
 class LossWatch:

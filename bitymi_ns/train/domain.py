@@ -1,7 +1,5 @@
 """The scene that training starts from: its surfels, and where in space the texture field lies."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
@@ -143,8 +141,7 @@ def table_size_of(image_pixels: int) -> int:
     return round(math.log2(max(1, image_pixels) / 32))
 
 
-SAMPLE = 4096
-"""Surfels that are tested first: nearly all views see one of them."""
+SAMPLE = 4096  # surfels that are tested first: nearly all views see one of them
 CHUNK = 1 << 20
 
 

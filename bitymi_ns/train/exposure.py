@@ -5,8 +5,6 @@ relative to the mean photograph: the logarithms of the gains, and what else ther
 after every step, so that they tint nothing. They are no part of the scene: held-out views have none, bundles neither.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Mapping, Sequence
@@ -24,20 +22,14 @@ from bitymi_ns.train.optimizers import set_rate
 from bitymi_ns.train.processes import Processes
 from bitymi_ns.train.views import OnDemand, View
 
-LIMIT = 2.0
-"""Largest logarithm of a gain: 7.4 times as bright, in the encoded colours of photographs some 6 stops."""
-OTHER_LIMIT = 0.5
-"""Largest other entry of an affine correction."""
+LIMIT = 2.0  # largest logarithm of a gain: 7.4 times as bright, in the encoded colours of photographs some 6 stops
+OTHER_LIMIT = 0.5  # largest other entry of an affine correction
 EXPLAINED = 0.1
 """`auto` corrects photographs where gains explain more than this share of how far they disagree at the points."""
-EXIF_SPREAD = 0.03
-"""Without enough points, `auto` corrects photographs whose EXIF gains deviate by this (0.1 stop)."""
-PRIOR_POINTS = 20
-"""Weight of the EXIF prior (mean exposure where unknown), in points."""
-BETAS = (0.9, 0.99)
-"""Adam's decay: a photograph is shown once an epoch, so averages must be short."""
-ENCODING = 2.2
-"""Encoded colours grow as this root of the light."""
+EXIF_SPREAD = 0.03  # without enough points, `auto` corrects photographs whose EXIF gains deviate by this (0.1 stop)
+PRIOR_POINTS = 20  # weight of the EXIF prior (mean exposure where unknown), in points
+BETAS = (0.9, 0.99)  # Adam's decay: a photograph is shown once an epoch, so averages must be short
+ENCODING = 2.2  # encoded colours grow as this root of the light
 
 
 class Exposure:

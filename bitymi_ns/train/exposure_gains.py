@@ -7,8 +7,6 @@ only those count that no other point hides: else what is seen of an object from 
 change of exposure.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -20,41 +18,26 @@ from torch.nn.functional import max_pool2d
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import View, as_float
 
-POINTS = 6000
-"""Most points compared."""
-HIDING = 100_000
-"""Most points that may occlude them."""
-OBSERVATIONS = 1_200_000
-"""Points times photographs, at most."""
-SWEEPS = 10
-"""Passes over points and photographs."""
-DARKEST, BRIGHTEST = 0.03, 0.97
-"""Channels beyond these are left out: noise, rounding and clipping decide them."""
-FEWEST_PHOTOGRAPHS = 3
-"""Points that fewer photographs show are left out."""
-CELL = 2.0
-"""Side of the cells of the occlusion test, in mean distances of the points in the picture."""
-HIDDEN = 1.05
-"""A point is hidden where one in its cell or a neighbouring one is nearer by this factor."""
-FEWEST_TESTED = 1000
-"""Fewest observations for a test on the other half of the points."""
+POINTS = 6000  # most points compared
+HIDING = 100_000  # most points that may occlude them
+OBSERVATIONS = 1_200_000  # points times photographs, at most
+SWEEPS = 10  # passes over points and photographs
+DARKEST, BRIGHTEST = 0.03, 0.97  # channels beyond these are left out: noise, rounding and clipping decide them
+FEWEST_PHOTOGRAPHS = 3  # points that fewer photographs show are left out
+CELL = 2.0  # side of the cells of the occlusion test, in mean distances of the points in the picture
+HIDDEN = 1.05  # a point is hidden where one in its cell or a neighbouring one is nearer by this factor
+FEWEST_TESTED = 1000  # fewest observations for a test on the other half of the points
 
 
 class ExposureGains(NamedTuple):
-    """Gains of the photographs, and how well they explain the differences of colours.
+    """Gains of the photographs, and how well they explain the differences of colours."""
 
-    Attributes:
-        log_gains: [V, 3] float32 natural logarithm of each photograph's gain per channel; each channel has mean 0.
-        points: [V] int64, how many points each photograph was judged by.
-        before: median over the observations of one half of the points of how far they are from their point's colour, in
-            natural logarithms; NaN where there were too few.
-        after: the same once the gains found on the other half of the points are taken out.
-    """
-
-    log_gains: Tensor
-    points: Tensor
+    log_gains: Tensor  # [V, 3] float32 natural logarithm of each photograph's gain per channel; each channel has mean 0
+    points: Tensor  # [V] int64, how many points each photograph was judged by
+    # median over the observations of one half of the points of how far they are from their point's colour, in natural
+    # logarithms; NaN where there were too few
     before: float
-    after: float
+    after: float  # the same once the gains found on the other half of the points are taken out
 
     @property
     def explained(self) -> float:

@@ -1,7 +1,5 @@
 """The first surfels of a scene, from the sparse points of the capture."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -15,16 +13,12 @@ from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.background_points import BackgroundPoints
 from bitymi_ns.train.config import TrainConfig
 
-BETA_RAW = 2.0
-"""Nearly Gaussian kernels at the start: beta = 4 sigmoid(2) = 3.52."""
+BETA_RAW = 2.0  # nearly Gaussian kernels at the start: beta = 4 sigmoid(2) = 3.52
 MAX_SCALE = 0.25
 """Largest first scale, as a share of the scene extent or of the distance to the nearest camera, whichever is larger."""
-PIXELS_PER_FIRST_SURFEL = 1000
-"""Fewest pixels rendered in a run per first surfel."""
-FEWEST_FIRST = 5000
-"""Points that are never thinned, however short the run."""
-MIN_SCALE = 1e-6
-"""Smallest first scale, as a share of the scene extent."""
+PIXELS_PER_FIRST_SURFEL = 1000  # fewest pixels rendered in a run per first surfel
+FEWEST_FIRST = 5000  # points that are never thinned, however short the run
+MIN_SCALE = 1e-6  # smallest first scale, as a share of the scene extent
 
 
 @dataclass

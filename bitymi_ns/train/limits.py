@@ -1,7 +1,5 @@
 """Messages for every limit that a run hits."""
 
-from __future__ import annotations
-
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
 from bitymi_ns.train.domain import default_table_size, table_size_of

@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 DEPTH_EDGE = 0.1
 """Relative difference of depth between neighbouring pixels that is an edge. Photographs blend both sides of it, depth
 maps do not, and those of sensors are least reliable there."""
-SSIM_WINDOW = 11
-"""Side of the SSIM window in pixels; images narrower than this have no valid window."""
+SSIM_WINDOW = 11  # side of the SSIM window in pixels; images narrower than this have no valid window
 
 
 def objective(

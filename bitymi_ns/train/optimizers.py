@@ -120,8 +120,7 @@ def forget_gradients(optimizers: Iterable[Optimizer]) -> None:
                 parameter.grad = None
 
 
-ResizeHook = Callable[[str, Parameter], None]
-"""Called with the name and the new Parameter after each replacement."""
+ResizeHook = Callable[[str, Parameter], None]  # called with the name and the new Parameter after each replacement
 
 
 @torch.no_grad()

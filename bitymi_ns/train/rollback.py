@@ -49,16 +49,11 @@ WORSE = 1.25
 """A window is bad when its mean loss is this many times that of the best window, or early on that of blank views."""
 RISE = 0.1
 """Share of the loss of blank views by which a bad window must also exceed the best one: losses near 0 may double."""
-EARLY = 0.1
-"""Share of the run in which views may still be drawn a little worse than blank ones."""
-EARLY_STEPS = 100
-"""Fewest steps in which that is allowed: surfels have to settle, however short the run."""
-BROKEN_SHARE = 0.01
-"""Surfels that are not finite are dropped up to this share of all; beyond, the run goes back."""
-COMPARED_VIEWS = 4
-"""Views on which the blank picture, the first scene and a change of the resolution are judged."""
-SHARE_OF_RUN = 5
-"""A window is at most one part in so many of the run, also where that is less than an epoch."""
+EARLY = 0.1  # share of the run in which views may still be drawn a little worse than blank ones
+EARLY_STEPS = 100  # fewest steps in which that is allowed: surfels have to settle, however short the run
+BROKEN_SHARE = 0.01  # surfels that are not finite are dropped up to this share of all; beyond, the run goes back
+COMPARED_VIEWS = 4  # views on which the blank picture, the first scene and a change of the resolution are judged
+SHARE_OF_RUN = 5  # a window is at most one part in so many of the run, also where that is less than an epoch
 
 
 class RollbackGuard:

@@ -1,15 +1,13 @@
 """Schedules of a run: events, learning rates, resolution."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
 from bitymi_ns.ops.view_kinds import VIEW_PARAMETERS
-from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig, check_ranges
+from bitymi_ns.ranges import check_ranges
+from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
 
-PATIENT_STEPS = 3000
-"""Steps of a run from which it has time for full size as early as the options say."""
+PATIENT_STEPS = 3000  # steps of a run from which it has time for full size as early as the options say
 FIELD_MLP = ("field_mlp", "field_w1", "field_w2", "field_w3")
 
 

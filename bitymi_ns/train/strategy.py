@@ -42,10 +42,8 @@ DrawViews = Callable[[int, torch.Generator], list[View]]
 
 SPLIT_LONG, SPLIT_WIDE = 0.6, 0.7
 """Scales of the halves of a split surfel, along its long axis and across it, as a share of the surfel's."""
-SPLIT_APART = 0.7
-"""Distance of the halves' centres from the surfel's, in scales of its long axis."""
-SPLIT_OPACITY = 0.9
-"""Opacity of the halves as a share of the surfel's: they overlap where it is most opaque."""
+SPLIT_APART = 0.7  # distance of the halves' centres from the surfel's, in scales of its long axis
+SPLIT_OPACITY = 0.9  # opacity of the halves as a share of the surfel's: they overlap where it is most opaque
 STATISTICS = ("grad_sum", "abs_grad_sum", "visible_count", "max_radius")
 
 

@@ -30,14 +30,10 @@ if TYPE_CHECKING:
     from bitymi_ns.train.schedules import Schedule
     from bitymi_ns.train.views import DownscaledViews, View
 
-FEWEST_VIEWS = 32
-"""Fewest views that tiles are measured on, however short the run."""
-SMALLEST = 4
-"""Side of the smallest tile, texels: a block of BC7."""
-FEW = 1 << 23
-"""Texels that no run is too short for: 235 MB."""
-FEWER = 0.8
-"""Factor by which tiles get fewer texels, as often as it takes until all are few enough."""
+FEWEST_VIEWS = 32  # fewest views that tiles are measured on, however short the run
+SMALLEST = 4  # side of the smallest tile, texels: a block of BC7
+FEW = 1 << 23  # texels that no run is too short for: 235 MB
+FEWER = 0.8  # factor by which tiles get fewer texels, as often as it takes until all are few enough
 LEAST_SHARE = 0.25
 """Lower bound of a texel's coverage where it is measured on a part of the views, as a share of what one view
 can show: no step is much longer than four times the rate. A whole view would slow down occluded texels."""

@@ -14,12 +14,10 @@ from torch.nn.functional import interpolate
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.config import TrainConfig
 
-DOWNSCALED_BYTES = 1 << 28
-"""Cache of downscaled pictures on the CPU; the others are downscaled at every use."""
+DOWNSCALED_BYTES = 1 << 28  # cache of downscaled pictures on the CPU; the others are downscaled at every use
 
 
-COVERED_VIEWS = 8
-"""Views sampled for the share of pixels that show something."""
+COVERED_VIEWS = 8  # views sampled for the share of pixels that show something
 
 
 class View(NamedTuple):

@@ -16,8 +16,7 @@ from .page import POLICY, PageError, Site, media_type
 
 LOOPBACK = "127.0.0.1"
 LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
-REQUEST_SECONDS, SEND_SECONDS = 20.0, 60.0
-"""Timeouts of receiving a request and of sending a piece of an answer."""
+REQUEST_SECONDS, SEND_SECONDS = 20.0, 60.0  # timeouts of receiving a request and of sending a piece of an answer
 _PIECE = 1 << 20
 _HEADERS = {
     "Content-Security-Policy": POLICY,

@@ -1,7 +1,5 @@
 """A path that was recorded in the browser, through `ns-render camera-path` on the same bundle."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A camera path of a bundle, on the bundle and on the run that it came from; a dataset as pictures."""
 
-from __future__ import annotations
-
 import gzip
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a run prints: a few lines of its own, none of nerfstudio's about itself, and nothing before it is checked."""
 
-from __future__ import annotations
-
 import io
 import warnings
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A ball of coloured discs seen from a ring of cameras."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """One of the processes of a run, as a program: part_of_a_run.py FOLDER RANK COUNT [STEP AT WHICH IT ENDS]."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import sys

@@ -1,7 +1,5 @@
 """Views that see nothing of what training starts from."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """How photographs agree at the points: gains are found, and what hides points, masks or clips is not taken for them."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

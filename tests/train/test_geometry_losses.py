@@ -1,7 +1,5 @@
 """Depth and normals as supervision: the loss terms, and a run with and without them."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

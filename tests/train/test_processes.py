@@ -1,7 +1,5 @@
 """Runs of two processes: those of one process that looks at the same views, and what happens when one ends."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Texels that learn in the last part of a run."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The path of the camera in a browser: keyframes, playing, its file and its film. `docs/viewer.md` describes them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Writes compact.json: little compact bundles, and what the package reads of them; from the root of a checkout."""
 
-from __future__ import annotations
-
 import base64
 import json
 import tempfile

@@ -6,13 +6,16 @@ from pathlib import Path
 
 import pycolmap
 
+from bitymi_ns.capture.sfm.consistency import contradicted, drop_unlinked
 from bitymi_ns.capture.sfm.job import Job, StageProgress
 from bitymi_ns.capture.sfm.refine import refined
+from bitymi_ns.capture.types import CONTRADICTED
 
 ENOUGH = 0.9
 """The global mapper's poses are taken as they are if they are of this share of the photographs that hang together."""
 GOOD_ERROR = 1.0
-"""... and their reprojection error is below so many pixels of the photographs as features were found on them."""
+"""... and their reprojection error is below so many pixels of the photographs as features were found on them, and few
+matches contradict them."""
 
 
 def reconstruct(job: Job, database: Path, connected: int, tell: StageProgress) -> pycolmap.Reconstruction | None:
@@ -29,18 +32,18 @@ def reconstruct(job: Job, database: Path, connected: int, tell: StageProgress) -
         found = _best(
             _in_folder(job, "global", lambda folder: _global(job, database, folder, tell)), job, database, tell
         )
-        if job.mapper == "global" or (found is not None and _satisfies(found, job, connected)):
+        if job.mapper == "global" or (found is not None and _satisfies(found, job, database, connected)):
             return found
     other = _best(
         _in_folder(job, "incremental", lambda folder: _incremental(job, database, folder, tell)), job, database, tell
     )
-    return better(found, other)
+    return better(job, database, found, other)
 
 
-def better(*models: pycolmap.Reconstruction | None) -> pycolmap.Reconstruction | None:
-    """The model with most cameras, of equals that with the smallest error; None if there is none."""
+def better(job: Job, database: Path, *models: pycolmap.Reconstruction | None) -> pycolmap.Reconstruction | None:
+    """The model with most cameras, of equals that which fewest matches contradict; None if there is none."""
     found = [model for model in models if model is not None]
-    return max(found, key=lambda m: (m.num_reg_images(), -m.compute_mean_reprojection_error()), default=None)
+    return max(found, key=lambda m: (m.num_reg_images(), -contradicted(m, database, pixel(job))), default=None)
 
 
 def pixel(job: Job) -> float:
@@ -48,9 +51,12 @@ def pixel(job: Job) -> float:
     return max(1.0, max(max(group.width, group.height) for group in job.cameras) / job.max_image_size)
 
 
-def _satisfies(model: pycolmap.Reconstruction, job: Job, connected: int) -> bool:
-    error = model.compute_mean_reprojection_error()
-    return model.num_reg_images() >= ENOUGH * connected and error <= GOOD_ERROR * pixel(job)
+def _satisfies(model: pycolmap.Reconstruction, job: Job, database: Path, connected: int) -> bool:
+    return (
+        model.num_reg_images() >= ENOUGH * connected
+        and model.compute_mean_reprojection_error() <= GOOD_ERROR * pixel(job)
+        and contradicted(model, database, pixel(job)) <= CONTRADICTED
+    )
 
 
 def _in_folder(
@@ -68,12 +74,13 @@ def _in_folder(
 def _best(
     models: dict[int, pycolmap.Reconstruction], job: Job, database: Path, tell: StageProgress
 ) -> pycolmap.Reconstruction | None:
-    """The largest component, refined."""
+    """The largest component, refined, of the cameras that its points link."""
     largest = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
     if largest is None or largest.num_points3D() == 0:
         return None
     tell("refining cameras and points", 0, 1)
     model = refined(largest, job, pixel(job))
+    drop_unlinked(model)
     tell("refining cameras and points", 1, 1)
     return model
 

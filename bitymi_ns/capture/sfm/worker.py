@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from bitymi_ns.capture.sfm import explain, features, mapping, pairs, triangulation
+from bitymi_ns.capture.sfm import consistency, explain, features, mapping, pairs, triangulation
 from bitymi_ns.capture.sfm.job import DATABASE, MODEL, Job, NoPoses
 from bitymi_ns.files import complete_folder
 
@@ -57,7 +57,7 @@ def find(job: Job, stages: Stages) -> dict[str, object]:
     if chosen and registered < mapping.ENOUGH * len(job.order):
         pairs.match_rest(job, database, stages)
         graph, again = _mapped(job, database, stages)
-        model = mapping.better(model, again)
+        model = mapping.better(job, database, model, again)
     if model is None or model.num_reg_images() < LEAST:
         raise explain.why_none(job, graph)
     angle = explain.parallax(model)
@@ -71,6 +71,7 @@ def find(job: Job, stages: Stages) -> dict[str, object]:
         "track_length": model.compute_mean_track_length(),
         "points": model.num_points3D(),
         "parallax_degrees": angle,
+        "contradicted": consistency.contradicted(model, database, mapping.pixel(job)),
         "pairs": len(graph.inliers),
         "left_out": explain.left_out(graph, placed, job.names),
         **write(model, job),

@@ -30,9 +30,6 @@ from bitymi_ns.measure.report.records import Records
 from bitymi_ns.measure.report.tables import NOTES, markdown_tables, quality_tables
 from bitymi_ns.trust import printable
 
-# A switch without its --no- twin, where this tyro knows how.
-Flag = tyro.conf.FlagCreatePairsOff[bool] if hasattr(tyro.conf, "FlagCreatePairsOff") else bool
-
 FAILED, INTERRUPTED = 1, 130  # exit statuses when a cell failed, and after Ctrl-C
 
 
@@ -59,8 +56,6 @@ class BenchRun:
     """Formats of bundles that each trained scene is baked into; none = no baking."""
     pictures: int = 2
     """Number of worst held-out views of each run to draw with errors and decomposition."""
-    knobs: Flag = False
-    """Also measure the error, time and bytes of each quality knob, for every run."""
     work: Path = Path("outputs/bench")
     """Folder of runs, bundles, logs and finished cells, which are not done again. The command may run several times at
     once on one folder, with other GPUs or on other machines: each takes runs that no other is working on."""
@@ -96,7 +91,7 @@ class BenchRun:
             raise BenchError("nothing to run: give --methods or --plan")
         rows = [Row(row.name, row.method, (*row.options, *extra)) for row in rows]
         bundles = format_bundles(self.formats) if bundles is None else bundles
-        return Matrix(self._scenes(), rows, self.seeds, self.steps, bundles, self.pictures, self.knobs)
+        return Matrix(self._scenes(), rows, self.seeds, self.steps, bundles, self.pictures)
 
     def run(self) -> int:
         """Run the missing cells, then print the table; returns the exit status."""

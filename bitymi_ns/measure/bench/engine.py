@@ -29,7 +29,7 @@ class Layout:
         self.work, self.run = work, run
 
     def path(self, what: str, *parts: str) -> Path:
-        """A path of the run below runs, bundles, evals, pictures, knobs or logs."""
+        """A path of the run below runs, bundles, evals, pictures or logs."""
         return self.work.joinpath(what, self.run.folder, *parts)
 
     @property
@@ -71,10 +71,8 @@ def stage_command(work: Path, stage: Stage) -> list[str]:
         config = at.config if stage.bundle is None else at.path("bundles", stage.form, "config.yml")
         result = at.path("evals", f"{stage.form}.json")
         return [tool("ns-eval"), "--load-config", str(config), "--output-path", str(result)]
-    command = [tool("bitymi"), "bench", stage.kind, "--load-config", str(at.config)]
-    if stage.kind == "pictures":
-        return [*command, "--output-dir", str(at.path("pictures")), "--views", str(stage.count)]
-    return [*command, "--output", str(at.path("knobs", "knobs.jsonl"))]
+    command = [tool("bitymi"), "bench", "pictures", "--load-config", str(at.config)]
+    return [*command, "--output-dir", str(at.path("pictures")), "--views", str(stage.count)]
 
 
 def prepare(work: Path, stage: Stage) -> Path:
@@ -85,12 +83,11 @@ def prepare(work: Path, stage: Stage) -> Path:
         "export": at.path("bundles", stage.form),
         "eval": at.path("evals"),
         "pictures": at.path("pictures"),
-        "knobs": at.path("knobs"),
     }[stage.kind]
-    if stage.kind != "eval":  # its folder holds the results of other evaluations
-        shutil.rmtree(folder, ignore_errors=True)
-    if stage.kind in ("eval", "knobs"):
+    if stage.kind == "eval":  # its folder holds the results of other evaluations
         folder.mkdir(parents=True, exist_ok=True)
+    else:
+        shutil.rmtree(folder, ignore_errors=True)
     return at.path("logs", f"{stage.kind}-{stage.form}.log")
 
 
@@ -99,14 +96,14 @@ def read_result(work: Path, stage: Stage) -> dict[str, Any]:
 
     train: `steps`, `seconds` and `cpu_seconds` of the training steps alone (no loading, evaluation or saving),
     `surfels`, `fragments`, `curve`. export: `bytes` and `files` of the bundle, its `statistics`. eval: nerfstudio's
-    `results`, means over the held-out views. pictures, knobs: what these commands wrote.
+    `results`, means over the held-out views. pictures: what that command wrote.
 
     Raises:
         CommandFailed: there are none.
     """
     at = Layout(work, stage.run)
     reader: dict[str, Callable[[Layout, Stage], dict[str, Any]]] = {
-        "train": _train, "export": _export, "eval": _evaluation, "pictures": _pictures, "knobs": _knobs,
+        "train": _train, "export": _export, "eval": _evaluation, "pictures": _pictures,
     }  # fmt: skip
     try:
         return without_nan(reader[stage.kind](at, stage))
@@ -153,14 +150,6 @@ def _pictures(at: Layout, stage: Stage) -> dict[str, Any]:
         "folder": at.relative(folder),
         "views": len(json_of((folder / "pictures.json").read_text("utf8"))["views"]),
     }
-
-
-def _knobs(at: Layout, stage: Stage) -> dict[str, Any]:
-    lines = at.path("knobs", "knobs.jsonl").read_text("utf8").splitlines()
-    points = [json_of(line) for line in lines if line.strip()]
-    if not points:
-        raise ValueError("no line in knobs.jsonl")
-    return {"points": points}
 
 
 def read_curve(path: Path) -> list[dict[str, Any]]:

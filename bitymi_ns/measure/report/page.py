@@ -14,16 +14,12 @@ from bitymi_ns.measure.report.pictures import ERROR_CAPTION, compare_views, read
 from bitymi_ns.measure.report.plots import Plot, draw_plots
 from bitymi_ns.measure.report.read import collect
 from bitymi_ns.measure.report.records import Records, ReportError, over_seeds
-from bitymi_ns.measure.report.tables import NOTES, knob_tables, poses_tables, quality_tables, training_table
+from bitymi_ns.measure.report.tables import NOTES, poses_tables, quality_tables, training_table
 
 PAGE = "index.html"
 GENERATOR = '<meta name="generator" content="bitymi report">'  # marks a page as ours, so that it may be replaced
 VIEWS_NOTE = f"The worst, the median and the best view by the PSNR of these pictures, with their {ERROR_CAPTION}."
 TRADE_OFF = "The dashed line is the Pareto front: of all points of a scene those that no other beats in both."
-KNOB_NOTE = (
-    "Errors are against the exact setting, in 8-bit steps of a colour (1/255), over all pixels of the measured views. "
-    "Milliseconds are per view at full size, of the renderer named."
-)
 
 
 def _counted(number: int, noun: str) -> str:
@@ -38,7 +34,6 @@ def compose(records: Records, title: str) -> dict[str, Any]:
         "evaluation": len(records.evaluations),
         "training run": len(records.curves),
         "scene": len({row.scene for row in records.evaluations}),
-        "knob setting": len(records.knobs),
         "capture with found poses": len(found),  # of several runs of one capture once
     }
     counted = ", ".join(_counted(number, noun) for noun, number in counts.items() if number)
@@ -59,7 +54,6 @@ def compose(records: Records, title: str) -> dict[str, Any]:
         "training": training_table(records.curves),
         "poses": poses,
         "sections": sections,
-        "knobs": knob_tables(records.knobs),
         "worst": worst_views(records.worst, notes),
         "notes": notes,
     }
@@ -67,7 +61,7 @@ def compose(records: Records, title: str) -> dict[str, Any]:
 
 def to_page(content: dict[str, Any]) -> str:
     """Write the report as a single HTML document that needs no other file."""
-    texts = {"views": VIEWS_NOTE, "tables": NOTES, "knobs": KNOB_NOTE, "trade_off": TRADE_OFF}
+    texts = {"views": VIEWS_NOTE, "tables": NOTES, "trade_off": TRADE_OFF}
     return rendered("report.html.j2", content=content, generator=GENERATOR, texts=texts)
 
 
@@ -85,7 +79,7 @@ def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report"
 
     Args:
         inputs: ns-eval JSON files, training curves (JSONL with `step` and any of `seconds`, `cpu_seconds`, `surfels`,
-            `fragments`, `psnr`), cells, knobs and pictures of `bitymi bench`, report.json of camera poses, PNG images
+            `fragments`, `psnr`), cells and pictures of `bitymi bench`, report.json of camera poses, PNG images
             of ns-eval, and folders that are searched for all of these.
         output_dir: folder of the report; created if needed. A report of an earlier call is replaced.
         title: heading of the page.

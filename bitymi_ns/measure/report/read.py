@@ -1,4 +1,4 @@
-"""Read the inputs of a report: ns-eval files, training curves, cells, knobs, pictures and found poses, and folders that
+"""Read the inputs of a report: ns-eval files, training curves, cells, pictures and found poses, and folders that
 are searched for these."""
 
 import json
@@ -107,11 +107,6 @@ def is_evaluation(data: Any) -> bool:
     return isinstance(data, dict) and isinstance(data.get("results"), dict)
 
 
-def is_knob(data: Any) -> bool:
-    """True for a measured setting of a quality knob."""
-    return isinstance(data, dict) and isinstance(data.get("knob"), str) and "max_steps" in data
-
-
 def is_cell(data: Any) -> bool:
     """True for a line of a benchmark's cells."""
     return isinstance(data, dict) and isinstance(data.get("key"), dict) and isinstance(data.get("value"), dict)
@@ -170,7 +165,6 @@ class _Run:
         self.train: dict[str, Any] = {}
         self.exports: dict[str, dict[str, Any]] = {}
         self.evaluations: list[tuple[str, dict[str, float]]] = []
-        self.knobs: list[dict[str, Any]] = []
         self.pictures: str = ""
 
     def add(self, key: dict[str, Any], value: dict[str, Any]) -> None:
@@ -183,8 +177,6 @@ class _Run:
             if not is_evaluation(value) or "psnr" not in value["results"]:
                 raise KeyError("psnr among its results")
             self.evaluations.append((bundle, finite_numbers(value["results"])))
-        elif kind == "knobs":
-            self.knobs = [point for point in value["points"] if is_knob(point)]
         elif kind == "pictures":
             self.pictures = str(value["folder"])
 
@@ -243,7 +235,6 @@ def _add_run(run: _Run, several_seeds: bool, path: Path, records: Records) -> No
                 run.scene, run.name, bool(bundle), group + seed, results, "", path, run.id, group, run.series, run.seed
             )
         )
-    records.knobs += [{**point, "scene": run.scene, "run": run.name + seed} for point in run.knobs]
     curve = path.parent / str(run.train["curve"]) if run.train.get("curve") else None
     if curve is not None and curve.is_file():
         _, curves, notes = read_jsonl(curve)
@@ -296,12 +287,9 @@ def _read(path: Path, records: Records) -> bool:
         if path.name == CELLS or any(is_cell(value) for _, value in numbered):
             read_cells(numbered, path, records)
             return bool(numbered)
-        if any(is_knob(value) for _, value in numbered):
-            records.knobs += [{**value, "run": value.get("method")} for _, value in numbered if is_knob(value)]
-        else:
-            evaluations, curves, _ = read_jsonl(path)
-            records.evaluations += evaluations
-            records.curves += curves
+        evaluations, curves, _ = read_jsonl(path)
+        records.evaluations += evaluations
+        records.curves += curves
     else:
         data = parse_json(read_text(path, MAX_JSON_BYTES), str(path))
         if isinstance(data, dict) and data.keys() >= _POSES:
@@ -346,7 +334,7 @@ def collect(inputs: list[Path], output_dir: Path) -> Records:
                 _read(file, records)
             except ReportError as error:
                 records.notes.append(str(error))
-    if not (records.evaluations or records.curves or records.knobs or records.worst or records.poses):
+    if not (records.evaluations or records.curves or records.worst or records.poses):
         where = ", ".join(map(str, paths)) or "no inputs"
         more = "".join(f"\n  {note}" for note in records.notes)
         raise ReportError(

@@ -7,7 +7,7 @@ from typing import Any, Literal, TypeVar
 from bitymi_ns.capture.report import overview
 from bitymi_ns.measure import markdown
 from bitymi_ns.measure.markdown import escaped
-from bitymi_ns.measure.report.records import Curve, Evaluation, finite_numbers, psnr_delta
+from bitymi_ns.measure.report.records import Curve, Evaluation, psnr_delta
 
 T = TypeVar("T")
 K = TypeVar("K", bound=Hashable)
@@ -218,48 +218,6 @@ def quality_tables(evaluations: list[Evaluation], training: bool = False) -> lis
     tables = [scene_table(scene, [e for e in evaluations if e.scene == scene], columns) for scene in scenes]
     mean = mean_table(evaluations, columns)
     return [*tables, mean] if mean else tables
-
-
-KNOBS = {
-    "weight_bound": "Weight bound",
-    "transmittance": "Termination threshold",
-    "format": "Atlas format",
-    "r_max": "Largest tile side",
-    "tolerance": "Atlas tolerance",
-    "resolution": "Resolution of rendering",
-}
-"""Knob -> title of its table."""
-
-
-KNOB_COLUMNS = {
-    "mean_steps": ("mean steps", "{:.3f}".format),
-    "max_steps": ("max steps", "{:.2f}".format),
-    "psnr_exact": ("dB to exact", lambda value: "equal" if value >= 100 else f"{value:.1f}"),
-    "psnr": ("PSNR", "{:.2f}".format),
-    "ms": ("ms", significant),
-    "cpu_ms": ("CPU ms", significant),
-    "bytes": ("MB", lambda value: significant(1e-6 * value)),
-}
-"""Figure of a setting -> title and text."""
-
-
-def knob_tables(points: list[dict[str, Any]]) -> list[Table]:
-    """One table per knob; the error is against its exact setting."""
-    tables = []
-    for knob, of_knob in _grouped(points, lambda p: p["knob"]).items():
-        rows: list[Row] = []
-        for title, group in _grouped(of_knob, lambda p: f"{p.get('scene')}, {p['run']}, {p.get('renderer')}").items():
-            rows.append(Row((f"{title} renderer",), section=True))
-            for p in group:
-                value, figures = p.get("value"), finite_numbers(p)
-                name = f"{value:.3g}" if isinstance(value, float) else str(value)
-                marks = ", ".join(mark for mark in ("exact", "default") if p.get(mark))
-                texts = (form(figures[k]) if k in figures else MISSING for k, (_, form) in KNOB_COLUMNS.items())
-                rows.append(Row((f"{name} ({marks})" if marks else name, *texts)))
-        against = str(of_knob[0].get("against") or "")
-        header = ("Setting", *(title for title, _ in KNOB_COLUMNS.values()))
-        tables.append(Table(KNOBS.get(knob, knob), header, tuple(rows), f"{against[:1].upper()}{against[1:]}"))
-    return tables
 
 
 MOST_NAMED = 60  # photographs that a table names; report.json has them all

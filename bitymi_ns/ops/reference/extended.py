@@ -4,8 +4,6 @@ of the adjugate. Complex inputs of tiny imaginary part give a directional deriva
 Trapp 1998): the imaginary part of the result over that of the input is exact to rounding.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Residual colour field, in float64: contraction of space, multiresolution hash encoding, small MLP."""
 
-from __future__ import annotations
-
 import itertools
 
 import torch

@@ -1,7 +1,5 @@
 """Surfels seen by a camera, in float64 and without tricks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

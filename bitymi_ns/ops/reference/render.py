@@ -1,7 +1,5 @@
 """The whole image formation, in float64: brute-force visibility, colours, weighted sums."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol

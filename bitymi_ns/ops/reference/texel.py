@@ -1,7 +1,5 @@
 """Bilinear fetch from a surfel's texture tile, in float64."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Weights of surfels at pixels: every pixel against every surfel, in float64."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """View-dependent colour of surfels, in float64: Spherical Voronoi, spherical harmonics, Spherical Beta, Gaussians."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """A baked scene as the arrays that the shaders read (shaders/scene.wgsl)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,8 +12,7 @@ from ..constants import SUPPORT
 from ..view_color import LEAN, check_lean, check_view_color
 from ..view_kinds import VIEW_COLORS
 
-WHOLE = " sites"
-"""What a form is called, behind its kind, that holds sites and no base."""
+WHOLE = " sites"  # what a form is called, behind its kind, that holds sites and no base
 FORMS = [kind + end for kind, entry in VIEW_COLORS.items() for end in (("", WHOLE) if entry.sites else ("",))]
 KINDS = {name: number for number, name in enumerate(FORMS)}
 """Forms of view colours, by their numbers in view_color.wgsl."""
@@ -31,18 +28,12 @@ SURFEL = np.dtype(
 
 @dataclass
 class Arrays:
-    """Arrays of a scene that the shaders read.
+    """Arrays of a scene that the shaders read."""
 
-    Attributes:
-        surfels: [N] of `SURFEL`.
-        terms: of the view colours, [.] float32.
-        kind: a number of `KINDS`.
-        origin: [3] float64, which is taken off positions: far from the world's origin float32 would not resolve them.
-    """
-
-    surfels: npt.NDArray
-    terms: npt.NDArray[np.float32]
-    kind: int
+    surfels: npt.NDArray  # [N] of `SURFEL`
+    terms: npt.NDArray[np.float32]  # of the view colours, [.] float32
+    kind: int  # a number of `KINDS`
+    # [3] float64, which is taken off positions: far from the world's origin float32 would not resolve them
     origin: npt.NDArray[np.float64]
 
 

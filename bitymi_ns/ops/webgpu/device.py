@@ -1,7 +1,5 @@
 """The graphics device that draws, and what it can do."""
 
-from __future__ import annotations
-
 import functools
 import importlib
 from types import ModuleType

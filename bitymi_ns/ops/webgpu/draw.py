@@ -1,7 +1,5 @@
 """Drawing a baked scene through WebGPU, as the kernels draw it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch
@@ -11,8 +9,7 @@ from ..baked_scene import BakedScene, check_images, common_size
 from ..project import Camera
 from .on_device import SceneOnDevice
 
-LAYERS = 16
-"""Batches in which surfels are drawn: docs/viewer.md has what fewer cost in the picture."""
+LAYERS = 16  # batches in which surfels are drawn: docs/viewer.md has what fewer cost in the picture
 _FROM = {
     "rgb": ("color", slice(0, 3)),
     "alpha": ("color", slice(3, 4)),

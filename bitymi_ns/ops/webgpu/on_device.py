@@ -1,7 +1,5 @@
 """A scene in the memory of a graphics device, and drawing it there."""
 
-from __future__ import annotations
-
 import functools
 import struct
 import warnings
@@ -19,13 +17,10 @@ from .arrays import arrays
 from .device import check_room, device, in_software, library
 from .programs import Programs
 
-SHOW = {"color": 0, "depth": 1, "normal": 2, "overdraw": 3}
-"""What is blended, by its number in scene.wgsl."""
-BLOCK, DIGITS, ROUNDS = 1024, 16, 8
-"""Of sort.wgsl: keys per block, digits, rounds of 4 bits."""
+SHOW = {"color": 0, "depth": 1, "normal": 2, "overdraw": 3}  # what is blended, by its number in scene.wgsl
+BLOCK, DIGITS, ROUNDS = 1024, 16, 8  # of sort.wgsl: keys per block, digits, rounds of 4 bits
 MOST_LAYERS = 64
-_RECTANGLE = slice(16, 22)
-"""Columns of `Seen` in scene.wgsl."""
+_RECTANGLE = slice(16, 22)  # columns of `Seen` in scene.wgsl
 _STRIDE = 256  # between the uniforms of batches and of rounds, which devices want so
 
 

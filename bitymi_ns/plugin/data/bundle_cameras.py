@@ -1,7 +1,5 @@
 """Parser of a bundle's cameras.json, for commands that need no photographs where the capture is gone."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,8 +1,6 @@
 """Conversion of nerfstudio's cameras to those of the renderer, checks of a capture's cameras, and depth and normal
 outputs for nerfstudio's tools."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
@@ -13,12 +11,9 @@ from torch import Tensor
 from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.scene.camera import Camera
 
-MAX_OFF_AXIS = 80
-"""Largest angle between the optical axis and the middle of the picture, degrees."""
-USUAL_VIEW = (0.5, 150.0)
-"""View angles, degrees; outside, the focal length is doubtful."""
-POSSIBLE_VIEW = (0.01, 178.0)
-"""View angles, degrees; outside, the focal length is refused."""
+MAX_OFF_AXIS = 80  # largest angle between the optical axis and the middle of the picture, degrees
+USUAL_VIEW = (0.5, 150.0)  # view angles, degrees; outside, the focal length is doubtful
+POSSIBLE_VIEW = (0.01, 178.0)  # view angles, degrees; outside, the focal length is refused
 
 
 def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Camera:

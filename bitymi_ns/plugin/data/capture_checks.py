@@ -1,7 +1,5 @@
 """Checks of a capture before any time is spent on it, and errors of nerfstudio's loaders in plain words."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Iterator, Sequence

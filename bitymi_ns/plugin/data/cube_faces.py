@@ -1,7 +1,5 @@
 """Wide cameras as pinhole views: the faces of a cube around the camera, as far as a photograph covers them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import lru_cache

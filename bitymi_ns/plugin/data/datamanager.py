@@ -36,10 +36,8 @@ from bitymi_ns.train.background_points import background_points
 from bitymi_ns.train.processes import Processes
 from bitymi_ns.train.views import MemoryBudget, OnDemand, View, spread, training_order
 
-ALPHA_SAMPLES = 8
-"""Photographs that are searched for transparent pixels."""
-FEW_VIEWS = 10
-"""Number of training views below which multi-view scores are unreliable."""
+ALPHA_SAMPLES = 8  # photographs that are searched for transparent pixels
+FEW_VIEWS = 10  # number of training views below which multi-view scores are unreliable
 
 
 if TYPE_CHECKING:

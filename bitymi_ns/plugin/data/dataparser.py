@@ -1,8 +1,6 @@
 """`bitymi-data`, the methods' default parser: recognizes the format of a folder or file, reads it as photographs with
 cameras and poses, and splits these by one rule for all formats."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -55,10 +53,8 @@ from bitymi_ns.plugin.data.views import (
     select_views,
 )
 
-WITH_MODEL = ("colmap", "photographs", "video")
-"""Formats that are read as a COLMAP model."""
-SCANNED = ("polycam", "record3d", "pose-files")
-"""Formats of scanning programs, with their poses."""
+WITH_MODEL = ("colmap", "photographs", "video")  # formats that are read as a COLMAP model
+SCANNED = ("polycam", "record3d", "pose-files")  # formats of scanning programs, with their poses
 OPTION_FORMATS: dict[str, tuple[str, ...]] = {
     "colmap_path": ("colmap",),
     "images_path": ("colmap",),
@@ -74,10 +70,8 @@ OPTION_FORMATS: dict[str, tuple[str, ...]] = {
     "sfm": ("photographs", "video"),
 }
 """Formats that an option is for, where that is not all of them."""
-NGP_SCALE = 0.3333
-"""Factor on positions of instant-ngp's captures, as in nerfstudio's reader."""
-BLENDER_SIDE = 1.5
-"""Half the side of the box of a Blender data set, as in nerfstudio's reader."""
+NGP_SCALE = 0.3333  # factor on positions of instant-ngp's captures, as in nerfstudio's reader
+BLENDER_SIDE = 1.5  # half the side of the box of a Blender data set, as in nerfstudio's reader
 
 
 @dataclass

@@ -1,7 +1,5 @@
 """Dataset of a capture: undistorted images with alpha and masks, cached in memory up to a budget."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -27,14 +25,11 @@ from bitymi_ns.plugin.data.views import NO_PHOTOS, photograph_files, select_view
 from bitymi_ns.plugin.run.commands import MOVED
 from bitymi_ns.train.views import MemoryBudget, nearest, over_background
 
-PHOTOGRAPH_BYTES = 1 << 28
-"""Memory for the images of a capture, training and held-out views together."""
-PREFETCH = 4
-"""Images that are read together at the start."""
+PHOTOGRAPH_BYTES = 1 << 28  # memory for the images of a capture, training and held-out views together
+PREFETCH = 4  # images that are read together at the start
 RECENT = 2
 """Images beyond the budget that stay cached until the next ones are read: one step asks for a view more than once."""
-POSE_STEP = 1e-4
-"""Resolution to which poses are compared, in units of the scene."""
+POSE_STEP = 1e-4  # resolution to which poses are compared, in units of the scene
 
 
 class BitymiDataset(InputDataset):

@@ -1,8 +1,7 @@
 """Depth maps, their confidence, and normal maps in files, as programs and scanners write them."""
 
-from __future__ import annotations
-
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
@@ -11,8 +10,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from bitymi_ns.plugin.console import fail
+from bitymi_ns.plugin.console import fail, warn
 from bitymi_ns.plugin.data.lens import Lens
+from bitymi_ns.train.views import spread
 
 MAP_FILES = (".png", ".tif", ".tiff", ".npy", ".npz", ".exr")
 """Extensions of depth and normal maps."""
@@ -20,6 +20,8 @@ MILLIMETER = 1e-3
 """Metres of a unit of integer depth, where no other is stated: nerfstudio's convention."""
 MAPS = "maps"
 """Metadata key of the `MapFiles` of each view."""
+COLOR_SAMPLES = 8
+"""Files of a scanner's depth that are tested for color pictures; all have to be."""
 FARTHEST = 65504.0
 """Depth from which on a number stands for "no depth": the largest of half floats, below Blender's 1e10."""
 
@@ -41,15 +43,35 @@ class MapFiles:
     normal: Path | None = None
 
 
-def maps_beside(photograph: Path) -> MapFiles:
-    """Find the depth and confidence of a scanner's photograph: files of its name in `depth` and `confidence` beside its
-    folder (Polycam, Record3D, ScanNet)."""
+def maps_beside(photographs: Sequence[Path]) -> list[MapFiles]:
+    """Find the depth and confidence of a scanner's photographs: files of their names in `depth` and `confidence` beside
+    their folder (Polycam, Record3D, ScanNet). A folder of color pictures is not used, with a warning."""
 
-    def find(folder: str) -> Path | None:
+    def find(photograph: Path, folder: str) -> Path | None:
         files = (photograph.parent.parent / folder / f"{photograph.stem}{ending}" for ending in MAP_FILES)
         return next((file for file in files if file.is_file()), None)
 
-    return MapFiles(find("depth"), find("confidence"))
+    found = [MapFiles(find(path, "depth"), find(path, "confidence")) for path in photographs]
+    depths = [files.depth for files in found if files.depth is not None]
+    if depths and all(_is_color(depths[i]) for i in spread(len(depths), COLOR_SAMPLES)):
+        warn(f"{depths[0].parent} is not used: it holds color pictures, not depth.")
+        return [MapFiles()] * len(found)
+    return found
+
+
+def _is_color(path: Path) -> bool:
+    """Test for an image of integers in channels that differ, which is no depth; a damaged one is none."""
+    if path.suffix.lower() not in (".png", ".tif", ".tiff"):
+        return False
+    try:
+        values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return False
+    return values is not None and values.ndim == 3 and values.dtype.kind in "iu" and _channels_differ(values)
+
+
+def _channels_differ(values: npt.NDArray[np.generic]) -> bool:
+    return not bool((values[..., :3] == values[..., :1]).all())
 
 
 def read_depth(files: MapFiles, lens: Lens, unit: float | None = None) -> Values:
@@ -116,9 +138,7 @@ def _read(path: Path) -> npt.NDArray[np.generic]:
             if values is None:
                 raise ValueError("not an image that OpenCV reads" if path.is_file() else "it does not exist")
             if values.ndim == 3:
-                values = values[..., [2, 1, 0]]
-                if (values == values[..., :1]).all():  # depth that a program has written as grey
-                    values = values[..., 0]
+                values = values[..., [2, 1, 0] if _channels_differ(values) else 0]  # grey: depth, as a program wrote it
     except (OSError, ValueError, LookupError, EOFError, BadZipFile, cv2.error) as error:
         fail(f"{path} cannot be read: {error}. {_WITHOUT}", error)
     if values.ndim not in (2, 3) or values.dtype.kind not in "iuf" or 0 in values.shape:

@@ -1,8 +1,6 @@
 """Image files of a capture: photographs and masks by their bit depth, sizes and EXIF from headers, blank and duplicate
 photographs."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections import Counter
@@ -23,13 +21,10 @@ from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.train.exposure import exif_stops
 
 T = TypeVar("T")
-ORIENTATION = 0x0112
-"""EXIF tag that asks viewers to turn a photograph; 1 = as it is stored."""
-MAX_PIXELS = 1_000_000_000
-"""Photographs with more pixels are refused; phones take some of 200 million."""
+ORIENTATION = 0x0112  # EXIF tag that asks viewers to turn a photograph; 1 = as it is stored
+MAX_PIXELS = 1_000_000_000  # photographs with more pixels are refused; phones take some of 200 million
 THREADS = 4
-FINGERPRINT_SIZE = 64
-"""Pixels across, and down, by which photographs are compared."""
+FINGERPRINT_SIZE = 64  # pixels across, and down, by which photographs are compared
 UNREADABLE = (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError)
 
 
@@ -206,8 +201,7 @@ def _plain(image: npt.NDArray[np.uint8]) -> bool:
     return bool((image == image[0, 0]).all())
 
 
-Pair = tuple[int, int]
-"""Index of a training photograph, and of a held-out one."""
+Pair = tuple[int, int]  # index of a training photograph, and of a held-out one
 
 
 def duplicate_files(train: Sequence[Path], held_out: Sequence[Path]) -> list[Pair]:

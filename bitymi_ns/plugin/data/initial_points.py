@@ -1,8 +1,6 @@
 """Initial points of training: those of the capture, triangulated ones, or random ones; colored by the photographs where
 they have no colors, and projected into these to detect poses in another convention."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -28,16 +26,12 @@ from bitymi_ns.train.views import spread
 Choice = Literal["auto", "triangulate", "random"]
 """auto = those of the capture, triangulated ones where it has none; triangulate = in any case; random = in any case."""
 MIRROR = np.diag([1.0, 1.0, -1.0])
-COLOR_VIEWS = 24
-"""Photographs, spread over all, in which colors are looked up."""
-COLOR_CHUNK = 100_000
-"""Points that are colored together."""
+COLOR_VIEWS = 24  # photographs, spread over all, in which colors are looked up
+COLOR_CHUNK = 100_000  # points that are colored together
 GREY = 128
-CHECK_VIEWS = 8
-"""Photographs, spread over all, into which points are projected to check conventions."""
+CHECK_VIEWS = 8  # photographs, spread over all, into which points are projected to check conventions
 CHECK_POINTS = 2000
-CHECK_SIZE = 800
-"""Pixels at least to which large JPEG files are downscaled as they are decoded for that check."""
+CHECK_SIZE = 800  # pixels at least to which large JPEG files are downscaled as they are decoded for that check
 NOTHING, SOMETHING = 0.01, 0.1
 """Share of the points that a picture shows by poses that are wrong, and by such as may be right."""
 MANY_TIMES, MORE_ALIKE = 2.5, 0.05

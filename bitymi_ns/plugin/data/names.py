@@ -1,7 +1,5 @@
 """Find files by the names in a capture's metadata, also where these were written on another machine."""
 
-from __future__ import annotations
-
 import difflib
 import os
 import re
@@ -15,8 +13,7 @@ from bitymi_ns.capture.recognise import PHOTOGRAPHS
 from bitymi_ns.plugin.console import listed
 from bitymi_ns.trust import leads_inside
 
-Parts = tuple[str, ...]
-"""Folders and file of a name, folded to one case and one Unicode form."""
+Parts = tuple[str, ...]  # folders and file of a name, folded to one case and one Unicode form
 _DRIVE = re.compile(r"^[A-Za-z]:")
 
 

@@ -4,8 +4,6 @@ The PLY reader that nerfstudio uses returns uninitialized memory for points that
 by 255, also those in [0, 1].
 """
 
-from __future__ import annotations
-
 import re
 import struct
 import time
@@ -25,8 +23,7 @@ from bitymi_ns.ply import PlyError, read_header, read_rows, rows_there, text_lin
 VERTEX = "vertex"
 COLOR_NAMES = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 """Property names by which programs write colors."""
-MANY_POINTS = 500_000
-"""Number of points from which on slow steps are announced and timed."""
+MANY_POINTS = 500_000  # number of points from which on slow steps are announced and timed
 
 
 class Points(NamedTuple):

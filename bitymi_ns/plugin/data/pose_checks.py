@@ -1,8 +1,6 @@
 """Checks of a capture's poses: rotations (or mirrored ones), positions that belong together, and points in their unit;
 and the rotation and translation that orient a capture."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,16 +11,11 @@ from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
 
 from bitymi_ns.plugin.console import fail, listed, warn
 
-EXACT = 1e-3
-"""Matrices this close to a rotation are taken as they are: float32, or four written digits."""
-ROUNDED = 2e-2
-"""Matrices this close to a rotation, up to a common factor, are meant to be one: two written digits."""
-FAR = 100.0
-"""Distance relative to all the others from which a camera may be misplaced."""
-TOO_FAR = 1000.0
-"""Relative distance beside which the other cameras shrink to one point."""
-FAR_FROM_ORIGIN = 100.0
-"""Distance from the origin relative to that from their middle at which float32 blurs cameras."""
+EXACT = 1e-3  # matrices this close to a rotation are taken as they are: float32, or four written digits
+ROUNDED = 2e-2  # matrices this close to a rotation, up to a common factor, are meant to be one: two written digits
+FAR = 100.0  # distance relative to all the others from which a camera may be misplaced
+TOO_FAR = 1000.0  # relative distance beside which the other cameras shrink to one point
+FAR_FROM_ORIGIN = 100.0  # distance from the origin relative to that from their middle at which float32 blurs cameras
 OTHER_UNIT = 150.0
 """Distance of points relative to that between cameras, or their extent as a part of the picture, in another unit."""
 

@@ -1,8 +1,6 @@
 """Photographs of scanning programs and RGB-D sets: Polycam's raw folder, Record3D's, and folders of color images with a
 text file per pose (ScanNet, 7-Scenes)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -56,7 +54,7 @@ def scanner_photographs(found: Found, need_photos: bool) -> list[Photograph]:
     files = [path for path, *_ in rows]
     parts = rotations(np.stack([pose[:3, :3] for _, pose, *_ in rows]), [file.name for file in files], str(found.path))
     result = []
-    for (path, pose, pinhole, stated), rotation in zip(rows, parts, strict=True):
+    for (path, pose, pinhole, stated), rotation, maps in zip(rows, parts, maps_beside(files), strict=True):
         pose = pose.copy()
         pose[:3, :3] = rotation
         size = image_size(path) or stated or (1, 1)
@@ -68,7 +66,7 @@ def scanner_photographs(found: Found, need_photos: bool) -> list[Photograph]:
                 )
             pinhole = rescaled("PINHOLE", pinhole, stated, size)
         camera, label = ModelCamera("PINHOLE", *size, tuple(pinhole)), f"the camera of {path}"
-        result.append(Photograph(path, camera, pose, label, maps=maps_beside(path)))
+        result.append(Photograph(path, camera, pose, label, maps=maps))
     return result
 
 

@@ -1,8 +1,6 @@
 """Poses of photographs and videos by structure from motion, and the copy of them that a training run keeps: whatever
 becomes of the photographs, the run goes on with the poses it was trained with."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -30,17 +28,11 @@ ORIGIN = "origin.json"
 
 @dataclass(frozen=True)
 class KeptPoses:
-    """Poses in the folder of a run.
+    """Poses in the folder of a run."""
 
-    Attributes:
-        folder: it holds MODEL, the report, and IMAGES where those were made for the training.
-        origin: input of structure from motion; its photographs are IMAGES where it names no folder.
-        left_out: photographs without a pose, and why.
-    """
-
-    folder: Path
-    origin: Origin
-    left_out: Mapping[str, str] = field(default_factory=dict)
+    folder: Path  # it holds MODEL, the report, and IMAGES where those were made for the training
+    origin: Origin  # input of structure from motion; its photographs are IMAGES where it names no folder
+    left_out: Mapping[str, str] = field(default_factory=dict)  # photographs without a pose, and why
 
     @property
     def model(self) -> Path:
@@ -86,6 +78,8 @@ def find_sfm_source(found: Found, masks_path: Path | None, downscale: int, setti
         f"Poses of {poses.registered} of {poses.given} photographs of {found.path}, to {poses.reprojection_error:.2f} "
         f"pixels; how they were found is in {poses.report}."
     )
+    if poses.doubt:
+        warn(poses.doubt)
     masks = _masks(found, masks_path, downscale)
     source = make_source(poses.model, poses.images, masks, downscale, poses.left_out)
     made = poses.images.is_relative_to(poses.report.parent)  # upright copies and frames lie in the work folder

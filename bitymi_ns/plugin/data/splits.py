@@ -1,7 +1,5 @@
 """Splits of a capture into training and held-out photographs: by rule, or by names."""
 
-from __future__ import annotations
-
 import os
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -16,8 +14,7 @@ from bitymi_ns.plugin.console import fail, listed
 from bitymi_ns.plugin.data.names import folded, without_extension
 
 Mode = Literal["fraction", "filename", "interval", "all"]
-NameLists = dict[str, list[str]]
-"""Names of photographs by split: train, val, test."""
+NameLists = dict[str, list[str]]  # names of photographs by split: train, val, test
 
 
 class Split(NamedTuple):

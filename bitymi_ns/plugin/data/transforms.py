@@ -1,7 +1,5 @@
 """Load and check the JSON files of nerfstudio, instant-ngp and Blender captures."""
 
-from __future__ import annotations
-
 import math
 import os
 from pathlib import Path
@@ -21,8 +19,7 @@ INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
 FILE_KEYS = ("file_path", "mask_path", "depth_file_path", "normal_file_path")
 LATLONG = ("latlong", "is_latlong")
 """Entries of instant-ngp's for pictures of all directions with latitude and longitude along their sides."""
-MAX_SIDE = 1 << 20
-"""Largest plausible width or height of a picture, pixels."""
+MAX_SIDE = 1 << 20  # largest plausible width or height of a picture, pixels
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 DISTORTION = (*COEFFICIENTS, "distortion_params")
 FOCALS = {"x": ("fl_x", "camera_angle_x", "x_fov"), "y": ("fl_y", "camera_angle_y", "y_fov")}

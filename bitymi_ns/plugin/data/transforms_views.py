@@ -4,8 +4,6 @@ The three differ in how they state a focal length and where photographs lie; eve
 a frame before the top of the file. Entries that nothing reads are reported.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Iterable, Sequence
@@ -54,19 +52,12 @@ UNKNOWN_SIZE = 800
 
 @dataclass(frozen=True)
 class Transforms:
-    """JSON file of a capture.
+    """JSON file of a capture."""
 
-    Attributes:
-        path: the file.
-        meta: its content.
-        photographs: sorted by file name.
-        lists: of names for training and evaluation.
-    """
-
-    path: Path
-    meta: dict[str, Any]
-    photographs: list[Photograph]
-    lists: NameLists
+    path: Path  # the file
+    meta: dict[str, Any]  # its content
+    photographs: list[Photograph]  # sorted by file name
+    lists: NameLists  # of names for training and evaluation
 
 
 def read_transforms(

@@ -1,8 +1,6 @@
 """Views of a capture for training: photographs with cameras and poses become pinhole pictures in nerfstudio's frame,
 those of wide cameras several."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -32,35 +30,22 @@ OPENCV_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 USUAL_SPREAD, MAX_SPREAD = 2.5, 25.0
 """Median distance of cameras from their middle, in half sides of the scene box: of NeRF-Synthetic, and from which on a
 capture is taken to be in another unit."""
-NO_PHOTOS = "without photographs"
-"""Metadata key of views whose photographs are gone."""
-LONGEST_SIDE = 1600
-"""Default longest side of a training photograph, pixels; as in papers on such captures."""
+NO_PHOTOS = "without photographs"  # metadata key of views whose photographs are gone
+LONGEST_SIDE = 1600  # default longest side of a training photograph, pixels; as in papers on such captures
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """A photograph with its camera.
+    """A photograph with its camera."""
 
-    Attributes:
-        file: image file.
-        camera: in pixels of the photograph before any downscaling.
-        pose: [4, 4] float64, camera to world in nerfstudio's axes (camera: x right, y up, z backward).
-        label: names the camera in messages.
-        mask: mask file; None = none.
-        downscaled: `file` is a copy that is downscaled already.
-        frame: number that photographs share which a rig took together; None = it stands alone.
-        maps: depth and normals.
-    """
-
-    file: Path
-    camera: ModelCamera
-    pose: Pose
-    label: str
-    mask: Path | None = None
-    downscaled: bool = False
-    frame: int | None = None
-    maps: MapFiles = MapFiles()
+    file: Path  # image file
+    camera: ModelCamera  # in pixels of the photograph before any downscaling
+    pose: Pose  # [4, 4] float64, camera to world in nerfstudio's axes (camera: x right, y up, z backward)
+    label: str  # names the camera in messages
+    mask: Path | None = None  # mask file; None = none
+    downscaled: bool = False  # `file` is a copy that is downscaled already
+    frame: int | None = None  # number that photographs share which a rig took together; None = it stands alone
+    maps: MapFiles = MapFiles()  # depth and normals
 
 
 @dataclass(frozen=True)

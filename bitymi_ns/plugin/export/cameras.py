@@ -1,7 +1,5 @@
 """The capture's cameras as a file of the bundle, for viewers; and held-out photographs, if they may be given away."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Sequence
@@ -14,8 +12,7 @@ from bitymi_ns.bundle.parts import CAMERAS
 from bitymi_ns.scene.baked import as_bytes
 from bitymi_ns.scene.camera import Camera
 
-MOST_PIXELS = 1600
-"""Longer side of a photograph in a bundle."""
+MOST_PIXELS = 1600  # longer side of a photograph in a bundle
 
 
 def camera_files(datamanager: Any, train: Sequence[Camera], photographs: bool) -> dict[str, bytes]:

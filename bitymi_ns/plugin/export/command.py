@@ -3,8 +3,6 @@
 Also `python -m bitymi_ns.plugin.export.command`, should a future nerfstudio not take the command in.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace

@@ -1,7 +1,5 @@
 """Options of the export that say what a bundle is stored as."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,8 +10,7 @@ from bitymi_ns.plugin.console import fail, say
 
 BundleFormat = Literal["compact", "bc7", "uint8", "fp16"]
 _MUCH_SMALLER = 0.9
-MANIFEST_BYTES = 28_000
-"""Upper estimate of bundle.json and config.yml."""
+MANIFEST_BYTES = 28_000  # upper estimate of bundle.json and config.yml
 
 
 @dataclass(kw_only=True)

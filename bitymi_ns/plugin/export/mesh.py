@@ -1,7 +1,5 @@
 """`ns-export bitymi-mesh`: the surface of a trained scene or of a bundle as a triangle mesh."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,32 +24,23 @@ from bitymi_ns.plugin.console import fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.export.trained import load_trained, world_of
 from bitymi_ns.progress import rich_progress
+from bitymi_ns.ranges import check_ranges
 from bitymi_ns.scene.camera import Camera
 
 NAME = "mesh"
-MOST_VIEWS = 400
-"""Training views that are fused at most, evenly spaced."""
+MOST_VIEWS = 400  # training views that are fused at most, evenly spaced
 
 
 @dataclass(frozen=True)
 class Source:
-    """Scene that a mesh is made of.
+    """Scene that a mesh is made of."""
 
-    Attributes:
-        surfels: geometry by name, on the device where it is drawn.
-        render: [H, W, 3] colors of a view.
-        cameras: of the training views, on that device.
-        near: nearest depth that is drawn, camera z.
-        prefilter: as in `ops.project`.
-        world: how the scene lies in the capture.
-    """
-
-    surfels: Mapping[str, Tensor]
-    render: Callable[[Camera], Tensor]
-    cameras: Sequence[Camera]
-    near: float
-    prefilter: Prefilter
-    world: WorldFrame
+    surfels: Mapping[str, Tensor]  # geometry by name, on the device where it is drawn
+    render: Callable[[Camera], Tensor]  # [H, W, 3] colors of a view
+    cameras: Sequence[Camera]  # of the training views, on that device
+    near: float  # nearest depth that is drawn, camera z
+    prefilter: Prefilter  # as in `ops.project`
+    world: WorldFrame  # how the scene lies in the capture
 
 
 @dataclass(kw_only=True)
@@ -82,7 +71,7 @@ class ExportMesh:
         options = SurfaceOptions(self.resolution, self.triangles, self.watertight)
         path = self.output_dir / f"{NAME}.{self.format}"
         try:
-            options.check()
+            check_ranges(options)
         except ValueError as error:
             fail(f"--{error}.", error)
         try:

@@ -1,7 +1,5 @@
 """Summary table of an export."""
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 

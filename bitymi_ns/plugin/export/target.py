@@ -1,7 +1,5 @@
 """Checks of the output folder before the work: writable, free, with enough disk space."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -13,10 +11,8 @@ from bitymi_ns.codec.quantise import BYTES_PER_TEXEL
 from bitymi_ns.files import check_writable, free_bytes, reason, reserved, size_text, write_file
 from bitymi_ns.plugin.console import fail, warn
 
-SURFEL_BYTES = 60 * 4
-"""Bytes of a surfel's parameters. A checkpoint holds them three times, with Adam's two moments."""
-TYPICAL_SIDE = 32
-"""Side of a texture tile in texels, estimated generously: within a tolerance most are far smaller."""
+SURFEL_BYTES = 60 * 4  # bytes of a surfel's parameters. A checkpoint holds them three times, with Adam's two moments.
+TYPICAL_SIDE = 32  # side of a texture tile in texels, estimated generously: within a tolerance most are far smaller
 
 
 def require_writable(path: Path) -> None:

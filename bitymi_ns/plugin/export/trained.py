@@ -1,7 +1,5 @@
 """A trained run as an export reads it: loading, previewing, and comparing with its bundle."""
 
-from __future__ import annotations
-
 import copy
 import io
 import pickle

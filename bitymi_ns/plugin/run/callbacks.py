@@ -1,7 +1,5 @@
 """A training run inside nerfstudio's loop: what it calls before, in and after a step, and the curve of progress."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Check of the camera paths that `ns-render camera-path` reads, before the scene is loaded."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,10 +9,8 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
 from bitymi_ns.plugin.console import fail, warn
 
-MOST_PIXELS = 16_384
-"""Along a side of a frame."""
-SLACK = 1e-3
-"""Of a rotation that was stored with rounding."""
+MOST_PIXELS = 16_384  # along a side of a frame
+SLACK = 1e-3  # of a rotation that was stored with rounding
 HELP = "Record it in the viewer of the run or bundle, or write nerfstudio's format."
 
 

@@ -1,7 +1,5 @@
 """Checkpoint files: written whole or not at all, read with errors that say what to do."""
 
-from __future__ import annotations
-
 import dataclasses
 import errno
 import json
@@ -19,10 +17,8 @@ from bitymi_ns.files import complete_file, reason
 from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.scene.config import SceneConfig
 
-EXTRA_STATE = "_extra_state"
-"""torch's name for what a module saves beside its tensors."""
-SURFELS = "scene.surfels."
-"""Prefix of the surfels' parameters in the model."""
+EXTRA_STATE = "_extra_state"  # torch's name for what a module saves beside its tensors
+SURFELS = "scene.surfels."  # prefix of the surfels' parameters in the model
 STATE_VERSION = 2
 MAY_DIFFER = ("near", "weight_bound", "rim", "texture_moves_surfels", "max_fragments")
 """Scene options that may differ from those that a checkpoint was trained with: they do not decide what its parameters

@@ -1,7 +1,5 @@
 """nerfstudio's other commands on our scenes: detection, refusal of unsupported ones, moved captures, and ns-viewer."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterator

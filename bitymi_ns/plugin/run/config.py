@@ -1,7 +1,5 @@
 """nerfstudio configurations of the registered methods, made from the presets."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -32,8 +30,7 @@ from bitymi_ns.plugin.run.render import adopt_render
 from bitymi_ns.plugin.run.trainer import BitymiPipelineConfig, BitymiTrainer
 from bitymi_ns.train.config import AdamConfig
 
-SEEDS = 1 << 32
-"""End of the range of seeds that numpy takes."""
+SEEDS = 1 << 32  # end of the range of seeds that numpy takes
 
 
 @dataclass

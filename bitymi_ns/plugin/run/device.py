@@ -1,7 +1,5 @@
 """Devices that the kernels can run on."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 from functools import cache

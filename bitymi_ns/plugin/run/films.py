@@ -1,7 +1,5 @@
 """Films as H.264 in MP4, encoded by PyAV, and pictures as files, all of them written whole or not at all."""
 
-from __future__ import annotations
-
 import gzip
 import os
 import re
@@ -19,10 +17,8 @@ from bitymi_ns.files import complete_file, complete_folder
 from bitymi_ns.plugin.console import fail
 from bitymi_ns.scene.baked import as_bytes
 
-RATES = (0.01, 1000.0)
-"""Frames per second of a film."""
-QUALITY = "18"
-"""Constant rate factor of H.264, at which its loss is hardly visible."""
+RATES = (0.01, 1000.0)  # frames per second of a film
+QUALITY = "18"  # constant rate factor of H.264, at which its loss is hardly visible
 ENDINGS = {"jpeg": ".jpg", "png": ".png"}
 FRAME = re.compile(r"\d{5}\.(jpg|png)")
 

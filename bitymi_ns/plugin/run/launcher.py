@@ -34,13 +34,10 @@ from bitymi_ns.train.processes import ProcessLost
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
 
-TIMEOUT = timedelta(minutes=30)
-"""Timeout for a process that does not answer; one that has ended is noticed at once."""
-PATIENCE = 10.0
-"""Seconds in which a process that is lost is expected to say why."""
+TIMEOUT = timedelta(minutes=30)  # timeout for a process that does not answer; one that has ended is noticed at once
+PATIENCE = 10.0  # seconds in which a process that is lost is expected to say why
 HOST = "127.0.0.1"
-LOST = 3
-"""Exit status of a process that ends because another one has."""
+LOST = 3  # exit status of a process that ends because another one has
 
 
 class Workers:

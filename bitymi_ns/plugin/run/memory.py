@@ -5,8 +5,6 @@ a few views. The other numbers are measured on the CPU and belong to the default
 from its arrays.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from contextlib import suppress
@@ -30,27 +28,21 @@ from bitymi_ns.train.config import TexelConfig
 from bitymi_ns.train.texels import SMALLEST, most_texels
 from bitymi_ns.train.views import DOWNSCALED_BYTES, photograph_budget, spread
 
-COUNTED_VIEWS = 3
-"""Views whose fragments are counted."""
-MARGIN = 1.1
-"""Factor by which another view may have more fragments than the counted ones."""
-PROGRAM = 800e6
-"""Bytes of Python, the libraries, and a capture's cameras and points."""
+COUNTED_VIEWS = 3  # views whose fragments are counted
+MARGIN = 1.1  # factor by which another view may have more fragments than the counted ones
+PROGRAM = 800e6  # bytes of Python, the libraries, and a capture's cameras and points
 PER_FRAGMENT = 36
 """Bytes: the list, the gradients of weights and coordinates, and the order in which the backward pass takes it."""
 PER_SHADED_FRAGMENT = 32
 """Bytes more where a field in space shades: whose fragments are and where, colours, and their gradients."""
-PER_CARD_FRAGMENT = 4 * NUMBERS
-"""Bytes of a fragment on a card, where textures of both kinds take as much."""
-PER_PIXEL = 400
-"""Bytes: pictures, gradients and maps of a view, and the ten views of the multi-view scores."""
+PER_CARD_FRAGMENT = 4 * NUMBERS  # bytes of a fragment on a card, where textures of both kinds take as much
+PER_PIXEL = 400  # bytes: pictures, gradients and maps of a view, and the ten views of the multi-view scores
 PER_SURFEL = 3000
 """Bytes in training: parameters, gradients, Adam's averages and the two states that a run could go back to."""
 
 PER_TEXEL = 28
 """Bytes in training: the texel, how far it moves, and the two states in half precision that a run could go back to."""
-PER_TEXEL_SUM = 16
-"""Bytes more of a texel on a card: its gradient, which the CPU adds tile by tile."""
+PER_TEXEL_SUM = 16  # bytes more of a texel on a card: its gradient, which the CPU adds tile by tile
 PER_BAKED_TEXEL = 96
 """Bytes in an export: eight copies of it, as it was learned, as it is listed and tuned, and in pages."""
 PER_KEPT_FRAGMENT, PER_KEPT_PIXEL = 20 * 0.22, 24

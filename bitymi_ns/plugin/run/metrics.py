@@ -1,7 +1,5 @@
 """Image quality and honest render times."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Any

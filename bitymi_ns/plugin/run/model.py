@@ -1,7 +1,5 @@
 """The scene in training as a nerfstudio model."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Mapping
@@ -184,8 +182,7 @@ class BitymiModel(SurfelModel):
         return super().load_state_dict(state_dict, strict=True)
 
 
-FEW_POINTS = 50
-"""Number of points below which much of a scene may have none near it."""
+FEW_POINTS = 50  # number of points below which much of a scene may have none near it
 
 
 def new_scene(

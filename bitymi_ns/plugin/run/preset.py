@@ -3,8 +3,6 @@
 A default is declared once, in the dataclass of the option; a file states what differs from it.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping

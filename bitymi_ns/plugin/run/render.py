@@ -4,8 +4,6 @@ nerfstudio's script reads a camera path, or makes one of the capture's cameras, 
 and writes. `adopt_render` puts functions of this module into the script.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Sequence
@@ -33,14 +31,11 @@ from bitymi_ns.train.views import spread
 
 TRAJECTORIES = ("RenderCameraPath", "RenderInterpolated", "SpiralRender")
 """Classes of nerfstudio's script that render along a path."""
-OUTPUTS = ("rgb", "rgba", "accumulation", "depth", "normal", "beta", "overdraw")
-"""Outputs of all our scenes."""
-WITHOUT_MAPS = {"rgb", "rgba", "accumulation"}
-"""Outputs for which no maps need to be drawn."""
+OUTPUTS = ("rgb", "rgba", "accumulation", "depth", "normal", "beta", "overdraw")  # outputs of all our scenes
+WITHOUT_MAPS = {"rgb", "rgba", "accumulation"}  # outputs for which no maps need to be drawn
 DEPTH_VIEWS, DEPTH_SIDE, DEPTH_SHARE = 16, 160, 0.01
 """Depth colours of a film span the depths of so many frames of this size, without this share at either end."""
-TURNS = 2
-"""Of a spiral."""
+TURNS = 2  # of a spiral
 INTERRUPTED = 130
 
 

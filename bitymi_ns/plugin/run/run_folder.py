@@ -1,7 +1,5 @@
 """The folder of a training run: one process at a time trains into it, and it keeps how the poses were found."""
 
-from __future__ import annotations
-
 import atexit
 import shutil
 from pathlib import Path
@@ -13,8 +11,7 @@ from bitymi_ns.plugin.data.colmap_views import Source
 from bitymi_ns.plugin.data.sfm_poses import write_kept_poses
 from bitymi_ns.trust import check_no_links
 
-LOCK = ".lock"
-"""Name of the file that lies in a run folder while a process trains into it."""
+LOCK = ".lock"  # name of the file that lies in a run folder while a process trains into it
 POSES = "poses"
 """Folder in that of the run for the poses and the report on how they were found, where this package found them."""
 

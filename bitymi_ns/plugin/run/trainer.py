@@ -28,8 +28,7 @@ from dataclasses import dataclass, field
 
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 
-INTERRUPTED = 130
-"""Exit status after Ctrl-C, by the convention of shells."""
+INTERRUPTED = 130  # exit status after Ctrl-C, by the convention of shells
 
 
 class _StopAfterStep(Exception):
@@ -37,13 +36,9 @@ class _StopAfterStep(Exception):
 
 
 class TogetherOptimizers(Optimizers):
-    """nerfstudio's optimisers, one per parameter group, that step together: the same steps in less time.
+    """nerfstudio's optimisers, one per parameter group, that step together: the same steps in less time."""
 
-    Attributes:
-        before_step: called before each step, with all gradients there.
-    """
-
-    before_step: Callable[[], None] | None = None
+    before_step: Callable[[], None] | None = None  # called before each step, with all gradients there
 
     def zero_grad_some(self, param_groups: list[str]) -> None:
         optimizers.forget_gradients(self.optimizers[group] for group in param_groups)

@@ -58,10 +58,6 @@ elif "pictures" in sys.argv:
     view = dict(view=3, rank=1, of=7, metrics=dict(psnr=19.5), files=dict(photo="view0003-photo.png"))
     text = dict(bitymi_pictures=1, scene="fox", method="bitymi", captions=dict(photo="photograph"), views=[view])
     (folder / "pictures.json").write_text(json.dumps(text))
-else:
-    point = dict(knob="r_max", value=64, renderer="baked", exact=False, default=True, max_steps=2.0, mean_steps=0.1,
-                 psnr_exact=60.0, psnr=21.0, ms=5.0, cpu_ms=9.0, bytes=5000)
-    pathlib.Path(given("--output")).write_text(json.dumps(point) + "\\n")
 """
 
 
@@ -149,7 +145,7 @@ def capture(tmp_path: Path) -> Callable[[str], Path]:
 
 @pytest.fixture
 def matrix(capture: Callable[[str], Path]) -> Matrix:
-    """Two captures, two seeds, one format, with pictures and knobs: 24 cells."""
+    """Two captures, two seeds, one format, with pictures: 20 cells."""
     scenes = [SceneSpec(name, capture(name)) for name in ("fox", "lego")]
     bundles = [Bundle("bc7", ("--format", "bc7"))]
-    return Matrix(scenes, [Row("bitymi", "bitymi")], (0, 1), 100, bundles, pictures=1, knobs=True)
+    return Matrix(scenes, [Row("bitymi", "bitymi")], (0, 1), 100, bundles, pictures=1)

@@ -26,16 +26,15 @@ def test_every_cell_is_a_line_with_its_settings_and_figures(fakes, matrix: Matri
     work = tmp_path / "work"
     assert run_chains(work, matrix.chains()) == []
     cells = lines(work)
-    assert len(cells) == 24 and len({identity(c["key"]) for c in cells}) == 24
-    kinds = [c["key"]["cell"] for c in cells[:6]]
-    assert kinds == ["train", "eval", "export", "eval", "pictures", "knobs"]
-    train = cells[6]
+    assert len(cells) == 20 and len({identity(c["key"]) for c in cells}) == 20
+    kinds = [c["key"]["cell"] for c in cells[:5]]
+    assert kinds == ["train", "eval", "export", "eval", "pictures"]
+    train = cells[5]
     assert train["key"]["seed"] == 1 and train["key"]["steps"] == 100 and train["key"]["scene"] == "fox"
     assert train["value"]["seconds"] == 10 and train["value"]["process_cpu_seconds"] > 0
     assert (work / train["value"]["curve"]).is_file()
     assert cells[2]["value"]["bytes"] > 6000 and cells[2]["value"]["format"] == "bc7"
     assert cells[3]["value"]["results"]["lpips"] is None  # NaN is no JSON
-    assert cells[5]["value"]["points"][0]["knob"] == "r_max"
     for cell in cells:
         assert cell["made"]["machine"] and cell["made"]["versions"]["python"] and cell["made"]["command"]
     log = (work / "logs" / "fox" / "bitymi").glob("*/train-trained.log")
@@ -44,24 +43,24 @@ def test_every_cell_is_a_line_with_its_settings_and_figures(fakes, matrix: Matri
 
 def test_commands_are_the_stock_ones_with_all_settings(fakes, matrix: Matrix, tmp_path: Path) -> None:
     run_chains(tmp_path / "work", matrix.chains()[1:2])
-    train, trained, export, baked, pictures, knobs = fakes.calls()
+    train, trained, export, baked, pictures = fakes.calls()
     assert train.startswith("ns-train bitymi ") and train.endswith("captures/fox")
     for words in ("--machine.seed 1", "--pipeline.model.train.seed 1", "--max-num-iterations 100", "--vis none"):
         assert words in train
     assert export.startswith("ns-export bitymi-atlas --load-config ") and export.endswith("--format bc7")
     assert trained.startswith("ns-eval --load-config ") and "/bundles/" in baked
-    assert pictures.startswith("bitymi bench pictures ") and knobs.startswith("bitymi bench knobs ")
+    assert pictures.startswith("bitymi bench pictures ")
 
 
 def test_finished_cells_are_skipped(fakes, matrix: Matrix, tmp_path: Path) -> None:
     run_chains(tmp_path / "work", matrix.chains())
     fakes.calls()
-    renamed = Matrix(matrix.scenes, [Row("another name", "bitymi")], (0, 1), 100, matrix.bundles, 1, True)
+    renamed = Matrix(matrix.scenes, [Row("another name", "bitymi")], (0, 1), 100, matrix.bundles, 1)
     assert run_chains(tmp_path / "work", matrix.chains()) == run_chains(tmp_path / "work", renamed.chains()) == []
     assert fakes.calls() == []
 
 
-@pytest.mark.parametrize("at", [0, 2, 5])
+@pytest.mark.parametrize("at", [0, 2, 4])
 def test_a_kill_costs_one_cell(fakes, matrix: Matrix, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int) -> None:
     work, chain = tmp_path / "work", matrix.chains()[0]
     calls = iter(range(99))
@@ -81,7 +80,7 @@ def test_a_kill_costs_one_cell(fakes, matrix: Matrix, tmp_path: Path, monkeypatc
     fakes.calls()
     monkeypatch.setattr(engine, "run_measured", run_measured)
     assert run_chains(work, [chain]) == []
-    assert len(fakes.calls()) == 6 - at and len(lines(work)) == 6
+    assert len(fakes.calls()) == 5 - at and len(lines(work)) == 5
 
 
 def test_a_killed_benchmark_goes_on_when_its_command_has_ended(
@@ -128,7 +127,7 @@ def test_a_training_that_is_done_again_takes_its_cells_with_it(fakes, matrix: Ma
     text = (work / "cells.jsonl").read_text().splitlines(keepends=True)
     (work / "cells.jsonl").write_text("".join(text[1:]))
     run_chains(work, [chain])
-    assert len(fakes.calls()) == 6
+    assert len(fakes.calls()) == 5
     (work / "cells.jsonl").write_text("".join([*text[:2], *text[3:]]))  # without the export
     run_chains(work, [chain])
     assert [call.split()[0] for call in fakes.calls()] == ["ns-export", "ns-eval"]
@@ -142,11 +141,11 @@ def test_a_failure_is_told_and_the_rest_goes_on(fakes, matrix: Matrix, tmp_path:
     assert "fox, bitymi, seed 0: training failed" in failures[0] and "status 3" in failures[0]
     assert "something is wrong with the capture" in failures[0]
     assert "export (bc7) failed" in failures[2]
-    assert len(lines(work)) == 6 + 4  # the second lego run has no export and no evaluation of it
+    assert len(lines(work)) == 5 + 3  # the second lego run has no export and no evaluation of it
     fakes.fail()
     fakes.calls()
     assert run_chains(work, matrix.chains()) == []
-    assert len(fakes.calls()) == 12 + 2
+    assert len(fakes.calls()) == 10 + 2
 
 
 def test_a_command_that_leaves_nothing_is_a_failure(fakes, matrix: Matrix, tmp_path: Path) -> None:
@@ -163,7 +162,7 @@ def test_two_benchmarks_do_not_work_on_one_run(fakes, matrix: Matrix, tmp_path: 
 
 
 def test_methods_of_others_are_trained_and_evaluated_only(fakes, matrix: Matrix, tmp_path: Path) -> None:
-    other = Matrix(matrix.scenes[:1], [Row("splatfacto", "splatfacto")], (), 100, matrix.bundles, 1, True)
+    other = Matrix(matrix.scenes[:1], [Row("splatfacto", "splatfacto")], (), 100, matrix.bundles, 1)
     assert run_chains(tmp_path / "work", other.chains()) == []
     assert [call.split()[0] for call in fakes.calls()] == ["ns-train", "ns-eval"]
     (cell, _) = lines(tmp_path / "work")

@@ -129,14 +129,6 @@ def figures(psnr: float, ms: float, **more: float) -> dict[str, Any]:
     return {"results": {"psnr": psnr, "ssim": 0.8, "flip": 0.1, "surfels": 5000.0, "render_ms": ms, **more}}
 
 
-def knob(value: Any, exact: bool = False, mean: float = 0.5) -> dict[str, Any]:
-    return {
-        "knob": "format", "value": value, "renderer": "baked", "exact": exact, "default": value == "bc7",
-        "max_steps": 0.0 if exact else 4 * mean, "mean_steps": 0.0 if exact else mean, "psnr_exact": 60.0,
-        "psnr": 25.0, "ms": 4.0, "cpu_ms": 8.0, "bytes": 1_000_000, "against": "texels; exact: floats",
-    }  # fmt: skip
-
-
 def write_lines(path: Path, lines: list[dict[str, Any]]) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -144,7 +136,7 @@ def write_lines(path: Path, lines: list[dict[str, Any]]) -> Path:
 
 
 def write_work(folder: Path) -> Path:
-    """A work folder: two seeds of one row, baked, with pictures and knobs."""
+    """A work folder: two seeds of one row, baked, with pictures."""
     cells = []
     for seed, shift in ((0, 0.0), (1, 0.2)):
         curve = folder / "runs" / str(seed) / "training_curve.jsonl"
@@ -162,7 +154,6 @@ def write_work(folder: Path) -> Path:
     listed = {"bitymi_pictures": 1, "scene": "fox", "method": "bitymi", "captions": {"photo": "the photo"}}
     (pictures / "pictures.json").write_text(json.dumps({**listed, "views": [view]}))
     cells.append(cell("pictures", {"folder": "pictures", "views": 1}))
-    cells.append(cell("knobs", {"points": [knob("float32", True), knob("fp16", mean=0.1), knob("bc7")]}))
     write_lines(folder / "cells.jsonl", cells)
     return folder
 

@@ -142,7 +142,7 @@ def test_a_work_folder_is_read_by_its_cells_alone(work: Path, tmp_path: Path) ->
     assert records.evaluations[1].results["bundle_bytes"] == 3e6
     assert records.evaluations[3].results["train_seconds"] == 11.0
     assert [c.label for c in records.curves] == ["bitymi, seed 0", "bitymi, seed 1"]
-    assert len(records.knobs) == 3 and len(records.worst) == 1 and records.machines == ["Abacus, 10 beads"]
+    assert len(records.worst) == 1 and records.machines == ["Abacus, 10 beads"]
     trained, baked = over_seeds(records.evaluations)
     assert trained.label == "bitymi (2 seeds)" and trained.results["psnr"] == pytest.approx(25.1)
     assert baked.results["psnr_seeds"] == pytest.approx(0.1414, abs=1e-3)
@@ -176,7 +176,6 @@ def test_runs_that_differ_in_length_are_told_apart(tmp_path: Path) -> None:
     [
         ("{}", r"line 2, is not a cell of a benchmark"),
         ('{"key": {"cell": "eval"}, "value": {}}', r"line 2: the eval cell lacks .*psnr"),
-        ('{"key": {"cell": "knobs"}, "value": {}}', r"line 2: the knobs cell lacks 'points'"),
         ('{"key": {"cell": "pictures"}, "value": {}}', r"line 2: the pictures cell lacks 'folder'"),
         ("nonsense", r"line 2, is not valid JSON"),
     ],

@@ -1,7 +1,5 @@
 """nerfstudio's cameras and ours see the same."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType

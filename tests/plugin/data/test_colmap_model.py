@@ -1,14 +1,13 @@
 """Models as other programs and editors write them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 
 from bitymi_ns.plugin.data.colmap_model import read_model
-from tests.plugin.data.captures import as_binary, expect, images_of, load_any, printed
+from tests.plugin.data.captures import as_binary, expect, held_out, images_of, load_any, printed
 
 
 def points(project: Path, *rows: str) -> Path:
@@ -23,22 +22,20 @@ def test_byte_order_marks(project: Path, encoding: str) -> None:
     names = [path.name for path in images_of(project)]
     (project / "test_list.txt").write_text("\n".join(names[:2]), encoding)
     manager = load_any(project)
-    assert [path.name for path in manager.eval_dataset.image_filenames] == names[:2]
+    assert held_out(manager) == names[:2]
     assert len(manager.train_dataset) == 10
 
 
 @pytest.mark.parametrize("name", ["{}", "my {}", "my photo {}"])
 def test_images_without_their_second_line(project: Path, name: str) -> None:
     path = project / "sparse/0/images.txt"
+    text = path.read_text()
+    path.write_text(text.replace("\n\n", "\n1.5 2.5 -1 3 4 5 6.5 7 8 9 10 11\n"))
+    assert len(read_model(path.parent).images) == 12
+    path.write_text(text)
     lines = [line.split() for line in path.read_text().splitlines() if line]
     path.write_text("".join(f"{' '.join(words[:9])} {name.format(words[9])}\n" for words in lines))
     assert [image.name for image in read_model(path.parent).images] == [name.format(words[9]) for words in lines]
-
-
-def test_second_lines_with_points(project: Path) -> None:
-    path = project / "sparse/0/images.txt"
-    path.write_text(path.read_text().replace("\n\n", "\n1.5 2.5 -1 3 4 5 6.5 7 8 9 10 11\n"))
-    assert len(read_model(path.parent).images) == 12
 
 
 @pytest.mark.parametrize(
@@ -97,3 +94,24 @@ def test_a_single_file_in_text_is_of_another_model(project: Path) -> None:
     as_binary(folder)
     (folder / "cameras.txt").write_text("1 PINHOLE 48 36 20 20 24 18\n")
     assert read_model(folder).cameras[1].params[0] == 40.0
+
+
+@pytest.mark.parametrize("form", ["txt", "bin"])
+def test_every_camera_of_a_rig_has_its_own_pose_in_a_model(tmp_path: Path, form: str) -> None:
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_cameras_per_rig=2, num_frames_per_rig=3, num_points3D=20, sensor_from_rig_rotation_stddev=20.0
+    )
+    written = pycolmap.synthesize_dataset(options)
+    (written.write_text if form == "txt" else written.write_binary)(tmp_path)
+    by_name = {image.name: image for image in written.images.values()}
+    images = read_model(tmp_path).images
+    assert len(images) == len(by_name) == 6
+    for image in images:
+        other = by_name[image.name]
+        x, y, z, w = other.cam_from_world().rotation.quat
+        np.testing.assert_allclose(image.qvec, [w, x, y, z], atol=1e-12)
+        np.testing.assert_allclose(image.tvec, other.cam_from_world().translation, atol=1e-12)
+        assert (image.camera_id, image.frame) == (other.camera_id, other.frame_id)
+    (turn,) = {round(image.cam_from_world().rotation.angle_to(image.frame.rig_from_world.rotation), 9)
+               for image in by_name.values() if image.camera_id == 2}  # fmt: skip
+    assert turn > 0.01  # else the poses would say nothing

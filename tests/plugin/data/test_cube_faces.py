@@ -1,7 +1,5 @@
 """Photographs of wide cameras as faces of a cube."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

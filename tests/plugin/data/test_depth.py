@@ -1,7 +1,5 @@
 """Depth and normals of a capture: files, units, fits, initial points, and what is wrong with them."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path
@@ -13,7 +11,7 @@ import torch
 
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.data.depth import DepthFit, _affine, _mode
-from bitymi_ns.plugin.data.depth_files import MapFiles, maps_beside, read_depth
+from bitymi_ns.plugin.data.depth_files import MAPS, MapFiles, maps_beside, read_depth
 from bitymi_ns.plugin.data.lens import lenses_of
 from bitymi_ns.sample.capture import View, first_hits, generate
 from bitymi_ns.sample.room import Room
@@ -163,9 +161,18 @@ def test_missing_maps_and_switching_off(capture, capsys) -> None:
     views = load(folder).train_views
     assert "1 files of depth_file_path are missing" in " ".join(capsys.readouterr().out.split())
     assert sum(view.depth is None for view in views) == 1
-    manager = load(folder, depth="off")
-    assert all(view.depth is None for view in manager.train_views)
-    assert len(manager.train_dataparser_outputs.metadata["points3D_xyz"]) == 400
+    off = load(folder, depth="off")
+    meta = json.loads((folder / "transforms.json").read_text())
+    for frame in meta["frames"]:
+        del frame["depth_file_path"]
+    (folder / "transforms.json").write_text(json.dumps(meta))
+    without = load(folder)
+    for a, b in zip(off.train_views, without.train_views, strict=True):
+        assert a.depth is None and b.depth is None and torch.equal(a.image, b.image)
+    given, expected = (manager.train_dataparser_outputs.metadata for manager in (off, without))
+    assert len(given["points3D_xyz"]) == 400 and torch.equal(given["points3D_xyz"], expected["points3D_xyz"])
+    assert given.keys() - {MAPS} == expected.keys() - {MAPS}
+    assert off.train_dataset.metadata.keys() - {MAPS} == without.train_dataset.metadata.keys() - {MAPS}
     assert len(load(folder, points="random").train_dataparser_outputs.metadata.get("points3D_xyz", ())) == 0
 
 
@@ -198,13 +205,29 @@ def test_maps_of_scanners(tmp_path) -> None:
     confidence[-1] = 0
     cv2.imwrite(str(tmp_path / "depth/7.png"), depth)
     cv2.imwrite(str(tmp_path / "confidence/7.png"), confidence)
-    files = maps_beside(tmp_path / "images/7.jpg")
+    (files,) = maps_beside([tmp_path / "images/7.jpg"])
     assert files == MapFiles(tmp_path / "depth/7.png", tmp_path / "confidence/7.png")
     (lens,), _ = lenses_of("PINHOLE", (100.0, 100.0, 64.0, 48.0), 128, 96, (128, 96), "")
     read = read_depth(files, lens)
     assert read.shape == (96, 128) and not read[:2].any() and not read[-4:].any()
     assert np.allclose(read[2:-4], 1.5)
     assert read_depth(files, lens, 0.01).max() == pytest.approx(15.0)
+
+
+def test_color_pictures_in_a_scanners_depth_folder_are_not_used(tmp_path, capsys) -> None:
+    photographs = [tmp_path / f"rgb/{i}.jpg" for i in range(3)]
+    (tmp_path / "depth").mkdir()
+    color = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
+    for i in range(3):
+        cv2.imwrite(str(tmp_path / f"depth/{i}.png"), color)
+    assert maps_beside(photographs) == [MapFiles()] * 3
+    assert "holds color pictures, not depth" in " ".join(capsys.readouterr().out.split())
+    for values in (np.full((24, 32, 3), 7, np.uint8), np.full((24, 32), 900, np.uint16)):  # grey, millimetres
+        cv2.imwrite(str(tmp_path / "depth/1.png"), values)
+        assert all(files.depth is not None for files in maps_beside(photographs))
+    (tmp_path / "depth/1.png").write_bytes(b"no image")
+    assert all(files.depth is not None for files in maps_beside(photographs))
+    assert "color" not in capsys.readouterr().out
 
 
 def test_distorted_photographs_have_their_depth_moved(tmp_path) -> None:

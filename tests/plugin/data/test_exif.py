@@ -1,7 +1,5 @@
 """Exposure settings in the EXIF data of photographs."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

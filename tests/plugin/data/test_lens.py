@@ -1,7 +1,5 @@
 """Pinhole pictures of photographs that were taken through a lens."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What scanning programs write is read with its poses, and only the photographs of it."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

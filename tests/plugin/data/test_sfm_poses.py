@@ -1,7 +1,5 @@
 """Photographs without poses: what the finding of poses is given of a capture."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

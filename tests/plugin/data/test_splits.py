@@ -1,7 +1,5 @@
 """Which photographs are held out."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from bitymi_ns.plugin.data import splits

@@ -1,7 +1,5 @@
 """Checkpoints that cannot be used are refused with the file's name and what to do."""
 
-from __future__ import annotations
-
 import dataclasses
 import errno
 import json

@@ -1,7 +1,5 @@
 """The GPU is used where the kernels can run on it; else a message says why and what to do."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from types import ModuleType

@@ -1,7 +1,5 @@
 """What the first process of a run says when another one is lost. Whole runs: tests/e2e/test_several_processes.py."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest

@@ -1,7 +1,5 @@
 """LPIPS: the formula against torchmetrics, and where its weights come from."""
 
-from __future__ import annotations
-
 import io
 import os
 import pickle

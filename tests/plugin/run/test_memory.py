@@ -1,7 +1,5 @@
 """The statement of the memory that a run will take."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Image metrics, the training curve and honest clocks."""
 
-from __future__ import annotations
-
 import json
 import math
 import time

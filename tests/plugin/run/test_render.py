@@ -1,7 +1,5 @@
 """`ns-render` on our scenes: films and frames by PyAV, whole or not at all; one line says what cannot be rendered."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable

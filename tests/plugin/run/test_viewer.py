@@ -1,7 +1,5 @@
 """The viewer is for this machine alone unless it is told otherwise, and Ctrl-C ends it without a traceback."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from types import SimpleNamespace

@@ -193,7 +193,7 @@ def test_reduced_photographs_of_another_size(project: Path) -> None:
 def test_a_reduced_photograph_that_is_missing(project: Path) -> None:
     reduce_photographs(project, 2, (24, 18))
     (project / "images_2/frame_00003.png").unlink()
-    with expect(r"1 of 12 images of the capture are missing:\s+.*images_2/frame_00003.png"):
+    with expect(r"1 of 12 photographs of .* are missing:\s+.*images_2/frame_00003.png"):
         load_any(project, downscale_factor=2)
 
 
@@ -249,7 +249,7 @@ def test_photographs_that_the_model_lacks_are_named(project: Path, capsys: pytes
 
 def test_photographs_of_the_model_that_are_not_there(project: Path) -> None:
     images_of(project)[3].unlink()
-    with expect(r"1 of 12 images of the capture are missing:\s+.*frame_00004.png"):
+    with expect(r"1 of 12 photographs of .* are missing:\s+.*frame_00004.png"):
         load_any(project)
     for path in images_of(project):
         path.unlink()

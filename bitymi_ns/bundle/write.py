@@ -32,7 +32,7 @@ from bitymi_ns.bundle.manifest import (
     dump,
     points_text,
 )
-from bitymi_ns.bundle.parts import check_target
+from bitymi_ns.bundle.parts import NOTES, check_target, notes_data, parts_of
 from bitymi_ns.bundle.poster import Pixels, draw_poster, encode_poster, most_bytes
 from bitymi_ns.bundle.statistics import Statistics
 from bitymi_ns.bundle.surfel_table import (
@@ -161,7 +161,7 @@ def write_bundle(
         statistics: anything worth knowing about the bake, for people and reports.
         extra_files: further files by name, such as preview.png.
         loose_files: files that bundle.json does not vouch for, because they may be edited later.
-        overwrite: replace an existing bundle.
+        overwrite: replace an existing bundle; its notes.json is carried over.
         interchange: write surfels.ply into a compact bundle, too, for other programs.
         poster: [H, W, 3] picture of what a viewer shows first.
 
@@ -177,7 +177,7 @@ def write_bundle(
     _check_surfels(scene)
     for name in (*(extra_files or {}), *(loose_files or {})):
         check_file_name(name, "extra_files")
-        if name in (SURFELS, ATLAS, COMPACT_SURFELS, TEXELS, POSTER):
+        if name in (SURFELS, ATLAS, COMPACT_SURFELS, TEXELS, POSTER, NOTES):
             raise BundleError(f"extra_files may not replace {name}")
     info = _describe(scene, atlas, background, world or World(), statistics)
     parts = {} if codes is None else _compact_parts(codes, info)
@@ -196,6 +196,10 @@ def write_bundle(
             (new / MANIFEST).write_bytes(dump(describe(info)))
             for name, data in (loose_files or {}).items():
                 (new / name).write_bytes(data)
+            with parts_of(folder) as earlier:
+                notes = notes_data(earlier)
+            if notes is not None:
+                (new / NOTES).write_bytes(notes)
     except OSError as error:
         size = sum(value.numel() * 4 for value in surfels.values()) + (atlas.nbytes if atlas else 0)
         needs = f" (it needs about {size_text(size)})" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""

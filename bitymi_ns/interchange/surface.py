@@ -16,11 +16,11 @@ from pydantic import Field
 from torch import Tensor
 
 from bitymi_ns.ops import Prefilter, fitting_lists, project
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.ranges import check_ranges
 from bitymi_ns.scene.baked import as_bytes
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.scene.scene import GEOMETRY
 
 if TYPE_CHECKING:
     import open3d
@@ -64,7 +64,6 @@ def median_depth(
 
     Args:
         surfels: geometry by name (`GEOMETRY`), of N surfels.
-        camera: the view.
         near: nearest depth that is drawn, camera z.
         prefilter: as in `ops.project`.
 

@@ -1,13 +1,9 @@
 #!/usr/bin/env python
 """Compare a fixed small job with the committed baseline: quality, bytes, memory and time.
 
-Each scene is trained, baked, tuned, written and drawn in a process of its own, with one thread. Training is chaotic: a
-change of rounding alone moves one seed's PSNR over the few held-out views by up to 0.13 dB. So the PSNR that is
-compared is over all photographs, and the mean of several seeds. The same code on the same kind of processor gives the
-same. CPU seconds are divided by those of a calibration that has nothing of this package in it and runs before, between
-and after the parts, so that a busy machine, or a slower one of the same kind, gives the same figures. With `--accept`
-the figures become the new baseline, benchmarks/gate.json; the commit then shows what changed.
-"""
+Training is chaotic: a change of rounding alone moves one seed's PSNR by up to 0.13 dB, so the mean over seeds and all
+photographs is compared. CPU seconds are divided by those of a calibration between the parts, so that a busy machine, or
+a slower one of the same kind, gives the same figures. `--accept` makes them the new baseline, benchmarks/gate.json."""
 
 import argparse
 import itertools
@@ -43,21 +39,13 @@ class Settings:
 
 @dataclass(frozen=True)
 class Limit:
-    """Tolerance of a figure against the baseline.
+    """Tolerance of a figure against the baseline."""
 
-    Attributes:
-        better: whether "more" or "less" of it is better.
-        by: the largest step in the wrong direction.
-        relative: `by` is a share of the baseline and not a difference.
-        digits: that are shown.
-        timed: depends on the kind of processor; judged only where it is that of the baseline.
-    """
-
-    better: str
-    by: float
-    relative: bool = True
-    digits: int = 0
-    timed: bool = False
+    better: str  # whether "more" or "less" of it is better
+    by: float  # the largest step in the wrong direction
+    relative: bool = True  # `by` is a share of the baseline and not a difference
+    digits: int = 0  # that are shown
+    timed: bool = False  # depends on the kind of processor; judged only where it is that of the baseline
 
     def worse(self, value: float, baseline: float, slack: float = 1.0) -> bool:
         """True if the figure is worse than the baseline by more than `slack` times its limit."""
@@ -212,17 +200,13 @@ def in_a_process(data: Path, downscale: int, settings: Settings) -> dict[str, fl
 
 @dataclass(frozen=True)
 class Line:
-    """One figure of one scene beside its baseline.
-
-    Attributes:
-        verdict: "ok", "WORSE", "new" (no baseline) or "not judged" (a time on another kind of processor).
-    """
+    """One figure of one scene beside its baseline."""
 
     scene: str
     figure: str
     before: float | None
     now: float
-    verdict: str
+    verdict: str  # "ok", "WORSE", "new" (no baseline) or "not judged" (a time on another kind of processor)
 
     def cells(self) -> list[str]:
         """For the table."""

@@ -33,24 +33,16 @@ CLOCK = 2.0e9  # cycles per second, at most about what cards run at: how long `t
 
 @dataclass(frozen=True)
 class Options:
-    """Settings of a benchmark.
+    """Settings of a benchmark."""
 
-    Attributes:
-        device: of the kernels; the CPU = their emulation, to try a script without a card.
-        warm_up, runs: of every timing.
-        surfels: sizes of the synthetic scenes.
-        sizes: image sizes, width and height.
-        copy_bytes: bytes per second of a device-to-device copy, read and written bytes counted.
-        bundles: folders of baked scenes to draw as well.
-    """
-
-    device: torch.device
+    device: torch.device  # of the kernels; the CPU = their emulation, to try a script without a card
+    # warm_up, runs: of every timing
     warm_up: int
     runs: int
-    surfels: Sequence[int] = ()
-    sizes: Sequence[tuple[int, int]] = ()
-    copy_bytes: float = 0.0
-    bundles: Sequence[Path] = ()
+    surfels: Sequence[int] = ()  # sizes of the synthetic scenes
+    sizes: Sequence[tuple[int, int]] = ()  # image sizes, width and height
+    copy_bytes: float = 0.0  # bytes per second of a device-to-device copy, read and written bytes counted
+    bundles: Sequence[Path] = ()  # folders of baked scenes to draw as well
 
 
 def attempt(what: str, run: Callable[[], T]) -> T | None:

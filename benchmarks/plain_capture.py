@@ -17,19 +17,14 @@ from bitymi_ns.train.views import View
 
 @dataclass
 class Capture:
-    """A capture for training.
+    """A capture for training."""
 
-    Attributes:
-        train, held_out: views; every `interval`-th photograph is held out, the first one too.
-        points: [M, 3] sparse points.
-        colours: [M, 3] in [0, 1].
-        middle, scale: [3] float64; a point x of the capture's own frame lies at (x - middle) scale.
-    """
-
+    # train, held_out: views; every `interval`-th photograph is held out, the first one too
     train: list[View]
     held_out: list[View]
-    points: Tensor
-    colours: Tensor
+    points: Tensor  # [M, 3] sparse points
+    colours: Tensor  # [M, 3] in [0, 1]
+    # middle, scale: [3] float64; a point x of the capture's own frame lies at (x - middle) scale
     middle: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
     scale: float = 1.0
 

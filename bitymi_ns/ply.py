@@ -1,10 +1,5 @@
-"""Reader of PLY files: header, and the rows of an element, binary or text.
-
-`bundle.ply` reads and writes the PLY file of a bundle with it, `plugin.data.point_files` the clouds of captures.
-
-plyfile, the library for such files, is not used: it is under the GPL and this package under Apache-2.0, and it takes
-memory for as many rows of text as a header claims. Here nothing is taken that the file does not have.
-"""
+"""Reader of PLY files: header, and the rows of an element, binary or text. plyfile, the library for such files, is not
+used: it is under the GPL, and takes memory for as many rows of text as a header claims."""
 
 import re
 import warnings
@@ -38,34 +33,21 @@ class PlyError(ValueError):
 
 @dataclass(frozen=True)
 class Element:
-    """Element of a PLY file.
+    """Element of a PLY file."""
 
-    Attributes:
-        count: of its rows.
-        names: of its properties.
-        row: type of a row, a field per property; None where a property is a list.
-    """
-
-    count: int
-    names: tuple[str, ...]
-    row: np.dtype | None
+    count: int  # of its rows
+    names: tuple[str, ...]  # of its properties
+    row: np.dtype | None  # type of a row, a field per property; None where a property is a list
 
 
 @dataclass(frozen=True)
 class Header:
-    """Header of a PLY file.
+    """Header of a PLY file."""
 
-    Attributes:
-        order: of the bytes, < or >; "" in a text file.
-        elements: by name, in the file's order.
-        start: where the rows begin, bytes.
-        lines: of the header.
-    """
-
-    order: str
-    elements: dict[str, Element]
-    start: int
-    lines: int
+    order: str  # of the bytes, < or >; "" in a text file
+    elements: dict[str, Element]  # by name, in the file's order
+    start: int  # where the rows begin, bytes
+    lines: int  # of the header
 
     def ahead(self, name: str) -> int | None:
         """Count lines of a text file, else bytes, between the header and an element's rows; None where lists hide

@@ -22,31 +22,23 @@ from bitymi_ns.scene.baked import BakedScene
 
 @dataclass
 class Baked:
-    """A baked scene, before it is written.
+    """A baked scene, before it is written."""
 
-    Attributes:
-        scene: the surfels that are kept, N of them on the CPU, without an atlas; their view colours are lean
-            (`ops.view_color.LEAN`) where they were reduced.
-        rows: [N] int64, their rows in the scene.
-        packing: where the tiles lie; `scene.tiles` are the same memory.
-        texels: [layers, height, width, 3] float32 residual colours before quantisation, None without texture.
-        atlas: the encoded atlas, None without texture.
-        options: what it was baked with.
-        uncoded: [T, 3] the texels of which the codes were made, in the order of `ops.TexelTiles`; None = `texels`.
-        in_front: [N] transmittance in front of the surfels, by which errors of their tiles count; None = 1.
-        codes: integer codes of the surfels, and of the texels once coded; None = not compact.
-        statistics: what was left out, what it cost, and the error of the quantisation.
-    """
-
+    # the surfels that are kept, N of them on the CPU, without an atlas; their view colours are lean
+    # (`ops.view_color.LEAN`) where they were reduced
     scene: BakedScene
-    rows: Tensor
-    packing: Packing
+    rows: Tensor  # [N] int64, their rows in the scene
+    packing: Packing  # where the tiles lie; `scene.tiles` are the same memory
+    # [layers, height, width, 3] float32 residual colours before quantisation, None without texture
     texels: Tensor | None
-    atlas: EncodedAtlas | None
-    options: BakeOptions
+    atlas: EncodedAtlas | None  # the encoded atlas, None without texture
+    options: BakeOptions  # what it was baked with
+    # what was left out, what it cost, and the error of the quantisation
     statistics: Statistics = field(default_factory=Statistics)
-    codes: SceneCodes | None = None
+    codes: SceneCodes | None = None  # integer codes of the surfels, and of the texels once coded; None = not compact
+    # [T, 3] the texels of which the codes were made, in the order of `ops.TexelTiles`; None = `texels`
     uncoded: Tensor | None = None
+    # [N] transmittance in front of the surfels, by which errors of their tiles count; None = 1
     in_front: Tensor | None = None
 
     def with_statistics(self, **changes: Any) -> Baked:

@@ -43,15 +43,10 @@ class Coding(Protocol[C]):
 
 @dataclass(frozen=True)
 class CosineTexels:
-    """Texels as the codes of a compact bundle.
+    """Texels as the codes of a compact bundle."""
 
-    Attributes:
-        listed: [T, 3] what was coded.
-        codes: as they are stored.
-    """
-
-    listed: Tensor
-    codes: TexelCodes
+    listed: Tensor  # [T, 3] what was coded
+    codes: TexelCodes  # as they are stored
 
     def texels(self) -> Tensor:
         return self.codes.texels()
@@ -79,17 +74,11 @@ class Cosines:
 
 @dataclass(frozen=True)
 class PageTexels:
-    """Texels in the pages of an atlas.
+    """Texels in the pages of an atlas."""
 
-    Attributes:
-        listed: [T, 3] what was encoded.
-        atlas: as it is stored.
-        drawn: [T, 3] as they are drawn: decoded, but for the constants of surfels without a tile.
-    """
-
-    listed: Tensor
-    atlas: EncodedAtlas
-    drawn: Tensor
+    listed: Tensor  # [T, 3] what was encoded
+    atlas: EncodedAtlas  # as it is stored
+    drawn: Tensor  # [T, 3] as they are drawn: decoded, but for the constants of surfels without a tile
 
     def texels(self) -> Tensor:
         return self.drawn

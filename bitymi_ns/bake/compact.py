@@ -73,23 +73,14 @@ class Compact:
 
 @dataclass(frozen=True)
 class RatePoint:
-    """A point of the rate-distortion curve.
+    """A point of the rate-distortion curve."""
 
-    Attributes:
-        baked: with the surfels that are kept, and their codes; its texels are as they were.
-        coding: of the texels.
-        shown: the scene as it is drawn then, its texels coded.
-        bytes: of surfels and texels, about.
-        error: mean square error against the training photographs.
-        psnr: of them, dB.
-    """
-
-    baked: Baked
-    coding: TexelCodeOptions
-    shown: BakedScene
-    bytes: int
-    error: float
-    psnr: float
+    baked: Baked  # with the surfels that are kept, and their codes; its texels are as they were
+    coding: TexelCodeOptions  # of the texels
+    shown: BakedScene  # the scene as it is drawn then, its texels coded
+    bytes: int  # of surfels and texels, about
+    error: float  # mean square error against the training photographs
+    psnr: float  # of them, dB
 
 
 class Coder:
@@ -109,8 +100,6 @@ class Coder:
             baked: with lean view colours, on the CPU.
             views: training views; without any the reference steps are taken.
             background: [3] colour behind the scene.
-            options: see `Compact`.
-            progress: called on the way.
             device: where views are drawn and weighed.
         """
         options.check()
@@ -188,8 +177,6 @@ def compacted(
         baked: with lean view colours, on the CPU.
         views: training views; without any the reference steps are taken.
         background: [3] colour behind the scene.
-        options: see `Compact`.
-        progress: called on the way.
         device: where views are drawn and weighed.
 
     Raises:
@@ -204,8 +191,6 @@ def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> 
 
     Args:
         coder: measured with options that differ at most in what decides lambda.
-        options: see `Compact`.
-        progress: called on the way.
 
     Raises:
         ValueError: as `compacted` does.

@@ -17,21 +17,13 @@ _CHUNK = 1 << 19  # directions at once
 
 @dataclass(frozen=True)
 class Directions:
-    """Directions of some surfels.
+    """Directions of some surfels."""
 
-    Attributes:
-        rows: [n] int64 rows of the surfels.
-        unit: [n, D, 3] float32 unit vectors from the camera to the surfel, world frame; those of the views first.
-        valid: [n, D] bool; the rest of a row is filling.
-        views: number of the D columns that are for views.
-        view: [n, views] int64, view of each of these columns.
-    """
-
-    rows: Tensor
-    unit: Tensor
-    valid: Tensor
-    views: int
-    view: Tensor
+    rows: Tensor  # [n] int64 rows of the surfels
+    unit: Tensor  # [n, D, 3] float32 unit vectors from the camera to the surfel, world frame; those of the views first
+    valid: Tensor  # [n, D] bool; the rest of a row is filling
+    views: int  # number of the D columns that are for views
+    view: Tensor  # [n, views] int64, view of each of these columns
 
 
 def view_directions(means: Tensor, seen: Tensor, centers: Tensor) -> Iterator[Directions]:

@@ -23,21 +23,15 @@ POINTS = 256  # points of `photo_resolution`; each takes 22 bytes of bundle.json
 
 @dataclass(frozen=True)
 class BakeInput:
-    """Surfels and the views of them.
+    """Surfels and the views of them."""
 
-    Attributes:
-        surfels: per-surfel parameters by name, N rows, float32.
-        cameras: training views; there may be none.
-        near, weight_bound, prefilter: as the scene is drawn.
-        views: visibility in the cameras; None = not computed.
-    """
-
-    surfels: Mapping[str, Tensor]
-    cameras: Sequence[Camera]
+    surfels: Mapping[str, Tensor]  # per-surfel parameters by name, N rows, float32
+    cameras: Sequence[Camera]  # training views; there may be none
+    # near, weight_bound, prefilter: as the scene is drawn
     near: float
     weight_bound: float
     prefilter: Prefilter
-    views: Visibility | None = None
+    views: Visibility | None = None  # visibility in the cameras; None = not computed
 
     @property
     def transmittance(self) -> Tensor | None:

@@ -32,17 +32,11 @@ loosely instead of diverging."""
 
 @dataclass
 class LeanColor:
-    """View colours of N surfels, of which only what is needed is left (`ops.view_color.LEAN`).
+    """View colours of N surfels, of which only what is needed is left (`ops.view_color.LEAN`)."""
 
-    Attributes:
-        base: [N, 3] float32.
-        span: [N, 2] int32 first term and number of terms.
-        terms: [T, lean_width of the kind] float32, those of one surfel after those of the one before.
-    """
-
-    base: Tensor
-    span: Tensor
-    terms: Tensor
+    base: Tensor  # [N, 3] float32
+    span: Tensor  # [N, 2] int32 first term and number of terms
+    terms: Tensor  # [T, lean_width of the kind] float32, those of one surfel after those of the one before
 
     def parameters(self) -> dict[str, Tensor]:
         """By the names that the renderers use."""
@@ -98,7 +92,6 @@ def reduce_view_color(
         centers: [V, 3] float64 camera centres.
         opacity: [N] largest blending weight.
         tolerance: 8-bit steps.
-        progress: called with the number of surfels done.
     """
     means, entry = surfels["means"], VIEW_COLORS[kind]
     full = {name: surfels[name] for name in entry.names}

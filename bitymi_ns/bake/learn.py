@@ -29,19 +29,12 @@ STEPS_AFTER_LEARNING = 100
 
 @dataclass(frozen=True)
 class Learning:
-    """Optimisation after the training, against the photographs.
+    """Optimisation after the training, against the photographs."""
 
-    Attributes:
-        polish: of texels and surfels together; None = none.
-        tune: of texels alone, after that; None = none.
-        train: options of the training, for the rates of the polish.
-        compact: rounding for a compact bundle, before the texels are tuned alone; None = none.
-    """
-
-    polish: PolishOptions | None = None
-    tune: TuneOptions | None = None
-    train: TrainConfig = field(default_factory=TrainConfig)
-    compact: Compact | None = None
+    polish: PolishOptions | None = None  # of texels and surfels together; None = none
+    tune: TuneOptions | None = None  # of texels alone, after that; None = none
+    train: TrainConfig = field(default_factory=TrainConfig)  # options of the training, for the rates of the polish
+    compact: Compact | None = None  # rounding for a compact bundle, before the texels are tuned alone; None = none
 
     @classmethod
     def of_scene(
@@ -121,7 +114,6 @@ def bake_and_learn(
     and view colours; rounding of the surfels (compact only); fine-tuning of the texels; coding; certificate.
 
     Args:
-        scene: a trained scene.
         cameras: of the training views, on the scene's device.
         photographs: the training views, with the corrections that training found.
         background: [3] colour behind the scene, on the CPU.

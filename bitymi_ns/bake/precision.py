@@ -67,15 +67,10 @@ class Pictures:
 
 @dataclass(frozen=True)
 class ColumnNoise:
-    """Image error of rounding by column of `REFERENCE`.
+    """Image error of rounding by column of `REFERENCE`."""
 
-    Attributes:
-        noise: mean square error of the pictures by the square of the step; 0 = it is not seen.
-        counts: numbers of the column.
-    """
-
-    noise: Mapping[str, float]
-    counts: Mapping[str, int]
+    noise: Mapping[str, float]  # mean square error of the pictures by the square of the step; 0 = it is not seen
+    counts: Mapping[str, int]  # numbers of the column
 
     def steps(self, lmbda: float) -> dict[str, float]:
         """Steps at which a further bit for each number of a column saves lambda.

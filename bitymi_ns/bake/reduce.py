@@ -60,19 +60,13 @@ def read_at(texels: Tensor, size: tuple[int, int]) -> Tensor:
 
 @dataclass
 class Reduced:
-    """The grids that were chosen, and their texels.
+    """The grids that were chosen, and their texels."""
 
-    Attributes:
-        sizes: [N, 2] int32 (r_u, r_v), 0 for a surfel without a tile.
-        constant: [N, 3] the residual of the surfels without a tile.
-        parts: (rows [n], texels [n, 3, r_v, r_u]) of tiles of one size.
-        nonfinite: number of points at which the field was not finite (taken as 0 there).
-    """
-
-    sizes: Tensor
-    constant: Tensor
+    sizes: Tensor  # [N, 2] int32 (r_u, r_v), 0 for a surfel without a tile
+    constant: Tensor  # [N, 3] the residual of the surfels without a tile
+    # (rows [n], texels [n, 3, r_v, r_u]) of tiles of one size
     parts: list[tuple[Tensor, Tensor]] = field(default_factory=list)
-    nonfinite: int = 0
+    nonfinite: int = 0  # number of points at which the field was not finite (taken as 0 there)
 
     def pages(self, packing: Packing) -> Tensor:
         """The texels in their places: [layers, height, width, 3] float32 on the CPU, 0 outside the tiles."""
@@ -106,7 +100,6 @@ def reduce_tiles(
         shown: how much of the tiles is.
         tolerance: largest error, 8-bit steps.
         r_min: smallest side of a tile, a power of two.
-        progress: called with the number of tiles done.
     """
     n = len(shown.extent)
     reduced = Reduced(torch.zeros(n, 2, dtype=torch.int32), torch.zeros(n, 3))

@@ -15,21 +15,13 @@ from bitymi_ns.ops.constants import SUPPORT
 
 @dataclass(frozen=True)
 class Tiles:
-    """Tiles of N surfels on the CPU.
+    """Tiles of N surfels on the CPU."""
 
-    Attributes:
-        packing: layout of the atlas.
-        texels: [layers, height, width, 3] float32 residual colours, None without any tile.
-        extent: [N] half side in scale units.
-        mean_residual: [N, 3] mean of every tile; the residual of a surfel without one.
-        nonfinite: points at which the field was not finite.
-    """
-
-    packing: Packing
-    texels: Tensor | None
-    extent: Tensor
-    mean_residual: Tensor
-    nonfinite: int = 0
+    packing: Packing  # layout of the atlas
+    texels: Tensor | None  # [layers, height, width, 3] float32 residual colours, None without any tile
+    extent: Tensor  # [N] half side in scale units
+    mean_residual: Tensor  # [N, 3] mean of every tile; the residual of a surfel without one
+    nonfinite: int = 0  # points at which the field was not finite
 
     @classmethod
     def none(cls, count: int, extent: float) -> Tiles:
@@ -39,41 +31,26 @@ class Tiles:
 
 @dataclass
 class Shown:
-    """Largest visible part and weight of N tiles.
+    """Largest visible part and weight of N tiles."""
 
-    Attributes:
-        opacity: [N] largest blending weight of the surfel's centre.
-        beta: [N] exponent of the kernel.
-        extent: [N] half side of the tile in scale units, beyond which every fragment is below the weight bound; 0 where
-            all are.
-        weight_bound: fragments of smaller weight get no residual.
-        pixels: [N, 2] pixels per scale unit in the closest view (`tile_errors.closest_pixels`); None = not known.
-    """
-
-    opacity: Tensor
-    beta: Tensor
+    opacity: Tensor  # [N] largest blending weight of the surfel's centre
+    beta: Tensor  # [N] exponent of the kernel
+    # [N] half side of the tile in scale units, beyond which every fragment is below the weight bound; 0 where all are
     extent: Tensor
-    weight_bound: float
+    weight_bound: float  # fragments of smaller weight get no residual
+    # [N, 2] pixels per scale unit in the closest view (`tile_errors.closest_pixels`); None = not known
     pixels: Tensor | None = field(default=None, kw_only=True)
 
 
 @dataclass
 class TileValues:
-    """Target texels of n tiles of one size.
+    """Target texels of n tiles of one size."""
 
-    Attributes:
-        rows: [n] int64 rows of the surfels.
-        size: (u, v) texels.
-        values: [n, 3, v, u] residual colours.
-        weight: [n, v, u] weight of an error.
-        nonfinite: points at which the field was not finite.
-    """
-
-    rows: Tensor
-    size: tuple[int, int]
-    values: Tensor
-    weight: Tensor
-    nonfinite: int
+    rows: Tensor  # [n] int64 rows of the surfels
+    size: tuple[int, int]  # (u, v) texels
+    values: Tensor  # [n, 3, v, u] residual colours
+    weight: Tensor  # [n, v, u] weight of an error
+    nonfinite: int  # points at which the field was not finite
 
 
 def texel_centers(count: int, extent: Tensor) -> Tensor:

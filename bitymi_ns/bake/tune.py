@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from pydantic import NonNegativeInt
 from torch import Tensor
 
 from bitymi_ns.bake.baked import Baked
@@ -17,6 +18,7 @@ from bitymi_ns.bake.tuning_views import TuningViews
 from bitymi_ns.bundle.statistics import FineTuning
 from bitymi_ns.codec.texel_codes import TexelCodeOptions, TexelCoder
 from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.ranges import Count, Positive, PositiveCount, Share, check_ranges
 from bitymi_ns.train.config import TexelSteps
 from bitymi_ns.train.schedules import falling
 from bitymi_ns.train.views import MemoryBudget, OnDemand, View, training_order
@@ -26,25 +28,26 @@ from bitymi_ns.train.views import MemoryBudget, OnDemand, View, training_order
 class TuneOptions(TexelSteps):
     """Options of the fine-tuning."""
 
-    steps: int = 400
+    rate: Positive = TexelSteps.rate
+    steps: Count = 400
     """Steps, before the texels are stored; each stopping at one training view."""
-    ssim_weight: float = 0.2
+    ssim_weight: Share = 0.2
     """Share of 1 - SSIM in the loss; the rest is L1."""
-    val_every: int = 8
+    val_every: Count = 8
     """Every so-many-th training view is a validation view; the texels that show these best are kept. 0 = none, and the
     last texels are kept: where they have learned from all views already, these tell nothing."""
-    checks: int = 16
+    checks: PositiveCount = 16
     """Evaluations of the validation views over the run."""
-    patience: int = 6
+    patience: PositiveCount = 6
     """Evaluations without a gain after which the run ends."""
-    cache_bytes: int = 1_000_000_000
+    cache_bytes: NonNegativeInt = 1_000_000_000
     """Memory for the fragments of the views, first of the validation views, which are drawn most often; what does not
     fit is traced anew whenever it is needed."""
     seed: int = 0
     """Of the order of the views."""
-    coded_steps: int = 120
+    coded_steps: Count = 120
     """Further steps, which see what is stored of the texels: blocks of BC7, say, or the codes of a compact bundle."""
-    coded_every: int = 10
+    coded_every: PositiveCount = 10
     """Steps between codings of the texels."""
     coded_rate: float = 0.02
     """Their rate at the start."""
@@ -57,14 +60,9 @@ class TuneOptions(TexelSteps):
 
     def check(self) -> None:
         """Refuse values that make no sense."""
-        least_of = {"steps": 0, "val_every": 0, "checks": 1, "patience": 1, "cache_bytes": 0}
-        for name, least in {**least_of, "coded_steps": 0, "coded_every": 1}.items():
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} of the fine-tuning must be at least {least}, not {getattr(self, name)}")
+        check_ranges(self)
         if self.val_every == 1:
-            raise ValueError("val_every of the fine-tuning must not be 1: no view would be left to learn from")
-        if not self.rate > 0 or not self.prior > 0 or not 0 <= self.ssim_weight <= 1:
-            raise ValueError("rate and prior of the fine-tuning must be positive, the SSIM weight between 0 and 1")
+            raise ValueError("val_every must not be 1: no view would be left to learn from")
 
 
 def tune_atlas(
@@ -89,8 +87,6 @@ def tune_atlas(
         baked: a bake with an atlas; reduced tiles, extents and constants are tuned as they are.
         views: training views, with the corrections that training found; every `val_every`-th is for validation.
         background: [3] colour behind the scene.
-        options: see `TuneOptions`.
-        progress: called after every step.
         eval_views: views of which the gain is stated, of what is stored; they decide nothing.
         coding: how texels are coded, where the surfels are rounded for a compact bundle. The last steps then see what
             the coding makes of the texels, and the codes that show the validation views best are kept.

@@ -19,25 +19,15 @@ LEAST_KEPT = 1 / 8
 
 @dataclass
 class TuningView:
-    """A photograph, and what the texels add to its picture.
+    """A photograph, and what the texels add to its picture."""
 
-    Attributes:
-        lists: the fragments that show a texel, in bands from top to bottom.
-        base: [N, 3] f_view of every surfel.
-        rest: [H, W, 3] the picture without these fragments: the faint ones, and the background.
-        target: [H, W, 3] the photograph over the background.
-        mask: [H, W, 1] bool, True where the pixel counts; None = everywhere.
-        correction: of the photograph's exposure, as in `View`; None = there is none.
-        alpha: [H, W, 1] coverage; None without a correction.
-    """
-
-    lists: list[Fragments]
-    base: Tensor
-    rest: Tensor
-    target: Tensor
-    mask: Tensor | None
-    correction: Tensor | None = None
-    alpha: Tensor | None = None
+    lists: list[Fragments]  # the fragments that show a texel, in bands from top to bottom
+    base: Tensor  # [N, 3] f_view of every surfel
+    rest: Tensor  # [H, W, 3] the picture without these fragments: the faint ones, and the background
+    target: Tensor  # [H, W, 3] the photograph over the background
+    mask: Tensor | None  # [H, W, 1] bool, True where the pixel counts; None = everywhere
+    correction: Tensor | None = None  # of the photograph's exposure, as in `View`; None = there is none
+    alpha: Tensor | None = None  # [H, W, 1] coverage; None without a correction
 
     @property
     def nbytes(self) -> int:

@@ -46,16 +46,11 @@ class Ktx2Error(ValueError):
 
 @dataclass(frozen=True)
 class Ktx2Image:
-    """A 2D array texture.
+    """A 2D array texture."""
 
-    Attributes:
-        payload: one bytes-like object a layer.
-        format: one of bc7, uint8, fp16.
-        width, height: size in texels.
-    """
-
-    payload: list[memoryview]
-    format: Format
+    payload: list[memoryview]  # one bytes-like object a layer
+    format: Format  # one of bc7, uint8, fp16
+    # width, height: size in texels
     width: int
     height: int
 
@@ -90,7 +85,6 @@ def write_ktx2(
     """Write a 2D array texture with one level, not supercompressed.
 
     Args:
-        path: file to write.
         payload: one bytes object a layer, rows from the top.
         format: bc7, uint8 (RGBA) or fp16 (RGBA).
         width, height: size in texels; multiples of 4 for bc7.
@@ -121,22 +115,15 @@ def write_ktx2(
 
 @dataclass(frozen=True)
 class Header:
-    """Header of a KTX2 file.
+    """Header of a KTX2 file."""
 
-    Attributes:
-        format: one of bc7, uint8, fp16.
-        width, height: size in texels.
-        layers: number of layers.
-        data_at: where the texels begin, bytes; they end with the file.
-        nbytes: size of the whole file.
-    """
-
-    format: Format
+    format: Format  # one of bc7, uint8, fp16
+    # width, height: size in texels
     width: int
     height: int
-    layers: int
-    data_at: int
-    nbytes: int
+    layers: int  # number of layers
+    data_at: int  # where the texels begin, bytes; they end with the file
+    nbytes: int  # size of the whole file
 
 
 def read_header(data: bytes | bytearray | memoryview, size: int) -> Header:

@@ -25,6 +25,7 @@ from bitymi_ns.trust import Refused, json_of, keep
 
 MANIFEST_LIMIT = 4 << 20  # bytes that a bundle.json may have
 DIRECTORY_LIMIT = 4 << 20  # bytes that the directory of a bundle in one file may have
+NOTES, NOTES_LIMIT = "notes.json", 256 << 10  # saved views and notes: `bundle.notes`; its bytes at most
 CONFIG = "config.yml"  # configuration for nerfstudio's tools, for which bundle.json does not vouch
 CAMERAS, PREVIEWS = "cameras.json", ("preview.jpg", "preview.png")
 _PHOTOGRAPH = re.compile(r"photograph-[0-9]{4,6}\.jpg")
@@ -174,12 +175,8 @@ def parts_of(bundle: str | Path, inside: bool = False) -> Iterator[Parts]:
 
 
 def _check_directory(file: BinaryIO) -> int:
-    """Size of a file. Refuses one whose directory exceeds `DIRECTORY_LIMIT`, which takes `zipfile` long to read, or
-    that begins with something else, which may then be of another type, too.
-
-    Raises:
-        ValueError: says why.
-    """
+    """Size of a file. Raises a ValueError for one whose directory exceeds `DIRECTORY_LIMIT`, which takes `zipfile` long
+    to read, or that begins with something else, which may then be of another type, too."""
     size = file.seek(0, os.SEEK_END)
     records = _LARGE.size + _LARGE_AT.size + _END.size
     file.seek(max(0, size - records))
@@ -200,11 +197,24 @@ def _check_directory(file: BinaryIO) -> int:
     return size
 
 
+def notes_data(parts: Parts) -> bytes | None:
+    """Bytes of notes.json, unchecked; None where a bundle has none.
+
+    Raises:
+        BundleError: it cannot be read, or has more than `NOTES_LIMIT` bytes.
+    """
+    try:
+        return parts.read(NOTES, NOTES_LIMIT)
+    except MissingPart:
+        return None
+
+
 def check_target(folder: str | Path, overwrite: bool = False) -> None:
     """Check that a bundle may be written to a folder, before the work of making one.
 
     Raises:
-        BundleError: it exists and `overwrite` is off; or it is something other than a bundle, or holds something else.
+        BundleError: it exists and `overwrite` is off; or it is something other than a bundle, or holds something else,
+            or a notes.json that cannot be carried over.
     """
     folder = Path(folder)
     if not os.path.lexists(folder):
@@ -220,8 +230,10 @@ def check_target(folder: str | Path, overwrite: bool = False) -> None:
         )
     if not overwrite:
         raise BundleError(f"{folder} is a bundle already; choose another folder, or replace it (--overwrite True)")
+    with parts_of(folder) as parts:
+        notes_data(parts)  # carried over to the new bundle
     try:
-        keep(folder, files_of(folder))
+        keep(folder, [*files_of(folder), NOTES])
     except Refused as error:
         raise BundleError(str(error)) from error
 

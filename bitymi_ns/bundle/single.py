@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bitymi_ns.bundle.manifest import ATLAS, COMPACT_SURFELS, MANIFEST, POSTER, SURFELS, TEXELS, BundleError
-from bitymi_ns.bundle.parts import MANIFEST_LIMIT, is_known, left_out, parts_of, passed_on
+from bitymi_ns.bundle.notes import read_notes
+from bitymi_ns.bundle.parts import MANIFEST_LIMIT, NOTES, is_known, left_out, parts_of, passed_on
 from bitymi_ns.bundle.read import manifest_of, read_file, read_manifest
 from bitymi_ns.bundle.sizes import enough_memory, machine_memory
 from bitymi_ns.files import size_text, write_file
@@ -18,21 +19,16 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 
 @dataclass(frozen=True)
 class Written:
-    """Sizes of a written file.
+    """Sizes of a written file."""
 
-    Attributes:
-        first: bytes from the start to the end of the surfels.
-        bytes: of the file.
-        left_out: files that the bundle lists and the format does not name, which the file does not have.
-    """
-
-    first: int
-    bytes: int
-    left_out: list[str]
+    first: int  # bytes from the start to the end of the surfels
+    bytes: int  # of the file
+    left_out: list[str]  # files that the bundle lists and the format does not name, which the file does not have
 
 
 def write_single(bundle: str | Path, path: str | Path) -> Written:
-    """Write the files of a bundle that bundle.json lists and the format names into one, whole or not at all.
+    """Write the files of a bundle that bundle.json lists and the format names into one, whole or not at all; and its
+    notes.json.
 
     Nothing is deflated, sizes stand before the parts, and bundle.json comes first: a reader of the beginning knows
     where everything lies, and any part is one range of the file.
@@ -77,6 +73,8 @@ def joined(bundle: str | Path) -> tuple[bytes, Written]:
                 archive.writestr(zipfile.ZipInfo(name, _DATE), data)
                 if name == info.surfels.file:
                     first = buffer.tell()
+            if (notes := read_notes(parts)) is not None:
+                archive.writestr(zipfile.ZipInfo(NOTES, _DATE), notes[0])
         with enough_memory(parts.bundle, info):
             whole = buffer.getvalue()
     return whole, Written(first, len(whole), left_out(info))

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bundle.manifest import MANIFEST, BundleError, WorldFrame
-from bitymi_ns.bundle.parts import Parts, parts_of
+from bitymi_ns.bundle.notes import read_notes
+from bitymi_ns.bundle.parts import NOTES, Parts, parts_of
 from bitymi_ns.bundle.read import Bundle, assemble, manifest_of, read_file
 from bitymi_ns.bundle.sizes import SCENE_FILES, enough_memory
 from bitymi_ns.bundle.sketch import estimated_rms, sketch, sketches_of
@@ -68,7 +69,16 @@ def _check_parts(parts: Parts) -> tuple[Bundle | None, list[Check]]:
     except BundleError as error:
         return None, [*checks, Check("contents", False, str(error))]
     checks.append(Check("contents", True, f"{len(bundle):,} surfels, all numbers finite, tiles inside the atlas"))
-    return bundle, [*checks, _tiles(bundle), _statements(bundle), *check_certificate(bundle)]
+    return bundle, [*checks, _tiles(bundle), _statements(bundle), *check_certificate(bundle), *_check_notes(parts)]
+
+
+def _check_notes(parts: Parts) -> list[Check]:
+    """Check notes.json, where there is one."""
+    try:
+        found = read_notes(parts)
+    except BundleError as error:
+        return [Check(NOTES, False, str(error))]
+    return [] if found is None else [Check(NOTES, True, f"{len(found[1].views)} views, {len(found[1].notes)} notes")]
 
 
 def _real_world(place: WorldFrame) -> str:

@@ -32,7 +32,7 @@ from bitymi_ns.bundle.manifest import (
     dump,
     points_text,
 )
-from bitymi_ns.bundle.parts import check_target
+from bitymi_ns.bundle.parts import NOTES, check_target, notes_data, parts_of
 from bitymi_ns.bundle.poster import Pixels, draw_poster, encode_poster, most_bytes
 from bitymi_ns.bundle.statistics import Statistics
 from bitymi_ns.bundle.surfel_table import (
@@ -57,21 +57,14 @@ _CHUNK = 1 << 22
 
 @dataclass(frozen=True)
 class World:
-    """Frame of the scene in the capture's own, x_scene = scale * (transform @ [x_capture, 1]), and in the real world.
+    """Frame of the scene in the capture's, x_scene = scale * (transform @ [x_capture, 1]), and in the real world."""
 
-    Attributes:
-        transform: [3, 4] (the dataparser's transform).
-        scale: the dataparser's scale.
-        up: [3] direction of the capture's own frame that points away from the ground; None = it is not known.
-        up_from: where `up` comes from, a word.
-        metres_per_unit: length of a unit of the capture's own frame; None = it is not known.
-    """
-
-    transform: npt.ArrayLike = field(default_factory=lambda: np.eye(4)[:3])
-    scale: float = 1.0
+    transform: npt.ArrayLike = field(default_factory=lambda: np.eye(4)[:3])  # [3, 4] (the dataparser's transform)
+    scale: float = 1.0  # the dataparser's scale
+    # [3] direction of the capture's own frame that points away from the ground; None = it is not known
     up: npt.ArrayLike | None = None
-    up_from: str = ""
-    metres_per_unit: float | None = None
+    up_from: str = ""  # where `up` comes from, a word
+    metres_per_unit: float | None = None  # length of a unit of the capture's own frame; None = it is not known
 
     def described(self) -> dict[str, Any]:
         """`manifest.WorldFrame`: up and length in the scene's own frame."""
@@ -168,7 +161,7 @@ def write_bundle(
         statistics: anything worth knowing about the bake, for people and reports.
         extra_files: further files by name, such as preview.png.
         loose_files: files that bundle.json does not vouch for, because they may be edited later.
-        overwrite: replace an existing bundle.
+        overwrite: replace an existing bundle; its notes.json is carried over.
         interchange: write surfels.ply into a compact bundle, too, for other programs.
         poster: [H, W, 3] picture of what a viewer shows first.
 
@@ -184,7 +177,7 @@ def write_bundle(
     _check_surfels(scene)
     for name in (*(extra_files or {}), *(loose_files or {})):
         check_file_name(name, "extra_files")
-        if name in (SURFELS, ATLAS, COMPACT_SURFELS, TEXELS, POSTER):
+        if name in (SURFELS, ATLAS, COMPACT_SURFELS, TEXELS, POSTER, NOTES):
             raise BundleError(f"extra_files may not replace {name}")
     info = _describe(scene, atlas, background, world or World(), statistics)
     parts = {} if codes is None else _compact_parts(codes, info)
@@ -203,6 +196,10 @@ def write_bundle(
             (new / MANIFEST).write_bytes(dump(describe(info)))
             for name, data in (loose_files or {}).items():
                 (new / name).write_bytes(data)
+            with parts_of(folder) as earlier:
+                notes = notes_data(earlier)
+            if notes is not None:
+                (new / NOTES).write_bytes(notes)
     except OSError as error:
         size = sum(value.numel() * 4 for value in surfels.values()) + (atlas.nbytes if atlas else 0)
         needs = f" (it needs about {size_text(size)})" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""

@@ -49,22 +49,15 @@ class NotRecognised(ValueError):
 
 @dataclass(frozen=True)
 class Found:
-    """Recognized capture.
+    """Recognized capture."""
 
-    Attributes:
-        format: to read it as.
-        path: nerfstudio, instant-ngp: the transforms.json; blender: the folder of its transforms_train.json; colmap:
-            the folder of the model; photographs: the folder; video: the file.
-        folder: of the capture, to which the names in its files are relative.
-        others: other captures there that are not read, with their formats.
-        unread: files of poses that cannot be read, with the program that wrote each.
-    """
-
-    format: Format
+    format: Format  # to read it as
+    # nerfstudio, instant-ngp: the transforms.json; blender: the folder of its transforms_train.json; colmap: the folder
+    # of the model; photographs: the folder; video: the file
     path: Path
-    folder: Path
-    others: tuple[tuple[Format, Path], ...] = ()
-    unread: tuple[tuple[Path, str], ...] = ()
+    folder: Path  # of the capture, to which the names in its files are relative
+    others: tuple[tuple[Format, Path], ...] = ()  # other captures there that are not read, with their formats
+    unread: tuple[tuple[Path, str], ...] = ()  # files of poses that cannot be read, with the program that wrote each
 
     def how_to_choose(self) -> str:
         """Describe what is not read and how to read it; empty where there is nothing else."""

@@ -11,21 +11,16 @@ ROWS = 64  # page heights are multiples of this, once an atlas has so many rows
 
 @dataclass(frozen=True)
 class Packing:
-    """Layout of the tiles in pages.
+    """Layout of the tiles in pages."""
 
-    Attributes:
-        tiles: [N, 5] int32 (x, y, layer, r_u, r_v): texel origin, page, and size, with u along x. A surfel without a
-            tile has a row of zeros.
-        width, height: size of every page in texels.
-        layers: number of pages.
-        occupancy: share of the pages' texels that belong to a tile.
-    """
-
+    # [N, 5] int32 (x, y, layer, r_u, r_v): texel origin, page, and size, with u along x. A surfel without a tile has a
+    # row of zeros
     tiles: npt.NDArray[np.int32]
+    # width, height: size of every page in texels
     width: int
     height: int
-    layers: int
-    occupancy: float
+    layers: int  # number of pages
+    occupancy: float  # share of the pages' texels that belong to a tile
 
     @property
     def texels(self) -> int:

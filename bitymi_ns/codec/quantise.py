@@ -44,26 +44,17 @@ class Range:
 
 @dataclass(frozen=True)
 class EncodedAtlas:
-    """An atlas in the format it is stored in.
+    """An atlas in the format it is stored in."""
 
-    Attributes:
-        payload: one bytes object per page: BC7 blocks, RGBA8 texels, or RGBA half floats, rows from the top.
-        format: one of bc7, uint8, fp16.
-        width, height: page size in texels.
-        range: quantisation range (offset 0 and scale 1 for fp16).
-        encoder: name of the encoder and its profile.
-        clipped_fraction: share of the tiles' colour values outside the range.
-        mse: mean squared error of the decoded tiles against the atlas, colour units squared.
-    """
-
-    payload: list[bytes]
-    format: Format
+    payload: list[bytes]  # one bytes object per page: BC7 blocks, RGBA8 texels, or RGBA half floats, rows from the top
+    format: Format  # one of bc7, uint8, fp16
+    # width, height: page size in texels
     width: int
     height: int
-    range: Range
-    encoder: str
-    clipped_fraction: float
-    mse: float
+    range: Range  # quantisation range (offset 0 and scale 1 for fp16)
+    encoder: str  # name of the encoder and its profile
+    clipped_fraction: float  # share of the tiles' colour values outside the range
+    mse: float  # mean squared error of the decoded tiles against the atlas, colour units squared
 
     @property
     def psnr(self) -> float | None:
@@ -152,7 +143,6 @@ def encode(
         value_range: quantisation range; not given: `choose_range` with its defaults. Not used by fp16.
         profile: effort of the BC7 encoder, from ultrafast to slow.
         threads: encoder threads; not given: one per processor. The result does not depend on it.
-        progress: called with the number of rows done.
     """
     if format not in BYTES_PER_TEXEL:
         raise ValueError(f"the atlas format must be bc7, uint8 or fp16, not {format!r}")

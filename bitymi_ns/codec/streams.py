@@ -18,17 +18,12 @@ class StreamError(ValueError):
 
 @dataclass(frozen=True)
 class Compressed:
-    """A compressed column of integers.
+    """A compressed column of integers."""
 
-    Attributes:
-        low: of each of its numbers, the smallest value, which was subtracted.
-        planes: of each of its numbers, the sizes in bytes of its frames, the lowest byte first; none where all are 0.
-        data: the frames, one after the other.
-    """
-
-    low: list[int]
+    low: list[int]  # of each of its numbers, the smallest value, which was subtracted
+    # of each of its numbers, the sizes in bytes of its frames, the lowest byte first; none where all are 0
     planes: list[list[int]]
-    data: bytes
+    data: bytes  # the frames, one after the other
 
 
 def compress(codes: npt.NDArray[np.int64], level: int = LEVEL) -> Compressed:

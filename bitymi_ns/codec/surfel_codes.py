@@ -38,40 +38,27 @@ PARAMETERS = {"place": "means", "rotation": "quats", "opacity": "opacity_logits"
 @dataclass(frozen=True)
 class PositionGrid:
     """Grid of positions: x = center + scale sinh(low + step k), per axis, with integers k from 0. It is about uniform
-    within `scale` of the centre, and beyond its cells grow with the distance.
+    within `scale` of the centre, and beyond its cells grow with the distance."""
 
-    Attributes:
-        center, low: one number per axis.
-        scale: world units.
-    """
-
+    # center, low: one number per axis
     center: tuple[float, float, float]
-    scale: float
+    scale: float  # world units
     low: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class SurfelCodes:
-    """N surfels along a Morton curve, as integers.
+    """N surfels along a Morton curve, as integers."""
 
-    Attributes:
-        kind: of the view colours, a name of `ops.VIEW_COLORS`.
-        frame: the grid of positions.
-        steps: the distance of neighbouring values by column, as in `REFERENCE`.
-        codes: column to [rows, numbers] int64.
-            place [N, 1]: Morton codes of the positions, ascending: bit 3 i + a is bit i of the cell along axis a.
-            largest [N, 1], rotation [N, 3]: which of w, x, y, z has the largest size and is positive; the others.
-            log_scales [N, 2], opacity [N, 1], beta [N, 1].
-            size [N, 1]: 16 log2(r_u) + log2(r_v); 0 = no tile.
-            extent [tiles, 1]: half sides of the tiles that there are.
-            view_base [N, 3], view_count [N, 1]: base colours and numbers of terms.
-            term_shape, term_color [T, ...]: the terms, those numbers that are no colours and those that are.
-            Colours are green, red - green, blue - green.
-    """
-
-    kind: str
-    frame: PositionGrid
-    steps: Mapping[str, float]
+    kind: str  # of the view colours, a name of `ops.VIEW_COLORS`
+    frame: PositionGrid  # the grid of positions
+    steps: Mapping[str, float]  # the distance of neighbouring values by column, as in `REFERENCE`
+    # column to [rows, numbers] int64. place [N, 1]: Morton codes of the positions, ascending: bit 3 i + a is bit i of
+    # the cell along axis a. largest [N, 1], rotation [N, 3]: which of w, x, y, z has the largest size and is positive;
+    # the others. log_scales [N, 2], opacity [N, 1], beta [N, 1]. size [N, 1]: 16 log2(r_u) + log2(r_v); 0 = no tile.
+    # extent [tiles, 1]: half sides of the tiles that there are. view_base [N, 3], view_count [N, 1]: base colours and
+    # numbers of terms. term_shape, term_color [T, ...]: the terms, those numbers that are no colours and those that
+    # are. Colours are green, red - green, blue - green
     codes: Mapping[str, Codes]
 
     def __len__(self) -> int:

@@ -49,17 +49,11 @@ class TexelCodeOptions:
 
 @dataclass(frozen=True)
 class Blocks:
-    """The blocks of one size of all tiles, by the rows of their surfels, then from the top, then from the left.
+    """The blocks of one size of all tiles, by the rows of their surfels, then from the top, then from the left."""
 
-    Attributes:
-        size: (b_u, b_v) texels.
-        tile: [B] int64, the number of the block's tile among the surfels that have one.
-        texels: [B, b_v, b_u] int64, rows of its texels in the list of `TexelTiles`.
-    """
-
-    size: tuple[int, int]
-    tile: Tensor
-    texels: Tensor
+    size: tuple[int, int]  # (b_u, b_v) texels
+    tile: Tensor  # [B] int64, the number of the block's tile among the surfels that have one
+    texels: Tensor  # [B, b_v, b_u] int64, rows of its texels in the list of `TexelTiles`
 
     @property
     def name(self) -> str:
@@ -95,23 +89,16 @@ def blocks_of(sizes: Tensor) -> list[Blocks]:
 
 @dataclass(frozen=True)
 class TexelCodes:
-    """The texels of N surfels as integers.
+    """The texels of N surfels as integers."""
 
-    Attributes:
-        sizes: [N, 2] int64 sides of the tiles; (0, 0) = one constant.
-        step: of the coefficients of a tile of grade 0, colour units.
-        residual: [N, 3] int64, mean of every tile or the constant, in steps: green, red - green, blue - green.
-        residual_step: of these, colour units.
-        grades: [tiles] int64.
-        coefficients: of every entry of `blocks_of(sizes)`, int32 [coefficients, B, 3] in their order; the channels are
-            (r + g + b) / sqrt(3), (r - b) / sqrt(2), (r - 2 g + b) / sqrt(6).
-    """
-
-    sizes: Tensor
-    step: float
+    sizes: Tensor  # [N, 2] int64 sides of the tiles; (0, 0) = one constant
+    step: float  # of the coefficients of a tile of grade 0, colour units
+    # [N, 3] int64, mean of every tile or the constant, in steps: green, red - green, blue - green
     residual: npt.NDArray[np.int64]
-    residual_step: float
-    grades: Tensor
+    residual_step: float  # of these, colour units
+    grades: Tensor  # [tiles] int64
+    # of every entry of `blocks_of(sizes)`, int32 [coefficients, B, 3] in their order; the channels are (r + g + b) /
+    # sqrt(3), (r - b) / sqrt(2), (r - 2 g + b) / sqrt(6)
     coefficients: Sequence[Tensor]
 
     @property
@@ -160,20 +147,13 @@ def residual_codes(values: Tensor, step: float = RESIDUAL_STEP) -> npt.NDArray[n
 
 @dataclass(frozen=True)
 class SceneCodes:
-    """Surfels and texels of a compact bundle as integers.
+    """Surfels and texels of a compact bundle as integers."""
 
-    Attributes:
-        surfels: of N surfels.
-        texels: of their tiles; None without tiles, or before they are coded.
-        residual: [N, 3] int64 mean residuals: green, red - green, blue - green.
-        residual_step: of these, colour units.
-        page_width, page_rows: arguments of `packing.pack`.
-    """
-
-    surfels: SurfelCodes
-    texels: TexelCodes | None
-    residual: npt.NDArray[np.int64]
-    residual_step: float
+    surfels: SurfelCodes  # of N surfels
+    texels: TexelCodes | None  # of their tiles; None without tiles, or before they are coded
+    residual: npt.NDArray[np.int64]  # [N, 3] int64 mean residuals: green, red - green, blue - green
+    residual_step: float  # of these, colour units
+    # page_width, page_rows: arguments of `packing.pack`
     page_width: int
     page_rows: int
 
@@ -187,7 +167,6 @@ class TexelCoder:
             sizes: [N, 2] sides of the tiles; (0, 0) = one constant.
             weights: [T] of the texels, in the order of `TexelTiles`: sum over views and fragments of the squared
                 blending weight times the bilinear weight. An error e of a texel adds weight times e^2 to the pictures.
-            options: see `TexelCodeOptions`.
         """
         options.check()
         self._sizes, self._weights = sizes.long(), weights + LEAST_WEIGHT

@@ -44,15 +44,10 @@ MOST_CAMERAS = 100_000
 
 @dataclass(frozen=True)
 class BundleCameras:
-    """Cameras of the capture that a bundle was made of.
+    """Cameras of the capture that a bundle was made of."""
 
-    Attributes:
-        train: the training cameras.
-        held_out: photographs that training did not see, with their cameras.
-    """
-
-    train: list[Camera] = field(default_factory=list)
-    held_out: list[View] = field(default_factory=list)
+    train: list[Camera] = field(default_factory=list)  # the training cameras
+    held_out: list[View] = field(default_factory=list)  # photographs that training did not see, with their cameras
 
 
 class NamedCamera(NamedTuple):

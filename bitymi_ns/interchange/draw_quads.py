@@ -46,19 +46,12 @@ def draw_quads(quads: Quads, camera: Camera, background: Tensor | None = None, n
 
 @dataclass(frozen=True)
 class Hits:
-    """Nearest quads at the centres of pixels; empty pixels are left out.
+    """Nearest quads at the centres of pixels; empty pixels are left out."""
 
-    Attributes:
-        pixel: [F] y * width + x.
-        quad: [F] rows of the quads.
-        uv: [F, 2] float64 texture coordinates.
-        color: [F, 3] float32.
-    """
-
-    pixel: Tensor
-    quad: Tensor
-    uv: Tensor
-    color: Tensor
+    pixel: Tensor  # [F] y * width + x
+    quad: Tensor  # [F] rows of the quads
+    uv: Tensor  # [F, 2] float64 texture coordinates
+    color: Tensor  # [F, 3] float32
 
 
 @torch.no_grad()

@@ -44,23 +44,15 @@ _UP = (0.0, 0.0, 1.0)  # nerfstudio's, where the bundle does not know
 
 @dataclass(frozen=True)
 class Written:
-    """Result of a written kind.
+    """Result of a written kind."""
 
-    Attributes:
-        file: its name.
-        bytes: of it.
-        count: Gaussians or quads.
-        psnr: dB against the photographs of `views` held-out views, as other programs draw it; None = there were none.
-        psnr_bundle: dB of the bundle there.
-        views: in which this was measured, reduced to `MEASURED_SIDE` pixels.
-    """
-
-    file: str
-    bytes: int
-    count: int
+    file: str  # its name
+    bytes: int  # of it
+    count: int  # Gaussians or quads
+    # dB against the photographs of `views` held-out views, as other programs draw it; None = there were none
     psnr: float | None
-    psnr_bundle: float | None
-    views: int
+    psnr_bundle: float | None  # dB of the bundle there
+    views: int  # in which this was measured, reduced to `MEASURED_SIDE` pixels
 
 
 def extras_folder(bundle: Path) -> Path:
@@ -114,7 +106,6 @@ def write_extras(
             over the whole sphere, and a mesh keeps the surfels' own colours.
         held_out: photographs to measure in.
         overwrite: replace a folder of extras.
-        progress: called on the way.
 
     Returns:
         what was written, by kind.

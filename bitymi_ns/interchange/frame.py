@@ -16,17 +16,11 @@ _SLACK = 1e-4  # of a rotation that was stored with rounding
 
 @dataclass(frozen=True)
 class Similarity:
-    """x_new = scale * (turn @ x) + shift.
+    """x_new = scale * (turn @ x) + shift."""
 
-    Attributes:
-        turn: [3, 3] float64, orthogonal; it may mirror.
-        scale: of lengths.
-        shift: [3] float64.
-    """
-
-    turn: Tensor
-    scale: float
-    shift: Tensor
+    turn: Tensor  # [3, 3] float64, orthogonal; it may mirror
+    scale: float  # of lengths
+    shift: Tensor  # [3] float64
 
     def points(self, points: Tensor) -> Tensor:
         """[..., 3] points in the new frame, of their type."""

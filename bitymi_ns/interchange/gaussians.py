@@ -32,21 +32,13 @@ _NAMES = {
 
 @dataclass(frozen=True)
 class Gaussians:
-    """N Gaussians, float32.
+    """N Gaussians, float32."""
 
-    Attributes:
-        means: [N, 3].
-        quats: [N, 4] wxyz, unit.
-        log_scales: [N, 3] natural logarithms of the standard deviations along the axes.
-        opacity_logits: [N].
-        harmonics: [N, 16, 3]; the colour is max(sum of harmonics Y(d) + 0.5, 0), d from the camera to the mean.
-    """
-
-    means: Tensor
-    quats: Tensor
-    log_scales: Tensor
-    opacity_logits: Tensor
-    harmonics: Tensor
+    means: Tensor  # [N, 3]
+    quats: Tensor  # [N, 4] wxyz, unit
+    log_scales: Tensor  # [N, 3] natural logarithms of the standard deviations along the axes
+    opacity_logits: Tensor  # [N]
+    harmonics: Tensor  # [N, 16, 3]; the colour is max(sum of harmonics Y(d) + 0.5, 0), d from the camera to the mean
 
     def __len__(self) -> int:
         return len(self.means)

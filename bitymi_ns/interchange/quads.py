@@ -22,19 +22,14 @@ _CHUNK = 1 << 20  # texels at once
 
 @dataclass(frozen=True)
 class Quads:
-    """Q parallelograms with a texture each.
+    """Q parallelograms with a texture each."""
 
-    Attributes:
-        corners: [Q, 4, 3] float32 positions, in a ring.
-        uv: [Q, 4, 2] float32 texture coordinates of the corners: (0, 0) is the outer corner of the first texel of the
-            page, (1, 1) that of the last one, as in glTF.
-        page: [Q] int64, which page holds its texels.
-        pages: [P, height, width, 4] uint8, red, green, blue and alpha; what is read of alpha below `MASK` is a hole.
-    """
-
-    corners: Tensor
+    corners: Tensor  # [Q, 4, 3] float32 positions, in a ring
+    # [Q, 4, 2] float32 texture coordinates of the corners: (0, 0) is the outer corner of the first texel of the page,
+    # (1, 1) that of the last one, as in glTF
     uv: Tensor
-    page: Tensor
+    page: Tensor  # [Q] int64, which page holds its texels
+    # [P, height, width, 4] uint8, red, green, blue and alpha; what is read of alpha below `MASK` is a hole
     pages: Tensor
 
     def __len__(self) -> int:

@@ -8,17 +8,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from bitymi_ns.ops import Prefilter, fitting_lists, project
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.ranges import check_ranges
 from bitymi_ns.scene.baked import as_bytes
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.scene.scene import GEOMETRY
 
 if TYPE_CHECKING:
     import open3d
@@ -52,22 +54,9 @@ class SurfaceOptions:
         watertight: close the mesh by a Poisson reconstruction from its vertices and normals.
     """
 
-    resolution: int = 256
-    triangles: int = 500_000
+    resolution: Annotated[int, Field(ge=16, le=4096)] = 256
+    triangles: Annotated[int, Field(ge=0, le=10**8)] = 500_000
     watertight: bool = False
-
-    def check(self) -> None:
-        """Refuse values out of range.
-
-        Raises:
-            ValueError: naming the option and its range.
-        """
-        for name, value, low, high in (
-            ("resolution", self.resolution, 16, 4096),
-            ("triangles", self.triangles, 0, 10**8),
-        ):
-            if not low <= value <= high:
-                raise ValueError(f"{name} must be from {low} to {high:,}, not {value}")
 
 
 @torch.no_grad()
@@ -78,7 +67,6 @@ def median_depth(
 
     Args:
         surfels: geometry by name (`GEOMETRY`), of N surfels.
-        camera: the view.
         near: nearest depth that is drawn, camera z.
         prefilter: as in `ops.project`.
 
@@ -157,7 +145,7 @@ def extract_surface(
     """
     import open3d
 
-    options.check()
+    check_ranges(options)
     small = [camera.within(BOX_SIDE) for camera in cameras]
     depths = []
     for i, camera in enumerate(small):

@@ -22,16 +22,11 @@ OUTSIDE, OUTSIDE_WEIGHT = 32, 0.1
 
 @dataclass(frozen=True)
 class SurfelColors:
-    """Colours of N surfels.
+    """Colours of N surfels."""
 
-    Attributes:
-        harmonics: [N, 16, 3] float32; the colour in the direction d from the camera is
-            max(sum of harmonics Y(d) + 0.5, 0).
-        color: [N, 3] float32, the mean colour without the residual, over the same directions.
-    """
-
+    # [N, 16, 3] float32; the colour in the direction d from the camera is max(sum of harmonics Y(d) + 0.5, 0)
     harmonics: Tensor
-    color: Tensor
+    color: Tensor  # [N, 3] float32, the mean colour without the residual, over the same directions
 
 
 def rows_of(surfels: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:

@@ -44,14 +44,10 @@ def decoded(blocks: Tensor) -> Tensor:
 
 
 class Sheet(NamedTuple):
-    """Arrangement of the pages of an atlas in one texture: below each other, then beside.
+    """Arrangement of the pages of an atlas in one texture: below each other, then beside."""
 
-    Attributes:
-        down: pages below each other.
-        width, height: from the corner of a page to that of the next, in texels of the atlas.
-    """
-
-    down: int
+    down: int  # pages below each other
+    # width, height: from the corner of a page to that of the next, in texels of the atlas
     width: int
     height: int
 
@@ -259,17 +255,11 @@ class Workspace:
 
 
 class ListedPairs(NamedTuple):
-    """The lists of a frame.
+    """The lists of a frame."""
 
-    Attributes:
-        ranges: [tiles, 2] where the list of each screen tile begins and ends, all views one after the other.
-        depth: [surfels * views] keys in the order of depth, 2^32 - 1: not visible.
-        pairs: row << 8 | mask of the 8 x 4 parts of the tile, tile by tile.
-    """
-
-    ranges: Tensor
-    depth: Tensor
-    pairs: Tensor
+    ranges: Tensor  # [tiles, 2] where the list of each screen tile begins and ends, all views one after the other
+    depth: Tensor  # [surfels * views] keys in the order of depth, 2^32 - 1: not visible
+    pairs: Tensor  # row << 8 | mask of the 8 x 4 parts of the tile, tile by tile
 
     @property
     def visible(self) -> Tensor:

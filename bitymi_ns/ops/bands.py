@@ -1,8 +1,5 @@
-"""Views with more fragments than memory, drawn a few rows of tiles at a time.
-
-A band is the same projection with the image's rows above it cut off. Its fragments are made when it is drawn, and once
-more in its backward pass; nothing of it is kept in between but its part of the image.
-"""
+"""Views with more fragments than memory, drawn a few rows of tiles at a time. A band is the same projection with the
+image's rows above it cut off; its fragments are made when it is drawn, and once more in its backward pass."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -26,19 +23,12 @@ view the system takes back and clears for the next, which takes longer than find
 
 @dataclass(frozen=True)
 class Bands:
-    """The fragments of a view that was drawn in bands: found again for every question.
+    """The fragments of a view that was drawn in bands: found again for every question."""
 
-    Attributes:
-        projection: of the whole view.
-        rows: first and last pixel row (exclusive) of every band, from top to bottom.
-        rim: as in `trace`.
-        count: number of fragments F.
-    """
-
-    projection: Projection
-    rows: tuple[tuple[int, int], ...]
-    rim: float
-    count: int
+    projection: Projection  # of the whole view
+    rows: tuple[tuple[int, int], ...]  # first and last pixel row (exclusive) of every band, from top to bottom
+    rim: float  # as in `trace`
+    count: int  # number of fragments F
 
     def __len__(self) -> int:
         return self.count

@@ -14,20 +14,14 @@ WEIGHTS = ("table", "w1", "w2", "w3")  # the kernels' names of the field's param
 
 @dataclass(frozen=True)
 class FieldGeometry:
-    """Position of the hash grid in the world.
+    """Position of the hash grid in the world."""
 
-    Attributes:
-        min_resolution: cells along an edge of the coarsest level; each level doubles it.
-        contract: mip-NeRF 360 contraction: the unit ball around `mid` of radius `half` is kept, all space outside maps
-            into the shell up to radius 2. Without it, the cube of half edge `half` is the domain; positions are clamped
-        mid: centre, world units.
-        half: radius or half edge, world units.
-    """
-
-    min_resolution: int
+    min_resolution: int  # cells along an edge of the coarsest level; each level doubles it
+    # mip-NeRF 360 contraction: the unit ball around `mid` of radius `half` is kept, all space outside maps into the
+    # shell up to radius 2. Without it, the cube of half edge `half` is the domain; positions are clamped
     contract: bool
-    mid: tuple[float, float, float]
-    half: float
+    mid: tuple[float, float, float]  # centre, world units
+    half: float  # radius or half edge, world units
 
 
 def kernel_field(geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Tensor, w3: Tensor):

@@ -24,17 +24,11 @@ only other programs change the answer: torch keeps the memory of a list for the 
 
 @dataclass
 class _Room:
-    """Fragments that the free memory of a device holds, as last measured.
+    """Fragments that the free memory of a device holds, as last measured."""
 
-    Attributes:
-        capacity: fragments.
-        largest: list that was compared with it.
-        lists: since then.
-    """
-
-    capacity: int
-    largest: int
-    lists: int = 0
+    capacity: int  # fragments
+    largest: int  # list that was compared with it
+    lists: int = 0  # since then
 
 
 _rooms: dict[torch.device, _Room] = {}
@@ -42,23 +36,14 @@ _rooms: dict[torch.device, _Room] = {}
 
 @dataclass(frozen=True)
 class Bins:
-    """Pairs of surfel and tile that may touch; P of them.
+    """Pairs of surfel and tile that may touch; P of them."""
 
-    Attributes:
-        order: [N] int32 surfels front to back.
-        slot_start: [N + 1] int64 by rank in that order: the surfel's first slot.
-        slot: [P] int32, by tile, then front to back: the pair's slot.
-        surfel: [P] int32, likewise: the pair's surfel.
-        tile_pairs: [tiles + 1] int64, where each tile's pairs begin.
-        differing: [1] int32, by how many pairs the lists differ from what was counted; not 0: the kernels were compiled
-            wrongly.
-    """
-
-    order: Tensor
-    slot_start: Tensor
-    slot: Tensor
-    surfel: Tensor
-    tile_pairs: Tensor
+    order: Tensor  # [N] int32 surfels front to back
+    slot_start: Tensor  # [N + 1] int64 by rank in that order: the surfel's first slot
+    slot: Tensor  # [P] int32, by tile, then front to back: the pair's slot
+    surfel: Tensor  # [P] int32, likewise: the pair's surfel
+    tile_pairs: Tensor  # [tiles + 1] int64, where each tile's pairs begin
+    # [1] int32, by how many pairs the lists differ from what was counted; not 0: the kernels were compiled wrongly
     differing: Tensor
 
     @property
@@ -165,7 +150,6 @@ def find_fragments(geom: Tensor, projection: Projection, most: int | None = None
 
     Args:
         geom: [N, 16] without graph.
-        projection: the view's.
         most: fragments that there may be; 0 = as many as a training step has memory for; None = any number.
 
     Returns:

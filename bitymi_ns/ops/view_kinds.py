@@ -1,8 +1,5 @@
-"""The kinds of view colour: one entry of `VIEW_COLORS` each.
-
-csrc/core/view_kinds.h computes the colour in a direction, in float64 `ops.reference.view_color`. Everything else that
-depends on the kind is in its entry here.
-"""
+"""The kinds of view colour: one entry of `VIEW_COLORS` each holds all that depends on the kind, but for the colour in a
+direction: csrc/core/view_kinds.h, and in float64 `ops.reference.view_color`."""
 
 import math
 from collections.abc import Callable, Collection, Mapping
@@ -27,23 +24,14 @@ VECTOR_LIMIT = 2e7  # of differences of two temperatures of at most exp(16) time
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of a view colour, of which every surfel has one row.
+    """A parameter of a view colour, of which every surfel has one row."""
 
-    Attributes:
-        name: as in checkpoints, optimiser groups and columns of surfels.ply.
-        shape: of a row; -1 = one for each term, or for each but the one that the first parameter holds.
-        limit: what a bundle may hold.
-        rate: the learning rate in `train.config.LearningRates` that it has,
-        share: and how much of it.
-        activation: what is done to it before use, as bundle.json says it; None = it says nothing.
-    """
-
-    name: str
-    shape: tuple[int, ...]
-    limit: Limit
-    rate: Literal["view_color", "view_shape"]
-    share: float = 1.0
-    activation: str | None = None
+    name: str  # as in checkpoints, optimiser groups and columns of surfels.ply
+    shape: tuple[int, ...]  # of a row; -1 = one for each term, or for each but the one that the first parameter holds
+    limit: Limit  # what a bundle may hold
+    rate: Literal["view_color", "view_shape"]  # the learning rate in `train.config.LearningRates` that it has,
+    share: float = 1.0  # and how much of it
+    activation: str | None = None  # what is done to it before use, as bundle.json says it; None = it says nothing
 
     @property
     def width(self) -> int:
@@ -57,48 +45,33 @@ class ViewColor:
 
     A term is a site, a coefficient or a lobe. Lean colours (`ops.view_color.LEAN`) have a base colour and as many terms
     as each surfel needs.
-
-    Attributes:
-        title: what people call it.
-        term, kept: a term, and the heading under which people read how many a bundle keeps, base colours included.
-        parameters: as the kernels take them, two or three; the second has one row per term.
-        counts: numbers of terms that there may be.
-        rule: the same in words, of the rows that there are.
-        base_terms: terms that the base of a lean colour stands for: 1, or 0 where it stands beside the terms.
-        option: the option of `SceneConfig` that decides how many terms there are,
-        option_range: its smallest and largest value,
-        terms_of: and the number of terms for a value.
-        start: the first parameters from colours [N, 3] less `COLOR_BIAS`, the number of terms and a random generator:
-            they show the colours from every direction, or on average over them.
-        lean_width: numbers of a lean term.
-        lean_limit: what a bundle may hold of them.
-        lean_counts: numbers of lean terms that a surfel may have.
-        lean_formula: how a lean colour is evaluated, for bundle.json.
-        base_unit: the colour that a base of 1 shows.
-        mean: f_view's mean over all directions [N, 3] from the parameters, for display; None = no closed form is known.
-        sites: the colour as softmax_k(v_k . d) rgb_k, from its parameters: v and rgb [N, K, 3] each. The bake then fits
-            fewer terms. None = it is nothing of the kind: a surfel keeps all terms, or one colour.
-        stated: the key of bundle.json's surfels under which the number of terms stands; None = it does not.
     """
 
-    title: str
+    title: str  # what people call it
+    # term, kept: a term, and the heading under which people read how many a bundle keeps, base colours included
     term: str
     kept: str
-    parameters: tuple[Parameter, ...]
-    counts: Collection[int]
-    rule: str
-    base_terms: int
-    option: str
-    option_range: tuple[int, int]
-    terms_of: Callable[[int], int]
+    parameters: tuple[Parameter, ...]  # as the kernels take them, two or three; the second has one row per term
+    counts: Collection[int]  # numbers of terms that there may be
+    rule: str  # the same in words, of the rows that there are
+    base_terms: int  # terms that the base of a lean colour stands for: 1, or 0 where it stands beside the terms
+    option: str  # the option of `SceneConfig` that decides how many terms there are,
+    option_range: tuple[int, int]  # its smallest and largest value,
+    terms_of: Callable[[int], int]  # and the number of terms for a value
+    # the first parameters from colours [N, 3] less `COLOR_BIAS`, the number of terms and a random generator: they show
+    # the colours from every direction, or on average over them
     start: Callable[[Tensor, int, torch.Generator], tuple[Tensor, ...]]
-    lean_width: int
-    lean_limit: Limit
-    lean_formula: str
-    lean_counts: Collection[int] = range(MAX_TERMS + 1)
-    base_unit: float = 1.0
+    lean_width: int  # numbers of a lean term
+    lean_limit: Limit  # what a bundle may hold of them
+    lean_formula: str  # how a lean colour is evaluated, for bundle.json
+    lean_counts: Collection[int] = range(MAX_TERMS + 1)  # numbers of lean terms that a surfel may have
+    base_unit: float = 1.0  # the colour that a base of 1 shows
+    # f_view's mean over all directions [N, 3] from the parameters, for display; None = no closed form is known
     mean: Callable[..., Tensor] | None = None
+    # the colour as softmax_k(v_k . d) rgb_k, from its parameters: v and rgb [N, K, 3] each. The bake then fits fewer
+    # terms. None = it is nothing of the kind: a surfel keeps all terms, or one colour
     sites: Callable[..., tuple[Tensor, Tensor]] | None = None
+    # the key of bundle.json's surfels under which the number of terms stands; None = it does not
     stated: str | None = None
 
     @cached_property
@@ -161,8 +134,8 @@ def _sb_start(color: Tensor, lobes: int, generator: torch.Generator) -> tuple[Te
 
 
 _SB_LOBE_MEAN = 0.1 * 0.1
-"""What one fresh Spherical Beta lobe adds on average over all directions: softplus(0) = 0.1 times the mean of
-max(0, cos)^4 over the sphere, 0.1."""
+"""Mean of a fresh Spherical Beta lobe over all directions: softplus(0) = 0.1 times the mean of max(0, cos)^4 over the
+sphere, 0.1."""
 
 
 def _sb_mean(base: Tensor, lobes: Tensor) -> Tensor:

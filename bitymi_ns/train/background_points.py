@@ -1,9 +1,5 @@
-"""Further first points, where the sparse points of a capture leave parts of its photographs empty.
-
-Structure from motion finds few points on what is smooth or seen by few photographs: walls, the sky, a room behind the
-subject. Densification can only halve the few large surfels there, too seldom in a short run, so such parts stay blurred
-(docs/benchmarks/training.md, Background points).
-"""
+"""Further first points, where the sparse points of a capture leave parts of its photographs empty: densification halves
+the few large surfels there too seldom in a short run (docs/benchmarks/training.md, Background points)."""
 
 from __future__ import annotations
 
@@ -30,17 +26,11 @@ IN_FRONT = 0.2  # most photographs that have it in front of the points of a cell
 
 
 class BackgroundPoints(NamedTuple):
-    """Points in empty cells, in random order.
+    """Points in empty cells, in random order."""
 
-    Attributes:
-        xyz: [B, 3] world positions.
-        rgb: [B, 3] mean colours of their cells, in [0, 1].
-        scales: [B] largest first scales of their surfels, world units.
-    """
-
-    xyz: Tensor
-    rgb: Tensor
-    scales: Tensor
+    xyz: Tensor  # [B, 3] world positions
+    rgb: Tensor  # [B, 3] mean colours of their cells, in [0, 1]
+    scales: Tensor  # [B] largest first scales of their surfels, world units
 
 
 @torch.no_grad()
@@ -90,14 +80,10 @@ def background_points(points: Tensor, views: Sequence[View], seed: int) -> Backg
 
 
 class _Grid(NamedTuple):
-    """Cells of a view.
+    """Cells of a view."""
 
-    Attributes:
-        nearest: [rows, columns] camera z of the nearest sparse point; infinite in empty cells.
-        width, height: of a cell, pixels.
-    """
-
-    nearest: Tensor
+    nearest: Tensor  # [rows, columns] camera z of the nearest sparse point; infinite in empty cells
+    # width, height: of a cell, pixels
     width: float
     height: float
 
@@ -133,12 +119,7 @@ def _in_picture(camera: Camera, points: Tensor) -> list[Tensor]:
 
 
 def _behind(view: View, camera: Camera, grid: _Grid, median: float, generator: torch.Generator) -> BackgroundPoints:
-    """Place a point behind each empty cell of a view.
-
-    Args:
-        camera: of the view, on the CPU.
-        median: depth of its points, camera z.
-    """
+    """Place a point behind each empty cell of a view whose points have the `median` depth, camera z."""
     rows, columns = grid.nearest.shape
     small = downscale_image(as_float(view.image.cpu()), columns, rows)  # [rows, columns, C]
     empty = grid.nearest.isinf()

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field
+
+from bitymi_ns.ranges import MOST, Count, NonNegative, Positive, PositiveCount, PositiveShare, Share, Threshold
 
 REFERENCE_STEPS = 30_000  # run length that every step count below is stated for
 ExposureKind = Literal["auto", "off", "gain", "affine"]  # colour corrections of the photographs
 Background = Literal["auto", "black", "white", "random"]  # colours behind the scene
-MOST = 10**9  # largest value of a count, and of a weight
-Share = Annotated[float, Field(ge=0, le=1)]
-PositiveShare = Annotated[float, Field(gt=0, le=1)]
-NonNegative = Annotated[float, Field(ge=0, le=MOST)]
-Positive = Annotated[float, Field(gt=0, le=MOST)]
-Threshold = Annotated[float, Field(ge=0)]
-Count = Annotated[int, Field(ge=0, le=MOST)]
-PositiveCount = Annotated[int, Field(ge=1, le=MOST)]
 
 
 @dataclass
@@ -174,8 +168,8 @@ class TexelConfig(TexelSteps):
     """First step of that part. Nothing is densified any more, no opacity is reset, and every surfel has a tile as fine
     as the training views see it; 30,000 or more = there is no such part."""
     travel: NonNegative = 0.3
-    """How far a texel can move in all of that part, colour units: where it passes over the views few times, `rate` is
-    raised so that texels get there, up to this."""
+    """Largest distance that a texel can move in that part, colour units: where it passes over the views few times,
+    `rate` is raised so that texels get there, up to this."""
     surfel_rates: NonNegative = 0.4
     """Rates of the surfels in that part, as a share of those of a run as long as it; they fall to 0 as a cosine."""
     pixels_per_texel: Positive = 0.25
@@ -250,17 +244,3 @@ class TrainConfig:
     ns-train that of the capture, where it states one."""
     seed: int = 0
     """Seed of every random choice in training."""
-
-
-def check_ranges(config: TrainConfig) -> None:
-    """Refuse options out of their range, NaN included. Learning rates are checked by the schedule that makes them.
-
-    Raises:
-        ValueError: names the option, its range and the value.
-    """
-    try:
-        TypeAdapter(TrainConfig).validate_python(asdict(config))
-    except ValidationError as error:
-        first = error.errors()[0]
-        name, rule = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Input should be ")
-        raise ValueError(f"{name} must be {rule}, not {first['input']}") from error

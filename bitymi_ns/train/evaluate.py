@@ -19,17 +19,11 @@ if TYPE_CHECKING:
 
 
 class Quality(NamedTuple):
-    """Means over views; NaN without views that count.
+    """Means over views; NaN without views that count."""
 
-    Attributes:
-        psnr: dB, over the views of which any pixel counts.
-        fragments: blended fragments per view.
-        cc_psnr: dB after the affine fit of each view's colours (`losses.color_corrected`), over the same views.
-    """
-
-    psnr: float
-    fragments: float
-    cc_psnr: float
+    psnr: float  # dB, over the views of which any pixel counts
+    fragments: float  # blended fragments per view
+    cc_psnr: float  # dB after the affine fit of each view's colours (`losses.color_corrected`), over the same views
 
 
 def evenly_spaced(count: int, most: int) -> list[int]:

@@ -1,11 +1,7 @@
 """Exposure gains of photographs, estimated from the colours of the sparse points.
 
-A point that a photograph shows has there the colour that it has elsewhere, times a gain of the photograph per channel.
-In logarithms, observation = point + photograph: two-way data, solved by medians in turn, which nothing that stands in
-front of a point, no highlight and no wrong point can move by much. Of the points that are projected into a photograph
-only those count that no other point hides: else what is seen of an object from its other side would be taken for a
-change of exposure.
-"""
+In logarithms, observation = point + photograph: two-way data, solved by medians in turn, which no highlight, nothing in
+front of a point and no wrong point can move by much. Points that others hide in a photograph do not count there."""
 
 import math
 from collections.abc import Sequence
@@ -30,20 +26,14 @@ FEWEST_TESTED = 1000  # fewest observations for a test on the other half of the 
 
 
 class ExposureGains(NamedTuple):
-    """Gains of the photographs, and how well they explain the differences of colours.
+    """Gains of the photographs, and how well they explain the differences of colours."""
 
-    Attributes:
-        log_gains: [V, 3] float32 natural logarithm of each photograph's gain per channel; each channel has mean 0.
-        points: [V] int64, how many points each photograph was judged by.
-        before: median over the observations of one half of the points of how far they are from their point's colour, in
-            natural logarithms; NaN where there were too few.
-        after: the same once the gains found on the other half of the points are taken out.
-    """
-
-    log_gains: Tensor
-    points: Tensor
+    log_gains: Tensor  # [V, 3] float32 natural logarithm of each photograph's gain per channel; each channel has mean 0
+    points: Tensor  # [V] int64, how many points each photograph was judged by
+    # median over the observations of one half of the points of how far they are from their point's colour, in natural
+    # logarithms; NaN where there were too few
     before: float
-    after: float
+    after: float  # the same once the gains found on the other half of the points are taken out
 
     @property
     def explained(self) -> float:

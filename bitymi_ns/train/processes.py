@@ -28,17 +28,11 @@ class ProcessesApart(RuntimeError):
 
 @dataclass(frozen=True)
 class Processes:
-    """The processes of a run, seen from one of them. For a single process every method is a no-op.
+    """The processes of a run, seen from one of them. For a single process every method is a no-op."""
 
-    Attributes:
-        rank: number of this process; 0 is the first, which alone writes and prints.
-        count: of processes.
-        each: views that a process renders in a step, one after the other.
-    """
-
-    rank: int = 0
-    count: int = 1
-    each: int = 1
+    rank: int = 0  # number of this process; 0 is the first, which alone writes and prints
+    count: int = 1  # of processes
+    each: int = 1  # views that a process renders in a step, one after the other
 
     @classmethod
     def joined(cls, each: int = 1) -> Processes:

@@ -4,7 +4,8 @@ import math
 from dataclasses import replace
 
 from bitymi_ns.ops.view_kinds import VIEW_PARAMETERS
-from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig, check_ranges
+from bitymi_ns.ranges import check_ranges
+from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
 
 PATIENT_STEPS = 3000  # steps of a run from which it has time for full size as early as the options say
 FIELD_MLP = ("field_mlp", "field_w1", "field_w2", "field_w3")
@@ -26,7 +27,6 @@ class Schedule:
     ) -> None:
         """
         Args:
-            config: training options.
             max_steps: length of the run in steps.
             extent: scene extent in world units; the learning rate of the means is in multiples of it.
             texels: whether texels learn in the last part of the run.
@@ -149,7 +149,6 @@ class Schedule:
 
         Args:
             step: index of the step.
-            views: training views.
         """
         texels = self.config.texels
         needed = 2.0 * texels.travel * views / self.texel_steps

@@ -20,15 +20,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Scores:
-    """One row per surfel.
+    """One row per surfel."""
 
-    Attributes:
-        importance: [N] int64, mean number of bad pixels, per view, that the surfel is blended into, rounded down.
-        prune: [N] float32 in [0, 1]; high = covers many bad pixels of bad views.
-    """
-
-    importance: Tensor
-    prune: Tensor
+    importance: Tensor  # [N] int64, mean number of bad pixels, per view, that the surfel is blended into, rounded down
+    prune: Tensor  # [N] float32 in [0, 1]; high = covers many bad pixels of bad views
 
 
 def normalise(values: Tensor) -> Tensor:
@@ -68,7 +63,6 @@ def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig, 
     Args:
         scene: N surfels.
         views: K views, at the size in which they are to be judged; none gives zero scores.
-        config: training options.
         processes: each renders its share of the views.
     """
     n = len(scene)

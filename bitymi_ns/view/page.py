@@ -9,7 +9,8 @@ from importlib import resources
 from pathlib import Path
 
 from bitymi_ns.bundle.manifest import MANIFEST, BundleError, Manifest
-from bitymi_ns.bundle.parts import MANIFEST_LIMIT, files_of, is_known, left_out, parts_of, passed_on
+from bitymi_ns.bundle.notes import notes_of
+from bitymi_ns.bundle.parts import MANIFEST_LIMIT, NOTES, MissingPart, files_of, is_known, left_out, parts_of, passed_on
 from bitymi_ns.bundle.read import manifest_of, read_file, read_manifest
 from bitymi_ns.bundle.single import joined
 from bitymi_ns.files import complete_folder
@@ -32,6 +33,7 @@ POLICY = (
 )
 """Nothing of a bundle runs: scripts come from the page alone, and a bundle's files are never sent as such."""
 BUNDLE = "bundle/"
+_NOTES = f"{BUNDLE}{NOTES}"
 SINGLE = "scene.bitymi"  # name of the one file beside an exported page
 _ASKS = '<meta name="bundle" content="{}" />'
 """Tag that names the bundle file of the page; empty = the folder beside it."""
@@ -43,24 +45,20 @@ class PageError(ValueError):
 
 @dataclass(frozen=True)
 class Site:
-    """Files served.
+    """Files served."""
 
-    Attributes:
-        files: path on the server, without the first slash, to the file.
-        made: the same for what is checked when it is asked for, or lies in no file: to what gives its contents.
-        left_out: files that the bundle lists, and that are not served.
-    """
-
-    files: Mapping[str, Path]
+    files: Mapping[str, Path]  # path on the server, without the first slash, to the file
+    # the same for what is checked when it is asked for, or lies in no file: to what gives its contents
     made: Mapping[str, Callable[[], bytes | bytearray]]
-    left_out: Sequence[str] = ()
+    left_out: Sequence[str] = ()  # files that the bundle lists, and that are not served
+    notes: Callable[[], bytes | None] = lambda: None  # the bundle's notes.json, which comes and goes; None without
 
     def __contains__(self, path: str) -> bool:
-        return path in self.made or path in self.files
+        return path in self.made or path in self.files or path == _NOTES
 
     @property
     def paths(self) -> list[str]:
-        return sorted({*self.files, *self.made})
+        return sorted({*self.files, *self.made, *([] if self.notes() is None else [_NOTES])})
 
     def read(self, path: str) -> bytes | bytearray:
         """The contents of one of `paths`.
@@ -69,6 +67,11 @@ class Site:
             BundleError: a file of the bundle is missing, altered, or a link that leads out of it.
             OSError: a file of the page cannot be read.
         """
+        if path == _NOTES:
+            notes = self.notes()
+            if notes is None:
+                raise MissingPart(f"the bundle has no {NOTES}")
+            return notes
         return self.made[path]() if path in self.made else self.files[path].read_bytes()
 
 
@@ -95,12 +98,14 @@ def site_of(bundle: Path) -> Site:
 
     Raises:
         PageError: the page was not built.
-        BundleError: there is no bundle, or its bundle.json is damaged.
+        BundleError: there is no bundle, or its bundle.json or notes.json is damaged.
     """
+    notes_of(bundle)
     shown = _Shown(Path(os.path.realpath(bundle)))
     names = [MANIFEST, *(name for name in shown.info.files if is_known(name))]
     made = {f"{BUNDLE}{name}": partial(shown.read, name) for name in names}
-    return Site(page_files(), {**made, "view.json": _title(bundle)}, left_out(shown.info))
+    made["view.json"] = partial(_about, bundle)
+    return Site(page_files(), made, left_out(shown.info), partial(notes_of, bundle))
 
 
 def single_site(bundle: Path) -> Site:
@@ -118,17 +123,20 @@ def single_site(bundle: Path) -> Site:
     made: dict[str, Callable[[], bytes | bytearray]] = {
         "index.html": lambda: index.replace(empty, named),
         SINGLE: lambda: joined(bundle)[0],
-        "view.json": _title(bundle),
+        "view.json": partial(_about, bundle),
     }
     return Site(files, made, left_out(info))
 
 
-def _title(bundle: Path) -> Callable[[], bytes]:
-    """Contents of view.json: the title of a bundle."""
+def _about(bundle: Path) -> bytes:
+    """Contents of view.json: the title of a bundle, and whether it has notes."""
+    try:
+        notes = notes_of(bundle) is not None
+    except BundleError:  # damaged since: the page asks for it, and states that it cannot be read
+        notes = True
     path = Path(os.path.realpath(bundle))
     title = path.stem if os.path.isfile(path) else path.parent.name if path.name == "bundle" else path.name
-    text = json.dumps({"title": title}).encode()
-    return lambda: text
+    return json.dumps({"title": title, "notes": notes}).encode()
 
 
 class _Shown:

@@ -290,7 +290,7 @@ def test_an_interruption_leaves_the_bake_as_it_was(wrong: Baked, views: list[Vie
 @pytest.mark.parametrize("bad", [{"steps": -1}, {"val_every": 1}, {"rate": 0.0}, {"prior": -1.0}, {"ssim_weight": 2}])
 def test_options_out_of_range_are_refused(wrong: Baked, views: list[View], bad: dict[str, float]) -> None:
     tune = partial(tune_atlas, wrong, views, BACKGROUND)
-    with pytest.raises(ValueError, match=f"{next(iter(bad))}.*fine-tuning|fine-tuning.*{next(iter(bad))[:4]}|SSIM"):
+    with pytest.raises(ValueError, match=next(iter(bad))):
         tune(replace(TuneOptions(), **bad))
 
 

@@ -43,7 +43,7 @@ def test_what_stands_in_the_place_of_a_mesh_is_kept(trained: BitymiTrainerConfig
     with pytest.raises(InputError, match="holds a mesh already"):
         mesh_of(config, folder)
     assert (folder / "mesh.ply").read_text() == "mine"
-    with pytest.raises(InputError, match="--resolution must be from 16"):
+    with pytest.raises(InputError, match="--resolution must be greater than or equal to 16"):
         ExportMesh(load_config=config, output_dir=tmp_path / "new", resolution=2).main()
     with pytest.raises(InputError, match="there is no"):
         ExportMesh(load_config=tmp_path / "config.yml", output_dir=tmp_path / "new").main()

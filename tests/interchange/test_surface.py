@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from bitymi_ns.interchange.surface import NoSurface, SurfaceOptions, extract_surface, median_depth
+from bitymi_ns.ranges import check_ranges
 from bitymi_ns.scene.camera import Camera
 from tests.ops.golden import GOLDEN_NAMES, SURFEL_KEYS, camera_of, load_golden, reference
 
@@ -93,5 +94,5 @@ def test_a_scene_without_a_surface_says_so() -> None:
 
 @pytest.mark.parametrize("option", [{"resolution": 8}, {"triangles": -1}])
 def test_options_out_of_range_are_named(option: dict[str, int]) -> None:
-    with pytest.raises(ValueError, match=f"{next(iter(option))} must be from"):
-        SurfaceOptions(**option).check()
+    with pytest.raises(ValueError, match=f"{next(iter(option))} must be"):
+        check_ranges(SurfaceOptions(**option))

@@ -1,6 +1,5 @@
 """Small captures in nerfstudio's format."""
 
-import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -45,16 +44,3 @@ def project(capture: Path) -> Path:
     for name in ("transforms.json", "sparse_pc.ply"):
         (capture / name).unlink()
     return capture
-
-
-def edit_transforms(capture: Path, change: Any) -> None:
-    """Apply `change` to the parsed transforms.json."""
-    path = capture / "transforms.json"
-    meta = json.loads(path.read_text("utf8"))
-    change(meta)
-    path.write_text(json.dumps(meta), "utf8")
-
-
-@pytest.fixture
-def edit() -> Any:
-    return edit_transforms

@@ -27,6 +27,8 @@ def test_an_open_scene_is_contracted_about_its_cameras(cloud) -> None:
     geometry = scene.field.geometry
     assert len(scene) == report.given == 50
     assert geometry.contract and geometry.mid == (1.0, 0.0, 1.0) and geometry.half == pytest.approx(2.2)
+    assert build(cloud, texture="none")[0].field is None
+    assert field_domain(torch.ones(1, 3), CENTERS[:0], contract=True) == ((1.0, 1.0, 1.0), 1e-3)  # never empty
 
 
 def test_a_bounded_scene_has_a_box_around_its_points(cloud) -> None:
@@ -45,11 +47,8 @@ def test_a_declared_box_is_the_domain_if_it_is_small(cloud) -> None:
     assert build(cloud, declared=2.21 * box)[0].field.geometry.contract is True
     assert build(cloud, declared=box, contraction="on")[0].field.geometry.contract is True
     assert build(cloud, declared=4 * box, contraction="off")[0].field.geometry.half == pytest.approx(8.8)
-
-
-@pytest.mark.parametrize(("option", "bounded", "contract"), [("on", True, True), ("off", False, False)])
-def test_the_option_comes_before_what_the_capture_says(cloud, option, bounded, contract) -> None:
-    assert build(cloud, bounded, contraction=option)[0].field.geometry.contract is contract
+    assert build(cloud, bounded=True, contraction="on")[0].field.geometry.contract is True  # the option comes first
+    assert build(cloud, bounded=False, contraction="off")[0].field.geometry.contract is False
 
 
 def test_the_near_plane_follows_the_cameras_unless_it_is_given(cloud) -> None:
@@ -66,30 +65,16 @@ def test_the_unit_of_length_does_not_decide_what_is_seen(cloud, unit) -> None:
     assert scene.render(camera).projection.visible.tolist() == [True, False, True]
 
 
-def test_a_domain_is_never_empty() -> None:
-    assert field_domain(torch.ones(1, 3), CENTERS[:0], contract=True) == ((1.0, 1.0, 1.0), 1e-3)
-
-
 def test_the_table_grows_with_the_photographs_between_two_bounds(cloud) -> None:
     assert [default_table_size(pixels) for pixels in (0, 44 * 270 * 480, 10**9)] == [14, 17, 17]
     assert build(cloud, pixels=2**20, log2_table_size=None)[0].field.field_table.shape == (4, 2**15, 4)
 
 
-def test_a_scene_without_texture_has_no_field(cloud) -> None:
-    assert build(cloud, texture="none")[0].field is None
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [("sv_sites", 0), ("sv_sites", 33), ("lobes", 0), ("sh_degree", 4), ("levels", 5), ("min_resolution", 0)]
-    + [
-        ("log2_table_size", 40),
-        ("log2_table_size", 0),
-        ("near", 0.0),
-        ("near", float("inf")),
-        ("weight_bound", -1.0),
-        ("rim", 0.0),
-    ],
+    + [("log2_table_size", 40), ("log2_table_size", 0), ("near", 0.0), ("near", float("inf"))]
+    + [("weight_bound", -1.0), ("rim", 0.0)],
 )
 def test_options_out_of_range_are_named(name, value) -> None:
     with pytest.raises(ValueError, match=f"{name} must be .*, not {value}"):

@@ -84,14 +84,11 @@ def test_an_affine_correction_is_its_formula() -> None:
 # what is kept
 
 
+ODD = [0.0, math.nan, math.inf, -math.inf, 1e30]
+
+
 @settings(max_examples=50, deadline=None)
-@given(
-    st.integers(1, 9),
-    st.sampled_from([3, 12]),
-    st.floats(0, 100),
-    st.sampled_from([0.0, math.nan, math.inf, -math.inf, 1e30]),
-    st.integers(0, 99),
-)
+@given(st.integers(1, 9), st.sampled_from([3, 12]), st.floats(0, 100), st.sampled_from(ODD), st.integers(0, 99))
 def test_tables_are_settled(count: int, columns: int, spread: float, odd: float, seed: int) -> None:
     table = spread * torch.randn(count, columns, generator=torch.Generator().manual_seed(seed))
     table[0, 0] = odd
@@ -112,9 +109,7 @@ def test_steps_keep_the_mean_and_the_limits(kind: str) -> None:
         exposure.step(1.0)
         assert exposure.table.grad is None and exposure.table.isfinite().all()
         assert exposure.log_gains.abs().max() <= LIMIT + 1e-6
-        torch.testing.assert_close(
-            exposure.table.detach().mean(0), torch.zeros_like(exposure.table[0]), atol=1e-6, rtol=0
-        )
+        assert exposure.table.detach().mean(0).abs().max() < 1e-6
     assert exposure.table.abs().max() > 0.1
 
 
@@ -207,35 +202,13 @@ def test_scores_are_of_the_corrected_image(make_scene, views) -> None:
     assert multi_view_scores(scene, [view._replace(correction=None)], TrainConfig()).importance.sum() > 0
 
 
-@pytest.mark.parametrize("kind", ["gain", "affine"])
-def test_a_resumed_run_is_the_same_run(make_scene, uneven, kind: str) -> None:
-    straight = Trainer(make_scene(), uneven, config(kind), 60)
-    for _ in range(14):
-        straight.advance()
-    state = straight.state_dict()
-    resumed = Trainer(make_scene(every=5), uneven, config(kind), 60)
-    resumed.load_state_dict(state)
-    for _ in range(14, 24):
-        straight.advance()
-        resumed.advance()
-    assert torch.equal(straight.training.exposure.table, resumed.training.exposure.table)
-    moments = [t.training.exposure.state_dict()["optimizer"]["state"][0] for t in (straight, resumed)]
-    assert torch.equal(moments[0]["exp_avg"].to_dense(), moments[1]["exp_avg"].to_dense())
-
-
-def test_a_run_that_is_resumed_on_a_device_has_its_corrections_there(make_scene, uneven) -> None:
-    trainer = Trainer(make_scene(), uneven, config("gain"), 20)
-    trainer.advance()
-    resumed = Exposure("gain")
-    resumed.load_state_dict(trainer.training.exposure.state_dict(), len(uneven), "meta")
-    assert resumed.table is not None and resumed.table.device.type == "meta"
-    assert resumed.of(0).device.type == "meta"  # type: ignore[union-attr]
-
-
 def test_states_of_earlier_versions_other_options_and_other_photographs(make_scene, uneven) -> None:
     trainer = Trainer(make_scene(), uneven, config("gain"), 20)
     trainer.advance()
     state = trainer.training.exposure.state_dict()
+    there = Exposure("gain")
+    there.load_state_dict(state, 6, "meta")
+    assert there.table.device.type == there.of(0).device.type == "meta"
     older = Exposure("auto")
     older.load_state_dict(None, 6)
     assert older.decided and older.table is None

@@ -56,6 +56,9 @@ def test_excluded_pixels_have_no_say(pair, shape):
     assert photometric(other, target, 0.2, mask) == pytest.approx(loss.item())
     l1 = (rgb - target).abs()[mask].mean()
     assert photometric(rgb, target, 0.0, mask) == pytest.approx(l1.item())
+    values = torch.rand(20, 24, 1)
+    mean = mean_where_right(error_weight(rgb, target, 2.0, mask=mask), values, mask)
+    torch.testing.assert_close(mean, (error_weight(rgb, target, 2.0) * values)[mask].mean())
 
 
 def test_nothing_counts():
@@ -84,18 +87,6 @@ def test_falloff_gives_no_gradient_to_the_colours(pair):
     mean_where_right(error_weight(a, target, 25.0), beta).backward()
     assert a.grad is None
     torch.testing.assert_close(beta.grad, error_weight(rgb, target, 25.0) / (20 * 24))
-
-
-def test_beta_only_moves_beta_alone(make_scene, views):
-    scene = make_scene(texture=False)
-    output = scene.render(views[0].camera, beta_alone=True)
-    torch.testing.assert_close(output.beta, scene.render(views[0].camera).beta)
-    mean_where_right(error_weight(output.rgb, views[0].image, 25.0), output.beta).backward()
-    moved = [name for name, p in scene.surfels.items() if p.grad is not None and (p.grad != 0).any()]
-    assert moved == ["beta_raw"]
-    output = scene.render(views[0].camera)
-    mean_where_right(error_weight(output.rgb, views[0].image, 25.0), output.beta).backward()
-    assert (scene.surfels["opacity_logits"].grad != 0).any()
 
 
 def test_objective_has_the_terms_that_are_on(make_scene, views):
@@ -131,21 +122,9 @@ def test_psnr_of_a_known_error() -> None:
     b[2:] = 0.0  # where it does not count
     assert psnr(b, a, mask) == 100.0
     assert psnr(b, a, ~mask) < 10
-
-
-def test_psnr_of_no_pixel_is_no_number() -> None:
-    a = torch.rand(4, 5, 3)
-    assert math.isnan(psnr(a, a, torch.zeros(4, 5, dtype=torch.bool)))
+    assert math.isnan(psnr(a, a, torch.zeros(8, 8, dtype=torch.bool)))
     assert mean_psnr([20.0, math.nan, 30.0]) == 25.0
     assert math.isnan(mean_psnr([math.nan])) and math.isnan(mean_psnr([]))
-
-
-def test_mean_where_right_is_a_mean_over_the_pixels_that_count(pair):
-    mask = torch.rand(20, 24, generator=torch.Generator().manual_seed(0)) < 0.5
-    omega = error_weight(*pair, 2.0, mask=mask)
-    values = torch.rand(20, 24, 1)
-    expected = (error_weight(*pair, 2.0) * values)[mask].mean()
-    torch.testing.assert_close(mean_where_right(omega, values, mask), expected)
 
 
 def test_the_overdraw_loss_leaves_fewer_fragments(make_scene, views):
@@ -183,10 +162,6 @@ def test_an_affine_change_of_colours_is_undone() -> None:
     mask = torch.rand(8, 9, generator=g) < 0.5
     spoilt = torch.where(mask[..., None], target, 0.3)
     torch.testing.assert_close(color_corrected(image, spoilt, mask), target, atol=1e-5, rtol=0)
-
-
-def test_fits_of_nothing_and_of_what_is_not_finite() -> None:
-    a = torch.rand(4, 5, 3)
-    assert math.isnan(cc_psnr(a, a, torch.zeros(4, 5, dtype=torch.bool)))
-    broken = torch.where(torch.arange(5)[None, :, None] == 2, math.nan, a)
-    assert torch.equal(color_corrected(broken, a).isnan(), broken.isnan())
+    assert math.isnan(cc_psnr(image, image, torch.zeros(8, 9, dtype=torch.bool)))
+    broken = torch.where(torch.arange(9)[None, :, None] == 2, math.nan, image)
+    assert torch.equal(color_corrected(broken, image).isnan(), broken.isnan())

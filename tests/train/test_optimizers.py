@@ -47,11 +47,5 @@ def test_a_step_together_is_a_step_of_each(left_out: tuple[int, ...]) -> None:
         for row, state in b.items():
             values = {key: value for key, value in state.items() if value is not None}
             assert all(torch.equal(a[row][key], value) for key, value in values.items())
-
-
-def test_gradients_are_forgotten() -> None:
-    given = optimizers()
-    for p in parameters_of(given):
-        p.grad = torch.ones_like(p)
-    forget_gradients(given.values())
-    assert all(p.grad is None for p in parameters_of(given))
+    forget_gradients(together.values())
+    assert all(p.grad is None for p in parameters_of(together))

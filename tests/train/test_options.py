@@ -6,7 +6,8 @@ from typing import Any, get_type_hints
 
 import pytest
 
-from bitymi_ns.train.config import LearningRates, TrainConfig, check_ranges
+from bitymi_ns.ranges import check_ranges
+from bitymi_ns.train.config import LearningRates, TrainConfig
 from bitymi_ns.train.schedules import Schedule
 
 UNBOUNDED = {"loss.overdraw_start", "loss.overdraw_stop", "densify.start", "densify.stop", "seed"}

@@ -14,15 +14,26 @@ from bitymi_ns.train.fit import Trainer
 
 def config_of(factor: float = 1.0, **guard: float) -> TrainConfig:
     densify = DensifyConfig(max_surfels=300, min_interval=20, min_reset_interval=10_000, pixels_per_surfel=0)
-    return TrainConfig(
-        densify=densify, lr=LearningRates().times(factor), guard=GuardConfig(**guard), resolution_schedule=0
-    )
+    rates = LearningRates().times(factor)
+    return TrainConfig(densify=densify, lr=rates, guard=GuardConfig(**guard), resolution_schedule=0)
 
 
 def run(trainer: Trainer, steps: int) -> list[dict[str, float]]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return [trainer.advance()[2] for _ in range(steps)]
+
+
+@pytest.fixture
+def begun(make_scene, views):
+    """begun(steps, ...) -> a trainer after these steps."""
+
+    def make(steps: int, of: int = 120, config: TrainConfig | None = None, **scene) -> Trainer:
+        trainer = Trainer(make_scene(**scene), views, config or config_of(), of)
+        run(trainer, steps)
+        return trainer
+
+    return make
 
 
 def test_a_healthy_run_is_left_alone(make_scene, views):
@@ -52,22 +63,19 @@ def test_rates_that_are_too_high_end_in_a_recovered_scene_or_a_message(make_scen
     assert sum("rolled_back" in report for report in reports) == trainer.training.guard.rollbacks or not reports
 
 
-def test_a_field_that_breaks_on_the_way_is_restored(make_scene, views):
-    scene = make_scene()
-    trainer = Trainer(scene, views, config_of(), 120)
-    run(trainer, 50)
+def test_a_field_that_breaks_on_the_way_is_restored(begun, views):
+    trainer = begun(50)
+    scene = trainer.scene
     good = scene.field.field_table.detach().clone()
     with torch.no_grad():
         scene.field.field_w3[4] = math.nan
-    with pytest.warns(
-        UserWarning, match=r"step 5\d: training diverged .*field_w3 is not finite.*learning rates times 0.3"
-    ):
+    message = r"step 5\d: training diverged .*field_w3 is not finite.*learning rates times 0.3"
+    with pytest.warns(UserWarning, match=message):
         for _ in range(20):
             trainer.advance()
     assert trainer.training.guard.rollbacks == 1 and not describe_broken(scene)
-    assert trainer.optimizers["means"].param_groups[0]["lr"] == pytest.approx(
-        0.3 * trainer.training.schedule.lr("means", 69)
-    )
+    rate = trainer.training.schedule.lr("means", 69)
+    assert trainer.optimizers["means"].param_groups[0]["lr"] == pytest.approx(0.3 * rate)
     assert (scene.field.field_table - good).abs().max() < 0.5
     run(trainer, 50)
     assert evaluate(scene, views, trainer.config)[0] > 15
@@ -78,9 +86,7 @@ def test_a_field_that_breaks_just_before_a_prune_is_restored(make_scene, views):
     scene = make_scene()
     trainer = Trainer(scene, views, config_of(), 120)
     schedule = trainer.training.schedule
-    prune = next(
-        step for step in range(50, 120) if step in schedule.densify_steps or step in schedule.final_prune_steps
-    )
+    prune = next(step for step in range(50, 120) if step in schedule.densify_steps | schedule.final_prune_steps)
     run(trainer, prune)
     step = trainer.training.strategy.step
 
@@ -98,10 +104,9 @@ def test_a_field_that_breaks_just_before_a_prune_is_restored(make_scene, views):
     assert trainer.training.guard.rollbacks == 1
 
 
-def test_views_drawn_worse_than_before_take_the_run_back(make_scene, views):
-    scene = make_scene()
-    trainer = Trainer(scene, views, config_of(), 120)
-    run(trainer, 96)
+def test_views_drawn_worse_than_before_take_the_run_back(begun, views):
+    trainer = begun(96)
+    scene = trainer.scene
     good, *_ = evaluate(scene, views, trainer.config)
     assert trainer.training.guard.window == 24  # four epochs; the windows end with the run
     with torch.no_grad():
@@ -137,10 +142,9 @@ def test_nothing_is_compared_with_before_where_the_resolution_changes_in_a_faded
     assert trainer.training.guard._best == math.inf
 
 
-def test_a_few_broken_surfels_are_dropped_and_counted(make_scene, views):
-    scene = make_scene(every=2)
-    trainer = Trainer(scene, views, config_of(), 200)
-    run(trainer, 30)
+def test_a_few_broken_surfels_are_dropped_and_many_take_the_run_back(begun):
+    trainer = begun(30, of=200, every=2)
+    scene = trainer.scene
     before = len(scene)
     with torch.no_grad():
         scene.surfels["sv_rgb"][3] = math.nan  # the loss is not finite
@@ -149,28 +153,20 @@ def test_a_few_broken_surfels_are_dropped_and_counted(make_scene, views):
         trainer.advance()
     assert len(scene) == before - 2 and not describe_broken(scene) and trainer.training.guard.rollbacks == 0
     run(trainer, 20)
-
-
-def test_many_surfels_that_cannot_be_drawn_take_the_run_back(make_scene, views):
-    scene = make_scene()
-    trainer = Trainer(scene, views, config_of(), 200)
-    run(trainer, 30)
     with torch.no_grad():
-        scene.surfels["means"][:20] = math.nan
-    with pytest.warns(UserWarning, match="means is not finite in 20 of .* rows"):
+        scene.surfels["means"][:60] = math.nan
+    with pytest.warns(UserWarning, match="means is not finite in 60 of .* rows"):
         report = trainer.advance()[2]
     assert report["rolled_back"] > 0 and report["rates"] == pytest.approx(0.3) and not describe_broken(scene)
     run(trainer, 5)
 
 
-def test_it_does_not_go_back_for_ever(make_scene, views):
-    scene = make_scene()
-    trainer = Trainer(scene, views, config_of(rollbacks=2, rates=0.5), 120)
-    run(trainer, 5)
+def test_it_does_not_go_back_for_ever(begun):
+    trainer = begun(5, config=config_of(rollbacks=2, rates=0.5))
     with pytest.raises(TrainingDiverged, match="It went back 2 times, to learning rates times 0.12. Lower"):
         for _ in range(3):
             with torch.no_grad():
-                scene.field.field_w1[0] = math.inf
+                trainer.scene.field.field_w1[0] = math.inf
             run(trainer, 1)
 
 
@@ -183,14 +179,12 @@ def test_images_that_are_not_finite_are_named_and_nothing_goes_back(make_scene, 
     assert trainer.training.guard.rollbacks == 0
 
 
-def test_a_resumed_run_keeps_its_lowered_rates(make_scene, views):
-    scene, config = make_scene(), config_of()
-    trainer = Trainer(scene, views, config, 120)
-    run(trainer, 30)
+def test_a_resumed_run_keeps_its_lowered_rates(begun):
+    trainer = begun(30)
     with torch.no_grad():
-        scene.field.field_w3[4] = math.nan
+        trainer.scene.field.field_w3[4] = math.nan
     run(trainer, 2)
-    resumed = Trainer(make_scene(every=5), views, config, 120)
+    resumed = begun(0, every=5)
     resumed.load_state_dict(trainer.state_dict())
     assert (resumed.training.guard.factor, resumed.training.guard.rollbacks) == (pytest.approx(0.3), 1)
     run(resumed, 10)

@@ -26,6 +26,14 @@ def test_reference_run_has_the_published_events():
     assert fired(schedule, "densify_steps") == list(range(1000, 15_000, 500))
     assert fired(schedule, "reset_steps") == [3000, 6000, 9000, 12_000]
     assert fired(schedule, "final_prune_steps") == [18_000, 21_000, 24_000, 27_000]
+    assert schedule.scaled(12_345) == 12_345
+    short = Schedule(TrainConfig(), 3000)
+    assert [short.scaled(step) for step in (500, 0, 1)] == [50, 0, 1]
+    assert fired(short, "densify_steps") == list(range(fired(short, "densify_steps")[0], 1500, 100))
+    assert min(short.densify_steps) >= 50 and not short.reset_steps
+    for extent in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="extent"):
+            Schedule(TrainConfig(), 100, extent)
 
 
 @pytest.mark.parametrize("max_steps", [60, 97, 300, 1000, 1999, 2000, 2500, 3000, 7000, 29_999, 35_000])
@@ -38,25 +46,12 @@ def test_every_event_fires_as_often_as_in_the_reference_run(max_steps, event):
         assert abs(step - at_30k * max_steps / 30_000) <= 0.5
 
 
-def test_resets_coincide_with_densification_in_short_runs():
-    for max_steps in (300, 2000, 2500, 3001):
-        schedule = Schedule(TrainConfig(), max_steps)
-        assert schedule.reset_steps <= schedule.densify_steps
-
-
-@pytest.mark.parametrize("max_steps", [1, 2, 3, 10, 59])
-def test_tiny_runs_stay_inside_the_run(max_steps):
+@pytest.mark.parametrize("max_steps", [1, 2, 3, 10, 59, 300, 2000, 2500, 3001])
+def test_short_runs_stay_inside_the_run_and_reset_as_they_densify(max_steps):
     schedule = Schedule(TrainConfig(), max_steps)
     for steps in (schedule.densify_steps, schedule.reset_steps, schedule.final_prune_steps):
         assert all(0 <= s < max_steps for s in steps)
-
-
-def test_scaled():
-    schedule = Schedule(TrainConfig(), 3000)
-    assert schedule.scaled(500) == 50
-    assert schedule.scaled(0) == 0
-    assert schedule.scaled(1) == 1
-    assert Schedule(TrainConfig(), 30_000).scaled(12_345) == 12_345
+    assert max_steps < 100 or schedule.reset_steps <= schedule.densify_steps
 
 
 @pytest.mark.parametrize("max_steps, every", [(30_000, 10), (3000, 8), (1200, 3), (300, 1)])
@@ -113,23 +108,9 @@ def test_learning_rates():
         schedule.lr("colour", 0)
 
 
-@pytest.mark.parametrize("extent", [0.0, -1.0, float("nan"), float("inf")])
-def test_unusable_extent_is_refused(extent):
-    with pytest.raises(ValueError, match="extent"):
-        Schedule(TrainConfig(), 100, extent)
-
-
 @pytest.mark.parametrize(("max_steps", "opacity"), [(30_000, 0.01), (3700, 0.01), (1000, 0.01613), (200, 0.2689)])
 def test_resets_leave_time_to_recover(max_steps, opacity):
     assert Schedule(every_event(), max_steps).reset_opacity() == pytest.approx(opacity, rel=1e-3)
-
-
-def test_short_runs_leave_events_out() -> None:
-    steps = sorted(Schedule(TrainConfig(), 3000).densify_steps)
-    assert steps[0] >= 50 and steps[-1] < 1500
-    assert all(b - a == 100 for a, b in zip(steps, steps[1:], strict=False))
-    assert not Schedule(TrainConfig(), 3000).reset_steps
-    assert len(Schedule(TrainConfig(), 30_000).densify_steps) == 28
 
 
 def test_short_runs_learn_faster() -> None:

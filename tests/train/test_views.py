@@ -25,19 +25,13 @@ def test_area_average():
     small = downscale_image(image, 6, 4)
     torch.testing.assert_close(small, image.reshape(4, 2, 6, 2, 3).mean((1, 3)))
     assert downscale_image(image, 12, 8) is image
-
-
-def test_hidden_colours_do_not_bleed_in():
-    image = torch.zeros(2, 2, 4)
-    image[0, 0] = torch.tensor([1.0, 0.5, 0.0, 1.0])
-    image[0, 1] = torch.tensor([0.0, 1.0, 1.0, 0.0])
+    image = torch.zeros(2, 2, 4)  # hidden colors do not bleed in
+    image[0, 0], image[0, 1] = torch.tensor([1.0, 0.5, 0.0, 1.0]), torch.tensor([0.0, 1.0, 1.0, 0.0])
     torch.testing.assert_close(downscale_image(image, 1, 1)[0, 0], torch.tensor([1.0, 0.5, 0.0, 0.25]))
-
-
-def test_a_reduced_pixel_counts_when_all_of_it_does():
     mask = torch.ones(4, 4, dtype=torch.bool)
-    mask[0, 3] = False
+    mask[0, 3] = False  # a reduced pixel counts when all of it does
     assert downscale_mask(mask, 2, 2)[..., 0].tolist() == [[True, False], [True, True]]
+    assert as_float(torch.tensor([0, 255], dtype=torch.uint8)).tolist() == [0, 1]
 
 
 def test_background():
@@ -60,17 +54,12 @@ def test_photographs_with_alpha_train_over_another_colour_in_every_step_and_are_
     drawn = step_background(config, transparent, 5, "cpu")
     assert torch.equal(drawn, background_color("random", 3, 5)) and drawn.unique().numel() == 3
     white = TrainConfig(alpha_color="white")
-    assert eval_background(white, "cpu").tolist() == [1, 1, 1] and torch.equal(
-        step_background(white, opaque, 5, "cpu"), torch.ones(3)
-    )
+    assert torch.equal(eval_background(white, "cpu"), torch.ones(3))
+    assert torch.equal(step_background(white, opaque, 5, "cpu"), torch.ones(3))
     for view in (opaque, transparent):
         assert step_background(TrainConfig(background="white"), view, 5, "cpu").tolist() == [1, 1, 1]
         assert step_background(TrainConfig(background="black"), view, 5, "cpu") is None
     assert eval_background(TrainConfig(background="black", alpha_color="white"), "cpu") is None
-
-
-def test_bytes_become_unit_floats():
-    assert as_float(torch.tensor([0, 255], dtype=torch.uint8)).tolist() == [0, 1]
 
 
 def test_a_picture_of_another_size_is_refused(cameras):
@@ -80,17 +69,15 @@ def test_a_picture_of_another_size_is_refused(cameras):
         at_size(View(cameras[0], torch.zeros(48, 48, 3), torch.ones(9, 10) > 0), cameras[0], "cpu")
 
 
-def test_reduced_views_are_kept_until_the_resolution_changes(views):
-    reduced = DownscaledViews(views)
-    half = reduced.at(1, 0.5)
-    assert half.image.shape == (24, 24, 3) and (half.camera.width, half.camera.height) == (24, 24)
-    assert reduced.at(1, 0.5) is half
-    assert reduced.at(1, 1.0).image.shape == (48, 48, 3)
-    assert reduced.camera(1).width == 48
-
-
 def test_reduced_views_take_only_so_much_memory(views, monkeypatch: pytest.MonkeyPatch) -> None:
     everything = DownscaledViews(views)
+    half = everything.at(1, 0.5)
+    assert half.image.shape == (24, 24, 3) and (half.camera.width, half.camera.height) == (24, 24)
+    assert everything.at(1, 0.5) is half and everything.at(1, 1.0).image.shape == (48, 48, 3)
+    assert everything.camera(1).width == 48
+    drawn = everything.draw(4, torch.Generator().manual_seed(1), 1.0)
+    assert len({id(view.camera) for view in drawn}) == 4
+    assert len(everything.draw(10, torch.Generator(), 1.0)) == len(views)
     monkeypatch.setattr(views_module, "DOWNSCALED_BYTES", 2 * everything.at(0, 0.5).nbytes)
     few = DownscaledViews(views)
     for factor in (0.5, 0.25, 0.5):  # the room is there again at every size
@@ -129,13 +116,6 @@ def test_pixels_that_show_something(cameras) -> None:
     assert covered_share([View(camera, opaque, mask)]) == pytest.approx(0.5)
     assert covered_share([shares[1.0], shares[0.5]]) == pytest.approx(0.75) and covered_share([]) == 0
     assert covered_share([shares[1.0]] * 300) == 1
-
-
-def test_views_are_drawn_without_replacement(views):
-    reduced = DownscaledViews(views)
-    drawn = reduced.draw(4, torch.Generator().manual_seed(1), 1.0)
-    assert len({id(view.camera) for view in drawn}) == 4
-    assert len(reduced.draw(10, torch.Generator(), 1.0)) == len(views)
 
 
 def test_every_view_comes_once_an_epoch():

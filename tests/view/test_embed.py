@@ -1,12 +1,14 @@
 """The page in the frame of a page of another origin: messages (`docs/viewer.md`), and which are heeded."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 
 from bitymi_ns.bundle.single import write_single
 from bitymi_ns.view import single_site, write_static
+from tests.bundle.test_notes import text
 from tests.view.browser import drive, plain_server
 
 HOST = """<!doctype html><link rel="icon" href="data:,"><iframe id="a" src="{a}"></iframe>
@@ -20,7 +22,9 @@ window.of = (type) => got.filter((m) => m.type === 'bitymi/1/' + type);
 
 
 def test_messages_of_the_page_around(bundle: Path, tmp_path: Path) -> None:
-    site = single_site(bundle)
+    shutil.copytree(bundle, noted := tmp_path / bundle.name)
+    (noted / "notes.json").write_bytes(text())
+    site = single_site(noted)
     for name in ("open", "closed"):
         write_static(site, tmp_path / "pages" / name)
     write_single(bundle, tmp_path / "pages/open/second.bitymi")
@@ -48,6 +52,11 @@ def test_messages_of_the_page_around(bundle: Path, tmp_path: Path) -> None:
                 ["until", "of('camera').some((m) => m.id === 7)"],
                 send("set-camera", camera=moved),
                 ["until", "of('camera').some((m) => m.camera.position[1] === -4)"],
+                send("list-views", id=8),
+                ["until", "of('views').some((m) => m.id === 8 && m.views.join() === 'door,Tür <b>')"],
+                send("go-to-view", name="door"),
+                ["until", "of('camera').some((m) => m.camera.position.join() === '0,-3,0.5')"],
+                send("go-to-view", id=9, name="window"),
                 *(send("set-camera", id=k, camera=camera) for k, camera in enumerate(bad)),
                 *(send("load", id=10 + k, file=file) for k, file in enumerate(files)),
                 send("explode", id=20),
@@ -64,7 +73,7 @@ def test_messages_of_the_page_around(bundle: Path, tmp_path: Path) -> None:
             viewport=(700, 200),
         )
     errors, ready, strangers = found.results[-7], found.results[-4], found.results[-1]
-    assert errors == [0, 1, 2, 3, 10, 11, 12, 13, 14, 20] and strangers == 0
+    assert errors == [9, 0, 1, 2, 3, 10, 11, 12, 13, 14, 20] and strangers == 0
     assert [each["title"] for each in ready] == [bundle.name, "second"]
     assert np.allclose(ready[0]["camera"]["position"], ready[1]["camera"]["position"])
     assert not [problem for problem in found.problems if "404" not in problem]

@@ -23,7 +23,7 @@ def test_the_command_writes_the_page_and_one_file(bundle: Path, tmp_path: Path, 
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     assert {"index.html", "index.js", "view.json", NAME} <= names and not any("/" in name for name in names)
     assert f'name="bundle" content="{NAME}"' in (folder / "index.html").read_text()
-    assert json.loads((folder / "view.json").read_text()) == {"title": "little"}
+    assert json.loads((folder / "view.json").read_text()) == {"title": "little", "notes": False}
     assert len(read_bundle(folder / NAME)) == len(read_bundle(bundle))
     single = tmp_path / "little.bitymi"
     write_single(bundle, single)

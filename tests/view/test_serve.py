@@ -18,10 +18,12 @@ from urllib.parse import urlsplit
 import pytest
 
 from bitymi_ns.bundle import BundleError, check_files
+from bitymi_ns.bundle.notes import notes_of
 from bitymi_ns.bundle.single import write_single
 from bitymi_ns.cli import main
-from bitymi_ns.view import PageError, is_loopback, serve, site_of, write_static
+from bitymi_ns.view import PageError, is_loopback, serve, single_site, site_of, write_static
 from tests.bundle.damage import amend
+from tests.bundle.test_notes import NOTES, text
 from tests.view.browser import running, served
 
 
@@ -55,7 +57,7 @@ def test_the_page_and_the_bundle_are_sent_with_their_types_and_a_policy(bundle: 
         assert ask(address, "/bundle/surfels.ply")[2] == (bundle / "surfels.ply").read_bytes()
         status, headers, body = ask(address, "/", "HEAD")
         assert status == 200 and not body and int(headers["Content-Length"]) > 0
-        assert json.loads(ask(address, "/view.json")[2]) == {"title": "little"}
+        assert json.loads(ask(address, "/view.json")[2]) == {"title": "little", "notes": False}
 
 
 @pytest.mark.parametrize(
@@ -190,13 +192,40 @@ def test_an_exported_page_is_complete_and_replaces_only_its_like(bundle: Path, t
     assert (other / "precious").read_text() == "x"
 
 
+def test_notes_come_and_go_while_a_bundle_is_served_and_are_exported_with_it(
+    bundle: Path, tmp_path: Path, capsys
+) -> None:
+    copy, site, one = (tmp_path / name for name in ("copy", "site", "one"))
+    shutil.copytree(bundle, copy)
+
+    def asked(address: str) -> tuple[bool, int]:
+        return json.loads(ask(address, "/view.json")[2])["notes"], ask(address, "/bundle/notes.json")[0]
+
+    with served(site_of(copy)) as address:
+        assert asked(address) == (False, 404)
+        (copy / "notes.json").write_bytes(text(NOTES))
+        assert asked(address) == (True, 200)
+        assert ask(address, "/bundle/notes.json")[2] == text(NOTES)
+        (copy / "notes.json").write_text("{}")
+        assert asked(address) == (True, 404)  # the page states that it cannot be read
+    (copy / "notes.json").write_bytes(text(NOTES))
+    write_static(site_of(copy), site)
+    write_static(single_site(copy), one)
+    assert json.loads((site / "view.json").read_text())["notes"] and notes_of(site / "bundle") == text(NOTES)
+    assert notes_of(one / "scene.bitymi") == text(NOTES)
+    write_static(site_of(copy), site, overwrite=True)
+    (copy / "notes.json").unlink()
+    assert main(["view", str(copy), "--export", str(site), "--overwrite"]) == 1
+    assert "also holds bundle/notes.json, which would be lost" in capsys.readouterr().err
+
+
 def test_a_bundle_in_one_file_is_sent_and_exported_as_its_parts(bundle: Path, tmp_path: Path) -> None:
     single = tmp_path / "little.bitymi"
     write_single(bundle, single)
     with served(site_of(single)) as address:
         for name in ("bundle.json", "surfels.ply", "photograph-0001.jpg"):
             assert ask(address, f"/bundle/{name}")[2] == (bundle / name).read_bytes()
-        assert json.loads(ask(address, "/view.json")[2]) == {"title": "little"}
+        assert json.loads(ask(address, "/view.json")[2]) == {"title": "little", "notes": False}
         assert ask(address, "/little.bitymi")[0] == 404 and ask(address, "/bundle/config.yml")[0] == 404
         single.write_bytes(single.read_bytes()[:-30])
         assert ask(address, "/bundle/surfels.ply")[0] == 404

@@ -1,16 +1,19 @@
 // The viewer: what is shown, drawn when something has changed, and the elements that change it.
 import type { Bundle } from './bundle/load';
 import type { Vec3 } from './bundle/manifest';
-import type { Look, Renderer } from './render/renderer';
+import type { Depths, Look, Renderer } from './render/renderer';
 import type { Show } from './render/programs';
 import type { Screen } from './render/screen';
 import { download, element, press, pressed, typing } from './ui/dom';
+import { NotesPanel } from './ui/notes_panel';
 import { notify, showError, stopped } from './ui/pages';
 import { PathPanel } from './ui/path_panel';
 import { endPoster } from './ui/poster';
 import type { Stage } from './ui/stage';
 import { type CaptureCamera, commonTarget, parseCameras } from './view/cameras';
 import { Controls, type Mode } from './view/controls';
+import { Flight } from './view/flight';
+import type { Notes, Place } from './view/notes';
 import { Pace } from './view/pace';
 import { DEFAULT_LENS, type Lens, type Pose, View, moved } from './view/pose';
 import { type Shared, fromHash, toHash } from './view/share';
@@ -21,18 +24,26 @@ const MOVING_LAYERS = 4; // batches while the camera moves, and of a picture tha
 const STILL_LAYERS = 16;
 const STILL_AFTER = 250; // milliseconds
 
+// What is beside the scene: the button that opens it, the one that closes it, and the section.
+const ASIDES = [
+  ['tools', 'close', 'aside'],
+  ['notes', 'close-notes', 'notes-panel'],
+] as const;
+
 const onPhone = (): boolean => matchMedia('(width <= 720px)').matches; // style.css
 const unsaved = (): void => notify('This view cannot be saved: there is not enough memory for it.');
 
 export class App implements Stage {
   private readonly controls: Controls;
   private readonly path: PathPanel;
+  readonly notes: NotesPanel;
   private readonly cameras: CaptureCamera[];
   private readonly pace = new Pace();
   private readonly size: number;
   private lens: Lens = DEFAULT_LENS;
   private first: { pose: Pose; target: Vec3; lens: Lens };
   private held: Vec3 | null = null;
+  private flight: Flight | null = null;
   private show: Show = 'color';
   private photograph: Promise<string> | null = null; // that is asked for
   private dirty = true;
@@ -45,6 +56,7 @@ export class App implements Stage {
     private readonly screen: Screen,
     private readonly renderer: Renderer,
     private readonly bundle: Bundle,
+    notes: Notes,
     private readonly shown: () => void, // after a picture
   ) {
     const { info, surfels } = bundle;
@@ -59,10 +71,12 @@ export class App implements Stage {
     }
     this.controls = new Controls(canvas, this.first.pose, this.first.target, up, size, () => {
       this.path.stop();
+      this.flight = null;
       this.touch();
     });
-    this.path = new PathPanel(this, canvas);
     this.lens = this.first.lens;
+    this.path = new PathPanel(this, canvas);
+    this.notes = new NotesPanel(this, canvas, notes);
     this.bind();
   }
 
@@ -96,7 +110,26 @@ export class App implements Stage {
 
   go(pose: Pose, lens: Lens, target?: Vec3): void {
     this.path.stop();
+    this.flight = null;
     this.place(pose, lens, target);
+  }
+
+  fly(to: Place): void {
+    if (matchMedia('(prefers-reduced-motion: reduce)').matches) {
+      this.go(to.pose, to.lens, to.target);
+      return;
+    }
+    this.path.stop();
+    this.flight = new Flight(this.shared(), to);
+    this.touch();
+  }
+
+  view(): View {
+    return View.contain(this.controls.pose, this.lens, ...this.pixels());
+  }
+
+  depths(view: View): Promise<Depths> {
+    return this.renderer.depths(view, this.look(view.width === 1));
   }
 
   private place(pose: Pose, lens: Lens, target = this.targetOf(pose)): void {
@@ -145,9 +178,16 @@ export class App implements Stage {
     this.controls.advance(now);
     const played = this.path.advance(now);
     if (played) this.place(played.pose, played);
+    else if (this.flight) this.flyOn(this.flight, now);
     if (this.drawing) return;
     if (this.dirty) void this.frame(false);
     else if (!this.still && now - this.movedAt > STILL_AFTER) void this.frame(true);
+  }
+
+  private flyOn(flight: Flight, now: number): void {
+    const view = flight.at(now, ...this.pixels());
+    if (view) this.place(view.pose, view);
+    else this.go(flight.to.pose, flight.to.lens, flight.to.target);
   }
 
   // Width and height of the canvas on the screen, as far as the device draws so many.
@@ -177,6 +217,7 @@ export class App implements Stage {
       const took = performance.now() - begin;
       endPoster();
       this.path.drawn(view.pose);
+      void this.notes.drawn(view, still);
       this.shown();
       if (!still && chosen === 'auto') this.pace.took(took);
       this.still = still && !this.dirty;
@@ -210,11 +251,13 @@ export class App implements Stage {
     on('share', () => void this.share());
     on('theme', () => this.turnTheme());
     on('menu', () => this.open('panel', !element('panel').classList.contains('open')));
-    on('tools', () => this.open('aside', element('aside').hidden));
-    on('close', () => {
-      this.open('aside', false);
-      this.canvas.focus();
-    });
+    for (const [button, close, aside] of ASIDES) {
+      on(button, () => this.open(aside, element(aside).hidden));
+      on(close, () => {
+        this.open(aside, false);
+        this.canvas.focus();
+      });
+    }
     element('resolution').addEventListener('change', () => this.touch());
     element('show').addEventListener('change', (e) => this.setShow((e.target as HTMLSelectElement).value as Show));
     element('camera').addEventListener('change', (e) => this.jump(Number((e.target as HTMLSelectElement).value)));
@@ -222,12 +265,15 @@ export class App implements Stage {
     this.fillCameras();
   }
 
-  // Opens or closes one of the panels; on a phone there is room for one.
-  private open(panel: 'panel' | 'aside', open: boolean): void {
+  // Opens or closes one of the panels; of those aside one is open, and on a phone one of all.
+  private open(panel: 'panel' | (typeof ASIDES)[number][2], open: boolean): void {
     element('panel').classList.toggle('open', panel === 'panel' && open);
-    element('aside').hidden = panel === 'aside' ? !open : element('aside').hidden || (open && onPhone());
     element('menu').setAttribute('aria-expanded', String(panel === 'panel' && open));
-    press(element('tools'), !element('aside').hidden);
+    for (const [button, , aside] of ASIDES) {
+      const stays = !element(aside).hidden && !(open && (panel !== 'panel' || onPhone()));
+      element(aside).hidden = panel === aside ? !open : !stays;
+      press(element(button), !element(aside).hidden);
+    }
   }
 
   private shortcut(e: KeyboardEvent): void {
@@ -238,7 +284,7 @@ export class App implements Stage {
     }
     if (e.ctrlKey || e.metaKey || e.altKey) return;
     const id = { o: 'orbit', f: 'fly', h: 'home', ',': 'previous', '.': 'next', p: 'beside', t: 'texture' }[e.key];
-    const other = { c: 'colors', l: 'share', n: 'tools', k: 'add-keyframe', v: 'play' }[e.key];
+    const other = { c: 'colors', l: 'share', n: 'tools', m: 'notes', k: 'add-keyframe', v: 'play' }[e.key];
     const found = id ?? other;
     if (found && !element(found).hidden) element(found).click();
   }

@@ -8,6 +8,7 @@ const PREFIX = 'bitymi/1/';
 export interface Embedded {
   shared(): Shared;
   apply(shared: Shared): void;
+  readonly notes: { names: string[]; goTo(name: string): boolean }; // false where no saved view has the name
 }
 
 // The origin of the page around: of the browser, of this page before it loaded another bundle, or of the referrer.
@@ -60,7 +61,7 @@ export class Embed {
 
   private heed(data: unknown): void {
     if (typeof data !== 'object' || data === null) return;
-    const { type, id, camera, file } = data as Record<string, unknown>;
+    const { type, id, camera, file, name } = data as Record<string, unknown>;
     if (typeof type !== 'string' || !type.startsWith(PREFIX)) return;
     const refuse = (message: string): void => this.send('error', { id, title: 'The message is refused', message });
     if (type === `${PREFIX}load`) {
@@ -82,6 +83,10 @@ export class Embed {
       const found = sharedOf(camera as Camera);
       if (found) this.viewer.apply({ ...this.viewer.shared(), ...found });
       else refuse('camera must have position, right, forward, target and lens.');
+    } else if (type === `${PREFIX}list-views`) {
+      this.send('views', { id, views: this.viewer.notes.names });
+    } else if (type === `${PREFIX}go-to-view`) {
+      if (typeof name !== 'string' || !this.viewer.notes.goTo(name)) refuse('name must be that of a saved view.');
     } else {
       refuse('There is no such message.');
     }

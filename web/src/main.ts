@@ -1,5 +1,6 @@
 // The page: loads the bundle beside it and shows it.
 import './ui/style.css';
+import './ui/notes.css';
 import { App } from './app';
 import { type Bundle, loadBundle, loadManifest } from './bundle/load';
 import { loadPoster } from './bundle/poster';
@@ -15,6 +16,7 @@ import { screenOf } from './render/screen';
 import { element } from './ui/dom';
 import { notify, onError, showError, showProgress, showScene } from './ui/pages';
 import { showPoster } from './ui/poster';
+import { type Notes, parseNotes } from './view/notes';
 import { fromHash } from './view/share';
 
 // The bundle beside the page: the file that the address asks for (?file=), the one that an export names, or a folder.
@@ -29,21 +31,32 @@ async function source(): Promise<Source> {
   return SingleFile.open(file, showProgress);
 }
 
-// The scene's name, which the service and an export write beside the page.
-async function title(): Promise<string> {
+// The scene's name, and whether there are notes beside it, which the service and an export write beside the page.
+async function about(): Promise<{ title: string; notes: boolean }> {
   const file = new URLSearchParams(location.search).get('file');
-  if (file) return file.replace(/\.bitymi$/, '');
+  if (file) return { title: file.replace(/\.bitymi$/, ''), notes: false };
   try {
-    const found = (await (await fetch('view.json')).json()) as { title?: unknown };
-    return typeof found.title === 'string' ? found.title.slice(0, 120) : 'Scene';
+    const { title, notes } = (await (await fetch('view.json')).json()) as { title?: unknown; notes?: unknown };
+    return { title: typeof title === 'string' ? title.slice(0, 120) : 'Scene', notes: notes === true };
   } catch {
-    return 'Scene';
+    return { title: 'Scene', notes: false };
   }
 }
 
+// A notes.json that cannot be used leaves the scene without.
+async function notesOf(from: Source, stated: boolean): Promise<Notes> {
+  try {
+    const text = await from.notes(stated);
+    if (text !== null) return parseNotes(text);
+  } catch (error) {
+    notify(`notes.json cannot be used: ${error instanceof Error ? error.message : String(error)}`);
+  }
+  return { views: [], notes: [] };
+}
+
 // The poster is asked for first, where the first view is the one that it shows.
-async function load(opening: Promise<Graphics>): Promise<Bundle> {
-  const from = await source();
+async function load(opened: Promise<Source>, opening: Promise<Graphics>): Promise<Bundle> {
+  const from = await opened;
   const info = await loadManifest(from);
   if (!fromHash(location.hash)) void loadPoster(from, info).then(showPoster);
   return loadBundle(from, info, showProgress, async () => {
@@ -54,7 +67,8 @@ async function load(opening: Promise<Graphics>): Promise<Bundle> {
 
 async function main(): Promise<void> {
   const opening = openDevice();
-  const loading = load(opening);
+  const opened = source();
+  const loading = load(opened, opening);
   loading.catch(() => undefined); // until it is waited for
   const graphics = await opening;
   const { device } = graphics;
@@ -63,14 +77,16 @@ async function main(): Promise<void> {
   const bundle = await loading;
   const scene = new SceneOnDevice(graphics, programs, bundle.info, bundle.surfels, bundle.pages);
   const canvas = element<HTMLCanvasElement>('canvas');
-  document.title = element('title').textContent = await title();
-  showScene();
-  const renderer = new Renderer(graphics, programs, scene);
-  const app = new App(canvas, screenOf(canvas, renderer, graphics), renderer, bundle, () => embed.shown());
   if (graphics.software) notify('No graphics card draws here: the processor does, slowly.');
   if (scene.decoded) {
     notify('This device draws no BC7 textures: the texture was decoded, at four times the graphics memory.');
   }
+  const { title, notes: stated } = await about();
+  document.title = element('title').textContent = title;
+  const notes = await notesOf(await opened, stated);
+  showScene();
+  const renderer = new Renderer(graphics, programs, scene);
+  const app = new App(canvas, screenOf(canvas, renderer, graphics), renderer, bundle, notes, () => embed.shown());
   app.start();
   embed.ready(app, document.title);
   if (bundle.later) {

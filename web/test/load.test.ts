@@ -23,6 +23,9 @@ class Sent implements Source {
   manifest(): Promise<string> {
     return Promise.reject(new Error('it is not asked for'));
   }
+  notes(): Promise<null> {
+    return Promise.resolve(null);
+  }
 }
 
 // Without surfels, which have no decoder here: what comes after them is asked for at the same time.

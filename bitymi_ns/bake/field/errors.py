@@ -18,19 +18,12 @@ from bitymi_ns.progress import Progress, no_progress
 
 @dataclass
 class TileErrors:
-    """Errors in 8-bit steps, each times the largest blending weight that a fragment has there.
+    """Errors in 8-bit steps, each times the largest blending weight that a fragment has there."""
 
-    Attributes:
-        rms: [N] root mean square over the visible part of each surfel and the colour channels.
-        largest: [N] largest absolute value.
-        seen: [N] root mean square of what the closest training view sees, which averages over its pixels.
-        shown: [N] bool, whether any fragment of the surfel gets a residual; the errors are 0 elsewhere.
-    """
-
-    rms: Tensor
-    largest: Tensor
-    seen: Tensor
-    shown: Tensor
+    rms: Tensor  # [N] root mean square over the visible part of each surfel and the colour channels
+    largest: Tensor  # [N] largest absolute value
+    seen: Tensor  # [N] root mean square of what the closest training view sees, which averages over its pixels
+    shown: Tensor  # [N] bool, whether any fragment of the surfel gets a residual; the errors are 0 elsewhere
 
     def summary(self, tolerance: float) -> TileError:
         """Percentiles over the surfels that get a residual at all, and the tolerance that was asked for."""
@@ -59,13 +52,11 @@ def tile_errors(
     """Compare stored tiles with the field on the grids of the plan.
 
     Args:
-        field: the residual field.
         plan: what the tiles have to hold; its extents must be those of the tiles.
         tiles: [N, 5] int32.
         mean_residual: [N, 3] the residual of the surfels without a tile.
         residuals: [layers, height, width, 3] the atlas as a renderer reads it, None without tiles.
         chunk: points evaluated at once.
-        progress: called with the number of tiles done.
     """
     rms, largest, seen = (torch.zeros(len(plan)) for _ in range(3))
     rectangles = torch.as_tensor(tiles)

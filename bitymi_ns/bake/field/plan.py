@@ -39,21 +39,13 @@ class Field(Protocol):
 
 @dataclass
 class Plan(Shown):
-    """Extents and grids of N tiles, before the field is evaluated.
+    """Extents and grids of N tiles, before the field is evaluated."""
 
-    Attributes:
-        means: [N, 3] world positions.
-        edges: [N, 3, 2] tangent directions times scales, world units.
-        probes: [N, 2] int32, the grid on which the field is evaluated (along u, v), at least the Nyquist rate.
-        limit: [N, 2] int32, the finest tile of use, at most `probes`.
-        texels: number of texels by the rules before the tolerance.
-    """
-
-    means: Tensor
-    edges: Tensor
-    probes: Tensor
-    limit: Tensor
-    texels: KeptTexels
+    means: Tensor  # [N, 3] world positions
+    edges: Tensor  # [N, 3, 2] tangent directions times scales, world units
+    probes: Tensor  # [N, 2] int32, the grid on which the field is evaluated (along u, v), at least the Nyquist rate
+    limit: Tensor  # [N, 2] int32, the finest tile of use, at most `probes`
+    texels: KeptTexels  # number of texels by the rules before the tolerance
 
     def __len__(self) -> int:
         return len(self.means)

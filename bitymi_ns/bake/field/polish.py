@@ -16,6 +16,7 @@ from bitymi_ns.bake.tune import TuneOptions
 from bitymi_ns.bundle.statistics import FineTuning
 from bitymi_ns.ops import TexelDescent
 from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.ranges import Positive, PositiveCount
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import Scene
@@ -31,23 +32,13 @@ from bitymi_ns.train.views import OnDemand, View, background_changes, step_backg
 class PolishOptions(TuneOptions):
     """Options of the polish: `rate` and `prior` are of the texels."""
 
-    steps: int = 300
-    share: float = 0.4
+    steps: PositiveCount = 300
+    share: Positive = 0.4
     """Rates of the surfels, as a share of those of a training run of as many steps; they fall to 0 as a cosine."""
-    checks: int = 10
-    pixels_per_texel: float = 0.25
+    checks: PositiveCount = 10
+    pixels_per_texel: Positive = 0.25
     """A tile starts with at most a texel for so many pixels that its surfel makes up of the view that shows most of
     it."""
-
-    def check(self) -> None:
-        """Refuse values that make no sense."""
-        super().check()
-        for name, least in (("steps", 1), ("val_every", 2)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} of the polish must be at least {least}, not {getattr(self, name)}")
-        for name in ("share", "pixels_per_texel"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} of the polish must be positive, not {getattr(self, name)}")
 
 
 class _Polish:
@@ -151,10 +142,8 @@ def polish_scene(
         baked: a bake with texels and all of its view colours, made with `pixels_per_texel`.
         views: training views, with the corrections that training found; every `val_every`-th is for validation.
         background: [3] colour behind the scene, but for steps on views behind which it changes (`train.background`).
-        options: see `PolishOptions`.
         train: options of the training, for the learning rates, the colours behind the scene, and for what is done when
             a step is not finite.
-        progress: called after every step.
         eval_views: views of which the gain is stated; they decide nothing.
         device: where the scene learns.
 

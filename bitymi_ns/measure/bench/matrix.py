@@ -21,18 +21,12 @@ Kind = Literal["train", "eval", "export", "pictures"]
 
 @dataclass(frozen=True)
 class SceneSpec:
-    """A capture and how it is read.
+    """A capture and how it is read."""
 
-    Attributes:
-        name: label in tables, and nerfstudio's experiment name.
-        data: its folder, absolute.
-        suite: name of the data set, or `local`.
-        parser: nerfstudio's dataparser with its options, the end of ns-train's command line; empty = the method's own.
-    """
-
-    name: str
-    data: Path
-    suite: str = "local"
+    name: str  # label in tables, and nerfstudio's experiment name
+    data: Path  # its folder, absolute
+    suite: str = "local"  # name of the data set, or `local`
+    # nerfstudio's dataparser with its options, the end of ns-train's command line; empty = the method's own
     parser: tuple[str, ...] = ()
 
 
@@ -132,20 +126,14 @@ class Stage:
 
 @dataclass(frozen=True)
 class Matrix:
-    """Every row is trained on every scene with every seed, then baked into every bundle.
-
-    Attributes:
-        seeds: empty = once, with the method's own seed.
-        steps: length of a run; None = the method's own for this machine.
-        pictures: number of worst held-out views that are drawn with their decomposition.
-    """
+    """Every row is trained on every scene with every seed, then baked into every bundle."""
 
     scenes: Sequence[SceneSpec]
     rows: Sequence[Row]
-    seeds: Sequence[int] = ()
-    steps: int | None = None
+    seeds: Sequence[int] = ()  # empty = once, with the method's own seed
+    steps: int | None = None  # length of a run; None = the method's own for this machine
     bundles: Sequence[Bundle] = field(default_factory=tuple)
-    pictures: int = 0
+    pictures: int = 0  # number of worst held-out views that are drawn with their decomposition
 
     def runs(self) -> list[Run]:
         """All trainings, the seeds of a row one after another."""

@@ -19,33 +19,19 @@ class ReportError(Exception):
 
 @dataclass(frozen=True)
 class Evaluation:
-    """One evaluation of a model on the held-out views.
+    """One evaluation of a model on the held-out views."""
 
-    Attributes:
-        scene: the experiment's name; evaluations are compared within one scene.
-        method: method name without any mark of baking, so that a bundle shares it with its trained parent.
-        baked: True for the images of a bundle.
-        label: shown in tables, unique within its scene and stage after `disambiguate`.
-        results: finite numbers by name (psnr, ssim, render_ms, atlas_bytes, ...).
-        checkpoint: path of the checkpoint as recorded, possibly empty.
-        source: the file that it was read from.
-        run: identifies its training run, empty when unknown (a bare ns-eval file).
-        group: its label without the seed; empty = it has none.
-        series: its run without the seed.
-        seed: of its training, None when not stated.
-    """
-
-    scene: str
-    method: str
-    baked: bool
-    label: str
-    results: dict[str, float]
-    checkpoint: str
-    source: Path
-    run: str = ""
-    group: str = ""
-    series: str = ""
-    seed: int | None = None
+    scene: str  # the experiment's name; evaluations are compared within one scene
+    method: str  # method name without any mark of baking, so that a bundle shares it with its trained parent
+    baked: bool  # True for the images of a bundle
+    label: str  # shown in tables, unique within its scene and stage after `disambiguate`
+    results: dict[str, float]  # finite numbers by name (psnr, ssim, render_ms, atlas_bytes, ...)
+    checkpoint: str  # path of the checkpoint as recorded, possibly empty
+    source: Path  # the file that it was read from
+    run: str = ""  # identifies its training run, empty when unknown (a bare ns-eval file)
+    group: str = ""  # its label without the seed; empty = it has none
+    series: str = ""  # its run without the seed
+    seed: int | None = None  # of its training, None when not stated
 
     def get(self, key: str) -> float | None:
         """A result; None when it is missing or was not finite."""
@@ -74,18 +60,14 @@ class Curve:
 
 @dataclass
 class Records:
-    """Everything that was read, with notes on what was skipped and why.
-
-    Attributes:
-        images: photographs beside renders, as ns-eval writes them.
-        worst: title of a view -> its pictures, (caption, file).
-        poses: report.json of found poses -> its content; a picture of the cameras lies beside it.
-    """
+    """Everything that was read, with notes on what was skipped and why."""
 
     evaluations: list[Evaluation] = field(default_factory=list)
     curves: list[Curve] = field(default_factory=list)
-    images: list[Path] = field(default_factory=list)
+    images: list[Path] = field(default_factory=list)  # photographs beside renders, as ns-eval writes them
+    # title of a view -> its pictures, (caption, file)
     worst: dict[str, list[tuple[str, Path]]] = field(default_factory=dict)
+    # report.json of found poses -> its content; a picture of the cameras lies beside it
     poses: dict[Path, dict[str, Any]] = field(default_factory=dict)
     machines: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)

@@ -32,16 +32,11 @@ from bitymi_ns.scene.camera import Camera
 
 @dataclass(frozen=True)
 class Backend:
-    """A set of compiled kernels behind `bitymi_ns.ops`.
+    """A set of compiled kernels behind `bitymi_ns.ops`."""
 
-    Attributes:
-        name: for tables and tests.
-        device: of the tensors that it takes.
-        use: context in which `bitymi_ns.ops` uses it, where the device alone does not choose it.
-    """
-
-    name: str
-    device: str
+    name: str  # for tables and tests
+    device: str  # of the tensors that it takes
+    # context in which `bitymi_ns.ops` uses it, where the device alone does not choose it
     use: Callable[[], AbstractContextManager[object]] = nullcontext
 
 

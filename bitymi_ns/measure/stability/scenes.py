@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bitymi_ns.ops import VIEW_COLORS, Prefilter, TexelTiles
 from bitymi_ns.ops.constants import SUPPORT
-from bitymi_ns.scene.scene import GEOMETRY
+from bitymi_ns.ops.project import GEOMETRY
 
 SURFEL_KEYS = GEOMETRY
 SV_KEYS = VIEW_COLORS["sv"].names
@@ -163,21 +163,14 @@ def quaternions(R: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Sweep:
-    """One kind of stiffness.
+    """One kind of stiffness."""
 
-    Attributes:
-        name: short, for tables.
-        axis: what the number is, with its unit.
-        values: from easy to hard.
-        make: the scene of a value; all scenes of a sweep differ in what the number says only.
-        near: nearest depth that is drawn, of a value.
-    """
-
-    name: str
-    axis: str
-    values: tuple[float, ...]
+    name: str  # short, for tables
+    axis: str  # what the number is, with its unit
+    values: tuple[float, ...]  # from easy to hard
+    # the scene of a value; all scenes of a sweep differ in what the number says only
     make: Callable[[float], SceneCase]
-    near: Callable[[float], float] = lambda value: 0.2
+    near: Callable[[float], float] = lambda value: 0.2  # nearest depth that is drawn, of a value
 
 
 def decades(first: int, last: int) -> tuple[float, ...]:
@@ -275,19 +268,14 @@ ON_A_TEXEL = 1e-6
 
 @dataclass(frozen=True)
 class Way:
-    """A rendering mode that is measured on the same scenes.
+    """A rendering mode that is measured on the same scenes."""
 
-    Attributes:
-        name: short, for tables and tests.
-        texels: every surfel has a tile of random texels; the gradient reaches them and, through the fetch, u and v.
-        prefilter: as in `ops.project`.
-        rim: bound of the derivative at the rim on both sides, `Scene.rim`. Through a pixel the bound is another
-            one, that of the kernel averaged over the pixel, which the reference does not have: 0 turns it off.
-    """
-
-    name: str
+    name: str  # short, for tables and tests
+    # every surfel has a tile of random texels; the gradient reaches them and, through the fetch, u and v
     texels: bool = False
-    prefilter: Prefilter = "low_pass"
+    prefilter: Prefilter = "low_pass"  # as in `ops.project`
+    # bound of the derivative at the rim on both sides, `Scene.rim`. Through a pixel the bound is another one, that of
+    # the kernel averaged over the pixel, which the reference does not have: 0 turns it off
     rim: float = RIM
 
     def of(self, case: SceneCase) -> SceneCase:

@@ -28,18 +28,12 @@ SURFEL = np.dtype(
 
 @dataclass
 class Arrays:
-    """Arrays of a scene that the shaders read.
+    """Arrays of a scene that the shaders read."""
 
-    Attributes:
-        surfels: [N] of `SURFEL`.
-        terms: of the view colours, [.] float32.
-        kind: a number of `KINDS`.
-        origin: [3] float64, which is taken off positions: far from the world's origin float32 would not resolve them.
-    """
-
-    surfels: npt.NDArray
-    terms: npt.NDArray[np.float32]
-    kind: int
+    surfels: npt.NDArray  # [N] of `SURFEL`
+    terms: npt.NDArray[np.float32]  # of the view colours, [.] float32
+    kind: int  # a number of `KINDS`
+    # [3] float64, which is taken off positions: far from the world's origin float32 would not resolve them
     origin: npt.NDArray[np.float64]
 
 

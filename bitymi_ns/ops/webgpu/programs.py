@@ -25,15 +25,10 @@ def source(program: str) -> str:
 
 @dataclass
 class Programs:
-    """Pipelines of a device.
+    """Pipelines of a device."""
 
-    Attributes:
-        device: of `device.device`.
-        format: of the target that is drawn to.
-    """
-
-    device: Any
-    format: str
+    device: Any  # of `device.device`
+    format: str  # of the target that is drawn to
 
     def _module(self, name: str) -> Any:
         return self.device.create_shader_module(label=name, code=source(name))

@@ -47,21 +47,13 @@ class ModelImage(NamedTuple):
 
 
 class Model(NamedTuple):
-    """COLMAP model.
+    """COLMAP model."""
 
-    Attributes:
-        cameras: by number.
-        images: sorted by name.
-        xyz: [N, 3] float64 points.
-        rgb: [N, 3] uint8 colors; [0, 3] where they have none.
-        without_colors: why they have none, in words that follow the name of the file; empty where they have.
-    """
-
-    cameras: dict[int, ModelCamera]
-    images: list[ModelImage]
-    xyz: npt.NDArray[np.float64]
-    rgb: npt.NDArray[np.uint8]
-    without_colors: str = ""
+    cameras: dict[int, ModelCamera]  # by number
+    images: list[ModelImage]  # sorted by name
+    xyz: npt.NDArray[np.float64]  # [N, 3] float64 points
+    rgb: npt.NDArray[np.uint8]  # [N, 3] uint8 colors; [0, 3] where they have none
+    without_colors: str = ""  # why they have none, in words that follow the name of the file; empty where they have
 
 
 def read_model(folder: Path) -> Model:

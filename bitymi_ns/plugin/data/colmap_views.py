@@ -25,45 +25,30 @@ TO_NERFSTUDIO = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0
 
 @dataclass(frozen=True)
 class Origin:
-    """Input of structure from motion, for a run that keeps its model.
+    """Input of structure from motion, for a run that keeps its model."""
 
-    Attributes:
-        kind: of the input.
-        path: folder that was searched for photographs, or the video, relative to the capture.
-        photographs: folder of the photographs, relative to the capture; None = those of the model are upright copies or
-            frames, in a folder that can go.
-        settings: of structure from motion; None = unknown.
-    """
-
-    kind: Literal["photographs", "video"]
-    path: str
+    kind: Literal["photographs", "video"]  # of the input
+    path: str  # folder that was searched for photographs, or the video, relative to the capture
+    # folder of the photographs, relative to the capture; None = those of the model are upright copies or frames, in a
+    # folder that can go
     photographs: str | None
-    settings: SfmSettings | None = None
+    settings: SfmSettings | None = None  # of structure from motion; None = unknown
 
 
 @dataclass(frozen=True)
 class Source:
-    """A COLMAP model and the photographs that belong to it.
+    """A COLMAP model and the photographs that belong to it."""
 
-    Attributes:
-        folder: of the model.
-        photographs: folder to which the names in the model are relative.
-        masks: folder of masks; None = none.
-        downscale: the photographs are used smaller by this factor.
-        copies: folder of copies that are that much smaller; None = photographs are downscaled as they are read.
-        left_out: photographs that the model lacks, with reasons where they are known.
-        report: folder of the report on structure from motion; None = none.
-        origin: input of structure from motion; None = the capture came with the model.
-    """
-
-    folder: Path
-    photographs: Path
-    masks: Path | None = None
-    downscale: int = 1
+    folder: Path  # of the model
+    photographs: Path  # folder to which the names in the model are relative
+    masks: Path | None = None  # folder of masks; None = none
+    downscale: int = 1  # the photographs are used smaller by this factor
+    # folder of copies that are that much smaller; None = photographs are downscaled as they are read
     copies: Path | None = None
+    # photographs that the model lacks, with reasons where they are known
     left_out: Mapping[str, str] = field(default_factory=dict)
-    report: Path | None = None
-    origin: Origin | None = None
+    report: Path | None = None  # folder of the report on structure from motion; None = none
+    origin: Origin | None = None  # input of structure from motion; None = the capture came with the model
 
     @property
     def image_folder(self) -> Path:

@@ -28,17 +28,11 @@ ORIGIN = "origin.json"
 
 @dataclass(frozen=True)
 class KeptPoses:
-    """Poses in the folder of a run.
+    """Poses in the folder of a run."""
 
-    Attributes:
-        folder: it holds MODEL, the report, and IMAGES where those were made for the training.
-        origin: input of structure from motion; its photographs are IMAGES where it names no folder.
-        left_out: photographs without a pose, and why.
-    """
-
-    folder: Path
-    origin: Origin
-    left_out: Mapping[str, str] = field(default_factory=dict)
+    folder: Path  # it holds MODEL, the report, and IMAGES where those were made for the training
+    origin: Origin  # input of structure from motion; its photographs are IMAGES where it names no folder
+    left_out: Mapping[str, str] = field(default_factory=dict)  # photographs without a pose, and why
 
     @property
     def model(self) -> Path:

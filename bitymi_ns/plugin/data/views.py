@@ -15,7 +15,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 
-from bitymi_ns.capture.panorama import SPHERICAL_MODEL
+from bitymi_ns.capture.panorama_detection import SPHERICAL_MODEL
 from bitymi_ns.plugin.console import fail, listed, say
 from bitymi_ns.plugin.data.colmap_model import ModelCamera
 from bitymi_ns.plugin.data.depth_files import MAPS, MapFiles
@@ -36,27 +36,16 @@ LONGEST_SIDE = 1600  # default longest side of a training photograph, pixels; as
 
 @dataclass(frozen=True)
 class Photograph:
-    """A photograph with its camera.
+    """A photograph with its camera."""
 
-    Attributes:
-        file: image file.
-        camera: in pixels of the photograph before any downscaling.
-        pose: [4, 4] float64, camera to world in nerfstudio's axes (camera: x right, y up, z backward).
-        label: names the camera in messages.
-        mask: mask file; None = none.
-        downscaled: `file` is a copy that is downscaled already.
-        frame: number that photographs share which a rig took together; None = it stands alone.
-        maps: depth and normals.
-    """
-
-    file: Path
-    camera: ModelCamera
-    pose: Pose
-    label: str
-    mask: Path | None = None
-    downscaled: bool = False
-    frame: int | None = None
-    maps: MapFiles = MapFiles()
+    file: Path  # image file
+    camera: ModelCamera  # in pixels of the photograph before any downscaling
+    pose: Pose  # [4, 4] float64, camera to world in nerfstudio's axes (camera: x right, y up, z backward)
+    label: str  # names the camera in messages
+    mask: Path | None = None  # mask file; None = none
+    downscaled: bool = False  # `file` is a copy that is downscaled already
+    frame: int | None = None  # number that photographs share which a rig took together; None = it stands alone
+    maps: MapFiles = MapFiles()  # depth and normals
 
 
 @dataclass(frozen=True)
@@ -172,15 +161,8 @@ def make_views(
 
 
 def _split(parts: Sequence[Sequence[Lens]], poses: Pose) -> tuple[list[Lens], list[int], Pose]:
-    """Split photographs into the views of their lenses.
-
-    Args:
-        parts: lenses of each photograph.
-        poses: [N, 3 or 4, 4] camera to world in nerfstudio's axes.
-
-    Returns:
-        lens, number of the photograph and pose of each view.
-    """
+    """Split photographs into the views of their lenses (`parts`, of each photograph), with poses [N, 3 or 4, 4] camera
+    to world in nerfstudio's axes. Returns lens, number of the photograph and pose of each view."""
     lenses = [lens for some in parts for lens in some]
     of = [i for i, some in enumerate(parts) for _ in some]
     turns = np.stack([OPENCV_AXES @ lens.turn @ OPENCV_AXES for lens in lenses])

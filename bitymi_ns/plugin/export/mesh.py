@@ -24,6 +24,7 @@ from bitymi_ns.plugin.console import fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.export.trained import load_trained, world_of
 from bitymi_ns.progress import rich_progress
+from bitymi_ns.ranges import check_ranges
 from bitymi_ns.scene.camera import Camera
 
 NAME = "mesh"
@@ -32,23 +33,14 @@ MOST_VIEWS = 400  # training views that are fused at most, evenly spaced
 
 @dataclass(frozen=True)
 class Source:
-    """Scene that a mesh is made of.
+    """Scene that a mesh is made of."""
 
-    Attributes:
-        surfels: geometry by name, on the device where it is drawn.
-        render: [H, W, 3] colors of a view.
-        cameras: of the training views, on that device.
-        near: nearest depth that is drawn, camera z.
-        prefilter: as in `ops.project`.
-        world: how the scene lies in the capture.
-    """
-
-    surfels: Mapping[str, Tensor]
-    render: Callable[[Camera], Tensor]
-    cameras: Sequence[Camera]
-    near: float
-    prefilter: Prefilter
-    world: WorldFrame
+    surfels: Mapping[str, Tensor]  # geometry by name, on the device where it is drawn
+    render: Callable[[Camera], Tensor]  # [H, W, 3] colors of a view
+    cameras: Sequence[Camera]  # of the training views, on that device
+    near: float  # nearest depth that is drawn, camera z
+    prefilter: Prefilter  # as in `ops.project`
+    world: WorldFrame  # how the scene lies in the capture
 
 
 @dataclass(kw_only=True)
@@ -79,7 +71,7 @@ class ExportMesh:
         options = SurfaceOptions(self.resolution, self.triangles, self.watertight)
         path = self.output_dir / f"{NAME}.{self.format}"
         try:
-            options.check()
+            check_ranges(options)
         except ValueError as error:
             fail(f"--{error}.", error)
         try:

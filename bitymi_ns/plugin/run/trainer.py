@@ -15,7 +15,7 @@ from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from bitymi_ns import files
-from bitymi_ns.plugin.console import fail, filter_console, ignore_torch_warnings, say, step_bar, warn
+from bitymi_ns.plugin.console import INTERRUPTED, fail, filter_console, ignore_torch_warnings, say, step_bar, warn
 from bitymi_ns.plugin.run import checkpoints, run_folder
 from bitymi_ns.plugin.run.launcher import Workers
 from bitymi_ns.train import optimizers
@@ -28,21 +28,15 @@ from dataclasses import dataclass, field
 
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 
-INTERRUPTED = 130  # exit status after Ctrl-C, by the convention of shells
-
 
 class _StopAfterStep(Exception):
     """Raised at the end of a training step after which the run is to stop."""
 
 
 class TogetherOptimizers(Optimizers):
-    """nerfstudio's optimisers, one per parameter group, that step together: the same steps in less time.
+    """nerfstudio's optimisers, one per parameter group, that step together: the same steps in less time."""
 
-    Attributes:
-        before_step: called before each step, with all gradients there.
-    """
-
-    before_step: Callable[[], None] | None = None
+    before_step: Callable[[], None] | None = None  # called before each step, with all gradients there
 
     def zero_grad_some(self, param_groups: list[str]) -> None:
         optimizers.forget_gradients(self.optimizers[group] for group in param_groups)

@@ -1,6 +1,7 @@
 """How tests read a capture."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from nerfstudio.data.utils import colmap_parsing_utils as reader
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from bitymi_ns.capture.types import Poses
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
@@ -35,6 +37,51 @@ def images_of(capture: Path) -> list[Path]:
     return sorted(p for p in (capture / "images").iterdir() if p.is_file())
 
 
+def held_out(manager: BitymiDataManager) -> list[str]:
+    return [path.name for path in manager.eval_dataset.image_filenames]
+
+
+def edit(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+    """Apply `change` to a JSON file, that of a capture by default."""
+    path = path / "transforms.json" if path.is_dir() else path
+    meta = json.loads(path.read_text("utf8"))
+    change(meta)
+    path.write_text(json.dumps(meta), "utf8")
+
+
+def edit_frames(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+    edit(path, lambda meta: [change(frame) for frame in meta["frames"]])
+
+
+def save_masks(capture: Path, mask: Any, folder: str = "masks", ending: str = ".png") -> None:
+    """Masks beside the photographs, of an array or one value; `mask(i)` gives that of the i-th."""
+    (capture / folder).mkdir()
+    for i, path in enumerate(images_of(capture)):
+        values = np.full((36, 48), mask(i) if callable(mask) else mask, np.uint8)
+        Image.fromarray(values).save(capture / folder / (path.stem + ending))
+
+
+def add_masks(capture: Path, mask: Any) -> None:
+    """Masks that transforms.json names."""
+    save_masks(capture, mask)
+    edit_frames(capture, lambda frame: frame.update(mask_path=f"masks/{Path(frame['file_path']).stem}.png"))
+
+
+def reduce_photographs(capture: Path, factor: int, size: tuple[int, int]) -> None:
+    """Write smaller copies into images_<factor>."""
+    (capture / f"images_{factor}").mkdir()
+    for path in images_of(capture):
+        Image.open(path).resize(size, Image.Resampling.BOX).save(capture / f"images_{factor}" / path.name)
+
+
+def write_cloud(path: Path, xyz: Any, rgb: str | None = "200 10 10") -> None:
+    """A point cloud in text, all of one color."""
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(xyz)}\n" + "".join(f"property double {c}\n" for c in "xyz")
+    header += "" if rgb is None else "".join(f"property uchar {c}\n" for c in ("red", "green", "blue"))
+    rows = [f"{x!r} {y!r} {z!r} {rgb or ''}\n" for x, y, z in np.asarray(xyz, float).tolist()]
+    path.write_text(f"{header}end_header\n{''.join(rows)}")
+
+
 def expect(message: str) -> Any:
     return pytest.raises(InputError, match=message)
 
@@ -42,6 +89,12 @@ def expect(message: str) -> Any:
 def printed(capsys: pytest.CaptureFixture[str]) -> str:
     """What was printed, on one line."""
     return " ".join(capsys.readouterr().out.split())
+
+
+def found_poses(model: Path, images: Path, report: Path, **changes: Any) -> Poses:
+    """Poses of twelve photographs, as the finding of poses gives them; one was left out."""
+    found = dict(left_out={"frame_00099.png": "blurred"}, registered=12, given=13, reprojection_error=0.5)
+    return Poses(model, images, report, **{**found, "track_length": 3.0, "seconds": {}, **changes})
 
 
 def colmap_model(capture: Path, folder: Path, scale: float = 1.0) -> None:

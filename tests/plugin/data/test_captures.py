@@ -11,7 +11,7 @@ from PIL import Image
 
 from bitymi_ns.plugin.run.model import train_config_for
 from bitymi_ns.train.config import TrainConfig
-from tests.plugin.data.captures import expect, images_of, load
+from tests.plugin.data.captures import add_masks, edit, edit_frames, expect, images_of, load, printed
 
 
 def test_every_eighth_image_is_held_out_and_cached_without_cuda(capture: Path) -> None:
@@ -46,11 +46,16 @@ def test_a_batch_does_not_share_its_dictionary_with_the_cache(capture: Path) -> 
     assert manager.cached_train[0]["image"] is not None
 
 
-def test_alpha_is_kept_for_the_model(capture: Path) -> None:
-    for path in images_of(capture):
+def add_alpha(paths: list[Path], alpha: int) -> None:
+    """Give photographs an alpha channel that is 255 but for one pixel."""
+    for path in paths:
         image = Image.open(path).convert("RGBA")
-        image.putpixel((0, 0), (0, 0, 0, 0))
-        image.save(path.with_suffix(".png"))
+        image.putpixel((0, 0), (0, 0, 0, alpha))
+        image.save(path)
+
+
+def test_alpha_is_kept_for_the_model(capture: Path) -> None:
+    add_alpha(images_of(capture), 0)
     manager = load(capture)
     assert manager.train_dataset.metadata["has_alpha"] is True
     assert manager.train_dataset.metadata["transparent"] is True
@@ -59,17 +64,12 @@ def test_alpha_is_kept_for_the_model(capture: Path) -> None:
 
 
 def test_an_alpha_channel_without_a_transparent_pixel_is_none(capture: Path) -> None:
-    for path in images_of(capture):
-        Image.open(path).convert("RGBA").save(path.with_suffix(".png"))
+    add_alpha(images_of(capture), 255)
     manager = load(capture)
     assert manager.train_dataset.metadata["transparent"] is False
     assert manager.cached_train[0]["image"].shape[-1] == 3
-    opaque = images_of(capture)[0]
-    for path in images_of(capture)[1:]:
-        image = Image.open(path).convert("RGBA")
-        image.putpixel((0, 0), (0, 0, 0, 0))
-        image.save(path.with_suffix(".png"))
-    assert opaque.exists() and load(capture).train_dataset.metadata["transparent"] is True
+    add_alpha(images_of(capture)[1:], 0)
+    assert load(capture).train_dataset.metadata["transparent"] is True
 
 
 def test_the_colour_behind_transparent_photographs() -> None:
@@ -85,23 +85,15 @@ def test_the_colour_behind_transparent_photographs() -> None:
     assert train_config_for(TrainConfig(), None, False).background == "black"
 
 
-def test_masks_are_loaded(capture: Path, edit: Any) -> None:
-    (capture / "masks").mkdir()
-
-    def add_masks(meta: dict) -> None:
-        for frame in meta["frames"]:
-            name = "masks/" + Path(frame["file_path"]).stem + ".png"
-            Image.fromarray(np.tile(np.uint8([[0, 255]]), (36, 24))).save(capture / name)
-            frame["mask_path"] = name
-
-    edit(capture, add_masks)
+def test_masks_are_loaded(capture: Path) -> None:
+    add_masks(capture, np.arange(48) % 2 * 255)
     mask = load(capture).cached_train[0]["mask"]
     assert mask.dtype == torch.bool and mask.shape == (36, 48, 1) and 0.4 < mask.float().mean() < 0.6
 
 
-def test_all_cameras_at_one_place(capture: Path, edit: Any) -> None:
+def test_all_cameras_at_one_place(capture: Path) -> None:
     first = json.loads((capture / "transforms.json").read_text())["frames"][0]["transform_matrix"]
-    edit(capture, lambda meta: [frame.update(transform_matrix=first) for frame in meta["frames"]])
+    edit_frames(capture, lambda frame: frame.update(transform_matrix=first))
     with expect("all cameras are at one place"):
         load(capture)
 
@@ -113,19 +105,16 @@ def test_an_image_of_another_size_is_named(capture: Path) -> None:
         _ = load(capture).cached_train
 
 
-def test_one_view(capture: Path, edit: Any) -> None:
+def test_few_views_and_one(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    edit(capture, lambda meta: meta.update(frames=meta["frames"][:5]))
+    assert len(load(capture).train_dataset) == 4
+    assert "Only 4 training views" in printed(capsys)
     edit(capture, lambda meta: meta.update(frames=meta["frames"][:2]))
     with expect("only one training view"):
         load(capture)  # the other is held out
     edit(capture, lambda meta: meta.update(frames=meta["frames"][:1]))
     with expect("has one image only"):
         load(capture)
-
-
-def test_few_views_work_with_a_warning(capture: Path, edit: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    edit(capture, lambda meta: meta.update(frames=meta["frames"][:5]))
-    assert len(load(capture).train_dataset) == 4
-    assert "Only 4 training views" in capsys.readouterr().out
 
 
 def test_a_point_cloud_that_is_cut_off(capture: Path) -> None:
@@ -152,7 +141,4 @@ def test_a_point_cloud_that_is_cut_off(capture: Path) -> None:
 def test_options_that_leave_no_capture(capture: Path, options: dict[str, Any], message: str) -> None:
     with expect(message):
         load(capture, **options)
-
-
-def test_options_that_nothing_reads_are_not_looked_at(capture: Path) -> None:
-    assert len(load(capture, eval_mode="interval", train_split_fraction=2.0).train_dataset) == 10
+    assert len(load(capture, eval_mode="interval", train_split_fraction=2.0).train_dataset) == 10  # nothing reads it

@@ -2,14 +2,13 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from bitymi_ns.plugin.data.point_files import read_points
-from tests.plugin.data.captures import colmap_model, load_any, printed
+from tests.plugin.data.captures import colmap_model, edit_frames, load_any, printed, write_cloud
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 Pose = np.ndarray
@@ -39,13 +38,9 @@ def model(capture: Path) -> Path:
     ],
 )
 def test_of_a_transforms_json(
-    capture: Path, edit: Any, written: Callable[[Pose], Pose], message: str, capsys: pytest.CaptureFixture[str]
+    capture: Path, written: Callable[[Pose], Pose], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def change(meta: dict[str, Any]) -> None:
-        for frame in meta["frames"]:
-            frame["transform_matrix"] = written(np.array(frame["transform_matrix"])).tolist()
-
-    edit(capture, change)
+    edit_frames(capture, lambda f: f.update(transform_matrix=written(np.array(f["transform_matrix"])).tolist()))
     load_any(capture)
     text = printed(capsys)
     assert f"another convention: {message}" in text and WRONG in text
@@ -85,10 +80,7 @@ def test_of_a_colmap_model(
 @pytest.mark.parametrize("colours", [True, False])
 def test_right_ones_are_nothing_to_speak_of(capture: Path, colours: bool, capsys: pytest.CaptureFixture[str]) -> None:
     if not colours:
-        xyz = read_points(capture / "sparse_pc.ply")[0].xyz
-        header = f"ply\nformat ascii 1.0\nelement vertex {len(xyz)}\n"
-        header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
-        (capture / "sparse_pc.ply").write_text(header + "".join(f"{x} {y} {z}\n" for x, y, z in xyz))
+        write_cloud(capture / "sparse_pc.ply", read_points(capture / "sparse_pc.ply")[0].xyz, None)
     load_any(capture)
     assert "convention" not in printed(capsys)
 

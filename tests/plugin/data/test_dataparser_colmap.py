@@ -1,6 +1,5 @@
 """The presets' parser: what it makes of COLMAP models."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,24 +15,30 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from PIL import Image
 
 from bitymi_ns.plugin.data.colmap_model import read_model
-from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
-from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.train.views import View
-from tests.plugin.data.captures import as_binary, expect, images_of, load_any, mixed_project, printed
+from tests.plugin.data.captures import (
+    as_binary,
+    expect,
+    images_of,
+    load_any,
+    mixed_project,
+    printed,
+    reduce_photographs,
+    save_masks,
+)
+from tests.plugin.data.test_dataparser import sides
 from tests.plugin.data.test_lens import camera_of
 
+LEFT = 255 * (np.arange(48) < 24)
 
-def edit(project: Path, file: str, *changes: tuple[str, str]) -> None:
+
+def change_model(project: Path, file: str, *changes: tuple[str, str]) -> None:
     path = project / "sparse/0" / file
     text = path.read_text("utf8")
     for old, new in changes:
         assert old in text
         text = text.replace(old, new)
     path.write_text(text, "utf8")
-
-
-def names(paths: Sequence[Path]) -> list[str]:
-    return [path.name for path in paths]
 
 
 @pytest.mark.parametrize(
@@ -44,8 +49,7 @@ def test_poses_and_points_are_those_of_nerfstudios_parser(
 ) -> None:
     if binary:
         as_binary(project / "sparse/0")
-    stock = ColmapDataParserConfig(data=project, colmap_path=Path("sparse/0"), downscale_factor=1).setup()
-    theirs = {"train": stock.get_dataparser_outputs("train"), "val": stock.get_dataparser_outputs("val")}
+    theirs = sides(ColmapDataParserConfig(data=project, colmap_path=Path("sparse/0"), downscale_factor=1).setup())
     (project / "sparse/0").rename(project / "model")
     (project / "sparse").rmdir()
     (project / place).mkdir(parents=True, exist_ok=True)
@@ -58,12 +62,11 @@ def test_poses_and_points_are_those_of_nerfstudios_parser(
     assert (
         f"Reading COLMAP model {folder} (12 photographs, 1 PINHOLE camera, 2 points), photographs {project}/images."
     ) in printed(capsys)
-    for a, b in ((one.train_dataset, theirs["train"]), (one.eval_dataset, theirs["val"])):
+    for a, b in zip(sides(one), theirs, strict=True):
         assert a.image_filenames == b.image_filenames
         assert torch.allclose(a.cameras.camera_to_worlds, b.cameras.camera_to_worlds, rtol=0, atol=2e-6)
         for column in ("fx", "fy", "cx", "cy", "width", "height"):
             assert torch.equal(getattr(a.cameras, column), getattr(b.cameras, column)), column
-    a, b = one.train_dataparser_outputs, theirs["train"]
     assert a.dataparser_scale == pytest.approx(b.dataparser_scale, rel=1e-5)
     assert torch.allclose(a.dataparser_transform, b.dataparser_transform.double(), rtol=0, atol=2e-6)
     assert torch.allclose(a.metadata["points3D_xyz"], b.metadata["points3D_xyz"], rtol=0, atol=2e-6)
@@ -138,14 +141,16 @@ def as_binary_by_colmap(folder: Path, model: Any) -> None:
 @pytest.mark.parametrize("model", ["FULL_OPENCV", "OPENCV_FISHEYE"])
 def test_camera_models_of_colmap(project: Path, model: str) -> None:
     params = " ".join(map(str, camera_of(model, 40.0, (48, 36))))
-    edit(project, "cameras.txt", ("PINHOLE 48 36 40 40 24 18", f"{model} 48 36 {params}"))
+    change_model(project, "cameras.txt", ("PINHOLE 48 36 40 40 24 18", f"{model} 48 36 {params}"))
     view = load_any(project).train_views[0]
     assert view.image.shape[:2] == (view.camera.height, view.camera.width) and view.image.float().std() > 1
 
 
 def test_undistorted_as_nerfstudio_does_it(project: Path) -> None:
     """The same scene point has the same colour in both pictures; they differ in how much they crop alone."""
-    edit(project, "cameras.txt", ("PINHOLE 48 36 40 40 24 18", "OPENCV 48 36 40 41 23 19 0.08 -0.01 0.002 -0.001"))
+    change_model(
+        project, "cameras.txt", ("PINHOLE 48 36 40 40 24 18", "OPENCV 48 36 40 41 23 19 0.08 -0.01 0.002 -0.001")
+    )
     ours = load_any(project).train_views[3]
     path = load_any(project).train_dataset.image_filenames[3]
     K = np.array([[40.0, 0.0, 23.0], [0.0, 41.0, 19.0], [0.0, 0.0, 1.0]])
@@ -165,13 +170,6 @@ def test_undistorted_as_nerfstudio_does_it(project: Path) -> None:
 # reduced photographs and masks
 
 
-def reduce_photographs(project: Path, factor: int, size: tuple[int, int]) -> None:
-    for path in images_of(project):
-        target = project / f"images_{factor}" / path.name
-        target.parent.mkdir(exist_ok=True)
-        Image.open(path).resize(size, Image.Resampling.BOX).save(target)
-
-
 @pytest.mark.parametrize("size", [(10, 7), (9, 8), (10, 8)])
 def test_reduced_photographs_are_used_as_they_are(project: Path, size: tuple[int, int]) -> None:
     reduce_photographs(project, 5, size)  # 48 x 36: sizes are rounded in more than one way
@@ -188,13 +186,9 @@ def test_reduced_photographs_of_another_size(project: Path) -> None:
     reduce_photographs(project, 4, (24, 18))
     with expect("images_4/frame_00001.png has 24 x 18 pixels, but its camera is for 48 x 36, of which 1/4 is 12 x 9"):
         load_any(project, downscale_factor=4)
-
-
-def test_a_reduced_photograph_that_is_missing(project: Path) -> None:
-    reduce_photographs(project, 2, (24, 18))
-    (project / "images_2/frame_00003.png").unlink()
-    with expect(r"1 of 12 images of the capture are missing:\s+.*images_2/frame_00003.png"):
-        load_any(project, downscale_factor=2)
+    (project / "images_4/frame_00003.png").unlink()
+    with expect(r"1 of 12 photographs of .* are missing:\s+.*images_4/frame_00003.png"):
+        load_any(project, downscale_factor=4)
 
 
 def test_photographs_are_reduced_where_no_folder_has_smaller_ones(
@@ -208,25 +202,18 @@ def test_photographs_are_reduced_where_no_folder_has_smaller_ones(
 
 @pytest.mark.parametrize(("ending", "reduction"), [(".png", 1), (".png.png", 2)])
 def test_masks_beside_the_photographs(project: Path, ending: str, reduction: int) -> None:
-    (project / "masks").mkdir()
-    for path in images_of(project):
-        mask = np.zeros((36, 48), np.uint8)
-        mask[:, :24] = 255
-        Image.fromarray(mask).save(project / "masks" / (path.stem + ending))
-    manager = load_any(project, downscale_factor=reduction)
-    mask = manager.cached_train[0]["mask"]
+    save_masks(project, LEFT, ending=ending)
+    mask = load_any(project, downscale_factor=reduction).cached_train[0]["mask"]
     width = 48 // reduction
     assert mask.shape == (36 // reduction, width, 1) and mask[:, : width // 2].all() and not mask[:, width // 2 :].any()
-    next((project / "masks").glob(f"frame_00004{ending}")).unlink()
+    (project / f"masks/frame_00004{ending}").unlink()
     with expect("masks has no mask of frame_00004.png, but of others"):
         load_any(project)
 
 
 def test_whole_masks_serve_reduced_photographs(project: Path) -> None:
     reduce_photographs(project, 2, (24, 18))
-    (project / "masks").mkdir()
-    for path in images_of(project):
-        Image.fromarray(np.uint8(np.arange(48) < 24)[None].repeat(36, 0)).save(project / "masks" / path.name)
+    save_masks(project, LEFT)
     mask = load_any(project, downscale_factor=2).cached_train[0]["mask"]
     assert mask.shape == (18, 24, 1) and mask[:, :12].all() and not mask[:, 12:].any()
     (project / "masks").rename(project / "masks_2")
@@ -249,7 +236,7 @@ def test_photographs_that_the_model_lacks_are_named(project: Path, capsys: pytes
 
 def test_photographs_of_the_model_that_are_not_there(project: Path) -> None:
     images_of(project)[3].unlink()
-    with expect(r"1 of 12 images of the capture are missing:\s+.*frame_00004.png"):
+    with expect(r"1 of 12 photographs of .* are missing:\s+.*frame_00004.png"):
         load_any(project)
     for path in images_of(project):
         path.unlink()
@@ -278,19 +265,20 @@ def test_the_model_itself_may_be_given(project: Path) -> None:
         ("cameras.txt", (" 40 40 24 18", " 40"), "cameras.txt: camera 1 has 1 parameters, but a PINHOLE has 4"),
         ("cameras.txt", ("PINHOLE", "PINHALE"), "cameras.txt has a line .*COLMAP has no camera model PINHALE"),
         ("cameras.txt", ("1 PIN", "7 PIN"), r"image 1 \(frame_00001.png\) was taken by camera 1, .* only 7"),
+        ("cameras.txt", ("PINHOLE 48 36 40 40 24 18", "EQUIRECTANGULAR 48 36 48 36"), "EQUIR.*, but .*twice as wide"),
+        ("cameras.txt", ("40 40 24", "nan 40 24"), "camera 1 .* has to be positive and all numbers finite"),
         (
             "cameras.txt",
-            ("PINHOLE 48 36 40 40 24 18", "EQUIRECTANGULAR 48 36 48 36"),
-            "EQUIRECTANGULAR, but .*twice as wide",
+            ("1 PINHOLE 48 36 40 40 24 18", "# a\n1 PINHOLE 48 36 40 40 24 inf"),
+            r"line 2: camera 1 \(PINHOLE .* inf\) cannot be used",
         ),
-        ("cameras.txt", ("40 40 24", "nan 40 24"), "camera 1 .* has to be positive and all numbers finite"),
         ("images.txt", ("_00002.png\n\n", "_00002.png\n1 2 3 4\n"), "images.txt has a line .*Each image has two lines"),
         ("images.txt", ("frame_00002", "frame_00001"), "images 1 and 2 are both of frame_00001.png"),
         ("points3D.txt", ("200", "red"), "points3D.txt has a line that cannot be read .*red"),
     ],
 )
 def test_models_that_cannot_be_used(project: Path, file: str, change: tuple[str, str], message: str) -> None:
-    edit(project, file, change)
+    change_model(project, file, change)
     with expect(message):
         load_any(project)
 
@@ -315,14 +303,6 @@ def test_binary_files_that_are_not_whole(project: Path, name: str, change: Any) 
         load_any(project)
 
 
-def test_a_model_without_points_starts_from_random_ones(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (project / "sparse/0/points3D.txt").unlink()
-    assert "points3D_xyz" not in load_any(project).train_dataparser_outputs.metadata
-    text = printed(capsys)
-    assert text.count("No points can be triangulated: not in this test. Training starts from random points.") == 1
-    assert "splatfacto" not in text
-
-
 def test_one_image_and_one_place(project: Path) -> None:
     path = project / "sparse/0/images.txt"
     lines = path.read_text().split("\n")
@@ -333,17 +313,3 @@ def test_one_image_and_one_place(project: Path) -> None:
     path.write_text("\n".join(lines[:2]) + "\n")
     with expect("has one image only"):
         load_any(project)
-
-
-def test_lists_beside_the_model(project: Path) -> None:
-    (project / "test_list.txt").write_text("frame_00002.png\nframe_00005.png\n")
-    manager = load_any(project)
-    assert names(manager.eval_dataset.image_filenames) == ["frame_00002.png", "frame_00005.png"]
-    assert len(manager.train_dataset) == 10
-
-
-def test_what_needs_no_photographs_opens_none(project: Path) -> None:
-    for path in images_of(project):
-        path.unlink()
-    config = BitymiDataManagerConfig(data=project, dataparser=BitymiDataParserConfig())
-    assert len(config.setup(device="cpu", test_mode="inference").train_dataset) == 10

@@ -10,50 +10,34 @@ import pytest
 import yaml
 from PIL import Image
 
+import bitymi_ns.capture
 from bitymi_ns.capture.types import CaptureError, SfmOptions, SfmSettings
-from tests.plugin.data.captures import expect, load_any, load_with, printed
+from tests.plugin.data.captures import expect, found_poses, load_any, load_with, printed
 from tests.plugin.data.test_dataparser import parsed
 
 
 @pytest.fixture
-def finder(project: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+def finder(project: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, SfmOptions]]:
     """Finding poses stands in: it gives the project's model, and records what it was asked for."""
-    return standing_in(project, monkeypatch)[0]
-
-
-def standing_in(project: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[list[Path], list[SfmOptions]]:
-    asked: list[Path] = []
-    options_given: list[SfmOptions] = []
-    capture = types.ModuleType("bitymi_ns.capture")
+    asked: list[tuple[Path, SfmOptions]] = []
 
     def find_poses(source: Path, options: Any, progress: Any, *told: Any) -> Any:
-        asked.append(source)
-        options_given.append(options)
+        asked.append((source, options))
         progress("matching", 1, 2)
         if source.name == "bad":
             raise CaptureError("photographs of bad share too little: take more of them")
-        return types.SimpleNamespace(
-            model=project / "sparse/0",
-            images=project / "images",
-            report=project / "report",
-            left_out={"frame_00099.png": "blurred"},
-            registered=12,
-            given=13,
-            reprojection_error=0.5,
-        )
+        return found_poses(project / "sparse/0", project / "images", project / "report")
 
-    capture.find_poses, capture.CaptureError = find_poses, CaptureError  # type: ignore[attr-defined]
-    capture.SfmOptions = SfmOptions  # type: ignore[attr-defined]
+    monkeypatch.setattr(bitymi_ns.capture, "find_poses", find_poses, raising=False)
     progress = types.ModuleType("bitymi_ns.progress")
     progress.rich_progress = lambda: nullcontext(lambda step, done, total: print(step))  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "bitymi_ns.capture", capture)
     monkeypatch.setitem(sys.modules, "bitymi_ns.progress", progress)
-    return asked, options_given
+    return asked
 
 
 @pytest.mark.parametrize("name", ["photographs", "walk.mp4"])
 def test_photographs_and_videos_are_given_to_the_finding_of_poses(
-    project: Path, finder: list[Path], tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+    project: Path, finder: list[Any], tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     given = tmp_path / name
     if given.suffix:
@@ -62,7 +46,7 @@ def test_photographs_and_videos_are_given_to_the_finding_of_poses(
         given.mkdir()
         Image.new("RGB", (8, 8)).save(given / "a.png")
     manager = load_any(given)
-    assert finder == [given] and len(manager.train_dataset) == 10
+    assert [source for source, _ in finder] == [given] and len(manager.train_dataset) == 10
     text = printed(capsys)
     assert "matching" in text
     assert f"Poses of 12 of 13 photographs of {given}, to 0.50 pixels" in text
@@ -70,25 +54,24 @@ def test_photographs_and_videos_are_given_to_the_finding_of_poses(
     assert "Held out for evaluation: 2 of 12 photographs" in text
 
 
-def test_what_is_wrong_with_photographs_is_a_message(project: Path, finder: list[Path], tmp_path: Path) -> None:
+def test_what_is_wrong_with_photographs_is_a_message(project: Path, finder: list[Any], tmp_path: Path) -> None:
     (tmp_path / "bad").mkdir()
     Image.new("RGB", (8, 8)).save(tmp_path / "bad/a.png")
     with expect("photographs of bad share too little: take more of them"):
         load_any(tmp_path / "bad")
 
 
-def test_options_of_structure_from_motion_reach_it(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    _, given = standing_in(project, monkeypatch)
+def test_options_of_structure_from_motion_reach_it(project: Path, finder: list[Any]) -> None:
     args = ["bitymi-data", "--sfm.matching", "sequential", "--sfm.max-features", "4000"]
     config = parsed(*args, "--sfm.camera-model", "OPENCV", "--sfm.frames", "50")
     load_with(project / "images", config)
     settings = SfmSettings(matching="sequential", max_features=4000, camera_model="OPENCV", frames=50)
-    assert given == [SfmOptions(**vars(settings))]
+    assert [options for _, options in finder] == [SfmOptions(**vars(settings))]
     again = yaml.load(yaml.dump(config), Loader=yaml.Loader)  # as config.yml is
     assert again.sfm == settings
 
 
-def test_options_of_structure_from_motion_that_cannot_be(project: Path, finder: list[Path]) -> None:
+def test_options_of_structure_from_motion_that_cannot_be(project: Path, finder: list[Any]) -> None:
     with expect("max_features is 1: give a number of at least 100"):
         load_any(project / "images", sfm=SfmSettings(max_features=1))
     with expect("--sfm is not for .*, which is read as colmap, but for photographs, video"):

@@ -8,14 +8,11 @@ import pytest
 import torch
 from PIL import Image
 
-pytest.importorskip("nerfstudio")
-
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.data.images import read_image
 from bitymi_ns.plugin.data.lens import lenses_of
-from tests.plugin.conftest import edit_transforms
-from tests.plugin.data.captures import expect
+from tests.plugin.data.captures import add_masks, expect
 
 
 def load(capture: Path, longest_side: int) -> BitymiDataManager:
@@ -54,17 +51,7 @@ def test_odd_sizes_keep_the_rays_of_the_corners(capture: Path) -> None:
 
 
 def test_masks_go_with_their_photographs(capture: Path) -> None:
-    (capture / "masks").mkdir()
-    mask = np.zeros((36, 48), np.uint8)
-    mask[:, 24:] = 255
-
-    def add(meta: dict) -> None:
-        for frame in meta["frames"]:
-            name = f"masks/{Path(frame['file_path']).stem}.png"
-            Image.fromarray(mask).save(capture / name)
-            frame["mask_path"] = name
-
-    edit_transforms(capture, add)
+    add_masks(capture, 255 * (np.arange(48) >= 24))
     view = load(capture, 24).train_views[0]
     assert view.mask is not None and view.mask.shape == (18, 24, 1)
     assert not view.mask[:, :12].any() and view.mask[:, 12:].all()

@@ -16,7 +16,7 @@ from PIL import Image
 from bitymi_ns.plugin.data import images
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.data.images import ImageSummary, read_image, read_mask, summarize
-from tests.plugin.data.captures import expect, images_of, load, load_with, printed
+from tests.plugin.data.captures import add_masks, edit, expect, images_of, load, load_with, printed
 from tests.profiles import DISPLAY_P3
 
 
@@ -95,17 +95,8 @@ def test_masks_of_any_mode_say_the_same(tmp_path: Path) -> None:
     swapped.putpalette([255, 255, 255, 0, 0, 0])
     cut_out = Image.new("RGBA", grey.size, (200, 0, 0, 255))
     cut_out.putalpha(grey)
-    for i, mask in enumerate(
-        (
-            grey,
-            swapped,
-            cut_out,
-            grey.convert("1"),
-            grey.convert("RGB"),
-            Image.merge("LA", [grey, Image.new("L", grey.size, 255)]),
-            Image.fromarray(np.uint16(counts * 256)),
-        )
-    ):
+    others = [Image.merge("LA", [grey, Image.new("L", grey.size, 255)]), Image.fromarray(np.uint16(counts * 256))]
+    for i, mask in enumerate((grey, swapped, cut_out, grey.convert("1"), grey.convert("RGB"), *others)):
         mask.save(tmp_path / f"{i}.png")
         assert np.array_equal(np.asarray(read_mask(tmp_path / f"{i}.png")), counts), mask.mode
     (tmp_path / "bad.png").write_bytes(b"no picture")
@@ -113,20 +104,8 @@ def test_masks_of_any_mode_say_the_same(tmp_path: Path) -> None:
         read_mask(tmp_path / "bad.png")
 
 
-def add_masks(capture: Path, edit: Any, shown: Any) -> None:
-    """Masks of all frames; `shown(i)` says whether that of frame i lets its pixels count."""
-    (capture / "masks").mkdir()
-
-    def add(meta: dict[str, Any]) -> None:
-        for i, frame in enumerate(meta["frames"]):
-            frame["mask_path"] = "masks/" + Path(frame["file_path"]).stem + ".png"
-            Image.new("L", (48, 36), 255 if shown(i) else 0).save(capture / frame["mask_path"])
-
-    edit(capture, add)
-
-
-def test_masks_without_a_pixel(capture: Path, edit: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    add_masks(capture, edit, lambda i: i not in (0, 4))
+def test_masks_without_a_pixel(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    add_masks(capture, lambda i: 255 * (i not in (0, 4)))
     manager = load(capture)
     assert (len(manager.train_dataset), len(manager.eval_dataset)) == (9, 1)
     assert "frame_00005" not in "".join(map(str, manager.train_dataset.image_filenames))
@@ -134,27 +113,20 @@ def test_masks_without_a_pixel(capture: Path, edit: Any, capsys: pytest.CaptureF
     message = printed(capsys)
     assert "The masks of 1 of 10 training photographs exclude every pixel" in message
     assert "The masks of 1 of 2 held-out photographs exclude every pixel" in message and "frame_00005.png" in message
-
-
-def test_masks_that_leave_nothing(capture: Path, edit: Any) -> None:
-    add_masks(capture, edit, lambda i: False)
+    for path in (capture / "masks").iterdir():
+        Image.new("L", (48, 36)).save(path)
     with expect("the masks of all 10 training photographs exclude every pixel.*if the masks are inverted"):
         load(capture)
-
-
-def test_a_mask_for_some_frames_only(capture: Path, edit: Any) -> None:
-    add_masks(capture, edit, lambda i: True)
     edit(capture, lambda meta: meta["frames"][5].pop("mask_path"))
     with expect("images/frame_00006.png has no mask_path, but other frames have one"):
         load(capture)
 
 
-def test_the_colour_for_what_masks_exclude(capture: Path, edit: Any) -> None:
-    add_masks(capture, edit, lambda i: True)
+def test_the_colour_for_what_masks_exclude(capture: Path) -> None:
+    add_masks(capture, 255)
     Image.fromarray(np.uint8(np.arange(48) % 2 * 255)[None].repeat(36, 0)).save(capture / "masks/frame_00002.png")
-    image = load_with(
-        capture, NerfstudioDataParserConfig(mask_color=(1.0, 0.0, 0.5), eval_mode="interval")
-    ).cached_train[0]["image"]
+    stock = NerfstudioDataParserConfig(mask_color=(1.0, 0.0, 0.5), eval_mode="interval")
+    image = load_with(capture, stock).cached_train[0]["image"]
     assert image.dtype == torch.uint8 and image[0, 0].tolist() == [255, 0, 128]
     original = np.asarray(Image.open(images_of(capture)[1]))
     assert np.array_equal(image[:, 1::2].numpy(), original[:, 1::2])
@@ -205,7 +177,7 @@ def test_the_same_photograph_on_both_sides(capture: Path, capsys: pytest.Capture
     assert f"{paths[8]} = {paths[5]}" in message and message.count(f"{paths[0]} = {paths[3]}") == 1
 
 
-def test_a_frame_that_is_listed_twice(capture: Path, edit: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_frame_that_is_listed_twice(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     edit(capture, lambda meta: meta["frames"].insert(1, dict(meta["frames"][0])))
     load(capture)
     first = images_of(capture)[0]
@@ -231,7 +203,7 @@ def with_orientation(path: Path, image: Image.Image, value: int) -> None:
     image.save(path, exif=exif)
 
 
-def test_turned_photographs(capture: Path, edit: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_turned_photographs(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     paths = images_of(capture)
     with_orientation(paths[3], Image.open(paths[3]), 3)
     load(capture)

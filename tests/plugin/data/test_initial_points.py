@@ -13,10 +13,10 @@ import bitymi_ns.capture
 from bitymi_ns.capture import known
 from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
-from bitymi_ns.ply import read_header, read_rows
+from bitymi_ns.plugin.data.point_files import read_points
 from bitymi_ns.sample.capture import camera_path, render
 from bitymi_ns.sample.room import Room
-from tests.plugin.data.captures import load_any, printed
+from tests.plugin.data.captures import edit, edit_frames, load_any, printed, write_cloud
 from tests.plugin.data.test_true_captures import ALL, blender, colmap, move
 
 SIZE = (200, 150)
@@ -48,10 +48,8 @@ def test_points_are_triangulated_once(
 ) -> None:
     capture = Path(shutil.copytree(arc, tmp_path / "arc"))
     if mirrored:
-        meta = json.loads((capture / "transforms.json").read_text())
-        for frame in meta["frames"]:
-            frame["transform_matrix"] = (np.diag([1, -1, 1, 1]) @ np.array(frame["transform_matrix"])).tolist()
-        (capture / "transforms.json").write_text(json.dumps(meta))
+        turn = np.diag([1, -1, 1, 1])
+        edit_frames(capture, lambda frame: frame.update(transform_matrix=(turn @ frame["transform_matrix"]).tolist()))
     outputs = load_any(capture, eval_interval=6).train_dataparser_outputs
     points = outputs.metadata["points3D_xyz"].double()
     transform, scale = outputs.dataparser_transform, outputs.dataparser_scale
@@ -65,14 +63,10 @@ def test_points_are_triangulated_once(
 
 def test_masked_pixels_give_no_points(arc: Path, tmp_path: Path, triangulating: None) -> None:
     capture = Path(shutil.copytree(arc, tmp_path / "arc"))
-    meta = json.loads((capture / "transforms.json").read_text())
-    (capture / "masks").mkdir()
     mask = np.zeros((SIZE[1], SIZE[0]), np.uint8)
     mask[: SIZE[1] // 2] = 255
-    for i, frame in enumerate(meta["frames"]):
-        Image.fromarray(mask).save(capture / f"masks/{i}.png")
-        frame["mask_path"] = f"masks/{i}.png"
-    (capture / "transforms.json").write_text(json.dumps(meta))
+    Image.fromarray(mask).save(capture / "mask.png")
+    edit_frames(capture, lambda frame: frame.update(mask_path="mask.png"))
     outputs = load_any(capture, eval_interval=6).train_dataparser_outputs
     camera = outputs.cameras[0]
     pose = camera.camera_to_worlds.double()
@@ -116,9 +110,7 @@ def test_every_format_without_points(capture: Path, form: Any, asked: list[Any])
     if form is colmap:
         (place / "points3D.txt").unlink()
     elif form is not blender:
-        meta = json.loads(place.read_text())
-        meta.pop("ply_file_path", None)
-        place.write_text(json.dumps(meta))
+        edit(place, lambda meta: meta.pop("ply_file_path", None))
     assert len(load_any(capture).train_dataparser_outputs.metadata["points3D_xyz"]) == 2
     (views,) = asked
     assert len(views) == 12 and views[3].model == "PINHOLE" and (views[3].width, views[3].height) == (48, 36)
@@ -140,14 +132,9 @@ def test_triangulated_points_instead_of_those_of_the_capture(capture: Path, form
 
 
 def test_points_without_colors_get_those_of_the_photographs(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    header = read_header(capture / "sparse_pc.ply")
-    rows = read_rows(capture / "sparse_pc.ply", header, "vertex")
+    points = read_points(capture / "sparse_pc.ply")[0].xyz
     with_colors = load_any(capture).train_dataparser_outputs.metadata["points3D_rgb"].float()
-    lines = "\n".join(f"{row['x']} {row['y']} {row['z']}" for row in rows)
-    properties = "".join(f"property float {c}\n" for c in "xyz")
-    (capture / "sparse_pc.ply").write_text(
-        f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\n{properties}end_header\n{lines}\n"
-    )
+    write_cloud(capture / "sparse_pc.ply", points, None)
     found = load_any(capture).train_dataparser_outputs.metadata["points3D_rgb"].float()
     assert (found - with_colors).abs().mean() < 0.5 * (128.0 - with_colors).abs().mean()
     assert "get the colors of the photographs that see them: its points have none." in printed(capsys)

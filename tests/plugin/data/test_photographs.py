@@ -13,6 +13,7 @@ from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManag
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.data.dataset import RECENT, BitymiDataset
 from bitymi_ns.sample import generate
+from tests.plugin.data.captures import edit
 
 WIDTH, HEIGHT = 48, 36
 PICTURE = WIDTH * HEIGHT * 3
@@ -78,7 +79,7 @@ def test_a_small_capture_is_read_once(many: Path, alive: Any) -> None:
 
 @pytest.mark.parametrize("distortion", [{}, {"k1": 0.05, "p1": 0.01}])
 def test_pixels_and_cameras_are_the_same(
-    many: Path, edit: Any, distortion: dict[str, float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    many: Path, distortion: dict[str, float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     capture = tmp_path / "many"
     capture.symlink_to(many) if not distortion else generate(capture, views=12, width=WIDTH, height=HEIGHT, points=50)

@@ -32,6 +32,7 @@ def test_whole_clouds(tmp_path: Path) -> None:
     assert ply_fault(write(path, b"1.5 2 3 4\n3 4 5 nan\n\n5 6 7 8", "ascii 1.0")) is None
     faces = "element face 1\nproperty list uchar int vertex_indices\n"
     assert ply_fault(write(path, bytes(45 + 13), further=faces)) is None
+    assert ply_fault(write(path, b"", further="property list uchar int tags\n")) is None  # left to the reader
 
 
 @pytest.mark.parametrize(("body", "format", "there"), [(bytes(44), BINARY, 2), (b"1 2 3 4\n5 6 7 8\n", "ascii 1.0", 2)])
@@ -65,16 +66,6 @@ def test_points_behind_another_element(tmp_path: Path) -> None:
         assert ply_fault(path) == "is cut off: it has 2 of 3 points"
 
 
-def test_points_without_a_coordinate(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.ply", bytes(45))
-    path.write_bytes(path.read_bytes().replace(b" z\n", b" q\n"))
-    assert ply_fault(path) == "gives no z of its points (property float z)"
-
-
-def test_rows_of_unknown_length_are_left_to_the_reader(tmp_path: Path) -> None:
-    assert ply_fault(write(tmp_path / "a.ply", b"", further="property list uchar int tags\n")) is None
-
-
 def test_other_files(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     for data in (b"", b"ply", b"hello", b"ply\nend_header"):
@@ -83,6 +74,8 @@ def test_other_files(tmp_path: Path) -> None:
     assert "no points" in str(ply_fault(write(path, b"", count="many")))
     assert "the count 'many' of the element vertex is not a number" in str(ply_fault(path))
     assert "cannot be read" in str(ply_fault(tmp_path))
+    path.write_bytes(write(path, bytes(45)).read_bytes().replace(b" z\n", b" q\n"))
+    assert ply_fault(path) == "gives no z of its points (property float z)"
 
 
 def test_making_surfels_of_many_points_is_announced_and_timed(

@@ -13,7 +13,18 @@ from PIL import Image
 from bitymi_ns.capture.recognise import recognise
 from bitymi_ns.plugin.console import InputError, say, warn
 from bitymi_ns.plugin.data import point_files
-from tests.plugin.data.captures import expect, images_of, load, load_any, load_with, printed
+from tests.plugin.data.captures import (
+    edit,
+    edit_frames,
+    expect,
+    held_out,
+    images_of,
+    load,
+    load_any,
+    load_with,
+    printed,
+    save_masks,
+)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
@@ -40,7 +51,10 @@ def test_names_do_not_control_the_terminal(capsys: pytest.CaptureFixture[str]) -
     assert str(InputError("\x1b]0;x\x07")) == "bitymi: \\x1b]0;x\\x07"
 
 
-def test_a_frame_with_a_camera_of_its_own(capture: Path, edit: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_frame_with_a_camera_of_its_own(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    edit(capture, lambda meta: meta["frames"][5].update(w=meta["w"], fl_x=meta["fl_x"]))
+    load(capture)
+    assert "single ones" not in printed(capsys)
     path = images_of(capture)[5]
     Image.open(path).resize((96, 72)).save(path)
     own = {"w": 96, "h": 72, "fl_x": 80.0, "fl_y": 81.0, "cx": 48.0, "cy": 36.0, "k1": 0.01}
@@ -56,14 +70,6 @@ def test_a_frame_with_a_camera_of_its_own(capture: Path, edit: Any, capsys: pyte
     assert len(manager.cached_train) == 10
 
 
-def test_equal_numbers_in_frames_are_nothing_to_speak_of(
-    capture: Path, edit: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
-    edit(capture, lambda meta: meta["frames"][5].update(w=meta["w"], fl_x=meta["fl_x"]))
-    load(capture)
-    assert "single ones" not in printed(capsys)
-
-
 def set_value(key: str, value: Any) -> Any:
     return lambda meta: meta.update({key: value})
 
@@ -71,10 +77,7 @@ def set_value(key: str, value: Any) -> Any:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            set_value("camera_model", "BANANA"),
-            "camera_model 'BANANA' of images/frame_00001.png is unknown.*write PINHOLE",
-        ),
+        (set_value("camera_model", "BANANA"), "camera_model 'BANANA' of .*_00001.png is unknown.*write PINHOLE"),
         (set_value("applied_transform", [[1, 0], [0, 1]]), "applied_transform is not a matrix of 3 x 4 finite numbers"),
         (set_value("applied_scale", 0), "applied_scale is 0.0, which is no positive number"),
         (set_value("w", "48px"), "w for all frames is '48px', which is no number"),
@@ -91,10 +94,7 @@ def set_value(key: str, value: Any) -> Any:
         (set_value("cx", 5e5), "frame_00002.png cannot be used: its principal point is so far .* 80 degrees off"),
         (set_value("k4", 0.1), "camera of images/frame_00001.png .*cannot be used: its k4 is 0.1.*image_undistorter"),
         (set_value("distortion_params", [0.1, 0.0]), "has 2 distortion_params; perspective cameras need six"),
-        (
-            set_value("camera_model", "EQUIRECTANGULAR"),
-            "EQUIRECTANGULAR, but .*: pictures of all directions are twice as wide",
-        ),
+        (set_value("camera_model", "EQUIRECTANGULAR"), "EQUIRECTANGULAR, but .*: pictures of all .* are twice as wide"),
         (set_value("camera_model", "ORTHOPHOTO"), "neither a perspective, a fisheye nor an equirectangular camera"),
         (set_value("fl_x", -30.0), "camera of images/frame_00001.png .* cannot be used: its size and focal"),
         (set_value("fl_y", float("inf")), "cannot be used: its size and focal lengths have to be positive and all"),
@@ -112,21 +112,39 @@ def set_value(key: str, value: Any) -> Any:
             lambda meta: [f.update(w=meta["w"]) for f in meta["frames"][1:]] and meta.pop("w"),
             "gives no w for images/frame_00001.png: .*at the top of the file, or to each frame",
         ),
+        (
+            lambda meta: meta["frames"][5].update(file_path="./" + meta["frames"][3]["file_path"]),
+            r"frames 3 and 5 \(counted from 0\) are both of images/frame_00004.png, but with different poses",
+        ),
+        (
+            set_value("applied_transform", [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0]]),
+            "transforms.json: applied_transform maps the capture to a plane, .*remove it: then exports are",
+        ),
+        (
+            lambda meta: [f.update(mask_path=f"/home/me/masks/{f['file_path']}") for f in meta["frames"]],
+            "the mask /home/me/masks/images/frame_.* is missing",
+        ),
+        (lambda meta: meta["frames"].insert(1, {"file_path": "a.png"}), "frame 1 .* has no transform_matrix. Add that"),
+        (lambda meta: meta["frames"].__setitem__(1, None), "frame 1 .* has no file_path and no transform_matrix"),
+        (
+            lambda meta: meta.update(frames=dict(enumerate(meta["frames"]))),
+            "frames is an object with names, not a list",
+        ),
     ],
 )
-def test_entries_that_cannot_be_used_are_named(capture: Path, edit: Any, change: Any, message: str) -> None:
+def test_entries_that_cannot_be_used_are_named(capture: Path, change: Any, message: str) -> None:
     edit(capture, change)
     with expect(message):
         load(capture)
 
 
-def test_numbers_in_quotes(capture: Path, edit: Any) -> None:
+def test_numbers_in_quotes(capture: Path) -> None:
     edit(capture, lambda meta: meta.update(w="48.0", h=36.0, fl_x=str(meta["fl_x"])))
     assert len(load(capture).cached_train) == 10
 
 
 def test_large_clouds_are_announced_and_timed(
-    capture: Path, edit: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    capture: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     load(capture)
     assert "This may take minutes" not in printed(capsys)
@@ -145,34 +163,26 @@ def test_points_are_counted_before_they_are_read(tmp_path: Path) -> None:
     assert counts == [5_000_000, 123, 7, 0, 0]
 
 
-def test_doubtful_focal_lengths_are_said(capture: Path, edit: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_doubtful_focal_lengths_are_said(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     load(capture)
     assert "focal length" not in printed(capsys)
     edit(capture, lambda meta: meta.update(fl_x=4.2))
     load(capture)
     message = printed(capsys)
-    assert (
-        message.count("The focal length of") == 1
-        and "is 4.2 pixels (fl_x): 48 pixels of the picture span 160 deg" in message
-    )
-
-
-def test_one_photograph_with_two_poses(capture: Path, edit: Any) -> None:
-    edit(capture, lambda meta: meta["frames"][5].update(file_path="./" + meta["frames"][3]["file_path"]))
-    with expect(r"frames 3 and 5 \(counted from 0\) are both of images/frame_00004.png, but with different poses"):
-        load(capture)
+    assert message.count("The focal length of") == 1
+    assert "is 4.2 pixels (fl_x): 48 pixels of the picture span 160 deg" in message
 
 
 @pytest.mark.parametrize("given", ["val_filenames", "test_filenames"])
-def test_lists_of_two_splits_are_enough(capture: Path, edit: Any, given: str) -> None:
+def test_lists_of_two_splits_are_enough(capture: Path, given: str) -> None:
     names = [f"images/{path.name}" for path in images_of(capture)]
     edit(capture, lambda meta: meta.update({"train_filenames": names[2:], given: names[:2]}))
     manager = load(capture)
-    assert [path.name for path in manager.eval_dataset.image_filenames] == ["frame_00001.png", "frame_00002.png"]
+    assert held_out(manager) == ["frame_00001.png", "frame_00002.png"]
     assert len(manager.train_dataset) == 10
 
 
-def test_null_is_what_a_capture_does_not_have(capture: Path, edit: Any) -> None:
+def test_null_is_what_a_capture_does_not_have(capture: Path) -> None:
     def change(meta: dict[str, Any]) -> None:
         meta.update(applied_transform=None, applied_scale=None, orientation_override=None, distortion_params=None)
         for i, frame in enumerate(meta["frames"]):
@@ -186,13 +196,6 @@ def test_null_is_what_a_capture_does_not_have(capture: Path, edit: Any) -> None:
     assert "points3D_xyz" not in load_any(capture).train_dataset.metadata
 
 
-def test_a_transform_that_cannot_be_undone(capture: Path, edit: Any) -> None:
-    flat = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0]]
-    edit(capture, lambda meta: meta.update(applied_transform=flat))
-    with expect("transforms.json: applied_transform maps the capture to a plane, .*remove it: then exports are"):
-        load_any(capture)
-
-
 @pytest.mark.parametrize("change", [lambda text: f"// by hand\n{text}", lambda text: f"{text.rstrip()[:-1]},}}"])
 def test_what_is_no_json_is_to_be_corrected(capture: Path, change: Any) -> None:
     path = capture / "transforms.json"
@@ -202,7 +205,7 @@ def test_what_is_no_json_is_to_be_corrected(capture: Path, change: Any) -> None:
 
 
 @pytest.mark.parametrize("name", ["points\\Cloud.ply", "/home/me/room/points/cloud.ply", "C:\\room\\CLOUD.PLY"])
-def test_a_point_cloud_by_its_name_on_another_machine(capture: Path, edit: Any, name: str) -> None:
+def test_a_point_cloud_by_its_name_on_another_machine(capture: Path, name: str) -> None:
     (capture / "points").mkdir()
     (capture / "sparse_pc.ply").rename(capture / "points/cloud.ply")
     edit(capture, lambda meta: meta.update(ply_file_path=name))
@@ -214,38 +217,9 @@ def test_a_point_cloud_by_its_name_on_another_machine(capture: Path, edit: Any, 
 
 
 @pytest.mark.parametrize("place", ["masks\\", "/home/me/room/masks/", "D:\\room\\Masks\\"])
-def test_masks_by_their_names_on_another_machine(capture: Path, edit: Any, place: str) -> None:
-    (capture / "masks").mkdir()
-    for i, image in enumerate(images_of(capture)):
-        Image.new("L", (48, 36), 255 if i else 0).save(capture / "masks" / f"{image.stem}.png")
-
-    def change(meta: dict[str, Any]) -> None:
-        for frame in meta["frames"]:
-            frame["mask_path"] = f"{place}{Path(frame['file_path']).stem}.PNG"
-
-    edit(capture, change)
+def test_masks_by_their_names_on_another_machine(capture: Path, place: str) -> None:
+    save_masks(capture, lambda i: 255 if i else 0)
+    edit_frames(capture, lambda frame: frame.update(mask_path=f"{place}{Path(frame['file_path']).stem}.PNG"))
     manager = load_any(capture)
     assert manager.train_dataset.get_data(0)["mask"].all()
     assert len(manager.eval_dataset) == 1  # the mask of the first photograph, which is held out, is black
-
-
-def test_a_photograph_is_no_mask(capture: Path, edit: Any) -> None:
-    def change(meta: dict[str, Any]) -> None:
-        for frame in meta["frames"]:
-            frame["mask_path"] = f"/home/me/masks/{frame['file_path']}"
-
-    edit(capture, change)
-    with expect("the mask /home/me/masks/images/frame_.* is missing"):
-        load_any(capture)
-
-
-def test_frames_that_are_none(capture: Path, edit: Any) -> None:
-    edit(capture, lambda meta: meta["frames"].insert(1, {"file_path": "images/a.png"}))
-    with expect("frame 1 .counted from 0. has no transform_matrix. Add that or remove the frame"):
-        load_any(capture)
-    edit(capture, lambda meta: meta["frames"].__setitem__(1, None))
-    with expect("frame 1 .* has no file_path and no transform_matrix"):
-        load_any(capture)
-    edit(capture, lambda meta: meta.update(frames=dict(enumerate(meta["frames"]))))
-    with expect("frames is an object with names, not a list"):
-        load_any(capture)

@@ -12,28 +12,34 @@ from PIL import Image
 
 from bitymi_ns.plugin.data.cube_faces import FACES
 from bitymi_ns.plugin.data.views import photograph_files, with_lenses
-from tests.plugin.data.captures import as_binary, colmap_model, expect, images_of, load_any, printed
+from tests.plugin.data.captures import (
+    as_binary,
+    colmap_model,
+    edit,
+    edit_frames,
+    expect,
+    held_out,
+    images_of,
+    load_any,
+    printed,
+)
 
 SIZE = (96, 48)
 
 
-def panoramas(capture: Path, edit: Any, count: int) -> list[str]:
+def panoramas(capture: Path, count: int) -> list[str]:
     """Make the first photographs pictures of all directions; their names."""
-    files = images_of(capture)[:count]
-    for i, file in enumerate(files):
-        Image.fromarray(np.random.default_rng(i).integers(0, 255, (*SIZE[::-1], 3), np.uint8)).save(file)
-
-    def change(meta: Any) -> None:
-        for frame in meta["frames"]:
-            if Path(frame["file_path"]).name in {file.name for file in files}:
-                frame.update(camera_model="EQUIRECTANGULAR", w=SIZE[0], h=SIZE[1], cx=SIZE[0] / 2, cy=SIZE[1] / 2)
-
-    edit(capture, change)
-    return [file.name for file in files]
+    names = [file.name for file in images_of(capture)[:count]]
+    for i, name in enumerate(names):
+        noise = np.random.default_rng(i).integers(0, 255, (*SIZE[::-1], 3), np.uint8)
+        Image.fromarray(noise).save(capture / "images" / name)
+    camera = dict(camera_model="EQUIRECTANGULAR", w=SIZE[0], h=SIZE[1], cx=SIZE[0] / 2, cy=SIZE[1] / 2)
+    edit_frames(capture, lambda frame: Path(frame["file_path"]).name in names and frame.update(camera))
+    return names
 
 
-def test_a_capture_of_both_kinds(capture: Path, edit: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    names = panoramas(capture, edit, 3)
+def test_a_capture_of_both_kinds(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names = panoramas(capture, 3)
     manager = load_any(capture, eval_interval=2)
     said = printed(capsys)
     assert "is EQUIRECTANGULAR: each of its photographs becomes 6 pinhole pictures (front 31 x 31" in said
@@ -51,22 +57,22 @@ def test_a_capture_of_both_kinds(capture: Path, edit: Any, capsys: pytest.Captur
     assert torch.allclose(poses[0, :, 2], -poses[2, :, 2], atol=1e-6)  # front and back
 
 
-def test_only_panoramas_need_no_focal_length(capture: Path, edit: Any) -> None:
-    panoramas(capture, edit, len(images_of(capture)))
+def test_only_panoramas_need_no_focal_length(capture: Path) -> None:
+    panoramas(capture, len(images_of(capture)))
     edit(capture, lambda meta: [meta.pop(key, None) for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")])
     manager = load_any(capture)
     assert len(manager.eval_dataset) == 6 * ((len(images_of(capture)) + 7) // 8)
 
 
 def test_a_mask_goes_with_each_face_and_a_face_without_pixels_is_left_out(
-    capture: Path, edit: Any, capsys: pytest.CaptureFixture[str]
+    capture: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     count = len(images_of(capture))
-    panoramas(capture, edit, count)
+    panoramas(capture, count)
     mask = np.full(SIZE[::-1], 255, np.uint8)
     mask[30:] = 0  # all of the face down, and parts of those around it
     Image.fromarray(mask).save(capture / "mask.png")
-    edit(capture, lambda meta: [frame.update(mask_path="mask.png") for frame in meta["frames"]])
+    edit_frames(capture, lambda frame: frame.update(mask_path="mask.png"))
     manager = load_any(capture)
     assert "These views are left out" in printed(capsys)
     assert len(manager.train_dataset) == 5 * (count - 2) and manager.train_dataset.photographs[-1] == count - 3
@@ -75,15 +81,11 @@ def test_a_mask_goes_with_each_face_and_a_face_without_pixels_is_left_out(
     assert front[: len(front) // 2].all() and not front[-5:].any()
 
 
-def test_a_wide_fisheye_among_others(capture: Path, edit: Any) -> None:
+def test_a_wide_fisheye_among_others(capture: Path) -> None:
     first = images_of(capture)[1]
     Image.new("RGB", (60, 60), (200, 50, 20)).save(first)
     camera = dict(camera_model="OPENCV_FISHEYE", w=60, h=60, fl_x=19.0, fl_y=19.0, cx=30.0, cy=30.0)
-
-    def change(meta: Any) -> None:
-        next(f for f in meta["frames"] if Path(f["file_path"]).name == first.name).update(camera)
-
-    edit(capture, change)
+    edit_frames(capture, lambda frame: Path(frame["file_path"]).name == first.name and frame.update(camera))
     manager = load_any(capture)
     names = [path.name for path in manager.train_dataset.image_filenames[:6]]
     assert names[:5] == [f"{first.stem}-{face}.png" for face in ("front", "right", "left", "up", "down")]
@@ -101,8 +103,8 @@ def test_a_colmap_model_of_panoramas(capture: Path) -> None:
     assert len(manager.eval_dataset) == 6 * ((len(images_of(capture)) + 7) // 8)
 
 
-def test_views_of_another_parser_are_split_too(capture: Path, edit: Any) -> None:
-    panoramas(capture, edit, len(images_of(capture)))
+def test_views_of_another_parser_are_split_too(capture: Path) -> None:
+    panoramas(capture, len(images_of(capture)))
     pixels = {"w": SIZE[0], "h": SIZE[1], "fl_x": SIZE[0] / 2, "fl_y": SIZE[1], "cx": SIZE[0] / 2, "cy": SIZE[1] / 2}
     edit(capture, lambda meta: meta.update(pixels, camera_model="EQUIRECTANGULAR"))
     stock = NerfstudioDataParserConfig(data=capture).setup().get_dataparser_outputs("train")
@@ -120,10 +122,9 @@ def test_views_of_another_parser_are_split_too(capture: Path, edit: Any) -> None
         ({"w": 192, "h": 96, "cx": 96.0, "cy": 48.0}, "has 96 x 48 pixels, but its camera is for 192 x 96"),
     ],
 )
-def test_panoramas_that_cannot_be_used(capture: Path, edit: Any, entries: dict[str, Any], message: str) -> None:
-    panoramas(capture, edit, 3)
-    edit(capture, lambda meta: meta["frames"][1].update(entries))
-    edit(capture, lambda meta: meta["frames"][1].setdefault("cy", 24.0))
+def test_panoramas_that_cannot_be_used(capture: Path, entries: dict[str, Any], message: str) -> None:
+    panoramas(capture, 3)
+    edit(capture, lambda meta: meta["frames"][1].update({"cy": 24.0} | entries))
     with expect(message):
         _ = load_any(capture).cached_train
 
@@ -151,10 +152,10 @@ def test_what_a_rig_took_together_is_held_out_together(
     rig_of_two(project, form)
     names = [path.name for path in images_of(project)]
     manager = load_any(project, eval_interval=4)
-    assert [path.name for path in manager.eval_dataset.image_filenames] == names[0:2] + names[8:10]
+    assert held_out(manager) == names[0:2] + names[8:10]
     assert f"Held out for evaluation: 4 of {len(names)} photographs" in printed(capsys)
     manager = load_any(project, eval_names=(names[3],))
-    assert [path.name for path in manager.eval_dataset.image_filenames] == names[2:4]
+    assert held_out(manager) == names[2:4]
     assert len(manager.train_dataset) == len(names) - 2
     manager = load_any(project, eval_mode="all")
     assert len(manager.train_dataset) == len(manager.eval_dataset) == len(names)

@@ -8,12 +8,16 @@ const MANIFEST = 'bundle.json';
 // Names of bundles in one file that the page may be asked to show: they lie beside it.
 export const BESIDE = /^[A-Za-z0-9][A-Za-z0-9._-]{0,99}\.bitymi$/;
 const MOST_MANIFEST = 1 << 22; // bytes
+const NOTES = 'notes.json';
+const MOST_NOTES = 1 << 18; // bytes
 
 export interface Source {
   // A file of so many bytes.
   read(name: string, size: number, came: Came): Promise<ArrayBuffer>;
   // bundle.json, whose size is stated nowhere.
   manifest(): Promise<string>;
+  // notes.json, null where there is none; `stated`: by view.json, for a folder.
+  notes(stated: boolean): Promise<string | null>;
 }
 
 async function get(url: string, range?: string): Promise<Response> {
@@ -65,7 +69,15 @@ export class Folder implements Source {
   }
 
   async manifest(): Promise<string> {
-    return new TextDecoder().decode(await bytesOf(await get(this.url + MANIFEST), MANIFEST, MOST_MANIFEST, nothing));
+    return this.text(MANIFEST, MOST_MANIFEST);
+  }
+
+  async notes(stated: boolean): Promise<string | null> {
+    return stated ? this.text(NOTES, MOST_NOTES) : null;
+  }
+
+  private async text(name: string, most: number): Promise<string> {
+    return new TextDecoder().decode(await bytesOf(await get(this.url + name), name, most, nothing));
   }
 }
 
@@ -120,9 +132,16 @@ export class SingleFile implements Source {
   }
 
   async manifest(): Promise<string> {
-    const { size } = this.entry(MANIFEST);
-    if (size > MOST_MANIFEST)
-      throw new DamagedBundle(`${MANIFEST} has ${size} bytes, at most ${MOST_MANIFEST} are read.`);
-    return new TextDecoder().decode(await this.read(MANIFEST, size, nothing));
+    return this.text(MANIFEST, MOST_MANIFEST);
+  }
+
+  async notes(): Promise<string | null> {
+    return this.entries.has(NOTES) ? this.text(NOTES, MOST_NOTES) : null;
+  }
+
+  private async text(name: string, most: number): Promise<string> {
+    const { size } = this.entry(name);
+    if (size > most) throw new DamagedBundle(`${name} has ${size} bytes, at most ${most} are read.`);
+    return new TextDecoder().decode(await this.read(name, size, nothing));
   }
 }

@@ -25,6 +25,13 @@ interface Target {
   batch: GPUBindGroup;
 }
 
+// A map of depths along the camera's axis, by rows; infinite where surfels cover less than half of a pixel.
+export interface Depths {
+  width: number;
+  height: number;
+  depth: Float32Array;
+}
+
 const MOST_SAMPLES = 4; // per pixel, along each axis, of a picture that stays
 const MOST_PIXELS = 1 << 22; // of a target
 export const MOST_OVERDRAW = 64; // of the last colour of the map
@@ -167,6 +174,33 @@ export class Renderer {
     return this.graphics.device.queue.onSubmittedWorkDone();
   }
 
+  // Draws the depths of a view.
+  async depths(view: View, look: Look): Promise<Depths> {
+    const { device } = this.graphics;
+    const encoder = device.createCommandEncoder();
+    const { width, height, format, sums } = this.encode(encoder, view, { ...look, show: 'depth' });
+    const bytes = format === 'rgba32float' ? 16 : 8; // of a pixel
+    const bytesPerRow = Math.ceil((bytes * width) / 256) * 256;
+    const buffer = device.createBuffer({
+      size: bytesPerRow * height,
+      usage: GPUBufferUsage.COPY_DST | GPUBufferUsage.MAP_READ,
+    });
+    encoder.copyTextureToBuffer({ texture: sums }, { buffer, bytesPerRow }, [width, height]);
+    device.queue.submit([encoder.finish()]);
+    await buffer.mapAsync(GPUMapMode.READ);
+    const mapped = new DataView(buffer.getMappedRange());
+    const depth = new Float32Array(width * height);
+    for (let i = 0; i < depth.length; i++) {
+      const at = Math.floor(i / width) * bytesPerRow + (i % width) * bytes;
+      const channel = (c: number): number =>
+        bytes === 16 ? mapped.getFloat32(at + 4 * c, true) : half(mapped.getUint16(at + 2 * c, true));
+      const covered = 1 - channel(3); // draw.wgsl
+      depth[i] = covered < 0.5 ? Infinity : channel(0) / covered;
+    }
+    buffer.destroy();
+    return { width, height, depth };
+  }
+
   // Draws a view to RGBA bytes.
   async read(view: View, look: Look, farthest: number): Promise<ImageData> {
     const { device } = this.graphics;
@@ -195,3 +229,9 @@ export class Renderer {
     return image;
   }
 }
+
+// A number of half precision that is not negative.
+const half = (bits: number): number => {
+  const exponent = bits >> 10;
+  return exponent ? 2 ** (exponent - 25) * (1024 + (bits & 1023)) : 2 ** -24 * bits;
+};

@@ -21,7 +21,7 @@ export function make<K extends keyof HTMLElementTagNameMap>(
 
 // Whether keys go to an element, and not to the scene.
 export const typing = (target: EventTarget | null): boolean =>
-  target instanceof HTMLSelectElement || target instanceof HTMLInputElement;
+  [HTMLSelectElement, HTMLInputElement, HTMLTextAreaElement].some((kind) => target instanceof kind);
 
 // Gives the reader a file.
 export function download(name: string, data: Blob): void {

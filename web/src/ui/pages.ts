@@ -24,7 +24,7 @@ export function showError(error: unknown): void {
   element('page-text').textContent = message;
   element('page-advice').textContent = advice;
   element('page-progress').hidden = true;
-  for (const id of ['top', 'panel', 'menu', 'aside']) element(id).hidden = true;
+  for (const id of ['top', 'panel', 'menu', 'aside', 'notes-panel', 'markers']) element(id).hidden = true;
   element('page').hidden = false;
   endPoster();
   document.documentElement.dataset.state = 'error';

@@ -40,7 +40,7 @@ export interface Camera {
   lens: number[];
 }
 
-export const cameraOf = ({ pose, lens: l, target }: Shared): Camera => ({
+export const cameraOf = ({ pose, lens: l, target }: Pick<Shared, 'pose' | 'lens' | 'target'>): Camera => ({
   position: pose.position,
   right: pose.right,
   forward: pose.forward,

@@ -1,0 +1,200 @@
+// Saved views and notes: their lists, their file, and the markers of notes over the scene.
+import { LONGEST_NAME, LONGEST_TEXT, MOST_NOTES, MOST_VIEWS, type Note, type Notes } from '../view/notes';
+import { cleared, notesText } from '../view/notes';
+import { View } from '../view/pose';
+import { add, dot, length, subtract, times } from '../view/vector';
+import { download, element, make, press, pressed } from './dom';
+import { notify } from './pages';
+import type { Stage } from './stage';
+
+const STILL_HAND = 5; // pixels that a click may move
+const BEHIND = 0.97; // of a note's depth: surfels nearer than that hide it
+
+type Entry = Notes['views'][number] | Note;
+
+export class NotesPanel {
+  private editing: Entry | null = null;
+  private saved = true;
+  private pressedAt = [0, 0];
+  private readonly markers = new Map<Note, HTMLElement>();
+
+  constructor(
+    private readonly stage: Stage,
+    private readonly canvas: HTMLCanvasElement,
+    private readonly all: Notes,
+  ) {
+    const on = (id: string, run: () => void): void => element(id).addEventListener('click', run);
+    on('save-view', () => this.addView());
+    on('add-note', () => this.placing(!pressed(element('add-note'))));
+    on('show-notes', () => {
+      press(element('show-notes'), !pressed(element('show-notes')));
+      element('markers').hidden = !pressed(element('show-notes'));
+    });
+    on('save-notes', () => {
+      download('notes.json', new Blob([notesText(all)], { type: 'application/json' }));
+      this.saved = true;
+      this.show();
+    });
+    canvas.addEventListener('pointerdown', ({ clientX, clientY }) => (this.pressedAt = [clientX, clientY]));
+    canvas.addEventListener('click', ({ clientX, clientY }) => {
+      const [x, y] = this.pressedAt;
+      if (pressed(element('add-note')) && Math.hypot(clientX - x, clientY - y) < STILL_HAND) {
+        this.placing(false);
+        void this.pin(clientX, clientY);
+      }
+    });
+    addEventListener('beforeunload', (e) => {
+      if (!this.saved) e.preventDefault();
+    });
+    this.show();
+  }
+
+  get names(): string[] {
+    return this.all.views.map(({ name }) => name);
+  }
+
+  // Goes to the view of a name; whether there is one.
+  goTo(name: string): boolean {
+    const found = this.all.views.find((view) => view.name === name);
+    if (found) this.stage.fly(found.place);
+    return found !== undefined;
+  }
+
+  // Puts the markers where a view shows their notes; `still`: also looks which of them surfels hide.
+  async drawn(view: View, still: boolean): Promise<void> {
+    const seen: { marker: HTMLElement; x: number; y: number; z: number }[] = [];
+    for (const [{ position }, marker] of this.markers) {
+      const from = subtract(position, view.pose.position);
+      const z = dot(from, view.pose.forward);
+      const x = ((view.fx * dot(from, view.pose.right)) / z + view.cx) / view.width;
+      const y = ((view.fy * dot(from, view.pose.down)) / z + view.cy) / view.height;
+      marker.hidden = !(z > 0 && x >= 0 && x < 1 && y >= 0 && y < 1);
+      if (marker.hidden) continue;
+      Object.assign(marker.style, { left: `${100 * x}%`, top: `${100 * y}%` });
+      marker.classList.toggle('left', x > 0.55);
+      if (!still) marker.classList.remove('behind');
+      seen.push({ marker, x, y, z });
+    }
+    if (!still || !seen.length || element('markers').hidden) return;
+    const map = await this.stage.depths(view.scaledTo(Math.ceil(view.width / 4), Math.ceil(view.height / 4)));
+    for (const { marker, x, y, z } of seen) {
+      const nearest = map.depth[Math.floor(y * map.height) * map.width + Math.floor(x * map.width)];
+      marker.classList.toggle('behind', nearest < BEHIND * z);
+    }
+  }
+
+  private changed(): void {
+    this.saved = false;
+    this.show();
+  }
+
+  private addView(): void {
+    const { views } = this.all;
+    const field = element<HTMLInputElement>('view-name');
+    let number = views.length + 1;
+    while (this.names.includes(`View ${number}`)) number++;
+    const name = cleared(field.value).trim() || `View ${number}`;
+    const { pose, lens, target } = this.stage.shared();
+    const there = views.find((view) => view.name === name);
+    if (there) there.place = { pose, lens, target };
+    else if (views.length < MOST_VIEWS) views.push({ name, place: { pose, lens, target } });
+    else notify(`There are ${MOST_VIEWS} views, as many as there can be.`);
+    field.value = '';
+    this.changed();
+  }
+
+  private placing(on: boolean): void {
+    if (on && this.all.notes.length >= MOST_NOTES) {
+      notify(`There are ${MOST_NOTES} notes, as many as there can be.`);
+      return;
+    }
+    press(element('add-note'), on);
+    this.canvas.classList.toggle('placing', on);
+  }
+
+  // A new note where the surfels are that a pixel of the screen shows.
+  private async pin(clientX: number, clientY: number): Promise<void> {
+    const [view, box] = [this.stage.view(), this.canvas.getBoundingClientRect()];
+    const x = ((clientX - box.left) / box.width) * view.width;
+    const y = ((clientY - box.top) / box.height) * view.height;
+    const pixel = new View(view.pose, view.fx, view.fy, view.cx - x + 0.5, view.cy - y + 0.5, 1, 1);
+    const [depth] = (await this.stage.depths(pixel)).depth;
+    if (!Number.isFinite(depth)) {
+      notify('The note needs a surface: there is none at that pixel.');
+      return;
+    }
+    const { position, right, down, forward } = view.pose;
+    const across = add(times((x - view.cx) / view.fx, right), times((y - view.cy) / view.fy, down));
+    const note = { text: '', position: add(position, times(depth, add(across, forward))) };
+    this.all.notes.push(note);
+    this.editing = note;
+    this.show();
+  }
+
+  private goToNote({ position }: Note): void {
+    const { pose, lens, target } = this.stage.shared();
+    const away = length(subtract(target, pose.position));
+    const from = subtract(position, times(away, pose.forward));
+    this.stage.fly({ pose: { ...pose, position: from }, lens, target: position });
+  }
+
+  private show(): void {
+    const { views, notes } = this.all;
+    const viewRows = views.map((view) => this.row(views, view, view.name, () => this.stage.fly(view.place)));
+    const noteRows = notes.map((note) => this.row(notes, note, note.text, () => this.goToNote(note)));
+    element('view-rows').replaceChildren(...viewRows);
+    element('note-rows').replaceChildren(...noteRows);
+    element<HTMLButtonElement>('save-notes').disabled = !views.length && !notes.length && this.saved;
+    element('save-notes').classList.toggle('unsaved', !this.saved);
+    this.markers.clear();
+    for (const note of notes) {
+      this.markers.set(note, make('div', { className: 'marker' }, make('span', { textContent: note.text })));
+    }
+    element('markers').replaceChildren(...this.markers.values());
+    void this.drawn(this.stage.view(), true);
+    document.querySelector<HTMLElement>('#notes-panel li :is(input, textarea)')?.focus();
+  }
+
+  private row<T extends Entry>(list: T[], entry: T, text: string, go: () => void): HTMLElement {
+    if (this.editing === entry) return make('li', {}, this.field(list, entry, text));
+    const name = make('button', { type: 'button', className: 'name', title: `Go to ${text}`, onclick: go }, text);
+    const edit = make('button', { type: 'button', ariaLabel: `Edit ${text}`, title: 'Edit' }, '✎');
+    edit.onclick = () => {
+      this.editing = entry;
+      this.show();
+    };
+    const remove = make('button', { type: 'button', ariaLabel: `Remove ${text}`, title: 'Remove' }, '×');
+    remove.onclick = () => {
+      list.splice(list.indexOf(entry), 1);
+      this.changed();
+    };
+    return make('li', {}, name, edit, remove);
+  }
+
+  // Where the name of a view or the text of a note is typed: Enter keeps it, Escape what was there.
+  private field<T extends Entry>(list: T[], entry: T, before: string): HTMLElement {
+    const isNote = 'text' in entry;
+    const common = { value: before, maxLength: isNote ? LONGEST_TEXT : LONGEST_NAME, className: 'name' };
+    const field = isNote
+      ? make('textarea', { ...common, rows: 3, ariaLabel: 'Text of the note' })
+      : make('input', { ...common, type: 'text', ariaLabel: 'Name of the view' });
+    const end = (text: string): void => {
+      if (this.editing !== entry) return; // the field is removed, and loses the focus
+      this.editing = null;
+      const taken = !isNote && text !== before && this.names.includes(text);
+      if (taken) notify(`Another view has the name ${text}.`);
+      const kept = taken ? before : text || before;
+      if (isNote) entry.text = kept;
+      else entry.name = kept;
+      if (!kept) list.splice(list.indexOf(entry), 1);
+      if (kept !== before) this.changed();
+      else this.show();
+    };
+    field.onblur = () => end(cleared(field.value).trim());
+    field.onkeydown = (e) => {
+      if ((e as KeyboardEvent).key === 'Escape') end(before);
+      else if ((e as KeyboardEvent).key === 'Enter' && !(e as KeyboardEvent).shiftKey) field.blur();
+    };
+    return field;
+  }
+}

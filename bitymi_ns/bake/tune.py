@@ -87,8 +87,6 @@ def tune_atlas(
         baked: a bake with an atlas; reduced tiles, extents and constants are tuned as they are.
         views: training views, with the corrections that training found; every `val_every`-th is for validation.
         background: [3] colour behind the scene.
-        options: see `TuneOptions`.
-        progress: called after every step.
         eval_views: views of which the gain is stated, of what is stored; they decide nothing.
         coding: how texels are coded, where the surfels are rounded for a compact bundle. The last steps then see what
             the coding makes of the texels, and the codes that show the validation views best are kept.

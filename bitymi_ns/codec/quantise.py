@@ -143,7 +143,6 @@ def encode(
         value_range: quantisation range; not given: `choose_range` with its defaults. Not used by fp16.
         profile: effort of the BC7 encoder, from ultrafast to slow.
         threads: encoder threads; not given: one per processor. The result does not depend on it.
-        progress: called with the number of rows done.
     """
     if format not in BYTES_PER_TEXEL:
         raise ValueError(f"the atlas format must be bc7, uint8 or fp16, not {format!r}")

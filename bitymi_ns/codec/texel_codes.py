@@ -167,7 +167,6 @@ class TexelCoder:
             sizes: [N, 2] sides of the tiles; (0, 0) = one constant.
             weights: [T] of the texels, in the order of `TexelTiles`: sum over views and fragments of the squared
                 blending weight times the bilinear weight. An error e of a texel adds weight times e^2 to the pictures.
-            options: see `TexelCodeOptions`.
         """
         options.check()
         self._sizes, self._weights = sizes.long(), weights + LEAST_WEIGHT

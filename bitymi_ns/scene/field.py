@@ -49,7 +49,6 @@ class ResidualField(Protocol):
 
         Args:
             fragments: of an H x W view.
-            projection: the view's.
             base: [N, 3] f_view of every surfel.
             how: it is made.
         """

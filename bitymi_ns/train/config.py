@@ -168,8 +168,8 @@ class TexelConfig(TexelSteps):
     """First step of that part. Nothing is densified any more, no opacity is reset, and every surfel has a tile as fine
     as the training views see it; 30,000 or more = there is no such part."""
     travel: NonNegative = 0.3
-    """How far a texel can move in all of that part, colour units: where it passes over the views few times, `rate` is
-    raised so that texels get there, up to this."""
+    """Largest distance that a texel can move in that part, colour units: where it passes over the views few times,
+    `rate` is raised so that texels get there, up to this."""
     surfel_rates: NonNegative = 0.4
     """Rates of the surfels in that part, as a share of those of a run as long as it; they fall to 0 as a cosine."""
     pixels_per_texel: Positive = 0.25

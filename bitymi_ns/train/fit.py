@@ -75,7 +75,6 @@ class Trainer:
         Args:
             scene: changed in place.
             views: training views at full size.
-            config: training options.
             max_steps: length of the run; the schedules depend on it.
             extent: scene extent in world units; default: from the cameras.
             processes: of the run, and the views of each per step; all are given the same.
@@ -160,7 +159,6 @@ def fit(
         scene: what is learned.
         views: training views at full size.
         eval_views: held-out views for the log.
-        config: training options.
         max_steps: length of the run.
         callback: called after each step with the trainer, the loss terms, the view and the strategy's report.
         eval_steps: numbers of steps after which the log gets an entry; the end of the run always gets one.

@@ -33,7 +33,6 @@ def level_changes(
     weight stays below `weight_bound` get no residual and are not counted.
 
     Args:
-        field: the residual field.
         surfels: per-surfel parameters, N rows.
         left_out: sets of levels.
         transmittance: [N] of `Visibility`, None = 1.
@@ -81,7 +80,6 @@ def lean_field(
     the tolerance.
 
     Args:
-        field: the residual field.
         surfels: per-surfel parameters, N rows.
         transmittance: [N] of `Visibility`, None = 1.
         weight_bound: fragments of smaller weight get no residual.

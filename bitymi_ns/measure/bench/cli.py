@@ -25,7 +25,7 @@ from bitymi_ns.measure.bench.matrix import (
     suites,
 )
 from bitymi_ns.measure.bench.process import BenchError, say
-from bitymi_ns.measure.report.read import read_cells
+from bitymi_ns.measure.report.read import add_cells
 from bitymi_ns.measure.report.records import Records
 from bitymi_ns.measure.report.tables import NOTES, markdown_tables, quality_tables
 from bitymi_ns.trust import printable
@@ -128,7 +128,7 @@ def results_page(title: str, matrix: Matrix, cells: Cells, failures: Sequence[st
     stages = [stage for chain in matrix.chains() for stage in chain if stage.kind in ("train", "eval", "export")]
     found = [cell for stage in stages if (cell := cells.get(stage.key)) is not None]
     records = Records()
-    read_cells(list(enumerate(found, 1)), cells.path, records)
+    add_cells(found, cells.path, records)
     failed = [f"Failed: {line.splitlines()[0].removesuffix(', whose end is:')}." for line in failures]
     body = "\n\n".join(markdown_tables(quality_tables(records.evaluations, training=True)))
     training = "Training s, CPU s: of the steps alone; peak: of ns-train as a whole."

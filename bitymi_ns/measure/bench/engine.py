@@ -1,8 +1,5 @@
-"""Run the cells of a matrix that are not finished: command lines, results, locks, progress.
-
-Several processes may work on the same folder, each on another GPU or machine: a run that another process holds is left
-to it.
-"""
+"""Run the cells of a matrix that are not finished. Processes may share a folder, each on another GPU or machine: a run
+that another process holds is left to it."""
 
 import shutil
 import statistics

@@ -24,11 +24,12 @@ from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.data import images
 from bitymi_ns.plugin.data.bundle_cameras import BundleCamerasConfig
 from bitymi_ns.plugin.data.cameras import check_cameras, to_camera
-from bitymi_ns.plugin.data.capture_checks import check_capture, check_images, declares_box, reporting_input_errors
+from bitymi_ns.plugin.data.capture_checks import check_capture, declares_box, reporting_input_errors
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.data.dataset import PHOTOGRAPH_BYTES, BitymiDataset, CachedImages, drop_blank_views
 from bitymi_ns.plugin.data.depth import with_depth
 from bitymi_ns.plugin.data.initial_points import reading_points
+from bitymi_ns.plugin.data.names import check_photographs_exist
 from bitymi_ns.plugin.data.point_files import reporting_time
 from bitymi_ns.plugin.data.pose_checks import check_outliers, check_point_unit, warn_of_mirrored
 from bitymi_ns.plugin.data.views import LONGEST_SIDE, NO_PHOTOS, limit_size, with_lenses
@@ -170,8 +171,10 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         poses = torch.cat([dataset.cameras.camera_to_worlds for dataset in datasets]).double().numpy()
         warn_of_mirrored(poses[:, :, :3], names)
         check_outliers(poses[:, :, 3], names)
-        check_images([*files[0], *files[1]])
-        images.check_orientation(list(dict.fromkeys([*files[0], *files[1]])))
+        every = list(dict.fromkeys([*files[0], *files[1]]))
+        check_photographs_exist(self.get_datapath(), every)
+        images.check_sizes(every)
+        images.check_orientation(every)
         self._duplicates = images.duplicate_files(*files)
         images.warn_of_duplicates(self._duplicates, train, held_out)
         if count == 1 and test_mode == "val":

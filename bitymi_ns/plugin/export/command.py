@@ -21,7 +21,7 @@ from bitymi_ns.bundle.manifest import MANIFEST, dump
 from bitymi_ns.bundle.parts import CONFIG
 from bitymi_ns.bundle.read import download_bytes
 from bitymi_ns.interchange import Frame, Kind, check_extras, extras_folder, summary_line, write_extras
-from bitymi_ns.plugin.console import fail, say, warn
+from bitymi_ns.plugin.console import INTERRUPTED, fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.export.cameras import camera_files
 from bitymi_ns.plugin.export.compact_options import BundleFormat, CompactOptions
@@ -35,8 +35,6 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.exposure import corrected
 from bitymi_ns.train.views import View
-
-INTERRUPTED = 130
 
 
 @dataclass(kw_only=True)

@@ -176,10 +176,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
             background=background,
             world=world_of(datamanager),
             statistics={"options": asdict(options), "method": config.method_name},
-            extra_files={
-                "preview.jpg" if self._is_compact else "preview.png": shown,
-                **cameras_of,
-            },
+            extra_files={"preview.jpg" if self._is_compact else "preview.png": shown, **cameras_of},
             loose_files={CONFIG: bundle_config(config, self.output_dir, background)},
             overwrite=self.overwrite,
             interchange=self.interchange,

@@ -107,13 +107,7 @@ class ExportMesh:
         cameras = source.cameras[::step]
         with rich_progress() as progress:
             mesh = extract_surface(
-                source.surfels,
-                source.render,
-                cameras,
-                source.near,
-                options,
-                source.prefilter,
-                progress,
+                source.surfels, source.render, cameras, source.near, options, source.prefilter, progress
             )
         if to is not None:
             vertices = torch.from_numpy(np.asarray(mesh.vertices))
@@ -151,12 +145,7 @@ def from_bundle(folder: Path) -> Source:
     rows = named_cameras(folder, bundle.info)
     cameras = [row.camera for row in rows if not row.held_out] or [row.camera for row in rows]
     return Source(
-        scene.surfels,
-        lambda camera: bundle.render(camera).rgb,
-        cameras,
-        scene.near,
-        scene.prefilter,
-        bundle.info.world,
+        scene.surfels, lambda camera: bundle.render(camera).rgb, cameras, scene.near, scene.prefilter, bundle.info.world
     )
 
 

@@ -107,11 +107,7 @@ def photometric(rgb: Tensor, target: Tensor, ssim_weight: float, mask: Tensor | 
 
 
 def error_weight(
-    rgb: Tensor,
-    target: Tensor,
-    gamma: float,
-    error: Literal["l1_sum", "mse"] = "l1_sum",
-    mask: Tensor | None = None,
+    rgb: Tensor, target: Tensor, gamma: float, error: Literal["l1_sum", "mse"] = "l1_sum", mask: Tensor | None = None
 ) -> Tensor:
     """omega = exp(-gamma e) of the falloff loss: 1 where the picture is right already, near 0 where it is wrong.
 

@@ -1,12 +1,9 @@
 #!/usr/bin/env python
 """Bring the package to a bare machine with a card, and run tests and benchmarks there.
 
-`card.py stage FOLDER --python python3.12` compiles the wheel here, for that Python and that card, and fetches the
-wheels of what the core packages need beside torch and numpy; nothing is compiled or fetched there. On the machine,
-`card.py run ORDER... --stage FOLDER --output RESULTS` unpacks them beside a copy of this checkout and runs the orders:
-each step is a process with a limit of its own, its output is appended to RESULTS/log.txt, and a step that fails is a
-line of the summary. Orders joined by a plus sign (check+gaussians) run at the same time: for what is not timed.
-"""
+`card.py stage FOLDER --python python3.12` compiles the wheel for that Python and card here, and fetches what it needs
+beside torch and numpy. `card.py run ORDER... --stage FOLDER --output RESULTS` unpacks that there and runs the orders;
+each step has a limit of its own. Orders joined by a plus sign run at the same time: for what is not timed."""
 
 import argparse
 import os
@@ -86,24 +83,14 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
             for name in ("baked", "steps")
         ],
         "fox": [
-            Step(
-                "fox",
-                [page("fox.md", "gpu_train.py", data / "fox", "--steps", "3000", "--keep", bundles)],
-                200,
-            ),
+            Step("fox", [page("fox.md", "gpu_train.py", data / "fox", "--steps", "3000", "--keep", bundles)], 200),
             Step("baked", [page("baked.md", "gpu.py", *baked, "--bundles", bundles / "bitymi-3000")], 90),
         ],
         "profile": [
-            Step(
-                "profile",
-                [[*ncu, *python("card_smoke.py", *large, "--profile", "--sections", *PROFILED)]],
-                400,
-            )
+            Step("profile", [[*ncu, *python("card_smoke.py", *large, "--profile", "--sections", *PROFILED)]], 400)
         ],
         "train": of_each(
-            "",
-            600,
-            lambda name: [page(f"{name}.md", "gpu_train.py", data / name, "--keep", bundles / name, *length)],
+            "", 600, lambda name: [page(f"{name}.md", "gpu_train.py", data / name, "--keep", bundles / name, *length)]
         ),
         "gaussians": of_each(
             "Gaussians of ",

@@ -1,13 +1,9 @@
 #!/usr/bin/env python
 """Compare a fixed small job with the committed baseline: quality, bytes, memory and time.
 
-Each scene is trained, baked, tuned, written and drawn in a process of its own, with one thread. Training is chaotic: a
-change of rounding alone moves one seed's PSNR over the few held-out views by up to 0.13 dB. So the PSNR that is
-compared is over all photographs, and the mean of several seeds. The same code on the same kind of processor gives the
-same. CPU seconds are divided by those of a calibration that has nothing of this package in it and runs before, between
-and after the parts, so that a busy machine, or a slower one of the same kind, gives the same figures. With `--accept`
-the figures become the new baseline, benchmarks/gate.json; the commit then shows what changed.
-"""
+Training is chaotic: a change of rounding alone moves one seed's PSNR by up to 0.13 dB, so the mean over seeds and all
+photographs is compared. CPU seconds are divided by those of a calibration between the parts, so that a busy machine, or
+a slower one of the same kind, gives the same figures. `--accept` makes them the new baseline, benchmarks/gate.json."""
 
 import argparse
 import itertools

@@ -2,11 +2,8 @@
 """Compare with gsplat at equal quality on a card: train its Gaussians on the photographs of our bundles by its MCMC
 strategy, with several numbers of Gaussians, and draw both at the held-out cameras: PSNR beside ms per frame.
 
-Our bundles are those that `gpu_train.py --keep` left; `--train` trains the Gaussians first. They get the rates of
-gsplat's own example (positions 1.6e-4 times the extent of the cameras, falling to a hundredth; scales 5e-3, opacities
-5e-2, rotations 1e-3, colours 2.5e-3 and a twentieth of it), the same points to start from, and losses of 0.8 L1 + 0.2
-(1 - SSIM) with the weights of 0.01 on opacities and scales that the strategy asks for.
-"""
+Our bundles are those that `gpu_train.py --keep` left; `--train` trains the Gaussians first, from the same points, with
+the rates of gsplat's own example and the regularisation that the strategy asks for."""
 
 import math
 import sys

@@ -128,7 +128,6 @@ def bake_scene(
         folder: of the bundle; appears complete or not at all.
         background: [3] color behind the scene; None = black.
         overwrite: replace a bundle that is there.
-        options: of the bake.
 
     Returns:
         The bundle as read from the folder.

@@ -1,10 +1,8 @@
 """Files and folders that appear whole or not at all, one writer at a time, and why something cannot be written.
 
-A file is written as `.NAME.unfinished`, a folder as `.NAME.new`, both beside their place; they are flushed, then
-renamed. While a folder is replaced, the earlier one is `.NAME.old`. Whoever writes holds a lock (`.NAME.lock` for a
-folder), which the kernel releases when the process ends, however it ends. So the names are fixed, and what a killed
-process left under them is found, and put back or removed, by the next one that writes there.
-"""
+Files are written as `.NAME.unfinished`, folders as `.NAME.new`, flushed, then renamed; a folder that is replaced is
+`.NAME.old` meanwhile. Writers hold a lock, which the kernel releases however they end. The names are fixed, so that the
+next writer finds what a killed process left, and puts it back or removes it."""
 
 from __future__ import annotations
 
@@ -101,14 +99,11 @@ def _nearest(path: Path) -> Path:
 
 def _open_locked(path: Path) -> tuple[BinaryIO, bool]:
     """Open a file for writing, made where it is missing, and lock it until it is closed in all processes that have it.
-
-    Returns:
-        the file, and whether it is locked: some network file systems know no locks.
+    Returns the file, and whether it is locked: some network file systems know no locks.
 
     Raises:
         BlockingIOError: another process has the lock.
-        OSError: it cannot be opened, or is not what it should be; see `no_links`.
-    """
+        OSError: it cannot be opened, or is not what it should be; see `no_links`."""
     while True:
         file = open(path, "r+b", opener=no_links)
         try:
@@ -275,19 +270,6 @@ def _remove(folder: Path) -> None:
 
 
 @contextmanager
-def staging(target: str | Path, tell: Tell = warnings.warn) -> Iterator[Path]:
-    """Make an empty temporary folder beside the target for the block; see `reserved`."""
-    with reserved(target, tell) as place:
-        new, _ = _beside(place)
-        try:
-            new.mkdir()
-            yield new
-        finally:
-            with suppress(OSError):  # the next writer tries again
-                _settle(place)
-
-
-@contextmanager
 def complete_folder(
     target: str | Path, check: Callable[[], None] = lambda: None, tell: Tell = warnings.warn
 ) -> Iterator[Path]:
@@ -310,17 +292,21 @@ def complete_folder(
     """
     with reserved(target, tell) as place:
         check()
-        with staging(place, tell) as new:
+        new, old = _beside(place)
+        try:
+            new.mkdir()
             yield new
             for path in new.rglob("*"):
                 flush(path)
             flush(new)
             check()
-            _, old = _beside(place)
             if place.exists():
                 place.rename(old)
             new.rename(place)
             flush(place.parent)
+        finally:
+            with suppress(OSError):  # the next writer tries again
+                _settle(place)
 
 
 @contextmanager

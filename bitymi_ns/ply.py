@@ -1,10 +1,5 @@
-"""Reader of PLY files: header, and the rows of an element, binary or text.
-
-`bundle.ply` reads and writes the PLY file of a bundle with it, `plugin.data.point_files` the clouds of captures.
-
-plyfile, the library for such files, is not used: it is under the GPL and this package under Apache-2.0, and it takes
-memory for as many rows of text as a header claims. Here nothing is taken that the file does not have.
-"""
+"""Reader of PLY files: header, and the rows of an element, binary or text. plyfile, the library for such files, is not
+used: it is under the GPL, and takes memory for as many rows of text as a header claims."""
 
 import re
 import warnings

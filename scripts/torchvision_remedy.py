@@ -1,15 +1,9 @@
 #!/usr/bin/env python3
 """Make a CUDA build of torchvision importable beside a CPU build of torch, in this virtual environment.
 
-`pip install torchvision` brings a build whose compiled operators need CUDA libraries. Beside a CPU torch they are
-silently left out, and `import torchvision` fails with "operator torchvision::nms does not exist", and nerfstudio with
-it. The better cure is the matching CPU wheel from https://download.pytorch.org/whl/cpu; where it cannot
-be had, this script declares the two missing operators (declares only: calling them stays an error).
-
-It does nothing unless the import fails with just that message. Otherwise it writes a module and a .pth file into
-site-packages; the module acts only when torchvision is first imported, and only for this mismatch, so it is harmless
-after torch or torchvision are replaced. `--remove` deletes both files.
-"""
+`import torchvision` then fails with "operator torchvision::nms does not exist", and nerfstudio with it. The better cure
+is the matching CPU wheel (https://download.pytorch.org/whl/cpu). Where that fails with just this message, this declares
+the missing operators whenever torchvision is imported with this mismatch; `--remove` deletes the two files."""
 
 import argparse
 import subprocess

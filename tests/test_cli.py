@@ -1,6 +1,7 @@
 """The `bitymi` console script: thin calls, and mistakes answered in one line."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -18,9 +19,48 @@ def test_sample(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([*args, "--overwrite"]) == 0
 
 
-def test_bad_value_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["sample", "--output-dir", str(tmp_path / "room"), "--views", "0"]) == 1
-    assert capsys.readouterr().err == "bitymi: views must be at least 1, got 0\n"
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        (["sample", "--output-dir", "{}/room", "--views", "0"], "bitymi: views must be at least 1, got 0\n"),
+        (
+            ["sample", "--output-dir", "{}/file/room"],
+            "bitymi: {0}/file/room cannot be written: {0}/file is not a folder",
+        ),
+        (["report", "{}/missing.json", "--output-dir", "{}/report"], "bitymi: {0}/missing.json does not exist"),
+        (["report"], "bitymi: nothing to report"),
+    ],
+)
+def test_mistakes_are_one_line(
+    tmp_path: Path, words: list[str], error: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    assert cli.main([word.format(tmp_path) for word in words]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(error.format(tmp_path)) and said.count("\n") == 1
+
+
+FULL = "{} cannot be written: the disk is full: free some space, or give a place on another disk\n"
+
+
+@pytest.mark.parametrize(
+    ("problem", "status", "error"),
+    [(OSError(28, "No space left on device"), 1, FULL), (KeyboardInterrupt(), 130, "interrupted")],
+)
+def test_a_full_disk_and_ctrl_c_are_named(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    problem: Any,
+    status: int,
+    error: str,
+) -> None:
+    def failing(*args: object, **kwargs: object) -> None:
+        raise problem
+
+    monkeypatch.setattr("bitymi_ns.sample.generate", failing)
+    assert cli.main(["sample", "--output-dir", str(tmp_path / "room")]) == status
+    assert error.format(tmp_path / "room") in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["a\x1b[2Jb", "\udcff", "\rx"])
@@ -36,32 +76,6 @@ def test_names_do_not_control_the_terminal(tmp_path: Path, capsys: pytest.Captur
     assert shown in capsys.readouterr().out
 
 
-def test_unwritable_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "file").write_text("")
-    assert cli.main(["sample", "--output-dir", str(tmp_path / "file" / "room")]) == 1
-    error = capsys.readouterr().err
-    assert error.startswith(
-        f"bitymi: {tmp_path / 'file' / 'room'} cannot be written: {tmp_path / 'file'} is not a folder"
-    )
-    assert error.count("\n") == 1
-
-
-def test_a_full_disk_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    import bitymi_ns.sample
-
-    def full(*args: object, **kwargs: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(bitymi_ns.sample, "generate", full)
-    assert cli.main(["sample", "--output-dir", str(tmp_path / "room")]) == 1
-    assert capsys.readouterr().err == (
-        f"bitymi: {tmp_path / 'room'} cannot be written: the disk is full: free some space, or give a place on another "
-        "disk\n"
-    )
-
-
 def test_report_calls_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import bitymi_ns.measure.report
 
@@ -75,31 +89,3 @@ def test_report_calls_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert cli.main(["report", "a.json", "b.json", "--output-dir", str(tmp_path), "--title", "Two"]) == 0
     expected = {"inputs": [Path("a.json"), Path("b.json")], "output_dir": tmp_path, "title": "Two"}
     assert seen == expected
-
-
-def test_broken_report_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["report", str(tmp_path / "missing.json"), "--output-dir", str(tmp_path / "report")]) == 1
-    error = capsys.readouterr().err
-    assert error.startswith("bitymi: ") and "missing.json" in error and error.count("\n") == 1
-
-
-def test_report_without_inputs(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["report"]) == 1
-    assert "nothing to report" in capsys.readouterr().err
-
-
-def test_interrupt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def interrupted(*args: object, **kwargs: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("bitymi_ns.sample.generate", interrupted)
-    assert cli.main(["sample", "--output-dir", str(tmp_path / "room")]) == 130
-    assert "interrupted" in capsys.readouterr().err
-
-
-def test_help_lists_commands(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stop:
-        cli.main(["--help"])
-    assert stop.value.code == 0
-    out = capsys.readouterr().out
-    assert "sample" in out and "report" in out

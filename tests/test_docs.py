@@ -128,21 +128,3 @@ def test_pages_that_code_refers_to_are_there() -> None:
     for path in tracked("*.py", "*.h", "*.cpp", "*.cu", "*.yaml", "Makefile", "*.toml"):
         for name in MENTION.findall(path.read_text("utf8")):
             assert (ROOT / name).is_file() or path == Path(__file__), f"{path} refers to {name}"
-
-
-def test_dead_links_are_found(tmp_path: Path) -> None:
-    (tmp_path / "b.md").write_text("# One & two\n\n```\n# no heading\n```\n## One & two\n")
-    page = tmp_path / "a.md"
-    page.write_text("# A\n[1](b.md) [2](b.md#one--two) [3](b.md#one--two-1) [4](https://x.y/z) [5](#a) `[6](no.md)`\n")
-    assert dead_links(page) == []
-    page.write_text("[1](c.md) [2](b.md#no-heading) [3](#b) ![4](c.png)\n")
-    assert dead_links(page) == ["c.md", "b.md#no-heading", "#b", "c.png"]
-
-
-def test_names_that_are_gone_are_found(tmp_path: Path) -> None:
-    package = tmp_path / "bitymi_ns" / "scene"
-    package.mkdir(parents=True)
-    (package / "config.py").write_text("class SceneConfig:\n    rim: float = 1\ndef f(): pass\n")
-    defined = owners([package / "config.py"])
-    assert {"rim", "f", "SceneConfig", "config"} <= defined["scene"] and "f" in defined["config"]
-    assert "near" not in defined["scene"] and "rim" in defined["sceneconfig"]

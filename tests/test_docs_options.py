@@ -15,17 +15,10 @@ ROOTS: dict[str, Any] = {
     "--pipeline.model.train.": TrainConfig(),
     "ns-export ... --": BakeOptions(),
 }
-ELSEWHERE = {
-    "--machine.num-devices",
-    "--max-num-iterations",
-    "--pipeline.model.train.first-surfels",
-    "ns-export ... --exact",
-    "ns-export ... --finetune-steps",
-    "ns-export ... --format",
-    "ns-export ... --photographs",
-    "ns-export ... --polish-steps",
-    "ns-export ... --compact-error",
-    "ns-export ... --target-mb",
+ELSEWHERE = {"--machine.num-devices", "--max-num-iterations", "--pipeline.model.train.first-surfels"}
+ELSEWHERE |= {
+    f"ns-export ... --{name}"
+    for name in "exact finetune-steps format photographs polish-steps compact-error target-mb".split()
 }
 """Options that are declared with the commands, which need nerfstudio."""
 

@@ -61,10 +61,3 @@ def test_snippets_run(page: Path, names: dict[str, object], tmp_path: Path, monk
     namespace = dict(names)
     for code in runnable:
         exec(compile(STEPS.sub("steps=10", code), str(page), "exec"), namespace)
-
-
-def test_a_broken_snippet_is_found() -> None:
-    runnable, wrong = snippets(
-        "```python\na = 1\n```\n\n```python no-run: needs a card\nb\n```\n```python later\nc\n```\n"
-    )
-    assert runnable == ["a = 1\n"] and wrong == ["later"]

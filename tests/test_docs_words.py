@@ -105,37 +105,3 @@ def test_no_banned_words() -> None:
 @pytest.mark.skipif(not FILES, reason="not a git checkout")
 def test_docstrings_begin_with_what_is_done() -> None:
     assert not [line for path in tracked(*DOCSTRINGS, *COMMENTS) for line in questions(path)]
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "count"),
-    [
-        ("a.md", "Points are dropped by\nlot.\n", 1),
-        ("a.md", "Run `by lot`.\n\n```\nset aside\n```\n", 0),
-        ("a.py", '"""Views that are set aside."""\nlooks = 1  # one price\n', 2),
-        ("a.py", "by_lot = packs = 1\n", 0),
-        ("a.py", 'print("nothing is done in silence")\n', 1),
-        ("a.h", "// Atlas packing.\n", 0),
-        ("a.h", "// blended a pack at a time, so packs are lanes\n", 2),
-        ("a.md", "A photograph looks sharp; several packages; a learned texture at the price of time.\n", 0),
-    ],
-)
-def test_banned_words_are_found(tmp_path: Path, name: str, text: str, count: int) -> None:
-    (tmp_path / name).write_text(text)
-    assert len(found(tmp_path / name)) == count
-
-
-def test_questions_are_found(tmp_path: Path) -> None:
-    path = tmp_path / "a.py"
-    path.write_text(
-        '"""What this is."""\n\n\ndef f():\n    """Whether it is so."""\n\n\ndef g():\n    """Draw it."""\n'
-    )
-    assert len(questions(path)) == 2
-
-
-def test_questions_are_found_in_comments(tmp_path: Path) -> None:
-    path = tmp_path / "a.h"
-    path.write_text(
-        "// Whether it is so,\n// or not.\nint f();\n  // Where it is.\nint g;  // What it is\n// The rest.\n"
-    )
-    assert len(questions(path)) == 2

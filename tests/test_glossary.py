@@ -3,8 +3,6 @@
 import re
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).resolve().parents[1]
 NUMBERED = 10
 """Numbered equations of the paper."""
@@ -64,20 +62,3 @@ def test_symbols_are_names_of_the_code() -> None:
     for symbol, names, _ in rows("Symbols"):
         for name in re.findall(CODE, names):
             assert name in words, f"{symbol}: the code has no {name}"
-
-
-@pytest.mark.parametrize(
-    ("file", "text", "found"),
-    [
-        ("a.py", "def f(x):\n", True),
-        ("a.py", "    y = f(x)\n", False),
-        ("a.h", "template <class S>\nBT_HD S f(S a,\n          S b) {\n", True),
-        ("a.h", "  void f(int a) {\n", True),
-        ("a.cu", "__global__ void __launch_bounds__(kThreads) f(int a) {\n", True),
-        ("a.h", "BT_HD S f(S a);\n", False),
-        ("a.h", "  const S b = f(a);\n", False),
-        ("a.h", "constexpr double f = 4.0;\n", True),
-    ],
-)
-def test_a_vanished_function_is_noticed(file: str, text: str, found: bool) -> None:
-    assert defines(file, text, "f") is found

@@ -22,7 +22,6 @@ def certified(baked: Baked, cameras: Sequence[Camera]) -> Baked:
 
     Args:
         baked: encoded, on the CPU.
-        cameras: training views.
     """
     scene, options = baked.scene, baked.options
     if baked.texels is None or baked.atlas is None or options.tolerance == 0 or baked.statistics.certificate:

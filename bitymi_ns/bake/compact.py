@@ -100,8 +100,6 @@ class Coder:
             baked: with lean view colours, on the CPU.
             views: training views; without any the reference steps are taken.
             background: [3] colour behind the scene.
-            options: see `Compact`.
-            progress: called on the way.
             device: where views are drawn and weighed.
         """
         options.check()
@@ -179,8 +177,6 @@ def compacted(
         baked: with lean view colours, on the CPU.
         views: training views; without any the reference steps are taken.
         background: [3] colour behind the scene.
-        options: see `Compact`.
-        progress: called on the way.
         device: where views are drawn and weighed.
 
     Raises:
@@ -195,8 +191,6 @@ def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> 
 
     Args:
         coder: measured with options that differ at most in what decides lambda.
-        options: see `Compact`.
-        progress: called on the way.
 
     Raises:
         ValueError: as `compacted` does.

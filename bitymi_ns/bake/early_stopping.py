@@ -36,7 +36,6 @@ class EarlyStopping(Generic[S]):
     def __init__(self, options: StoppingOptions, psnr: float, first: S) -> None:
         """
         Args:
-            options: see `StoppingOptions`.
             psnr: of the views before the first step, dB; NaN without any.
             first: the state then.
         """

@@ -92,7 +92,6 @@ def reduce_view_color(
         centers: [V, 3] float64 camera centres.
         opacity: [N] largest blending weight.
         tolerance: 8-bit steps.
-        progress: called with the number of surfels done.
     """
     means, entry = surfels["means"], VIEW_COLORS[kind]
     full = {name: surfels[name] for name in entry.names}

@@ -114,7 +114,6 @@ def bake_and_learn(
     and view colours; rounding of the surfels (compact only); fine-tuning of the texels; coding; certificate.
 
     Args:
-        scene: a trained scene.
         cameras: of the training views, on the scene's device.
         photographs: the training views, with the corrections that training found.
         background: [3] colour behind the scene, on the CPU.

@@ -39,7 +39,6 @@ def trained_texels(scene: BakeableScene, options: BakeOptions) -> Baked:
 
     Args:
         scene: with a `TexelField`.
-        options: see `BakeOptions`.
 
     Raises:
         ValueError: no surfel is left, an option is out of range, or the atlas would be too large.

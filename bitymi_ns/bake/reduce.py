@@ -81,11 +81,7 @@ class Reduced:
 
 @torch.no_grad()
 def reduce_tiles(
-    wanted: Iterable[TileValues],
-    shown: Shown,
-    tolerance: float,
-    r_min: int = 4,
-    progress: Progress = no_progress,
+    wanted: Iterable[TileValues], shown: Shown, tolerance: float, r_min: int = 4, progress: Progress = no_progress
 ) -> Reduced:
     """Choose every tile's grid.
 
@@ -100,7 +96,6 @@ def reduce_tiles(
         shown: how much of the tiles is.
         tolerance: largest error, 8-bit steps.
         r_min: smallest side of a tile, a power of two.
-        progress: called with the number of tiles done.
     """
     n = len(shown.extent)
     reduced = Reduced(torch.zeros(n, 2, dtype=torch.int32), torch.zeros(n, 3))

@@ -8,9 +8,9 @@ from torch import Tensor
 from bitymi_ns.bake.baked import Baked
 from bitymi_ns.codec.pages import listed_texels, paged_texels
 from bitymi_ns.ops import Projection, TexelTiles, add_texel_coverage, fitting_lists, project
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.scene.scene import GEOMETRY
 from bitymi_ns.train.views import View
 
 
@@ -58,8 +58,6 @@ class TexelList:
         """Coverage of every texel, in pixels.
 
         Args:
-            views: training views.
-            progress: called after every view.
             squared: square the blending weights.
 
         Returns:
@@ -76,10 +74,8 @@ class TexelList:
         """Add the same of both kinds.
 
         Args:
-            views: training views.
             total: [T, 3], added to, alike in all columns; None = not wanted.
             squares: [T, 3], added to: that of the blending weights' squares. None = not wanted.
-            progress: called after every view.
         """
         for done, view in enumerate(views, start=1):
             lists = fitting_lists(self.projection(view.camera))

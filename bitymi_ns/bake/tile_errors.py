@@ -64,7 +64,6 @@ def closest_pixels(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], ext
 
     Args:
         surfels: per-surfel parameters, N rows.
-        cameras: training views.
         extent: half side in scale units of the square that has to be in the picture.
         near: nearest drawn depth.
     """

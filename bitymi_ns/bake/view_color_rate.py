@@ -14,12 +14,12 @@ from bitymi_ns.bake.voronoi_fit import fit_sites, least_needed, site_weights
 from bitymi_ns.codec.limits import beyond
 from bitymi_ns.ops import fitting_lists, project
 from bitymi_ns.ops.constants import COLOR_BIAS
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.sphere import fibonacci_sphere
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, ViewColor
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.scene.scene import GEOMETRY
 
 BITS_PER_NUMBER = 5.5  # bits of a number of a term in a compact bundle, about
 LEAST_WEIGHT = 1e-12  # weight of any direction: a surfel that no view shows has a colour, too
@@ -154,13 +154,7 @@ def _weights(at: Directions, weights: Tensor) -> Tensor:
 def _blind(means: Tensor, weights: Tensor, centers: Tensor, near: float) -> tuple[Tensor, Tensor]:
     """Directions [n, BLIND, 3] from the nearest views that do not show a surfel, and how much each counts: by what the
     views that do show would show from there, by the square of the distance; none from where there is no such view.
-
-    Args:
-        means: [n, 3].
-        weights: [V, n] of the views.
-        centers: [V, 3] float64.
-        near: nearest depth that is drawn.
-    """
+    `means` [n, 3], `weights` [V, n] of the views, `centers` [V, 3] float64."""
     offset = means.double()[:, None] - centers.to(means.device)  # [n, V, 3]
     square, shows = offset.square().sum(2).clamp(min=near * near), weights.T > 0
     from_unit = (weights.T * square).sum(1) / shows.sum(1).clamp(min=1)

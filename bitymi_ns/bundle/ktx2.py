@@ -75,17 +75,11 @@ def descriptor(format: Format) -> bytes:
 
 
 def write_ktx2(
-    path: str | Path,
-    payload: Sequence[bytes],
-    format: Format,
-    width: int,
-    height: int,
-    writer: str,
+    path: str | Path, payload: Sequence[bytes], format: Format, width: int, height: int, writer: str
 ) -> None:
     """Write a 2D array texture with one level, not supercompressed.
 
     Args:
-        path: file to write.
         payload: one bytes object a layer, rows from the top.
         format: bc7, uint8 (RGBA) or fp16 (RGBA).
         width, height: size in texels; multiples of 4 for bc7.

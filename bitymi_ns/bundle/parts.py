@@ -175,12 +175,8 @@ def parts_of(bundle: str | Path, inside: bool = False) -> Iterator[Parts]:
 
 
 def _check_directory(file: BinaryIO) -> int:
-    """Size of a file. Refuses one whose directory exceeds `DIRECTORY_LIMIT`, which takes `zipfile` long to read, or
-    that begins with something else, which may then be of another type, too.
-
-    Raises:
-        ValueError: says why.
-    """
+    """Size of a file. Raises a ValueError for one whose directory exceeds `DIRECTORY_LIMIT`, which takes `zipfile` long
+    to read, or that begins with something else, which may then be of another type, too."""
     size = file.seek(0, os.SEEK_END)
     records = _LARGE.size + _LARGE_AT.size + _END.size
     file.seek(max(0, size - records))

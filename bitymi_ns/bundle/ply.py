@@ -20,7 +20,6 @@ def write_ply(
     """Write the columns as properties of `vertex`, in their order.
 
     Args:
-        path: file to write.
         columns: name to [N] array; integer columns become `int`, the others `float`.
         comments: header comments, one line each.
         more: columns of further elements by their name, in the order in which they follow.

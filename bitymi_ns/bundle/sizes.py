@@ -1,5 +1,6 @@
 """Checks of a bundle's files before they are read: headers, bundle.json, memory."""
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -15,7 +16,6 @@ HEAD = max(ply.HEADER_LIMIT, ktx2.HEADER_LIMIT)  # bytes from the start of a fil
 _SURFEL_BYTES, _TERM_BYTES, _TEXEL_BYTES = 340, 150, 60
 """Bytes of a compact bundle while it is decoded: 2 million surfels took 370 each, 4 million terms 165, 17 million
 texels 67 with their pages."""
-_CONTROL_GROUPS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
 
 def check_head(info: Manifest, name: str, head: bytes, size: int) -> None:
@@ -95,9 +95,23 @@ def least_memory(info: Manifest, name: str) -> int:
 
 
 def machine_memory() -> int:
-    """Bytes of memory that this machine has, or that its control group may use."""
-    found = [psutil.virtual_memory().total]
-    for path in _CONTROL_GROUPS:
-        with suppress(OSError, ValueError):  # there is none, or it has no limit
-            found.append(int(Path(path).read_text()))
+    """Bytes of memory that this machine has, or that this process may use of it."""
+    return int(min(psutil.virtual_memory().total, memory_limit()))
+
+
+def memory_limit(mount: Path = Path("/sys/fs/cgroup"), cgroups: Path = Path("/proc/self/cgroup")) -> float:
+    """Bytes that the control groups (v2 and v1) of this process may take; infinite where none has a limit."""
+    found = [math.inf]
+    with suppress(OSError):  # no Linux
+        for line in cgroups.read_text().splitlines():
+            _, controllers, path = line.split(":", 2)
+            if controllers and "memory" not in controllers.split(","):
+                continue
+            base, name = (mount / "memory", "memory.limit_in_bytes") if controllers else (mount, "memory.max")
+            folder = base / path.lstrip("/")
+            for each in (folder, *folder.parents):
+                with suppress(OSError, ValueError):  # of another namespace; "max"
+                    found.append(float((each / name).read_text()))
+                if each == base:
+                    break
     return min(found)

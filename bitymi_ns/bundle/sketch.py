@@ -1,10 +1,7 @@
 """Count sketches of lists of texels: the distance between two lists is estimated from their sketches alone.
 
 The sketch of numbers x_i is M sums, S_g = sum over i in group g of s_i x_i, where a hash of i gives the group and the
-sign s_i. It is linear, and over the hashes sum_g (S_g(x) - S_g(y))^2 has the mean |x - y|^2 and a relative standard
-deviation of at most sqrt(2 / M). So a bundle that holds the sketch of its texels before quantisation tells how far the
-decoded ones are from them.
-"""
+sign s_i. sum_g (S_g(x) - S_g(y))^2 has the mean |x - y|^2 and a relative standard deviation of at most sqrt(2 / M)."""
 
 import base64
 

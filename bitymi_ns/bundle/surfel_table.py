@@ -20,10 +20,10 @@ from bitymi_ns.bundle.ply import PlyError
 from bitymi_ns.codec.limits import EXTENTS, UNIT_SLACK, beyond, limit_of
 from bitymi_ns.ops import view_color
 from bitymi_ns.ops.constants import MAX_TERMS, SH_C0
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.sphere import fibonacci_sphere
 from bitymi_ns.ops.view_color import LEAN, check_lean
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, kind_of
-from bitymi_ns.scene.scene import GEOMETRY
 
 FLAT_LOG_SCALE = -31.0
 TILE_COLUMNS = ("tile_x", "tile_y", "tile_layer", "tile_ru", "tile_rv")

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import ExifTags, Image, ImageCms, ImageOps
 
 from bitymi_ns.capture.exif import Exif, exposure_exif, read_exif
-from bitymi_ns.capture.panorama import has_panorama_metadata, looks_panoramic
+from bitymi_ns.capture.panorama_detection import has_panorama_metadata, looks_panoramic
 from bitymi_ns.capture.recognise import is_photograph, open_picture, photographs_below
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.progress import Progress

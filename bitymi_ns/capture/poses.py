@@ -17,16 +17,8 @@ from bitymi_ns.capture import prepare
 from bitymi_ns.capture.cache import content_key, replace_stale, work_folder
 from bitymi_ns.capture.frame import local_positions, move_to_world, write_frame
 from bitymi_ns.capture.masks import mask_folder
-from bitymi_ns.capture.panorama import SPHERICAL_MODEL, is_full_sphere
-from bitymi_ns.capture.photos import (
-    Photo,
-    blurred,
-    check_names,
-    duplicates,
-    find_photos,
-    photo_folder,
-    read_photos,
-)
+from bitymi_ns.capture.panorama_detection import SPHERICAL_MODEL, is_full_sphere
+from bitymi_ns.capture.photos import Photo, blurred, check_names, duplicates, find_photos, photo_folder, read_photos
 from bitymi_ns.capture.recognise import VIDEOS, is_model
 from bitymi_ns.capture.report import write_report
 from bitymi_ns.capture.sfm import process
@@ -53,7 +45,6 @@ def find_poses(
     Args:
         source: a folder of photographs, a folder that holds them in `images` (and masks in `masks`), or a video.
         options: how; None = the defaults.
-        progress: called with the stage and its progress.
         warn: called with the location of the result, if not beside writable photographs.
 
     Raises:
@@ -83,11 +74,7 @@ def find_poses(
 
 
 def _what(source: Path) -> tuple[Path, Path, list[str]]:
-    """Return the source, the folder of its photographs and their names; for a video no names.
-
-    Raises:
-        CaptureError: there is nothing, or too little.
-    """
+    """Return the source, the folder of its photographs and their names; for a video no names."""
     if source.suffix.lower() in VIDEOS and source.is_file():
         return source, source, []
     if not source.exists():

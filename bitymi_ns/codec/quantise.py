@@ -87,11 +87,7 @@ def sample_texels(
 
 
 def choose_range(
-    texels: npt.NDArray[np.float32],
-    packing: Packing,
-    rule: RangeRule = "sigma6",
-    samples: int = 1 << 18,
-    seed: int = 0,
+    texels: npt.NDArray[np.float32], packing: Packing, rule: RangeRule = "sigma6", samples: int = 1 << 18, seed: int = 0
 ) -> Range:
     """The quantisation range of an atlas, one (offset, scale) for all channels.
 
@@ -143,7 +139,6 @@ def encode(
         value_range: quantisation range; not given: `choose_range` with its defaults. Not used by fp16.
         profile: effort of the BC7 encoder, from ultrafast to slow.
         threads: encoder threads; not given: one per processor. The result does not depend on it.
-        progress: called with the number of rows done.
     """
     if format not in BYTES_PER_TEXEL:
         raise ValueError(f"the atlas format must be bc7, uint8 or fp16, not {format!r}")

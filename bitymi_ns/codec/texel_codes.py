@@ -36,8 +36,7 @@ class TexelCodeOptions:
     step: float = 7.5
     """Step of a coefficient, in 8-bit steps, of texels that make up one pixel of the views each: of those that make up
     w pixels it is step / sqrt(w)."""
-    most_bytes: int | None = None
-    """Texels take no more than this: the step grows until they fit. None = it stays."""
+    most_bytes: int | None = None  # Texels take no more than this: the step grows until they fit. None = it stays.
 
     def check(self) -> None:
         """Refuse values that make no sense."""
@@ -167,7 +166,6 @@ class TexelCoder:
             sizes: [N, 2] sides of the tiles; (0, 0) = one constant.
             weights: [T] of the texels, in the order of `TexelTiles`: sum over views and fragments of the squared
                 blending weight times the bilinear weight. An error e of a texel adds weight times e^2 to the pictures.
-            options: see `TexelCodeOptions`.
         """
         options.check()
         self._sizes, self._weights = sizes.long(), weights + LEAST_WEIGHT

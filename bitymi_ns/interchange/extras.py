@@ -106,7 +106,6 @@ def write_extras(
             over the whole sphere, and a mesh keeps the surfels' own colours.
         held_out: photographs to measure in.
         overwrite: replace a folder of extras.
-        progress: called on the way.
 
     Returns:
         what was written, by kind.

@@ -34,7 +34,6 @@ def recolored(
         picture: draws the scene for a camera, [H, W, 3].
         cameras: views to draw.
         near: nearest depth that is drawn.
-        progress: called after every view.
     """
     pages, height, width, _ = quads.pages.shape
     shift, shown = torch.zeros(len(quads), 3), torch.zeros(len(quads), 1)

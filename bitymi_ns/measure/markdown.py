@@ -23,7 +23,6 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], text_columns: Se
     """Format a table, without a trailing newline.
 
     Args:
-        header: of the columns.
         rows: their cells; markup in them is kept.
         text_columns: indices of left-aligned columns; the others hold numbers.
     """

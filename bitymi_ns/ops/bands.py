@@ -1,8 +1,5 @@
-"""Views with more fragments than memory, drawn a few rows of tiles at a time.
-
-A band is the same projection with the image's rows above it cut off. Its fragments are made when it is drawn, and once
-more in its backward pass; nothing of it is kept in between but its part of the image.
-"""
+"""Views with more fragments than memory, drawn a few rows of tiles at a time. A band is the same projection with the
+image's rows above it cut off; its fragments are made when it is drawn, and once more in its backward pass."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace

@@ -71,11 +71,7 @@ class _BlendedImage(torch.autograd.Function):
 
 
 def _check(fragments: Fragments, base: Tensor, texels: Tensor, tiles: TexelTiles, descent: TexelDescent | None) -> None:
-    """Refuse what does not belong together; see `blended_image`.
-
-    Raises:
-        ValueError: says what it is.
-    """
+    """Raise a ValueError where inputs do not belong together; see `blended_image`."""
     named = {} if descent is None else descent.arguments(texels)
     named.pop("rate", None)
     on_same_device(fragments.weight, base=base, texels=texels, **tiles.arrays, **named)

@@ -54,7 +54,6 @@ def composite_image(fragments: Fragments, projection: Projection, colors: Tensor
 
     Args:
         fragments: F fragments of an H x W view.
-        projection: the view's.
         colors: [F, 3].
         maps: add depth and normal.
 

@@ -28,7 +28,6 @@ def find_fragments(geom: Tensor, projection: Projection, most: int | None = None
 
     Args:
         geom: [N, 16] without graph.
-        projection: the view's.
         most: fragments that there may be; 0 = `MOST`, None = any number.
 
     Returns:

@@ -150,7 +150,6 @@ def find_fragments(geom: Tensor, projection: Projection, most: int | None = None
 
     Args:
         geom: [N, 16] without graph.
-        projection: the view's.
         most: fragments that there may be; 0 = as many as a training step has memory for; None = any number.
 
     Returns:

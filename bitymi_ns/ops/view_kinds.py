@@ -1,8 +1,5 @@
-"""The kinds of view colour: one entry of `VIEW_COLORS` each.
-
-csrc/core/view_kinds.h computes the colour in a direction, in float64 `ops.reference.view_color`. Everything else that
-depends on the kind is in its entry here.
-"""
+"""The kinds of view colour: one entry of `VIEW_COLORS` each holds all that depends on the kind, but for the colour in a
+direction: csrc/core/view_kinds.h, and in float64 `ops.reference.view_color`."""
 
 import math
 from collections.abc import Callable, Collection, Mapping
@@ -137,8 +134,8 @@ def _sb_start(color: Tensor, lobes: int, generator: torch.Generator) -> tuple[Te
 
 
 _SB_LOBE_MEAN = 0.1 * 0.1
-"""What one fresh Spherical Beta lobe adds on average over all directions: softplus(0) = 0.1 times the mean of
-max(0, cos)^4 over the sphere, 0.1."""
+"""Mean of a fresh Spherical Beta lobe over all directions: softplus(0) = 0.1 times the mean of max(0, cos)^4 over the
+sphere, 0.1."""
 
 
 def _sb_mean(base: Tensor, lobes: Tensor) -> Tensor:

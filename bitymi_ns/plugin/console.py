@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from bitymi_ns.trust import printable
 
+INTERRUPTED = 130  # exit status after Ctrl-C, by the convention of shells
 REMARKS = re.compile(
     r"Saving config to|Saving checkpoints to"  # our summary of the run says where
     r"|Mixed precision is disabled|Auto image downscale factor of 1$"

@@ -1,9 +1,6 @@
-"""Entry points of nerfstudio's method registry (pyproject.toml), one name per method.
-
-nerfstudio loads these names without any error handling, from every ns-* command: an exception here would take all of
-its methods down. So nothing here raises; a method that cannot be set up is registered under its name and says why when
-it is used.
-"""
+"""Entry points of nerfstudio's method registry (pyproject.toml), one name per method. nerfstudio loads them without any
+error handling, from every ns-* command, so nothing here raises: a method that cannot be set up is registered under its
+name and says why when it is used."""
 
 import warnings
 from dataclasses import dataclass
@@ -19,7 +16,7 @@ class UnavailableConfig(TrainerConfig):
     """Stands in for a method that could not be set up: reports the reason as soon as it is used."""
 
     reason: str = ""
-    """Why the method is not available."""
+    """The reason that the method is not available."""
 
     def set_timestamp(self) -> None:
         raise SystemExit(f"{self.method_name} is not available: {self.reason}")

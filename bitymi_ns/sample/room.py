@@ -1,11 +1,8 @@
 """The sample room and its ray tracer, in numpy.
 
-World frame: metres, x and y along the floor, z up. Rays are structures of arrays: an origin and a direction as three
-float32 arrays [n] (or scalars for a shared origin); a ray's length parameter t counts in direction lengths.
-Colors are display values in [0, 1]; the light on walls and floor is worked out once, with soft shadows, and multiplied
-into their textures, so that those surfaces look the same from everywhere. The sphere and the box are glossy: what they
-mirror moves with the eye.
-"""
+World frame: metres, x and y along the floor, z up. Rays are an origin and a direction of three float32 arrays [n] each
+(or scalars); their parameter t counts in direction lengths. The light on walls and floor is multiplied into their
+textures once; sphere and box are glossy. Colors are display values in [0, 1]."""
 
 from dataclasses import dataclass
 
@@ -62,12 +59,9 @@ def _bars() -> tuple[np.ndarray, np.ndarray]:
 class Hits:
     """First hits of n rays."""
 
-    t: Image
-    """[n] distance in direction lengths"""
-    surface: np.ndarray
-    """[n] int8, which surface"""
-    part: np.ndarray
-    """[n] int8, which bar or pole"""
+    t: Image  # [n] distance in direction lengths
+    surface: np.ndarray  # [n] int8, which surface
+    part: np.ndarray  # [n] int8, which bar or pole
 
 
 def _dot(a: Vec, b: Vec) -> Image:

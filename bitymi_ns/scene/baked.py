@@ -124,7 +124,6 @@ class BakedScene:
         On a CUDA device this allocates its images and waits for them; `baked_renderer` keeps memory and CUDA graphs.
 
         Args:
-            camera: the view.
             background: [3] colour behind the scene; None = black.
             maps: also beta, depth, normals and overdraw.
 

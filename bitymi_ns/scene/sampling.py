@@ -40,7 +40,6 @@ def size_of(photographed: Tensor, camera: Camera) -> float:
 
     Args:
         photographed: [P, 4] points of the scene, and the pixels per unit of length with which they were photographed.
-        camera: the view.
 
     Returns:
         the median over the points in the picture; 1 where there is none.

@@ -27,13 +27,12 @@ from bitymi_ns.ops import (
     view_color,
 )
 from bitymi_ns.ops.constants import IMAGE_CHANNELS
+from bitymi_ns.ops.project import GEOMETRY
 
 from .camera import Camera
 from .config import SceneConfig
 from .field import ResidualField, Shading, TexelField
 
-GEOMETRY = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
-"""Names of the per-surfel parameters that every scene has."""
 NEAR = 0.02  # nearest depth that is drawn, for cameras of extent 1
 
 
@@ -173,7 +172,6 @@ class Scene(nn.Module):
         A view with more fragments than `config.max_fragments`, or than memory holds, is drawn in bands of tiles.
 
         Args:
-            camera: the view.
             background: [3] colour behind the scene; None = black.
             field_mode: train = the residual field gets gradients; frozen = it is evaluated without; off = left out.
             maps: also depth and normals.

@@ -58,7 +58,6 @@ def visibility(
         near: nearest drawn depth.
         weight_bound: fragments of smaller weight get no residual.
         prefilter: as in `ops.project`.
-        progress: called after every view.
     """
     means = surfels["means"]
     geometry = [surfels[name] for name in ("quats", "log_scales", "opacity_logits", "beta_raw")]

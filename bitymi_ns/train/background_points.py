@@ -1,9 +1,5 @@
-"""Further first points, where the sparse points of a capture leave parts of its photographs empty.
-
-Structure from motion finds few points on what is smooth or seen by few photographs: walls, the sky, a room behind the
-subject. Densification can only halve the few large surfels there, too seldom in a short run, so such parts stay blurred
-(docs/benchmarks/training.md, Background points).
-"""
+"""Further first points, where the sparse points of a capture leave parts of its photographs empty: densification halves
+the few large surfels there too seldom in a short run (docs/benchmarks/training.md, Background points)."""
 
 from __future__ import annotations
 
@@ -123,12 +119,7 @@ def _in_picture(camera: Camera, points: Tensor) -> list[Tensor]:
 
 
 def _behind(view: View, camera: Camera, grid: _Grid, median: float, generator: torch.Generator) -> BackgroundPoints:
-    """Place a point behind each empty cell of a view.
-
-    Args:
-        camera: of the view, on the CPU.
-        median: depth of its points, camera z.
-    """
+    """Place a point behind each empty cell of a view whose points have the `median` depth, camera z."""
     rows, columns = grid.nearest.shape
     small = downscale_image(as_float(view.image.cpu()), columns, rows)  # [rows, columns, C]
     empty = grid.nearest.isinf()

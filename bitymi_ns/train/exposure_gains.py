@@ -1,11 +1,7 @@
 """Exposure gains of photographs, estimated from the colours of the sparse points.
 
-A point that a photograph shows has there the colour that it has elsewhere, times a gain of the photograph per channel.
-In logarithms, observation = point + photograph: two-way data, solved by medians in turn, which nothing that stands in
-front of a point, no highlight and no wrong point can move by much. Of the points that are projected into a photograph
-only those count that no other point hides: else what is seen of an object from its other side would be taken for a
-change of exposure.
-"""
+In logarithms, observation = point + photograph: two-way data, solved by medians in turn, which no highlight, nothing in
+front of a point and no wrong point can move by much. Points that others hide in a photograph do not count there."""
 
 import math
 from collections.abc import Sequence

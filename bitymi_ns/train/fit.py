@@ -29,19 +29,13 @@ class LogEntry:
     """The state of a run after `step` steps."""
 
     step: int
-    seconds: float
-    """Wall-clock time of training, without evaluation."""
-    cpu_seconds: float
-    """Processor time of training over all threads, without evaluation."""
+    seconds: float  # Wall-clock time of training, without evaluation.
+    cpu_seconds: float  # Processor time of training over all threads, without evaluation.
     surfels: int
-    fragments: float
-    """Blended fragments per view, mean over the evaluation views."""
-    loss: float
-    """Objective of the last training step."""
-    psnr: float
-    """dB, mean over the evaluation views at full size; NaN without such views."""
-    cc_psnr: float
-    """PSNR in dB after the affine fit of each view's colours (`losses.color_corrected`)."""
+    fragments: float  # Blended fragments per view, mean over the evaluation views.
+    loss: float  # Objective of the last training step.
+    psnr: float  # dB, mean over the evaluation views at full size; NaN without such views.
+    cc_psnr: float  # PSNR in dB after the affine fit of each view's colours (`losses.color_corrected`).
 
 
 @dataclass
@@ -49,8 +43,7 @@ class TrainLog:
     """Log of a run."""
 
     entries: list[LogEntry] = field(default_factory=list)
-    events: list[dict[str, float]] = field(default_factory=list)
-    """Reports of the strategy, each with its `step`."""
+    events: list[dict[str, float]] = field(default_factory=list)  # Reports of the strategy, each with its `step`.
 
 
 class Trainer:
@@ -75,7 +68,6 @@ class Trainer:
         Args:
             scene: changed in place.
             views: training views at full size.
-            config: training options.
             max_steps: length of the run; the schedules depend on it.
             extent: scene extent in world units; default: from the cameras.
             processes: of the run, and the views of each per step; all are given the same.
@@ -160,7 +152,6 @@ def fit(
         scene: what is learned.
         views: training views at full size.
         eval_views: held-out views for the log.
-        config: training options.
         max_steps: length of the run.
         callback: called after each step with the trainer, the loss terms, the view and the strategy's report.
         eval_steps: numbers of steps after which the log gets an entry; the end of the run always gets one.

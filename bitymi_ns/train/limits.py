@@ -40,7 +40,6 @@ def start(points: PointReport, config: TrainConfig, image_pixels: int, scene: Sc
 
     Args:
         points: what became of the sparse points.
-        config: training options.
         image_pixels: of all training images together.
         scene: the representation.
     """

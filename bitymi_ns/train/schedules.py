@@ -27,7 +27,6 @@ class Schedule:
     ) -> None:
         """
         Args:
-            config: training options.
             max_steps: length of the run in steps.
             extent: scene extent in world units; the learning rate of the means is in multiples of it.
             texels: whether texels learn in the last part of the run.
@@ -150,7 +149,6 @@ class Schedule:
 
         Args:
             step: index of the step.
-            views: training views.
         """
         texels = self.config.texels
         needed = 2.0 * texels.travel * views / self.texel_steps

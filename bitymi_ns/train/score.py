@@ -63,7 +63,6 @@ def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig, 
     Args:
         scene: N surfels.
         views: K views, at the size in which they are to be judged; none gives zero scores.
-        config: training options.
         processes: each renders its share of the views.
     """
     n = len(scene)

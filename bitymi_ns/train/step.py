@@ -39,7 +39,6 @@ def view_losses(
         scene: what is learned.
         view: on the scene's device, its picture at the size of its camera.
         schedule, step: which parts of the scene learn.
-        config: training options.
         watch: checks the losses of the run; without one a step waits until its own loss is known.
 
     Returns:
@@ -102,7 +101,6 @@ class Training:
             scene: changed in place.
             data: what it is learned from.
             optimizers: one per surfel parameter, under its name, and those of the field.
-            config: training options.
             max_steps: length of the run; the schedules depend on it.
             on_resize: told the name and the new Parameter after each replacement of a surfel parameter.
             announce: told in a sentence whenever the run goes back, or surfels are dropped.

@@ -75,7 +75,6 @@ class Strategy:
     ) -> None:
         """
         Args:
-            config: training options.
             schedule: of the run's events.
             extent: scene extent in world units.
             on_resize: told the name and the new Parameter after each replacement of a surfel parameter.
@@ -130,10 +129,8 @@ class Strategy:
 
     @torch.no_grad()
     def _note(self, output: RenderOutput) -> None:
-        """Add the statistics of one training view.
-
-        Reads `projection.mean2d_grad` and `mean2d_absgrad` ([N, 2], pixels), `visible` [N] and `radii` [N, 2].
-        """
+        """Add the statistics of one training view: `projection.mean2d_grad` and `mean2d_absgrad` ([N, 2], pixels),
+        `visible` [N] and `radii` [N, 2]."""
         projection = output.projection
         n, device = len(projection.radii), projection.radii.device
         if len(self.grad_sum) == 0:
@@ -299,14 +296,8 @@ class Strategy:
         return int(broken.sum())
 
     def _keep_minimum(self, pruned: Tensor, opacity_logits: Tensor, count: int, among: Tensor | None = None) -> Tensor:
-        """Take back as much of `pruned` [N] as `min_surfels` asks for, the most opaque first.
-
-        Args:
-            pruned: [N] bool.
-            opacity_logits: [N].
-            count: number of surfels there would be without this prune.
-            among: [N] bool, rows that may be pruned at all.
-        """
+        """Take back as much of `pruned` [N] bool, among the rows `among` [N] bool, as `min_surfels` asks for, the most
+        opaque first; `count` surfels there would be without this prune."""
         if among is not None:
             pruned = pruned & among
         lowest = max(1, self.config.densify.min_surfels)
@@ -320,11 +311,9 @@ class Strategy:
         return pruned
 
     def _draw(self, weights: Tensor, k: int) -> Tensor:
-        """[min(k, number of positive weights)] different rows, drawn one after the other in proportion to `weights`.
-
-        Exponential races: the k rows with the smallest Exp(1) / weight are such a sample (and, unlike
-        torch.multinomial, there may be more than 2^24 rows).
-        """
+        """[min(k, number of positive weights)] different rows, drawn one after the other in proportion to `weights`:
+        the k rows with the smallest Exp(1) / weight are such a sample (torch.multinomial takes no more than 2^24
+        rows)."""
         k = min(k, int((weights > 0).sum()))
         race = torch.empty(len(weights), dtype=torch.float64).exponential_(generator=self.generator).to(weights.device)
         return (race / weights).topk(k, largest=False).indices
@@ -349,7 +338,6 @@ def most_surfels(config: TrainConfig, image_pixels: int, first_surfels: int = 0)
     """The number of surfels at which densification stops; 0 = never.
 
     Args:
-        config: training options.
         image_pixels: of all training images at full size.
         first_surfels: that training started with.
     """

@@ -14,9 +14,9 @@ from torch.utils.hooks import RemovableHandle
 
 from bitymi_ns.ops import TexelDescent, add_texel_coverage, fitting_lists, project
 from bitymi_ns.ops.constants import SUPPORT
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
-from bitymi_ns.scene.scene import GEOMETRY
 from bitymi_ns.scene.tile_sizes import coarsened, kernel_parameters, max_projected_extent, seen_sides, visible_extent
 from bitymi_ns.scene.visibility import Visibility, visibility
 from bitymi_ns.train.init import tangents
@@ -81,7 +81,8 @@ class LearningTexels:
         field = self.scene.field
         if isinstance(field, TexelField):
             # the loss is a mean, the step wants a sum
-            rate = factor * self.schedule.texel_rate(step, self._views) * numbers(view.image, view.mask)
+            values = numbers(view.image, view.mask, view.counted)
+            rate = factor * self.schedule.texel_rate(step, self._views) * values
             if self.processes.views == 1:
                 field.descent = TexelDescent(field.share, rate)
                 return
@@ -117,7 +118,6 @@ def blank_texels(
         scene: its surfels.
         views: sample to measure on, at full size; their pictures do not matter.
         count: of all training views, which these stand for.
-        options: see `TexelConfig`.
         to_come: views that the texels learn from, counted with repetition.
     """
     surfels = {name: value.detach() for name, value in scene.surfels.items()}
@@ -197,7 +197,6 @@ def tiles_as_seen(
         seen: what they see.
         near: nearest drawn depth.
         weight_bound: fragments of smaller weight get no residual.
-        options: see `TexelConfig`.
         to_come: views that the texels learn from, counted with repetition.
 
     Returns:

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from bitymi_ns.capture import CaptureError, KnownView, SfmOptions, find_poses, triangulate
-from bitymi_ns.capture.panorama import SPHERICAL_MODEL, has_panorama_metadata, looks_panoramic
+from bitymi_ns.capture.panorama_detection import SPHERICAL_MODEL, has_panorama_metadata, looks_panoramic
 from bitymi_ns.sample.room import Room
 
 XMP = (

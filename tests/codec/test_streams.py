@@ -19,23 +19,14 @@ def test_integers_come_back(rows: int, numbers: int, bits: int, random) -> None:
     np.testing.assert_array_equal(decompress(memoryview(found.data), rows, found.low, found.planes), codes)
 
 
-def test_equal_integers_take_no_bytes() -> None:
-    found = compress(np.full((100, 2), -7))
-    assert found.data == b"" and found.planes == [[], []] and found.low == [-7, -7]
-
-
-@pytest.mark.parametrize("size", [999, 1001, 0])
-def test_a_frame_of_another_size_is_refused(size: int) -> None:
+def test_frames_of_another_size_or_form_are_refused() -> None:
     frame = zstandard.compress(bytes(1000))
-    with pytest.raises(StreamError, match=f"declares 1000 bytes, {size} are wanted"):
-        plane_bytes(memoryview(frame), size)
-
-
-def test_a_frame_that_hides_its_size_or_is_followed_by_more_is_refused() -> None:
+    for size in (999, 1001, 0):
+        with pytest.raises(StreamError, match=f"declares 1000 bytes, {size} are wanted"):
+            plane_bytes(memoryview(frame), size)
     hidden = zstandard.ZstdCompressor(write_content_size=False).compress(bytes(1000))
-    with pytest.raises(StreamError):
-        plane_bytes(memoryview(hidden), 1000)
-    with pytest.raises(StreamError):
-        plane_bytes(memoryview(zstandard.compress(bytes(1000)) + b"\0"), 1000)
-    with pytest.raises(StreamError):
-        plane_bytes(memoryview(b"no frame"), 8)
+    for data in (hidden, frame + b"\0", b"no frame"):
+        with pytest.raises(StreamError):
+            plane_bytes(memoryview(data), 1000)
+    found = compress(np.full((100, 2), -7))  # equal integers take no bytes
+    assert found.data == b"" and found.planes == [[], []] and found.low == [-7, -7]

@@ -1,18 +1,16 @@
 """The command lines of `bitymi bench` are understood by nerfstudio: standard layouts, seeds and own captures."""
 
-import json
 import shutil
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils.eval_utils import eval_setup
-from scipy.spatial.transform import Rotation
 
 from bitymi_ns.measure.bench.engine import CURVE, Layout, read_curve, train_command
 from bitymi_ns.measure.bench.matrix import Row, Run, local_scenes, standard_scenes, suites
+from tests.plugin.data.captures import colmap_model
 
 SMALL = (
     "--pipeline.model.scene.log2-table-size", "10", "--pipeline.model.scene.min-resolution", "16",
@@ -20,26 +18,11 @@ SMALL = (
 )  # fmt: skip
 
 
-def colmap_scene(room: Path, folder: Path, images: str, factor: int) -> None:
-    """The room as COLMAP would leave it, its images `factor` times smaller than those that COLMAP saw."""
-    meta = json.loads((room / "transforms.json").read_text())
-    sparse = folder / "sparse" / "0"
-    sparse.mkdir(parents=True)
-    shutil.copytree(room / "images", folder / images)
-    size = [factor * meta[key] for key in ("w", "h")]
-    intrinsics = [factor * meta[key] for key in ("fl_x", "fl_y", "cx", "cy")]
-    (sparse / "cameras.txt").write_text("1 PINHOLE " + " ".join(f"{v:g}" for v in [*size, *intrinsics]) + "\n")
-    lines = []
-    for i, frame in enumerate(meta["frames"], 1):
-        pose = np.array(frame["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL to OpenCV axes
-        view = np.linalg.inv(pose)
-        x, y, z, w = Rotation.from_matrix(view[:3, :3]).as_quat()
-        numbers = " ".join(f"{v:.9f}" for v in (w, x, y, z, *view[:3, 3]))
-        lines += [f"{i} {numbers} 1 {Path(frame['file_path']).name}", ""]
-    (sparse / "images.txt").write_text("\n".join(lines) + "\n")
-    points = np.random.default_rng(0).uniform(-1.0, 1.0, (60, 3))
-    rows = [f"{i} {x:.5f} {y:.5f} {z:.5f} 128 128 128 0.5 1 0" for i, (x, y, z) in enumerate(points, 1)]
-    (sparse / "points3D.txt").write_text("\n".join(rows) + "\n")
+def colmap_scene(room: Path, folder: Path) -> None:
+    """The room as COLMAP would leave it, its images half as large as those that COLMAP saw."""
+    colmap_model(room, folder / "sparse/0")
+    (folder / "sparse/0/cameras.txt").write_text("1 PINHOLE 96 72 80 80 48 36\n")
+    shutil.copytree(room / "images", folder / "images_2")
 
 
 def train(work: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -50,7 +33,7 @@ def train(work: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_scene_of_mipnerf360(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    colmap_scene(room, tmp_path / "360" / "bonsai", "images_2", 2)
+    colmap_scene(room, tmp_path / "360" / "bonsai")
     (scene,) = standard_scenes(suites()["mipnerf360"], tmp_path / "360", ["bonsai"])
     run = Run(scene, Row("small", "bitymi", SMALL), seed=3, steps=2)
     path = train(tmp_path / "work", run, monkeypatch)

@@ -40,13 +40,8 @@ def test_frames_of_a_recorded_path_are_the_pictures_of_the_page(
     path["camera_path"] = [path["camera_path"][k] for k in (0, -1)]
     file.write_text(json.dumps(path))
     monkeypatch.setattr(render.install_checks, "check_ffmpeg_installed", lambda: None)
-    render.RenderCameraPath(
-        load_config=bundle / "config.yml",
-        camera_path_filename=file,
-        output_path=tmp_path / "frames.mp4",
-        output_format="images",
-        image_format="png",
-    ).main()
+    options = dict(output_path=tmp_path / "frames.mp4", output_format="images", image_format="png")
+    render.RenderCameraPath(load_config=bundle / "config.yml", camera_path_filename=file, **options).main()
 
     pictures = [np.asarray(Image.open(shot).convert("RGB"), np.float64) / 255 for shot in shots]
     frames = [np.asarray(Image.open(tmp_path / f"frames/{k:05d}.png"), np.float64) / 255 for k in range(2)]

@@ -67,19 +67,3 @@ def test_a_resumed_run_goes_on_with_its_corrections(
     assert held_out["cc_psnr_neural_against_photos"] > held_out["psnr_neural_against_photos"]
     assert held_out["cc_psnr_baked_against_photos"] > held_out["psnr_baked_against_photos"]
     assert "after a fit of the colours" in " ".join(capsys.readouterr().out.split())
-
-
-def test_a_checkpoint_of_before_goes_on_without(trained: BitymiTrainerConfig, start: Start, tmp_path: Path) -> None:
-    old = checkpoint(trained, 20)
-    del old["pipeline"]["_model._extra_state"]["run"]["exposure"]
-    path = tmp_path / "step-000000020.ckpt"
-    torch.save(old, path)
-    config = start(name="resumed")
-    config.load_checkpoint = path
-    ns_train.main(config)
-    run = checkpoint(config, 59)["pipeline"]["_model._extra_state"]["run"]
-    assert run["exposure"]["table"] is None
-    assert torch.equal(
-        checkpoint(config, 59)["pipeline"]["_model.scene.surfels.means"],
-        checkpoint(trained, 59)["pipeline"]["_model.scene.surfels.means"],
-    )

@@ -4,7 +4,6 @@ import errno
 import json
 import os
 import shutil
-import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,12 +21,11 @@ from bitymi_ns.capture.types import SfmSettings
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export.trained import load_trained, world_of
 from bitymi_ns.plugin.run import run_folder
-from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from bitymi_ns.plugin.run.run_folder import POSES
 from tests.e2e.conftest import small_run
 from tests.e2e.exports import run_export
 from tests.e2e.runs import a_run_of, checkpoint, config_of, different, rewrite
-from tests.plugin.data.captures import colmap_model, printed
+from tests.plugin.data.captures import colmap_model, found_poses, printed
 
 STEPS = 4
 
@@ -62,10 +60,7 @@ class Shot:
         return self.config.get_base_dir()
 
     def find_poses(self, *arguments: Any) -> Any:
-        return types.SimpleNamespace(
-            model=self.work / "result/sparse/0", images=self.images, report=self.work / "result",
-            left_out={"frame_00099.png": "blurred"}, registered=12, given=13, reprojection_error=0.5,
-        )  # fmt: skip
+        return found_poses(self.work / "result/sparse/0", self.images, self.work / "result")
 
     def spoil(self) -> None:
         """What gives the photographs another key: they are touched, one is added, and what was kept of them goes."""
@@ -205,10 +200,8 @@ def test_options_for_poses_that_are_not_found_anew(
     del values["origin"]["settings"]  # as of an earlier version
     origin.write_text(json.dumps(values))
     config = small_run(shot.photographs, shot.outputs, "earlier")
-    config.load_dir, config.pipeline.datamanager.dataparser.sfm = (
-        shot.config.get_checkpoint_dir(),
-        SfmSettings(frames=7),
-    )
+    config.load_dir = shot.config.get_checkpoint_dir()
+    config.pipeline.datamanager.dataparser.sfm = SfmSettings(frames=7)
     config.set_timestamp()
     assert "--sfm.frames 7 is not used" in printed(capsys)
 
@@ -222,15 +215,10 @@ def test_a_run_that_goes_on_in_its_own_folder(shoot: Callable[..., Shot]) -> Non
     ns_train.main(config)
     assert sorted(path for path in (shot.run / POSES).rglob("*")) == kept
     assert checkpoint(config, STEPS + 1)["step"] == STEPS + 1
-
-
-def test_a_new_run_finds_its_own(shoot: Callable[..., Shot], monkeypatch: pytest.MonkeyPatch) -> None:
-    shot = shoot()
-    config = config_of(shot.run)
-    config.pipeline.datamanager.dataparser.poses = shot.run / POSES  # as that of a resumed run states
-    config.timestamp = "new"
-    with pytest.raises(pytest.fail.Exception, match="poses are found anew"):
-        ns_train.main(config)
+    gone = shot.photographs / "frame_00004.png"  # behind a link
+    gone.unlink()
+    with pytest.raises(InputError, match=f"trained with, 1 are missing \\({gone}\\), so"):
+        eval_setup(shot.run / "config.yml")
 
 
 def test_a_run_that_was_moved_and_a_capture_with_other_files_by_now(shoot: Callable[..., Shot], tmp_path: Path) -> None:
@@ -279,37 +267,28 @@ def test_photographs_that_changed_are_named_in_one_message(shoot: Callable[..., 
     eval_setup(shot.run / "config.yml", test_mode="inference")  # needs none
 
 
-def test_the_photograph_behind_a_link_is_named(shoot: Callable[..., Shot]) -> None:
-    shot = shoot(upright=True)
-    gone = shot.photographs / "frame_00004.png"
-    gone.unlink()
-    with pytest.raises(InputError, match=f"trained with, 1 are missing \\({gone}\\), so"):
-        eval_setup(shot.run / "config.yml")
+DAMAGED = ["", "[]", "{}", json.dumps({"origin": {"kind": "photographs"}, "left_out": {}}),
+           json.dumps({"origin": {"kind": "x", "path": ".", "photographs": None}, "left_out": {}})]  # fmt: skip
 
 
-def test_a_run_of_an_earlier_version_finds_them_as_before(
+def test_poses_that_are_damaged_are_named_and_new_and_earlier_runs_find_their_own(
     shoot: Callable[..., Shot], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shot = shoot()
-    for name in ("sparse", "origin.json"):
-        path = shot.run / POSES / name
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
-
-    def earlier(config: BitymiTrainerConfig) -> None:
-        vars(config.pipeline.datamanager.dataparser).pop("poses")
-
-    rewrite(shot.run, earlier)
+    origin = shot.run / POSES / "origin.json"
+    config = config_of(shot.run)
+    config.pipeline.datamanager.dataparser.poses = shot.run / POSES  # as that of a resumed run states
+    config.timestamp = "new"
+    with pytest.raises(pytest.fail.Exception, match="poses are found anew"):
+        ns_train.main(config)
+    for text in DAMAGED:
+        origin.write_text(text)
+        with pytest.raises(InputError, match=r"origin.json, which says .* cannot be read"):
+            eval_setup(shot.run / "config.yml")
+    shutil.rmtree(shot.run / POSES / "sparse")
+    origin.unlink()
+    rewrite(shot.run, lambda config: vars(config.pipeline.datamanager.dataparser).pop("poses"))  # an earlier version
     with pytest.raises(pytest.fail.Exception, match="poses are found anew"):
         eval_setup(shot.run / "config.yml")
     monkeypatch.setattr(bitymi_ns.capture, "find_poses", shot.find_poses)
     eval_setup(shot.run / "config.yml")
-
-
-@pytest.mark.parametrize("text", ["", "[]", "{}", json.dumps({"origin": {"kind": "photographs"}, "left_out": {}}),
-                                  json.dumps({"origin": {"kind": "x", "path": ".", "photographs": None},
-                                              "left_out": {}})])  # fmt: skip
-def test_poses_that_are_damaged_are_named(shoot: Callable[..., Shot], text: str) -> None:
-    shot = shoot()
-    (shot.run / POSES / "origin.json").write_text(text)
-    with pytest.raises(InputError, match=r"origin.json, which says .* cannot be read"):
-        eval_setup(shot.run / "config.yml")

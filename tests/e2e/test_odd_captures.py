@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from nerfstudio.scripts import train as ns_train
 from nerfstudio.scripts.eval import ComputePSNR
-from PIL import Image
 
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export.command import ExportAtlas
 from bitymi_ns.plugin.run import callbacks
 from bitymi_ns.plugin.run.callbacks import FILE
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
-from tests.plugin.data.captures import mixed_project
+from tests.plugin.data.captures import add_masks, mixed_project, write_cloud
 
 Start = Callable[..., BitymiTrainerConfig]
 
@@ -28,40 +27,12 @@ def capture(room: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(room, tmp_path / "spoilt"))
 
 
-def edit(capture: Path, change: Callable[[dict[str, Any]], Any]) -> None:
-    path = capture / "transforms.json"
-    meta = json.loads(path.read_text("utf8"))
-    change(meta)
-    path.write_text(json.dumps(meta), "utf8")
-
-
 def curve(config: BitymiTrainerConfig) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (config.get_base_dir() / FILE).read_text().splitlines()]
 
 
-def test_scaled_rotations_train_like_clean_ones(trained: BitymiTrainerConfig, start: Start, capture: Path) -> None:
-    def scale(meta: dict[str, Any]) -> None:
-        for frame in meta["frames"]:
-            pose = np.array(frame["transform_matrix"])
-            pose[:3, :3] *= 2.5
-            frame["transform_matrix"] = pose.tolist()
-
-    edit(capture, scale)
-    config = start(data=capture)
-    ns_train.main(config)
-    for scaled, clean in zip(curve(config), curve(trained), strict=True):
-        assert scaled["psnr"] == pytest.approx(clean["psnr"], abs=0.02)
-
-
 def test_no_quality_is_reported_over_no_pixels(start: Start, capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (capture / "masks").mkdir()
-
-    def mask(meta: dict[str, Any]) -> None:
-        for i, frame in enumerate(meta["frames"]):
-            frame["mask_path"] = f"masks/{i}.png"
-            Image.new("L", (48, 36), 0 if i in (0, 8) else 255).save(capture / frame["mask_path"])
-
-    edit(capture, mask)
+    add_masks(capture, lambda i: 0 if i in (0, 8) else 255)
     config = start(data=capture)
     config.steps_per_eval_image = config.steps_per_eval_all_images = 30
     config.vis = "tensorboard"
@@ -73,13 +44,7 @@ def test_no_quality_is_reported_over_no_pixels(start: Start, capture: Path, caps
 
 
 def test_points_that_no_view_sees(start: Start, capture: Path) -> None:
-    cloud = capture / "sparse_pc.ply"
-    ply = cloud.read_bytes()
-    body = ply.index(b"end_header\n") + len("end_header\n")
-    assert b"property float x" in ply[:body]
-    rows = np.frombuffer(ply[body:], np.uint8).reshape(200, -1).copy()
-    rows[:, :12].view(np.float32)[:] += 1000.0
-    cloud.write_bytes(ply[:body] + rows.tobytes())
+    write_cloud(capture / "sparse_pc.ply", np.random.default_rng(0).normal(1000.0, 1.0, (200, 3)))
     with pytest.raises(InputError, match="none of the 200 points .* lies in any training view.*in another frame"):
         ns_train.main(start(data=capture))
 
@@ -93,14 +58,6 @@ def test_a_view_that_sees_none_of_the_points(
     ns_train.main(config)
     output = " ".join(capsys.readouterr().out.split())
     assert f"{room}/images/frame_00003.png sees none of the points that training starts from" in output
-
-
-def test_photographs_that_show_nothing(start: Start, capture: Path) -> None:
-    for path in (capture / "images").iterdir():
-        if path.is_file():
-            Image.new("RGB", (48, 36), (9, 9, 9)).save(path)
-    with pytest.raises(InputError, match="nothing to learn from the 10 training photographs: of one color"):
-        ns_train.main(start(data=capture))
 
 
 def test_a_capture_of_several_cameras_trains_is_exported_and_evaluated(

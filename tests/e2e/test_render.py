@@ -50,12 +50,8 @@ def test_a_camera_path_is_that_of_the_bundle_and_of_its_run(
 
 def test_pictures_of_a_dataset(bundle: Path, tmp_path: Path) -> None:
     names = ["rgb", "rgba", "raw-depth"]
-    render.DatasetRender(
-        load_config=bundle / "config.yml",
-        output_path=tmp_path / "maps",
-        rendered_output_names=names,
-        image_format="png",
-    ).main()
+    options = dict(rendered_output_names=names, image_format="png")
+    render.DatasetRender(load_config=bundle / "config.yml", output_path=tmp_path / "maps", **options).main()
     files = sorted(path.relative_to(tmp_path / "maps" / "test") for path in (tmp_path / "maps").rglob("*.*"))
     assert len(files) == 6 and not [path for path in files if path.name.startswith(".")]
     rgb, rgba = (np.array(Image.open(tmp_path / "maps" / "test" / n / "frame_00001.png")) for n in names[:2])

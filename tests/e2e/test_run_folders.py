@@ -94,9 +94,7 @@ def test_a_folder_that_cannot_be_written(start: Start) -> None:
 def test_a_new_run_keeps_out_of_the_folder_of_an_earlier_one(trained: BitymiTrainerConfig, start: Start) -> None:
     config = start(name="run")
     config.output_dir = trained.output_dir
-    with pytest.raises(
-        InputError, match="holds a run already, its newest checkpoint is step-000000059.ckpt.*--load-dir"
-    ):
+    with pytest.raises(InputError, match="holds a run already, its newest checkpoint is step-0+59.ckpt.*--load-dir"):
         ns_train.main(config)
     assert len(list(trained.get_checkpoint_dir().glob("*.ckpt"))) == 3
 

@@ -14,20 +14,12 @@ from typing import Any
 from bitymi_ns import files
 
 KILLED = 77
+EVENTS = ("mkdir", "rename", "remove", "rmdir", "truncate", "listdir", "scandir")
 
 
 def accesses(folder: Path, event: str, arguments: tuple[Any, ...]) -> bool:
     """Whether Python is about to touch something in the folder, by the events that it audits."""
-    if event not in (
-        "open",
-        "os.mkdir",
-        "os.rename",
-        "os.remove",
-        "os.rmdir",
-        "os.truncate",
-        "os.listdir",
-        "os.scandir",
-    ):
+    if event != "open" and event not in {f"os.{name}" for name in EVENTS}:
         return False
     inside = any(isinstance(path, (str, Path)) and str(path).startswith(str(folder)) for path in arguments[:2])
     relative = event in ("os.remove", "os.rmdir", "open") and len(arguments) > 1 and "/" not in str(arguments[0])

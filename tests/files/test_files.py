@@ -101,17 +101,14 @@ def test_a_file_system_without_locks_costs_a_warning(tmp_path: Path, monkeypatch
 
 
 def test_parents_that_were_made_for_nothing_go_again(tmp_path: Path) -> None:
+    files.check_writable(Path("/dev/null"))
+    files.write_file(Path("/dev/null"), b"x")
+    assert not Path("/dev/null").is_file()  # a device is written to as it is
     files.check_writable(tmp_path / "a" / "b" / "c")
     assert names(tmp_path) == []
     with files.complete_folder(tmp_path / "a" / "b" / "c"):
         pass
     assert names(tmp_path / "a" / "b") == ["c"]
-
-
-def test_devices_are_written_to_as_they_are() -> None:
-    files.check_writable(Path("/dev/null"))
-    files.write_file(Path("/dev/null"), b"x")
-    assert not Path("/dev/null").is_file()
 
 
 def below_a_file(folder: Path) -> Path:

@@ -36,15 +36,17 @@ def test_harmonics_that_stay_positive_are_found_again(surfels) -> None:
     found = fit_colors(baked(params, "sh"), None, *NOBODY).harmonics
     assert torch.allclose(found[:, 0], params["sh_dc"], atol=1e-5)
     assert torch.allclose(found[:, 1:], params["sh_rest"], atol=1e-5)
+    terms = torch.randn(7, 6)
+    rows = rows_of({"means": torch.arange(6.0).view(2, 3), "view_terms": terms}, torch.tensor([1]))
+    assert rows["view_terms"] is terms and rows["means"].tolist() == [[3.0, 4.0, 5.0]]
 
 
 @pytest.mark.parametrize("residual", [None, -0.2])
 def test_the_fit_follows_the_colour_where_cameras_look_from(surfels, residual: float | None) -> None:
     """Voronoi colours, with what both ReLUs cut off."""
     params, g = surfels(40, "sv"), torch.Generator().manual_seed(0)
-    centers = params["means"].mean(0).double() + 9 * torch.nn.functional.normalize(
-        torch.tensor([0.0, 0.0, 1.0]) + 0.2 * torch.randn(6, 3, generator=g), dim=1
-    )
+    away = torch.tensor([0.0, 0.0, 1.0]) + 0.2 * torch.randn(6, 3, generator=g)
+    centers = params["means"].mean(0).double() + 9 * torch.nn.functional.normalize(away, dim=1)
     seen = torch.ones(6, 40, dtype=torch.bool)
     added = None if residual is None else torch.full((40, 3), residual)
     fitted = fit_colors(baked(params, "sv"), added, seen, centers.double())
@@ -72,10 +74,3 @@ def test_the_residual_is_the_mean_over_the_disc(bundle: Bundle) -> None:
     assert torch.equal(weighted_residuals(scene), scene.mean_residual)
     scene.mean_residual = None
     assert weighted_residuals(scene) is None
-
-
-def test_rows_of_lean_colours_keep_their_terms() -> None:
-    terms = torch.randn(7, 6)
-    params = {"means": torch.arange(6.0).view(2, 3), "view_terms": terms}
-    rows = rows_of(params, torch.tensor([1]))
-    assert rows["view_terms"] is terms and rows["means"].tolist() == [[3.0, 4.0, 5.0]]

@@ -38,10 +38,8 @@ def cloud(capture: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_files(capture: Path, meta: dict, images: np.ndarray, cloud: tuple[np.ndarray, np.ndarray]) -> None:
-    assert [frame["file_path"] for frame in meta["frames"]][::11] == [
-        "images/frame_00001.png",
-        "images/frame_00012.png",
-    ]
+    names = [frame["file_path"] for frame in meta["frames"]]
+    assert names[::11] == ["images/frame_00001.png", "images/frame_00012.png"]
     assert images.shape == (VIEWS, HEIGHT, WIDTH, 3)
     assert (meta["w"], meta["h"]) == (WIDTH, HEIGHT)
     assert cloud[0].shape == (3000, 3)
@@ -97,6 +95,8 @@ def test_cameras_stand_in_the_room_upright_and_clear(meta: dict) -> None:
         assert np.linalg.det(matrix[:3, :3]) > 0
         assert (matrix[:3, 3] > LOW + 0.1).all() and (matrix[:3, 3] < HIGH - 0.1).all()
         assert matrix[2, 1] > 0.5, "up in the picture is up in the room"
+    turned = look_at(np.array([0.0, -2.0, 0.0]), np.zeros(3))[:3, :3]
+    assert np.allclose(turned, [[1, 0, 0], [0, 0, -1], [0, 1, 0]])
     room = Room(0)
     for view in camera_path(60, 64, 48, 0):
         _, hits = first_hits(room, view, np.arange(64 * 48))
@@ -180,17 +180,14 @@ def test_bad_sizes(tmp_path: Path, bad: dict) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_failure_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_stops_soon_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full_disk(*args: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("bitymi_ns.sample.capture.write_ply", full_disk)
-    with pytest.raises(OSError, match="No space"):
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
+        patch.setattr("bitymi_ns.sample.capture.write_ply", full_disk)
         generate(tmp_path / "room", views=1, width=16, height=12)
     assert not list(tmp_path.iterdir())
-
-
-def test_interrupted_stops_soon_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
 
     def interrupted(*args: object) -> None:
@@ -202,8 +199,3 @@ def test_interrupted_stops_soon_and_leaves_nothing(tmp_path: Path, monkeypatch: 
         generate(tmp_path / "room", views=1000, width=16, height=12)
     assert len(calls) < 1000
     assert not list(tmp_path.iterdir())
-
-
-def test_look_at() -> None:
-    matrix = look_at(np.array([0.0, -2.0, 0.0]), np.zeros(3))
-    assert np.allclose(matrix[:3, :3], [[1, 0, 0], [0, 0, -1], [0, 1, 0]])

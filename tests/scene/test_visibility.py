@@ -28,13 +28,18 @@ def test_what_stands_in_front_is_counted(surfels, camera):
     assert visibility(params, [], 0.2).transmittance.tolist() == [0.0] * 4
 
 
-def test_pixels_of_the_view_that_shows_most(surfels, camera):
+def two_hard_discs(surfels, second: list[float]) -> dict[str, torch.Tensor]:
+    """One at the origin, and another one, facing the camera."""
     params = surfels(2)
-    params["means"] = torch.tensor([[0.0, 0.0, 0.0], [90.0, 0.0, 0.0]])
+    params["means"] = torch.tensor([[0.0, 0.0, 0.0], second])
     params["quats"] = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(2, 4).clone()
-    params["log_scales"] = torch.full((2, 2), -1.5)
+    params["log_scales"], params["beta_raw"] = torch.full((2, 2), -1.5), torch.full((2,), -9.0)
     params["opacity_logits"] = torch.tensor([0.0, 3.0])
-    params["beta_raw"] = torch.full((2,), -9.0)  # hard discs
+    return params
+
+
+def test_pixels_of_the_view_that_shows_most(surfels, camera):
+    params = two_hard_discs(surfels, [90.0, 0.0, 0.0])
     near, far = (float(visibility(params, [camera(d)], 0.2).pixels[0]) for d in (4.0, 8.0))
     assert near == pytest.approx(4 * far, rel=0.2) and far > 5
     both = visibility(params, [camera(8.0), camera(4.0)], 0.2, weight_bound=0.4).pixels
@@ -43,12 +48,7 @@ def test_pixels_of_the_view_that_shows_most(surfels, camera):
 
 
 def test_a_pixel_is_shared_among_its_layers_by_weight(surfels, camera):
-    params = surfels(2)
-    params["means"] = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.5]])
-    params["quats"] = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(2, 4).clone()
-    params["log_scales"] = torch.full((2, 2), -1.5)
-    params["opacity_logits"] = torch.tensor([0.0, 3.0])
-    params["beta_raw"] = torch.full((2,), -9.0)  # hard discs
+    params = two_hard_discs(surfels, [0.0, 0.0, 0.5])
     view = camera(6.0)
     drawn = project(*(params[n] for n in ("means", "quats", "log_scales", "opacity_logits", "beta_raw")), view, 0.2)
     fragments = trace(drawn)

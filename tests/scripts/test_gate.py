@@ -58,13 +58,7 @@ def test_equal_and_better_pass(gate: ModuleType, monkeypatch: pytest.MonkeyPatch
     ],
 )
 def test_each_limit(
-    gate: ModuleType,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    figure: str,
-    passes: float,
-    fails: float,
-    capsys: Any,
+    gate: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, figure: str, passes: Any, fails: Any, capsys: Any
 ) -> None:
     baseline = tmp_path / "gate.json"
     run(gate, monkeypatch, baseline, {}, accept=True)
@@ -89,14 +83,6 @@ def test_times_are_taken_again_and_not_judged_elsewhere(
         run(gate, monkeypatch, baseline, {"psnr_trained": 19.89})
     with pytest.raises(SystemExit, match="1 of 9"):
         run(gate, monkeypatch, baseline, {"surfels": 200.0})
-
-
-def test_a_baseline_of_another_job_is_refused(
-    gate: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    baseline = tmp_path / "gate.json"
-    run(gate, monkeypatch, baseline, {}, accept=True)
-    stated = json.loads(baseline.read_text())
     stated["settings"]["steps"] += 1
     baseline.write_text(json.dumps(stated))
     with pytest.raises(SystemExit, match="the baseline is of"):

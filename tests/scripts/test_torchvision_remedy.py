@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -71,47 +72,26 @@ def test_acts_only_on_the_mismatch(
         assert remedy.SYMPTOM in result.stderr
 
 
-def test_writes_nothing_when_all_is_well(
-    tmp_path: Path, remedy: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(remedy, "shim_files", lambda: (tmp_path / "shim.py", tmp_path / "shim.pth"))
-    monkeypatch.setattr(remedy, "import_error", lambda: "")
-    monkeypatch.setattr(sys, "argv", ["remedy"])
-    monkeypatch.setattr(sys, "base_prefix", "elsewhere")
-    assert remedy.main() == 0
-    assert "nothing to do" in capsys.readouterr().out
-    assert not list(tmp_path.iterdir())
+NMS = "RuntimeError: operator torchvision::nms does not exist"
 
 
 @pytest.mark.parametrize(
-    ("errors", "status", "left"),
-    [
-        (["RuntimeError: operator torchvision::nms does not exist", ""], 0, 2),
-        (["RuntimeError: operator torchvision::nms does not exist", "still broken"], 1, 0),
-        (["ImportError: something else"], 1, 0),
-    ],
+    ("words", "errors", "status", "left"),
+    [([], [""], 0, 0), ([], [NMS, ""], 0, 2), ([], [NMS, "still broken"], 1, 0)]
+    + [([], ["ImportError: something else"], 1, 0), (["--remove"], [], 0, 0)],
 )
-def test_writes_when_needed_and_takes_back_when_useless(
-    tmp_path: Path, remedy: ModuleType, monkeypatch: pytest.MonkeyPatch, errors: list[str], status: int, left: int
+def test_files_are_written_when_needed_and_taken_back(
+    tmp_path: Path, remedy: ModuleType, monkeypatch: pytest.MonkeyPatch, words: Any, errors: Any, status: int, left: int
 ) -> None:
-    answers = iter(errors)
-    monkeypatch.setattr(remedy, "shim_files", lambda: (tmp_path / "shim.py", tmp_path / "shim.pth"))
+    answers, files = iter(errors), (tmp_path / "shim.py", tmp_path / "shim.pth")
+    for path in files if words else ():
+        path.write_text("")
+    monkeypatch.setattr(remedy, "shim_files", lambda: files)
     monkeypatch.setattr(remedy, "import_error", lambda: next(answers))
-    monkeypatch.setattr(sys, "argv", ["remedy"])
+    monkeypatch.setattr(sys, "argv", ["remedy", *words])
     monkeypatch.setattr(sys, "base_prefix", "elsewhere")
     assert remedy.main() == status
     assert len(list(tmp_path.iterdir())) == left
-
-
-def test_remove(tmp_path: Path, remedy: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    files = (tmp_path / "shim.py", tmp_path / "shim.pth")
-    for path in files:
-        path.write_text("")
-    monkeypatch.setattr(remedy, "shim_files", lambda: files)
-    monkeypatch.setattr(sys, "argv", ["remedy", "--remove"])
-    monkeypatch.setattr(sys, "base_prefix", "elsewhere")
-    assert remedy.main() == 0
-    assert not list(tmp_path.iterdir())
 
 
 def test_refuses_outside_a_virtual_environment(remedy: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:

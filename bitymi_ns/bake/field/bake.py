@@ -46,9 +46,7 @@ def bake(
     without a field has no atlas. There is none, either, where all tiles are constant within the tolerance.
 
     Args:
-        scene: a trained scene.
         cameras: training views, for the cap on tile sizes and for what they see; with none nothing is left out for it.
-        options: see `BakeOptions`.
         progress: called after every chunk of work.
         pixels_per_texel: for a bake that is polished next: a tile gets at most a texel for so many pixels that its
             surfel makes up of the view that shows most of it, and is not encoded; view colours stay whole. `reduced`
@@ -116,13 +114,7 @@ def _textured(
     pixels_per_texel: float | None,
     progress: Progress,
 ) -> tuple[Tiles, EncodedAtlas | None, Statistics]:
-    """Tiles of a scene with a field, the atlas where any surfel needs a tile, and the statistics of both.
-
-    Args:
-        paper: texels by the paper's rule.
-        statistics: with the numbers of surfels.
-        pixels_per_texel: as in `bake`.
-    """
+    """Tiles of a scene with a field, the atlas where any surfel needs one, and the statistics of both."""
     if pixels_per_texel is not None:
         at = (inputs.cameras, inputs.transmittance, inputs.near, inputs.weight_bound)
         plan, levels = make_plan(inputs.surfels, field, options, *at), None

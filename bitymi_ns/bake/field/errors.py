@@ -52,13 +52,11 @@ def tile_errors(
     """Compare stored tiles with the field on the grids of the plan.
 
     Args:
-        field: the residual field.
         plan: what the tiles have to hold; its extents must be those of the tiles.
         tiles: [N, 5] int32.
         mean_residual: [N, 3] the residual of the surfels without a tile.
         residuals: [layers, height, width, 3] the atlas as a renderer reads it, None without tiles.
         chunk: points evaluated at once.
-        progress: called with the number of tiles done.
     """
     rms, largest, seen = (torch.zeros(len(plan)) for _ in range(3))
     rectangles = torch.as_tensor(tiles)

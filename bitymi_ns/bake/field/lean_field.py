@@ -33,7 +33,6 @@ def level_changes(
     weight stays below `weight_bound` get no residual and are not counted.
 
     Args:
-        field: the residual field.
         surfels: per-surfel parameters, N rows.
         left_out: sets of levels.
         transmittance: [N] of `Visibility`, None = 1.
@@ -68,11 +67,7 @@ def level_changes(
 
 
 def lean_field(
-    field: HashField,
-    surfels: Mapping[str, Tensor],
-    transmittance: Tensor | None,
-    weight_bound: float,
-    tolerance: float,
+    field: HashField, surfels: Mapping[str, Tensor], transmittance: Tensor | None, weight_bound: float, tolerance: float
 ) -> tuple[HashField, FieldLevels]:
     """Remove the finest and coarsest levels of a field, as far as no surfel needs them.
 
@@ -81,7 +76,6 @@ def lean_field(
     the tolerance.
 
     Args:
-        field: the residual field.
         surfels: per-surfel parameters, N rows.
         transmittance: [N] of `Visibility`, None = 1.
         weight_bound: fragments of smaller weight get no residual.

@@ -142,10 +142,8 @@ def polish_scene(
         baked: a bake with texels and all of its view colours, made with `pixels_per_texel`.
         views: training views, with the corrections that training found; every `val_every`-th is for validation.
         background: [3] colour behind the scene, but for steps on views behind which it changes (`train.background`).
-        options: see `PolishOptions`.
         train: options of the training, for the learning rates, the colours behind the scene, and for what is done when
             a step is not finite.
-        progress: called after every step.
         eval_views: views of which the gain is stated; they decide nothing.
         device: where the scene learns.
 
@@ -173,8 +171,7 @@ def polish_scene(
     run.scene.load_state_dict(stopping.best)
     spent = time.perf_counter() - started, time.process_time() - cpu_started
     statistics = stopping.statistics(len(trained), len(validation), *spent).but(
-        error_before=baked.statistics.error,
-        psnr_held_out=gain(before, run.psnr(eval_views)) if eval_views else None,
+        error_before=baked.statistics.error, psnr_held_out=gain(before, run.psnr(eval_views)) if eval_views else None
     )
     texels = run.field.texels.detach()
     result = run.texels.baked(texels).with_surfels(dict(run.scene.surfels))

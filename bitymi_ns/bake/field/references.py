@@ -19,7 +19,6 @@ def references(field: Field, plan: Plan, chunk: int = 1 << 18) -> Iterator[TileV
     nearest point of the disc, so values stay smooth and within the range of what is seen.
 
     Args:
-        field: the residual field.
         plan: N tiles; those of extent 0 are left out.
         chunk: probes evaluated at once (a tile is never split).
     """

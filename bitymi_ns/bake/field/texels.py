@@ -55,7 +55,6 @@ def evaluate_tiles(
         packing: where the tiles lie, N rows.
         extent: half side of a tile in scale units.
         chunk: texels evaluated at once (a tile is never split).
-        progress: called with the number of texels done.
 
     Returns:
         texels: [layers, height, width, 3] float32 on the CPU; 0 (no residual) outside the tiles and where the field

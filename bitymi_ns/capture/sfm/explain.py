@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from bitymi_ns.capture.panorama import SPHERICAL_MODEL
+from bitymi_ns.capture.panorama_detection import SPHERICAL_MODEL
 from bitymi_ns.capture.sfm.job import CameraGroup, Job, NoPoses
 
 FEW_FEATURES = 60  # a photograph with fewer features shows hardly any detail
@@ -174,12 +174,8 @@ def _rays(group: CameraGroup, points: np.ndarray, guess: float) -> tuple[np.ndar
 
 
 def _turn_errors(a: np.ndarray, b: np.ndarray, focal: float) -> np.ndarray:
-    """Distances [n] in pixels between points and those that the best turn takes to them.
-
-    Args:
-        a, b: [n,3] unit rays.
-        focal: pixels per radian.
-    """
+    """Distances [n] in pixels between points and those that the best turn takes to them, of unit rays a, b [n, 3];
+    `focal` in pixels per radian."""
     keep = np.ones(len(a), bool)
     for _ in range(3):  # least squares, then without the worst half, in which the wrong matches are
         u, _, vt = np.linalg.svd(b[keep].T @ a[keep])

@@ -22,7 +22,6 @@ def reconstruct(job: Job, database: Path, connected: int, tell: StageProgress) -
     """The best model of the photographs, or None where there is none.
 
     Args:
-        job: what is to be done.
         database: features and verified matches.
         connected: size of the largest set of photographs that hang together by verified pairs.
         tell: told the stage.

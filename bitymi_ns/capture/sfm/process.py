@@ -25,7 +25,6 @@ def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:
     """Run a job to its end.
 
     Args:
-        job: what is to be done.
         source: the photographs or the video, for messages.
         progress: told the stage and how far it is.
 

@@ -20,7 +20,6 @@ def refined(model: pycolmap.Reconstruction, job: Job, pixel: float) -> pycolmap.
 
     Args:
         model: a mapper's result; changed in place.
-        job: what is to be done.
         pixel: side of a pixel of the images on which features were found, in pixels of the photographs.
     """
     _filter(model, pixel)

@@ -1,8 +1,5 @@
-"""Store finished cells: one JSON object per line, appended when a cell is done.
-
-A line has `key` (every setting that decides the result), `value` (the figures; paths are relative to the work folder)
-and `made` (time, machine, versions, command).
-"""
+"""Store finished cells: JSON lines of `key` (every setting that decides the result), `value` (the figures; paths are
+relative to the work folder) and `made` (time, machine, versions, command)."""
 
 import datetime
 import fcntl

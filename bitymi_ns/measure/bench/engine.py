@@ -1,8 +1,5 @@
-"""Run the cells of a matrix that are not finished: command lines, results, locks, progress.
-
-Several processes may work on the same folder, each on another GPU or machine: a run that another process holds is left
-to it.
-"""
+"""Run the cells of a matrix that are not finished. Processes may share a folder, each on another GPU or machine: a run
+that another process holds is left to it."""
 
 import shutil
 import statistics
@@ -146,10 +143,7 @@ def _evaluation(at: Layout, stage: Stage) -> dict[str, Any]:
 
 def _pictures(at: Layout, stage: Stage) -> dict[str, Any]:
     folder = at.path("pictures")
-    return {
-        "folder": at.relative(folder),
-        "views": len(json_of((folder / "pictures.json").read_text("utf8"))["views"]),
-    }
+    return {"folder": at.relative(folder), "views": len(json_of((folder / "pictures.json").read_text("utf8"))["views"])}
 
 
 def read_curve(path: Path) -> list[dict[str, Any]]:

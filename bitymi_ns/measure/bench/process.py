@@ -31,7 +31,6 @@ def run_measured(command: Sequence[str], log: Path, lock: Lock | None = None) ->
     OpenMP threads wait without spinning, so that CPU seconds count work.
 
     Args:
-        command: the command line.
         log: file for its output.
         lock: inherited by the command and naming it: when this process is killed while the command goes on, the lock
             outlives it.

@@ -1,9 +1,5 @@
-"""Embed pictures in a report: held-out views (photograph, render, error), worst views, cameras of found poses.
-
-`ns-eval --render-output-path FOLDER` writes one image per held-out view, the photograph beside the render. The views
-with the lowest, the median and the highest PSNR are shown. Folders of the same photographs (of a trained scene and of
-its bundle) are compared view by view.
-"""
+"""Embed pictures in a report: the best, median and worst held-out views that `ns-eval --render-output-path` wrote
+(photograph, render, error; side by side where folders show the same photographs), and cameras of found poses."""
 
 import hashlib
 import io

@@ -4,11 +4,14 @@ are searched for these."""
 import json
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from bitymi_ns.measure.bench.cells import FILE as CELLS
+from bitymi_ns.measure.bench.cells import NAMES, Cells
+from bitymi_ns.measure.bench.process import BenchError
 from bitymi_ns.measure.report.records import (
     Curve,
     Evaluation,
@@ -19,18 +22,16 @@ from bitymi_ns.measure.report.records import (
     finite_numbers,
     link,
 )
+from bitymi_ns.trust import json_of
 
-CELLS, PICTURES = "cells.jsonl", "pictures.json"
-MAX_JSON_BYTES = 4 << 20  # larger JSON files are no evaluation
-MAX_JSONL_BYTES = 64 << 20
+PICTURES = "pictures.json"
+MAX_BYTES = 64 << 20  # larger files are no evaluation
 MAX_DEPTH = 8  # folders are searched this many levels down
-MAX_ENTRIES = 50_000  # a search stops after this many files
 SIDE_BY_SIDE = re.compile(r"^eval_img_(?P<index>\d{4,})$", re.IGNORECASE)
 """Stem of a photograph beside its render, as `ns-eval --render-output-path` writes it."""
 
 _SKIPPED = {"__pycache__", "node_modules", "wandb", "nerfstudio_models"}
-_LABELS = ("suite", "row")
-_NOT_OF_A_RUN = ("cell", "bundle", "export", "views", *_LABELS)
+_NOT_OF_A_RUN = ("cell", "bundle", "export", "views", *NAMES)
 _POSES = {"source", "registered", "given", "reprojection_error", "track_length", "left_out", "seconds"}
 _SHOWN = (
     ("psnr", 2, "dB"),
@@ -49,28 +50,23 @@ def parse_json(text: str, where: str) -> Any:
     """Parse JSON (NaN and Infinity tokens allowed).
 
     Raises:
-        ReportError: with the file, line, column and reason.
+        ReportError: with the file and reason.
     """
     try:
-        return json.loads(text)
-    except json.JSONDecodeError as error:
-        reason = "it is empty" if not text.strip() else f"{error.msg} at line {error.lineno}, column {error.colno}"
-    except RecursionError:
-        reason = "it is nested too deeply"
-    except ValueError as error:  # an integer with thousands of digits
-        reason = str(error)
-    raise ReportError(f"{where} is not valid JSON: {reason}. Write it again, or leave it out.") from None
+        return json_of(text)
+    except ValueError as error:
+        raise ReportError(f"{where} is not valid JSON: {error}. Write it again, or leave it out.") from None
 
 
-def read_text(path: Path, limit: int) -> str:
-    """Read a file of at most `limit` bytes.
+def read_text(path: Path) -> str:
+    """Read a file.
 
     Raises:
-        ReportError: it is larger, no text, or cannot be read.
+        ReportError: it is too large, no text, or cannot be read.
     """
     try:
         size = path.stat().st_size
-        if size > limit:
+        if size > MAX_BYTES:
             raise ReportError(f"{path} is too large ({size:,} bytes) for an evaluation or a training curve.")
         return path.read_text("utf8")
     except UnicodeDecodeError:
@@ -79,19 +75,19 @@ def read_text(path: Path, limit: int) -> str:
         raise ReportError(f"{path} cannot be read: {error.strerror or error}.") from None
 
 
-def read_lines(path: Path) -> tuple[list[tuple[int, Any]], list[str]]:
-    """Read the values of a JSONL file with their line numbers, and notes.
+def read_lines(path: Path) -> tuple[list[Any], list[str]]:
+    """Read the values of a JSONL file, and notes.
 
     A truncated last line (of a run that was killed while it wrote) is left out with a note.
 
     Raises:
         ReportError: an earlier line is broken.
     """
-    numbered = [(i, s) for i, s in enumerate(read_text(path, MAX_JSONL_BYTES).splitlines(), 1) if s.strip()]
+    numbered = [(i, s) for i, s in enumerate(read_text(path).splitlines(), 1) if s.strip()]
     values, notes = [], []
     for position, (number, line) in enumerate(numbered):
         try:
-            values.append((number, parse_json(line, f"{path}, line {number},")))
+            values.append(parse_json(line, f"{path}, line {number},"))
         except ReportError:
             if position + 1 < len(numbered) or position == 0:
                 raise
@@ -107,15 +103,9 @@ def is_evaluation(data: Any) -> bool:
     return isinstance(data, dict) and isinstance(data.get("results"), dict)
 
 
-def is_cell(data: Any) -> bool:
-    """True for a line of a benchmark's cells."""
-    return isinstance(data, dict) and isinstance(data.get("key"), dict) and isinstance(data.get("value"), dict)
-
-
 def read_jsonl(path: Path) -> tuple[list[Evaluation], list[Curve], list[str]]:
     """Read the evaluations, the curve and notes of a JSONL file; all empty when it holds something else."""
-    numbered, notes = read_lines(path)
-    values = [value for _, value in numbered]
+    values, notes = read_lines(path)
     evaluations = [evaluation_from(value, path) for value in values if is_evaluation(value)]
     points = [v for v in values if isinstance(v, dict) and "step" in finite_numbers(v) and not is_evaluation(v)]
     return evaluations, [curve_from(points, path)] if points else [], notes
@@ -127,7 +117,7 @@ def read_pictures(path: Path, run: str = "") -> dict[str, list[tuple[str, Path]]
     Raises:
         ReportError: it is no valid JSON, or lists its views in another form.
     """
-    data = parse_json(read_text(path, MAX_JSON_BYTES), str(path))
+    data = parse_json(read_text(path), str(path))
     if not isinstance(data, dict) or "bitymi_pictures" not in data:
         return {}
     scene, method = str(data.get("scene") or "unnamed scene"), run or str(data.get("method") or "")
@@ -181,23 +171,17 @@ class _Run:
             self.pictures = str(value["folder"])
 
 
-def read_cells(numbered: Sequence[tuple[int, Any]], path: Path, records: Records) -> None:
+def add_cells(cells: Iterable[dict[str, Any]], path: Path, records: Records) -> None:
     """Add the cells of a benchmark, and the curves and pictures that they name, where these are there.
 
-    Of lines with equal keys the last counts.
+    Args:
+        cells: of the file `path`.
 
     Raises:
-        ReportError: a line is no cell, or lacks what its kind must have; the message has its number.
+        ReportError: one lacks what its kind must have.
     """
-    latest: dict[str, tuple[int, dict[str, Any]]] = {}
-    for number, value in numbered:
-        if not is_cell(value):
-            raise ReportError(f"{path}, line {number}, is not a cell of a benchmark: it has no key and value objects.")
-        name = _identity(value["key"], *_LABELS)
-        latest.pop(name, None)
-        latest[name] = (number, value)
     runs: dict[str, _Run] = {}
-    for number, cell in latest.values():
+    for cell in cells:
         run = _Run(cell["key"])
         run = runs.setdefault(run.id, run)
         made = cell.get("made")
@@ -207,7 +191,7 @@ def read_cells(numbered: Sequence[tuple[int, Any]], path: Path, records: Records
         try:
             run.add(cell["key"], cell["value"])
         except (KeyError, TypeError, AttributeError) as error:
-            raise ReportError(f"{path}, line {number}: the {cell['key'].get('cell')} cell lacks {error}.") from error
+            raise ReportError(f"{path}: the {cell['key'].get('cell')} cell of {run.name} lacks {error}.") from error
     lengths: dict[tuple, list[_Run]] = {}
     for run in runs.values():
         lengths.setdefault((run.scene, run.name, run.seed), []).append(run)
@@ -248,12 +232,9 @@ def _add_run(run: _Run, several_seeds: bool, path: Path, records: Records) -> No
 # files and folders
 
 
-def _walk(folder: Path, skip: Path, notes: list[str]) -> Iterator[Path]:
-    """Files below `folder`, sorted, without hidden folders, links to folders, and `skip` when it lies below.
-
-    Of a benchmark's work folder only its cells: they name everything else that counts.
-    """
-    seen = 0
+def _walk(folder: Path, skip: Path) -> Iterator[Path]:
+    """Files below `folder`, sorted, without hidden folders, links to folders, and `skip` when it lies below; of a
+    benchmark's work folder only its cells, which name everything else that counts."""
     for root, folders, files in os.walk(folder):
         here = Path(root)
         if CELLS in files:
@@ -266,12 +247,7 @@ def _walk(folder: Path, skip: Path, notes: list[str]) -> Iterator[Path]:
             for name in folders
             if depth < MAX_DEPTH and not name.startswith(".") and name not in _SKIPPED and here / name != skip
         )
-        for name in sorted(files):
-            seen += 1
-            if seen > MAX_ENTRIES:
-                notes.append(f"{folder}: only the first {MAX_ENTRIES:,} files were searched; name a smaller folder.")
-                return
-            yield here / name
+        yield from (here / name for name in sorted(files))
 
 
 def _read(path: Path, records: Records) -> bool:
@@ -282,16 +258,18 @@ def _read(path: Path, records: Records) -> bool:
     elif path.name == PICTURES:
         records.worst |= read_pictures(path)
     elif path.suffix.lower() == ".jsonl":
-        numbered, notes = read_lines(path)
-        records.notes += notes
-        if path.name == CELLS or any(is_cell(value) for _, value in numbered):
-            read_cells(numbered, path, records)
-            return bool(numbered)
-        evaluations, curves, _ = read_jsonl(path)
-        records.evaluations += evaluations
-        records.curves += curves
+        if path.name == CELLS:
+            try:
+                add_cells(Cells(path), path, records)
+            except BenchError as error:
+                raise ReportError(str(error)) from error
+        else:
+            evaluations, curves, notes = read_jsonl(path)
+            records.evaluations += evaluations
+            records.curves += curves
+            records.notes += notes
     else:
-        data = parse_json(read_text(path, MAX_JSON_BYTES), str(path))
+        data = parse_json(read_text(path), str(path))
         if isinstance(data, dict) and data.keys() >= _POSES:
             records.poses[path] = data
         elif is_evaluation(data):
@@ -324,7 +302,7 @@ def collect(inputs: list[Path], output_dir: Path) -> Records:
                 )
             seen.add(path.resolve())
             continue
-        for file in _walk(path.resolve(), output_dir.resolve(), records.notes):
+        for file in _walk(path.resolve(), output_dir.resolve()):
             wanted = file.suffix.lower() in (".json", ".jsonl")
             wanted = wanted or (file.suffix.lower() == ".png" and SIDE_BY_SIDE.match(file.stem))
             if not wanted or file.resolve() in seen:

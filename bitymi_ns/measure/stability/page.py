@@ -144,7 +144,6 @@ def write(path: Path, backend: Backend = BACKENDS["cpu"], progress: Callable[[st
     Args:
         path: of the Markdown file.
         backend: kernels to measure.
-        progress: callback with the name of each scene.
 
     Returns:
         The rows of the cases and the sweeps.

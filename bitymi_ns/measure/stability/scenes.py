@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bitymi_ns.ops import VIEW_COLORS, Prefilter, TexelTiles
 from bitymi_ns.ops.constants import SUPPORT
-from bitymi_ns.scene.scene import GEOMETRY
+from bitymi_ns.ops.project import GEOMETRY
 
 SURFEL_KEYS = GEOMETRY
 SV_KEYS = VIEW_COLORS["sv"].names

@@ -243,7 +243,6 @@ class SceneOnDevice:
         """Draws a view.
 
         Args:
-            camera: the view.
             show: of `SHOW`.
             layers: batches, at most `MOST_LAYERS`.
             photo_pixel: side of a photograph's pixel in pixels of the view.

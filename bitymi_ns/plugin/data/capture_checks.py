@@ -2,7 +2,7 @@
 
 import math
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import MISSING, fields
 from pathlib import Path
@@ -26,11 +26,11 @@ from bitymi_ns.plugin.data.colmap_model import read_model
 from bitymi_ns.plugin.data.colmap_views import mask_files
 from bitymi_ns.plugin.data.dataparser import SCANNED, BitymiDataParserConfig
 from bitymi_ns.plugin.data.images import MAX_PIXELS, check_sizes
+from bitymi_ns.plugin.data.names import check_photographs_exist
 from bitymi_ns.plugin.data.point_files import ply_fault, point_count
 from bitymi_ns.plugin.data.pose_checks import check_spread
 from bitymi_ns.plugin.data.scanner_views import scanner_photographs
 from bitymi_ns.plugin.data.transforms import HOW_TO_GET_ONE
-from bitymi_ns.plugin.data.transforms_views import check_photographs_exist
 from bitymi_ns.plugin.run.commands import folder_being_evaluated, how_to_say_where
 from bitymi_ns.trust import json_of
 
@@ -125,13 +125,15 @@ def _check_found(dataparser: BitymiDataParserConfig, found: Found, need_photos: 
         source = dataparser.source(found, need_photos)
         model = read_model(source.folder)
         if need_photos:
-            check_images(source.files(model))
+            files = source.files(model)
+            check_photographs_exist(found.path, files)
+            check_sizes(files)
             mask_files(source, model)
         return len(model.xyz) if own else 0
     read = dataparser.transforms(found, "transforms_train.json", need_photos, verbose=False)
     if need_photos:
-        check_photographs_exist(read.path, read.photographs)
-        check_sizes([photograph.file for photograph in read.photographs])
+        check_photographs_exist(read.path, read.files)
+        check_sizes(read.files)
     if dataparser.auto_scale_poses and found.format == "nerfstudio":
         check_spread(np.array([photograph.pose[:3, 3] for photograph in read.photographs]), str(read.path))
     if found.format == "blender":
@@ -147,20 +149,6 @@ def _check_found(dataparser: BitymiDataParserConfig, found: Found, need_photos: 
     if fault is not None:
         fail(f"the point cloud {file} {fault}. Put it there again, or {hint} to start from random points.")
     return point_count(file)
-
-
-def check_images(paths: Sequence[Path]) -> None:
-    """Fail where images that the capture has poses for are missing, or larger than plausible."""
-    names = list(dict.fromkeys(paths))
-    missing = [path for path in names if not path.is_file()]
-    if not missing:
-        check_sizes(names)
-        return
-    some = "\n  ".join(f"{path}{' (a link to nothing)' if path.is_symlink() else ''}" for path in missing[:3])
-    fail(
-        f"{len(missing)} of {len(names)} images of the capture are missing:\n  {some}\n"
-        "Poses without images cannot be used: copy the images there, correct the names or remove the frames."
-    )
 
 
 def declares_box(dataparser: DataParserConfig) -> bool:

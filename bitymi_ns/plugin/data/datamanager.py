@@ -13,10 +13,7 @@ import torch
 import tyro
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.dataparser_configs import all_dataparsers
-from nerfstudio.data.datamanagers.full_images_datamanager import (
-    FullImageDatamanager,
-    FullImageDatamanagerConfig,
-)
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
@@ -24,11 +21,12 @@ from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.data import images
 from bitymi_ns.plugin.data.bundle_cameras import BundleCamerasConfig
 from bitymi_ns.plugin.data.cameras import check_cameras, to_camera
-from bitymi_ns.plugin.data.capture_checks import check_capture, check_images, declares_box, reporting_input_errors
+from bitymi_ns.plugin.data.capture_checks import check_capture, declares_box, reporting_input_errors
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.data.dataset import PHOTOGRAPH_BYTES, BitymiDataset, CachedImages, drop_blank_views
 from bitymi_ns.plugin.data.depth import with_depth
 from bitymi_ns.plugin.data.initial_points import reading_points
+from bitymi_ns.plugin.data.names import check_photographs_exist
 from bitymi_ns.plugin.data.point_files import reporting_time
 from bitymi_ns.plugin.data.pose_checks import check_outliers, check_point_unit, warn_of_mirrored
 from bitymi_ns.plugin.data.views import LONGEST_SIDE, NO_PHOTOS, limit_size, with_lenses
@@ -105,11 +103,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         self.step_view: Callable[[int], View] = lambda index: self.train_views[index]
         images.set_up_pillow()
         points = check_capture(config, need_photos=test_mode != "inference")
-        with (
-            reporting_input_errors(config),
-            reporting_time("Reading", points),
-            reading_points(test_mode == "val"),
-        ):
+        with reporting_input_errors(config), reporting_time("Reading", points), reading_points(test_mode == "val"):
             super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
         self._check_images(test_mode)
         if test_mode == "val":
@@ -170,8 +164,10 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         poses = torch.cat([dataset.cameras.camera_to_worlds for dataset in datasets]).double().numpy()
         warn_of_mirrored(poses[:, :, :3], names)
         check_outliers(poses[:, :, 3], names)
-        check_images([*files[0], *files[1]])
-        images.check_orientation(list(dict.fromkeys([*files[0], *files[1]])))
+        every = list(dict.fromkeys([*files[0], *files[1]]))
+        check_photographs_exist(self.get_datapath(), every)
+        images.check_sizes(every)
+        images.check_orientation(every)
         self._duplicates = images.duplicate_files(*files)
         images.warn_of_duplicates(self._duplicates, train, held_out)
         if count == 1 and test_mode == "val":

@@ -37,11 +37,12 @@ from bitymi_ns.plugin.data.initial_points import (
     read_colored_points,
     with_colors,
 )
+from bitymi_ns.plugin.data.names import check_photographs_exist
 from bitymi_ns.plugin.data.scanner_views import scanner_photographs
 from bitymi_ns.plugin.data.sfm_poses import KeptPoses, find_sfm_source, kept_source, read_kept_poses
 from bitymi_ns.plugin.data.splits import NameLists, Split
 from bitymi_ns.plugin.data.transforms import colmap_points
-from bitymi_ns.plugin.data.transforms_views import Transforms, check_photographs_exist, read_transforms
+from bitymi_ns.plugin.data.transforms_views import Transforms, read_transforms
 from bitymi_ns.plugin.data.views import (
     FrameOptions,
     Photograph,
@@ -248,7 +249,7 @@ class BitymiDataParser(DataParser):
         config, need_photos = self.config, self._need_photos
         read = config.transforms(found, "", need_photos)
         if need_photos:
-            check_photographs_exist(read.path, read.photographs)
+            check_photographs_exist(read.path, read.files)
         meta, frame = read.meta, config.frame_options()
         if found.format == "instant-ngp":  # whose scale is that of its bounding box
             half = 0.5 * float(meta.get("aabb_scale", 1))
@@ -321,7 +322,7 @@ class BitymiDataParser(DataParser):
         config, need_photos = self.config, self._need_photos
         train = config.transforms(found, "transforms_train.json", need_photos)
         if need_photos:
-            check_photographs_exist(train.path, train.photographs)
+            check_photographs_exist(train.path, train.files)
         parts: dict[str, list[Photograph]] = {"train": train.photographs}
         for name in ("val", "test"):
             if (found.path / f"transforms_{name}.json").is_file():

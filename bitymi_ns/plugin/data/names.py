@@ -5,12 +5,12 @@ import os
 import re
 import unicodedata
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 
 from bitymi_ns.capture.recognise import PHOTOGRAPHS
-from bitymi_ns.plugin.console import listed
+from bitymi_ns.plugin.console import fail, listed
 from bitymi_ns.trust import leads_inside
 
 Parts = tuple[str, ...]  # folders and file of a name, folded to one case and one Unicode form
@@ -125,6 +125,28 @@ class FileFinder:
         for folder, below, files in os.walk(self.folder):
             below[:] = [name for name in below if not name.startswith(".")]
             yield from (Path(folder, name) for name in files if name.lower().endswith(self.extensions))
+
+
+def check_photographs_exist(source: Path, files: Iterable[Path]) -> None:
+    """Fail where photographs of a capture's file or folder are missing, with similar names of files that exist."""
+    names = list(dict.fromkeys(files))
+    missing = [file for file in names if not file.is_file()]
+    if not missing:
+        return
+    some = "\n  ".join(f"{file}{_hint(source.parent, file)}" for file in missing[:3])
+    fail(
+        f"{len(missing)} of {len(names)} photographs of {source} are missing:\n  {some}\n"
+        "Copy them there, correct the names or remove the frames."
+    )
+
+
+def _hint(folder: Path, file: Path) -> str:
+    if file.is_symlink():
+        return " (a link to nothing)"
+    if file.exists():
+        return " (not a file)"
+    near = FileFinder(file.parent if file.parent.is_dir() else folder).nearest(file.name)
+    return f" ({near})" if near else ""
 
 
 def renamed_message(names: Sequence[str], files: Sequence[Path], folder: Path) -> str:

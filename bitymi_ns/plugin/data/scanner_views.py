@@ -15,6 +15,7 @@ from bitymi_ns.plugin.data.colmap_model import ModelCamera
 from bitymi_ns.plugin.data.depth_files import maps_beside
 from bitymi_ns.plugin.data.images import image_size
 from bitymi_ns.plugin.data.lens import rescaled
+from bitymi_ns.plugin.data.names import check_photographs_exist
 from bitymi_ns.plugin.data.pose_checks import rotations
 from bitymi_ns.plugin.data.views import OPENCV_AXES, Photograph
 from bitymi_ns.trust import json_of
@@ -48,10 +49,9 @@ def scanner_photographs(found: Found, need_photos: bool) -> list[Photograph]:
         fail(f"{found.path}, read as {found.format}, is damaged: {detail}. Export it again.", error)
     if len(rows) < 2:
         fail(f"{found.path}, read as {found.format}, has {len(rows)} photographs with poses: a scene needs many.")
-    missing = [path for path, *_ in rows if not path.is_file()]
-    if need_photos and missing:
-        fail(f"{len(missing)} of {len(rows)} photographs of {found.path} are missing: {listed(missing)}.")
     files = [path for path, *_ in rows]
+    if need_photos:
+        check_photographs_exist(found.path, files)
     parts = rotations(np.stack([pose[:3, :3] for _, pose, *_ in rows]), [file.name for file in files], str(found.path))
     result = []
     for (path, pose, pinhole, stated), rotation, maps in zip(rows, parts, maps_beside(files), strict=True):

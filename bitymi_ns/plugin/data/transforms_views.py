@@ -6,7 +6,7 @@ a frame before the top of the file. Entries that nothing reads are reported.
 
 import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 
-from bitymi_ns.capture.panorama import SPHERICAL_MODEL
+from bitymi_ns.capture.panorama_detection import SPHERICAL_MODEL
 from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data.colmap_model import ModelCamera
 from bitymi_ns.plugin.data.depth_files import MAP_FILES, MapFiles
@@ -58,6 +58,11 @@ class Transforms:
     meta: dict[str, Any]  # its content
     photographs: list[Photograph]  # sorted by file name
     lists: NameLists  # of names for training and evaluation
+
+    @property
+    def files(self) -> list[Path]:
+        """Files of the photographs."""
+        return [photograph.file for photograph in self.photographs]
 
 
 def read_transforms(
@@ -133,11 +138,8 @@ def _report_unused(path: Path, meta: dict[str, Any], own_format: bool) -> None:
 
 
 def _find_photographs(path: Path, names: Sequence[str], need_photos: bool) -> list[Path]:
-    """Find the photographs of a file; missing ones keep the stated names.
-
-    Raises:
-        InputError: a name without extension fits several files.
-    """
+    """Find the photographs of a file; missing ones keep the stated names. Fails where a name fits more than one
+    file."""
     folder = path.parent
     finder = FileFinder(folder, outside=True)
     found = finder.find_all(names)
@@ -178,34 +180,9 @@ def _find_maps(path: Path, frames: Sequence[dict[str, Any]], verbose: bool) -> l
     return [MapFiles(depth, normal=normal) for depth, normal in zip(*found.values(), strict=True)]
 
 
-def check_photographs_exist(path: Path, photographs: Iterable[Photograph]) -> None:
-    """Fail where photographs of a file are missing, with similar names of files that exist."""
-    files = list(dict.fromkeys(photograph.file for photograph in photographs))
-    missing = [file for file in files if not file.is_file()]
-    if not missing:
-        return
-    some = "\n  ".join(f"{file}{_hint(path.parent, file)}" for file in missing[:3])
-    fail(
-        f"{len(missing)} of {len(files)} photographs of {path} are missing:\n  {some}\n"
-        "Copy them there, correct the names or remove the frames."
-    )
-
-
-def _hint(folder: Path, file: Path) -> str:
-    if file.is_symlink():
-        return " (a link to nothing)"
-    if file.exists():
-        return " (not a file)"
-    near = FileFinder(file.parent if file.parent.is_dir() else folder).nearest(file.name)
-    return f" ({near})" if near else ""
-
-
 def _downscaled(photographs: list[Photograph], folder: Path, downscale: int) -> list[Photograph]:
-    """Replace photographs by their downscaled copies, where there are such; else they are downscaled as they are read.
-
-    Copies lie in `images_2` beside `images`, under the same names or, as nerfstudio's tool writes them, without
-    folders.
-    """
+    """Replace photographs by their downscaled copies, where there are such, in `images_2` beside `images`, under the
+    same names or, as nerfstudio's tool writes them, without folders; else they are downscaled as they are read."""
 
     def copies(file: Path) -> list[Path]:
         inside = file.relative_to(folder).parts if file.is_relative_to(folder) else (file.parent.name, file.name)

@@ -15,7 +15,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 
-from bitymi_ns.capture.panorama import SPHERICAL_MODEL
+from bitymi_ns.capture.panorama_detection import SPHERICAL_MODEL
 from bitymi_ns.plugin.console import fail, listed, say
 from bitymi_ns.plugin.data.colmap_model import ModelCamera
 from bitymi_ns.plugin.data.depth_files import MAPS, MapFiles
@@ -161,15 +161,8 @@ def make_views(
 
 
 def _split(parts: Sequence[Sequence[Lens]], poses: Pose) -> tuple[list[Lens], list[int], Pose]:
-    """Split photographs into the views of their lenses.
-
-    Args:
-        parts: lenses of each photograph.
-        poses: [N, 3 or 4, 4] camera to world in nerfstudio's axes.
-
-    Returns:
-        lens, number of the photograph and pose of each view.
-    """
+    """Split photographs into the views of their lenses (`parts`, of each photograph), with poses [N, 3 or 4, 4] camera
+    to world in nerfstudio's axes. Returns lens, number of the photograph and pose of each view."""
     lenses = [lens for some in parts for lens in some]
     of = [i for i, some in enumerate(parts) for _ in some]
     turns = np.stack([OPENCV_AXES @ lens.turn @ OPENCV_AXES for lens in lenses])

@@ -1,9 +1,6 @@
-"""Add `bitymi-atlas` and `bitymi-mesh` to nerfstudio's `ns-export`.
-
-nerfstudio has no registry of exporters. Its script binds `tyro` at the top, then imports modules that load this plugin,
-and only at the end builds the union of commands and hands it to `tyro.cli`. So the module's own reference to tyro is
-replaced by a proxy that adds members to that union; tyro itself and every other module are left alone.
-"""
+"""Add `bitymi-atlas` and `bitymi-mesh` to nerfstudio's `ns-export`, which has no registry: its script builds the union
+of commands after this plugin is loaded, and hands it to `tyro.cli`, so its own reference to tyro is replaced by a proxy
+that adds members to that union. tyro itself is left alone."""
 
 from __future__ import annotations
 

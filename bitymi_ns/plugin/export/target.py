@@ -58,7 +58,6 @@ def space_needed(load_config: Path, options: BakeOptions, exact: bool, compact: 
 
     Args:
         load_config: config.yml of the run; without a checkpoint beside it the estimate is 0.
-        options: of the bake.
         exact: whether everything is kept.
         compact: whether the bundle is compact, of which a texel takes less than a byte.
     """

@@ -1,8 +1,5 @@
-"""A bundle as a nerfstudio model, for ns-eval, ns-viewer and ns-render.
-
-nerfstudio's tools read a config.yml and then look for a checkpoint at the path in it. A bundle has none, and may have
-been moved: `find_bundle` finds it, and `stub_checkpoint_dir` writes a stand-in for the checkpoint.
-"""
+"""A bundle as a nerfstudio model, for ns-eval, ns-viewer and ns-render, which look for a checkpoint beside config.yml:
+`find_bundle` finds a bundle that may have been moved, and `stub_checkpoint_dir` writes a stand-in."""
 
 from __future__ import annotations
 

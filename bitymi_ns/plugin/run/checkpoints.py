@@ -41,7 +41,6 @@ def save(state: dict[str, Any], path: Path, scratch: Path) -> None:
 
     Args:
         state: what to save.
-        path: the file.
         scratch: a folder of the same file system for the unfinished file; nerfstudio takes every name in the
             checkpoint folder for a checkpoint.
     """

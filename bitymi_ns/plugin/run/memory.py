@@ -1,21 +1,17 @@
-"""Estimate of the memory that training or an export takes on its device, printed before it starts.
+"""Estimate of the memory that training or an export takes on its device, printed before it starts: by the length of the
+fragment lists of a few views (docs/training.md, Memory), and numbers measured with the default preset on the CPU, or
+counted from the arrays on a card."""
 
-What decides is the fragment list of one view (docs/training.md, Memory), whose length is found by counting those of
-a few views. The other numbers are measured on the CPU and belong to the default preset; those of a card are counted
-from its arrays.
-"""
-
-import math
 from collections.abc import Sequence
-from contextlib import suppress
-from pathlib import Path
 
 import psutil
 import torch
 
 from bitymi_ns.bake.tuning_views import LEAST_KEPT
 from bitymi_ns.bake.view_color_rate import choice_bytes
+from bitymi_ns.bundle.sizes import memory_limit
 from bitymi_ns.ops import project
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.trace_cpu import MOST, count
 from bitymi_ns.ops.trace_cuda import NUMBERS, free_memory
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
@@ -23,7 +19,7 @@ from bitymi_ns.plugin.console import say, warn
 from bitymi_ns.plugin.data.dataset import PHOTOGRAPH_BYTES
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
-from bitymi_ns.scene.scene import GEOMETRY, Scene
+from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import TexelConfig
 from bitymi_ns.train.texels import SMALLEST, most_texels
 from bitymi_ns.train.views import DOWNSCALED_BYTES, photograph_budget, spread
@@ -139,24 +135,6 @@ def state_export(
 def available_memory() -> float:
     """Bytes that this process may have, with what it has already: of the machine, within its control group's limit."""
     return min(psutil.virtual_memory().available + psutil.Process().memory_info().rss, memory_limit())
-
-
-def memory_limit(mount: Path = Path("/sys/fs/cgroup"), cgroups: Path = Path("/proc/self/cgroup")) -> float:
-    """Bytes that the control groups (v2 and v1) of this process may take; infinite where none has a limit."""
-    found = [math.inf]
-    with suppress(OSError):  # no Linux
-        for line in cgroups.read_text().splitlines():
-            _, controllers, path = line.split(":", 2)
-            if controllers and "memory" not in controllers.split(","):
-                continue
-            base, name = (mount / "memory", "memory.limit_in_bytes") if controllers else (mount, "memory.max")
-            folder = base / path.lstrip("/")
-            for each in (folder, *folder.parents):
-                with suppress(OSError, ValueError):  # of another namespace; "max"
-                    found.append(float((each / name).read_text()))
-                if each == base:
-                    break
-    return min(found)
 
 
 def _per_fragment(scene: Scene) -> float:

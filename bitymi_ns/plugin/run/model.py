@@ -13,6 +13,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from torch import Tensor
 from torch.nn import Parameter
 
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.view_kinds import VIEW_PARAMETERS
 from bitymi_ns.plugin.console import fail, say, warn
 from bitymi_ns.plugin.data.point_files import reporting_time
@@ -22,7 +23,7 @@ from bitymi_ns.plugin.run.surfel_model import SurfelModel, SurfelModelConfig
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import HashField
-from bitymi_ns.scene.scene import GEOMETRY, Scene
+from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train import limits
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.domain import build_scene

@@ -18,7 +18,7 @@ from nerfstudio.utils import colormaps
 from torch import Tensor
 
 from bitymi_ns.files import check_writable, reason, size_text
-from bitymi_ns.plugin.console import fail, say, warn
+from bitymi_ns.plugin.console import INTERRUPTED, fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.run.camera_path import MOST_PIXELS, check_camera_path
@@ -36,7 +36,6 @@ WITHOUT_MAPS = {"rgb", "rgba", "accumulation"}  # outputs for which no maps need
 DEPTH_VIEWS, DEPTH_SIDE, DEPTH_SHARE = 16, 160, 0.01
 """Depth colours of a film span the depths of so many frames of this size, without this share at either end."""
 TURNS = 2  # of a spiral
-INTERRUPTED = 130
 
 
 def adopt_render() -> None:

@@ -42,7 +42,6 @@ def check_unused(folder: Path, checkpoints: Path) -> None:
     """Stop where a new run would mix with, and in time replace, the checkpoints of an earlier one.
 
     Args:
-        folder: the run's.
         checkpoints: the folder of its checkpoints.
     """
     there = sorted(checkpoints.glob("step-*.ckpt"))
@@ -62,7 +61,6 @@ def keep_poses_report(folder: Path, report: Path | None, source: Source | None =
     """Copy the poses that were found, and the report on how, to POSES, so that they stay when the photographs change.
 
     Args:
-        folder: the run's.
         report: folder of the report; None = the capture came with its poses.
         source: the poses that were found; None = the capture came with them.
     """
@@ -88,7 +86,6 @@ def check_space(folder: Path, needed: int) -> None:
     """Stop before the first step when there is no room for a single checkpoint.
 
     Args:
-        folder: the run's.
         needed: bytes of a checkpoint of the scene as it is now.
     """
     free = files.free_bytes(folder)

@@ -15,7 +15,7 @@ from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from bitymi_ns import files
-from bitymi_ns.plugin.console import fail, filter_console, ignore_torch_warnings, say, step_bar, warn
+from bitymi_ns.plugin.console import INTERRUPTED, fail, filter_console, ignore_torch_warnings, say, step_bar, warn
 from bitymi_ns.plugin.run import checkpoints, run_folder
 from bitymi_ns.plugin.run.launcher import Workers
 from bitymi_ns.train import optimizers
@@ -27,8 +27,6 @@ import math
 from dataclasses import dataclass, field
 
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
-
-INTERRUPTED = 130  # exit status after Ctrl-C, by the convention of shells
 
 
 class _StopAfterStep(Exception):

@@ -174,10 +174,10 @@ def test_runs_that_differ_in_length_are_told_apart(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
-        ("{}", r"line 2, is not a cell of a benchmark"),
-        ('{"key": {"cell": "eval"}, "value": {}}', r"line 2: the eval cell lacks .*psnr"),
-        ('{"key": {"cell": "pictures"}, "value": {}}', r"line 2: the pictures cell lacks 'folder'"),
-        ("nonsense", r"line 2, is not valid JSON"),
+        ("{}", r"line 2, is not a finished cell"),
+        ('{"key": {"cell": "eval"}, "value": {}}', r"the eval cell of .* lacks .*psnr"),
+        ('{"key": {"cell": "pictures"}, "value": {}}', r"the pictures cell of .* lacks 'folder'"),
+        ("nonsense", r"line 2, is not a finished cell"),
     ],
 )
 def test_malformed_lines_are_named(tmp_path: Path, line: str, reason: str) -> None:

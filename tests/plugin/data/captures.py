@@ -11,6 +11,7 @@ from nerfstudio.data.utils import colmap_parsing_utils as reader
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from bitymi_ns.capture.types import Poses
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
@@ -88,6 +89,12 @@ def expect(message: str) -> Any:
 def printed(capsys: pytest.CaptureFixture[str]) -> str:
     """What was printed, on one line."""
     return " ".join(capsys.readouterr().out.split())
+
+
+def found_poses(model: Path, images: Path, report: Path, **changes: Any) -> Poses:
+    """Poses of twelve photographs, as the finding of poses gives them; one was left out."""
+    found = dict(left_out={"frame_00099.png": "blurred"}, registered=12, given=13, reprojection_error=0.5)
+    return Poses(model, images, report, **{**found, "track_length": 3.0, "seconds": {}, **changes})
 
 
 def colmap_model(capture: Path, folder: Path, scale: float = 1.0) -> None:

@@ -187,7 +187,7 @@ def test_reduced_photographs_of_another_size(project: Path) -> None:
     with expect("images_4/frame_00001.png has 24 x 18 pixels, but its camera is for 48 x 36, of which 1/4 is 12 x 9"):
         load_any(project, downscale_factor=4)
     (project / "images_4/frame_00003.png").unlink()
-    with expect(r"1 of 12 images of the capture are missing:\s+.*images_4/frame_00003.png"):
+    with expect(r"1 of 12 photographs of .* are missing:\s+.*images_4/frame_00003.png"):
         load_any(project, downscale_factor=4)
 
 
@@ -236,7 +236,7 @@ def test_photographs_that_the_model_lacks_are_named(project: Path, capsys: pytes
 
 def test_photographs_of_the_model_that_are_not_there(project: Path) -> None:
     images_of(project)[3].unlink()
-    with expect(r"1 of 12 images of the capture are missing:\s+.*frame_00004.png"):
+    with expect(r"1 of 12 photographs of .* are missing:\s+.*frame_00004.png"):
         load_any(project)
     for path in images_of(project):
         path.unlink()

@@ -12,7 +12,7 @@ from PIL import Image
 
 import bitymi_ns.capture
 from bitymi_ns.capture.types import CaptureError, SfmOptions, SfmSettings
-from tests.plugin.data.captures import expect, load_any, load_with, printed
+from tests.plugin.data.captures import expect, found_poses, load_any, load_with, printed
 from tests.plugin.data.test_dataparser import parsed
 
 
@@ -26,10 +26,7 @@ def finder(project: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, S
         progress("matching", 1, 2)
         if source.name == "bad":
             raise CaptureError("photographs of bad share too little: take more of them")
-        return types.SimpleNamespace(
-            model=project / "sparse/0", images=project / "images", report=project / "report",
-            left_out={"frame_00099.png": "blurred"}, registered=12, given=13, reprojection_error=0.5,
-        )  # fmt: skip
+        return found_poses(project / "sparse/0", project / "images", project / "report")
 
     monkeypatch.setattr(bitymi_ns.capture, "find_poses", find_poses, raising=False)
     progress = types.ModuleType("bitymi_ns.progress")

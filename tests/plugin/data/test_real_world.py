@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import types
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from bitymi_ns.plugin.export.trained import world_of
 from bitymi_ns.plugin.run.run_folder import POSES, keep_poses_report
 from tests.bake.conftest import surfels
 from tests.bake.scenes import write
-from tests.plugin.data.captures import colmap_model, images_of, load_any
+from tests.plugin.data.captures import colmap_model, found_poses, images_of, load_any
 
 __all__ = ["surfels"]
 
@@ -43,13 +42,8 @@ def photographs(capture: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     colmap_model(capture, capture / "found/sparse/0")
     write_frame(capture / "found", frame())
 
-    def find_poses(source: Path, options: Any = None, *told: Any) -> Any:
-        return types.SimpleNamespace(
-            model=capture / "found/sparse/0", images=capture / "images", report=capture / "found", left_out={},
-            registered=12, given=12, reprojection_error=0.5,
-        )  # fmt: skip
-
-    monkeypatch.setattr(bitymi_ns.capture, "find_poses", find_poses, raising=False)
+    found = found_poses(capture / "found/sparse/0", capture / "images", capture / "found", left_out={}, given=12)
+    monkeypatch.setattr(bitymi_ns.capture, "find_poses", lambda *arguments: found, raising=False)
     folder = capture.parent / "photographs"
     shutil.copytree(capture / "images", folder)
     return folder

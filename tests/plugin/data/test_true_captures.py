@@ -280,7 +280,7 @@ def test_names_of_a_model_that_lead_elsewhere_are_those_of_photographs_in_the_ca
     Image.new("RGB", (48, 36)).save(elsewhere)
     for name in (str(elsewhere), "../../elsewhere/private.png", "..\\..\\elsewhere\\private.png"):
         images.write_text(text.replace("frame_00004.png", name))
-        with expect(r"(?s)1 of 12 images of the capture are missing:.*private.png"):
+        with expect(r"(?s)1 of 12 photographs of .* are missing:.*private.png"):
             load_any(project)
 
 

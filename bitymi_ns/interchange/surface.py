@@ -34,6 +34,9 @@ REACH = 3.0
 more, of the median depth of all views."""
 SMALLEST = 0.005  # connected parts with less than this share of the triangles of the largest part are dropped
 BOX_SIDE = 160  # longer side in pixels of the depth maps that the box is found from
+PIXELS_PER_VOXEL = 2.0
+"""Pixels along a voxel where a view is far: a finer depth map tells the volume nothing."""
+FAR = 0.9  # quantile of a view's depths in the box that counts as far
 POISSON_DEPTH = 9  # depth of the octree of the watertight reconstruction
 
 
@@ -77,15 +80,15 @@ def median_depth(
     projection = project(*(surfels[name] for name in GEOMETRY), camera, near, prefilter)
     rows = []
     for fragments in fitting_lists(projection):
-        pixel = fragments.pixel.long()
-        order = pixel.argsort(stable=True)  # front to back within each pixel, as the fragments of a tile are
-        pixel, weight = pixel[order], fragments.weight[order].double()
+        order = fragments.pixel.argsort(stable=True)  # front to back within each pixel, as the fragments of a tile are
+        weight = fragments.weight[order].double()
         total = weight.cumsum(0)
-        first = torch.searchsorted(pixel, pixel)  # of the same pixel
-        reached = total - (total[first] - weight[first])
-        crossing = (reached >= HALF) & (reached - weight < HALF)
         part = fragments.weight.new_zeros(fragments.height * fragments.width)
-        part[pixel[crossing]] = fragments.depth[order][crossing]
+        count = torch.bincount(fragments.pixel, minlength=len(part))
+        before = torch.cat([total.new_zeros(1), total])[count.cumsum(0) - count]  # of the pixels in front
+        reached = total - before.repeat_interleave(count)
+        crossing = order[(reached >= HALF) & (reached - weight < HALF)]
+        part[fragments.pixel[crossing].long()] = fragments.depth[crossing]
         rows.append(part.view(fragments.height, fragments.width))
     return torch.cat(rows)
 
@@ -154,8 +157,10 @@ def extract_surface(
         voxel, TRUNCATION * voxel, open3d.pipelines.integration.TSDFVolumeColorType.RGB8
     )
     for i, camera in enumerate(cameras):
-        depth = median_depth(surfels, camera, near, prefilter).cpu()
-        depth = _cut(depth, camera, box)
+        inside = _cut(depths[i], small[i], box)
+        far = inside[inside > 0].quantile(FAR).item() if inside.any() else 0.0
+        camera = _coarsened(camera, PIXELS_PER_VOXEL * far / voxel)
+        depth = _cut(median_depth(surfels, camera, near, prefilter).cpu(), camera, box)
         rgb = as_bytes(render(camera)).numpy()
         picture = open3d.geometry.RGBDImage.create_from_color_and_depth(
             open3d.geometry.Image(np.ascontiguousarray(rgb)),
@@ -174,6 +179,12 @@ def extract_surface(
     if not len(mesh.triangles):
         raise NoSurface("the depth maps fuse to no surface: try a smaller --resolution")
     return _finished(mesh, options, progress)
+
+
+def _coarsened(camera: Camera, focal: float) -> Camera:
+    """The camera with pictures reduced to a focal length in pixels, but not below `BOX_SIDE`."""
+    side = max(camera.width, camera.height)
+    return camera.within(max(BOX_SIDE, math.ceil(side * focal / float(camera.K[:2, :2].diagonal().max()))))
 
 
 def _cut(depth: Tensor, camera: Camera, box: Tensor) -> Tensor:

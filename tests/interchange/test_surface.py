@@ -63,6 +63,23 @@ def test_a_plane_is_fused_where_it_lies() -> None:
     assert np.asarray(mesh.vertex_normals)[:, 2].min() > 0.9  # towards the cameras
 
 
+def test_large_views_are_drawn_no_finer_than_the_voxels_need() -> None:
+    sizes = []
+
+    def render(camera: Camera) -> torch.Tensor:
+        sizes.append((camera.width, camera.height))
+        return gray(camera)
+
+    large = [camera.scaled(10.0) for camera in CAMERAS]
+    mesh = extract_surface(plane(60), render, large, 0.02, SurfaceOptions(resolution=128))
+    width = 64 / 62 * 2 * 2.0 / (2.04 / 128)  # two pixels for a voxel of the box, at the distance of 2
+    assert all(abs(w / width - 1.0) < 0.05 and abs(h / w - 0.75) < 0.01 for w, h in sizes)
+    assert np.abs(np.asarray(mesh.vertices)[:, 2]).max() < 2e-3
+    sizes.clear()
+    extract_surface(plane(60), render, large, 0.02, SurfaceOptions(resolution=512))
+    assert set(sizes) == {(640, 480)}
+
+
 def test_the_budget_and_the_closed_surface_are_kept() -> None:
     few = extract_surface(plane(40), gray, CAMERAS, 0.02, SurfaceOptions(resolution=64, triangles=200))
     assert 50 < len(few.triangles) <= 200

@@ -8,6 +8,8 @@
 # make clang-test  the same tests with the CPU kernels as Clang compiles them (CLANG=clang++)
 # make baseline-test  the same tests with the CPU kernels for any CPU of this kind: on x86-64 without AVX
 # make wheel-test  builds the wheel, without CUDA, looks into it and runs tests against it in an environment of its own
+# make wheel   builds a wheel in dist/; with CUDA=1 one that has the kernels for cards of compute capability 7.5 to 12.0
+#              (ARCHITECTURES) and needs nvcc here, not where it is installed
 # make gate    trains, bakes and draws a fixed small scene (and DATA=folder) and compares quality, bytes, memory and time
 #              with the committed baseline, benchmarks/gate.json; make gate-accept renews the baseline
 # make web     builds the viewer's page from web/ into bitymi_ns/view/page, which is committed: users need no Node.js
@@ -29,6 +31,8 @@ WORK   ?= outputs/bench
 CLANG  ?= clang++
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 1); echo $$((n < 8 ? n : 8)))
 TESTS  ?= tests/ops tests/stress tests/scene
+CUDA   ?=
+ARCHITECTURES ?= 75;80;86;89;90;100;120
 
 TORCH       := torch==2.13.0
 TORCHVISION := torchvision==0.28.0
@@ -41,7 +45,7 @@ CMAKE_ARGS  := -Ccmake.define.BITYMI_EMULATED_CUDA=ON \
 
 export OMP_NUM_THREADS ?= $(shell nproc 2>/dev/null || echo 1)
 
-.PHONY: setup demo test gate gate-accept wheel-test sanitize clang-test baseline-test bench web web-test web-test-here lint format clean
+.PHONY: setup demo test gate gate-accept wheel wheel-test sanitize clang-test baseline-test bench web web-test web-test-here lint format clean
 .DELETE_ON_ERROR:
 
 setup: $(VENV)/.stamp-build
@@ -115,6 +119,11 @@ web-test-here: web/node_modules/.package-lock.json
 
 gate gate-accept: setup
 	$(BIN)/python benchmarks/gate.py $(if $(DATA),--capture "$(DATA)") $(if $(filter %-accept,$@),--accept)
+
+wheel: $(VENV)/.stamp-deps
+	$(PIP) wheel -q --no-build-isolation --no-deps -w dist -Ccmake.define.BITYMI_CUDA=$(if $(CUDA),ON,OFF) \
+	  $(if $(CUDA),'-Ccmake.define.BITYMI_CUDA_ARCHITECTURES=$(ARCHITECTURES)') .
+	@ls -l dist/*.whl
 
 wheel-test: setup
 	$(BIN)/python scripts/wheel_test.py

@@ -83,24 +83,14 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
             for name in ("baked", "steps")
         ],
         "fox": [
-            Step(
-                "fox",
-                [page("fox.md", "gpu_train.py", data / "fox", "--steps", "3000", "--keep", bundles)],
-                200,
-            ),
+            Step("fox", [page("fox.md", "gpu_train.py", data / "fox", "--steps", "3000", "--keep", bundles)], 200),
             Step("baked", [page("baked.md", "gpu.py", *baked, "--bundles", bundles / "bitymi-3000")], 90),
         ],
         "profile": [
-            Step(
-                "profile",
-                [[*ncu, *python("card_smoke.py", *large, "--profile", "--sections", *PROFILED)]],
-                400,
-            )
+            Step("profile", [[*ncu, *python("card_smoke.py", *large, "--profile", "--sections", *PROFILED)]], 400)
         ],
         "train": of_each(
-            "",
-            600,
-            lambda name: [page(f"{name}.md", "gpu_train.py", data / name, "--keep", bundles / name, *length)],
+            "", 600, lambda name: [page(f"{name}.md", "gpu_train.py", data / name, "--keep", bundles / name, *length)]
         ),
         "gaussians": of_each(
             "Gaussians of ",

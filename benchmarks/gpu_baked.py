@@ -23,15 +23,7 @@ from pathlib import Path
 
 import torch
 from common import number, say, table
-from harness import (
-    Options,
-    arithmetic_rate,
-    attempt,
-    failures,
-    milliseconds,
-    trained_like,
-    with_launches,
-)
+from harness import Options, arithmetic_rate, attempt, failures, milliseconds, trained_like, with_launches
 from torch import Tensor
 
 from bitymi_ns.bundle import read_bundle

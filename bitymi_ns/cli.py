@@ -32,20 +32,13 @@ Flag = tyro.conf.FlagCreatePairsOff[bool] if hasattr(tyro.conf, "FlagCreatePairs
 class Sample:
     """Ray-trace a small room and write it as a nerfstudio capture: images, exact cameras and sparse points."""
 
-    output_dir: Path
-    """Folder to write; it must not hold anything yet."""
-    views: int = 60
-    """Number of images."""
-    width: int = 320
-    """Image width in pixels."""
-    height: int = 240
-    """Image height in pixels."""
-    seed: int = 0
-    """Chooses textures, camera path and points; equal seeds give equal captures."""
-    points: int = 8000
-    """Number of sparse points."""
-    overwrite: Flag = False
-    """Replace the folder if it holds something."""
+    output_dir: Path  # Folder to write; it must not hold anything yet.
+    views: int = 60  # Number of images.
+    width: int = 320  # Image width in pixels.
+    height: int = 240  # Image height in pixels.
+    seed: int = 0  # Chooses textures, camera path and points; equal seeds give equal captures.
+    points: int = 8000  # Number of sparse points.
+    overwrite: Flag = False  # Replace the folder if it holds something.
 
     def run(self) -> None:
         from bitymi_ns import sample
@@ -60,8 +53,7 @@ class Sample:
 class Sfm:
     """Find the camera poses of photographs or of a video; write a COLMAP model and a nerfstudio capture."""
 
-    source: tyro.conf.Positional[Path]
-    """Folder of photographs (or with `images`, and `masks`, in it), or a video."""
+    source: tyro.conf.Positional[Path]  # Folder of photographs (or with `images`, and `masks`, in it), or a video.
     output: Path | None = None
     """Folder to write the capture to; none = the poses are kept beside the photographs, and their folder is printed."""
     options: tyro.conf.OmitArgPrefixes[SfmOptions] = SfmOptions()
@@ -94,10 +86,8 @@ class Report:
     inputs: tyro.conf.Positional[tuple[Path, ...]]
     """JSON files that ns-eval wrote, cells of `bitymi bench`, training curves, images, and folders to search
     for these."""
-    output_dir: Path = Path("report")
-    """Folder to write the page to."""
-    title: str = "bitymi report"
-    """Heading of the page."""
+    output_dir: Path = Path("report")  # Folder to write the page to.
+    title: str = "bitymi report"  # Heading of the page.
 
     def run(self) -> None:
         from bitymi_ns.measure import report
@@ -115,10 +105,8 @@ class Report:
 class Stability:
     """Measure what float32 costs on extreme scenes and write the page of it, with a plot beside it."""
 
-    output: Path = Path("docs/stability.md")
-    """Markdown file to write; the plot gets its name with .png."""
-    backend: str = "cpu"
-    """Kernels to measure."""
+    output: Path = Path("docs/stability.md")  # Markdown file to write; the plot gets its name with .png.
+    backend: str = "cpu"  # Kernels to measure.
 
     def run(self) -> None:
         from bitymi_ns.measure.stability import page
@@ -138,12 +126,9 @@ class Stability:
 class BenchPictures:
     """Draw the worst held-out views of a run: photograph, render, error, f_view alone, residual, overdraw."""
 
-    load_config: Path
-    """config.yml of a trained run."""
-    output_dir: Path = Path("pictures")
-    """Folder for the PNG files and pictures.json."""
-    views: int = 2
-    """Number of worst views."""
+    load_config: Path  # config.yml of a trained run.
+    output_dir: Path = Path("pictures")  # Folder for the PNG files and pictures.json.
+    views: int = 2  # Number of worst views.
 
     def run(self) -> None:
         from bitymi_ns.measure.pictures import draw_worst
@@ -178,12 +163,10 @@ class Bench:
 class Verify:
     """Check a bundle: files, hashes, formats, tiles; and optionally against the run it was baked from."""
 
-    bundle: tyro.conf.Positional[Path]
-    """Folder of the bundle, or its one file (bitymi pack)."""
+    bundle: tyro.conf.Positional[Path]  # Folder of the bundle, or its one file (bitymi pack).
     run_config: Annotated[Path | None, tyro.conf.arg(name="run")] = None
     """config.yml, folder or checkpoint of the run: also checks the error against its field, and renders of both."""
-    views: int = 4
-    """Held-out views to render."""
+    views: int = 4  # Held-out views to render.
 
     def run(self) -> int:
         from rich.console import Console
@@ -223,12 +206,9 @@ def _say_left_out(names: Sequence[str]) -> None:
 class Pack:
     """Write a bundle as one file, its parts in the order of their use; everything reads it like the folder."""
 
-    bundle: tyro.conf.Positional[Path]
-    """Folder of the bundle, or its one file."""
-    output: Path | None = None
-    """File to write; not given: beside the folder, with its name and .bitymi."""
-    overwrite: Flag = False
-    """Replace a bundle in one file that is there already."""
+    bundle: tyro.conf.Positional[Path]  # Folder of the bundle, or its one file.
+    output: Path | None = None  # File to write; not given: beside the folder, with its name and .bitymi.
+    overwrite: Flag = False  # Replace a bundle in one file that is there already.
 
     def run(self) -> None:
         from bitymi_ns.bundle.single import SUFFIX, is_single, write_single
@@ -250,16 +230,12 @@ class Pack:
 class Extras:
     """Write a bundle for other programs into a folder beside it: as Gaussian splats, and as a textured mesh."""
 
-    bundle: tyro.conf.Positional[Path]
-    """Folder of the bundle, or its one file."""
+    bundle: tyro.conf.Positional[Path]  # Folder of the bundle, or its one file.
     kinds: tuple[Literal["gaussians", "mesh"], ...] = ("gaussians", "mesh")
     """gaussians: gaussians.ply, as 3DGS writes it; mesh: mesh.glb, a textured quad for each surfel."""
-    frame: Literal["scene", "capture"] = "scene"
-    """Frame of the files: the scene's, or the capture's own."""
-    output: Path | None = None
-    """Folder to write; not given: beside the bundle, with its name and .extras."""
-    overwrite: Flag = False
-    """Replace a folder of extras that is there already."""
+    frame: Literal["scene", "capture"] = "scene"  # Frame of the files: the scene's, or the capture's own.
+    output: Path | None = None  # Folder to write; not given: beside the bundle, with its name and .extras.
+    overwrite: Flag = False  # Replace a folder of extras that is there already.
 
     def run(self) -> None:
         from bitymi_ns import interchange
@@ -292,20 +268,14 @@ class Extras:
 class View:
     """Show a bundle in the browser; or write it with its page as a folder, which any web server can send."""
 
-    bundle: tyro.conf.Positional[Path]
-    """Folder of the bundle, or its one file."""
-    export: Path | None = None
-    """Folder to write the page and the bundle to; none = show it now."""
-    one_file: Flag = False
-    """With --export: write the bundle as one file, which the page reads in ranges."""
-    overwrite: Flag = False
-    """Replace a page that was exported there before."""
+    bundle: tyro.conf.Positional[Path]  # Folder of the bundle, or its one file.
+    export: Path | None = None  # Folder to write the page and the bundle to; none = show it now.
+    one_file: Flag = False  # With --export: write the bundle as one file, which the page reads in ranges.
+    overwrite: Flag = False  # Replace a page that was exported there before.
     host: str = "127.0.0.1"
     """Address to listen at. Others than loopback addresses show the bundle to all who can reach this machine."""
-    port: int = 0
-    """Port to listen at; 0 = any that is free."""
-    open_browser: bool = True
-    """Open the page in the browser."""
+    port: int = 0  # Port to listen at; 0 = any that is free.
+    open_browser: bool = True  # Open the page in the browser.
 
     def run(self) -> None:
         import webbrowser

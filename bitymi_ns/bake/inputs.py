@@ -55,8 +55,7 @@ class BakeInput:
         if not self.cameras or not options.needs_visibility:
             return self
         return replace(
-            self,
-            views=visibility(self.surfels, self.cameras, self.near, self.weight_bound, self.prefilter, progress),
+            self, views=visibility(self.surfels, self.cameras, self.near, self.weight_bound, self.prefilter, progress)
         )
 
 

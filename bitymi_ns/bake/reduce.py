@@ -81,11 +81,7 @@ class Reduced:
 
 @torch.no_grad()
 def reduce_tiles(
-    wanted: Iterable[TileValues],
-    shown: Shown,
-    tolerance: float,
-    r_min: int = 4,
-    progress: Progress = no_progress,
+    wanted: Iterable[TileValues], shown: Shown, tolerance: float, r_min: int = 4, progress: Progress = no_progress
 ) -> Reduced:
     """Choose every tile's grid.
 

@@ -29,28 +29,21 @@ class TuneOptions(TexelSteps):
     """Options of the fine-tuning."""
 
     rate: Positive = TexelSteps.rate
-    steps: Count = 400
-    """Steps, before the texels are stored; each stopping at one training view."""
-    ssim_weight: Share = 0.2
-    """Share of 1 - SSIM in the loss; the rest is L1."""
+    steps: Count = 400  # Steps, before the texels are stored; each stopping at one training view.
+    ssim_weight: Share = 0.2  # Share of 1 - SSIM in the loss; the rest is L1.
     val_every: Count = 8
     """Every so-many-th training view is a validation view; the texels that show these best are kept. 0 = none, and the
     last texels are kept: where they have learned from all views already, these tell nothing."""
-    checks: PositiveCount = 16
-    """Evaluations of the validation views over the run."""
-    patience: PositiveCount = 6
-    """Evaluations without a gain after which the run ends."""
+    checks: PositiveCount = 16  # Evaluations of the validation views over the run.
+    patience: PositiveCount = 6  # Evaluations without a gain after which the run ends.
     cache_bytes: NonNegativeInt = 1_000_000_000
     """Memory for the fragments of the views, first of the validation views, which are drawn most often; what does not
     fit is traced anew whenever it is needed."""
-    seed: int = 0
-    """Of the order of the views."""
+    seed: int = 0  # Of the order of the views.
     coded_steps: Count = 120
     """Further steps, which see what is stored of the texels: blocks of BC7, say, or the codes of a compact bundle."""
-    coded_every: PositiveCount = 10
-    """Steps between codings of the texels."""
-    coded_rate: float = 0.02
-    """Their rate at the start."""
+    coded_every: PositiveCount = 10  # Steps between codings of the texels.
+    coded_rate: float = 0.02  # Their rate at the start.
 
     @classmethod
     def of_learned(cls, steps: int, cache_bytes: int = cache_bytes) -> TuneOptions:

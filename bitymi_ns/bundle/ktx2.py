@@ -75,12 +75,7 @@ def descriptor(format: Format) -> bytes:
 
 
 def write_ktx2(
-    path: str | Path,
-    payload: Sequence[bytes],
-    format: Format,
-    width: int,
-    height: int,
-    writer: str,
+    path: str | Path, payload: Sequence[bytes], format: Format, width: int, height: int, writer: str
 ) -> None:
     """Write a 2D array texture with one level, not supercompressed.
 

@@ -35,13 +35,7 @@ from bitymi_ns.bundle.manifest import (
 from bitymi_ns.bundle.parts import NOTES, check_target, notes_data, parts_of
 from bitymi_ns.bundle.poster import Pixels, draw_poster, encode_poster, most_bytes
 from bitymi_ns.bundle.statistics import Statistics
-from bitymi_ns.bundle.surfel_table import (
-    EXTENT_COLUMN,
-    TERMS,
-    first_problem,
-    term_columns,
-    to_columns,
-)
+from bitymi_ns.bundle.surfel_table import EXTENT_COLUMN, TERMS, first_problem, term_columns, to_columns
 from bitymi_ns.codec.limits import RESIDUAL_LIMIT
 from bitymi_ns.codec.quantise import EncodedAtlas
 from bitymi_ns.codec.texel_codes import SceneCodes
@@ -263,10 +257,7 @@ def _describe(
             "background": list(background),
         },
         "world": world.described(),
-        "bounds": {
-            "min": [0.0] * 3 if empty else means.amin(0),
-            "max": [0.0] * 3 if empty else means.amax(0),
-        },
+        "bounds": {"min": [0.0] * 3 if empty else means.amin(0), "max": [0.0] * 3 if empty else means.amax(0)},
         "statistics": dict(statistics or {}),
     }
     if lean:

@@ -18,15 +18,7 @@ from bitymi_ns.capture.cache import content_key, replace_stale, work_folder
 from bitymi_ns.capture.frame import local_positions, move_to_world, write_frame
 from bitymi_ns.capture.masks import mask_folder
 from bitymi_ns.capture.panorama_detection import SPHERICAL_MODEL, is_full_sphere
-from bitymi_ns.capture.photos import (
-    Photo,
-    blurred,
-    check_names,
-    duplicates,
-    find_photos,
-    photo_folder,
-    read_photos,
-)
+from bitymi_ns.capture.photos import Photo, blurred, check_names, duplicates, find_photos, photo_folder, read_photos
 from bitymi_ns.capture.recognise import VIDEOS, is_model
 from bitymi_ns.capture.report import write_report
 from bitymi_ns.capture.sfm import process

@@ -27,15 +27,12 @@ class SfmSettings:
     ] = "auto"
     """Camera model of COLMAP; auto = SIMPLE_RADIAL, and OPENCV where that lowers the reprojection error, and
     EQUIRECTANGULAR for pictures that are recognized as 360-degree ones."""
-    focal_length: float | None = None
-    """Focal length of all photographs in pixels; None = from EXIF or estimated."""
+    focal_length: float | None = None  # Focal length of all photographs in pixels; None = from EXIF or estimated.
     max_image_size: int = 1600
     """Detect features on photographs downscaled to this many pixels along their longer side. Cameras stay in pixels of
     the photographs."""
-    max_features: int = 8192
-    """Most features per photograph."""
-    frames: int | None = None
-    """Number of frames of a video; None = by camera motion."""
+    max_features: int = 8192  # Most features per photograph.
+    frames: int | None = None  # Number of frames of a video; None = by camera motion.
 
 
 @dataclass(frozen=True)
@@ -67,22 +64,14 @@ class Poses:
     distorted. Its world is that of `report`'s frame.json: up and metres, as far as they are known."""
     images: Path
     """Folder that the model's image names are relative to: that of the photographs, or of upright copies, or frames."""
-    report: Path
-    """Folder with report.json, report.md, cameras.png and frame.json."""
-    left_out: dict[str, str]
-    """Photographs that have no pose, by name, and why."""
-    registered: int
-    """Number of photographs that have a pose."""
-    given: int
-    """Number of photographs, or of frames taken of a video."""
-    reprojection_error: float
-    """Mean over all observations, in pixels of the photographs."""
-    track_length: float
-    """Mean number of photographs that see a point."""
-    seconds: dict[str, float]
-    """Wall time per stage of the run that found the poses."""
-    contradicted: float = 0.0
-    """Share of the verified matches that the poses contradict."""
+    report: Path  # Folder with report.json, report.md, cameras.png and frame.json.
+    left_out: dict[str, str]  # Photographs that have no pose, by name, and why.
+    registered: int  # Number of photographs that have a pose.
+    given: int  # Number of photographs, or of frames taken of a video.
+    reprojection_error: float  # Mean over all observations, in pixels of the photographs.
+    track_length: float  # Mean number of photographs that see a point.
+    seconds: dict[str, float]  # Wall time per stage of the run that found the poses.
+    contradicted: float = 0.0  # Share of the verified matches that the poses contradict.
 
     @property
     def doubt(self) -> str:

@@ -87,11 +87,7 @@ def sample_texels(
 
 
 def choose_range(
-    texels: npt.NDArray[np.float32],
-    packing: Packing,
-    rule: RangeRule = "sigma6",
-    samples: int = 1 << 18,
-    seed: int = 0,
+    texels: npt.NDArray[np.float32], packing: Packing, rule: RangeRule = "sigma6", samples: int = 1 << 18, seed: int = 0
 ) -> Range:
     """The quantisation range of an atlas, one (offset, scale) for all channels.
 

@@ -42,11 +42,7 @@ def compress(codes: npt.NDArray[np.int64], level: int = LEVEL) -> Compressed:
 
 
 def decompress(
-    view: memoryview,
-    rows: int,
-    low: Sequence[int],
-    planes: Sequence[Sequence[int]],
-    dtype: type[np.integer] = np.int64,
+    view: memoryview, rows: int, low: Sequence[int], planes: Sequence[Sequence[int]], dtype: type[np.integer] = np.int64
 ) -> npt.NDArray:
     """Decompress integers [rows, numbers] of `compress`, in memory for `rows` of them and no more.
 

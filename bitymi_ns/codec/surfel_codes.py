@@ -123,11 +123,7 @@ class SurfelCodes:
 
 
 def code_surfels(
-    surfels: Mapping[str, Tensor],
-    kind: str,
-    sizes: npt.ArrayLike,
-    extent: Tensor,
-    steps: Mapping[str, float],
+    surfels: Mapping[str, Tensor], kind: str, sizes: npt.ArrayLike, extent: Tensor, steps: Mapping[str, float]
 ) -> tuple[SurfelCodes, Tensor]:
     """Round surfels to the given steps, in Morton order of their positions.
 

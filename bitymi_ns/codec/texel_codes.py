@@ -36,8 +36,7 @@ class TexelCodeOptions:
     step: float = 7.5
     """Step of a coefficient, in 8-bit steps, of texels that make up one pixel of the views each: of those that make up
     w pixels it is step / sqrt(w)."""
-    most_bytes: int | None = None
-    """Texels take no more than this: the step grows until they fit. None = it stays."""
+    most_bytes: int | None = None  # Texels take no more than this: the step grows until they fit. None = it stays.
 
     def check(self) -> None:
         """Refuse values that make no sense."""

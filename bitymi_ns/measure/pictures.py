@@ -83,11 +83,7 @@ def decompose(scene: Scene, camera: Any, background: Tensor, photo: Tensor) -> d
     """Draw the pictures of one view, [H, W, 3] each; without a texture there are none of the residual."""
     output = scene.render(camera, background, "frozen")
     final = output.rgb.clamp(0.0, 1.0)
-    pictures = {
-        "photo": photo,
-        "final": final,
-        "error": heat_map((final - photo).abs().mean(-1), ERROR_SCALE),
-    }
+    pictures = {"photo": photo, "final": final, "error": heat_map((final - photo).abs().mean(-1), ERROR_SCALE)}
     if scene.field is not None:
         pictures["view_color"] = scene.render(camera, background, "off").rgb
         positive, negative = residual_parts(scene, output)

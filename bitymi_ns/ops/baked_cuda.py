@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .backend import function, module, on_device, require
-from .baked_scene import IMAGES, BakedScene, check_images, common_size, residual, tile_levels
+from .baked_scene import IMAGES, LEVELS, BakedScene, check_images, common_size, residual
 from .bc7_decode import decode_bc7
 from .constants import TILE
 from .project import GEOMETRY, Camera
@@ -58,10 +58,10 @@ class Sheet(NamedTuple):
         height, width = -(-height // 4) * 4, -(-width // 4) * 4  # corners on the grid of the coarsest level
         return cls(max(1, min(pages, 2**14 // height)), width, height)
 
-    def joined(self, pages: Tensor, texels: int) -> Tensor:
-        """Pages [pages, rows, columns, channels] as one [rows, columns, channels]; those of a level, or of blocks, with
-        `texels` texels of the atlas along a side of theirs."""
-        height, width = self.height // texels, self.width // texels
+    def joined(self, pages: Tensor, side: int) -> Tensor:
+        """Pages [pages, rows, columns, channels] of texels, or of blocks with `side` texels along a side, as one
+        [rows, columns, channels]."""
+        height, width = self.height // side, self.width // side
         count, rows, columns, channels = pages.shape
         beside = max(1, -(-count // self.down))
         if beside == 1 and (rows, columns) == (height, width):
@@ -72,55 +72,83 @@ class Sheet(NamedTuple):
 
 
 class AtlasTexture:
-    """The pages of an atlas in the memory of a device, as its texture unit reads them.
+    """A sheet of texels in the memory of a device, as its texture unit reads them.
 
     Args:
-        texels: [layers, height, width, 4] uint8, or float16 or float32 (stored as float16); or BC7 blocks
-            [layers, height / 4, width / 4, 16] uint8. On the CPU.
-        blocks: `texels` are BC7 blocks; decoded, with a warning, where the device draws no such textures.
+        texels: [height, width, 4] uint8, or float16 or float32 (stored as float16); or BC7 blocks
+            [height / 4, width / 4, 16] uint8. On the CPU.
+        blocks: `texels` are BC7 blocks.
         device: where the surfels are.
-        sheet: of the atlas whose level these are; None: they are the atlas.
-        level: which one.
+
+    Attributes:
+        size: height and width in texels.
 
     Raises:
         ValueError: there are more texels than a texture has.
-        RuntimeError: the device has too little memory, or is no CUDA device.
+        RuntimeError: the device has too little memory or draws no such blocks, or is no CUDA device.
     """
 
-    def __init__(
-        self, texels: Tensor, blocks: bool, device: torch.device, sheet: Sheet | None = None, level: int = 0
-    ) -> None:
+    def __init__(self, texels: Tensor, blocks: bool, device: torch.device) -> None:
         require("baked_cuda.AtlasTexture", "cuda", device, ON_CPU)
-        texels = texels.detach().cpu()
+        side = 4 if blocks else 1
+        self.size, self._device = (side * texels.shape[0], side * texels.shape[1]), device
+        self._bytes = texels.dtype == torch.uint8
+        stored = texels if self._bytes else texels.half()
+        name = "bc7" if blocks else "uint8" if self._bytes else "half"
+        height, width = self.size
+        with on_device(device):
+            self.texture = module(device).AtlasTexture(
+                format=name, texels=stored.contiguous().view(torch.uint8), height=height, width=width
+            )
+
+    def halved(self) -> AtlasTexture:
+        """Return the texture of half the sides, means of 2 x 2 texels: made on the device, which need not decode
+        blocks for it."""
+        height, width = (side // 2 for side in self.size)
+        dtype = torch.uint8 if self._bytes else torch.float32
+        texels = torch.empty(height, width, 4, dtype=dtype, device=self._device)
+        halve = function("halve_texels_uint8" if self._bytes else "halve_texels_half", self._device)
+        halve(texture=self.texture, height=height, width=width, texels=texels)
+        return AtlasTexture(texels.cpu(), False, self._device)
+
+
+class Atlas(NamedTuple):
+    """The pages of an atlas on a device.
+
+    Attributes:
+        sheet: arrangement of the pages.
+        texture: of them.
+    """
+
+    sheet: Sheet
+    texture: AtlasTexture
+
+    @classmethod
+    def of(cls, pages: Tensor, blocks: bool, device: torch.device) -> Atlas:
+        """Upload pages.
+
+        Args:
+            pages: [pages, height, width, 4] texels, or BC7 blocks [pages, height / 4, width / 4, 16], as `AtlasTexture`
+                takes them.
+            blocks: they are BC7 blocks; decoded, with a warning, where the device draws none.
+            device: where the surfels are.
+        """
+        pages = pages.detach().cpu()
         if blocks and not draws_blocks(device):
-            texels, blocks = decoded(texels), False
+            pages, blocks = decoded(pages), False
             warnings.warn(
                 f"the device '{device}' draws no BC7 textures: the atlas was decoded, at four times the memory",
                 stacklevel=2,
             )
-        side = 4 if blocks else 1  # of what a texel of `texels` stands for
-        count, height, width = texels.shape[:3]
-        self.sheet = sheet or Sheet.of(count, side * height, side * width)
-        if blocks:
-            name = "bc7"
-        elif texels.dtype == torch.uint8:
-            name = "uint8"
-        else:
-            name, texels = "half", texels.half()
-        joined = self.sheet.joined(texels, side << level)
-        size = {"height": side * joined.shape[0], "width": side * joined.shape[1]}
-        with on_device(device):
-            self.texture = module(device).AtlasTexture(format=name, texels=joined.view(torch.uint8), **size)
+        side = 4 if blocks else 1
+        count, height, width = pages.shape[:3]
+        sheet = Sheet.of(count, side * height, side * width)
+        return cls(sheet, AtlasTexture(sheet.joined(pages, side), blocks, device))
 
-
-def coarser(scene: BakedScene, device: torch.device, sheet: Sheet) -> dict[str, AtlasTexture]:
-    """The levels of an atlas as textures, by name; those of blocks are bytes."""
-    texels = scene.atlas
-    if texels is None:
-        assert scene.blocks is not None
-        texels = decoded(scene.blocks)
-    levels = enumerate(tile_levels(texels, scene.tiles.cpu()), start=1)
-    return {name: AtlasTexture(pages, False, device, sheet, level) for level, (name, pages, _) in levels}
+    def levels(self) -> dict[str, AtlasTexture]:
+        """The coarser levels of the tiles by name (`tile_levels`)."""
+        half = self.texture.halved()
+        return dict(zip(LEVELS, (half, half.halved()), strict=True))
 
 
 def compiled(scene: BakedScene, photo_pixel: float = 1.0) -> Any:
@@ -154,12 +182,11 @@ def compiled(scene: BakedScene, photo_pixel: float = 1.0) -> Any:
     atlas = {}
     if texels is not None:
         is_blocks = texels is scene.blocks
-        kept = scene.cache.atlas(lambda: AtlasTexture(texels, is_blocks, device), texels, str(device))
-        atlas = {"texture": kept.texture, "pages_down": kept.sheet.down}
+        kept = scene.cache.atlas(lambda: Atlas.of(texels, is_blocks, device), texels, str(device))
+        atlas = {"texture": kept.texture.texture, "pages_down": kept.sheet.down}
         atlas |= {"page_width": kept.sheet.width, "page_height": kept.sheet.height}
         if photo_pixel < 1.0:
-            for name, level in scene.cache.coarser(lambda: coarser(scene, device, kept.sheet)).items():
-                atlas[name] = level.texture
+            atlas |= {name: level.texture for name, level in scene.cache.coarser(kept.levels).items()}
     with on_device(device):
         return module(device).BakedScene(
             **{name: p[name] for name in GEOMETRY},

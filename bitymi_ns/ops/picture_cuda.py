@@ -14,43 +14,56 @@ from .ssim import similarity
 
 class _PictureLosses(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, image, target, share, weight, gamma, squared):
-        pixels, wanted = dense(image, image), dense(target, image)
-        alike, dalike = similarity(pixels[..., :3], wanted, ctx.needs_input_grad[0])
-        photometric, falloff = image.new_empty(()), image.new_empty(())
+    def forward(ctx, image, target, mask, share, weight, gamma, squared):
+        pixels, wanted, rgb, flat = dense(image, image), dense(target, image), image[..., :3].detach(), None
+        if mask is not None:  # pixels that do not count are equal in both pictures
+            flat, counts = mask.reshape(-1).contiguous().view(torch.uint8), mask.reshape(*image.shape[:2], 1)
+            rgb, wanted = torch.where(counts, rgb, 0.0), torch.where(counts, wanted, 0.0)
+        alike, dalike = similarity(rgb, wanted, ctx.needs_input_grad[0])
+        photometric, falloff, counted = (image.new_empty(()) for _ in range(3))
         sums = torch.empty(module(image.device).LOSS_SUMS, dtype=torch.float64, device=image.device)
         ctx.arguments = {"gamma": gamma, "squared": squared, "share": share, "weight": weight}
         kernel("picture_loss", image)(
             image=pixels,
             target=wanted,
+            mask=flat,
             similarity=alike,
             sums=sums,
             photometric=photometric,
             falloff=falloff,
+            counted=counted,
             **ctx.arguments,
         )
-        ctx.save_for_backward(pixels, wanted)
+        ctx.save_for_backward(pixels, wanted, flat, counted)
         ctx.dalike = dalike
         return photometric, falloff
 
     @staticmethod
     def backward(ctx, dphotometric, dfalloff):
-        image, target = ctx.saved_tensors
+        image, target, mask, counted = ctx.saved_tensors
         dimage = torch.empty_like(image)
         kernel("picture_loss_backward", image)(
             image=image,
             target=target,
+            mask=mask,
+            counted=counted,
             dsimilarity=ctx.dalike,
             dphotometric=dense(dphotometric, image),
             dfalloff=dense(dfalloff, image),
             dimage=dimage,
             **ctx.arguments,
         )
-        return dimage, None, None, None, None, None
+        return dimage, None, None, None, None, None, None
 
 
 def picture_losses(
-    image: Tensor, target: Tensor, ssim_weight: float, falloff_weight: float, gamma: float, squared: bool = False
+    image: Tensor,
+    target: Tensor,
+    ssim_weight: float,
+    falloff_weight: float,
+    gamma: float,
+    squared: bool = False,
+    mask: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """The photometric and the weighted falloff loss of a picture (`train.losses.objective`), two scalars.
 
@@ -61,6 +74,7 @@ def picture_losses(
         falloff_weight: of the mean of omega beta, omega = exp(-gamma e).
         gamma: how fast omega fades with the error e.
         squared: e is the mean of the squares over rgb instead of the sum of the absolute values.
+        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
 
     Raises:
         ValueError: shapes or devices do not agree.
@@ -70,7 +84,11 @@ def picture_losses(
     if image.dim() != 3 or image.shape[-1] != IMAGE_CHANNELS or tuple(target.shape) != (*image.shape[:2], 3):
         raise ValueError(f"the picture is {list(image.shape)} and the photograph {list(target.shape)}")
     on_same_device(image, target=target)
-    return _PictureLosses.apply(image, target, ssim_weight, falloff_weight, gamma, squared)
+    if mask is not None:
+        on_same_device(image, mask=mask)
+        if mask.dtype != torch.bool or mask.numel() != image.shape[0] * image.shape[1]:
+            raise ValueError(f"the picture is {list(image.shape)}, its mask {list(mask.shape)} {mask.dtype}, not bool")
+    return _PictureLosses.apply(image, target, mask, ssim_weight, falloff_weight, gamma, squared)
 
 
 @torch.no_grad()

@@ -59,12 +59,9 @@ def _bars() -> tuple[np.ndarray, np.ndarray]:
 class Hits:
     """First hits of n rays."""
 
-    t: Image
-    """[n] distance in direction lengths"""
-    surface: np.ndarray
-    """[n] int8, which surface"""
-    part: np.ndarray
-    """[n] int8, which bar or pole"""
+    t: Image  # [n] distance in direction lengths
+    surface: np.ndarray  # [n] int8, which surface
+    part: np.ndarray  # [n] int8, which bar or pole
 
 
 def _dot(a: Vec, b: Vec) -> Image:

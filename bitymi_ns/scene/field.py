@@ -8,15 +8,7 @@ from typing import ClassVar, NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
-from bitymi_ns.ops import (
-    Fragments,
-    Projection,
-    TexelDescent,
-    TexelTiles,
-    blended_image,
-    composite_image,
-    shade,
-)
+from bitymi_ns.ops import Fragments, Projection, TexelDescent, TexelTiles, blended_image, composite_image, shade
 from bitymi_ns.ops.constants import FEATURES, WIDTH
 from bitymi_ns.ops.field import FieldGeometry, field
 

@@ -18,8 +18,7 @@ Background = Literal["auto", "black", "white", "random"]  # colours behind the s
 class LossConfig:
     """The objective: photometric loss, falloff and overdraw reduction."""
 
-    ssim_weight: Share = 0.2
-    """Photometric loss = (1 - w) L1 + w (1 - SSIM)."""
+    ssim_weight: Share = 0.2  # Photometric loss = (1 - w) L1 + w (1 - SSIM).
     falloff_weight: NonNegative = 0.005
     """Weight lambda of the falloff loss; 0 turns it off (the paper's quality setting)."""
     falloff_gamma: NonNegative = 25.0
@@ -30,16 +29,12 @@ class LossConfig:
     """full: the falloff loss also moves the blending weights; beta_only: beta alone."""
     overdraw_weight: NonNegative = 0.0
     """Weight of the loss on the number of fragments per pixel, which fades with the error as the falloff loss does."""
-    overdraw_start: int = 12_000
-    """First step with the overdraw loss: before, it costs quality."""
-    overdraw_stop: int = 27_000
-    """Step from which the overdraw loss is off again, so that the picture settles."""
+    overdraw_start: int = 12_000  # First step with the overdraw loss: before, it costs quality.
+    overdraw_stop: int = 27_000  # Step from which the overdraw loss is off again, so that the picture settles.
     overdraw_half: Positive = 0.005
     """Blending weight of a fragment that counts as half a fragment in the overdraw loss."""
-    depth_weight: NonNegative = 0.01
-    """Weight of the depth loss, for captures with depth; 0 turns it off."""
-    normal_weight: NonNegative = 0.02
-    """Weight of the normal loss, for captures with normals; 0 turns it off."""
+    depth_weight: NonNegative = 0.01  # Weight of the depth loss, for captures with depth; 0 turns it off.
+    normal_weight: NonNegative = 0.02  # Weight of the normal loss, for captures with normals; 0 turns it off.
     geometry_interval: PositiveCount = 4
     """Steps between those with the depth and the normal loss, which weigh so many times as much there."""
 
@@ -48,44 +43,29 @@ class LossConfig:
 class DensifyConfig:
     """FastGS multi-view densification and pruning."""
 
-    start: int = 500
-    """First step of densification (exclusive)."""
-    stop: int = 15_000
-    """Last step of densification (exclusive)."""
-    interval: PositiveCount = 500
-    """Steps between densifications."""
+    start: int = 500  # First step of densification (exclusive).
+    stop: int = 15_000  # Last step of densification (exclusive).
+    interval: PositiveCount = 500  # Steps between densifications.
     views: PositiveCount = 10
     """Training views rendered for the multi-view score; with fewer training views, all of them."""
-    error_threshold: Share = 0.1
-    """A pixel counts as bad when its min-max normalised error is above this."""
+    error_threshold: Share = 0.1  # A pixel counts as bad when its min-max normalised error is above this.
     importance: Annotated[int, Field(ge=-1, le=MOST)] = 5
     """Surfels are densified when their mean count of bad pixels per view is above this."""
-    grad_threshold: Threshold = 2e-4
-    """Clone when the mean gradient of the projected centre (NDC) is at least this."""
+    grad_threshold: Threshold = 2e-4  # Clone when the mean gradient of the projected centre (NDC) is at least this.
     abs_grad_threshold: Threshold = 7e-4
     """Split when the mean absolute gradient of the projected centre (NDC) is at least this."""
-    dense: Threshold = 0.001
-    """Surfels larger than this share of the scene extent are split, smaller ones are cloned."""
-    prune_opacity: Share = 0.005
-    """Surfels below this opacity are candidates for pruning."""
-    prune_world: Threshold = 0.1
-    """Surfels larger than this share of the scene extent are candidates for pruning."""
+    dense: Threshold = 0.001  # Surfels larger than this share of the scene extent are split, smaller ones are cloned.
+    prune_opacity: Share = 0.005  # Surfels below this opacity are candidates for pruning.
+    prune_world: Threshold = 0.1  # Surfels larger than this share of the scene extent are candidates for pruning.
     prune_screen: Threshold = 20.0
     """Surfels with a larger radius on screen, in pixels, are candidates for pruning after the first opacity reset."""
-    prune_budget: Share = 0.5
-    """Share of the candidates that is drawn for pruning at each densification."""
-    opacity_clamp: PositiveShare = 0.8
-    """Opacities are clamped to this at each densification."""
-    reset_interval: PositiveCount = 3000
-    """Steps between opacity resets (until `stop`)."""
-    min_reset_interval: Count = 1500
-    """Fewest steps between opacity resets, however short the run."""
-    reset_opacity: PositiveShare = 0.01
-    """Opacity after a reset, at most. Very short runs reset to a higher one."""
-    final_prune_steps: tuple[int, ...] = (18_000, 21_000, 24_000, 27_000)
-    """Steps of the final prunes."""
-    final_prune_opacity: Share = 0.1
-    """Final prunes remove surfels below this opacity."""
+    prune_budget: Share = 0.5  # Share of the candidates that is drawn for pruning at each densification.
+    opacity_clamp: PositiveShare = 0.8  # Opacities are clamped to this at each densification.
+    reset_interval: PositiveCount = 3000  # Steps between opacity resets (until `stop`).
+    min_reset_interval: Count = 1500  # Fewest steps between opacity resets, however short the run.
+    reset_opacity: PositiveShare = 0.01  # Opacity after a reset, at most. Very short runs reset to a higher one.
+    final_prune_steps: tuple[int, ...] = (18_000, 21_000, 24_000, 27_000)  # Steps of the final prunes.
+    final_prune_opacity: Share = 0.1  # Final prunes remove surfels below this opacity.
     final_prune_score: Threshold = 1.0
     """Final prunes remove surfels whose multi-view error score (0 to 1) is above this; 1 = none. FastGS's 0.9 removes
     those that cover most bad pixels, the largest of a background among them, when nothing can close the hole."""
@@ -96,10 +76,8 @@ class DensifyConfig:
     growth: NonNegative = 2.0
     """... but not before there are so many times the surfels that training started with, however few the pixels: a
     scene that cannot grow cannot put surfels where its errors are."""
-    max_surfels: Count = 0
-    """Hard cap on the number of surfels; 0 = none."""
-    min_surfels: Count = 100
-    """No prune leaves fewer surfels than this."""
+    max_surfels: Count = 0  # Hard cap on the number of surfels; 0 = none.
+    min_surfels: Count = 100  # No prune leaves fewer surfels than this.
 
 
 @dataclass
@@ -108,26 +86,17 @@ class LearningRates:
 
     short_run_power: Annotated[float, Field(ge=0, le=10)] = 0.35
     """Runs of n < 30,000 steps multiply the rates of the surfels, not of the field, by (30,000 / n) to this power."""
-    short_run_max: Positive = 4.0
-    """The largest such factor: at 7 times the rates the held-out error grows again."""
-    means: tuple[float, float] = (1.6e-4, 1.6e-6)
-    """Positions, times the scene extent."""
-    quats: float = 1e-3
-    """Rotations."""
-    log_scales: float = 5e-3
-    """Logarithms of the tangent scales."""
-    opacity_logits: float = 0.025
-    """Opacities, as logits."""
-    beta_raw: float = 5e-3
-    """Kernel exponents: beta = 4 sigmoid(beta_raw)."""
-    view_color: tuple[float, float] = (2.5e-3, 5e-4)
-    """View-dependent colour: sv_rgb, sh_dc, sb_base and sg_base."""
+    short_run_max: Positive = 4.0  # The largest such factor: at 7 times the rates the held-out error grows again.
+    means: tuple[float, float] = (1.6e-4, 1.6e-6)  # Positions, times the scene extent.
+    quats: float = 1e-3  # Rotations.
+    log_scales: float = 5e-3  # Logarithms of the tangent scales.
+    opacity_logits: float = 0.025  # Opacities, as logits.
+    beta_raw: float = 5e-3  # Kernel exponents: beta = 4 sigmoid(beta_raw).
+    view_color: tuple[float, float] = (2.5e-3, 5e-4)  # View-dependent colour: sv_rgb, sh_dc, sb_base and sg_base.
     view_shape: tuple[float, float] = (5e-3, 5e-4)
     """View-dependent colour: Voronoi sites and temperatures, lobes; higher SH bands use a twentieth of view_color."""
-    field_table: tuple[float, float] = (1e-2, 1e-3)
-    """Hash table of the texture field."""
-    field_mlp: tuple[float, float] = (1e-2, 1e-3)
-    """MLP of the texture field."""
+    field_table: tuple[float, float] = (1e-2, 1e-3)  # Hash table of the texture field.
+    field_mlp: tuple[float, float] = (1e-2, 1e-3)  # MLP of the texture field.
     exposure: tuple[float, float] = (5e-3, 5e-4)
     """Colour corrections of the photographs: logarithms of gains, and what else they have."""
 
@@ -178,8 +147,7 @@ class TexelConfig(TexelSteps):
     rendered_pixels_per_texel: Positive = 32.0
     """Limit on the texels of all tiles: one per this many pixels rendered in that part, but not below 8 million. Saves
     memory."""
-    largest: Annotated[int, Field(ge=4, le=4096)] = 64
-    """Largest side of a tile, texels, a power of two."""
+    largest: Annotated[int, Field(ge=4, le=4096)] = 64  # Largest side of a tile, texels, a power of two.
     views: NonNegative = 0.25
     """Views that tile sizes and coverage are measured on, as a share of the steps of that part; at least 32."""
 
@@ -188,15 +156,12 @@ class TexelConfig(TexelSteps):
 class GuardConfig:
     """Rollback of diverged training."""
 
-    rollbacks: Count = 5
-    """Most rollbacks to the last good state; 0 = a loss that is not finite ends the run."""
+    rollbacks: Count = 5  # Most rollbacks to the last good state; 0 = a loss that is not finite ends the run.
     rates: PositiveShare = 0.3
     """All learning rates are multiplied by this at a rollback; by its square, cube, ... at further ones without a good
     window between."""
-    window: PositiveCount = 300
-    """Steps over which the loss is judged."""
-    min_window: PositiveCount = 20
-    """Fewest steps of a window, however short the run."""
+    window: PositiveCount = 300  # Steps over which the loss is judged.
+    min_window: PositiveCount = 20  # Fewest steps of a window, however short the run.
 
 
 @dataclass
@@ -208,24 +173,20 @@ class TrainConfig:
     lr: LearningRates = field(default_factory=LearningRates)
     guard: GuardConfig = field(default_factory=GuardConfig)
     texels: TexelConfig = field(default_factory=TexelConfig)
-    freeze_after: Count = 5000
-    """From this step on the texture field learns on one step in `freeze_every` only."""
+    freeze_after: Count = 5000  # From this step on the texture field learns on one step in `freeze_every` only.
     freeze_every: PositiveCount = 10
     """Stride of the steps on which the texture field learns after `freeze_after`; 1 = every step."""
     freeze_min_updates: Count = 300
     """Short runs freeze less, so that the field still learns on about this many steps after `freeze_after`."""
-    field_warmup: Count = 500
-    """Steps over which the learning rate of the texture field rises to its full value."""
+    field_warmup: Count = 500  # Steps over which the learning rate of the texture field rises to its full value.
     resolution_schedule: Count = 3000
     """Training starts at a lower image resolution and doubles it every this many steps; 0 = full size throughout. Where
     texels learn in the last part, runs of fewer than 3,000 steps use a longer interval, but reach full size by then."""
     small_photograph: PositiveCount = 10_000
     """Photographs with at most this many pixels that show something do not stretch that interval; n times as many
     stretch it by at most sqrt(n)."""
-    num_downscales: Annotated[int, Field(ge=0, le=16)] = 2
-    """Halvings of the image size at the start."""
-    init_opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1
-    """Opacity of the first surfels."""
+    num_downscales: Annotated[int, Field(ge=0, le=16)] = 2  # Halvings of the image size at the start.
+    init_opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1  # Opacity of the first surfels.
     first_surfels: int | None = None
     """Most surfels that training starts with; excess points are dropped at random. Not given: in ns-train one for every
     1,000 pixels that the run renders; else all points."""
@@ -242,5 +203,4 @@ class TrainConfig:
     alpha_color: Literal["black", "white"] = "black"
     """Colour behind images with alpha where views are judged and after training, with background auto and random. In
     ns-train that of the capture, where it states one."""
-    seed: int = 0
-    """Seed of every random choice in training."""
+    seed: int = 0  # Seed of every random choice in training.

@@ -175,10 +175,7 @@ def _sees(camera: Camera, means: Tensor, radii: Tensor, near: float) -> bool:
     K = camera.K
     depth = z.clamp(min=near)
     seen = z > near - radii
-    for along, focal, middle, size in (
-        (x, K[0, 0], K[0, 2], camera.width),
-        (y, K[1, 1], K[1, 2], camera.height),
-    ):
+    for along, focal, middle, size in ((x, K[0, 0], K[0, 2], camera.width), (y, K[1, 1], K[1, 2], camera.height)):
         at, reach = focal * along / depth + middle, focal * radii / depth
         seen &= (at > -reach) & (at < size + reach)
     return bool(seen.any())

@@ -29,19 +29,13 @@ class LogEntry:
     """The state of a run after `step` steps."""
 
     step: int
-    seconds: float
-    """Wall-clock time of training, without evaluation."""
-    cpu_seconds: float
-    """Processor time of training over all threads, without evaluation."""
+    seconds: float  # Wall-clock time of training, without evaluation.
+    cpu_seconds: float  # Processor time of training over all threads, without evaluation.
     surfels: int
-    fragments: float
-    """Blended fragments per view, mean over the evaluation views."""
-    loss: float
-    """Objective of the last training step."""
-    psnr: float
-    """dB, mean over the evaluation views at full size; NaN without such views."""
-    cc_psnr: float
-    """PSNR in dB after the affine fit of each view's colours (`losses.color_corrected`)."""
+    fragments: float  # Blended fragments per view, mean over the evaluation views.
+    loss: float  # Objective of the last training step.
+    psnr: float  # dB, mean over the evaluation views at full size; NaN without such views.
+    cc_psnr: float  # PSNR in dB after the affine fit of each view's colours (`losses.color_corrected`).
 
 
 @dataclass
@@ -49,8 +43,7 @@ class TrainLog:
     """Log of a run."""
 
     entries: list[LogEntry] = field(default_factory=list)
-    events: list[dict[str, float]] = field(default_factory=list)
-    """Reports of the strategy, each with its `step`."""
+    events: list[dict[str, float]] = field(default_factory=list)  # Reports of the strategy, each with its `step`.
 
 
 class Trainer:

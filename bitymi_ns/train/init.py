@@ -29,10 +29,8 @@ class PointReport:
     not_finite: int = 0
     duplicates: int = 0
     over_cap: int = 0
-    random: int = 0
-    """Surfels placed at random because no point was usable."""
-    background: int = 0
-    """Surfels placed where the photographs show no point (`background_points`)."""
+    random: int = 0  # Surfels placed at random because no point was usable.
+    background: int = 0  # Surfels placed where the photographs show no point (`background_points`).
 
 
 def first_surfels_for(steps: int, pixels: float) -> int:

@@ -48,13 +48,13 @@ def objective(
     image = output.image
     if (
         image is not None
-        and mask is None
         and config.ssim_weight > 0.0
         and min(image.shape[:2]) >= SSIM_WINDOW
         and cuda_backend(image.device)
     ):
         squared = _squared(config.falloff_error)
-        both = picture_losses(image, target, config.ssim_weight, config.falloff_weight, config.falloff_gamma, squared)
+        weights = (config.ssim_weight, config.falloff_weight, config.falloff_gamma)
+        both = picture_losses(image, target, *weights, squared, mask)
         return dict(zip(("photometric", "falloff"), both[: 1 + (config.falloff_weight > 0.0)], strict=False))
     terms = {"photometric": photometric(output.rgb, target, config.ssim_weight, mask)}
     if config.falloff_weight > 0.0 or output.soft_overdraw is not None:
@@ -72,9 +72,12 @@ def objective(
     return terms
 
 
-def numbers(image: Tensor, mask: Tensor | None) -> int:
-    """Count of the values of a picture [H, W, C] that its mean loss is taken over."""
-    return 3 * (image.shape[0] * image.shape[1] if mask is None else int(mask.sum()))
+def numbers(image: Tensor, mask: Tensor | None, counted: int | None = None) -> int:
+    """Count of the values of a picture [H, W, C] that its mean loss is taken over; `counted` pixels of the mask count,
+    None = not known, to be read back."""
+    if mask is None:
+        return 3 * image.shape[0] * image.shape[1]
+    return 3 * (int(mask.sum()) if counted is None else counted)
 
 
 def photometric(rgb: Tensor, target: Tensor, ssim_weight: float, mask: Tensor | None = None) -> Tensor:
@@ -104,11 +107,7 @@ def photometric(rgb: Tensor, target: Tensor, ssim_weight: float, mask: Tensor | 
 
 
 def error_weight(
-    rgb: Tensor,
-    target: Tensor,
-    gamma: float,
-    error: Literal["l1_sum", "mse"] = "l1_sum",
-    mask: Tensor | None = None,
+    rgb: Tensor, target: Tensor, gamma: float, error: Literal["l1_sum", "mse"] = "l1_sum", mask: Tensor | None = None
 ) -> Tensor:
     """omega = exp(-gamma e) of the falloff loss: 1 where the picture is right already, near 0 where it is wrong.
 

@@ -81,7 +81,8 @@ class LearningTexels:
         field = self.scene.field
         if isinstance(field, TexelField):
             # the loss is a mean, the step wants a sum
-            rate = factor * self.schedule.texel_rate(step, self._views) * numbers(view.image, view.mask)
+            values = numbers(view.image, view.mask, view.counted)
+            rate = factor * self.schedule.texel_rate(step, self._views) * values
             if self.processes.views == 1:
                 field.descent = TexelDescent(field.share, rate)
                 return

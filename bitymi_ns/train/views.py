@@ -32,6 +32,7 @@ class View(NamedTuple):
         depth: [H, W] or [H, W, 1] float, camera z in world units, 0 or NaN where it is unknown; None = everywhere.
         normal: [H, W, 3] float, surface normals in the camera frame (OpenCV axes, facing the camera), 0 or NaN where
             they are unknown; None = everywhere.
+        counted: number of pixels that count, where that is known and `mask` is not None.
     """
 
     camera: Camera
@@ -40,6 +41,7 @@ class View(NamedTuple):
     correction: Tensor | None = None
     depth: Tensor | None = None
     normal: Tensor | None = None
+    counted: int | None = None
 
     @property
     def nbytes(self) -> int:
@@ -48,7 +50,8 @@ class View(NamedTuple):
 
     def to(self, device: torch.device | str) -> View:
         """The view on a device. Copies to a card go through pinned memory: the host does not wait."""
-        return View(self.camera.to(device), *(_moved(value, device) for value in self[1:]))
+        maps = (_moved(value, device) for value in self[1:-1])
+        return View(self.camera.to(device), *maps, self.counted)
 
     def shown(self, rgb: Tensor, alpha: Tensor, background: Tensor | None) -> Tensor:
         """`shown` by this photograph's correction."""
@@ -259,6 +262,7 @@ class DownscaledViews:
         self._factor = 1.0
         self._kept: dict[int, View] = {}
         self._resident: dict[int, View] = {}
+        self._counted: dict[int, int] = {}  # a step must not wait for the device to count
         if resident_bytes is None:
             resident_bytes = photograph_budget(self._device)
         self._budget = MemoryBudget(resident_bytes)
@@ -280,12 +284,16 @@ class DownscaledViews:
     def _at(self, index: int, factor: float) -> View:
         if factor != self._factor:
             self._reduced_budget.left += sum(view.nbytes for view in self._kept.values())
-            self._factor, self._kept = factor, {}
+            self._factor, self._kept, self._counted = factor, {}, {}
         if index in self._kept:
             return self._kept[index]
         view = self._full_size(index)
         camera = view.camera
         view = at_size(view, camera.scaled(factor) if factor < 1.0 else camera, self._device)
+        if view.mask is not None:
+            if index not in self._counted:
+                self._counted[index] = int(view.mask.sum())
+            view = view._replace(counted=self._counted[index])
         if factor < 1.0 and self._reduced_budget.reserve(view.nbytes):
             self._kept[index] = view
         return view

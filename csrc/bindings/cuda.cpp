@@ -58,13 +58,12 @@ template <class S> void bind_operations(nb::module_& m) {
   m.def(name("ssim_workspace").c_str(), &ssim_workspace<S>, "height"_a, "width"_a, "channels"_a, "gradient"_a);
 }
 
-constexpr const char* kFormats[] = {"bc7", "uint8", "half"};
 struct Texels {
   int format, height, width;
   const uint8_t* texels;
 
   template <class R> void fields(R& r) {
-    r.choice("format", format, kFormats);
+    r.choice("format", format, kTexelFormats);
     r.numbers("height", height, "width", width);
     const int bytes[] = {1, 4, 8};  // per texel
     r.array("texels", texels, bytes[format] * int64_t(height) * width);
@@ -78,6 +77,8 @@ void bind_baked(nb::module_& m) {
     const Texels t = read<Texels>(r);
     new (to) AtlasTexture(TexelFormat(t.format), t.height, t.width, t.texels);
   });
+  bind_operation(m, "halve_texels_uint8", &halve_texels<uint8_t>);
+  bind_operation(m, "halve_texels_half", &halve_texels<float>);
   m.def("draws_bc7", &draws_bc7, "True where the current device draws BC7 blocks; tried once.");
   bind_class<BakedScene>(m, "BakedScene", kCard, "A baked scene as the kernels read it.");
   bind_operation(m, "baked_frame", &baked_frame);
@@ -105,7 +106,7 @@ void bind_all(nb::module_& m) {
   bind_baked(m);
   m.attr("TILE_WARPS") = kTileWarps;
   m.attr("TRACE_SUMS") = kTraceSums;
-  m.attr("LOSS_SUMS") = 2 * kMostSums;
+  m.attr("LOSS_SUMS") = kLossSums * kMostSums;
   m.attr("MLP_WORK") = int64_t(kMostBlocks) * kMlpWeights;
   m.def("exact_size", &exact_size, "entries"_a, "surfels"_a, "frames"_a, "Numbers of exact_work, int64.");
 }

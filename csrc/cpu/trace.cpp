@@ -243,9 +243,18 @@ void select_fragments(const SelectBlocks& a) {
 }
 
 void masked_counts(const MaskedCounts<TileBlocks>& a) {
-  for (int64_t tile = 0; tile < a.layout.tiles; ++tile)
-    each_fragment(a.layout, tile, a.width,
-                  [&](const BlockRun& run, int64_t, int64_t pixel) { a.counts[run.surfel] += a.mask[pixel] != 0; });
+  std::vector<std::vector<int32_t>> partial(std::max(num_threads(), 1));
+  const int parts = parallel_tiles(a.layout.start, a.layout.tiles, 64, [&](int part, int64_t first, int64_t last) {
+    std::vector<int32_t>& counts = partial[part];
+    counts.assign(a.n, 0);
+    for (int64_t tile = first; tile < last; ++tile)
+      each_fragment(a.layout, tile, a.width,
+                    [&](const BlockRun& run, int64_t, int64_t pixel) { counts[run.surfel] += a.mask[pixel] != 0; });
+  });
+  parallel_parts(a.n, 4096, [&](int, int64_t begin, int64_t end) {
+    for (int p = 0; p < parts; ++p)
+      for (int64_t i = begin; i < end; ++i) a.counts[i] += partial[p][i];
+  });
 }
 
 #define BT_INSTANTIATE(S)                                         \

@@ -5,6 +5,7 @@
 #include <string>
 #include <vector>
 
+#include "core/common.h"
 #include "cuda/atlas_texture.h"
 
 #if !defined(__CUDACC__)
@@ -21,7 +22,34 @@ void check_size(int height, int width) {
                                 std::to_string(height) + " texels, a texture has " + std::to_string(kMostTextureWidth) +
                                 " x " + std::to_string(kMostTextureHeight) + " at most: bake fewer texels");
 }
+
+BT_HD void put_mean(const float (&texels)[4], uint8_t& to) {
+  int sum = 2;
+  for (const float texel : texels) sum += int(texel * 255.0f + 0.5f);
+  to = uint8_t(sum / 4);
+}
+BT_HD void put_mean(const float (&texels)[4], float& to) { to = (texels[0] + texels[1] + texels[2] + texels[3]) / 4; }
+
+constexpr int kHalvedThreads = 128;  // texels of a row, half as wide as the atlas
+template <class T> __global__ void __launch_bounds__(kHalvedThreads) halve_kernel(uint64_t texture, int width, T* to) {
+  const int x = int(blockIdx.x) * kHalvedThreads + int(threadIdx.x), y = int(blockIdx.y);
+  if (x >= width) return;
+  float texels[4][4];  // channels of four texels
+  for (int k = 0; k < 4; ++k) {
+    const float4 c = fetch_texel(texture, float(2 * x + k % 2) + 0.5f, float(2 * y + k / 2) + 0.5f);
+    texels[0][k] = c.x, texels[1][k] = c.y, texels[2][k] = c.z, texels[3][k] = c.w;
+  }
+  for (int channel = 0; channel < 4; ++channel) put_mean(texels[channel], to[4 * (int64_t(y) * width + x) + channel]);
+}
 }  // namespace
+
+template <class T> void halve_texels(const HalvedTexels<T>& a, Stream stream) {
+  if (!a.height || !a.width) return;
+  const dim3 blocks(unsigned(ceil_div(a.width, kHalvedThreads)), unsigned(a.height));
+  BT_LAUNCH(halve_kernel<T>, blocks, dim3(kHalvedThreads), 0, stream, a.texture->handle(), a.width, a.texels);
+}
+template void halve_texels(const HalvedTexels<uint8_t>&, Stream);
+template void halve_texels(const HalvedTexels<float>&, Stream);
 
 #if defined(__CUDACC__)
 

@@ -9,6 +9,7 @@
 namespace bt::cuda {
 
 enum class TexelFormat { kBc7, kUint8, kHalf };
+constexpr const char* kTexelFormats[] = {"bc7", "uint8", "half"};
 
 // True where the current device draws BC7 blocks; tested by drawing some. The first call waits for the device.
 bool draws_bc7();
@@ -35,6 +36,21 @@ class AtlasTexture {
   void* texels_ = nullptr;
   int device_ = 0;
 };
+
+// Means of 2 x 2 texels of a texture: texels [height, width, 4], half its sides. Those of bytes are bytes, and rounded
+// as `ops.tile_levels` rounds them; of halves they are floats.
+template <class T> struct HalvedTexels {
+  const AtlasTexture* texture;
+  int height, width;
+  T* texels;
+
+  template <class R> void fields(R& r) {
+    r.object("texture", texture);
+    r.numbers("height", height, "width", width);
+    r.array("texels", texels, int64_t(4) * height * width);
+  }
+};
+template <class T> void halve_texels(const HalvedTexels<T>& a, Stream stream);
 
 #if defined(__CUDACC__)
 __device__ __forceinline__ float4 fetch_texel(uint64_t texture, float x, float y) {

@@ -30,40 +30,47 @@ template <class S> BT_HD Error<S> error_at(const Picture<S>& p, int64_t i) {
 }
 
 // In an order that depends on the numbers of threads and blocks alone. Thread 0 has the sums.
-template <int kSums> __device__ void add_up(double (&own)[kSums], double (*total)[kThreads]) {
+__device__ void add_up(double (&own)[kLossSums], double (*total)[kThreads]) {
   const int thread = int(threadIdx.x);
-  for (int k = 0; k < kSums; ++k) total[k][thread] = own[k];
+  for (int k = 0; k < kLossSums; ++k) total[k][thread] = own[k];
   for (int half = kThreads / 2; half; half /= 2) {
     __syncthreads();
     if (thread < half)
-      for (int k = 0; k < kSums; ++k) total[k][thread] += total[k][thread + half];
+      for (int k = 0; k < kLossSums; ++k) total[k][thread] += total[k][thread + half];
   }
   if (thread == 0)
-    for (int k = 0; k < kSums; ++k) own[k] = total[k][0];
+    for (int k = 0; k < kLossSums; ++k) own[k] = total[k][0];
 }
 
+template <class S> BT_HD bool counts(const Picture<S>& p, int64_t i) { return !p.mask || p.mask[i]; }
+
 template <class S> __global__ void __launch_bounds__(kThreads) sums_kernel(Picture<S> p, double* sums) {
-  __shared__ double total[2][kThreads];
-  double own[2] = {0, 0};
+  __shared__ double total[kLossSums][kThreads];
+  double own[kLossSums] = {};
   const int64_t step = int64_t(gridDim.x) * kThreads;
   for (int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x; i < p.pixels; i += step) {
+    if (!counts(p, i)) continue;
     const Error<S> e = error_at(p, i);
-    own[0] += double(e.l1), own[1] += double(e.omega * p.image[i * kImageChannels + 4]);
+    own[0] += double(e.l1), own[1] += double(e.omega * p.image[i * kImageChannels + 4]), own[2] += 1;
   }
   add_up(own, total);
-  if (threadIdx.x == 0) sums[2 * blockIdx.x] = own[0], sums[2 * blockIdx.x + 1] = own[1];
+  if (threadIdx.x) return;
+  for (int k = 0; k < kLossSums; ++k) sums[kLossSums * blockIdx.x + k] = own[k];
 }
 
 template <class S>
 __global__ void __launch_bounds__(kThreads)
-    loss_kernel(int blocks, const double* __restrict__ sums, int64_t pixels, S share, S weight,
-                const S* __restrict__ similarity, S* photometric, S* falloff) {
-  __shared__ double total[2][kThreads];
-  double own[2] = {0, 0};
-  for (int i = int(threadIdx.x); i < blocks; i += kThreads) own[0] += sums[2 * i], own[1] += sums[2 * i + 1];
+    loss_kernel(int blocks, const double* __restrict__ sums, S share, S weight, const S* __restrict__ similarity,
+                S* photometric, S* falloff, S* counted) {
+  __shared__ double total[kLossSums][kThreads];
+  double own[kLossSums] = {};
+  for (int i = int(threadIdx.x); i < blocks; i += kThreads)
+    for (int k = 0; k < kLossSums; ++k) own[k] += sums[kLossSums * i + k];
   add_up(own, total);
   if (threadIdx.x) return;
-  const S l1 = S(own[0] / (3.0 * double(pixels))), right = S(own[1] / double(pixels));
+  const double count = own[2] > 1 ? own[2] : 1;
+  const S l1 = S(own[0] / (3.0 * count)), right = S(own[1] / count);
+  *counted = S(count);
   *photometric = (S(1) - share) * l1 + share * (S(1) - *similarity);
   *falloff = weight * right;
 }
@@ -71,15 +78,20 @@ __global__ void __launch_bounds__(kThreads)
 template <class S>
 __global__ void __launch_bounds__(kThreads)
     gradient_kernel(Picture<S> p, S share, S weight, const S* __restrict__ dsimilarity,
-                    const S* __restrict__ dphotometric, const S* __restrict__ dfalloff, S* __restrict__ dimage) {
+                    const S* __restrict__ dphotometric, const S* __restrict__ dfalloff, const S* __restrict__ counted,
+                    S* __restrict__ dimage) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= p.pixels) return;
-  const Error<S> e = error_at(p, i);
-  const S l1 = *dphotometric * (S(1) - share) / (S(3) * S(p.pixels)), similar = *dphotometric * share;
   S* to = dimage + i * kImageChannels;
+  if (!counts(p, i)) {
+    for (int k = 0; k < kImageChannels; ++k) to[k] = S(0);
+    return;
+  }
+  const Error<S> e = error_at(p, i);
+  const S l1 = *dphotometric * (S(1) - share) / (S(3) * *counted), similar = *dphotometric * share;
   for (int k = 0; k < 3; ++k) to[k] = l1 * sign_(e.d[k]) - similar * dsimilarity[3 * i + k];
   to[3] = S(0);
-  to[4] = *dfalloff * weight / S(p.pixels) * e.omega;
+  to[4] = *dfalloff * weight / *counted * e.omega;
 }
 
 template <class S> BT_HD float length_(S x, S y) {
@@ -106,14 +118,14 @@ template <class S> void picture_loss(const PictureLoss<S>& a, Stream stream) {
   const int64_t wanted = ceil_div(a.picture.pixels, kThreads);
   const int blocks = int(wanted < kMostSums ? wanted : kMostSums);
   if (blocks) BT_LAUNCH(sums_kernel<S>, dim3(unsigned(blocks)), dim3(kThreads), 0, stream, a.picture, a.sums);
-  BT_LAUNCH(loss_kernel<S>, dim3(1), dim3(kThreads), 0, stream, blocks, a.sums, a.picture.pixels, a.share, a.weight,
-            a.similarity, a.photometric, a.falloff);
+  BT_LAUNCH(loss_kernel<S>, dim3(1), dim3(kThreads), 0, stream, blocks, a.sums, a.share, a.weight, a.similarity,
+            a.photometric, a.falloff, a.counted);
 }
 
 template <class S> void picture_loss_backward(const PictureLossBackward<S>& a, Stream stream) {
   if (!a.picture.pixels) return;
   BT_LAUNCH(gradient_kernel<S>, blocks_for(a.picture.pixels), dim3(kThreads), 0, stream, a.picture, a.share, a.weight,
-            a.dsimilarity, a.dphotometric, a.dfalloff, a.dimage);
+            a.dsimilarity, a.dphotometric, a.dfalloff, a.counted, a.dimage);
 }
 
 template <class S> void note_centers(const NoteCenters<S>& a, Stream stream) {

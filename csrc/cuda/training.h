@@ -8,38 +8,40 @@
 
 namespace bt::cuda {
 
-// image [pixels, kImageChannels]: rgb, alpha and beta; target [pixels, 3]. The losses that `train.losses.objective`
-// describes: l1 is the mean of |rgb - target|, right that of omega beta, omega = exp(-gamma e), e = |rgb - target|
-// summed over rgb, or with `squared` the mean of the squares.
+// image [pixels, kImageChannels]: rgb, alpha and beta; target [pixels, 3]; mask [pixels], not 0 where the pixel counts,
+// null: all count. The losses that `train.losses.objective` describes: l1 is the mean of |rgb - target|, right that of
+// omega beta, omega = exp(-gamma e), e = |rgb - target| summed over rgb, or with `squared` the mean of the squares.
 template <class S> struct Picture {
   int64_t pixels;
   const S *image, *target;
+  const uint8_t* mask;
   S gamma;
   bool squared;
 
   template <class R> void fields(R& r) {
     r.rows("image", image, pixels, kImageChannels);
     r.array("target", target, 3 * pixels);
+    r.maybe("mask", mask, pixels);
     r.numbers("gamma", gamma, "squared", squared);
   }
 };
 
-// Writes photometric = (1 - share) l1 + share (1 - similarity) and falloff = weight right, [1] each. sums is working
-// memory.
-constexpr int kMostSums = 1024;  // blocks
+// Writes photometric = (1 - share) l1 + share (1 - similarity), falloff = weight right, and counted, the number of
+// pixels that count, at least 1; [1] each. sums is working memory.
+constexpr int kMostSums = 1024, kLossSums = 3;  // blocks; of l1, right and count
 template <class S> struct PictureLoss {
   Picture<S> picture;
   S share, weight;
   const S* similarity;  // [1]
-  double* sums;         // [kMostSums, 2]
-  S *photometric, *falloff;
+  double* sums;         // [kMostSums, kLossSums]
+  S *photometric, *falloff, *counted;
 
   template <class R> void fields(R& r) {
     picture.fields(r);
     r.numbers("share", share, "weight", weight);
     r.array("similarity", similarity, 1);
-    r.array("sums", sums, 2 * kMostSums);
-    r.arrays(1, "photometric", photometric, "falloff", falloff);
+    r.array("sums", sums, kLossSums * kMostSums);
+    r.arrays(1, "photometric", photometric, "falloff", falloff, "counted", counted);
   }
 };
 template <class S> void picture_loss(const PictureLoss<S>& a, Stream stream);
@@ -49,14 +51,14 @@ template <class S> void picture_loss(const PictureLoss<S>& a, Stream stream);
 template <class S> struct PictureLossBackward {
   Picture<S> picture;
   S share, weight;
-  const S *dsimilarity, *dphotometric, *dfalloff;
+  const S *dsimilarity, *dphotometric, *dfalloff, *counted;
   S* dimage;
 
   template <class R> void fields(R& r) {
     picture.fields(r);
     r.numbers("share", share, "weight", weight);
     r.array("dsimilarity", dsimilarity, 3 * picture.pixels);
-    r.arrays(1, "dphotometric", dphotometric, "dfalloff", dfalloff);
+    r.arrays(1, "dphotometric", dphotometric, "dfalloff", dfalloff, "counted", counted);
     r.array("dimage", dimage, picture.pixels * kImageChannels);
   }
 };

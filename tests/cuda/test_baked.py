@@ -4,8 +4,6 @@ Colours of textured fragments differ by the texture unit's weights, which have 8
 rounds them alike): 1.2e-3 was the largest difference seen.
 """
 
-import threading
-import time
 import warnings
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -24,7 +22,6 @@ from bitymi_ns.ops import baked_cuda
 from bitymi_ns.ops.backend import emulated_cuda, module
 from bitymi_ns.ops.baked import draw
 from bitymi_ns.ops.baked_cuda import Sheet, Stage, draws_blocks
-from bitymi_ns.ops.baked_scene import DrawCache
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene import Camera, baked_renderer
 from bitymi_ns.scene.baked import FAST, BakedScene
@@ -297,32 +294,6 @@ def test_nothing_to_see(device: torch.device) -> None:
         assert torch.equal(output.rgb, background.expand_as(output.rgb)) and not output.overdraw.any()
 
 
-@pytest.mark.parametrize("photo_pixel", [1.0, 0.5, 0.25])
-@pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
-def test_where_pages_lie_in_the_texture_does_not_show(
-    prefilter: str, photo_pixel: float, device: torch.device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Below each other, beside, in a grid with a gap, and with pages whose sides are on no grid."""
-    scene = replace(textured(30, 5), prefilter=prefilter)
-    assert scene.atlas is not None
-    atlas = torch.cat([scene.atlas, scene.atlas.flip(1)[:1]])
-    tiles = scene.tiles.clone()
-    tiles[:, 2] = torch.arange(30) % 3
-    wider = torch.zeros(3, atlas.shape[1] + 3, atlas.shape[2] + 1, 4, dtype=torch.uint8)
-    wider[:, :-3, :-1] = atlas
-    images = []
-    for down, pages in ((3, atlas), (1, atlas), (2, atlas), (3, wider), (2, wider)):
-        made = Sheet.of(3, *pages.shape[1:3])
-        assert made.down == 3 and made.width % 4 == 0 and made.height % 4 == 0
-        monkeypatch.setattr(Sheet, "of", lambda *size, made=made, down=down: made._replace(down=down))
-        placed = replace(scene, atlas=pages, tiles=tiles).to(device)
-        images.append(baked_cuda.draw(placed, [front()], None, ("rgb",), photo_pixel)["rgb"])
-        monkeypatch.undo()
-    for image in images[1:]:
-        off = (image - images[0]).abs()  # where a coordinate lies between two of the texture unit's fractions
-        assert off.max() < 1 / 256 and (off > 0).double().mean() < 0.01
-
-
 def test_errors(device: torch.device, cpu) -> None:
     scene = textured(4, 0).to(device)
     double = BakedScene({name: v.double() for name, v in scene.surfels.items()}, "sv", scene.tiles, None)
@@ -340,7 +311,7 @@ def test_errors(device: torch.device, cpu) -> None:
         "16777217, at most 16777216": lambda: memory(2**24 + 1, 1, 8, 8, 32, 1, False),
         "has 33 slots, it needs a multiple of 32": lambda: memory(1, 1, 8, 8, 33, 1, False),
         "too many views, pixels or pairs": lambda: memory(1, 1, 2**20, 2**20, 32, 1, False),
-        "come to 131076 x 4 texels, a texture has 131072 x 65536 at most: bake fewer": lambda: baked_cuda.AtlasTexture(
+        "come to 131076 x 4 texels, a texture has 131072 x 65536 at most: bake fewer": lambda: baked_cuda.Atlas.of(
             wide, False, device
         ),
         "a frame can have": lambda: BakedRenderer(scene, 8, 8)._resize(2**40),
@@ -396,22 +367,3 @@ def test_frames_are_begun_on_the_device_of_the_scene(device: torch.device, monke
     monkeypatch.setattr(baked_renderer, "on_device", on_device)
     BakedRenderer(textured(4, 0).to(device), 8, 9).draw([front(8, 9)])
     assert [of.type for of in entered] == [device.type]
-
-
-def test_threads_that_draw_a_scene_share_one_atlas() -> None:
-    cache, made, inside = DrawCache(), [], threading.Event()
-
-    def make() -> object:
-        inside.set()
-        time.sleep(0.05)  # the other thread comes meanwhile
-        made.append(object())
-        return made[-1]
-
-    texels, got = torch.zeros(3), []
-    threads = [threading.Thread(target=lambda: got.append(cache.atlas(make, texels))) for _ in range(2)]
-    threads[0].start()
-    inside.wait()
-    threads[1].start()
-    for thread in threads:
-        thread.join()
-    assert len(made) == 1 and got[0] is got[1]

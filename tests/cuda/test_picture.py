@@ -1,6 +1,7 @@
 """Losses and statistics of a training step by the CUDA kernels, against torch."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -9,7 +10,9 @@ from torch import Tensor
 from bitymi_ns.ops.picture_cuda import note_centers, picture_losses
 from bitymi_ns.ops.project import Projection
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.train.losses import error_weight, mean_where_right, photometric
+from bitymi_ns.scene.scene import RenderOutput
+from bitymi_ns.train.config import LossConfig
+from bitymi_ns.train.losses import error_weight, mean_where_right, objective, photometric
 from tests.ops.test_kernels import relative
 
 DTYPES = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
@@ -49,6 +52,30 @@ def test_losses_and_gradient(
     assert not got[2][..., 3].any()
 
 
+@DTYPES
+@pytest.mark.parametrize("share", [0.6, 0.0], ids=["some", "none"])
+def test_losses_and_gradient_where_a_mask_counts(share: float, dtype: torch.dtype, device: torch.device, cpu) -> None:
+    image, target = picture(37, 300, dtype)  # of more pixels than a block adds up
+    view = SimpleNamespace(camera=SimpleNamespace(height=37, width=300))
+    mask = torch.rand(37, 300, generator=torch.Generator().manual_seed(3)) < share
+    target[~mask] = math.nan
+
+    def losses(device: torch.device, dtype: torch.dtype) -> list[Tensor]:
+        drawn = image.to(device, dtype, copy=True).requires_grad_()
+        output = RenderOutput.of_image(drawn.view(-1, 5), view, None, None, maps=False)
+        config = LossConfig(ssim_weight=0.2, falloff_weight=0.5, falloff_gamma=4.0)
+        terms = objective(output, target.to(device, dtype), config, mask.to(device))
+        (found,) = torch.autograd.grad(2.0 * terms["photometric"] + 3.0 * terms["falloff"], drawn)
+        return [value.detach().cpu().double() for value in (*terms.values(), found)]
+
+    got = losses(device, dtype)
+    with cpu():
+        want = losses(torch.device("cpu"), torch.float64)
+    for a, b in zip(got, want, strict=True):
+        assert a.isfinite().all() and relative(a, b) < (1e-12 if dtype == torch.float64 else 3e-5)
+    assert not got[2][~mask].any()
+
+
 def test_one_loss_alone_has_a_gradient(device: torch.device) -> None:
     image, target = (value.to(device) for value in picture(12, 13, torch.float32))
     image.requires_grad_()
@@ -63,6 +90,9 @@ def test_shapes_are_checked(device: torch.device) -> None:
         picture_losses(image, target[1:], 0.2, 0.5, 4.0)
     with pytest.raises(ValueError, match="the picture is"):
         picture_losses(image[..., :4], target, 0.2, 0.5, 4.0)
+    for mask in (target[..., 0], target[1:, :, 0] > 0.5):
+        with pytest.raises(ValueError, match="its mask"):
+            picture_losses(image, target, 0.2, 0.5, 4.0, mask=mask)
 
 
 @DTYPES

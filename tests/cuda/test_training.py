@@ -17,7 +17,7 @@ STEPS = 3
 
 
 def scene_and_views(dtype: torch.dtype = torch.float32) -> tuple[Scene, list[View]]:
-    """A few discs with a texture, and photographs of other colours."""
+    """A few discs with a texture, and photographs of other colours, of one with a mask."""
     case = random_scene(20, 5, width=20, height=16, scale=0.5)
     config = SceneConfig(min_resolution=8, near=0.2)
     field = HashField(config, (0.0, 0.0, 0.0), 4.0, True, 6, torch.Generator().manual_seed(0))
@@ -26,7 +26,8 @@ def scene_and_views(dtype: torch.dtype = torch.float32) -> tuple[Scene, list[Vie
     scene = Scene(config, {key: value.to(dtype) for key, value in case.params.items()}, field.to(dtype))
     g = torch.Generator().manual_seed(2)
     camera = Camera(case.viewmat.float(), case.K.float(), case.width, case.height)
-    return scene, [View(camera, torch.rand(16, 20, channels, generator=g)) for channels in (3, 4)]
+    first, second = (torch.rand(16, 20, channels, generator=g) for channels in (3, 4))
+    return scene, [View(camera, first, torch.rand(16, 20, generator=g) < 0.8), View(camera, second)]
 
 
 def train(device: torch.device, background: str, exposure: str) -> tuple[list[float], float, dict[str, torch.Tensor]]:

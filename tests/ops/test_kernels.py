@@ -292,12 +292,15 @@ def test_compositing_equals_index_add() -> None:
     torch.testing.assert_close(got, want, rtol=1e-12, atol=1e-13)
 
 
-def test_masked_counts_count_blended_fragments_on_masked_pixels() -> None:
+@pytest.mark.parametrize("threads", [1, 3])
+def test_masked_counts_count_blended_fragments_on_masked_pixels(threads: int) -> None:
     case = random_scene(30, 4)
     scene, camera = scene_of(case, torch.float32)
     fragments = scene.render(camera).fragments
     mask = torch.rand(case.width * case.height, generator=torch.Generator().manual_seed(0)) > 0.5
+    backend.module(torch.device("cpu")).set_num_threads(threads)
     counts = ops.masked_counts(fragments, mask, 30)
+    backend.module(torch.device("cpu")).set_num_threads(0)
     on_mask = fragments.surfel[mask[fragments.pixel.long()]].long()
     assert torch.equal(counts.long(), torch.bincount(on_mask, minlength=30))
 

@@ -77,6 +77,8 @@ def test_other_processors_get_the_compilers_default(tmp_path: Path) -> None:
 def test_cuda_kernels_for_two_kinds_of_cards(tmp_path: Path) -> None:
     said = configure(tmp_path, BITYMI_CUDA="ON", BITYMI_CUDA_ARCHITECTURES="80;90")
     assert "CUDA kernels for 80, 90" in said
+    built = (tmp_path / "build.ninja").read_text("utf8")
+    assert "code=[sm_80]" in built and "code=[compute_90,sm_90]" in built
     compiled = "CMakeFiles/bitymi_cuda.dir/csrc/cuda/device_check.cu.o"
     done = subprocess.run([str(NINJA), "-C", str(tmp_path), compiled], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout

@@ -34,6 +34,17 @@ def test_area_average():
     assert as_float(torch.tensor([0, 255], dtype=torch.uint8)).tolist() == [0, 1]
 
 
+def test_the_pixels_that_count_are_counted_once_at_each_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    mask = torch.rand(8, 12, generator=torch.Generator().manual_seed(0)) < 0.9
+    camera = Camera(torch.eye(4), torch.eye(3), 12, 8)
+    views = DownscaledViews([View(camera, torch.rand(8, 12, 3), mask), View(camera, torch.rand(8, 12, 3))])
+    for factor, count in ((1.0, mask.sum()), (0.5, downscale_mask(mask, 6, 4).sum())):
+        assert views.at(0, factor).counted == count and views.at(1, factor).counted is None
+        with monkeypatch.context() as patch:
+            patch.setattr(torch.Tensor, "sum", None)
+            assert views.at(0, factor).counted == count
+
+
 def test_background():
     assert background_color("black", 0, 0) is None
     assert background_color("white", 0, 0).tolist() == [1, 1, 1]

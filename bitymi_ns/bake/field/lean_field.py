@@ -67,11 +67,7 @@ def level_changes(
 
 
 def lean_field(
-    field: HashField,
-    surfels: Mapping[str, Tensor],
-    transmittance: Tensor | None,
-    weight_bound: float,
-    tolerance: float,
+    field: HashField, surfels: Mapping[str, Tensor], transmittance: Tensor | None, weight_bound: float, tolerance: float
 ) -> tuple[HashField, FieldLevels]:
     """Remove the finest and coarsest levels of a field, as far as no surfel needs them.
 

@@ -12,12 +12,7 @@ from bitymi_ns.bake.tiles import Shown
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.statistics import KeptTexels
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.scene.tile_sizes import (
-    kernel_parameters,
-    nyquist_resolution,
-    visible_extent,
-    voxel_along_axes,
-)
+from bitymi_ns.scene.tile_sizes import kernel_parameters, nyquist_resolution, visible_extent, voxel_along_axes
 from bitymi_ns.train.init import tangents
 
 PAPER_EXTENT = 4.0  # e of the paper's rule

@@ -171,8 +171,7 @@ def polish_scene(
     run.scene.load_state_dict(stopping.best)
     spent = time.perf_counter() - started, time.process_time() - cpu_started
     statistics = stopping.statistics(len(trained), len(validation), *spent).but(
-        error_before=baked.statistics.error,
-        psnr_held_out=gain(before, run.psnr(eval_views)) if eval_views else None,
+        error_before=baked.statistics.error, psnr_held_out=gain(before, run.psnr(eval_views)) if eval_views else None
     )
     texels = run.field.texels.detach()
     result = run.texels.baked(texels).with_surfels(dict(run.scene.surfels))

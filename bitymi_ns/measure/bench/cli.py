@@ -37,30 +37,22 @@ FAILED, INTERRUPTED = 1, 130  # exit statuses when a cell failed, and after Ctrl
 class BenchRun:
     """Train, bake and evaluate a matrix of scenes, methods and seeds."""
 
-    data: tuple[Path, ...]
-    """local: folders of captures. A standard data set: the folder that holds its scenes."""
-    scenes: tuple[str, ...] = ()
-    """Only these scenes of a standard data set."""
-    methods: tuple[str, ...] = ("bitymi",)
-    """Methods of ns-train."""
+    data: tuple[Path, ...]  # local: folders of captures. A standard data set: the folder that holds its scenes.
+    scenes: tuple[str, ...] = ()  # Only these scenes of a standard data set.
+    methods: tuple[str, ...] = ("bitymi",)  # Methods of ns-train.
     plan: str | None = None
     """Rows to train instead of --methods: ablation, atlas, overdraw, resolution, or
     a YAML file of that form."""
     extra: str = ""
     """Further options of ns-train for every run, as one word: --extra="--pipeline.model.scene.weight-bound 0"."""
-    seeds: tuple[int, ...] = ()
-    """Train once for each of these seeds; none = once, with the method's own."""
-    steps: int | None = None
-    """Steps of a training; the schedules follow. None = the method's own for this machine."""
-    formats: tuple[str, ...] = FORMATS
-    """Formats of bundles that each trained scene is baked into; none = no baking."""
-    pictures: int = 2
-    """Number of worst held-out views of each run to draw with errors and decomposition."""
+    seeds: tuple[int, ...] = ()  # Train once for each of these seeds; none = once, with the method's own.
+    steps: int | None = None  # Steps of a training; the schedules follow. None = the method's own for this machine.
+    formats: tuple[str, ...] = FORMATS  # Formats of bundles that each trained scene is baked into; none = no baking.
+    pictures: int = 2  # Number of worst held-out views of each run to draw with errors and decomposition.
     work: Path = Path("outputs/bench")
     """Folder of runs, bundles, logs and finished cells, which are not done again. The command may run several times at
     once on one folder, with other GPUs or on other machines: each takes runs that no other is working on."""
-    output: Path | None = None
-    """Also write the table to this Markdown file."""
+    output: Path | None = None  # Also write the table to this Markdown file.
     suite: tyro.conf.Suppress[str] = "local"
 
     def _scenes(self) -> list[SceneSpec]:

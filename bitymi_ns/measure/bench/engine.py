@@ -143,10 +143,7 @@ def _evaluation(at: Layout, stage: Stage) -> dict[str, Any]:
 
 def _pictures(at: Layout, stage: Stage) -> dict[str, Any]:
     folder = at.path("pictures")
-    return {
-        "folder": at.relative(folder),
-        "views": len(json_of((folder / "pictures.json").read_text("utf8"))["views"]),
-    }
+    return {"folder": at.relative(folder), "views": len(json_of((folder / "pictures.json").read_text("utf8"))["views"])}
 
 
 def read_curve(path: Path) -> list[dict[str, Any]]:

@@ -13,10 +13,7 @@ import torch
 import tyro
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.dataparser_configs import all_dataparsers
-from nerfstudio.data.datamanagers.full_images_datamanager import (
-    FullImageDatamanager,
-    FullImageDatamanagerConfig,
-)
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
@@ -106,11 +103,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         self.step_view: Callable[[int], View] = lambda index: self.train_views[index]
         images.set_up_pillow()
         points = check_capture(config, need_photos=test_mode != "inference")
-        with (
-            reporting_input_errors(config),
-            reporting_time("Reading", points),
-            reading_points(test_mode == "val"),
-        ):
+        with reporting_input_errors(config), reporting_time("Reading", points), reading_points(test_mode == "val"):
             super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
         self._check_images(test_mode)
         if test_mode == "val":

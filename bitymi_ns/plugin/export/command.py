@@ -45,12 +45,9 @@ class ExportAtlas(BakeOptions, CompactOptions):
     on the held-out views.
     """
 
-    load_config: Path
-    """config.yml of a trained scene."""
-    output_dir: Path
-    """Folder of the bundle."""
-    overwrite: bool = False
-    """Replace a bundle that is there already."""
+    load_config: Path  # config.yml of a trained scene.
+    output_dir: Path  # Folder of the bundle.
+    overwrite: bool = False  # Replace a bundle that is there already.
     format: BundleFormat | None = None  # type: ignore[assignment]  # of the bundle; that of the bake is `_options`
     """compact: surfels and view colours as far as the pictures need them, texels by cosine transform; a sixth to a
     half of the bytes of bc7, which is surfels.ply and texels of 1 byte each. uint8, fp16: the same with texels of 4
@@ -76,8 +73,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
     extras: tuple[Kind, ...] = ()
     """Also write the scene for other programs, into a folder beside the bundle with its name and .extras: gaussians (a
     preview as Gaussian splats), mesh (textured quads). `bitymi extras BUNDLE` does so later."""
-    extras_frame: Frame = "scene"
-    """Frame of these files: the scene's, or the capture's own."""
+    extras_frame: Frame = "scene"  # Frame of these files: the scene's, or the capture's own.
     check_room: bool = True
     """Stop before the work where the disk may have too little room, by an estimate that can be many times too high."""
     photographs: bool = False
@@ -180,10 +176,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
             background=background,
             world=world_of(datamanager),
             statistics={"options": asdict(options), "method": config.method_name},
-            extra_files={
-                "preview.jpg" if self._is_compact else "preview.png": shown,
-                **cameras_of,
-            },
+            extra_files={"preview.jpg" if self._is_compact else "preview.png": shown, **cameras_of},
             loose_files={CONFIG: bundle_config(config, self.output_dir, background)},
             overwrite=self.overwrite,
             interchange=self.interchange,

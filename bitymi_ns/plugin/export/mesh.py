@@ -47,24 +47,19 @@ class Source:
 class ExportMesh:
     """Extract the surface as a triangle mesh with vertex colors: TSDF fusion of median depths (open3d)."""
 
-    load_config: Path
-    """config.yml of a trained scene or of a bundle."""
-    output_dir: Path
-    """Folder of the mesh: mesh.ply, mesh.glb or mesh.obj."""
-    format: Literal["ply", "glb", "obj"] = "ply"
-    """Of the file."""
+    load_config: Path  # config.yml of a trained scene or of a bundle.
+    output_dir: Path  # Folder of the mesh: mesh.ply, mesh.glb or mesh.obj.
+    format: Literal["ply", "glb", "obj"] = "ply"  # Of the file.
     resolution: int = SurfaceOptions.resolution
     """Voxels along the longest side of the box that holds what the cameras see, 16 to 4096. Time and memory grow with
     its square."""
-    triangles: int = SurfaceOptions.triangles
-    """Budget of triangles, met by simplification; 0 = no limit."""
+    triangles: int = SurfaceOptions.triangles  # Budget of triangles, met by simplification; 0 = no limit.
     watertight: bool = False
     """Close the mesh by a Poisson reconstruction: for printing and simulation. Invents surface where nothing was
     seen."""
     frame: Frame = "capture"
     """Frame of the vertices: the capture's own, with its unit of length, or the scene's, in which nerfstudio trains."""
-    overwrite: bool = False
-    """Replace a mesh that is there already."""
+    overwrite: bool = False  # Replace a mesh that is there already.
 
     def main(self) -> None:
         """Run the export."""
@@ -112,13 +107,7 @@ class ExportMesh:
         cameras = source.cameras[::step]
         with rich_progress() as progress:
             mesh = extract_surface(
-                source.surfels,
-                source.render,
-                cameras,
-                source.near,
-                options,
-                source.prefilter,
-                progress,
+                source.surfels, source.render, cameras, source.near, options, source.prefilter, progress
             )
         if to is not None:
             vertices = torch.from_numpy(np.asarray(mesh.vertices))
@@ -156,12 +145,7 @@ def from_bundle(folder: Path) -> Source:
     rows = named_cameras(folder, bundle.info)
     cameras = [row.camera for row in rows if not row.held_out] or [row.camera for row in rows]
     return Source(
-        scene.surfels,
-        lambda camera: bundle.render(camera).rgb,
-        cameras,
-        scene.near,
-        scene.prefilter,
-        bundle.info.world,
+        scene.surfels, lambda camera: bundle.render(camera).rgb, cameras, scene.near, scene.prefilter, bundle.info.world
     )
 
 

@@ -83,20 +83,12 @@ class TrainingRun:
         self.curve_steps = points(self.total, curve_points)
         resumed_from = trainer.config.load_dir or getattr(trainer.config.load_checkpoint, "parent", None)
         self.curve = TrainingCurve(
-            trainer.base_dir / FILE,
-            None if resumed_from is None else resumed_from.parent / FILE,
-            self.first_step,
+            trainer.base_dir / FILE, None if resumed_from is None else resumed_from.parent / FILE, self.first_step
         )
-        self.names = {
-            "experiment_name": trainer.config.experiment_name,
-            "method_name": trainer.config.method_name,
-        }
+        self.names = {"experiment_name": trainer.config.experiment_name, "method_name": trainer.config.method_name}
         self._held_back = False  # whether it was said that densification meets its bound
         for sentence in limits.short_run(
-            self.training.schedule,
-            len(self.datamanager.train_dataset),
-            scene.config.texture == "hash",
-            processes.views,
+            self.training.schedule, len(self.datamanager.train_dataset), scene.config.texture == "hash", processes.views
         ):
             say(sentence)
         _ = self.datamanager.cached_train  # read the images now: loading is not training time

@@ -61,6 +61,7 @@ const actionsOf = (context, page) => ({
     await page.keyboard.type(text);
     await page.keyboard.press('Tab');
   },
+  upload: ([selector, path]) => page.setInputFiles(selector, path),
   wheel: async ([at, by]) => {
     await page.mouse.move(...at);
     await page.mouse.wheel(0, by);

@@ -62,6 +62,29 @@ def test_keyframes_and_the_file_of_a_path(bundle: Path, tmp_path: Path) -> None:
     assert screen["camera_path"][0]["fov"] == pytest.approx(2 * np.degrees(np.arctan(0.5)))
 
 
+def test_a_saved_path_is_opened_again(bundle: Path, tmp_path: Path) -> None:
+    page = Steps()
+    page.do(["press", "#add-keyframe"], there(SECOND), ["settle"], ["press", "#add-keyframe"], ["key", "k"])
+    page.do(["press", "#loop"], ["press", "#smooth"], ["key", "n"])
+    page.do(["fill", "#seconds", "3"], ["save", "#save-path", tmp_path / "a.json"])
+    for _ in range(3):
+        page.do(["press", "#keyframes [title=Remove]"])
+    page.do(["press", "#loop"], ["press", "#smooth"], ["upload", "#path-file", tmp_path / "a.json"])
+    page.do(["until", "document.querySelectorAll('#keyframes li').length === 3"])
+    total = page.ask(TOTAL)
+    pressed = page.ask("['loop', 'smooth'].map((id) => document.getElementById(id).ariaPressed).join()")
+    page.do(["save", "#save-path", tmp_path / "b.json"], ["press", "#keyframes .name"])
+    first = page.view()
+    page.do(["upload", "#path-file", bundle / "cameras.json"])
+    page.do(["until", "document.getElementById('notice').textContent.includes('cameras.json is no camera path')"])
+    kept = page.ask(ROWS)
+    page.run(bundle, START)
+
+    assert page[total] == "3" and page[pressed] == "true,false" and page[kept].count("Keyframe") == 3
+    assert np.allclose(page.seen(first).position, [0, -3, 0], atol=1e-6)
+    assert json.loads((tmp_path / "a.json").read_text()) == json.loads((tmp_path / "b.json").read_text())
+
+
 def test_a_path_plays_until_the_reader_moves(bundle: Path) -> None:
     page = Steps()
     name = "document.getElementById('play').textContent"

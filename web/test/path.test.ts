@@ -75,7 +75,9 @@ describe('the file of a path', () => {
     const made = path([around(0), around(1)], [2]);
     const file = JSON.parse(made.file(640, 360));
     expect(Object.keys(file).sort()).toEqual(
-      'camera_path camera_type crop fps is_cycle render_height render_width seconds smoothness_value'.split(' '),
+      'camera_path camera_type crop fps is_cycle keyframes render_height render_width seconds smoothness_value'.split(
+        ' ',
+      ),
     );
     expect([file.render_width, file.render_height, file.fps, file.seconds]).toEqual([640, 360, 30, 2]);
     expect(file.camera_path).toHaveLength(60);
@@ -89,6 +91,66 @@ describe('the file of a path', () => {
       expect(m.slice(4 * c, 4 * c + 4)).toEqual(row.map((x) => expect.closeTo(x, 9)));
     });
     expect(m.slice(12)).toEqual([0, 0, 0, 1]);
+  });
+  it('has the principal points of the lenses', () => {
+    const aside = { ...LENS, cx: 60, cy: 44 };
+    const made = path([around(0), around(0)], [2], [aside, LENS]);
+    expect(made.at(0, 200, 160).cx).toBeCloseTo(120);
+    const points = JSON.parse(made.file(200, 160)).camera_path.map(
+      (each: { principal_point: number[] }) => each.principal_point,
+    );
+    expect([points[0], points[59]]).toEqual([
+      [expect.closeTo(0.6, 9), expect.closeTo(0.55, 9)],
+      [0.5, 0.5].map((x) => expect.closeTo(x, 9)),
+    ]);
+  });
+  it.each([true, false])('is taken back as it was; loop: %s', (loop) => {
+    const poses = [around(0), rolled(around(0.8), 0.4), around(2)];
+    const made = path(poses, [1, 3, 0.5], [{ ...LENS, cx: 60, fy: 120 }]);
+    [made.loop, made.smooth] = [loop, !loop];
+    const again = new CameraPath();
+    again.load(made.file(640, 360));
+    expect([again.loop, again.smooth, again.seconds]).toEqual([loop, !loop, made.seconds]);
+    [0, 0.7, 2.2, 4].forEach((time) => {
+      const [a, b] = [made, again].map((each) => each.at(time, 300, 200));
+      expect(apart(a.pose, b.pose)).toBeLessThan(1e-9);
+      expect([b.fx, b.fy, b.cx, b.cy]).toEqual([a.fx, a.fy, a.cx, a.cy].map((x) => expect.closeTo(x, 9)));
+    });
+  });
+  it("of nerfstudio's viewer is taken, with the time of a keyframe before it", () => {
+    const row = (angle: number, seconds: number | null): object => {
+      const { position: p, right: r, down: d, forward: f } = around(angle);
+      const matrix = [0, 1, 2].flatMap((c) => [r[c], -d[c], -f[c], p[c]]).concat(0, 0, 0, 1);
+      const own = { override_transition_enabled: seconds !== null, override_transition_sec: seconds };
+      return { matrix, fov: 90, aspect: 2, ...own };
+    };
+    const made = new CameraPath();
+    const rest = { default_fov: 75, default_transition_sec: 1.5, camera_type: 'perspective', is_cycle: false };
+    made.load(JSON.stringify({ keyframes: [row(0, 9), row(1, null), row(2, 4)], ...rest, smoothness_value: 0 }));
+    expect([made.seconds, made.smooth]).toEqual([5.5, true]);
+    expect(apart(made.at(1.5, 20, 10).pose, around(1))).toBeLessThan(1e-9);
+    const { fy, cx, cy } = made.at(0, 20, 10);
+    expect([fy, cx, cy]).toEqual([5, 10, 5].map((x) => expect.closeTo(x, 9)));
+  });
+  it.each([
+    [/JSON/, '{'],
+    [/keyframes/, 'null'],
+    [/keyframes/, '{"camera_path": []}'],
+    [/keyframes/, '{"keyframes": []}'],
+    [/perspective/, '{"keyframes": [{}], "camera_type": "fisheye"}'],
+    [/keyframe 1 /, '{"keyframes": [null]}'],
+    [
+      /keyframe 1 /,
+      '{"keyframes": [{"matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], "fov": 200, "aspect": 1}]}',
+    ],
+    [
+      /keyframe 1 /,
+      '{"keyframes": [{"matrix": [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], "fov": 50, "aspect": 1}]}',
+    ],
+  ])('is refused: %s %s', (words, text) => {
+    const made = path([around(0)], [2]);
+    expect(() => made.load(text)).toThrowError(words);
+    expect(made.keyframes).toHaveLength(1);
   });
   it('of a loop ends before it begins again', () => {
     const made = path([around(0), around(1)], [2, 2]);

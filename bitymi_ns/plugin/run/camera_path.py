@@ -27,12 +27,14 @@ def _pose(value: list[Any]) -> list[Any]:
 
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_Share = Annotated[float, Field(ge=-1, le=2)]
 _Side = Annotated[int, Field(ge=1, le=MOST_PIXELS)]
 
 
 class _Frame(BaseModel):
     camera_to_world: Annotated[list[Any], AfterValidator(_pose)]
     fov: Annotated[float, Field(gt=0, lt=180)]
+    principal_point: Annotated[list[_Share], Field(min_length=2, max_length=2)] = [0.5, 0.5]
 
 
 class _Path(BaseModel):

@@ -72,6 +72,7 @@ def adopt_render() -> None:
     script.update(
         install_checks=SimpleNamespace(check_ffmpeg_installed=lambda: None),
         get_crop_from_json=lambda path: None,  # crops are not supported
+        get_path_from_json=lambda found: _with_principal_points(stock["get_path_from_json"](found), found),
         get_interpolated_camera_path=lambda **options: _interpolated(stock["get_interpolated_camera_path"], **options),
         get_spiral_path=lambda camera, **options: camera,
         VanillaDataManager=(stock["VanillaDataManager"], BitymiDataManager),  # those that a spiral is allowed for
@@ -82,6 +83,7 @@ def adopt_render() -> None:
 _REPLACED = (
     "install_checks",
     "get_crop_from_json",
+    "get_path_from_json",
     "get_interpolated_camera_path",
     "get_spiral_path",
     "VanillaDataManager",
@@ -163,14 +165,26 @@ def _check_outputs(command: Any, transparency: bool) -> None:
 
 
 def _interpolated(stock: Any, cameras: Cameras, **options: Any) -> Cameras:
-    """nerfstudio's path between cameras, in the size of the first one: it takes the principal point for the middle."""
+    """nerfstudio's path between cameras, in the size of the first one: nerfstudio takes the principal point for the
+    middle, and that of the first camera for all."""
     if len(cameras) < 2:
         fail(
             f"a path leads from camera to camera, and there is {'only one' if len(cameras) else 'none'} to start from. "
             "Choose --pose-source train, or `ns-render spiral`."
         )
     path = stock(cameras=cameras, **options)
+    points = Cameras(cameras.camera_to_worlds, fx=cameras.cx, fy=cameras.cy, cx=cameras.cx, cy=cameras.cy)
+    along = stock(cameras=points, **options)  # the same way, with principal points for focal lengths
+    path.cx, path.cy = along.fx, along.fy
     _resize(path, cameras)
+    return path
+
+
+def _with_principal_points(path: Cameras, found: dict[str, Any]) -> Cameras:
+    """Give the cameras of a path the `principal_point` of their frames, parts of width and height, which our viewer
+    writes and nerfstudio ignores; 0.5, 0.5 where a frame has none."""
+    points = torch.tensor([frame.get("principal_point", (0.5, 0.5)) for frame in found["camera_path"]]).float()
+    path.cx, path.cy = found["render_width"] * points[:, :1], found["render_height"] * points[:, 1:]
     return path
 
 

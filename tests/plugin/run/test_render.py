@@ -56,7 +56,7 @@ def wall(monkeypatch: pytest.MonkeyPatch) -> Wall:
     model = Wall()
     for name in ("install_checks", "_render_trajectory_video", "get_crop_from_json", "VanillaDataManager", "media"):
         monkeypatch.setattr(render, name, getattr(render, name))
-    for name in ("get_interpolated_camera_path", "get_spiral_path", "gzip"):
+    for name in ("get_path_from_json", "get_interpolated_camera_path", "get_spiral_path", "gzip"):
         monkeypatch.setattr(render, name, getattr(render, name))
 
     def eval_setup(*_: Any, **__: Any) -> tuple:
@@ -88,7 +88,8 @@ def cameras(count: int) -> Cameras:
     """Cameras in a row whose principal point is off the middle."""
     poses = torch.eye(4)[:3].repeat(count, 1, 1)
     poses[:, 0, 3] = torch.arange(count) * 0.1
-    return Cameras(poses, fx=40.0, fy=40.0, cx=17.0, cy=11.0, width=32, height=24)
+    cy = 11.0 + torch.arange(count)[:, None]
+    return Cameras(poses, fx=40.0, fy=40.0, cx=17.0, cy=cy, width=32, height=24)
 
 
 def path_of(count: int = 12, **changes: Any) -> dict[str, Any]:
@@ -130,6 +131,15 @@ def test_a_camera_path_becomes_a_film_that_browsers_play(wall: Wall, camera_path
     data = (tmp_path / "film.mp4").read_bytes()
     assert data.index(b"moov") < data.index(b"mdat")  # plays before it is there as a whole
     assert sorted(path.name for path in tmp_path.iterdir()) == ["film.mp4", "path.json"]
+
+
+def test_frames_of_a_path_keep_their_principal_points(wall: Wall, camera_path: Any) -> None:
+    found = path_of(3)
+    found["camera_path"][0]["principal_point"] = [0.25, 0.75]
+    found["camera_path"][1]["principal_point"] = [1, 0]
+    camera_path(found, downscale_factor=2.0)
+    assert [(c.width, c.height) for c in wall.drawn] == [(16, 12)] * 3
+    assert [camera.K[:2, 2].tolist() for camera in wall.drawn] == [[4, 9], [16, 0], [8, 6]]
 
 
 def test_odd_sizes_and_single_frames(
@@ -182,7 +192,7 @@ def test_paths_of_the_captures_cameras(wall: Wall, tmp_path: Path) -> None:
     render.RenderInterpolated(interpolation_steps=6, frame_rate=30, **options).main()
     stream, frames = decoded(tmp_path / "film.mp4")
     assert stream.average_rate == 30 and len(frames) == 12 and frames[0].shape == (24, 32, 3)
-    assert float(wall.drawn[0].K[0, 2]) == 17.0
+    assert [camera.K[:2, 2].tolist() for camera in (wall.drawn[0], wall.drawn[6])] == [[17, 11], [17, 12]]
     render.SpiralRender(seconds=0.5, frame_rate=20, **options).main()
     stream, frames = decoded(tmp_path / "film.mp4")
     assert stream.average_rate == 20 and len(frames) == 10 and frames[0].shape == (24, 32, 3)
@@ -206,6 +216,7 @@ BAD_PATHS = {
     "render_width: Field required": lambda p: p.pop("render_width"),
     "camera_path: List should have at least 1 item": lambda p: p.update(camera_path=[]),
     "camera_path.1.fov: Field required": lambda p: p["camera_path"][1].pop("fov"),
+    "camera_path.0.principal_point.1: Input should be": lambda p: p["camera_path"][0].update(principal_point=[0, 3]),
     "camera_path.0.fov: Input should be less than 180": lambda p: p["camera_path"][0].update(fov=180),
     "camera_path.2.camera_to_world: must be 16 numbers": lambda p: p["camera_path"][2].update(camera_to_world=[1.0]),
     "camera_path.0.camera_to_world: must be a rotation": lambda p: p["camera_path"][0].update(
@@ -229,7 +240,9 @@ def test_camera_paths_that_cannot_be_used(wall: Wall, camera_path: Any, tmp_path
     assert not wall.drawn and not (tmp_path / "film.mp4").exists()
 
 
-def test_files_that_are_no_camera_path(wall: Wall, camera_path: Any, tmp_path: Path) -> None:
+def test_files_that_are_no_camera_path_and_one_camera(
+    wall: Wall, camera_path: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(InputError, match="gone.json cannot be read: No such file.*--camera-path-filename"):
         camera_path(camera_path_filename=tmp_path / "gone.json")
     (tmp_path / "other.json").write_bytes(b"\xff\xfe{")
@@ -237,6 +250,9 @@ def test_files_that_are_no_camera_path(wall: Wall, camera_path: Any, tmp_path: P
         camera_path(camera_path_filename=tmp_path / "other.json")
     with pytest.raises(InputError, match="path.json cannot be used: Input should be .*dictionary"):
         camera_path([1, 2])
+    monkeypatch.setattr(HeldOut, "count", 1)
+    with pytest.raises(InputError, match="there is only one to start from. Choose --pose-source train"):
+        render.RenderInterpolated(load_config=tmp_path / "c.yml", output_path=tmp_path / "film.mp4").main()
 
 
 @pytest.mark.parametrize(
@@ -252,11 +268,7 @@ def test_files_that_are_no_camera_path(wall: Wall, camera_path: Any, tmp_path: P
         ("RenderInterpolated", {"rendered_output_names": ["rgba"]}, "rgba has transparency"),
         ("RenderInterpolated", {"rendered_output_names": []}, "--rendered-output-names names nothing"),
         ("RenderInterpolated", {"rendered_output_names": ["rgb", "deep"]}, "there is no output deep: .* may be rgb,"),
-        (
-            "DatasetRender",
-            {"rendered_output_names": ["raw-deep"]},
-            "there is no output raw-deep: .*; with raw-",
-        ),
+        ("DatasetRender", {"rendered_output_names": ["raw-deep"]}, "there is no output raw-deep: .*; with raw-"),
         ("DatasetRender", {"downscale_factor": -1.0}, "--downscale-factor must be from"),
         ("DatasetRender", {"output_path": Path("/proc/maps")}, "/proc/maps/test cannot be written"),
         ("SpiralRender", {"seconds": 0.0}, "--seconds must be at least 0.001, not 0.0"),
@@ -272,12 +284,6 @@ def test_options_that_cannot_be_used(
     with pytest.raises(InputError, match=message):
         getattr(render, command)(load_config=tmp_path / "config.yml", **options).main()
     assert not list(tmp_path.iterdir())
-
-
-def test_a_path_needs_two_cameras(wall: Wall, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(HeldOut, "count", 1)
-    with pytest.raises(InputError, match="there is only one to start from. Choose --pose-source train"):
-        render.RenderInterpolated(load_config=tmp_path / "c.yml", output_path=tmp_path / "film.mp4").main()
 
 
 def test_scenes_of_other_methods_are_rendered_as_before(

@@ -1,11 +1,12 @@
 // The path of the camera: its keyframes in a list, playing it, and saving it.
-import { CameraPath, LONGEST, SHORTEST } from '../view/path';
+import { CameraPath, LONGEST, SECONDS, SHORTEST } from '../view/path';
 import type { Pose, View } from '../view/pose';
 import { download, element, make, press, pressed } from './dom';
 import { Film, filmable } from './film';
+import { notify } from './pages';
 import type { Stage } from './stage';
 
-const SECONDS = 2; // of a new segment
+const MOST_BYTES = 1 << 26; // of a file that is read
 
 interface Playing {
   record: boolean;
@@ -28,6 +29,11 @@ export class PathPanel {
     on('loop', () => this.toggle('loop'));
     on('play', () => (this.playing ? this.stop() : this.play(false)));
     on('save-path', () => this.save());
+    on('open-path', () => element('path-file').click());
+    element('path-file').addEventListener('change', ({ target }) => {
+      const [file] = (target as HTMLInputElement).files ?? [];
+      if (file) void this.open(file);
+    });
     on('record', () => (this.playing ? this.stop() : this.play(true)));
     element('seconds').addEventListener('change', ({ target }) => {
       const { valueAsNumber: seconds } = target as HTMLInputElement;
@@ -104,6 +110,19 @@ export class PathPanel {
     const [width, height] = size ? size.split('x').map(Number) : this.stage.pixels().map((side) => side - (side % 2));
     const file = this.path.file(width, height);
     download('camera_path.json', new Blob([file], { type: 'application/json' }));
+  }
+
+  private async open(file: File): Promise<void> {
+    this.stop();
+    try {
+      if (file.size > MOST_BYTES) throw new Error(`it has ${file.size} bytes, at most ${MOST_BYTES} are read.`);
+      this.path.load(await file.text());
+    } catch (error) {
+      notify(`${file.name} is no camera path: ${error instanceof Error ? error.message : String(error)}`);
+    }
+    element<HTMLInputElement>('path-file').value = ''; // the same file can be chosen again
+    for (const what of ['smooth', 'loop'] as const) press(element(what), this.path[what]);
+    this.show();
   }
 
   private show(): void {

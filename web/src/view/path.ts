@@ -2,7 +2,8 @@
 import type { Vec3 } from '../bundle/manifest';
 import { type Lens, type Pose, View } from './pose';
 import { type Quat, difference, exponential, poseOf, product, quatOf, slerp } from './rotation';
-import { add, length, subtract, times } from './vector';
+import { lensOf, sharedOf } from './share';
+import { add, dot, length, subtract, times } from './vector';
 
 export interface Keyframe {
   pose: Pose;
@@ -12,8 +13,10 @@ export interface Keyframe {
 
 export const SHORTEST = 0.1; // seconds of a segment
 export const LONGEST = 600;
+export const SECONDS = 2; // of a new segment
 export const RATE = 30; // frames per second of the file
 const MOST_FRAMES = 36_000; // of the file: 20 minutes
+const MOST_KEYFRAMES = 1000; // that are read
 const STEEPEST = 3; // times the slower of two segments: a tangent beyond overshoots
 
 export class CameraPath {
@@ -43,7 +46,9 @@ export class CameraPath {
     const [from, to] = [this.keyframes[segment], this.keyframes[(segment + 1) % last]];
     const h = from.seconds;
     const t = rest / h;
-    const focal = ({ pose, lens }: Keyframe): Vec3 => [Math.log(View.contain(pose, lens, width, height).fy), 0, 0];
+    const shown = ({ pose, lens }: Keyframe): View => View.contain(pose, lens, width, height);
+    const focal = (k: Keyframe): Vec3 => [Math.log(shown(k).fx), Math.log(shown(k).fy), 0];
+    const middle = (k: Keyframe): Vec3 => [shown(k).cx, shown(k).cy, 0];
     const place = ({ pose }: Keyframe): Vec3 => pose.position;
     const along = (value: (k: Keyframe) => Vec3): Vec3 => {
       const speeds = this.speeds(segment, (a, b) => subtract(value(b), value(a)));
@@ -51,8 +56,9 @@ export class CameraPath {
     };
     const turns = this.speeds(segment, (a, b) => difference(quatOf(a.pose), quatOf(b.pose)));
     const rotation = bezier(quatOf(from.pose), quatOf(to.pose), times(h, turns[0]), times(h, turns[1]), t);
-    const f = Math.exp(along(focal)[0]);
-    return new View(poseOf(along(place), rotation), f, f, width / 2, height / 2, width, height);
+    const [fx, fy] = along(focal).map(Math.exp);
+    const [cx, cy] = along(middle);
+    return new View(poseOf(along(place), rotation), fx, fy, cx, cy, width, height);
   }
 
   // How fast what `step` measures between keyframes changes at the ends of a segment, per second.
@@ -75,17 +81,28 @@ export class CameraPath {
     return [joined(segment), joined(segment + 1)];
   }
 
-  // The file that `ns-render camera-path` takes, for pictures of a size. Frame: the scene's, OpenGL's axes.
+  // The file that `ns-render camera-path` takes, for pictures of a size. Frame: the scene's, OpenGL's axes. nerfstudio
+  // ignores principal points, parts of width and height, and the lens of keyframes: fx, fy, cx, cy, width, height.
   file(width: number, height: number): string {
     const { seconds } = this;
+    const aspect = width / height;
     const count = Math.min(MOST_FRAMES, Math.max(2, Math.round(RATE * seconds)));
     const step = seconds / (this.loop ? count : count - 1);
     const frames = Array.from({ length: count }, (_, k) => {
-      const { pose, fy } = this.at(k * step, width, height);
-      const fov = (360 / Math.PI) * Math.atan(height / 2 / fy); // vertical, degrees
-      return { camera_to_world: cameraToWorld(pose), fov, aspect: width / height };
+      const { pose, fy, cx, cy } = this.at(k * step, width, height);
+      const principal_point = [cx / width, cy / height];
+      return { camera_to_world: cameraToWorld(pose), fov: fovOf(fy, height), aspect, principal_point };
     });
+    const keyframes = this.keyframes.map(({ pose, lens }, k) => ({
+      matrix: cameraToWorld(pose),
+      fov: fovOf(View.contain(pose, lens, width, height).fy, height),
+      aspect,
+      override_transition_enabled: true,
+      override_transition_sec: this.keyframes.at(k - 1)!.seconds, // from the keyframe before
+      lens: lensOf(lens),
+    }));
     return JSON.stringify({
+      keyframes,
       camera_type: 'perspective',
       render_height: height,
       render_width: width,
@@ -97,6 +114,41 @@ export class CameraPath {
       crop: null,
     });
   }
+
+  // Takes the keyframes of such a file, or of one that nerfstudio's viewer wrote; throws where it cannot.
+  load(text: string): void {
+    const file = JSON.parse(text) as Record<string, unknown> | null;
+    const rows = file?.keyframes;
+    if (!Array.isArray(rows) || !rows.length || rows.length > MOST_KEYFRAMES) {
+      throw new Error(`it has not 1 to ${MOST_KEYFRAMES} keyframes.`);
+    }
+    if ((file?.camera_type ?? 'perspective') !== 'perspective') throw new Error('its cameras are not perspective.');
+    const usual = secondsOf(file?.default_transition_sec) ?? SECONDS;
+    const read = rows.map((row, k) => keyframeOf((row ?? {}) as Record<string, unknown>, k, usual));
+    this.keyframes = read.map((each, k) => ({ ...each, seconds: read[(k + 1) % read.length].seconds }));
+    this.smooth = file?.smoothness_value !== 1;
+    this.loop = file?.is_cycle === true;
+  }
+}
+
+const fovOf = (fy: number, height: number): number => (360 / Math.PI) * Math.atan(height / 2 / fy); // degrees
+const secondsOf = (given: unknown): number | null =>
+  typeof given === 'number' && given > 0 ? Math.min(LONGEST, Math.max(SHORTEST, given)) : null;
+
+// Keyframe k of a file; `seconds` are those from the keyframe before.
+function keyframeOf(row: Record<string, unknown>, k: number, usual: number): Keyframe {
+  const { matrix, fov, aspect, override_transition_enabled: own, override_transition_sec: seconds } = row;
+  const m = Array.isArray(matrix) && matrix.length === 16 ? (matrix as number[]) : [];
+  const [right, up, back, position] = [0, 1, 2, 3].map((c) => [m[c], m[c + 4], m[c + 8]] as Vec3);
+  let { lens } = row;
+  if (lens === undefined) {
+    const [width, height] = [1000 * Number(aspect), 1000];
+    const f = height / 2 / Math.tan((Math.PI / 360) * Number(fov));
+    lens = [f, f, width / 2, height / 2, width, height];
+  }
+  const found = sharedOf({ position, right, forward: times(-1, back), target: position, lens });
+  if (!found || !(dot(found.pose.down, up) < -0.9)) throw new Error(`keyframe ${k + 1} is no camera.`);
+  return { ...found, seconds: (own === true ? secondsOf(seconds) : null) ?? usual };
 }
 
 // By rows; x right, y up, z backward.

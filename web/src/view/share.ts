@@ -12,6 +12,7 @@ export interface Shared {
   residuals: boolean;
 }
 
+export const lensOf = (l: Lens): number[] => [l.fx, l.fy, l.cx, l.cy, l.width, l.height];
 const round = (x: number): string => String(Number(x.toPrecision(9)));
 const numbers = (text: string | null, count: number): number[] | null => {
   const found = (text ?? '').split(',').map(Number);
@@ -24,7 +25,7 @@ export function toHash({ pose, lens, target, show, residuals }: Shared): string 
     part('p', pose.position),
     part('r', [...pose.right, ...pose.forward]),
     part('t', target),
-    part('l', [lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height]),
+    part('l', lensOf(lens)),
   ];
   if (show !== 'color') parts.push(`show=${show}`);
   if (!residuals) parts.push('texture=off');
@@ -40,12 +41,12 @@ export interface Camera {
   lens: number[];
 }
 
-export const cameraOf = ({ pose, lens: l, target }: Pick<Shared, 'pose' | 'lens' | 'target'>): Camera => ({
+export const cameraOf = ({ pose, lens, target }: Pick<Shared, 'pose' | 'lens' | 'target'>): Camera => ({
   position: pose.position,
   right: pose.right,
   forward: pose.forward,
   target,
-  lens: [l.fx, l.fy, l.cx, l.cy, l.width, l.height],
+  lens: lensOf(lens),
 });
 
 const FARTHEST = 1e9;

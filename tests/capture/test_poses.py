@@ -90,6 +90,25 @@ def test_a_result_that_is_damaged_counts_as_none(text: str, tmp_path: Path) -> N
     assert _finished(tmp_path, tmp_path) is None
 
 
+def test_a_kept_result_is_doubted_as_when_it_was_found(tmp_path: Path) -> None:
+    (tmp_path / "result/sparse/0").mkdir(parents=True)
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        (tmp_path / "result/sparse/0" / name).touch()
+    values = {
+        "made": False,
+        "left_out": {},
+        "registered": 3,
+        "given": 3,
+        "reprojection_error": 0.3,
+        "track_length": 3.0,
+    }
+    values["seconds"] = {}
+    for more, doubtful in (({}, False), ({"contradicted": 0.05}, False), ({"contradicted": 0.2}, True)):
+        (tmp_path / "result/poses.json").write_text(json.dumps({**values, **more}))
+        found = _finished(tmp_path, tmp_path)
+        assert found is not None and bool(found.doubt) == doubtful
+
+
 def test_names_that_are_not_utf8_are_refused_before_the_work(copied: Copy, tmp_path: Path) -> None:
     folder = copied("cap")
     (folder / "photo_1.png").rename(os.fsdecode(os.fsencode(folder) + b"/f\xfcr.png"))

@@ -1,7 +1,7 @@
 """Read an undistorted capture with a transforms.json without nerfstudio: photographs, poses and points."""
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +24,6 @@ class Capture:
     held_out: list[View]
     points: Tensor  # [M, 3] sparse points
     colours: Tensor  # [M, 3] in [0, 1]
-    # middle, scale: [3] float64; a point x of the capture's own frame lies at (x - middle) scale
-    middle: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
-    scale: float = 1.0
 
     @property
     def views(self) -> list[View]:
@@ -67,7 +64,7 @@ def load_capture(folder: Path, interval: int = 8, downscale: int = 1) -> Capture
     points = ((points.double() - middle) * scale).float()
     held_out = [view for i, view in enumerate(views) if i % interval == 0]
     train = [view for i, view in enumerate(views) if i % interval]
-    return Capture(train, held_out, points, colours, middle, scale)
+    return Capture(train, held_out, points, colours)
 
 
 def _camera(values: dict[str, Any], pose: Tensor, middle: Tensor, scale: float, width: int, height: int) -> Camera:

@@ -1,8 +1,6 @@
 """The public functions, and the examples that use them."""
 
 import importlib.util
-import subprocess
-import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -65,13 +63,8 @@ def test_rasterize_gives_values_and_gradients_of_the_float64_reference() -> None
     (expected.rgb * weights).sum().backward()
     for name, value in values.items():
         torch.testing.assert_close(value.grad, twin[name].grad, atol=1e-7, rtol=1e-7, msg=name)
-
-
-def test_rasterize_names_the_argument_of_the_wrong_shape() -> None:
-    values = surfels()
-    values["quats"] = values["quats"][:, :3]
     with pytest.raises(ValueError, match="quats must have shape"):
-        bitymi_ns.rasterize(**values, camera=camera_of())
+        bitymi_ns.rasterize(**(values | {"quats": values["quats"][:, :3]}), camera=camera)
 
 
 def test_a_scene_is_trained_baked_read_and_rendered_from_arrays(room: Path, tmp_path: Path) -> None:
@@ -88,15 +81,8 @@ def test_a_field_and_a_scene_without_texture_are_baked_too(room: Path, tmp_path:
     views = example("train_from_arrays").load_views(room)
     steps = []
     points = torch.rand(100, 3) * 2 - 1
-    scene, log = bitymi_ns.train_scene(
-        views,
-        points,
-        torch.rand(100, 3),
-        steps=6,
-        method=method,
-        eval_views=views[:1],
-        callback=lambda *s: steps.append(s),
-    )
+    how = dict(steps=6, method=method, eval_views=views[:1], callback=lambda *s: steps.append(s))
+    scene, log = bitymi_ns.train_scene(views, points, torch.rand(100, 3), **how)
     assert [step for step, _ in steps] == list(range(1, 7)) and np.isfinite(log.entries[-1].psnr)
     assert len(bitymi_ns.bake_scene(scene, views, tmp_path / method)) <= len(scene)
 
@@ -106,11 +92,6 @@ def test_a_picture_is_fitted_through_rasterize(tmp_path: Path) -> None:
     Image.fromarray(ramp).save(tmp_path / "ramp.png")
     error = example("fit_image").main(tmp_path / "ramp.png", tmp_path / "fitted.png", surfels=100, steps=40, size=32)
     assert error < 0.02 and Image.open(tmp_path / "fitted.png").size == (32, 32)
-
-
-def test_the_public_functions_do_not_need_nerfstudio() -> None:
-    code = "import sys; sys.modules['nerfstudio'] = None; import bitymi_ns; bitymi_ns.train_scene, bitymi_ns.rasterize"
-    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
 
 
 def test_examples_are_short() -> None:

@@ -25,6 +25,11 @@ class Directions:
     views: int  # number of the D columns that are for views
     view: Tensor  # [n, views] int64, view of each of these columns
 
+    def thinned(self, values: Tensor, most: int) -> Tensor:
+        """Columns of `values` [n, D, ...]: an even choice of at most `most` views, and every other one of the rest."""
+        stride = -(-self.views // most) if self.views else 1
+        return torch.cat([values[:, : self.views : stride], values[:, self.views :: 2]], dim=1)
+
 
 def view_directions(means: Tensor, seen: Tensor, centers: Tensor) -> Iterator[Directions]:
     """The directions of all surfels, in chunks of surfels that about equally many views see.

@@ -136,10 +136,8 @@ def _fewer_sites(
     vectors, rgb = own
     sites = vectors.shape[1]
     outside = fibonacci_sphere(OUTSIDE).to(vectors).expand(len(vectors), -1, -1)
-    stride = -(-at.views // FIT_VIEWS) if at.views else 1  # views that see a surfel come first: an even choice of them
-    samples = torch.cat([at.unit[:, : at.views : stride], at.unit[:, at.views :: 2], outside], dim=1)
-    weight = torch.cat([at.valid[:, : at.views : stride], at.valid[:, at.views :: 2]], dim=1).float()
-    weight = F.pad(weight, (0, OUTSIDE), value=OUTSIDE_WEIGHT)
+    samples = torch.cat([at.thinned(at.unit, FIT_VIEWS), outside], dim=1)
+    weight = F.pad(at.thinned(at.valid, FIT_VIEWS).float(), (0, OUTSIDE), value=OUTSIDE_WEIGHT)
     colors = site_weights(vectors, samples) @ rgb
     left = least_needed(vectors, rgb, samples, weight)
     result = []

@@ -178,10 +178,9 @@ def _fewer(
         return []
     base, terms = own
     vectors, rgb = F.pad(terms[..., :3], (0, 0, 1, 0)), torch.cat([base[:, None], terms[..., 3:]], dim=1)
-    stride = -(-at.views // FIT_VIEWS) if at.views else 1
     outside = fibonacci_sphere(OUTSIDE).to(vectors).expand(len(vectors), -1, -1)
-    samples = torch.cat([at.unit[:, : at.views : stride], at.unit[:, at.views :: 2], outside], dim=1)
-    counts = torch.cat([weight[:, : at.views : stride], weight[:, at.views :: 2]], dim=1)
+    samples = torch.cat([at.thinned(at.unit, FIT_VIEWS), outside], dim=1)
+    counts = at.thinned(weight, FIT_VIEWS)
     counts = counts / counts.mean(1, keepdim=True).clamp(min=1e-20)
     counts = F.pad(counts, (0, OUTSIDE), value=OUTSIDE_WEIGHT)
     colors = site_weights(vectors, samples) @ rgb

@@ -52,6 +52,7 @@ def overview(values: Mapping[str, Any]) -> dict[str, str]:
         "Mean track length, photographs per point": text("track_length", "{:.2f}"),
         "Points": text("points", "{:,}"),
         "Median parallax, degrees": text("parallax_degrees", "{:.1f}"),
+        "Matches that contradict the poses": text("contradicted", "{:.1%}"),
         "Up, scale": _frame_text(values.get("up"), numbers),
         "Seconds": ", ".join(seconds),
     }

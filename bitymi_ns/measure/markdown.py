@@ -36,12 +36,6 @@ def number(value: float | None, digits: int = 2) -> str:
     return "" if value is None else f"{value:,.{digits}f}"
 
 
-def difference(value: float, digits: int = 3) -> str:
-    """Format a signed number; no sign where it rounds to zero."""
-    rounded = round(value, digits)
-    return f"{rounded:+.{digits}f}" if rounded else f"{0.0:.{digits}f}"
-
-
 def _command_line() -> str:
     program = os.path.basename(sys.argv[0])
     start = ["python", os.path.relpath(sys.argv[0])] if program.endswith(".py") else [program]

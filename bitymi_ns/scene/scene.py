@@ -147,10 +147,6 @@ class Scene(nn.Module):
         elif isinstance(self.field, TexelField):
             self.field = None
 
-    def parameters_per_surfel(self) -> int:
-        """Numbers stored per surfel: 60 for sv, 59 for sh, 26 for sb."""
-        return sum(p[:1].numel() if len(p) else p.new_zeros(1, *p.shape[1:]).numel() for p in self.surfels.values())
-
     def base_color(self, projection: Projection) -> Tensor:
         """[N, 3] f_view(d) of the surfels that the camera sees, 0 elsewhere."""
         means = self.surfels["means"]
@@ -163,7 +159,6 @@ class Scene(nn.Module):
         background: Tensor | None = None,
         field_mode: Literal["train", "frozen", "off"] = "train",
         maps: bool = False,
-        weight_bound: float | None = None,
         overdraw_half: float | None = None,
         beta_alone: bool = False,
     ) -> RenderOutput:
@@ -175,7 +170,6 @@ class Scene(nn.Module):
             background: [3] colour behind the scene; None = black.
             field_mode: train = the residual field gets gradients; frozen = it is evaluated without; off = left out.
             maps: also depth and normals.
-            weight_bound: fragments of smaller weight keep the surfel's colour, without residual; None = as configured.
             overdraw_half: also the count of fragments with a gradient, see `ops.soft_overdraw`; None = without.
             beta_alone: the gradient of the Beta map reaches beta alone, not the blending weights.
 
@@ -185,7 +179,7 @@ class Scene(nn.Module):
         p = self.surfels
         projection = project(*(p[name] for name in GEOMETRY), camera, self.near, self.config.prefilter)
         field = None if field_mode == "off" else self.field
-        learns, bound = field_mode == "train", self.config.weight_bound if weight_bound is None else weight_bound
+        learns, bound = field_mode == "train", self.config.weight_bound
         base = self.base_color(projection)
         read: Tensor | None = None
 

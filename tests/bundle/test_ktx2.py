@@ -56,6 +56,9 @@ def by_the_specification(data):
 @pytest.mark.parametrize("format", FORMATS)
 def test_every_field_is_what_the_specification_asks_for(tmp_path, format):
     payload, data = make(tmp_path, format)
+    image = parse_ktx2(data)
+    assert (image.format, image.width, image.height) == (format, 8, 12)
+    assert [bytes(layer) for layer in image.payload] == payload
     f = by_the_specification(data)
     assert f["identifier"] == bytes([0xAB, 0x4B, 0x54, 0x58, 0x20, 0x32, 0x30, 0xBB, 0x0D, 0x0A, 0x1A, 0x0A])
     assert f["vkFormat"] == {"bc7": 145, "uint8": 37, "fp16": 97}[format]
@@ -82,14 +85,6 @@ def test_every_field_is_what_the_specification_asks_for(tmp_path, format):
         assert f["samples"] == [(bits * i, bits, c, qualifier, 0, low, high) for i, c in enumerate((0, 1, 2, 15))]
 
 
-@pytest.mark.parametrize("format", FORMATS)
-def test_what_is_written_is_read(tmp_path, format):
-    payload, data = make(tmp_path, format)
-    image = parse_ktx2(data)
-    assert (image.format, image.width, image.height) == (format, 8, 12)
-    assert [bytes(layer) for layer in image.payload] == payload
-
-
 def test_the_payload_opens_as_dds_in_pillow(tmp_path):
     packing = pack([[16, 16]] * 5)
     texels = np.random.default_rng(0).random((packing.layers, packing.height, packing.width, 3)).astype(np.float32)
@@ -101,13 +96,6 @@ def test_the_payload_opens_as_dds_in_pillow(tmp_path):
     dds += struct.pack("<5I", 98, 3, 0, 1, 0)  # DXGI_FORMAT_BC7_UNORM, a 2D texture
     opened = np.asarray(Image.open(io.BytesIO(dds + bytes(image.payload[0]))).convert("RGBA"))
     np.testing.assert_array_equal(opened, decode_pages(image.payload, "bc7", image.width, image.height)[0])
-
-
-def test_layers_of_the_wrong_size_are_refused(tmp_path):
-    with pytest.raises(Ktx2Error, match="have 16 bytes each"):
-        write_ktx2(tmp_path / "a", [bytes(15)], "bc7", 4, 4, "test")
-    with pytest.raises(Ktx2Error):
-        write_ktx2(tmp_path / "a", [], "bc7", 4, 4, "test")
 
 
 def test_other_files_are_refused_with_a_reason(tmp_path):
@@ -122,3 +110,6 @@ def test_other_files_are_refused_with_a_reason(tmp_path):
     for reason, bad in cases.items():
         with pytest.raises(Ktx2Error, match=reason):
             parse_ktx2(bad)
+    for payload in ([bytes(15)], []):
+        with pytest.raises(Ktx2Error):
+            write_ktx2(tmp_path / "a", payload, "bc7", 4, 4, "test")

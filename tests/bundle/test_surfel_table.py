@@ -63,9 +63,8 @@ def test_mean_view_colours_match_a_sum_over_the_sphere(surfels, kind):
 def test_extreme_temperatures_leave_the_colour_finite(surfels):
     for kind, name in (("sv", "sv_log_tau"), ("sb", "sb_lobes"), ("sg", "sg_lobes")):
         params = surfels(3, kind)
-        params[name] = params[name] * 0 + torch.tensor([[-80.0], [0.0], [9.0]]).reshape(
-            3, *[1] * (params[name].dim() - 1)
-        )
+        extremes = torch.tensor([-80.0, 0.0, 9.0]).reshape(3, *[1] * (params[name].dim() - 1))
+        params[name] = extremes.expand_as(params[name])
         columns = to_columns(params, TILES[:3])
         assert all(np.isfinite(columns[f"f_dc_{i}"]).all() for i in range(3))
 

@@ -16,7 +16,6 @@ from nerfstudio.plugins.types import MethodSpecification
 
 import bitymi_ns.plugin.run.config as config
 from bitymi_ns.plugin import methods
-from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run.bundle_model import BakedModelConfig
 
 NAMES = ["bitymi", *(f"bitymi-{name}" for name in ("quality", "fast", "sb", "sg", "sh", "field", "notexture"))]
@@ -32,15 +31,8 @@ def test_every_method_is_registered_under_its_name(name: str) -> None:
 
 def test_a_method_parses_from_the_command_line() -> None:
     default = methods.bitymi.config
-    args = [
-        "--pipeline.model.train.loss.falloff-weight",
-        "0.001",
-        "--vis",
-        "none",
-        "--pipeline.model.scene.levels",
-        "3",
-    ]
-    parsed = tyro.cli(type(default), default=default, args=args)
+    args = "--pipeline.model.train.loss.falloff-weight 0.001 --vis none --pipeline.model.scene.levels 3"
+    parsed = tyro.cli(type(default), default=default, args=args.split())
     assert parsed.pipeline.model.train.loss.falloff_weight == 0.001
     assert parsed.pipeline.model.scene.levels == 3
     assert parsed.vis == "none" and not parsed.is_viewer_enabled()
@@ -70,49 +62,30 @@ def fresh() -> config.BitymiTrainerConfig:
     return config.method_config("bitymi").config
 
 
-def test_a_cpu_gets_a_short_run_and_says_so() -> None:
-    run = fresh()
-    run.machine.device_type = "cpu"
-    run.set_timestamp()
-    assert run.max_num_iterations == 3000 and run.steps_per_save == 600
-    assert "3,000 steps on cpu, the short schedule" in run.length()
-    run.max_num_iterations = 500
-    assert run.length() == "500 steps on cpu"
-
-
-def test_a_gpu_gets_the_full_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(config, "why_not_cuda", lambda: None)
+@pytest.mark.parametrize(("problem", "steps"), [(None, 30_000), ("the card is too old", 3000)])
+def test_a_gpu_gets_the_full_run_and_a_cpu_a_short_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], problem: str | None, steps: int
+) -> None:
+    monkeypatch.setattr(config, "why_not_cuda", lambda: problem)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     run = fresh()
     run.machine.device_type = "cuda"
     run.set_timestamp()
-    assert run.max_num_iterations == 30_000
-
-
-def test_a_device_without_kernels_is_not_used(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(config, "why_not_cuda", lambda: "the card is too old")
-    run = fresh()
-    run.machine.device_type = "cuda"
-    run.set_timestamp()
-    assert run.machine.device_type == "cpu" and run.max_num_iterations == 3000
-    assert "on the CPU instead of cuda: the card is too old" in capsys.readouterr().out
+    assert run.max_num_iterations == steps
+    assert ("on the CPU instead of cuda: the card is too old" in capsys.readouterr().out) is (problem is not None)
+    if problem is not None:
+        assert run.machine.device_type == "cpu" and run.steps_per_save == 600
+        assert "3,000 steps on cpu, the short schedule" in run.length()
 
 
 def test_a_given_length_is_kept_where_it_makes_sense() -> None:
     run = fresh()
     run.machine.device_type, run.max_num_iterations, run.steps_per_save = "cpu", 77, 5
     run.set_timestamp()
-    assert (run.max_num_iterations, run.steps_per_save) == (77, 5)
+    assert (run.max_num_iterations, run.steps_per_save) == (77, 5) and run.length() == "77 steps on cpu"
     run.max_num_iterations = 0
-    with pytest.raises(SystemExit, match="at least 1"):
+    with pytest.raises(SystemExit, match="bitymi: .*at least 1"):
         run.set_timestamp()
-
-
-def test_the_device_is_the_cpu_without_a_gpu() -> None:
-    if not torch.cuda.is_available():
-        assert fresh().machine.device_type == "cpu"
 
 
 def test_a_failing_configuration_leaves_nerfstudio_alone(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -133,11 +106,6 @@ def test_a_failing_configuration_leaves_nerfstudio_alone(monkeypatch: pytest.Mon
     finally:
         monkeypatch.undo()
         importlib.reload(methods)
-
-
-def test_errors_for_the_user_end_the_process_with_status_1_and_a_message() -> None:
-    error = InputError("no such capture")
-    assert isinstance(error, SystemExit) and error.code == "bitymi: no such capture"
 
 
 OLD_MODULES = {

@@ -21,4 +21,3 @@ def test_parameters_per_surfel(kind: str, expected: int) -> None:
     surfels = {name: torch.zeros(n, *shape) for name, shape in (GEOMETRY | COLORS[kind]).items()}
     scene = Scene(SceneConfig(view_color=kind, texture="none"), surfels, None)
     assert sum(p.numel() for p in scene.parameters()) == expected * n
-    assert scene.parameters_per_surfel() == expected

@@ -26,11 +26,8 @@ def make_suite(root: Path, name: str) -> Path:
 
 def test_standard_suites_are_the_published_ones() -> None:
     found = suites()
-    assert {name: len(suite.scenes) for name, suite in found.items()} == {
-        "mipnerf360": 9,
-        "tanksandtemples": 2,
-        "nerf-synthetic": 8,
-    }
+    counts = {"mipnerf360": 9, "tanksandtemples": 2, "nerf-synthetic": 8}
+    assert {name: len(suite.scenes) for name, suite in found.items()} == counts
     images = found["mipnerf360"].scenes
     assert {s for s, folder in images.items() if folder == "images_2"} == {"bonsai", "counter", "kitchen", "room"}
     assert {s for s, f in images.items() if f == "images_4"} == {"bicycle", "flowers", "garden", "stump", "treehill"}
@@ -80,9 +77,6 @@ def test_plans_name_methods_that_there_are(name: str) -> None:
     rows, bundles = read_plan(name)
     assert {row.method for row in rows} <= set(preset_names()) and len({row.name for row in rows}) == len(rows) > 2
     assert bundles is not None and len(bundles) == (name == "overdraw")
-
-
-def test_the_atlas_plan_compares_rules_of_one_run() -> None:
     rows, bundles = read_plan("atlas")
     assert len(rows) == 1 and bundles is not None and [b.name for b in bundles][:2] == ["paper-rule", "local-voxel"]
     assert all("--format bc7" in " ".join(b.options) for b in bundles)
@@ -93,6 +87,10 @@ def test_a_plan_of_ones_own(tmp_path: Path) -> None:
     path.write_text('rows: {a: {method: bitymi, options: [--x, 0.5]}}\nbundles: {small: [--r-max, "16"]}\n')
     (row,), (bundle,) = read_plan(str(path))
     assert row.options == ("--x", "0.5") and bundle.options == ("--r-max", "16")
+    with pytest.raises(BenchError, match="there is no plan x: give ablation"):
+        read_plan("x")
+    with pytest.raises(BenchError, match="no atlas format jpeg"):
+        format_bundles(["jpeg"])
 
 
 @pytest.mark.parametrize(
@@ -108,6 +106,7 @@ def test_a_plan_of_ones_own(tmp_path: Path) -> None:
         ("rows: {a: {method: bitymi}}\nbundles: {'../x': []}", "bundles, ../x"),
         ("rows: {a: {method: bitymi}}\nbundles: [bc7]", "bundles: .*valid dictionary"),
         ("3", "the file: "),
+        ("[" * 5000, "plan.yaml is nested too deeply"),
     ],
 )
 def test_a_malformed_plan_says_where(tmp_path: Path, text: str, reason: str) -> None:
@@ -115,13 +114,6 @@ def test_a_malformed_plan_says_where(tmp_path: Path, text: str, reason: str) -> 
     path.write_text(text)
     with pytest.raises(BenchError, match=reason):
         read_plan(str(path))
-
-
-def test_unknown_plan_and_format() -> None:
-    with pytest.raises(BenchError, match="there is no plan x: give ablation"):
-        read_plan("x")
-    with pytest.raises(BenchError, match="no atlas format jpeg"):
-        format_bundles(["jpeg"])
 
 
 def run(*words: object) -> int:

@@ -27,12 +27,8 @@ def evaluation(scene: str, method: str, checkpoint: str, **results: float) -> di
     """ns-eval's JSON object, with the standard deviations and rates that ns-eval adds."""
     results = {"lpips": math.nan, "num_rays_per_sec": 81_234.5, "fps": 0.63, **results}
     spread = {f"{key}_std": abs(value) * 0.04 for key, value in results.items()}
-    return {
-        "experiment_name": scene,
-        "method_name": method,
-        "checkpoint": checkpoint,
-        "results": results | spread,
-    }
+    names = {"experiment_name": scene, "method_name": method, "checkpoint": checkpoint}
+    return {**names, "results": results | spread}
 
 
 def view(path: Path, index: int, noise: float, phase: float) -> None:
@@ -68,26 +64,13 @@ def write_results(root: Path) -> Path:
         shared = {"ssim": ssim, "flip": flip, "surfels": surfels, "fragments_per_pixel": 14.2}
         evals = root / "evals" / scene
         evals.mkdir(parents=True, exist_ok=True)
-        trained = evaluation(
-            scene,
-            method,
-            str(run / "nerfstudio_models/step-000002999.ckpt"),
-            psnr=psnr,
-            render_ms=ms,
-            atlas_bytes=0,
-            **shared,
-        )
+        checkpoint = str(run / "nerfstudio_models/step-000002999.ckpt")
+        trained = evaluation(scene, method, checkpoint, psnr=psnr, render_ms=ms, atlas_bytes=0, **shared)
         (evals / f"{method}.json").write_text(json.dumps(trained, indent=2))
         for name, (delta, texel, share) in FORMATS.items():
-            baked = evaluation(
-                scene,
-                f"{method}-bundle",
-                f"/data/exports/{scene}/{method}-{name}/nerfstudio_models/step-000002999.ckpt",
-                psnr=psnr + delta,
-                render_ms=ms * share,
-                atlas_bytes=surfels * 190 * texel,
-                **shared,
-            )
+            checkpoint = f"/data/exports/{scene}/{method}-{name}/nerfstudio_models/step-000002999.ckpt"
+            figures = dict(psnr=psnr + delta, render_ms=ms * share, atlas_bytes=surfels * 190 * texel)
+            baked = evaluation(scene, f"{method}-bundle", checkpoint, **figures, **shared)
             (evals / f"{method}-{name}.json").write_text(json.dumps(baked, indent=2))
         if method == "bitymi":
             phase = 0.5 * list(RUNS).index((scene, method))  # other photographs in every scene

@@ -28,11 +28,8 @@ def test_worst_median_and_best_of_trained_scene_and_bundle_side_by_side(tmp_path
     notes: list[str] = []
     views = compare_views([*baked, *trained], notes)
     assert notes == []
-    assert [view.title for view in views] == [
-        "Worst view of 5: number 1",
-        "Median view of 5: number 4",
-        "Best view of 5: number 3",
-    ]
+    titles = ["Worst view of 5: number 1", "Median view of 5: number 4", "Best view of 5: number 3"]
+    assert [view.title for view in views] == titles
     for view in views:
         photograph, *renders = [[picture.caption for picture in column] for column in view.columns]
         assert photograph == ["photograph"]

@@ -26,7 +26,8 @@ def finder(project: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, S
         progress("matching", 1, 2)
         if source.name == "bad":
             raise CaptureError("photographs of bad share too little: take more of them")
-        return found_poses(project / "sparse/0", project / "images", project / "report")
+        doubtful = {"contradicted": 0.27} if source.name == "walk.mp4" else {}
+        return found_poses(project / "sparse/0", project / "images", project / "report", **doubtful)
 
     monkeypatch.setattr(bitymi_ns.capture, "find_poses", find_poses, raising=False)
     progress = types.ModuleType("bitymi_ns.progress")
@@ -50,6 +51,7 @@ def test_photographs_and_videos_are_given_to_the_finding_of_poses(
     text = printed(capsys)
     assert "matching" in text
     assert f"Poses of 12 of 13 photographs of {given}, to 0.50 pixels" in text
+    assert ("27% of what photographs have in common contradicts their poses" in text) == (name == "walk.mp4")
     assert "have no pose in the model and are left out: frame_00099.png (blurred)." in text
     assert "Held out for evaluation: 2 of 12 photographs" in text
 

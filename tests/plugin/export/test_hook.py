@@ -14,13 +14,7 @@ import tyro
 from bitymi_ns.plugin.export import hook
 from bitymi_ns.plugin.export.command import ExportAtlas
 
-
-class First:
-    pass
-
-
-class Second:
-    pass
+First, Second = (type(name, (), {}) for name in ("First", "Second"))
 
 
 def test_the_union_grows_by_one_member_and_keeps_its_markers() -> None:

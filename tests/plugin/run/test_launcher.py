@@ -24,18 +24,12 @@ def others(monkeypatch: pytest.MonkeyPatch) -> launcher.Workers:
 
 
 def test_what_went_wrong_in_another_process_is_told(others: launcher.Workers) -> None:
-    others._processes[0] = process(launcher.LOST)  # because the other one ended
-    others._store.set("why 2", "bitymi: there is no capture")
-    with pytest.raises(InputError, match="process 3 of the 3 of this run has ended: bitymi: there is no capture"):
+    with pytest.raises(InputError, match="the 3 processes of this run do not hear each other .* within 30 min"):
         others.explain()
-
-
-def test_a_process_that_said_nothing(others: launcher.Workers) -> None:
     others._processes[1] = process(-9)
     with pytest.raises(InputError, match="process 3 of the 3 of this run has ended: exit status -9"):
         others.explain()
-
-
-def test_processes_that_are_there_but_do_not_answer(others: launcher.Workers) -> None:
-    with pytest.raises(InputError, match="the 3 processes of this run do not hear each other .* within 30 min"):
+    others._processes[0], others._processes[1] = process(launcher.LOST), process(None)  # because the other one ended
+    others._store.set("why 2", "bitymi: there is no capture")
+    with pytest.raises(InputError, match="process 3 of the 3 of this run has ended: bitymi: there is no capture"):
         others.explain()

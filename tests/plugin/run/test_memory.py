@@ -7,7 +7,6 @@ import psutil
 import pytest
 import torch
 
-from bitymi_ns.ops import trace_cpu
 from bitymi_ns.plugin.run import memory
 from bitymi_ns.scene import Camera, Scene
 from bitymi_ns.scene.field import TexelField
@@ -111,23 +110,27 @@ def test_it_grows_with_fragments_up_to_the_bound_and_not_with_views(
     assert needed[0] == needed[1]
 
 
-def test_surfels_that_learn_in_an_export_take_what_they_take_in_training(
-    scene: tuple[Scene, Camera], capsys: pytest.CaptureFixture[str]
+def test_an_export_grows_with_learning_surfels_kept_views_and_texels(
+    scene: tuple[Scene, Camera], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    needed = []
-    for learning in (0, 1_000_000):
-        memory.state_export(scene[0], [scene[1]], 0, learning)
-        needed.append(gigabytes(said(capsys)))
-    assert needed[1] - needed[0] == pytest.approx(1e-3 * memory.PER_SURFEL, abs=0.11)
+    one, camera = scene
+
+    def taken(*arguments: float, views: int = 1) -> float:
+        memory.state_export(one, [camera] * views, *arguments)
+        return gigabytes(said(capsys))
+
+    assert taken(0, 1_000_000) - taken(0, 0) == pytest.approx(1e-3 * memory.PER_SURFEL, abs=0.11)
+    kept = 2.0 - memory.PHOTOGRAPH_BYTES / 1e9
+    assert taken(2e9, views=10) - taken(2e9, views=300_000) == pytest.approx(kept, abs=0.11)
+    monkeypatch.setattr(memory, "PER_BAKED_TEXEL", 1e6)
+    before = taken(0)
+    one.field = TexelField.blank(len(one), 5000, one.surfels["means"].detach())
+    assert taken(0) - before == pytest.approx(5.0, abs=0.11)
 
 
 @pytest.mark.parametrize(("compact", "bytes_each"), [(False, 2), (True, 6)])
 def test_an_export_holds_what_every_view_shows_of_every_surfel(
-    scene: tuple[Scene, Camera],
-    compact: bool,
-    bytes_each: int,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    scene: tuple[Scene, Camera], compact: bool, bytes_each: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(memory, "_state", lambda what, needed, *more: stated.append(needed))
     stated: list[float] = []
@@ -138,35 +141,6 @@ def test_an_export_holds_what_every_view_shows_of_every_surfel(
     for views in (30_000, 40_000):
         memory.state_training(scene[0], [scene[1]] * views, 0, options, 1000)
     assert stated[3] - stated[2] == 10_000 * len(scene[0])
-
-
-def test_views_are_counted_where_the_fine_tuning_keeps_them(
-    scene: tuple[Scene, Camera], capsys: pytest.CaptureFixture[str]
-) -> None:
-    needed = []
-    for views in (10, 300_000):
-        memory.state_export(scene[0], [scene[1]] * views, 2e9)
-        needed.append(gigabytes(said(capsys)))
-    assert needed[0] - needed[1] == pytest.approx(2.0 - memory.PHOTOGRAPH_BYTES / 1e9, abs=0.11)
-
-
-def test_an_export_takes_copies_of_the_texels_that_were_learned(
-    scene: tuple[Scene, Camera], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    one, camera = scene
-    texels = TexelField.blank(len(one), 5000, one.surfels["means"].detach())
-    monkeypatch.setattr(memory, "PER_BAKED_TEXEL", 1e6)
-    needed = []
-    for field in (None, texels):
-        one.field = field
-        memory.state_export(one, [camera], 0)
-        needed.append(gigabytes(said(capsys)))
-    assert needed[1] - needed[0] == pytest.approx(5.0, abs=0.11)
-
-
-def test_counting_is_that_of_the_list(scene: tuple[Scene, Camera]) -> None:
-    output = scene[0].render(scene[1])
-    assert trace_cpu.count(output.projection) == len(output.fragments)
 
 
 @pytest.mark.parametrize(

@@ -16,13 +16,10 @@ from bitymi_ns.train.config import AdamConfig
 METHODS = ["bitymi", *(f"bitymi-{name}" for name in ("quality", "fast", "sb", "sg", "sh", "field", "notexture"))]
 
 
-def test_the_presets_are_those_that_are_registered() -> None:
-    assert sorted(METHODS) == preset_names()
-
-
 def test_the_default_preset_is_the_declared_defaults_but_for_the_texture() -> None:
     preset = load_preset("bitymi")
     assert preset == Preset("bitymi", preset.description, scene=SceneConfig(texture="texels"))
+    assert sorted(METHODS) == preset_names()
 
 
 def repeated(values: dict, defaults: object, prefix: str = "") -> list[str]:
@@ -38,7 +35,9 @@ def repeated(values: dict, defaults: object, prefix: str = "") -> list[str]:
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_a_preset_states_no_default_again(name: str) -> None:
+def test_a_preset_describes_itself_and_states_no_default_again(name: str) -> None:
+    preset = load_preset(name)
+    assert preset.name == name and len(preset.description) > 20
     values = yaml.safe_load((preset_dir() / f"{name}.yaml").read_text("utf8"))
     base = values.pop("base", None)
     assert repeated(values, Preset(name) if base is None else load_preset(base)) == []
@@ -60,13 +59,6 @@ def documented(cls: type) -> list[str]:
 @pytest.mark.parametrize("cls", [SceneConfig, AdamConfig, BakeOptions])
 def test_every_option_is_documented_where_it_is_declared(cls: type) -> None:
     assert documented(cls) == []
-
-
-@pytest.mark.parametrize("name", METHODS)
-def test_every_preset_loads_and_describes_itself(name: str) -> None:
-    preset = load_preset(name)
-    assert preset.name == name
-    assert len(preset.description) > 20
 
 
 def test_the_variants_differ_where_they_should() -> None:

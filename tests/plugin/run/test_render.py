@@ -240,7 +240,9 @@ def test_camera_paths_that_cannot_be_used(wall: Wall, camera_path: Any, tmp_path
     assert not wall.drawn and not (tmp_path / "film.mp4").exists()
 
 
-def test_files_that_are_no_camera_path(wall: Wall, camera_path: Any, tmp_path: Path) -> None:
+def test_files_that_are_no_camera_path_and_one_camera(
+    wall: Wall, camera_path: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(InputError, match="gone.json cannot be read: No such file.*--camera-path-filename"):
         camera_path(camera_path_filename=tmp_path / "gone.json")
     (tmp_path / "other.json").write_bytes(b"\xff\xfe{")
@@ -248,6 +250,9 @@ def test_files_that_are_no_camera_path(wall: Wall, camera_path: Any, tmp_path: P
         camera_path(camera_path_filename=tmp_path / "other.json")
     with pytest.raises(InputError, match="path.json cannot be used: Input should be .*dictionary"):
         camera_path([1, 2])
+    monkeypatch.setattr(HeldOut, "count", 1)
+    with pytest.raises(InputError, match="there is only one to start from. Choose --pose-source train"):
+        render.RenderInterpolated(load_config=tmp_path / "c.yml", output_path=tmp_path / "film.mp4").main()
 
 
 @pytest.mark.parametrize(
@@ -263,11 +268,7 @@ def test_files_that_are_no_camera_path(wall: Wall, camera_path: Any, tmp_path: P
         ("RenderInterpolated", {"rendered_output_names": ["rgba"]}, "rgba has transparency"),
         ("RenderInterpolated", {"rendered_output_names": []}, "--rendered-output-names names nothing"),
         ("RenderInterpolated", {"rendered_output_names": ["rgb", "deep"]}, "there is no output deep: .* may be rgb,"),
-        (
-            "DatasetRender",
-            {"rendered_output_names": ["raw-deep"]},
-            "there is no output raw-deep: .*; with raw-",
-        ),
+        ("DatasetRender", {"rendered_output_names": ["raw-deep"]}, "there is no output raw-deep: .*; with raw-"),
         ("DatasetRender", {"downscale_factor": -1.0}, "--downscale-factor must be from"),
         ("DatasetRender", {"output_path": Path("/proc/maps")}, "/proc/maps/test cannot be written"),
         ("SpiralRender", {"seconds": 0.0}, "--seconds must be at least 0.001, not 0.0"),
@@ -283,12 +284,6 @@ def test_options_that_cannot_be_used(
     with pytest.raises(InputError, match=message):
         getattr(render, command)(load_config=tmp_path / "config.yml", **options).main()
     assert not list(tmp_path.iterdir())
-
-
-def test_a_path_needs_two_cameras(wall: Wall, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(HeldOut, "count", 1)
-    with pytest.raises(InputError, match="there is only one to start from. Choose --pose-source train"):
-        render.RenderInterpolated(load_config=tmp_path / "c.yml", output_path=tmp_path / "film.mp4").main()
 
 
 def test_scenes_of_other_methods_are_rendered_as_before(

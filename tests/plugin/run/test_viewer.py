@@ -60,11 +60,7 @@ def test_training_serves_this_machine_alone() -> None:
     ],
 )
 def test_ns_viewer_listens_where_it_is_told(
-    hosts: list[str],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    arguments: list[str],
-    host: str,
+    hosts: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: Any, host: str
 ) -> None:
     view(monkeypatch, method_config("bitymi").config, arguments)
     assert hosts == [host]

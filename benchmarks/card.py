@@ -1,9 +1,10 @@
 #!/usr/bin/env python
 """Bring the package to a bare machine with a card, and run tests and benchmarks there.
 
-`card.py stage FOLDER --python python3.12` compiles the wheel for that Python and card here, and fetches what it needs
-beside torch and numpy. `card.py run ORDER... --stage FOLDER --output RESULTS` unpacks that there and runs the orders;
-each step has a limit of its own. Orders joined by a plus sign run at the same time: for what is not timed."""
+`card.py stage FOLDER --python python3.12` compiles the wheel for that Python and card here, and fetches what it and
+nerfstudio need beside torch and numpy, in parts FOLDER/0 and on, for machines that take so much at a time. `card.py run
+ORDER... --stage PART... --output RESULTS` unpacks them there and runs the orders; each step has a limit of its own.
+Orders joined by a plus sign run at the same time: for what is not timed."""
 
 import argparse
 import os
@@ -20,7 +21,10 @@ ROOT = Path(__file__).resolve().parent.parent
 CARRIED = ("bitymi_ns", "benchmarks", "tests", "method_configs", "pyproject.toml", "csrc", "docs", "README.md")
 NEEDED = ("ispc_texcomp", "pydantic", "flip-evaluator", "torchmetrics", "lightning-utilities", "typing-extensions")
 NEEDED += ("zstandard", "wgpu", "cffi", "pycparser", "rendercanvas")
-"""Wheels that machines with torch and the usual scientific packages lack."""
+NEEDED += ("nerfstudio", "viser", "websockets", "msgspec", "trimesh", "tyro", "docstring-parser", "typeguard")
+NEEDED += ("appdirs", "mediapy", "pyquaternion", "pytorch-msssim", "splines", "pycolmap", "nerfacc")
+"""Wheels that machines with torch and the usual scientific packages lack, in the versions of constraints.txt. What else
+nerfstudio imports has stand-ins (card_nerfstudio.py)."""
 TOOLS = ("scikit-build-core", "nanobind", "cmake", "ninja", "numpy")
 
 
@@ -116,6 +120,14 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
             )
             for size in ("1297x840", "3840x2160")
         ],
+        "nerfstudio": [
+            Step(
+                f"nerfstudio on {name}",
+                [page(f"{name}-nerfstudio.md", "card_nerfstudio.py", data / name, "--folder", results / name, *length)],
+                600,
+            )
+            for name in captures(data)
+        ],
         "webgpu": [Step("webgpu tests", [[*pytest, "--timeout=60", "tests/ops/webgpu"]], 60)],
     }
 
@@ -140,9 +152,11 @@ SANITIZERS = ("memcheck", "racecheck", "initcheck", "synccheck")
 
 
 def stage(arguments: argparse.Namespace) -> int:
-    """Make the folder of wheels."""
+    """Make the folder of wheels, and of the weights of LPIPS."""
     folder = arguments.folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
+    for file in folder.glob("*/*"):
+        file.rename(folder / file.name)
     with tempfile.TemporaryDirectory() as temporary:
         tools = Path(arguments.tools or Path(temporary) / "tools")
         if not tools.exists():
@@ -158,21 +172,42 @@ def stage(arguments: argparse.Namespace) -> int:
         for old in folder.glob("bitymi_ns-*.whl"):
             old.unlink()
         subprocess.run([*wheel, *options], check=True)
-        fetched = [*pip, "download", "-q", "--only-binary", ":all:", "-d", str(folder)]
+        fetched = [*pip, "download", "-q", "--only-binary", ":all:", "-d", str(folder), "-c", f"{ROOT}/constraints.txt"]
         for name in NEEDED:
             if not list(folder.glob(f"{name.replace('-', '_')}-*.whl")):
                 with_needs = [] if name == "pydantic" else ["--no-deps"]
                 subprocess.run([*fetched, *with_needs, name], check=True)
-    for wheel_file in sorted(folder.glob("*.whl")):
-        print(f"{wheel_file.stat().st_size / 1e6:8.2f} MB  {wheel_file.name}")
+    from bitymi_ns.plugin.run import lpips  # where `run` begins there is no such package yet
+
+    lpips.load("alex")
+    shutil.copy(lpips.weights_path("alex"), folder)
+    for part, files in enumerate(parts(folder, 1e6 * arguments.megabytes)):
+        for file in files:
+            print(f"{part} {file.stat().st_size / 1e6:8.2f} MB  {file.name}")
+            (folder / str(part)).mkdir(exist_ok=True)
+            file.rename(folder / str(part) / file.name)
     return 0
 
 
-def unpack(wheels: Path, work: Path) -> dict[str, str]:
+def parts(folder: Path, most: float) -> list[list[Path]]:
+    """The files of a folder, the largest first, in as many lists as need at most so many bytes each."""
+    lists: list[list[Path]] = []
+    for file in sorted(filter(Path.is_file, folder.iterdir()), key=lambda file: -file.stat().st_size):
+        sizes = [sum(other.stat().st_size for other in files) for files in lists]
+        roomy = [files for files, size in zip(lists, sizes, strict=True) if size + file.stat().st_size <= most]
+        if not roomy:
+            lists.append(roomy_one := [])
+            roomy = [roomy_one]
+        roomy[0].append(file)
+    return lists
+
+
+def unpack(staged: Sequence[Path], work: Path) -> dict[str, str]:
     """Install the wheels into a folder, copy the checkout with their compiled modules; returns the environment."""
     site = work / "site"
     command = [sys.executable, "-m", "pip", "install", "-q", "--no-index", "--no-deps", "--no-compile", "--target"]
-    subprocess.run([*command, str(site), *map(str, sorted(wheels.glob("*.whl")))], check=True)
+    wheels = [str(file) for folder in staged for file in folder.glob("**/*.whl")]
+    subprocess.run([*command, str(site), *wheels], check=True)
     tree = work / "tree"
     tree.mkdir()
     for name in CARRIED:
@@ -181,8 +216,14 @@ def unpack(wheels: Path, work: Path) -> dict[str, str]:
     for compiled in [*(site / "bitymi_ns").glob("*.so"), site / "bitymi_ns/_cpu_features.py"]:
         shutil.copy(compiled, tree / "bitymi_ns")
     shutil.rmtree(site / "bitymi_ns")
+    cache = work / "cache/bitymi-ns"
+    cache.mkdir(parents=True)
+    for file in (file for folder in staged for file in folder.glob("**/*.npz")):
+        shutil.copy(file, cache)
     path = os.pathsep.join([str(tree), str(site), *filter(None, [os.environ.get("PYTHONPATH")])])
-    return {**os.environ, "PYTHONPATH": path, "PYTHONUNBUFFERED": "1"}
+    programs = os.pathsep.join([str(site / "bin"), os.environ["PATH"]])
+    changed = {"PATH": programs, "PYTHONPATH": path, "PYTHONUNBUFFERED": "1", "XDG_CACHE_HOME": str(cache.parent)}
+    return {**os.environ, **changed}
 
 
 def run_step(step: Step, tree: Path, environment: dict[str, str], log: Path, deadline: float) -> str:
@@ -235,11 +276,12 @@ def main() -> int:
     staging.add_argument(
         "--tools", type=Path, help="virtual environment with the build tools, made where it is missing"
     )
+    staging.add_argument("--megabytes", type=float, default=45, help="most of a part (%(default)s)")
     staging.add_argument("--build", type=Path, help="build folder that is kept")
     running = commands.add_parser("run", help="run orders on the machine")
     names = list(orders(Path(), Path()))
     running.add_argument("orders", nargs="+", metavar="ORDER", help=f"{', '.join(names)}; A+B: at the same time")
-    running.add_argument("--stage", type=Path, required=True, help="folder of wheels")
+    running.add_argument("--stage", type=Path, nargs="+", required=True, help="folders of wheels")
     running.add_argument("--data", type=Path, default=Path(), help="folder of the captures")
     running.add_argument("--output", type=Path, required=True)
     running.add_argument("--surfels", nargs="+", default=["50000", "150000", "500000"], help="scenes of the tables")
@@ -257,7 +299,7 @@ def main() -> int:
     log = results / "log.txt"
     lines = ["| step | exit status | s |", "|---|---|---:|"]
     with tempfile.TemporaryDirectory() as work:
-        environment = unpack(arguments.stage.resolve(), Path(work))
+        environment = unpack([folder.resolve() for folder in arguments.stage], Path(work))
         for order in arguments.orders:
             known = orders(results, arguments.data.resolve(), arguments.surfels, arguments.steps)
             steps = [step for name in order.split("+") for step in known[name]]

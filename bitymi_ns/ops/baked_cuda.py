@@ -80,9 +80,6 @@ class AtlasTexture:
         blocks: `texels` are BC7 blocks.
         device: where the surfels are.
 
-    Attributes:
-        size: height and width in texels.
-
     Raises:
         ValueError: there are more texels than a texture has.
         RuntimeError: the device has too little memory or draws no such blocks, or is no CUDA device.
@@ -90,8 +87,8 @@ class AtlasTexture:
 
     def __init__(self, texels: Tensor, blocks: bool, device: torch.device) -> None:
         require("baked_cuda.AtlasTexture", "cuda", device, ON_CPU)
-        side = 4 if blocks else 1
-        self.size, self._device = (side * texels.shape[0], side * texels.shape[1]), device
+        side, self._device = 4 if blocks else 1, device
+        self.size = (side * texels.shape[0], side * texels.shape[1])  # height and width in texels
         self._bytes = texels.dtype == torch.uint8
         stored = texels if self._bytes else texels.half()
         name = "bc7" if blocks else "uint8" if self._bytes else "half"
@@ -113,14 +110,9 @@ class AtlasTexture:
 
 
 class Atlas(NamedTuple):
-    """The pages of an atlas on a device.
+    """The pages of an atlas on a device."""
 
-    Attributes:
-        sheet: arrangement of the pages.
-        texture: of them.
-    """
-
-    sheet: Sheet
+    sheet: Sheet  # arrangement of the pages
     texture: AtlasTexture
 
     @classmethod
@@ -252,10 +244,7 @@ class Workspace:
             self.memory = torch.empty(needed, dtype=torch.uint8, device=device)
 
     def counts(self) -> tuple[int, int]:
-        """Pairs of surfel and tile in the latest frame, which had surfels, and how many of them found no slot.
-
-        Waits for the device.
-        """
+        """Pairs of the latest frame, which had surfels, and how many of them found no slot; waits for the device."""
         assert self.memory is not None
         pairs, spilled = self.memory[:16].view(torch.int64).tolist()
         return pairs, spilled
@@ -271,10 +260,8 @@ class Workspace:
         return self.counts()[1] <= self.capacity
 
     def frame_fitted(self) -> bool:
-        """Return True if the latest frame fitted; the next `resize` makes room for as many pairs and a quarter more.
-
-        Waits for the device.
-        """
+        """Return True if the latest frame fitted; waits for the device. The next `resize` makes room for as many pairs
+        and a quarter more."""
         pairs, spilled = self.counts()
         fitted = spilled <= self.capacity
         self.capacity = pairs + pairs // 4 + 1
@@ -342,7 +329,7 @@ def stack_cameras(cameras: Sequence[Camera], device: torch.device) -> tuple[Tens
 
 
 def frame(
-    scene: Any,
+    scene: Any,  # of `compiled`
     viewmats: Tensor,
     Ks: Tensor,
     background: Tensor | None,
@@ -357,13 +344,11 @@ def frame(
     and draw again.
 
     Args:
-        scene: of `compiled`.
         viewmats: [V, 4, 4] float32, world to camera, on the scene's device.
         Ks: [V, 3, 3] float32, likewise.
         background: [3] float32, likewise; None = black.
         images: what to draw, as `empty_images` makes them.
         workspace: fitted to such a frame.
-        stages: the stages to run.
         photo_pixel: side of a photograph's pixel in pixels of the views.
 
     Raises:

@@ -19,9 +19,8 @@ def test_rates_are_geometric_means_over_the_views() -> None:
     row = photo_resolution(BakeInput(surfels, cameras, 0.2, 0.02, False))
     assert row.tolist() == [[0.0, 0.0, 0.0, pytest.approx(focal / (4 * 8 * 4) ** (1 / 3))]]
     seen = torch.tensor([[False], [True], [False]])
-    row = photo_resolution(
-        BakeInput(surfels, cameras, 0.2, 0.02, False, Visibility(torch.ones(1), torch.ones(1), seen))
-    )
+    visible = Visibility(torch.ones(1), torch.ones(1), seen)
+    row = photo_resolution(BakeInput(surfels, cameras, 0.2, 0.02, False, visible))
     assert row[0, 3] == pytest.approx(focal / 8)
 
 

@@ -67,9 +67,8 @@ def test_the_visible_extent_is_where_the_kernel_falls_to_the_bound():
 
 def test_a_constant_residual_needs_no_tile(discs):
     made, _ = discs(PlaneField(torch.tensor([1.0, 0.0, 0.0]), 0.0))
-    made.field = type("Flat", (PlaneField,), {"__call__": lambda self, x: torch.full((len(x), 3), 0.25)})(
-        torch.zeros(3), 0.0
-    )
+    flat = type("Flat", (PlaneField,), {"__call__": lambda self, x: torch.full((len(x), 3), 0.25)})
+    made.field = flat(torch.zeros(3), 0.0)
     baked = bake(made, options=OPTIONS)
     assert baked.atlas is None and not baked.packing.tiles.any()
     torch.testing.assert_close(baked.mean_residual, torch.full((8, 3), 0.25))
@@ -84,7 +83,7 @@ def test_detail_along_one_axis_refines_that_axis_alone(discs, axis):
     assert (sizes[:, 1 - axis] == 4).all() and (sizes[:, axis] >= 16).all()
 
 
-def test_the_error_stays_below_the_tolerance_and_the_next_smaller_grid_does_not(discs):
+def test_the_error_stays_below_the_tolerance_and_the_next_smaller_grid_does_not(discs, camera):
     made, axes = discs()
     made.field = PlaneField(axes[:, 0] + 0.3 * axes[:, 1], 25.0)
     sizes = {}
@@ -93,6 +92,10 @@ def test_the_error_stays_below_the_tolerance_and_the_next_smaller_grid_does_not(
         assert baked.statistics.error.rms.p100 <= tolerance + 0.02  # half floats
         sizes[tolerance] = baked.packing.texels
     assert sizes[0.1] > sizes[0.5] > sizes[2.0] > sizes[20.0] == 0
+    exact = bake(made, options=replace(OPTIONS, tolerance=0.0))
+    assert exact.statistics.texels.kept == exact.statistics.texels.nyquist and exact.extent.tolist() == [3.0] * 8
+    near, far = (bake(made, [camera(d)], replace(OPTIONS, drop_unseen=False)) for d in (1.0, 60.0))
+    assert far.packing.texels < near.packing.texels  # views that see less allow less
 
 
 def test_the_error_is_the_one_that_independent_points_show(discs):
@@ -114,14 +117,6 @@ def test_the_error_is_the_one_that_independent_points_show(discs):
     assert 0.3 < stated <= float(error.square().mean().sqrt()) < 1.2 * stated
 
 
-def test_no_tolerance_gives_the_sizes_of_the_rule(discs):
-    made, axes = discs()
-    made.field = PlaneField(axes[:, 0], 1.0)
-    exact = bake(made, options=replace(OPTIONS, tolerance=0.0))
-    assert exact.statistics.texels.kept == exact.statistics.texels.nyquist
-    assert exact.extent.tolist() == [3.0] * 8
-
-
 def test_texels_out_of_sight_do_not_widen_the_range(discs):
     made, _ = discs()
     radius = float(visible_extent(*kernel_parameters(made.surfels), BOUND)[0]) * 0.1353353
@@ -132,13 +127,6 @@ def test_texels_out_of_sight_do_not_widen_the_range(discs):
 
     made.field = type("Wild", (PlaneField,), {"__call__": wild_outside})(torch.zeros(3), 0.0)
     assert bake(made, options=OPTIONS).texels.abs().max() < 0.5
-
-
-def test_views_that_see_less_allow_less(discs, camera):
-    made, axes = discs()
-    made.field = PlaneField(axes[:, 0], 25.0)
-    near, far = (bake(made, [camera(d)], replace(OPTIONS, drop_unseen=False)) for d in (1.0, 60.0))
-    assert far.packing.texels < near.packing.texels
 
 
 def test_what_is_hidden_counts_less(discs):

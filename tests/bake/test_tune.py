@@ -120,14 +120,6 @@ def test_texels_that_no_view_sees_stay_and_the_hardly_seen_hardly_move(wrong: Ba
     assert moved[few].mean() < 0.2 * moved[many].mean()
 
 
-def test_masked_pixels_are_not_seen(wrong: Baked, views: list[View]) -> None:
-    scene = TexelList(wrong)
-    hidden = torch.zeros(40, 48, 1, dtype=torch.bool)
-    masked = [views[0], *(View(v.camera, v.image, hidden) for v in views[1:3])]
-    one, all_but_masked = (scene.coverage(each) for each in (views[:1], masked))
-    assert torch.equal(one, all_but_masked) and one.any()
-
-
 def test_coverage_of_several_views_is_their_sum(wrong: Baked, views: list[View]) -> None:
     texels = TexelList(wrong)
     both, squares, want = (torch.zeros_like(texels.values) for _ in range(3))
@@ -137,16 +129,37 @@ def test_coverage_of_several_views_is_their_sum(wrong: Baked, views: list[View])
     for view in views[:5]:
         texels.add_coverage([view], want, None)
     assert torch.equal(both, want) and covered.max() > 1 and (squares <= both).all()
+    hidden = torch.zeros(40, 48, 1, dtype=torch.bool)  # masked pixels are not seen
+    masked = [views[0], *(View(v.camera, v.image, hidden) for v in views[1:3])]
+    assert torch.equal(*(texels.coverage(each) for each in (views[:1], masked)))
 
 
-def test_it_ends_with_the_best_texels_of_the_held_in_views(wrong: Baked, views: list[View]) -> None:
-    wild = replace(OPTIONS, rate=50.0, steps=40, patience=2)
-    statistics = tune_atlas(wrong, views, BACKGROUND, wild).statistics.finetune
-    assert statistics.steps < 40  # no gain: it gives up
+@pytest.mark.parametrize("patience", [2, 99])
+def test_it_gives_up_without_a_gain_and_its_progress_ends_with_it(
+    wrong: Baked, views: list[View], patience: int
+) -> None:
+    told: list[tuple[int, int]] = []
+
+    def progress(step: str, done: int, total: int) -> None:
+        if step == "tuning texels":
+            told.append((done, total))
+
+    wild = replace(OPTIONS, rate=50.0, steps=40, patience=patience)
+    statistics = tune_atlas(wrong, views, BACKGROUND, wild, progress).statistics.finetune
+    assert (statistics.steps < 40) == (patience == 2) and statistics.steps_asked == 40
+    assert told[0] == (1, 40) and told[-1] == (statistics.steps, statistics.steps)
     perfect = [View(v.camera, render(wrong, v.camera)) for v in views]
-    kept = tune_atlas(wrong, perfect, BACKGROUND, wild)
+    kept = tune_atlas(wrong, perfect, BACKGROUND, replace(wild, steps=10))
     assert kept.statistics.finetune.best_step == 0
     torch.testing.assert_close(kept.texels, wrong.texels, rtol=0, atol=0)
+
+    def interrupt(step: str, done: int, total: int) -> None:
+        if step == "tuning texels" and done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        tune_atlas(wrong, views, BACKGROUND, OPTIONS, interrupt)
+    assert (wrong.texels == 0.1).all()
 
 
 def test_the_texels_kept_are_those_of_the_best_look(
@@ -168,20 +181,6 @@ def test_the_texels_kept_are_those_of_the_best_look(
     assert 0 < best < len(seen) - 1 and seen[-1][0] < seen[best][0] - 0.5
     assert tuned.statistics.finetune.psnr_held_in.after == pytest.approx(seen[best][0], abs=1e-4)
     torch.testing.assert_close(texels_of(tuned), seen[best][1], rtol=0, atol=0)
-
-
-@pytest.mark.parametrize("patience", [2, 99])
-def test_its_progress_ends_with_it(wrong: Baked, views: list[View], patience: int) -> None:
-    told: list[tuple[int, int]] = []
-
-    def progress(step: str, done: int, total: int) -> None:
-        if step == "tuning texels":
-            told.append((done, total))
-
-    wild = replace(OPTIONS, rate=50.0, steps=40, patience=patience)
-    statistics = tune_atlas(wrong, views, BACKGROUND, wild, progress).statistics.finetune
-    assert (statistics.steps < 40) == (patience == 2) and statistics.steps_asked == 40
-    assert told[0] == (1, 40) and told[-1] == (statistics.steps, statistics.steps)
 
 
 def test_memory_for_the_views_does_not_change_the_result(wrong: Baked, views: list[View]) -> None:
@@ -266,25 +265,11 @@ def test_exposures_are_not_tuned_into_the_texels(truth: Baked, wrong: Baked, vie
     assert after["known"] > after["unknown"] + 1.0
 
 
-def test_too_few_views_leave_the_atlas_alone(wrong: Baked, views: list[View]) -> None:
+def test_too_few_views_leave_the_atlas_alone(scene, wrong: Baked, views: list[View]) -> None:
     same = tune_atlas(wrong, views[:3], BACKGROUND)
     assert same.texels is wrong.texels and same.statistics.finetune.model_dump() == {"steps": 0, "views": 3}
-
-
-def test_a_scene_without_texture_is_refused(scene, views: list[View]) -> None:
     with pytest.raises(ValueError, match="without texture"):
         tune_atlas(bake(scene(20, field=None)), views, BACKGROUND)
-
-
-def test_an_interruption_leaves_the_bake_as_it_was(wrong: Baked, views: list[View]) -> None:
-    def interrupt(step: str, done: int, total: int) -> None:
-        if step == "tuning texels" and done == 3:
-            raise KeyboardInterrupt
-
-    before = wrong.texels.clone()
-    with pytest.raises(KeyboardInterrupt):
-        tune_atlas(wrong, views, BACKGROUND, OPTIONS, interrupt)
-    assert torch.equal(wrong.texels, before)
 
 
 @pytest.mark.parametrize("bad", [{"steps": -1}, {"val_every": 1}, {"rate": 0.0}, {"prior": -1.0}, {"ssim_weight": 2}])

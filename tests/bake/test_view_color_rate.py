@@ -100,9 +100,8 @@ def test_views_that_pass_close_by_count_though_they_look_elsewhere(colored, came
     turned = torch.diag(torch.tensor([-1.0, 1.0, -1.0]))  # the other way round
     viewmat = torch.eye(4)
     viewmat[:3, :3] = turned @ cameras[0].viewmat[:3, :3]
-    center = scene.surfels["means"][row] + 0.05 * torch.nn.functional.normalize(
-        cameras[0].center - scene.surfels["means"][row], dim=0
-    ).roll(1)
+    toward = torch.nn.functional.normalize(cameras[0].center - scene.surfels["means"][row], dim=0)
+    center = scene.surfels["means"][row] + 0.05 * toward.roll(1)
     viewmat[:3, 3] = -viewmat[:3, :3] @ center
     blind = replace(cameras[0], viewmat=viewmat)
     assert float(shown_weights(scene, [blind])[0, row]) == 0.0

@@ -27,12 +27,7 @@ from bitymi_ns.capture.masks import in_proportion, mask_folder, mask_of, mask_pi
     ],
 )
 def test_the_folder_of_masks(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    photographs: str,
-    data: str,
-    there: list[str],
-    found: str | None,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, photographs: str, data: str, there: list[str], found: str | None
 ) -> None:
     for folder in (photographs, data, *there):
         (tmp_path / folder).mkdir(parents=True, exist_ok=True)
@@ -42,42 +37,36 @@ def test_the_folder_of_masks(
     assert mask_folder(tmp_path / photographs, Path()) == expected
 
 
-def test_the_folder_of_masks_that_is_given(tmp_path: Path) -> None:
-    for name in ("images", "masks", "mine"):
+def test_the_folder_of_masks_that_is_given_and_of_smaller_ones_alone(tmp_path: Path) -> None:
+    for name in ("images", "masks_2", "mine"):
         (tmp_path / name).mkdir()
     assert mask_folder(tmp_path / "images", tmp_path, tmp_path / "mine") == tmp_path / "mine"
     with pytest.raises(CaptureError, match="the folder of masks .*/yours does not exist"):
         mask_folder(tmp_path / "images", tmp_path, tmp_path / "yours")
-
-
-def test_a_folder_of_smaller_masks_alone(tmp_path: Path) -> None:
-    for name in ("images", "masks_2"):
-        (tmp_path / name).mkdir()
     assert mask_folder(tmp_path / "images", tmp_path) is None
     assert mask_folder(tmp_path / "images", tmp_path, downscale=2) == tmp_path / "masks"
+    assert in_proportion((144, 108), (288, 216)) and in_proportion((67, 50), (4000, 3000))
+    assert not in_proportion((216, 288), (288, 216))
 
 
 @pytest.mark.parametrize(
-    ("file", "name"),
+    ("name", "files"),
     [
-        ("a.png", "a.jpg"),
-        ("a.jpg.png", "a.jpg"),
-        ("a.PNG", "a.jpg"),
-        ("a.jpg.PNG", "a.jpg"),
-        ("a.jpg", "a.png"),
-        ("b/a.png", "b/a.jpg"),
-        ("a.png", "a.heic.jpg"),  # an upright copy
-        ("a.heic.png", "a.heic.jpg"),
-        ("a.heic.jpg.png", "a.heic.jpg"),
-        ("a.png", "b/a.jpg"),
-        ("a.png", "a.b.jpg"),
+        ("a.jpg", ["a.png", "a.jpg.png", "a.PNG", "a.jpg.PNG"]),
+        ("a.png", ["a.jpg"]),
+        ("b/a.jpg", ["b/a.png"]),
+        ("a.heic.jpg", ["a.png", "a.heic.png", "a.heic.jpg.png"]),  # an upright copy
     ],
 )
-def test_a_mask_is_found_by_the_name_of_its_photograph(tmp_path: Path, file: str, name: str) -> None:
-    path = tmp_path / file
-    path.parent.mkdir(exist_ok=True)
-    path.write_bytes(b"")
-    assert mask_of(tmp_path, name) == (None if (file, name) in [("a.png", "b/a.jpg"), ("a.png", "a.b.jpg")] else path)
+def test_a_mask_is_found_by_the_name_of_its_photograph(tmp_path: Path, name: str, files: list[str]) -> None:
+    for file in files:
+        path = tmp_path / file
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(b"")
+        assert mask_of(tmp_path, name) == path
+        path.unlink()
+    (tmp_path / "a.png").write_bytes(b"")
+    assert mask_of(tmp_path, "c/a.jpg") is None and mask_of(tmp_path, "a.b.jpg") is None
 
 
 def blob() -> np.ndarray:
@@ -101,8 +90,3 @@ def test_pixels_of_a_lossy_mask_count_above_the_middle(tmp_path: Path, ending: s
     ripples = np.asarray(stored.convert("L"))[~blob()]
     assert (ripples > 0).sum() > 50  # what would count where nothing does
     assert (mask_pixels(stored) != blob()).sum() <= 20  # of 132 along the edge
-
-
-def test_masks_in_the_proportions_of_their_photographs() -> None:
-    assert in_proportion((144, 108), (288, 216)) and in_proportion((67, 50), (4000, 3000))
-    assert not in_proportion((216, 288), (288, 216))

@@ -28,13 +28,9 @@ def test_names_are_sorted_by_the_numbers_in_them(tmp_path: Path) -> None:
         (tmp_path / name).touch()
     assert find_photos(tmp_path) == ["B_1.JPG", "b_9.jpg", "b_10.jpg", "x/2.png"]
     assert natural("a2") < natural("a10")
-
-
-def test_photographs_may_stand_in_images(tmp_path: Path) -> None:
-    (tmp_path / "images").mkdir()
-    assert photo_folder(tmp_path) == tmp_path / "images"
-    (tmp_path / "1.jpg").touch()
     assert photo_folder(tmp_path) == tmp_path
+    (tmp_path / "below/images").mkdir(parents=True)
+    assert photo_folder(tmp_path / "below") == tmp_path / "below/images"
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tif", ".bmp", ".heic"])
@@ -68,12 +64,13 @@ def test_a_damaged_file_among_good_ones_is_named(tmp_path: Path, pictures: list[
     photos, broken = read_photos(tmp_path, ["0.jpg", "1.jpg", "2.jpg"], silent)
     assert [photo.name for photo in photos] == ["0.jpg"]
     assert "truncated" in broken["1.jpg"] and "damaged or not an image" in broken["2.jpg"]
-
-
-def test_an_icon_is_no_photograph(tmp_path: Path) -> None:
-    Image.new("RGB", (16, 16)).save(tmp_path / "a.png")
+    Image.new("RGB", (16, 16)).save(tmp_path / "a.png")  # an icon
     with pytest.raises(CaptureError, match="16 x 16"):
         read_photo(tmp_path, "a.png")
+    first, second = (Image.fromarray(picture) for picture in pictures[:2])  # two pictures in one file
+    first.save(tmp_path / "a.tif", save_all=True, append_images=[second])
+    photo = read_photo(tmp_path, "a.tif")
+    assert not photo.plain and np.array_equal(np.asarray(upright(photo)), pictures[0])
 
 
 def test_a_blurred_photograph_is_found(arc: Path, tmp_path: Path) -> None:
@@ -114,13 +111,6 @@ def test_deep_grey_pictures_are_scaled_and_turned(
     assert np.abs(np.asarray(upright(photo).convert("L"), float) - expected).max() < 2
 
 
-def test_a_file_of_several_pictures_is_not_used_as_it_is(tmp_path: Path, pictures: list[np.ndarray]) -> None:
-    first, second = (Image.fromarray(picture) for picture in pictures[:2])
-    first.save(tmp_path / "a.tif", save_all=True, append_images=[second])
-    photo = read_photo(tmp_path, "a.tif")
-    assert not photo.plain and np.array_equal(np.asarray(upright(photo)), pictures[0])
-
-
 @pytest.mark.parametrize(
     ("name", "format"), [("a.jpg", "HEIF"), ("a.jpg", "WEBP"), ("a.png", "JPEG2000"), ("a.jpeg", "PNG")]
 )
@@ -129,7 +119,9 @@ def test_a_file_that_is_not_what_its_name_says_is_converted(tmp_path: Path, name
     assert not read_photo(tmp_path, name).plain
 
 
-def test_colours_of_another_profile_are_those_of_screens() -> None:
+def test_colours_of_another_profile_are_those_of_screens(tmp_path: Path) -> None:
+    Image.new("RGB", (64, 64), (200, 100, 80)).save(tmp_path / "a.webp", lossless=True, icc_profile=DISPLAY_P3)
+    assert upright(read_photo(tmp_path, "a.webp")).getpixel((9, 9))[0] > 205
     pixels = np.full((4, 4, 4), (200, 100, 80, 60), np.uint8)
     for mode in ("RGB", "RGBA"):
         image = Image.fromarray(pixels[..., : len(mode)])
@@ -143,8 +135,3 @@ def test_colours_of_another_profile_are_those_of_screens() -> None:
     grey = Image.new("L", (4, 4))
     grey.info["icc_profile"] = DISPLAY_P3
     assert in_srgb(grey) is grey
-
-
-def test_upright_copies_have_the_colours_of_screens(tmp_path: Path) -> None:
-    Image.new("RGB", (64, 64), (200, 100, 80)).save(tmp_path / "a.webp", lossless=True, icc_profile=DISPLAY_P3)
-    assert upright(read_photo(tmp_path, "a.webp")).getpixel((9, 9))[0] > 205

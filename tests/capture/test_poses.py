@@ -34,8 +34,7 @@ def capture(arc: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copy(path, folder / f"Bild {path.name}")
     (folder / "kaputt.jpg").write_bytes(b"\xff\xd8\xff\xe0 no photograph")
     shutil.copy(arc / "photo_3.png", folder / "wieder.png")
-    noise = np.random.default_rng(1).integers(0, 256, (54, 72, 3)).astype(np.uint8)
-    Image.fromarray(noise).resize((288, 216), Image.BICUBIC).save(folder / "woanders.png")
+    noise(np.random.default_rng(1), (72, 54)).resize((288, 216), Image.BICUBIC).save(folder / "woanders.png")
     find_poses(folder)
     return folder
 
@@ -148,32 +147,21 @@ def test_the_poses_are_those_the_photographs_were_taken_from(capture: Path, view
     assert up[2] > 0.98, "z is up, as the cameras were held"
 
 
-def test_every_photograph_without_a_pose_is_named_with_the_reason(capture: Path) -> None:
-    left_out = find_poses(capture).left_out
-    assert set(left_out) == {"kaputt.jpg", "wieder.png", "woanders.png"} or set(left_out) == {
-        "kaputt.jpg",
-        "Bild photo_3.png",
-        "woanders.png",
-    }
-    assert "damaged or not an image" in left_out["kaputt.jpg"]
-    assert "no other photograph shows the same" in left_out["woanders.png"]
-    assert any(why.startswith("the same as") for why in left_out.values())
-
-
-def test_the_report_says_what_was_found(capture: Path) -> None:
+def test_the_report_says_what_was_found_and_what_was_left_out(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bitymi_ns.capture.poses._find", lambda *arguments: pytest.fail("found anew"))
     poses = find_poses(capture)
+    assert not list(capture.glob(".bitymi/*/database.db"))
     values = json.loads((poses.report / "report.json").read_text("utf8"))
     page = (poses.report / "report.md").read_text("utf8")
     assert values["registered"] == 8 and values["seconds"]["finding features"] > 0
     assert "8 of 11" in page and "kaputt.jpg" in page and "cameras.png" in page
     assert Image.open(poses.report / "cameras.png").size == (1200, 600)
     assert json.loads((poses.report / "frame.json").read_text("utf8"))["metres_per_unit"] is None
-
-
-def test_it_runs_once(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bitymi_ns.capture.poses._find", lambda *arguments: pytest.fail("found anew"))
-    assert find_poses(capture).registered == 8
-    assert not list(capture.glob(".bitymi/*/database.db"))
+    left_out = poses.left_out
+    assert len(left_out) == 3 and left_out.keys() & {"wieder.png", "Bild photo_3.png"}
+    assert "damaged or not an image" in left_out["kaputt.jpg"]
+    assert "no other photograph shows the same" in left_out["woanders.png"]
+    assert any(why.startswith("the same as") for why in left_out.values())
 
 
 def test_a_capture_of_nerfstudio_is_written(
@@ -214,48 +202,36 @@ def test_points_are_triangulated_for_known_poses(arc: Path, views: list[View], c
         np.testing.assert_allclose(found, view.world_to_camera, atol=1e-9)
 
 
-@pytest.mark.parametrize(("count", "said"), [(0, "no photographs"), (1, "one photograph"), (2, "2 photographs")])
-def test_too_few_photographs(arc: Path, tmp_path: Path, count: int, said: str) -> None:
-    for i in range(count):
-        shutil.copy(arc / f"photo_{i + 1}.png", tmp_path)
-    with pytest.raises(CaptureError, match=f"holds {said}: camera poses need at least 3"):
-        find_poses(tmp_path)
+def noise(rng: np.random.Generator, size: tuple[int, int] = (50, 40)) -> Image.Image:
+    return Image.fromarray(rng.integers(0, 256, (*size[::-1], 3)).astype(np.uint8))
 
 
-def test_too_few_that_can_be_read(arc: Path, tmp_path: Path) -> None:
-    shutil.copy(arc / "photo_1.png", tmp_path)
-    for name in "abc":
-        (tmp_path / f"{name}.jpg").write_bytes(b"nothing")
-    with pytest.raises(CaptureError, match=r"only 1 can be used \(a.jpg: it cannot be read"):
-        find_poses(tmp_path)
-
-
-def test_copies_of_one_photograph(arc: Path, tmp_path: Path) -> None:
-    for name in "abcd":
-        shutil.copy(arc / "photo_1.png", tmp_path / f"{name}.png")
-    with pytest.raises(CaptureError, match="only 1 differ"):
-        find_poses(tmp_path)
-
-
-def test_no_such_folder(tmp_path: Path) -> None:
+def test_photographs_that_give_no_poses(arc: Path, tmp_path: Path) -> None:
+    """Too few, unreadable ones, copies of one, of different things, of nothing."""
+    rng = np.random.default_rng(0)
+    one, two = (Image.open(arc / f"photo_{i}.png") for i in (1, 2))
+    for i, (pictures, message) in enumerate(
+        [
+            ([], "holds no photographs: camera poses need at least 3"),
+            ([one], "holds one photograph: camera poses need at least 3"),
+            ([one, two], "holds 2 photographs: camera poses need at least 3"),
+            ([None, None, None, one], r"only 1 can be used \(0.png: it cannot be read"),
+            ([one] * 4, "only 1 differ"),
+            (
+                [noise(rng).resize((300, 240), Image.BICUBIC) for _ in range(4)],
+                "do not overlap: no two of them show the",
+            ),
+            ([Image.new("L", (300, 240), 60 * k) for k in range(4)], "4 of 4 photographs show hardly any detail"),
+        ]
+    ):
+        folder = tmp_path / f"{i}"
+        folder.mkdir()
+        for k, picture in enumerate(pictures):
+            (folder / f"{k}.png").write_bytes(b"nothing") if picture is None else picture.save(folder / f"{k}.png")
+        with pytest.raises(CaptureError, match=message):
+            find_poses(folder)
     with pytest.raises(CaptureError, match="does not exist: name a folder of photographs, or a video"):
         find_poses(tmp_path / "none")
-
-
-def test_photographs_of_different_things(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    for i in range(4):
-        noise = rng.integers(0, 256, (40, 50, 3)).astype(np.uint8)
-        Image.fromarray(noise).resize((300, 240), Image.BICUBIC).save(tmp_path / f"{i}.png")
-    with pytest.raises(CaptureError, match="do not overlap: no two of them show the same"):
-        find_poses(tmp_path)
-
-
-def test_photographs_of_nothing(tmp_path: Path) -> None:
-    for i in range(4):
-        Image.new("L", (300, 240), 60 * i).save(tmp_path / f"{i}.png")
-    with pytest.raises(CaptureError, match="4 of 4 photographs show hardly any detail"):
-        find_poses(tmp_path)
 
 
 def test_photographs_from_one_spot(tmp_path: Path, views: list[View]) -> None:
@@ -296,41 +272,19 @@ def photo(name: str, size: tuple[int, int] = (400, 300), **exif: object) -> Phot
     return Photo(name, Path(name), *size, Exif(**exif), True, np.zeros((1, 1), np.float32), 1.0)  # type: ignore[arg-type]
 
 
-def test_photographs_share_a_camera_by_size_and_exif() -> None:
-    photos = [
-        photo("a", camera="x"),
-        photo("b", camera="x"),
-        photo("c", camera="y"),
-        photo("d", (300, 400), camera="x"),
-    ]
-    assert [[p.name for p in group] for group in by_camera(photos)] == [["a", "b"], ["c"], ["d"]]
-
-
-def test_a_focal_length_is_known_only_if_all_photographs_state_it() -> None:
+def test_photographs_share_a_camera_and_a_focal_length_that_all_of_them_state() -> None:
     both = [photo("a", focal_length=350.0), photo("b", focal_length=352.0)]
     assert camera_group(both, [], SfmOptions()).params[0] == 351 and camera_group(both, [], SfmOptions()).prior
     one = [photo("a", focal_length=350.0), photo("b")]
     assert camera_group(one, [], SfmOptions()).params[0] == 480 and not camera_group(one, [], SfmOptions()).prior
     assert camera_group(one, [], SfmOptions(focal_length=300.0)).params[0] == 300
+    cameras = {"a": "x", "b": "x", "c": "y", "d": "x"}
+    photos = [photo(name, (300, 400) if name == "d" else (400, 300), camera=c) for name, c in cameras.items()]
+    assert [[p.name for p in group] for group in by_camera(photos)] == [["a", "b"], ["c"], ["d"]]
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("max_image_size", 0), ("max_features", -1), ("frames", 2), ("focal_length", float("nan"))]
-)
-def test_options_out_of_range_are_refused(name: str, value: float) -> None:
-    with pytest.raises(CaptureError, match=f"{name} is .*: give a number of at least"):
-        SfmOptions(**{name: value})
-
-
-OTHER = {
-    "matching": "sequential",
-    "mapper": "global",
-    "camera_model": "OPENCV",
-    "focal_length": 321.0,
-    "max_image_size": 800,
-    "max_features": 1234,
-    "frames": 30,
-}
+OTHER = dict(matching="sequential", mapper="global", camera_model="OPENCV", focal_length=321.0, max_image_size=800,
+             max_features=1234, frames=30)  # fmt: skip
 """Another value of every setting."""
 
 
@@ -338,6 +292,9 @@ def test_every_setting_is_part_of_the_key(copied: Copy, monkeypatch: pytest.Monk
     folder, keys = copied("keys"), []
     monkeypatch.setattr("bitymi_ns.capture.poses._find", lambda *arguments: keys.append(arguments[-2].name))
     assert OTHER.keys() == {field.name for field in fields(SfmSettings)}
+    for name, value in (("max_image_size", 0), ("max_features", -1), ("frames", 2), ("focal_length", float("nan"))):
+        with pytest.raises(CaptureError, match=f"{name} is .*: give a number of at least"):
+            SfmOptions(**{name: value})
     for options in [{}, {}, *({name: value} for name, value in OTHER.items())]:
         find_poses(folder, SfmOptions(**options))
     assert keys[0] == keys[1] and len(set(keys)) == 1 + len(OTHER)

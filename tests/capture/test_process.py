@@ -27,14 +27,8 @@ def started(folder: Path, prepare: Callable[[], object] = lambda: None) -> subpr
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # a shell's background jobs, and what they start, ignore it
         prepare()
 
-    return subprocess.Popen(
-        [*COMMAND, str(folder)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        preexec_fn=preexec,
-    )
+    pipes = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen([*COMMAND, str(folder)], **pipes, start_new_session=True, preexec_fn=preexec)
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 120) -> None:

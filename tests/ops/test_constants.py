@@ -62,7 +62,6 @@ def test_each_is_stated_in_one_place(what: str) -> None:
 
 def test_an_older_compiled_module_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(_cpu, "SUPPORT")
-    with pytest.raises(
-        RuntimeError, match="_cpu does not know SUPPORT: it is older than the package. Install the package again"
-    ):
+    older = "_cpu does not know SUPPORT: it is older than the package. Install the package again"
+    with pytest.raises(RuntimeError, match=older):
         constants._compiled("SUPPORT")

@@ -168,31 +168,6 @@ def test_names_that_are_held_out(capture: Path, capsys: pytest.CaptureFixture[st
         load_any(capture, eval_names=tuple(path.name for path in images_of(capture)))
 
 
-def test_fisheyes_of_nerfstudio_become_pinholes(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    edit(capture, lambda meta: meta.update(camera_model="OPENCV_FISHEYE", fl_x=40.0, fl_y=40.0, k1=0.01))
-    manager = load_any(capture)
-    assert "is OPENCV_FISHEYE: its photographs are used as pinhole pictures of" in printed(capsys)
-    image, camera = manager.cached_train[0]["image"], manager.train_dataset.cameras[0]
-    assert image.shape[:2] == (int(camera.height), int(camera.width))
-    assert manager.train_view(0)[0].distortion_params is None
-
-
-def test_a_damaged_photograph_among_good_ones_is_named(capture: Path) -> None:
-    path = images_of(capture)[4]
-    Image.open(path).save(path.with_suffix(".jpg"))
-    broken = path.with_suffix(".jpg").read_bytes()[:200]
-    path.write_bytes(broken)
-    with expect(f"{path.name} cannot be read"):
-        _ = load_any(capture).cached_train
-
-
-def test_an_empty_folder_and_one_that_is_not_there(tmp_path: Path) -> None:
-    with expect("is empty. Give a folder of photographs, a video, or a capture with poses"):
-        load_any(tmp_path)
-    with expect("nowhere does not exist"):
-        load_any(tmp_path / "nowhere")
-
-
 def test_two_things_in_one_folder(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     colmap_model(capture, capture / "sparse/0")
     load_any(capture)

@@ -13,7 +13,7 @@ from bitymi_ns.train.losses import cc_psnr, psnr
 
 LPIPS = {"lpips": "alex", "lpips_vgg": "vgg"}
 """Names of LPIPS in the results, by the backbone: the conventions of nerfstudio and gsplat, and of 3DGS."""
-_lpips_missing: list[bool] = []
+_lpips_missing: list[str] = []
 _flip_missing: list[bool] = []
 
 
@@ -63,16 +63,19 @@ def flip(image: Tensor, reference: Tensor) -> float | None:
 
 
 def lpips_metrics(image: Tensor, reference: Tensor) -> dict[str, float]:
-    """`LPIPS` of two images; empty when the weights cannot be had (one warning per process says why), and for images
-    of fewer than 32 pixels along a side."""
-    if _lpips_missing or min(image.shape[:2]) < lpips.LEAST_SIDE:
-        return {}
-    try:
-        return {name: lpips.lpips(image, reference, backbone) for name, backbone in LPIPS.items()}
-    except lpips.LpipsUnavailable as error:
-        _lpips_missing.append(True)
-        warn(f"LPIPS is left out: {error}.")
-        return {}
+    """`LPIPS` of two images, without those whose weights cannot be had (one warning per process says why); empty for
+    images of fewer than 32 pixels along a side."""
+    found: dict[str, float] = {}
+    for name, backbone in LPIPS.items() if min(image.shape[:2]) >= lpips.LEAST_SIDE else ():
+        if name in _lpips_missing:  # they are fetched together: the next is not there either
+            break
+        try:
+            found[name] = lpips.lpips(image, reference, backbone)
+        except lpips.LpipsUnavailable as error:
+            _lpips_missing.append(name)
+            warn(f"{name.upper()} is left out: {error}.")
+            break
+    return found
 
 
 def render_milliseconds(render: Callable[[], Any], device: torch.device, repeats: int = 3) -> float:

@@ -24,7 +24,7 @@ def pair() -> tuple[torch.Tensor, torch.Tensor]:
 
 def test_metrics_agree_with_their_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     flip_evaluator = pytest.importorskip("flip_evaluator")
-    monkeypatch.setattr(metrics, "_lpips_missing", [True])
+    monkeypatch.setattr(metrics, "_lpips_missing", ["lpips"])
     image, reference = pair()
     result = metrics.image_metrics(image, reference)
     _, flip, _ = flip_evaluator.evaluate(reference.numpy(), image.numpy(), "LDR")
@@ -40,7 +40,7 @@ def test_metrics_agree_with_their_packages(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_quality_is_stated_as_it_is_and_after_a_fit_of_the_colours(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(metrics, "_lpips_missing", [True])
+    monkeypatch.setattr(metrics, "_lpips_missing", ["lpips"])
     _, reference = pair()
     darker = 0.7 * reference + 0.02
     result = metrics.image_metrics(darker, reference)
@@ -65,6 +65,22 @@ def test_lpips_that_cannot_be_had_is_left_out_with_one_warning(
         assert "lpips" not in metrics.image_metrics(*pair())
     output = " ".join(capsys.readouterr().out.split())
     assert output.count("LPIPS is left out") == 1 and "pip is offline" in output
+
+
+def test_the_lpips_whose_weights_are_there_is_stated(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def one_of_two(image: torch.Tensor, reference: torch.Tensor, backbone: str) -> float:
+        if backbone == "vgg":
+            raise metrics.lpips.LpipsUnavailable("its weights are not there")
+        return 0.25
+
+    monkeypatch.setattr(metrics, "_lpips_missing", [])
+    monkeypatch.setattr(metrics.lpips, "lpips", one_of_two)
+    for _ in range(2):
+        found = metrics.image_metrics(*pair())
+        assert found["lpips"] == 0.25 and "lpips_vgg" not in found
+    assert capsys.readouterr().out.count("LPIPS_VGG is left out") == 1
 
 
 def test_rendering_is_timed_alone() -> None:

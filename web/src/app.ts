@@ -13,7 +13,7 @@ import type { Stage } from './ui/stage';
 import { type CaptureCamera, commonTarget, parseCameras } from './view/cameras';
 import { Controls, type Mode } from './view/controls';
 import { Flight } from './view/flight';
-import type { Notes, Place } from './view/notes';
+import type { Notes, Viewpoint } from './view/notes';
 import { Pace } from './view/pace';
 import { DEFAULT_LENS, type Lens, type Pose, View, moved } from './view/pose';
 import { type Shared, fromHash, toHash } from './view/share';
@@ -114,7 +114,7 @@ export class App implements Stage {
     this.place(pose, lens, target);
   }
 
-  fly(to: Place): void {
+  fly(to: Viewpoint): void {
     if (matchMedia('(prefers-reduced-motion: reduce)').matches) {
       this.go(to.pose, to.lens, to.target);
       return;

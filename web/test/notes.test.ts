@@ -19,7 +19,7 @@ describe('notes.json', () => {
   it('is read, and written as it was read', () => {
     const found = parseNotes(JSON.stringify(file()));
     expect(found.views.map(({ name }) => name)).toEqual(['door', 'Tür <b>']);
-    expect(found.views[0].place.pose.down).toEqual([0, 0, -1]);
+    expect(found.views[0].viewpoint.pose.down).toEqual([0, 0, -1]);
     expect(found.notes).toEqual(file().notes);
     expect(JSON.parse(notesText(found))).toEqual(file());
   });

@@ -56,7 +56,7 @@ export class NotesPanel {
   // Goes to the view of a name; whether there is one.
   goTo(name: string): boolean {
     const found = this.all.views.find((view) => view.name === name);
-    if (found) this.stage.fly(found.place);
+    if (found) this.stage.fly(found.viewpoint);
     return found !== undefined;
   }
 
@@ -96,8 +96,8 @@ export class NotesPanel {
     const name = cleared(field.value).trim() || `View ${number}`;
     const { pose, lens, target } = this.stage.shared();
     const there = views.find((view) => view.name === name);
-    if (there) there.place = { pose, lens, target };
-    else if (views.length < MOST_VIEWS) views.push({ name, place: { pose, lens, target } });
+    if (there) there.viewpoint = { pose, lens, target };
+    else if (views.length < MOST_VIEWS) views.push({ name, viewpoint: { pose, lens, target } });
     else notify(`There are ${MOST_VIEWS} views, as many as there can be.`);
     field.value = '';
     this.changed();
@@ -140,7 +140,7 @@ export class NotesPanel {
 
   private show(): void {
     const { views, notes } = this.all;
-    const viewRows = views.map((view) => this.row(views, view, view.name, () => this.stage.fly(view.place)));
+    const viewRows = views.map((view) => this.row(views, view, view.name, () => this.stage.fly(view.viewpoint)));
     const noteRows = notes.map((note) => this.row(notes, note, note.text, () => this.goToNote(note)));
     element('view-rows').replaceChildren(...viewRows);
     element('note-rows').replaceChildren(...noteRows);

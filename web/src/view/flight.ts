@@ -1,5 +1,5 @@
 // The way from one view to another.
-import type { Place } from './notes';
+import type { Viewpoint } from './notes';
 import { CameraPath } from './path';
 import type { View } from './pose';
 
@@ -10,8 +10,8 @@ export class Flight {
   private since: number | null = null; // time, ms, of the first view
 
   constructor(
-    from: Place,
-    readonly to: Place,
+    from: Viewpoint,
+    readonly to: Viewpoint,
   ) {
     this.path.keyframes = [from, to].map(({ pose, lens }) => ({ pose, lens, seconds: SECONDS }));
   }

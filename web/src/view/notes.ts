@@ -2,11 +2,11 @@
 import type { Vec3 } from '../bundle/manifest';
 import { type Shared, cameraOf, sharedOf } from './share';
 
-export type Place = Pick<Shared, 'pose' | 'lens' | 'target'>;
+export type Viewpoint = Pick<Shared, 'pose' | 'lens' | 'target'>;
 
 export interface SavedView {
   name: string;
-  place: Place;
+  viewpoint: Viewpoint;
 }
 export interface Note {
   text: string; // shown as text, never as HTML
@@ -67,7 +67,7 @@ export function parseNotes(text: string): Notes {
     const found = textOf(name, `${where}.name`, LONGEST_NAME);
     if (names.has(found)) refuse(`${where}.name`, 'is there twice');
     names.add(found);
-    return { name: found, place: sharedOf(camera) ?? refuse(where, 'must be a camera') };
+    return { name: found, viewpoint: sharedOf(camera) ?? refuse(where, 'must be a camera') };
   });
   const notes = rows(root.notes, 'notes', MOST_NOTES).map((each, k) => {
     const { text: words, position } = keysOf(each, `notes.${k}`, ['text', 'position']);
@@ -81,6 +81,6 @@ export function parseNotes(text: string): Notes {
 }
 
 export function notesText({ views, notes }: Notes): string {
-  const cameras = views.map(({ name, place }) => ({ name, ...cameraOf(place) }));
+  const cameras = views.map(({ name, viewpoint }) => ({ name, ...cameraOf(viewpoint) }));
   return JSON.stringify({ format: FORMAT, version: 1, views: cameras, notes }, null, 1);
 }

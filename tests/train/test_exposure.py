@@ -177,21 +177,21 @@ def test_off_and_auto_on_even_photographs_are_the_same_run(make_scene, views) ->
 # in training
 
 
-@pytest.mark.parametrize("kind", ["gain", "affine"])
-def test_training_learns_the_exposures(make_scene, views, uneven, kind: str) -> None:
-    results = {}
-    for option in ("off", kind):
+def test_training_learns_the_exposures(make_scene, views, uneven) -> None:
+    results, grey = {}, torch.full((1, 1, 3), 0.5)
+    for kind in ("off", "gain", "affine"):
         lr = LearningRates(exposure=(0.02, 0.005))
-        trainer = Trainer(make_scene(every=2), uneven, config(option, lr=lr, resolution_schedule=0), 150)
+        trainer = Trainer(make_scene(every=2), uneven, config(kind, lr=lr, resolution_schedule=0), 150)
         while trainer.step < 150:
             trainer.advance()
-        results[option] = evaluate(trainer.scene, views, trainer.config)
-    grey = torch.full((1, 1, 3), 0.5)
-    shades = [shown(grey, trainer.training.exposure.of(i), torch.ones(1, 1, 1), None).mean() / 0.5 for i in range(6)]
-    want = torch.tensor([0.3, -0.2, 0.1, -0.3, 0.25, -0.15])
-    torch.testing.assert_close(torch.stack(shades).log(), want, atol=0.1, rtol=0)
-    assert results[kind].cc_psnr > results["off"].cc_psnr + 0.5
-    assert results[kind].psnr > results["off"].psnr - 0.1
+        results[kind] = evaluate(trainer.scene, views, trainer.config)
+        if kind == "off":
+            continue
+        learned = [shown(grey, trainer.training.exposure.of(i), torch.ones(1, 1, 1), None) for i in range(6)]
+        logs = torch.stack([image.mean() / 0.5 for image in learned]).log()
+        torch.testing.assert_close(logs, torch.tensor([0.3, -0.2, 0.1, -0.3, 0.25, -0.15]), atol=0.1, rtol=0)
+        assert results[kind].cc_psnr > results["off"].cc_psnr + 0.5
+        assert results[kind].psnr > results["off"].psnr - 0.1
 
 
 def test_scores_are_of_the_corrected_image(make_scene, views) -> None:

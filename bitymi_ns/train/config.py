@@ -71,9 +71,9 @@ class DensifyConfig:
     those that cover most bad pixels, the largest of a background among them, when nothing can close the hole."""
     min_interval: Count = 100
     """Fewest steps between densifications, however short the run: surfels need time to settle first."""
-    pixels_per_surfel: NonNegative = 300.0
+    pixels_per_surfel: NonNegative = 150.0
     """Densification stops at one surfel for so many pixels of all training photographs together; 0 = no such bound."""
-    growth: NonNegative = 2.0
+    growth: NonNegative = 4.0
     """... but not before there are so many times the surfels that training started with, however few the pixels: a
     scene that cannot grow cannot put surfels where its errors are."""
     max_surfels: Count = 0  # Hard cap on the number of surfels; 0 = none.

@@ -47,4 +47,4 @@ def test_a_bound_that_densification_meets_is_named() -> None:
     config = TrainConfig(densify=DensifyConfig(max_surfels=800))
     capped, by_pixels = limits.held_back(1234, 800, config), limits.held_back(1234, 700, config)
     assert "800 surfels and would have made 1,234 more" in capped and "densify.max-surfels" in capped
-    assert "one for 300 pixels of all photographs" in by_pixels and "densify.pixels-per-surfel" in by_pixels
+    assert "one for 150 pixels of all photographs" in by_pixels and "densify.pixels-per-surfel" in by_pixels

@@ -239,7 +239,7 @@ def test_the_cap_is_met_exactly_and_the_most_important_grow(bench, cap):
 @pytest.mark.parametrize(("views", "surfels"), [(1, 60), (2, 80), (9, 80)])
 def test_the_bound_follows_the_pixels_of_all_photographs(bench, views, surfels):
     b = bench(40)
-    b.strategy = Strategy(b.config, Schedule(b.config, 30_000), 1.0, image_pixels=views * 60 * 300)
+    b.strategy = Strategy(b.config, Schedule(b.config, 30_000), 1.0, image_pixels=views * 60 * 150)
     b.importance = torch.full((40,), 10)
     b.set("log_scales", slice(0, 40), LARGE)
     b.see(1.0, 1.0)
@@ -264,7 +264,7 @@ def test_the_bound_follows_the_pixels_of_all_photographs(bench, views, surfels):
     ],
 )
 def test_the_tighter_bound_holds(cap, per_surfel, pixels, first, most):
-    config = TrainConfig(densify=DensifyConfig(max_surfels=cap, pixels_per_surfel=per_surfel))
+    config = TrainConfig(densify=DensifyConfig(max_surfels=cap, pixels_per_surfel=per_surfel, growth=2.0))
     assert most_surfels(config, pixels, first) == most
     # 263 photographs of 979 x 543, 98,705 points; the paper ends at up to 159,000 surfels there
     assert most_surfels(TrainConfig(), 263 * 979 * 543) > 2 * 159_000

@@ -96,7 +96,7 @@ class Row:
         command: as it was typed.
         status: exit status.
         seconds: wall clock.
-        host: largest resident memory, MB.
+        host: largest resident memory, MB; the kernel counts this process, until the command starts, as well.
         card: largest memory in use on the card, MB, that of other programs included; None = there is no card.
     """
 

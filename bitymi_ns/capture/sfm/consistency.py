@@ -15,7 +15,7 @@ pair."""
 
 
 def drop_unlinked(model: pycolmap.Reconstruction) -> None:
-    """Take the pose from cameras that points do not link to most of the others: their place is arbitrary.
+    """Take the pose from cameras that points do not link to most of the others: their pose is arbitrary.
 
     Mappers place them by directions between pairs, whose points the filters may have removed.
     """

@@ -42,7 +42,11 @@ def reconstruct(job: Job, database: Path, connected: int, tell: StageProgress) -
 def better(job: Job, database: Path, *models: pycolmap.Reconstruction | None) -> pycolmap.Reconstruction | None:
     """The model with most cameras, of equals that which fewest matches contradict; None if there is none."""
     found = [model for model in models if model is not None]
-    return max(found, key=lambda m: (m.num_reg_images(), -contradicted(m, database, pixel(job))), default=None)
+    most = max((model.num_reg_images() for model in found), default=0)
+    equal = [model for model in found if model.num_reg_images() == most]
+    if len(equal) < 2:  # no matches need to be read
+        return equal[0] if equal else None
+    return min(equal, key=lambda model: contradicted(model, database, pixel(job)))
 
 
 def pixel(job: Job) -> float:

@@ -1,8 +1,8 @@
 // Saved views and notes: their lists, their file, and the markers of notes over the scene.
 import { LONGEST_NAME, LONGEST_TEXT, MOST_NOTES, MOST_VIEWS, type Note, type Notes } from '../view/notes';
 import { cleared, notesText } from '../view/notes';
-import { View } from '../view/pose';
-import { add, dot, length, subtract, times } from '../view/vector';
+import { View, moved } from '../view/pose';
+import { length, subtract } from '../view/vector';
 import { download, element, make, press, pressed } from './dom';
 import { notify } from './pages';
 import type { Stage } from './stage';
@@ -60,16 +60,14 @@ export class NotesPanel {
     return found !== undefined;
   }
 
-  // Puts the markers where a view shows their notes; `still`: also looks which of them surfels hide.
+  // Puts the markers where a view shows their notes; `still`: and finds which of them surfels hide.
   async drawn(view: View, still: boolean): Promise<void> {
     const seen: { marker: HTMLElement; x: number; y: number; z: number }[] = [];
     for (const [{ position }, marker] of this.markers) {
-      const from = subtract(position, view.pose.position);
-      const z = dot(from, view.pose.forward);
-      const x = ((view.fx * dot(from, view.pose.right)) / z + view.cx) / view.width;
-      const y = ((view.fy * dot(from, view.pose.down)) / z + view.cy) / view.height;
-      marker.hidden = !(z > 0 && x >= 0 && x < 1 && y >= 0 && y < 1);
-      if (marker.hidden) continue;
+      const at = view.project(position);
+      marker.hidden = !at;
+      if (!at) continue;
+      const [x, y, z] = [at[0] / view.width, at[1] / view.height, at[2]];
       Object.assign(marker.style, { left: `${100 * x}%`, top: `${100 * y}%` });
       marker.classList.toggle('left', x > 0.55);
       if (!still) marker.classList.remove('behind');
@@ -123,9 +121,8 @@ export class NotesPanel {
       notify('The note needs a surface: there is none at that pixel.');
       return;
     }
-    const { position, right, down, forward } = view.pose;
-    const across = add(times((x - view.cx) / view.fx, right), times((y - view.cy) / view.fy, down));
-    const note = { text: '', position: add(position, times(depth, add(across, forward))) };
+    const [right, down] = [((x - view.cx) / view.fx) * depth, ((y - view.cy) / view.fy) * depth];
+    const note = { text: '', position: moved(view.pose, right, down, depth).position };
     this.all.notes.push(note);
     this.editing = note;
     this.show();
@@ -134,8 +131,7 @@ export class NotesPanel {
   private goToNote({ position }: Note): void {
     const { pose, lens, target } = this.stage.shared();
     const away = length(subtract(target, pose.position));
-    const from = subtract(position, times(away, pose.forward));
-    this.stage.fly({ pose: { ...pose, position: from }, lens, target: position });
+    this.stage.fly({ pose: moved({ ...pose, position }, 0, 0, -away), lens, target: position });
   }
 
   private show(): void {

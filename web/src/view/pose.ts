@@ -35,6 +35,14 @@ export class View implements Lens {
     const [x, y] = [width / this.width, height / this.height];
     return new View(this.pose, this.fx * x, this.fy * y, this.cx * x, this.cy * y, width, height);
   }
+  // The pixel coordinates of a point and its depth along the camera's axis; null where the picture does not show it.
+  project(point: Vec3): Vec3 | null {
+    const from = subtract(point, this.pose.position);
+    const z = dot(from, this.pose.forward);
+    const x = (this.fx * dot(from, this.pose.right)) / z + this.cx;
+    const y = (this.fy * dot(from, this.pose.down)) / z + this.cy;
+    return z > 0 && x >= 0 && x < this.width && y >= 0 && y < this.height ? [x, y, z] : null;
+  }
   // The view through a lens, of which a screen shows all, and more on two sides.
   static contain(pose: Pose, lens: Lens, width: number, height: number): View {
     const k = Math.min(width / lens.width, height / lens.height);

@@ -1,7 +1,5 @@
 // How a view of another size than the photographs is drawn: bitymi_ns/scene/sampling.py does the same.
-import { dot, subtract } from './vector';
 import type { View } from './pose';
-import type { Vec3 } from '../bundle/manifest';
 
 const AS_TRAINED = [0.75, 1.5]; // views between these sizes are drawn as in training
 const [SMALLEST, LARGEST] = [0.5, 2]; // beyond, for what they are; in between it changes over
@@ -16,18 +14,10 @@ export interface Sampling {
 
 // How large a view shows what was photographed: 1 = as large as the photographs. `photographed` has rows x, y, z, rate.
 export function sizeOf(photographed: Float32Array, view: View): number {
-  const { pose } = view;
   const sizes: number[] = [];
   for (let i = 0; i < photographed.length; i += 4) {
-    const point: Vec3 = [photographed[i], photographed[i + 1], photographed[i + 2]];
-    const from = subtract(point, pose.position);
-    const z = dot(from, pose.forward);
-    if (!(z > 0)) continue;
-    const x = (view.fx * dot(from, pose.right)) / z + view.cx;
-    const y = (view.fy * dot(from, pose.down)) / z + view.cy;
-    if (x >= 0 && x < view.width && y >= 0 && y < view.height) {
-      sizes.push(Math.sqrt(view.fx * view.fy) / (z * photographed[i + 3]));
-    }
+    const at = view.project([photographed[i], photographed[i + 1], photographed[i + 2]]);
+    if (at) sizes.push(Math.sqrt(view.fx * view.fy) / (at[2] * photographed[i + 3]));
   }
   if (!sizes.length) return 1;
   sizes.sort((a, b) => a - b);

@@ -14,7 +14,7 @@ from .fragment_list import TooManyFragments
 from .project import Prefilter, Projection, project
 from .shade import shade
 from .ssim import ssim
-from .texel import TexelDescent, TexelTiles
+from .texel import TexelAlpha, TexelDescent, TexelTiles
 from .trace import Fragments, masked_counts, select, trace
 from .view_color import view_color
 from .view_kinds import VIEW_COLORS
@@ -26,6 +26,7 @@ __all__ = [
     "Fragments",
     "Prefilter",
     "Projection",
+    "TexelAlpha",
     "TexelDescent",
     "TexelTiles",
     "TooManyFragments",

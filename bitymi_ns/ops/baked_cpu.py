@@ -42,9 +42,9 @@ def gather(atlas: Tensor | None, tiles: Tensor) -> Any:
     return module(tiles.device).Patches(**texels, layers=layers, height=height, width=width, tiles=tiles.contiguous())
 
 
-def coarser(atlas: Tensor, tiles: Tensor) -> dict[str, Any]:
-    """The levels of an atlas as the kernel reads them, by name."""
-    return {name: gather(pages, of) for name, pages, of in tile_levels(atlas, tiles)}
+def coarser(atlas: Tensor, tiles: Tensor, alpha: bool) -> dict[str, Any]:
+    """The levels of an atlas, with alpha texels or without, as the kernel reads them, by name."""
+    return {name: gather(pages, of) for name, pages, of in tile_levels(atlas, tiles, alpha)}
 
 
 def frame(scene: BakedScene, camera: Camera, maps: bool, photo_pixel: float = 1.0) -> tuple[Tensor, Tensor | None]:
@@ -72,13 +72,13 @@ def frame(scene: BakedScene, camera: Camera, maps: bool, photo_pixel: float = 1.
     geom = projection.geom
     texture = residual(scene)
     if atlas is not None and atlas.dtype == torch.uint8:
-        texture["scale"] /= 255  # the kernel reads bytes as 0 to 255
+        texture |= {name: texture[name] / 255 for name in ("scale", "alpha_scale")}  # the kernel reads 0 to 255
     image = geom.new_empty(camera.height, camera.width, MAP_CHANNELS if maps else BAKED_CHANNELS)
     overdraw = torch.empty(camera.height, camera.width, 1, dtype=torch.int32) if maps else None
     patches = scene.cache.atlas(lambda: gather(atlas, tiles), atlas, tiles)
     levels = {}
     if atlas is not None and photo_pixel < 1.0:
-        levels = scene.cache.coarser(lambda: coarser(atlas, tiles))
+        levels = scene.cache.coarser(lambda: coarser(atlas, tiles, scene.alpha_scale > 0))
     with _bins().borrow() as bins:
         kernel("baked_forward", geom)(
             **projection.view(geom),

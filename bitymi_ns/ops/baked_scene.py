@@ -74,6 +74,8 @@ class BakedScene(Protocol):
     scale: float
     extent: Tensor | None
     mean_residual: Tensor | None
+    alpha_scale: float
+    mean_alpha: Tensor | None
     near: float
     weight_bound: float
     transmittance_min: float
@@ -84,8 +86,8 @@ class BakedScene(Protocol):
 
 def residual(scene: BakedScene) -> dict[str, Any]:
     """Arguments of the kernels for texels (`BakedResidual` of csrc/ops/texel.h)."""
-    numbers = ("offset", "scale", "weight_bound", "transmittance_min")
-    arrays = {"extent": scene.extent, "mean_residual": scene.mean_residual}
+    numbers = ("offset", "scale", "alpha_scale", "weight_bound", "transmittance_min")
+    arrays = {name: getattr(scene, name) for name in ("extent", "mean_residual", "mean_alpha")}
     dense = {name: None if t is None else t.detach().float().contiguous() for name, t in arrays.items()}
     return {name: getattr(scene, name) for name in numbers} | dense
 
@@ -120,22 +122,36 @@ def common_size(cameras: Sequence[Camera]) -> tuple[int, int]:
 LEVELS = ("half", "quarter")  # names of the levels: what is left of a side
 
 
-def halved(atlas: Tensor) -> Tensor:
+def halved(atlas: Tensor, alpha: bool = False) -> Tensor:
     """Means of 2 x 2 texels, those of bytes rounded: [layers, height / 2, width / 2, 4] of [layers, height, width, 4];
-    an odd row or column is left out."""
+    an odd row or column is left out. With `alpha` colours are weighted by the fourth channel where any of the four is
+    not 0: what is cut away does not tint its neighbours."""
     layers, height, width, channels = atlas.shape
     cut = atlas[:, : height // 2 * 2, : width // 2 * 2].reshape(layers, height // 2, 2, width // 2, 2, channels)
     if atlas.dtype == torch.uint8:
-        return ((cut.to(torch.int16).sum((2, 4), dtype=torch.int16) + 2) >> 2).to(torch.uint8)
-    return cut.mean((2, 4))
+        summed = cut.to(torch.int32)
+        means = (summed.sum((2, 4), dtype=torch.int32) + 2) >> 2
+        if alpha:
+            weight = summed[..., 3:]
+            total = weight.sum((2, 4), dtype=torch.int32)
+            colors = ((weight * summed[..., :3]).sum((2, 4), dtype=torch.int32) + (total >> 1)) // total.clamp(min=1)
+            means[..., :3] = torch.where(total > 0, colors, means[..., :3])
+        return means.to(torch.uint8)
+    means = cut.mean((2, 4))
+    if alpha:
+        total = cut[..., 3:].sum((2, 4))
+        colors = (cut[..., 3:] * cut[..., :3]).sum((2, 4)) / total.clamp(min=1e-6)
+        means[..., :3] = torch.where(total > 0, colors, means[..., :3])
+    return means
 
 
-def tile_levels(atlas: Tensor, tiles: Tensor) -> Iterator[tuple[str, Tensor, Tensor]]:
+def tile_levels(atlas: Tensor, tiles: Tensor, alpha: bool = False) -> Iterator[tuple[str, Tensor, Tensor]]:
     """The levels of an atlas, finest first, without that of the atlas itself.
 
     Args:
         atlas: [layers, height, width, 4] uint8 or float.
         tiles: [N, 5] int32: x, y, layer, r_u, r_v in texels.
+        alpha: as in `halved`.
 
     Yields:
         name, pages, and the tiles on them: r_u = 0 where a tile has no such level, because its corner or its sides do
@@ -143,7 +159,7 @@ def tile_levels(atlas: Tensor, tiles: Tensor) -> Iterator[tuple[str, Tensor, Ten
     """
     scaled = tiles.new_tensor([1, 1, 0, 1, 1])
     for level, name in enumerate(LEVELS, start=1):
-        atlas = halved(atlas)
+        atlas = halved(atlas, alpha)
         if 0 in atlas.shape:
             return
         fits = (tiles * scaled % (1 << level) == 0).all(1, keepdim=True)

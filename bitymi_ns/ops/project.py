@@ -11,6 +11,7 @@ from torch import Tensor
 
 from .backend import check_shapes, cuda_backend, dense, kernel, on_same_device
 from .constants import FRAME, GEOM
+from .texel import TexelAlpha
 
 Prefilter = Literal["low_pass", "pixel"]  # how surfels smaller than a pixel are drawn, see `project`
 
@@ -54,6 +55,7 @@ class Projection:
         mean2d_grad: [N, 2] after backward: gradient with respect to the projected centre, in pixels.
         mean2d_absgrad: [N, 2] after backward: the same with the absolute value taken per fragment before the sum.
         whole: the view that this is a band of (ops/bands.py).
+        alpha: what texels make of the surfels' opacity; None = opaque texels.
     """
 
     geom: Tensor
@@ -67,6 +69,7 @@ class Projection:
     mean2d_grad: Tensor | None = None
     mean2d_absgrad: Tensor | None = None
     whole: Projection | None = None
+    alpha: TexelAlpha | None = None
 
     def take_mean2d(self, grad: Tensor, absgrad: Tensor) -> None:
         """Notes the gradients of the projected centres; those of bands are added up in the whole view."""

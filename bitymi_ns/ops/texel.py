@@ -51,6 +51,27 @@ class TexelTiles:
 
 
 @dataclass(frozen=True)
+class TexelAlpha:
+    """Factors of opacity by texel: sigma = min(0.99, sigma0 m) of a fragment whose weight sigma0 T would be at least
+    `bound`, with m the bilinear fetch at its u and v. sigma0 < 1/255 is no fragment, whatever m.
+
+    Attributes:
+        tiles: of the texels.
+        values: [T] m, from 0 to 2.
+        bound: fragments whose weight would be less keep their sigma.
+    """
+
+    tiles: TexelTiles
+    values: Tensor
+    bound: float
+
+    @property
+    def arrays(self) -> dict[str, Any]:
+        """Arguments of the kernels, by name."""
+        return {**self.tiles.arrays, "texel_alpha": self.values.detach(), "alpha_bound": self.bound}
+
+
+@dataclass(frozen=True)
 class TexelDescent:
     """Step of a backward pass for texels: texel t moves by -rate share[t] times its gradient.
 

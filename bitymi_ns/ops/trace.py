@@ -100,7 +100,7 @@ def _for_layout(numbers: dict[str, Tensor], layout: Layout) -> dict[str, Tensor]
 
 class _Trace(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, geom, projection, rim, most):
+    def forward(ctx, geom, texel_alpha, projection, rim, most):
         find_fragments = trace_cuda.find_fragments if cuda_backend(geom.device) else trace_cpu.find_fragments
         layout, found = find_fragments(geom.detach(), projection, most)
         weight, uv, depth, sigma = (found[name] for name in ("weight", "uv", "depth", "sigma"))
@@ -119,10 +119,16 @@ class _Trace(torch.autograd.Function):
         grads = {name: None if g is None else dense(g, geom) for name, g in grads.items()}
         dgeom, absgrad = torch.empty_like(geom), geom.new_empty(geom.shape[0], 2)
         work = trace_cuda.backward_memory(geom, ctx.layout) if cuda_backend(geom.device) else {}
+        of_alpha = {}
+        if projection.alpha is not None:
+            of_alpha = projection.alpha.arrays
+            if ctx.needs_input_grad[1]:
+                of_alpha["dtexel_alpha"] = torch.empty_like(of_alpha["texel_alpha"])
         kernel("trace_backward", geom)(
             **projection.view(geom),
             **dict(zip(ctx.names, arrays, strict=True)),
             **grads,
+            **of_alpha,
             **work,
             rim=ctx.rim,
             layout=ctx.layout.handle,
@@ -130,14 +136,15 @@ class _Trace(torch.autograd.Function):
             absgrad=absgrad,
         )
         projection.take_mean2d(dgeom[:, :2], absgrad)
-        return dgeom, None, None, None
+        return dgeom, of_alpha.get("dtexel_alpha"), None, None, None
 
 
 def trace(projection: Projection, rim: float = 1e-3, most: int | None = None) -> Fragments:
     """Finds the fragments of a view: for each pixel the surfels that are blended there, front to back by centre depth.
 
     They have sigma = min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))) >= 1/255. A pixel ends before the surfel
-    that would take its transmittance below 1e-4.
+    that would take its transmittance below 1e-4. Where the projection has alpha texels, these multiply sigma
+    (`TexelAlpha`); the last bit of v then says of which fragments.
 
     The backward pass fills `projection.mean2d_grad` and `projection.mean2d_absgrad`.
 
@@ -148,14 +155,16 @@ def trace(projection: Projection, rim: float = 1e-3, most: int | None = None) ->
             its free memory holds together with what shading, blending and their backward pass need.
 
     Raises:
-        ValueError: the rows are not of `project`, or not for a view of the photographs' size.
+        ValueError: the rows are not of `project`, not for a view of the photographs' size, or the tiles of alpha texels
+            are of other surfels.
         TooManyFragments: there are more, or their list does not fit the memory of the CUDA device.
     """
     if projection.photo_pixel != 1.0:
         raise ValueError("surfels in a view of another size than the photographs are drawn by the baked renderer alone")
     if projection.geom.shape[1] != GEOM:
         raise ValueError(f"geom must have {GEOM} columns, not {projection.geom.shape[1]}")
-    weight, uv, depth, sigma, layout = _Trace.apply(projection.geom, projection, rim, most)
+    texel_alpha = None if projection.alpha is None else projection.alpha.values
+    weight, uv, depth, sigma, layout = _Trace.apply(projection.geom, texel_alpha, projection, rim, most)
     camera, n = projection.camera, len(projection.geom)
     return Fragments(weight, uv, depth, sigma, camera.width, camera.height, layout, n)
 

@@ -61,6 +61,9 @@ class BakedScene:
         offset, scale: residual = offset + scale * value, value = stored / 255 for uint8, stored for float32.
         extent: [N] half side of the tile in scale units, None = 3, the kernel's support, everywhere.
         mean_residual: [N, 3] float32 mean residual of every tile; a surfel without a tile has this residual. None = 0.
+        alpha_scale: texels multiply their surfel's sigma by m = alpha_scale * value of their fourth channel, see
+            `ops.TexelAlpha`; 0 = they do not.
+        mean_alpha: [N] float32 mean m of every tile; that of a surfel without a tile. None = 1.
         near: nearest depth that is drawn, camera z.
         weight_bound: fragments of smaller blending weight keep the surfel's colour without the residual.
         prefilter: low_pass or pixel, as in `SceneConfig`.
@@ -81,6 +84,8 @@ class BakedScene:
     scale: float = 1.0
     extent: Tensor | None = None
     mean_residual: Tensor | None = None
+    alpha_scale: float = 0.0
+    mean_alpha: Tensor | None = None
     near: float = 0.2
     weight_bound: float = 0.0
     prefilter: Prefilter = "low_pass"
@@ -109,7 +114,7 @@ class BakedScene:
             return None if t is None else t.to(device)
 
         surfels = {name: value.to(device) for name, value in self.surfels.items()}
-        optional = {"extent": moved(self.extent), "mean_residual": moved(self.mean_residual)}
+        optional = {name: moved(getattr(self, name)) for name in ("extent", "mean_residual", "mean_alpha")}
         return replace(self, surfels=surfels, tiles=self.tiles.to(device), **optional)
 
     def __len__(self) -> int:

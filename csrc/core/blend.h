@@ -17,6 +17,9 @@ template <class T> BT_HD Blend<T> blend(T sigma, T transmittance) {
   return {weight, transmittance - weight};
 }
 
+// Sigma under a texel of alpha m, see AlphaTiles.
+template <class T> BT_HD T alpha_cut(T sigma, T m) { return min_(T(kAlphaMax), sigma * m); }
+
 // The open pixels that take the fragment, and those that it ends, as it would leave them less than `stop`. One that
 // would leave less than kTransmittanceMin is not blended itself, unless `stop` is below that.
 template <class T> struct BlendTest {

@@ -12,18 +12,18 @@
 namespace bt {
 
 namespace {
-// Red, green and blue of a texel for each lane.
-template <class S> struct Texels {
-  Lanes<S> rgb[3];
+// Red, green and blue of a texel for each lane, and its alpha where there are four channels.
+template <class S, int channels> struct Texels {
+  Lanes<S> of[channels];
 };
 // The texels at the lanes' offsets in a tile's texels, and their right neighbours.
-template <class S> struct TexelPairs {
-  Texels<S> left, right;
+template <class S, int channels> struct TexelPairs {
+  Texels<S, channels> left, right;
 };
 
-template <class S> inline Texels<S> texels_of(const Wide<uint32_t>& rgba) {
-  Texels<S> t;
-  for (int c = 0; c < 3; ++c) t.rgb[c] = from_integers<S>(rgba >> 8 * c & 255u);
+template <class S, int channels> inline Texels<S, channels> texels_of(const Wide<uint32_t>& rgba) {
+  Texels<S, channels> t;
+  for (int c = 0; c < channels; ++c) t.of[c] = from_integers<S>(rgba >> 8 * c & 255u);
   return t;
 }
 // The texels at 16 offsets and their right neighbours, from 8 bytes for each, which hold both.
@@ -58,34 +58,35 @@ inline void pairs_of(const uint8_t* patch, const int32_t* at, Wide<uint32_t>* le
   }
 #endif
 }
-template <class S> inline TexelPairs<S> texel_pairs(const uint8_t* patch, const int32_t* at) {
+template <class S, int channels> inline TexelPairs<S, channels> texel_pairs(const uint8_t* patch, const int32_t* at) {
   Wide<uint32_t> left, right;
   pairs_of(patch, at, &left, &right);
-  return {texels_of<S>(left), texels_of<S>(right)};
+  return {texels_of<S, channels>(left), texels_of<S, channels>(right)};
 }
-template <class S> inline TexelPairs<S> texel_pairs(const float* patch, const int32_t* at) {
-  TexelPairs<S> t;
+template <class S, int channels> inline TexelPairs<S, channels> texel_pairs(const float* patch, const int32_t* at) {
+  TexelPairs<S, channels> t;
   for (int i = 0; i < kLanes; ++i)
-    for (int c = 0; c < 3; ++c) {
+    for (int c = 0; c < channels; ++c) {
       const float* p = patch + 4 * int64_t(at[i]) + c;
-      t.left.rgb[c].set(i, S(p[0])), t.right.rgb[c].set(i, S(p[4]));
+      t.left.of[c].set(i, S(p[0])), t.right.of[c].set(i, S(p[4]));
     }
   return t;
 }
 
-// Residuals at the lanes' positions in a tile, bilinear. A position is clamped to the outer texel centres, so at a
+// Stored values at the lanes' positions in a tile, bilinear. A position is clamped to the outer texel centres, so at a
 // tile's last column and row the neighbour has weight 0 and may be any texel.
-template <class S, class T> inline Texels<S> bilinear(const T* patch, int columns, Lanes<S> x, Lanes<S> y) {
+template <class S, int channels, class T>
+inline Texels<S, channels> bilinear(const T* patch, int columns, Lanes<S> x, Lanes<S> y) {
   using P = Lanes<S>;
   const P x0 = floor_(x), y0 = floor_(y), fx = x - x0, fy = y - y0;
   int32_t at[kLanes];
   store_integers(at, y0 * P(S(columns)) + x0);  // exact: a tile has fewer than 2^24 texels
-  const TexelPairs<S> top = texel_pairs<S>(patch, at), bottom = texel_pairs<S>(patch + 4 * columns, at);
-  Texels<S> t;
-  for (int c = 0; c < 3; ++c) {
-    const P left = top.left.rgb[c] + fy * (bottom.left.rgb[c] - top.left.rgb[c]);
-    const P right = top.right.rgb[c] + fy * (bottom.right.rgb[c] - top.right.rgb[c]);
-    t.rgb[c] = left + fx * (right - left);
+  const auto top = texel_pairs<S, channels>(patch, at), bottom = texel_pairs<S, channels>(patch + 4 * columns, at);
+  Texels<S, channels> t;
+  for (int c = 0; c < channels; ++c) {
+    const P left = top.left.of[c] + fy * (bottom.left.of[c] - top.left.of[c]);
+    const P right = top.right.of[c] + fy * (bottom.right.of[c] - top.right.of[c]);
+    t.of[c] = left + fx * (right - left);
   }
   return t;
 }
@@ -128,7 +129,8 @@ namespace {
 template <class S> struct DrawnSurfel {
   S view[3];             // its colour without a residual
   S bound;               // fragments of smaller weight have none
-  S flat[3];             // the residual where there are no texels
+  S flat[4];             // the residual and alpha where there are no texels
+  bool cut;              // whether alpha is another than 1 anywhere
   S k;                   // texels per scale unit are k times the texels along a side
   const Patches* level;  // null: no texels
   int64_t first;
@@ -152,24 +154,31 @@ template <class S> DrawnSurfel<S> drawn_surfel(const BakedForward<S>& a, int64_t
   DrawnSurfel<S> d;
   store3(d.view, view_base(load3(a.base + 3 * id)));
   for (int c = 0; c < 3; ++c) d.flat[c] = atlas.mean_residual ? S(atlas.mean_residual[3 * id + c]) : S(0);
+  d.flat[3] = atlas.mean_alpha ? S(atlas.mean_alpha[id]) : S(1);
   d.k = S(1) / (S(2) * extent);
   d.level = level_of(a, id, extent);
   d.first = d.level ? 4 * d.level->first[id] : 0;
   for (int k = 0; k < 2; ++k) d.sides[k] = d.level ? d.level->sides[2 * id + k] : 0;
-  const bool plain = !d.level && d.flat[0] == 0 && d.flat[1] == 0 && d.flat[2] == 0;
+  d.cut = d.level ? atlas.alpha_scale != 0 : d.flat[3] != 1;
+  const bool plain = !d.level && !d.cut && d.flat[0] == 0 && d.flat[1] == 0 && d.flat[2] == 0;
   d.bound = plain ? S(2) : S(atlas.weight_bound);  // no weight reaches 2
   return d;
 }
 
-// Residuals of a surfel at surfel coordinates.
-template <class S>
-inline Texels<S> residual_of(const DrawnSurfel<S>& d, Lanes<S> u, Lanes<S> v, const BakedResidual& atlas) {
+// Residuals of a surfel at surfel coordinates, and alpha where there are four channels.
+template <int channels, class S>
+inline Texels<S, channels> texels_at(const DrawnSurfel<S>& d, Lanes<S> u, Lanes<S> v, const BakedResidual& atlas) {
   using P = Lanes<S>;
-  if (!d.level) return {P(d.flat[0]), P(d.flat[1]), P(d.flat[2])};
+  Texels<S, channels> t;
+  if (!d.level) {
+    for (int c = 0; c < channels; ++c) t.of[c] = P(d.flat[c]);
+    return t;
+  }
   const P x = texel_position_scaled(u, S(d.sides[0] - 1), d.k), y = texel_position_scaled(v, S(d.sides[1] - 1), d.k);
-  Texels<S> t = d.level->floats.empty() ? bilinear<S>(d.level->bytes.data() + d.first, d.sides[0], x, y)
-                                        : bilinear<S>(d.level->floats.data() + d.first, d.sides[0], x, y);
-  for (auto& channel : t.rgb) channel = P(S(atlas.offset)) + P(S(atlas.scale)) * channel;
+  t = d.level->floats.empty() ? bilinear<S, channels>(d.level->bytes.data() + d.first, d.sides[0], x, y)
+                              : bilinear<S, channels>(d.level->floats.data() + d.first, d.sides[0], x, y);
+  for (int c = 0; c < 3; ++c) t.of[c] = P(S(atlas.offset)) + P(S(atlas.scale)) * t.of[c];
+  if constexpr (channels == 4) t.of[3] = P(S(atlas.alpha_scale)) * t.of[3];
   return t;
 }
 
@@ -203,27 +212,42 @@ template <class Kernel, bool kMaps, class S> void baked_forward(const BakedForwa
       }
       if (k + 1 < bins.start[tile + 1]) prefetch_texels(drawn[bins.surfels[k + 1]]);
       const DrawnSurfel<S>& d = drawn[id];
+      const auto add = [&](int block, const typename P::M& taken, const Fragment<P>& f, P weight, auto&& texels) {
+        const typename P::M textures = taken & (weight >= P(d.bound));
+        const P w = select(taken, weight, P(S(0)));
+        P colour[3] = {P(d.view[0]), P(d.view[1]), P(d.view[2])};
+        if (bits(textures)) {
+          const auto& t = texels(f);
+          for (int c = 0; c < 3; ++c) colour[c] = select(textures, shaded(colour[c], t.of[c]), colour[c]);
+        }
+        for (int c = 0; c < 3; ++c) sums[c][block] += w * colour[c];
+        sums[3][block] += w;
+        if constexpr (kMaps) {
+          const S* g = a.view.geom + id * kGeom;
+          sums[4][block] += w * P(g[kBeta]);
+          sums[5][block] += select(taken, w * f.depth, P(S(0)));
+          for (int c = 0; c < 3; ++c) sums[6 + c][block] += w * P(g[kNx + c]);
+        }
+        if (overdraw) sums[kMapChannels][block] += select(taken, P(S(1)), P(S(0)));
+      };
+      if (!d.cut) {
+        const auto fetch = [&](const Fragment<P>& f) { return texels_at<3>(d, f.u, f.v, atlas); };
+        state.template blend<Kernel, kMaps>(
+            a.view, bins, id, [&](int block, const auto& taken, const auto& f, P w) { add(block, taken, f, w, fetch); },
+            sharp);
+        continue;
+      }
+      Texels<S, 4> fetched;  // of a block: what has the weight for a residual had it for alpha
+      const auto cut = [&](Fragment<P>& f, const typename P::M& covered, const P& transmittance) {
+        const typename P::M reaches = covered & (f.sigma * transmittance >= P(d.bound));
+        if (!bits(reaches)) return;
+        fetched = texels_at<4>(d, f.u, f.v, atlas);
+        f.sigma = select(reaches, alpha_cut(f.sigma, fetched.of[3]), f.sigma);
+      };
+      const auto kept = [&](const Fragment<P>&) -> const Texels<S, 4>& { return fetched; };
       state.template blend<Kernel, kMaps>(
-          a.view, bins, id,
-          [&](int block, const typename P::M& taken, const Fragment<P>& f, P weight) {
-            const typename P::M textures = taken & (weight >= P(d.bound));
-            const P w = select(taken, weight, P(S(0)));
-            P colour[3] = {P(d.view[0]), P(d.view[1]), P(d.view[2])};
-            if (bits(textures)) {
-              const Texels<S> residual = residual_of(d, f.u, f.v, atlas);
-              for (int c = 0; c < 3; ++c) colour[c] = select(textures, shaded(colour[c], residual.rgb[c]), colour[c]);
-            }
-            for (int c = 0; c < 3; ++c) sums[c][block] += w * colour[c];
-            sums[3][block] += w;
-            if constexpr (kMaps) {
-              const S* g = a.view.geom + id * kGeom;
-              sums[4][block] += w * P(g[kBeta]);
-              sums[5][block] += select(taken, w * f.depth, P(S(0)));
-              for (int c = 0; c < 3; ++c) sums[6 + c][block] += w * P(g[kNx + c]);
-            }
-            if (overdraw) sums[kMapChannels][block] += select(taken, P(S(1)), P(S(0)));
-          },
-          sharp);
+          a.view, bins, id, [&](int block, const auto& taken, const auto& f, P w) { add(block, taken, f, w, kept); },
+          sharp, cut);
     }
     each_pixel(tile, width, height, [&](int64_t pixel, int block, int lane) {
       S* to = image + pixel * channels;

@@ -79,9 +79,11 @@ template <class S> struct Trace {
 template <class S> struct TraceForward {
   View<S> view;
   int64_t most;
+  AlphaTiles<S> alpha;
 
   template <class R> void fields(R& r) {
     view.fields(r);
+    alpha.fields(r, view.n);
     r.number("most", most);
   }
 };

@@ -54,8 +54,9 @@ template <class S> struct TileState {
 
   // Blends surfel `id`: fn(block, mask of its pixels, fragment, weight) for every block in which some pixel takes it.
   // Without kAll the fragment has no depth and does not tell whether the low pass is drawn.
-  template <class Kernel, bool kAll, class F>
-  void blend(const View<S>& view, const Bins& bins, int64_t id, F&& fn, S sharp = S(1)) {
+  // cut(fragment, mask, transmittance): multiplies the sigma of pixels by that of texels.
+  template <class Kernel, bool kAll, class F, class C>
+  void blend(const View<S>& view, const Bins& bins, int64_t id, F&& fn, S sharp, C&& cut) {
     const S *g = view.geom + id * kGeom, cx = g[kCx] - x0, cy = g[kCy] - y0;
     const ReachedCells r = reached_in_tile<Kernel>(g, cx, cy, view.radii + 2 * id, bins.level.data() + 2 * id);
     uint32_t blocks = open_blocks & (r.support | r.centre);
@@ -78,7 +79,14 @@ template <class S> struct TileState {
       if constexpr (kAll) to.depth = f.depth, to.low_pass = f.low_pass;
       at[n++] = block;
     }
-    for (int i = 0; i < n; ++i) take_fragment(at[i], found[i], fn);
+    for (int i = 0; i < n; ++i) {
+      cut(found[i], open[at[i]] & (found[i].sigma >= P(S(kAlphaMin))), transmittance[at[i]]);
+      take_fragment(at[i], found[i], fn);
+    }
+  }
+  template <class Kernel, bool kAll, class F>
+  void blend(const View<S>& view, const Bins& bins, int64_t id, F&& fn, S sharp = S(1)) {
+    blend<Kernel, kAll>(view, bins, id, fn, sharp, [](const Fragment<P>&, const M&, const P&) {});
   }
 
  private:

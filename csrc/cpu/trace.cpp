@@ -6,6 +6,7 @@
 #include "core/kernel.h"
 #include "cpu/kernels.h"
 #include "cpu/simd.h"
+#include "cpu/texel_alpha.h"
 #include "cpu/threads.h"
 #include "cpu/tiles.h"
 
@@ -19,7 +20,8 @@ constexpr int64_t kKept = int64_t(1) << 22;  // lists up to this length keep the
 }  // namespace
 
 namespace {
-template <class Kernel, class S> void trace_forward(const View<S>& view, int64_t most, Trace<S>& to) {
+template <class Kernel, class S>
+void trace_forward(const View<S>& view, const AlphaTiles<S>& alpha, int64_t most, Trace<S>& to) {
   using P = Lanes<S>;
   using Chunk = typename FoundFragments<S>::Chunk;
   const int width = view.width, height = view.height;
@@ -67,7 +69,20 @@ template <class Kernel, class S> void trace_forward(const View<S>& view, int64_t
         }
         count += part.count();
       };
-      state.template blend<Kernel, true>(view, bins, id, take);
+      if (!alpha.values) {
+        state.template blend<Kernel, true>(view, bins, id, take);
+        continue;
+      }
+      AlphaPatch<S> patch(alpha, id);
+      state.template blend<Kernel, true>(
+          view, bins, id, take, S(1), [&](Fragment<P>& f, const typename P::M& covered, const P& transmittance) {
+            if (!patch.textured()) return;
+            const uint32_t lanes = bits(covered & (f.sigma * transmittance >= P(alpha.bound)));
+            f.v = marked(f.v, lanes);
+            if (!lanes) return;
+            patch.locate(f.u, f.v);
+            f.sigma = alpha_cut(f.sigma, patch.fetch(lanes));
+          });
     }
     if (keep) a.used += count, a.used_blocks += blocks;
     found.fetch_add(count, std::memory_order_relaxed);
@@ -86,7 +101,7 @@ template <class Kernel, class S> void trace_forward(const View<S>& view, int64_t
 template <class S> void trace_forward(const TraceForward<S>& a, Trace<S>& to) {
   const auto lists = binner(a.view, to.bins);
   run_together([&](const Member& m) { lists->run(m, nullptr); });
-  with_kernel(a.view.prefilter, [&](auto kernel) { trace_forward<decltype(kernel)>(a.view, a.most, to); });
+  with_kernel(a.view.prefilter, [&](auto kernel) { trace_forward<decltype(kernel)>(a.view, a.alpha, a.most, to); });
 }
 
 template <class S> void trace_copy(const TraceCopy<S>& a, Trace<S>& from) {
@@ -134,12 +149,12 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
   const S near = a.view.near, rim = a.rim;
   const FragmentArrays<S>& f = a.fragments.f;
   const TileBlocks& layout = a.fragments.layout;
-  const int64_t n = a.view.n, total = f.total;
+  const int64_t n = a.view.n, total = f.total, texels = a.dtexel_alpha ? a.alpha.texels : 0;
   S *dgeom = a.dgeom, *absgrad = a.absgrad;
   const int tiles_x = tiles_across(a.view.width);
   const int most =
-      int(std::max<int64_t>(1, std::min<int64_t>(64, (int64_t(1) << 28) / std::max<int64_t>(n, 1) / kGeom)));
-  std::vector<std::vector<S>> partial(std::max(num_threads(), 1));
+      int(std::max<int64_t>(1, std::min<int64_t>(64, (int64_t(1) << 28) / std::max(n * kGeom + texels, int64_t(1)))));
+  std::vector<std::vector<S>> partial(std::max(num_threads(), 1)), of_texels(partial.size());
   std::fill(dgeom, dgeom + n * kGeom, S(0));
   std::fill(absgrad, absgrad + 2 * n, S(0));
   const BlockCentres<S> centres;
@@ -153,6 +168,7 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
   const int parts = parallel_tiles(layout.start, layout.tiles, most, [&](int part, int64_t first, int64_t last) {
     std::vector<S>& sums = partial[part];
     sums.assign(n * kSums, S(0));
+    of_texels[part].assign(texels, S(0));
     for (int64_t tile = first; tile < last; ++tile) {
       const S x0 = S(tile % tiles_x * kTile), y0 = S(tile / tiles_x * kTile);
       P behind[kBlocks];  // per pixel: sum of w dL/dw over the fragments behind
@@ -163,6 +179,7 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
         const S* g = geom + id * kGeom;
         const S cx = g[kCx] - x0, cy = g[kCy] - y0;
         P d[kGeom], ax = zero, ay = zero;
+        AlphaPatch<S> patch(a.alpha, id);
         for (int k = 0; k < kColumns; ++k) d[k] = zero;
         d[kArea] = zero;
         each_block(layout, run, [&](int64_t, int64_t at, const BlockPart& of) {
@@ -172,13 +189,25 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
             if (p) __builtin_prefetch(p + soon);
           const auto gradient = [&](const S* p) { return p ? expand(p + at, of.lanes) : zero; };
           const P listed = expand(f.sigma + at, of.lanes), sigma = abs_(listed);
-          const P dsigma = blend_vjp(expand(f.weight + at, of.lanes), sigma, gradient(dweight), behind[of.block]);
+          P dsigma = blend_vjp(expand(f.weight + at, of.lanes), sigma, gradient(dweight), behind[of.block]);
           const P dx = centres.x + P(kBlockOffsets<S>.column[of.block] - cx);
           const P dy = centres.y + P(kBlockOffsets<S>.row[of.block] - cy);
-          P ddx, ddy;
+          P ddx, ddy, gu = gradient(duv), gv = gradient(duv ? duv + total : nullptr);
+          if (patch.textured() && marks(expand(f.uv + total + at, of.lanes))) {
+            const P v = expand(f.uv + total + at, of.lanes);
+            const uint32_t lanes = of.lanes & marks(v);
+            patch.locate(expand(f.uv + at, of.lanes), v);
+            const P m = patch.fetch(lanes);
+            S g[kLanes], su[kLanes], sv[kLanes];
+            store(g, select(there & (sigma < P(S(kAlphaMax))), dsigma * sigma / m, zero));
+            store(su, gu), store(sv, gv);
+            patch.add_gradient(lanes, g, texels ? of_texels[part].data() : nullptr, su, sv);
+            if (duv) gu = load(su), gv = load(sv);
+            // the kernel's own clamp passes no gradient either
+            dsigma = select(sigma < m * P(S(kAlphaMax)), dsigma, zero);
+          }
           fragment_vjp<Kernel, S, P>(g, near, rim, select(there, dx, zero), select(there, dy, zero), listed,
-                                     select(there, dsigma, zero), gradient(duv), gradient(duv ? duv + total : nullptr),
-                                     gradient(ddepth), d, ddx, ddy);
+                                     select(there, dsigma, zero), gu, gv, gradient(ddepth), d, ddx, ddy);
           ax += abs_(ddx), ay += abs_(ddy);
         });
         S* to = sums.data() + id * kSums;
@@ -197,6 +226,11 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
         dgeom[i * kGeom + kArea] += from[kColumns + 2];
       }
     }
+  });
+  parallel_parts(texels, 1 << 16, [&](int, int64_t begin, int64_t end) {
+    std::fill(a.dtexel_alpha + begin, a.dtexel_alpha + end, S(0));
+    for (int p = 0; p < parts; ++p)
+      for (int64_t t = begin; t < end; ++t) a.dtexel_alpha[t] += of_texels[p][t];
   });
 }
 }  // namespace

@@ -74,13 +74,17 @@ struct BakedResidual {
   float offset, scale;         // residual = offset + scale * stored
   const float* extent;         // [n] half side of the tile, scale units; null: kSupport everywhere
   const float* mean_residual;  // [n, 3], the residual of a surfel without a tile; null: 0
-  float weight_bound;          // fragments of smaller weight get no residual
+  float alpha_scale;           // m = alpha_scale * stored multiplies sigma, as AlphaTiles say; 0: opaque
+  const float* mean_alpha;     // [n], m of a surfel without a tile; null: 1
+  float weight_bound;          // fragments of smaller weight get neither
   float transmittance_min;     // a surfel that would leave a pixel less ends it, see blend_test; 0: none does
 
   template <class R> void fields(R& r, int64_t n) {
     r.numbers("offset", offset, "scale", scale);
     r.maybe("extent", extent, n);
     r.maybe("mean_residual", mean_residual, 3 * n);
+    r.number("alpha_scale", alpha_scale);
+    r.maybe("mean_alpha", mean_alpha, n);
     r.numbers("weight_bound", weight_bound, "transmittance_min", transmittance_min);
   }
 };

@@ -71,6 +71,27 @@ template <class S> struct View {
   }
 };
 
+// Alpha texels: the sigma of a fragment whose weight would be at least `bound` is multiplied by the bilinear fetch at
+// its u and v, and clamped again; the last bit of its listed v is then 1, else 0. Absent: `values` is null.
+template <class S> struct AlphaTiles {
+  int64_t texels;
+  const int64_t* first;  // [n], as in TexelTiles
+  const int32_t* size;   // [n, 2]
+  const S* extent;       // [n]
+  const S* values;       // [texels], from 0 to 2
+  S bound;               // fragments whose weight would be less keep their sigma
+
+  template <class R> void fields(R& r, int64_t n) {
+    values = nullptr, bound = 0;
+    if (!r.has("texel_alpha")) return;
+    r.array("first", first, n);
+    r.array("size", size, 2 * n);
+    r.array("extent", extent, n);
+    r.rows("texel_alpha", values, texels, 1);
+    r.number("alpha_bound", bound);
+  }
+};
+
 // dgeom [n, kGeom] and absgrad [n, 2] are written. dweight, duv, ddepth may be null (zero). dsigma and partial are
 // working memory; the sums of a pair: columns 0 to kBeta of geom, two absolute gradients, one unused, kArea.
 constexpr int kTraceSums = 16;
@@ -81,9 +102,13 @@ template <class S, class Layout> struct TraceBackward {
   const S *dweight, *duv, *ddepth;
   S *dsigma, *partial;
   S *dgeom, *absgrad;
+  AlphaTiles<S> alpha;
+  S* dtexel_alpha;  // [texels] is written; may be null
 
   template <class R> void fields(R& r) {
     view.fields(r);
+    alpha.fields(r, view.n);
+    r.maybe("dtexel_alpha", dtexel_alpha, alpha.values ? alpha.texels : 0);
     r.number("rim", rim);
     fragments.fields(r, view.n, view.width, view.height);
     const int64_t total = fragments.f.total;

@@ -70,11 +70,11 @@ def _texel_rows(packing: Packing) -> Iterator[tuple[Tensor, Tensor]]:
 
 
 def listed_texels(pages: Tensor, packing: Packing, constants: Tensor) -> Tensor:
-    """Texel list [T, 3] of pages [layers, height, width, 3]; a surfel without a tile has its constant of [N, 3]."""
+    """Texel list [T, C] of pages [layers, height, width, C]; a surfel without a tile has its constant of [N, C]."""
     area = torch.from_numpy(packing.tiles[:, 3:]).long().clamp(min=1).prod(dim=1)
     texels = constants.repeat_interleave(area, dim=0)
     for listed, paged in _texel_rows(packing):
-        texels[listed] = pages.reshape(-1, 3)[paged]
+        texels[listed] = pages.reshape(-1, texels.shape[1])[paged]
     return texels
 
 

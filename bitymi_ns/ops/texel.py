@@ -65,6 +65,11 @@ class TexelAlpha:
     values: Tensor
     bound: float
 
+    def of(self, surfels: Tensor) -> TexelAlpha:
+        """The same of some of the surfels [n] int64."""
+        tiles = TexelTiles.of_sizes(self.tiles.size[surfels], self.tiles.extent[surfels])
+        return TexelAlpha(tiles, self.values[self.tiles.rows_of(surfels)], self.bound)
+
     @property
     def arrays(self) -> dict[str, Any]:
         """Arguments of the kernels, by name."""

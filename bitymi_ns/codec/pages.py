@@ -74,7 +74,7 @@ def listed_texels(pages: Tensor, packing: Packing, constants: Tensor) -> Tensor:
     area = torch.from_numpy(packing.tiles[:, 3:]).long().clamp(min=1).prod(dim=1)
     texels = constants.repeat_interleave(area, dim=0)
     for listed, paged in _texel_rows(packing):
-        texels[listed] = pages.reshape(-1, texels.shape[1])[paged]
+        texels[listed] = pages.reshape(-1, pages.shape[3])[paged]
     return texels
 
 

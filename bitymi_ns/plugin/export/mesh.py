@@ -136,7 +136,7 @@ def from_run(load_config: Path) -> Source:
         scene.near,
         scene.config.prefilter,
         WorldFrame.model_validate_json(json.dumps(plain(world_of(datamanager).described()))),
-        None,
+        None if scene.field is None else scene.field.opacity(scene.config.weight_bound, learns=False),
     )
 
 

@@ -143,7 +143,8 @@ class Scene(nn.Module):
             parameter.data = parameter.new_zeros(n, *parameter.shape[1:])
         texels = state.get(f"{prefix}field.texels")
         if texels is not None:
-            self.field = TexelField.blank(n, len(texels), self.surfels["means"].detach())
+            alpha = f"{prefix}field.alpha" in state
+            self.field = TexelField.blank(n, len(texels), self.surfels["means"].detach(), alpha)
         elif isinstance(self.field, TexelField):
             self.field = None
 
@@ -168,7 +169,8 @@ class Scene(nn.Module):
 
         Args:
             background: [3] colour behind the scene; None = black.
-            field_mode: train = the residual field gets gradients; frozen = it is evaluated without; off = left out.
+            field_mode: train = the residual field gets gradients; frozen = it is evaluated without; off = its
+                colours are left out.
             maps: also depth and normals.
             overdraw_half: also the count of fragments with a gradient, see `ops.soft_overdraw`; None = without.
             beta_alone: the gradient of the Beta map reaches beta alone, not the blending weights.
@@ -180,6 +182,8 @@ class Scene(nn.Module):
         projection = project(*(p[name] for name in GEOMETRY), camera, self.near, self.config.prefilter)
         field = None if field_mode == "off" else self.field
         learns, bound = field_mode == "train", self.config.weight_bound
+        if self.field is not None:
+            projection.alpha = self.field.opacity(bound, learns)
         base = self.base_color(projection)
         read: Tensor | None = None
 

@@ -3,7 +3,7 @@ import { pack } from '../src/bundle/compact/packing';
 import { readCompactSurfels } from '../src/bundle/compact/surfels';
 import { readCompactTexels } from '../src/bundle/compact/texels';
 import { parseManifest } from '../src/bundle/manifest';
-import { KINDS, LEAN_WIDTH, SURFEL_WORDS, WORD } from '../src/bundle/surfels';
+import { KINDS, LEAN_WIDTH, SURFEL_WORDS, WORD, alphaIn, layerIn } from '../src/bundle/surfels';
 import { frameBytes } from '../src/bundle/zstd';
 import { DamagedBundle } from '../src/errors';
 import { BUNDLES, bytes, floats, frameOf, ints } from './compact_bundles';
@@ -46,8 +46,9 @@ describe.each(Object.keys(BUNDLES))('the compact bundle %s', (name) => {
     for (let i = 0; i < info.count; i++) {
       const row = i * SURFEL_WORDS;
       const sides = numbers[row + WORD.sides];
-      const found = [WORD.tile, WORD.tile + 1, WORD.layer].map((word) => numbers[row + word]);
-      expect([...found, sides & 0xffff, sides >>> 16]).toEqual([...tiles.subarray(5 * i, 5 * i + 5)]);
+      const [x, y, word] = [WORD.tile, WORD.tile + 1, WORD.layer].map((at) => numbers[row + at]);
+      if ('mean_alpha' in scene) expect(alphaIn(word)).toBe(floats(scene.mean_alpha)[i]);
+      expect([x, y, layerIn(word), sides & 0xffff, sides >>> 16]).toEqual([...tiles.subarray(5 * i, 5 * i + 5)]);
       const first = numbers[row + WORD.firstTerm] / LEAN_WIDTH[info.viewColor];
       expect([first, numbers[row + WORD.terms]]).toEqual([...span.subarray(2 * i, 2 * i + 2)]);
     }

@@ -23,6 +23,8 @@ def described(folder: Path) -> dict[str, object]:
     """The files of a bundle, and its scene."""
     scene = read_bundle(folder).scene
     found = {**scene.surfels, "tiles": scene.tiles, "extent": scene.extent, "mean_residual": scene.mean_residual}
+    if scene.mean_alpha is not None:
+        found["mean_alpha"] = scene.mean_alpha
     if scene.atlas is not None:
         found["atlas"] = scene.atlas
     return {
@@ -38,6 +40,7 @@ def main() -> None:
         for kind in sorted(VIEW_COLORS):
             bundles[kind] = described(write_compact(Path(folder) / kind, make_codes(kind)))
         bundles["finest"] = described(write_compact(Path(folder) / "finest", make_codes(steps=FINEST)))
+        bundles["alpha"] = described(write_compact(Path(folder) / "alpha", make_codes(alpha=True)))
         bundles["plain"] = described(write_compact(Path(folder) / "plain", make_codes(textured=False)))
     path = Path(__file__).with_name("compact.json")
     path.write_text(json.dumps(bundles) + "\n", "utf8")

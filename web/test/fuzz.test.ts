@@ -4,7 +4,7 @@ import { expect, it } from 'vitest';
 import { readCompactSurfels } from '../src/bundle/compact/surfels';
 import { readCompactTexels } from '../src/bundle/compact/texels';
 import { parseManifest } from '../src/bundle/manifest';
-import { SURFEL_WORDS, WORD } from '../src/bundle/surfels';
+import { SURFEL_WORDS, WORD, layerIn } from '../src/bundle/surfels';
 import { DamagedBundle } from '../src/errors';
 import { BUNDLES, bytes, frameOf } from './compact_bundles';
 
@@ -80,9 +80,18 @@ class Vandal {
     const { surfels, atlas } = info;
     const places: [Json, string][] = [
       ...['count', 'terms'].map((key): [Json, string] => [surfels, key]),
-      ...['texels', 'step', 'width', 'height', 'layers', 'page_width', 'page_rows', 'offset', 'scale'].map(
-        (key): [Json, string] => [atlas, key],
-      ),
+      ...[
+        'texels',
+        'step',
+        'width',
+        'height',
+        'layers',
+        'page_width',
+        'page_rows',
+        'offset',
+        'scale',
+        'alpha_scale',
+      ].map((key): [Json, string] => [atlas, key]),
       [surfels.frame, 'scale'],
     ];
     for (const column of [...surfels.columns, ...atlas.columns]) {
@@ -115,7 +124,7 @@ function opens(info: Described, files: Files): boolean {
       const sides = numbers[row + WORD.sides];
       hold(numbers[row + WORD.tile] + (sides & 0xffff) <= width);
       hold(numbers[row + WORD.tile + 1] + (sides >>> 16) <= height);
-      hold(numbers[row + WORD.layer] < layers);
+      hold(layerIn(numbers[row + WORD.layer]) < layers);
       hold(numbers[row + WORD.firstTerm] + 6 * numbers[row + WORD.terms] <= surfels.terms.length);
     }
     hold(surfels.terms.every((x) => Math.abs(x) <= 2e7));
@@ -130,7 +139,7 @@ function opens(info: Described, files: Files): boolean {
 
 it(`${EXAMPLES} damaged bundles are refused, or have numbers within their limits`, () => {
   const vandal = new Vandal(draws(1));
-  const { files } = BUNDLES.sv;
+  const { files } = BUNDLES.alpha;
   const text = new TextDecoder().decode(bytes(files['bundle.json']));
   let [found, slowest] = [0, 0];
   for (let k = 0; k < EXAMPLES; k++) {

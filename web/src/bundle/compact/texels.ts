@@ -11,7 +11,6 @@ const MOST_TEXELS = 2 ** 30; // of all pages: four gigabytes
 const BLOCK = 8;
 const GRADES: [number, number] = [-8, 24];
 const MOST_PLANES = 3; // bytes of a coefficient
-const ALPHA_GAIN = 4; // steps of alphas, in those of colours
 const FILE = 'texels.bin';
 
 // The tiles of surfels, in their order.
@@ -150,7 +149,7 @@ class Painter {
       inverse(coefficients, block, of.texels / (u * v), waves, sums);
       for (let t = 0; t < u * v; t++) {
         const to = first + Math.floor(t / u) * this.atlas.width + (t % u);
-        const byte = byteOf((mean + ALPHA_GAIN * steps[tile] * sums[t]) * perByte);
+        const byte = byteOf((mean + steps[tile] * sums[t]) * perByte);
         this.pages[to] = (this.pages[to] & 0xffffff) | (byte << 24);
       }
     });
@@ -204,15 +203,17 @@ export function readCompactTexels(data: Uint8Array, atlas: Atlas, surfels: Surfe
     throw new DamagedBundle(`${FILE}: a grade is not from ${GRADES.join(' to ')}.`);
   }
   const painter = new Painter(atlas, surfels, tiles);
-  const steps = grades.map((grade) => coded.step * 2 ** (grade / 2));
-  for (const { name, planes } of coded.columns.slice(1)) {
+  const stepsOf = (step: number): Float64Array => grades.map((grade) => step * 2 ** (grade / 2));
+  for (const { name, step, planes } of coded.columns.slice(1)) {
     if (planes.some((bytes) => bytes.length > MOST_PLANES)) {
       throw new DamagedBundle(`${FILE}: the coefficients ${name} have more than ${MOST_PLANES} bytes.`);
     }
+    const isAlpha = name.startsWith('alpha_');
+    if (isAlpha && step === null) throw new DamagedBundle(`${FILE}: ${name} has no step.`);
     const of = held.get(name.replace('alpha_', ''))!;
     const coefficients = reader.read(of.texels, (rows) => new Int32Array(rows));
-    if (name.startsWith('alpha_')) painter.alphas(of, coefficients, steps);
-    else painter.colors(of, coefficients, steps);
+    if (isAlpha) painter.alphas(of, coefficients, stepsOf(step!));
+    else painter.colors(of, coefficients, stepsOf(coded.step));
   }
   return { format: 'uint8', width: atlas.width, height: atlas.height, layers: painter.layers() };
 }

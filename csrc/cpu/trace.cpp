@@ -202,7 +202,7 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
             store(g, select(there & (sigma < P(S(kAlphaMax))), dsigma * sigma / m, zero));
             store(su, gu), store(sv, gv);
             patch.add_gradient(lanes, g, texels ? of_texels[part].data() : nullptr, su, sv);
-            if (duv) gu = load(su), gv = load(sv);
+            gu = load(su), gv = load(sv);
             // the kernel's own clamp passes no gradient either
             dsigma = select(sigma < m * P(S(kAlphaMax)), dsigma, zero);
           }

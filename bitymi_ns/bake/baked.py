@@ -12,10 +12,12 @@ from torch import Tensor
 from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.statistics import AtlasCost, Statistics
+from bitymi_ns.codec.limits import ALPHA_SCALE
 from bitymi_ns.codec.packing import Packing, pack
 from bitymi_ns.codec.pages import listed_texels, paged_texels, tile_means
 from bitymi_ns.codec.quantise import EncodedAtlas, Range, choose_range, decode_pages, encode
 from bitymi_ns.codec.texel_codes import SceneCodes, TexelCodes
+from bitymi_ns.ops import TexelAlpha, TexelTiles
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
 
@@ -29,14 +31,14 @@ class Baked:
     scene: BakedScene
     rows: Tensor  # [N] int64, their rows in the scene
     packing: Packing  # where the tiles lie; `scene.tiles` are the same memory
-    # [layers, height, width, 3] float32 residual colours before quantisation, None without texture
+    # [layers, height, width, C] float32 before quantisation: residual colours and, where C = 4, alpha; None without any
     texels: Tensor | None
     atlas: EncodedAtlas | None  # the encoded atlas, None without texture
     options: BakeOptions  # what it was baked with
     # what was left out, what it cost, and the error of the quantisation
     statistics: Statistics = field(default_factory=Statistics)
     codes: SceneCodes | None = None  # integer codes of the surfels, and of the texels once coded; None = not compact
-    # [T, 3] the texels of which the codes were made, in the order of `ops.TexelTiles`; None = `texels`
+    # [T, C] the texels of which the codes were made, in the order of `ops.TexelTiles`; None = `texels`
     uncoded: Tensor | None = None
     # [N] transmittance in front of the surfels, by which errors of their tiles count; None = 1
     in_front: Tensor | None = None
@@ -57,19 +59,42 @@ class Baked:
         assert self.scene.extent is not None
         return self.scene.extent
 
-    def with_mean_residual(self, mean_residual: Tensor) -> Baked:
-        """Copy with other means [N, 3]."""
-        return replace(self, scene=replace(self.scene, mean_residual=mean_residual))
+    @property
+    def constants(self) -> Tensor:
+        """[N, C] mean residual and, where C = 4, mean alpha of every tile; those of a surfel without a tile."""
+        alpha = self.scene.mean_alpha
+        return self.mean_residual if alpha is None else torch.cat([self.mean_residual, alpha[:, None]], 1)
+
+    def with_constants(self, constants: Tensor) -> Baked:
+        """Copy with other means [N, C], or [N, 3] to keep those of alpha."""
+        return replace(self, scene=with_means(self.scene, constants))
+
+    @property
+    def listed(self) -> Tensor:
+        """[T, C] the texels in the order of `ops.TexelTiles`: a surfel without a tile has one, its constant."""
+        assert self.texels is not None
+        return listed_texels(self.texels, self.packing, self.constants)
+
+    @property
+    def alpha(self) -> TexelAlpha | None:
+        """Opacities of the texels; None = opaque texels."""
+        if self.texels is None or self.scene.mean_alpha is None:
+            return None
+        sizes = torch.from_numpy(self.packing.tiles[:, 3:])
+        tiles = TexelTiles.of_sizes(sizes.clamp(min=1), self.extent.float())
+        return TexelAlpha(tiles, self.listed[:, 3].contiguous(), self.scene.weight_bound)
 
     @property
     def tiles(self) -> Tiles:
         """Tiles of the surfels."""
-        return Tiles(self.packing, self.texels, self.extent, self.mean_residual)
+        return Tiles(self.packing, self.texels, self.extent, self.constants)
 
     def unquantised(self) -> BakedScene:
         """The scene with its texels as 32-bit floats."""
         if self.texels is None:
             return self.scene
+        if self.scene.mean_alpha is not None:
+            return replace(self.scene, atlas=self.texels.contiguous(), alpha_scale=1.0)
         rgba = torch.cat([self.texels, torch.ones_like(self.texels[..., :1])], -1).contiguous()
         return replace(self.scene, atlas=rgba)
 
@@ -80,7 +105,9 @@ class Baked:
         atlas = self.atlas
         pages = torch.from_numpy(decode_pages(atlas.payload, atlas.format, atlas.width, atlas.height))
         pages = pages if pages.dtype == torch.uint8 else pages.float()
-        return replace(self.scene, atlas=pages, offset=atlas.range.offset, scale=atlas.range.scale)
+        alpha_scale = 0.0 if self.scene.mean_alpha is None else ALPHA_SCALE if pages.dtype == torch.uint8 else 1.0
+        scaled = {"offset": atlas.range.offset, "scale": atlas.range.scale, "alpha_scale": alpha_scale}
+        return replace(self.scene, atlas=pages, **scaled)
 
     def with_surfels(self, surfels: Mapping[str, Tensor]) -> Baked:
         """Copy with other parameters of its N surfels, and the same tiles."""
@@ -89,12 +116,8 @@ class Baked:
 
     def with_tiles(self, tiles: Tiles) -> Baked:
         """Copy with other tiles of its N surfels, not encoded yet."""
-        scene = replace(
-            self.scene,
-            tiles=torch.from_numpy(tiles.packing.tiles),
-            extent=tiles.extent,
-            mean_residual=tiles.mean_residual,
-        )
+        scene = replace(self.scene, tiles=torch.from_numpy(tiles.packing.tiles), extent=tiles.extent)
+        scene = with_means(scene, tiles.constants)
         return replace(self, scene=scene, packing=tiles.packing, texels=tiles.texels, atlas=None)
 
     def only(self, kept: Tensor) -> Baked:
@@ -106,20 +129,20 @@ class Baked:
         packing = pack(before.tiles[:, 3:], self.options.page_width, self.options.page_rows)
         texels = None
         if self.texels is not None and packing.texels:
-            texels = paged_texels(listed_texels(self.texels, before, self.mean_residual[kept]), packing)
+            texels = paged_texels(listed_texels(self.texels, before, self.constants[kept]), packing)
         in_front = None if self.in_front is None else self.in_front[kept]
         some = replace(self, scene=replace(self.scene, surfels=surfels), rows=self.rows[kept], in_front=in_front)
-        return some.with_tiles(Tiles(packing, texels, self.extent[kept], self.mean_residual[kept]))
+        return some.with_tiles(Tiles(packing, texels, self.extent[kept], self.constants[kept]))
 
     def with_texels(self, texels: Tensor) -> Baked:
-        """Copy with other residual colours, not encoded yet."""
+        """Copy with other texels, not encoded yet."""
         if self.texels is None or texels.shape != self.texels.shape:
             raise ValueError(f"texels of shape {tuple(texels.shape)} do not fit the bake")
         texels = texels.detach().float().cpu().contiguous()
-        means = tile_means(texels, self.packing, self.mean_residual)
+        means = tile_means(texels, self.packing, self.constants)
         # no error: the field is no longer what the texels are meant to hold
         statistics = self.statistics.but(atlas=None, error=None, certificate=None)
-        return replace(self.with_mean_residual(means), texels=texels, atlas=None, statistics=statistics)
+        return replace(self.with_constants(means), texels=texels, atlas=None, statistics=statistics)
 
     def encoded(self, progress: Progress = no_progress) -> Baked:
         """Copy with its texels quantised and encoded, where that is not done."""
@@ -140,13 +163,20 @@ class Baked:
         )
         atlas = replace(encode(texels.numpy(), self.packing, "uint8", value_range), encoder="cosine transform")
         return replace(
-            self.with_mean_residual(codes.constants),
+            self.with_constants(codes.constants),
             texels=texels,
             atlas=atlas,
             statistics=self.statistics.but(atlas=atlas_cost(self.packing, atlas), error=None, certificate=None),
             uncoded=uncoded,
             codes=replace(self.codes, texels=codes, residual=codes.residual, residual_step=codes.residual_step),
         )
+
+
+def with_means(scene: BakedScene, constants: Tensor) -> BakedScene:
+    """The scene with other means of its tiles, [N, 3] or with alpha [N, 4]."""
+    if constants.shape[1] == 3:
+        return replace(scene, mean_residual=constants)
+    return replace(scene, mean_residual=constants[:, :3].contiguous(), mean_alpha=constants[:, 3].contiguous())
 
 
 def encoded_pages(
@@ -156,7 +186,7 @@ def encoded_pages(
     progress: Progress = no_progress,
     value_range: Range | None = None,
 ) -> EncodedAtlas:
-    """Pages [layers, height, width, 3] as the options say, in a range of values that is not theirs to choose where one
+    """Pages [layers, height, width, C] as the options say, in a range of values that is not theirs to choose where one
     is given."""
     if options.format != "fp16" and value_range is None:
         value_range = choose_range(texels.numpy(), packing, options.range, options.range_samples, options.seed)

@@ -26,10 +26,11 @@ def certified(baked: Baked, cameras: Sequence[Camera]) -> Baked:
     scene, options = baked.scene, baked.options
     if baked.texels is None or baked.atlas is None or options.tolerance == 0 or baked.statistics.certificate:
         return baked
-    stored = listed_texels(torch.from_numpy(baked.atlas.decoded()), baked.packing, baked.mean_residual)
+    stored = listed_texels(torch.from_numpy(baked.atlas.decoded()[..., :3]), baked.packing, baked.mean_residual)
     before = baked.uncoded
     if before is None:
-        before = listed_texels(baked.texels, baked.packing, baked.mean_residual)
+        before = baked.listed
+    before = before[:, :3]
     pixels = closest_pixels(scene.surfels, cameras, options.extent, scene.near) if cameras else None
     opacity, beta = kernel_parameters(scene.surfels, baked.in_front)
     shown = Shown(opacity, beta, baked.extent, scene.weight_bound, pixels=pixels)

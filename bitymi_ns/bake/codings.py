@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.baked import Baked, encoded_pages
+from bitymi_ns.bake.texel_list import with_alpha
 from bitymi_ns.codec.pages import listed_texels, paged_texels
 from bitymi_ns.codec.quantise import EncodedAtlas
 from bitymi_ns.codec.texel_codes import TexelCodeOptions, TexelCoder, TexelCodes
@@ -94,7 +95,7 @@ class Pages:
             first: [N] int64, the first texel of every surfel in the list.
         """
         assert baked.texels is not None
-        self._pages, self._packing, self._options = baked.texels, baked.packing, baked.options
+        self._baked, self._packing, self._options = baked, baked.packing, baked.options
         self._first, self._range = first, None
 
     def first(self, texels: Tensor) -> PageTexels:
@@ -104,9 +105,9 @@ class Pages:
         return coded
 
     def again(self, texels: Tensor) -> PageTexels:
-        pages = paged_texels(texels, self._packing, self._pages)
+        pages = paged_texels(with_alpha(texels, self._baked), self._packing, self._baked.texels)
         atlas = encoded_pages(pages, self._packing, self._options, value_range=self._range)
-        drawn = listed_texels(torch.from_numpy(atlas.decoded()), self._packing, texels[self._first])
+        drawn = listed_texels(torch.from_numpy(atlas.decoded()[..., :3]), self._packing, texels[self._first])
         return PageTexels(texels.clone(), atlas, drawn)
 
     def last(self, coded: PageTexels) -> PageTexels:

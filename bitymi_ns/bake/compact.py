@@ -288,4 +288,4 @@ def _thinned(baked: Baked) -> ViewColorError | None:
 
 def _with_texels(baked: Baked, coded: TexelCodes) -> Baked:
     """The bake as it is drawn with coded texels."""
-    return replace(baked, texels=paged_texels(coded.texels(), baked.packing)).with_mean_residual(coded.constants)
+    return replace(baked, texels=paged_texels(coded.texels(), baked.packing)).with_constants(coded.constants)

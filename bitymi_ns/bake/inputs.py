@@ -11,7 +11,7 @@ from torch import Tensor
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.statistics import LeftOut
 from bitymi_ns.codec.limits import within
-from bitymi_ns.ops import Prefilter
+from bitymi_ns.ops import Prefilter, TexelAlpha
 from bitymi_ns.ops.constants import ALPHA_MIN
 from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.progress import Progress, no_progress
@@ -32,6 +32,7 @@ class BakeInput:
     weight_bound: float
     prefilter: Prefilter
     views: Visibility | None = None  # visibility in the cameras; None = not computed
+    alpha: TexelAlpha | None = None  # opacities of the texels; None = opaque texels
 
     @property
     def transmittance(self) -> Tensor | None:
@@ -48,15 +49,16 @@ class BakeInput:
     def of(self, rows: Tensor) -> BakeInput:
         """Inputs of some of the surfels."""
         surfels = {name: value[rows] for name, value in self.surfels.items()}
-        return replace(self, surfels=surfels, views=None if self.views is None else self.views.of(rows))
+        rows = torch.nonzero(rows).squeeze(1) if rows.dtype == torch.bool else rows
+        alpha, views = (None if part is None else part.of(rows) for part in (self.alpha, self.views))
+        return replace(self, surfels=surfels, alpha=alpha, views=views)
 
     def with_visibility(self, options: BakeOptions, progress: Progress = no_progress) -> BakeInput:
         """Add the visibility, where there are cameras and the options need it."""
         if not self.cameras or not options.needs_visibility:
             return self
-        return replace(
-            self, views=visibility(self.surfels, self.cameras, self.near, self.weight_bound, self.prefilter, progress)
-        )
+        drawn = (self.near, self.weight_bound, self.prefilter)
+        return replace(self, views=visibility(self.surfels, self.cameras, *drawn, progress, self.alpha))
 
 
 def device_of(cameras: Sequence[Camera]) -> torch.device:

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.baked import Baked
+from bitymi_ns.bake.baked import Baked, with_means
 from bitymi_ns.bake.inputs import BakeInput, device_of, drawable, photo_resolution, visible
 from bitymi_ns.bake.lean_color import kept_view_colors
 from bitymi_ns.bake.reduce import reduced_tiles
@@ -54,17 +54,19 @@ def trained_texels(scene: BakeableScene, options: BakeOptions) -> Baked:
     bare = field.size.long().prod(1) == 1  # their one texel is their constant
     packing = pack(torch.where(bare[:, None], 0, field.size), options.page_width, options.page_rows)
     listed = field.texels.detach().float()
+    if field.alpha is not None:
+        listed = torch.cat([listed, field.alpha.detach().float()[:, None]], 1)
     pages, constants = paged_texels(listed, packing), torch.where(bare[:, None], listed[field.tiles.first], 0.0)
     baked = BakedScene(
         surfels,
         kind_of(surfels),
         torch.from_numpy(packing.tiles),
         extent=field.extent.float(),
-        mean_residual=tile_means(pages, packing, constants),
         near=scene.near,
         weight_bound=scene.config.weight_bound,
         prefilter=scene.config.prefilter,
     )
+    baked = with_means(baked, tile_means(pages, packing, constants))
     statistics = Statistics(
         surfels=KeptSurfels(
             trained=len(scene.surfels["means"]), kept=len(rows), left_out=left_out, without_tile=int(bare.sum())
@@ -92,7 +94,8 @@ def reduced(baked: Baked, cameras: Sequence[Camera], progress: Progress = no_pro
     kept[rows] = True
     scene, options, device = baked.scene, baked.options, device_of(cameras)
     surfels = {name: value[rows].to(device) for name, value in scene.surfels.items()}
-    inputs = BakeInput(surfels, cameras, scene.near, scene.weight_bound, scene.prefilter)
+    alpha = None if baked.alpha is None else baked.alpha.of(rows).to(device)
+    inputs = BakeInput(surfels, cameras, scene.near, scene.weight_bound, scene.prefilter, alpha=alpha)
     inputs, seen = visible(inputs, options, progress)
     if seen is not None:
         gone = gone.but(unseen=int((~seen).sum()))

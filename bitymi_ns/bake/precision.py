@@ -121,7 +121,7 @@ def rounded_scene(scene: BakedScene, codes: SurfelCodes) -> BakedScene:
 
 def permuted(scene: BakedScene, order: Tensor) -> BakedScene:
     """The scene with its surfels in another order [N]."""
-    moved = {name: getattr(scene, name) for name in ("tiles", "extent", "mean_residual")}
+    moved = {name: getattr(scene, name) for name in ("tiles", "extent", "mean_residual", "mean_alpha")}
     moved = {name: None if value is None else value[order].contiguous() for name, value in moved.items()}
     return replace(scene, surfels=reordered(scene.surfels, order), **moved)
 

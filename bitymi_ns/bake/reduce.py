@@ -41,19 +41,19 @@ def fit(probes: int, texels: int) -> Tensor:
 
 
 def along_axes(x: Tensor, along_u: Tensor, along_v: Tensor) -> Tensor:
-    """along_v x along_u^T of every channel: [n, 3, V, U] with [u, U], [v, V] -> [n, 3, v, u]."""
+    """along_v x along_u^T of every channel: [n, C, V, U] with [u, U], [v, V] -> [n, C, v, u]."""
     y = (x @ along_u.T).transpose(2, 3)  # one product of matrices each
     return (y.contiguous() @ along_v.T).transpose(2, 3).contiguous()
 
 
 def fitted(values: Tensor, size: tuple[int, int]) -> Tensor:
-    """Tiles [n, 3, v, u] on another grid (u, v), by least squares."""
+    """Tiles [n, C, v, u] on another grid (u, v), by least squares."""
     u, v = values.shape[3], values.shape[2]
     return along_axes(values, fit(u, size[0]).to(values), fit(v, size[1]).to(values))
 
 
 def read_at(texels: Tensor, size: tuple[int, int]) -> Tensor:
-    """Interpolate tiles [n, 3, v, u] on a finer grid (u, v)."""
+    """Interpolate tiles [n, C, v, u] on a finer grid (u, v)."""
     u, v = texels.shape[3], texels.shape[2]
     return along_axes(texels, interpolation(size[0], u).to(texels), interpolation(size[1], v).to(texels))
 
@@ -63,25 +63,31 @@ class Reduced:
     """The grids that were chosen, and their texels."""
 
     sizes: Tensor  # [N, 2] int32 (r_u, r_v), 0 for a surfel without a tile
-    constant: Tensor  # [N, 3] the residual of the surfels without a tile
-    # (rows [n], texels [n, 3, r_v, r_u]) of tiles of one size
+    constant: Tensor  # [N, C] the residual, and alpha where C = 4, of the surfels without a tile
+    # (rows [n], texels [n, C, r_v, r_u]) of tiles of one size
     parts: list[tuple[Tensor, Tensor]] = field(default_factory=list)
     nonfinite: int = 0  # number of points at which the field was not finite (taken as 0 there)
 
     def pages(self, packing: Packing) -> Tensor:
-        """The texels in their places: [layers, height, width, 3] float32 on the CPU, 0 outside the tiles."""
-        pages = torch.zeros(packing.layers * packing.height * packing.width, 3)
+        """The texels in the atlas: [layers, height, width, C] float32 on the CPU, 0 outside the tiles."""
+        channels = self.constant.shape[1]
+        pages = torch.zeros(packing.layers * packing.height * packing.width, channels)
         tiles = torch.from_numpy(packing.tiles)
         for rows, texels in self.parts:
             size = (texels.shape[3], texels.shape[2])
             at = texel_index(tiles[rows], size, packing.width, packing.height)
-            pages[at.reshape(-1)] = texels.permute(0, 2, 3, 1).reshape(-1, 3)
-        return pages.reshape(packing.layers, packing.height, packing.width, 3)
+            pages[at.reshape(-1)] = texels.permute(0, 2, 3, 1).reshape(-1, channels)
+        return pages.reshape(packing.layers, packing.height, packing.width, channels)
 
 
 @torch.no_grad()
 def reduce_tiles(
-    wanted: Iterable[TileValues], shown: Shown, tolerance: float, r_min: int = 4, progress: Progress = no_progress
+    wanted: Iterable[TileValues],
+    shown: Shown,
+    tolerance: float,
+    r_min: int = 4,
+    progress: Progress = no_progress,
+    channels: int = 3,
 ) -> Reduced:
     """Choose every tile's grid.
 
@@ -96,9 +102,10 @@ def reduce_tiles(
         shown: how much of the tiles is.
         tolerance: largest error, 8-bit steps.
         r_min: smallest side of a tile, a power of two.
+        channels: C of the tiles.
     """
     n = len(shown.extent)
-    reduced = Reduced(torch.zeros(n, 2, dtype=torch.int32), torch.zeros(n, 3))
+    reduced = Reduced(torch.zeros(n, 2, dtype=torch.int32), torch.zeros(n, channels))
     done = int((shown.extent <= 0).sum())
     for part in wanted:
         reduced.nonfinite += part.nonfinite
@@ -116,7 +123,7 @@ def reduce_tiles(
 
 
 def _constant(part: TileValues, tolerance: float) -> tuple[Tensor, Tensor]:
-    """The colour nearest to the tile, [n, 3], and whether it is near enough, [n] bool."""
+    """The constant nearest to the tile, [n, C], and whether it is near enough, [n] bool."""
     square = part.weight.square()[:, None]
     constant = (part.values * square).sum((2, 3)) / square.sum((2, 3)).clamp(min=1e-12)
     return constant, weighted_rms(part.values - constant[:, :, None, None], part.weight) <= tolerance
@@ -165,9 +172,9 @@ def reduced_tiles(tiles: Tiles, inputs: BakeInput, options: BakeOptions, progres
     opacity, beta = kernel_parameters(inputs.surfels, inputs.transmittance)
     shown = Shown(opacity, beta, tiles.extent.to(opacity.device), inputs.weight_bound)
     parts = tile_values(tiles.texels.to(opacity.device), tiles.packing, shown, options.chunk)
-    smaller = reduce_tiles(parts, shown, options.tolerance, options.r_min, progress)
+    smaller = reduce_tiles(parts, shown, options.tolerance, options.r_min, progress, tiles.texels.shape[3])
     bare = torch.from_numpy(tiles.packing.tiles)[:, 3] == 0
-    smaller.constant[bare] = tiles.mean_residual[bare]
+    smaller.constant[bare] = tiles.constants[bare]
     return packed_tiles(smaller, shown, options)
 
 

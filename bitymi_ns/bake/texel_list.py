@@ -6,12 +6,17 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.baked import Baked
-from bitymi_ns.codec.pages import listed_texels, paged_texels
+from bitymi_ns.codec.pages import paged_texels
 from bitymi_ns.ops import Projection, TexelTiles, add_texel_coverage, fitting_lists, project
 from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import View
+
+
+def with_alpha(colors: Tensor, baked: Baked) -> Tensor:
+    """[T, C] texels of other residual colours [T, 3], with the alphas of the bake where it has such."""
+    return colors if baked.alpha is None else torch.cat([colors, baked.alpha.values[:, None]], 1)
 
 
 class TexelList:
@@ -20,7 +25,8 @@ class TexelList:
     Attributes:
         scene: the surfels, on the device.
         tiles: where the texels lie.
-        values: [T, 3] as baked, on the device.
+        values: [T, 3] residual colours as baked, on the device.
+        alpha: opacities of the texels on the device, which stand still; None = opaque texels.
         sizes: [N, 2] int32 sides of the tiles, on the CPU; (0, 0) = none.
     """
 
@@ -39,20 +45,23 @@ class TexelList:
         self.scene = baked.scene.to(device)
         self.sizes = torch.from_numpy(baked.packing.tiles[:, 3:])
         self.tiles = TexelTiles.of_sizes(self.sizes.clamp(min=1).to(device), baked.extent.float().to(device))
-        self.values = listed_texels(baked.texels, baked.packing, baked.mean_residual).to(device)
+        self.values = baked.listed[:, :3].contiguous().to(device)
+        self.alpha = None if baked.alpha is None else baked.alpha.to(device)
 
     def baked(self, texels: Tensor) -> Baked:
         """The bake with these texels [T, 3], to be `encoded`."""
-        texels = texels.cpu()
+        texels = with_alpha(texels.cpu(), self._baked)
         pages = paged_texels(texels, self._baked.packing, self._baked.texels)
         bare = self.sizes[:, 0] == 0
-        constants = torch.where(bare[:, None], texels[self.tiles.first.cpu()], self._baked.mean_residual)
-        return self._baked.with_mean_residual(constants).with_texels(pages)
+        constants = torch.where(bare[:, None], texels[self.tiles.first.cpu()], self._baked.constants)
+        return self._baked.with_constants(constants).with_texels(pages)
 
     def projection(self, camera: Camera) -> Projection:
         """Of the surfels into a view."""
         geometry = (self.scene.surfels[name] for name in GEOMETRY)
-        return project(*geometry, camera.to(self.device), self.scene.near, self.scene.prefilter)
+        projection = project(*geometry, camera.to(self.device), self.scene.near, self.scene.prefilter)
+        projection.alpha = self.alpha
+        return projection
 
     def coverage(self, views: Sequence[View], progress: Progress = no_progress, squared: bool = False) -> Tensor:
         """Coverage of every texel, in pixels.

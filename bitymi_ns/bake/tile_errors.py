@@ -13,13 +13,18 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.tile_sizes import max_projected_extent
 from bitymi_ns.train.init import tangents
 
+ALPHA_CONTRAST = 0.25  # of an error of alpha: how far a surfel's colour differs from that behind it, as a rule
 _CONSTANT = (8, 8)  # grid on which the weight of a surfel without a tile is evaluated
 
 
 def weighted_rms(difference: Tensor, weight: Tensor) -> Tensor:
-    """Root mean square of difference [n, 3, v, u] times weight [n, v, u] where that is not 0, in 8-bit steps: [n]."""
+    """Root mean square of difference [n, C, v, u] times weight [n, v, u] where that is not 0, in 8-bit steps: [n].
+    Alpha, the fourth of four channels, counts by `ALPHA_CONTRAST`."""
     count = 3 * (weight > 0).flatten(1).sum(1).clamp(min=1)
-    square = (difference.square().sum(1) * weight.square()).flatten(1).sum(1)
+    squares = difference[:, :3].square().sum(1)
+    if difference.shape[1] == 4:
+        squares = squares + (ALPHA_CONTRAST * difference[:, 3]).square()
+    square = (squares * weight.square()).flatten(1).sum(1)
     return STEPS * (square / count).sqrt()
 
 

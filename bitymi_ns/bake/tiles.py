@@ -18,9 +18,9 @@ class Tiles:
     """Tiles of N surfels on the CPU."""
 
     packing: Packing  # layout of the atlas
-    texels: Tensor | None  # [layers, height, width, 3] float32 residual colours, None without any tile
+    texels: Tensor | None  # [layers, height, width, C] float32: residual colour and, where C = 4, alpha; None = no tile
     extent: Tensor  # [N] half side in scale units
-    mean_residual: Tensor  # [N, 3] mean of every tile; the residual of a surfel without one
+    constants: Tensor  # [N, C] mean of every tile; the residual, and alpha, of a surfel without one
     nonfinite: int = 0  # points at which the field was not finite
 
     @classmethod
@@ -48,7 +48,7 @@ class TileValues:
 
     rows: Tensor  # [n] int64 rows of the surfels
     size: tuple[int, int]  # (u, v) texels
-    values: Tensor  # [n, 3, v, u] residual colours
+    values: Tensor  # [n, C, v, u] residual colours, and alpha where C = 4
     weight: Tensor  # [n, v, u] weight of an error
     nonfinite: int  # points at which the field was not finite
 
@@ -85,12 +85,12 @@ def tile_values(texels: Tensor, packing: Packing, shown: Shown, chunk: int = 1 <
     """Texels of the tiles, in chunks of tiles of one size.
 
     Args:
-        texels: [layers, height, width, 3] in the layout of `packing`, on the device of `shown`.
+        texels: [layers, height, width, C] in the layout of `packing`, on the device of `shown`.
         packing: N tiles; surfels without one are left out.
         shown: N rows.
         chunk: texels taken at once (a tile is never split).
     """
-    tiles, flat = torch.from_numpy(packing.tiles).to(texels.device), texels.reshape(-1, 3)
+    tiles, flat = torch.from_numpy(packing.tiles).to(texels.device), texels.reshape(-1, texels.shape[3])
     for r_u, r_v, members in size_classes(tiles):
         for rows in members.split(max(1, chunk // (r_u * r_v))):
             at = texel_index(tiles[rows], (r_u, r_v), packing.width, packing.height)

@@ -14,10 +14,8 @@ from bitymi_ns.bundle.read import Bundle, assemble, manifest_of, read_file
 from bitymi_ns.bundle.sizes import SCENE_FILES, enough_memory
 from bitymi_ns.bundle.sketch import estimated_rms, sketch, sketches_of
 from bitymi_ns.bundle.write import World
-from bitymi_ns.codec.packing import Packing
-from bitymi_ns.codec.pages import listed_texels
 from bitymi_ns.codec.quantise import STEPS
-from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.codec.scene_texels import scene_texels
 
 SLACK_STEPS = 0.02  # 8-bit steps by which a measured error may exceed the stated one
 _SLACK_CODES = 4.0
@@ -128,14 +126,6 @@ def check_certificate(bundle: Bundle) -> list[Check]:
     detail += f"; texels {found:.2f} steps from those before they were stored (stated {stated.texel_rms:.2f})"
     detail += "" if same else "; these are not those that were measured"
     return [Check("certificate", same and near, detail)]
-
-
-def scene_texels(scene: BakedScene) -> Tensor:
-    """[T, 3] residual colours of a scene in the order of `ops.TexelTiles`."""
-    assert scene.atlas is not None and scene.mean_residual is not None
-    layers, height, width = scene.atlas.shape[:3]
-    packing = Packing(scene.tiles.numpy(), width, height, layers, 1.0)
-    return listed_texels(scene.residuals(), packing, scene.mean_residual)
 
 
 def steps_text(error: float | None) -> str:

@@ -46,14 +46,21 @@ def texel_index(tiles: Tensor, size: tuple[int, int], width: int, height: int) -
 
 
 def tile_means(texels: Tensor, packing: Packing, constant: Tensor | None = None, chunk: int = 1 << 20) -> Tensor:
-    """[N, 3] mean of every tile of `texels` [layers, height, width, 3]; without a tile `constant` [N, 3], or 0."""
+    """[N, C] mean of every tile of `texels` [layers, height, width, C]; without a tile `constant` [N, C], or 0.
+    Colours are weighted by alpha, where there is a fourth channel and not all of it is 0."""
     tiles = torch.from_numpy(packing.tiles)
-    flat = texels.reshape(-1, 3)
-    means = torch.zeros(len(tiles), 3) if constant is None else constant.clone()
+    flat = texels.reshape(-1, texels.shape[3])
+    means = torch.zeros(len(tiles), texels.shape[3]) if constant is None else constant.clone()
     for r_u, r_v, rows in size_classes(tiles):
         for part in rows.split(max(1, chunk // (r_u * r_v))):
             index = texel_index(tiles[part], (r_u, r_v), packing.width, packing.height)
-            means[part] = flat[index].mean(dim=(1, 2))
+            values = flat[index]
+            means[part] = values.mean(dim=(1, 2))
+            if values.shape[3] == 4:
+                alpha = values[..., 3:]
+                total = alpha.sum(dim=(1, 2))
+                colors = (alpha * values[..., :3]).sum(dim=(1, 2)) / total.clamp(min=1e-9)
+                means[part, :3] = torch.where(total > 0, colors, means[part, :3])
     return means
 
 
@@ -70,11 +77,11 @@ def _texel_rows(packing: Packing) -> Iterator[tuple[Tensor, Tensor]]:
 
 
 def listed_texels(pages: Tensor, packing: Packing, constants: Tensor) -> Tensor:
-    """Texel list [T, 3] of pages [layers, height, width, 3]; a surfel without a tile has its constant of [N, 3]."""
+    """Texel list [T, C] of pages [layers, height, width, C]; a surfel without a tile has its constant of [N, C]."""
     area = torch.from_numpy(packing.tiles[:, 3:]).long().clamp(min=1).prod(dim=1)
     texels = constants.repeat_interleave(area, dim=0)
     for listed, paged in _texel_rows(packing):
-        texels[listed] = pages.reshape(-1, 3)[paged]
+        texels[listed] = pages.reshape(-1, pages.shape[3])[paged]
     return texels
 
 

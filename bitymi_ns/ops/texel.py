@@ -65,6 +65,16 @@ class TexelAlpha:
     values: Tensor
     bound: float
 
+    def of(self, surfels: Tensor) -> TexelAlpha:
+        """The same of some of the surfels [n] int64."""
+        tiles = TexelTiles.of_sizes(self.tiles.size[surfels], self.tiles.extent[surfels])
+        return TexelAlpha(tiles, self.values[self.tiles.rows_of(surfels)], self.bound)
+
+    def to(self, device: torch.device | str) -> TexelAlpha:
+        """The same on another device."""
+        tiles = TexelTiles(*(t.to(device) for t in (self.tiles.first, self.tiles.size, self.tiles.extent)))
+        return TexelAlpha(tiles, self.values.to(device), self.bound)
+
     @property
     def arrays(self) -> dict[str, Any]:
         """Arguments of the kernels, by name."""

@@ -101,11 +101,25 @@ class BakedScene:
         Raises:
             ValueError: there is no atlas, or only its BC7 blocks.
         """
+        return self._values(slice(3)) * self.scale + self.offset
+
+    def alphas(self) -> Tensor | None:
+        """Factors of sigma of the atlas: m [layers, height, width] float32; None without an atlas, or where its texels
+        have none.
+
+        Raises:
+            ValueError: there are only the atlas's BC7 blocks.
+        """
+        if not self.alpha_scale or (self.atlas is None and self.blocks is None):
+            return None
+        return self._values(3) * self.alpha_scale
+
+    def _values(self, channels: int | slice) -> Tensor:
+        """Values of the atlas as the renderers read them."""
         if self.atlas is None:
             raise ValueError("the scene has no atlas" if self.blocks is None else "the atlas was not decoded")
-        rgb = self.atlas[..., :3].float()
-        unorm = rgb / 255.0 if self.atlas.dtype == torch.uint8 else rgb
-        return unorm * self.scale + self.offset
+        values = self.atlas[..., channels].float()
+        return values / 255.0 if self.atlas.dtype == torch.uint8 else values
 
     def to(self, device: torch.device | str) -> BakedScene:
         """The scene with its surfels on another device; texels go there, as textures, when it is first drawn."""

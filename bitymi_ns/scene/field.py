@@ -8,7 +8,16 @@ from typing import ClassVar, NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
-from bitymi_ns.ops import Fragments, Projection, TexelDescent, TexelTiles, blended_image, composite_image, shade
+from bitymi_ns.ops import (
+    Fragments,
+    Projection,
+    TexelAlpha,
+    TexelDescent,
+    TexelTiles,
+    blended_image,
+    composite_image,
+    shade,
+)
 from bitymi_ns.ops.constants import FEATURES, WIDTH
 from bitymi_ns.ops.field import FieldGeometry, field
 
@@ -44,6 +53,10 @@ class ResidualField(Protocol):
             base: [N, 3] f_view of every surfel.
             how: it is made.
         """
+
+    def opacity(self, bound: float, learns: bool) -> TexelAlpha | None:
+        """Opacities of texels, with gradients or without; None = all of a surfel is as opaque as it is. See
+        `ops.TexelAlpha` for the bound."""
 
     def snapshot(self) -> Tensor | None:
         """State that parts of a view read in place of the field itself, because the backward passes of other parts
@@ -140,6 +153,9 @@ class HashField(nn.Module):
         colors = shade(fragments, base, projection.frames, self.geometry, weights, how.bound, how.moves_surfels)
         return composite_image(fragments, projection, colors, how.maps)
 
+    def opacity(self, bound: float, learns: bool) -> None:
+        """See `ResidualField`: a field in space adds colours alone."""
+
     def snapshot(self) -> None:
         """See `ResidualField`: the optimizer changes the weights, after all backward passes."""
 
@@ -174,14 +190,23 @@ class TexelField(nn.Module):
         extent: [N] their half sides in scale units.
         texels: [T, 3] residual colours to start from, tile after tile as in `TexelTiles.of_sizes`.
         share: [T] how far a texel moves in a step, see `TexelDescent`; None = they are not stepped.
+        alpha: [T] factors of their surfel's opacity, from 0 to 2, see `ops.TexelAlpha`; None = opaque texels.
     """
 
     STEADY: ClassVar = ("size", "extent", "share")
     """Buffers that training replaces and never writes into, so that copies of the scene may share them."""
 
-    def __init__(self, size: Tensor, extent: Tensor, texels: Tensor, share: Tensor | None = None) -> None:
+    def __init__(
+        self,
+        size: Tensor,
+        extent: Tensor,
+        texels: Tensor,
+        share: Tensor | None = None,
+        alpha: Tensor | None = None,
+    ) -> None:
         super().__init__()
         self.texels = nn.Parameter(texels.detach().clone())
+        self.alpha = None if alpha is None else nn.Parameter(alpha.detach().clone())
         # in the checkpoint, as the texels are
         self.register_buffer("size", size.to(torch.int32).clone())
         self.register_buffer("extent", extent.detach().to(texels).clone())
@@ -191,10 +216,11 @@ class TexelField(nn.Module):
         self._tiles: tuple[Tensor, int, TexelTiles] | None = None
 
     @classmethod
-    def blank(cls, surfels: int, texels: int, like: Tensor) -> TexelField:
-        """One of so many surfels and texels, for a state to be loaded into."""
+    def blank(cls, surfels: int, texels: int, like: Tensor, alpha: bool = False) -> TexelField:
+        """One of so many surfels and texels, with alpha or without, for a state to be loaded into."""
         size = torch.zeros(surfels, 2, dtype=torch.int32, device=like.device)
-        return cls(size, like.new_zeros(surfels), like.new_zeros(texels, 3))
+        factors = like.new_ones(texels) if alpha else None
+        return cls(size, like.new_zeros(surfels), like.new_zeros(texels, 3), alpha=factors)
 
     @property
     def tiles(self) -> TexelTiles:
@@ -209,6 +235,7 @@ class TexelField(nn.Module):
         """Lets go of all surfels but `rows` [n] int64, which are in that order from now on."""
         old = self.tiles.rows_of(rows)
         self.texels = nn.Parameter(self.texels.detach()[old])
+        self.alpha = None if self.alpha is None else nn.Parameter(self.alpha.detach()[old])
         self.share, self.size, self.extent = self.share[old], self.size[rows], self.extent[rows]
 
     def image(self, fragments: Fragments, projection: Projection, base: Tensor, how: Shading) -> Tensor:
@@ -219,6 +246,12 @@ class TexelField(nn.Module):
             texels, descent = how.read, replace(descent, moved=texels)
         given = (texels, self.tiles, how.bound, how.maps, how.moves_surfels, descent)
         return blended_image(fragments, projection, base, *given)
+
+    def opacity(self, bound: float, learns: bool) -> TexelAlpha | None:
+        """See `ResidualField`."""
+        if self.alpha is None:
+            return None
+        return TexelAlpha(self.tiles, self.alpha if learns else self.alpha.detach(), bound)
 
     def snapshot(self) -> Tensor | None:
         """See `ResidualField`."""

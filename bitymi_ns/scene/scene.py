@@ -143,7 +143,8 @@ class Scene(nn.Module):
             parameter.data = parameter.new_zeros(n, *parameter.shape[1:])
         texels = state.get(f"{prefix}field.texels")
         if texels is not None:
-            self.field = TexelField.blank(n, len(texels), self.surfels["means"].detach())
+            alpha = f"{prefix}field.alpha" in state
+            self.field = TexelField.blank(n, len(texels), self.surfels["means"].detach(), alpha)
         elif isinstance(self.field, TexelField):
             self.field = None
 
@@ -180,6 +181,8 @@ class Scene(nn.Module):
         projection = project(*(p[name] for name in GEOMETRY), camera, self.near, self.config.prefilter)
         field = None if field_mode == "off" else self.field
         learns, bound = field_mode == "train", self.config.weight_bound
+        if field is not None:
+            projection.alpha = field.opacity(bound, learns)
         base = self.base_color(projection)
         read: Tensor | None = None
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops import Prefilter, fitting_lists, project
+from bitymi_ns.ops import Prefilter, TexelAlpha, fitting_lists, project
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 
@@ -49,6 +49,7 @@ def visibility(
     weight_bound: float = 0.0,
     prefilter: Prefilter = "low_pass",
     progress: Progress = no_progress,
+    alpha: TexelAlpha | None = None,
 ) -> Visibility:
     """Find the views that see every surfel, and the transmittance in front of it.
 
@@ -58,6 +59,7 @@ def visibility(
         near: nearest drawn depth.
         weight_bound: fragments of smaller weight get no residual.
         prefilter: as in `ops.project`.
+        alpha: opacities of the surfels' texels; None = opaque texels.
     """
     means = surfels["means"]
     geometry = [surfels[name] for name in ("quats", "log_scales", "opacity_logits", "beta_raw")]
@@ -67,6 +69,7 @@ def visibility(
     for done, camera in enumerate(cameras, start=1):
         here = torch.zeros_like(pixels)
         projection = project(means, *geometry, camera.to(means.device), near, prefilter)
+        projection.alpha = alpha
         for fragments in fitting_lists(projection):
             lists = (fragments.surfel, fragments.weight, fragments.sigma)
             for surfel, weight, sigma in zip(*(values.split(PART) for values in lists), strict=True):

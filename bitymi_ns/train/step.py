@@ -196,12 +196,11 @@ class Training:
         Raises:
             ProcessesApart, ProcessLost: see `Processes.average_gradients`.
         """
-        if self.processes.views == 1:
-            return
-        groups = (group for optimizer in self.optimizers.values() for group in optimizer.param_groups)
-        learned = [parameter for group in groups for parameter in group["params"]]
-        self.processes.average_gradients([*learned, *self.texels.gathered], len(self.scene))
-        self.exposure.average(self.processes)
+        if self.processes.views > 1:
+            groups = (group for optimizer in self.optimizers.values() for group in optimizer.param_groups)
+            learned = [parameter for group in groups for parameter in group["params"]]
+            self.processes.average_gradients([*learned, *self.texels.gathered], len(self.scene))
+            self.exposure.average(self.processes)
         self.texels.step()
 
     def finish(self) -> dict[str, float]:

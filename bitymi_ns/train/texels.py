@@ -13,6 +13,7 @@ from torch.nn import Parameter
 from torch.utils.hooks import RemovableHandle
 
 from bitymi_ns.ops import TexelDescent, add_texel_coverage, fitting_lists, project
+from bitymi_ns.ops.backend import cuda_backend
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.scene.camera import Camera
@@ -34,6 +35,7 @@ FEWEST_VIEWS = 32  # fewest views that tiles are measured on, however short the 
 SMALLEST = 4  # side of the smallest tile, texels: a block of BC7
 FEW = 1 << 23  # texels that no run is too short for: 235 MB
 FEWER = 0.8  # factor by which tiles get fewer texels, as often as it takes until all are few enough
+MOST_ALPHA = 2.0
 LEAST_SHARE = 0.25
 """Lower bound of a texel's coverage where it is measured on a part of the views, as a share of what one view
 can show: no step is much longer than four times the rate. A whole view would slow down occluded texels."""
@@ -47,7 +49,7 @@ class LearningTexels:
 
     def __init__(self, scene: Scene, schedule: Schedule, options: TexelConfig, processes: Processes = ALONE) -> None:
         self.scene, self.schedule, self.options, self.processes = scene, schedule, options, processes
-        self._rate: RemovableHandle | None = None
+        self._rates: list[RemovableHandle] = []
         self._views = 1
 
     def begin(self, step: int, views: DownscaledViews) -> bool:
@@ -63,7 +65,7 @@ class LearningTexels:
         if self.processes.count > 1:
             device = self.scene.surfels["means"].device
             found = self.processes.from_first(None if field is None else field.state_dict(), device)
-            field = TexelField(found["size"], found["extent"], found["texels"], found["share"])
+            field = TexelField(found["size"], found["extent"], found["texels"], found["share"], found.get("alpha"))
         self.scene.field = field
         return True
 
@@ -79,38 +81,49 @@ class LearningTexels:
             factor: of all rates.
         """
         field = self.scene.field
-        if isinstance(field, TexelField):
-            # the loss is a mean, the step wants a sum
-            values = numbers(view.image, view.mask, view.counted)
-            rate = factor * self.schedule.texel_rate(step, self._views) * values
-            if self.processes.views == 1:
-                field.descent = TexelDescent(field.share, rate)
-                return
-            field.descent = None  # several views move the texels together, in `step`
-            if self._rate is not None:
-                self._rate.remove()
-            self._rate = field.texels.register_hook(lambda gradient: gradient * rate)
+        if not isinstance(field, TexelField):
+            return
+        # the loss is a mean, the step wants a sum
+        values = numbers(view.image, view.mask, view.counted)
+        rate = factor * self.schedule.texel_rate(step, self._views) * values
+        for handle in self._rates:
+            handle.remove()
+        self._rates = []
+        # one view moves the colours in its backward pass; several move them together, in `step`
+        field.descent = TexelDescent(field.share, rate) if self.processes.views == 1 else None
+        if field.descent is None:
+            self._rates.append(field.texels.register_hook(lambda gradient: gradient * rate))
+        if field.alpha is not None:
+            alpha_rate = self.options.alpha_rate * rate
+            self._rates.append(field.alpha.register_hook(lambda gradient: gradient * alpha_rate))
 
     @property
     def gathered(self) -> list[Parameter]:
-        """The texels, where the views of a step move them together."""
+        """Colours and alphas of the texels that `step` moves."""
         field = self.scene.field
-        return [field.texels] if self.processes.views > 1 and isinstance(field, TexelField) else []
+        if not isinstance(field, TexelField):
+            return []
+        colors = [] if self.processes.views == 1 else [field.texels]
+        return colors if field.alpha is None else [*colors, field.alpha]
 
     @torch.no_grad()
     def step(self) -> None:
-        """Moves the texels by the mean of what each view of the step would have moved them by."""
+        """Moves them by the mean of what each view of the step would have moved them by."""
         field = self.scene.field
-        if isinstance(field, TexelField) and field.texels.grad is not None:
-            field.texels.addcmul_(field.share[:, None], field.texels.grad, value=-1.0)
-            field.texels.grad = None
+        for values in self.gathered:
+            if values.grad is not None:
+                share = field.share if values is field.alpha else field.share[:, None]
+                values.addcmul_(share, values.grad, value=-1.0)
+                values.grad = None
+                if values is field.alpha:
+                    values.clamp_(0.0, MOST_ALPHA)
 
 
 @torch.no_grad()
 def blank_texels(
     scene: Scene, views: Sequence[View], count: int, options: TexelConfig, to_come: float = math.inf
 ) -> TexelField:
-    """A tile for every surfel, with residuals of 0.
+    """A tile for every surfel, with residuals of 0, and alphas of 1 where they learn.
 
     A surfel of which no view shows a residual has one texel.
 
@@ -135,6 +148,8 @@ def blank_texels(
         least = LEAST_SHARE * single_view_coverage(surfels, cameras, size, extent, scene.near)
         seen_in_all = torch.maximum(seen_in_all, least)
     field.share.copy_(1.0 / (seen_in_all + options.prior))
+    if options.alpha_rate > 0 and not cuda_backend(extent.device):
+        field.alpha = Parameter(torch.ones_like(field.share))
     return field
 
 

@@ -79,7 +79,7 @@ def views(truth: Baked) -> list[View]:
 @pytest.fixture(scope="module")
 def wrong(truth: Baked) -> Baked:
     """The same scene with another constant for a residual."""
-    grey = truth.with_mean_residual(torch.full_like(truth.mean_residual, 0.1))
+    grey = truth.with_constants(torch.full_like(truth.mean_residual, 0.1))
     return grey.with_texels(torch.full_like(truth.texels, 0.1))
 
 

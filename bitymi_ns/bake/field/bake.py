@@ -82,7 +82,7 @@ def bake(
         kind_of(scene.surfels),
         torch.from_numpy(tiles.packing.tiles),
         extent=tiles.extent,
-        mean_residual=tiles.mean_residual,
+        mean_residual=tiles.constants,
         near=inputs.near,
         weight_bound=inputs.weight_bound,
         prefilter=getattr(scene.config, "prefilter", "low_pass"),
@@ -137,7 +137,7 @@ def _textured(
             tiles = packed_tiles(reduced, plan, options)
         atlas = None if tiles.texels is None else encoded_pages(tiles.texels, tiles.packing, options, progress)
         stored = None if atlas is None else atlas.decoded()
-        errors = tile_errors(field, plan, tiles.packing.tiles, tiles.mean_residual, stored, options.chunk, progress)
+        errors = tile_errors(field, plan, tiles.packing.tiles, tiles.constants, stored, options.chunk, progress)
         counts = plan.texels
     packing = tiles.packing
     assert statistics.surfels is not None

@@ -2,8 +2,8 @@
 // alpha, the transmittance that is left. The blending unit does the rest of core/blend.h:
 //   sums += transmittance * (sigma * color),   transmittance *= 1 - sigma.
 //
-// What a fragment's weight is, the blending unit does not tell. Where the weight decides (the bound of the residual, the
-// end of a pixel), it is judged by the transmittance that was left before the batch: from above. The more batches, the
+// What a fragment's weight is, the blending unit does not tell. Where the weight decides (the bound of residual and
+// alpha, the end of a pixel), it is judged by the transmittance that was left before the batch: from above. The more batches, the
 // closer; what it costs in the picture is in docs/viewer.md.
 
 @group(0) @binding(0) var<uniform> frame: Frame;
@@ -23,7 +23,7 @@ struct Corner {
   @location(1) @interpolate(flat) v_w: vec4f,
   @location(2) @interpolate(flat) w0_z_opacity_beta: vec4f,
   @location(3) @interpolate(flat) color_area: vec4f,
-  @location(4) @interpolate(flat) tile: vec4f,  // first texel, span; without a tile the residual
+  @location(4) @interpolate(flat) tile: vec4f,  // first texel, span; without a tile residual and alpha
   @location(5) @interpolate(flat) texel: vec4f,  // layer, -1 without a tile; 1 / (2 extent); normal z; level
 }
 
@@ -43,12 +43,12 @@ fn corner(@builtin(vertex_index) vertex: u32, @builtin(instance_index) instance:
   out.w0_z_opacity_beta = vec4f(s.w0, s.z, s.opacity, s.beta);
   out.color_area = vec4f(s.color, s.area);
   if s.level == TILE_LEVELS {
-    out.tile = vec4f(surfel.residual, 0.0);
+    out.tile = vec4f(surfel.residual, f32(surfel.layer >> 24) / 128.0);
     out.texel = vec4f(-1.0, 0.0, s.normal_z, 0.0);
   } else {
     let sides = vec2u(surfel.sides & 0xffff, surfel.sides >> 16) >> vec2u(s.level);
     out.tile = vec4f(vec2f(surfel.tile >> vec2u(s.level)), vec2f(sides) - 1.0);
-    out.texel = vec4f(f32(surfel.layer), 0.5 / surfel.extent, s.normal_z, f32(s.level));
+    out.texel = vec4f(f32(surfel.layer & 0xffffff), 0.5 / surfel.extent, s.normal_z, f32(s.level));
   }
   return out;
 }
@@ -106,8 +106,9 @@ fn filtered_fragment(c: Corner, d: vec2f) -> Fragment {
   return f;
 }
 
-fn residual(c: Corner, at: vec2f) -> vec3f {
-  if c.texel.x < 0.0 { return c.tile.xyz; }
+// The residual, and what sigma is multiplied by.
+fn texels(c: Corner, at: vec2f) -> vec4f {
+  if c.texel.x < 0.0 { return c.tile; }
   let span = c.tile.zw;
   let texel = c.tile.xy + clamp(at * (span + 1.0) * c.texel.y + 0.5 * span, vec2f(0.0), span) + 0.5;
   let layer = u32(c.texel.x);
@@ -118,7 +119,7 @@ fn residual(c: Corner, at: vec2f) -> vec3f {
     let level = c.texel.w - 1.0;
     stored = textureSampleLevel(coarser, bilinear, texel / vec2f(textureDimensions(coarser, u32(level))), layer, level);
   }
-  return frame.offset + frame.scale * stored.rgb;
+  return vec4f(frame.offset + frame.scale * stored.rgb, frame.alpha_scale * stored.a);
 }
 
 @fragment
@@ -130,7 +131,16 @@ fn surfel(c: Corner) -> @location(0) vec4f {
   var front = 1.0;
   if layer.x > 0 { front = textureLoad(before, vec2i(c.position.xy), 0).a; }
   if front < TRANSMITTANCE_MIN { discard; }
-  let textured = frame.residuals != 0 && f.sigma * front >= frame.weight_bound;
+  var texel = vec4f(0.0);
+  let cut = frame.alpha_scale > 0.0 && f.sigma * front >= frame.weight_bound;
+  if cut {
+    texel = texels(c, f.at);
+    f.sigma = min(ALPHA_MAX, f.sigma * texel.a);
+    if f.sigma < ALPHA_MIN { discard; }
+  }
+  let colored = frame.residuals != 0 && (frame.show == SHOW_COLOR || frame.show == SHOW_RESIDUAL);
+  let textured = colored && f.sigma * front >= frame.weight_bound;
+  if textured && !cut { texel = texels(c, f.at); }
   switch frame.show {
     case SHOW_DEPTH: { return vec4f(f.sigma * f.depth, f.sigma * c.w0_z_opacity_beta.w, f.sigma, f.sigma); }
     case SHOW_NORMAL: {
@@ -139,12 +149,12 @@ fn surfel(c: Corner) -> @location(0) vec4f {
     case SHOW_OVERDRAW: { return vec4f(1.0, 0.0, 0.0, f.sigma); }
     case SHOW_RESIDUAL: {
       var shift = vec3f(0.0);
-      if textured { shift = residual(c, f.at); }
+      if textured { shift = texel.rgb; }
       return vec4f(f.sigma * max(shift + 0.5, vec3f(0.0)), f.sigma);
     }
     default: {
       var color = c.color_area.xyz;
-      if textured { color = max(color + residual(c, f.at), vec3f(0.0)); }
+      if textured { color = max(color + texel.rgb, vec3f(0.0)); }
       return vec4f(f.sigma * color, f.sigma);
     }
   }

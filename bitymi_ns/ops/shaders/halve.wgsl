@@ -1,4 +1,5 @@
-// A page of an atlas at half its size: means of 2 x 2 texels.
+// A page of an atlas at half its size: means of 2 x 2 texels, as `ops.tile_levels` takes them. With alpha colours are
+// weighted by it, where it is not 0 in all four: what is cut away does not tint its neighbours.
 
 @group(0) @binding(0) var finer: texture_2d<f32>;
 
@@ -7,19 +8,46 @@ fn page(@builtin(vertex_index) vertex: u32) -> @builtin(position) vec4f {
   return vec4f(f32(vertex & 1) * 4.0 - 1.0, f32(vertex >> 1) * 4.0 - 1.0, 0.0, 1.0);
 }
 
-fn sum(position: vec4f) -> vec4f {
+fn texels(position: vec4f) -> array<vec4f, 4> {
   let at = 2 * vec2i(position.xy);
-  return textureLoad(finer, at, 0) + textureLoad(finer, at + vec2i(1, 0), 0) + textureLoad(finer, at + vec2i(0, 1), 0)
-    + textureLoad(finer, at + vec2i(1, 1), 0);
+  return array<vec4f, 4>(
+    textureLoad(finer, at, 0), textureLoad(finer, at + vec2i(1, 0), 0), textureLoad(finer, at + vec2i(0, 1), 0),
+    textureLoad(finer, at + vec2i(1, 1), 0),
+  );
+}
+fn sum(t: array<vec4f, 4>) -> vec4f {
+  return t[0] + t[1] + t[2] + t[3];
+}
+fn weighted(t: array<vec4f, 4>) -> vec3f {
+  return t[0].a * t[0].rgb + t[1].a * t[1].rgb + t[2].a * t[2].rgb + t[3].a * t[3].rgb;
 }
 
-// Of bytes, rounded as `ops.tile_levels` rounds them.
+// Bytes, rounded.
+fn bytes(t: array<vec4f, 4>) -> vec4f {
+  return floor((round(sum(t) * 255.0) + 2.0) / 4.0) / 255.0;
+}
 @fragment
 fn halve_bytes(@builtin(position) position: vec4f) -> @location(0) vec4f {
-  return floor((round(sum(position) * 255.0) + 2.0) / 4.0) / 255.0;
+  return bytes(texels(position));
+}
+@fragment
+fn halve_alpha_bytes(@builtin(position) position: vec4f) -> @location(0) vec4f {
+  let t = texels(position);
+  let mean = bytes(t);
+  let total = u32(round(sum(t).a * 255.0));
+  if total == 0 { return mean; }
+  let colors = (vec3u(round(weighted(t) * 65025.0)) + total / 2) / total;
+  return vec4f(vec3f(colors) / 255.0, mean.a);
 }
 
 @fragment
 fn halve_floats(@builtin(position) position: vec4f) -> @location(0) vec4f {
-  return sum(position) / 4.0;
+  return sum(texels(position)) / 4.0;
+}
+@fragment
+fn halve_alpha_floats(@builtin(position) position: vec4f) -> @location(0) vec4f {
+  let t = texels(position);
+  let mean = sum(t) / 4.0;
+  if mean.a == 0.0 { return mean; }
+  return vec4f(weighted(t) / (4.0 * mean.a), mean.a);
 }

@@ -24,7 +24,7 @@ fn prepare(@builtin(global_invocation_id) id: vec3u) {
   order[i] = i;
   keys[i] = HIDDEN;
   let surfel = surfels[i];
-  let p = to_camera(surfel.mean - frame.center.xyz);
+  let p = to_camera(surfel.mean - frame.center);
   if !(p.z > frame.near) { return; }
 
   let h = surfel.quat;  // w, x, y, z of unit length

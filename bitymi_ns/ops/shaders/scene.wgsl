@@ -23,7 +23,7 @@ struct Surfel {
   beta_raw: f32,
   extent: f32,  // half side of the tile, scale units
   residual: vec3f,  // of a surfel without a tile
-  layer: u32,
+  layer: u32,  // of the tile, 24 bits; above them 128 times the alpha of a surfel without a tile
   base: vec3f,  // view colour: base, and its terms
   first_term: u32,
   tile: vec2u,  // first texel
@@ -52,7 +52,8 @@ struct Seen {
 
 struct Frame {
   rotation: array<vec4f, 3>,  // rows, world to camera
-  center: vec4f,  // where the camera stands, relative to the scene's origin
+  center: vec3f,  // where the camera stands, relative to the scene's origin
+  alpha_scale: f32,  // m = alpha_scale * a texel's alpha multiplies sigma; 0: the scene is opaque
   color_center: vec4f,  // from where view colours are seen; `center`, unless they are held
   lens: vec4f,  // fx, fy, cx, cy
   size: vec2f,  // pixels

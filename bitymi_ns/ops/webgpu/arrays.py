@@ -62,6 +62,8 @@ def arrays(scene: BakedScene) -> Arrays:
     if scene.mean_residual is not None:
         surfels["residual"] = scene.mean_residual.detach().cpu().numpy()
     _set_tiles(surfels, scene)
+    alpha = torch.ones(n) if scene.mean_alpha is None else scene.mean_alpha.detach().float().cpu()
+    surfels["layer"] |= (128 * alpha).round().clamp(0, 255).numpy().astype(np.uint32) << 24
     kind, base, span, terms = _view_colors(scene.view_color, p, n)
     surfels["base"], surfels["first_term"], surfels["terms"] = base.numpy(), span[:, 0].numpy(), span[:, 1].numpy()
     _hide_broken(surfels, p)

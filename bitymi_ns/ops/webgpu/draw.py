@@ -37,8 +37,10 @@ def draw(
     if "packed" in images:
         raise ValueError("the image 'packed' is drawn on a CUDA device only: draw rgb and alpha")
     common_size(cameras)
-    sources = (*scene.surfels.values(), scene.tiles, scene.atlas, scene.blocks, scene.extent, scene.mean_residual)
-    numbers = f"webgpu {scene.near} {scene.weight_bound} {scene.offset} {scene.scale} {scene.prefilter}"
+    arrays = (scene.tiles, scene.atlas, scene.blocks, scene.extent, scene.mean_residual, scene.mean_alpha)
+    sources = (*scene.surfels.values(), *arrays)
+    scales = f"{scene.offset} {scene.scale} {scene.alpha_scale}"
+    numbers = f"webgpu {scene.near} {scene.weight_bound} {scales} {scene.prefilter}"
     there = scene.cache.atlas(lambda: SceneOnDevice(scene), *sources, numbers)
     drawn: dict[str, list[Tensor]] = {name: [] for name in images}
     for camera in cameras:

@@ -61,7 +61,7 @@ class SceneOnDevice:
         check_room(max(packed.surfels.nbytes, packed.terms.nbytes), -(-self.count // 64), (1, 1))
         self._near, self._bound = scene.near, scene.weight_bound
         self._prefilter = scene.prefilter == "pixel"
-        self._offset, self._scale = scene.offset, scene.scale
+        self._offset, self._scale, self._alpha_scale = scene.offset, scene.scale, scene.alpha_scale
         flags = library().BufferUsage
         storage, n = flags.STORAGE, max(1, self.count)
         self._surfels = self._upload(packed.surfels, storage)
@@ -185,6 +185,7 @@ class SceneOnDevice:
             usage=flags.TEXTURE_BINDING | flags.RENDER_ATTACHMENT,
         )
         encoder, p = self._device.create_command_encoder(), self._programs
+        pipeline = p.halve(format, self._alpha_scale > 0)
         for level in range(self._coarser.mip_level_count):
             source, at = (self._coarser, level - 1) if level else (self._atlas, 0)
             for layer in range(layers):
@@ -200,7 +201,7 @@ class SceneOnDevice:
                 )
                 attachment = {"view": to, "load_op": "clear", "store_op": "store"}
                 work = encoder.begin_render_pass(color_attachments=[attachment])
-                work.set_pipeline(p.halve[format])
+                work.set_pipeline(pipeline)
                 work.set_bind_group(0, self._group(p.halve_layout, finer))
                 work.draw(3)
                 work.end()
@@ -230,7 +231,7 @@ class SceneOnDevice:
         data = struct.pack(
             "<32f6IfI",
             *(value for row in rows for value in row),
-            *(*center, 0.0, *center, 0.0),
+            *(*center, self._alpha_scale, *center, 0.0),
             *(K[0, 0], K[1, 1], K[0, 2], K[1, 2]),
             *(camera.width, camera.height, self._near, self._bound),
             *(self._offset, self._scale, *self._atlas_size),

@@ -127,13 +127,9 @@ class Programs:
     def _halve_module(self) -> Any:
         return self._module("halve")
 
-    @cached_property
-    def halve(self) -> dict[str, Any]:
-        """Renders a page at half its size, by the format of the target."""
-        entries = {"rgba8unorm": "halve_bytes", "rgba16float": "halve_floats", "rgba32float": "halve_floats"}
-        return {format: self._halve(format, entry) for format, entry in entries.items()}
-
-    def _halve(self, format: str, entry: str) -> Any:
+    def halve(self, format: str, alpha: bool) -> Any:
+        """Renders a page at half its size to a target of this format; `alpha`: with colours weighted by alpha."""
+        entry = f"halve{'_alpha' if alpha else ''}_{'bytes' if format == 'rgba8unorm' else 'floats'}"
         module = self._halve_module
         wgpu = library()
         return self.device.create_render_pipeline(

@@ -198,8 +198,8 @@ fn on_screen(r: Rectangle) -> bool {
 // alpha, the transmittance that is left. The blending unit does the rest of core/blend.h:
 //   sums += transmittance * (sigma * color),   transmittance *= 1 - sigma.
 //
-// What a fragment's weight is, the blending unit does not tell. Where the weight decides (the bound of the residual, the
-// end of a pixel), it is judged by the transmittance that was left before the batch: from above. The more batches, the
+// What a fragment's weight is, the blending unit does not tell. Where the weight decides (the bound of residual and
+// alpha, the end of a pixel), it is judged by the transmittance that was left before the batch: from above. The more batches, the
 // closer; what it costs in the picture is in docs/viewer.md.
 
 @group(0) @binding(0) var<uniform> frame: Frame;
@@ -219,7 +219,7 @@ struct Corner {
   @location(1) @interpolate(flat) v_w: vec4f,
   @location(2) @interpolate(flat) w0_z_opacity_beta: vec4f,
   @location(3) @interpolate(flat) color_area: vec4f,
-  @location(4) @interpolate(flat) tile: vec4f,  // first texel, span; without a tile the residual
+  @location(4) @interpolate(flat) tile: vec4f,  // first texel, span; without a tile residual and alpha
   @location(5) @interpolate(flat) texel: vec4f,  // layer, -1 without a tile; 1 / (2 extent); normal z; level
 }
 
@@ -239,12 +239,12 @@ fn corner(@builtin(vertex_index) vertex: u32, @builtin(instance_index) instance:
   out.w0_z_opacity_beta = vec4f(s.w0, s.z, s.opacity, s.beta);
   out.color_area = vec4f(s.color, s.area);
   if s.level == TILE_LEVELS {
-    out.tile = vec4f(surfel.residual, 0.0);
+    out.tile = vec4f(surfel.residual, f32(surfel.layer >> 24) / 128.0);
     out.texel = vec4f(-1.0, 0.0, s.normal_z, 0.0);
   } else {
     let sides = vec2u(surfel.sides & 0xffff, surfel.sides >> 16) >> vec2u(s.level);
     out.tile = vec4f(vec2f(surfel.tile >> vec2u(s.level)), vec2f(sides) - 1.0);
-    out.texel = vec4f(f32(surfel.layer), 0.5 / surfel.extent, s.normal_z, f32(s.level));
+    out.texel = vec4f(f32(surfel.layer & 0xffffff), 0.5 / surfel.extent, s.normal_z, f32(s.level));
   }
   return out;
 }
@@ -302,8 +302,9 @@ fn filtered_fragment(c: Corner, d: vec2f) -> Fragment {
   return f;
 }
 
-fn residual(c: Corner, at: vec2f) -> vec3f {
-  if c.texel.x < 0.0 { return c.tile.xyz; }
+// The residual, and what sigma is multiplied by.
+fn texels(c: Corner, at: vec2f) -> vec4f {
+  if c.texel.x < 0.0 { return c.tile; }
   let span = c.tile.zw;
   let texel = c.tile.xy + clamp(at * (span + 1.0) * c.texel.y + 0.5 * span, vec2f(0.0), span) + 0.5;
   let layer = u32(c.texel.x);
@@ -314,7 +315,7 @@ fn residual(c: Corner, at: vec2f) -> vec3f {
     let level = c.texel.w - 1.0;
     stored = textureSampleLevel(coarser, bilinear, texel / vec2f(textureDimensions(coarser, u32(level))), layer, level);
   }
-  return frame.offset + frame.scale * stored.rgb;
+  return vec4f(frame.offset + frame.scale * stored.rgb, frame.alpha_scale * stored.a);
 }
 
 @fragment
@@ -326,7 +327,16 @@ fn surfel(c: Corner) -> @location(0) vec4f {
   var front = 1.0;
   if layer.x > 0 { front = textureLoad(before, vec2i(c.position.xy), 0).a; }
   if front < TRANSMITTANCE_MIN { discard; }
-  let textured = frame.residuals != 0 && f.sigma * front >= frame.weight_bound;
+  var texel = vec4f(0.0);
+  let cut = frame.alpha_scale > 0.0 && f.sigma * front >= frame.weight_bound;
+  if cut {
+    texel = texels(c, f.at);
+    f.sigma = min(ALPHA_MAX, f.sigma * texel.a);
+    if f.sigma < ALPHA_MIN { discard; }
+  }
+  let colored = frame.residuals != 0 && (frame.show == SHOW_COLOR || frame.show == SHOW_RESIDUAL);
+  let textured = colored && f.sigma * front >= frame.weight_bound;
+  if textured && !cut { texel = texels(c, f.at); }
   switch frame.show {
     case SHOW_DEPTH: { return vec4f(f.sigma * f.depth, f.sigma * c.w0_z_opacity_beta.w, f.sigma, f.sigma); }
     case SHOW_NORMAL: {
@@ -335,17 +345,18 @@ fn surfel(c: Corner) -> @location(0) vec4f {
     case SHOW_OVERDRAW: { return vec4f(1.0, 0.0, 0.0, f.sigma); }
     case SHOW_RESIDUAL: {
       var shift = vec3f(0.0);
-      if textured { shift = residual(c, f.at); }
+      if textured { shift = texel.rgb; }
       return vec4f(f.sigma * max(shift + 0.5, vec3f(0.0)), f.sigma);
     }
     default: {
       var color = c.color_area.xyz;
-      if textured { color = max(color + residual(c, f.at), vec3f(0.0)); }
+      if textured { color = max(color + texel.rgb, vec3f(0.0)); }
       return vec4f(f.sigma * color, f.sigma);
     }
   }
 }
-`,l=`// A page of an atlas at half its size: means of 2 x 2 texels.
+`,l=`// A page of an atlas at half its size: means of 2 x 2 texels, as \`ops.tile_levels\` takes them. With alpha colours are
+// weighted by it, where it is not 0 in all four: what is cut away does not tint its neighbours.
 
 @group(0) @binding(0) var finer: texture_2d<f32>;
 
@@ -354,21 +365,48 @@ fn page(@builtin(vertex_index) vertex: u32) -> @builtin(position) vec4f {
   return vec4f(f32(vertex & 1) * 4.0 - 1.0, f32(vertex >> 1) * 4.0 - 1.0, 0.0, 1.0);
 }
 
-fn sum(position: vec4f) -> vec4f {
+fn texels(position: vec4f) -> array<vec4f, 4> {
   let at = 2 * vec2i(position.xy);
-  return textureLoad(finer, at, 0) + textureLoad(finer, at + vec2i(1, 0), 0) + textureLoad(finer, at + vec2i(0, 1), 0)
-    + textureLoad(finer, at + vec2i(1, 1), 0);
+  return array<vec4f, 4>(
+    textureLoad(finer, at, 0), textureLoad(finer, at + vec2i(1, 0), 0), textureLoad(finer, at + vec2i(0, 1), 0),
+    textureLoad(finer, at + vec2i(1, 1), 0),
+  );
+}
+fn sum(t: array<vec4f, 4>) -> vec4f {
+  return t[0] + t[1] + t[2] + t[3];
+}
+fn weighted(t: array<vec4f, 4>) -> vec3f {
+  return t[0].a * t[0].rgb + t[1].a * t[1].rgb + t[2].a * t[2].rgb + t[3].a * t[3].rgb;
 }
 
-// Of bytes, rounded as \`ops.tile_levels\` rounds them.
+// Bytes, rounded.
+fn bytes(t: array<vec4f, 4>) -> vec4f {
+  return floor((round(sum(t) * 255.0) + 2.0) / 4.0) / 255.0;
+}
 @fragment
 fn halve_bytes(@builtin(position) position: vec4f) -> @location(0) vec4f {
-  return floor((round(sum(position) * 255.0) + 2.0) / 4.0) / 255.0;
+  return bytes(texels(position));
+}
+@fragment
+fn halve_alpha_bytes(@builtin(position) position: vec4f) -> @location(0) vec4f {
+  let t = texels(position);
+  let mean = bytes(t);
+  let total = u32(round(sum(t).a * 255.0));
+  if total == 0 { return mean; }
+  let colors = (vec3u(round(weighted(t) * 65025.0)) + total / 2) / total;
+  return vec4f(vec3f(colors) / 255.0, mean.a);
 }
 
 @fragment
 fn halve_floats(@builtin(position) position: vec4f) -> @location(0) vec4f {
-  return sum(position) / 4.0;
+  return sum(texels(position)) / 4.0;
+}
+@fragment
+fn halve_alpha_floats(@builtin(position) position: vec4f) -> @location(0) vec4f {
+  let t = texels(position);
+  let mean = sum(t) / 4.0;
+  if mean.a == 0.0 { return mean; }
+  return vec4f(weighted(t) / (4.0 * mean.a), mean.a);
 }
 `,u=`// One thread per surfel: its projection, view colour, rectangle, and the key by which it is sorted.
 
@@ -396,7 +434,7 @@ fn prepare(@builtin(global_invocation_id) id: vec3u) {
   order[i] = i;
   keys[i] = HIDDEN;
   let surfel = surfels[i];
-  let p = to_camera(surfel.mean - frame.center.xyz);
+  let p = to_camera(surfel.mean - frame.center);
   if !(p.z > frame.near) { return; }
 
   let h = surfel.quat;  // w, x, y, z of unit length
@@ -586,7 +624,7 @@ struct Surfel {
   beta_raw: f32,
   extent: f32,  // half side of the tile, scale units
   residual: vec3f,  // of a surfel without a tile
-  layer: u32,
+  layer: u32,  // of the tile, 24 bits; above them 128 times the alpha of a surfel without a tile
   base: vec3f,  // view colour: base, and its terms
   first_term: u32,
   tile: vec2u,  // first texel
@@ -615,7 +653,8 @@ struct Seen {
 
 struct Frame {
   rotation: array<vec4f, 3>,  // rows, world to camera
-  center: vec4f,  // where the camera stands, relative to the scene's origin
+  center: vec3f,  // where the camera stands, relative to the scene's origin
+  alpha_scale: f32,  // m = alpha_scale * a texel's alpha multiplies sigma; 0: the scene is opaque
   color_center: vec4f,  // from where view colours are seen; \`center\`, unless they are held
   lens: vec4f,  // fx, fy, cx, cy
   size: vec2f,  // pixels

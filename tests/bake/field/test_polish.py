@@ -46,7 +46,7 @@ def wrong(truth: Baked) -> Baked:
     surfels = {name: value.clone() for name, value in truth.scene.surfels.items()}
     surfels["means"] += 0.03 * torch.randn(surfels["means"].shape, generator=g)
     surfels["opacity_logits"] -= 0.4
-    grey = truth.with_mean_residual(torch.full_like(truth.mean_residual, 0.1))
+    grey = truth.with_constants(torch.full_like(truth.mean_residual, 0.1))
     return grey.with_texels(torch.full_like(truth.texels, 0.1)).with_surfels(surfels)
 
 

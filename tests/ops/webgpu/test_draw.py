@@ -47,13 +47,15 @@ EXTREME = extreme_scenes()
 def check(
     scene: BakedScene, camera: Camera, background: Tensor | None = None, fields: Sequence[str] = FIELDS
 ) -> Tensor:
-    """Holds a view against the CPU's, colours to a step, but for a pixel in a thousand; the differences of colours."""
+    """Holds a view against the CPU's, colours to a step, but for a pixel in a thousand; the differences of colours. A
+    texture unit's weights have 8 bits of fraction, which alpha carries to all images."""
     got = replace(scene, through_webgpu=True).render(camera, background, maps=True)
     want = scene.render(camera, background, maps=True)
     for name in fields:
         a, b = getattr(got, name), getattr(want, name)
         assert a.shape == b.shape and a.dtype == b.dtype and a.isfinite().all(), name
-        step = STEP if name == "rgb" else 0.5 if name == "overdraw" else 1e-3 * max(1.0, float(b.abs().max()))
+        share = STEP if scene.alpha_scale else 1e-3
+        step = STEP if name == "rgb" else 0.5 if name == "overdraw" else share * max(1.0, float(b.abs().max()))
         assert ((a - b).abs() <= step).double().mean() >= 0.999, name
     return (got.rgb - want.rgb).abs()
 
@@ -132,6 +134,21 @@ def test_texels_are_fetched_within_their_tile(prefilter: str) -> None:
         assert check(scene, front(), torch.tensor([0.2, 0.4, 0.6])).max() < 2 * STEP
 
 
+def cutting(scene: BakedScene) -> BakedScene:
+    """The scene with alpha texels, which its atlas's fourth channel then are, and without a weight bound."""
+    mean = torch.randint(0, 256, (len(scene),), generator=torch.Generator().manual_seed(5)) / 128
+    return replace(scene, alpha_scale=255 / 128, mean_alpha=mean, weight_bound=0.0)
+
+
+@pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
+def test_alpha_texels_cut_surfels(dtype: torch.dtype, prefilter: str) -> None:
+    scene = replace(cutting(textured(60, 0, dtype)), prefilter=prefilter)
+    assert check(scene, front(), torch.tensor([0.2, 0.4, 0.6])).max() < 2 * STEP
+    opaque = replace(scene, alpha_scale=0.0, mean_alpha=None)
+    assert (scene.render(front()).alpha - opaque.render(front()).alpha).abs().mean() > 0.01
+
+
 @pytest.fixture
 def as_a_card(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks are left to the device even where it is the processor."""
@@ -168,10 +185,13 @@ def test_bc7_blocks_are_drawn_by_the_texture_unit_as_they_are_decoded(as_a_card:
     # nothing but the blocks is needed
     alone = replace(scene, atlas=None, through_webgpu=True).render(front())
     assert (alone.rgb - replace(scene, through_webgpu=True).render(front()).rgb).abs().max() == 0
+    assert check(cutting(scene), front()).max() < 2 * STEP
 
 
-def test_more_batches_come_closer_to_the_weight_bound() -> None:
-    scene, camera = replace(textured(200, 3), weight_bound=0.05), front()
+@pytest.mark.parametrize("alpha", [False, True])
+def test_more_batches_come_closer_to_the_weight_bound(alpha: bool) -> None:
+    scene, camera = textured(200, 3), front()
+    scene = replace(cutting(scene) if alpha else scene, weight_bound=0.05)
     want = scene.render(camera).rgb
     off = [
         float((webgpu.draw(scene, [camera], None, ["rgb"], layers=n)["rgb"][0] - want).abs().mean()) for n in (1, 8, 64)
@@ -216,13 +236,15 @@ def photographed(scene: BakedScene, camera: Camera) -> BakedScene:
     return replace(scene, photographed=points, weight_bound=0.0)
 
 
+@pytest.mark.parametrize("alpha", [False, True])
 @pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
 @pytest.mark.parametrize("share", [2.0, 1.0, 0.5, 0.25, 0.12])
-def test_views_of_other_sizes(share: float, prefilter: str) -> None:
+def test_views_of_other_sizes(share: float, prefilter: str, alpha: bool) -> None:
     camera = front(240, 176)
     camera.K[:2, :2] *= 2.0
     for dtype in (torch.uint8, torch.float32):
         scene = photographed(replace(textured(300, 3, dtype), prefilter=prefilter), camera)
+        scene = cutting(scene) if alpha else scene
         off = check(scene, camera.scaled(share), torch.tensor([0.2, 0.4, 0.6]), ("rgb", "alpha", "depth"))
         assert off.mean() < 0.1 * STEP and off.max() < 2 * STEP, (off.mean() / STEP, off.max() / STEP)
 

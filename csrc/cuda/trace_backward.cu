@@ -45,16 +45,20 @@ template <class S> struct AlphaGradient {
   ExactSums exact;
 };
 
-// Gradients of alpha's share of a fragment's sigma: from gs, that of sigma, to that of the kernel's sigma in its place,
-// more of gu and gv, and the return value, that of m.
+// Gradients of alpha's share of a fragment's sigma: from gs, that of the listed sigma, to that of the kernel's sigma,
+// which takes the place of the listed one; more of gu and gv; and the return value, that of m.
 template <class S>
-__device__ S alpha_vjp(const AlphaPatch<S>& patch, const TexelCorners<S>& at, S sigma, S& gs, S& gu, S& gv) {
+__device__ S alpha_vjp(const AlphaPatch<S>& patch, const TexelCorners<S>& at, S& listed, S& gs, S& gu, S& gv) {
   S t[4];
-  const S m = patch.fetch(at, t), dm = sigma < S(kAlphaMax) ? gs * sigma / m : S(0);
+  const S m = patch.fetch(at, t), sigma = abs_(listed);
+  // neither clamp passes a gradient, that of the product and the kernel's own; m may be rounded otherwise than when the
+  // fragment was written
+  const bool moves = sigma < S(kAlphaMax), uncut_moves = moves && sigma < m * S(kAlphaMax * (1 - 1e-6));
+  const S dm = moves ? gs * sigma / m : S(0);
   if (at.inside_u) gu += dm * texel_density(patch.size[0], patch.extent) * texel_slope_u(t, at.fy);
   if (at.inside_v) gv += dm * texel_density(patch.size[1], patch.extent) * texel_slope_v(t, at.fx);
-  // the kernel's own clamp passes no gradient either; m may be rounded otherwise than when the fragment was written
-  if (!(sigma < m * S(kAlphaMax * (1 - 1e-6)))) gs = S(0);
+  gs = uncut_moves ? gs * m : S(0);
+  listed /= m;
   return dm;
 }
 
@@ -107,7 +111,7 @@ __global__ void __launch_bounds__(kRunThreads)
       const bool is_cut = mine && patch.textured() && is_marked(v);
       if (is_cut) {
         corners = patch.corners(f.uv[i], v);
-        dm = alpha_vjp(patch, corners, abs_(listed), gs, gu, gv);
+        dm = alpha_vjp(patch, corners, listed, gs, gu, gv);
       }
       if (alpha.texels)
         add_to_alpha(is_cut ? patch.first + corners.at[0] : int64_t(-1), corners, dm, int(threadIdx.x) % kWarp,

@@ -13,6 +13,7 @@ from bitymi_ns.bake.lean_color import centers_of, view_color_errors
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.read import Bundle
 from bitymi_ns.bundle.verify import SLACK_STEPS, Check, steps_text
+from bitymi_ns.codec.scene_texels import texel_alpha
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.tile_sizes import kernel_parameters
@@ -88,7 +89,8 @@ def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Seq
     means, render = bundle.scene.surfels["means"], bundle.info.render
     seen, transmittance = means.new_zeros(0, len(means), dtype=torch.bool), None
     if cameras:
-        views = visibility(trained, cameras, render.near, prefilter=bundle.scene.prefilter)
+        drawn = {"prefilter": bundle.scene.prefilter, "alpha": texel_alpha(bundle.scene)}
+        views = visibility(trained, cameras, render.near, **drawn)
         seen, transmittance = views.seen, views.in_front
     opacity, _ = kernel_parameters(trained, transmittance)
     at = (means, seen, centers_of(cameras, means), opacity)

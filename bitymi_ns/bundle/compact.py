@@ -12,7 +12,7 @@ from bitymi_ns.codec import streams
 from bitymi_ns.codec.packing import Packing, pack
 from bitymi_ns.codec.streams import StreamError
 from bitymi_ns.codec.surfel_codes import POSITION_BITS, REFERENCE, Codes, PositionGrid, SurfelCodes, term_numbers
-from bitymi_ns.codec.texel_codes import GRADES, TexelCodes, blocks_of
+from bitymi_ns.codec.texel_codes import GRADES, AlphaCodes, TexelCodes, blocks_of, coefficient_columns
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 
 SURFELS_PER_BYTE, TEXELS_PER_BYTE = 1, 64
@@ -24,18 +24,23 @@ MOST_EXPONENT = 12  # of two, in the side of a tile
 _COEFFICIENT_PLANES = 3
 
 
-def encode_surfels(codes: SurfelCodes, residual: Codes, residual_step: float) -> tuple[dict[str, Any], bytes]:
+def encode_surfels(
+    codes: SurfelCodes, residual: Codes, residual_step: float, alpha: Codes | None = None
+) -> tuple[dict[str, Any], bytes]:
     """Entries of bundle.json for surfels.bin, and the file.
 
     Args:
         codes: of N surfels.
         residual: [N, 3] mean residuals: green, red less green, blue less green.
         residual_step: of these.
+        alpha: [N] mean alphas, 128 for 1; None = opaque texels.
     """
     columns = {**codes.columns, "residual": residual}
+    if alpha is not None:
+        columns["alpha"] = alpha[:, None]
     steps = {**codes.steps, "residual": residual_step}
     described, data = [], []
-    for name in _surfel_columns(codes.kind)[0]:
+    for name in _surfel_columns(codes.kind, alpha is not None)[0]:
         compressed = streams.compress(columns[name])
         described.append({"name": name, "step": steps.get(name), "low": compressed.low, "planes": compressed.planes})
         data.append(compressed.data)
@@ -43,14 +48,16 @@ def encode_surfels(codes: SurfelCodes, residual: Codes, residual_step: float) ->
     return {"frame": frame, "columns": described}, b"".join(data)
 
 
-def decode_surfels(info: Surfels, data: memoryview) -> tuple[SurfelCodes, Codes, float]:
-    """Decode surfels.bin: the codes, the residuals [N, 3] and their step.
+def decode_surfels(
+    info: Surfels, data: memoryview, has_alpha: bool = False
+) -> tuple[SurfelCodes, Codes, float, Codes | None]:
+    """Decode surfels.bin: the codes, the residuals [N, 3] and their step, and mean alphas [N] where it has them.
 
     Raises:
         StreamError: the file is damaged, contradicts bundle.json, or holds a number that no surfel can have.
     """
     assert info.columns is not None and info.frame is not None
-    names, numbers = _surfel_columns(info.view_color)
+    names, numbers = _surfel_columns(info.view_color, has_alpha)
     steps = _check_columns(info.columns, names, numbers, (*REFERENCE, "residual"))
     rows = dict.fromkeys(names, info.count) | dict.fromkeys(("term_shape", "term_color"), info.terms or 0)
     codes: dict[str, Codes] = {}
@@ -63,7 +70,8 @@ def decode_surfels(info: Surfels, data: memoryview) -> tuple[SurfelCodes, Codes,
     f, residual = info.frame, codes.pop("residual")
     frame = PositionGrid(f.center, f.scale, f.low)
     residual_step = steps.pop("residual")
-    return SurfelCodes(info.view_color, frame, steps, codes), residual, residual_step
+    alpha = codes.pop("alpha")[:, 0] if has_alpha else None
+    return SurfelCodes(info.view_color, frame, steps, codes), residual, residual_step, alpha
 
 
 def encode_texels(codes: TexelCodes) -> tuple[dict[str, Any], bytes]:
@@ -71,13 +79,16 @@ def encode_texels(codes: TexelCodes) -> tuple[dict[str, Any], bytes]:
     described, data = [], []
     for name, values in codes.columns.items():
         compressed = streams.compress(values)
-        described.append({"name": name, "low": compressed.low, "planes": compressed.planes})
+        step = codes.alpha.step if codes.alpha is not None and name.startswith("alpha_") else None
+        described.append({"name": name, "step": step, "low": compressed.low, "planes": compressed.planes})
         data.append(compressed.data)
     count = int(codes.sizes.clamp(min=1).prod(dim=1)[codes.sizes[:, 0] > 0].sum())
     return {"texels": count, "step": codes.step, "columns": described}, b"".join(data)
 
 
-def decode_texels(info: Atlas, sizes: Tensor, residual: Codes, residual_step: float, data: memoryview) -> TexelCodes:
+def decode_texels(
+    info: Atlas, sizes: Tensor, residual: Codes, residual_step: float, data: memoryview, alpha: Codes | None = None
+) -> TexelCodes:
     """Decode texels.bin.
 
     Args:
@@ -85,6 +96,7 @@ def decode_texels(info: Atlas, sizes: Tensor, residual: Codes, residual_step: fl
         sizes: [N, 2] sides of the tiles.
         residual, residual_step: of surfels.bin.
         data: of texels.bin.
+        alpha: of surfels.bin, None = opaque texels.
 
     Raises:
         StreamError: the file is damaged, contradicts bundle.json or the sizes of the tiles.
@@ -94,20 +106,25 @@ def decode_texels(info: Atlas, sizes: Tensor, residual: Codes, residual_step: fl
     if count != info.texels:
         raise StreamError(f"the tiles of the surfels have {count} texels, atlas.texels says {info.texels}")
     blocks = blocks_of(sizes)
-    names = ["grade", *(each.name for each in blocks)]
-    _check_columns(info.columns, names, {name: 1 if name == "grade" else 3 for name in names}, ())
+    names, alphas = coefficient_columns(sizes, False), coefficient_columns(sizes, alpha is not None)[len(blocks) :]
+    numbers = {"grade": 1} | dict.fromkeys(names, 3) | dict.fromkeys(alphas, 1)
+    steps = set(_check_columns(info.columns, list(numbers), numbers, alphas).values())
+    if len(steps) > 1:
+        raise StreamError("the columns of alphas have different steps")
     parts = _parts(data, info.columns)
     column, tiles = info.columns[0], int((sizes[:, 0] > 0).sum())
     grades = streams.decompress(next(parts), tiles, column.low, column.planes)[:, 0]
     if tiles and not (GRADES[0] <= grades.min() and grades.max() <= GRADES[1]):
         raise StreamError(f"a grade is not from {GRADES[0]} to {GRADES[1]}")
     coefficients = []
-    for each, column, part in zip(blocks, info.columns[1:], parts, strict=True):
+    for each, column, part in zip([*blocks, *blocks[: len(alphas)]], info.columns[1:], parts, strict=True):
         if any(len(planes) > _COEFFICIENT_PLANES for planes in column.planes):
             raise StreamError(f"the coefficients {column.name} have more than {_COEFFICIENT_PLANES} bytes")
         values = streams.decompress(part, each.texels.numel(), column.low, column.planes, np.int32)
-        coefficients.append(torch.from_numpy(values).view(-1, len(each.texels), 3))
-    return TexelCodes(sizes, info.step, residual, residual_step, torch.from_numpy(grades), coefficients)
+        coefficients.append(torch.from_numpy(values).view(-1, len(each.texels), values.shape[1]))
+    coded = None if alpha is None else AlphaCodes(alpha, steps.pop() if steps else 1.0, coefficients[len(blocks) :])
+    colors = coefficients[: len(blocks)]
+    return TexelCodes(sizes, info.step, residual, residual_step, torch.from_numpy(grades), colors, coded)
 
 
 def packing_of(info: Atlas, sizes: Tensor) -> Packing:
@@ -151,11 +168,11 @@ def check_texels_size(info: Atlas, size: int, surfels: int) -> None:
         raise StreamError(f"{info.texels} texels cannot be in {size} bytes, and {surfels} of {COMPACT_SURFELS}")
 
 
-def _surfel_columns(kind: str) -> tuple[list[str], dict[str, int]]:
+def _surfel_columns(kind: str, has_alpha: bool) -> tuple[list[str], dict[str, int]]:
     """Columns of surfels.bin in their order, and how many numbers each has."""
     colors, shapes = term_numbers(kind)
     numbers = {"place": 1, "largest": 1, "rotation": 3, "log_scales": 2, "opacity": 1, "beta": 1, "size": 1}
-    numbers |= {"residual": 3, "view_base": 3, "extent": 1, "view_count": 1}
+    numbers |= {"residual": 3, **({"alpha": 1} if has_alpha else {}), "view_base": 3, "extent": 1, "view_count": 1}
     numbers |= {"term_shape": len(shapes), "term_color": len(colors)}
     return list(numbers), numbers
 
@@ -186,6 +203,8 @@ def _check_codes(name: str, codes: Codes, info: Surfels) -> None:
         raise StreamError("the positions are not in ascending order, or beyond their grid")
     if name == "largest" and (low < 0 or high > 3):
         raise StreamError("a rotation's largest number is not one of four")
+    if name == "alpha" and (low < 0 or high > 255):
+        raise StreamError(f"the mean alpha of a surfel is {low if low < 0 else high}; it must be from 0 to 255")
     if name == "size":
         sides = np.stack([codes >> 4, codes & 15])[:, codes > 0]
         if low < 0 or (sides < 2).any() or (sides > MOST_EXPONENT).any():

@@ -17,13 +17,14 @@ from torch import Tensor
 
 from bitymi_ns.bundle import strict_json
 from bitymi_ns.bundle.statistics import Decibels, Part, Share, Statistics, Whole
-from bitymi_ns.codec.limits import EXTENTS, LIMITS, RESIDUAL_LIMIT
+from bitymi_ns.codec.limits import ALPHA_SCALE, EXTENTS, LIMITS, RESIDUAL_LIMIT
 from bitymi_ns.codec.streams import MOST_PLANES
 from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, SUPPORT, TRANSMITTANCE_MIN
 from bitymi_ns.ops.view_kinds import Kind
 
 FORMAT = "bitymi-bundle"
-VERSION = (3, 0)  # the newest version that is read: surfels and texels as columns of integers
+VERSION = (4, 0)  # the newest version that is read: texels with alphas, which readers of version 3 would draw opaque
+COMPACT_VERSION = (3, 0)  # surfels and texels as columns of integers
 LEAN_VERSION = (2, 3)  # version of a bundle with lean view colours in a PLY file, which readers of version 1 refuse
 FULL_VERSION = (1, 4)  # version of a bundle whose surfels have all parameters
 _DIGEST_SINCE = {1: 2, 2: 1, 3: 0}  # major version to the minor one from which on bundle.json has a digest
@@ -167,6 +168,9 @@ class Atlas(Part):
     offset: Annotated[float, Field(ge=-RESIDUAL_LIMIT, le=RESIDUAL_LIMIT)]
     scale: Annotated[float, Field(gt=0, le=2 * RESIDUAL_LIMIT)]
     range: str | None = None
+    alpha_scale: Annotated[float, Field(gt=0, le=2)] | None = None
+    """Scale of the fourth channel: alpha = alpha_scale * value multiplies the surfel's opacity, and the texels of a
+    surfel without a tile have the alpha of its column; None = opaque texels. Since version 4."""
     clipped_fraction: Share | None = None
     encoder: str | None = None
     psnr: Decibels = None
@@ -175,6 +179,17 @@ class Atlas(Part):
     def _half_floats_are_residuals(self) -> Atlas:
         if self.format == "fp16" and (self.offset, self.scale) != (0.0, 1.0):
             raise PydanticCustomError("range", "must have offset 0 and scale 1, as its format is fp16")
+        return self
+
+    @model_validator(mode="after")
+    def _alphas_are_drawn(self) -> Atlas:
+        scale = 1.0 if self.format == "fp16" else ALPHA_SCALE
+        if self.alpha_scale not in (None, scale):
+            raise PydanticCustomError(
+                "alpha",
+                "must have alpha_scale {scale}, as its format is {format}",
+                {"scale": scale, "format": self.format},
+            )
         return self
 
     @model_validator(mode="after")
@@ -267,14 +282,22 @@ class Manifest(Part):
 
     @model_validator(mode="after")
     def _surfels_fit(self) -> Manifest:
-        surfels, compact = self.surfels, self.version.split(".")[0] == "3"
-        if compact != (surfels.file == COMPACT_SURFELS):
-            raise PydanticCustomError("file", "surfels.file must be surfels.bin in version 3, and in no other")
+        surfels, compact = self.surfels, self.surfels.file == COMPACT_SURFELS
+        major = self.version.split(".")[0]
+        if major != "4" and compact != (major == "3"):
+            raise PydanticCustomError("file", "surfels.file must be surfels.bin in version 3, and in no earlier one")
         if compact and None in (surfels.frame, surfels.columns, surfels.terms):
             raise PydanticCustomError("file", "surfels.bin needs surfels.frame, columns and terms")
         if self.atlas is not None and compact != (self.atlas.file == TEXELS):
-            raise PydanticCustomError("file", "atlas.file must be texels.bin in version 3, and in no other")
+            raise PydanticCustomError("file", "atlas.file must be texels.bin beside surfels.bin, and atlas.ktx2 else")
+        if self.has_alpha != (major == "4"):
+            raise PydanticCustomError("alpha", "atlas.alpha_scale must be stated in version 4, and in no other")
         return self
+
+    @property
+    def has_alpha(self) -> bool:
+        """Texels multiply their surfels' opacities."""
+        return self.atlas is not None and self.atlas.alpha_scale is not None
 
 
 def describe(info: Mapping[str, Any]) -> Manifest:

@@ -26,14 +26,14 @@ from bitymi_ns.bundle.manifest import (
 )
 from bitymi_ns.bundle.parts import MANIFEST_LIMIT, MissingPart, Parts, parts_of
 from bitymi_ns.bundle.sizes import HEAD, SCENE_FILES, check_head, check_memory, enough_memory
-from bitymi_ns.bundle.surfel_table import TERMS, from_columns, mean_residuals, tile_extents
+from bitymi_ns.bundle.surfel_table import TERMS, from_columns, mean_alphas, mean_residuals, tile_extents
 from bitymi_ns.codec.bc7_encode import Profile, bc7_blocks
-from bitymi_ns.codec.limits import RESIDUAL_LIMIT
+from bitymi_ns.codec.limits import ALPHA_LIMIT, RESIDUAL_LIMIT
 from bitymi_ns.codec.packing import Packing
 from bitymi_ns.codec.pages import paged_texels
-from bitymi_ns.codec.quantise import Range, decode_pages
+from bitymi_ns.codec.quantise import Range, alpha_bytes, decode_pages
 from bitymi_ns.codec.streams import StreamError
-from bitymi_ns.codec.texel_codes import constants
+from bitymi_ns.codec.texel_codes import TexelCodes, constants, mean_alphas_of
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.baked import BakedOutput, BakedScene
 from bitymi_ns.scene.camera import Camera
@@ -202,6 +202,7 @@ def assemble(folder: Path, info: Manifest, files: dict[str, bytearray], decode: 
         surfels, tiles = from_columns(columns, kind, elements.get(TERMS))
         extent = tile_extents(columns, info.atlas.extent if info.atlas else SUPPORT)
         mean_residual = mean_residuals(columns)
+        mean_alpha = mean_alphas(columns) if info.has_alpha else None
     except ply.PlyError as error:
         raise BundleError(f"{path}: {error}") from error
     _check_tiles(tiles, info, path)
@@ -212,6 +213,7 @@ def assemble(folder: Path, info: Manifest, files: dict[str, bytearray], decode: 
         None,
         extent=extent,
         mean_residual=mean_residual,
+        mean_alpha=mean_alpha,
         near=info.render.near,
         weight_bound=info.render.weight_bound,
         prefilter=info.render.prefilter,
@@ -223,8 +225,8 @@ def assemble(folder: Path, info: Manifest, files: dict[str, bytearray], decode: 
         image = ktx2.parse_ktx2(files[ATLAS])
     except ktx2.Ktx2Error as error:
         raise BundleError(f"{folder / ATLAS}: {error}") from error
-    scene.atlas, scene.blocks = _texels(image, decode, folder / ATLAS)
-    scene.offset, scene.scale = info.atlas.offset, info.atlas.scale
+    scene.atlas, scene.blocks = _texels(image, decode, info.has_alpha, folder / ATLAS)
+    scene.offset, scene.scale, scene.alpha_scale = info.atlas.offset, info.atlas.scale, info.atlas.alpha_scale or 0.0
     return Bundle(scene, info)
 
 
@@ -232,17 +234,18 @@ def _assemble_compact(folder: Path, info: Manifest, files: dict[str, bytearray],
     """The bundle of surfels.bin and texels.bin."""
     atlas, where = info.atlas, folder / COMPACT_SURFELS
     try:
-        codes, residual, step = compact.decode_surfels(info.surfels, memoryview(files[COMPACT_SURFELS]))
+        data = memoryview(files[COMPACT_SURFELS])
+        codes, residual, step, alpha = compact.decode_surfels(info.surfels, data, info.has_alpha)
         sizes = torch.from_numpy(codes.sizes)
         tiles, texels, blocks = torch.zeros(len(codes), 5, dtype=torch.int32), None, None
         if atlas is not None:
             packing = compact.packing_of(atlas, sizes)
             tiles, where = torch.from_numpy(packing.tiles), folder / TEXELS
-            found = compact.decode_texels(atlas, sizes, residual, step, memoryview(files[TEXELS]))
+            found = compact.decode_texels(atlas, sizes, residual, step, memoryview(files[TEXELS]), alpha)
             value_range = Range(atlas.offset, atlas.scale, "")
-            texels = _rounded(found.texels(), packing, value_range)
+            texels = _rounded(found, packing, value_range)
             if not decode and texels.numel() >= LARGE_ATLAS:
-                blocks = _blocks(texels)
+                blocks = _blocks(texels, info.has_alpha)
                 texels = texels if blocks is None else None
         elif bool((sizes > 0).any()):
             raise StreamError("a surfel has a tile, and there is no atlas")
@@ -255,6 +258,7 @@ def _assemble_compact(folder: Path, info: Manifest, files: dict[str, bytearray],
         texels,
         extent=codes.extent(SUPPORT),
         mean_residual=constants(residual, step),
+        mean_alpha=None if alpha is None else mean_alphas_of(alpha),
         near=info.render.near,
         weight_bound=info.render.weight_bound,
         prefilter=info.render.prefilter,
@@ -262,7 +266,7 @@ def _assemble_compact(folder: Path, info: Manifest, files: dict[str, bytearray],
         photographed=_photographed(info),
     )
     if atlas is not None:
-        scene.offset, scene.scale = atlas.offset, atlas.scale
+        scene.offset, scene.scale, scene.alpha_scale = atlas.offset, atlas.scale, atlas.alpha_scale or 0.0
     return Bundle(scene, info)
 
 
@@ -271,23 +275,26 @@ def _photographed(info: Manifest) -> Tensor | None:
     return None if points is None else points_of(points)
 
 
-def _rounded(texels: Tensor, packing: Packing, value_range: Range) -> Tensor:
-    """[layers, height, width, 4] uint8 of a list of residual colours [T, 3]: rounded, then moved, a texel at once."""
+def _rounded(codes: TexelCodes, packing: Packing, value_range: Range) -> Tensor:
+    """[layers, height, width, 4] uint8 of coded texels: rounded, then moved, a texel at once."""
 
-    def whole(values: np.ndarray) -> np.ndarray:
-        rgba = np.full((len(values), 4), 255, dtype=np.uint8)
-        rgba[:, :3] = value_range.to_unorm8(values)
+    def whole(colors: np.ndarray, alphas: np.ndarray | None) -> np.ndarray:
+        rgba = np.full((len(colors), 4), 255, dtype=np.uint8)
+        rgba[:, :3] = value_range.to_unorm8(colors)
+        if alphas is not None:
+            rgba[:, 3] = alpha_bytes(alphas)
         return rgba.view(np.int32)[:, 0]
 
-    nothing = int(whole(np.zeros((1, 3), dtype=np.float32))[0])
-    listed = torch.from_numpy(whole(texels.numpy()))
+    alphas, zeros = codes.alphas(), np.zeros((1, 3), dtype=np.float32)
+    listed = torch.from_numpy(whole(codes.texels().numpy(), None if alphas is None else alphas.numpy()))
+    nothing = int(whole(zeros, None if alphas is None else zeros[:, 0])[0])
     return paged_texels(listed, packing, nothing)[..., None].view(torch.uint8)
 
 
-def _blocks(texels: Tensor) -> Tensor | None:
+def _blocks(texels: Tensor, alpha: bool) -> Tensor | None:
     """BC7 blocks of decoded texels; None, with a warning, where the encoder is not installed."""
     try:
-        return torch.from_numpy(bc7_blocks(texels.numpy(), LOAD_PROFILE))
+        return torch.from_numpy(bc7_blocks(texels.numpy(), LOAD_PROFILE, alpha))
     except RuntimeError:
         warnings.warn(
             f"the texels stay decoded, {texels.numel() / 1e6:.0f} MB on the card where BC7 takes a quarter: the "
@@ -307,7 +314,7 @@ def _check_tiles(tiles: Tensor, info: Manifest, source: Path) -> None:
         raise BundleError(f"{source}: the tile of surfel {int(torch.nonzero(~good)[0])} lies outside the atlas")
 
 
-def _texels(image: ktx2.Ktx2Image, decode: bool, source: Path) -> tuple[Tensor | None, Tensor | None]:
+def _texels(image: ktx2.Ktx2Image, decode: bool, has_alpha: bool, source: Path) -> tuple[Tensor | None, Tensor | None]:
     """The texels, and the BC7 blocks where the atlas has such."""
     blocks = None
     if image.format == "bc7":
@@ -318,10 +325,14 @@ def _texels(image: ktx2.Ktx2Image, decode: bool, source: Path) -> tuple[Tensor |
     texels = decode_pages(image.payload, image.format, image.width, image.height)
     if image.format != "fp16":
         return torch.from_numpy(texels), blocks
-    bad = ~(np.abs(texels) <= RESIDUAL_LIMIT)
+    _check_floats(texels[..., :3] if has_alpha else texels, -RESIDUAL_LIMIT, RESIDUAL_LIMIT, source, "texel")
+    if has_alpha:
+        _check_floats(texels[..., 3:], 0.0, ALPHA_LIMIT, source, "alpha of the texel")
+    return torch.from_numpy(texels.astype(np.float32)), None
+
+
+def _check_floats(values: np.ndarray, low: float, high: float, source: Path, what: str) -> None:
+    bad = ~((values >= low) & (values <= high))
     if bad.any():
         layer, y, x, _ = (int(i) for i in np.argwhere(bad)[0])
-        raise BundleError(
-            f"{source}: the texel ({x}, {y}) of layer {layer} is not from {-RESIDUAL_LIMIT:g} to {RESIDUAL_LIMIT:g}"
-        )
-    return torch.from_numpy(texels.astype(np.float32)), None
+        raise BundleError(f"{source}: the {what} ({x}, {y}) of layer {layer} is not from {low:g} to {high:g}")

@@ -4,6 +4,7 @@ The names of 3D Gaussian splatting come first, so that its viewers show a sensib
 (logit), scale_0..2 (log; scale_2 = -31, a flat disc), rot_0..3 (wxyz, unit). Then beta (raw), the view colour by
 name, `<parameter>_<i>` in C order, the tile rectangle tile_x, tile_y, tile_layer, tile_ru, tile_rv, the half side of
 the tile in scale units, tile_extent, and the mean residual residual_0..2, which is that of a surfel without a tile.
+Where texels have alphas, alpha is their mean, or that of a surfel without a tile.
 
 Lean view colours (`ops.view_color.LEAN`) have view_base_0..2 and view_terms, the number of the surfel's terms, instead;
 the terms themselves, surfel after surfel, are rows of a second element, `view_term`: term_0, term_1, ...
@@ -17,7 +18,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bundle.ply import PlyError
-from bitymi_ns.codec.limits import EXTENTS, UNIT_SLACK, beyond, limit_of
+from bitymi_ns.codec.limits import ALPHA_LIMIT, EXTENTS, UNIT_SLACK, beyond, limit_of
 from bitymi_ns.ops import view_color
 from bitymi_ns.ops.constants import MAX_TERMS, SH_C0
 from bitymi_ns.ops.project import GEOMETRY
@@ -28,6 +29,7 @@ from bitymi_ns.ops.view_kinds import VIEW_COLORS, kind_of
 FLAT_LOG_SCALE = -31.0
 TILE_COLUMNS = ("tile_x", "tile_y", "tile_layer", "tile_ru", "tile_rv")
 EXTENT_COLUMN = "tile_extent"
+ALPHA_COLUMN = "alpha"
 COUNT_COLUMN = "view_terms"
 TERMS = "view_term"
 
@@ -64,6 +66,7 @@ def to_columns(
     mean_residual: Tensor | None = None,
     extent: Tensor | None = None,
     kind: str | None = None,
+    mean_alpha: Tensor | None = None,
 ) -> dict[str, npt.NDArray]:
     """The columns of surfels.ply; those of the terms of lean view colours are `term_columns`.
 
@@ -73,6 +76,7 @@ def to_columns(
         mean_residual: [N, 3] mean of each tile, added to the colour shown by other viewers; None = 0, no column.
         extent: [N] half side of each tile in scale units; None = no column.
         kind: a name of `ops.VIEW_COLORS`; None = the one whose parameters are there.
+        mean_alpha: [N] mean alpha of each tile; None = no column.
     """
     kind = kind or kind_of(surfels)
     lean = "view_terms" in surfels
@@ -103,6 +107,8 @@ def to_columns(
     if mean_residual is not None:
         residual = mean_residual.detach().float().cpu().numpy()
         columns |= {name: residual[:, i] for i, name in enumerate(COLUMNS["mean_residual"])}
+    if mean_alpha is not None:
+        columns[ALPHA_COLUMN] = mean_alpha.detach().float().cpu().numpy()
     return columns
 
 
@@ -124,13 +130,25 @@ def tile_extents(columns: Mapping[str, npt.NDArray], default: float) -> Tensor:
     """
     if EXTENT_COLUMN not in columns:
         return torch.full((len(columns["x"]),), default)
-    extent = _stack(columns, (EXTENT_COLUMN,))[:, 0].contiguous()
-    low, high = EXTENTS
-    bad = (extent < low) | (extent > high)
+    return _bounded(columns, EXTENT_COLUMN, *EXTENTS)
+
+
+def mean_alphas(columns: Mapping[str, npt.NDArray]) -> Tensor:
+    """[N] float32 mean alphas.
+
+    Raises:
+        PlyError: a value is out of range, or the column is missing or has the wrong type.
+    """
+    return _bounded(columns, ALPHA_COLUMN, 0.0, ALPHA_LIMIT)
+
+
+def _bounded(columns: Mapping[str, npt.NDArray], name: str, low: float, high: float) -> Tensor:
+    values = _stack(columns, (name,))[:, 0].contiguous()
+    bad = ~((values >= low) & (values <= high))
     if bad.any():
         row = int(torch.nonzero(bad)[0])
-        raise PlyError(f"{EXTENT_COLUMN} is {extent[row]:g} in row {row}; it must be from {low:g} to {high:g}")
-    return extent
+        raise PlyError(f"{name} is {values[row]:g} in row {row}; it must be from {low:g} to {high:g}")
+    return values
 
 
 def mean_residuals(columns: Mapping[str, npt.NDArray]) -> Tensor:

@@ -19,6 +19,7 @@ from bitymi_ns.bundle.manifest import (
     ACTIVATIONS,
     ATLAS,
     COMPACT_SURFELS,
+    COMPACT_VERSION,
     FULL_VERSION,
     LEAN_VERSION,
     MANIFEST,
@@ -36,7 +37,7 @@ from bitymi_ns.bundle.parts import NOTES, check_target, notes_data, parts_of
 from bitymi_ns.bundle.poster import Pixels, draw_poster, encode_poster, most_bytes
 from bitymi_ns.bundle.statistics import Statistics
 from bitymi_ns.bundle.surfel_table import EXTENT_COLUMN, TERMS, first_problem, term_columns, to_columns
-from bitymi_ns.codec.limits import RESIDUAL_LIMIT
+from bitymi_ns.codec.limits import ALPHA_LIMIT, RESIDUAL_LIMIT
 from bitymi_ns.codec.quantise import EncodedAtlas
 from bitymi_ns.codec.texel_codes import SceneCodes
 from bitymi_ns.files import complete_folder, reason, size_text
@@ -147,7 +148,8 @@ def write_bundle(
     Args:
         folder: the bundle's folder.
         scene: on the CPU, all numbers finite, the view colours all or lean. Its own atlas is not looked at. The mean
-            residuals are also a part of the colour that other viewers show.
+            residuals are also a part of the colour that other viewers show. Its mean alphas are written beside an
+            atlas with alphas, which needs them.
         atlas: the encoded atlas, None for a scene without texture.
         codes: what surfels and texels stand for, for a compact bundle; the scene and the atlas are decoded from them.
         background: colour behind the surfels.
@@ -169,6 +171,7 @@ def write_bundle(
     folder = Path(folder)
     surfels = scene.surfels
     _check_surfels(scene)
+    _check_alpha(scene, atlas, codes)
     for name in (*(extra_files or {}), *(loose_files or {})):
         check_file_name(name, "extra_files")
         if name in (SURFELS, ATLAS, COMPACT_SURFELS, TEXELS, POSTER, NOTES):
@@ -178,7 +181,7 @@ def write_bundle(
     try:
         with complete_folder(folder, lambda: check_target(folder, overwrite)) as new:
             if codes is None or interchange:
-                write_surfels(new / SURFELS, scene)
+                write_surfels(new / SURFELS, scene, atlas is not None and atlas.alpha_scale > 0)
             if codes is None and atlas is not None:
                 ktx2.write_ktx2(new / ATLAS, atlas.payload, atlas.format, atlas.width, atlas.height, GENERATOR)
             for name, data in parts.items():
@@ -207,18 +210,22 @@ def _scene_bytes(folder: Path, parts: Mapping[str, bytes]) -> int:
     return sum(map(len, parts.values())) if parts else sum(path.stat().st_size for path in folder.iterdir())
 
 
-def write_surfels(path: Path, scene: BakedScene) -> None:
-    """Write the surfels of a scene on the CPU as a PLY file, which viewers of Gaussian splats open, too."""
-    columns = to_columns(scene.surfels, scene.tiles.numpy(), scene.mean_residual, scene.extent, scene.view_color)
+def write_surfels(path: Path, scene: BakedScene, has_alpha: bool) -> None:
+    """Write the surfels of a scene on the CPU, with or without their mean alphas, as a PLY file, which viewers of
+    Gaussian splats open, too."""
+    means = scene.mean_residual, scene.extent, scene.view_color, scene.mean_alpha if has_alpha else None
+    columns = to_columns(scene.surfels, scene.tiles.numpy(), *means)
     terms = {TERMS: term_columns(scene.surfels)} if "view_terms" in scene.surfels else None
     ply.write_ply(path, columns, [GENERATOR, "2D Beta surfels; see bundle.json"], terms)
 
 
 def _compact_parts(codes: SceneCodes, info: dict[str, Any]) -> dict[str, bytes]:
     """The two files of a compact bundle; their description goes into `info`."""
-    of_surfels, surfels = compact.encode_surfels(codes.surfels, codes.residual, codes.residual_step)
+    alpha = None if codes.texels is None else codes.alpha
+    of_surfels, surfels = compact.encode_surfels(codes.surfels, codes.residual, codes.residual_step, alpha)
     info["surfels"] |= {"file": COMPACT_SURFELS, **of_surfels}
-    info["version"] = f"{VERSION[0]}.{VERSION[1]}"
+    if alpha is None:
+        info["version"] = "{}.{}".format(*COMPACT_VERSION)
     parts = {COMPACT_SURFELS: surfels}
     if codes.texels is not None:
         of_texels, parts[TEXELS] = compact.encode_texels(codes.texels)
@@ -242,7 +249,8 @@ def _describe(
     surfels, kind = scene.surfels, scene.view_color
     entry = VIEW_COLORS[kind]
     means, lean = surfels["means"].detach(), "view_terms" in surfels
-    version = LEAN_VERSION if lean else FULL_VERSION
+    has_alpha = atlas is not None and atlas.alpha_scale > 0
+    version = VERSION if has_alpha else LEAN_VERSION if lean else FULL_VERSION
     empty = len(means) == 0
     described: dict[str, Any] = {
         "version": f"{version[0]}.{version[1]}",
@@ -278,12 +286,29 @@ def _describe(
             "extent_column": EXTENT_COLUMN,
             "offset": atlas.range.offset,
             "scale": atlas.range.scale,
+            "alpha_scale": atlas.alpha_scale or None,
             "range": atlas.range.rule,
             "clipped_fraction": atlas.clipped_fraction,
             "encoder": atlas.encoder,
             "psnr": atlas.psnr,
         }
     return described
+
+
+def _check_alpha(scene: BakedScene, atlas: EncodedAtlas | None, codes: SceneCodes | None) -> None:
+    """Refuse mean alphas, pages and codes of which some have alpha and some have none."""
+    if codes is not None and codes.texels is not None:
+        coded = {codes.alpha is not None, codes.texels.alpha is not None}
+        if coded != {atlas is not None and atlas.alpha_scale > 0}:
+            raise BundleError("the atlas, the codes of surfels and those of texels disagree whether there are alphas")
+    if atlas is None or not atlas.alpha_scale:
+        return
+    if scene.mean_alpha is None:
+        raise BundleError("the atlas has alphas, the surfels have no mean alphas")
+    bad = ~((scene.mean_alpha >= 0) & (scene.mean_alpha <= ALPHA_LIMIT))
+    if bad.any():
+        row = int(torch.nonzero(bad)[0])
+        raise BundleError(f"alpha is {scene.mean_alpha[row]:g} in row {row}; it must be from 0 to {ALPHA_LIMIT:g}")
 
 
 def _check_surfels(scene: BakedScene) -> None:

@@ -13,8 +13,9 @@ Profile = Literal["slow", "basic", "fast", "veryfast", "ultrafast"]
 STRIP = 64  # rows encoded at once: small enough to share among threads and to report progress
 
 
-def bc7_encoder(profile: Profile) -> Callable[[npt.NDArray[np.uint8]], bytes]:
-    """A function from RGBA texels [h, w, 4] (sides multiples of 4) to BC7 blocks, rows of blocks from the top.
+def bc7_encoder(profile: Profile, alpha: bool = False) -> Callable[[npt.NDArray[np.uint8]], bytes]:
+    """A function from RGBA texels [h, w, 4] (sides multiples of 4) to BC7 blocks, rows of blocks from the top. Without
+    `alpha` all alphas are 255.
 
     Raises:
         RuntimeError: the encoder is not installed.
@@ -28,7 +29,7 @@ def bc7_encoder(profile: Profile) -> Callable[[npt.NDArray[np.uint8]], bytes]:
         ) from error
     if profile not in ("slow", "basic", "fast", "veryfast", "ultrafast"):
         raise ValueError(f"the BC7 profile must be slow, basic, fast, veryfast or ultrafast, not {profile!r}")
-    settings = ispc_texcomp.BC7EncSettings.from_profile(profile)
+    settings = ispc_texcomp.BC7EncSettings.from_profile(f"alpha_{profile}" if alpha else profile)
 
     def compress(rgba: npt.NDArray[np.uint8]) -> bytes:
         height, width = rgba.shape[:2]
@@ -38,18 +39,21 @@ def bc7_encoder(profile: Profile) -> Callable[[npt.NDArray[np.uint8]], bytes]:
     return compress
 
 
-def bc7_blocks(pages: npt.NDArray[np.uint8], profile: Profile, threads: int | None = None) -> npt.NDArray[np.uint8]:
+def bc7_blocks(
+    pages: npt.NDArray[np.uint8], profile: Profile, alpha: bool = False, threads: int | None = None
+) -> npt.NDArray[np.uint8]:
     """The BC7 blocks of texels [layers, height, width, 4], sides multiples of 4: [layers, height / 4, width / 4, 16].
 
     Args:
         pages: RGBA texels.
         profile: effort of the encoder.
+        alpha: alphas are encoded; without, all of them are 255.
         threads: of the encoder; not given: one per processor. The result does not depend on it.
 
     Raises:
         RuntimeError: the encoder is not installed.
     """
-    compress = bc7_encoder(profile)
+    compress = bc7_encoder(profile, alpha)
     layers, height, width, _ = pages.shape
     strips = [page[top : top + STRIP] for page in pages for top in range(0, height, STRIP)]
     with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:

@@ -12,7 +12,9 @@ from torch import Tensor
 from bitymi_ns.ops.view_kinds import COLOR_LIMIT, SHAPE_LIMIT, VIEW_COLORS, VIEW_PARAMETERS, Limit
 
 RESIDUAL_LIMIT = 256.0  # largest absolute value of a residual colour
-ALPHA_SCALE = 255 / 128  # alpha of a texel whose byte is 255: 128 is 1
+ALPHA_ONE = 128  # byte of an alpha of 1
+ALPHA_SCALE = 255 / ALPHA_ONE  # alpha of a texel whose byte is 255
+ALPHA_LIMIT = 2.0  # largest alpha
 BRIGHTEST = 1e4  # no channel of a rendered picture exceeds this: a base colour, 32 lobes and a residual
 EXTENTS = (1e-6, 16.0)  # half sides of tiles in scale units
 UNIT_SLACK = 0.01  # tolerance of the length of a stored rotation

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bitymi_ns.codec.bc7_encode import STRIP, Profile, bc7_encoder
-from bitymi_ns.codec.limits import RESIDUAL_LIMIT
+from bitymi_ns.codec.limits import ALPHA_LIMIT, ALPHA_ONE, ALPHA_SCALE, RESIDUAL_LIMIT
 from bitymi_ns.codec.packing import Packing
 from bitymi_ns.codec.pages import covered_blocks
 from bitymi_ns.ops.bc7_decode import decode_bc7
@@ -54,11 +54,12 @@ class EncodedAtlas:
     range: Range  # quantisation range (offset 0 and scale 1 for fp16)
     encoder: str  # name of the encoder and its profile
     clipped_fraction: float  # share of the tiles' colour values outside the range
-    mse: float  # mean squared error of the decoded tiles against the atlas, colour units squared
+    mse: float  # mean squared error of the decoded tiles' colours against the atlas, colour units squared
+    alpha_scale: float = 0.0  # alpha = alpha_scale * value, as in `BakedScene`; 0 = opaque texels
 
     @property
     def psnr(self) -> float | None:
-        """PSNR in dB of the decoded tiles against the atlas, for a peak of 1; None when they are equal."""
+        """PSNR in dB of the decoded tiles' colours against the atlas, for a peak of 1; None when they are equal."""
         return None if self.mse == 0 else float(-10.0 * np.log10(self.mse))
 
     @property
@@ -67,14 +68,17 @@ class EncodedAtlas:
         return sum(len(page) for page in self.payload)
 
     def decoded(self) -> npt.NDArray[np.float32]:
-        """Residual colours as a renderer reads them: [layers, height, width, 3]."""
-        return decode(self.payload, self.format, self.width, self.height, self.range.offset, self.range.scale)
+        """Residual colours and, where there are such, alphas as a renderer reads them: [layers, height, width, C]."""
+        return decode(
+            self.payload, self.format, self.width, self.height, self.range.offset, self.range.scale, self.alpha_scale
+        )
 
 
 def sample_texels(
     texels: npt.NDArray[np.float32], packing: Packing, count: int = 1 << 18, seed: int = 0
 ) -> npt.NDArray[np.float32]:
-    """A bootstrap sample (with replacement, uniform over the texels of all tiles), [count, 3]; [0, 3] without tiles."""
+    """A bootstrap sample of colours, with replacement, uniform over the texels of all tiles: [count, 3]; [0, 3] without
+    tiles."""
     area = packing.tiles[:, 3].astype(np.int64) * packing.tiles[:, 4]
     ends = np.cumsum(area)
     if len(ends) == 0 or ends[-1] == 0:
@@ -83,19 +87,19 @@ def sample_texels(
     tile = np.searchsorted(ends, drawn, side="right")
     x, y, layer, r_u, _ = packing.tiles[tile].astype(np.int64).T
     inside = drawn - (ends[tile] - area[tile])
-    return texels[layer, y + inside // r_u, x + inside % r_u]
+    return texels[layer, y + inside // r_u, x + inside % r_u, :3]
 
 
 def choose_range(
     texels: npt.NDArray[np.float32], packing: Packing, rule: RangeRule = "sigma6", samples: int = 1 << 18, seed: int = 0
 ) -> Range:
-    """The quantisation range of an atlas, one (offset, scale) for all channels.
+    """The quantisation range of an atlas, one (offset, scale) for the three channels of its colours.
 
     sigma6: mean +- 6 standard deviations of a bootstrap sample (paper, Quantization). minmax: smallest to largest
     value, nothing clipped. auto: whichever of the two has the smaller mean squared 8-bit error on the sample.
 
     Args:
-        texels: [layers, height, width, 3] float32.
+        texels: [layers, height, width, C] float32.
         packing: where the tiles lie; values outside tiles are not looked at.
         rule: see above.
         samples: size of the bootstrap sample.
@@ -130,10 +134,10 @@ def encode(
     threads: int | None = None,
     progress: Progress = no_progress,
 ) -> EncodedAtlas:
-    """Quantise and encodes an atlas, and measures the error of what was written.
+    """Quantise and encode an atlas, and measure the error of its stored colours.
 
     Args:
-        texels: [layers, height, width, 3] float32 residual colours.
+        texels: [layers, height, width, C] float32 residual colours and, where C = 4, alphas.
         packing: where the tiles lie: errors are measured there only.
         format: bc7 (1 byte per texel), uint8 (RGBA, 4) or fp16 (RGBA half floats, 8).
         value_range: quantisation range; not given: `choose_range` with its defaults. Not used by fp16.
@@ -142,21 +146,22 @@ def encode(
     """
     if format not in BYTES_PER_TEXEL:
         raise ValueError(f"the atlas format must be bc7, uint8 or fp16, not {format!r}")
-    layers, height, width, _ = texels.shape
+    layers, height, width, channels = texels.shape
+    alpha_scale = 0.0 if channels == 3 else 1.0 if format == "fp16" else ALPHA_SCALE
     if format == "fp16":
         value_range = Range(0.0, 1.0, "none")
     elif value_range is None:
         value_range = choose_range(texels, packing)
     owned = covered_blocks(packing.tiles, width, height, layers)
-    encoder = bc7_encoder(profile) if format == "bc7" else None
+    encoder = bc7_encoder(profile, channels == 4) if format == "bc7" else None
 
     def strip(layer: int, top: int) -> tuple[bytes, int, float]:
-        values = texels[layer, top : top + STRIP]  # [h, width, 3]
+        values = texels[layer, top : top + STRIP]  # [h, width, C]
         mask = owned[layer, top // 4 : (top + len(values)) // 4].repeat(4, axis=0).repeat(4, axis=1)
         rgba = _quantised(values, format, value_range)
         data = encoder(rgba) if encoder else rgba.tobytes()
         decoded = decode([data], format, width, len(values), value_range.offset, value_range.scale)[0]
-        inside = values[mask]
+        inside = values[mask, :3]
         if format == "fp16":
             low, high = -RESIDUAL_LIMIT, RESIDUAL_LIMIT
         else:
@@ -184,6 +189,7 @@ def encode(
         encoder=f"ispc_texcomp {profile}" if format == "bc7" else f"{format} rounding",
         clipped_fraction=clipped / values,
         mse=squares / values,
+        alpha_scale=alpha_scale,
     )
 
 
@@ -207,23 +213,43 @@ def decode_pages(payload: Sequence[bytes], format: Format, width: int, height: i
 
 
 def decode(
-    payload: Sequence[bytes], format: Format, width: int, height: int, offset: float, scale: float
+    payload: Sequence[bytes],
+    format: Format,
+    width: int,
+    height: int,
+    offset: float,
+    scale: float,
+    alpha_scale: float = 0.0,
 ) -> npt.NDArray[np.float32]:
-    """Residual colours of an encoded atlas: [layers, height, width, 3] float32, offset + scale * stored value."""
-    stored = decode_pages(payload, format, width, height)[..., :3]
+    """Texels of an encoded atlas: [layers, height, width, C] float32, colours offset + scale * stored value and, where
+    `alpha_scale` is not 0, alphas."""
+    stored = decode_pages(payload, format, width, height)[..., : 4 if alpha_scale else 3]
     if format == "fp16":
         return stored.astype(np.float32)
-    return Range(offset, scale, "none").from_unorm8(stored)
+    values = Range(offset, scale, "none").from_unorm8(stored)
+    if alpha_scale:
+        values[..., 3] = stored[..., 3] * np.float32(alpha_scale / 255.0)
+    return values
+
+
+def alpha_bytes(alpha: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
+    """Nearest bytes of alphas, 128 for 1, clipped to 0 to 255."""
+    return np.rint(np.clip(alpha * np.float32(ALPHA_ONE), 0.0, 255.0)).astype(np.uint8)
 
 
 def _quantised(values: npt.NDArray[np.float32], format: Format, value_range: Range) -> np.ndarray:
-    """RGBA texels with full alpha: [h, w, 4] uint8, or little-endian float16."""
+    """RGBA texels, of full alpha where they are opaque: [h, w, 4] uint8, or little-endian float16."""
+    alpha = values[..., 3] if values.shape[2] == 4 else None
     if format == "fp16":
         rgba = np.ones((*values.shape[:2], 4), dtype="<f2")
-        rgba[..., :3] = np.clip(values, -RESIDUAL_LIMIT, RESIDUAL_LIMIT)
+        rgba[..., :3] = np.clip(values[..., :3], -RESIDUAL_LIMIT, RESIDUAL_LIMIT)
+        if alpha is not None:
+            rgba[..., 3] = np.clip(alpha, 0.0, ALPHA_LIMIT)
         return rgba
     rgba = np.full((*values.shape[:2], 4), 255, dtype=np.uint8)
-    rgba[..., :3] = value_range.to_unorm8(values)
+    rgba[..., :3] = value_range.to_unorm8(values[..., :3])
+    if alpha is not None:
+        rgba[..., 3] = alpha_bytes(alpha)
     return rgba
 
 
@@ -231,7 +257,7 @@ def _extremes(texels: npt.NDArray[np.float32], packing: Packing) -> tuple[float,
     layers, height, width, _ = texels.shape
     low, high = np.inf, -np.inf
     for page, owned in zip(texels, covered_blocks(packing.tiles, width, height, layers), strict=True):
-        blocks = page.reshape(height // 4, 4, width // 4, 4, 3)
+        blocks = page[..., :3].reshape(height // 4, 4, width // 4, 4, 3)
         if owned.any():
             low = min(low, float(blocks.min(axis=(1, 3, 4))[owned].min()))
             high = max(high, float(blocks.max(axis=(1, 3, 4))[owned].max()))

@@ -10,20 +10,10 @@ from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.baked import BakedScene
 
 
-def scene_constants(scene: BakedScene) -> Tensor:
-    """[N, C] texels of surfels without a tile: the residual colour and, where texels have it, alpha."""
-    assert scene.mean_residual is not None
-    if scene.mean_alpha is None:
-        return scene.mean_residual
-    return torch.cat([scene.mean_residual, scene.mean_alpha[:, None]], dim=1)
-
-
 def scene_texels(scene: BakedScene) -> Tensor:
-    """[T, C] texels of a scene on the CPU: residual colours and, where they have it, alpha."""
-    pages, alphas = scene.residuals(), scene.alphas()
-    if alphas is not None:
-        pages = torch.cat([pages, alphas[..., None]], dim=3)
-    return _listed(scene, pages, scene_constants(scene))
+    """[T, 3] residual colours of a scene on the CPU; a surfel without a tile has one, its mean residual."""
+    assert scene.mean_residual is not None
+    return _listed(scene, scene.residuals(), scene.mean_residual)
 
 
 def texel_alpha(scene: BakedScene) -> TexelAlpha | None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.codec import streams
-from bitymi_ns.codec.limits import RESIDUAL_LIMIT
+from bitymi_ns.codec.limits import ALPHA_ONE, RESIDUAL_LIMIT
 from bitymi_ns.codec.pages import size_classes
 from bitymi_ns.codec.surfel_codes import SurfelCodes
 
@@ -20,6 +20,9 @@ GRADES = (-8, 24)  # range of the grades: a tile's step is the common one times 
 RESIDUAL_STEP = 4.0 / 255  # step of the mean residuals of tiles and of the residuals of surfels without a tile
 LEAST_WEIGHT = 1e-3  # least weight of a texel, pixels, so that unseen ones stay near their values
 SPARSE_ROUNDS = 8  # round in which coefficients that only texels nobody sees would need are shrunk
+ALPHA_GAIN = 4.0
+"""Step of alphas in those of residual colours: a surfel's colour differs from that behind it by about a quarter, so an
+error of alpha costs a quarter of that of a colour."""
 SHRINK = 0.6  # soft threshold of an iteration as a share of the step, where all texels of a block are seen alike
 _ATTEMPTS = 16
 _FAST = 9
@@ -27,6 +30,7 @@ _LARGEST_STEP = 50.0
 # Brightness, and two differences: an orthonormal basis, so that errors are as large as those of the channels.
 _OPPONENT = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, -1.0], [1.0, -2.0, 1.0]])
 _OPPONENT = _OPPONENT / _OPPONENT.norm(dim=1, keepdim=True)
+_CHANNELS = {3: _OPPONENT, 1: torch.ones(1, 1)}  # coded channels of values, by their number: of colours, and of alphas
 
 
 @dataclass
@@ -87,6 +91,25 @@ def blocks_of(sizes: Tensor) -> list[Blocks]:
 
 
 @dataclass(frozen=True)
+class AlphaCodes:
+    """The alphas of the texels of N surfels as integers."""
+
+    mean: npt.NDArray[np.int64]  # [N] of every tile, or the constant: 0 to 255, 128 = 1
+    step: float  # of the coefficients of a tile of grade 0
+    coefficients: Sequence[Tensor]  # as in `TexelCodes`, [coefficients, B, 1]
+
+    @property
+    def means(self) -> Tensor:
+        """[N] float32 mean alphas."""
+        return mean_alphas_of(self.mean)
+
+    def values(self, sizes: Tensor, grades: Tensor) -> Tensor:
+        """[T] float32 alphas of tiles of the sizes [N, 2] and grades [tiles]: whole bytes / 128, as they are drawn."""
+        found = _decoded(self.means[:, None], self.coefficients, sizes, _steps(self.step, grades))
+        return _bytes(found[:, 0]) / ALPHA_ONE
+
+
+@dataclass(frozen=True)
 class TexelCodes:
     """The texels of N surfels as integers."""
 
@@ -99,13 +122,16 @@ class TexelCodes:
     # of every entry of `blocks_of(sizes)`, int32 [coefficients, B, 3] in their order; the channels are (r + g + b) /
     # sqrt(3), (r - b) / sqrt(2), (r - 2 g + b) / sqrt(6)
     coefficients: Sequence[Tensor]
+    alpha: AlphaCodes | None = None  # None = opaque texels
 
     @property
     def columns(self) -> dict[str, npt.NDArray[np.int64]]:
         """The columns of texels.bin: name to [rows, numbers]."""
         columns = {"grade": self.grades.numpy()[:, None]}
-        for blocks, values in zip(blocks_of(self.sizes), self.coefficients, strict=True):
-            columns[blocks.name] = values.reshape(-1, 3).numpy().astype(np.int64)
+        names = coefficient_columns(self.sizes, self.alpha is not None)
+        alpha = () if self.alpha is None else self.alpha.coefficients
+        for name, values in zip(names, (*self.coefficients, *alpha), strict=True):
+            columns[name] = values.reshape(-1, values.shape[2]).numpy().astype(np.int64)
         return columns
 
     def nbytes(self, level: int = streams.LEVEL) -> int:
@@ -119,16 +145,22 @@ class TexelCodes:
 
     def texels(self) -> Tensor:
         """[T, 3] residual colours, in the order of `TexelTiles`."""
-        every, tiled = self.constants, self.sizes[:, 0] > 0
-        texels = every.repeat_interleave(self.sizes.clamp(min=1).prod(dim=1), dim=0)
-        of_tile, steps = every[tiled], _steps(self.step, self.grades)
-        for blocks, coefficients in zip(blocks_of(self.sizes), self.coefficients, strict=True):
-            count, texels_of = coefficients.shape[1], len(blocks.order)
-            channels = coefficients.view(texels_of, -1).T.float() @ _basis(blocks)  # [B 3, texels]: one product
-            channels = channels.view(count, 3, -1).transpose(1, 2) * steps[blocks.tile, None, None]
-            rgb = channels @ _OPPONENT + of_tile[blocks.tile, None, :]
-            texels[blocks.texels.reshape(-1)] = rgb.reshape(-1, 3)
-        return texels
+        return _decoded(self.constants, self.coefficients, self.sizes, _steps(self.step, self.grades))
+
+    def alphas(self) -> Tensor | None:
+        """[T] alphas in the same order; None = opaque texels."""
+        return None if self.alpha is None else self.alpha.values(self.sizes, self.grades)
+
+
+def coefficient_columns(sizes: Tensor, alpha: bool) -> list[str]:
+    """Names of the columns of coefficients of tiles of the sizes [N, 2]: of colours, then of alphas."""
+    names = [blocks.name for blocks in blocks_of(sizes)]
+    return [*names, *(f"alpha_{name}" for name in names if alpha)]
+
+
+def mean_alphas_of(mean: npt.NDArray[np.int64]) -> Tensor:
+    """[N] float32 mean alphas of integers."""
+    return torch.from_numpy(mean).float() / ALPHA_ONE
 
 
 def constants(residual: npt.NDArray[np.int64], step: float) -> Tensor:
@@ -155,6 +187,7 @@ class SceneCodes:
     # page_width, page_rows: arguments of `packing.pack`
     page_width: int
     page_rows: int
+    alpha: npt.NDArray[np.int64] | None = None  # [N] int64 mean alphas, 0 to 255: 128 = 1; None = opaque texels
 
 
 class TexelCoder:
@@ -177,9 +210,10 @@ class TexelCoder:
         mean = self._sums(self._weights[:, None])[:, 0] / area
         low, high = GRADES
         self.grades = (-torch.log2(mean[tiled])).round().long().clamp(low, high)
+        self.alpha: AlphaCodes | None = None
 
     def fit(self, texels: Tensor, most_bytes: float, rounds: int = SPARSE_ROUNDS) -> TexelCodes:
-        """Code texels [T, 3] in at most `most_bytes`, with a larger step where that takes it.
+        """Code texels [T, 3] in at most `most_bytes`, alphas included, with a larger step where that takes it.
 
         Bytes fall about as 1 / step. They are estimated with a fast packing until they fit nearly, and then counted.
         """
@@ -196,25 +230,42 @@ class TexelCoder:
         """Sums over tiles of [T, ...]."""
         return values.new_zeros(len(self._sizes), *values.shape[1:]).index_add_(0, self._owner, values)
 
+    def _means(self, values: Tensor) -> Tensor:
+        """[N, C] means over tiles of [T, C]."""
+        weights = self._weights[:, None]
+        return self._sums(values * weights) / self._sums(weights)
+
+    @torch.no_grad()
+    def code_alpha(self, alpha: Tensor, rounds: int = SPARSE_ROUNDS) -> Tensor:
+        """Code alphas [T], from 0 to 2, which stay the same in all later codes of colours: [T] as they are drawn."""
+        step = ALPHA_GAIN * self._step
+        mean = _bytes(self._means(alpha[:, None])[:, 0])
+        codes = AlphaCodes(mean.numpy().astype(np.int64), step, [])
+        found = self._coefficients(alpha[:, None], codes.means[:, None], step, rounds)
+        self.alpha = replace(codes, coefficients=found)
+        return self.alpha.values(self._sizes, self.grades)
+
     @torch.no_grad()
     def code(self, texels: Tensor, rounds: int = SPARSE_ROUNDS) -> TexelCodes:
-        """Code texels [T, 3].
+        """Code texels [T, 3], with the alphas that were coded.
 
         Coefficients c minimise sum over texels of weight (t - t(c))^2 plus an L1 penalty, by as many iterations of
         ISTA (a gradient step and soft thresholding). So unseen texels take what their visible neighbours need.
         """
-        weights = self._weights[:, None]
-        means = self._sums(texels * weights) / self._sums(weights)
-        residual = residual_codes(means)
-        codes = TexelCodes(self._sizes, self._step, residual, RESIDUAL_STEP, self.grades, [])
-        of_tile, steps = codes.constants[self._sizes[:, 0] > 0], _steps(self._step, self.grades)
+        residual = residual_codes(self._means(texels))
+        codes = TexelCodes(self._sizes, self._step, residual, RESIDUAL_STEP, self.grades, [], self.alpha)
+        return replace(codes, coefficients=self._coefficients(texels, codes.constants, self._step, rounds))
+
+    def _coefficients(self, texels: Tensor, means: Tensor, step: float, rounds: int) -> list[Tensor]:
+        """Of every entry of the blocks, int32 [coefficients, B, C], of texels [T, C] and the means [N, C] of tiles."""
+        of_tile, steps = means[self._sizes[:, 0] > 0], _steps(step, self.grades)
         coefficients = []
         for blocks in self._blocks:
-            step = steps[blocks.tile, None, None, None]
+            step_of = steps[blocks.tile, None, None, None]
             target = texels[blocks.texels] - of_tile[blocks.tile, None, None, :]
-            values = self._sparse(blocks, target, step, rounds) / step
+            values = self._sparse(blocks, target, step_of, rounds) / step_of
             coefficients.append(_ordered(blocks, torch.sign(values) * torch.floor(values.abs() + 0.5)))
-        return replace(codes, coefficients=coefficients)
+        return coefficients
 
     def _sparse(self, blocks: Blocks, target: Tensor, step: Tensor, rounds: int) -> Tensor:
         values = _forward(target)
@@ -230,6 +281,23 @@ class TexelCoder:
         return values
 
 
+def _decoded(means: Tensor, coefficients: Sequence[Tensor], sizes: Tensor, steps: Tensor) -> Tensor:
+    """[T, C] texels of the means [N, C], and of coefficients of tiles of the sizes [N, 2] and steps [tiles]."""
+    texels, of_tile = means.repeat_interleave(sizes.clamp(min=1).prod(dim=1), dim=0), means[sizes[:, 0] > 0]
+    for blocks, values in zip(blocks_of(sizes), coefficients, strict=True):
+        texels_of, count, width = values.shape
+        channels = values.view(texels_of, -1).T.float() @ _basis(blocks)  # [B C, texels]: one product
+        channels = channels.view(count, width, -1).transpose(1, 2) * steps[blocks.tile, None, None]
+        found = channels @ _CHANNELS[width] + of_tile[blocks.tile, None, :]
+        texels[blocks.texels.reshape(-1)] = found.reshape(-1, width)
+    return texels
+
+
+def _bytes(alpha: Tensor) -> Tensor:
+    """Whole numbers from 0 to 255 nearest to alphas, 128 of which are 1."""
+    return torch.floor(alpha * ALPHA_ONE + 0.5).clamp(0, 255)
+
+
 def _steps(step: float, grades: Tensor) -> Tensor:
     return (step * torch.exp2(0.5 * grades.double())).float()
 
@@ -243,18 +311,18 @@ def _cosines(count: int) -> Tensor:
     return torch.from_numpy(rows.astype(np.float32))
 
 
-def _forward(rgb: Tensor) -> Tensor:
-    """[B, k_v, k_u, channel] of [B, b_v, b_u, rgb]."""
-    v, u = _cosines(rgb.shape[1]), _cosines(rgb.shape[2])
-    across = torch.einsum("nvuc,lu->nvlc", rgb @ _OPPONENT.T, u)
+def _forward(texels: Tensor) -> Tensor:
+    """[B, k_v, k_u, channel] of [B, b_v, b_u, C]."""
+    v, u = _cosines(texels.shape[1]), _cosines(texels.shape[2])
+    across = torch.einsum("nvuc,lu->nvlc", texels @ _CHANNELS[texels.shape[3]].T, u)
     return torch.einsum("kv,nvlc->nklc", v, across)
 
 
 def _inverse(values: Tensor) -> Tensor:
-    """[B, b_v, b_u, rgb] of [B, k_v, k_u, channel]."""
+    """[B, b_v, b_u, C] of [B, k_v, k_u, channel]."""
     v, u = _cosines(values.shape[1]), _cosines(values.shape[2])
     down = torch.einsum("kv,nklc->nvlc", v, values)
-    return torch.einsum("nvlc,lu->nvuc", down, u) @ _OPPONENT
+    return torch.einsum("nvlc,lu->nvuc", down, u) @ _CHANNELS[values.shape[3]]
 
 
 def _ordered(blocks: Blocks, values: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from bitymi_ns.bake.lean_color import centers_of
 from bitymi_ns.bundle import Bundle, BundleError
+from bitymi_ns.codec.scene_texels import texel_alpha
 from bitymi_ns.files import complete_folder, reason
 from bitymi_ns.interchange.draw_quads import draw_quads
 from bitymi_ns.interchange.frame import to_capture
@@ -164,7 +165,8 @@ def summary_line(written: Written) -> str:
 def _fitted_colors(scene: BakedScene, cameras: Sequence[Camera], progress: Progress) -> SurfelColors:
     """Fitted to what the cameras see."""
     chosen = [camera.within(SEEN_SIDE) for camera in cameras]
-    seen = visibility(scene.surfels, chosen, scene.near, scene.weight_bound, scene.prefilter, progress).seen
+    drawn = (scene.near, scene.weight_bound, scene.prefilter, progress, texel_alpha(scene))
+    seen = visibility(scene.surfels, chosen, *drawn).seen
     return fit_colors(scene, weighted_residuals(scene), seen, centers_of(cameras, scene.surfels["means"]))
 
 

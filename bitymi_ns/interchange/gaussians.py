@@ -11,13 +11,17 @@ from torch import Tensor
 
 from bitymi_ns.bundle import ply
 from bitymi_ns.interchange import harmonics
+from bitymi_ns.interchange.fetch import fetch_texels
 from bitymi_ns.interchange.frame import Similarity
 from bitymi_ns.ops.constants import ALPHA_MAX, SUPPORT
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.tile_sizes import kernel_parameters
+from bitymi_ns.train.init import tangents
 
 FLAT_LOG_SCALE = -16.0
 """Third scale of the Gaussians in the scene's frame, whose cameras lie within a unit of the origin."""
+GRID = 24  # points along both axes of a kernel, of which the moments under alpha texels are summed
+LEAST_OPACITY = 1e-4  # of a surfel that alpha texels cut away
 _NAMES = {
     "means": ("x", "y", "z"),
     "normals": ("nx", "ny", "nz"),
@@ -61,20 +65,69 @@ def gaussians_of(scene: BakedScene, coefficients: Tensor) -> Gaussians:
     `surfel_colors.fit_colors`.
 
     They have the surfels' opacities and the second moments of their kernels: of (1 - r^2 / R^2)^beta on the disc of
-    radius R the mean of u^2 is R^2 / (2 (beta + 2)).
+    radius R the mean of u^2 is R^2 / (2 (beta + 2)). Alpha texels move and stretch them by the moments of
+    f = min(0.99, o k m), and multiply their opacities by the mean of f over itself, over that of o k.
     """
     surfels = scene.surfels
+    means, quats = surfels["means"].float(), torch.nn.functional.normalize(surfels["quats"].float(), dim=1)
     variance = SUPPORT**2 / (2.0 * (kernel_parameters(surfels)[1].double() + 2.0))
     tangent = surfels["log_scales"].double() + 0.5 * variance.log()[:, None]
     flat = tangent.new_full((len(tangent), 1), FLAT_LOG_SCALE)
     opacity = torch.sigmoid(surfels["opacity_logits"].double()).clamp(max=ALPHA_MAX)
+    if scene.alpha_scale or scene.mean_alpha is not None:
+        strength, center, covariance = _moments(scene)
+        scales = surfels["log_scales"].double().exp()
+        means = means + (tangents(quats).double() @ (scales * center)[..., None])[..., 0].float()
+        spread = tangent.exp()
+        values, axes = torch.linalg.eigh(spread[:, :, None] * covariance * spread[:, None])
+        tangent = 0.5 * values.clamp(min=torch.finfo(torch.float64).tiny).log()
+        quats = _turned(quats, torch.atan2(axes[:, 1, 0], axes[:, 0, 0]).float())
+        opacity = (opacity * strength).clamp(LEAST_OPACITY, ALPHA_MAX)
     return Gaussians(
-        surfels["means"].float(),
-        torch.nn.functional.normalize(surfels["quats"].float(), dim=1),
+        means,
+        quats,
         torch.cat([tangent, flat], dim=1).float(),
         torch.logit(opacity).float(),
         coefficients.float(),
     )
+
+
+def _turned(quats: Tensor, angle: Tensor) -> Tensor:
+    """Rotations [N, 4] after a turn about their normals, from the first tangent to the second."""
+    w, x, y, z = quats.unbind(1)
+    c, s = (0.5 * angle).cos(), (0.5 * angle).sin()
+    return torch.stack([w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s], dim=1)
+
+
+def _moments(scene: BakedScene, chunk: int = 1 << 20) -> tuple[Tensor, Tensor, Tensor]:
+    """Moments of f = min(0.99, o k m), float64: its mean weighted by itself [N], over that of o k; its centre [N, 2] in
+    scale units; and its covariance [N, 2, 2], over the variance of k."""
+    n, step = len(scene), 2.0 * SUPPORT / GRID
+    opacity, beta = kernel_parameters(scene.surfels)
+    constant = torch.ones(n) if scene.mean_alpha is None else scene.mean_alpha
+    extent = torch.full((n,), float(SUPPORT)) if scene.extent is None else scene.extent
+    axis = step * (torch.arange(GRID) + 0.5) - SUPPORT
+    at = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1).view(-1, 2).double()  # v, then u
+    rest = (1.0 - at.square().sum(1) / SUPPORT**2).clamp(min=0.0)
+    strength, center = at.new_zeros(n), at.new_zeros(n, 2)
+    covariance = at.new_zeros(n, 2, 2)
+    for rows in torch.arange(n).split(max(1, chunk // GRID**2)):
+        m = constant[rows, None].double().expand(-1, len(at)).clone()
+        tiled = torch.nonzero(scene.tiles[rows, 3] > 0).squeeze(1)
+        if scene.atlas is not None and scene.alpha_scale and len(tiled):
+            own = rows[tiled]
+            of_tile = axis / extent[own, None]
+            m[tiled] = fetch_texels(scene, scene.tiles[own].long(), of_tile, of_tile)[..., 3].flatten(1).double()
+        kernel = opacity[rows, None].double() * torch.where(rest > 0, rest ** beta[rows, None].double(), 0.0)
+        cut = (kernel * m).clamp(max=ALPHA_MAX)
+        share, uncut = (f / f.sum(1, keepdim=True).clamp(min=1e-12) for f in (cut, kernel))
+        strength[rows] = (share * cut).sum(1) / (uncut * kernel).sum(1).clamp(min=1e-12)
+        center[rows] = share @ at
+        least = step**2 / 12.0 * torch.eye(2, dtype=torch.float64)  # of a point, which stands for a cell
+        second = torch.einsum("np,pi,pj->nij", share, at, at) - center[rows, :, None] * center[rows, None] + least
+        whole = uncut @ at[:, 0].square() + step**2 / 12.0
+        covariance[rows] = second / whole[:, None, None]
+    return strength, center, covariance
 
 
 def write_gaussians(path: str | Path, gaussians: Gaussians) -> None:

@@ -9,6 +9,8 @@ from torch import Tensor
 
 from bitymi_ns.codec.packing import GRID, pack
 from bitymi_ns.codec.pages import size_classes, texel_index
+from bitymi_ns.codec.scene_texels import texel_alpha
+from bitymi_ns.interchange.fetch import fetch_texels
 from bitymi_ns.interchange.frame import Similarity
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.baked import BakedScene
@@ -45,9 +47,10 @@ def quads_of(scene: BakedScene, color: Tensor, level: float) -> Quads:
     """The quads that stand for the surfels of a scene.
 
     A quad is the square around the disc in which the surfel's opacity o (1 - r^2 / R^2)^beta is at least `level`, and
-    its alpha is 1 - r^2 / (2 radius^2): half of it at the rim of the disc. A surfel whose opacity nowhere reaches the
-    level has none. Its colours are max(color + residual, 0), the residual
-    read from the surfel's tile, on a grid about as fine as that, whose outer texel centres are the corners.
+    its alpha is 1 - r^2 / (2 radius^2): half of it at the rim of the disc. Alpha texels m make the opacity o k m: the
+    disc is that of the largest m, and alpha at most o k m / (2 level). A surfel whose opacity nowhere reaches the level
+    has none. Its colours are max(color + residual, 0). Texels are read from the surfel's tile, on a grid about as fine
+    as that, whose outer texel centres are the corners.
 
     Args:
         scene: N surfels on the CPU, with its texels decoded.
@@ -55,7 +58,7 @@ def quads_of(scene: BakedScene, color: Tensor, level: float) -> Quads:
         level: of the opacity, in (0, 1).
     """
     surfels = scene.surfels
-    opacity = torch.sigmoid(surfels["opacity_logits"].double())
+    opacity = torch.sigmoid(surfels["opacity_logits"].double()) * _largest_alpha(scene)
     kept = torch.nonzero(opacity > level).squeeze(1)
     share = (level / opacity[kept]) ** (1.0 / kernel_parameters(surfels)[1][kept].double().clamp(min=1e-6))
     radius = (SUPPORT * (1.0 - share).clamp(min=1e-12).sqrt()).float()
@@ -66,7 +69,7 @@ def quads_of(scene: BakedScene, color: Tensor, level: float) -> Quads:
     pages = torch.zeros(packing.layers * packing.height * packing.width, 4, dtype=torch.uint8)
     for r_u, r_v, rows in size_classes(tiles):
         for part in rows.split(max(1, _CHUNK // (r_u * r_v))):
-            texels = _texels(scene, color, kept[part], (r_u, r_v), radius[part], extent[part])
+            texels = _texels(scene, color, kept[part], (r_u, r_v), radius[part], extent[part], level)
             pages[texel_index(tiles[part], (r_u, r_v), packing.width, packing.height)] = texels
     ring = torch.tensor(_CORNERS)
     axes = tangents(surfels["quats"][kept]) * surfels["log_scales"][kept].exp()[:, None] * radius[:, None, None]
@@ -83,7 +86,13 @@ def _sizes(tiles: Tensor, share: Tensor) -> Tensor:
 
 
 def _texels(
-    scene: BakedScene, color: Tensor, rows: Tensor, size: tuple[int, int], radius: Tensor, extent: Tensor
+    scene: BakedScene,
+    color: Tensor,
+    rows: Tensor,
+    size: tuple[int, int],
+    radius: Tensor,
+    extent: Tensor,
+    level: float,
 ) -> Tensor:
     """[n, r_v, r_u, 4] uint8 of quads of one size."""
     across, down = (torch.linspace(-1.0, 1.0, count) for count in size)
@@ -91,41 +100,25 @@ def _texels(
     shown = color[rows, None, None].expand(-1, size[1], size[0], -1)
     if scene.mean_residual is not None:
         shown = shown + scene.mean_residual[rows, None, None]
+    alpha = (1.0 - 0.5 * r2).clamp(min=0.0).expand(len(rows), -1, -1)
     tiled = torch.nonzero(scene.tiles[rows, 3] > 0).squeeze(1)
     if scene.atlas is not None and len(tiled):
         u, v = (axis * (radius / extent)[tiled, None] for axis in (across, down))
-        shown = shown.clone()
-        shown[tiled] = color[rows[tiled], None, None] + _read(scene, scene.tiles[rows[tiled]].long(), u, v)
-    alpha = (1.0 - 0.5 * r2).clamp(min=0.0).expand(len(rows), -1, -1)[..., None]
-    return (torch.cat([shown, alpha], dim=3).clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
+        shown, alpha, own = shown.clone(), alpha.clone(), rows[tiled]
+        texels = fetch_texels(scene, scene.tiles[own].long(), u, v)
+        shown[tiled] = color[own, None, None] + texels[..., :3]
+        if scene.alpha_scale:
+            opacity, beta = (value[own, None, None] for value in kernel_parameters(scene.surfels))
+            # beyond the rim as at the rim, where the disc cuts
+            uncut = opacity * (1.0 - r2.clamp(max=1.0) * (radius[tiled, None, None] / SUPPORT).square()) ** beta
+            alpha[tiled] = torch.minimum(alpha[tiled], 0.5 * uncut * texels[..., 3] / level)
+    return (torch.cat([shown, alpha[..., None]], dim=3).clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
 
 
-def _read(scene: BakedScene, tiles: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """[n, r_v, r_u, 3] residuals of tiles [n, 5] at u [n, r_u] and v [n, r_v] from -1 to 1, as the renderers fetch
-    them: bilinear between texel centres, constant beyond the outer ones."""
-    assert scene.atlas is not None
-    _, height, width, _ = scene.atlas.shape
-    (low_u, high_u, fu), (low_v, high_v, fv) = (
-        _between(at, tiles[:, 3 + i], tiles[:, i]) for i, at in enumerate((u, v))
-    )
-    layer = tiles[:, 2, None, None] * height
-    texels = scene.atlas.view(-1, 4)[:, :3]
-    unit = 255.0 if texels.dtype == torch.uint8 else 1.0
-
-    def fetch(x: Tensor, y: Tensor) -> Tensor:
-        found = texels[(layer + y[:, :, None]) * width + x[:, None]]
-        return found.float() / unit * scene.scale + scene.offset
-
-    fu, fv = fu[:, None, :, None], fv[:, :, None, None]
-    top = fetch(low_u, low_v) * (1 - fu) + fetch(high_u, low_v) * fu
-    bottom = fetch(low_u, high_v) * (1 - fu) + fetch(high_u, high_v) * fu
-    return top * (1 - fv) + bottom * fv
-
-
-def _between(at: Tensor, count: Tensor, first: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The texels on both sides of positions [n, r] from -1 to 1 along an axis, and how far they are to the second."""
-    last = (count - 1)[:, None]
-    x = ((0.5 * (at + 1.0)) * count[:, None] - 0.5).clamp(min=0.0)
-    x = torch.minimum(x, last.to(x))
-    low = x.floor().long()
-    return low + first[:, None], torch.minimum(low + 1, last) + first[:, None], x - low
+def _largest_alpha(scene: BakedScene) -> Tensor:
+    """[N] the largest alpha of every surfel's texels; 1 where texels are opaque."""
+    alpha = texel_alpha(scene)
+    if alpha is None:
+        return torch.ones(len(scene), dtype=torch.float64)
+    surfel = torch.arange(len(scene)).repeat_interleave(alpha.tiles.size.long().prod(dim=1))
+    return torch.zeros(len(scene)).scatter_reduce(0, surfel, alpha.values, "amax").double()

@@ -15,7 +15,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from bitymi_ns.ops import Prefilter, fitting_lists, project
+from bitymi_ns.ops import Prefilter, TexelAlpha, fitting_lists, project
 from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.ranges import check_ranges
@@ -61,7 +61,11 @@ class SurfaceOptions:
 
 @torch.no_grad()
 def median_depth(
-    surfels: Mapping[str, Tensor], camera: Camera, near: float, prefilter: Prefilter = "low_pass"
+    surfels: Mapping[str, Tensor],
+    camera: Camera,
+    near: float,
+    prefilter: Prefilter = "low_pass",
+    alpha: TexelAlpha | None = None,
 ) -> Tensor:
     """Depth at which half of the light of each pixel is blocked.
 
@@ -69,6 +73,7 @@ def median_depth(
         surfels: geometry by name (`GEOMETRY`), of N surfels.
         near: nearest depth that is drawn, camera z.
         prefilter: as in `ops.project`.
+        alpha: opacities of the surfels' texels; None = opaque texels.
 
     Returns:
         [H, W] camera z of the first fragment with which the blending weights of its pixel reach 0.5; 0 where they do
@@ -78,6 +83,7 @@ def median_depth(
         TooManyFragments: a single row of screen tiles has more fragments than memory holds.
     """
     projection = project(*(surfels[name] for name in GEOMETRY), camera, near, prefilter)
+    projection.alpha = alpha
     rows = []
     for fragments in fitting_lists(projection):
         order = fragments.pixel.argsort(stable=True)  # front to back within each pixel, as the fragments of a tile are
@@ -127,6 +133,7 @@ def extract_surface(
     options: SurfaceOptions = SurfaceOptions(),  # noqa: B008 - frozen
     prefilter: Prefilter = "low_pass",
     progress: Progress = no_progress,
+    alpha: TexelAlpha | None = None,
 ) -> open3d.geometry.TriangleMesh:
     """Fuse the median depths of views into a triangle mesh with vertex colors, in the scene's frame.
 
@@ -138,6 +145,7 @@ def extract_surface(
         options: resolution and budget.
         prefilter: as in `ops.project`.
         progress: called after every view and step.
+        alpha: as in `median_depth`.
 
     Raises:
         NoSurface: there is nothing to fuse.
@@ -149,7 +157,7 @@ def extract_surface(
     small = [camera.within(BOX_SIDE) for camera in cameras]
     depths = []
     for i, camera in enumerate(small):
-        depths.append(median_depth(surfels, camera, near, prefilter).cpu())
+        depths.append(median_depth(surfels, camera, near, prefilter, alpha).cpu())
         progress("finding the box", i + 1, len(small))
     box = observed_box(depths, small)
     voxel = float((box[1] - box[0]).max()) / options.resolution
@@ -160,7 +168,7 @@ def extract_surface(
         inside = _cut(depths[i], small[i], box)
         far = inside[inside > 0].quantile(FAR).item() if inside.any() else 0.0
         camera = _coarsened(camera, PIXELS_PER_VOXEL * far / voxel)
-        depth = _cut(median_depth(surfels, camera, near, prefilter).cpu(), camera, box)
+        depth = _cut(median_depth(surfels, camera, near, prefilter, alpha).cpu(), camera, box)
         rgb = as_bytes(render(camera)).numpy()
         picture = open3d.geometry.RGBDImage.create_from_color_and_depth(
             open3d.geometry.Image(np.ascontiguousarray(rgb)),

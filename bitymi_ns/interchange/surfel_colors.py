@@ -78,8 +78,8 @@ def weighted_fit(directions: Tensor, values: Tensor, weight: Tensor) -> Tensor:
 
 @torch.no_grad()
 def weighted_residuals(scene: BakedScene, chunk: int = 1 << 20) -> Tensor | None:
-    """[N, 3] mean residual of each surfel, over its texels with the weight of the kernel there; of a surfel without a
-    tile its constant. None = the scene has no residual."""
+    """[N, 3] mean residual of each surfel, over its texels with the weight of the kernel there, times their alpha; of a
+    surfel without a tile its constant. None = the scene has no residual."""
     if scene.mean_residual is None and scene.atlas is None:
         return None
     means = scene.surfels["means"]
@@ -89,12 +89,15 @@ def weighted_residuals(scene: BakedScene, chunk: int = 1 << 20) -> Tensor | None
     extent = means.new_full((len(means),), SUPPORT) if scene.extent is None else scene.extent
     beta = kernel_parameters(scene.surfels)[1]
     _, height, width, _ = scene.atlas.shape
-    flat = scene.residuals().reshape(-1, 3)
+    flat, alphas = scene.residuals().reshape(-1, 3), scene.alphas()
     for r_u, r_v, rows in size_classes(scene.tiles):
         for part in rows.split(max(1, chunk // (r_u * r_v))):
             u, v = (texel_centers(r, extent[part, None]) for r in (r_u, r_v))
             rest = (1 - (u[:, None, :].square() + v[:, :, None].square()) / SUPPORT**2).clamp(min=0)
             weight = (rest ** beta[part, None, None]).where(rest > 0, 0.0) + 1e-6
-            texels = flat[texel_index(scene.tiles[part], (r_u, r_v), width, height)]
+            index = texel_index(scene.tiles[part], (r_u, r_v), width, height)
+            texels = flat[index]
+            if alphas is not None:
+                weight = weight * (alphas.flatten()[index] + 1e-6)
             residual[part] = (texels * weight[..., None]).sum((1, 2)) / weight.sum((1, 2))[:, None]
     return residual

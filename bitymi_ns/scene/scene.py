@@ -169,7 +169,8 @@ class Scene(nn.Module):
 
         Args:
             background: [3] colour behind the scene; None = black.
-            field_mode: train = the residual field gets gradients; frozen = it is evaluated without; off = left out.
+            field_mode: train = the residual field gets gradients; frozen = it is evaluated without; off = its
+                colours are left out.
             maps: also depth and normals.
             overdraw_half: also the count of fragments with a gradient, see `ops.soft_overdraw`; None = without.
             beta_alone: the gradient of the Beta map reaches beta alone, not the blending weights.
@@ -181,8 +182,8 @@ class Scene(nn.Module):
         projection = project(*(p[name] for name in GEOMETRY), camera, self.near, self.config.prefilter)
         field = None if field_mode == "off" else self.field
         learns, bound = field_mode == "train", self.config.weight_bound
-        if field is not None:
-            projection.alpha = field.opacity(bound, learns)
+        if self.field is not None:
+            projection.alpha = self.field.opacity(bound, learns)
         base = self.base_color(projection)
         read: Tensor | None = None
 

@@ -3,15 +3,16 @@
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from bitymi_ns.bundle import write_bundle
 from bitymi_ns.codec.limits import EXTENTS
-from bitymi_ns.codec.packing import pack
+from bitymi_ns.codec.packing import Packing, pack
 from bitymi_ns.codec.pages import paged_texels
 from bitymi_ns.codec.quantise import Range, encode
 from bitymi_ns.codec.surfel_codes import REFERENCE, code_surfels
-from bitymi_ns.codec.texel_codes import SceneCodes, TexelCodeOptions, TexelCoder
+from bitymi_ns.codec.texel_codes import SceneCodes, TexelCodeOptions, TexelCoder, mean_alphas_of
 from bitymi_ns.measure.stability.scenes import random_scene
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene.baked import BakedScene
@@ -26,9 +27,13 @@ FINEST = {**REFERENCE, "place": 1e-9}
 
 
 def make_codes(
-    kind: str = "sv", count: int = 12, textured: bool = True, steps: Mapping[str, float] = REFERENCE
+    kind: str = "sv",
+    count: int = 12,
+    textured: bool = True,
+    steps: Mapping[str, float] = REFERENCE,
+    alpha: bool = False,
 ) -> SceneCodes:
-    """SceneCodes of random surfels, every fourth of which has no tile."""
+    """SceneCodes of random surfels, every fourth of which has no tile, with alpha texels or opaque ones."""
     params = {key: value.float() for key, value in random_scene(count, 0).params.items()}
     params = {key: value for key, value in params.items() if key not in VIEW_COLORS["sv"].names}
     params |= lean_parameters(kind, count, torch.float32)
@@ -37,8 +42,12 @@ def make_codes(
     sizes = sizes[order]
     generator = torch.Generator().manual_seed(0)
     texels = torch.rand(int(sizes.clamp(min=1).prod(1).sum()), 3, generator=generator) - 0.5
-    coded = TexelCoder(sizes, torch.ones(len(texels)), TexelCodeOptions()).code(texels)
-    return SceneCodes(surfels, coded if textured else None, coded.residual, coded.residual_step, 4096, 8192)
+    coder = TexelCoder(sizes, torch.ones(len(texels)), TexelCodeOptions())
+    if alpha:
+        coder.code_alpha(2 * torch.rand(len(texels), generator=generator))
+    coded = coder.code(texels)
+    means = None if coded.alpha is None else coded.alpha.mean
+    return SceneCodes(surfels, coded if textured else None, coded.residual, coded.residual_step, 4096, 8192, means)
 
 
 def scene_of(codes: SceneCodes) -> BakedScene:
@@ -51,13 +60,18 @@ def scene_of(codes: SceneCodes) -> BakedScene:
         torch.from_numpy(packing.tiles),
         extent=codes.surfels.extent(3.0),
         mean_residual=None,
+        mean_alpha=None if codes.alpha is None else mean_alphas_of(codes.alpha),
     )
+
+
+def pages_of(codes: SceneCodes) -> tuple[np.ndarray, Packing]:
+    """Pages [layers, height, width, C] of the texels, and where the tiles lie in them."""
+    packing, alphas = pack(codes.surfels.sizes, codes.page_width, codes.page_rows), codes.texels.alphas()
+    texels = codes.texels.texels()
+    return paged_texels(texels if alphas is None else torch.cat([texels, alphas[:, None]], 1), packing).numpy(), packing
 
 
 def write_compact(folder: Path, codes: SceneCodes, **options) -> Path:
     """Writes it as a bundle."""
-    atlas = None
-    if codes.texels is not None:
-        packing = pack(codes.surfels.sizes, codes.page_width, codes.page_rows)
-        atlas = encode(paged_texels(codes.texels.texels(), packing).numpy(), packing, "uint8", RANGE)
+    atlas = None if codes.texels is None else encode(*pages_of(codes), "uint8", RANGE)
     return write_bundle(folder, scene_of(codes), atlas, codes, **options)

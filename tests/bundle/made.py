@@ -10,14 +10,17 @@ from tests.bake.scenes import write
 from tests.ops.test_view_color import lean_parameters
 
 
-def make(surfels, folder, kind="sv", format="uint8", count=6, lean=False, **kwargs):
+def make(surfels, folder, kind="sv", format="uint8", count=6, lean=False, alpha=False, **kwargs):
     """A bundle of a few surfels and random texels; returns what went in."""
     params = surfels(count, kind)
     if lean:
         params = {k: v for k, v in params.items() if k not in VIEW_COLORS[kind].names}
         params |= lean_parameters(kind, count, torch.float32)
     packing = pack([[8, 4]] * count)
-    texels = np.random.default_rng(0).random((packing.layers, packing.height, packing.width, 3)).astype(np.float32)
+    texels = np.random.default_rng(0).random((packing.layers, packing.height, packing.width, 4)).astype(np.float32)
+    texels = texels if alpha else texels[..., :3]
+    if alpha:
+        kwargs.setdefault("mean_alpha", torch.linspace(0, 2, count))
     atlas = None if format is None else encode(texels, packing, format, Range(-0.5, 2.0, "test"))
     tiles = packing.tiles if atlas else np.zeros_like(packing.tiles)
     write(folder, params, tiles, atlas, kind=kind, **kwargs)

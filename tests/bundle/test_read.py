@@ -157,6 +157,8 @@ COLUMNS = [
     ("sv", True, "view_term", "term_3", 256, 257),
     ("sg", True, "view_term", "term_3", 1e4, 1e5),
     ("sh", True, "view_term", "term_1", 256, 257),
+    ("sh", True, "vertex", "alpha", 2, 2.5),
+    ("sv", False, "vertex", "alpha", 0, -0.1),
 ]
 
 
@@ -164,11 +166,25 @@ COLUMNS = [
 def test_values_beyond_their_limits_are_refused_by_column_and_row(
     surfels, tmp_path, kind, lean, element, column, good, bad
 ):
-    folder = make(surfels, tmp_path / "b", kind, lean=lean)
+    folder = make(surfels, tmp_path / "b", kind, lean=lean, alpha=column == "alpha")
     change_columns(folder, lambda columns: columns[column].__setitem__(2, good), element)
     read_bundle(folder)
     change_columns(folder, lambda columns: columns[column].__setitem__(2, bad), element)
     with pytest.raises(BundleError, match=f"surfels.ply: {column} is .* in row 2; it must be from"):
+        read_bundle(folder)
+
+
+def test_alphas_that_are_missing_or_out_of_range_are_refused(surfels, tmp_path):
+    folder = make(surfels, tmp_path / "b", format="fp16", alpha=True)
+    image = ktx2.parse_ktx2((folder / "atlas.ktx2").read_bytes())
+    layer = np.frombuffer(bytes(image.payload[0]), "<f2").reshape(image.height, image.width, 4).copy()
+    layer[3, 5, 3] = -0.5
+    ktx2.write_ktx2(folder / "atlas.ktx2", [layer.tobytes()], "fp16", image.width, image.height, "test")
+    amend(folder)
+    with pytest.raises(BundleError, match=r"atlas.ktx2: the alpha of the texel \(5, 3\) of layer 0 is not from 0 to 2"):
+        read_bundle(folder)
+    change_columns(folder, lambda columns: columns.pop("alpha"))
+    with pytest.raises(BundleError, match="the column alpha is missing"):
         read_bundle(folder)
 
 
@@ -196,6 +212,12 @@ def test_what_would_be_refused_is_not_written(surfels, tmp_path):
     params["quats"][2] = 0
     with pytest.raises(BundleError, match="quats has the length 0 in row 2"):
         write(tmp_path / "b", params, tiles, None)
+    for means, reason in (
+        (None, "the atlas has alphas, the surfels have no mean alphas"),
+        (torch.full((COUNT,), 2.5), "alpha is 2.5 in row 0; it must be from 0 to 2"),
+    ):
+        with pytest.raises(BundleError, match=reason):
+            make(surfels, tmp_path / "b", alpha=True, mean_alpha=means)
     with pytest.raises(BundleError, match="render.background.0 must be less than or equal to 1"):
         write(tmp_path / "b", surfels(COUNT), tiles, None, background=(255, 0, 0))
     assert list(tmp_path.iterdir()) == []

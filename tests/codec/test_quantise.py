@@ -125,3 +125,28 @@ def test_errors_say_what_to_choose(atlas):
         encode(texels, packing, "bc7", profile="best")
     with pytest.raises(ValueError, match="has 64 bytes, not 3"):
         decode_pages([b"abc"], "uint8", 4, 4)
+
+
+@pytest.mark.parametrize("format, bound", [("bc7", 0.1), ("uint8", 0.5 / 128), ("fp16", 1e-3)])
+def test_alphas_are_a_fourth_channel_and_do_not_count_as_colours(format, bound):
+    packing = pack([[32, 32]] * 4)
+    v, u = np.mgrid[0:1:32j, 0:1:32j]
+    colors = paint(packing, lambda *_: np.stack([v, u, np.full_like(u, 0.5)], axis=-1))
+    alphas = paint(packing, lambda i, r_v, r_u: np.stack([2 * np.minimum(u * (i + 1), 1)] * 3, axis=-1))[..., :1]
+    texels = np.concatenate([colors, alphas], axis=-1)
+    with_alpha, opaque = (encode(each, packing, format) for each in (texels, colors))
+    assert opaque.alpha_scale == 0 and with_alpha.alpha_scale == (1.0 if format == "fp16" else 255 / 128)
+    assert with_alpha.range == opaque.range and with_alpha.clipped_fraction == opaque.clipped_fraction
+    if format != "bc7":
+        assert with_alpha.mse == opaque.mse
+    decoded = with_alpha.decoded()
+    assert decoded.shape == texels.shape and opaque.decoded().shape == colors.shape
+    assert np.abs(decoded[..., 3] - np.minimum(texels[..., 3], with_alpha.alpha_scale * 255)).max() <= bound + 1 / 128
+
+
+def test_an_alpha_of_one_is_exact_in_every_format():
+    packing = pack([[16, 8]] * 4)
+    texels = np.random.default_rng(0).random((packing.layers, packing.height, packing.width, 4)).astype(np.float32)
+    texels[..., 3] = 1.0
+    for format in ("uint8", "fp16"):
+        assert (encode(texels, packing, format).decoded()[..., 3] == 1.0).all()

@@ -57,6 +57,40 @@ def test_texels_that_nobody_sees_cost_little() -> None:
     assert float((sparse.texels() - mixed)[~hidden & _tiled()].abs().mean()) < 0.04
 
 
+def test_alphas_are_coded_before_the_colours_and_stay() -> None:
+    texels, alpha = noise(), 2 * noise()[:, 0] + 1
+    coder = TexelCoder(SIZES, torch.ones(COUNT), TexelCodeOptions(step=0.05))
+    drawn = coder.code_alpha(alpha, rounds=0)
+    assert torch.equal(drawn * 128, (drawn * 128).round()) and float((drawn - alpha).abs().max()) < 1 / 128
+    codes = coder.code(texels, rounds=0)
+    opaque = TexelCoder(SIZES, torch.ones(COUNT), TexelCodeOptions(step=0.05)).code(texels, rounds=0)
+    assert opaque.alphas() is None and torch.equal(codes.texels(), opaque.texels())
+    assert list(codes.columns) == [*opaque.columns, *(f"alpha_{each.name}" for each in blocks_of(SIZES))]
+    coarse = coder.fit(texels, codes.nbytes() - 0.5 * opaque.nbytes())
+    for each in (codes, coarse):
+        assert torch.equal(each.alphas(), drawn)
+    bare = SIZES[:, 0] == 0
+    area = SIZES.clamp(min=1).prod(1)
+    assert torch.equal(codes.alpha.means[bare], drawn[(area.cumsum(0) - area)[bare]])
+
+
+def test_alphas_are_bytes_within_their_range() -> None:
+    alpha = torch.where(noise()[:, 0] > 0, 2.0, 0.0)
+    coder = TexelCoder(SIZES, torch.ones(COUNT), TexelCodeOptions(step=30.0))
+    drawn = coder.code_alpha(alpha)
+    assert float(drawn.min()) == 0 and float(drawn.max()) == 255 / 128
+    assert coder.alpha.mean.min() >= 0 and coder.alpha.mean.max() <= 255
+
+
+def test_alphas_of_one_cost_next_to_nothing() -> None:
+    sizes = SIZES.repeat(100, 1)
+    texels = noise().repeat(100, 1)
+    coder = TexelCoder(sizes, torch.ones(len(texels)), TexelCodeOptions())
+    opaque = coder.code(texels).nbytes()
+    assert bool((coder.code_alpha(torch.ones(len(texels))) == 1).all())
+    assert coder.code(texels).nbytes() == opaque
+
+
 def _tiled() -> torch.Tensor:
     area = SIZES.clamp(min=1).prod(1)
     return torch.repeat_interleave(SIZES[:, 0] > 0, area)

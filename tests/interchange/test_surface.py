@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from bitymi_ns.interchange.surface import NoSurface, SurfaceOptions, extract_surface, median_depth
+from bitymi_ns.ops import TexelAlpha, TexelTiles
 from bitymi_ns.ranges import check_ranges
 from bitymi_ns.scene.camera import Camera
 from tests.ops.golden import GOLDEN_NAMES, SURFEL_KEYS, camera_of, load_golden, reference
@@ -44,6 +45,14 @@ def test_median_depth_is_that_of_the_reference(name: str) -> None:
     expected = torch.where(reached.any(1), z, 0.0).view(case.height, case.width)
     close = (depth - expected).abs() <= 1e-6
     assert close.double().mean() > 0.999  # the sum may reach one half a surfel earlier by rounding
+
+
+def test_what_is_cut_away_has_no_depth() -> None:
+    surfels, camera = plane(30), looking_down(0.0, 0.0)
+    left = surfels["means"][:, 0] < 0
+    tiles = TexelTiles.of_sizes(torch.ones(len(left), 2, dtype=torch.int32), torch.full((len(left),), 3.0))
+    depth = median_depth(surfels, camera, 0.2, alpha=TexelAlpha(tiles, torch.where(left, 0.0, 1.0), 0.0))
+    assert bool((depth[25, 4:28] == 0).all()) and torch.allclose(depth[25, 36:60], torch.tensor(2.0), atol=1e-3)
 
 
 CAMERAS = [looking_down(x, y) for x in (-0.3, 0.0, 0.3) for y in (-0.2, 0.2)]

@@ -70,6 +70,12 @@ def test_the_residual_is_the_mean_over_the_disc(bundle: Bundle) -> None:
         weight = torch.where(rest > 0, rest ** beta[i], 0.0) + 1e-6
         tile = atlas[layer, y : y + r_v, x : x + r_u]
         assert torch.allclose(found[i].double(), (tile * weight[..., None]).sum((0, 1)) / weight.sum(), atol=1e-5)
+    scene.atlas[..., 3], scene.alpha_scale = 0, 255 / 128
+    x, y, layer, r_u, r_v = scene.tiles[0].tolist()
+    scene.atlas[layer, y + 1, x + 2, 3] = 128  # all else is cut away
+    cut = weighted_residuals(scene)
+    assert torch.allclose(cut[0], scene.residuals()[layer, y + 1, x + 2], atol=1e-3)
+    assert torch.allclose(cut[1:], found[1:], atol=1e-5)
     scene.atlas = None
     assert torch.equal(weighted_residuals(scene), scene.mean_residual)
     scene.mean_residual = None

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from bitymi_ns.ops import project, trace
+from bitymi_ns.ops import TexelAlpha, TexelTiles, project, trace
 from bitymi_ns.scene.visibility import visibility
 
 
@@ -55,6 +55,15 @@ def test_a_pixel_is_shared_among_its_layers_by_weight(surfels, camera):
     expected = [float(fragments.weight[fragments.surfel == i].sum()) for i in range(2)]
     assert visibility(params, [view], 0.2).pixels.tolist() == pytest.approx(expected, rel=1e-5)
     assert min(expected) > 5
+
+
+def test_what_is_cut_away_hides_nothing(surfels, camera):
+    params = two_hard_discs(surfels, [0.0, 0.0, 0.5])
+    tiles = TexelTiles.of_sizes(torch.ones(2, 2, dtype=torch.int32), torch.full((2,), 3.0))
+    alpha = TexelAlpha(tiles, torch.tensor([0.0, 1.0]), 0.0)
+    found = visibility(params, [camera(6.0)], 0.2, alpha=alpha)
+    assert found.seen.tolist() == [[False, True]] and found.transmittance.tolist() == [0.0, 1.0]
+    assert found.pixels[1] > visibility(params, [camera(6.0)], 0.2).pixels[1]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -14,12 +14,13 @@ from torch import Tensor
 from bitymi_ns.bundle import BundleError, read_bundle
 from bitymi_ns.bundle.manifest import MANIFEST, WorldFrame
 from bitymi_ns.bundle.strict_json import plain
+from bitymi_ns.codec.scene_texels import texel_alpha
 from bitymi_ns.files import complete_folder, reason, reserved, size_text
 from bitymi_ns.interchange import Frame
 from bitymi_ns.interchange.bundle_cameras import named_cameras
 from bitymi_ns.interchange.frame import to_capture
 from bitymi_ns.interchange.surface import NoSurface, SurfaceOptions, extract_surface
-from bitymi_ns.ops import Prefilter
+from bitymi_ns.ops import Prefilter, TexelAlpha
 from bitymi_ns.plugin.console import fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.export.trained import load_trained, world_of
@@ -41,6 +42,7 @@ class Source:
     near: float  # nearest depth that is drawn, camera z
     prefilter: Prefilter  # as in `ops.project`
     world: WorldFrame  # how the scene lies in the capture
+    alpha: TexelAlpha | None  # opacities of the texels, on that device; None = opaque texels
 
 
 @dataclass(kw_only=True)
@@ -106,9 +108,8 @@ class ExportMesh:
         step = max(1, -(-len(source.cameras) // MOST_VIEWS))
         cameras = source.cameras[::step]
         with rich_progress() as progress:
-            mesh = extract_surface(
-                source.surfels, source.render, cameras, source.near, options, source.prefilter, progress
-            )
+            drawn = (cameras, source.near, options, source.prefilter, progress, source.alpha)
+            mesh = extract_surface(source.surfels, source.render, *drawn)
         if to is not None:
             vertices = torch.from_numpy(np.asarray(mesh.vertices))
             mesh.vertices = open3d.utility.Vector3dVector(to.points(vertices).numpy())
@@ -135,6 +136,7 @@ def from_run(load_config: Path) -> Source:
         scene.near,
         scene.config.prefilter,
         WorldFrame.model_validate_json(json.dumps(plain(world_of(datamanager).described()))),
+        None if scene.field is None else scene.field.opacity(scene.config.weight_bound, learns=False),
     )
 
 
@@ -144,9 +146,8 @@ def from_bundle(folder: Path) -> Source:
     scene = bundle.scene
     rows = named_cameras(folder, bundle.info)
     cameras = [row.camera for row in rows if not row.held_out] or [row.camera for row in rows]
-    return Source(
-        scene.surfels, lambda camera: bundle.render(camera).rgb, cameras, scene.near, scene.prefilter, bundle.info.world
-    )
+    drawn = (cameras, scene.near, scene.prefilter, bundle.info.world, texel_alpha(scene))
+    return Source(scene.surfels, lambda camera: bundle.render(camera).rgb, *drawn)
 
 
 def default_export() -> ExportMesh:

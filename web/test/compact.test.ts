@@ -54,6 +54,15 @@ describe.each(Object.keys(BUNDLES))('the compact bundle %s', (name) => {
     }
   });
 
+  it.runIf('mean_alpha' in scene)('has alphas of their own step, whatever that of the colours is', () => {
+    const { coded, ...atlas } = info.atlas!;
+    const alphas = (step: number): number[] => {
+      const pages = readCompactTexels(bytes(files['texels.bin']), { ...atlas, coded: { ...coded!, step } }, surfels);
+      return [...Buffer.concat(pages.layers)].filter((_, at) => at % 4 === 3);
+    };
+    expect(alphas(2 * coded!.step)).toEqual(alphas(coded!.step));
+  });
+
   it.runIf('atlas' in scene)('has the texels that the package decodes', () => {
     const pages = readCompactTexels(bytes(files['texels.bin']), info.atlas!, surfels);
     const want = bytes(scene.atlas);

@@ -98,14 +98,14 @@ class AtlasTexture:
                 format=name, texels=stored.contiguous().view(torch.uint8), height=height, width=width
             )
 
-    def halved(self) -> AtlasTexture:
-        """Return the texture of half the sides, means of 2 x 2 texels: made on the device, which need not decode
-        blocks for it."""
+    def halved(self, alpha: bool) -> AtlasTexture:
+        """Return the texture of half the sides, means of 2 x 2 texels as `baked_scene.halved` takes them: made on the
+        device, which need not decode blocks for it."""
         height, width = (side // 2 for side in self.size)
         dtype = torch.uint8 if self._bytes else torch.float32
         texels = torch.empty(height, width, 4, dtype=dtype, device=self._device)
         halve = function("halve_texels_uint8" if self._bytes else "halve_texels_half", self._device)
-        halve(texture=self.texture, height=height, width=width, texels=texels)
+        halve(texture=self.texture, height=height, width=width, alpha=alpha, texels=texels)
         return AtlasTexture(texels.cpu(), False, self._device)
 
 
@@ -137,10 +137,10 @@ class Atlas(NamedTuple):
         sheet = Sheet.of(count, side * height, side * width)
         return cls(sheet, AtlasTexture(sheet.joined(pages, side), blocks, device))
 
-    def levels(self) -> dict[str, AtlasTexture]:
-        """The coarser levels of the tiles by name (`tile_levels`)."""
-        half = self.texture.halved()
-        return dict(zip(LEVELS, (half, half.halved()), strict=True))
+    def levels(self, alpha: bool) -> dict[str, AtlasTexture]:
+        """The coarser levels of the tiles, with alpha texels or without, by name (`tile_levels`)."""
+        half = self.texture.halved(alpha)
+        return dict(zip(LEVELS, (half, half.halved(alpha)), strict=True))
 
 
 def compiled(scene: BakedScene, photo_pixel: float = 1.0) -> Any:
@@ -178,7 +178,8 @@ def compiled(scene: BakedScene, photo_pixel: float = 1.0) -> Any:
         atlas = {"texture": kept.texture.texture, "pages_down": kept.sheet.down}
         atlas |= {"page_width": kept.sheet.width, "page_height": kept.sheet.height}
         if photo_pixel < 1.0:
-            atlas |= {name: level.texture for name, level in scene.cache.coarser(kept.levels).items()}
+            levels = scene.cache.coarser(lambda: kept.levels(scene.alpha_scale > 0))
+            atlas |= {name: level.texture for name, level in levels.items()}
     with on_device(device):
         return module(device).BakedScene(
             **{name: p[name] for name in GEOMETRY},

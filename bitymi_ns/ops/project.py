@@ -92,6 +92,11 @@ class Projection:
         return dict(geom=geom, radii=self.radii, **size, **drawn)
 
     @property
+    def alpha_arrays(self) -> dict[str, Any]:
+        """Arguments of the kernels for alpha texels (`AlphaTiles` of csrc/ops/visibility.h); none where opaque."""
+        return {} if self.alpha is None else self.alpha.arrays
+
+    @property
     def not_finite(self) -> int:
         """`broken` as a number; waits for the device."""
         return int(self.broken)

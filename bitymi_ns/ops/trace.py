@@ -118,12 +118,11 @@ class _Trace(torch.autograd.Function):
         grads = {"dweight": dweight, "duv": duv, "ddepth": ddepth}
         grads = {name: None if g is None else dense(g, geom) for name, g in grads.items()}
         dgeom, absgrad = torch.empty_like(geom), geom.new_empty(geom.shape[0], 2)
-        work = trace_cuda.backward_memory(geom, ctx.layout) if cuda_backend(geom.device) else {}
-        of_alpha = {}
-        if projection.alpha is not None:
-            of_alpha = projection.alpha.arrays
-            if ctx.needs_input_grad[1]:
-                of_alpha["dtexel_alpha"] = torch.empty_like(of_alpha["texel_alpha"])
+        of_alpha = projection.alpha_arrays
+        if of_alpha and ctx.needs_input_grad[1]:
+            of_alpha["dtexel_alpha"] = torch.empty_like(of_alpha["texel_alpha"])
+        dalpha = of_alpha.get("dtexel_alpha")
+        work = trace_cuda.backward_memory(geom, ctx.layout, dalpha) if cuda_backend(geom.device) else {}
         kernel("trace_backward", geom)(
             **projection.view(geom),
             **dict(zip(ctx.names, arrays, strict=True)),
@@ -136,7 +135,7 @@ class _Trace(torch.autograd.Function):
             absgrad=absgrad,
         )
         projection.take_mean2d(dgeom[:, :2], absgrad)
-        return dgeom, of_alpha.get("dtexel_alpha"), None, None, None
+        return dgeom, dalpha, None, None, None
 
 
 def trace(projection: Projection, rim: float = 1e-3, most: int | None = None) -> Fragments:

@@ -40,17 +40,13 @@ def find_fragments(geom: Tensor, projection: Projection, most: int | None = None
     require("trace_cpu.find_fragments", "cpu", geom.device, "call `trace`")
     most = MOST if most == 0 else most or 0
     with tracers(geom).borrow() as tracer:
-        n = tracer.run(**projection.view(geom), **_alpha(projection), most=most)
+        n = tracer.run(**projection.view(geom), **projection.alpha_arrays, most=most)
         if most and n > most:
             raise TooManyFragments(geom, projection, n, most, ids=False)
         found = empty_list(geom, n)
         arrays = _empty_layout(tracer.tiles, tracer.blocks)
         tracer.copy(**found, **arrays)
     return _layout(arrays, projection.camera.width, projection.camera.height), found
-
-
-def _alpha(projection: Projection) -> dict[str, Any]:
-    return {} if projection.alpha is None else projection.alpha.arrays
 
 
 def select(layout: Layout, keep: Tensor, width: int, height: int) -> Layout:
@@ -93,4 +89,4 @@ def count(projection: Projection) -> int:
     geom = projection.geom.detach()
     require("trace_cpu.count", "cpu", geom.device, "count those of `trace`")
     with tracers(geom).borrow() as tracer:
-        return tracer.run(**projection.view(geom), **_alpha(projection), most=1)
+        return tracer.run(**projection.view(geom), **projection.alpha_arrays, most=1)

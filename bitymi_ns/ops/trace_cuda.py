@@ -92,6 +92,7 @@ def blended(geom: Tensor, projection: Projection, bins: Bins) -> Layout:
     marks = {"masks": _ints(geom, module(geom.device).TILE_WARPS, pairs), "offsets": _longs(geom, pairs + 1)}
     kernel("trace_mark", geom)(
         **projection.view(geom),
+        **projection.alpha_arrays,
         **marks,
         surfel=bins.surfel,
         tile_pairs=bins.tile_pairs,
@@ -141,7 +142,8 @@ def fill(geom: Tensor, projection: Projection, layout: Layout) -> dict[str, Tens
         found, ids = empty_list(geom, count), layout.ids()
     except torch.cuda.OutOfMemoryError as error:
         raise TooManyFragments(geom, projection, count, fragment_capacity(geom), ids=True) from error
-    kernel("trace_fill", geom)(**projection.view(geom), **found, **ids, layout=layout.handle)
+    view = projection.view(geom) | projection.alpha_arrays
+    kernel("trace_fill", geom)(**view, **found, **ids, layout=layout.handle)
     return found
 
 
@@ -179,7 +181,19 @@ def select(layout: Layout, keep: Tensor, width: int, height: int) -> Layout:
     return _layout(layout.arrays | {"masks": masks, "offsets": offsets}, width, height, ids)
 
 
-def backward_memory(geom: Tensor, layout: Layout) -> dict[str, Tensor]:
-    """Working memory of the backward kernel, by name."""
-    partial = geom.new_empty(layout.handle.pairs, module(geom.device).TRACE_SUMS)
-    return {"dsigma": geom.new_empty(layout.handle.fragments), "partial": partial}
+def backward_memory(geom: Tensor, layout: Layout, texel_alpha: Tensor | None) -> dict[str, Tensor]:
+    """Working memory of the backward kernel, by name.
+
+    Args:
+        geom: [N, 16] without graph.
+        layout: of the fragments.
+        texel_alpha: [T] gradients that are added up, None = none; in int64 where torch is asked for deterministic
+            algorithms.
+    """
+    kernels = module(geom.device)
+    work = {"dsigma": geom.new_empty(layout.handle.fragments)}
+    work["partial"] = geom.new_empty(layout.handle.pairs, kernels.TRACE_SUMS)
+    if texel_alpha is not None and torch.are_deterministic_algorithms_enabled():
+        numbers = kernels.exact_size(len(texel_alpha), 0, False)
+        work["exact_work"] = torch.empty(numbers, dtype=torch.int64, device=geom.device)
+    return work

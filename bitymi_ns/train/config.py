@@ -141,7 +141,7 @@ class TexelConfig(TexelSteps):
     `rate` is raised so that texels get there, up to this."""
     alpha_rate: NonNegative = 0.0
     """Rate of the texels' alphas, which cut silhouettes out of surfels, as a multiple of that of their colours; 0 =
-    opaque texels. On a CUDA device texels are opaque."""
+    opaque texels."""
     surfel_rates: NonNegative = 0.4
     """Rates of the surfels in that part, as a share of those of a run as long as it; they fall to 0 as a cosine."""
     pixels_per_texel: Positive = 0.25

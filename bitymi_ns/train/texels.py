@@ -13,7 +13,6 @@ from torch.nn import Parameter
 from torch.utils.hooks import RemovableHandle
 
 from bitymi_ns.ops import TexelDescent, add_texel_coverage, fitting_lists, project
-from bitymi_ns.ops.backend import cuda_backend
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.scene.camera import Camera
@@ -148,7 +147,7 @@ def blank_texels(
         least = LEAST_SHARE * single_view_coverage(surfels, cameras, size, extent, scene.near)
         seen_in_all = torch.maximum(seen_in_all, least)
     field.share.copy_(1.0 / (seen_in_all + options.prior))
-    if options.alpha_rate > 0 and not cuda_backend(extent.device):
+    if options.alpha_rate > 0:
         field.alpha = Parameter(torch.ones_like(field.share))
     return field
 

@@ -188,7 +188,8 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
           for (const S* p : columns)
             if (p) __builtin_prefetch(p + soon);
           const auto gradient = [&](const S* p) { return p ? expand(p + at, of.lanes) : zero; };
-          const P listed = expand(f.sigma + at, of.lanes), sigma = abs_(listed);
+          P listed = expand(f.sigma + at, of.lanes);
+          const P sigma = abs_(listed);
           P dsigma = blend_vjp(expand(f.weight + at, of.lanes), sigma, gradient(dweight), behind[of.block]);
           const P dx = centres.x + P(kBlockOffsets<S>.column[of.block] - cx);
           const P dy = centres.y + P(kBlockOffsets<S>.row[of.block] - cy);
@@ -199,12 +200,14 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
             patch.locate(expand(f.uv + at, of.lanes), v);
             const P m = patch.fetch(lanes);
             S g[kLanes], su[kLanes], sv[kLanes];
-            store(g, select(there & (sigma < P(S(kAlphaMax))), dsigma * sigma / m, zero));
+            // neither clamp passes a gradient, that of the product and the kernel's own
+            const auto moves = there & (sigma < P(S(kAlphaMax)));
+            store(g, select(moves, dsigma * sigma / m, zero));
             store(su, gu), store(sv, gv);
             patch.add_gradient(lanes, g, texels ? of_texels[part].data() : nullptr, su, sv);
-            if (duv) gu = load(su), gv = load(sv);
-            // the kernel's own clamp passes no gradient either
-            dsigma = select(sigma < m * P(S(kAlphaMax)), dsigma, zero);
+            gu = load(su), gv = load(sv);
+            dsigma = select(moves & (sigma < m * P(S(kAlphaMax))), dsigma * m, zero);
+            listed = listed / m;
           }
           fragment_vjp<Kernel, S, P>(g, near, rim, select(there, dx, zero), select(there, dy, zero), listed,
                                      select(there, dsigma, zero), gu, gv, gradient(ddepth), d, ddx, ddy);

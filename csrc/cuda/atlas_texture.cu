@@ -29,9 +29,24 @@ BT_HD void put_mean(const float (&texels)[4], uint8_t& to) {
   to = uint8_t(sum / 4);
 }
 BT_HD void put_mean(const float (&texels)[4], float& to) { to = (texels[0] + texels[1] + texels[2] + texels[3]) / 4; }
+// Weighted by alpha, of which some is not 0.
+BT_HD void put_mean(const float (&texels)[4], const float (&alpha)[4], uint8_t& to) {
+  int sum = 0, total = 0;
+  for (int k = 0; k < 4; ++k) {
+    const int weight = int(alpha[k] * 255.0f + 0.5f);
+    sum += weight * int(texels[k] * 255.0f + 0.5f), total += weight;
+  }
+  to = uint8_t((sum + total / 2) / total);
+}
+BT_HD void put_mean(const float (&texels)[4], const float (&alpha)[4], float& to) {
+  float sum = 0, total = 0;
+  for (int k = 0; k < 4; ++k) sum += alpha[k] * texels[k], total += alpha[k];
+  to = sum / max_(total, 1e-6f);
+}
 
 constexpr int kHalvedThreads = 128;  // texels of a row, half as wide as the atlas
-template <class T> __global__ void __launch_bounds__(kHalvedThreads) halve_kernel(uint64_t texture, int width, T* to) {
+template <class T>
+__global__ void __launch_bounds__(kHalvedThreads) halve_kernel(uint64_t texture, int width, bool alpha, T* to) {
   const int x = int(blockIdx.x) * kHalvedThreads + int(threadIdx.x), y = int(blockIdx.y);
   if (x >= width) return;
   float texels[4][4];  // channels of four texels
@@ -39,14 +54,22 @@ template <class T> __global__ void __launch_bounds__(kHalvedThreads) halve_kerne
     const float4 c = fetch_texel(texture, float(2 * x + k % 2) + 0.5f, float(2 * y + k / 2) + 0.5f);
     texels[0][k] = c.x, texels[1][k] = c.y, texels[2][k] = c.z, texels[3][k] = c.w;
   }
-  for (int channel = 0; channel < 4; ++channel) put_mean(texels[channel], to[4 * (int64_t(y) * width + x) + channel]);
+  const float (&fourth)[4] = texels[3];
+  const bool weighted = alpha && (fourth[0] > 0 || fourth[1] > 0 || fourth[2] > 0 || fourth[3] > 0);
+  to += 4 * (int64_t(y) * width + x);
+  for (int channel = 0; channel < 4; ++channel) {
+    if (weighted && channel < 3)
+      put_mean(texels[channel], fourth, to[channel]);
+    else
+      put_mean(texels[channel], to[channel]);
+  }
 }
 }  // namespace
 
 template <class T> void halve_texels(const HalvedTexels<T>& a, Stream stream) {
   if (!a.height || !a.width) return;
   const dim3 blocks(unsigned(ceil_div(a.width, kHalvedThreads)), unsigned(a.height));
-  BT_LAUNCH(halve_kernel<T>, blocks, dim3(kHalvedThreads), 0, stream, a.texture->handle(), a.width, a.texels);
+  BT_LAUNCH(halve_kernel<T>, blocks, dim3(kHalvedThreads), 0, stream, a.texture->handle(), a.width, a.alpha, a.texels);
 }
 template void halve_texels(const HalvedTexels<uint8_t>&, Stream);
 template void halve_texels(const HalvedTexels<float>&, Stream);

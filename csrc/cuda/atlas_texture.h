@@ -38,15 +38,16 @@ class AtlasTexture {
 };
 
 // Means of 2 x 2 texels of a texture: texels [height, width, 4], half its sides. Those of bytes are bytes, and rounded
-// as `ops.tile_levels` rounds them; of halves they are floats.
+// as `ops.tile_levels` rounds them; of halves they are floats. alpha: as there.
 template <class T> struct HalvedTexels {
   const AtlasTexture* texture;
   int height, width;
+  bool alpha;
   T* texels;
 
   template <class R> void fields(R& r) {
     r.object("texture", texture);
-    r.numbers("height", height, "width", width);
+    r.numbers("height", height, "width", width, "alpha", alpha);
     r.array("texels", texels, int64_t(4) * height * width);
   }
 };

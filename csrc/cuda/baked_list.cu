@@ -43,11 +43,13 @@ __device__ void write_texture(const BakedScene& s, int64_t i, Vec3<float> color,
     const int x = tile[0] + tile[2] / s.pages_down * s.page_width, y = tile[1] + tile[2] % s.pages_down * s.page_height;
     texture[0] = float(x >> level) + 0.5f, texture[1] = float(y >> level) + 0.5f;
     texture[2] = float((tile[3] >> level) - 1), texture[3] = float((tile[4] >> level) - 1);
-  } else if (s.mean_residual) {
-    const Vec3<float> flat = load3(s.mean_residual + 3 * i);
-    if (flat.x != 0 || flat.y != 0 || flat.z != 0) {
+  } else if (s.mean_residual || s.mean_alpha) {
+    const Vec3<float> flat = s.mean_residual ? load3(s.mean_residual + 3 * i) : Vec3<float>{0, 0, 0};
+    const float alpha = s.mean_alpha ? s.mean_alpha[i] : 1.0f;
+    if (flat.x != 0 || flat.y != 0 || flat.z != 0 || alpha != 1) {
       scale = -1;
       store3(texture, shaded(color, flat));
+      texture[3] = alpha;
     }
   }
   row[kTexelScale] = scale;

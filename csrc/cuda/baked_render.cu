@@ -31,7 +31,7 @@ constexpr int kCheckEvery = 8;       // rows after which finished pixels are che
 struct DrawArgs {
   BakedFrame frame;
   uint64_t atlas[kTileLevels];
-  float near, offset, scale, weight_bound, transmittance_min;
+  float near, offset, scale, alpha_offset, alpha_scale, weight_bound, transmittance_min;
   float sharp;  // of the low pass (core/resize.h)
   BakedImages images;
 };
@@ -50,12 +50,55 @@ struct Row {
   uint32_t id;
 };
 
-// Adds a row's fragments to the thread's pixels, with weight 0 to those that do not take it. The texels of all are on
-// their way before one is used.
-template <bool kMaps, bool kLevels>
+// The texels under the pixels that want them, all on their way before one is used. c, t: the row's `rest`.
+template <bool kLevels>
+__device__ __forceinline__ void fetch_texels(const DrawArgs& a, const float4& c, const float4& t,
+                                             const bool (&wanted)[kPixels], const Fragment<FastFloat> (&f)[kPixels],
+                                             float4 (&texel)[kPixels]) {
+  const auto fetch = [&](uint64_t atlas) {
+    BT_UNROLL
+    for (int j = 0; j < kPixels; ++j)
+      if (wanted[j])
+        texel[j] = fetch_texel(atlas, t.x + texel_position_scaled(f[j].u, t.z, c.y).v,
+                               t.y + texel_position_scaled(f[j].v, t.w, c.y).v);
+  };
+  // by name, not by index: see AtlasTexture
+  if (!kLevels || c.z == 0)
+    fetch(a.atlas[0]);
+  else if (c.z == 1)
+    fetch(a.atlas[1]);
+  else
+    fetch(a.atlas[2]);
+}
+
+// Multiplies sigma by alpha where the weight reaches the bound, as AlphaTiles say, and leaves the texels there: what
+// has the weight for a residual afterwards is among them.
+template <bool kLevels>
+__device__ __forceinline__ void cut(const DrawArgs& a, const Row& s, const bool (&covers)[kPixels],
+                                    const Pixel (&p)[kPixels], Fragment<FastFloat> (&f)[kPixels],
+                                    float4 (&texel)[kPixels]) {
+  const float4 c = s.rest[0];
+  bool reaches[kPixels], any = false;
+  BT_UNROLL
+  for (int j = 0; j < kPixels; ++j) {
+    const float sigma = f[j].sigma.v;
+    any |= reaches[j] = covers[j] && sigma >= float(kAlphaMin) && sigma * p[j].transmittance >= a.weight_bound;
+  }
+  if (!any || c.y == 0) return;
+  const float4 t = s.rest[1];
+  if (c.y > 0) fetch_texels<kLevels>(a, c, t, reaches, f, texel);
+  BT_UNROLL
+  for (int j = 0; j < kPixels; ++j)
+    if (reaches[j])
+      f[j].sigma = FastFloat(alpha_cut(f[j].sigma.v, c.y > 0 ? a.alpha_offset + a.alpha_scale * texel[j].w : t.w));
+}
+
+// Adds a row's fragments to the thread's pixels, with weight 0 to those that do not take it. texel: with kAlpha what
+// `cut` left.
+template <bool kMaps, bool kLevels, bool kAlpha>
 __device__ __forceinline__ void add(const DrawArgs& a, const Row& s, const bool (&taken)[kPixels],
                                     const float (&weight)[kPixels], const Fragment<FastFloat> (&f)[kPixels],
-                                    Pixel (&p)[kPixels]) {
+                                    float4 (&texel)[kPixels], Pixel (&p)[kPixels]) {
   const float4 c = s.rest[0];
   Vec3<FastFloat> color[kPixels];
   BT_UNROLL
@@ -66,21 +109,7 @@ __device__ __forceinline__ void add(const DrawArgs& a, const Row& s, const bool 
   if (any && c.y != 0) {
     const float4 t = s.rest[1];
     if (c.y > 0) {
-      float4 texel[kPixels];
-      const auto fetch = [&](uint64_t atlas) {
-        BT_UNROLL
-        for (int j = 0; j < kPixels; ++j)
-          if (textured[j])
-            texel[j] = fetch_texel(atlas, t.x + texel_position_scaled(f[j].u, t.z, c.y).v,
-                                   t.y + texel_position_scaled(f[j].v, t.w, c.y).v);
-      };
-      // by name, not by index: see AtlasTexture
-      if (!kLevels || c.z == 0)
-        fetch(a.atlas[0]);
-      else if (c.z == 1)
-        fetch(a.atlas[1]);
-      else
-        fetch(a.atlas[2]);
+      if (!kAlpha) fetch_texels<kLevels>(a, c, t, textured, f, texel);
       BT_UNROLL
       for (int j = 0; j < kPixels; ++j)
         if (textured[j])
@@ -110,7 +139,7 @@ __device__ __forceinline__ void add(const DrawArgs& a, const Row& s, const bool 
 // A row under the thread's pixels, of which the first is dx, dy from the projected centre. Both are worked on together,
 // so that one does not wait for the other's steps. Unless kAll the low pass does not show, and no pixel of the disc
 // lies before the near plane; PixelKernel is for the rows that it filters alone.
-template <bool kMaps, bool kLevels, class Kernel, bool kAll>
+template <bool kMaps, bool kLevels, bool kAlpha, class Kernel, bool kAll>
 __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx, float dy, Pixel (&p)[kPixels]) {
   Planes<FastFloat> at[kPixels];
   FastFloat y[kPixels];
@@ -129,6 +158,7 @@ __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx,
   }
   if (!any) return;
   Fragment<FastFloat> f[kPixels];
+  float4 texel[kPixels];
   float weight[kPixels];
   any = false;
   BT_UNROLL
@@ -137,6 +167,10 @@ __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx,
       f[j] = fragment<Kernel, true>(s.g, a.near, FastFloat(dx), y[j], a.sharp);
     else
       f[j] = fragment_within(s.g, at[j]);
+  }
+  if (kAlpha) cut<kLevels>(a, s, taken, p, f, texel);
+  BT_UNROLL
+  for (int j = 0; j < kPixels; ++j) {
     const float sigma = f[j].sigma.v;
     const Blend<float> b = bt::blend(sigma, p[j].transmittance);
     const BlendTest<float> v = blend_test(taken[j], sigma, b.behind, a.transmittance_min);
@@ -146,7 +180,7 @@ __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx,
     taken[j] = v.takes;
     any |= taken[j];
   }
-  if (any) add<kMaps, kLevels>(a, s, taken, weight, f, p);
+  if (any) add<kMaps, kLevels, kAlpha>(a, s, taken, weight, f, texel, p);
 }
 
 // Rounded as the image of floats would be: the product for itself.
@@ -187,12 +221,12 @@ __device__ unsigned tile_of_block(const BakedMemory& m, unsigned block) {
 }
 
 // Blocks per multiprocessor: as many as registers allow that the loop over pairs needs without the sort.
-template <bool kMaps, class Kernel>
-constexpr int kBlocks =
-    bounded_blocks(kMaps ? (Kernel::kPixel ? 6 : 7) : (Kernel::kPixel || Kernel::kResized ? 8 : 9), kThreads);
+template <bool kMaps, class Kernel, bool kAlpha>
+constexpr int kBlocks = bounded_blocks(
+    (kMaps ? (Kernel::kPixel ? 6 : 7) : (Kernel::kPixel || Kernel::kResized ? 8 : 9)) - int(kAlpha), kThreads);
 
-template <bool kMaps, class Kernel>
-__global__ void __launch_bounds__(kThreads, kBlocks<kMaps, Kernel>) draw_kernel(DrawArgs a) {
+template <bool kMaps, class Kernel, bool kAlpha>
+__global__ void __launch_bounds__(kThreads, kBlocks<kMaps, Kernel, kAlpha>) draw_kernel(DrawArgs a) {
   __shared__ float4 staged[kWarps][kWarp * kRowQuads];
   __shared__ uint32_t queues[kWarps][2 * kWarp];
   constexpr bool kLevels = Kernel::kPixel || Kernel::kResized;  // those of smaller views are among these
@@ -258,11 +292,11 @@ __global__ void __launch_bounds__(kThreads, kBlocks<kMaps, Kernel>) draw_kernel(
                        kMaps ? queue[k] >> 8 : 0};
         const float dx = px - s.g[kCx], dy = py - s.g[kCy];
         if (filtered<Kernel>(s.g))
-          blend<kMaps, kLevels, Kernel, true>(a, s, dx, dy, p);
+          blend<kMaps, kLevels, kAlpha, Kernel, true>(a, s, dx, dy, p);
         else if (Kernel::kPixel || s.blur2 != 0)
-          blend<kMaps, kLevels, Unfiltered<Kernel>, true>(a, s, dx, dy, p);
+          blend<kMaps, kLevels, kAlpha, Unfiltered<Kernel>, true>(a, s, dx, dy, p);
         else
-          blend<kMaps, kLevels, Unfiltered<Kernel>, false>(a, s, dx, dy, p);
+          blend<kMaps, kLevels, kAlpha, Unfiltered<Kernel>, false>(a, s, dx, dy, p);
       }
     }
     wanted = 0;
@@ -289,17 +323,20 @@ void baked_draw(const BakedScene& s, const BakedImages& images, const BakedFrame
                       s.near,
                       s.offset,
                       s.scale,
+                      s.alpha_scale != 0 ? 0.0f : 1.0f,  // opaque texels have m = 1
+                      s.alpha_scale,
                       max_(s.weight_bound, 1e-30f),  // above the weight of a pixel without a fragment
                       s.transmittance_min,
                       Resize<float>(f.photo_pixel).sharp,
                       images};
   const dim3 grid(static_cast<unsigned>(f.tiles));
   const bool maps = images.beta || images.depth || images.normal || images.overdraw;
+  const bool alpha = s.alpha_scale != 0 || s.mean_alpha;
   with_kernel(f.prefilter, f.photo_pixel, [&](auto kernel) {
-    if (maps)
-      BT_LAUNCH((draw_kernel<true, decltype(kernel)>), grid, dim3(kThreads), 0, stream, a);
-    else
-      BT_LAUNCH((draw_kernel<false, decltype(kernel)>), grid, dim3(kThreads), 0, stream, a);
+    using Kernel = decltype(kernel);
+    const auto draw = alpha ? (maps ? draw_kernel<true, Kernel, true> : draw_kernel<false, Kernel, true>)
+                            : (maps ? draw_kernel<true, Kernel, false> : draw_kernel<false, Kernel, false>);
+    BT_LAUNCH(draw, grid, dim3(kThreads), 0, stream, a);
   });
 }
 

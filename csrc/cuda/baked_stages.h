@@ -18,10 +18,10 @@ enum RowColumn {
                     // kNearCuts: no low pass, but pixels have to be compared with the near plane. With ResizedKernel it
                     // also says how high the low pass is: 1/255 is left of it there
   kRed,             // relu(view colour + 0.5), three
-  kTexelScale = kRed + 3,  // 1 / (2 extent); 0: no residual; -1: a constant one
+  kTexelScale = kRed + 3,  // 1 / (2 extent); 0: neither residual nor alpha; -1: constant ones
   kLevel,                  // of the tile; the column after it is free
-  kTileX = kLevel + 2,     // centre of the tile's first texel, two; or three: the colour with the constant residual
-  kSpanX = kTileX + 2,     // texels of the tile less one, two
+  kTileX = kLevel + 2,  // centre of the tile's first texel, two; or four: the colour with the constant residual, alpha
+  kSpanX = kTileX + 2,  // texels of the tile less one, two
   kRow = kSpanX + 2
 };
 static_assert(kRow == 24 && kR2 == 12);

@@ -100,7 +100,7 @@ template <class S> void field_backward(const FieldBackward<S>& a, Stream stream)
     const auto kernel = field_backward_kernel<S, true>;
     BT_ALLOW_SHARED(kernel, shared);
     BT_LAUNCH(kernel, grid, block, shared, stream, a.n, field, a.x, a.drho, out.table, exact, work.mlp, a.dx);
-    end_exact(exact, &field, 0, out.table, static_cast<S*>(nullptr), static_cast<S*>(nullptr), stream);
+    end_exact(exact, field.table_size(), 0, out.table, static_cast<S*>(nullptr), static_cast<S*>(nullptr), stream);
   } else {
     const auto kernel = field_backward_kernel<S, false>;
     fill_zero(out.table, field.table_size(), stream);

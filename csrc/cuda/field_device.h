@@ -280,9 +280,9 @@ struct ExactSums {
 template <class S>
 ExactSums begin_exact(int64_t* memory, int64_t entries, const FieldArrays<S>* field, int64_t surfels, bool frames,
                       int64_t count, int64_t numbers, const S* gradients, Stream stream);
-// Writes the exact sums as numbers: where not null, dtable (of a field), dbase and dframes.
+// Writes the exact sums as numbers: where not null, dtable [entries], dbase and dframes.
 template <class S>
-void end_exact(const ExactSums& exact, const FieldArrays<S>* field, int64_t surfels, S* dtable, S* dbase, S* dframes,
+void end_exact(const ExactSums& exact, int64_t entries, int64_t surfels, S* dtable, S* dbase, S* dframes,
                Stream stream);
 // Adds up the blocks' sums of the weights' gradients.
 template <class S>

@@ -125,9 +125,9 @@ ExactSums begin_exact(int64_t* memory, int64_t entries, const FieldArrays<S>* fi
 }
 
 template <class S>
-void end_exact(const ExactSums& exact, const FieldArrays<S>* field, int64_t surfels, S* dtable, S* dbase, S* dframes,
+void end_exact(const ExactSums& exact, int64_t entries, int64_t surfels, S* dtable, S* dbase, S* dframes,
                Stream stream) {
-  if (dtable) convert(field->table_size(), exact.table, &exact.range->table, dtable, stream);
+  if (dtable) convert(entries, exact.table, &exact.range->table, dtable, stream);
   if (dbase) convert(3 * surfels, exact.base, &exact.range->base, dbase, stream);
   if (dframes) convert(kFrame * surfels, exact.frames, &exact.range->frames, dframes, stream);
 }
@@ -141,7 +141,7 @@ void sum_weights(const S* partial, int blocks, int levels, const FieldGradients<
 #define BT_INSTANTIATE(S)                                                                                      \
   template ExactSums begin_exact<S>(int64_t*, int64_t, const FieldArrays<S>*, int64_t, bool, int64_t, int64_t, \
                                     const S*, Stream);                                                         \
-  template void end_exact<S>(const ExactSums&, const FieldArrays<S>*, int64_t, S*, S*, S*, Stream);            \
+  template void end_exact<S>(const ExactSums&, int64_t, int64_t, S*, S*, S*, Stream);                          \
   template void sum_weights<S>(const S*, int, int, const FieldGradients<S>&, Stream);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)

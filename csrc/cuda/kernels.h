@@ -71,6 +71,7 @@ template <class S> void bin_fill(const BinFill<S>& a, Stream stream);
 // of fragments is offsets[pairs].
 template <class S> struct TraceMark {
   View<S> view;
+  AlphaTiles<S> alpha;
   int64_t pairs;
   const int32_t* surfel;
   const int64_t* tile_pairs;
@@ -80,6 +81,7 @@ template <class S> struct TraceMark {
 
   template <class R> void fields(R& r) {
     view.fields(r);
+    alpha.fields(r, view.n);
     r.rows("surfel", surfel, pairs, 1);
     check_pairs(r, pairs);
     const int64_t tiles = tiles_of(view.width, view.height);
@@ -95,10 +97,12 @@ template <class S> void trace_mark(const TraceMark<S>& a, Stream stream);
 // Writes the fragments.
 template <class S> struct TraceFill {
   View<S> view;
+  AlphaTiles<S> alpha;
   Fragments<S, Pairs> fragments;
 
   template <class R> void fields(R& r) {
     view.fields(r);
+    alpha.fields(r, view.n);
     fragments.fields(r, view.n, view.width, view.height);
   }
 };

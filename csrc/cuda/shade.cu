@@ -242,7 +242,7 @@ template <class S> void shade_backward(const ShadeBackward<S>& a, Stream stream)
     const ExactSums exact = begin_exact(a.work.exact, learned ? learned->table_size() : 0, learned, a.n,
                                         a.dframes != nullptr, a.f.total, 3 * a.f.total, a.dcolors, stream);
     trains_field ? run(backward_kernel<S, true, true>, exact) : run(backward_kernel<S, true, false>, exact);
-    end_exact(exact, learned, a.n, out.table, a.dbase, a.dframes, stream);
+    end_exact(exact, arrays.table_size(), a.n, out.table, a.dbase, a.dframes, stream);
   } else {
     fill_zero(a.dbase, 3 * a.n, stream);
     if (a.dframes) fill_zero(a.dframes, kFrame * a.n, stream);

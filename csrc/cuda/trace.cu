@@ -10,6 +10,7 @@
 #include "cuda/fast.h"
 #include "cuda/kernels.h"
 #include "cuda/primitives.h"
+#include "cuda/texel_alpha.h"
 
 namespace bt::cuda {
 
@@ -36,10 +37,10 @@ template <class Kernel, class S> __device__ bool reached_by_warp(const S* g, con
   return r.support || r.centre;
 }
 
-template <class Kernel, class S>
+template <class Kernel, class S, bool kAlpha>
 __global__ void __launch_bounds__(kTileThreads)
-    mark_kernel(const S* geom, const S* radii, S near, int width, int height, int64_t pairs, const int32_t* surfel,
-                const int64_t* tile_pairs, uint32_t* masks) {
+    mark_kernel(const S* geom, const S* radii, S near, int width, int height, AlphaTiles<S> alpha, int64_t pairs,
+                const int32_t* surfel, const int64_t* tile_pairs, uint32_t* masks) {
   using T = FastFloatOr<S>;
   const TileThread s = tile_thread(width);
   const int64_t end = tile_pairs[blockIdx.x + 1];
@@ -70,14 +71,20 @@ __global__ void __launch_bounds__(kTileThreads)
       const int j = __ffs(int(todo)) - 1;
       todo &= todo - 1;
       S g[kGeom];
-      load_shape(geom + int64_t(__shfl_sync(kFullMask, id, j)) * kGeom, g);
+      const int64_t drawn = __shfl_sync(kFullMask, id, j);
+      load_shape(geom + drawn * kGeom, g);
       const T dx = T(x - g[kCx]), dy = T(y - g[kCy]);
       // a cheap test first: an open pixel in the support or near the centre
       const bool close = near_centre(dx, dy);
       const bool reached = filtered<Kernel>(g) ? in_support(filtered_hit<S, T>(g, dx, dy))
                                                : close || in_support(planes<S, T>(g, dx, dy));
       if (!__any_sync(kFullMask, open && reached)) continue;
-      const S sigma = plain(fragment<Kernel>(g, near, dx, dy, __any_sync(kFullMask, close)).sigma);
+      const Fragment<T> f = fragment<Kernel>(g, near, dx, dy, __any_sync(kFullMask, close));
+      S sigma = plain(f.sigma);
+      if constexpr (kAlpha) {
+        S v = plain(f.v);
+        if (open && sigma >= S(kAlphaMin)) cut(alpha, drawn, transmittance, plain(f.u), v, sigma);
+      }
       const S behind = blend(sigma, transmittance).behind;
       const BlendTest<S> v = blend_test(open, sigma, behind, S(kTransmittanceMin));
       open = open && !v.ends;
@@ -105,9 +112,11 @@ __global__ void __launch_bounds__(kThreads)
 // A warp has about ten fragments of a pair, which rarely fill a sector of 32 bytes. If each warp wrote its own, most
 // sectors would be written in parts, by several warps, and memory takes longer for a part than for a whole sector. So a
 // block collects the fragments of up to 32 pairs, in the list's order, and writes them as one contiguous stretch.
-template <class Kernel, class S>
-__global__ void __launch_bounds__(kTileThreads, sizeof(S) == 4 ? 6 : 1)
-    fill_kernel(const S* geom, S near, Pairs p, FragmentArrays<S> out) {
+template <class Kernel, class S, bool kAlpha>
+__global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
+                                                : kAlpha       ? 5
+                                                               : 6)
+    fill_kernel(const S* geom, S near, AlphaTiles<S> alpha, Pairs p, FragmentArrays<S> out) {
   using T = FastFloatOr<S>;
   struct alignas(16) Row {
     S g[kGeom];
@@ -145,12 +154,19 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 4 ? 6 : 1)
       if (!mine) return;
       // The mark found at least that much. Where the kernel ends abruptly the same formula, rounded otherwise here,
       // may find nothing, and the gradient would divide by it.
-      const S sigma = max_(plain(f.sigma), S(kAlphaMin));
+      S sigma = max_(plain(f.sigma), S(kAlphaMin)), v = plain(f.v);
+      if constexpr (kAlpha) {
+        const S uncut = sigma;
+        cut(alpha, ids[j], transmittance, plain(f.u), v, sigma);
+        // far less is that of a weight at the bound, which the mark found to be below it
+        if (sigma < S(0.5 * kAlphaMin)) sigma = uncut, v = with_mark(v, false);
+        sigma = max_(sigma, S(kAlphaMin));
+      }
       const Blend<S> b = blend(sigma, transmittance);
       transmittance = b.behind;
       surfels[i] = ids[j], pixels[i] = pixel;
       weights[i] = b.weight;
-      us[i] = plain(f.u), vs[i] = plain(f.v);
+      us[i] = plain(f.u), vs[i] = v;
       depths[i] = plain(f.depth);
       sigmas[i] = plain(f.low_pass) > S(0) ? -sigma : sigma;
     });
@@ -209,8 +225,10 @@ template <class S> void trace_mark(const TraceMark<S>& a, Stream stream) {
   const MarkSpace w(arena, pairs);
   if (pairs)
     with_kernel(v.prefilter, [&](auto kernel) {
-      BT_LAUNCH((mark_kernel<decltype(kernel), S>), dim3(unsigned(tiles)), dim3(kTileThreads), 0, stream, v.geom,
-                v.radii, v.near, v.width, v.height, pairs, a.surfel, a.tile_pairs, a.masks);
+      const auto mark =
+          a.alpha.values ? mark_kernel<decltype(kernel), S, true> : mark_kernel<decltype(kernel), S, false>;
+      BT_LAUNCH(mark, dim3(unsigned(tiles)), dim3(kTileThreads), 0, stream, v.geom, v.radii, v.near, v.width, v.height,
+                a.alpha, pairs, a.surfel, a.tile_pairs, a.masks);
     });
   BT_LAUNCH(size_kernel, dim3(unsigned(ceil_div(pairs + 1, kThreads))), dim3(kThreads), 0, stream, pairs,
             a.tile_pairs + tiles, a.masks, w.counts);
@@ -221,8 +239,9 @@ template <class S> void trace_fill(const TraceFill<S>& a, Stream stream) {
   const Pairs& p = a.fragments.layout;
   if (!p.fragments) return;
   with_kernel(a.view.prefilter, [&](auto kernel) {
-    BT_LAUNCH((fill_kernel<decltype(kernel), S>), dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, a.view.geom,
-              a.view.near, p, a.fragments.f);
+    const auto fill = a.alpha.values ? fill_kernel<decltype(kernel), S, true> : fill_kernel<decltype(kernel), S, false>;
+    BT_LAUNCH(fill, dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, a.view.geom, a.view.near, a.alpha, p,
+              a.fragments.f);
   });
 }
 

@@ -2,10 +2,13 @@
 //
 // dL/dsigma of a fragment needs the sum of w dL/dw over the fragments behind it in its pixel: a walk back to front with
 // that sum in a register, 16 bytes per fragment. The long formulas then need no order any more, so they run through the
-// list one pair at a time with all lanes busy (in the walk two thirds would idle) and reduce once per pair.
+// list one pair at a time with all lanes busy (in the walk two thirds would idle) and reduce once per pair. Gradients
+// of alpha texels are summed over neighbouring fragments between the same texels, then added in memory.
 #include "core/kernel.h"
 #include "cuda/fast.h"
 #include "cuda/kernels.h"
+#include "cuda/texel_alpha.h"
+#include "cuda/texel_sums.h"
 
 namespace bt::cuda {
 
@@ -35,17 +38,57 @@ __global__ void __launch_bounds__(kTileThreads)
   for_each_fragment<4, true>(p, s, load, use);
 }
 
-template <class Kernel, class S>
+// Alpha texels, and where their gradients are added up; `texels` null: nowhere.
+template <class S> struct AlphaGradient {
+  AlphaTiles<S> tiles;
+  S* texels;
+  ExactSums exact;
+};
+
+// Gradients of alpha's share of a fragment's sigma: from gs, that of the listed sigma, to that of the kernel's sigma,
+// which takes the place of the listed one; more of gu and gv; and the return value, that of m.
+template <class S>
+__device__ S alpha_vjp(const AlphaPatch<S>& patch, const TexelCorners<S>& at, S& listed, S& gs, S& gu, S& gv) {
+  S t[4];
+  const S m = patch.fetch(at, t), sigma = abs_(listed);
+  // neither clamp passes a gradient, that of the product and the kernel's own; m may be rounded otherwise than when the
+  // fragment was written
+  const bool moves = sigma < S(kAlphaMax), uncut_moves = moves && sigma < m * S(kAlphaMax * (1 - 1e-6));
+  const S dm = moves ? gs * sigma / m : S(0);
+  if (at.inside_u) gu += dm * texel_density(patch.size[0], patch.extent) * texel_slope_u(t, at.fy);
+  if (at.inside_v) gv += dm * texel_density(patch.size[1], patch.extent) * texel_slope_v(t, at.fx);
+  gs = uncut_moves ? gs * m : S(0);
+  listed /= m;
+  return dm;
+}
+
+// Adds the gradients of every lane's four corners, one addition per run of lanes between the same texels; row as in
+// add_to_texels.
+template <class S, bool kExact>
+__device__ void add_to_alpha(int64_t row, const TexelCorners<S>& at, S dm, int lane, const Adder<S, kExact>& to) {
+  S value[4];
+  BT_UNROLL
+  for (int k = 0; k < 4; ++k) value[k] = at.weight[k] * dm;
+  const unsigned run = run_of(row, lane);
+  sum_over_run(run, lane, value);
+  if (row < 0 || count_below(run, lane)) return;
+  BT_UNROLL
+  for (int k = 0; k < 4; ++k)
+    if (value[k] != S(0)) to.add(row + at.at[k] - at.at[0], value[k]);
+}
+
+template <class Kernel, class S, bool kAlpha, bool kExact>
 __global__ void __launch_bounds__(kRunThreads)
-    surfel_kernel(const S* geom, S near, S rim, Pairs p, FragmentArrays<S> f, const S* dsigma, const S* duv,
-                  const S* ddepth, S* partial) {
+    surfel_kernel(const S* geom, S near, S rim, Pairs p, FragmentArrays<S> f, AlphaGradient<S> alpha, const S* dsigma,
+                  const S* duv, const S* ddepth, S* partial) {
   using T = FastFloatOr<S>;
   const Run r = run(p);
   T d[kTraceSums], ax = T(S(0)), ay = T(S(0));
   BT_UNROLL
   for (int c = 0; c < kTraceSums; ++c) d[c] = T(S(0));
   S g[kGeom];
-  load_shape(geom + (r.some ? int64_t(p.surfel[r.k]) : 0) * kGeom, g);
+  const int64_t id = r.some ? int64_t(p.surfel[r.k]) : 0;
+  load_shape(geom + id * kGeom, g);
   const RowOf row_of(p.width);
   const int own = int(r.end - r.begin), most = max_(own, __shfl_xor_sync(kFullMask, own, kRunLanes));
   for (int at = r.lane; at - r.lane < most; at += kRunLanes) {
@@ -60,6 +103,20 @@ __global__ void __launch_bounds__(kRunThreads)
       if (ddepth) gz = ddepth[i];
     }
     __syncwarp();  // no load is put off until its number is used: one wait is for all
+    if constexpr (kAlpha) {
+      const AlphaPatch<S> patch(alpha.tiles, id);
+      TexelCorners<S> corners = {};
+      S v = S(0), dm = S(0);
+      if (mine && patch.textured()) v = f.uv[f.total + i];
+      const bool is_cut = mine && patch.textured() && is_marked(v);
+      if (is_cut) {
+        corners = patch.corners(f.uv[i], v);
+        dm = alpha_vjp(patch, corners, listed, gs, gu, gv);
+      }
+      if (alpha.texels)
+        add_to_alpha(is_cut ? patch.first + corners.at[0] : int64_t(-1), corners, dm, int(threadIdx.x) % kWarp,
+                     texel_adder<kExact>(alpha.texels, alpha.exact));
+    }
     if (mine) {
       const int32_t y = row_of(pixel), x = pixel - y * p.width;
       T ddx, ddy;
@@ -91,11 +148,25 @@ template <class S> void trace_backward(const TraceBackward<S, Pairs>& a, Stream 
   if (a.dweight && f.total)
     BT_LAUNCH(dsigma_kernel<S>, dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, p, f, a.dweight, a.dsigma);
   const S* dsigma = a.dweight ? a.dsigma : nullptr;
+  const int64_t texels = a.dtexel_alpha ? a.alpha.texels : 0;
+  const bool cuts = a.alpha.values && dsigma, exact = cuts && texels && a.exact_alpha;
+  AlphaGradient<S> alpha = {a.alpha, a.dtexel_alpha, {}};
+  if (exact)
+    alpha.exact = begin_exact(a.exact_alpha, texels, static_cast<const FieldArrays<S>*>(nullptr), 0, false, f.total,
+                              f.total, dsigma, stream);
+  else
+    fill_zero(a.dtexel_alpha, texels, stream);
   if (p.pairs)
     with_kernel(a.view.prefilter, [&](auto kernel) {
-      BT_LAUNCH((surfel_kernel<decltype(kernel), S>), run_blocks(p), dim3(kRunThreads), 0, stream, a.view.geom,
-                a.view.near, a.rim, p, f, dsigma, a.duv, a.ddepth, a.partial);
+      using Kernel = decltype(kernel);
+      const auto run = exact  ? surfel_kernel<Kernel, S, true, true>
+                       : cuts ? surfel_kernel<Kernel, S, true, false>
+                              : surfel_kernel<Kernel, S, false, false>;
+      BT_LAUNCH(run, run_blocks(p), dim3(kRunThreads), 0, stream, a.view.geom, a.view.near, a.rim, p, f, alpha, dsigma,
+                a.duv, a.ddepth, a.partial);
     });
+  if (exact)
+    end_exact(alpha.exact, texels, 0, a.dtexel_alpha, static_cast<S*>(nullptr), static_cast<S*>(nullptr), stream);
   sum_slots<kTraceSums>(p, static_cast<const S*>(a.partial), StoreGeomGradient<S>{a.dgeom, a.absgrad}, stream);
 }
 

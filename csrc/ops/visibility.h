@@ -4,6 +4,7 @@
 #include "core/blend.h"
 #include "core/surfel.h"
 #include "ops/arguments.h"
+#include "ops/field.h"
 
 namespace bt {
 
@@ -103,12 +104,15 @@ template <class S, class Layout> struct TraceBackward {
   S *dsigma, *partial;
   S *dgeom, *absgrad;
   AlphaTiles<S> alpha;
-  S* dtexel_alpha;  // [texels] is written; may be null
+  S* dtexel_alpha;       // [texels] is written; may be null
+  int64_t* exact_alpha;  // working memory of CUDA for sums of it that do not depend on the order, or null
 
   template <class R> void fields(R& r) {
     view.fields(r);
     alpha.fields(r, view.n);
-    r.maybe("dtexel_alpha", dtexel_alpha, alpha.values ? alpha.texels : 0);
+    const int64_t texels = alpha.values ? alpha.texels : 0;
+    r.maybe("dtexel_alpha", dtexel_alpha, texels);
+    r.maybe("exact_work", exact_alpha, exact_size(texels, 0, false));
     r.number("rim", rim);
     fragments.fields(r, view.n, view.width, view.height);
     const int64_t total = fragments.f.total;

@@ -1,5 +1,7 @@
 """Scenes and bounds of the tests of the baked renderer."""
 
+from dataclasses import replace
+
 import torch
 
 from bitymi_ns.scene import Camera
@@ -41,6 +43,16 @@ def textured(count: int, seed: int, dtype: torch.dtype = torch.uint8, kind: str 
         mean_residual=0.5 * torch.randn(count, 3, generator=g) * (i % 2 == 0)[:, None],
         weight_bound=0.02,
     )
+
+
+def cut_out(count: int, seed: int, dtype: torch.dtype = torch.uint8) -> BakedScene:
+    """The same with alpha texels, a third of them 0, some 2; other surfels have a constant between 0 and 2."""
+    scene, g = textured(count, seed, dtype), torch.Generator().manual_seed(seed)
+    assert scene.atlas is not None
+    m = (3 * torch.rand(scene.atlas.shape[:3], generator=g) - 1).clamp(0, 255 / 128)
+    scene.atlas[..., 3] = (128 * m).round().to(torch.uint8) if dtype == torch.uint8 else m
+    mean = (3 * torch.rand(count, generator=g) - 0.5).clamp(0, 2)
+    return replace(scene, alpha_scale=255 / 128 if dtype == torch.uint8 else 1.0, mean_alpha=mean)
 
 
 def front(width: int = 60, height: int = 44, distance: float = 4.0) -> Camera:

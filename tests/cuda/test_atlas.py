@@ -39,13 +39,16 @@ def test_where_pages_lie_in_the_texture_does_not_show(
         assert off.max() < 1 / 256 and (off > 0).double().mean() < 0.01
 
 
+@pytest.mark.parametrize("alpha", [False, True])
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32], ids=["uint8", "half"])
 def test_levels_are_made_of_the_texture(
-    dtype: torch.dtype, device: torch.device, monkeypatch: pytest.MonkeyPatch
+    dtype: torch.dtype, alpha: bool, device: torch.device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Those of blocks, too: nothing is decoded for a smaller view."""
     generator = torch.Generator().manual_seed(0)
     pages = torch.randint(256, (3, 8, 12, 4), generator=generator, dtype=torch.uint8)
+    pages[..., 3] *= torch.rand(3, 8, 12, generator=generator) < 0.5
+    pages[0, :4, :4, 3] = 0
     if dtype != torch.uint8:
         pages = pages / 255
     atlas, made = baked_cuda.Atlas.of(pages, False, device), []
@@ -57,9 +60,10 @@ def test_levels_are_made_of_the_texture(
             super().__init__(texels, blocks, device)
 
     monkeypatch.setattr(baked_cuda, "AtlasTexture", Noted)
-    assert list(atlas.levels()) == ["half", "quarter"]
+    assert list(atlas.levels(alpha)) == ["half", "quarter"]
     whole = atlas.sheet.joined(pages if dtype == torch.uint8 else pages.half().float(), 1)
-    for got, (_, want, _) in zip(made, tile_levels(whole[None], torch.zeros(1, 5, dtype=torch.int32)), strict=True):
+    levels = tile_levels(whole[None], torch.zeros(1, 5, dtype=torch.int32), alpha)
+    for got, (_, want, _) in zip(made, levels, strict=True):
         torch.testing.assert_close(got, want[0], rtol=0, atol=0 if dtype == torch.uint8 else 1e-3)
 
 

@@ -29,7 +29,7 @@ from bitymi_ns.scene.baked_renderer import BakedRenderer, SceneRenderer
 from tests.bake.conftest import make_surfels
 from tests.bake.test_real_scene import real_scene
 from tests.bundle.compact_scene import make_codes, write_compact
-from tests.cuda.baked_scenes import FLIP, camera_of, front, most, scene_of, textured
+from tests.cuda.baked_scenes import FLIP, camera_of, cut_out, front, most, scene_of, textured
 from tests.ops.golden import SceneCase, atlas_of, extreme_scenes, load_golden, random_scene
 from tests.ops.test_view_color import lean_parameters
 
@@ -92,6 +92,38 @@ def test_numbers_that_misbehave(case: SceneCase, prefilter: str, device: torch.d
 def test_textures_extents_and_constant_residuals(dtype: torch.dtype, device: torch.device, cpu) -> None:
     off = check(textured(60, 0, dtype), front(), device, cpu, torch.tensor([0.2, 0.4, 0.6]))
     assert off < most(device, 3e-3, TEXEL + FLIP)
+
+
+@pytest.mark.parametrize(
+    "prefilter, photo_pixel", [("low_pass", 1.0), ("pixel", 1.0), ("low_pass", 0.2), ("pixel", 0.45)]
+)
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32], ids=["uint8", "half"])
+def test_alpha_texels(dtype: torch.dtype, prefilter: str, photo_pixel: float, device: torch.device, cpu) -> None:
+    """The texture unit's weights move sigma, and with it what lies behind: by more than they move colours."""
+    scene = replace(cut_out(60, 0, dtype), prefilter=prefilter)
+    background, names = torch.tensor([0.2, 0.4, 0.6]), ("rgb", "alpha", "beta", "depth", "overdraw")
+    no_constants = {"mean_alpha": None, "mean_residual": None}
+    opaque_texels = {"alpha_scale": 0.0}
+    for changed in ({}, {"weight_bound": 0.0}, opaque_texels, no_constants):
+        of = replace(scene, **changed)
+        got = draw(of.to(device), [front()], background.to(device), names, photo_pixel)
+        with cpu():
+            want = draw(of, [front()], background, names, photo_pixel)
+        for name in names:
+            a, b = got[name].cpu().double(), want[name].double()
+            step = 0.5 if name == "overdraw" else STEP * max(1.0, float(b.abs().max()))
+            assert ((a - b).abs() <= step).double().mean() >= 0.998, (name, changed)
+        assert (got["rgb"].cpu() - want["rgb"]).abs().max() < most(device, 8e-3, 2 * TEXEL + FLIP)
+
+
+def test_opaque_alpha_texels_change_nothing(device: torch.device) -> None:
+    scene = textured(60, 0)
+    assert scene.atlas is not None
+    scene.atlas[..., 3] = 128
+    ones = replace(scene, alpha_scale=255 / 128, mean_alpha=torch.ones(60))
+    plain, cut = (s.to(device).render(front(), maps=True) for s in (scene, ones))
+    for name in FIELDS:
+        torch.testing.assert_close(getattr(cut, name), getattr(plain, name), rtol=0, atol=2e-6, msg=name)
 
 
 @pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])

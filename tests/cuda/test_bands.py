@@ -37,8 +37,9 @@ def test_lists_that_find_no_memory(device: torch.device, fit: int, monkeypatch: 
         torch.testing.assert_close(scene.render(camera).rgb, want.rgb, rtol=1e-9, atol=1e-12)
 
 
-def test_bands_read_texels_that_no_other_band_has_moved(device: torch.device) -> None:
-    whole, want = bands.texel_step(device, 0)
-    parts, got = bands.texel_step(device, len(whole) // 3)
+@pytest.mark.parametrize("alpha", [False, True])
+def test_bands_read_texels_that_no_other_band_has_moved(alpha: bool, device: torch.device) -> None:
+    whole, want = bands.texel_step(device, 0, alpha)
+    parts, got = bands.texel_step(device, len(whole) // 3, alpha)
     assert isinstance(parts, ops.Bands)
     bands.assert_same(got, want)

@@ -58,17 +58,17 @@ def scene_and_views() -> tuple[Scene, list[View]]:
     return scene, [View(camera, torch.rand(20, 24, 3, generator=g), each) for each in (None, mask)]
 
 
-def config() -> TrainConfig:
+def config(alpha_rate: float = 0.0) -> TrainConfig:
     """Texels in the second half of the run, with the final prunes within it."""
     prunes = {"min_surfels": 5, "final_prune_steps": (20_000, 22_500), "final_prune_opacity": 0.3}
     densify = DensifyConfig(max_surfels=20, min_interval=1, min_reset_interval=1000, pixels_per_surfel=0, **prunes)
-    texels = TexelConfig(start=30_000 * START // STEPS, pixels_per_texel=0.5)
+    texels = TexelConfig(start=30_000 * START // STEPS, pixels_per_texel=0.5, alpha_rate=alpha_rate)
     return TrainConfig(background="black", resolution_schedule=0, densify=densify, texels=texels)
 
 
-def trainer_on(device: torch.device) -> Trainer:
+def trainer_on(device: torch.device, alpha_rate: float = 0.0) -> Trainer:
     scene, views = scene_and_views()
-    return Trainer(scene.to(device), views, config(), STEPS)
+    return Trainer(scene.to(device), views, config(alpha_rate), STEPS)
 
 
 def state_of(scene: Scene) -> dict[str, Tensor]:
@@ -93,9 +93,10 @@ def test_tiles_and_coverage_are_those_of_the_cpu(device: torch.device, cpu: Cont
     assert want.share.max() > 2 * want.share.min()
 
 
-def test_a_run_is_that_of_the_cpu(device: torch.device, cpu: Context) -> None:
+@pytest.mark.parametrize("alpha_rate", [0.0, 0.5])
+def test_a_run_is_that_of_the_cpu(alpha_rate: float, device: torch.device, cpu: Context) -> None:
     def losses(where: torch.device) -> tuple[list[float], list[int], dict[str, Tensor]]:
-        trainer, seen, surfels = trainer_on(where), [], []
+        trainer, seen, surfels = trainer_on(where, alpha_rate), [], []
         for _ in range(STEPS):
             trainer.advance()
             seen.append(trainer.loss)
@@ -109,6 +110,7 @@ def test_a_run_is_that_of_the_cpu(device: torch.device, cpu: Context) -> None:
     assert surfels == cpu_surfels and surfels[-1] < surfels[START]  # pruned while texels learned
     assert state.keys() == cpu_state.keys() and torch.equal(state["field.size"], cpu_state["field.size"])
     assert cpu_state["field.texels"].abs().max() > 0.1
+    assert not alpha_rate or (cpu_state["field.alpha"] - 1).abs().max() > 0.1
     for name, value in cpu_state.items():
         # Adam's first steps are as long as the rate whatever the gradient: where that is all but 0 its sign may differ
         close = torch.isclose(state[name].double(), value.double(), rtol=1e-2, atol=2e-3)

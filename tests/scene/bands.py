@@ -38,19 +38,22 @@ def step(device: torch.device, most: int) -> tuple[Bands | object, dict[str, Ten
     return output.fragments, result
 
 
-def texel_step(device: torch.device, most: int) -> tuple[Bands | object, dict[str, Tensor]]:
-    """The fragments, and what a training step gives whose backward pass moves texels."""
+def texel_step(device: torch.device, most: int, alpha: bool = False) -> tuple[Bands | object, dict[str, Tensor]]:
+    """The fragments, and what a training step gives whose backward pass moves texels, with alphas or without."""
     scene, camera = make(device, most, texture_moves_surfels=True)
     g = torch.Generator().manual_seed(2)
     texels = torch.randn(60 * 16, 3, generator=g, dtype=torch.float64)
     size = torch.full((60, 2), 4, dtype=torch.int32)
-    field = TexelField(size, torch.full((60,), 3.0), texels, torch.rand(60 * 16, generator=g, dtype=torch.float64))
+    share, factors = torch.rand(2, 60 * 16, generator=g, dtype=torch.float64)
+    field = TexelField(size, torch.full((60,), 3.0), texels, share, 2 * factors if alpha else None)
     scene.field = field.to(device)
     scene.field.descent = TexelDescent(scene.field.share, 0.5)
     output = scene.render(camera, maps=True)
     weight = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(device)
     (output.rgb * weight).sum().backward()
     moved = {"texels": scene.field.texels.detach() - texels.to(device)}
+    if scene.field.alpha is not None:
+        moved["gradient of alpha"] = scene.field.alpha.grad
     return output.fragments, moved | {f"gradient of {name}": p.grad for name, p in scene.surfels.items()}
 
 

@@ -36,9 +36,10 @@ def test_values_and_gradients_do_not_change(share: float, monkeypatch: pytest.Mo
     bands.assert_same(got, want)
 
 
-def test_bands_read_texels_that_no_other_band_has_moved() -> None:
-    whole, want = bands.texel_step(CPU, 0)
-    parts, got = bands.texel_step(CPU, int(0.3 * len(whole)))
+@pytest.mark.parametrize("alpha", [False, True])
+def test_bands_read_texels_that_no_other_band_has_moved(alpha: bool) -> None:
+    whole, want = bands.texel_step(CPU, 0, alpha)
+    parts, got = bands.texel_step(CPU, int(0.3 * len(whole)), alpha)
     assert isinstance(parts, ops.Bands) and len(parts.rows) > 2 and want["texels"].abs().max() > 0.1
     bands.assert_same(got, want)
 

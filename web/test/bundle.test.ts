@@ -1,7 +1,7 @@
 import { describe, expect, it } from 'vitest';
 import { parseKtx2 } from '../src/bundle/ktx2';
 import { parseManifest } from '../src/bundle/manifest';
-import { SURFEL_WORDS, readSurfels } from '../src/bundle/surfels';
+import { SURFEL_WORDS, WORD, alphaIn, layerIn, readSurfels } from '../src/bundle/surfels';
 import { DamagedBundle, ViewerError } from '../src/errors';
 
 const HASH = 'a'.repeat(64);
@@ -23,26 +23,26 @@ const FLOATS = [
 ];
 const INTS = ['view_terms', 'tile_x', 'tile_y', 'tile_layer', 'tile_ru', 'tile_rv'];
 
-function ply(rows: number[][], terms: number[][]): ArrayBuffer {
+function ply(rows: number[][], terms: number[][], floats = FLOATS): ArrayBuffer {
   const header = [
     'ply',
     'format binary_little_endian 1.0',
     'comment made by a test',
     `element vertex ${rows.length}`,
-    ...FLOATS.map((name) => `property float ${name}`),
+    ...floats.map((name) => `property float ${name}`),
     ...INTS.map((name) => `property int ${name}`),
     `element view_term ${terms.length}`,
     ...[0, 1, 2, 3, 4, 5].map((k) => `property float term_${k}`),
     'end_header\n',
   ].join('\n');
   const head = new TextEncoder().encode(header);
-  const words = FLOATS.length + INTS.length;
+  const words = floats.length + INTS.length;
   const data = new DataView(new ArrayBuffer(head.length + 4 * (rows.length * words + terms.length * 6)));
   head.forEach((byte, i) => data.setUint8(i, byte));
   let at = head.length;
   for (const row of rows) {
     row.forEach((value, k) => {
-      if (k < FLOATS.length) data.setFloat32(at, value, true);
+      if (k < floats.length) data.setFloat32(at, value, true);
       else data.setInt32(at, value, true);
       at += 4;
     });
@@ -81,7 +81,7 @@ describe('bundle.json', () => {
     expect(info.files.get('surfels.ply')?.bytes).toBe(1);
   });
   it('of a newer major version is refused, with what to do', () => {
-    expect(() => parseManifest(manifest({ version: '4.0' }))).toThrowError(/version 4.0/);
+    expect(() => parseManifest(manifest({ version: '5.0' }))).toThrowError(/version 5.0/);
     try {
       parseManifest(manifest({ version: '7.1' }));
     } catch (error) {
@@ -133,6 +133,22 @@ describe('surfels.ply', () => {
   ])('%s is refused', (_, data) => {
     expect(() => readSurfels(data, info)).toThrowError(DamagedBundle);
   });
+  it('with alphas has them beside the layers of the tiles', () => {
+    const atlas = { format: 'uint8', width: 8, height: 8, layers: 2, offset: 0, scale: 1, alpha_scale: 255 / 128 };
+    const about = parseManifest(manifest({ version: '4.0', atlas }));
+    const rows = (second: number): ArrayBuffer => {
+      const each = [0.5, second].map((alpha, i) => [...row(i, 0).slice(0, FLOATS.length), alpha, 0, 0, 0, i, 4, 4]);
+      return ply(each, [], [...FLOATS, 'alpha']);
+    };
+    const { words } = readSurfels(rows(2), about);
+    const found = [0, SURFEL_WORDS].map((at) => new Uint32Array(words.buffer)[at + WORD.layer]);
+    expect(found.map((word) => [layerIn(word), alphaIn(word)])).toEqual([
+      [0, 0.5],
+      [1, 255 / 128],
+    ]);
+    for (const bad of [-0.1, 2.1, NaN]) expect(() => readSurfels(rows(bad), about)).toThrowError(/alpha .* in row 1/);
+    expect(() => readSurfels(ply([row(0, 0), row(2, 0)], []), about)).toThrowError(DamagedBundle);
+  });
   it('with a tile outside of the atlas is refused', () => {
     const bad = row(0, 0);
     bad[FLOATS.length + 4] = 4;
@@ -151,6 +167,7 @@ describe('atlas.ktx2', () => {
       extent: 3,
       offset: 0,
       scale: 1,
+      alphaScale: 0,
       coded: null,
     } as const;
     await expect(parseKtx2(new ArrayBuffer(200), atlas)).rejects.toThrowError(DamagedBundle);

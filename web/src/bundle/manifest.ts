@@ -3,7 +3,7 @@ import { DamagedBundle, ViewerError } from '../errors';
 import type { Column } from './compact/columns';
 
 export const FORMAT = 'bitymi-bundle';
-export const NEWEST_MAJOR = 3;
+export const NEWEST_MAJOR = 4;
 
 export type ViewKind = 'sv' | 'sh' | 'sb' | 'sg';
 export type AtlasFormat = 'bc7' | 'uint8' | 'fp16';
@@ -33,6 +33,7 @@ export interface Atlas {
   extent: number;
   offset: number;
   scale: number;
+  alphaScale: number; // a texel's alpha times this multiplies sigma; 0: the scene is opaque
   coded: CodedTexels | null; // of the format dct
 }
 
@@ -41,7 +42,7 @@ export interface Manifest {
   count: number;
   viewColor: ViewKind;
   terms: number | null;
-  compact: CompactSurfels | null; // of version 3
+  compact: CompactSurfels | null; // of surfels.bin
   atlas: Atlas | null;
   near: number;
   weightBound: number;
@@ -174,6 +175,7 @@ function atlas(r: Reader, isCompact: boolean, surfelBytes: number): Atlas {
     extent: r.has('extent') ? r.number('extent', 1e-6, 16) : 3,
     offset: r.number('offset', -256, 256),
     scale: r.number('scale', 0, 512),
+    alphaScale: r.has('alpha_scale') ? r.number('alpha_scale', 1e-6, 2) : 0,
     coded: isCompact ? coded(r, surfelBytes) : null,
   };
 }
@@ -226,7 +228,7 @@ export function parseManifest(text: string): Manifest {
       .entries(MOST_FILES)
       .map(([name, r]) => [name, { bytes: r.whole('bytes', 0, 2 ** 36), sha256: r.text('sha256', /^[0-9a-f]{64}$/) }]),
   );
-  const isCompact = version.startsWith('3.');
+  const isCompact = files.has('surfels.bin');
   return {
     version,
     count: surfels.whole('count', 0, 2 ** 28),

@@ -16,7 +16,7 @@ export const WORD = {
   beta: 10,
   extent: 11,
   residual: 12,
-  layer: 15,
+  layer: 15, // and the mean alpha: alphaWord
   base: 16,
   firstTerm: 19,
   tile: 20,
@@ -32,6 +32,11 @@ export interface Surfels {
   origin: Vec3; // taken off the means
   means: boolean; // whether the mean residuals of tiles are there
 }
+
+// The mean alpha m of a surfel as it is beside its layer: scene.wgsl.
+export const alphaWord = (m: number): number => (Math.min(Math.round(128 * m), 255) << 24) >>> 0;
+export const layerIn = (word: number): number => word & 0xffffff;
+export const alphaIn = (word: number): number => (word >>> 24) / 128;
 
 // The middle of the scene: far from the world's origin float32 would not place surfels.
 export const originOf = ({ bounds }: Manifest): Vec3 => bounds.min.map((low, c) => (low + bounds.max[c]) / 2) as Vec3;
@@ -123,6 +128,17 @@ function tiles(rows: Table, words: Float32Array, info: Manifest): void {
   }
 }
 
+// Mean alphas of tiles, and those of surfels without one.
+function alphas(rows: Table, words: Float32Array): void {
+  const numbers = new Uint32Array(words.buffer);
+  const means = new Float32Array(rows.count);
+  rows.into('alpha', means, 0, 1);
+  means.forEach((m, i) => {
+    if (!(m >= 0 && m <= 2)) throw new DamagedBundle(`surfels.ply: alpha is not from 0 to 2 in row ${i}.`);
+    numbers[i * SURFEL_WORDS + WORD.layer] |= alphaWord(m);
+  });
+}
+
 export function readSurfels(data: ArrayBuffer, info: Manifest): Surfels {
   const elements = parsePly(data);
   const vertex = elements.get('vertex');
@@ -143,6 +159,7 @@ export function readSurfels(data: ArrayBuffer, info: Manifest): Surfels {
   const means = rows.has('residual_0');
   if (means) [0, 1, 2].forEach((c) => copy(`residual_${c}`, WORD.residual + c));
   tiles(rows, words, info);
+  if (info.atlas?.alphaScale) alphas(rows, words);
   const term = elements.get('view_term');
   const form = WHOLE[info.viewColor];
   const terms = term

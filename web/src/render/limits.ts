@@ -3,7 +3,7 @@ import type { Atlas, Manifest } from '../bundle/manifest';
 import { LEAN_WIDTH, SURFEL_WORDS } from '../bundle/surfels';
 import { tooLarge } from '../errors';
 
-const DECODED_NUMBERS = 18; // of a surfel of a compact bundle, besides its terms: doubles, all at once
+const DECODED_NUMBERS = 19; // of a surfel of a compact bundle, besides its terms: doubles, all at once
 const TEXEL_BYTES = 12; // of a texel on its way: three coefficients
 const GIGABYTE = 2 ** 30;
 const UNKNOWN_MEMORY = 4; // gigabytes, where the browser does not say how many the device has

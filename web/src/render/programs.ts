@@ -102,9 +102,9 @@ export class Programs {
     return found;
   }
 
-  // Renders a page at half its size.
-  halve(format: GPUTextureFormat): GPURenderPipeline {
-    const entryPoint = format === 'rgba8unorm' ? 'halve_bytes' : 'halve_floats';
+  // Renders a page at half its size; `alpha`: with colours weighted by alpha.
+  halve(format: GPUTextureFormat, alpha: boolean): GPURenderPipeline {
+    const entryPoint = `halve${alpha ? '_alpha' : ''}_${format === 'rgba8unorm' ? 'bytes' : 'floats'}`;
     return this.device.createRenderPipeline({
       layout: 'auto',
       vertex: { module: this.halving, entryPoint: 'page' },

@@ -87,13 +87,13 @@ export class Renderer {
   }
 
   private setFrame(view: View, width: number, height: number, photoPixel: number, look: Look): void {
-    const { info, surfels, atlasSize, count } = this.scene;
+    const { info, surfels, atlasSize, alphaScale, count } = this.scene;
     const data = new ArrayBuffer(160);
     const [f, u] = [new Float32Array(data), new Uint32Array(data)];
     const { right, down, forward } = view.pose;
     [right, down, forward].forEach((row, k) => f.set(row, 4 * k));
     const relative = (at: Vec3): number[] => at.map((x, c) => x - surfels.origin[c]);
-    f.set(relative(view.pose.position), 12);
+    f.set([...relative(view.pose.position), alphaScale], 12);
     f.set(relative(look.held ?? view.pose.position), 16);
     f.set([view.fx, view.fy, view.cx, view.cy], 20);
     f.set([width, height, info.near, info.weightBound], 24);

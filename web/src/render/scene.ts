@@ -94,6 +94,9 @@ export class SceneOnDevice {
   get atlasSize(): [number, number] {
     return [this.atlas.width, this.atlas.height];
   }
+  get alphaScale(): number {
+    return this.info.atlas?.alphaScale ?? 0;
+  }
   // DETAIL_* of scene.wgsl.
   get detail(): number {
     return this.complete ? (this.surfels.means ? 2 : 1) : 0;
@@ -128,7 +131,7 @@ export class SceneOnDevice {
       mipLevelCount: Math.max(...size) > 1 ? 2 : 1,
       usage: GPUTextureUsage.TEXTURE_BINDING | GPUTextureUsage.RENDER_ATTACHMENT,
     });
-    const pipeline = this.programs.halve(format);
+    const pipeline = this.programs.halve(format, this.alphaScale > 0);
     const encoder = this.device.createCommandEncoder();
     const page = (texture: GPUTexture, baseMipLevel: number, baseArrayLayer: number): GPUTextureView =>
       texture.createView({ dimension: '2d', baseMipLevel, mipLevelCount: 1, baseArrayLayer, arrayLayerCount: 1 });

@@ -1,7 +1,7 @@
 // surfels.bin: docs/baking.md says what the numbers of its columns stand for; bake/surfel_codes.py is their writer.
 import { DamagedBundle } from '../../errors';
 import type { CompactSurfels, Manifest, ViewKind } from '../manifest';
-import { KINDS, LEAN_WIDTH, SURFEL_WORDS, type Surfels, WORD, centred, originOf } from '../surfels';
+import { KINDS, LEAN_WIDTH, SURFEL_WORDS, type Surfels, WORD, alphaWord, centred, originOf } from '../surfels';
 import { ColumnReader, checkColumns } from './columns';
 import { pack } from './packing';
 
@@ -37,7 +37,7 @@ const logit = (share: number, least: number): number => {
 };
 const sinh = (x: number): number => Math.sinh(within(x, BENT));
 
-function expected(kind: ViewKind): [string, number][] {
+function expected(kind: ViewKind, alpha: boolean): [string, number][] {
   const shapes = SHAPES[kind].limits.length;
   return [
     ['place', 1],
@@ -48,6 +48,7 @@ function expected(kind: ViewKind): [string, number][] {
     ['beta', 1],
     ['size', 1],
     ['residual', 3],
+    ...(alpha ? [['alpha', 1] as [string, number]] : []),
     ['view_base', 3],
     ['extent', 1],
     ['view_count', 1],
@@ -79,6 +80,7 @@ class Decoder {
   private readonly count: number;
   private readonly terms: number;
   private readonly stated: CompactSurfels;
+  private readonly alpha: boolean;
 
   constructor(
     data: Uint8Array,
@@ -87,8 +89,9 @@ class Decoder {
     this.stated = info.compact!;
     this.count = info.count;
     this.terms = info.terms ?? 0;
+    this.alpha = Boolean(info.atlas?.alphaScale);
     const columns = this.stated.columns;
-    checkColumns(columns, expected(info.viewColor), data.length, FILE);
+    checkColumns(columns, expected(info.viewColor, this.alpha), data.length, FILE);
     if (Math.max(this.count, this.terms) > SURFELS_PER_BYTE * data.length + SPARE_SURFELS) {
       throw new DamagedBundle(`${FILE}: ${this.count} surfels cannot be in ${data.length} bytes.`);
     }
@@ -197,6 +200,14 @@ class Decoder {
     }
   }
 
+  private alphas(): void {
+    const [codes] = this.column('alpha');
+    codes.forEach((code, i) => {
+      if (!(code >= 0 && code <= 255)) this.refuse('an alpha is not a byte');
+      this.numbers[i * SURFEL_WORDS + WORD.layer] |= alphaWord(code / 128);
+    });
+  }
+
   private viewColors(): Float32Array {
     const kind = this.info.viewColor;
     const [[counts], shape, colors] = ['view_count', 'term_shape', 'term_color'].map((name) => this.column(name));
@@ -226,6 +237,7 @@ class Decoder {
     this.rotations();
     this.shapes();
     this.tiles();
+    if (this.alpha) this.alphas();
     const terms = this.viewColors();
     const origin = originOf(this.info);
     centred(this.words, origin);

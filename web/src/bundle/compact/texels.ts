@@ -2,7 +2,7 @@
 import { DamagedBundle } from '../../errors';
 import type { Pages } from '../ktx2';
 import type { Atlas, CodedTexels } from '../manifest';
-import { SURFEL_WORDS, type Surfels, WORD } from '../surfels';
+import { SURFEL_WORDS, type Surfels, WORD, alphaIn, layerIn } from '../surfels';
 import { ColumnReader, checkColumns } from './columns';
 
 export const TEXELS_PER_BYTE = 64; // of both files; what is said to hold more is refused, and so many beside
@@ -11,6 +11,7 @@ const MOST_TEXELS = 2 ** 30; // of all pages: four gigabytes
 const BLOCK = 8;
 const GRADES: [number, number] = [-8, 24];
 const MOST_PLANES = 3; // bytes of a coefficient
+const ALPHA_GAIN = 4; // steps of alphas, in those of colours
 const FILE = 'texels.bin';
 
 // The tiles of surfels, in their order.
@@ -64,6 +65,16 @@ function inverse(values: Int32Array, first: number, stride: number, waves: Float
   }
 }
 
+// The blocks of one size.
+interface Blocks {
+  u: number;
+  v: number;
+  texels: number; // of all of them
+}
+
+// The nearest byte.
+const byteOf = (x: number): number => (x > 0 ? (x < 255 ? (x + 0.5) | 0 : 255) : 0);
+
 class Painter {
   private readonly pages: Uint32Array; // all of them
   private readonly numbers: Uint32Array;
@@ -74,56 +85,73 @@ class Painter {
   constructor(
     private readonly atlas: Atlas,
     private readonly surfels: Surfels,
+    private readonly tiles: Tile[],
   ) {
     const { width, height, layers } = atlas;
     this.offset = atlas.offset;
     this.perByte = 255 / atlas.scale;
-    this.pages = new Uint32Array(width * height * layers).fill(this.code(0, 0, 0));
+    const empty = this.code(0, 0, 0) & (atlas.alphaScale ? 0xffffff : -1);
+    this.pages = new Uint32Array(width * height * layers).fill(empty);
     this.numbers = new Uint32Array(surfels.words.buffer, surfels.words.byteOffset, surfels.words.length);
   }
 
-  // The nearest byte of a residual colour.
-  private byte(value: number): number {
-    const x = (value - this.offset) * this.perByte;
-    return x > 0 ? (x < 255 ? (x + 0.5) | 0 : 255) : 0;
+  private byte(residual: number): number {
+    return byteOf((residual - this.offset) * this.perByte);
   }
+  // An opaque texel of a residual colour.
   private code(r: number, g: number, b: number): number {
     return (this.byte(r) | (this.byte(g) << 8) | (this.byte(b) << 16) | (255 << 24)) >>> 0;
   }
 
-  // Blocks of one size of all tiles; [channel][frequency * blocks + block] are the coefficients.
-  blocks(tiles: Tile[], u: number, v: number, blocks: number, coefficients: Int32Array[], steps: Float64Array): void {
-    const waves = wavesOf(u, v);
-    const [p0, p1, p2] = this.sums;
+  // Visits blocks of one size: the number of the tile, the row of its surfel, the block, and its first texel.
+  private each({ u, v }: Blocks, visit: (tile: number, row: number, block: number, first: number) => void): void {
+    const { width, height } = this.atlas;
     let block = 0;
-    tiles.forEach((tile, number) => {
+    this.tiles.forEach((tile, number) => {
       if (Math.min(tile.u, BLOCK) !== u || Math.min(tile.v, BLOCK) !== v) return;
       const row = tile.surfel * SURFEL_WORDS;
-      const [red, green, blue] = this.surfels.words.subarray(row + WORD.residual, row + WORD.residual + 3);
-      const { width, height } = this.atlas;
-      const [x, y, layer] = [WORD.tile, WORD.tile + 1, WORD.layer].map((word) => this.numbers[row + word]);
-      const first = (layer * height + y) * width + x;
-      const [a, b, c] = [steps[number] / Math.sqrt(3), steps[number] / Math.sqrt(2), steps[number] / Math.sqrt(6)];
+      const [x, y, word] = [WORD.tile, WORD.tile + 1, WORD.layer].map((at) => this.numbers[row + at]);
+      const first = (layerIn(word) * height + y) * width + x;
       for (let at_v = 0; at_v < tile.v; at_v += v) {
-        for (let at_u = 0; at_u < tile.u; at_u += u, block++) {
-          for (let channel = 0; channel < 3; channel++) {
-            inverse(coefficients[channel], block, blocks, waves, this.sums[channel]);
-          }
-          let t = 0;
-          for (let j = 0; j < v; j++) {
-            const to = first + (at_v + j) * width + at_u;
-            for (let i = 0; i < u; i++, t++) {
-              const grey = a * p0[t];
-              const tilt = b * p1[t];
-              const bend = c * p2[t];
-              this.pages[to + i] = this.code(
-                red + grey + tilt + bend,
-                green + grey - 2 * bend,
-                blue + grey - tilt + bend,
-              );
-            }
-          }
-        }
+        for (let at_u = 0; at_u < tile.u; at_u += u) visit(number, row, block++, first + at_v * width + at_u);
+      }
+    });
+  }
+
+  // Residual colours of blocks; [channel][frequency * blocks + block] are the coefficients.
+  colors(of: Blocks, coefficients: Int32Array[], steps: Float64Array): void {
+    const { u, v } = of;
+    const waves = wavesOf(u, v);
+    const [p0, p1, p2] = this.sums;
+    this.each(of, (tile, row, block, first) => {
+      const [red, green, blue] = this.surfels.words.subarray(row + WORD.residual, row + WORD.residual + 3);
+      const [a, b, c] = [steps[tile] / Math.sqrt(3), steps[tile] / Math.sqrt(2), steps[tile] / Math.sqrt(6)];
+      for (let channel = 0; channel < 3; channel++) {
+        inverse(coefficients[channel], block, of.texels / (u * v), waves, this.sums[channel]);
+      }
+      for (let t = 0; t < u * v; t++) {
+        const grey = a * p0[t];
+        const tilt = b * p1[t];
+        const bend = c * p2[t];
+        const to = first + Math.floor(t / u) * this.atlas.width + (t % u);
+        this.pages[to] = this.code(red + grey + tilt + bend, green + grey - 2 * bend, blue + grey - tilt + bend);
+      }
+    });
+  }
+
+  // Alphas of blocks, whose colours are there.
+  alphas(of: Blocks, [coefficients]: Int32Array[], steps: Float64Array): void {
+    const { u, v } = of;
+    const waves = wavesOf(u, v);
+    const [sums] = this.sums;
+    const perByte = 255 / this.atlas.alphaScale;
+    this.each(of, (tile, row, block, first) => {
+      const mean = alphaIn(this.numbers[row + WORD.layer]);
+      inverse(coefficients, block, of.texels / (u * v), waves, sums);
+      for (let t = 0; t < u * v; t++) {
+        const to = first + Math.floor(t / u) * this.atlas.width + (t % u);
+        const byte = byteOf((mean + ALPHA_GAIN * steps[tile] * sums[t]) * perByte);
+        this.pages[to] = (this.pages[to] & 0xffffff) | (byte << 24);
       }
     });
   }
@@ -153,35 +181,38 @@ function check(data: Uint8Array, atlas: Atlas, coded: CodedTexels, found: number
 export function readCompactTexels(data: Uint8Array, atlas: Atlas, surfels: Surfels): Pages {
   const coded = atlas.coded!;
   const tiles = tilesOf(surfels);
-  const held = new Map<string, { u: number; v: number; texels: number }>();
+  const held = new Map<string, Blocks>();
   for (const tile of tiles) {
     const [u, v] = [Math.min(tile.u, BLOCK), Math.min(tile.v, BLOCK)];
     const of = held.get(`${u}x${v}`) ?? { u, v, texels: 0 };
     of.texels += tile.u * tile.v;
     held.set(`${u}x${v}`, of);
   }
-  const names = [...held.keys()].sort();
   check(
     data,
     atlas,
     coded,
     [...held.values()].reduce((sum, { texels }) => sum + texels, 0),
   );
-  checkColumns(coded.columns, [['grade', 1], ...names.map((name): [string, number] => [name, 3])], data.length, FILE);
+  const names = [...held.keys()].sort();
+  const colors = names.map((name): [string, number] => [name, 3]);
+  const alphas = names.map((name): [string, number] => [`alpha_${name}`, 1]);
+  checkColumns(coded.columns, [['grade', 1], ...colors, ...(atlas.alphaScale ? alphas : [])], data.length, FILE);
   const reader = new ColumnReader(data, coded.columns, FILE);
   const [grades] = reader.read(tiles.length, (rows) => new Float64Array(rows));
   if (grades.some((grade) => !(grade >= GRADES[0] && grade <= GRADES[1]))) {
     throw new DamagedBundle(`${FILE}: a grade is not from ${GRADES.join(' to ')}.`);
   }
-  const painter = new Painter(atlas, surfels);
+  const painter = new Painter(atlas, surfels, tiles);
   const steps = grades.map((grade) => coded.step * 2 ** (grade / 2));
-  for (const name of names) {
-    const { u, v, texels } = held.get(name)!;
-    if (coded.columns.find((column) => column.name === name)?.planes.some((planes) => planes.length > MOST_PLANES)) {
+  for (const { name, planes } of coded.columns.slice(1)) {
+    if (planes.some((bytes) => bytes.length > MOST_PLANES)) {
       throw new DamagedBundle(`${FILE}: the coefficients ${name} have more than ${MOST_PLANES} bytes.`);
     }
-    const coefficients = reader.read(texels, (rows) => new Int32Array(rows));
-    painter.blocks(tiles, u, v, texels / (u * v), coefficients, steps);
+    const of = held.get(name.replace('alpha_', ''))!;
+    const coefficients = reader.read(of.texels, (rows) => new Int32Array(rows));
+    if (name.startsWith('alpha_')) painter.alphas(of, coefficients, steps);
+    else painter.colors(of, coefficients, steps);
   }
   return { format: 'uint8', width: atlas.width, height: atlas.height, layers: painter.layers() };
 }

@@ -1,0 +1,62 @@
+// Alpha texels on the device (ops/visibility.h): the fetch, and the mark in a fragment's v.
+#pragma once
+
+#include <cstring>
+
+#include "core/blend.h"
+#include "core/texel.h"
+#include "cuda/device.h"
+#include "ops/visibility.h"
+
+namespace bt::cuda {
+
+// v with the last bit of its mantissa set or cleared: whether the fragment's sigma was multiplied.
+template <class S> using BitsOf = std::conditional_t<sizeof(S) == 4, uint32_t, uint64_t>;
+template <class S> __device__ BitsOf<S> bits_of(S v) {
+  BitsOf<S> bits;
+  memcpy(&bits, &v, sizeof bits);
+  return bits;
+}
+template <class S> __device__ bool is_marked(S v) { return bits_of(v) & 1; }
+template <class S> __device__ S with_mark(S v, bool mark) {
+  const BitsOf<S> bits = (bits_of(v) & ~BitsOf<S>(1)) | BitsOf<S>(mark);
+  memcpy(&v, &bits, sizeof bits);
+  return v;
+}
+
+// The alpha texels of one surfel.
+template <class S> struct AlphaPatch {
+  const int32_t* size;  // r_u, r_v; 0, 0 = no tile
+  const S* tile;
+  int64_t first;
+  S extent;
+
+  __device__ AlphaPatch(const AlphaTiles<S>& tiles, int64_t id)
+      : size(tiles.size + 2 * id),
+        tile(tiles.values + tiles.first[id]),
+        first(tiles.first[id]),
+        extent(tiles.extent[id]) {}
+  __device__ bool textured() const { return size[0] > 0; }
+  __device__ TexelCorners<S> corners(S u, S v) const { return texel_corners(u, v, size, extent); }
+  // m, exactly 1 between texels of 1, and the four texels.
+  __device__ S fetch(const TexelCorners<S>& at, S (&t)[4]) const {
+    BT_UNROLL
+    for (int k = 0; k < 4; ++k) t[k] = tile[at.at[k]];
+    const S above = t[0] + at.fx * (t[1] - t[0]), below = t[2] + at.fx * (t[3] - t[2]);
+    return above + at.fy * (below - above);
+  }
+};
+
+// Multiplies the sigma of a surfel's fragment, at least 1/255, where its weight would be at least the bound, and marks
+// v. Both passes over a view call it, so that they agree.
+template <class S> __device__ void cut(const AlphaTiles<S>& tiles, int64_t id, S transmittance, S u, S& v, S& sigma) {
+  const AlphaPatch<S> patch(tiles, id);
+  if (!patch.textured()) return;
+  const bool reaches = sigma * transmittance >= tiles.bound;
+  v = with_mark(v, reaches);
+  if (!reaches) return;
+  S t[4];
+  sigma = alpha_cut(sigma, patch.fetch(patch.corners(u, v), t));
+}
+
+}  // namespace bt::cuda

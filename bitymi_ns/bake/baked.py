@@ -12,7 +12,6 @@ from torch import Tensor
 from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.statistics import AtlasCost, Statistics
-from bitymi_ns.codec.limits import ALPHA_SCALE
 from bitymi_ns.codec.packing import Packing, pack
 from bitymi_ns.codec.pages import listed_texels, paged_texels, tile_means
 from bitymi_ns.codec.quantise import EncodedAtlas, Range, choose_range, decode_pages, encode
@@ -40,6 +39,7 @@ class Baked:
     codes: SceneCodes | None = None  # integer codes of the surfels, and of the texels once coded; None = not compact
     # [T, C] the texels of which the codes were made, in the order of `ops.TexelTiles`; None = `texels`
     uncoded: Tensor | None = None
+    alpha_codes: TexelCodes | None = None  # codes whose alphas those of the bundle keep; None = not coded, or opaque
     # [N] transmittance in front of the surfels, by which errors of their tiles count; None = 1
     in_front: Tensor | None = None
 
@@ -105,8 +105,7 @@ class Baked:
         atlas = self.atlas
         pages = torch.from_numpy(decode_pages(atlas.payload, atlas.format, atlas.width, atlas.height))
         pages = pages if pages.dtype == torch.uint8 else pages.float()
-        alpha_scale = 0.0 if self.scene.mean_alpha is None else ALPHA_SCALE if pages.dtype == torch.uint8 else 1.0
-        scaled = {"offset": atlas.range.offset, "scale": atlas.range.scale, "alpha_scale": alpha_scale}
+        scaled = {"offset": atlas.range.offset, "scale": atlas.range.scale, "alpha_scale": atlas.alpha_scale}
         return replace(self.scene, atlas=pages, **scaled)
 
     def with_surfels(self, surfels: Mapping[str, Tensor]) -> Baked:
@@ -157,7 +156,9 @@ class Baked:
     def with_texel_codes(self, codes: TexelCodes, uncoded: Tensor) -> Baked:
         """Copy with the residual colours of the codes of its tiles, which were made of `uncoded` [T, 3]."""
         assert self.codes is not None
-        texels = paged_texels(codes.texels(), self.packing)
+        alphas = codes.alphas()
+        listed = codes.texels() if alphas is None else joined(codes.texels(), alphas)
+        texels = paged_texels(listed, self.packing)
         value_range = choose_range(
             texels.numpy(), self.packing, self.options.range, self.options.range_samples, self.options.seed
         )
@@ -168,8 +169,19 @@ class Baked:
             atlas=atlas,
             statistics=self.statistics.but(atlas=atlas_cost(self.packing, atlas), error=None, certificate=None),
             uncoded=uncoded,
-            codes=replace(self.codes, texels=codes, residual=codes.residual, residual_step=codes.residual_step),
+            codes=replace(
+                self.codes,
+                texels=codes,
+                residual=codes.residual,
+                residual_step=codes.residual_step,
+                alpha=None if codes.alpha is None else codes.alpha.mean,
+            ),
         )
+
+
+def joined(colors: Tensor, alphas: Tensor) -> Tensor:
+    """[T, 4] texels of residual colours [T, 3] and alphas [T]."""
+    return torch.cat([colors, alphas[:, None]], 1)
 
 
 def with_means(scene: BakedScene, constants: Tensor) -> BakedScene:

@@ -7,15 +7,15 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.baked import Baked
+from bitymi_ns.bake.baked import Baked, joined
 from bitymi_ns.bake.early_stopping import FEWEST_VIEWS, validation_split
 from bitymi_ns.bake.precision import PER_BIT, Pictures, column_noise
-from bitymi_ns.bake.texel_list import TexelList
+from bitymi_ns.bake.texel_list import TexelList, with_alpha
 from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bake.view_color_rate import color_choices
 from bitymi_ns.bundle.statistics import Rounding, ViewColorError
 from bitymi_ns.codec.packing import pack
-from bitymi_ns.codec.pages import listed_texels, paged_texels
+from bitymi_ns.codec.pages import paged_texels
 from bitymi_ns.codec.surfel_codes import code_surfels
 from bitymi_ns.codec.texel_codes import (
     RESIDUAL_STEP,
@@ -111,13 +111,15 @@ class Coder:
         rows = validation_split(len(views), options.val_every if len(views) >= FEWEST_VIEWS else 0)[1]
         trained = [views[row] for row in rows]
         self._numbers = self._pictures.numbers / max(1, self._pictures.views) * len(trained)
-        self._colors = color_choices(scene, [view.camera.to(device) for view in trained], progress)
+        cameras = [view.camera.to(device) for view in trained]
+        self._colors = color_choices(scene, cameras, progress, baked.alpha)
         reduced = replace(scene, surfels={**scene.surfels, **self._colors.at(START)})
         self._noise = column_noise(reduced, self._sizes, self._pictures, progress)
-        self._tiles = self._texels = self._weights = None
+        self._tiles = self._texels = self._weights = self._alphas = None
         if baked.texels is not None:
             texels = TexelList(baked, device)
             self._tiles, self._texels = texels.tiles, texels.values.cpu()
+            self._alphas = None if baked.alpha is None else baked.alpha.values
             self._weights = texels.coverage(trained, progress, squared=True).cpu()
 
     @property
@@ -141,21 +143,26 @@ class Coder:
         codes, order = code_surfels(surfels, baked.scene.view_color, self._sizes, baked.extent, steps)
         packing = pack(codes.sizes, baked.options.page_width, baked.options.page_rows)
         residual = baked.mean_residual[order]
-        texels = pages = None
+        texels = pages = coded = None
+        coding = TexelCodeOptions(step=min(1000.0, max(0.01, 255 * math.sqrt(TEXEL_SHARE * 12 * lmbda / PER_BIT))))
+        constants = residual
         if self._texels is not None:
             moved = self._tiles.rows_of(order.to(self._tiles.size.device)).cpu()
             texels, weights = self._texels[moved], self._weights[moved]
-            pages = paged_texels(texels, packing)
-        kept = SceneCodes(
-            codes, None, residual_codes(residual), RESIDUAL_STEP, baked.options.page_width, baked.options.page_rows
-        )
+            coder, listed = TexelCoder(self._sizes[order], weights, coding), texels
+            if self._alphas is not None:
+                listed = joined(texels, coder.code_alpha(self._alphas[moved]))
+                assert coder.alpha is not None
+                constants = joined(residual, coder.alpha.means)
+            pages, coded = paged_texels(listed, packing), coder.code(texels)
+        pages_of = (baked.options.page_width, baked.options.page_rows)
+        kept = SceneCodes(codes, None, residual_codes(residual), RESIDUAL_STEP, *pages_of)
         in_front = None if baked.in_front is None else baked.in_front[order]
         rounded = replace(baked, rows=baked.rows[order], codes=kept, in_front=in_front).with_surfels(codes.surfels())
-        rounded = rounded.with_tiles(Tiles(packing, pages, codes.extent(baked.options.extent), residual))
-        coding = TexelCodeOptions(step=min(1000.0, max(0.01, 255 * math.sqrt(TEXEL_SHARE * 12 * lmbda / PER_BIT))))
+        rounded = rounded.with_tiles(Tiles(packing, pages, codes.extent(baked.options.extent), constants))
+        rounded = replace(rounded, alpha_codes=coded if self._alphas is not None else None)
         size, shown = kept.surfels.nbytes(), rounded
-        if texels is not None:
-            coded = TexelCoder(self._sizes[order], weights, coding).code(texels)
+        if coded is not None:
             size, shown = size + coded.nbytes(_FAST), _with_texels(rounded, coded)
         scene = shown.unquantised()
         pictures = self._pictures.of(scene)
@@ -266,9 +273,9 @@ def with_coded_texels(baked: Baked, options: TexelCodeOptions | None = None) -> 
     assert baked.codes is not None
     if baked.texels is None:
         return baked
-    texels = listed_texels(baked.texels, baked.packing, baked.mean_residual)
-    options = options or TexelCodeOptions()
-    coder = TexelCoder(torch.from_numpy(baked.packing.tiles[:, 3:]), torch.ones(len(texels)), options)
+    texels, options = baked.listed[:, :3].contiguous(), options or TexelCodeOptions()
+    sizes = torch.from_numpy(baked.packing.tiles[:, 3:])
+    coder = TexelCoder(sizes, torch.ones(len(texels)), options, baked.alpha_codes)
     coded = coder.code(texels) if options.most_bytes is None else coder.fit(texels, options.most_bytes)
     return baked.with_texel_codes(coded, texels)
 
@@ -288,4 +295,5 @@ def _thinned(baked: Baked) -> ViewColorError | None:
 
 def _with_texels(baked: Baked, coded: TexelCodes) -> Baked:
     """The bake as it is drawn with coded texels."""
-    return replace(baked, texels=paged_texels(coded.texels(), baked.packing)).with_constants(coded.constants)
+    texels = with_alpha(coded.texels(), baked)
+    return replace(baked, texels=paged_texels(texels, baked.packing)).with_constants(coded.constants)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.baked import Baked
+from bitymi_ns.bake.baked import Baked, joined
 from bitymi_ns.codec.pages import paged_texels
 from bitymi_ns.ops import Projection, TexelTiles, add_texel_coverage, fitting_lists, project
 from bitymi_ns.ops.project import GEOMETRY
@@ -16,7 +16,7 @@ from bitymi_ns.train.views import View
 
 def with_alpha(colors: Tensor, baked: Baked) -> Tensor:
     """[T, C] texels of other residual colours [T, 3], with the alphas of the bake where it has such."""
-    return colors if baked.alpha is None else torch.cat([colors, baked.alpha.values[:, None]], 1)
+    return colors if baked.alpha is None else joined(colors, baked.alpha.values)
 
 
 class TexelList:

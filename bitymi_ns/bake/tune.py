@@ -132,7 +132,7 @@ def _coding(
 ) -> Coding[CosineTexels] | Coding[PageTexels]:
     """Coding of the texels: by their squared coverage [T, 3], or as pages where there is none."""
     if squares is not None:
-        return Cosines(TexelCoder(texels.sizes, squares[:, 0].cpu(), options), options)
+        return Cosines(TexelCoder(texels.sizes, squares[:, 0].cpu(), options, baked.alpha_codes), options)
     return Pages(baked, texels.tiles.first.cpu())
 
 

@@ -20,7 +20,7 @@ GRADES = (-8, 24)  # range of the grades: a tile's step is the common one times 
 RESIDUAL_STEP = 4.0 / 255  # step of the mean residuals of tiles and of the residuals of surfels without a tile
 LEAST_WEIGHT = 1e-3  # least weight of a texel, pixels, so that unseen ones stay near their values
 SPARSE_ROUNDS = 8  # round in which coefficients that only texels nobody sees would need are shrunk
-ALPHA_GAIN = 4.0
+ALPHA_GAIN = 6.0
 """Step of alphas in those of residual colours: a surfel's colour differs from that behind it by about a quarter, so an
 error of alpha costs a quarter of that of a colour."""
 SHRINK = 0.6  # soft threshold of an iteration as a share of the step, where all texels of a block are seen alike
@@ -193,12 +193,15 @@ class SceneCodes:
 class TexelCoder:
     """Coder of the texels of given tiles, weighted by their coverage in the views."""
 
-    def __init__(self, sizes: Tensor, weights: Tensor, options: TexelCodeOptions) -> None:
+    def __init__(
+        self, sizes: Tensor, weights: Tensor, options: TexelCodeOptions, first: TexelCodes | None = None
+    ) -> None:
         """
         Args:
             sizes: [N, 2] sides of the tiles; (0, 0) = one constant.
             weights: [T] of the texels, in the order of `TexelTiles`: sum over views and fragments of the squared
                 blending weight times the bilinear weight. An error e of a texel adds weight times e^2 to the pictures.
+            first: earlier codes, whose alphas stay, and so the grades; None = there are none.
         """
         options.check()
         self._sizes, self._weights = sizes.long(), weights + LEAST_WEIGHT
@@ -209,8 +212,8 @@ class TexelCoder:
         self._owner = torch.repeat_interleave(torch.arange(len(area)), area)
         mean = self._sums(self._weights[:, None])[:, 0] / area
         low, high = GRADES
-        self.grades = (-torch.log2(mean[tiled])).round().long().clamp(low, high)
-        self.alpha: AlphaCodes | None = None
+        self.grades = (-torch.log2(mean[tiled])).round().long().clamp(low, high) if first is None else first.grades
+        self.alpha: AlphaCodes | None = None if first is None else first.alpha
 
     def fit(self, texels: Tensor, most_bytes: float, rounds: int = SPARSE_ROUNDS) -> TexelCodes:
         """Code texels [T, 3] in at most `most_bytes`, alphas included, with a larger step where that takes it.

@@ -139,7 +139,7 @@ class TexelConfig(TexelSteps):
     travel: NonNegative = 0.3
     """Largest distance that a texel can move in that part, colour units: where it passes over the views few times,
     `rate` is raised so that texels get there, up to this."""
-    alpha_rate: NonNegative = 0.0
+    alpha_rate: NonNegative = 30.0
     """Rate of the texels' alphas, which cut silhouettes out of surfels, as a multiple of that of their colours; 0 =
     opaque texels."""
     surfel_rates: NonNegative = 0.4

@@ -16,7 +16,7 @@ from bitymi_ns.cli import main
 from bitymi_ns.codec.limits import ALPHA_SCALE
 from bitymi_ns.codec.pages import covered_blocks
 from bitymi_ns.codec.quantise import encode
-from bitymi_ns.codec.scene_texels import scene_texels
+from bitymi_ns.codec.scene_texels import texel_alpha
 from bitymi_ns.ops.baked_cuda import decoded
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from tests.bundle.compact_scene import FINEST, RANGE, make_codes, pages_of, scene_of, write_compact
@@ -49,7 +49,7 @@ def test_a_compact_bundle_holds_what_its_codes_stand_for(
     assert got.alpha_scale == (ALPHA_SCALE if alpha else 0.0) and (got.mean_alpha is not None) == alpha
     if alpha:
         assert torch.equal(got.mean_alpha, codes.texels.alpha.means)
-        assert torch.equal(scene_texels(got)[:, 3], codes.texels.alphas())
+        assert torch.equal(texel_alpha(got).values, codes.texels.alphas())
 
 
 @pytest.mark.parametrize("count", [1, 2, 12])

@@ -48,6 +48,22 @@ def test_what_is_written_is_read(surfels, tmp_path, kind, format):
     assert loaded.info.atlas.psnr == pytest.approx(atlas.psnr)
 
 
+@pytest.mark.parametrize("lean", [False, True])
+@pytest.mark.parametrize("format", ["bc7", "uint8", "fp16"])
+def test_alphas_are_read_as_they_were_written(surfels, tmp_path, format, lean):
+    _, _, texels, atlas = make(surfels, tmp_path / "b", "sh", format, lean=lean, alpha=True)
+    loaded = read_bundle(tmp_path / "b")
+    assert loaded.info.version == "4.0" and loaded.scene.alpha_scale == loaded.info.atlas.alpha_scale
+    torch.testing.assert_close(loaded.scene.mean_alpha, torch.linspace(0, 2, 6), rtol=0, atol=0)
+    alphas = loaded.scene.alphas()
+    torch.testing.assert_close(alphas, torch.from_numpy(atlas.decoded()[..., 3]))
+    if format != "bc7":
+        assert float((alphas - torch.from_numpy(texels[..., 3])).abs().max()) < (
+            1e-3 if format == "fp16" else 0.51 / 128
+        )
+    assert float((loaded.scene.residuals() - torch.from_numpy(texels[..., :3])).square().mean()) < 2 * atlas.mse
+
+
 @pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
 def test_lean_view_colours_are_read_as_they_were_written(surfels, tmp_path, kind):
     params, *_ = make(surfels, tmp_path / "b", kind, None, lean=True)

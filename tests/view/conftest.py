@@ -14,6 +14,9 @@ from bitymi_ns.bake import Baked, bake
 from bitymi_ns.bake.compact import compacted, with_coded_texels
 from bitymi_ns.bundle import export
 from bitymi_ns.bundle.bake_options import BakeOptions
+from bitymi_ns.codec.pages import listed_texels, paged_texels, tile_means
+from bitymi_ns.codec.quantise import encode
+from bitymi_ns.codec.texel_codes import TexelCodeOptions, TexelCoder
 from bitymi_ns.scene import Camera
 from tests.bake.conftest import make_surfels
 from tests.bake.test_real_scene import real_scene
@@ -27,6 +30,25 @@ def view() -> Camera:
     return front(WIDTH, HEIGHT, 3.0)
 
 
+def with_alpha(baked: Baked) -> Baked:
+    """The bake with random alphas from 0 to 2, coded where its texels are."""
+    colors = listed_texels(baked.texels, baked.packing, baked.mean_residual)
+    random = torch.Generator().manual_seed(0)
+    alpha, codes = 2 * torch.rand(len(colors), generator=random), baked.codes
+    if codes is not None:
+        sizes = torch.from_numpy(baked.packing.tiles[:, 3:])
+        coder = TexelCoder(sizes, torch.ones(len(colors)), TexelCodeOptions())
+        alpha, coded = coder.code_alpha(alpha), coder.code(colors)
+        codes = replace(codes, texels=coded, residual=coded.residual, alpha=coded.alpha.mean)
+        colors, constants = coded.texels(), torch.cat([coded.constants, coded.alpha.means[:, None]], 1)
+    pages = paged_texels(torch.cat([colors, alpha[:, None]], 1), baked.packing)
+    if codes is None:
+        constants = torch.cat([baked.mean_residual, 2 * torch.rand(len(baked.rows), 1, generator=random)], 1)
+        constants = tile_means(pages, baked.packing, constants)
+    atlas = encode(pages.numpy(), baked.packing, "uint8" if codes else baked.options.format)
+    return replace(baked, texels=pages, atlas=atlas, codes=codes).with_constants(constants)
+
+
 @lru_cache
 @torch.no_grad()
 def baked_scene(
@@ -36,14 +58,16 @@ def baked_scene(
     seen: bool,
     kind: str,
     larger: float,
+    alpha: bool,
     options: tuple[tuple[str, object], ...],
 ) -> Baked:
     """The bake's test scene; `compact`: for version 3; `seen`: photographed by the camera, so that it is drawn for the
-    size of a view; `larger`: added to the logarithms of the scales."""
+    size of a view; `larger`: added to the logarithms of the scales; `alpha`: with alpha texels."""
     made = real_scene(make_surfels, count=count, kind=kind)
     made.surfels["log_scales"] += larger
     baked = bake(made, [view()] if seen else [], options=BakeOptions(format=format, **dict(options)))
-    return with_coded_texels(*compacted(baked, [], torch.zeros(3))) if compact else baked
+    baked = with_coded_texels(*compacted(baked, [], torch.zeros(3))) if compact else baked
+    return with_alpha(baked) if alpha else baked
 
 
 def write(
@@ -55,6 +79,7 @@ def write(
     poster: bool = False,
     kind: str = "sv",
     larger: float = 0.0,
+    alpha: bool = False,
     near: float | None = None,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     **options: object,
@@ -77,7 +102,7 @@ def write(
         "cameras.json": json.dumps({"cameras": [row, other]}).encode(),
         "photograph-0001.jpg": picture.getvalue(),
     }
-    baked = baked_scene(format, count, compact, seen, kind, larger, tuple(options.items()))
+    baked = baked_scene(format, count, compact, seen, kind, larger, alpha, tuple(options.items()))
     if near is not None:
         baked = replace(baked, scene=replace(baked.scene, near=near))
     export(baked, folder, background=background, extra_files=extra, first=camera if poster else None)

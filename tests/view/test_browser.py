@@ -49,16 +49,19 @@ def page_of(site: Site, *before: list[object], path: str = "") -> tuple[str, str
 
 
 @pytest.mark.parametrize(
-    "format, seen, share",
+    "format, seen, share, alpha",
     [
-        *(("bc7", False, 1.0), ("fp16", False, 1.0), ("bc7", True, 1.0)),
-        *(("bc7", True, 0.25), ("compact", True, 0.5), ("compact", True, 0.25)),
+        *(("bc7", False, 1.0, False), ("fp16", False, 1.0, False), ("bc7", True, 1.0, False)),
+        *(("bc7", True, 0.25, False), ("compact", True, 0.5, False), ("compact", True, 0.25, False)),
+        *(("bc7", False, 1.0, True), ("fp16", True, 0.5, True), ("compact", True, 0.25, True)),
     ],
 )
-def test_frames_are_those_of_the_cpu_renderer(format: str, seen: bool, share: float, tmp_path: Path) -> None:
+def test_frames_are_those_of_the_cpu_renderer(
+    format: str, seen: bool, share: float, alpha: bool, tmp_path: Path
+) -> None:
     """Of formats, and of sizes for which surfels are filtered; of kinds of view colours: test_frames.py."""
     compact = format == "compact"
-    bundle = write(tmp_path / "b", "uint8" if compact else format, compact=compact, seen=seen)
+    bundle = write(tmp_path / "b", "uint8" if compact else format, compact=compact, seen=seen, alpha=alpha)
     screen = (round(WIDTH * share), round(HEIGHT * share))
     with served(site_of(bundle)) as address:
         found = drive([["goto", address], ["settle"], ["save", "#screenshot", tmp_path / "p.png"]], screen)
@@ -69,7 +72,7 @@ def test_frames_are_those_of_the_cpu_renderer(format: str, seen: bool, share: fl
 
 def test_the_first_picture_needs_no_texels(tmp_path: Path) -> None:
     """The server keeps them back until that picture is saved; the bundle is one file."""
-    bundle = write(tmp_path / "b", "uint8", compact=True)
+    bundle = write(tmp_path / "b", "uint8", compact=True, alpha=True)
     single, first = tmp_path / "b.bitymi", tmp_path / "first.png"
     write_single(bundle, single)
     site = site_of(single)

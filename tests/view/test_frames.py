@@ -25,6 +25,7 @@ LARGEST = 12 / 255
 ALL, COMPACT = {"format": "uint8", "tolerance": 0.0}, {"compact": True}
 CASES = {f"{kind} {name}": {"kind": kind, **terms} for kind in ("sv", "sh", "sb", "sg")
          for name, terms in (("all", ALL), ("compact", COMPACT))}  # fmt: skip
+CASES |= {"sv alpha": {"alpha": True}, "sv alpha compact": {"alpha": True, "seen": True, **COMPACT}}
 CASES |= {"sv lean": {}, "near 3, colour": {"near": 3.0, "background": (0.2, 0.5, 0.9), **COMPACT}}
 
 

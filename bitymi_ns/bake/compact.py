@@ -57,7 +57,7 @@ class Compact:
         val_every: as in `tune.TuneOptions`: validation views do not weigh texels.
     """
 
-    share: float = 0.03
+    share: float = 0.1
     most_bytes: int | None = None
     psnr: float | None = None
     views: int = 8

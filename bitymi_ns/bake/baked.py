@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -15,8 +16,9 @@ from bitymi_ns.bundle.statistics import AtlasCost, Statistics
 from bitymi_ns.codec.packing import Packing, pack
 from bitymi_ns.codec.pages import listed_texels, paged_texels, tile_means
 from bitymi_ns.codec.quantise import EncodedAtlas, Range, choose_range, decode_pages, encode
+from bitymi_ns.codec.scene_texels import texel_alpha
 from bitymi_ns.codec.texel_codes import SceneCodes, TexelCodes
-from bitymi_ns.ops import TexelAlpha, TexelTiles
+from bitymi_ns.ops import TexelAlpha
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
 
@@ -75,14 +77,14 @@ class Baked:
         assert self.texels is not None
         return listed_texels(self.texels, self.packing, self.constants)
 
-    @property
+    @cached_property
     def alpha(self) -> TexelAlpha | None:
         """Opacities of the texels; None = opaque texels."""
-        if self.texels is None or self.scene.mean_alpha is None:
-            return None
-        sizes = torch.from_numpy(self.packing.tiles[:, 3:])
-        tiles = TexelTiles.of_sizes(sizes.clamp(min=1), self.extent.float())
-        return TexelAlpha(tiles, self.listed[:, 3].contiguous(), self.scene.weight_bound)
+        return None if self.texels is None or self.scene.mean_alpha is None else texel_alpha(self.unquantised())
+
+    def cut(self, colors: Tensor) -> Tensor:
+        """[T, C] texels of residual colours [T, 3], with the alphas of the bake where it has such."""
+        return colors if self.alpha is None else joined(colors, self.alpha.values)
 
     @property
     def tiles(self) -> Tiles:

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.baked import Baked, encoded_pages
-from bitymi_ns.bake.texel_list import with_alpha
 from bitymi_ns.codec.pages import listed_texels, paged_texels
 from bitymi_ns.codec.quantise import EncodedAtlas
 from bitymi_ns.codec.texel_codes import TexelCodeOptions, TexelCoder, TexelCodes
@@ -105,7 +104,7 @@ class Pages:
         return coded
 
     def again(self, texels: Tensor) -> PageTexels:
-        pages = paged_texels(with_alpha(texels, self._baked), self._packing, self._baked.texels)
+        pages = paged_texels(self._baked.cut(texels), self._packing, self._baked.texels)
         atlas = encoded_pages(pages, self._packing, self._options, value_range=self._range)
         drawn = listed_texels(torch.from_numpy(atlas.decoded()[..., :3]), self._packing, texels[self._first])
         return PageTexels(texels.clone(), atlas, drawn)

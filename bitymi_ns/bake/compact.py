@@ -10,7 +10,7 @@ from torch import Tensor
 from bitymi_ns.bake.baked import Baked, joined
 from bitymi_ns.bake.early_stopping import FEWEST_VIEWS, validation_split
 from bitymi_ns.bake.precision import PER_BIT, Pictures, column_noise
-from bitymi_ns.bake.texel_list import TexelList, with_alpha
+from bitymi_ns.bake.texel_list import TexelList
 from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bake.view_color_rate import color_choices
 from bitymi_ns.bundle.statistics import Rounding, ViewColorError
@@ -112,7 +112,7 @@ class Coder:
         trained = [views[row] for row in rows]
         self._numbers = self._pictures.numbers / max(1, self._pictures.views) * len(trained)
         cameras = [view.camera.to(device) for view in trained]
-        self._colors = color_choices(scene, cameras, progress, baked.alpha)
+        self._colors = color_choices(scene, cameras, progress)
         reduced = replace(scene, surfels={**scene.surfels, **self._colors.at(START)})
         self._noise = column_noise(reduced, self._sizes, self._pictures, progress)
         self._tiles = self._texels = self._weights = self._alphas = None
@@ -295,5 +295,5 @@ def _thinned(baked: Baked) -> ViewColorError | None:
 
 def _with_texels(baked: Baked, coded: TexelCodes) -> Baked:
     """The bake as it is drawn with coded texels."""
-    texels = with_alpha(coded.texels(), baked)
+    texels = baked.cut(coded.texels())
     return replace(baked, texels=paged_texels(texels, baked.packing)).with_constants(coded.constants)

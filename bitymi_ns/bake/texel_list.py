@@ -5,18 +5,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.baked import Baked, joined
+from bitymi_ns.bake.baked import Baked
 from bitymi_ns.codec.pages import paged_texels
 from bitymi_ns.ops import Projection, TexelTiles, add_texel_coverage, fitting_lists, project
 from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import View
-
-
-def with_alpha(colors: Tensor, baked: Baked) -> Tensor:
-    """[T, C] texels of other residual colours [T, 3], with the alphas of the bake where it has such."""
-    return colors if baked.alpha is None else joined(colors, baked.alpha.values)
 
 
 class TexelList:
@@ -50,7 +45,7 @@ class TexelList:
 
     def baked(self, texels: Tensor) -> Baked:
         """The bake with these texels [T, 3], to be `encoded`."""
-        texels = with_alpha(texels.cpu(), self._baked)
+        texels = self._baked.cut(texels.cpu())
         pages = paged_texels(texels, self._baked.packing, self._baked.texels)
         bare = self.sizes[:, 0] == 0
         constants = torch.where(bare[:, None], texels[self.tiles.first.cpu()], self._baked.constants)

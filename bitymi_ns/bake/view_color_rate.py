@@ -12,7 +12,8 @@ from bitymi_ns.bake.inputs import device_of
 from bitymi_ns.bake.lean_color import FIT_STEPS, FIT_VIEWS, OUTSIDE, OUTSIDE_WEIGHT, centers_of, shown_at
 from bitymi_ns.bake.voronoi_fit import fit_sites, least_needed, site_weights
 from bitymi_ns.codec.limits import beyond
-from bitymi_ns.ops import TexelAlpha, fitting_lists, project
+from bitymi_ns.codec.scene_texels import texel_alpha
+from bitymi_ns.ops import fitting_lists, project
 from bitymi_ns.ops.constants import COLOR_BIAS
 from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.sphere import fibonacci_sphere
@@ -58,20 +59,16 @@ class ColorChoices:
 
 
 @torch.no_grad()
-def shown_weights(
-    scene: BakedScene,
-    cameras: Sequence[Camera],
-    progress: Progress = no_progress,
-    alpha: TexelAlpha | None = None,
-) -> Tensor:
+def shown_weights(scene: BakedScene, cameras: Sequence[Camera], progress: Progress = no_progress) -> Tensor:
     """[V, N] sum over a view's pixels of the squared blending weight of each surfel: an error e of its colour adds e^2
     times as much to the picture. On the device of the cameras."""
     device = device_of(cameras)
     found = torch.zeros(len(cameras), len(scene), device=device)
-    geometry = [scene.surfels[name].to(device) for name in GEOMETRY]
+    geometry, alpha = [scene.surfels[name].to(device) for name in GEOMETRY], texel_alpha(scene)
+    alpha = None if alpha is None else alpha.to(device)
     for done, camera in enumerate(cameras):
         projection = project(*geometry, camera, scene.near, scene.prefilter)
-        projection.alpha = None if alpha is None else alpha.to(device)
+        projection.alpha = alpha
         for fragments in fitting_lists(projection):
             found[done].index_add_(0, fragments.surfel.long(), fragments.weight.square())
             del fragments  # before the next list is made
@@ -95,12 +92,7 @@ def choice_bytes(kind: str, surfels: int, views: int, most: int) -> int:
 
 
 @torch.no_grad()
-def color_choices(
-    scene: BakedScene,
-    cameras: Sequence[Camera],
-    progress: Progress = no_progress,
-    alpha: TexelAlpha | None = None,
-) -> ColorChoices:
+def color_choices(scene: BakedScene, cameras: Sequence[Camera], progress: Progress = no_progress) -> ColorChoices:
     """Errors of lean view colours with fewer terms, from all of a surfel's down to one colour.
 
     Terms are left out and the others fitted as in `lean_color`, but the error is that of the pictures: squared, of
@@ -111,12 +103,11 @@ def color_choices(
     Args:
         scene: with lean view colours.
         cameras: training views; their device does the work.
-        alpha: opacities of the texels; None = opaque texels.
 
     Returns:
         on the CPU.
     """
-    weights, kind = shown_weights(scene, cameras, progress, alpha), scene.view_color
+    weights, kind = shown_weights(scene, cameras, progress), scene.view_color
     entry, surfels = VIEW_COLORS[kind], {name: value.to(weights.device) for name, value in scene.surfels.items()}
     counts = surfels["view_span"][:, 1].long()
     most, width = int(counts.max()) if len(counts) else 0, entry.lean_width

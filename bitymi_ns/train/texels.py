@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.utils.hooks import RemovableHandle
 
+from bitymi_ns.codec.limits import ALPHA_LIMIT
 from bitymi_ns.ops import TexelDescent, add_texel_coverage, fitting_lists, project
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.ops.project import GEOMETRY
@@ -34,7 +35,6 @@ FEWEST_VIEWS = 32  # fewest views that tiles are measured on, however short the 
 SMALLEST = 4  # side of the smallest tile, texels: a block of BC7
 FEW = 1 << 23  # texels that no run is too short for: 235 MB
 FEWER = 0.8  # factor by which tiles get fewer texels, as often as it takes until all are few enough
-MOST_ALPHA = 2.0
 LEAST_SHARE = 0.25
 """Lower bound of a texel's coverage where it is measured on a part of the views, as a share of what one view
 can show: no step is much longer than four times the rate. A whole view would slow down occluded texels."""
@@ -115,7 +115,7 @@ class LearningTexels:
                 values.addcmul_(share, values.grad, value=-1.0)
                 values.grad = None
                 if values is field.alpha:
-                    values.clamp_(0.0, MOST_ALPHA)
+                    values.clamp_(0.0, ALPHA_LIMIT)
 
 
 @torch.no_grad()

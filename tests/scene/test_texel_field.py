@@ -13,7 +13,9 @@ from tests.ops.golden import random_scene
 BOUND = 0.03125  # the same number in either precision
 
 
-def make(moves: bool = True, count: int = 40, most: int = 0, **options: float) -> tuple[Scene, Camera, Tensor]:
+def make(
+    moves: bool = True, count: int = 40, most: int = 0, alpha: bool = False, **options: float
+) -> tuple[Scene, Camera, Tensor]:
     """A scene in float64, a view of it, and its atlas [1, 16, 8 N, 4]: tiles of 8 x 16 texels side by side."""
     case = random_scene(count, 3, **{"width": 60, "height": 40, **options})
     g = torch.Generator().manual_seed(0)
@@ -21,29 +23,33 @@ def make(moves: bool = True, count: int = 40, most: int = 0, **options: float) -
     size, extent = torch.tensor([[8, 16]]).expand(count, -1), torch.rand(count, generator=g) * 2 + 1
     texels = atlas[0, :, :, :3].view(16, count, 8, 3).transpose(0, 1).reshape(-1, 3)
     config = SceneConfig(weight_bound=BOUND, near=0.2, texture_moves_surfels=moves, max_fragments=most)
-    field = TexelField(size, extent.double(), texels.double())
+    atlas[..., 3] = 2 * torch.rand(1, 16, 8 * count, generator=g)
+    alphas = atlas[0, :, :, 3].view(16, count, 8).transpose(0, 1).reshape(-1).double() if alpha else None
+    field = TexelField(size, extent.double(), texels.double(), alpha=alphas)
     scene = Scene(config, {name: value.double() for name, value in case.params.items()}, field)
     return scene, Camera(case.viewmat, case.K, case.width, case.height), atlas
 
 
-def test_it_is_what_the_baked_renderer_shows() -> None:
-    scene, camera, atlas = make()
+@pytest.mark.parametrize("alpha", [False, True])
+def test_it_is_what_the_baked_renderer_shows(alpha: bool) -> None:
+    scene, camera, atlas = make(alpha=alpha)
     tiles = torch.tensor([[8 * i, 0, 0, 8, 16] for i in range(len(scene))], dtype=torch.int32)
     surfels = {name: value.detach() for name, value in scene.surfels.items()}
     extent = scene.field.tiles.extent
-    want = BakedScene(surfels, "sv", tiles, atlas, extent=extent, weight_bound=BOUND, near=0.2).render(camera).rgb
+    how = {"extent": extent, "weight_bound": BOUND, "near": 0.2, "alpha_scale": float(alpha)}
+    want = BakedScene(surfels, "sv", tiles, atlas, **how).render(camera).rgb
     with torch.no_grad():
         torch.testing.assert_close(scene.render(camera).rgb, want, rtol=1e-6, atol=1e-6)
         plain = scene.render(camera, field_mode="off").rgb
     assert (plain - want).abs().max() > 0.1
 
 
-@pytest.mark.parametrize("name", ["means", "quats", "log_scales", "opacity_logits", "sv_rgb", "texels"])
+@pytest.mark.parametrize("name", ["means", "quats", "log_scales", "opacity_logits", "sv_rgb", "texels", "alpha"])
 def test_gradients_against_steps_in_a_direction(name: str) -> None:
     """The picture is piecewise smooth: a small step along the gradient changes it as the gradient says."""
-    scene, camera, _ = make(count=12, width=24, height=18)
+    scene, camera, _ = make(count=12, width=24, height=18, alpha=name == "alpha")
     weights = torch.linspace(-1, 1, 24 * 18 * 3, dtype=torch.float64).view(18, 24, 3)
-    parameter = scene.field.texels if name == "texels" else scene.surfels[name]
+    parameter = getattr(scene.field, name) if name in ("texels", "alpha") else scene.surfels[name]
 
     def value() -> Tensor:
         return (scene.render(camera).rgb * weights).sum()

@@ -41,8 +41,9 @@ def at_step(monkeypatch: pytest.MonkeyPatch, step: int, action: Any) -> None:
 
 @pytest.fixture(scope="module")
 def pair(room: Path, tmp_path_factory: pytest.TempPathFactory) -> BitymiTrainerConfig:
-    """A finished run of two processes. Not to be changed."""
+    """A finished run of two processes that has kept all its checkpoints. Not to be changed."""
     config = two(small_run(room, tmp_path_factory.mktemp("outputs")))
+    config.save_only_latest_checkpoint = False
     ns_train.main(config)
     return config
 
@@ -63,29 +64,22 @@ def test_two_processes_leave_the_run_of_one(pair: BitymiTrainerConfig) -> None:
 
 
 @pytest.mark.slow
-def test_ctrl_c_stops_both_and_the_resumed_run_ends_bit_for_bit_alike(
+def test_a_run_that_lost_a_process_goes_on_bit_for_bit_alike_until_ctrl_c(
     pair: BitymiTrainerConfig, start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = two(start(name="interrupted"))
-    at_step(monkeypatch, 24, lambda trainer: os.kill(os.getpid(), signal.SIGINT))
-    with pytest.raises(SystemExit) as stopped:
-        ns_train.main(config)
-    assert stopped.value.code == 130
-    monkeypatch.undo()
-    resumed = two(start(name="resumed"))
-    resumed.load_dir = config.get_checkpoint_dir()
-    ns_train.main(resumed)
-    assert different(checkpoint(pair, STEPS - 1), checkpoint(resumed, STEPS - 1)) == []
-
-
-@pytest.mark.slow
-def test_a_process_that_ends_ends_the_run_with_a_message(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = two(start(name="killed"))
-    at_step(monkeypatch, 15, lambda trainer: trainer._workers._processes[0].kill())
-    with pytest.raises(InputError, match="process 2 of the 2 of this run has ended: exit status -9"):
-        ns_train.main(config)
-    assert [p.name for p in config.get_checkpoint_dir().iterdir()] == ["step-000000010.ckpt"]
+    lost, resumed = two(start(name="lost")), two(start(name="resumed"))
+    with monkeypatch.context() as patch:
+        at_step(patch, 15, lambda trainer: trainer._workers._processes[0].kill())
+        with pytest.raises(InputError, match="process 2 of the 2 of this run has ended: exit status -9"):
+            ns_train.main(lost)
+    assert [p.name for p in lost.get_checkpoint_dir().iterdir()] == ["step-000000010.ckpt"]
     assert not dist.is_initialized()
+    resumed.load_dir, resumed.steps_per_save = lost.get_checkpoint_dir(), 1000  # so that only Ctrl-C saves
+    at_step(monkeypatch, 20, lambda trainer: os.kill(os.getpid(), signal.SIGINT))
+    with pytest.raises(SystemExit) as stopped:
+        ns_train.main(resumed)
+    assert stopped.value.code == 130 and not dist.is_initialized()
+    assert different(checkpoint(pair, 20), checkpoint(resumed, 20)) == []
 
 
 @pytest.mark.parametrize(

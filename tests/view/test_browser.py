@@ -51,9 +51,9 @@ def page_of(site: Site, *before: list[object], path: str = "") -> tuple[str, str
 @pytest.mark.parametrize(
     "format, seen, share, alpha",
     [
-        *(("bc7", False, 1.0, False), ("fp16", False, 1.0, False), ("bc7", True, 1.0, False)),
-        *(("bc7", True, 0.25, False), ("compact", True, 0.5, False), ("compact", True, 0.25, False)),
-        *(("bc7", False, 1.0, True), ("fp16", True, 0.5, True), ("compact", True, 0.25, True)),
+        *(("fp16", False, 1.0, False), ("bc7", True, 1.0, False)),
+        *(("bc7", True, 0.25, False), ("compact", True, 0.5, False)),
+        *(("bc7", False, 1.0, True), ("compact", True, 0.25, True)),
     ],
 )
 def test_frames_are_those_of_the_cpu_renderer(
@@ -153,7 +153,8 @@ def test_an_exported_folder_is_shown_by_a_plain_file_server(bundle: Path, tmp_pa
     with plain_server(tmp_path / "site", ranges=False) as (address, _):
         found = drive([["goto", address], ["settle"], ["save", "#screenshot", tmp_path / "p.png"]], SCREEN)
     assert not found.problems
-    assert difference(tmp_path / "p.png", bundle)[0] < MEAN
+    mean, largest = difference(tmp_path / "p.png", bundle)
+    assert mean < MEAN and largest < 12 / 255
 
 
 def test_an_atlas_of_more_pages_than_the_device_takes_is_too_large(tmp_path: Path) -> None:

@@ -139,12 +139,24 @@ def test_a_damaged_file_leaves_the_scene_without(noted: Path, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("phone", [False, True])
-def test_the_panel_fits_the_screen(noted: Path, phone: bool) -> None:
-    page = Steps()
-    page.do(*[["click", "#menu"]] * phone, ["click", "#notes"])
-    page.do(["press", "#note-rows [title=Edit]"])
-    fits = page.ask(FITS.replace("aside", "notes-panel").replace("SIZE", "40" if phone else "30"))
+def test_the_panels_fit_the_screen(noted: Path, phone: bool) -> None:
+    """That of the path, then that of notes."""
+    page, size = Steps(), "40" if phone else "30"
+    page.do(*[["click", "#menu"]] * phone, ["click", "#tools"])
+    for _ in range(3):
+        page.do(["press", "#add-keyframe"])
+    path = page.ask(FITS.replace("SIZE", size))
+    canvas = page.ask("document.getElementById('aside').getBoundingClientRect().top > innerHeight * 0.3")
+    page.do(*[["click", "#menu"]] * phone)
+    hidden = page.ask("document.getElementById('aside').hidden")
+    page.do(*[["click", "#tools"]] * phone, ["click", "#close"])
+    closed = page.ask("document.getElementById('aside').hidden")
+    page.do(*[["click", "#menu"]] * phone, ["click", "#notes"], ["press", "#note-rows [title=Edit]"])
+    notes = page.ask(FITS.replace("aside", "notes-panel").replace("SIZE", size))
     page.do(*[["click", "#menu"]] * phone, ["press", "#tools"])
     panels = page.ask("['aside', 'notes-panel'].map((id) => document.getElementById(id).hidden).join()")
     page.run(noted, START, **({"viewport": PHONE, "touch": True} if phone else {}))
-    assert page[fits] and page[panels] == "false,true"
+
+    assert page[path] and page[hidden] == phone and page[closed]
+    assert page[canvas] or not phone
+    assert page[notes] and page[panels] == "false,true"

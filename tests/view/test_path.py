@@ -7,7 +7,7 @@ import av
 import numpy as np
 import pytest
 
-from tests.view.test_controls import MIDDLE, PHONE, START, Steps
+from tests.view.test_controls import MIDDLE, START, Steps
 
 SECOND = START.replace("p=0,-3,0", "p=1,-3,0")
 ROWS = "[...document.querySelectorAll('#keyframes .name')].map((e) => e.textContent).join()"
@@ -120,21 +120,3 @@ def test_a_film_has_the_size_and_time_of_what_is_shown(bundle: Path, tmp_path: P
     assert 1.5 < frames[-1][0] - frames[0][0] < 4
     first, last = (image.astype(float) for image in (frames[0][1], frames[-1][1]))
     assert np.abs(first - last).mean() > 2
-
-
-@pytest.mark.parametrize("phone", [False, True])
-def test_the_panel_fits_the_screen(bundle: Path, phone: bool) -> None:
-    page = Steps()
-    page.do(*[["click", "#menu"]] * phone, ["click", "#tools"])
-    for _ in range(3):
-        page.do(["press", "#add-keyframe"])
-    fits = page.ask(FITS.replace("SIZE", "40" if phone else "30"))
-    canvas = page.ask("document.getElementById('aside').getBoundingClientRect().top > innerHeight * 0.3")
-    page.do(*[["click", "#menu"]] * phone)
-    hidden = page.ask("document.getElementById('aside').hidden")
-    page.do(*[["click", "#tools"]] * phone, ["click", "#close"])
-    closed = page.ask("document.getElementById('aside').hidden")
-    page.run(bundle, START, **({"viewport": PHONE, "touch": True} if phone else {}))
-
-    assert page[fits] and page[hidden] == phone and page[closed]
-    assert page[canvas] or not phone

@@ -239,7 +239,7 @@ template <class Kernel, bool kMaps, class S> void baked_forward(const BakedForwa
       }
       Texels<S, 4> fetched;  // of a block: what has the weight for a residual had it for alpha
       const auto cut = [&](Fragment<P>& f, const typename P::M& covered, const P& transmittance) {
-        const typename P::M reaches = covered & (f.sigma * transmittance >= P(d.bound));
+        const typename P::M reaches = covered & (bt::blend(f.sigma, transmittance).weight >= P(d.bound));
         if (!bits(reaches)) return;
         fetched = texels_at<4>(d, f.u, f.v, atlas);
         f.sigma = select(reaches, alpha_cut(f.sigma, fetched.of[3]), f.sigma);

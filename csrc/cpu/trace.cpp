@@ -77,7 +77,7 @@ void trace_forward(const View<S>& view, const AlphaTiles<S>& alpha, int64_t most
       state.template blend<Kernel, true>(
           view, bins, id, take, S(1), [&](Fragment<P>& f, const typename P::M& covered, const P& transmittance) {
             if (!patch.textured()) return;
-            const uint32_t lanes = bits(covered & (f.sigma * transmittance >= P(alpha.bound)));
+            const uint32_t lanes = bits(covered & (bt::blend(f.sigma, transmittance).weight >= P(alpha.bound)));
             f.v = marked(f.v, lanes);
             if (!lanes) return;
             patch.locate(f.u, f.v);

@@ -82,7 +82,8 @@ __device__ __forceinline__ void cut(const DrawArgs& a, const Row& s, const bool 
   BT_UNROLL
   for (int j = 0; j < kPixels; ++j) {
     const float sigma = f[j].sigma.v;
-    any |= reaches[j] = covers[j] && sigma >= float(kAlphaMin) && sigma * p[j].transmittance >= a.weight_bound;
+    any |= reaches[j] =
+        covers[j] && sigma >= float(kAlphaMin) && bt::blend(sigma, p[j].transmittance).weight >= a.weight_bound;
   }
   if (!any || c.y == 0) return;
   const float4 t = s.rest[1];

@@ -52,7 +52,7 @@ template <class S> struct AlphaPatch {
 template <class S> __device__ void cut(const AlphaTiles<S>& tiles, int64_t id, S transmittance, S u, S& v, S& sigma) {
   const AlphaPatch<S> patch(tiles, id);
   if (!patch.textured()) return;
-  const bool reaches = sigma * transmittance >= tiles.bound;
+  const bool reaches = blend(sigma, transmittance).weight >= tiles.bound;
   v = with_mark(v, reaches);
   if (!reaches) return;
   S t[4];

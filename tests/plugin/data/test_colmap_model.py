@@ -101,6 +101,7 @@ def test_every_camera_of_a_rig_has_its_own_pose_in_a_model(tmp_path: Path, form:
     options = pycolmap.SyntheticDatasetOptions(
         num_rigs=1, num_cameras_per_rig=2, num_frames_per_rig=3, num_points3D=20, sensor_from_rig_rotation_stddev=20.0
     )
+    pycolmap.set_random_seed(0)
     written = pycolmap.synthesize_dataset(options)
     (written.write_text if form == "txt" else written.write_binary)(tmp_path)
     by_name = {image.name: image for image in written.images.values()}

@@ -65,7 +65,7 @@ class Baked:
     def constants(self) -> Tensor:
         """[N, C] mean residual and, where C = 4, mean alpha of every tile; those of a surfel without a tile."""
         alpha = self.scene.mean_alpha
-        return self.mean_residual if alpha is None else torch.cat([self.mean_residual, alpha[:, None]], 1)
+        return self.mean_residual if alpha is None else joined(self.mean_residual, alpha)
 
     def with_constants(self, constants: Tensor) -> Baked:
         """Copy with other means [N, C], or [N, 3] to keep those of alpha."""
@@ -171,18 +171,12 @@ class Baked:
             atlas=atlas,
             statistics=self.statistics.but(atlas=atlas_cost(self.packing, atlas), error=None, certificate=None),
             uncoded=uncoded,
-            codes=replace(
-                self.codes,
-                texels=codes,
-                residual=codes.residual,
-                residual_step=codes.residual_step,
-                alpha=None if codes.alpha is None else codes.alpha.mean,
-            ),
+            codes=replace(self.codes, texels=codes, residual=codes.residual, residual_step=codes.residual_step),
         )
 
 
 def joined(colors: Tensor, alphas: Tensor) -> Tensor:
-    """[T, 4] texels of residual colours [T, 3] and alphas [T]."""
+    """[n, 4] texels of residual colours [n, 3] and alphas [n]."""
     return torch.cat([colors, alphas[:, None]], 1)
 
 

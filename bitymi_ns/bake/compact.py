@@ -111,8 +111,7 @@ class Coder:
         rows = validation_split(len(views), options.val_every if len(views) >= FEWEST_VIEWS else 0)[1]
         trained = [views[row] for row in rows]
         self._numbers = self._pictures.numbers / max(1, self._pictures.views) * len(trained)
-        cameras = [view.camera.to(device) for view in trained]
-        self._colors = color_choices(scene, cameras, progress)
+        self._colors = color_choices(scene, [view.camera.to(device) for view in trained], progress)
         reduced = replace(scene, surfels={**scene.surfels, **self._colors.at(START)})
         self._noise = column_noise(reduced, self._sizes, self._pictures, progress)
         self._tiles = self._texels = self._weights = self._alphas = None

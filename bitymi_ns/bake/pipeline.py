@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.baked import Baked, with_means
+from bitymi_ns.bake.baked import Baked, joined, with_means
 from bitymi_ns.bake.inputs import BakeInput, device_of, drawable, photo_resolution, visible
 from bitymi_ns.bake.lean_color import kept_view_colors
 from bitymi_ns.bake.reduce import reduced_tiles
@@ -55,7 +55,7 @@ def trained_texels(scene: BakeableScene, options: BakeOptions) -> Baked:
     packing = pack(torch.where(bare[:, None], 0, field.size), options.page_width, options.page_rows)
     listed = field.texels.detach().float()
     if field.alpha is not None:
-        listed = torch.cat([listed, field.alpha.detach().float()[:, None]], 1)
+        listed = joined(listed, field.alpha.detach().float())
     pages, constants = paged_texels(listed, packing), torch.where(bare[:, None], listed[field.tiles.first], 0.0)
     baked = BakedScene(
         surfels,

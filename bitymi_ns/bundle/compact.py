@@ -106,7 +106,8 @@ def decode_texels(
     if count != info.texels:
         raise StreamError(f"the tiles of the surfels have {count} texels, atlas.texels says {info.texels}")
     blocks = blocks_of(sizes)
-    names, alphas = coefficient_columns(sizes, False), coefficient_columns(sizes, alpha is not None)[len(blocks) :]
+    names, alphas = coefficient_columns(blocks)
+    alphas = [] if alpha is None else alphas
     numbers = {"grade": 1} | dict.fromkeys(names, 3) | dict.fromkeys(alphas, 1)
     steps = set(_check_columns(info.columns, list(numbers), numbers, alphas).values())
     if len(steps) > 1:

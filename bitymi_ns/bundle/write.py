@@ -181,7 +181,7 @@ def write_bundle(
     try:
         with complete_folder(folder, lambda: check_target(folder, overwrite)) as new:
             if codes is None or interchange:
-                write_surfels(new / SURFELS, scene, atlas is not None and atlas.alpha_scale > 0)
+                write_surfels(new / SURFELS, scene, _has_alpha(atlas))
             if codes is None and atlas is not None:
                 ktx2.write_ktx2(new / ATLAS, atlas.payload, atlas.format, atlas.width, atlas.height, GENERATOR)
             for name, data in parts.items():
@@ -221,10 +221,9 @@ def write_surfels(path: Path, scene: BakedScene, has_alpha: bool) -> None:
 
 def _compact_parts(codes: SceneCodes, info: dict[str, Any]) -> dict[str, bytes]:
     """The two files of a compact bundle; their description goes into `info`."""
-    alpha = None if codes.texels is None else codes.alpha
-    of_surfels, surfels = compact.encode_surfels(codes.surfels, codes.residual, codes.residual_step, alpha)
+    of_surfels, surfels = compact.encode_surfels(codes.surfels, codes.residual, codes.residual_step, codes.alpha)
     info["surfels"] |= {"file": COMPACT_SURFELS, **of_surfels}
-    if alpha is None:
+    if codes.alpha is None:
         info["version"] = "{}.{}".format(*COMPACT_VERSION)
     parts = {COMPACT_SURFELS: surfels}
     if codes.texels is not None:
@@ -249,8 +248,7 @@ def _describe(
     surfels, kind = scene.surfels, scene.view_color
     entry = VIEW_COLORS[kind]
     means, lean = surfels["means"].detach(), "view_terms" in surfels
-    has_alpha = atlas is not None and atlas.alpha_scale > 0
-    version = VERSION if has_alpha else LEAN_VERSION if lean else FULL_VERSION
+    version = VERSION if _has_alpha(atlas) else LEAN_VERSION if lean else FULL_VERSION
     empty = len(means) == 0
     described: dict[str, Any] = {
         "version": f"{version[0]}.{version[1]}",
@@ -295,13 +293,15 @@ def _describe(
     return described
 
 
+def _has_alpha(atlas: EncodedAtlas | None) -> bool:
+    return atlas is not None and atlas.alpha_scale > 0
+
+
 def _check_alpha(scene: BakedScene, atlas: EncodedAtlas | None, codes: SceneCodes | None) -> None:
     """Refuse mean alphas, pages and codes of which some have alpha and some have none."""
-    if codes is not None and codes.texels is not None:
-        coded = {codes.alpha is not None, codes.texels.alpha is not None}
-        if coded != {atlas is not None and atlas.alpha_scale > 0}:
-            raise BundleError("the atlas, the codes of surfels and those of texels disagree whether there are alphas")
-    if atlas is None or not atlas.alpha_scale:
+    if codes is not None and codes.texels is not None and (codes.alpha is not None) != _has_alpha(atlas):
+        raise BundleError("the atlas and the codes of the texels disagree whether there are alphas")
+    if not _has_alpha(atlas):
         return
     if scene.mean_alpha is None:
         raise BundleError("the atlas has alphas, the surfels have no mean alphas")

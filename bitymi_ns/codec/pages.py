@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.codec.packing import Packing
+from bitymi_ns.ops.baked_scene import alpha_means
 
 
 def size_classes(tiles: Tensor) -> list[tuple[int, int, Tensor]]:
@@ -55,12 +56,7 @@ def tile_means(texels: Tensor, packing: Packing, constant: Tensor | None = None,
         for part in rows.split(max(1, chunk // (r_u * r_v))):
             index = texel_index(tiles[part], (r_u, r_v), packing.width, packing.height)
             values = flat[index]
-            means[part] = values.mean(dim=(1, 2))
-            if values.shape[3] == 4:
-                alpha = values[..., 3:]
-                total = alpha.sum(dim=(1, 2))
-                colors = (alpha * values[..., :3]).sum(dim=(1, 2)) / total.clamp(min=1e-9)
-                means[part, :3] = torch.where(total > 0, colors, means[part, :3])
+            means[part] = alpha_means(values, (1, 2)) if values.shape[3] == 4 else values.mean(dim=(1, 2))
     return means
 
 

@@ -137,11 +137,15 @@ def halved(atlas: Tensor, alpha: bool = False) -> Tensor:
             colors = ((weight * summed[..., :3]).sum((2, 4), dtype=torch.int32) + (total >> 1)) // total.clamp(min=1)
             means[..., :3] = torch.where(total > 0, colors, means[..., :3])
         return means.to(torch.uint8)
-    means = cut.mean((2, 4))
-    if alpha:
-        total = cut[..., 3:].sum((2, 4))
-        colors = (cut[..., 3:] * cut[..., :3]).sum((2, 4)) / total.clamp(min=1e-6)
-        means[..., :3] = torch.where(total > 0, colors, means[..., :3])
+    return alpha_means(cut, (2, 4)) if alpha else cut.mean((2, 4))
+
+
+def alpha_means(texels: Tensor, dims: tuple[int, ...]) -> Tensor:
+    """Means over dimensions of texels [..., 4]: colours weighted by alpha, the fourth channel, where any is not 0."""
+    means, alpha = texels.mean(dims), texels[..., 3:]
+    total = alpha.sum(dims)
+    colors = (alpha * texels[..., :3]).sum(dims) / total.clamp(min=1e-6)
+    means[..., :3] = torch.where(total > 0, colors, means[..., :3])
     return means
 
 

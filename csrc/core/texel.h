@@ -69,6 +69,11 @@ template <class S> BT_HD void texel_weights(S fx, S fy, S* weight) {
 template <class V, class S> BT_HD V texel_mix(const V* t, const S* weight) {
   return (weight[0] * t[0] + weight[1] * t[1]) + (weight[2] * t[2] + weight[3] * t[3]);
 }
+// The same along u, then along v: exactly the texels' value where they are equal, as those of an alpha of 1.
+template <class S> BT_HD S texel_lerp(const S* t, S fx, S fy) {
+  const S above = t[0] + fx * (t[1] - t[0]), below = t[2] + fx * (t[3] - t[2]);
+  return above + fy * (below - above);
+}
 template <class V, class S> BT_HD V texel_slope_u(const V* t, S fy) {
   return (S(1) - fy) * (t[1] - t[0]) + fy * (t[3] - t[2]);
 }

@@ -27,8 +27,7 @@ template <class S> class AlphaPatch {
         first_(tiles.values ? tiles.first[id] : 0),
         extent_(tiles.values ? tiles.extent[id] : S(1)),
         tile_(tiles.values ? tiles.values + first_ : nullptr),
-        right_(size_[0] > 1 ? 1 : 0),
-        down_(size_[1] > 1 ? size_[0] : 0) {}
+        next_(size_) {}
   bool textured() const { return size_[0] > 0; }
 
   // Computes the texel positions of a block's fragments.
@@ -44,7 +43,9 @@ template <class S> class AlphaPatch {
     std::fill(m, m + kLanes, S(1));
     for (; lanes; lanes &= lanes - 1) {
       const int i = __builtin_ctz(lanes);
-      m[i] = mix(i);
+      S t[4];
+      load_four(i, t);
+      m[i] = texel_lerp(t, fx_[i], fy_[i]);
     }
     return load(m);
   }
@@ -52,31 +53,30 @@ template <class S> class AlphaPatch {
   void add_gradient(uint32_t lanes, const S* g, S* texels, S* du, S* dv) const {
     for (; lanes; lanes &= lanes - 1) {
       const int i = __builtin_ctz(lanes);
-      const S *t = tile_ + at_[i], fx = fx_[i], fy = fy_[i];
       if (texels) {
         S w[4], *to = texels + first_ + at_[i];
-        texel_weights(fx, fy, w);
-        to[0] += w[0] * g[i], to[right_] += w[1] * g[i], to[down_] += w[2] * g[i], to[down_ + right_] += w[3] * g[i];
+        texel_weights(fx_[i], fy_[i], w);
+        for (int k = 0; k < 4; ++k) to[offset(k)] += w[k] * g[i];
       }
-      const S four[4] = {t[0], t[right_], t[down_], t[down_ + right_]};
-      if (inside_u_ >> i & 1) du[i] += g[i] * texel_density(size_[0], extent_) * texel_slope_u(four, fy);
-      if (inside_v_ >> i & 1) dv[i] += g[i] * texel_density(size_[1], extent_) * texel_slope_v(four, fx);
+      S t[4];
+      load_four(i, t);
+      if (inside_u_ >> i & 1) du[i] += g[i] * texel_density(size_[0], extent_) * texel_slope_u(t, fy_[i]);
+      if (inside_v_ >> i & 1) dv[i] += g[i] * texel_density(size_[1], extent_) * texel_slope_v(t, fx_[i]);
     }
   }
 
  private:
   static constexpr int32_t kNone[2] = {0, 0};
-  S mix(int i) const {
-    const S *t = tile_ + at_[i], fx = fx_[i], fy = fy_[i];
-    const S above = t[0] + fx * (t[right_] - t[0]);
-    const S below = t[down_] + fx * (t[down_ + right_] - t[down_]);
-    return above + fy * (below - above);
+  // Of corner k of a fetch from its first.
+  int offset(int k) const { return (k & 1 ? next_.right : 0) + (k & 2 ? next_.down : 0); }
+  void load_four(int i, S* t) const {
+    for (int k = 0; k < 4; ++k) t[k] = tile_[at_[i] + offset(k)];
   }
   const int32_t* size_;
   int64_t first_;
   S extent_;
   const S* tile_;
-  int right_, down_;
+  TexelSteps next_;
   int32_t at_[kLanes];
   S fx_[kLanes], fy_[kLanes];
   uint32_t inside_u_ = 0, inside_v_ = 0;

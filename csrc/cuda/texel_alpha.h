@@ -42,8 +42,7 @@ template <class S> struct AlphaPatch {
   __device__ S fetch(const TexelCorners<S>& at, S (&t)[4]) const {
     BT_UNROLL
     for (int k = 0; k < 4; ++k) t[k] = tile[at.at[k]];
-    const S above = t[0] + at.fx * (t[1] - t[0]), below = t[2] + at.fx * (t[3] - t[2]);
-    return above + at.fy * (below - above);
+    return texel_lerp(t, at.fx, at.fy);
   }
 };
 

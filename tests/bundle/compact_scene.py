@@ -46,8 +46,7 @@ def make_codes(
     if alpha:
         coder.code_alpha(2 * torch.rand(len(texels), generator=generator))
     coded = coder.code(texels)
-    means = None if coded.alpha is None else coded.alpha.mean
-    return SceneCodes(surfels, coded if textured else None, coded.residual, coded.residual_step, 4096, 8192, means)
+    return SceneCodes(surfels, coded if textured else None, coded.residual, coded.residual_step, 4096, 8192)
 
 
 def scene_of(codes: SceneCodes) -> BakedScene:

@@ -11,12 +11,11 @@ import torch
 from PIL import Image
 
 from bitymi_ns.bake import Baked, bake
+from bitymi_ns.bake.baked import joined
 from bitymi_ns.bake.compact import compacted, with_coded_texels
 from bitymi_ns.bundle import export
 from bitymi_ns.bundle.bake_options import BakeOptions
-from bitymi_ns.codec.pages import listed_texels, paged_texels, tile_means
-from bitymi_ns.codec.quantise import encode
-from bitymi_ns.codec.texel_codes import TexelCodeOptions, TexelCoder
+from bitymi_ns.codec.pages import paged_texels, tile_means
 from bitymi_ns.scene import Camera
 from tests.bake.conftest import make_surfels
 from tests.bake.test_real_scene import real_scene
@@ -31,22 +30,12 @@ def view() -> Camera:
 
 
 def with_alpha(baked: Baked) -> Baked:
-    """The bake with random alphas from 0 to 2, coded where its texels are."""
-    colors = listed_texels(baked.texels, baked.packing, baked.mean_residual)
+    """The bake with random alphas from 0 to 2."""
     random = torch.Generator().manual_seed(0)
-    alpha, codes = 2 * torch.rand(len(colors), generator=random), baked.codes
-    if codes is not None:
-        sizes = torch.from_numpy(baked.packing.tiles[:, 3:])
-        coder = TexelCoder(sizes, torch.ones(len(colors)), TexelCodeOptions())
-        alpha, coded = coder.code_alpha(alpha), coder.code(colors)
-        codes = replace(codes, texels=coded, residual=coded.residual, alpha=coded.alpha.mean)
-        colors, constants = coded.texels(), torch.cat([coded.constants, coded.alpha.means[:, None]], 1)
-    pages = paged_texels(torch.cat([colors, alpha[:, None]], 1), baked.packing)
-    if codes is None:
-        constants = torch.cat([baked.mean_residual, 2 * torch.rand(len(baked.rows), 1, generator=random)], 1)
-        constants = tile_means(pages, baked.packing, constants)
-    atlas = encode(pages.numpy(), baked.packing, "uint8" if codes else baked.options.format)
-    return replace(baked, texels=pages, atlas=atlas, codes=codes).with_constants(constants)
+    alphas, means = (2 * torch.rand(count, generator=random) for count in (len(baked.listed), len(baked.rows)))
+    pages = paged_texels(joined(baked.listed, alphas), baked.packing)
+    constants = tile_means(pages, baked.packing, joined(baked.mean_residual, means))
+    return replace(baked, texels=pages, atlas=None).with_constants(constants)
 
 
 @lru_cache
@@ -66,8 +55,8 @@ def baked_scene(
     made = real_scene(make_surfels, count=count, kind=kind)
     made.surfels["log_scales"] += larger
     baked = bake(made, [view()] if seen else [], options=BakeOptions(format=format, **dict(options)))
-    baked = with_coded_texels(*compacted(baked, [], torch.zeros(3))) if compact else baked
-    return with_alpha(baked) if alpha else baked
+    baked = with_alpha(baked) if alpha else baked
+    return with_coded_texels(*compacted(baked, [], torch.zeros(3))) if compact else baked
 
 
 def write(

@@ -81,13 +81,6 @@ def test_it_is_shading_and_compositing(textured: bool, moves: bool, maps: bool, 
         torch.testing.assert_close(mine, theirs, rtol=tolerance, atol=tolerance * float(theirs.abs().max()))
 
 
-def test_texels_that_do_not_learn_have_no_gradient_and_move_surfels() -> None:
-    case = random_scene(60, 3, width=70, height=40)
-    fixed, learning = View(case, torch.float64, True, learns=False), View(case, torch.float64, True)
-    mine, theirs = fixed.gradients(fixed.image()), learning.gradients(learning.image())
-    assert all(torch.equal(a, b) for a, b in zip(mine, theirs, strict=False)) and len(mine) == len(theirs) - 1
-
-
 def test_a_descent_moves_the_texels_by_their_gradient() -> None:
     case = random_scene(60, 3, width=70, height=40)
     learning, moving = View(case, torch.float64, True), View(case, torch.float64, True, learns=False)

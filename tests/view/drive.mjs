@@ -91,8 +91,7 @@ const actionsOf = (context, page) => ({
 
 const run = async (browser, { steps, viewport, touch, ratio, patience }) => {
   const context = await browser.newContext({
-    ...{ viewport, hasTouch: touch, isMobile: touch },
-    ...{ deviceScaleFactor: ratio },
+    ...{ viewport, hasTouch: touch, isMobile: touch, deviceScaleFactor: ratio },
   });
   context.setDefaultTimeout(1000 * patience);
   const page = await context.newPage();

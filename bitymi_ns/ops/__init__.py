@@ -7,7 +7,7 @@ or `baked_cuda`.
 
 from .bands import Bands, band, by_bands, fitting_lists, refused
 from .blend import blended_image
-from .composite import beta_map, composite, composite_image, soft_overdraw
+from .composite import composite, composite_image, soft_overdraw
 from .coverage import add_texel_coverage
 from .field import FieldGeometry, field
 from .fragment_list import TooManyFragments
@@ -32,7 +32,6 @@ __all__ = [
     "TooManyFragments",
     "add_texel_coverage",
     "band",
-    "beta_map",
     "blended_image",
     "by_bands",
     "composite",

@@ -55,7 +55,6 @@ def view_losses(
         field_mode="train" if schedule.field_trains(step) else "frozen",
         maps=(view.depth is not None or view.normal is not None) and schedule.geometry_counts(step),
         overdraw_half=config.loss.overdraw_half if schedule.overdraw_counts(step) else None,
-        beta_alone=config.loss.falloff_weight > 0.0 and config.loss.falloff_gradient == "beta_only",
     )
     shown = output
     if view.correction is not None:
@@ -113,14 +112,10 @@ class Training:
         textured = scene.config.texture == "texels"
         pixels = data.covered * data.image_pixels / max(1, len(data.views))
         self.schedule = Schedule(config, max_steps, data.extent, textured, pixels)
-        self.schedule.reset_opacity()
-        for name in optimizers:
-            self.schedule.lr(name, 0)
         self.strategy = Strategy(
             config, self.schedule, data.extent, on_resize, data.image_pixels, data.first_surfels, processes
         )
         self.exposure = Exposure(config.exposure, data.exif_stops, data.photographs)
-        self.schedule.lr("exposure", 0)
         self.guard = RollbackGuard(
             scene, optimizers, self.strategy, self.schedule, config, announce, self.exposure, processes
         )

@@ -111,10 +111,6 @@ class Schedule:
         loss = self.config.loss
         return max(loss.depth_weight, loss.normal_weight) > 0.0 and step % loss.geometry_interval == 0
 
-    def after_first_reset(self, step: int) -> bool:
-        """True where the first opacity reset is over: from then on size on screen counts for pruning."""
-        return step > self.reset_every
-
     def densification_over(self, step: int) -> bool:
         """True where no densification can follow this step, so that its statistics are needed no more."""
         return not self.densify_steps or step > max(self.densify_steps)

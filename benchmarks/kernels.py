@@ -32,8 +32,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch loads Ope
 
 import torch
 from common import arguments_of, number, page, publish, say, table
-from gpu_baked import textured
-from harness import LOG2_TABLE, SITES, backward, trained_like, without_graph
+from harness import LOG2_TABLE, SITES, backward, textured, trained_like, without_graph
 
 from bitymi_ns import ops
 from bitymi_ns.ops.constants import SUPPORT

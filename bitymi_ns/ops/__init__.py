@@ -6,7 +6,7 @@ scene on both, by `baked_cpu` or `baked_cuda`.
 
 from .bands import Bands, band, by_bands, fitting_lists, refused
 from .blend import blended_image
-from .composite import beta_map, composite, soft_overdraw
+from .composite import composite, soft_overdraw
 from .coverage import add_texel_coverage
 from .field import FieldGeometry, field, fragment_residual
 from .fragment_list import TooManyFragments
@@ -30,7 +30,6 @@ __all__ = [
     "TooManyFragments",
     "add_texel_coverage",
     "band",
-    "beta_map",
     "blended_image",
     "by_bands",
     "composite",

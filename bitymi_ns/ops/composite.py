@@ -1,12 +1,8 @@
 """Weighted sums of any values of the fragments per pixel."""
 
-from dataclasses import replace
-
-import torch
 from torch import Tensor
 
 from .backend import on_same_device
-from .constants import BETA_MAX
 from .trace import Fragments
 
 
@@ -24,18 +20,6 @@ def soft_overdraw(fragments: Fragments, half: float) -> Tensor:
         raise ValueError(f"the weight that counts one half must be above 0, not {half}")
     count = fragments.weight / (fragments.weight + half)
     return count.new_zeros(fragments.width * fragments.height).index_add(0, fragments.pixel, count)
-
-
-def beta_map(fragments: Fragments, beta_raw: Tensor) -> Tensor:
-    """The blended Beta value, sum of w beta, with the weights held fixed: its gradient reaches beta alone.
-    [H * W, 1].
-
-    Args:
-        fragments: of an H x W view.
-        beta_raw: [N] the surfels' parameter, beta = 4 sigmoid(beta_raw).
-    """
-    beta = BETA_MAX * torch.sigmoid(beta_raw)
-    return composite(replace(fragments, weight=fragments.weight.detach()), beta[fragments.surfel.long(), None])
 
 
 def composite(fragments: Fragments, values: Tensor) -> Tensor:

@@ -80,7 +80,7 @@ template <class S> struct Gradients {
   bool sums_texels;
 };
 
-// What fragments have beside their surfel's colour.
+// The residual colours of fragments: none, those of texels, or one listed for each.
 enum class Residual { kNone, kTexels, kListed };
 // Blocks at a time on a multiprocessor, as many as there are registers for: the look-up of texels and the sums of its
 // gradients take 80 in single precision.

@@ -19,7 +19,7 @@ struct ExactSums {
   unsigned long long* sums = nullptr;
   ExactRange* range = nullptr;
 };
-// Where to add: exact sums, or the numbers of `sums`.
+// Adds to exact sums, or to the numbers of `sums`.
 template <bool kExact, class S> __device__ Adder<S, kExact> adder(S* sums, const ExactSums& exact) {
   if constexpr (kExact)
     return {exact.sums, exact.range->scale};

@@ -174,7 +174,7 @@ def tiles_reached(weights: Tensor, width: int, height: int) -> Tensor:
 def composite_colors(
     fragments: ops.Fragments, projection: ops.Projection, colors: Tensor, maps: bool = False
 ) -> Tensor:
-    """What `ops.blended_image` gives for colours [F, 3] of the fragments, by torch."""
+    """Image of `ops.blended_image` for colours [F, 3] of the fragments, by torch."""
     geom = projection.geom.index_select(0, fragments.surfel)
     values = [colors, torch.ones_like(colors[:, :1]), geom[:, 11:12]]
     values += [fragments.depth[:, None], geom[:, 12:15]] if maps else []

@@ -69,7 +69,7 @@ CHANNELS = {
     "depth": slice(5, 6),
     "normal": slice(6, 9),
 }
-"""Channels of the image of `ops.composite_image`."""
+"""Channels of the image of `ops.blended_image`."""
 ROUNDING = {torch.float32: 2.0**-24, torch.float64: 2.0**-53}
 NOTHING = 1e-15
 """Images and gradients that are smaller than this everywhere are compared absolutely: beside the others of their scene

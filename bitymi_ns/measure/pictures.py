@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bitymi_ns.files import reason
 from bitymi_ns.measure.report.pictures import ERROR_CAPTION, ERROR_SCALE, heat
-from bitymi_ns.ops import blended_image, composite, shade
+from bitymi_ns.ops import blended_image, fragment_residual
 from bitymi_ns.ops.constants import COLOR_BIAS
 from bitymi_ns.plugin.console import fail, say
 from bitymi_ns.plugin.export.target import replace_file, require_writable
@@ -54,16 +54,12 @@ def residual_parts(scene: Scene, output: RenderOutput) -> tuple[Tensor, Tensor]:
     dark = torch.full_like(scene.surfels["means"], -COLOR_BIAS)
     bands = []
     for fragments in output.fragments.lists():
-        parts = []
-        for sign in (1, -1):
-            if isinstance(field, TexelField):
-                texels = (sign * field.texels.detach(), field.tiles)
-                image = blended_image(fragments, output.projection, dark, *texels, bound)
-            else:
-                weights = (*field.weights[:-1], sign * field.weights[-1])  # the last layer is linear
-                frames = output.projection.frames
-                image = composite(fragments, shade(fragments, dark, frames, field.geometry, weights, bound))
-            parts.append(image[:, :3])
+        if isinstance(field, TexelField):
+            textures = [{"texels": sign * field.texels.detach(), "tiles": field.tiles} for sign in (1, -1)]
+        else:
+            rho = fragment_residual(fragments, output.projection.frames, field.geometry, field.weights, bound)
+            textures = [{"residual": rho}, {"residual": -rho}]
+        parts = [blended_image(fragments, output.projection, dark, bound=bound, **t)[:, :3] for t in textures]
         bands.append(torch.cat(parts, dim=1).view(fragments.height, fragments.width, 6))
     positive, negative = torch.cat(bands).split(3, dim=-1)
     return positive, negative

@@ -6,7 +6,6 @@ A bare machine lacks much that nerfstudio imports and this plugin never uses the
 use is an error, here too where the real ones are installed, so that a run on any machine shows that none is needed.
 """
 
-import argparse
 import contextlib
 import json
 import os
@@ -22,9 +21,10 @@ import time
 import urllib.request
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+from common import arguments_of, number, page, publish, table
 
 STAND_INS = ("IPython", "av", "fpsample", "gsplat", "open3d", "pathos", "pillow_heif", "plotly", "pymeshlab")
 STAND_INS += ("rawpy", "tensorly", "xatlas", "yourdfpy")
@@ -88,23 +88,14 @@ def stand_in(folder: Path) -> dict[str, str]:
     return {**os.environ, "PATH": programs, "PYTHONPATH": path, "COLUMNS": "200", "BITYMI_NO_DOWNLOAD": "1"}
 
 
-@dataclass
-class Row:
-    """A command and what it took.
+class Row(NamedTuple):
+    """A command and what it took."""
 
-    Attributes:
-        command: as it was typed.
-        status: exit status.
-        seconds: wall clock.
-        host: largest resident memory, MB; the kernel counts this process, until the command starts, as well.
-        card: largest memory in use on the card, MB, that of other programs included; None = there is no card.
-    """
-
-    command: str
+    command: str  # as it was typed
     status: int
-    seconds: float
-    host: float
-    card: float | None
+    seconds: float  # wall clock
+    host: float  # largest resident memory, MB; the kernel counts this process, until the command starts, as well
+    card: float | None  # largest memory in use on the card, MB, that of other programs included; None = no card
 
 
 def card_memory() -> float | None:
@@ -135,12 +126,7 @@ def watched() -> Iterator[list[float]]:
 
 
 class Commands:
-    """Runs commands one after the other; their output goes to a log.
-
-    Args:
-        folder: of the log.
-        environment: of the commands.
-    """
+    """Runs commands one after the other, with an environment; their output goes to a log in a folder."""
 
     def __init__(self, folder: Path, environment: dict[str, str]) -> None:
         self.rows: list[Row] = []
@@ -254,24 +240,18 @@ def all_commands(capture: Path, folder: Path, steps: int, options: Sequence[str]
         commands.run(sys.executable, Path(__file__).resolve(), "--waits", *short)
 
 
-def page(folder: Path, capture: Path, steps: int, rows: Sequence[Row]) -> str:
-    """The table as Markdown."""
-    text = f"`{capture.name}`, {steps} steps; stand-ins for {', '.join(STAND_INS)}.\n\n"
-    text += "| command | exit status | s | MB of host | MB of card |\n|---|---|---:|---:|---:|\n"
-    for row in rows:
-        card = "" if row.card is None else f"{row.card:.0f}"
-        text += f"| `{row.command}` | {row.status} | {row.seconds:.1f} | {row.host:.0f} | {card} |\n"
-    text += "\n| | PSNR | SSIM | LPIPS | surfels |\n|---|---:|---:|---:|---:|\n"
+def tables(folder: Path, rows: Sequence[Row]) -> str:
+    """What the commands took and found, as Markdown."""
+    cells = [
+        [f"`{r.command}`", str(r.status), number(r.seconds, 1), number(r.host, 0), number(r.card, 0)] for r in rows
+    ]
+    quality, digits = [], {"psnr": 2, "ssim": 3, "lpips": 3, "surfels": 0}
     for name in ("trained", "baked"):
         with contextlib.suppress(OSError):
             found = json.loads((folder / f"{name}.json").read_text())["results"]
-            digits = {"psnr": 2, "ssim": 3, "lpips": 3, "surfels": 0}
-            cells = [f"{found[key]:.{n}f}" if key in found else "" for key, n in digits.items()]
-            text += f"| {name} | {' | '.join(cells)} |\n"
-    said = re.findall(r"waits per step: ([\d.]+)", (folder / "log.txt").read_text())
-    return text + (
-        f"\nWaits of the host for the card per step, nerfstudio's own included: {said[-1]}.\n" if said else ""
-    )
+            quality.append([name, *(number(found.get(key), n) for key, n in digits.items())])
+    text = table(("command", "exit status", "s", "MB of host", "MB of card"), cells)
+    return f"{text}\n\n{table(('', 'PSNR', 'SSIM', 'LPIPS', 'surfels'), quality)}"
 
 
 def main() -> int:
@@ -279,12 +259,12 @@ def main() -> int:
     if sys.argv[1:2] == ["--waits"]:
         waits(sys.argv[2:])
         return 0
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments_of(__doc__)
     parser.add_argument("data", type=Path, help="folder of an undistorted capture with transforms.json")
     parser.add_argument("--steps", type=int, default=3000, help="length of the run (%(default)s)")
     parser.add_argument("--folder", type=Path, required=True, help="of runs, bundle and log; emptied first")
     parser.add_argument("--output", type=Path, help="also write the Markdown to this file")
-    parser.add_argument("--options", nargs=argparse.REMAINDER, default=[], help="of ns-train, at the end")
+    parser.add_argument("--options", nargs="...", default=[], help="of ns-train, at the end")
     arguments = parser.parse_args()
     folder, capture = arguments.folder.resolve(), arguments.data.resolve()
     shutil.rmtree(folder, ignore_errors=True)
@@ -292,10 +272,11 @@ def main() -> int:
     try:
         all_commands(capture, folder, arguments.steps, arguments.options, commands)
     finally:
-        text = page(folder, capture, arguments.steps, commands.rows)
-        print(text)
-        if arguments.output:
-            arguments.output.write_text(text)
+        notes = [f"Stand-ins for {', '.join(STAND_INS)}."]
+        for waits_per_step in re.findall(r"waits per step: ([\d.]+)", (folder / "log.txt").read_text()):
+            notes.append(f"Waits of the host for the card per step, nerfstudio's own included: {waits_per_step}.")
+        title = f"nerfstudio on {capture.name}, {arguments.steps} steps"
+        publish(page(title, tables(folder, commands.rows), notes), arguments.output)
     return int(any(row.status for row in commands.rows))
 
 

@@ -12,8 +12,8 @@ import tyro
 
 from bitymi_ns.files import check_writable, explained, write_file
 from bitymi_ns.measure import markdown
-from bitymi_ns.measure.bench.cells import Cells
-from bitymi_ns.measure.bench.engine import open_cells, run_chains
+from bitymi_ns.measure.bench.cells import FILE, Cells
+from bitymi_ns.measure.bench.engine import run_chains
 from bitymi_ns.measure.bench.matrix import (
     Bundle,
     Format,
@@ -91,14 +91,14 @@ class BenchRun:
     def run(self) -> int:
         """Run the missing cells, then print the table; returns the exit status."""
         matrix, work = self.matrix(), Path(os.path.expanduser(self.work)).resolve()
-        cells = open_cells(work)
+        cells = Cells(work / FILE)
         if self.output is not None:
             with explained(self.output, BenchError):
                 check_writable(self.output)
         try:
             failures = run_chains(work, matrix.chains())
         except KeyboardInterrupt:
-            finished = len(open_cells(work))
+            finished = len(Cells(work / FILE))
             kept = f"{finished} finished cells are in {work}" if finished else "no cell was finished"
             say(f"interrupted; {kept}. Run the same command to continue")
             return INTERRUPTED

@@ -128,8 +128,8 @@ def run_seed(capture: "Capture", seed: int, settings: Settings, calibration: Cal
     """The figures of one scene and seed."""
     import torch
 
-    from bitymi_ns.bake import BakeOptions, Learning, TuneOptions, bake_and_learn
-    from bitymi_ns.bundle import export, read_bundle
+    from bitymi_ns.bake import BakeOptions, Learning, TuneOptions, bake_and_learn, export
+    from bitymi_ns.bundle import read_bundle
     from bitymi_ns.scene.config import SceneConfig
     from bitymi_ns.train.config import TrainConfig
     from bitymi_ns.train.domain import scene_for_views

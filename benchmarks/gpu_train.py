@@ -20,8 +20,8 @@ from common import arguments_of, number, page, publish, say, table
 from harness import Options, milliseconds
 from plain_capture import Capture, load_capture
 
-from bitymi_ns import bundle
-from bitymi_ns.bake import BakeOptions, Learning, bake_and_learn
+from bitymi_ns.bake import BakeOptions, Learning, bake_and_learn, export
+from bitymi_ns.bundle import read_bundle
 from bitymi_ns.plugin.run.preset import Preset, load_preset
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.train.config import REFERENCE_STEPS
@@ -100,8 +100,8 @@ def run(
     cameras = [view.camera.to(device) for view in capture.train]
     made = bake_and_learn(scene, cameras, (), background, BakeOptions(), Learning())  # without fine-tuning
     bake_seconds = time.perf_counter() - start
-    bundle.export(made, target)
-    baked = bundle.read_bundle(target).scene.to(device)
+    export(made, target)
+    baked = read_bundle(target).scene.to(device)
     baked_frame = milliseconds(lambda: baked.render(camera), options)
     size = 0 if made.atlas is None else made.atlas.nbytes
     figures = [number(peak / 1e6, 0), number(waits, 1), number(1e3 / frame, 0), number(bake_seconds, 1)]

@@ -49,31 +49,31 @@ def sanitizer(tool: str, *sections: str) -> list[str]:
 
 
 def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | None = None) -> dict[str, list[Step]]:
-    """Steps of every order, by name. `fox` needs that capture in `data`; `train`, `gaussians` and `peers` take every
-    other one. `peers` and `kernels` draw the bundles that orders before them left, `peers` the Gaussians of
-    `gaussians`, too.
+    """Steps of every order, by name. `frames`, `peers` and `kernels` draw the bundles that `train` left, `peers` the
+    Gaussians of `gaussians`, too.
 
     Args:
         results: folder of the tables.
         data: folder of captures.
         surfels: sizes of the scenes in the tables.
-        steps: of the runs of `train`; None = the preset's.
+        steps: of the runs of `train` and `nerfstudio`; None = the script's default.
     """
     length = [] if steps is None else ["--steps", str(steps)]
     pytest = [sys.executable, "-m", "pytest", "-q", "-rfEs", "--tb=short"]
     bundles = results / "bundles"
-    baked = ("--surfels", "150000", "--runs", "100", "--sections", "baked")
     ncu = ["ncu", "--profile-from-start", "off", "--set", "detailed", "--clock-control", "none", "--page", "details"]
     large = ("--surfels", "150000", "--size", "1297x840")
-    kept = sorted(file.parent for file in bundles.glob("**/bundle.json"))
+    kept = sorted(str(file.parent) for file in bundles.glob("**/bundle.json"))
+    bundled = ["--bundles", *kept] if kept else []
 
     def page(name: str, script: str, *words: object) -> list[str]:
         """A command that also writes its Markdown to a file of the results."""
-        return python(script, *map(str, words), "--output", str(results / name))
+        return python(script, *map(str, words), "--output", str(results / f"{name}.md"))
 
     def of_each(what: str, limit: float, commands: Callable[[str], list[list[str]]]) -> list[Step]:
-        """A step for every capture but fox."""
-        return [Step(f"{what}{name}", commands(name), limit) for name in captures(data) if name != "fox"]
+        """A step for every capture."""
+        names = sorted(file.parent.name for file in data.glob("*/transforms.json"))
+        return [Step(f"{what}{name}", commands(name), limit) for name in names]
 
     return {
         "check": [
@@ -82,20 +82,13 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
             Step("kernels", [python("card_smoke.py", *large, "--times", "20")], 90),
             Step("sanitizers", [sanitizer(tool, *PROFILED) for tool in SANITIZERS], 150),
         ],
-        "tables": [
-            Step(name, [page(f"{name}.md", "gpu.py", "--runs", "100", "--sections", name, "--surfels", *surfels)], 120)
-            for name in ("baked", "steps")
-        ],
-        "fox": [
-            Step("fox", [page("fox.md", "gpu_train.py", data / "fox", "--steps", "3000", "--keep", bundles)], 200),
-            Step("baked", [page("baked.md", "gpu.py", *baked, "--bundles", bundles / "bitymi-3000")], 90),
-        ],
         "profile": [
             Step("profile", [[*ncu, *python("card_smoke.py", *large, "--profile", "--sections", *PROFILED)]], 400)
         ],
         "train": of_each(
-            "", 600, lambda name: [page(f"{name}.md", "gpu_train.py", data / name, "--keep", bundles / name, *length)]
+            "", 600, lambda name: [page(name, "gpu_train.py", data / name, "--keep", bundles / name, *length)]
         ),
+        "frames": [Step("frames", [page("frames", "gpu.py", "--runs", "100", "--surfels", *surfels, *bundled)], 200)],
         "gaussians": of_each(
             "Gaussians of ",
             300,
@@ -108,36 +101,31 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
             "peers on ",
             120,
             lambda name: [
-                page(f"{name}-peers.md", "gpu_peers.py", data / name, "--bundles", *sorted(bundles.glob(f"{name}/*")))
+                page(f"{name}-peers", "gpu_peers.py", data / name, "--bundles", *sorted(bundles.glob(f"{name}/*")))
                 + ["--gaussians", str(results / name)]
             ],
         ),
         "kernels": [
             Step(
                 f"kernels of bundles, {size}",
-                [python("card_smoke.py", "--sections", "--size", size, "--times", "20", "--bundles", *map(str, kept))],
+                [python("card_smoke.py", "--sections", "--size", size, "--times", "20", *bundled)],
                 60,
             )
             for size in ("1297x840", "3840x2160")
         ],
-        "nerfstudio": [
-            Step(
-                f"nerfstudio on {name}",
-                [page(f"{name}-nerfstudio.md", "card_nerfstudio.py", data / name, "--folder", results / name, *length)],
-                600,
-            )
-            for name in captures(data)
-        ],
+        "nerfstudio": of_each(
+            "nerfstudio on ",
+            600,
+            lambda name: [
+                page(f"{name}-nerfstudio", "card_nerfstudio.py", data / name, "--folder", results / f"{name}-runs")
+                + length
+            ],
+        ),
         "webgpu": [Step("webgpu tests", [[*pytest, "--timeout=60", "tests/ops/webgpu"]], 60)],
     }
 
 
 GAUSSIANS = (300_000, 1_000_000)  # numbers that are trained to compare with
-
-
-def captures(data: Path) -> list[str]:
-    """Names of the captures in a folder."""
-    return sorted(file.parent.name for file in data.glob("*/transforms.json"))
 
 
 def together(steps: Sequence[Step]) -> Step:
@@ -285,7 +273,7 @@ def main() -> int:
     running.add_argument("--data", type=Path, default=Path(), help="folder of the captures")
     running.add_argument("--output", type=Path, required=True)
     running.add_argument("--surfels", nargs="+", default=["50000", "150000", "500000"], help="scenes of the tables")
-    running.add_argument("--steps", type=int, help="of the runs of `train` (default: the preset's)")
+    running.add_argument("--steps", type=int, help="of the runs of `train` and `nerfstudio`")
     running.add_argument("--seconds", type=float, default=570, help="for all of it (%(default)s)")
     arguments = parser.parse_args()
     if arguments.command == "stage":

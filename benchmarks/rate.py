@@ -14,13 +14,13 @@ compact` does; `--keep` stores that in a file, from which the command continues 
 import os
 import sys
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 os.environ.setdefault("BITYMI_NO_DOWNLOAD", "1")
 
 import torch
 from common import arguments_of, number, page, publish, say, table
+from harness import quality
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -32,7 +32,6 @@ from bitymi_ns.plugin.export.trained import load_trained
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.exposure import corrected
-from bitymi_ns.train.losses import psnr
 from bitymi_ns.train.views import View
 
 COLUMNS = ("lambda", "surfels", "per surfel", "terms", "texels", "MB", "training", "held-out", "tuned")
@@ -53,9 +52,8 @@ def polished(load_config: Path, steps: int) -> dict[str, Any]:
 
 def held_out(scene: BakedScene, views: list[View], background: torch.Tensor) -> float:
     """Mean dB."""
-    drawn = (scene.render(view.camera.to("cpu"), background=background).rgb.clamp(0.0, 1.0) for view in views)
-    pairs = zip(drawn, views, strict=True)
-    return fmean(psnr(rgb, v.target(background, "cpu"), None if v.mask is None else v.mask.cpu()) for rgb, v in pairs)
+    cpu = torch.device("cpu")
+    return quality(lambda camera: scene.render(camera, background=background).rgb, views, cpu, background)[0]
 
 
 def plot(points: list[tuple[float, float]], name: str, path: Path) -> None:

@@ -15,8 +15,7 @@ from bitymi_ns.ops import (
     TexelDescent,
     TexelTiles,
     blended_image,
-    composite_image,
-    shade,
+    fragment_residual,
 )
 from bitymi_ns.ops.constants import FEATURES, WIDTH
 from bitymi_ns.ops.field import FieldGeometry, field
@@ -46,7 +45,7 @@ class ResidualField(Protocol):
     """Residual colours of fragments, beside the surfels' view colours."""
 
     def image(self, fragments: Fragments, projection: Projection, base: Tensor, how: Shading) -> Tensor:
-        """[H * W, C] what `composite_image` gives for colours ReLU(ReLU(f_view + 0.5) + residual).
+        """[H * W, C] what `blended_image` gives for colours ReLU(ReLU(f_view + 0.5) + residual).
 
         Args:
             fragments: of an H x W view.
@@ -150,8 +149,8 @@ class HashField(nn.Module):
     def image(self, fragments: Fragments, projection: Projection, base: Tensor, how: Shading) -> Tensor:
         """See `ResidualField`."""
         weights = self.weights if how.learns else tuple(w.detach() for w in self.weights)
-        colors = shade(fragments, base, projection.frames, self.geometry, weights, how.bound, how.moves_surfels)
-        return composite_image(fragments, projection, colors, how.maps)
+        rho = fragment_residual(fragments, projection.frames, self.geometry, weights, how.bound, how.moves_surfels)
+        return blended_image(fragments, projection, base, maps=how.maps, residual=rho)
 
     def opacity(self, bound: float, learns: bool) -> None:
         """See `ResidualField`: a field in space adds colours alone."""

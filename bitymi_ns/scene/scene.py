@@ -17,7 +17,6 @@ from bitymi_ns.ops import (
     Projection,
     TooManyFragments,
     band,
-    beta_map,
     blended_image,
     by_bands,
     project,
@@ -161,7 +160,6 @@ class Scene(nn.Module):
         field_mode: Literal["train", "frozen", "off"] = "train",
         maps: bool = False,
         overdraw_half: float | None = None,
-        beta_alone: bool = False,
     ) -> RenderOutput:
         """Renders a view: visibility, then shading, then compositing.
 
@@ -173,7 +171,6 @@ class Scene(nn.Module):
                 colours are left out.
             maps: also depth and normals.
             overdraw_half: also the count of fragments with a gradient, see `ops.soft_overdraw`; None = without.
-            beta_alone: the gradient of the Beta map reaches beta alone, not the blending weights.
 
         Raises:
             TooManyFragments: a single row of tiles has too many.
@@ -194,8 +191,6 @@ class Scene(nn.Module):
             else:
                 moves = learns and self.config.residual_moves_surfels
                 image = field.image(fragments, part, base, Shading(bound, learns, moves, maps, read))
-            if beta_alone:
-                image = torch.cat([image[:, :4], beta_map(fragments, p["beta_raw"]), image[:, 5:]], 1)
             if overdraw_half is not None:
                 image = torch.cat([image, soft_overdraw(fragments, overdraw_half).unsqueeze(1)], 1)
             return image, fragments

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops.constants import MAX_LEVELS, SUPPORT
-from bitymi_ns.ops.view_kinds import VIEW_COLORS
+from bitymi_ns.ops.constants import SUPPORT
+from bitymi_ns.ranges import check_ranges
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import HashField
@@ -51,13 +51,16 @@ def build_scene(
     Raises:
         ValueError: an option is out of range, or there is nothing to start from.
     """
-    check_representation(scene_config)
+    check_ranges(scene_config)
+    check_ranges(train_config)
     surfels, report = surfels_from_points(points, colours, camera_centers, train_config, scene_config, box, background)
     means = surfels["means"][: len(surfels["means"]) - report.background]  # the others would make the field coarse
     near = NEAR * scene_extent(camera_centers, means)
     if scene_config.texture != "hash":  # texels are added once the geometry has settled
         return Scene(scene_config, surfels, None, near), report
-    bounded = bounded or (declared is not None and box_is_small(declared, camera_centers))
+    if declared is not None:  # captures of open scenes may declare a large box: a grid over it would be coarser than
+        # one over contracted space, which is twice as wide as the cameras' ball
+        bounded |= float((declared[1] - declared[0]).max()) <= 4 * scene_extent(camera_centers)
     contract = scene_config.contraction == "on" or (scene_config.contraction == "auto" and not bounded)
     mid, half = field_domain(means if declared is None else declared, camera_centers, contract)
     log2_size = scene_config.log2_table_size
@@ -85,32 +88,6 @@ def scene_for_views(
     points, colors = points.cpu(), colors.cpu()
     background = background_points(points, views, train_config.seed) if train_config.background_points else None
     return build_scene(points, colors, centers, scene_config, train_config, bounded, pixels, background=background)[0]
-
-
-def check_representation(config: SceneConfig) -> None:
-    """Refuse options that the kernels would stumble over later.
-
-    Raises:
-        ValueError: naming the option and its range.
-    """
-    ranges = {
-        **{kind.option: (getattr(config, kind.option), *kind.option_range) for kind in VIEW_COLORS.values()},
-        "levels": (config.levels, 1, MAX_LEVELS),
-        "min_resolution": (config.min_resolution, 2, 1 << 20),
-        "log2_table_size": (1 if config.log2_table_size is None else config.log2_table_size, 1, 24),
-        "near": (1.0 if config.near is None else config.near, 1e-6, 1e6),
-        "weight_bound": (config.weight_bound, 0.0, 1.0),
-        "rim": (config.rim, 1e-8, 1.0),
-    }
-    for name, (value, low, high) in ranges.items():
-        if not low <= value <= high:
-            raise ValueError(f"the scene option {name} must be between {low:g} and {high:g}, not {value}")
-
-
-def box_is_small(box: Tensor, camera_centers: Tensor) -> bool:
-    """True where a grid over the box [2, 3] is at least as fine as one over contracted space, which is twice as wide as
-    the cameras' ball. Captures of open scenes may declare a large box."""
-    return float((box[1] - box[0]).max()) <= 4 * scene_extent(camera_centers)
 
 
 def field_domain(means: Tensor, camera_centers: Tensor, contract: bool) -> tuple[tuple[float, float, float], float]:

@@ -97,10 +97,6 @@ def surfels_from_points(
     Returns:
         The parameters by name, float32, on the CPU (table in docs/overview.md), and what became of the points.
     """
-    if not 0.0 < config.init_opacity < 1.0:
-        raise ValueError(f"the training option init_opacity must lie between 0 and 1, not {config.init_opacity}")
-    if config.first_surfels is not None and config.first_surfels < 1:
-        raise ValueError(f"the training option first_surfels must be at least 1, not {config.first_surfels}")
     generator = torch.Generator().manual_seed(config.seed)
     centers = camera_centers.detach().reshape(-1, 3).float().cpu()
     centers = centers[centers.isfinite().all(-1)]
@@ -172,8 +168,6 @@ def _usable(xyz: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor, PointReport]:
 
 
 def _random_points(n: int, centers: Tensor, box: Tensor | None, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    if n < 1:
-        raise ValueError("the capture has no usable sparse points and random_points is 0: nothing to start from")
     if box is None:
         middle = centers.mean(0) if len(centers) else torch.zeros(3)
         extent = scene_extent(centers)

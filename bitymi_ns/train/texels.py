@@ -22,7 +22,7 @@ from bitymi_ns.scene.tile_sizes import coarsened, kernel_parameters, max_project
 from bitymi_ns.scene.visibility import Visibility, visibility
 from bitymi_ns.train.init import tangents
 from bitymi_ns.train.losses import numbers
-from bitymi_ns.train.processes import ALONE, Processes
+from bitymi_ns.train.processes import Processes
 from bitymi_ns.train.views import OnDemand, at_size, spread
 
 if TYPE_CHECKING:
@@ -46,8 +46,8 @@ the time."""
 class LearningTexels:
     """The part of a run in which texels learn."""
 
-    def __init__(self, scene: Scene, schedule: Schedule, options: TexelConfig, processes: Processes = ALONE) -> None:
-        self.scene, self.schedule, self.options, self.processes = scene, schedule, options, processes
+    def __init__(self, scene: Scene, schedule: Schedule, processes: Processes) -> None:
+        self.scene, self.schedule, self.options, self.processes = scene, schedule, schedule.config.texels, processes
         self._rates: list[RemovableHandle] = []
         self._views = 1
 

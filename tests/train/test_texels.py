@@ -1,6 +1,5 @@
 """Texels that learn in the last part of a run."""
 
-import copy
 from dataclasses import replace
 
 import pytest
@@ -24,6 +23,7 @@ from bitymi_ns.train.texels import (
     tiles_as_seen,
 )
 from bitymi_ns.train.views import at_size
+from tests.train.part_of_a_run import resume, state_of
 
 OPTIONS = TexelConfig(start=18_000, pixels_per_texel=0.5)
 
@@ -165,12 +165,12 @@ def test_a_run_resumes_before_and_after_its_texels_came(textured, views) -> None
     straight, states = Trainer(textured(), views, config(), 60), []
     for step in range(60):
         if step in (30, 40):
-            states.append(copy.deepcopy(straight.state_dict()))
+            states.append(state_of(straight))
         straight.advance()
     assert isinstance(straight.scene.field, TexelField)
     for state in states:
         resumed = Trainer(textured(every=5), views, config(), 60)
-        resumed.load_state_dict(state)
+        resume(resumed, state)
         assert isinstance(resumed.scene.field, TexelField) == (resumed.step == 40)
         while resumed.step < 60:
             resumed.advance()

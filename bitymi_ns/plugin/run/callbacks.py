@@ -24,7 +24,7 @@ from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train import limits
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.domain import views_without_surfels
-from bitymi_ns.train.evaluate import Quality, evenly_spaced, held_out_quality
+from bitymi_ns.train.evaluate import Quality, evaluate, evenly_spaced
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.step import Training
 from bitymi_ns.train.views import OnDemand, TrainingData, View, covered_share
@@ -43,7 +43,6 @@ class TrainingRun:
         config: TrainConfig,
         attributes: TrainingCallbackAttributes,
         metadata: Mapping[str, Any],
-        background: Tensor,
         resume_state: Mapping[str, Any],
         curve_points: int,
         curve_views: int,
@@ -51,7 +50,7 @@ class TrainingRun:
         trainer, pipeline = attributes.trainer, attributes.pipeline
         if trainer is None or pipeline is None or attributes.optimizers is None:
             raise ValueError("a training run needs nerfstudio's trainer, pipeline and optimisers")
-        self.scene, self.config, self.background = scene, config, background
+        self.scene, self.config = scene, config
         self.datamanager = pipeline.datamanager
         self.total: int = trainer.config.max_num_iterations
         self.first_step: int = trainer._start_step
@@ -205,12 +204,7 @@ class TrainingRun:
         """Means over held-out views at full size; None where no pixel counts."""
         views = self.datamanager.eval_views
         rows = evenly_spaced(len(views), 0 if all_views else self._curve_views)
-        quality = held_out_quality(
-            lambda camera: self.scene.render(camera, background=self.background, field_mode="frozen"),
-            OnDemand(len(rows), lambda i: views[rows[i]]),
-            self.background,
-            self.background.device,
-        )
+        quality = evaluate(self.scene, OnDemand(len(rows), lambda i: views[rows[i]]), self.config)
         return None if math.isnan(quality.psnr) else quality
 
 

@@ -135,7 +135,6 @@ class BitymiModel(SurfelModel):
             self.train_config,
             training_callback_attributes,
             self.metadata,
-            self.background,
             self.resume_state,
             self.config.curve_points,
             self.config.curve_views,

@@ -3,7 +3,7 @@
 Needs the package `wgpu`, which is optional (`pip install 'bitymi-ns[webgpu]'`).
 """
 
-from .device import WebGpuUnavailable, adapters, require
+from .device import WebGpuUnavailable
 from .draw import draw
 
-__all__ = ["WebGpuUnavailable", "adapters", "draw", "require"]
+__all__ = ["WebGpuUnavailable", "draw"]

@@ -20,7 +20,6 @@ from .programs import Programs
 SHOW = {"color": 0, "depth": 1, "normal": 2, "overdraw": 3}  # what is blended, by its number in scene.wgsl
 BLOCK, DIGITS, ROUNDS = 1024, 16, 8  # of sort.wgsl: keys per block, digits, rounds of 4 bits
 MOST_LAYERS = 64
-_RECTANGLE = slice(16, 22)  # columns of `Seen` in scene.wgsl
 _STRIDE = 256  # between the uniforms of batches and of rounds, which devices want so
 
 
@@ -251,20 +250,6 @@ class SceneOnDevice:
         Returns:
             [H, W, 4]: the sums, and what is left of the transmittance.
         """
-        target = self.begin(camera, show, layers, photo_pixel)
-        encoder = self._device.create_command_encoder()
-        sums, _ = target.sums
-        encoder.copy_texture_to_buffer(
-            {"texture": sums},
-            {"buffer": target.read, "bytes_per_row": target.row_bytes, "rows_per_image": camera.height},
-            (camera.width, camera.height, 1),
-        )
-        self._device.queue.submit([encoder.finish()])
-        return self._read(target)
-
-    def begin(self, camera: Camera, show: str, layers: int, photo_pixel: float = 1.0) -> _Target:
-        """Queues the drawing of a view, with the arguments of `draw`, and does not wait for it: what it draws stays on
-        the device."""
         target = self._target_of(camera.width, camera.height)
         if photo_pixel < 1.0 and self._coarser is None:
             self._make_coarser()
@@ -273,17 +258,14 @@ class SceneOnDevice:
         encoder = self._device.create_command_encoder()
         self._encode_sorting(encoder)
         self._encode_drawing(encoder, target, show, layers)
+        sums, _ = target.sums
+        encoder.copy_texture_to_buffer(
+            {"texture": sums},
+            {"buffer": target.read, "bytes_per_row": target.row_bytes, "rows_per_image": camera.height},
+            (camera.width, camera.height, 1),
+        )
         self._device.queue.submit([encoder.finish()])
-        return target
-
-    def rectangles(self) -> npt.NDArray[np.float32]:
-        """Read the rectangles of the latest view's surfels, front to back: [M, 6] axis (a unit vector on the screen),
-        middle, and half the size along the axis and across, in pixels."""
-        queue = self._device.queue
-        count = int(np.frombuffer(queue.read_buffer(self._visible), np.uint32)[0])
-        order = np.frombuffer(queue.read_buffer(self._order[0]), np.uint32)[:count]
-        seen = np.frombuffer(queue.read_buffer(self._seen), np.float32).reshape(-1, 24)
-        return seen[order, _RECTANGLE]
+        return self._read(target)
 
     def _encode_sorting(self, encoder: Any) -> None:
         p, work = self._programs, encoder.begin_compute_pass()

@@ -24,7 +24,7 @@ from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train import limits
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.domain import views_without_surfels
-from bitymi_ns.train.evaluate import Quality, evaluate, evenly_spaced
+from bitymi_ns.train.evaluate import evaluate, evenly_spaced
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.step import Training
 from bitymi_ns.train.views import OnDemand, TrainingData, View, covered_share
@@ -48,8 +48,7 @@ class TrainingRun:
         curve_views: int,
     ) -> None:
         trainer, pipeline = attributes.trainer, attributes.pipeline
-        if trainer is None or pipeline is None or attributes.optimizers is None:
-            raise ValueError("a training run needs nerfstudio's trainer, pipeline and optimisers")
+        assert trainer is not None and pipeline is not None and attributes.optimizers is not None
         self.scene, self.config = scene, config
         self.datamanager = pipeline.datamanager
         self.total: int = trainer.config.max_num_iterations
@@ -79,7 +78,8 @@ class TrainingRun:
             self._random_state = resume_state["random"]
             if "capture" in resume_state:  # checkpoints of earlier versions have none
                 warn_of_other_capture(resume_state["capture"], self.capture)
-        self.curve_steps = points(self.total, curve_points)
+        # after which the curve gets a point: evenly spaced, the last step included
+        self.curve_steps = {max(0, round(self.total * (i + 1) / curve_points) - 1) for i in range(curve_points)}
         resumed_from = trainer.config.load_dir or getattr(trainer.config.load_checkpoint, "parent", None)
         self.curve = TrainingCurve(
             trainer.base_dir / FILE, None if resumed_from is None else resumed_from.parent / FILE, self.first_step
@@ -182,7 +182,9 @@ class TrainingRun:
     # the curve
 
     def _add_point(self, step: int) -> None:
-        quality = self._held_out(all_views=step + 1 >= self.total)
+        views = self.datamanager.eval_views
+        rows = evenly_spaced(len(views), 0 if step + 1 >= self.total else self._curve_views)
+        quality = evaluate(self.scene, OnDemand(len(rows), lambda i: views[rows[i]]), self.config)
         point = {
             "step": step + 1,
             "seconds": round(self.training.clock.seconds, 4),
@@ -190,7 +192,7 @@ class TrainingRun:
             "surfels": len(self.scene),
         }
         shown = ""
-        if quality is not None:
+        if not math.isnan(quality.psnr):
             point |= {name: round(value, 4) for name, value in quality._asdict().items()}
             shown = f"{quality.psnr:6.2f} dB held out, "
             writer.put_scalar("Held-out PSNR", torch.tensor(quality.psnr), step)
@@ -199,13 +201,6 @@ class TrainingRun:
             f"step {step + 1:6,d} of {self.total:,}: {shown}{point['surfels']:,} surfels, "
             f"{self.training.clock.seconds:.0f} s of training"
         )
-
-    def _held_out(self, all_views: bool) -> Quality | None:
-        """Means over held-out views at full size; None where no pixel counts."""
-        views = self.datamanager.eval_views
-        rows = evenly_spaced(len(views), 0 if all_views else self._curve_views)
-        quality = evaluate(self.scene, OnDemand(len(rows), lambda i: views[rows[i]]), self.config)
-        return None if math.isnan(quality.psnr) else quality
 
 
 FILE = "training_curve.jsonl"
@@ -242,10 +237,3 @@ def _points_until(path: Path, steps: int) -> list[str]:
         except (ValueError, KeyError, TypeError):
             continue  # cut off when the run was killed
     return kept
-
-
-def points(total: int, count: int) -> frozenset[int]:
-    """The steps after which the curve gets a point: `count` of them, evenly spaced, the last step included."""
-    if count <= 0:
-        return frozenset()
-    return frozenset(max(0, round(total * (i + 1) / count) - 1) for i in range(count))

@@ -31,8 +31,7 @@ from bitymi_ns.train.init import first_surfels_for
 from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.views import View, eval_background
 
-SURFEL_PARAMETERS = (*GEOMETRY, *VIEW_PARAMETERS)
-PARAMETER_GROUPS = (*SURFEL_PARAMETERS, "field_table", "field_mlp")
+PARAMETER_GROUPS = (*GEOMETRY, *VIEW_PARAMETERS, "field_table", "field_mlp")
 """Groups that an optimiser is configured for; a scene has those that its view colour and texture call for."""
 
 
@@ -121,9 +120,8 @@ class BitymiModel(SurfelModel):
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         groups = {name: [parameter] for name, parameter in self.scene.surfels.items()}
         if isinstance(self.scene.field, HashField):
-            named = dict(self.scene.field.named_parameters())
-            groups["field_table"] = [p for n, p in named.items() if n.endswith("table")]
-            groups["field_mlp"] = [p for n, p in named.items() if not n.endswith("table")]
+            table, *mlp = self.scene.field.weights
+            groups |= {"field_table": [table], "field_mlp": mlp}
         return groups
 
     def get_training_callbacks(
@@ -211,7 +209,12 @@ def new_scene(
     declared = _corners(scene_box) if metadata.get("declares_box") else None
     box = None
     if not bool(torch.isfinite(xyz).all(1).any()):
-        box = _box_for_random_points(scene_box, len(xyz))
+        if len(xyz):
+            fail(
+                f"all {len(xyz)} points of the capture's point cloud are NaN or infinite. Make the cloud again, or "
+                "remove ply_file_path from transforms.json to start from random points."
+            )
+        box = None if scene_box is None else _corners(scene_box)
     try:
         with reporting_time("Making surfels of", len(xyz)):
             scene, report = build_scene(
@@ -257,16 +260,6 @@ def _points(points: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:
     if rgb.shape[:1] != xyz.shape[:1]:
         return xyz, torch.full_like(xyz, 0.5)  # a cloud without colours
     return xyz, rgb.detach().float().reshape(-1, 3) / (255.0 if rgb.dtype == torch.uint8 else 1.0)
-
-
-def _box_for_random_points(scene_box: SceneBox | None, given: int) -> Tensor | None:
-    """[2, 3] corners."""
-    if given:
-        fail(
-            f"all {given} points of the capture's point cloud are NaN or infinite. Make the cloud again, or remove "
-            "ply_file_path from transforms.json to start from random points."
-        )
-    return None if scene_box is None else _corners(scene_box)
 
 
 def _corners(scene_box: SceneBox) -> Tensor:

@@ -15,7 +15,7 @@ from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor
 from torch.nn import Parameter
 
-from bitymi_ns.plugin.console import InputError, warn
+from bitymi_ns.plugin.console import InputError, warn_once
 from bitymi_ns.plugin.data.cameras import normal_image, ray_distance, to_camera
 from bitymi_ns.plugin.run.device import kernel_device
 from bitymi_ns.plugin.run.metrics import image_metrics, render_milliseconds
@@ -103,22 +103,16 @@ class SurfelModel(Model):
         would end the thread, and the viewer would show nothing any more.
         """
         if obb_box is not None:
-            self._say_once("Crop boxes are not supported: the whole scene is rendered.")
+            warn_once("Crop boxes are not supported: the whole scene is rendered.")
         try:
             self._last_camera = to_camera(camera, self.device)
             outputs = self.get_outputs(camera)
         except InputError as error:
             if threading.current_thread() is threading.main_thread():
                 raise
-            self._say_once(str(error))
+            warn_once(str(error))
             return self._empty(int(camera.height.flatten()[0]), int(camera.width.flatten()[0]))
         return {name: value for name, value in outputs.items() if isinstance(value, Tensor)}
-
-    def _say_once(self, message: str) -> None:
-        warned: set[str] = self.__dict__.setdefault("_warned", set())
-        if message not in warned:
-            warned.add(message)
-            warn(message)
 
     def _empty(self, height: int, width: int) -> dict[str, Tensor]:
         """The outputs of `get_outputs` where nothing is seen."""

@@ -62,8 +62,8 @@ class Golden(SceneCase):
 
 
 def reference_ssim(a: Tensor, b: Tensor) -> Tensor:
-    """Mean SSIM of two images [H, W, C] in [0, 1] over the pixels whose window lies inside, by torchmetrics: some of its
-    versions average padded windows, too."""
+    """Mean SSIM of two images [H, W, C] in [0, 1] over the pixels whose window lies inside, by torchmetrics; some of
+    its versions average padded windows, too."""
     from torchmetrics.functional.image.ssim import _ssim_update  # imported by few tests: it takes seconds
 
     pair = (image.permute(2, 0, 1)[None] for image in (a, b))

@@ -4,6 +4,6 @@ Needs the package `wgpu`, which is optional (`pip install 'bitymi-ns[webgpu]'`).
 """
 
 from .device import WebGpuUnavailable
-from .draw import draw
+from .on_device import draw
 
 __all__ = ["WebGpuUnavailable", "draw"]

@@ -62,13 +62,15 @@ class BakedModel(SurfelModel):
         except BundleError as error:
             fail(f"{error}. {REMEDY}", error)
         atlas = bundle.info.atlas
-        self._atlas_bytes = 0 if atlas is None else bundle.info.files[atlas.file].bytes
-        self._bundle_bytes = download_bytes(folder, bundle.info)
+        self._sizes = {
+            "surfels": float(len(bundle)),
+            "atlas_bytes": 0.0 if atlas is None else float(bundle.info.files[atlas.file].bytes),
+            "bundle_bytes": float(download_bytes(folder, bundle.info)),
+        }
         bundle.scene.through_webgpu = through_webgpu
         if renderer == "fast":
             bundle.scene.transmittance_min = FAST
         self._renderer = SceneRenderer(bundle.scene)
-        self._count = len(bundle)
 
     def _renderer_name(self) -> str:
         """The renderer of the options; stops where it is unknown, or WebGPU is not available."""
@@ -87,16 +89,12 @@ class BakedModel(SurfelModel):
             return drawn
         return BakedOutput(**{name: None if t is None else t.to(self.device) for name, t in vars(drawn).items()})
 
-    def surfel_count(self) -> int:
-        return self._count
-
     @property
     def background(self) -> Tensor:
         return torch.tensor(self.config.background, device=self.device)
 
-    def size_metrics(self) -> dict[str, float]:
-        sizes = {"atlas_bytes": float(self._atlas_bytes), "bundle_bytes": float(self._bundle_bytes)}
-        return {**super().size_metrics(), **sizes}
+    def sizes(self) -> dict[str, float]:
+        return self._sizes
 
     def to(self, *args: Any, **kwargs: Any) -> BakedModel:
         super().to(*args, **kwargs)

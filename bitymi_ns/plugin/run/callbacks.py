@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -20,12 +19,9 @@ from bitymi_ns.plugin.data.dataset import capture_fingerprint, warn_of_other_cap
 from bitymi_ns.plugin.data.images import exposure_stops
 from bitymi_ns.plugin.run.memory import state_training
 from bitymi_ns.scene.field import TexelField
-from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train import limits
-from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.domain import views_without_surfels
 from bitymi_ns.train.evaluate import evaluate, evenly_spaced
-from bitymi_ns.train.init import scene_extent
+from bitymi_ns.train.init import scene_extent, views_without_surfels
 from bitymi_ns.train.step import Training
 from bitymi_ns.train.views import OnDemand, TrainingData, View, covered_share
 from bitymi_ns.trust import json_of, no_links
@@ -37,43 +33,34 @@ class TrainingRun:
     `before` -> the data manager's `next_train` -> `losses` -> backward -> `Training.combine` -> optimisers -> `after`.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        config: TrainConfig,
-        attributes: TrainingCallbackAttributes,
-        metadata: Mapping[str, Any],
-        resume_state: Mapping[str, Any],
-        curve_points: int,
-        curve_views: int,
-    ) -> None:
+    def __init__(self, model: Any, attributes: TrainingCallbackAttributes) -> None:
+        """
+        Args:
+            model: a `BitymiModel`.
+        """
         trainer, pipeline = attributes.trainer, attributes.pipeline
         assert trainer is not None and pipeline is not None and attributes.optimizers is not None
-        self.scene, self.config = scene, config
+        self.scene, self.config, self._curve_views = model.scene, model.train_config, model.config.curve_views
+        scene, config, curve_points = self.scene, self.config, model.config.curve_points
         self.datamanager = pipeline.datamanager
         self.total: int = trainer.config.max_num_iterations
         self.first_step: int = trainer._start_step
         self._parameters = attributes.optimizers.parameters
-        self._curve_views = curve_views
         data = TrainingData(
             self.datamanager.train_views,
-            scene_extent(metadata["camera_centers"], scene.surfels["means"]),
-            metadata["train_pixels"],
-            metadata["first_surfels"],
+            scene_extent(model.metadata["camera_centers"], scene.surfels["means"]),
+            model.metadata["train_pixels"],
+            model.metadata["first_surfels"],
             covered_share(self.datamanager.train_views),
             exposure_stops(self.datamanager.train_dataset.files),
             self.datamanager.train_dataset.photographs,
         )
-        optimizers = attributes.optimizers.optimizers
-        try:
-            processes = trainer.processes
-            self.training = Training(scene, data, optimizers, config, self.total, self._on_resize, warn, processes)
-        except ValueError as error:
-            fail(f"a training option is out of range (--pipeline.model.train.*): {error}", error)
+        optimizers, processes = attributes.optimizers.optimizers, trainer.processes
+        self.training = Training(scene, data, optimizers, config, self.total, self._on_resize, warn, processes)
         attributes.optimizers.before_step = self.training.combine
         self.capture = capture_fingerprint(self.datamanager.train_dataset)
         self._random_state: Tensor | None = None
-        if resume_state:
+        if resume_state := model.resume_state:
             self.training.load_state_dict(resume_state)
             self._random_state = resume_state["random"]
             if "capture" in resume_state:  # checkpoints of earlier versions have none

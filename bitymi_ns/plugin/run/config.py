@@ -28,6 +28,7 @@ from bitymi_ns.plugin.run.model import PARAMETER_GROUPS, BitymiModelConfig
 from bitymi_ns.plugin.run.preset import load_preset
 from bitymi_ns.plugin.run.render import adopt_render
 from bitymi_ns.plugin.run.trainer import BitymiPipelineConfig, BitymiTrainer
+from bitymi_ns.ranges import check_ranges
 from bitymi_ns.train.config import AdamConfig
 
 SEEDS = 1 << 32  # end of the range of seeds that numpy takes
@@ -75,7 +76,7 @@ class BitymiTrainerConfig(TrainerConfig):
         if self.machine.device_type != "cpu" and (why := why_not_cuda()):
             warn(f"Training on the CPU instead of {self.machine.device_type}: {why}.")
             self.machine.device_type = "cpu"
-        self._check_machine()
+        self._check_options()
         self._make_paths_absolute()
         self._take_poses_of_resumed()
         if self.load_dir is None and self.load_checkpoint is None:
@@ -85,8 +86,13 @@ class BitymiTrainerConfig(TrainerConfig):
         """The trainer of a process; that of the first starts the others."""
         return super().setup(**{**kwargs, "world_size": self.processes})
 
-    def _check_machine(self) -> None:
+    def _check_options(self) -> None:
         machine = self.machine
+        for options in (self.pipeline.model.scene, self.pipeline.model.train):
+            try:
+                check_ranges(options)
+            except ValueError as error:
+                fail(f"an option is out of range (--pipeline.model.*): {error}", error)
         for name in ("mixed_precision", "use_grad_scaler"):
             if getattr(self, name):
                 fail(

@@ -26,8 +26,7 @@ from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train import limits
 from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.domain import build_scene
-from bitymi_ns.train.init import first_surfels_for
+from bitymi_ns.train.init import build_scene, first_surfels_for
 from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.views import View, eval_background
 
@@ -104,8 +103,8 @@ class BitymiModel(SurfelModel):
         with torch.no_grad():
             return self.scene.render(camera, background=background, field_mode="frozen", maps=maps)
 
-    def surfel_count(self) -> int:
-        return len(self.scene)
+    def sizes(self) -> dict[str, float]:
+        return {"surfels": float(len(self.scene))}
 
     def get_outputs(self, ray_bundle: Any) -> dict[str, Any]:
         """Loss terms of a training view, or pictures of cameras."""
@@ -128,15 +127,7 @@ class BitymiModel(SurfelModel):
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
         self.measure_time = False
-        self._run = TrainingRun(
-            self.scene,
-            self.train_config,
-            training_callback_attributes,
-            self.metadata,
-            self.resume_state,
-            self.config.curve_points,
-            self.config.curve_views,
-        )
+        self._run = TrainingRun(self, training_callback_attributes)
         return self._run.callbacks()
 
     def get_loss_dict(
@@ -215,22 +206,10 @@ def new_scene(
                 "remove ply_file_path from transforms.json to start from random points."
             )
         box = None if scene_box is None else _corners(scene_box)
-    try:
-        with reporting_time("Making surfels of", len(xyz)):
-            scene, report = build_scene(
-                xyz,
-                rgb,
-                centers,
-                config,
-                train,
-                bounded=metadata.get("has_alpha", False),
-                image_pixels=pixels,
-                box=box,
-                declared=declared,
-                background=find_background() if find_background and train.background_points else None,
-            )
-    except ValueError as error:
-        fail(str(error), error)
+    with reporting_time("Making surfels of", len(xyz)):
+        background = find_background() if find_background and train.background_points else None
+        bounded = metadata.get("has_alpha", False)
+        scene, report = build_scene(xyz, rgb, centers, config, train, bounded, pixels, box, declared, background)
     for sentence in limits.start(report, train, pixels, config):
         say(sentence)
     if report.random:

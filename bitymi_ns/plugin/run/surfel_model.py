@@ -48,17 +48,13 @@ class SurfelModel(Model):
         """A RenderOutput: rgb, alpha, beta, overdraw, and with maps also depth and normal."""
 
     @abstractmethod
-    def surfel_count(self) -> int:
-        """Number of primitives."""
+    def sizes(self) -> dict[str, float]:
+        """Number of `surfels`, and other sizes that are reported with the image metrics."""
 
     @property
     @abstractmethod
     def background(self) -> Tensor:
         """[3] colour behind the scene in evaluation."""
-
-    def size_metrics(self) -> dict[str, float]:
-        """Sizes that are reported with the image metrics."""
-        return {"surfels": float(self.surfel_count())}
 
     def to(self, *args: Any, **kwargs: Any) -> SurfelModel:
         """Move the model, except to a device that this installation has no kernels for: there it stays on the CPU.
@@ -137,7 +133,7 @@ class SurfelModel(Model):
         target, mask = self.photograph(batch, rgb)
         metrics = image_metrics(rgb, target, mask)
         metrics["fragments_per_pixel"] = float(outputs["overdraw"].mean()) * OVERDRAW_SCALE
-        metrics.update(self.size_metrics())
+        metrics.update(self.sizes())
         camera = getattr(self, "_last_camera", None)
         if self.measure_time and camera is not None and (camera.width, camera.height) == (width, height):
             metrics["render_ms"] = render_milliseconds(
@@ -152,7 +148,7 @@ class SurfelModel(Model):
         return torch.cat([torch.where(alpha > 0, rgb, 0.0).clamp(0.0, 1.0), alpha], dim=-1)
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
-        return {"surfels": torch.tensor(float(self.surfel_count()))}
+        return {"surfels": torch.tensor(self.sizes()["surfels"])}
 
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: Any = None

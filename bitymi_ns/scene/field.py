@@ -15,8 +15,7 @@ from bitymi_ns.ops import (
     TexelDescent,
     TexelTiles,
     blended_image,
-    composite_image,
-    shade,
+    fragment_residual,
 )
 from bitymi_ns.ops.constants import FEATURES, WIDTH
 from bitymi_ns.ops.field import FieldGeometry, field
@@ -55,7 +54,7 @@ class ResidualField(nn.Module):
     """Residual colours of fragments, beside the surfels' view colours."""
 
     def image(self, fragments: Fragments, projection: Projection, base: Tensor, how: Shading) -> Tensor:
-        """[H * W, C] what `composite_image` gives for colours ReLU(ReLU(f_view + 0.5) + residual).
+        """[H * W, C] what `blended_image` gives for colours ReLU(ReLU(f_view + 0.5) + residual).
 
         Args:
             fragments: of an H x W view.
@@ -151,8 +150,8 @@ class HashField(ResidualField):
 
     def image(self, fragments: Fragments, projection: Projection, base: Tensor, how: Shading) -> Tensor:
         weights = self.weights if how.learns else tuple(w.detach() for w in self.weights)
-        colors = shade(fragments, base, projection.frames, self.geometry, weights, how.bound, how.moves_surfels)
-        return composite_image(fragments, projection, colors, how.maps)
+        rho = fragment_residual(fragments, projection.frames, self.geometry, weights, how.bound, how.moves_surfels)
+        return blended_image(fragments, projection, base, maps=how.maps, residual=rho)
 
     def forward(self, x: Tensor) -> Tensor:
         """Residual colour [M, 3] at world positions [M, 3]."""

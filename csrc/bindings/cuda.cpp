@@ -47,7 +47,6 @@ template <class S> void bind_operations(nb::module_& m) {
   bind_operation(m, name("bin_fill"), &bin_fill<S>);
   bind_operation(m, name("trace_mark"), &trace_mark<S>);
   bind_operation(m, name("trace_fill"), &trace_fill<S>);
-  bind_operation(m, name("field_tiles"), &field_tiles<S>);
   bind_operation(m, name("picture_loss"), &picture_loss<S>);
   bind_operation(m, name("picture_loss_backward"), &picture_loss_backward<S>);
   bind_operation(m, name("note_centers"), &note_centers<S>);
@@ -108,7 +107,7 @@ void bind_all(nb::module_& m) {
   m.attr("TRACE_SUMS") = kTraceSums;
   m.attr("LOSS_SUMS") = kLossSums * kMostSums;
   m.attr("MLP_WORK") = int64_t(kMostBlocks) * kMlpWeights;
-  m.def("exact_size", &exact_size, "entries"_a, "surfels"_a, "frames"_a, "Numbers of exact_work, int64.");
+  m.def("exact_size", &exact_size, "entries"_a, "Numbers of exact_work, int64.");
 }
 }  // namespace
 }  // namespace bt::cuda

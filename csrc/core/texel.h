@@ -39,9 +39,6 @@ template <class S> BT_HD int tile_level(const S* g, int r_u, int r_v, S extent, 
   return level && side <= 2 ? kTileLevels : min_(level, kTileLevels - 1);
 }
 
-// Surfel coordinate of the centre of texel i, eq. (texel centres), rounded as bake/texels.py does.
-template <class S> BT_HD S texel_centre(int i, int r, S extent) { return extent * (S(2 * i + 1) / S(r) - S(1)); }
-
 // The texels on both sides of a position along one axis: `first`, a whole number, and the next, which weighs
 // `fraction`. A tile of one texel has no next: `first` stands for it. Beyond the outer texel centres, not `inside`, the
 // position stands still.

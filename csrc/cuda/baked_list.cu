@@ -20,8 +20,8 @@ constexpr int kLargeBlocks = 528;      // four for each multiprocessor of a larg
 
 // The presets' numbers of terms as constants, so that the loops unroll and nothing goes to local memory.
 __device__ Vec3<float> view_color_of(const BakedScene& s, int64_t i, Vec3<float> d) {
-  if (s.lean.base) return view_color(s.lean, i, d);
-  const ViewColorArrays<const float>& p = s.colors;
+  if (s.colors.lean.base) return view_color(s.colors.lean, i, d);
+  const ViewColorArrays<const float>& p = s.colors.whole;
   return for_view_color(p.kind, [&](auto kind) {
     using Kind = decltype(kind);
     constexpr int kPreset = Kind::kPresetTerms;

@@ -2,18 +2,10 @@
 // so that a texel takes one vector reduction (warp.h); or integers, for sums that do not depend on the order.
 #pragma once
 
-#include "cuda/field_device.h"
-#include "cuda/warp.h"
+#include "cuda/exact_sums.h"
 #include "ops/texel.h"
 
 namespace bt::cuda {
-
-template <bool kExact, class S> __device__ Adder<S, kExact> texel_adder(S* sums, const ExactSums& exact) {
-  if constexpr (kExact)
-    return {exact.table, exact.range->table};
-  else
-    return {sums};
-}
 
 // Adds the gradients of every lane's four corners, one addition per run of lanes between the same texels. Row: that of
 // the first corner in the list of texels, -1 where there is none; sums have rows of four.
@@ -39,7 +31,7 @@ __global__ void __launch_bounds__(kFinishThreads)
                          S* __restrict__ dtexels, S* __restrict__ moved) {
   const int64_t t = int64_t(blockIdx.x) * kFinishThreads + threadIdx.x;
   if (t >= texels) return;
-  const Adder<S, kExact> of = texel_adder<kExact>(sums, exact);
+  const Adder<S, kExact> of = adder<kExact>(sums, exact);
   const Vec3<S> g = {of.sum(4 * t), of.sum(4 * t + 1), of.sum(4 * t + 2)};
   if (dtexels) store3(dtexels + 3 * t, g);
   if (moved && (g.x != S(0) || g.y != S(0) || g.z != S(0)))

@@ -45,23 +45,6 @@ template <class S> struct AlphaGradient {
   ExactSums exact;
 };
 
-// Gradients of alpha's share of a fragment's sigma: from gs, that of the listed sigma, to that of the kernel's sigma,
-// which takes the place of the listed one; more of gu and gv; and the return value, that of m.
-template <class S>
-__device__ S alpha_vjp(const AlphaPatch<S>& patch, const TexelCorners<S>& at, S& listed, S& gs, S& gu, S& gv) {
-  S t[4];
-  const S m = patch.fetch(at, t), sigma = abs_(listed);
-  // neither clamp passes a gradient, that of the product and the kernel's own; m may be rounded otherwise than when the
-  // fragment was written
-  const bool moves = sigma < S(kAlphaMax), uncut_moves = moves && sigma < m * S(kAlphaMax * (1 - 1e-6));
-  const S dm = moves ? gs * sigma / m : S(0);
-  if (at.inside_u) gu += dm * texel_density(patch.size[0], patch.extent) * texel_slope_u(t, at.fy);
-  if (at.inside_v) gv += dm * texel_density(patch.size[1], patch.extent) * texel_slope_v(t, at.fx);
-  gs = uncut_moves ? gs * m : S(0);
-  listed /= m;
-  return dm;
-}
-
 // Adds the gradients of every lane's four corners, one addition per run of lanes between the same texels; row as in
 // add_to_texels.
 template <class S, bool kExact>
@@ -115,7 +98,7 @@ __global__ void __launch_bounds__(kRunThreads)
       }
       if (alpha.texels)
         add_to_alpha(is_cut ? patch.first + corners.at[0] : int64_t(-1), corners, dm, int(threadIdx.x) % kWarp,
-                     texel_adder<kExact>(alpha.texels, alpha.exact));
+                     adder<kExact>(alpha.texels, alpha.exact));
     }
     if (mine) {
       const int32_t y = row_of(pixel), x = pixel - y * p.width;
@@ -152,8 +135,8 @@ template <class S> void trace_backward(const TraceBackward<S, Pairs>& a, Stream 
   const bool cuts = a.alpha.values && dsigma, exact = cuts && texels && a.exact_alpha;
   AlphaGradient<S> alpha = {a.alpha, a.dtexel_alpha, {}};
   if (exact)
-    alpha.exact = begin_exact(a.exact_alpha, texels, static_cast<const FieldArrays<S>*>(nullptr), 0, false, f.total,
-                              f.total, dsigma, stream);
+    alpha.exact = begin_exact(a.exact_alpha, texels, static_cast<const FieldArrays<S>*>(nullptr), f.total, f.total,
+                              dsigma, stream);
   else
     fill_zero(a.dtexel_alpha, texels, stream);
   if (p.pairs)
@@ -165,8 +148,7 @@ template <class S> void trace_backward(const TraceBackward<S, Pairs>& a, Stream 
       BT_LAUNCH(run, run_blocks(p), dim3(kRunThreads), 0, stream, a.view.geom, a.view.near, a.rim, p, f, alpha, dsigma,
                 a.duv, a.ddepth, a.partial);
     });
-  if (exact)
-    end_exact(alpha.exact, texels, 0, a.dtexel_alpha, static_cast<S*>(nullptr), static_cast<S*>(nullptr), stream);
+  if (exact) end_exact(alpha.exact, texels, a.dtexel_alpha, stream);
   sum_slots<kTraceSums>(p, static_cast<const S*>(a.partial), StoreGeomGradient<S>{a.dgeom, a.absgrad}, stream);
 }
 

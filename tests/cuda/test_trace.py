@@ -61,9 +61,8 @@ def render(
     projection = ops.project(*(leaves[key] for key in SURFEL_KEYS), camera, prefilter=prefilter)
     fragments = ops.trace(projection, rim)
     directions = reference_render.view_directions(leaves["means"], camera.viewmat.to(device))
-    base = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions) + 0.5
-    rows = fragments.surfel.long()
-    image = ops.composite_image(fragments, projection, base.clamp(min=0)[rows], maps)
+    base = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions)
+    image = ops.blended_image(fragments, projection, base, maps=maps)
     # directions by pixel and surfel: they do not depend on the order in which the list has them
     by_fragment = torch.sin(fragments.pixel.double() * 0.7 + fragments.surfel.double() * 1.3).to(dtype)
     by_pixel = torch.cos(torch.arange(image.numel(), device=device).double() * 1.7).to(dtype).view_as(image)
@@ -282,12 +281,13 @@ def test_wrong_arrays_are_refused(device: torch.device) -> None:
     shifted = torch.zeros(10 * 16 + 1, device=device, dtype=torch.float64)[1:].view(10, 16)
     few, mask = torch.zeros(3, 3, device=device).double(), torch.ones(400, dtype=torch.bool, device="meta")
     camera, frames = projection.camera, projection.frames
+    grid = ops.FieldGeometry(4, False, (0.0, 0.0, 0.0), 1.0)
     for match, call in {
-        "colors must have shape": lambda: ops.composite_image(fragments, projection, few),
-        "colors is on device 'meta'": lambda: ops.composite_image(fragments, projection, far),
+        "residual must have shape": lambda: ops.blended_image(fragments, projection, frames[:, :3], residual=few),
+        "residual is on device 'meta'": lambda: ops.blended_image(fragments, projection, frames[:, :3], residual=far),
         "mask is on device 'meta'": lambda: ops.masked_counts(fragments, mask, 10),
         "log_scales is on device 'meta', it must be on": lambda: ops.project(*moved, camera),
-        "frames is on device 'meta'": lambda: ops.shade(fragments, frames[:, :3], frames.to("meta")),
+        "frames is on device 'meta'": lambda: ops.fragment_residual(fragments, frames.to("meta"), grid, ()),
         "sv_rgb is on device 'meta'": lambda: ops.view_color("sv", sites, leaves[0], camera.exact_center),
         "values is on device 'meta'": lambda: ops.composite(fragments, far),
         "16 bytes": lambda: ops.trace(replace(projection, geom=shifted)),

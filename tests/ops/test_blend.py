@@ -8,7 +8,15 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.ops import backend
-from tests.ops.golden import SURFEL_KEYS, SceneCase, camera_of, load_golden, random_scene, reference_colors
+from tests.ops.golden import (
+    SURFEL_KEYS,
+    SceneCase,
+    camera_of,
+    composite_colors,
+    load_golden,
+    random_scene,
+    reference_colors,
+)
 
 SIZES = [(4, 8), (1, 1), (8, 4), (0, 0), (4, 4), (16, 4)]
 BOUND = 0.03
@@ -59,8 +67,8 @@ class View:
             listed = fragments if moves else replace(fragments, uv=fragments.uv.detach())
             colors = reference_colors(listed, self.base, **self.given, bound=BOUND)
         else:
-            colors = ops.shade(fragments, self.base, projection.frames)
-        return ops.composite_image(fragments, projection, colors, maps)
+            colors = (self.base + 0.5).relu()[fragments.surfel.long()]
+        return composite_colors(fragments, projection, colors, maps)
 
     def gradients(self, image: Tensor) -> list[Tensor]:
         towards = torch.linspace(-1, 1, image.numel(), dtype=torch.float64).view_as(image).to(image)
@@ -74,6 +82,30 @@ def test_it_is_shading_and_compositing(textured: bool, moves: bool, maps: bool, 
     view = View(random_scene(60, 3, width=70, height=40), dtype, textured)
     got, want = view.image(maps, moves), view.one_by_one(maps, moves)
     assert got.shape == (70 * 40, 9 if maps else 5)
+    tolerance = 1e-11 if dtype == torch.float64 else 2e-4
+    torch.testing.assert_close(got, want, rtol=0.01 * tolerance, atol=0.01 * tolerance)
+    for mine, theirs in zip(view.gradients(got), view.gradients(want), strict=True):
+        assert theirs.abs().max() > 1e-3
+        torch.testing.assert_close(mine, theirs, rtol=tolerance, atol=tolerance * float(theirs.abs().max()))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
+@pytest.mark.parametrize("maps", [False, True], ids=["image", "maps"])
+def test_a_residual_of_each_fragment(maps: bool, dtype: torch.dtype) -> None:
+    view = View(random_scene(60, 3, width=70, height=40), dtype, False)
+    g = torch.Generator().manual_seed(0)
+    count = len(view.fragments()[0])
+    rho = (torch.rand(count, 3, generator=g, dtype=torch.float64) - 0.6).to(dtype).requires_grad_()
+    view.leaves.append(rho)
+
+    def image(fused: bool) -> Tensor:
+        fragments, projection = view.fragments()
+        if fused:
+            return ops.blended_image(fragments, projection, view.base, maps=maps, residual=rho)
+        colors = ((view.base + 0.5).relu()[fragments.surfel.long()] + rho).relu()
+        return composite_colors(fragments, projection, colors, maps)
+
+    got, want = image(True), image(False)
     tolerance = 1e-11 if dtype == torch.float64 else 2e-4
     torch.testing.assert_close(got, want, rtol=0.01 * tolerance, atol=0.01 * tolerance)
     for mine, theirs in zip(view.gradients(got), view.gradients(want), strict=True):
@@ -168,5 +200,10 @@ def test_what_does_not_fit_is_refused() -> None:
         ops.blended_image(fragments, projection, view.base, view.given["texels"][1:], view.given["tiles"])
     with pytest.raises(ValueError, match="base must have shape"):
         ops.blended_image(fragments, projection, view.base[1:])
+    rho = torch.zeros(len(fragments), 3)
+    with pytest.raises(ValueError, match="residual must have shape"):
+        ops.blended_image(fragments, projection, view.base, residual=rho[1:])
+    with pytest.raises(ValueError, match="of texels or of fragments"):
+        ops.blended_image(fragments, projection, view.base, **view.given, residual=rho)
     with pytest.raises(ValueError, match="fragments are those of 61 surfels, not of 60"):
         ops.blended_image(replace(fragments, surfels=61), projection, view.base, **view.given)

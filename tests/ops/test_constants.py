@@ -20,7 +20,7 @@ SOURCES = [
     if "reference" not in path.parts
 ]
 STATED = {
-    "relu of f_view + 0.5": (r"relu\(.*\+ S?\(?(0\.5|kColorBias|COLOR_BIAS)", ["shading.h", "shade.py"]),
+    "relu of f_view + 0.5": (r"relu\(.*\+ S?\(?(0\.5|kColorBias|COLOR_BIAS)", ["shading.h", "view_color.py"]),
     "smallest alpha": (r"1(\.0)? ?/ ?255\b(?!\))", ["surfel.h"]),
     "harmonic of degree 0": (r"= 0\.28209", ["view_kinds.h"]),
     "side of a tile": (r"(TILE|kTile\w*) = 16", ["bounds.h"]),
@@ -36,7 +36,6 @@ STATED = {
     "gradient of a weight": (r"d\[3\] \+ d\[4\] \*", ["blend.h"]),
     "moments of SSIM": (r"\[4\] \+= k\w \*", ["ssim.h"]),
     "mask of a hash": (r"log2_size\) - 1u", ["field.h"]),
-    "gradient of a point of a surfel": (r"dot\(dx, load3\(", ["field.h"]),
     "where a camera stands": (r"-\(double\(\w\[k\]\) \*", ["camera.h"]),
     "reals as sort keys": (r"\? ~bits", ["primitives.h"]),
     "temperature": (r"min_\(.*kLogTauMax", ["view_kinds.h"]),

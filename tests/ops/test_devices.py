@@ -5,23 +5,14 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from bitymi_ns import ops
 from bitymi_ns.ops import baked, baked_cpu, baked_cuda, trace_cpu, trace_cuda
 from bitymi_ns.ops.backend import emulated_cuda, kernel, module
-from bitymi_ns.ops.field_tiles import field_tiles
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from tests.cuda.conftest import why_not_emulated
 from tests.ops.golden import SURFEL_KEYS, camera_of, random_scene, traced
 
 emulated = pytest.mark.skipif(why_not_emulated() is not None, reason=str(why_not_emulated()))
-GEOMETRY = ops.FieldGeometry(4, False, (0.0, 0.0, 0.0), 1.0)
-
-
-def test_tiles_are_evaluated_on_a_cuda_device_only() -> None:
-    weights = (torch.zeros(1, 2, 4), torch.zeros(4, 16), torch.zeros(16, 16), torch.zeros(16, 3))
-    with pytest.raises(RuntimeError, match="field_tiles runs on a CUDA device only, .* evaluate `field`"):
-        field_tiles(torch.zeros(0, 9), torch.zeros(0), torch.zeros(0, 5), (1, 4, 4), GEOMETRY, *weights)
 
 
 def test_the_cuda_renderer_refuses_the_cpu() -> None:

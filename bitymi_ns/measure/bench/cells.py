@@ -19,9 +19,9 @@ FILE = "cells.jsonl"
 NAMES = ("suite", "row")  # entries of a key that are labels and do not tell cells apart
 
 
-def identity(key: dict[str, Any]) -> str:
-    """Text that is equal for equal cells."""
-    return json.dumps({name: value for name, value in key.items() if name not in NAMES}, sort_keys=True)
+def identity(key: dict[str, Any], *without: str) -> str:
+    """Text that is equal for equal cells; for those that differ in these entries alone, too."""
+    return json.dumps({name: value for name, value in key.items() if name not in (*NAMES, *without)}, sort_keys=True)
 
 
 def provenance(command: list[str], seconds: float) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import tyro
 
@@ -14,11 +15,11 @@ from bitymi_ns.measure import markdown
 from bitymi_ns.measure.bench.cells import Cells
 from bitymi_ns.measure.bench.engine import open_cells, run_chains
 from bitymi_ns.measure.bench.matrix import (
-    FORMATS,
+    Bundle,
+    Format,
     Matrix,
     Row,
     SceneSpec,
-    format_bundles,
     local_scenes,
     read_plan,
     standard_scenes,
@@ -47,7 +48,9 @@ class BenchRun:
     """Further options of ns-train for every run, as one word: --extra="--pipeline.model.scene.weight-bound 0"."""
     seeds: tuple[int, ...] = ()  # Train once for each of these seeds; none = once, with the method's own.
     steps: int | None = None  # Steps of a training; the schedules follow. None = the method's own for this machine.
-    formats: tuple[str, ...] = FORMATS  # Formats of bundles that each trained scene is baked into; none = no baking.
+    formats: tuple[Format, ...] = get_args(
+        Format
+    )  # Formats of bundles that each trained scene is baked into; none = no baking.
     pictures: int = 2  # Number of worst held-out views of each run to draw with errors and decomposition.
     work: Path = Path("outputs/bench")
     """Folder of runs, bundles, logs and finished cells, which are not done again. The command may run several times at
@@ -82,7 +85,8 @@ class BenchRun:
         if not rows:
             raise BenchError("nothing to run: give --methods or --plan")
         rows = [Row(row.name, row.method, (*row.options, *extra)) for row in rows]
-        bundles = format_bundles(self.formats) if bundles is None else bundles
+        if bundles is None:
+            bundles = [Bundle(name, ("--format", name)) for name in dict.fromkeys(self.formats)]
         return Matrix(self._scenes(), rows, self.seeds, self.steps, bundles, self.pictures)
 
     def run(self) -> int:

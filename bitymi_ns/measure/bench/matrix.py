@@ -87,7 +87,7 @@ class Run:
 
     @property
     def folder(self) -> str:
-        """Its path below runs/, bundles/, evals/, pictures/ and logs/."""
+        """Its path below runs/, bundles/, evals/, pictures/ and logs/ of the work folder."""
         return f"{self.scene.name}/{self.row.method}/{self.name}"
 
     def __str__(self) -> str:
@@ -156,7 +156,7 @@ class Matrix:
         return [self.stages(run) for run in self.runs()]
 
 
-FORMATS = ("fp16", "uint8", "bc7", "compact")  # formats of `ns-export bitymi-atlas`
+Format = Literal["fp16", "uint8", "bc7", "compact"]  # of `ns-export bitymi-atlas`
 
 
 @dataclass(frozen=True)
@@ -243,14 +243,6 @@ def _standard_scene(suite: Suite, name: str, folder: Path) -> SceneSpec:
     parser += ["--downscale-factor", factor or "1", "--downscale-rounding-mode", "round"]
     parser += ["--eval-mode", "interval", "--eval-interval", str(suite.hold_out)]
     return SceneSpec(name, folder, suite.name, tuple(parser))
-
-
-def format_bundles(formats: Sequence[str]) -> list[Bundle]:
-    """One bundle per atlas format."""
-    unknown = [name for name in formats if name not in FORMATS]
-    if unknown:
-        raise BenchError(f"there is no atlas format {', '.join(unknown)}; there are {', '.join(FORMATS)}")
-    return [Bundle(name, ("--format", name)) for name in dict.fromkeys(formats)]
 
 
 Words = list[str | int | float]

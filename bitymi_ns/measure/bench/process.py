@@ -17,7 +17,7 @@ TAIL = 25  # lines of a failed command's log that are shown
 GRACE = 20.0  # seconds from an interrupt until a command that has not ended is killed
 
 
-class BenchError(Exception):
+class BenchError(ValueError):
     """A benchmark cannot be run as asked; the message says what to change."""
 
 

@@ -29,8 +29,8 @@ MARGIN = 1.1  # factor by which another view may have more fragments than the co
 PROGRAM = 800e6  # bytes of Python, the libraries, and a capture's cameras and points
 PER_FRAGMENT = 36
 """Bytes: the list, the gradients of weights and coordinates, and the order in which the backward pass takes it."""
-PER_SHADED_FRAGMENT = 32
-"""Bytes more where a field in space shades: whose fragments are and where, colours, and their gradients."""
+PER_SHADED_FRAGMENT = 60
+"""Bytes more where a field in space shades: surfels and pixels of fragments, points, residuals and their gradients."""
 PER_CARD_FRAGMENT = 4 * NUMBERS  # bytes of a fragment on a card, where textures of both kinds take as much
 PER_PIXEL = 400  # bytes: pictures, gradients and maps of a view, and the ten views of the multi-view scores
 PER_SURFEL = 3000

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from bitymi_ns import cli
-from bitymi_ns.measure.bench.matrix import format_bundles, local_scenes, read_plan, standard_scenes, suites
+from bitymi_ns.measure.bench.matrix import local_scenes, read_plan, standard_scenes, suites
 from bitymi_ns.measure.bench.process import BenchError
 from bitymi_ns.presets import preset_names
 
@@ -89,8 +89,6 @@ def test_a_plan_of_ones_own(tmp_path: Path) -> None:
     assert row.options == ("--x", "0.5") and bundle.options == ("--r-max", "16")
     with pytest.raises(BenchError, match="there is no plan x: give ablation"):
         read_plan("x")
-    with pytest.raises(BenchError, match="no atlas format jpeg"):
-        format_bundles(["jpeg"])
 
 
 @pytest.mark.parametrize(

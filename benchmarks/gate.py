@@ -114,9 +114,9 @@ def run_seed(capture: "Capture", seed: int, calibration: Calibration) -> dict[st
     from bitymi_ns.bundle import read_bundle
     from bitymi_ns.scene.config import SceneConfig
     from bitymi_ns.train.config import TrainConfig
-    from bitymi_ns.train.domain import scene_for_views
     from bitymi_ns.train.evaluate import evaluate
     from bitymi_ns.train.fit import fit
+    from bitymi_ns.train.init import scene_for_views
     from bitymi_ns.train.losses import psnr
 
     config, background = TrainConfig(seed=seed), torch.zeros(3)

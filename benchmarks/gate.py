@@ -110,13 +110,13 @@ def run_seed(capture: "Capture", seed: int, calibration: Calibration) -> dict[st
     """The figures of one scene and seed."""
     import torch
 
-    from bitymi_ns.bake import BakeOptions, Learning, TuneOptions, bake_and_learn
-    from bitymi_ns.bundle import export, read_bundle
+    from bitymi_ns.bake import BakeOptions, Learning, TuneOptions, bake_and_learn, export
+    from bitymi_ns.bundle import read_bundle
     from bitymi_ns.scene.config import SceneConfig
     from bitymi_ns.train.config import TrainConfig
-    from bitymi_ns.train.domain import scene_for_views
     from bitymi_ns.train.evaluate import evaluate
     from bitymi_ns.train.fit import fit
+    from bitymi_ns.train.init import scene_for_views
     from bitymi_ns.train.losses import psnr
 
     config, background = TrainConfig(seed=seed), torch.zeros(3)

@@ -185,7 +185,7 @@ def all_commands(capture: Path, folder: Path, steps: int, options: Sequence[str]
 
 
 def tables(folder: Path, commands: Commands) -> str:
-    """What the commands took and found, as Markdown."""
+    """Tabulate what the commands took and found, as Markdown."""
     cells = []
     for command, cost, card in commands.rows:
         took = (number(cost["process_seconds"], 1), number(cost["peak_bytes"] / 1e6, 0)) if cost else ("failed", "")

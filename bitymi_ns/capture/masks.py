@@ -9,7 +9,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from bitymi_ns.capture.photos import COPY
-from bitymi_ns.capture.recognise import PHOTOGRAPHS
+from bitymi_ns.capture.recognise import PHOTOGRAPHS, open_picture
 from bitymi_ns.capture.types import CaptureError
 
 USUAL_FOLDERS = ("images", "input", "image", "photos", "photographs", "rgb", "color")
@@ -67,6 +67,12 @@ def mask_of(masks: Path, name: str) -> Path | None:
     found = next((masks / c for c in candidates if (masks / c).is_file()), None)
     is_copy = found is None and name.endswith(COPY) and stem.lower().endswith(PHOTOGRAPHS)
     return mask_of(masks, stem) if is_copy else found
+
+
+def read_mask(path: Path) -> Image.Image:
+    """Read a mask as a 1-bit image, True where pixels count; see `mask_pixels`. Raises Pillow's errors."""
+    with open_picture(path) as image:
+        return Image.fromarray(mask_pixels(image))
 
 
 def mask_pixels(image: Image.Image) -> npt.NDArray[np.bool_]:

@@ -11,6 +11,8 @@ from bitymi_ns.capture.sfm.job import Job, StageProgress
 from bitymi_ns.capture.sfm.refine import refined
 from bitymi_ns.capture.types import CONTRADICTED
 
+Mapper = Callable[[Job, Path, Path, StageProgress], dict[int, pycolmap.Reconstruction]]
+"""Maps the features and matches of a database with a folder for its files; returns connected components."""
 ENOUGH = 0.9
 """The global mapper's poses are taken as they are if they are of this share of the photographs that hang together."""
 GOOD_ERROR = 1.0
@@ -28,15 +30,10 @@ def reconstruct(job: Job, database: Path, connected: int, tell: StageProgress) -
     """
     found = None
     if job.mapper in ("auto", "global"):
-        found = _best(
-            _in_folder(job, "global", lambda folder: _global(job, database, folder, tell)), job, database, tell
-        )
+        found = _mapped(_global, job, database, tell)
         if job.mapper == "global" or (found is not None and _satisfies(found, job, database, connected)):
             return found
-    other = _best(
-        _in_folder(job, "incremental", lambda folder: _incremental(job, database, folder, tell)), job, database, tell
-    )
-    return better(job, database, found, other)
+    return better(job, database, found, _mapped(_incremental, job, database, tell))
 
 
 def better(job: Job, database: Path, *models: pycolmap.Reconstruction | None) -> pycolmap.Reconstruction | None:
@@ -46,43 +43,26 @@ def better(job: Job, database: Path, *models: pycolmap.Reconstruction | None) ->
     equal = [model for model in found if model.num_reg_images() == most]
     if len(equal) < 2:  # no matches need to be read
         return equal[0] if equal else None
-    return min(equal, key=lambda model: contradicted(model, database, pixel(job)))
-
-
-def pixel(job: Job) -> float:
-    """Side of a pixel of the images on which features were found, in pixels of the photographs."""
-    return max(1.0, max(max(group.width, group.height) for group in job.cameras) / job.max_image_size)
+    return min(equal, key=lambda model: contradicted(model, database, job.pixel))
 
 
 def _satisfies(model: pycolmap.Reconstruction, job: Job, database: Path, connected: int) -> bool:
     return (
         model.num_reg_images() >= ENOUGH * connected
-        and model.compute_mean_reprojection_error() <= GOOD_ERROR * pixel(job)
-        and contradicted(model, database, pixel(job)) <= CONTRADICTED
+        and model.compute_mean_reprojection_error() <= GOOD_ERROR * job.pixel
+        and contradicted(model, database, job.pixel) <= CONTRADICTED
     )
 
 
-def _in_folder(
-    job: Job, name: str, make: Callable[[Path], dict[int, pycolmap.Reconstruction]]
-) -> dict[int, pycolmap.Reconstruction]:
-    folder = Path(job.work) / name
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
-    try:
-        return make(folder)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def _best(
-    models: dict[int, pycolmap.Reconstruction], job: Job, database: Path, tell: StageProgress
-) -> pycolmap.Reconstruction | None:
-    """The largest component, refined, of the cameras that its points link."""
+def _mapped(mapper: Mapper, job: Job, database: Path, tell: StageProgress) -> pycolmap.Reconstruction | None:
+    """The largest component of a mapper's, refined, of the cameras that its points link."""
+    with job.scratch() as folder:
+        models = mapper(job, database, folder, tell)
     largest = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
     if largest is None or largest.num_points3D() == 0:
         return None
     tell("refining cameras and points", 0, 1)
-    model = refined(largest, job, pixel(job))
+    model = refined(largest, job)
     drop_unlinked(model)
     tell("refining cameras and points", 1, 1)
     return model

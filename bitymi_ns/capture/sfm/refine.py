@@ -15,18 +15,13 @@ misused by few observations."""
 OBSERVATIONS_PER_CAMERA = 2000  # a camera with fewer observations keeps the simple model
 
 
-def refined(model: pycolmap.Reconstruction, job: Job, pixel: float) -> pycolmap.Reconstruction:
-    """Drop what does not fit, adjust all cameras and points, and drop again.
-
-    Args:
-        model: a mapper's result; changed in place.
-        pixel: side of a pixel of the images on which features were found, in pixels of the photographs.
-    """
-    _filter(model, pixel)
+def refined(model: pycolmap.Reconstruction, job: Job) -> pycolmap.Reconstruction:
+    """Drop what does not fit, adjust all cameras and points of a mapper's `model` in place, and drop again."""
+    _filter(model, job.pixel)
     if model.num_points3D() == 0:
         return model
     _adjust(model, job)
-    _filter(model, pixel)
+    _filter(model, job.pixel)
     if job.opencv_if_better and model.compute_num_observations() >= OBSERVATIONS_PER_CAMERA * model.num_cameras():
         freer = copy.deepcopy(model)
         for camera in freer.cameras.values():
@@ -36,7 +31,7 @@ def refined(model: pycolmap.Reconstruction, job: Job, pixel: float) -> pycolmap.
                 camera.params = [focal, focal, cx, cy, k, 0.0, 0.0, 0.0]
         _adjust(freer, job)
         if freer.compute_mean_reprojection_error() < (1 - GAIN) * model.compute_mean_reprojection_error():
-            _filter(freer, pixel)
+            _filter(freer, job.pixel)
             return freer
     return model
 

@@ -1,20 +1,18 @@
 """Points for photographs whose cameras are known."""
 
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
 from bitymi_ns.capture.sfm import features, pairs
-from bitymi_ns.capture.sfm.job import DATABASE, MODEL, Job, NoPoses, StageProgress
-from bitymi_ns.files import complete_folder
+from bitymi_ns.capture.sfm.job import DATABASE, Job, NoPoses, StageProgress
 
 LEAST = 10  # fewer points are none to start from
 
 
-def triangulate(job: Job, tell: StageProgress) -> dict[str, object]:
-    """Triangulate points from a job's photographs with their poses as they are, and write the model.
+def triangulate(job: Job, tell: StageProgress) -> pycolmap.Reconstruction:
+    """Triangulate points from a job's photographs with their poses as they are.
 
     Raises:
         NoPoses: the photographs do not show the same from the poses given.
@@ -24,17 +22,14 @@ def triangulate(job: Job, tell: StageProgress) -> dict[str, object]:
     pairs.match(job, database, tell)
     tell("triangulating", 0, 1)
     model = _known(job, database)
-    pixel = max(1.0, max(max(group.width, group.height) for group in job.cameras) / job.max_image_size)
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = 0
     options.num_threads = options.mapper.num_threads = job.threads
-    options.mapper.filter_max_reproj_error *= pixel
-    options.triangulation.complete_max_reproj_error *= pixel
-    options.triangulation.merge_max_reproj_error *= pixel
-    scratch = Path(job.work) / "triangulated"
-    shutil.rmtree(scratch, ignore_errors=True)
-    scratch.mkdir()
-    model = pycolmap.triangulate_points(model, database, job.images, scratch, options=options)
+    options.mapper.filter_max_reproj_error *= job.pixel
+    options.triangulation.complete_max_reproj_error *= job.pixel
+    options.triangulation.merge_max_reproj_error *= job.pixel
+    with job.scratch() as scratch:
+        model = pycolmap.triangulate_points(model, database, job.images, scratch, options=options)
     tell("triangulating", 1, 1)
     if model.num_points3D() < LEAST:
         raise NoPoses(
@@ -44,15 +39,7 @@ def triangulate(job: Job, tell: StageProgress) -> dict[str, object]:
     # The poses are written back as given: the triangulation leaves them as they are, but for rounding.
     for image in model.images.values():
         image.frame.rig_from_world = _pose(job.poses[image.name])
-        image.name = job.names[image.name]
-    with complete_folder(Path(job.work) / MODEL) as folder:
-        model.write_binary(folder)
-    return {
-        "registered": model.num_reg_images(),
-        "points": model.num_points3D(),
-        "reprojection_error": model.compute_mean_reprojection_error(),
-        "track_length": model.compute_mean_track_length(),
-    }
+    return model
 
 
 def _pose(matrix: list[list[float]]) -> pycolmap.Rigid3d:

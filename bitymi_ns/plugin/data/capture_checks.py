@@ -21,13 +21,12 @@ from PIL import Image, UnidentifiedImageError
 
 from bitymi_ns.capture.recognise import Format, Found
 from bitymi_ns.plugin.console import fail
-from bitymi_ns.plugin.data.bundle_cameras import BundleCamerasConfig
 from bitymi_ns.plugin.data.colmap_model import read_model
 from bitymi_ns.plugin.data.colmap_views import mask_files
 from bitymi_ns.plugin.data.dataparser import SCANNED, BitymiDataParserConfig
 from bitymi_ns.plugin.data.images import MAX_PIXELS, check_sizes
 from bitymi_ns.plugin.data.names import check_photographs_exist
-from bitymi_ns.plugin.data.point_files import ply_fault, point_count
+from bitymi_ns.plugin.data.point_files import ply_fault
 from bitymi_ns.plugin.data.pose_checks import check_spread
 from bitymi_ns.plugin.data.scanner_views import scanner_photographs
 from bitymi_ns.plugin.data.transforms import HOW_TO_GET_ONE
@@ -70,16 +69,13 @@ def bitymi_parser(config: DataParserConfig) -> DataParserConfig:
     return BitymiDataParserConfig(format=format, **options)
 
 
-def check_capture(config: FullImageDatamanagerConfig, need_photos: bool = True) -> int:
+def check_capture(config: FullImageDatamanagerConfig, need_photos: bool = True) -> None:
     """Check that there is a usable capture where the configuration points; parsers of nerfstudio are replaced by
     `bitymi_parser`.
 
     Args:
         config: of the data manager.
         need_photos: False = photographs may be missing.
-
-    Returns:
-        the number of its points as far as it is known before they are read, else 0.
 
     Raises:
         InputError: there is none.
@@ -89,13 +85,10 @@ def check_capture(config: FullImageDatamanagerConfig, need_photos: bool = True) 
     if not data.exists():
         made = "" if folder_being_evaluated() else f" {HOW_TO_GET_ONE}"
         fail(f"the capture {data} does not exist. {how_to_say_where()}{made}")
-    if isinstance(dataparser, BundleCamerasConfig):
-        return 0
     _check_options(dataparser)
-    if not isinstance(dataparser, BitymiDataParserConfig):
-        return 0
-    dataparser.data = data
-    return _check_found(dataparser, dataparser.find(), need_photos)
+    if isinstance(dataparser, BitymiDataParserConfig):
+        dataparser.data = data
+        _check_found(dataparser, dataparser.find(), need_photos)
 
 
 def _check_options(dataparser: DataParserConfig) -> None:
@@ -111,16 +104,15 @@ def _check_options(dataparser: DataParserConfig) -> None:
             fail(f"--{name.replace('_', '-')} is {value}, but has to be {what}. Correct it, or leave it out.")
 
 
-def _check_found(dataparser: BitymiDataParserConfig, found: Found, need_photos: bool) -> int:
-    """Check a capture in a known format; returns the number of its points."""
+def _check_found(dataparser: BitymiDataParserConfig, found: Found, need_photos: bool) -> None:
+    """Check a capture in a known format."""
     if found.format in ("photographs", "video"):
-        return 0  # there are no poses yet
+        return  # there are no poses yet
     if found.format in SCANNED:
         photographs = scanner_photographs(found, need_photos)
         if need_photos:
             check_sizes([photograph.file for photograph in photographs])
-        return 0
-    own = dataparser.points == "auto"
+        return
     if found.format == "colmap":
         source = dataparser.source(found, need_photos)
         model = read_model(source.folder)
@@ -129,7 +121,7 @@ def _check_found(dataparser: BitymiDataParserConfig, found: Found, need_photos: 
             check_photographs_exist(found.path, files)
             check_sizes(files)
             mask_files(source, model)
-        return len(model.xyz) if own else 0
+        return
     read = dataparser.transforms(found, "transforms_train.json", need_photos, verbose=False)
     if need_photos:
         check_photographs_exist(read.path, read.files)
@@ -140,15 +132,14 @@ def _check_found(dataparser: BitymiDataParserConfig, found: Found, need_photos: 
         name, hint = dataparser.ply_path, "leave --ply-path out"
     else:
         name, hint = read.meta.get("ply_file_path"), f"remove ply_file_path from {read.path}"
-    if not own or name is None:
-        return 0
+    if dataparser.points != "auto" or name is None:
+        return
     if not isinstance(name, (str, Path)) or not str(name):
         fail(f"{read.path}: ply_file_path is {name!r}, not the name of a file. Correct it or remove it.")
     file = found.folder / name
     fault = ply_fault(file) if file.is_file() else "does not exist"
     if fault is not None:
         fail(f"the point cloud {file} {fault}. Put it there again, or {hint} to start from random points.")
-    return point_count(file)
 
 
 def declares_box(dataparser: DataParserConfig) -> bool:

@@ -337,7 +337,7 @@ def _new_points(seen: Sequence[_Seen], files: Sequence[Path], count: int) -> tup
         agree, through, _ = _votes(xyz, i, seen)
         kept = agree >= through
         lens = seen[i].lens
-        image = lens.undistort(read_image(files[i], lens.stored, lens.size).convert("RGB"))
+        image = lens.undistort(read_image(files[i], lens.stored, lens.camera.size).convert("RGB"))
         return xyz[kept], np.asarray(image).reshape(-1, 3)[draws[i][kept]], 1.0 / (1.0 + agree[kept])
 
     with ThreadPoolExecutor(THREADS) as pool:

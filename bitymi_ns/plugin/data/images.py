@@ -13,8 +13,9 @@ import numpy as np
 import numpy.typing as npt
 from PIL import EpsImagePlugin, Image, UnidentifiedImageError
 
+from bitymi_ns.capture import masks
 from bitymi_ns.capture.exif import exposure_settings
-from bitymi_ns.capture.masks import has_transparency, mask_pixels
+from bitymi_ns.capture.masks import has_transparency
 from bitymi_ns.capture.photos import eight_bits, in_srgb
 from bitymi_ns.capture.recognise import open_picture
 from bitymi_ns.plugin.console import fail, listed, warn
@@ -150,8 +151,7 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
 def read_mask(path: Path) -> Image.Image:
     """Read a mask as a 1-bit image, True where pixels count; see `mask_pixels`."""
     try:
-        with open_picture(path) as file:
-            return Image.fromarray(mask_pixels(file))
+        return masks.read_mask(path)
     except FileNotFoundError as error:
         fail(f"the mask {path} is missing", error)
     except UNREADABLE as error:
@@ -224,11 +224,7 @@ def duplicates(train: Sequence[Any], held_out: Sequence[Any]) -> list[Pair]:
 
 
 def _digest(path: Path) -> bytes:
-    digest = hashlib.sha256()
-    with open(path, "rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.digest()
+    return hashlib.sha256(path.read_bytes()).digest()
 
 
 def warn_of_duplicates(pairs: Sequence[Pair], train: Sequence[Path], held_out: Sequence[Path]) -> None:

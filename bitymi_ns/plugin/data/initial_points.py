@@ -15,9 +15,7 @@ from scipy.spatial.transform import Rotation
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.plugin.console import fail, say, warn
 from bitymi_ns.plugin.data.colmap_model import read_model
-from bitymi_ns.plugin.data.cube_faces import colmap_camera
 from bitymi_ns.plugin.data.images import image_size, read_image
-from bitymi_ns.plugin.data.lens import rescaled
 from bitymi_ns.plugin.data.point_files import Points, read_points
 from bitymi_ns.plugin.data.views import OPENCV_AXES, Photograph, Pose
 from bitymi_ns.ply import PlyError
@@ -82,7 +80,7 @@ def initial_points(
 
 def triangulated(photographs: Sequence[Photograph], folder: Path, source: str) -> Points | None:
     """Triangulate points from photographs with poses; None (with a warning) where that is not possible."""
-    from bitymi_ns.capture import KnownView, triangulate  # slow to import, and seldom needed
+    from bitymi_ns.capture.known import KnownView, triangulate  # slow to import, and seldom needed
     from bitymi_ns.progress import rich_progress
 
     middle = np.mean([photograph.pose[:3, 3] for photograph in photographs], axis=0)
@@ -91,14 +89,12 @@ def triangulated(photographs: Sequence[Photograph], folder: Path, source: str) -
     views = []
     for photograph in photographs:
         camera = photograph.camera
-        size = (camera.width, camera.height)
-        stored = (image_size(photograph.file) or size) if photograph.downscaled else size
+        stored = (photograph.downscaled and image_size(photograph.file)) or camera.size
         c2w = photograph.pose @ OPENCV_AXES
         rotation = (mirror @ c2w[:3, :3]).T
         translation = -rotation @ mirror @ (c2w[:3, 3] - middle)
-        params = rescaled(camera.model, camera.params, size, stored)
         pose = np.column_stack([rotation, translation])
-        views.append(KnownView(photograph.file, camera.model, *stored, params, pose, photograph.mask))
+        views.append(KnownView(photograph.file, camera.rescaled(*stored), pose, photograph.mask))
     say(f"{source} has no points: they are triangulated from the photographs, once. --points random does without.")
     try:
         if any(mirrored) and not all(mirrored):
@@ -159,13 +155,13 @@ def sample_colors(
     camera = photograph.camera
     colors = np.full((len(xyz), 3), np.nan, np.float32)
     local = (xyz - photograph.pose[:3, 3]) @ photograph.pose[:3, :3] * [1.0, -1.0, -1.0]
-    lens = colmap_camera(camera.model, camera.params, (camera.width, camera.height))
+    lens = camera.colmap
     front = np.flatnonzero(lens.is_spherical() | (local[:, 2] > 0.0))
     if not len(front):
         return colors
     pixels = lens.img_from_cam(local[front] / np.abs(local[front, 2:]).clip(min=1e-12))
     height, width = image.shape[:2]
-    pixels = np.nan_to_num(pixels * [width / camera.width, height / camera.height], nan=-1.0, posinf=-1.0, neginf=-1.0)
+    pixels = np.nan_to_num(pixels * np.divide((width, height), camera.size), nan=-1.0, posinf=-1.0, neginf=-1.0)
     inside = ((pixels >= 0.0) & (pixels < (width, height))).all(1)
     x, y = pixels[inside].astype(int).T
     colors[front[inside]] = image[y, x]

@@ -1,13 +1,9 @@
-"""Checks of a capture's poses: rotations (or mirrored ones), positions that belong together, and points in their unit;
-and the rotation and translation that orient a capture."""
+"""Checks of poses: rotations (or mirrored ones), positions that belong together, and points in their unit."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
-from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
 
 from bitymi_ns.plugin.console import fail, listed, warn
 
@@ -161,12 +157,3 @@ def check_point_unit(
 
 def _rounded(ratio: float) -> str:
     return f"{ratio:,.0f}" if ratio < 1e6 else f"{ratio:.0e}"
-
-
-def orient(poses: torch.Tensor, method: Any, center_method: Any) -> torch.Tensor:
-    """Compute the transform [3, 4] by which nerfstudio orients and centers poses [N, 4, 4].
-
-    Its poses are not used: for `pca`, nerfstudio 1.1.5 turns a capture that comes out upside down, but of its cameras
-    the second and the third alone. The transform is right.
-    """
-    return auto_orient_and_center_poses(poses, method, center_method)[1]

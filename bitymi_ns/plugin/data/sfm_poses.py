@@ -61,7 +61,8 @@ def find_sfm_source(found: Found, masks_path: Path | None, downscale: int, setti
     Raises:
         InputError: no poses can be found; says what to photograph differently.
     """
-    from bitymi_ns.capture import CaptureError, SfmOptions, find_poses  # slow to import, and seldom needed
+    from bitymi_ns.capture.poses import find_poses  # slow to import, and seldom needed
+    from bitymi_ns.capture.types import CaptureError, SfmOptions
     from bitymi_ns.progress import rich_progress
 
     masks = _masks(found, masks_path)

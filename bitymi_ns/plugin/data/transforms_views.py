@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 
+from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.capture.panorama_detection import SPHERICAL_MODEL
 from bitymi_ns.plugin.console import fail, listed, say, warn
-from bitymi_ns.plugin.data.colmap_model import ModelCamera
 from bitymi_ns.plugin.data.depth_files import MAP_FILES, MapFiles
 from bitymi_ns.plugin.data.images import image_size
 from bitymi_ns.plugin.data.lens import colmap_distortion
@@ -102,7 +102,7 @@ def read_transforms(
         _report_files(path, names, files, masks)
     if verbose:
         _report_unused(path, meta, own_format)
-    made: dict[ModelCamera, ModelCamera] = {}
+    made: dict[ColmapCamera, ColmapCamera] = {}
     photographs = []
     for frame, file, mask, beside in zip(frames, files, masks, maps, strict=True):
         camera = _camera(path, meta, frame, file)
@@ -216,7 +216,7 @@ def _downscaled(photographs: list[Photograph], folder: Path, downscale: int) -> 
             for each, copy in zip(photographs, found, strict=True) if copy is not None]  # fmt: skip
 
 
-def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path) -> ModelCamera:
+def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path) -> ColmapCamera:
     """Convert the camera of a frame to COLMAP's terms."""
     name = frame["file_path"]
 
@@ -242,7 +242,7 @@ def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path)
                 f"{path}: {name} is EQUIRECTANGULAR, but its cx and cy are {middle[0]:g} and {middle[1]:g}, not the "
                 f"middle of its {width} x {height} pixels. Remove them, or shift the picture and turn the pose."
             )
-        return ModelCamera(SPHERICAL_MODEL, int(width), int(height), (float(width), float(height)))
+        return ColmapCamera(SPHERICAL_MODEL, int(width), int(height), (float(width), float(height)))
     sides = {"x": width, "y": height}
     focal: dict[str, float] = {}
     for axis, keys in FOCALS.items():
@@ -257,7 +257,7 @@ def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path)
     fx, fy = focal.get("x", focal.get("y", 0.0)), focal.get("y", focal.get("x", 0.0))
     pinhole = (fx, fy, width / 2.0 if cx is None else cx, height / 2.0 if cy is None else cy)
     model, coefficients = _distortion(path, meta, frame)
-    return ModelCamera(model, int(width), int(height), (*pinhole, *coefficients))
+    return ColmapCamera(model, int(width), int(height), (*pinhole, *coefficients))
 
 
 def _focal_length(path: Path, key: str, value: float, side: float) -> float:

@@ -38,14 +38,8 @@ class KnownView:
 def triangulate(
     capture: Path, views: Sequence[KnownView], progress: Progress | None = None, tell: Tell = warnings.warn
 ) -> Path:
-    """Triangulate points from photographs whose cameras are known; the cameras stay as they are. Kept and continued as
-    `find_poses` does.
-
-    Args:
-        capture: folder in which the result is kept.
-        views: the photographs with their cameras.
-        progress: told the stage and how far it is.
-        tell: told where the points are kept, if not beside the photographs although these can be written.
+    """Triangulate points from photographs whose cameras are known; the cameras stay as they are. Kept in the folder
+    `capture` and continued as by `find_poses`.
 
     Returns:
         folder of a COLMAP model (cameras.bin, images.bin, points3D.bin) in the world of the given poses, in which the

@@ -22,17 +22,12 @@ PROPORTIONS = 0.02  # relative difference of aspect ratios that counts as roundi
 
 def mask_folder(photographs: Path, data: Path, stated: Path | None = None, downscale: int = 1) -> Path | None:
     """Find the folder of a capture's masks: the stated one; else `masks` beside the folder of the photographs, in that
-    folder, or in that of the data, the first of them that is there.
+    folder, or in that of the data, the first of them that is there. A folder of masks that are smaller by `downscale`,
+    as `masks_2`, counts, too.
 
     Beside a folder that is the data, or holds it, lie other things than the capture. There `masks` is used if the
     folder has a usual name for the photographs of a capture: `bed/masks` for `bed/images`, but not `all/masks` for
     `all/bed`.
-
-    Args:
-        photographs: their folder.
-        data: folder that the user names as the capture.
-        stated: folder that the user names as that of the masks.
-        downscale: a folder of masks that are smaller by this factor, as `masks_2`, counts, too.
 
     Raises:
         CaptureError: the stated one does not exist.

@@ -34,11 +34,8 @@ def is_full_sphere(width: float, height: float) -> bool:
 
 
 def looks_panoramic(grey: npt.NDArray[np.float32]) -> bool:
-    """Test if left and right edge continue each other, and the first and last row are constant.
-
-    Args:
-        grey: [h, w] grey levels to 255 of the whole picture, reduced to some hundreds of pixels.
-    """
+    """Test if left and right edge continue each other, and the first and last row are constant, in grey levels [h, w]
+    to 255 of the whole picture, reduced to some hundreds of pixels."""
     height, width = grey.shape
     if height < 32 or not is_full_sphere(width, height):
         return False

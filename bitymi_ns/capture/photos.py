@@ -220,11 +220,8 @@ def _reduced(image: Image.Image, size: int) -> Image.Image:
 
 
 def sharpness(grey: np.ndarray) -> float:
-    """Root mean square of the Laplacian over that of the gradient: low where fine detail is missing.
-
-    Args:
-        grey: [h,w] float32.
-    """
+    """Root mean square of the Laplacian over that of the gradient of [h,w] float32: low where fine detail is
+    missing."""
     right, down = np.diff(grey, axis=1), np.diff(grey, axis=0)
     gradient = float(np.mean(right**2) + np.mean(down**2))
     laplacian = float(np.mean(np.diff(right, axis=1) ** 2) + np.mean(np.diff(down, axis=0) ** 2))
@@ -269,11 +266,8 @@ def duplicates(photos: Sequence[Photo]) -> dict[str, str]:
 
 
 def shift(first: np.ndarray, second: np.ndarray) -> float:
-    """Root mean square difference of two images over that of their gradient: the shift in pixels that would explain it.
-
-    Args:
-        first, second: [h,w] float32 grey levels.
-    """
+    """Root mean square difference of two images [h,w] float32 over that of their gradient: the shift in pixels that
+    would explain it."""
     gradient = np.mean(np.diff(first, axis=0) ** 2) + np.mean(np.diff(first, axis=1) ** 2)
     difference = np.mean((first - second) ** 2)
     return float(np.sqrt(difference / gradient)) if gradient > 0 else (0.0 if difference == 0 else np.inf)

@@ -45,7 +45,6 @@ def find_poses(
 
     Args:
         source: a folder of photographs, a folder that holds them in `images` (and masks in `masks`), or a video.
-        options: how; None = the defaults.
         warn: called with the location of the result, if not beside writable photographs.
 
     Raises:
@@ -222,15 +221,9 @@ def make_job(
     work: Path,
     sequence: bool,
 ) -> Job:
-    """Make the job for these photographs in their order, with links to them under names without spaces for COLMAP's
-    lists.
-
-    Args:
-        images, used: folder of the upright photographs, and their names in it.
-        masks: folder of the masks, or None.
-        work: gets the links and the masks.
-        sequence: neighbours overlap, as a video's frames do.
-    """
+    """Make the job for these photographs in their order, with links to them in the work folder under names without
+    spaces for COLMAP's lists. `images` is the folder of the upright photographs, `used` their names in it; neighbours
+    overlap in a `sequence`, as a video's frames do."""
     links, mask_files = emptied(work / "links"), emptied(work / "masks")
     plain = {photo.name: f"{i:06d}{Path(used[photo.name]).suffix.lower()}" for i, photo in enumerate(photos)}
     for photo in photos:

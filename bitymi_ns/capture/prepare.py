@@ -20,16 +20,9 @@ IMAGES = "images"  # subfolder of the work folder for upright copies, or the fra
 def upright_photos(
     photos: Sequence[Photo], folder: Path, work: Path, progress: Progress
 ) -> tuple[Path, dict[str, str]]:
-    """Make a folder in which every photograph is upright and in a format that everything reads.
-
-    Args:
-        photos: the photographs to be used.
-        folder: the one they stand in.
-        work: gets `images` where some have to be converted; the others are links in it.
-
-    Returns:
-        the folder, which is `folder` itself where no photograph needs a copy, and the names in it by photograph.
-    """
+    """Return a folder in which every photograph is upright and in a format that everything reads, and the names in it
+    by photograph: `folder` itself where no photograph needs a copy, else `images` in the work folder, with links to the
+    others."""
     if all(photo.plain for photo in photos):
         return folder, {photo.name: photo.name for photo in photos}
     names = {photo.name: photo.name if photo.plain else photo.name + COPY for photo in photos}

@@ -57,13 +57,7 @@ def view_graph(database: Path) -> ViewGraph:
 
 
 def left_out(graph: ViewGraph, placed: set[str], title: dict[str, str]) -> dict[str, str]:
-    """Explain by name why photographs have no pose.
-
-    Args:
-        graph: of all photographs.
-        placed: those that have a pose.
-        title: names of the photographs for messages.
-    """
+    """Explain by name (`title`) why photographs have no pose; `placed` ones have."""
     best: Counter[str] = Counter()
     with_placed: Counter[str] = Counter()
     for (first, second), count in graph.inliers.items():

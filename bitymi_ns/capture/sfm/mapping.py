@@ -21,13 +21,8 @@ matches contradict them."""
 
 
 def reconstruct(job: Job, database: Path, connected: int, tell: StageProgress) -> pycolmap.Reconstruction | None:
-    """The best model of the photographs, or None where there is none.
-
-    Args:
-        database: features and verified matches.
-        connected: size of the largest set of photographs that hang together by verified pairs.
-        tell: told the stage.
-    """
+    """The best model of the photographs, or None where there is none; `connected` of them hang together by verified
+    pairs."""
     found = None
     if job.mapper in ("auto", "global"):
         found = _mapped(_global, job, database, tell)

@@ -108,11 +108,8 @@ def likeness(job: Job, database: Path, tell: StageProgress) -> np.ndarray:
 
 
 def nearest(alike: np.ndarray, neighbours: int) -> set[tuple[int, int]]:
-    """For each photograph those most alike, and a tree of the best pairs, so that no part stands alone.
-
-    Args:
-        alike: [n,n] symmetric, 0 or more; 0 = nothing shared.
-    """
+    """For each photograph those most alike, and a tree of the best pairs, so that no part stands alone; `alike` [n,n]
+    is symmetric, 0 = nothing shared."""
     pairs = set()
     for i, row in enumerate(alike):
         best = np.argsort(-row, kind="stable")[:neighbours]

@@ -22,14 +22,7 @@ LITTLE_SPACE = 50_000_000  # bytes; where less is left, the disk is what stopped
 
 
 def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:
-    """Run a job to its end.
-
-    Args:
-        source: the photographs or the video, for messages.
-        progress: told the stage and how far it is.
-
-    Returns:
-        what the worker found.
+    """Run a job to its end, and return what the worker found; `source` is for messages.
 
     Raises:
         CaptureError: there are no poses, or COLMAP ended otherwise.

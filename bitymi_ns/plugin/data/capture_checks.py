@@ -70,12 +70,8 @@ def bitymi_parser(config: DataParserConfig) -> DataParserConfig:
 
 
 def check_capture(config: FullImageDatamanagerConfig, need_photos: bool = True) -> None:
-    """Check that there is a usable capture where the configuration points; parsers of nerfstudio are replaced by
-    `bitymi_parser`.
-
-    Args:
-        config: of the data manager.
-        need_photos: False = photographs may be missing.
+    """Check that there is a usable capture where the data manager's configuration points; parsers of nerfstudio are
+    replaced by `bitymi_parser`. Photographs may be missing where they are not needed.
 
     Raises:
         InputError: there is none.

@@ -83,15 +83,13 @@ def find_source(
     downscale: int = 1,
     need_photos: bool = True,
 ) -> Source:
-    """Find a model's photographs and masks.
+    """Find a model's photographs and masks; photographs may be missing where they are not needed.
 
     Args:
         folder: of the model.
         capture: folder to which the paths are relative, and below which photographs are searched; where it is that of
             the model, the folders above it, too.
-        images_path, masks_path: where they are, if that is known.
         downscale: use photographs that are smaller by this factor.
-        need_photos: False = photographs may be missing.
 
     Raises:
         InputError: no folder has the model's photographs, or the masks are incomplete.
@@ -170,13 +168,7 @@ def _photo_folder(
 
 
 def find_masks(photographs: Path, capture: Path, stated: Path | None, downscale: int = 1) -> Path | None:
-    """Find the folder of masks; see `mask_folder`.
-
-    Args:
-        photographs: folder of the photographs.
-        capture: folder of the data.
-        stated: folder of masks, relative to the capture; None = find it.
-        downscale: photographs that are smaller by this factor may be used.
+    """Find the folder of masks, or the stated one relative to the capture; see `mask_folder`.
 
     Raises:
         InputError: the stated one does not exist.
@@ -230,12 +222,7 @@ def warn_of_left_out(source: Source, model: Model) -> None:
 
 
 def model_photographs(source: Source, need_photos: bool) -> list[Photograph]:
-    """Return the photographs of a model in the order of their names, with cameras and poses.
-
-    Args:
-        source: model and photographs.
-        need_photos: False = photographs may be missing.
-    """
+    """Return the photographs of a model in the order of their names, with cameras and poses."""
     model = read_model(source.folder)
     files = source.files(model)
     masks = mask_files(source, model) if need_photos else None

@@ -96,11 +96,9 @@ def resample(
     pinhole: tuple[float, float, float, float, int, int],
     nearest: bool = False,
 ) -> npt.NDArray[np.uint8]:
-    """Resample a photograph [H, W] or [H, W, C] of a wide camera to a face of the cube.
+    """Resample a photograph [H, W] or [H, W, C], of the size that its wide camera is for, to a face of the cube.
 
     Args:
-        pixels: photograph, of the size that `camera` is for.
-        face: of FACES.
         pinhole: fx, fy, cx, cy, width and height of the result in pixels.
         nearest: take the nearest pixel, for masks.
     """

@@ -187,11 +187,7 @@ class CachedImages(Sequence):
 
 
 def drop_blank_views(outputs: DataparserOutputs, split: str) -> DataparserOutputs:
-    """Leave out the views whose masks exclude every pixel.
-
-    Args:
-        outputs: of a parser.
-        split: "training" or "held-out", for messages.
+    """Leave out the views whose masks exclude every pixel; `split` is "training" or "held-out".
 
     Raises:
         InputError: no training view is left.

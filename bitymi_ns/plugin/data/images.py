@@ -126,7 +126,6 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
     Deep grey images are scaled to 8 bits, where PIL would clip them to white.
 
     Args:
-        path: image file.
         stored: width and height that it must have; None = any.
         wanted: width and height to which it will be downscaled. A JPEG may then be decoded at a half, a quarter or an
             eighth of its size, but no smaller than this.

@@ -62,15 +62,8 @@ def points_wanted() -> bool:
 def initial_points(
     own: Points | None, choice: Choice, photographs: Sequence[Photograph], folder: Path, source: str
 ) -> Points | None:
-    """Choose the points to start from; None = random ones.
-
-    Args:
-        own: points of the capture; None = it has none.
-        choice: which are wanted.
-        photographs: from which points are triangulated.
-        folder: of the capture, where triangulated points are kept.
-        source: of the poses, for messages.
-    """
+    """Choose the points to start from: the capture's `own`, or triangulated ones, which are kept in its `folder`; None
+    = random ones. `source` of the poses is for messages."""
     if choice == "random":
         return None
     if own is not None and len(own.xyz) and choice == "auto":
@@ -118,14 +111,8 @@ def read_colored_points(path: Path, photographs: Sequence[Photograph]) -> Points
 
 
 def with_colors(points: Points, without: str, photographs: Sequence[Photograph], source: Path) -> Points:
-    """Color points that have no colors by the photographs, where a scene starts from them.
-
-    Args:
-        points: in the frame of the photographs.
-        without: why they have no colors; empty where they have.
-        photographs: see `color_points`.
-        source: of the points, for the message.
-    """
+    """Color points in the frame of the photographs that have no colors, for the reason `without`, by `color_points`,
+    where a scene starts from them."""
     if not without and not points.rgb.any():
         without = "its own are all black"
     if not without or not len(points.xyz) or not points_wanted():
@@ -213,15 +200,9 @@ def check_conventions(
     source: str,
     frame: Pose | None = None,
 ) -> None:
-    """Warn where the points are not seen by the poses as they are read, but would be by another convention.
-
-    Args:
-        points: in the frame of the poses.
-        photographs: with their poses.
-        conventions: `JSON_CONVENTIONS` or `COLMAP_CONVENTIONS`.
-        source: of the poses, for messages.
-        frame: [4, 4] from the frame in which the poses were written to that of the photographs; None = the same.
-    """
+    """Warn where the points are not seen by the poses as they are read, but would be by another of these conventions.
+    `frame` [4, 4] is from the frame in which the poses were written to that of points and photographs; None = the
+    same."""
     rgb = points.rgb if len(points.rgb) == len(points.xyz) else np.zeros((len(points.xyz), 3), np.uint8)
     kept = np.flatnonzero(np.isfinite(points.xyz).all(1))
     kept = kept[:: max(1, len(kept) // CHECK_POINTS)]

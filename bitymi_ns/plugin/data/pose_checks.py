@@ -19,19 +19,11 @@ OTHER_UNIT = 150.0
 def rotations(
     matrices: npt.NDArray[np.float64], names: Sequence[object], source: str, verbose: bool = True
 ) -> npt.NDArray[np.float64]:
-    """Recover rotations from the 3 x 3 parts of poses.
+    """Recover rotations from the 3 x 3 parts [N, 3, 3] of poses, camera to world; rows that need no change stay equal.
 
     A factor common to a matrix is divided out, and rounding is undone by the nearest rotation. Mirrored rotations
-    (determinant -1) stay mirrored: captures may be mirrored as a whole.
-
-    Args:
-        matrices: [N, 3, 3], camera to world.
-        names: of the N frames, for messages.
-        source: file or capture, for messages.
-        verbose: report what was changed.
-
-    Returns:
-        [N, 3, 3]; rows that need no change are equal to the input.
+    (determinant -1) stay mirrored: captures may be mirrored as a whole. Names of the frames and `source` are for
+    messages; changes are reported if `verbose`.
 
     Raises:
         InputError: a matrix is not finite, zero or sheared.
@@ -123,15 +115,11 @@ def far_from_origin(centers: npt.NDArray[np.float64]) -> bool:
 def check_point_unit(
     points: npt.NDArray[np.float64], centers: npt.NDArray[np.float64], widths: npt.NDArray[np.float64]
 ) -> None:
-    """Warn where the points seem to be in another unit than the poses.
+    """Warn where the points [N, 3] seem to be in another unit than the camera positions [M, 3], finite; `widths` [M] of
+    the pictures are in focal lengths.
 
-    They are then far beyond the cameras, or all in a spot of the picture: both leave training next to nothing to start
-    from. Medians and percentiles are used because clouds and captures have outliers.
-
-    Args:
-        points: [N, 3] of the cloud.
-        centers: [M, 3] camera positions, finite.
-        widths: [M] of the pictures, in focal lengths.
+    Points are then far beyond the cameras, or all in a spot of the picture: both leave training next to nothing to
+    start from. Medians and percentiles are used because clouds and captures have outliers.
     """
     points = points[:: max(1, len(points) // 100_000)]
     points = points[np.isfinite(points).all(1)]

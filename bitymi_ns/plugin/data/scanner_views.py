@@ -27,14 +27,11 @@ Y_UP = np.array([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0
 
 
 def scanner_photographs(found: Found, need_photos: bool) -> list[Photograph]:
-    """Read the photographs of such a capture, with cameras and poses, in the order of their names.
-
-    Args:
-        found: of the format polycam, record3d or pose-files.
-        need_photos: False = photographs may be missing.
+    """Read the photographs of a polycam, record3d or pose-files capture, with cameras and poses, in the order of their
+    names.
 
     Raises:
-        InputError: a file is damaged, or photographs are missing.
+        InputError: a file is damaged, or photographs that are needed are missing.
     """
     readers: dict[str, Callable[[Path], list[Row]]] = {
         "polycam": _polycam, "record3d": _record3d, "pose-files": _pose_files

@@ -50,13 +50,8 @@ class KeptPoses:
 
 
 def find_sfm_source(found: Found, masks_path: Path | None, downscale: int, settings: SfmSettings) -> Source:
-    """Run structure from motion on a folder of photographs or a video, or find the model of an earlier run.
-
-    Args:
-        found: photographs, or a video.
-        masks_path: folder of masks, relative to the capture; None = find it.
-        downscale: train on photographs that are smaller by this factor.
-        settings: of structure from motion.
+    """Run structure from motion on a folder of photographs or a video, or find the model of an earlier run. Photographs
+    are used smaller by `downscale`; `masks_path` is relative to the capture, None = find it.
 
     Raises:
         InputError: no poses can be found; says what to photograph differently.
@@ -93,14 +88,8 @@ def find_sfm_source(found: Found, masks_path: Path | None, downscale: int, setti
 def kept_source(found: Found, kept: KeptPoses, masks_path: Path | None, downscale: int, need_photos: bool) -> Source:
     """Return the COLMAP model that a run was trained with; see `find_sfm_source`.
 
-    Args:
-        found: see `KeptPoses.found`.
-        kept: poses of the run.
-        masks_path, downscale: see `find_sfm_source`.
-        need_photos: False = photographs may be missing.
-
     Raises:
-        InputError: photographs of the model are missing, or have another size than they had.
+        InputError: photographs of the model that are needed are missing, or have another size than they had.
     """
     masks = _masks(found, masks_path, downscale)
     source = make_source(kept.model, kept.images(found.folder), masks, downscale, kept.left_out)

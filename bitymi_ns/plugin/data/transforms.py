@@ -27,12 +27,8 @@ FOCALS = {"x": ("fl_x", "camera_angle_x", "x_fov"), "y": ("fl_y", "camera_angle_
 
 
 def load_transforms(path: Path, own_format: bool, verbose: bool = True) -> dict[str, Any]:
-    """Load a file and check its frames, poses and lists of names; poses become rotations.
-
-    Args:
-        path: JSON file in any Unicode encoding, with or without byte order mark.
-        own_format: it is in nerfstudio's format, in which each camera is stated in full.
-        verbose: report what was corrected.
+    """Load a file in any Unicode encoding, with or without byte order mark, and check its frames, poses and lists of
+    names; poses become rotations. nerfstudio's own format states each camera in full.
 
     Raises:
         InputError: the file cannot be used; names the frame.

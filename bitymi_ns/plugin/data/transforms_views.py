@@ -68,14 +68,9 @@ class Transforms:
 def read_transforms(
     path: Path, own_format: bool, downscale: int = 1, need_photos: bool = True, verbose: bool = True
 ) -> Transforms:
-    """Read and check a file, and find its photographs.
-
-    Args:
-        path: JSON file.
-        own_format: it is in nerfstudio's format, in which every frame states its camera.
-        downscale: use copies that are smaller by this factor, where there are some.
-        need_photos: False = photographs may be missing.
-        verbose: report what was corrected, found elsewhere, or is not used.
+    """Read and check a JSON file, see `load_transforms`, and find its photographs, or copies that are smaller by
+    `downscale`. Photographs may be missing where they are not needed. What was corrected, found elsewhere, or is not
+    used is reported if `verbose`.
 
     Raises:
         InputError: the file cannot be used, or lacks photographs.

@@ -66,15 +66,9 @@ class FrameOptions:
 
 
 def fit_scale(frame: FrameOptions, photographs: Sequence[Photograph], source: str) -> FrameOptions:
-    """Reduce the scale of a capture whose cameras lie far outside of the scene box.
-
-    In millimetres they would, and random points would all fall on one spot of the pictures.
-
-    Args:
-        frame: default of the format, without auto_scale_poses.
-        photographs: of the capture.
-        source: of their poses, for the message.
-    """
+    """Reduce the scale of a capture whose cameras lie far outside of the scene box: in millimetres they would, and
+    random points would all fall on one spot of the pictures. `frame` is the format's default, without
+    auto_scale_poses."""
     centers = np.stack([photograph.pose[:3, 3] for photograph in photographs])
     spread = float(np.median(np.linalg.norm(centers - centers.mean(0), axis=1)))
     ratio = spread * frame.scale_factor / frame.scene_scale
@@ -114,13 +108,10 @@ def make_views(
 
     Args:
         photographs: at least two.
-        frame: how to orient, center and scale them.
         points: in the frame of the poses; None = none.
-        source: of the poses, for messages.
         downscale: use photographs that are smaller by this factor.
         need_photos: open downscaled copies for their size; else they may be missing.
-        applied: [4, 4] that was applied to the capture already, before `photographs` state it.
-        applied_scale: the same for a scale.
+        applied, applied_scale: [4, 4] and scale that were applied to the capture before `photographs` state it.
         alpha_color: behind transparent pixels.
 
     Raises:
@@ -189,15 +180,11 @@ def photograph_files(outputs: DataparserOutputs) -> list[Path]:
 
 
 def training_frame(poses: Pose, frame: FrameOptions, source: str) -> tuple[Pose, float]:
-    """Compute the transform [3, 4] that orients and centers a capture, and the scale that follows it.
+    """Compute the transform [3, 4] that orients and centers poses [N, 4, 4] camera to world, and the scale that follows
+    it.
 
     Both are nerfstudio's, but the capture is centered in float64 first: UTM or ECEF positions have seven digits before
     the point, which is all that float32 has.
-
-    Args:
-        poses: [N, 4, 4] camera to world.
-        frame: options.
-        source: of the poses, for messages.
     """
     middle = poses[:, :3, 3].mean(0)
     local = poses.copy()

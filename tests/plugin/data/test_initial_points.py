@@ -19,6 +19,7 @@ from tests.plugin.data.captures import edit, edit_frames, load_any, printed, wri
 from tests.plugin.data.test_true_captures import ALL, blender, colmap, move
 
 SIZE = (200, 150)
+TRIANGULATE = known.triangulate  # before fixtures replace it
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +39,7 @@ def arc(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def triangulating(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bitymi_ns.capture.known.triangulate", known.triangulate)
+    monkeypatch.setattr("bitymi_ns.capture.known.triangulate", TRIANGULATE)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])

@@ -98,6 +98,9 @@ def _read_model(folder: Path, stamps: tuple[Any, ...]) -> Model:
     return Model(cameras, sorted(images.values(), key=lambda image: Path(image.name)), xyz, rgb, without_colors)
 
 
+forget_model = _read_model.cache_clear
+
+
 def _file(folder: Path, name: str) -> Path:
     """Choose the text or binary file. All are of one form where one is complete: a single file of the other form is of
     another time."""

@@ -148,11 +148,11 @@ class BitymiDataParserConfig(FrameOptions, DataParserConfig):
         """Replace the name of a file of names by its content, so that config.yml stands on its own."""
         self.eval_names = splits.read_names(self.eval_names)
 
-    def transforms(self, found: Found, name: str, need_photos: bool, verbose: bool = True) -> Transforms:
+    def transforms(self, found: Found, name: str, need_photos: bool) -> Transforms:
         """Read a JSON file of a nerfstudio, instant-ngp or Blender capture; `name` of the file for the latter. See
         `read_transforms`."""
         path = found.folder / name if found.format == "blender" else found.path
-        return read_transforms(path, found.format == "nerfstudio", self.downscale_factor or 1, need_photos, verbose)
+        return read_transforms(path, found.format == "nerfstudio", self.downscale_factor or 1, need_photos)
 
     def source(self, found: Found, need_photos: bool = True) -> Source:
         """Find the COLMAP model and its photographs, by structure from motion for photographs without poses."""
@@ -249,8 +249,9 @@ class BitymiDataParser(DataParser):
         what = f"{found.path} ({found.format}, {len(read.photographs)} photographs)"
         own = None
         if config.points == "auto":
-            if meta.get("ply_file_path"):
-                own = read_colored_points(found.folder / meta["ply_file_path"], read.photographs)
+            if "ply_file_path" in meta:
+                hint = f"remove ply_file_path from {read.path}"
+                own = read_colored_points(found.folder / meta["ply_file_path"], hint, read.photographs)
             elif model is not None:
                 own = model_points(read_model(model), np.eye(4) if applied is None else applied)
                 own = with_colors(own, read_model(model).without_colors, read.photographs, model)
@@ -277,6 +278,8 @@ class BitymiDataParser(DataParser):
         self.poses_report = source.report or self.poses_report
         self.sfm_source = None if source.origin is None else source
         model = read_model(source.folder)
+        if need_photos and found.format == "colmap":
+            check_photographs_exist(found.path, source.files(model))
         self._report(found, source.describe(model))
         if need_photos:
             warn_of_left_out(source, model)
@@ -315,7 +318,9 @@ class BitymiDataParser(DataParser):
                 parts[name] = _existing(part) if need_photos else part.photographs
         there = [name for name in ("val", "test") if parts.get(name)]
         self._report(found, f"{train.path} (blender, {len(train.photographs)} photographs)")
-        own = None if config.ply_path is None else read_colored_points(found.path / config.ply_path, train.photographs)
+        own = None
+        if config.ply_path is not None and config.points == "auto":
+            own = read_colored_points(found.path / config.ply_path, "leave --ply-path out", train.photographs)
         frame = FrameOptions(config.scale_factor, "none", "none", auto_scale_poses=False, scene_scale=BLENDER_SIDE)
         if config.scale_factor == 1.0:  # else the user has chosen it
             frame = fit_scale(frame, train.photographs, str(train.path))

@@ -16,7 +16,7 @@ from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.plugin.console import fail, say, warn
 from bitymi_ns.plugin.data.colmap_model import read_model
 from bitymi_ns.plugin.data.images import image_size, read_image
-from bitymi_ns.plugin.data.point_files import Points, read_points
+from bitymi_ns.plugin.data.point_files import Points, ply_fault, read_points
 from bitymi_ns.plugin.data.views import OPENCV_AXES, Photograph, Pose
 from bitymi_ns.ply import PlyError
 from bitymi_ns.train.views import spread
@@ -101,8 +101,12 @@ def triangulated(photographs: Sequence[Photograph], folder: Path, source: str) -
     return Points(model.xyz @ mirror + middle, model.rgb)
 
 
-def read_colored_points(path: Path, photographs: Sequence[Photograph]) -> Points:
-    """Read the points of a PLY file, with colors from the photographs where it has none; see `with_colors`."""
+def read_colored_points(path: Path, without: str, photographs: Sequence[Photograph]) -> Points:
+    """Read the points of a PLY file, with colors from the photographs where it has none; see `with_colors`. `without`
+    says how to do without it."""
+    fault = ply_fault(path) if path.is_file() else "does not exist"
+    if fault is not None:
+        fail(f"the point cloud {path} {fault}. Put it there again, or {without} to start from random points.")
     try:
         points, without_colors = read_points(path)
     except PlyError as error:

@@ -16,14 +16,12 @@ OTHER_UNIT = 150.0
 """Distance of points relative to that between cameras, or their extent as a part of the picture, in another unit."""
 
 
-def rotations(
-    matrices: npt.NDArray[np.float64], names: Sequence[object], source: str, verbose: bool = True
-) -> npt.NDArray[np.float64]:
+def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source: str) -> npt.NDArray[np.float64]:
     """Recover rotations from the 3 x 3 parts [N, 3, 3] of poses, camera to world; rows that need no change stay equal.
 
     A factor common to a matrix is divided out, and rounding is undone by the nearest rotation. Mirrored rotations
     (determinant -1) stay mirrored: captures may be mirrored as a whole. Names of the frames and `source` are for
-    messages; changes are reported if `verbose`.
+    messages.
 
     Raises:
         InputError: a matrix is not finite, zero or sheared.
@@ -49,7 +47,7 @@ def rotations(
     rounded = error > EXACT
     u, _, v = np.linalg.svd(unit[rounded])
     result[rounded] = u @ v
-    if verbose and scaled.any():
+    if scaled.any():
         low, high = scale[scaled].min(), scale[scaled].max()
         factor = f"{low:.4g}" if high - low <= EXACT * high else f"{low:.4g} to {high:.4g}"
         warn(
@@ -57,7 +55,7 @@ def rotations(
             f"{listed([names[i] for i in scaled.nonzero()[0]])}. The factor is divided out; positions stay as they are."
         )
     only_rounded = rounded & ~scaled
-    if verbose and only_rounded.any():
+    if only_rounded.any():
         warn(
             f"{source}: rotations are off by up to {error[only_rounded].max():.1g} in the poses of "
             f"{listed([names[i] for i in only_rounded.nonzero()[0]])}. The nearest ones are used."

@@ -65,17 +65,14 @@ class Transforms:
         return [photograph.file for photograph in self.photographs]
 
 
-def read_transforms(
-    path: Path, own_format: bool, downscale: int = 1, need_photos: bool = True, verbose: bool = True
-) -> Transforms:
+def read_transforms(path: Path, own_format: bool, downscale: int = 1, need_photos: bool = True) -> Transforms:
     """Read and check a JSON file, see `load_transforms`, and find its photographs, or copies that are smaller by
-    `downscale`. Photographs may be missing where they are not needed. What was corrected, found elsewhere, or is not
-    used is reported if `verbose`.
+    `downscale`. Photographs may be missing where they are not needed.
 
     Raises:
         InputError: the file cannot be used, or lacks photographs.
     """
-    meta = load_transforms(path, own_format, verbose)
+    meta = load_transforms(path, own_format)
     frames = meta["frames"]
     for holder in (meta, *frames):
         for key in EQUAL_AREA:
@@ -88,15 +85,16 @@ def read_transforms(
     names = [frame["file_path"] for frame in frames]
     files = _find_photographs(path, names, need_photos)
     masks = _find_masks(path.parent, [frame.get("mask_path") for frame in frames], files, need_photos)
-    maps = _find_maps(path, frames, need_photos and verbose)
+    maps = _find_maps(path, frames, need_photos)
     cloud = meta.get("ply_file_path")
-    if isinstance(cloud, str) and cloud and not (path.parent / cloud).is_file():
+    if cloud is not None and (not isinstance(cloud, str) or not cloud):
+        fail(f"{path}: ply_file_path is {cloud!r}, not the name of a file. Correct it or remove it.")
+    if cloud and not (path.parent / cloud).is_file():
         there = FileFinder(path.parent, extensions=(".ply",)).find(cloud)
         meta["ply_file_path"] = cloud if there is None else there.relative_to(path.parent).as_posix()
-    if verbose and need_photos:
+    if need_photos:
         _report_files(path, names, files, masks)
-    if verbose:
-        _report_unused(path, meta, own_format)
+    _report_unused(path, meta, own_format)
     made: dict[ColmapCamera, ColmapCamera] = {}
     photographs = []
     for frame, file, mask, beside in zip(frames, files, masks, maps, strict=True):
@@ -162,7 +160,7 @@ def _find_masks(
     return [None if name is None else paths[name] for name in names]
 
 
-def _find_maps(path: Path, frames: Sequence[dict[str, Any]], verbose: bool) -> list[MapFiles]:
+def _find_maps(path: Path, frames: Sequence[dict[str, Any]], need_photos: bool) -> list[MapFiles]:
     """Find the maps of depth and normals, with a warning on those that are missing."""
     finder = FileFinder(path.parent, outside=True, extensions=MAP_FILES)
     found: dict[str, list[Path | None]] = {}
@@ -170,7 +168,7 @@ def _find_maps(path: Path, frames: Sequence[dict[str, Any]], verbose: bool) -> l
         names = [frame.get(key) for frame in frames]
         found[key] = [None if name is None else finder.find(name) for name in names]
         lacking = [name for name, file in zip(names, found[key], strict=True) if name is not None and file is None]
-        if lacking and verbose:
+        if lacking and need_photos:
             warn(f"{path}: {len(lacking)} files of {key} are missing, and not used: {listed(lacking)}.")
     return [MapFiles(depth, normal=normal) for depth, normal in zip(*found.values(), strict=True)]
 

@@ -20,13 +20,13 @@ RADIAL = ColmapCamera("SIMPLE_RADIAL", *SIZE, (80.0, 48.0, 36.0, 0.1))
 MODELS = [name for name in pycolmap.CameraModelId.__members__ if name not in ("INVALID", "EQUIRECTANGULAR")]
 
 
-def camera_of(model: str, f: float, first: float = 0.02) -> ColmapCamera:
+def camera_of(model: str, f: float, size: tuple[int, int] = SIZE, first: float = 0.02) -> ColmapCamera:
     """A camera with a slight distortion, where the model has any."""
-    camera = pycolmap.Camera.create_from_model_name(1, model, f, *SIZE)
+    camera = pycolmap.Camera.create_from_model_name(1, model, f, *size)
     params, extra = np.array(camera.params), camera.extra_params_idxs()
     if extra:
         params[extra[0]] = {"FOV": 0.5, "EUCM": 0.5}.get(model, first)
-    return ColmapCamera(model, *SIZE, tuple(params.tolist()))
+    return ColmapCamera(model, *size, tuple(params.tolist()))
 
 
 def picture(one: Lens) -> np.ndarray:

@@ -1,7 +1,6 @@
 """Checks of a capture before any time is spent on it, and errors of nerfstudio's loaders in plain words."""
 
 import math
-import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import MISSING, fields
@@ -131,18 +130,7 @@ def reporting_input_errors(config: Any) -> Iterator[None]:
             f"the capture {_folder_of(config)} has a photograph of more than {MAX_PIXELS:,} pixels: make it smaller",
             error,
         )
-    except (
-        AssertionError,
-        OSError,
-        EOFError,
-        LookupError,
-        ValueError,
-        TypeError,
-        AttributeError,
-        ArithmeticError,
-        RuntimeError,
-        struct.error,
-    ) as error:
+    except Exception as error:
         detail = " ".join(str(error).split()).rstrip(".") or type(error).__name__
         if isinstance(error, KeyError):
             detail = f"the entry {detail} is missing"

@@ -2,7 +2,6 @@
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -36,20 +35,10 @@ PAD = 2
 """Columns of the other edge that continue a picture of all directions."""
 
 
-class Window(NamedTuple):
-    """Part of a face, left to right and top to bottom in focal lengths, within -1 to 1."""
-
-    left: float
-    right: float
-    top: float
-    bottom: float
-    whole: bool
-    """The photograph covers all of it."""
-
-
 @lru_cache(maxsize=64)
-def windows(camera: ColmapCamera) -> dict[str, Window]:
-    """Find the part of each face of the cube that a camera covers; see `covered`."""
+def windows(camera: ColmapCamera) -> dict[str, tuple[float, float, float, float, bool]]:
+    """Find the part of each face of the cube that a camera covers, see `covered`: left, right, top and bottom in focal
+    lengths, within -1 to 1, and whether the photograph covers all of it."""
     found = {}
     t = np.linspace(-1.0, 1.0, NODES)
     rays = np.stack(np.broadcast_arrays(t[None, :], t[:, None], 1.0), -1)
@@ -59,7 +48,7 @@ def windows(camera: ColmapCamera) -> dict[str, Window]:
             continue
         (top, bottom), (left, right) = (np.flatnonzero(seen.any(axis))[[0, -1]] for axis in (1, 0))
         whole = bool(seen[top : bottom + 1, left : right + 1].all())
-        found[face] = Window(t[left], t[right], t[top], t[bottom], whole)
+        found[face] = (t[left], t[right], t[top], t[bottom], whole)
     return found
 
 

@@ -102,10 +102,14 @@ def check_sizes(paths: Sequence[Path]) -> None:
     with ThreadPoolExecutor(THREADS) as pool:
         large = [path for path, refused in zip(paths, pool.map(too_large, paths), strict=True) if refused]
     if large:
-        fail(
-            f"{listed(large)} has more than {MAX_PIXELS:,} pixels. Make it smaller, and w, h, fl_x, fl_y, cx and cy "
-            "of its camera with it."
-        )
+        fail(_too_large(large))
+
+
+def _too_large(paths: Sequence[Path]) -> str:
+    return (
+        f"{listed(paths)} has more than {MAX_PIXELS:,} pixels. Make it smaller, and w, h, fl_x, fl_y, cx and cy of its "
+        "camera with it."
+    )
 
 
 def check_orientation(paths: Sequence[Path]) -> None:
@@ -143,6 +147,8 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
             return picture.convert("RGBA" if has_transparency(file) else "RGB")
     except FileNotFoundError as error:
         fail(f"the image {path} is missing, but the capture has a pose for it", error)
+    except Image.DecompressionBombError as error:
+        fail(_too_large([path]), error)
     except UNREADABLE as error:
         fail(f"the image {path} cannot be read: {error}. Replace it or remove it from the capture.", error)
 

@@ -200,8 +200,7 @@ def _faces(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tuple[l
     around = colmap.width / (2.0 * math.pi)
     fx, fy = (around, around) if camera.is_spherical() else (camera.focal_length_x, camera.focal_length_y)
     lenses = []
-    for face, window in windows(colmap).items():
-        left, right, top, bottom, whole = window
+    for face, (left, right, top, bottom, whole) in windows(colmap).items():
         w, h = max(1, round((right - left) * fx)), max(1, round((bottom - top) * fy))
         u, v = w / (right - left), h / (bottom - top)
         lenses.append(Lens(colmap, stored, Pinhole(u, v, -left * u, -top * v, w, h), face, whole))

@@ -1,5 +1,6 @@
 """Structure from motion: camera poses of photographs or of the frames of a video."""
 
+import json
 import os
 import shutil
 import statistics
@@ -7,11 +8,11 @@ import time
 import warnings
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import pycolmap
-from pydantic import BaseModel
+from pydantic import TypeAdapter
 
 from bitymi_ns.capture.cache import content_key, replace_stale, work_folder
 from bitymi_ns.capture.camera import ColmapCamera
@@ -28,6 +29,7 @@ from bitymi_ns.capture.types import CaptureError, Poses, SfmOptions
 from bitymi_ns.capture.video import extract_frames
 from bitymi_ns.files import Tell, complete_folder, explained, write_file
 from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.trust import json_of
 
 GUESSED_FOCAL = 1.2  # initial focal length where it is unknown, in units of the longer side; COLMAP's own
 TELLING = 0.25  # share of 360-degree pictures among photographs of one size from which on all of them count as such
@@ -101,31 +103,20 @@ def _few(count: int) -> str:
     )
 
 
-class _Kept(BaseModel, extra="forbid"):
-    """Content of poses.json, which marks a result as complete."""
-
-    made: bool  # the photographs of the model are copies or frames in the work folder
-    left_out: dict[str, str]
-    registered: int
-    given: int
-    reprojection_error: float
-    track_length: float
-    seconds: dict[str, float]
-    contradicted: float = 0.0  # results of earlier versions have none
-
-
 def _finished(work: Path, folder: Path) -> Poses | None:
-    """Read the poses of an earlier run; None where there are none, or they are damaged."""
+    """Read the poses of an earlier run by poses.json, which marks a result as complete; None where there are none, or
+    they are damaged."""
     result = work / "result"
     try:
-        kept = _Kept.model_validate_json((result / "poses.json").read_bytes())
-    except (OSError, ValueError):
+        kept = json_of((result / "poses.json").read_bytes())
+        made = kept.pop("made")  # the photographs of the model are copies or frames in the work folder
+        images = work / IMAGES if made else Path(os.path.abspath(folder))
+        values = {**kept, "model": result / SPARSE, "images": images, "report": result}
+        poses = TypeAdapter(Poses).validate_python(values)
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
         return None
-    images = work / IMAGES if kept.made else Path(os.path.abspath(folder))
-    whole = images.is_dir() and all(path.exists() for path in images.rglob("*")) if kept.made else True
-    if not whole or not is_model(result / SPARSE):
-        return None
-    return Poses(model=result / SPARSE, images=images, report=result, **kept.model_dump(exclude={"made"}))
+    whole = images.is_dir() and all(path.exists() for path in images.rglob("*")) if made else True
+    return poses if whole and is_model(result / SPARSE) else None
 
 
 def _find(
@@ -292,15 +283,14 @@ def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence
         }
         for c in model.cameras.values()
     ]
-    keys = ("left_out", "registered", "given", "reprojection_error", "track_length", "seconds", "contradicted")
+    kept = {each.name: values[each.name] for each in fields(Poses) if each.name in values}
     with complete_folder(work / "result") as result:
         sparse = result / SPARSE
         sparse.mkdir(parents=True)
         model.write_binary(sparse)
         write_frame(result, frame)
         write_report(result, values, model)
-        kept = _Kept(made=images == work / IMAGES, **{key: values[key] for key in keys})
-        write_file(result / "poses.json", kept.model_dump_json().encode())
+        write_file(result / "poses.json", json.dumps({"made": images == work / IMAGES, **kept}).encode())
     for name in ("links", "masks", MODEL):
         shutil.rmtree(work / name, ignore_errors=True)
     process.forget(work)

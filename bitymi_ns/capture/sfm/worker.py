@@ -55,7 +55,7 @@ def find(job: Job, stages: Stages) -> tuple[pycolmap.Reconstruction, dict[str, o
     registered = model.num_reg_images() if model is not None else 0
     chosen = pairs.FEW < len(job.order) <= pairs.WORTH_ALL and job.matching == "auto"
     if chosen and registered < mapping.ENOUGH * len(job.order):
-        pairs.match_rest(job, database, stages)
+        pairs.match(job, database, stages, every=True)
         graph, again = _mapped(job, database, stages)
         model = mapping.better(job, database, model, again)
     if model is None or model.num_reg_images() < LEAST:

@@ -277,12 +277,12 @@ class BitymiDataParser(DataParser):
         source = config.source(found, need_photos)
         self.poses_report = source.report or self.poses_report
         self.sfm_source = None if source.origin is None else source
-        model = read_model(source.folder)
+        model = source.model
         if need_photos and found.format == "colmap":
-            check_photographs_exist(found.path, source.files(model))
-        self._report(found, source.describe(model))
+            check_photographs_exist(found.path, source.files())
+        self._report(found, source.describe())
         if need_photos:
-            warn_of_left_out(source, model)
+            warn_of_left_out(source)
         photographs, where = model_photographs(source, need_photos), str(source.folder)
         own = model_points(model, TO_NERFSTUDIO)
         if need_photos and points_wanted() and config.points == "auto":

@@ -15,7 +15,7 @@ from bitymi_ns.capture.photos import photo_folder
 from bitymi_ns.capture.recognise import Found, passed_over
 from bitymi_ns.capture.types import SfmSettings
 from bitymi_ns.plugin.console import fail, listed, say, warn
-from bitymi_ns.plugin.data.colmap_model import Model, read_model
+from bitymi_ns.plugin.data.colmap_model import Model
 from bitymi_ns.plugin.data.colmap_views import Origin, Source, find_masks, make_source
 from bitymi_ns.plugin.data.images import THREADS, image_size
 from bitymi_ns.trust import Refused, json_of, leads_inside
@@ -95,7 +95,7 @@ def kept_source(found: Found, kept: KeptPoses, masks_path: Path | None, downscal
     source = make_source(kept.model, kept.images(found.folder), masks, downscale, kept.left_out)
     if need_photos:
         _check_photographs(source, kept.folder)
-    count = len(read_model(source.folder).images)
+    count = len(source.model.images)
     say(f"Poses of {count} photographs of {found.path} as the run was trained with them, of {kept.folder}.")
     return replace(source, report=kept.folder, origin=kept.origin)
 
@@ -165,7 +165,7 @@ def write_kept_poses(folder: Path, source: Source, origin: Origin) -> None:
     """
     shutil.copytree(source.folder, folder / MODEL)
     if origin.photographs is None:
-        for image in read_model(source.folder).images:
+        for image in source.model.images:
             if not leads_inside(image.name):
                 raise Refused(f"{source.folder} names {image.name!r}, which leads out of its folder", folder)
             _link(source.photographs / image.name, folder / IMAGES / image.name)
@@ -186,10 +186,9 @@ def _link(file: Path, target: Path) -> None:
 
 def _check_photographs(source: Source, kept: Path) -> None:
     """Fail where photographs of kept poses are missing, or have another size than their cameras."""
-    model = read_model(source.folder)
-    files = source.files(model)
+    files = source.files()
     missing = [file.readlink() if file.is_symlink() else file for file in files if not file.is_file()]
-    changed = [] if source.copies is not None else _other_sizes(model, files)
+    changed = [] if source.copies is not None else _other_sizes(source.model, files)
     what = [f"{len(missing)} are missing ({listed(missing)})"] if missing else []
     what += [f"{len(changed)} have another size ({listed(changed)})"] if changed else []
     if what:

@@ -6,7 +6,13 @@ from typing import NamedTuple
 
 import pycolmap
 
-from bitymi_ns.capture.panorama_detection import SPHERICAL_MODEL
+SPHERICAL_MODEL = "EQUIRECTANGULAR"  # COLMAP camera model of 360-degree pictures; its parameters are width and height
+ASPECT = 0.01  # relative difference from aspect ratio 2 that counts as rounding
+
+
+def is_full_sphere(width: float, height: float) -> bool:
+    """Test the shape of a picture of all directions, but for rounding."""
+    return abs(width / (2.0 * height) - 1.0) <= ASPECT + 1.0 / height
 
 
 class ColmapCamera(NamedTuple):

@@ -15,10 +15,9 @@ import pycolmap
 from pydantic import TypeAdapter
 
 from bitymi_ns.capture.cache import content_key, replace_stale, work_folder
-from bitymi_ns.capture.camera import ColmapCamera
+from bitymi_ns.capture.camera import SPHERICAL_MODEL, ColmapCamera, is_full_sphere
 from bitymi_ns.capture.frame import local_positions, move_to_world, write_frame
 from bitymi_ns.capture.masks import mask_folder
-from bitymi_ns.capture.panorama_detection import SPHERICAL_MODEL, is_full_sphere
 from bitymi_ns.capture.photos import Photo, blurred, check_names, duplicates, find_photos, photo_folder, read_photos
 from bitymi_ns.capture.prepare import IMAGES, colmap_masks, emptied, upright_photos
 from bitymi_ns.capture.recognise import VIDEOS, is_model

@@ -7,7 +7,7 @@ import pycolmap
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from bitymi_ns.capture.sfm.refine import MAX_ERROR
+from bitymi_ns.capture.sfm.job import MAX_ERROR
 
 LINK = 15
 """Points that two photographs see together, from which on they link each other; COLMAP's least number of inliers of a

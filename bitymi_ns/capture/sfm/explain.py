@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 from scipy.cluster.hierarchy import DisjointSet
 
-from bitymi_ns.capture.panorama_detection import SPHERICAL_MODEL
+from bitymi_ns.capture.camera import SPHERICAL_MODEL
 from bitymi_ns.capture.sfm.job import CameraGroup, Job, NoPoses
 
 FEW_FEATURES = 60  # a photograph with fewer features shows hardly any detail

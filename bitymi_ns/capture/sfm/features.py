@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pycolmap
 
-from bitymi_ns.capture.panorama_detection import SPHERICAL_MODEL
+from bitymi_ns.capture.camera import SPHERICAL_MODEL
 from bitymi_ns.capture.sfm.job import CameraGroup, Job, StageProgress
 
 SMALL = 1000

@@ -16,6 +16,8 @@ DATABASE = "database.db"
 PAIRS = "pairs.txt"
 MODEL = "model"  # names in the work folder: COLMAP's database, the pairs to match, and the resulting model
 
+MAX_ERROR = 4.0
+"""Observations farther off, in pixels of the images on which features were found, are dropped; COLMAP's own limit."""
 SERIAL = 100
 """Number of photographs up to which one thread maps, so that runs are equal. For 50, two threads are no faster."""
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from bitymi_ns.capture.sfm import consistency, explain, features, mapping, pairs, triangulation
+from bitymi_ns.capture.sfm import consistency, explain, features, mapping, pairs
 from bitymi_ns.capture.sfm.job import DATABASE, MODEL, Job, NoPoses
 from bitymi_ns.files import complete_folder
 
@@ -95,7 +95,7 @@ def main() -> None:
     np.seterr(all="ignore")
     stages = Stages()
     try:
-        model, result = (triangulation.triangulate(job, stages), {}) if job.poses else find(job, stages)
+        model, result = (mapping.triangulate(job, stages), {}) if job.poses else find(job, stages)
         for image in model.images.values():
             image.name = job.names[image.name]
         with complete_folder(Path(job.work) / MODEL) as folder:

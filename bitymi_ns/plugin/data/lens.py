@@ -16,9 +16,8 @@ import pycolmap
 from nerfstudio.cameras.cameras import CameraType
 from PIL import Image
 
-from bitymi_ns.capture.camera import ColmapCamera
+from bitymi_ns.capture.camera import SPHERICAL_MODEL, ColmapCamera, is_full_sphere
 from bitymi_ns.capture.masks import in_proportion
-from bitymi_ns.capture.panorama_detection import SPHERICAL_MODEL, is_full_sphere
 from bitymi_ns.plugin.console import fail, warn
 from bitymi_ns.plugin.data.cube_faces import FACES, covered, resample, windows
 from bitymi_ns.plugin.data.images import wrong_size

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 
-from bitymi_ns.capture.camera import ColmapCamera
-from bitymi_ns.capture.panorama_detection import SPHERICAL_MODEL
+from bitymi_ns.capture.camera import SPHERICAL_MODEL, ColmapCamera
 from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data.depth_files import MAP_FILES, MapFiles
 from bitymi_ns.plugin.data.images import image_size

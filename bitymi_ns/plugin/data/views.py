@@ -16,8 +16,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 
-from bitymi_ns.capture.camera import ColmapCamera
-from bitymi_ns.capture.panorama_detection import SPHERICAL_MODEL
+from bitymi_ns.capture.camera import SPHERICAL_MODEL, ColmapCamera
 from bitymi_ns.plugin.console import fail, listed, say
 from bitymi_ns.plugin.data.depth_files import MAPS, MapFiles
 from bitymi_ns.plugin.data.images import THREADS, image_size

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -41,7 +41,16 @@ class Shading(NamedTuple):
     read: Tensor | None = None
 
 
-class ResidualField(Protocol):
+def _version(buffer: Tensor) -> int:
+    return -1 if buffer.is_inference() else buffer._version
+
+
+def _is_of(cached: tuple[Tensor, int, Any] | None, buffer: Tensor) -> bool:
+    """True where something was computed from a buffer that has neither been replaced nor written to since."""
+    return cached is not None and cached[0] is buffer and cached[1] == _version(buffer)
+
+
+class ResidualField(nn.Module):
     """Residual colours of fragments, beside the surfels' view colours."""
 
     def image(self, fragments: Fragments, projection: Projection, base: Tensor, how: Shading) -> Tensor:
@@ -52,17 +61,20 @@ class ResidualField(Protocol):
             base: [N, 3] f_view of every surfel.
             how: it is made.
         """
+        raise NotImplementedError
 
     def opacity(self, bound: float, learns: bool) -> TexelAlpha | None:
         """Opacities of texels, with gradients or without; None = all of a surfel is as opaque as it is. See
         `ops.TexelAlpha` for the bound."""
+        return None
 
     def snapshot(self) -> Tensor | None:
         """State that parts of a view read in place of the field itself, because the backward passes of other parts
         change it before they have been drawn again; None: nothing changes."""
+        return None
 
 
-class HashField(nn.Module):
+class HashField(ResidualField):
     """Multiresolution hash grid and MLP: view-independent residual colour rho(x), eq. (color).
 
     The residual starts at zero: the last layer does. Table entries start at U(-1e-4, 1e-4).
@@ -86,10 +98,6 @@ class HashField(nn.Module):
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
-        if not half > 0:
-            raise ValueError(f"the field's domain needs a positive size, not {half}")
-        if not 1 <= config.levels <= 4:
-            raise ValueError(f"levels must be 1 to 4, not {config.levels}")
         self.levels, self.min_resolution = config.levels, config.min_resolution
 
         def uniform(bound: float, *shape: int) -> nn.Parameter:
@@ -103,8 +111,7 @@ class HashField(nn.Module):
         self.field_w3 = nn.Parameter(torch.zeros(WIDTH, 3))
         # in the checkpoint: a loaded field lies where the trained one did
         self.register_buffer("domain", torch.tensor([*mid, half, float(contract)], dtype=torch.float64))
-        self._geometry = FieldGeometry(self.min_resolution, contract, tuple(mid), half)
-        self._read_from = self._state_of_domain()
+        self._geometry: tuple[Tensor, int, FieldGeometry] | None = None
 
     @torch.no_grad()
     def only(self, first: int, count: int) -> HashField:
@@ -130,16 +137,11 @@ class HashField(nn.Module):
     @property
     def geometry(self) -> FieldGeometry:
         """Geometry of the grid. Read back once: a step must not wait for the device to tell."""
-        now = self._state_of_domain()
-        if self._read_from[0] is not now[0] or self._read_from[1] != now[1]:
+        if not _is_of(self._geometry, self.domain):
             *mid, half, contract = self.domain.tolist()
-            self._geometry = FieldGeometry(self.min_resolution, bool(contract), tuple(mid), half)
-            self._read_from = now
-        return self._geometry
-
-    def _state_of_domain(self) -> tuple[Tensor, int]:
-        """Changes when the buffer is replaced or written to."""
-        return self.domain, -1 if self.domain.is_inference() else self.domain._version
+            geometry = FieldGeometry(self.min_resolution, bool(contract), tuple(mid), half)
+            self._geometry = (self.domain, _version(self.domain), geometry)
+        return self._geometry[2]
 
     @property
     def weights(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -147,16 +149,9 @@ class HashField(nn.Module):
         return self.field_table, self.field_w1, self.field_w2, self.field_w3
 
     def image(self, fragments: Fragments, projection: Projection, base: Tensor, how: Shading) -> Tensor:
-        """See `ResidualField`."""
         weights = self.weights if how.learns else tuple(w.detach() for w in self.weights)
         rho = fragment_residual(fragments, projection.frames, self.geometry, weights, how.bound, how.moves_surfels)
         return blended_image(fragments, projection, base, maps=how.maps, residual=rho)
-
-    def opacity(self, bound: float, learns: bool) -> None:
-        """See `ResidualField`: a field in space adds colours alone."""
-
-    def snapshot(self) -> None:
-        """See `ResidualField`: the optimizer changes the weights, after all backward passes."""
 
     def forward(self, x: Tensor) -> Tensor:
         """Residual colour [M, 3] at world positions [M, 3]."""
@@ -181,7 +176,7 @@ class HashField(nn.Module):
         return (4 * g.half / finest) * torch.stack([r * r, r / (2 - 1 / r)], dim=-1)
 
 
-class TexelField(nn.Module):
+class TexelField(ResidualField):
     """Residual colours of N surfels in texels, as a bundle has them: each surfel carries its own, wherever it moves.
 
     Args:
@@ -224,9 +219,8 @@ class TexelField(nn.Module):
     @property
     def tiles(self) -> TexelTiles:
         """Tiles of the surfels: sizes and offsets of their texels."""
-        now = self.size, -1 if self.size.is_inference() else self.size._version
-        if self._tiles is None or self._tiles[0] is not now[0] or self._tiles[1] != now[1]:
-            self._tiles = (*now, TexelTiles.of_sizes(self.size, self.extent))
+        if not _is_of(self._tiles, self.size):
+            self._tiles = (self.size, _version(self.size), TexelTiles.of_sizes(self.size, self.extent))
         return self._tiles[2]
 
     @torch.no_grad()
@@ -238,7 +232,6 @@ class TexelField(nn.Module):
         self.share, self.size, self.extent = self.share[old], self.size[rows], self.extent[rows]
 
     def image(self, fragments: Fragments, projection: Projection, base: Tensor, how: Shading) -> Tensor:
-        """See `ResidualField`."""
         descent = self.descent if how.learns else None
         texels = self.texels if how.learns and descent is None else self.texels.detach()
         if descent is not None and how.read is not None:
@@ -247,11 +240,9 @@ class TexelField(nn.Module):
         return blended_image(fragments, projection, base, *given)
 
     def opacity(self, bound: float, learns: bool) -> TexelAlpha | None:
-        """See `ResidualField`."""
         if self.alpha is None:
             return None
         return TexelAlpha(self.tiles, self.alpha if learns else self.alpha.detach(), bound)
 
     def snapshot(self) -> Tensor | None:
-        """See `ResidualField`."""
         return None if self.descent is None else self.texels.detach().clone()

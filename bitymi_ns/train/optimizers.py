@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping, MutableMapping
 from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor
+from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
 
 from bitymi_ns.scene.field import HashField
@@ -13,18 +15,11 @@ from bitymi_ns.train.config import AdamConfig
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
-from collections.abc import Callable, Mapping, MutableMapping
-
-from torch import Tensor
-from torch.nn import Parameter
 
 
 def adam(parameters: list[torch.nn.Parameter], betas: tuple[float, float] = AdamConfig.betas) -> Adam:
-    """Adam with the method's epsilon, fused where torch can do that on the parameters' device."""
-    try:
-        return Adam(parameters, lr=0.0, betas=betas, eps=AdamConfig.eps, fused=True)
-    except RuntimeError:
-        return Adam(parameters, lr=0.0, betas=betas, eps=AdamConfig.eps)
+    """Fused Adam with the method's epsilon."""
+    return Adam(parameters, lr=0.0, betas=betas, eps=AdamConfig.eps, fused=True)
 
 
 def surfel_optimizers(scene: Scene) -> dict[str, Adam]:

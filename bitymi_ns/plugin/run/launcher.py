@@ -63,7 +63,7 @@ class Workers:
             assert process.stdin is not None
             with suppress(BrokenPipeError), process.stdin:  # one that has ended already is noticed below
                 process.stdin.write(pickle.dumps(inputs))
-        keys = [_here(rank) for rank in range(1, count)]
+        keys = [f"here {rank}" for rank in range(1, count)]
         while not self._store.check(keys):
             if any(process.poll() is not None for process in self._processes):
                 self.explain()
@@ -85,9 +85,9 @@ class Workers:
         until, count = time.monotonic() + PATIENCE, len(self._processes) + 1
         while True:
             for rank, process in enumerate(self._processes, 1):
-                told = self._store.check([_why(rank)])
+                told = self._store.check([f"why {rank}"])
                 if told or process.poll() not in (None, LOST):
-                    why = self._store.get(_why(rank)).decode() if told else f"exit status {process.returncode}"
+                    why = self._store.get(f"why {rank}").decode() if told else f"exit status {process.returncode}"
                     fail(f"process {rank + 1} of the {count} of this run has ended: {why}")
             if time.monotonic() > until:
                 minutes = round(TIMEOUT.total_seconds() / 60)
@@ -114,14 +114,6 @@ class Workers:
             dist.destroy_process_group()
 
 
-def _here(rank: int) -> str:
-    return f"here {rank}"
-
-
-def _why(rank: int) -> str:
-    return f"why {rank}"
-
-
 def _join(store: dist.Store, rank: int, count: int, cards: bool) -> None:
     """Enter torch.distributed's default group: gloo for what decides, and nccl for what lies on cards."""
     backend = "gloo"
@@ -143,7 +135,7 @@ def work() -> None:
     CONSOLE.quiet = True
     store = dist.TCPStore(HOST, port, count, is_master=False, timeout=TIMEOUT)
     try:
-        store.set(_here(rank), "1")
+        store.set(f"here {rank}", "1")
         _join(store, rank, count, config.machine.device_type == "cuda")
         train_loop(rank, count, config)  # with the seed of the first process
         dist.destroy_process_group()
@@ -154,5 +146,5 @@ def work() -> None:
     except BaseException as error:
         message = str(error) if isinstance(error, SystemExit) else traceback.format_exc()
         with suppress(RuntimeError):  # the first process has ended
-            store.set(_why(rank), message)
+            store.set(f"why {rank}", message)
         sys.exit(1)

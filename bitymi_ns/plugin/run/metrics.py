@@ -7,14 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bitymi_ns.plugin.console import warn
+from bitymi_ns.plugin.console import warn, warn_once
 from bitymi_ns.plugin.run import lpips
 from bitymi_ns.train.losses import cc_psnr, psnr
 
 LPIPS = {"lpips": "alex", "lpips_vgg": "vgg"}
 """Names of LPIPS in the results, by the backbone: the conventions of nerfstudio and gsplat, and of 3DGS."""
 _lpips_missing: list[str] = []
-_flip_missing: list[bool] = []
 
 
 def image_metrics(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> dict[str, float]:
@@ -48,13 +47,10 @@ def ssim(image: Tensor, reference: Tensor) -> float:
 
 def flip(image: Tensor, reference: Tensor) -> float | None:
     """NVIDIA's FLIP (LDR), mean over the image; None when its package is not installed."""
-    if _flip_missing:
-        return None
     try:
         from flip_evaluator import nbflip
     except ImportError:
-        _flip_missing.append(True)
-        warn("FLIP is left out: its package is not installed (pip install flip-evaluator).")
+        warn_once("FLIP is left out: its package is not installed (pip install flip-evaluator).")
         return None
     # LDR, sRGB input, no colour map, with mean error, default viewing conditions
     pair = (reference.cpu().contiguous().numpy(), image.cpu().contiguous().numpy())

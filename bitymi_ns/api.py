@@ -9,9 +9,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake import BakeOptions, Learning, bake_and_learn
+from bitymi_ns.bake import BakeOptions, Learning, bake_and_learn, export
 from bitymi_ns.bake.compact import Compact
-from bitymi_ns.bundle import Bundle, export, read_bundle
+from bitymi_ns.bundle import Bundle, read_bundle
 from bitymi_ns.bundle.parts import CAMERAS
 from bitymi_ns.ops import blended_image, project, trace
 from bitymi_ns.ops.constants import COLOR_BIAS

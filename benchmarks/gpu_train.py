@@ -16,12 +16,12 @@ from common import arguments_of, number, page, publish, say, table
 from harness import quality
 from plain_capture import load_capture
 
-from bitymi_ns import bundle
-from bitymi_ns.bake import BakeOptions, Learning, bake_and_learn
+from bitymi_ns.bake import BakeOptions, Learning, bake_and_learn, export
+from bitymi_ns.bundle import read_bundle
 from bitymi_ns.plugin.run.preset import load_preset
 from bitymi_ns.train.config import REFERENCE_STEPS
-from bitymi_ns.train.domain import scene_for_views
 from bitymi_ns.train.fit import fit
+from bitymi_ns.train.init import scene_for_views
 from bitymi_ns.train.views import eval_background
 
 CURVE = ("steps", "training s", "surfels", "PSNR dB", "after affine fit")
@@ -61,8 +61,8 @@ def main() -> int:
     seconds = time.perf_counter() - start
     with tempfile.TemporaryDirectory() as folder:
         target = (arguments.keep or Path(folder)) / f"{arguments.preset}-{steps}"
-        bundle.export(made, target)
-        baked = bundle.read_bundle(target).scene.to(device)
+        export(made, target)
+        baked = read_bundle(target).scene.to(device)
     background = eval_background(config, device)
     psnr, *_ = quality(lambda camera: baked.render(camera, background).rgb, capture.held_out, device, background)
     size = 0 if made.atlas is None else made.atlas.nbytes

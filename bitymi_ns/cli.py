@@ -15,7 +15,6 @@ from bitymi_ns import KernelsUnavailable
 from bitymi_ns.capture.types import SfmOptions
 from bitymi_ns.files import explained
 from bitymi_ns.measure.bench.cli import BenchRun
-from bitymi_ns.measure.bench.process import BenchError
 from bitymi_ns.trust import printable
 
 
@@ -90,15 +89,11 @@ class Report:
     title: str = "bitymi report"  # Heading of the page.
 
     def run(self) -> None:
-        from bitymi_ns.measure import report
+        from bitymi_ns.measure.report import page
 
         if not self.inputs:
             raise ValueError("nothing to report: name at least one JSON file that ns-eval wrote")
-        try:
-            page = report.build(list(self.inputs), self.output_dir, title=self.title)
-        except report.ReportError as error:
-            raise ValueError(str(error)) from error
-        say(f"Wrote {page}")
+        say(f"Wrote {page.build(self.inputs, self.output_dir, self.title)}")
 
 
 @dataclass
@@ -333,7 +328,7 @@ def main(args: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="backslashreplace")  # a terminal that lacks a letter gets its number
     try:
         return command.run() or 0
-    except (ValueError, OSError, BenchError, KernelsUnavailable) as error:
+    except (ValueError, OSError, KernelsUnavailable) as error:
         say(f"bitymi: {error}", sys.stderr)
         return 1
     except (MemoryError, KeyboardInterrupt) as error:

@@ -39,6 +39,7 @@ __all__ = [
     "load_golden",
     "random_scene",
     "reference",
+    "reference_ssim",
     "relative",
     "tiles_reached",
     "traced",
@@ -58,6 +59,16 @@ class Golden(SceneCase):
     loss: float = 0.0
     grads: dict[str, Tensor] = field(default_factory=dict)  # as params
     tile_grads: list[Tensor] | None = None
+
+
+def reference_ssim(a: Tensor, b: Tensor) -> Tensor:
+    """Mean SSIM of two images [H, W, C] in [0, 1] over the pixels whose window lies inside, by torchmetrics; some of
+    its versions average padded windows, too."""
+    from torchmetrics.functional.image.ssim import _ssim_update  # imported by few tests: it takes seconds
+
+    pair = (image.permute(2, 0, 1)[None] for image in (a, b))
+    _, values = _ssim_update(*pair, data_range=1.0, return_full_image=True)
+    return (values[..., 5:-5, 5:-5] if values.shape[-2:] == a.shape[:2] else values).mean()
 
 
 def load_golden(name: str) -> Golden:

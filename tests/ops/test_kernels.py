@@ -11,7 +11,6 @@ from bitymi_ns.ops import backend
 from bitymi_ns.ops.reference import field as reference_field
 from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color
-from bitymi_ns.ops.reference.ssim import ssim as reference_ssim
 from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig
 from bitymi_ns.scene.baked import BakedScene
 from tests.cuda.baked_scenes import front, textured
@@ -25,6 +24,7 @@ from tests.ops.golden import (
     composite_colors,
     load_golden,
     random_scene,
+    reference_ssim,
     relative,
     values_of,
 )

@@ -132,11 +132,6 @@ def state_export(
     _state("The export", needed, cameras, "export with --finetune-memory 0, which takes longer", device)
 
 
-def available_memory() -> float:
-    """Bytes that this process may have, with what it has already: of the machine, within its control group's limit."""
-    return min(psutil.virtual_memory().available + psutil.Process().memory_info().rss, memory_limit())
-
-
 def _per_fragment(scene: Scene) -> float:
     if scene.surfels["means"].device.type == "cuda":
         return PER_CARD_FRAGMENT
@@ -157,7 +152,9 @@ def _state(what: str, needed: float, cameras: Sequence[Camera], advice: str, dev
     card = device.type == "cuda"
     memory, where = ("memory of the card", "the card") if card else ("memory", "this machine")
     say(f"{what} will take about {needed / 1e9:.1f} GB of {memory} for {photographs}.")
-    available = free_memory(device) if card else available_memory()
+    # with what the process has already, within the limit of its control group
+    of_machine = min(psutil.virtual_memory().available + psutil.Process().memory_info().rss, memory_limit())
+    available = free_memory(device) if card else of_machine
     if needed > available:
         warn(
             f"That is more than the {available / 1e9:.1f} GB that {where} has available. Close other programs, or "

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from bitymi_ns.measure.report import ReportError, build
+from bitymi_ns.measure.report.page import build
+from bitymi_ns.measure.report.records import ReportError
 from tests.measure.report.conftest import POSES, write_poses
 
 PLOTS = 12

@@ -160,73 +160,62 @@ export class Renderer {
     work.end();
   }
 
-  // Draws a view for a screen, at `scale` of the screen's resolution.
-  draw(view: View, to: GPUTexture, scale: number, look: Look, farthest: number): void {
+  // Draws a view for a screen, at `scale` of the screen's resolution; ends when it is drawn.
+  draw(view: View, to: GPUTexture, scale: number, look: Look, farthest: number): Promise<undefined> {
+    const { queue } = this.graphics.device;
     const encoder = this.graphics.device.createCommandEncoder();
     const [width, height] = [to.width, to.height].map((side) => Math.max(1, Math.round(side * scale)));
     const target = this.encode(encoder, view.scaledTo(width, height), look);
     this.encodePresent(encoder, target, to, look, farthest);
-    this.graphics.device.queue.submit([encoder.finish()]);
-  }
-
-  // When what was asked for so far is drawn.
-  done(): Promise<undefined> {
-    return this.graphics.device.queue.onSubmittedWorkDone();
+    queue.submit([encoder.finish()]);
+    return queue.onSubmittedWorkDone();
   }
 
   // Draws the depths of a view.
   async depths(view: View, look: Look): Promise<Depths> {
-    const { device } = this.graphics;
-    const encoder = device.createCommandEncoder();
+    const encoder = this.graphics.device.createCommandEncoder();
     const { width, height, format, sums } = this.encode(encoder, view, { ...look, show: 'depth' });
     const bytes = format === 'rgba32float' ? 16 : 8; // of a pixel
-    const bytesPerRow = Math.ceil((bytes * width) / 256) * 256;
-    const buffer = device.createBuffer({
-      size: bytesPerRow * height,
-      usage: GPUBufferUsage.COPY_DST | GPUBufferUsage.MAP_READ,
-    });
-    encoder.copyTextureToBuffer({ texture: sums }, { buffer, bytesPerRow }, [width, height]);
-    device.queue.submit([encoder.finish()]);
-    await buffer.mapAsync(GPUMapMode.READ);
-    const mapped = new DataView(buffer.getMappedRange());
+    const rows = await this.rowsOf(encoder, sums, bytes);
     const depth = new Float32Array(width * height);
     for (let i = 0; i < depth.length; i++) {
-      const at = Math.floor(i / width) * bytesPerRow + (i % width) * bytes;
+      const row = rows[Math.floor(i / width)];
+      const pixel = new DataView(row.buffer, row.byteOffset + (i % width) * bytes, bytes);
       const channel = (c: number): number =>
-        bytes === 16 ? mapped.getFloat32(at + 4 * c, true) : half(mapped.getUint16(at + 2 * c, true));
+        bytes === 16 ? pixel.getFloat32(4 * c, true) : half(pixel.getUint16(2 * c, true));
       const covered = 1 - channel(3); // draw.wgsl
       depth[i] = covered < 0.5 ? Infinity : channel(0) / covered;
     }
-    buffer.destroy();
     return { width, height, depth };
   }
 
   // Draws a view to RGBA bytes.
   async read(view: View, look: Look, farthest: number): Promise<ImageData> {
     const { device } = this.graphics;
-    const { width, height } = view;
-    const { RENDER_ATTACHMENT, COPY_SRC } = GPUTextureUsage;
-    const to = device.createTexture({
-      size: [width, height],
-      format: 'rgba8unorm',
-      usage: RENDER_ATTACHMENT | COPY_SRC,
-    });
-    const bytesPerRow = Math.ceil((4 * width) / 256) * 256;
-    const { COPY_DST, MAP_READ } = GPUBufferUsage;
-    const buffer = device.createBuffer({ size: bytesPerRow * height, usage: COPY_DST | MAP_READ });
+    const size: [number, number] = [view.width, view.height];
+    const usage = GPUTextureUsage.RENDER_ATTACHMENT | GPUTextureUsage.COPY_SRC;
+    const to = device.createTexture({ size, format: 'rgba8unorm', usage });
     const encoder = device.createCommandEncoder();
     this.encodePresent(encoder, this.encode(encoder, view, look), to, look, farthest);
-    encoder.copyTextureToBuffer({ texture: to }, { buffer, bytesPerRow }, [width, height]);
-    device.queue.submit([encoder.finish()]);
-    await buffer.mapAsync(GPUMapMode.READ);
-    const mapped = new Uint8Array(buffer.getMappedRange());
-    const image = new ImageData(width, height);
-    for (let y = 0; y < height; y++) {
-      image.data.set(mapped.subarray(y * bytesPerRow, y * bytesPerRow + 4 * width), 4 * width * y);
-    }
-    buffer.destroy();
+    const image = new ImageData(...size);
+    (await this.rowsOf(encoder, to, 4)).forEach((row, y) => image.data.set(row, 4 * view.width * y));
     to.destroy();
     return image;
+  }
+
+  // Has the work done, and reads a texture of so many bytes a pixel.
+  private async rowsOf(encoder: GPUCommandEncoder, texture: GPUTexture, bytes: number): Promise<Uint8Array[]> {
+    const { device } = this.graphics;
+    const { width, height } = texture;
+    const bytesPerRow = Math.ceil((bytes * width) / 256) * 256;
+    const usage = GPUBufferUsage.COPY_DST | GPUBufferUsage.MAP_READ;
+    const buffer = device.createBuffer({ size: bytesPerRow * height, usage });
+    encoder.copyTextureToBuffer({ texture }, { buffer, bytesPerRow }, [width, height]);
+    device.queue.submit([encoder.finish()]);
+    await buffer.mapAsync(GPUMapMode.READ);
+    const mapped = buffer.getMappedRange().slice(0);
+    buffer.destroy();
+    return Array.from({ length: height }, (_, y) => new Uint8Array(mapped, y * bytesPerRow, bytes * width));
   }
 }
 

@@ -1,7 +1,8 @@
 // surfels.bin: docs/baking.md says what the numbers of its columns stand for; bake/surfel_codes.py is their writer.
 import { DamagedBundle } from '../../errors';
 import type { CompactSurfels, Manifest, ViewKind } from '../manifest';
-import { KINDS, LEAN_WIDTH, SURFEL_WORDS, type Surfels, WORD, alphaWord, centred, originOf } from '../surfels';
+import { KINDS, LEAN_WIDTH, SURFEL_WORDS, type Surfels, WORD } from '../surfels';
+import { alphaWord, centred, originOf, setTerms, setTile } from '../surfels';
 import { ColumnReader, checkColumns } from './columns';
 import { pack } from './packing';
 
@@ -191,13 +192,9 @@ class Decoder {
     if (packing.width !== atlas.width || packing.height !== atlas.height || packing.layers !== atlas.layers) {
       throw new DamagedBundle('bundle.json: width, height and layers of the atlas are not those of its tiles.');
     }
-    for (let i = 0, to = 0; i < this.count; i++, to += SURFEL_WORDS) {
-      if (!u[i]) continue;
-      this.numbers[to + WORD.tile] = packing.x[i];
-      this.numbers[to + WORD.tile + 1] = packing.y[i];
-      this.numbers[to + WORD.layer] = packing.layer[i];
-      this.numbers[to + WORD.sides] = u[i] | (v[i] << 16);
-    }
+    u.forEach((side, i) => {
+      if (side) setTile(this.words, i, [packing.x[i], packing.y[i], packing.layer[i], side, v[i]]);
+    });
   }
 
   private alphas(): void {
@@ -213,14 +210,12 @@ class Decoder {
     const [[counts], shape, colors] = ['view_count', 'term_shape', 'term_color'].map((name) => this.column(name));
     const good = kind === 'sh' ? [0, 3, 8, 15] : Array.from({ length: MOST_TERMS + 1 }, (_, k) => k);
     const width = LEAN_WIDTH[kind];
-    let first = 0;
-    for (let i = 0, to = 0; i < this.count; i++, to += SURFEL_WORDS) {
-      if (!good.includes(counts[i])) this.refuse('a view colour has a number of terms that none can have');
-      this.numbers[to + WORD.firstTerm] = first * width;
-      this.numbers[to + WORD.terms] = counts[i];
-      first += counts[i];
+    if (!counts.every((count) => good.includes(count))) {
+      this.refuse('a view colour has a number of terms that none can have');
     }
-    if (first !== this.terms) this.refuse(`the view colours do not have the ${this.terms} terms of bundle.json`);
+    if (setTerms(this.words, counts, width) !== this.terms) {
+      this.refuse(`the view colours do not have the ${this.terms} terms of bundle.json`);
+    }
     const { at, limits } = SHAPES[kind];
     const colored = at === 0 ? limits.length : 0;
     const out = new Float32Array(this.terms * width);

@@ -45,57 +45,46 @@ def python(script: str, *words: str) -> list[str]:
 def sanitizer(tool: str, *sections: str) -> list[str]:
     """A command that runs kernels under a tool of compute-sanitizer."""
     command = ["compute-sanitizer", "--tool", tool, "--error-exitcode", "9", "--print-limit", "20"]
-    return [*command, *python("card_smoke.py", "--sections", *sections)]
+    return [*command, *python("gpu_kernels.py", "--sections", *sections)]
 
 
 def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | None = None) -> dict[str, list[Step]]:
-    """Steps of every order, by name. `fox` needs that capture in `data`; `train`, `gaussians` and `peers` take every
-    other one. `peers` and `kernels` draw the bundles that orders before them left, `peers` the Gaussians of
-    `gaussians`, too.
+    """Steps of every order, by name. `frames`, `peers` and `kernels` draw the bundles that `train` left, `peers` the
+    Gaussians of `gaussians`, too.
 
     Args:
         results: folder of the tables.
         data: folder of captures.
         surfels: sizes of the scenes in the tables.
-        steps: of the runs of `train`; None = the preset's.
+        steps: of the runs of `train` and `nerfstudio`; None = the script's default.
     """
     length = [] if steps is None else ["--steps", str(steps)]
     pytest = [sys.executable, "-m", "pytest", "-q", "-rfEs", "--tb=short"]
     bundles = results / "bundles"
-    baked = ("--surfels", "150000", "--runs", "100", "--sections", "baked")
-    ncu = ["ncu", "--profile-from-start", "off", "--set", "detailed", "--clock-control", "none", "--page", "details"]
     large = ("--surfels", "150000", "--size", "1297x840")
-    kept = sorted(file.parent for file in bundles.glob("**/bundle.json"))
+    kept = sorted(str(file.parent) for file in bundles.glob("**/bundle.json"))
+    bundled = ["--bundles", *kept] if kept else []
 
     def page(name: str, script: str, *words: object) -> list[str]:
         """A command that also writes its Markdown to a file of the results."""
-        return python(script, *map(str, words), "--output", str(results / name))
+        return python(script, *map(str, words), "--output", str(results / f"{name}.md"))
 
     def of_each(what: str, limit: float, commands: Callable[[str], list[list[str]]]) -> list[Step]:
-        """A step for every capture but fox."""
-        return [Step(f"{what}{name}", commands(name), limit) for name in captures(data) if name != "fox"]
+        """A step for every capture."""
+        names = sorted(file.parent.name for file in data.glob("*/transforms.json"))
+        return [Step(f"{what}{name}", commands(name), limit) for name in names]
 
     return {
         "check": [
             Step("block textures", [[sys.executable, "-c", BLOCKS]], 60),
             Step("tests", [[*pytest, "--timeout=90", "tests/cuda", "-k", "not emulated"]], 240),
-            Step("kernels", [python("card_smoke.py", *large, "--times", "20")], 90),
-            Step("sanitizers", [sanitizer(tool, *PROFILED) for tool in SANITIZERS], 150),
-        ],
-        "tables": [
-            Step(name, [page(f"{name}.md", "gpu.py", "--runs", "100", "--sections", name, "--surfels", *surfels)], 120)
-            for name in ("baked", "steps")
-        ],
-        "fox": [
-            Step("fox", [page("fox.md", "gpu_train.py", data / "fox", "--steps", "3000", "--keep", bundles)], 200),
-            Step("baked", [page("baked.md", "gpu.py", *baked, "--bundles", bundles / "bitymi-3000")], 90),
-        ],
-        "profile": [
-            Step("profile", [[*ncu, *python("card_smoke.py", *large, "--profile", "--sections", *PROFILED)]], 400)
+            Step("kernels", [python("gpu_kernels.py", *large, "--times", "20")], 90),
+            Step("sanitizers", [sanitizer(tool, *CHECKED) for tool in SANITIZERS], 150),
         ],
         "train": of_each(
-            "", 600, lambda name: [page(f"{name}.md", "gpu_train.py", data / name, "--keep", bundles / name, *length)]
+            "", 600, lambda name: [page(name, "gpu_train.py", data / name, "--keep", bundles / name, *length)]
         ),
+        "frames": [Step("frames", [page("frames", "gpu.py", "--runs", "100", "--surfels", *surfels, *bundled)], 200)],
         "gaussians": of_each(
             "Gaussians of ",
             300,
@@ -108,36 +97,31 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
             "peers on ",
             120,
             lambda name: [
-                page(f"{name}-peers.md", "gpu_peers.py", data / name, "--bundles", *sorted(bundles.glob(f"{name}/*")))
+                page(f"{name}-peers", "gpu_peers.py", data / name, "--bundles", *sorted(bundles.glob(f"{name}/*")))
                 + ["--gaussians", str(results / name)]
             ],
         ),
         "kernels": [
             Step(
                 f"kernels of bundles, {size}",
-                [python("card_smoke.py", "--sections", "--size", size, "--times", "20", "--bundles", *map(str, kept))],
+                [python("gpu_kernels.py", "--sections", "--size", size, "--times", "20", *bundled)],
                 60,
             )
             for size in ("1297x840", "3840x2160")
         ],
-        "nerfstudio": [
-            Step(
-                f"nerfstudio on {name}",
-                [page(f"{name}-nerfstudio.md", "card_nerfstudio.py", data / name, "--folder", results / name, *length)],
-                600,
-            )
-            for name in captures(data)
-        ],
+        "nerfstudio": of_each(
+            "nerfstudio on ",
+            600,
+            lambda name: [
+                page(f"{name}-nerfstudio", "card_nerfstudio.py", data / name, "--folder", results / f"{name}-runs")
+                + length
+            ],
+        ),
         "webgpu": [Step("webgpu tests", [[*pytest, "--timeout=60", "tests/ops/webgpu"]], 60)],
     }
 
 
 GAUSSIANS = (300_000, 1_000_000)  # numbers that are trained to compare with
-
-
-def captures(data: Path) -> list[str]:
-    """Names of the captures in a folder."""
-    return sorted(file.parent.name for file in data.glob("*/transforms.json"))
 
 
 def together(steps: Sequence[Step]) -> Step:
@@ -147,7 +131,7 @@ def together(steps: Sequence[Step]) -> Step:
 
 
 BLOCKS = "from bitymi_ns import _cuda; print(repr(_cuda.device_problem(0)), _cuda.draws_bc7())"
-PROFILED = ("baked", "training", "texels")  # sections of card_smoke.py
+CHECKED = ("baked", "training", "texels")  # sections of gpu_kernels.py
 SANITIZERS = ("memcheck", "racecheck", "initcheck", "synccheck")
 
 
@@ -157,26 +141,22 @@ def stage(arguments: argparse.Namespace) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     for file in folder.glob("*/*"):
         file.rename(folder / file.name)
-    with tempfile.TemporaryDirectory() as temporary:
-        tools = Path(arguments.tools or Path(temporary) / "tools")
-        if not tools.exists():
-            subprocess.run([arguments.python, "-m", "venv", str(tools)], check=True)
-            subprocess.run([tools / "bin/python", "-m", "pip", "install", "-q", *TOOLS], check=True)
-        pip = [str(tools / "bin/python"), "-m", "pip", "--disable-pip-version-check"]
-        wheel = [*pip, "wheel", "-q", "--no-build-isolation", "--no-deps", "-w", str(folder), str(ROOT)]
-        options = [
-            "-Ccmake.define.BITYMI_CUDA=ON",
-            f"-Ccmake.define.BITYMI_CUDA_ARCHITECTURES={arguments.architectures}",
-        ]
-        options.append(f"-Cbuild-dir={arguments.build or Path(temporary) / 'build'}")
-        for old in folder.glob("bitymi_ns-*.whl"):
-            old.unlink()
-        subprocess.run([*wheel, *options], check=True)
-        fetched = [*pip, "download", "-q", "--only-binary", ":all:", "-d", str(folder), "-c", f"{ROOT}/constraints.txt"]
-        for name in NEEDED:
-            if not list(folder.glob(f"{name.replace('-', '_')}-*.whl")):
-                with_needs = [] if name == "pydantic" else ["--no-deps"]
-                subprocess.run([*fetched, *with_needs, name], check=True)
+    kept = ROOT / "build" / f"card-{Path(arguments.python).name}"
+    tools, build = kept / "tools", kept / "build"
+    if not tools.exists():
+        subprocess.run([arguments.python, "-m", "venv", str(tools)], check=True)
+        subprocess.run([tools / "bin/python", "-m", "pip", "install", "-q", *TOOLS], check=True)
+    pip = [str(tools / "bin/python"), "-m", "pip", "--disable-pip-version-check"]
+    for old in folder.glob("bitymi_ns-*.whl"):
+        old.unlink()
+    options = ["-Ccmake.define.BITYMI_CUDA=ON", f"-Ccmake.define.BITYMI_CUDA_ARCHITECTURES={arguments.architectures}"]
+    wheel = [*pip, "wheel", "-q", "--no-build-isolation", "--no-deps", "-w", str(folder), str(ROOT)]
+    subprocess.run([*wheel, *options, f"-Cbuild-dir={build}"], check=True)
+    fetched = [*pip, "download", "-q", "--only-binary", ":all:", "-d", str(folder), "-c", f"{ROOT}/constraints.txt"]
+    for name in NEEDED:
+        if not list(folder.glob(f"{name.replace('-', '_')}-*.whl")):
+            with_needs = [] if name == "pydantic" else ["--no-deps"]
+            subprocess.run([*fetched, *with_needs, name], check=True)
     from bitymi_ns.plugin.run import lpips  # where `run` begins there is no such package yet
 
     lpips.load("alex")
@@ -226,40 +206,33 @@ def unpack(staged: Sequence[Path], work: Path) -> dict[str, str]:
     return {**os.environ, **changed}
 
 
-def run_step(step: Step, tree: Path, environment: dict[str, str], log: Path, deadline: float) -> str:
-    """Run a step; returns its line of the summary."""
+def run_step(step: Step, tree: Path, environment: dict[str, str], logs: Path, deadline: float) -> str:
+    """Run a step, with a log for every command; returns its line of the summary."""
     start = time.perf_counter()
     limit = min(step.limit, deadline - time.monotonic())
     if limit < 5:
         return f"| {step.name} | not begun: no time left | |"
-    running = []
+    running, ends = [], []
     with tempfile.TemporaryDirectory() as folder:
+        environment = {**environment, "TMPDIR": folder}
+        if len(step.commands) > 1:
+            environment["OMP_NUM_THREADS"] = str(max(1, (os.cpu_count() or 1) // len(step.commands)))
+        how = {"cwd": tree, "env": environment, "stderr": subprocess.STDOUT, "start_new_session": True}
         for i, command in enumerate(step.commands):
-            output = open(Path(folder) / str(i), "w+")  # noqa: SIM115
-            environment_of = {**environment, "TMPDIR": folder}
-            if len(step.commands) > 1:
-                environment_of["OMP_NUM_THREADS"] = str(max(1, (os.cpu_count() or 1) // len(step.commands)))
+            with (logs / f"{step.name}-{i}.txt").open("w") as log:
+                log.write(f"{' '.join(command)}\n")
+                log.flush()
+                try:
+                    running.append(subprocess.Popen(command, stdout=log, **how))
+                except OSError as error:
+                    return f"| {step.name} | {error} | |"
+        for process in running:
             try:
-                process = subprocess.Popen(
-                    command, cwd=tree, env=environment_of, stdout=output, stderr=output, start_new_session=True
-                )
-            except OSError as error:
-                return f"| {step.name} | {error} | |"
-            running.append((command, process, output))
-        ends = []
-        for command, process, output in running:
-            try:
-                status = str(process.wait(max(1.0, limit - (time.perf_counter() - start))))
+                ends.append(str(process.wait(max(1.0, limit - (time.perf_counter() - start)))))
             except subprocess.TimeoutExpired:
                 os.killpg(process.pid, 9)
                 process.wait()
-                status = "stopped"
-            output.seek(0)
-            text = output.read()
-            output.close()
-            with log.open("a") as file:
-                file.write(f"\n===== {step.name}: {' '.join(command)}\n{text}\n===== status {status}\n")
-            ends.append(status)
+                ends.append("stopped")
     return f"| {step.name} | {', '.join(ends)} | {time.perf_counter() - start:.0f} |"
 
 
@@ -273,11 +246,7 @@ def main() -> int:
     staging.add_argument("folder", type=Path)
     staging.add_argument("--python", default=sys.executable, help="a Python of the machine's version (%(default)s)")
     staging.add_argument("--architectures", default="90", help="compute capabilities of its card (%(default)s)")
-    staging.add_argument(
-        "--tools", type=Path, help="virtual environment with the build tools, made where it is missing"
-    )
     staging.add_argument("--megabytes", type=float, default=45, help="most of a part (%(default)s)")
-    staging.add_argument("--build", type=Path, help="build folder that is kept")
     running = commands.add_parser("run", help="run orders on the machine")
     names = list(orders(Path(), Path()))
     running.add_argument("orders", nargs="+", metavar="ORDER", help=f"{', '.join(names)}; A+B: at the same time")
@@ -285,7 +254,7 @@ def main() -> int:
     running.add_argument("--data", type=Path, default=Path(), help="folder of the captures")
     running.add_argument("--output", type=Path, required=True)
     running.add_argument("--surfels", nargs="+", default=["50000", "150000", "500000"], help="scenes of the tables")
-    running.add_argument("--steps", type=int, help="of the runs of `train` (default: the preset's)")
+    running.add_argument("--steps", type=int, help="of the runs of `train` and `nerfstudio`")
     running.add_argument("--seconds", type=float, default=570, help="for all of it (%(default)s)")
     arguments = parser.parse_args()
     if arguments.command == "stage":
@@ -296,7 +265,6 @@ def main() -> int:
     deadline = time.monotonic() + arguments.seconds
     results = arguments.output.resolve()
     results.mkdir(parents=True, exist_ok=True)
-    log = results / "log.txt"
     lines = ["| step | exit status | s |", "|---|---|---:|"]
     with tempfile.TemporaryDirectory() as work:
         environment = unpack([folder.resolve() for folder in arguments.stage], Path(work))
@@ -304,7 +272,7 @@ def main() -> int:
             known = orders(results, arguments.data.resolve(), arguments.surfels, arguments.steps)
             steps = [step for name in order.split("+") for step in known[name]]
             for step in steps if "+" not in order else [together(steps)]:
-                lines.append(run_step(step, Path(work) / "tree", environment, log, deadline))
+                lines.append(run_step(step, Path(work) / "tree", environment, results, deadline))
                 print(lines[-1], flush=True)
                 (results / "summary.md").write_text("\n".join(lines) + "\n")
     return 0

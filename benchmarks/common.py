@@ -15,10 +15,9 @@ def arguments_of(script: str | None) -> argparse.ArgumentParser:
     return argparse.ArgumentParser(description=script, formatter_class=formatter, allow_abbrev=False)
 
 
-def publish(text: str, output: Path | None, silent: bool = False) -> None:
-    """Print a page (unless `silent`), and write it to `output` if that is a path."""
-    if not silent:
-        print(text)
+def publish(text: str, output: Path | None) -> None:
+    """Print a page, and write it to `output` if that is a path."""
+    print(text)
     if output is not None:
         output.parent.mkdir(parents=True, exist_ok=True)
         output.write_text(text, "utf8")

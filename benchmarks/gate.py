@@ -8,15 +8,15 @@ a slower one of the same kind, gives the same figures. `--accept` makes them the
 import argparse
 import itertools
 import json
+import multiprocessing
 import os
 import resource
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,19 +28,15 @@ BASELINE = Path(__file__).with_suffix(".json")
 THREADS = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
 
 
-@dataclass(frozen=True)
-class Settings:
-    """The job: steps of training and of the texel tuning, and how many seeds."""
-
-    steps: int = 320
-    tuning: int = 20
-    seeds: int = 4
+SETTINGS = {"steps": 320, "tuning": 20, "seeds": 4}
+"""The job: steps of training and of the texel tuning, and how many seeds."""
 
 
 @dataclass(frozen=True)
 class Limit:
     """Tolerance of a figure against the baseline."""
 
+    title: str
     better: str  # whether "more" or "less" of it is better
     by: float  # the largest step in the wrong direction
     relative: bool = True  # `by` is a share of the baseline and not a difference
@@ -53,31 +49,17 @@ class Limit:
         return loss > slack * (self.by * abs(baseline) if self.relative else self.by)
 
 
-QUALITY = Limit("more", 0.05, relative=False, digits=3)
 LIMITS = {
-    "psnr_trained": QUALITY,
-    "psnr_baked": QUALITY,
-    "bundle_bytes": Limit("less", 0.03),
-    "surfels": Limit("less", 0.03),
-    "fragments_per_pixel": Limit("less", 0.03, digits=2),
-    "peak_mb": Limit("less", 0.10),
-    "train": Limit("less", 0.15, digits=2, timed=True),
-    "bake": Limit("less", 0.15, digits=2, timed=True),
-    "frame": Limit("less", 0.15, digits=4, timed=True),
+    "psnr_trained": Limit("PSNR trained, dB", "more", 0.05, relative=False, digits=3),
+    "psnr_baked": Limit("PSNR baked, dB", "more", 0.05, relative=False, digits=3),
+    "bundle_bytes": Limit("bundle, bytes", "less", 0.03),
+    "surfels": Limit("surfels", "less", 0.03),
+    "fragments_per_pixel": Limit("fragments per pixel", "less", 0.03, digits=2),
+    "peak_mb": Limit("peak memory, MB", "less", 0.10),
+    "train": Limit("training, calibrations", "less", 0.15, digits=2, timed=True),
+    "bake": Limit("bake and tuning, calibrations", "less", 0.15, digits=2, timed=True),
+    "frame": Limit("a baked frame, calibrations", "less", 0.15, digits=4, timed=True),
 }
-UNITS = {
-    "psnr_trained": "PSNR trained, dB",
-    "psnr_baked": "PSNR baked, dB",
-    "bundle_bytes": "bundle, bytes",
-    "surfels": "surfels",
-    "fragments_per_pixel": "fragments per pixel",
-    "peak_mb": "peak memory, MB",
-    "train": "training, calibrations",
-    "bake": "bake and tuning, calibrations",
-    "frame": "a baked frame, calibrations",
-}
-
-
 ELSEWHERE = 2.0  # factor of the limits on another kind of processor than the baseline's
 Scenes = dict[str, dict[str, float]]  # scene -> figure -> value
 
@@ -124,28 +106,28 @@ class Calibration:
         return result, seconds / statistics.median(self.seconds)
 
 
-def run_seed(capture: "Capture", seed: int, settings: Settings, calibration: Calibration) -> dict[str, float]:
+def run_seed(capture: "Capture", seed: int, calibration: Calibration) -> dict[str, float]:
     """The figures of one scene and seed."""
     import torch
 
-    from bitymi_ns.bake import BakeOptions, Learning, TuneOptions, bake_and_learn
-    from bitymi_ns.bundle import export, read_bundle
+    from bitymi_ns.bake import BakeOptions, Learning, TuneOptions, bake_and_learn, export
+    from bitymi_ns.bundle import read_bundle
     from bitymi_ns.scene.config import SceneConfig
     from bitymi_ns.train.config import TrainConfig
-    from bitymi_ns.train.domain import scene_for_views
     from bitymi_ns.train.evaluate import evaluate
     from bitymi_ns.train.fit import fit
+    from bitymi_ns.train.init import scene_for_views
     from bitymi_ns.train.losses import psnr
 
     config, background = TrainConfig(seed=seed), torch.zeros(3)
     cameras = [view.camera for view in capture.train]
     scene = scene_for_views(capture.train, capture.points, capture.colours, SceneConfig(texture="texels"), config)
     aside = calibration.every(10)
-    _, train = calibration.timed(lambda: fit(scene, capture.train, [], config, settings.steps, callback=aside))
+    _, train = calibration.timed(lambda: fit(scene, capture.train, [], config, SETTINGS["steps"], callback=aside))
     trained, fragments, _ = evaluate(scene, capture.views, config)
 
     def make() -> Any:
-        learning = Learning(tune=TuneOptions.of_learned(settings.tuning), train=config)
+        learning = Learning(tune=TuneOptions.of_learned(SETTINGS["tuning"]), train=config)
         aside = calibration.every(10)
         return bake_and_learn(scene, cameras, capture.train, background, BakeOptions(), learning, aside)
 
@@ -172,7 +154,7 @@ def run_seed(capture: "Capture", seed: int, settings: Settings, calibration: Cal
     }
 
 
-def run_job(data: Path, downscale: int, settings: Settings) -> dict[str, float]:
+def run_job(data: Path, downscale: int) -> dict[str, float]:
     """The figures of one scene, in this process: their means over the seeds, but for the peak memory."""
     import torch
     from plain_capture import load_capture
@@ -180,7 +162,7 @@ def run_job(data: Path, downscale: int, settings: Settings) -> dict[str, float]:
     torch.set_num_threads(int(THREADS["OMP_NUM_THREADS"]))
     calibration = Calibration()
     capture = load_capture(data, downscale=downscale)
-    seeds = [run_seed(capture, seed, settings, calibration) for seed in range(settings.seeds)]
+    seeds = [run_seed(capture, seed, calibration) for seed in range(SETTINGS["seeds"])]
     means = {key: statistics.fmean(figures[key] for figures in seeds) for key in seeds[0]}
     means["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     means["psnr_spread"] = statistics.pstdev(figures["psnr_trained"] for figures in seeds)
@@ -188,54 +170,35 @@ def run_job(data: Path, downscale: int, settings: Settings) -> dict[str, float]:
     return means
 
 
-def in_a_process(data: Path, downscale: int, settings: Settings) -> dict[str, float]:
+def in_a_process(data: Path, downscale: int) -> dict[str, float]:
     """`run_job` in a process of its own, whose peak memory is that of the job."""
-    numbers = [str(n) for n in (downscale, *asdict(settings).values())]
-    command = [sys.executable, __file__, "--job", str(data), *numbers]
-    done = subprocess.run(command, env={**os.environ, **THREADS}, stdout=subprocess.PIPE, text=True, check=False)
-    if done.returncode:
-        raise SystemExit(f"gate: {' '.join(command)} ended with exit status {done.returncode}")
-    return json.loads(done.stdout.splitlines()[-1])
+    os.environ |= THREADS  # read when torch loads OpenMP
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
+        return process.submit(run_job, data, downscale).result()
 
 
-@dataclass(frozen=True)
-class Line:
-    """One figure of one scene beside its baseline."""
-
-    scene: str
-    figure: str
-    before: float | None
-    now: float
-    verdict: str  # "ok", "WORSE", "new" (no baseline) or "not judged" (a time on another kind of processor)
-
-    def cells(self) -> list[str]:
-        """For the table."""
-        limit = LIMITS[self.figure]
-        shown = ["" if value is None else f"{value:,.{limit.digits}f}" for value in (self.before, self.now)]
-        allowed = f"{100 * limit.by:g} %" if limit.relative else f"{limit.by:g}"
-        if self.before is None:
-            change = ""
-        elif limit.relative:
-            change = f"{100 * (self.now / self.before - 1):+.1f} %"
-        else:
-            change = f"{self.now - self.before:+.{limit.digits}f}"
-        return [self.scene, UNITS[self.figure], *shown, change, allowed, self.verdict]
+Line = tuple[str, str, list[str]]  # figure, verdict, cells of the table
 
 
 def judge(found: Scenes, baseline: Scenes, same_cpu: bool) -> list[Line]:
-    """Every figure against its baseline."""
+    """Every figure against its baseline. Verdicts: "ok", "WORSE", "new" (no baseline) or "not judged" (a time on
+    another kind of processor)."""
     lines = []
     for scene, figures in found.items():
         for key, limit in LIMITS.items():
-            before = baseline.get(scene, {}).get(key)
+            before, now = baseline.get(scene, {}).get(key), figures[key]
             if before is None:
-                verdict = "new"
-            elif limit.timed and not same_cpu:
-                verdict = "not judged"
+                verdict, change = "new", ""
             else:
                 slack = 1.0 if same_cpu else ELSEWHERE
-                verdict = "WORSE" if limit.worse(figures[key], before, slack) else "ok"
-            lines.append(Line(scene, key, before, figures[key], verdict))
+                verdict = "WORSE" if limit.worse(now, before, slack) else "ok"
+                relative = f"{100 * (now / before - 1):+.1f} %" if limit.relative else ""
+                change = relative or f"{now - before:+.{limit.digits}f}"
+                if limit.timed and not same_cpu:
+                    verdict = "not judged"
+            shown = ["" if value is None else f"{value:,.{limit.digits}f}" for value in (before, now)]
+            allowed = f"{100 * limit.by:g} %" if limit.relative else f"{limit.by:g}"
+            lines.append((key, verdict, [scene, limit.title, *shown, change, allowed, verdict]))
     return lines
 
 
@@ -245,7 +208,7 @@ def quicker(found: Scenes, again: Scenes) -> Scenes:
     return {scene: {**f, **{key: min(f[key], again[scene][key]) for key in timed}} for scene, f in found.items()}
 
 
-def measure(settings: Settings, capture: Path | None) -> Scenes:
+def measure(capture: Path | None) -> Scenes:
     """The figures of the room at 160 x 120, and of a capture at half its size."""
     from common import say
 
@@ -255,10 +218,10 @@ def measure(settings: Settings, capture: Path | None) -> Scenes:
     with tempfile.TemporaryDirectory() as folder:
         say("gate: the room")
         room = generate(Path(folder) / "room", views=24, width=160, height=120, points=3000)
-        found["room"] = in_a_process(room, 1, settings)
+        found["room"] = in_a_process(room, 1)
     if capture is not None:
         say(f"gate: {capture.name}")
-        found[capture.name] = in_a_process(capture.absolute(), 2, settings)
+        found[capture.name] = in_a_process(capture.absolute(), 2)
     return found
 
 
@@ -268,34 +231,26 @@ def main() -> None:
     parser.add_argument("--capture", type=Path, help="an undistorted capture to run at half its size beside the room")
     parser.add_argument("--accept", action="store_true", help="make the figures the new baseline")
     parser.add_argument("--baseline", type=Path, default=BASELINE, help="the file to compare with, or to write")
-    for field in fields(Settings):
-        parser.add_argument(f"--{field.name}", type=int, default=field.default)
-    parser.add_argument("--job", nargs=5, help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.job:
-        data, downscale, *numbers = options.job
-        print(json.dumps(run_job(Path(data), int(downscale), Settings(*map(int, numbers)))))
-        return
     from common import say, table
 
     from bitymi_ns.files import write_file
     from bitymi_ns.measure.machine import processor
 
-    settings = Settings(options.steps, options.tuning, options.seeds)
-    empty = {"settings": asdict(settings), "processor": processor(), "scenes": {}}
+    empty = {"settings": SETTINGS, "processor": processor(), "scenes": {}}
     baseline = json.loads(options.baseline.read_text("utf8")) if options.baseline.is_file() else empty
-    if not options.accept and baseline["settings"] != asdict(settings):
-        raise SystemExit(f"gate: the baseline is of {baseline['settings']}, not of {asdict(settings)}")
-    found = measure(settings, options.capture)
+    if not options.accept and baseline["settings"] != SETTINGS:
+        raise SystemExit(f"gate: the baseline is of {baseline['settings']}, not of {SETTINGS}")
+    found = measure(options.capture)
     same_cpu = baseline["processor"] == processor()
     lines = judge(found, baseline["scenes"], same_cpu)
-    worse = [line for line in lines if line.verdict == "WORSE"]
-    if worse and all(LIMITS[line.figure].timed for line in worse) and not options.accept:
+    worse = [key for key, verdict, _ in lines if verdict == "WORSE"]
+    if worse and all(LIMITS[key].timed for key in worse) and not options.accept:
         say("gate: slower than the baseline; timed once more, as the machine may have been busy")
-        found = quicker(found, measure(settings, options.capture))
+        found = quicker(found, measure(options.capture))
         lines = judge(found, baseline["scenes"], same_cpu)
-        worse = [line for line in lines if line.verdict == "WORSE"]
-    rows = [line.cells() for line in lines]
+        worse = [key for key, verdict, _ in lines if verdict == "WORSE"]
+    rows = [cells for *_, cells in lines]
     print(table(("scene", "figure", "baseline", "now", "change", "may be worse by", ""), rows, (0, 1, 6)))
     if not same_cpu:
         print(

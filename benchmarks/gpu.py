@@ -1,5 +1,10 @@
 #!/usr/bin/env python
-"""Time baked frames and training steps on a card (median after a warm-up) and print tables.
+"""Time frames of baked scenes on a card (medians after a warm-up) and print a table.
+
+The scenes of `harness.textured`, and bundles (--bundles) seen by three cameras around their middle. "list" and "draw"
+are the two stages of a frame, "frame" both launched by the host, "graph" the same as a CUDA graph, "packed" that with 8
+bits per channel instead of floats, "waited for" the time of a program that waits for each frame. "ends at 1/512" is the
+packed graph where a pixel takes no more light at that transmittance instead of 1e-4.
 
 Needs the core packages alone (torch, numpy). `--emulated` runs the host's emulation of the kernels on tiny scenes, to
 try the script without a card; its times mean nothing.
@@ -7,80 +12,80 @@ try the script without a card; its times mean nothing.
 
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import gpu_baked
 import torch
 from common import arguments_of, number, page, publish, say, table
-from harness import (
-    Options,
-    attempt,
-    copy_bandwidth,
-    failures,
-    milliseconds,
-    peak_memory,
-    photo_loss,
-    trained_like,
-    training_step,
-    with_texels,
-)
-from torch import Tensor
+from harness import Options, around, attempt, failures, milliseconds, textured, with_launches
 
+from bitymi_ns.bundle import read_bundle
 from bitymi_ns.ops.backend import emulated_cuda
+from bitymi_ns.ops.baked_cuda import Stage
+from bitymi_ns.scene.baked import FAST, BakedScene
+from bitymi_ns.scene.baked_renderer import BakedRenderer
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.scene.scene import Scene
+
+TIMED = ("list", "draw", "frame", "graph", "packed", "waited for", "early")
+"""Timings of `measured`, in the order of the columns from "list ms" on."""
+HEADER = (
+    "scene", "size", "million pairs", "fragments/pixel", "list ms", "draw ms", "frame ms", "graph ms",
+    "packed, graph ms", "packed, waited for ms", "ends at 1/512, graph ms", "frames/s", "G fragments/s",
+)  # fmt: skip
 
 
-def steps(options: Options) -> str:
-    """Whole training steps: rendering, 0.8 L1 + 0.2 (1 - SSIM), backward, Adam."""
-    parts = []
-    for width, height in options.sizes:
-        photo = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(1)).to(options.device)
-        for n in options.surfels:
-            rows, where = [], f"{n:,} surfels, {width} x {height}"
-            for name, run, pairs in attempt(where, partial(_steps, n, width, height, photo, options)) or ():
-                ms = attempt(f"{where}, {name}", partial(milliseconds, run, options))
-                if ms is None:
-                    continue
-                say(f"{where}, step of {name}: {ms:.3f} ms")
-                memory = peak_memory(run, options.device) / 1e6
-                rows.append([name, number(ms, 3), number(pairs, 0), number(memory, 0)])
-            header = ("step", "ms", "pairs of surfel and tile", "peak MB")
-            parts.append(f"#### {n:,} surfels at {width} x {height}\n\n" + table(header, rows))
-    return "### Training steps\n\n" + "\n\n".join(parts) + failures()
+def measured(scene: BakedScene, cameras: Sequence[Camera], options: Options) -> dict[str, float]:
+    """Means over cameras of one size: pairs of surfel and tile, fragments, and the milliseconds of TIMED."""
+    size, graph = (cameras[0].width, cameras[0].height), options.device.type == "cuda"
+    sums = dict.fromkeys(("pairs", "fragments", *TIMED), 0.0)
+    for camera in cameras:
+        sums["fragments"] += float(scene.render_views([camera], None, ("overdraw",))["overdraw"].sum())
+        frame = BakedRenderer(scene, *size)
+        recorded = BakedRenderer(scene, *size, graph=graph)
+        packed = BakedRenderer(scene, *size, images=("packed",), graph=graph)
+        early = BakedRenderer(replace(scene, transmittance_min=FAST), *size, images=("packed",), graph=graph)
+        for renderer in (frame, recorded, packed, early):
+            renderer.draw([camera])
+        sums["pairs"] += frame.workspace.pairs
+        cases: dict[str, Callable[[], object]] = {
+            "list": partial(frame.run, Stage.LIST), "draw": partial(frame.run, Stage.DRAW), "frame": frame.run,
+            "graph": recorded.run, "packed": packed.run, "early": early.run,
+        }  # fmt: skip
+        for name, run in cases.items():
+            sums[name] += milliseconds(run, options)
+        sums["waited for"] += with_launches(packed.run, options)
+    return {key: value / len(cameras) for key, value in sums.items()}
 
 
-def _steps(
-    n: int, width: int, height: int, photo: Tensor, options: Options
-) -> list[tuple[str, Callable[[], object], int]]:
-    device, loss = options.device, photo_loss(photo)
-    cases: list[tuple[str, Callable[[], object], int]] = []
-    for name, mode in (
-        ("bitymi, field training", "train"),
-        ("bitymi, field frozen", "frozen"),
-        ("bitymi, sv", "off"),
-        ("bitymi, texels training", "train"),
-    ):
-        if "texels" in name:
-            scene, camera = with_texels(n, width, height, device)
-        else:
-            scene, camera = trained_like(n, width, height, device, texture=mode != "off")
-        # texels have no optimiser: the backward pass moves them
-        whole = mode == "train" and "texels" not in name
-        parameters = list(scene.parameters() if whole else scene.surfels.parameters())
-
-        def render(scene: Scene = scene, camera: Camera = camera, mode: str = mode) -> Tensor:
-            return scene.render(camera, field_mode=mode).rgb
-
-        pairs = scene.render(camera, field_mode="off").fragments.layout.handle.pairs
-        cases.append((name, training_step(render, loss, parameters), pairs))
-    return cases
+def synthetic(n: int, width: int, height: int, options: Options) -> list[str]:
+    """Row of a scene of n surfels."""
+    scene, camera = textured(n, width, height, options.device)
+    return row(f"synthetic, {n:,}", scene, [camera], options)
 
 
-SECTIONS = {"baked": gpu_baked.frames, "steps": steps}
+def bundled(folder: Path, width: int, height: int, options: Options) -> list[str]:
+    """Row of a bundle."""
+    bundle = read_bundle(folder, decode=options.device.type != "cuda")
+    scene = bundle.scene.to(options.device)
+    return row(f"{folder.name}, {len(bundle):,}", scene, around(bundle, width, height), options)
+
+
+def row(name: str, scene: BakedScene, cameras: Sequence[Camera], options: Options) -> list[str]:
+    """Cells of HEADER."""
+    width, height, mean = cameras[0].width, cameras[0].height, measured(scene, cameras, options)
+    say(f"{name} surfels, {width} x {height}: {mean['graph']:.3f} ms")
+    return [
+        name,
+        f"{width} x {height}",
+        number(mean["pairs"] / 1e6, 2),
+        number(mean["fragments"] / (width * height), 1),
+        *(number(mean[key], 3) for key in TIMED),
+        number(1e3 / mean["graph"], 0),
+        number(mean["fragments"] / mean["draw"] / 1e6, 1),
+    ]
 
 
 def card(device: torch.device) -> list[str]:
@@ -104,35 +109,34 @@ def card(device: torch.device) -> list[str]:
 def main() -> int:
     """Command line."""
     parser = arguments_of(__doc__)
-    parser.add_argument("--surfels", nargs="+", type=int, default=[50_000, 150_000, 500_000], help="of the scenes")
-    parser.add_argument("--sizes", nargs="+", default=["1297x840", "1920x1080"], metavar="WxH", help="(%(default)s)")
+    parser.add_argument("--surfels", nargs="*", type=int, default=[50_000, 150_000, 500_000], help="of the scenes")
+    parser.add_argument(
+        "--sizes", nargs="+", default=["1297x840", "1920x1080", "3840x2160"], metavar="WxH", help="(%(default)s)"
+    )
     parser.add_argument("--bundles", nargs="+", type=Path, default=[], help="baked scenes to draw as well")
     parser.add_argument("--warm-up", type=int, default=10)
     parser.add_argument("--runs", type=int, default=200)
-    parser.add_argument("--sections", nargs="+", choices=list(SECTIONS), default=list(SECTIONS))
     parser.add_argument("--emulated", action="store_true", help="try the script without a card")
-    parser.add_argument("--output", type=Path, help="also write the Markdown to this file, anew as each section ends")
+    parser.add_argument("--output", type=Path, help="also write the Markdown to this file")
     arguments = parser.parse_args()
     if not (arguments.emulated or torch.cuda.is_available()):
         parser.error("no CUDA device was found (or torch is a CPU build); --emulated tries the script without")
-    device = torch.device("cpu" if arguments.emulated else "cuda")
     surfels, sizes = arguments.surfels, [tuple(int(part) for part in size.split("x")) for size in arguments.sizes]
-    warm_up, runs = arguments.warm_up, arguments.runs
+    options = Options(torch.device("cuda"), arguments.warm_up, arguments.runs)
     if arguments.emulated:
-        surfels, sizes, warm_up, runs = [60], [(40, 24)], 0, 1
-    parts: list[str] = []
+        surfels, sizes, options = [60], [(40, 24)], Options(torch.device("cpu"), 0, 1)
+    notes = [
+        *card(options.device),
+        f"Times: medians of about {options.runs} calls after {options.warm_up}, queued so that the host does not hold "
+        "the device up, unless a column says otherwise.",
+    ]
+    rows = []
     with emulated_cuda() if arguments.emulated else nullcontext():
-        bandwidth = copy_bandwidth(device)
-        notes = [
-            *card(device),
-            f"Copy within the device: {number(bandwidth / 1e9, 0)} GB/s, read and written bytes counted.",
-            f"Times: medians of about {runs} calls after {warm_up}, queued so that the host does not hold the device "
-            "up, unless a column says otherwise.",
-        ]
-        options = Options(device, warm_up, runs, surfels, sizes, bandwidth, arguments.bundles)
-        for name in arguments.sections:
-            parts.append(SECTIONS[name](options))
-            publish(page("CUDA kernels", "\n\n".join(parts), notes), arguments.output, name != arguments.sections[-1])
+        for width, height in sizes:
+            for make, each in [(synthetic, n) for n in surfels] + [(bundled, folder) for folder in arguments.bundles]:
+                rows.append(attempt(f"{each}, {width} x {height}", partial(make, each, width, height, options)))
+    text = table(HEADER, list(filter(None, rows))) + failures()
+    publish(page("Frames of baked scenes", text, notes), arguments.output)
     return 0
 
 

@@ -5,40 +5,56 @@ strategy, with several numbers of Gaussians, and draw both at the held-out camer
 Our bundles are those that `gpu_train.py --keep` left; `--train` trains the Gaussians first, from the same points, with
 the rates of gsplat's own example and the regularisation that the strategy asks for."""
 
-import math
 import sys
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 import torch
 from common import arguments_of, number, page, publish, say, table
-from gpu_baked import measured
-from harness import Options, attempt, milliseconds
+from harness import Options, attempt, failures, milliseconds, quality
 from plain_capture import Capture, load_capture
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.ops.constants import SH_C0
-from bitymi_ns.ops.ssim import ssim
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.init import neighbour_distance, scene_extent
-from bitymi_ns.train.losses import cc_psnr, photometric, psnr
-from bitymi_ns.train.views import View, training_order
+from bitymi_ns.train.losses import photometric
+from bitymi_ns.train.views import training_order
 
 RATES = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}
 
-Frames = Callable[[Camera], Callable[[], Tensor]]  # makes for a camera a function that draws its view, [H, W, 3]
+CAMERAS = 6  # held-out cameras that are timed
+RUNS = 50  # frames per camera
+Frames = Callable[[Camera], Callable[[], Tensor]]
+"""Makes for a camera a function that draws its view: [H, W, 3], or [H, W, 1] int32 with 8 bits per channel."""
+
+
+def packed(scene: BakedScene) -> Frames:
+    """Frames of a bundle as a CUDA graph, with 8 bits per channel."""
+
+    def make(camera: Camera) -> Callable[[], Tensor]:
+        renderer = BakedRenderer(scene, camera.width, camera.height, images=("packed",), graph=True)
+        images = renderer.draw([camera])
+
+        def run() -> Tensor:
+            renderer.run()
+            return images["packed"][0]
+
+        return run
+
+    return make
 
 
 def rasterized(gsplat: Any, g: dict[str, Tensor]) -> Frames:
-    """Frames by gsplat's rasterization, of Gaussians as in `Gaussians.finished`."""
+    """Frames by gsplat's rasterization, of Gaussians as in `activated`."""
 
     def make(camera: Camera) -> Callable[[], Tensor]:
         view = (camera.viewmat[None], camera.K[None], camera.width, camera.height)
@@ -47,7 +63,7 @@ def rasterized(gsplat: Any, g: dict[str, Tensor]) -> Frames:
     return make
 
 
-def inferred(gsplat: Any, g: dict[str, Tensor]) -> Frames:
+def inferred(g: dict[str, Tensor]) -> Frames:
     """Frames by its inference renderer, of a scene that is packed to half precision beforehand."""
     from gsplat.experimental import GaussianInferenceRenderer, GaussianInferenceScene
 
@@ -73,162 +89,98 @@ def load() -> tuple[Any, str]:
     return gsplat, ""
 
 
-@dataclass
-class Row:
-    """A way to draw a scene: renderer, primitives, seconds of training (None = not trained here), means over the
-    held-out views of psnr, psnr after the affine fit and ssim, and factor of the size -> mean ms per frame."""
-
-    name: str
-    count: int
-    seconds: float | None
-    quality: tuple[float, ...]
-    frames: dict[int, float]
-
-
-def quality(draw: Callable[[Camera], Tensor], views: Sequence[View], device: torch.device) -> tuple[float, ...]:
-    """Means over the views: psnr, psnr after the affine fit, ssim."""
-    values = []
-    for view in (view.to(device) for view in views):
-        rgb, target = draw(view.camera).float().clamp(0, 1), view.target(None, device)
-        values.append((psnr(rgb, target, view.mask), cc_psnr(rgb, target, view.mask), float(ssim(rgb, target))))
-    return tuple(fmean(column) for column in zip(*values, strict=True))
+def first_gaussians(capture: Capture, most: int, extent: float) -> dict[str, Tensor]:
+    """means, scales (logarithms), quats, opacities (logits), sh0 [N, 1, 3], shN [N, 15, 3], from the points."""
+    chosen = torch.randperm(len(capture.points), generator=torch.Generator().manual_seed(0))[:most]
+    points, colours = capture.points[chosen], capture.colours[chosen]
+    size = neighbour_distance(points, extent).clamp_min(1e-6)
+    n = len(points)
+    return {
+        "means": points.clone(),
+        "scales": torch.log(0.1 * size)[:, None].repeat(1, 3),
+        "quats": torch.randn(n, 4, generator=torch.Generator().manual_seed(1)),
+        "opacities": torch.logit(torch.full((n,), 0.5)),
+        "sh0": ((colours - 0.5) / SH_C0)[:, None],
+        "shN": torch.zeros(n, 15, 3),
+    }
 
 
-def timed(make: Callable[[Camera], Callable[[], object]], cameras: Sequence[Camera], options: Options) -> float:
-    """Mean over the cameras of the median milliseconds of a frame."""
-    return fmean(milliseconds(make(camera), options) for camera in cameras)
+def activated(p: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """means, quats (unit), scales, opacities, sh [N, 16, 3] of parameters as in `first_gaussians`."""
+    return {
+        "means": p["means"],
+        "quats": normalize(p["quats"], dim=-1),
+        "scales": p["scales"].exp(),
+        "opacities": p["opacities"].sigmoid(),
+        "sh": torch.cat([p["sh0"], p["shN"]], 1),
+    }
 
 
-class Gaussians:
-    """Trains Gaussians on a capture, by gsplat's MCMC strategy.
+def train(
+    gsplat: Any, capture: Capture, most: int, steps: int, device: torch.device
+) -> tuple[dict[str, Tensor], float]:
+    """Train Gaussians on a capture, by gsplat's MCMC strategy, which refines in the first 25 of 30 parts of the steps.
 
-    Attributes:
-        parameters: means, scales (logarithms), quats, opacities (logits), sh0 [N, 1, 3], shN [N, 15, 3].
-        seconds: of training.
+    Args:
+        most: Gaussians.
+
+    Returns:
+        the Gaussians, as in `activated`, and seconds of training.
     """
+    extent = scene_extent(torch.stack([view.camera.center for view in capture.train]), capture.points)
+    parameters = torch.nn.ParameterDict(
+        {name: torch.nn.Parameter(value.to(device)) for name, value in first_gaussians(capture, most, extent).items()}
+    )
+    rates = {**RATES, "means": RATES["means"] * extent}
+    optimizers = {
+        name: torch.optim.Adam([{"params": value, "lr": rates[name], "name": name}], eps=1e-15, fused=True)
+        for name, value in parameters.items()
+    }
+    refine = {"refine_start_iter": min(500, steps // 10), "refine_stop_iter": steps * 25 // 30}
+    strategy = gsplat.MCMCStrategy(cap_max=most, **refine)
+    strategy.check_sanity(parameters, optimizers)
+    state = strategy.initialize_state()
+    falling = torch.optim.lr_scheduler.ExponentialLR(optimizers["means"], gamma=0.01 ** (1 / steps))
+    views = [view.to(device) for view in capture.train]
+    torch.cuda.synchronize(device)
+    start = time.perf_counter()
+    for step in range(steps):
+        view = views[training_order(len(views), 0, step)]
+        at = (view.camera.viewmat[None], view.camera.K[None], view.camera.width, view.camera.height)
+        degree = min(3, step // max(1, min(1000, steps // 10)))
+        rgb, _, information = gsplat.rasterization(*activated(parameters).values(), *at, sh_degree=degree, packed=False)
+        loss = photometric(rgb[0], view.target(None, device), 0.2)
+        loss = loss + 0.01 * torch.sigmoid(parameters["opacities"]).mean()
+        loss = loss + 0.01 * torch.exp(parameters["scales"]).mean()
+        loss.backward()
+        for optimizer in optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+        falling.step()
+        rate = falling.get_last_lr()[0]
+        strategy.step_post_backward(parameters, optimizers, state, step, information, lr=rate)
+    torch.cuda.synchronize(device)
+    seconds = time.perf_counter() - start
+    return {name: value.detach().contiguous() for name, value in activated(parameters).items()}, seconds
 
-    def __init__(self, gsplat: Any, capture: Capture, most: int, steps: int, device: torch.device) -> None:
-        """
-        Args:
-            most: Gaussians.
-            steps: of training; the strategy refines in the first 25 of 30 parts.
-        """
-        self._gsplat = gsplat
-        centres = torch.stack([view.camera.center for view in capture.train])
-        extent = scene_extent(centres, capture.points)
-        self.parameters = torch.nn.ParameterDict(
-            {name: torch.nn.Parameter(value.to(device)) for name, value in self._first(capture, most, extent).items()}
-        )
-        rates = {**RATES, "means": RATES["means"] * extent}
-        optimizers = {
-            name: torch.optim.Adam([{"params": value, "lr": rates[name], "name": name}], eps=1e-15, fused=True)
-            for name, value in self.parameters.items()
-        }
-        strategy = gsplat.MCMCStrategy(
-            cap_max=most, refine_start_iter=min(500, steps // 10), refine_stop_iter=steps * 25 // 30
-        )
-        strategy.check_sanity(self.parameters, optimizers)
-        state = strategy.initialize_state()
-        falling = torch.optim.lr_scheduler.ExponentialLR(optimizers["means"], gamma=0.01 ** (1 / steps))
-        views = [view.to(device) for view in capture.train]
-        torch.cuda.synchronize(device)
-        start = time.perf_counter()
-        for step in range(steps):
-            view = views[training_order(len(views), 0, step)]
-            rgb, information = self._draw(view.camera, min(3, step // max(1, min(1000, steps // 10))))
-            target = view.target(None, device)
-            loss = photometric(rgb, target, 0.2) + 0.01 * torch.sigmoid(self.parameters["opacities"]).mean()
-            loss = loss + 0.01 * torch.exp(self.parameters["scales"]).mean()
-            loss.backward()
-            for optimizer in optimizers.values():
-                optimizer.step()
-                optimizer.zero_grad(set_to_none=True)
-            falling.step()
-            rate = falling.get_last_lr()[0]
-            strategy.step_post_backward(self.parameters, optimizers, state, step, information, lr=rate)
-        torch.cuda.synchronize(device)
-        self.seconds = time.perf_counter() - start
 
-    @staticmethod
-    def _first(capture: Capture, most: int, extent: float) -> dict[str, Tensor]:
-        chosen = torch.randperm(len(capture.points), generator=torch.Generator().manual_seed(0))[:most]
-        points, colours = capture.points[chosen], capture.colours[chosen]
-        size = neighbour_distance(points, extent).clamp_min(1e-6)
-        n = len(points)
-        return {
-            "means": points.clone(),
-            "scales": torch.log(0.1 * size)[:, None].repeat(1, 3),
-            "quats": torch.randn(n, 4, generator=torch.Generator().manual_seed(1)),
-            "opacities": torch.logit(torch.full((n,), 0.5)),
-            "sh0": ((colours - 0.5) / SH_C0)[:, None],
-            "shN": torch.zeros(n, 15, 3),
-        }
-
-    def _draw(self, camera: Camera, degree: int = 3) -> tuple[Tensor, dict]:
-        p = self.parameters
-        rgb, _, information = self._gsplat.rasterization(
-            p["means"],
-            p["quats"],
-            torch.exp(p["scales"]),
-            torch.sigmoid(p["opacities"]),
-            torch.cat([p["sh0"], p["shN"]], 1),
-            camera.viewmat[None],
-            camera.K[None],
-            camera.width,
-            camera.height,
-            sh_degree=degree,
-            packed=False,
-        )
-        return rgb[0], information
-
-    @torch.no_grad()
-    def finished(self) -> dict[str, Tensor]:
-        """means, quats (unit), scales, opacities, sh [N, 16, 3]."""
-        p = self.parameters
-        return {
-            "means": p["means"].detach().contiguous(),
-            "quats": normalize(p["quats"].detach(), dim=-1).contiguous(),
-            "scales": p["scales"].detach().exp().contiguous(),
-            "opacities": torch.sigmoid(p["opacities"].detach()).contiguous(),
-            "sh": torch.cat([p["sh0"], p["shN"]], 1).detach().contiguous(),
-        }
+def picture(image: Tensor) -> Tensor:
+    """[H, W, 3] of a frame."""
+    return image if image.is_floating_point() else image.view(torch.uint8)[..., :3] / 255
 
 
 def row(
-    name: str,
-    count: int,
-    seconds: float | None,
-    make: Frames,
-    capture: Capture,
-    cameras: Sequence[Camera],
-    times: Sequence[int],
-    options: Options,
-) -> Row:
-    """Measure one renderer."""
-    good = quality(lambda camera: make(camera)(), capture.held_out, options.device)
-    frames = {k: timed(make, [camera.scaled(k) for camera in cameras], options) for k in times}
-    say(f"{name}, {count:,}: {good[0]:.2f} dB, " + ", ".join(f"{ms:.3f} ms at {k} x" for k, ms in frames.items()))
-    return Row(name, count, seconds, good, frames)
-
-
-def packed_picture(scene: BakedScene, camera: Camera) -> Tensor:
-    """[H, W, 3] of a frame with 8 bits per channel."""
-    drawn = BakedRenderer(scene, camera.width, camera.height, images=("packed",)).draw([camera])["packed"][0]
-    return drawn.view(torch.uint8).reshape(camera.height, camera.width, 4)[..., :3] / 255
-
-
-def report(rows: Sequence[Row], capture: Capture, times: Sequence[int]) -> str:
-    """Markdown."""
-    camera = capture.held_out[0].camera
-    header = ("what draws", "primitives", "training s", "PSNR dB", "after affine fit", "SSIM")
-    header += tuple(f"ms at {k * camera.width} x {k * camera.height}" for k in times)
-    cells = [
-        [r.name, number(r.count, 0), number(r.seconds, 0), *(number(r.quality[i], 2) for i in (0, 1))]
-        + [number(r.quality[2], 3), *(number(r.frames.get(k, math.nan), 3) for k in times)]
-        for r in rows
-    ]
-    text = f"{len(capture.train)} photographs of {camera.width} x {camera.height}; {len(capture.held_out)} held out.\n"
-    return text + "\n" + table(header, cells)
+    name: str, count: int, seconds: float | None, make: Frames, capture: Capture, times: dict[int, list[Camera]]
+) -> list[str]:
+    """Cells of a renderer: primitives, seconds of training (None = not trained here), means over the held-out views,
+    and mean over cameras of the median milliseconds of a frame, by factor of the size."""
+    device = torch.device("cuda")
+    good = quality(lambda camera: picture(make(camera)()), capture.held_out, device)
+    options = Options(device, 5, RUNS)
+    frames = [fmean(milliseconds(make(camera), options) for camera in cameras) for cameras in times.values()]
+    say(f"{name}, {count:,}: {good[0]:.2f} dB, {', '.join(f'{ms:.3f} ms' for ms in frames)}")
+    cells = [name, number(count, 0), number(seconds, 0), number(good[0]), number(good[1]), number(good[2], 3)]
+    return [*cells, *(number(ms, 3) for ms in frames)]
 
 
 def main() -> int:
@@ -240,51 +192,45 @@ def main() -> int:
     parser.add_argument("--gaussians", type=Path, required=True, help="folder of the trained Gaussians")
     parser.add_argument("--bundles", nargs="*", type=Path, default=[], help="baked scenes of the same capture")
     parser.add_argument("--times", nargs="+", type=int, default=[1, 2], help="sizes, of the photographs' (%(default)s)")
-    parser.add_argument("--cameras", type=int, default=6, help="held-out cameras that are timed (%(default)s)")
-    parser.add_argument("--runs", type=int, default=50, help="frames per camera (%(default)s)")
     parser.add_argument("--output", type=Path, help="also write the Markdown to this file, anew after each row")
     arguments = parser.parse_args()
     if not torch.cuda.is_available():
         parser.error("no CUDA device was found (or torch is a CPU build)")
-    device, times = torch.device("cuda"), arguments.times
+    device = torch.device("cuda")
     capture = load_capture(arguments.data.expanduser())
     gsplat, why = load()
     if arguments.train:
         arguments.gaussians.mkdir(parents=True, exist_ok=True)
         for most in arguments.train:
-            trained = Gaussians(gsplat, capture, most, arguments.steps, device)
-            torch.save((trained.finished(), trained.seconds), arguments.gaussians / f"{most}.pt")
-            say(f"{most:,} Gaussians, {arguments.steps:,} steps: {trained.seconds:.0f} s")
+            trained = train(gsplat, capture, most, arguments.steps, device)
+            torch.save(trained, arguments.gaussians / f"{most}.pt")
+            say(f"{most:,} Gaussians, {arguments.steps:,} steps: {trained[1]:.0f} s")
         return 0
-    every = max(1, len(capture.held_out) // arguments.cameras)
-    cameras = [view.camera.to(device) for view in capture.held_out[::every][: arguments.cameras]]
-    options = Options(device, 5, arguments.runs)
-    rows: list[Row] = []
-    notes = [f"Device: {torch.cuda.get_device_name(device)}.", *filter(None, [why])]
-
-    def write(silent: bool = True) -> None:
-        text = page(f"Equal quality: {arguments.data.name}", report(rows, capture, times), notes)
-        publish(text, arguments.output, silent=silent)
-
+    camera, every = capture.held_out[0].camera, max(1, len(capture.held_out) // CAMERAS)
+    timed = [view.camera.to(device) for view in capture.held_out[::every][:CAMERAS]]
+    times = {k: [camera.scaled(k) for camera in timed] for k in arguments.times}
+    header = ("what draws", "primitives", "training s", "PSNR dB", "after affine fit", "SSIM")
+    header += tuple(f"ms at {k * camera.width} x {k * camera.height}" for k in times)
+    made: list[tuple[str, int, float | None, Callable[[], Frames]]] = []
     for folder in arguments.bundles:
         bundle = read_bundle(folder, decode=False)
-        scene = bundle.scene.to(device)
-        good = quality(lambda camera, scene=scene: packed_picture(scene, camera), capture.held_out, device)
-        frames = {k: measured(scene, [camera.scaled(k) for camera in cameras], options)["packed"] for k in times}
-        say(f"{folder.name}: {good[0]:.2f} dB, {frames}")
-        rows.append(Row(folder.name, len(bundle), None, good, frames))
-        write()
+        made.append((folder.name, len(bundle), None, partial(packed, bundle.scene.to(device))))
     for file in sorted(arguments.gaussians.glob("*.pt")) if gsplat is not None else []:
         g, seconds = torch.load(file, map_location=device, weights_only=True)
-        for name, renderer in {"rasterization": rasterized, "inference renderer": inferred}.items():
+        count = len(g["means"])
+        made.append(("gsplat rasterization", count, seconds, partial(rasterized, gsplat, g)))
+        made.append(("gsplat inference renderer", count, seconds, partial(inferred, g)))
+    rows: list[list[str]] = []
+    notes = [f"Device: {torch.cuda.get_device_name(device)}.", *filter(None, [why])]
+    about = f"{len(capture.train)} photographs of {camera.width} x {camera.height}; {len(capture.held_out)} held out."
+    for *named, make in made:
 
-            def drawn(name: str = name, make: Callable = renderer, g: dict = g, s: float = seconds) -> Row:
-                return row(f"gsplat {name}", len(g["means"]), s, make(gsplat, g), capture, cameras, times, options)
+        def measured(named: list = named, make: Callable[[], Frames] = make) -> list[str]:
+            return row(*named, make(), capture, times)
 
-            if found := attempt(f"{name}, {file.stem}", drawn):
-                rows.append(found)
-            write()
-    write(silent=False)
+        rows += filter(None, [attempt(f"{named[0]}, {named[1]:,}", measured)])
+        text = f"{about}\n\n{table(header, rows)}{failures()}"
+        publish(page(f"Equal quality: {arguments.data.name}", text, notes), arguments.output)
     return 0
 
 

@@ -1,11 +1,10 @@
-"""Shared by the kernel benchmarks: timing on the device, the card's measured limits, scenes like trained ones."""
+"""Shared by the kernel benchmarks: timing on the device, scenes like trained ones."""
 
 import math
 import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TypeVar
 
 import torch
@@ -14,11 +13,15 @@ from torch import Tensor
 from torch.nn.functional import l1_loss
 
 from bitymi_ns import ops
+from bitymi_ns.bundle import Bundle
+from bitymi_ns.codec.packing import pack
+from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import TexelConfig
+from bitymi_ns.train.losses import cc_psnr, psnr
 from bitymi_ns.train.texels import blank_texels
 from bitymi_ns.train.views import View
 
@@ -39,10 +42,6 @@ class Options:
     # warm_up, runs: of every timing
     warm_up: int
     runs: int
-    surfels: Sequence[int] = ()  # sizes of the synthetic scenes
-    sizes: Sequence[tuple[int, int]] = ()  # image sizes, width and height
-    copy_bytes: float = 0.0  # bytes per second of a device-to-device copy, read and written bytes counted
-    bundles: Sequence[Path] = ()  # folders of baked scenes to draw as well
 
 
 def attempt(what: str, run: Callable[[], T]) -> T | None:
@@ -106,23 +105,20 @@ def _seconds(run: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-def copy_bandwidth(device: torch.device) -> float:
-    """Bytes per second that a copy within the device reads and writes."""
-    cuda = device.type == "cuda"
-    a = torch.empty(1 << (30 if cuda else 24), dtype=torch.uint8, device=device)
-    b = torch.empty_like(a)
-    ms = milliseconds(lambda: b.copy_(a), Options(device, 3, 20))
-    return 2 * a.numel() / (1e-3 * ms)
+def quality(
+    draw: Callable[[Camera], Tensor], views: Sequence[View], device: torch.device, background: Tensor | None = None
+) -> tuple[float, ...]:
+    """Means over held-out views: PSNR, PSNR after the affine fit of colours, SSIM.
 
-
-def peak_memory(run: Callable[[], object], device: torch.device) -> int:
-    """Most bytes allocated at once during a call; 0 without a card."""
-    if device.type != "cuda":
-        return 0
-    torch.cuda.reset_peak_memory_stats(device)
-    run()
-    torch.cuda.synchronize(device)
-    return torch.cuda.max_memory_allocated(device)
+    Args:
+        draw: makes the picture [H, W, 3] of a camera.
+        background: [3] colour behind photographs with alpha; None = black.
+    """
+    values = []
+    for view in (view.to(device) for view in views):
+        rgb, target = draw(view.camera).float().clamp(0, 1), view.target(background, device)
+        values.append((psnr(rgb, target, view.mask), cc_psnr(rgb, target, view.mask), float(ops.ssim(rgb, target))))
+    return tuple(statistics.fmean(column) for column in zip(*values, strict=True))
 
 
 def backward(outputs: Tensor | Sequence[Tensor], inputs: Sequence[Tensor]) -> Callable[[], object]:
@@ -132,36 +128,12 @@ def backward(outputs: Tensor | Sequence[Tensor], inputs: Sequence[Tensor]) -> Ca
     return lambda: torch.autograd.grad(outputs, inputs, gradients, retain_graph=True)
 
 
-def arithmetic_rate(options: Options) -> float:
-    """Floating-point operations a second of a large matrix product in full single precision."""
-    n = 8192 if options.device.type == "cuda" else 64
-    a, b = (torch.rand(n, n, device=options.device) for _ in range(2))
-    before = torch.backends.cuda.matmul.allow_tf32
-    torch.backends.cuda.matmul.allow_tf32 = False
-    ms = milliseconds(lambda: a @ b, Options(options.device, 3, 10))
-    torch.backends.cuda.matmul.allow_tf32 = before
-    return 2 * n**3 / (1e-3 * ms)
-
-
 def without_graph(run: Callable[[], object]) -> Callable[[], object]:
     """A call that records nothing for a backward pass."""
 
     def call() -> object:
         with torch.no_grad():
             return run()
-
-    return call
-
-
-def deterministic(run: Callable[[], object], warn_only: bool = False) -> Callable[[], object]:
-    """A call with sums that do not depend on the order; `warn_only` where torch's own operations have none such."""
-
-    def call() -> object:
-        torch.use_deterministic_algorithms(True, warn_only=warn_only)
-        try:
-            return run()
-        finally:
-            torch.use_deterministic_algorithms(False)
 
     return call
 
@@ -186,9 +158,7 @@ def training_step(
     return run
 
 
-def trained_like(
-    n: int, width: int, height: int, device: torch.device, view_color: str = "sv", texture: bool = True
-) -> tuple[Scene, Camera]:
+def trained_like(n: int, width: int, height: int, device: torch.device, texture: bool = True) -> tuple[Scene, Camera]:
     """A scene with the statistics of trained ones and its camera; the same every time.
 
     Fitted to scenes of 17,000 to 22,000 surfels after 1,200 steps on three captures: ln(s_u / s_v) is normal with
@@ -222,13 +192,9 @@ def trained_like(
     }
     beside = n - round(CROSSING * n)
     _move_beside_the_camera({name: value[beside:] for name, value in surfels.items()}, g)
-    if view_color == "sv":
-        surfels |= {"sv_sites": normal(n, SITES, 3), "sv_log_tau": torch.zeros(n, SITES)}
-        surfels |= {"sv_rgb": uniform(n, SITES, 3) - 0.5}
-    else:
-        surfels |= {"sh_dc": normal(n, 3), "sh_rest": 0.1 * normal(n, 15, 3)}
-    texture_kind = "hash" if texture else "none"
-    config = SceneConfig(view_color=view_color, sv_sites=SITES, texture=texture_kind, near=0.2)
+    surfels |= {"sv_sites": normal(n, SITES, 3), "sv_log_tau": torch.zeros(n, SITES)}
+    surfels |= {"sv_rgb": uniform(n, SITES, 3) - 0.5}
+    config = SceneConfig(view_color="sv", sv_sites=SITES, texture="hash" if texture else "none", near=0.2)
     field = None
     if texture:
         field = HashField(config, (0.0, 0.0, 5.0), 5.0, True, LOG2_TABLE, g)
@@ -267,3 +233,48 @@ def with_texels(n: int, width: int, height: int, device: torch.device) -> tuple[
     field.descent = ops.TexelDescent(field.share, 0.0)
     scene.field = field
     return scene, camera
+
+
+def textured(n: int, width: int, height: int, device: torch.device) -> tuple[BakedScene, Camera]:
+    """`trained_like` with an atlas of random texels, as large as surfels are on screen: BC7 on a card, else bytes."""
+    scene, camera = trained_like(n, width, height, torch.device("cpu"), texture=False)
+    surfels = {name: value.detach().contiguous() for name, value in scene.surfels.items()}
+    pixels = 6 * surfels["log_scales"].exp() * camera.K[0, 0] / surfels["means"][:, 2:]
+    packing = pack(torch.exp2(torch.log2(pixels).ceil()).clamp(4, 64).long().numpy())
+    g = torch.Generator().manual_seed(1)
+    atlas = blocks = None
+    if device.type == "cuda":
+        blocks = torch.randint(
+            0, 256, (packing.layers, packing.height // 4, packing.width // 4, 16), dtype=torch.uint8, generator=g
+        )
+        blocks[..., 0] = 0x40  # mode 6: any other bits are a valid block
+    else:
+        shape = (packing.layers, packing.height, packing.width, 4)
+        atlas = torch.randint(0, 256, shape, dtype=torch.uint8, generator=g)
+    baked = BakedScene(
+        surfels,
+        "sv",
+        torch.from_numpy(packing.tiles).contiguous(),
+        atlas,
+        offset=-0.2,
+        scale=0.4,
+        weight_bound=scene.config.weight_bound,
+        blocks=blocks,
+    )
+    return baked.to(device), camera
+
+
+def around(bundle: Bundle, width: int, height: int) -> list[Camera]:
+    """Three cameras around the middle of a bundle; training scales the cameras of a capture to the unit ball."""
+    middle = bundle.scene.surfels["means"].median(dim=0).values
+    K = torch.tensor([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]])
+    cameras = []
+    for angle in (0.0, 2.1, 4.2):
+        eye = middle + 0.7 * torch.tensor([math.cos(angle), math.sin(angle), 0.3])
+        forward = torch.nn.functional.normalize(middle - eye, dim=0)
+        right = torch.nn.functional.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0])), dim=0)
+        viewmat = torch.eye(4)
+        viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+        viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+        cameras.append(Camera(viewmat, K, width, height))
+    return cameras

@@ -13,8 +13,8 @@ The formulas are in `cases`, with n surfels of which v are visible, p pixels, f 
 (weight at least the scene's bound), b pairs of surfel and tile, r of them with a fragment, K sites, L levels:
 
 - trace: fragments are written, then put in order; its backward reads a row of geom and 14 sums per pair.
-- shade: 88 L for cell, weights and interpolation, then an MLP of 4 L x 16 x 16 x 3; its backward shades again, and half
-  of its loads are read-modify-write; 128 L are indices and weights written and read again; 64 MB of table gradient.
+- field: 88 L for cell, weights and interpolation, then an MLP of 4 L x 16 x 16 x 3; its backward looks up again, and
+  half of its loads are read-modify-write; 128 L are indices and weights written and read again; 64 MB of gradient.
 - blend, texels: neighbouring texels are gathered from the cache, so their loads are not counted.
 """
 
@@ -32,8 +32,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch loads Ope
 
 import torch
 from common import arguments_of, number, page, publish, say, table
-from gpu_baked import textured
-from harness import LOG2_TABLE, SITES, backward, trained_like, without_graph
+from harness import LOG2_TABLE, SITES, backward, textured, trained_like, without_graph
 
 from bitymi_ns import ops
 from bitymi_ns.ops.constants import SUPPORT
@@ -87,26 +86,24 @@ def cases(n: int, width: int, height: int) -> tuple[str, list[Case]]:
     leaf = base.detach().requires_grad_()  # leaves, so that each backward pass is one kernel's
     frames = projection.frames.detach()
 
-    def shade(weights: tuple[torch.Tensor, ...]) -> torch.Tensor:
-        return ops.shade(fragments, leaf, frames, field.geometry, weights, bound)
+    def residual(weights: tuple[torch.Tensor, ...]) -> torch.Tensor:
+        return ops.fragment_residual(fragments, frames, field.geometry, weights, bound)
 
     weights = field.weights
     fixed = tuple(w.detach() for w in weights)
-    frozen = shade(fixed)
-    colors = frozen.detach().requires_grad_()
+    listed = residual(fixed).requires_grad_()
     geom = projection.geom.detach().requires_grad_()
     at = replace(projection, geom=geom)
     weight, uv = (values.detach().requires_grad_() for values in (fragments.weight, fragments.uv))
     alone = replace(fragments, weight=weight, uv=uv, depth=fragments.depth.detach())
-    image = ops.composite_image(alone, at, colors)
     photo, other = (torch.rand(height, width, 3) for _ in range(2))
     other.requires_grad_()
     side = torch.full((n, 2), TILE_SIDE, dtype=torch.int32)
     tiles = ops.TexelTiles.of_sizes(side, projection.geom.new_full((n,), SUPPORT))
     texels = (torch.rand(tiles.count, 3) - 0.5).requires_grad_()
 
-    def blend(*textures: Any) -> torch.Tensor:
-        return ops.blended_image(alone, at, leaf, *textures, bound=bound)
+    def blend(*textures: Any, residual: torch.Tensor | None = None) -> torch.Tensor:
+        return ops.blended_image(alone, at, leaf, *textures, bound=bound, residual=residual)
 
     view = tuple(q[name] for name in ops.VIEW_COLORS["sv"].names)
     K, L = SITES, LEVELS
@@ -133,17 +130,18 @@ def cases(n: int, width: int, height: int) -> tuple[str, list[Case]]:
             65 * f + rows, 60 * f + 72 * b + 16 * v, 0,
         ),
         ("trace backward", back(fragments.weight, (projection.geom,)), 140 * f, 20 * f + 176 * (r + n), 0),
-        ("shade", without_graph(lambda: shade(fixed)), 6 * f + look_up * t, 32 * f + (44 + 128 * L) * t, 8 * L * t),
-        ("shade backward, field frozen", back(frozen, (leaf,)), 6 * f, 68 * f + 36 * n, 0),
+        ("field", without_graph(lambda: residual(fixed)), look_up * t, 12 * f + (56 + 128 * L) * t, 8 * L * t),
         (
-            "shade backward, field training", back(shade(weights), (leaf, *weights)),
-            6 * f + learning * t, 68 * f + 36 * n + (172 + 512 * L) * t + table_bytes, 16 * L * t,
+            "field backward", back(residual(weights), weights),
+            learning * t, 12 * f + (184 + 512 * L) * t + table_bytes, 16 * L * t,
         ),
-        ("composite", without_graph(lambda: ops.composite_image(fragments, projection, colors)),
-         9 * f, 21 * f + 40 * p, 0),
-        ("composite backward", back(image, (weight, geom, colors)), 14 * f, 45 * f + 20 * p + 96 * n, 0),
         ("blend", without_graph(blend), 15 * f, 5 * f + 40 * p, 0),
         ("blend backward", back(blend(), (weight, geom, leaf)), 20 * f, 9 * f + 20 * p + 108 * n, 0),
+        ("blend, field", without_graph(lambda: blend(residual=listed)), 18 * f, 17 * f + 40 * p, 0),
+        (
+            "blend backward, field", back(blend(residual=listed), (weight, geom, leaf, listed)),
+            23 * f, 33 * f + 20 * p + 108 * n, 0,
+        ),
         ("blend, texels", without_graph(lambda: blend(texels, tiles)), 15 * f + 45 * t, 5 * f + 56 * t + 40 * p, 0),
         (
             "blend backward, texels", back(blend(texels, tiles), (weight, uv, geom, leaf, texels)),

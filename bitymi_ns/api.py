@@ -9,9 +9,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake import BakeOptions, Learning, bake_and_learn
+from bitymi_ns.bake import BakeOptions, Learning, bake_and_learn, export
 from bitymi_ns.bake.compact import Compact
-from bitymi_ns.bundle import Bundle, export, read_bundle
+from bitymi_ns.bundle import Bundle, read_bundle
 from bitymi_ns.bundle.parts import CAMERAS
 from bitymi_ns.ops import blended_image, project, trace
 from bitymi_ns.ops.constants import COLOR_BIAS
@@ -19,8 +19,8 @@ from bitymi_ns.plugin.export.cameras import camera_row
 from bitymi_ns.plugin.run.preset import load_preset
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import NEAR, RenderOutput, Scene
-from bitymi_ns.train.domain import scene_for_views
 from bitymi_ns.train.fit import TrainLog, fit
+from bitymi_ns.train.init import scene_for_views
 from bitymi_ns.train.views import View
 
 __all__ = ["Bundle", "Camera", "View", "bake_scene", "rasterize", "read_bundle", "train_scene"]
@@ -100,7 +100,7 @@ def train_scene(
         The scene on `device`, and the log with the PSNR of `eval_views` at the end.
 
     Raises:
-        ValueError: there are no views, or nothing to start from.
+        ValueError: there are no views, or an option is out of range.
         PresetError: there is no such preset.
     """
     preset = load_preset(method)

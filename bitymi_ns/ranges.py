@@ -16,7 +16,7 @@ PositiveCount = Annotated[int, Field(ge=1, le=MOST)]
 
 
 def check_ranges(options: Any) -> None:
-    """Refuse options out of their range, NaN included. Learning rates are checked by the schedule that makes them.
+    """Refuse options out of their range, NaN included.
 
     Raises:
         ValueError: names the option, its range and the value.

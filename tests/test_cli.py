@@ -77,15 +77,15 @@ def test_names_do_not_control_the_terminal(tmp_path: Path, capsys: pytest.Captur
 
 
 def test_report_calls_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import bitymi_ns.measure.report
+    import bitymi_ns.measure.report.page
 
     seen = {}
 
-    def build(inputs: list[Path], output_dir: Path, title: str = "") -> Path:
+    def build(inputs: tuple[Path, ...], output_dir: Path, title: str = "") -> Path:
         seen.update(inputs=inputs, output_dir=output_dir, title=title)
         return output_dir / "index.html"
 
-    monkeypatch.setattr(bitymi_ns.measure.report, "build", build, raising=False)
+    monkeypatch.setattr(bitymi_ns.measure.report.page, "build", build, raising=False)
     assert cli.main(["report", "a.json", "b.json", "--output-dir", str(tmp_path), "--title", "Two"]) == 0
-    expected = {"inputs": [Path("a.json"), Path("b.json")], "output_dir": tmp_path, "title": "Two"}
+    expected = {"inputs": (Path("a.json"), Path("b.json")), "output_dir": tmp_path, "title": "Two"}
     assert seen == expected

@@ -1,6 +1,6 @@
 """Trained scene to bundle contents: tiles, view colours, fine-tuning, coding; the paper's bake is in `field`."""
 
-from bitymi_ns.bake.baked import Baked
+from bitymi_ns.bake.baked import Baked, export
 from bitymi_ns.bake.field.bake import bake
 from bitymi_ns.bake.field.polish import PolishOptions, polish_scene
 from bitymi_ns.bake.learn import Learning, bake_and_learn, baked_and_reduced
@@ -19,6 +19,7 @@ __all__ = [
     "bake",
     "bake_and_learn",
     "baked_and_reduced",
+    "export",
     "polish_scene",
     "reduced",
     "rich_progress",

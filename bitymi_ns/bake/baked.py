@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -12,7 +13,10 @@ from torch import Tensor
 
 from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bundle.bake_options import BakeOptions
+from bitymi_ns.bundle.poster import draw_poster
 from bitymi_ns.bundle.statistics import AtlasCost, Statistics
+from bitymi_ns.bundle.write import write_bundle
+from bitymi_ns.codec.limits import RESIDUAL_LIMIT
 from bitymi_ns.codec.packing import Packing, pack
 from bitymi_ns.codec.pages import listed_texels, paged_texels, tile_means
 from bitymi_ns.codec.quantise import EncodedAtlas, Range, choose_range, decode_pages, encode
@@ -21,6 +25,7 @@ from bitymi_ns.codec.texel_codes import SceneCodes, TexelCodes
 from bitymi_ns.ops import TexelAlpha
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.scene.camera import Camera
 
 
 @dataclass
@@ -173,6 +178,37 @@ class Baked:
             uncoded=uncoded,
             codes=replace(self.codes, texels=codes, residual=codes.residual, residual_step=codes.residual_step),
         )
+
+
+def export(
+    baked: Baked,
+    folder: str | Path,
+    *,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    statistics: Mapping[str, Any] | None = None,
+    first: Camera | None = None,
+    **options: Any,
+) -> Path:
+    """Write a baked scene, encoded where it is not yet, as a bundle; errors are those of `write_bundle`.
+
+    Args:
+        background: colour behind the surfels.
+        statistics: added to those of the bake.
+        first: camera with which a viewer opens, the first of cameras.json that was held out, or its first: the poster
+            is drawn from there; None = the bundle gets no poster.
+        options: further arguments of `write_bundle` by name.
+    """
+    baked = baked.encoded()
+    return write_bundle(
+        folder,
+        with_means(baked.scene, baked.mean_residual.clamp(-RESIDUAL_LIMIT, RESIDUAL_LIMIT)),
+        baked.atlas,
+        baked.codes,
+        background=background,
+        statistics={**baked.statistics.model_dump(), **(statistics or {})},
+        poster=None if first is None else draw_poster(baked.stored(), first, background),
+        **options,
+    )
 
 
 def joined(colors: Tensor, alphas: Tensor) -> Tensor:

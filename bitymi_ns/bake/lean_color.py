@@ -17,8 +17,8 @@ from bitymi_ns.codec.limits import beyond
 from bitymi_ns.codec.quantise import STEPS
 from bitymi_ns.ops import view_color
 from bitymi_ns.ops.constants import COLOR_BIAS
-from bitymi_ns.ops.shade import view_base
 from bitymi_ns.ops.sphere import fibonacci_sphere
+from bitymi_ns.ops.view_color import view_base
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, kind_of
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.tile_sizes import kernel_parameters

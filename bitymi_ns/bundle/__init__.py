@@ -4,7 +4,7 @@ from bitymi_ns.bundle.manifest import BundleError
 from bitymi_ns.bundle.parts import check_target
 from bitymi_ns.bundle.read import REMEDY, Bundle, read_bundle
 from bitymi_ns.bundle.verify import Check, check_files, check_world
-from bitymi_ns.bundle.write import World, export, write_bundle
+from bitymi_ns.bundle.write import World, write_bundle
 
 __all__ = [
     "REMEDY",
@@ -15,7 +15,6 @@ __all__ = [
     "check_files",
     "check_world",
     "check_target",
-    "export",
     "read_bundle",
     "write_bundle",
 ]

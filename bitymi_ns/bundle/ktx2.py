@@ -5,7 +5,7 @@ Written from the Khronos KTX File Format Specification 2.0 and the Khronos Data 
 
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bitymi_ns.codec.quantise import Format
@@ -48,11 +48,13 @@ class Ktx2Error(ValueError):
 class Ktx2Image:
     """A 2D array texture."""
 
-    payload: list[memoryview]  # one bytes-like object a layer
     format: Format  # one of bc7, uint8, fp16
     # width, height: size in texels
     width: int
     height: int
+    layers: int  # number of layers
+    data_at: int  # where the texels begin, bytes; they end with the file
+    payload: Sequence[memoryview] = ()  # one bytes-like object a layer, where more than the header was read
 
 
 def layer_bytes(format: Format, width: int, height: int) -> int:
@@ -108,20 +110,7 @@ def write_ktx2(
             file.write(layer)
 
 
-@dataclass(frozen=True)
-class Header:
-    """Header of a KTX2 file."""
-
-    format: Format  # one of bc7, uint8, fp16
-    # width, height: size in texels
-    width: int
-    height: int
-    layers: int  # number of layers
-    data_at: int  # where the texels begin, bytes; they end with the file
-    nbytes: int  # size of the whole file
-
-
-def read_header(data: bytes | bytearray | memoryview, size: int) -> Header:
+def read_header(data: bytes | bytearray | memoryview, size: int) -> Ktx2Image:
     """The header of a file, from its first `HEADER_LIMIT` bytes or more.
 
     Args:
@@ -158,7 +147,7 @@ def read_header(data: bytes | bytearray | memoryview, size: int) -> Header:
         raise Ktx2Error(f"the level index does not match {layers} layers of {width} x {height} texels")
     if data_at < kvd_at + kvd_size or data_at < dfd_at + dfd_size or data_at + data_size != size:
         raise Ktx2Error(f"truncated or too long: {size} bytes, {data_at + data_size} expected")
-    return Header(format, width, height, layers, data_at, size)
+    return Ktx2Image(format, width, height, layers, data_at)
 
 
 def parse_ktx2(data: bytes | bytearray | memoryview) -> Ktx2Image:
@@ -170,8 +159,7 @@ def parse_ktx2(data: bytes | bytearray | memoryview) -> Ktx2Image:
     view = memoryview(data)
     header = read_header(view, len(view))
     size = layer_bytes(header.format, header.width, header.height)
-    payload = [view[at : at + size] for at in range(header.data_at, header.nbytes, size)]
-    return Ktx2Image(payload, header.format, header.width, header.height)
+    return replace(header, payload=[view[at : at + size] for at in range(header.data_at, len(view), size)])
 
 
 def _key_values(pairs: Mapping[str, str]) -> bytes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
@@ -192,46 +193,50 @@ def assemble(folder: Path, info: Manifest, files: dict[str, bytearray], decode: 
     Raises:
         BundleError: a file is malformed, or a value is out of range.
     """
-    if info.surfels.file == COMPACT_SURFELS:
-        return _assemble_compact(folder, info, files, decode)
+    render, atlas, points = info.render, info.atlas, info.render.photographed
+    contents = _compact_contents if info.surfels.file == COMPACT_SURFELS else _ply_contents
+    scene = BakedScene(
+        view_color=info.surfels.view_color,
+        near=render.near,
+        weight_bound=render.weight_bound,
+        prefilter=render.prefilter,
+        photographed=None if points is None else points_of(points),
+        **contents(folder, info, files, decode),
+    )
+    if atlas is not None:
+        scene.offset, scene.scale, scene.alpha_scale = atlas.offset, atlas.scale, atlas.alpha_scale or 0.0
+    return Bundle(scene, info)
+
+
+def _ply_contents(folder: Path, info: Manifest, files: Mapping[str, bytearray], decode: bool) -> dict[str, Any]:
+    """Surfels, tiles and texels of surfels.ply and atlas.ktx2, by the names of `BakedScene`."""
     path = folder / SURFELS
-    kind = info.surfels.view_color
     try:
         elements = ply.parse_ply(files[SURFELS])
         columns = elements["vertex"]
-        surfels, tiles = from_columns(columns, kind, elements.get(TERMS))
-        extent = tile_extents(columns, info.atlas.extent if info.atlas else SUPPORT)
-        mean_residual = mean_residuals(columns)
-        mean_alpha = mean_alphas(columns) if info.has_alpha else None
+        surfels, tiles = from_columns(columns, info.surfels.view_color, elements.get(TERMS))
+        found = {
+            "surfels": surfels,
+            "tiles": tiles.contiguous(),
+            "extent": tile_extents(columns, info.atlas.extent if info.atlas else SUPPORT),
+            "mean_residual": mean_residuals(columns),
+            "mean_alpha": mean_alphas(columns) if info.has_alpha else None,
+        }
     except ply.PlyError as error:
         raise BundleError(f"{path}: {error}") from error
     _check_tiles(tiles, info, path)
-    scene = BakedScene(
-        surfels,
-        kind,
-        tiles.contiguous(),
-        None,
-        extent=extent,
-        mean_residual=mean_residual,
-        mean_alpha=mean_alpha,
-        near=info.render.near,
-        weight_bound=info.render.weight_bound,
-        prefilter=info.render.prefilter,
-        photographed=_photographed(info),
-    )
     if info.atlas is None:
-        return Bundle(scene, info)
+        return found
     try:
         image = ktx2.parse_ktx2(files[ATLAS])
     except ktx2.Ktx2Error as error:
         raise BundleError(f"{folder / ATLAS}: {error}") from error
-    scene.atlas, scene.blocks = _texels(image, decode, info.has_alpha, folder / ATLAS)
-    scene.offset, scene.scale, scene.alpha_scale = info.atlas.offset, info.atlas.scale, info.atlas.alpha_scale or 0.0
-    return Bundle(scene, info)
+    texels, blocks = _texels(image, decode, info.has_alpha, folder / ATLAS)
+    return {**found, "atlas": texels, "blocks": blocks}
 
 
-def _assemble_compact(folder: Path, info: Manifest, files: dict[str, bytearray], decode: bool) -> Bundle:
-    """The bundle of surfels.bin and texels.bin."""
+def _compact_contents(folder: Path, info: Manifest, files: Mapping[str, bytearray], decode: bool) -> dict[str, Any]:
+    """The same of surfels.bin and texels.bin."""
     atlas, where = info.atlas, folder / COMPACT_SURFELS
     try:
         data = memoryview(files[COMPACT_SURFELS])
@@ -242,8 +247,7 @@ def _assemble_compact(folder: Path, info: Manifest, files: dict[str, bytearray],
             packing = compact.packing_of(atlas, sizes)
             tiles, where = torch.from_numpy(packing.tiles), folder / TEXELS
             found = compact.decode_texels(atlas, sizes, residual, step, memoryview(files[TEXELS]), alpha)
-            value_range = Range(atlas.offset, atlas.scale, "")
-            texels = _rounded(found, packing, value_range)
+            texels = _rounded(found, packing, Range(atlas.offset, atlas.scale, ""))
             if not decode and texels.numel() >= LARGE_ATLAS:
                 blocks = _blocks(texels, info.has_alpha)
                 texels = texels if blocks is None else None
@@ -251,28 +255,15 @@ def _assemble_compact(folder: Path, info: Manifest, files: dict[str, bytearray],
             raise StreamError("a surfel has a tile, and there is no atlas")
     except StreamError as error:
         raise BundleError(f"{where}: {error}") from error
-    scene = BakedScene(
-        codes.surfels(),
-        info.surfels.view_color,
-        tiles,
-        texels,
-        extent=codes.extent(SUPPORT),
-        mean_residual=constants(residual, step),
-        mean_alpha=None if alpha is None else mean_alphas_of(alpha),
-        near=info.render.near,
-        weight_bound=info.render.weight_bound,
-        prefilter=info.render.prefilter,
-        blocks=blocks,
-        photographed=_photographed(info),
-    )
-    if atlas is not None:
-        scene.offset, scene.scale, scene.alpha_scale = atlas.offset, atlas.scale, atlas.alpha_scale or 0.0
-    return Bundle(scene, info)
-
-
-def _photographed(info: Manifest) -> Tensor | None:
-    points = info.render.photographed
-    return None if points is None else points_of(points)
+    return {
+        "surfels": codes.surfels(),
+        "tiles": tiles,
+        "atlas": texels,
+        "blocks": blocks,
+        "extent": codes.extent(SUPPORT),
+        "mean_residual": constants(residual, step),
+        "mean_alpha": None if alpha is None else mean_alphas_of(alpha),
+    }
 
 
 def _rounded(codes: TexelCodes, packing: Packing, value_range: Range) -> Tensor:

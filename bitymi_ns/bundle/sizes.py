@@ -1,7 +1,7 @@
 """Checks of a bundle's files before they are read: headers, bundle.json, memory."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from bitymi_ns.bundle.manifest import ATLAS, COMPACT_SURFELS, MANIFEST, SURFELS,
 from bitymi_ns.bundle.surfel_table import TERMS
 from bitymi_ns.files import size_text
 
+SCENE_FILES = frozenset((SURFELS, ATLAS, COMPACT_SURFELS, TEXELS))  # the files of which a scene is made
 HEAD = max(ply.HEADER_LIMIT, ktx2.HEADER_LIMIT)  # bytes from the start of a file that `check_head` reads
 _SURFEL_BYTES, _TERM_BYTES, _TEXEL_BYTES = 340, 150, 60
 """Bytes of a compact bundle while it is decoded: 2 million surfels took 370 each, 4 million terms 165, 17 million
@@ -24,42 +25,23 @@ def check_head(info: Manifest, name: str, head: bytes, size: int) -> None:
     Raises:
         PlyError, Ktx2Error, StreamError: say why.
     """
-    if name in _CHECKS:
-        _CHECKS[name](info, head, size)
-
-
-def _check_surfels_header(info: Manifest, head: bytes, size: int) -> None:
-    elements = ply.read_header(head, size).elements
-    count, terms = elements["vertex"].count, elements[TERMS].count if TERMS in elements else None
-    if count != info.surfels.count:
-        raise ply.PlyError(f"it has {count} surfels, surfels.count of {MANIFEST} says {info.surfels.count}")
-    if terms != info.surfels.terms:
-        raise ply.PlyError(f"it has {terms} view-colour terms, surfels.terms of {MANIFEST} says {info.surfels.terms}")
-
-
-def _check_atlas_header(info: Manifest, head: bytes, size: int) -> None:
-    header, stated = ktx2.read_header(head, size), info.atlas
-    found = (header.format, header.width, header.height, header.layers)
-    if stated is None or found != (stated.format, stated.width, stated.height, stated.layers):
-        raise ktx2.Ktx2Error(f"format and size {found} are not those of {MANIFEST}")
-
-
-def _check_compact_size(info: Manifest, head: bytes, size: int) -> None:
-    compact.check_surfels_size(info.surfels, size)
-
-
-def _check_texels_size(info: Manifest, head: bytes, size: int) -> None:
-    if info.atlas is not None:
-        compact.check_texels_size(info.atlas, size, info.files[COMPACT_SURFELS].bytes)
-
-
-_CHECKS: dict[str, Callable[[Manifest, bytes, int], None]] = {
-    SURFELS: _check_surfels_header,
-    ATLAS: _check_atlas_header,
-    COMPACT_SURFELS: _check_compact_size,
-    TEXELS: _check_texels_size,
-}
-SCENE_FILES = frozenset(_CHECKS)  # the files of which a scene is made
+    surfels, atlas = info.surfels, info.atlas
+    if name == SURFELS:
+        elements = ply.read_header(head, size).elements
+        count, terms = elements["vertex"].count, elements[TERMS].count if TERMS in elements else None
+        if count != surfels.count:
+            raise ply.PlyError(f"it has {count} surfels, surfels.count of {MANIFEST} says {surfels.count}")
+        if terms != surfels.terms:
+            raise ply.PlyError(f"it has {terms} view-colour terms, surfels.terms of {MANIFEST} says {surfels.terms}")
+    elif name == ATLAS:
+        header = ktx2.read_header(head, size)
+        found = (header.format, header.width, header.height, header.layers)
+        if atlas is None or found != (atlas.format, atlas.width, atlas.height, atlas.layers):
+            raise ktx2.Ktx2Error(f"format and size {found} are not those of {MANIFEST}")
+    elif name == COMPACT_SURFELS:
+        compact.check_surfels_size(surfels, size)
+    elif name == TEXELS and atlas is not None:
+        compact.check_texels_size(atlas, size, info.files[COMPACT_SURFELS].bytes)
 
 
 @contextmanager

@@ -5,9 +5,9 @@ from __future__ import annotations
 import errno
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -34,17 +34,15 @@ from bitymi_ns.bundle.manifest import (
     points_text,
 )
 from bitymi_ns.bundle.parts import NOTES, check_target, notes_data, parts_of
-from bitymi_ns.bundle.poster import Pixels, draw_poster, encode_poster, most_bytes
-from bitymi_ns.bundle.statistics import Statistics
+from bitymi_ns.bundle.poster import Pixels, encode_poster, most_bytes
 from bitymi_ns.bundle.surfel_table import EXTENT_COLUMN, TERMS, first_problem, term_columns, to_columns
-from bitymi_ns.codec.limits import ALPHA_LIMIT, RESIDUAL_LIMIT
+from bitymi_ns.codec.limits import ALPHA_LIMIT
 from bitymi_ns.codec.quantise import EncodedAtlas
 from bitymi_ns.codec.texel_codes import SceneCodes
 from bitymi_ns.files import complete_folder, reason, size_text
 from bitymi_ns.ops.view_color import check_lean
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene.baked import BakedScene
-from bitymi_ns.scene.camera import Camera
 
 GENERATOR = f"bitymi-ns {__version__}"
 _CHUNK = 1 << 22
@@ -72,60 +70,6 @@ class World:
             stretch = abs(float(np.linalg.det(transform[:, :3]))) ** (1 / 3) * float(self.scale)
             place["metres_per_unit"] = float(self.metres_per_unit) / stretch
         return place
-
-
-class Baked(Protocol):
-    """The part of `bake.Baked` that is written."""
-
-    scene: BakedScene
-    atlas: EncodedAtlas | None
-    codes: SceneCodes | None
-    statistics: Statistics
-
-    @property
-    def mean_residual(self) -> torch.Tensor:
-        """[N, 3] mean of every tile; the residual of a surfel without a tile."""
-
-    def encoded(self) -> Baked:
-        """Quantise and encode the texels, where that is not done."""
-
-    def stored(self) -> BakedScene:
-        """Scene with its texels as a bundle has them."""
-
-
-def export(
-    baked: Baked,
-    folder: str | Path,
-    *,
-    background: Sequence[float] = (0.0, 0.0, 0.0),
-    world: World | None = None,
-    statistics: Mapping[str, Any] | None = None,
-    extra_files: Mapping[str, bytes] | None = None,
-    loose_files: Mapping[str, bytes] | None = None,
-    overwrite: bool = False,
-    interchange: bool = False,
-    first: Camera | None = None,
-) -> Path:
-    """Write a baked scene, encoded where it is not yet, as a bundle; see `write_bundle` for the arguments and errors.
-
-    `statistics` is added to those of the bake. `first` is the camera with which a viewer opens, the first of
-    cameras.json that was held out, or its first: the poster is drawn from there; None = the bundle gets no poster.
-    """
-    baked = baked.encoded()
-    return write_bundle(
-        folder,
-        replace(baked.scene, mean_residual=baked.mean_residual.clamp(-RESIDUAL_LIMIT, RESIDUAL_LIMIT)),
-        baked.atlas,
-        baked.codes,
-        background=background,
-        world=world,
-        statistics={**baked.statistics.model_dump(), **(statistics or {})},
-        extra_files=extra_files,
-        loose_files=loose_files,
-        overwrite=overwrite,
-        interchange=interchange,
-        poster=None if first is None else draw_poster(baked.stored(), first, background),
-    )
 
 
 def write_bundle(

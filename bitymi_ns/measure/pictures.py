@@ -11,7 +11,8 @@ from torch import Tensor
 
 from bitymi_ns.files import reason
 from bitymi_ns.measure.report.pictures import ERROR_CAPTION, ERROR_SCALE, heat
-from bitymi_ns.ops import blended_image, composite
+from bitymi_ns.measure.report.read import PICTURES
+from bitymi_ns.ops import blended_image, fragment_residual
 from bitymi_ns.ops.constants import COLOR_BIAS
 from bitymi_ns.plugin.console import fail, say
 from bitymi_ns.plugin.export.target import replace_file, require_writable
@@ -21,10 +22,8 @@ from bitymi_ns.plugin.run.surfel_model import OVERDRAW_SCALE
 from bitymi_ns.scene import RenderOutput, Scene
 from bitymi_ns.scene.baked import as_bytes
 from bitymi_ns.scene.field import TexelField
-from bitymi_ns.train.init import tangents
 
 RESIDUAL_GAIN = 4.0  # residuals are small; the pictures of them are brightened by this factor
-FILE = "pictures.json"
 
 KINDS = {
     "photo": "photograph",
@@ -48,32 +47,20 @@ def residual_parts(scene: Scene, output: RenderOutput) -> tuple[Tensor, Tensor]:
     """Blend the positive and the negative part of the residual: sum of w max(rho, 0) and of w max(-rho, 0), [H, W, 3].
 
     As in rendering, fragments below the weight bound have none. The sum of the view colour alone and the difference
-    of the two is the render wherever no colour had to be cut off at 0.
+    of the two is the render wherever no colour had to be cut off at 0. The scene has a texture.
     """
-    p = scene.surfels
+    field, bound = scene.field, scene.config.weight_bound
+    # over view colours of 0 a colour is the positive part of its residual
+    dark = torch.full_like(scene.surfels["means"], -COLOR_BIAS)
     bands = []
     for fragments in output.fragments.lists():
-        if isinstance(scene.field, TexelField):
-            # over view colours of 0 a colour is the positive part of its residual
-            dark = torch.full_like(p["means"], -COLOR_BIAS)
-            texels, tiles, bound = scene.field.texels.detach(), scene.field.tiles, scene.config.weight_bound
-            parts = torch.cat(
-                [blended_image(fragments, output.projection, dark, t, tiles, bound)[:, :3] for t in (texels, -texels)],
-                dim=1,
-            )
-            bands.append(parts.view(fragments.height, fragments.width, 6))
-            continue
-        rho = fragments.weight.new_zeros(len(fragments), 3)
-        if scene.field is not None:
-            textured = torch.nonzero(fragments.weight >= scene.config.weight_bound).squeeze(1)
-            surfel = fragments.surfel[textured].long()
-            u, v = fragments.uv[:, textured]
-            axes = tangents(p["quats"][surfel])
-            size = p["log_scales"][surfel].exp()
-            x = p["means"][surfel] + (u * size[:, 0])[:, None] * axes[..., 0] + (v * size[:, 1])[:, None] * axes[..., 1]
-            rho[textured] = scene.field(x)
-        parts = composite(fragments, torch.cat([rho, -rho], 1).clamp(min=0.0))
-        bands.append(parts.view(fragments.height, fragments.width, 6))
+        if isinstance(field, TexelField):
+            textures = [{"texels": sign * field.texels.detach(), "tiles": field.tiles} for sign in (1, -1)]
+        else:
+            rho = fragment_residual(fragments, output.projection.frames, field.geometry, field.weights, bound)
+            textures = [{"residual": rho}, {"residual": -rho}]
+        parts = [blended_image(fragments, output.projection, dark, bound=bound, **t)[:, :3] for t in textures]
+        bands.append(torch.cat(parts, dim=1).view(fragments.height, fragments.width, 6))
     positive, negative = torch.cat(bands).split(3, dim=-1)
     return positive, negative
 
@@ -110,7 +97,7 @@ def draw_worst(load_config: Path, output_dir: Path, views: int) -> None:
     """
     if views < 1:
         fail(f"--views must be at least 1, not {views}")
-    require_writable(output_dir / FILE)
+    require_writable(output_dir / PICTURES)
     config, pipeline = load_trained(load_config)
     model, datamanager = pipeline.model, pipeline.datamanager
     count = len(datamanager.eval_dataset)
@@ -137,5 +124,5 @@ def draw_worst(load_config: Path, output_dir: Path, views: int) -> None:
         listed.append({"view": index, "rank": rank + 1, "of": count, "metrics": figures, "files": files})
     about = {"scene": config.experiment_name, "method": config.method_name}
     text = json.dumps({"bitymi_pictures": 1, **about, "captions": KINDS, "views": listed}, indent=1)
-    replace_file(output_dir / FILE, text.encode("utf8"))
+    replace_file(output_dir / PICTURES, text.encode("utf8"))
     say(f"Wrote {len(listed)} views to {output_dir}")

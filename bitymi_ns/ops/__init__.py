@@ -1,18 +1,16 @@
 """Differentiable torch operations over the compiled kernels; float64 twins are in `ops.reference`.
 
-Every function takes float32 or float64 tensors and dispatches on their device and dtype. `field_tiles` is for a CUDA
-device only: elsewhere it raises a RuntimeError that says so. `baked.draw` draws a baked scene on both, by `baked_cpu`
-or `baked_cuda`.
+Every function takes float32 or float64 tensors and dispatches on their device and dtype. `baked.draw` draws a baked
+scene on both, by `baked_cpu` or `baked_cuda`.
 """
 
 from .bands import Bands, band, by_bands, fitting_lists, refused
 from .blend import blended_image
-from .composite import beta_map, composite, composite_image, soft_overdraw
+from .composite import composite, soft_overdraw
 from .coverage import add_texel_coverage
-from .field import FieldGeometry, field
+from .field import FieldGeometry, field, fragment_residual
 from .fragment_list import TooManyFragments
 from .project import Prefilter, Projection, project
-from .shade import shade
 from .ssim import ssim
 from .texel import TexelAlpha, TexelDescent, TexelTiles
 from .trace import Fragments, masked_counts, select, trace
@@ -32,18 +30,16 @@ __all__ = [
     "TooManyFragments",
     "add_texel_coverage",
     "band",
-    "beta_map",
     "blended_image",
     "by_bands",
     "composite",
-    "composite_image",
     "field",
     "fitting_lists",
+    "fragment_residual",
     "masked_counts",
     "project",
     "refused",
     "select",
-    "shade",
     "soft_overdraw",
     "ssim",
     "trace",

@@ -1,4 +1,4 @@
-"""Shading and compositing in one: the image of surfels with texels, or with their view colours alone."""
+"""Shading and compositing in one: the image of surfels with their view colours and a residual."""
 
 import functools
 
@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from .backend import check_shapes, cuda_backend, dense, kernel, module, on_same_device
-from .composite import check_projection
 from .constants import IMAGE_CHANNELS, MAP_CHANNELS
 from .project import Projection
 from .texel import TexelDescent, TexelTiles
@@ -27,14 +26,14 @@ def backward_memory(fragments: Fragments, maps: bool, texels: int) -> dict[str, 
         fragments: of the view.
         maps: as in `blended_image`.
         texels: T of which gradients are added up. On CUDA a row of four numbers each; where torch is asked for
-            deterministic algorithms, int64 sums in its place, as in `field.backward_memory`.
+            deterministic algorithms, int64 sums in its place: a sum of integers does not depend on the order.
     """
     like = fragments.weight
     if not cuda_backend(like.device):
         return {}
     work = {"partial": like.new_empty(fragments.layout.handle.pairs, 8 if maps else 4)}  # of surfels, by pair
     if texels and torch.are_deterministic_algorithms_enabled():
-        numbers = module(like.device).exact_size(4 * texels, 0, False)
+        numbers = module(like.device).exact_size(4 * texels)
         work["exact_work"] = torch.empty(numbers, dtype=torch.int64, device=like.device)
     elif texels:
         work["texel_work"] = like.new_empty(4 * texels)
@@ -43,30 +42,33 @@ def backward_memory(fragments: Fragments, maps: bool, texels: int) -> dict[str, 
 
 class _BlendedImage(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, weight, depth, uv, geom, base, texels, fragments, tiles, bound, maps, descent):
+    def forward(ctx, weight, depth, uv, geom, base, texels, residual, fragments, tiles, bound, maps, descent):
         g, b, t, arrays = dense(geom, geom), dense(base, geom), dense(texels, geom), fragments.arrays_for_layout
+        r = None if residual is None else dense(residual, geom)
         image = geom.new_empty(fragments.width * fragments.height, MAP_CHANNELS if maps else IMAGE_CHANNELS)
         ctx.arguments = {"maps": maps, **fragments.view, **tiles.arrays, "bound": bound}
-        kernel("blend_forward", geom)(**ctx.arguments, **arrays, geom=g, base=b, texels=t, image=image)
-        ctx.save_for_backward(g, b, t, *arrays.values())
+        kernel("blend_forward", geom)(**ctx.arguments, **arrays, geom=g, base=b, texels=t, residual=r, image=image)
+        ctx.save_for_backward(g, b, t, r, *arrays.values())
         ctx.descent, ctx.names, ctx.fragments = descent, tuple(arrays), fragments
         return image
 
     @staticmethod
     def backward(ctx, dimage):
-        geom, base, texels, *rest = ctx.saved_tensors
+        geom, base, texels, residual, *rest = ctx.saved_tensors
         arrays = dict(zip(ctx.names, rest, strict=True))
-        weighs, _, moves, _, _, learns, *_ = ctx.needs_input_grad
+        weighs, _, moves, _, _, learns, residual_learns, *_ = ctx.needs_input_grad
         out = {"dweight": torch.empty_like(arrays["weight"]) if weighs else None, "dgeom": torch.empty_like(geom)}
         out |= {"dbase": torch.empty_like(base), "dtexels": torch.empty_like(texels) if learns else None}
         out |= {"duv": torch.empty_like(arrays["uv"]) if moves else None}
+        out |= {"dresidual": torch.empty_like(residual) if residual_learns else None}
         out |= {"ddepth": torch.empty_like(arrays["depth"]) if ctx.arguments["maps"] else None}
         step = {"rate": 0.0} if ctx.descent is None else ctx.descent.arguments(texels)
-        inputs = {"geom": geom, "base": base, "texels": texels, "dimage": dense(dimage, geom)}
+        inputs = {"geom": geom, "base": base, "texels": texels, "residual": residual, "dimage": dense(dimage, geom)}
         sums_texels = learns or ctx.descent is not None
         work = backward_memory(ctx.fragments, ctx.arguments["maps"], len(texels) if sums_texels else 0)
         kernel("blend_backward", geom)(**ctx.arguments, **arrays, **inputs, **step, **work, **out)
-        gradients = (out[name] for name in ("dweight", "ddepth", "duv", "dgeom", "dbase", "dtexels"))
+        names = ("dweight", "ddepth", "duv", "dgeom", "dbase", "dtexels", "dresidual")
+        gradients = (out[name] for name in names)
         return *gradients, None, None, None, None, None
 
 
@@ -94,13 +96,15 @@ def blended_image(
     maps: bool = False,
     move_surfels: bool = True,
     descent: TexelDescent | None = None,
+    residual: Tensor | None = None,
 ) -> Tensor:
-    """Shade and composite: the image of surfels with texels, or with their view colours alone.
+    """Shade and composite: sums of w times colour, 1 and beta, and with maps also depth and normal, per pixel.
 
-    A fragment's colour is ReLU(ReLU(f_view(d) + 0.5) + r(u, v)), eq. (color) with the texels' residual r: bilinear
-    between the four nearest texel centres, constant beyond the outer ones. Differentiable in the fragments' weights,
-    depths and coordinates, `projection.geom`, `base` and `texels`. Along u and v the slope is that of the bilinear
-    fetch, and 0 beyond the outer texel centres.
+    A fragment's colour is ReLU(ReLU(f_view(d) + 0.5) + r), eq. (color), with the residual r of texels at (u, v),
+    bilinear between the four nearest texel centres, constant beyond the outer ones; or a residual of each fragment, as
+    `fragment_residual` has it of a field; or none. Differentiable in the fragments' weights, depths and coordinates,
+    `projection.geom`, `base`, `texels` and `residual`. Along u and v the slope is that of the bilinear fetch, and 0
+    beyond the outer texel centres.
 
     It is one pass over the fragments, and one backward, which list neither colours nor their gradients: of 64 bytes per
     fragment 40 are left on a card, 32 on the CPU. On the CPU the sums of the backward pass depend neither on the number
@@ -111,22 +115,32 @@ def blended_image(
         fragments: F fragments of an H x W view.
         projection: the view's, of N surfels.
         base: [N, 3] f_view of every surfel.
-        texels: [T, 3] residual colours, of the fragments' dtype; None = there is no residual.
+        texels: [T, 3] residual colours, of the fragments' dtype; None = none.
         tiles: of the texels.
         bound: fragments of weight below this, and those of surfels without a tile, keep ReLU(f_view + 0.5).
         maps: add depth and normal.
         move_surfels: the gradient of r with respect to u and v reaches the fragments.
         descent: the backward pass moves the texels that the view shows, in place, and keeps no gradient of them. So a
             whole atlas need not be cleared and read for every view.
+        residual: [F, 3] residual colour of each fragment, in place of texels.
 
     Returns:
-        [H * W, 5], with maps [H * W, 9]: as `composite_image` does.
+        [H * W, 5] rgb, alpha, sum w beta; with maps [H * W, 9]: also sum w z (camera z) and sum w n (unit normals in
+        the camera frame, OpenCV axes, facing the camera). Nothing is divided by alpha; the background is not included.
 
     Raises:
         ValueError: the tiles are not those of these texels or surfels, or the fragments those of others; or texels
-            that ask for a gradient are to be moved; or tensors lie on several devices.
+            that ask for a gradient are to be moved; or there are texels and a residual; or tensors lie on several
+            devices.
     """
-    check_projection(fragments, projection)
+    on_same_device(fragments.weight, geom=projection.geom)
+    if len(projection.geom) != fragments.surfels:
+        raise ValueError(f"the fragments are those of {fragments.surfels} surfels, not of {len(projection.geom)}")
+    if residual is not None:
+        on_same_device(fragments.weight, residual=residual)
+        check_shapes(residual=(residual, (len(fragments), 3)))
+        if texels is not None:
+            raise ValueError("the residual is that of texels or of fragments, not both")
     if texels is None or tiles is None:
         tiles = _no_tiles(fragments.surfels, base.dtype, base.device)
         texels, move_surfels, descent = base.new_zeros(0, 3), False, None
@@ -134,5 +148,5 @@ def blended_image(
     uv = fragments.uv if move_surfels else fragments.uv.detach()
     if descent is not None and not base.requires_grad:
         base = base.detach().requires_grad_()  # so that there is a backward pass, whatever else learns
-    rest = (projection.geom, base, texels, fragments, tiles, bound, maps, descent)
+    rest = (projection.geom, base, texels, residual, fragments, tiles, bound, maps, descent)
     return _BlendedImage.apply(fragments.weight, fragments.depth, uv, *rest)

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from .backend import check_shapes, cuda_backend, dense, kernel, kernel_class, module, on_device, on_same_device
-from .constants import FEATURES, WIDTH
+from .constants import FEATURES, FRAME, WIDTH
+from .trace import Fragments
 
 WEIGHTS = ("table", "w1", "w2", "w3")  # the kernels' names of the field's parameters
 
@@ -42,36 +43,6 @@ def kernel_field(geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Tensor,
         return kernel_class("Field", table)(**weights, **where, levels=levels, log2_size=log2_size)
 
 
-def gradients(params: Sequence[Tensor]) -> dict[str, Tensor]:
-    """Memory for the gradients of the field's parameters, by the kernels' names."""
-    return {f"d{name}": torch.empty_like(p) for name, p in zip(WEIGHTS, params, strict=True)}
-
-
-def backward_memory(
-    like: Tensor, table: Tensor | None, surfels: int = 0, frames: bool = False
-) -> dict[str, Tensor | None]:
-    """Working memory of the backward kernels of field and shading, by name: none on the CPU.
-
-    On CUDA: sums of the MLP's gradients per block; and, where torch is asked for deterministic algorithms
-    (torch.use_deterministic_algorithms), int64 sums of what blocks add up together: a sum of integers does not depend
-    on the order.
-
-    Args:
-        like: tells device and dtype.
-        table: the hash table where the field learns, else None.
-        surfels: number of surfels whose base colours get gradients.
-        frames: their frames get gradients, too.
-    """
-    if not cuda_backend(like.device):
-        return {}
-    kernels = module(like.device)
-    mlp = None if table is None else like.new_empty(kernels.MLP_WORK)
-    if not torch.are_deterministic_algorithms_enabled():
-        return {"mlp_work": mlp}
-    numbers = kernels.exact_size(0 if table is None else table.numel(), surfels, frames)
-    return {"mlp_work": mlp, "exact_work": torch.empty(numbers, dtype=torch.int64, device=like.device)}
-
-
 class _Field(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x, geometry, *params):
@@ -85,10 +56,17 @@ class _Field(torch.autograd.Function):
     @staticmethod
     def backward(ctx, drho):
         points, *params = ctx.saved_tensors
-        grads = gradients(params)
+        grads = {f"d{name}": torch.empty_like(p) for name, p in zip(WEIGHTS, params, strict=True)}
         dx = torch.empty_like(points) if ctx.needs_input_grad[0] else None
-        handle, memory = kernel_field(ctx.geometry, *params), backward_memory(points, params[0])
-        kernel("field_backward", points)(field=handle, x=points, drho=dense(drho, points), dx=dx, **grads, **memory)
+        work = {}
+        if cuda_backend(points.device):  # sums of the MLP's gradients per block, and exact sums of the table's
+            kernels = module(points.device)
+            work["mlp_work"] = points.new_empty(kernels.MLP_WORK)
+            if torch.are_deterministic_algorithms_enabled():
+                numbers = kernels.exact_size(params[0].numel())
+                work["exact_work"] = torch.empty(numbers, dtype=torch.int64, device=points.device)
+        handle = kernel_field(ctx.geometry, *params)
+        kernel("field_backward", points)(field=handle, x=points, drho=dense(drho, points), dx=dx, **grads, **work)
         return dx, None, *grads.values()
 
 
@@ -107,3 +85,38 @@ def field(x: Tensor, geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Ten
     """
     on_same_device(x, field_table=table, field_w1=w1, field_w2=w2, field_w3=w3)
     return _Field.apply(x, geometry, table, w1, w2, w3)
+
+
+def fragment_residual(
+    fragments: Fragments,
+    frames: Tensor,
+    geometry: FieldGeometry,
+    weights: Sequence[Tensor],
+    bound: float = 0.0,
+    move_surfels: bool = False,
+) -> Tensor:
+    """rho(x) of fragments, x = mean + u s_u t_u + v s_v t_v.
+
+    Args:
+        fragments: F fragments.
+        frames: [N, 9] of the projection.
+        geometry, weights: the field (table, w1, w2, w3), as in `field`.
+        bound: fragments of weight below this have none.
+        move_surfels: the gradient of rho with respect to x reaches uv and frames.
+
+    Returns:
+        [F, 3], 0 below the bound.
+
+    Raises:
+        ValueError: shapes or devices do not agree.
+    """
+    check_shapes(frames=(frames, (fragments.surfels, FRAME)))
+    on_same_device(fragments.weight, frames=frames)
+    if not move_surfels:
+        frames = frames.detach()
+    rows = (fragments.weight.detach() >= bound).nonzero().squeeze(1)
+    at = frames.index_select(0, fragments.surfel.index_select(0, rows))
+    uv = fragments.uv if move_surfels else fragments.uv.detach()
+    u, v = uv.index_select(1, rows).unsqueeze(2)
+    x = at[:, :3] + u * at[:, 3:6] + v * at[:, 6:]
+    return frames.new_zeros(len(fragments), 3).index_copy(0, rows, field(x, geometry, *weights))

@@ -14,7 +14,7 @@ from .ssim import similarity
 
 class _PictureLosses(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, image, target, mask, share, weight, gamma, squared):
+    def forward(ctx, image, target, mask, share, weight, gamma):
         pixels, wanted, rgb, flat = dense(image, image), dense(target, image), image[..., :3].detach(), None
         if mask is not None:  # pixels that do not count are equal in both pictures
             flat, counts = mask.reshape(-1).contiguous().view(torch.uint8), mask.reshape(*image.shape[:2], 1)
@@ -22,7 +22,7 @@ class _PictureLosses(torch.autograd.Function):
         alike, dalike = similarity(rgb, wanted, ctx.needs_input_grad[0])
         photometric, falloff, counted = (image.new_empty(()) for _ in range(3))
         sums = torch.empty(module(image.device).LOSS_SUMS, dtype=torch.float64, device=image.device)
-        ctx.arguments = {"gamma": gamma, "squared": squared, "share": share, "weight": weight}
+        ctx.arguments = {"gamma": gamma, "squared": False, "share": share, "weight": weight}
         kernel("picture_loss", image)(
             image=pixels,
             target=wanted,
@@ -53,7 +53,7 @@ class _PictureLosses(torch.autograd.Function):
             dimage=dimage,
             **ctx.arguments,
         )
-        return dimage, None, None, None, None, None, None
+        return dimage, None, None, None, None, None
 
 
 def picture_losses(
@@ -62,7 +62,6 @@ def picture_losses(
     ssim_weight: float,
     falloff_weight: float,
     gamma: float,
-    squared: bool = False,
     mask: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """The photometric and the weighted falloff loss of a picture (`train.losses.objective`), two scalars.
@@ -72,8 +71,7 @@ def picture_losses(
         target: [H, W, 3] photograph.
         ssim_weight: w of (1 - w) L1 + w (1 - SSIM).
         falloff_weight: of the mean of omega beta, omega = exp(-gamma e).
-        gamma: how fast omega fades with the error e.
-        squared: e is the mean of the squares over rgb instead of the sum of the absolute values.
+        gamma: how fast omega fades with the error e, the sum of the absolute differences over rgb.
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
 
     Raises:
@@ -88,7 +86,7 @@ def picture_losses(
         on_same_device(image, mask=mask)
         if mask.dtype != torch.bool or mask.numel() != image.shape[0] * image.shape[1]:
             raise ValueError(f"the picture is {list(image.shape)}, its mask {list(mask.shape)} {mask.dtype}, not bool")
-    return _PictureLosses.apply(image, target, mask, ssim_weight, falloff_weight, gamma, squared)
+    return _PictureLosses.apply(image, target, mask, ssim_weight, falloff_weight, gamma)
 
 
 @torch.no_grad()

@@ -13,7 +13,7 @@ from .project import Projection
 
 MOST = 1 << 25
 """Fragments of a list whose length memory decides: 1.2 GB with what blending and its backward pass add, 36 bytes per
-fragment; 68 where a field shades them. Fixed, so that what is computed does not depend on the machine."""
+fragment; 96 where a field shades them. Fixed, so that what is computed does not depend on the machine."""
 
 _pool = functools.cache(Pool)
 

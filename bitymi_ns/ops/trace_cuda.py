@@ -1,4 +1,4 @@
-"""The fragment list by the CUDA kernels (csrc/cuda/pairs.h describes it).
+"""The fragment list by the CUDA kernels (csrc/cuda/fragment_list.h describes it).
 
 Two numbers decide how much memory is needed, so the host waits for the device twice per view: for the number of pairs
 of surfel and tile, and for the number of fragments.
@@ -15,7 +15,7 @@ from .fragment_list import Layout, TooManyFragments, empty_ids, empty_list
 from .project import Projection
 
 NUMBERS = 24
-"""That a fragment takes in a training step: 7 in the list, 3 of its colour, 8 of their gradients; the rest is slack."""
+"""That a fragment takes in a training step: 7 in the list, 3 of its residual, 8 of gradients; the rest is slack."""
 FEW = 1 << 23  # fragments for which there is always room, so that nobody asks the device for its free memory
 LISTS_PER_CHECK = 100
 """Lists after which the device is asked again. Asking takes as long as a tenth of a training step, and between steps
@@ -194,6 +194,6 @@ def backward_memory(geom: Tensor, layout: Layout, texel_alpha: Tensor | None) ->
     work = {"dsigma": geom.new_empty(layout.handle.fragments)}
     work["partial"] = geom.new_empty(layout.handle.pairs, kernels.TRACE_SUMS)
     if texel_alpha is not None and torch.are_deterministic_algorithms_enabled():
-        numbers = kernels.exact_size(len(texel_alpha), 0, False)
+        numbers = kernels.exact_size(len(texel_alpha))
         work["exact_work"] = torch.empty(numbers, dtype=torch.int64, device=geom.device)
     return work

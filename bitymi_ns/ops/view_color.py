@@ -6,11 +6,16 @@ import torch
 from torch import Tensor
 
 from .backend import check_shapes, dense, kernel, on_same_device
-from .constants import MAX_TERMS
+from .constants import COLOR_BIAS, MAX_TERMS
 from .view_kinds import entry_of
 
 LEAN = ("view_base", "view_span", "view_terms")
 """Names of the parameters of lean view colours, of which every surfel has as many terms as it needs."""
+
+
+def view_base(f_view: Tensor) -> Tensor:
+    """ReLU(f_view + 0.5): a fragment's colour without residual."""
+    return torch.relu(f_view + COLOR_BIAS)
 
 
 def _directions(means: Tensor, center: Tensor, active: Tensor) -> dict[str, Tensor]:
@@ -114,7 +119,7 @@ def view_color(
         base, span, terms = (params[name] for name in LEAN)
         out, to = means.new_empty(n, 3), _directions(means, center, flags)
         colors = {"base": dense(base, means), "span": span.contiguous(), "lean": dense(terms, means)}
-        kernel("lean_color", means)(kind=kind, **colors, **to, out=out)
+        kernel("view_color_forward", means)(kind=kind, **colors, **to, out=out)
         return out
     terms = check_view_color(kind, params, n)
     entry = entry_of(kind)

@@ -56,7 +56,6 @@ class ViewColor:
     rule: str  # the same in words, of the rows that there are
     base_terms: int  # terms that the base of a lean colour stands for: 1, or 0 where it stands beside the terms
     option: str  # the option of `SceneConfig` that decides how many terms there are,
-    option_range: tuple[int, int]  # its smallest and largest value,
     terms_of: Callable[[int], int]  # and the number of terms for a value
     # the first parameters from colours [N, 3] less `COLOR_BIAS`, the number of terms and a random generator: they show
     # the colours from every direction, or on average over them
@@ -184,7 +183,6 @@ def _with_lobes(
         rule=f"{title} colours have at most {MAX_TERMS} lobes per surfel",
         base_terms=0,
         option="lobes",
-        option_range=(1, MAX_TERMS),
         terms_of=int,
         start=start,
         lean_width=len(limit),
@@ -208,7 +206,6 @@ VIEW_COLORS: dict[str, ViewColor] = {
         rule=f"Spherical Voronoi colours need 1 to {MAX_TERMS} sites per surfel",
         base_terms=1,
         option="sv_sites",
-        option_range=(1, MAX_TERMS),
         terms_of=int,
         start=_sv_start,
         lean_width=6,  # b, rgb relative to the first site
@@ -230,7 +227,6 @@ VIEW_COLORS: dict[str, ViewColor] = {
         rule="sh_rest must hold 0, 3, 8 or 15 coefficients",
         base_terms=1,
         option="sh_degree",
-        option_range=(0, 3),
         terms_of=lambda degree: (degree + 1) ** 2,
         start=_sh_start,
         lean_width=3,  # the coefficients of one function, from degree 1 on

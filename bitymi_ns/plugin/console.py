@@ -1,5 +1,6 @@
 """Console messages: errors without a traceback, warnings, a step bar; filtering of nerfstudio's own lines."""
 
+import functools
 import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -119,6 +120,9 @@ def say(message: str) -> None:
 def warn(message: str) -> None:
     """Tell the user about something that goes on without what it should have had."""
     CONSOLE.print(f"[bold yellow]{escape(printable(message))}", soft_wrap=True)
+
+
+warn_once = functools.cache(warn)  # the same message only once in a process
 
 
 def listed(names: Sequence[object], most: int = 3) -> str:

@@ -29,20 +29,10 @@ def _specification(name: str) -> MethodSpecification:
         return method_config(name)
     except Exception as error:  # noqa: BLE001 - see the module's docstring
         reason = str(error) if isinstance(error, KernelsUnavailable) else f"{type(error).__name__}: {error}"
-        _warn_once(f"bitymi-ns: its methods are not available: {reason}")
+        warnings.warn(f"bitymi-ns: its methods are not available: {reason}", stacklevel=1)
         return MethodSpecification(
             config=UnavailableConfig(method_name=name, reason=reason), description=f"not available: {reason}"
         )
-
-
-_warned = False
-
-
-def _warn_once(message: str) -> None:
-    global _warned
-    if not _warned:
-        _warned = True
-        warnings.warn(message, stacklevel=3)
 
 
 def _install() -> None:
@@ -52,15 +42,17 @@ def _install() -> None:
 
         checkpoints.allow_numpy_scalars()
     except Exception as error:  # noqa: BLE001 - see the module's docstring
-        _warn_once(f"bitymi-ns: checkpoints of nerfstudio's own methods may not load ({type(error).__name__}: {error})")
+        why = f"{type(error).__name__}: {error}"
+        warnings.warn(f"bitymi-ns: checkpoints of nerfstudio's own methods may not load ({why})", stacklevel=1)
     try:
         from bitymi_ns.plugin.export import hook
 
         hook.install()
     except Exception as error:  # noqa: BLE001
-        _warn_once(
+        warnings.warn(
             f"bitymi-ns: `ns-export bitymi-atlas` is not available ({type(error).__name__}: {error}); "
-            "use `python -m bitymi_ns.plugin.export.command` instead"
+            "use `python -m bitymi_ns.plugin.export.command` instead",
+            stacklevel=1,
         )
 
 

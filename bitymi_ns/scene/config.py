@@ -1,10 +1,14 @@
 """Options that decide the parameters of a scene and how they are rendered."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+from pydantic import Field
 
 from bitymi_ns.ops import Prefilter
+from bitymi_ns.ops.constants import MAX_LEVELS, MAX_TERMS
 from bitymi_ns.ops.view_kinds import Kind
+from bitymi_ns.ranges import Count, Share
 
 Texture = Literal["hash", "texels", "none"]  # what colours a surfel beside its view colour
 
@@ -15,41 +19,35 @@ class SceneConfig:
 
     view_color: Kind = "sv"
     """View colour: sv = Spherical Voronoi, sh = spherical harmonics, sb = Spherical Beta, sg = spherical Gaussians."""
-    sv_sites: int = 7
+    sv_sites: Annotated[int, Field(ge=1, le=MAX_TERMS)] = 7
     """Number of Spherical Voronoi sites per surfel (the paper's K), 1 to 32."""
-    sh_degree: int = 3
+    sh_degree: Annotated[int, Field(ge=0, le=3)] = 3
     """Degree of the spherical harmonics, 0 to 3."""
-    lobes: int = 2
+    lobes: Annotated[int, Field(ge=1, le=MAX_TERMS)] = 2
     """Number of lobes per surfel of the Spherical Beta and spherical Gaussian colours, 1 to 32."""
     texture: Texture = "hash"
     """Residual colours: hash = a field in space, multiresolution hash grid and MLP; texels = texels on every surfel,
     which learn in the last part of the run (train.texels); none = surfels alone."""
-    levels: int = 4
+    levels: Annotated[int, Field(ge=1, le=MAX_LEVELS)] = 4
     """Hash grid levels, 1 to 4, with resolutions min_resolution * 2^level; the paper's 4."""
-    min_resolution: int = 256
+    min_resolution: Annotated[int, Field(ge=2, le=1 << 20)] = 256
     """Cells along an edge of the coarsest hash grid level, 2 to 2^20."""
-    log2_table_size: int | None = None
+    log2_table_size: Annotated[int, Field(ge=1, le=24)] | None = None
     """Entries per hash level, as a power of two, 1 to 24; not given: chosen by the number of pixels in the photographs,
     so that the table fits the cache."""
     contraction: Literal["auto", "on", "off"] = "auto"
     """Contraction of space beyond the cameras; auto: off for images with alpha, and where a small box is declared."""
-    near: float | None = None
+    near: Annotated[float, Field(ge=1e-6, le=1e6)] | None = None
     """Nearest depth that is drawn, in scene units (camera z), above 0; not given: 0.02 of the extent of the cameras."""
-    weight_bound: float = 0.02
+    weight_bound: Share = 0.02
     """Fragments whose blending weight is below this keep the surfel's colour without the residual field; 0 to 1."""
     texture_moves_surfels: bool = False
     """The gradient of the residual field with respect to position reaches the surfels; that of texels always does."""
     prefilter: Prefilter = "low_pass"
     """How discs of a pixel or less are drawn: low_pass = never smaller than a fixed blob around their centre; pixel =
     as what they cover of each pixel, with the right moments (docs/numerics.md)."""
-    max_fragments: int = 0
+    max_fragments: Count = 0
     """Fragments that are kept at once. Views with more are drawn in bands, which the backward pass draws once more. 0:
     on a GPU as many as its memory holds, on the CPU 2^25, which take 1.5 GB."""
-    rim: float = 1e-3
+    rim: Annotated[float, Field(ge=1e-8, le=1)] = 1e-3
     """Lower bound of 1 - x in the derivative of the Beta kernel, which diverges at the rim for beta < 1; 1e-8 to 1."""
-
-    @property
-    def residual_moves_surfels(self) -> bool:
-        """True if the gradient of the residual reaches the surfels. A surfel takes its own texels along, so that they
-        tell it where to go."""
-        return self.texture_moves_surfels or self.texture == "texels"

@@ -3,67 +3,56 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from bitymi_ns.ops import (
-    Fragments,
-    Projection,
-    TexelAlpha,
-    TexelDescent,
-    TexelTiles,
-    blended_image,
-    composite_image,
-    shade,
-)
+from bitymi_ns.ops import Fragments, TexelAlpha, TexelDescent, TexelTiles, fragment_residual
 from bitymi_ns.ops.constants import FEATURES, WIDTH
 from bitymi_ns.ops.field import FieldGeometry, field
 
 from .config import SceneConfig
 
 
-class Shading(NamedTuple):
-    """Options of compositing a view from its fragments.
-
-    Attributes:
-        bound: fragments of weight below this have no residual.
-        learns: whether the residual gets gradients.
-        moves_surfels: whether the residual's gradient with respect to place reaches the surfels.
-        maps: also depth and normals.
-        read: what `snapshot` gave, for a view that is drawn in parts.
-    """
-
-    bound: float
-    learns: bool
-    moves_surfels: bool
-    maps: bool
-    read: Tensor | None = None
+def _version(buffer: Tensor) -> int:
+    return -1 if buffer.is_inference() else buffer._version
 
 
-class ResidualField(Protocol):
+def _is_of(cached: tuple[Tensor, int, Any] | None, buffer: Tensor) -> bool:
+    """True where something was computed from a buffer that has neither been replaced nor written to since."""
+    return cached is not None and cached[0] is buffer and cached[1] == _version(buffer)
+
+
+class ResidualField(nn.Module):
     """Residual colours of fragments, beside the surfels' view colours."""
 
-    def image(self, fragments: Fragments, projection: Projection, base: Tensor, how: Shading) -> Tensor:
-        """[H * W, C] what `composite_image` gives for colours ReLU(ReLU(f_view + 0.5) + residual).
+    def residual(
+        self, fragments: Fragments, frames: Tensor, bound: float, learns: bool, read: Tensor | None = None
+    ) -> dict[str, Any]:
+        """Arguments of `blended_image` for the residual of a view.
 
         Args:
-            fragments: of an H x W view.
-            base: [N, 3] f_view of every surfel.
-            how: it is made.
+            fragments: of the view.
+            frames: [N, 3, 3] of its `Projection`.
+            bound: fragments of weight below this have no residual.
+            learns: whether it gets gradients.
+            read: what `snapshot` gave, for a view that is drawn in parts.
         """
+        raise NotImplementedError
 
     def opacity(self, bound: float, learns: bool) -> TexelAlpha | None:
         """Opacities of texels, with gradients or without; None = all of a surfel is as opaque as it is. See
         `ops.TexelAlpha` for the bound."""
+        return None
 
     def snapshot(self) -> Tensor | None:
         """State that parts of a view read in place of the field itself, because the backward passes of other parts
         change it before they have been drawn again; None: nothing changes."""
+        return None
 
 
-class HashField(nn.Module):
+class HashField(ResidualField):
     """Multiresolution hash grid and MLP: view-independent residual colour rho(x), eq. (color).
 
     The residual starts at zero: the last layer does. Table entries start at U(-1e-4, 1e-4).
@@ -87,11 +76,8 @@ class HashField(nn.Module):
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
-        if not half > 0:
-            raise ValueError(f"the field's domain needs a positive size, not {half}")
-        if not 1 <= config.levels <= 4:
-            raise ValueError(f"levels must be 1 to 4, not {config.levels}")
         self.levels, self.min_resolution = config.levels, config.min_resolution
+        self._moves_surfels = config.texture_moves_surfels
 
         def uniform(bound: float, *shape: int) -> nn.Parameter:
             return nn.Parameter((torch.rand(*shape, generator=generator) * 2 - 1) * bound)
@@ -104,8 +90,7 @@ class HashField(nn.Module):
         self.field_w3 = nn.Parameter(torch.zeros(WIDTH, 3))
         # in the checkpoint: a loaded field lies where the trained one did
         self.register_buffer("domain", torch.tensor([*mid, half, float(contract)], dtype=torch.float64))
-        self._geometry = FieldGeometry(self.min_resolution, contract, tuple(mid), half)
-        self._read_from = self._state_of_domain()
+        self._geometry: tuple[Tensor, int, FieldGeometry] | None = None
 
     @torch.no_grad()
     def only(self, first: int, count: int) -> HashField:
@@ -131,33 +116,23 @@ class HashField(nn.Module):
     @property
     def geometry(self) -> FieldGeometry:
         """Geometry of the grid. Read back once: a step must not wait for the device to tell."""
-        now = self._state_of_domain()
-        if self._read_from[0] is not now[0] or self._read_from[1] != now[1]:
+        if not _is_of(self._geometry, self.domain):
             *mid, half, contract = self.domain.tolist()
-            self._geometry = FieldGeometry(self.min_resolution, bool(contract), tuple(mid), half)
-            self._read_from = now
-        return self._geometry
-
-    def _state_of_domain(self) -> tuple[Tensor, int]:
-        """Changes when the buffer is replaced or written to."""
-        return self.domain, -1 if self.domain.is_inference() else self.domain._version
+            geometry = FieldGeometry(self.min_resolution, bool(contract), tuple(mid), half)
+            self._geometry = (self.domain, _version(self.domain), geometry)
+        return self._geometry[2]
 
     @property
     def weights(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Table and MLP weights, in the order the operations take them."""
         return self.field_table, self.field_w1, self.field_w2, self.field_w3
 
-    def image(self, fragments: Fragments, projection: Projection, base: Tensor, how: Shading) -> Tensor:
-        """See `ResidualField`."""
-        weights = self.weights if how.learns else tuple(w.detach() for w in self.weights)
-        colors = shade(fragments, base, projection.frames, self.geometry, weights, how.bound, how.moves_surfels)
-        return composite_image(fragments, projection, colors, how.maps)
-
-    def opacity(self, bound: float, learns: bool) -> None:
-        """See `ResidualField`: a field in space adds colours alone."""
-
-    def snapshot(self) -> None:
-        """See `ResidualField`: the optimizer changes the weights, after all backward passes."""
+    def residual(
+        self, fragments: Fragments, frames: Tensor, bound: float, learns: bool, read: Tensor | None = None
+    ) -> dict[str, Any]:
+        weights = self.weights if learns else tuple(w.detach() for w in self.weights)
+        moves = learns and self._moves_surfels
+        return {"residual": fragment_residual(fragments, frames, self.geometry, weights, bound, moves)}
 
     def forward(self, x: Tensor) -> Tensor:
         """Residual colour [M, 3] at world positions [M, 3]."""
@@ -182,7 +157,7 @@ class HashField(nn.Module):
         return (4 * g.half / finest) * torch.stack([r * r, r / (2 - 1 / r)], dim=-1)
 
 
-class TexelField(nn.Module):
+class TexelField(ResidualField):
     """Residual colours of N surfels in texels, as a bundle has them: each surfel carries its own, wherever it moves.
 
     Args:
@@ -225,9 +200,8 @@ class TexelField(nn.Module):
     @property
     def tiles(self) -> TexelTiles:
         """Tiles of the surfels: sizes and offsets of their texels."""
-        now = self.size, -1 if self.size.is_inference() else self.size._version
-        if self._tiles is None or self._tiles[0] is not now[0] or self._tiles[1] != now[1]:
-            self._tiles = (*now, TexelTiles.of_sizes(self.size, self.extent))
+        if not _is_of(self._tiles, self.size):
+            self._tiles = (self.size, _version(self.size), TexelTiles.of_sizes(self.size, self.extent))
         return self._tiles[2]
 
     @torch.no_grad()
@@ -238,21 +212,20 @@ class TexelField(nn.Module):
         self.alpha = None if self.alpha is None else nn.Parameter(self.alpha.detach()[old])
         self.share, self.size, self.extent = self.share[old], self.size[rows], self.extent[rows]
 
-    def image(self, fragments: Fragments, projection: Projection, base: Tensor, how: Shading) -> Tensor:
-        """See `ResidualField`."""
-        descent = self.descent if how.learns else None
-        texels = self.texels if how.learns and descent is None else self.texels.detach()
-        if descent is not None and how.read is not None:
-            texels, descent = how.read, replace(descent, moved=texels)
-        given = (texels, self.tiles, how.bound, how.maps, how.moves_surfels, descent)
-        return blended_image(fragments, projection, base, *given)
+    def residual(
+        self, fragments: Fragments, frames: Tensor, bound: float, learns: bool, read: Tensor | None = None
+    ) -> dict[str, Any]:
+        descent = self.descent if learns else None
+        texels = self.texels if learns and descent is None else self.texels.detach()
+        if descent is not None and read is not None:
+            texels, descent = read, replace(descent, moved=texels)
+        # a surfel takes its own texels along, so that they tell it where to go
+        return {"texels": texels, "tiles": self.tiles, "bound": bound, "move_surfels": learns, "descent": descent}
 
     def opacity(self, bound: float, learns: bool) -> TexelAlpha | None:
-        """See `ResidualField`."""
         if self.alpha is None:
             return None
         return TexelAlpha(self.tiles, self.alpha if learns else self.alpha.detach(), bound)
 
     def snapshot(self) -> Tensor | None:
-        """See `ResidualField`."""
         return None if self.descent is None else self.texels.detach().clone()

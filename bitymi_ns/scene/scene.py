@@ -17,7 +17,6 @@ from bitymi_ns.ops import (
     Projection,
     TooManyFragments,
     band,
-    beta_map,
     blended_image,
     by_bands,
     project,
@@ -31,7 +30,7 @@ from bitymi_ns.ops.project import GEOMETRY
 
 from .camera import Camera
 from .config import SceneConfig
-from .field import ResidualField, Shading, TexelField
+from .field import ResidualField, TexelField
 
 NEAR = 0.02  # nearest depth that is drawn, for cameras of extent 1
 
@@ -161,7 +160,6 @@ class Scene(nn.Module):
         field_mode: Literal["train", "frozen", "off"] = "train",
         maps: bool = False,
         overdraw_half: float | None = None,
-        beta_alone: bool = False,
     ) -> RenderOutput:
         """Renders a view: visibility, then shading, then compositing.
 
@@ -173,7 +171,6 @@ class Scene(nn.Module):
                 colours are left out.
             maps: also depth and normals.
             overdraw_half: also the count of fragments with a gradient, see `ops.soft_overdraw`; None = without.
-            beta_alone: the gradient of the Beta map reaches beta alone, not the blending weights.
 
         Raises:
             TooManyFragments: a single row of tiles has too many.
@@ -189,13 +186,8 @@ class Scene(nn.Module):
 
         def draw(part: Projection, most: int | None) -> tuple[Tensor, Fragments]:
             fragments = trace(part, self.config.rim, most)
-            if field is None:
-                image = blended_image(fragments, part, base, maps=maps)
-            else:
-                moves = learns and self.config.residual_moves_surfels
-                image = field.image(fragments, part, base, Shading(bound, learns, moves, maps, read))
-            if beta_alone:
-                image = torch.cat([image[:, :4], beta_map(fragments, p["beta_raw"]), image[:, 5:]], 1)
+            residual = {} if field is None else field.residual(fragments, part.frames, bound, learns, read)
+            image = blended_image(fragments, part, base, maps=maps, **residual)
             if overdraw_half is not None:
                 image = torch.cat([image, soft_overdraw(fragments, overdraw_half).unsqueeze(1)], 1)
             return image, fragments

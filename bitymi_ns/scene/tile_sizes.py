@@ -80,7 +80,7 @@ def nyquist_resolution(
         delta: [N, 2] (or [N, 1]) finest voxel edge at the surfel along each axis, world units.
         extent: e, half side of the tile in scale units. 3 covers the support exactly; the paper's 4 more than that.
         r_min, r_max: smallest and largest resolution, powers of two >= 4.
-        max_pixels: [N, 2] or [N] largest projected extent of the tile over the training views, pixels.
+        max_pixels: [N, 2] largest projected extent of the tile over the training views, pixels.
 
     Returns:
         [N, 2] int32 (r_u, r_v), powers of two in [r_min, r_max].
@@ -88,8 +88,6 @@ def nyquist_resolution(
     check_sides(r_min, r_max)
     resolution = next_power_of_two(4.0 * extent * scales / delta)  # [N, 2]
     if max_pixels is not None:
-        if max_pixels.dim() == 1:
-            max_pixels = max_pixels[:, None]
         resolution = torch.minimum(resolution, next_power_of_two(max_pixels))
     return resolution.clamp(r_min, r_max).to(torch.int32)
 

@@ -22,11 +22,7 @@ class LossConfig:
     falloff_weight: NonNegative = 0.005
     """Weight lambda of the falloff loss; 0 turns it off (the paper's quality setting)."""
     falloff_gamma: NonNegative = 25.0
-    """Decay of the falloff and overdraw losses with the photometric error e: omega = exp(-gamma e)."""
-    falloff_error: Literal["l1_sum", "mse"] = "l1_sum"
-    """The error e in omega: L1 summed over rgb, or the mean squared error."""
-    falloff_gradient: Literal["full", "beta_only"] = "full"
-    """full: the falloff loss also moves the blending weights; beta_only: beta alone."""
+    """Decay of the falloff and overdraw losses with the photometric error e, L1 summed over rgb: exp(-gamma e)."""
     overdraw_weight: NonNegative = 0.0
     """Weight of the loss on the number of fragments per pixel, which fades with the error as the falloff loss does."""
     overdraw_start: int = 12_000  # First step with the overdraw loss: before, it costs quality.
@@ -87,17 +83,18 @@ class LearningRates:
     short_run_power: Annotated[float, Field(ge=0, le=10)] = 0.35
     """Runs of n < 30,000 steps multiply the rates of the surfels, not of the field, by (30,000 / n) to this power."""
     short_run_max: Positive = 4.0  # The largest such factor: at 7 times the rates the held-out error grows again.
-    means: tuple[float, float] = (1.6e-4, 1.6e-6)  # Positions, times the scene extent.
-    quats: float = 1e-3  # Rotations.
-    log_scales: float = 5e-3  # Logarithms of the tangent scales.
-    opacity_logits: float = 0.025  # Opacities, as logits.
-    beta_raw: float = 5e-3  # Kernel exponents: beta = 4 sigmoid(beta_raw).
-    view_color: tuple[float, float] = (2.5e-3, 5e-4)  # View-dependent colour: sv_rgb, sh_dc, sb_base and sg_base.
-    view_shape: tuple[float, float] = (5e-3, 5e-4)
+    means: tuple[Positive, Positive] = (1.6e-4, 1.6e-6)  # Positions, times the scene extent.
+    quats: NonNegative = 1e-3  # Rotations.
+    log_scales: NonNegative = 5e-3  # Logarithms of the tangent scales.
+    opacity_logits: NonNegative = 0.025  # Opacities, as logits.
+    beta_raw: NonNegative = 5e-3  # Kernel exponents: beta = 4 sigmoid(beta_raw).
+    view_color: tuple[Positive, Positive] = (2.5e-3, 5e-4)
+    """View-dependent colour: sv_rgb, sh_dc, sb_base and sg_base."""
+    view_shape: tuple[Positive, Positive] = (5e-3, 5e-4)
     """View-dependent colour: Voronoi sites and temperatures, lobes; higher SH bands use a twentieth of view_color."""
-    field_table: tuple[float, float] = (1e-2, 1e-3)  # Hash table of the texture field.
-    field_mlp: tuple[float, float] = (1e-2, 1e-3)  # MLP of the texture field.
-    exposure: tuple[float, float] = (5e-3, 5e-4)
+    field_table: tuple[Positive, Positive] = (1e-2, 1e-3)  # Hash table of the texture field.
+    field_mlp: tuple[Positive, Positive] = (1e-2, 1e-3)  # MLP of the texture field.
+    exposure: tuple[Positive, Positive] = (5e-3, 5e-4)
     """Colour corrections of the photographs: logarithms of gains, and what else they have."""
 
     def times(self, factor: float) -> LearningRates:
@@ -142,7 +139,7 @@ class TexelConfig(TexelSteps):
     alpha_rate: NonNegative = 30.0
     """Rate of the texels' alphas, which cut silhouettes out of surfels, as a multiple of that of their colours; 0 =
     opaque texels."""
-    surfel_rates: NonNegative = 0.4
+    surfel_rates: Positive = 0.4
     """Rates of the surfels in that part, as a share of those of a run as long as it; they fall to 0 as a cosine."""
     pixels_per_texel: Positive = 0.25
     """A tile has at most one texel per this many pixels of its surfel (summed blending weight), in the view that shows
@@ -190,7 +187,7 @@ class TrainConfig:
     stretch it by at most sqrt(n)."""
     num_downscales: Annotated[int, Field(ge=0, le=16)] = 2  # Halvings of the image size at the start.
     init_opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1  # Opacity of the first surfels.
-    first_surfels: int | None = None
+    first_surfels: PositiveCount | None = None
     """Most surfels that training starts with; excess points are dropped at random. Not given: in ns-train one for every
     1,000 pixels that the run renders; else all points."""
     background_points: NonNegative = 0.15

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import copy
-import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -61,7 +59,6 @@ class Trainer:
         views: Sequence[View],
         config: TrainConfig,
         max_steps: int,
-        extent: float | None = None,
         processes: Processes = ALONE,
     ) -> None:
         """
@@ -69,14 +66,11 @@ class Trainer:
             scene: changed in place.
             views: training views at full size.
             max_steps: length of the run; the schedules depend on it.
-            extent: scene extent in world units; default: from the cameras.
             processes: of the run, and the views of each per step; all are given the same.
         """
         if not views:
             raise ValueError("there is nothing to train on: no views")
-        if extent is None:
-            centers = torch.stack([view.camera.center for view in views])
-            extent = scene_extent(centers, scene.surfels["means"])
+        extent = scene_extent(torch.stack([view.camera.center for view in views]), scene.surfels["means"])
         self.scene, self.config = scene, config
         self.optimizers = make_optimizers(scene)
         pixels = sum(view.camera.width * view.camera.height for view in views)
@@ -95,7 +89,7 @@ class Trainer:
             terms, output = self.training.losses(view)
             learning = [term for term in terms.values() if term.requires_grad]
             if learning:
-                torch.autograd.backward(learning, [_one(term.device, term.dtype) for term in learning])
+                torch.autograd.backward(learning)
         self.training.combine()
         step(self.optimizers.values())
         report = self.training.finish()
@@ -107,34 +101,6 @@ class Trainer:
     def loss(self) -> float:
         return torch.stack(self._terms).sum().item() if self._terms else math.nan
 
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that an exact resume needs: tensors, numbers and text only."""
-        return {
-            "step": self.step,
-            "max_steps": self.training.schedule.max_steps,
-            "scene": {name: value.detach().clone() for name, value in self.scene.state_dict().items()},
-            "optimizers": {name: copy.deepcopy(optimizer.state_dict()) for name, optimizer in self.optimizers.items()},
-            "training": self.training.state_dict(),
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on where `state_dict` was taken; the run has the same options, views and length."""
-        max_steps = self.training.schedule.max_steps
-        if state["max_steps"] != max_steps:
-            raise ValueError(f"the run had {state['max_steps']} steps, this one has {max_steps}")
-        self.scene.make_room(state["scene"])
-        self.scene.load_state_dict(state["scene"])
-        for name, optimizer in self.optimizers.items():
-            optimizer.load_state_dict(copy.deepcopy(state["optimizers"][name]))
-        self.training.load_state_dict(state["training"])
-        self.step = state["step"]
-
-
-@functools.cache
-def _one(device: torch.device, dtype: torch.dtype) -> Tensor:
-    """The gradient of a sum with respect to one of its terms."""
-    return torch.ones((), device=device, dtype=dtype)
-
 
 def fit(
     scene: Scene,
@@ -144,7 +110,6 @@ def fit(
     max_steps: int,
     callback: Callable[[Trainer, dict[str, Tensor], RenderOutput, dict[str, float]], None] | None = None,
     eval_steps: Sequence[int] = (),
-    extent: float | None = None,
 ) -> TrainLog:
     """Train a scene in place.
 
@@ -155,9 +120,8 @@ def fit(
         max_steps: length of the run.
         callback: called after each step with the trainer, the loss terms, the view and the strategy's report.
         eval_steps: numbers of steps after which the log gets an entry; the end of the run always gets one.
-        extent: scene extent in world units; default: from the cameras.
     """
-    trainer = Trainer(scene, views, config, max_steps, extent)
+    trainer = Trainer(scene, views, config, max_steps)
     clock, log = trainer.training.clock, TrainLog()
     due = {*eval_steps, max_steps}
     while trainer.step < max_steps:

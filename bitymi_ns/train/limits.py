@@ -2,8 +2,7 @@
 
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
-from bitymi_ns.train.domain import default_table_size, table_size_of
-from bitymi_ns.train.init import PointReport
+from bitymi_ns.train.init import PointReport, default_table_size, table_size_of
 from bitymi_ns.train.schedules import Schedule
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -34,10 +34,9 @@ def objective(
     """The terms of the objective, weighted: their sum is what training minimises.
 
     Args:
-        output: the rendered view, [H, W]; with `soft_overdraw` where the overdraw loss is on, and with `beta_alone`
-            where the falloff loss is to move beta alone.
+        output: the rendered view, [H, W]; with `soft_overdraw` where the overdraw loss is on.
         target: [H, W, 3] the photograph at the same size, over the same background.
-        config: weights and variants.
+        config: weights.
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
         depth, normal: of the view, see `View`; they count where the view was rendered with maps.
 
@@ -52,13 +51,11 @@ def objective(
         and min(image.shape[:2]) >= SSIM_WINDOW
         and cuda_backend(image.device)
     ):
-        squared = _squared(config.falloff_error)
-        weights = (config.ssim_weight, config.falloff_weight, config.falloff_gamma)
-        both = picture_losses(image, target, *weights, squared, mask)
+        both = picture_losses(image, target, config.ssim_weight, config.falloff_weight, config.falloff_gamma, mask)
         return dict(zip(("photometric", "falloff"), both[: 1 + (config.falloff_weight > 0.0)], strict=False))
     terms = {"photometric": photometric(output.rgb, target, config.ssim_weight, mask)}
     if config.falloff_weight > 0.0 or output.soft_overdraw is not None:
-        omega = error_weight(output.rgb, target, config.falloff_gamma, config.falloff_error, mask)
+        omega = error_weight(output.rgb, target, config.falloff_gamma, mask)
     if config.falloff_weight > 0.0:
         terms["falloff"] = config.falloff_weight * mean_where_right(omega, output.beta, mask)
     if output.soft_overdraw is not None:
@@ -106,34 +103,23 @@ def photometric(rgb: Tensor, target: Tensor, ssim_weight: float, mask: Tensor | 
     return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - ops.ssim(rgb, target))
 
 
-def error_weight(
-    rgb: Tensor, target: Tensor, gamma: float, error: Literal["l1_sum", "mse"] = "l1_sum", mask: Tensor | None = None
-) -> Tensor:
-    """omega = exp(-gamma e) of the falloff loss: 1 where the picture is right already, near 0 where it is wrong.
+def error_weight(rgb: Tensor, target: Tensor, gamma: float, mask: Tensor | None = None) -> Tensor:
+    """omega = exp(-gamma e) of the falloff loss, with the error e = L1 summed over rgb: 1 where the picture is right
+    already, near 0 where it is wrong.
 
     Without gradient: else the loss could be lowered by making the error larger.
 
     Args:
         rgb, target: [H, W, 3].
         gamma: how fast omega fades with the error.
-        error: e = L1 summed over rgb (the formula of the paper), or the mean squared error over rgb.
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts; omega is 0 elsewhere.
 
     Returns:
         [H, W, 1].
     """
-    difference = rgb.detach() - target.detach()
-    squared = _squared(error)
-    e = difference.square().mean(-1, keepdim=True) if squared else difference.abs().sum(-1, keepdim=True)
-    omega = torch.exp(-gamma * e)
+    omega = torch.exp(-gamma * (rgb.detach() - target.detach()).abs().sum(-1, keepdim=True))
     # where() also keeps a NaN in an excluded pixel of the photograph out
     return omega if mask is None else torch.where(mask.reshape(omega.shape), omega, 0.0)
-
-
-def _squared(error: str) -> bool:
-    if error not in ("l1_sum", "mse"):
-        raise ValueError(f"falloff_error must be l1_sum or mse, not {error!r}")
-    return error == "mse"
 
 
 def mean_where_right(omega: Tensor, values: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -141,9 +127,8 @@ def mean_where_right(omega: Tensor, values: Tensor, mask: Tensor | None = None) 
 
     Args:
         omega: [H, W, 1] from `error_weight`, with the same mask.
-        values: [H, W, 1]. Falloff: the alpha-blended beta, sum_i w_i beta_i; `RenderOutput.beta` carries gradient to
-            the blending weights and to beta (the literal formula), or to beta alone where the view was
-            rendered so. Overdraw: `RenderOutput.soft_overdraw`, sum_i w_i / (w_i + half).
+        values: [H, W, 1]. Falloff: `RenderOutput.beta`, sum_i w_i beta_i, which carries gradient to the blending
+            weights and to beta. Overdraw: `RenderOutput.soft_overdraw`, sum_i w_i / (w_i + half).
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts.
 
     Returns:

@@ -73,8 +73,6 @@ class Processes:
 
     def mean(self, value: float) -> float:
         """Mean over the processes of a number that all have, to within rounding."""
-        if self.count == 1:
-            return value
         total = torch.tensor(value, dtype=torch.float64)
         self.sum(total)
         return float(total) / self.count
@@ -140,8 +138,6 @@ class Processes:
             torch._foreach_div_(gradients, float(self.views))
 
     def _largest(self, values: Sequence[int]) -> list[int]:
-        if self.count == 1:
-            return list(values)
         found = torch.tensor(values, dtype=torch.int64)
         self.maximum(found)
         return found.tolist()

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import copy
 import math
-import warnings
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -32,18 +31,15 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from bitymi_ns.scene.field import TexelField
-from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.divergence import TrainingDiverged, describe_broken
 from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.optimizers import replace_rows
-from bitymi_ns.train.processes import ALONE, Processes
+from bitymi_ns.train.strategy import Strategy, finite_rows
 from bitymi_ns.train.views import DownscaledViews, spread, step_background
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
     from bitymi_ns.train.exposure import Exposure
-    from bitymi_ns.train.schedules import Schedule
-    from bitymi_ns.train.strategy import Strategy
 
 WORSE = 1.25
 """A window is bad when its mean loss is this many times that of the best window, or early on that of blank views."""
@@ -69,17 +65,13 @@ class RollbackGuard:
         scene: Scene,
         optimizers: Mapping[str, Optimizer],
         strategy: Strategy,
-        schedule: Schedule,
-        config: TrainConfig,
-        announce: Callable[[str], None] = warnings.warn,
-        exposure: Exposure | None = None,
-        processes: Processes = ALONE,
+        exposure: Exposure,
+        announce: Callable[[str], None],
     ) -> None:
-        self.processes = processes
-        self.exposure = exposure
-        self.scene, self.optimizers, self.strategy = scene, optimizers, strategy
-        self.schedule, self.config, self.announce = schedule, config, announce
-        self.window = max(config.guard.min_window, schedule.scaled(config.guard.window))
+        self.scene, self.optimizers, self.strategy, self.exposure = scene, optimizers, strategy, exposure
+        self.schedule, self.config, self.processes = strategy.schedule, strategy.config, strategy.processes
+        self.announce = announce
+        self.window = max(self.config.guard.min_window, self.schedule.scaled(self.config.guard.window))
         self.factor, self.rollbacks = 1.0, 0
         self._streak = 0  # times in a row, without a good window between
         self._limit, self._best = math.nan, math.inf  # mean losses: of what is blank, of the best window
@@ -179,9 +171,7 @@ class RollbackGuard:
         cause = describe_broken(self.scene)
         if not self.on or not cause:
             raise error
-        if self.strategy.broken_share(self.scene) <= BROKEN_SHARE and self._field_is_finite():
-            return self._drop(step)
-        return self._go_back(step, cause)
+        return self._mend(step, cause)
 
     def after(self, step: int, loss: Tensor, broken: Tensor) -> dict[str, float]:
         """Call after each step, when optimisers and strategy are done with it.
@@ -226,10 +216,8 @@ class RollbackGuard:
                 step, f"the views are drawn worse than before (loss {mean:.3f} after {self._best:.3f})"
             )
         cause = describe_broken(self.scene)
-        if cause and (self.strategy.broken_share(self.scene) > BROKEN_SHARE or not self._field_is_finite()):
-            return self._go_back(step, cause)
         if cause:
-            return self._drop(step)
+            return self._mend(step, cause)
         self._streak = 0
         if whole:
             self._best = min(self._best, mean)
@@ -239,13 +227,16 @@ class RollbackGuard:
             self._states.append((step + 1, self._capture()))
         return {}
 
-    def _field_is_finite(self) -> bool:
-        return self.scene.field is None or not describe_broken(self.scene.field)
-
-    def _drop(self, step: int) -> dict[str, float]:
-        dropped = self.strategy.drop_broken(self.scene, self.optimizers)
-        self.announce(f"step {step}: {dropped} surfels were no longer finite and were dropped")
-        return {"not_finite": float(dropped), "surfels": float(len(self.scene))}
+    def _mend(self, step: int, cause: str) -> dict[str, float]:
+        """Drop a few surfels that are not finite; go back where there are more, or the field is broken."""
+        broken = ~finite_rows(self.scene)
+        dropped = float(broken.sum())
+        field_broken = self.scene.field is not None and describe_broken(self.scene.field)
+        if field_broken or dropped > BROKEN_SHARE * len(self.scene):
+            return self._go_back(step, cause)
+        self.strategy.remove(broken, self.scene, self.optimizers)
+        self.announce(f"step {step}: {dropped:.0f} surfels were no longer finite and were dropped")
+        return {"not_finite": dropped, "surfels": float(len(self.scene))}
 
     def _go_back(self, step: int, cause: str) -> dict[str, float]:
         options = self.config.guard
@@ -281,7 +272,7 @@ class RollbackGuard:
             },
             "optimizers": {name: copy.deepcopy(o.state_dict()) for name, o in self.optimizers.items()},
             "strategy": self.strategy.state_dict(),
-            "exposure": None if self.exposure is None else self.exposure.state_dict(),
+            "exposure": self.exposure.state_dict(),
         }
 
     def _restore(self, state: Mapping[str, Any]) -> None:
@@ -297,5 +288,5 @@ class RollbackGuard:
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(copy.deepcopy(state["optimizers"][name]))
         self.strategy.load_state_dict(state["strategy"])
-        if self.exposure is not None and self._views is not None:
+        if self._views is not None:
             self.exposure.load_state_dict(state["exposure"], len(self._views), surfels["means"].device)

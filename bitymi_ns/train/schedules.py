@@ -8,7 +8,6 @@ from bitymi_ns.ranges import check_ranges
 from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
 
 PATIENT_STEPS = 3000  # steps of a run from which it has time for full size as early as the options say
-FIELD_MLP = ("field_mlp", "field_w1", "field_w2", "field_w3")
 
 
 class Schedule:
@@ -93,8 +92,6 @@ class Schedule:
         with the rates of a short run).
         """
         densify = self.config.densify
-        if not 0.0 < densify.reset_opacity < 1.0:
-            raise ValueError(f"reset_opacity must be between 0 and 1, not {densify.reset_opacity}")
         deepest = max(-500.0, -0.5 * self.reset_every * self.lr("opacity_logits", 0))  # exp() overflows beyond
         return max(densify.reset_opacity, 1.0 / (1.0 + math.exp(-deepest)))
 
@@ -113,10 +110,6 @@ class Schedule:
         """True where the depth and the normal loss are part of this step's objective, if the view has such maps."""
         loss = self.config.loss
         return max(loss.depth_weight, loss.normal_weight) > 0.0 and step % loss.geometry_interval == 0
-
-    def after_first_reset(self, step: int) -> bool:
-        """True where the first opacity reset is over: from then on size on screen counts for pruning."""
-        return step > self.reset_every
 
     def densification_over(self, step: int) -> bool:
         """True where no densification can follow this step, so that its statistics are needed no more."""
@@ -157,10 +150,6 @@ class Schedule:
     def _falling(self, step: int) -> float:
         return falling(1.0, step - self.texels_start, self.texel_steps)
 
-    def field_warmup(self, step: int) -> float:
-        """Factor of the field's learning rate: rises linearly to 1 over the first `field_warmup` steps."""
-        return min(1.0, (step + 1) / max(1, self.scaled(self.config.field_warmup)))
-
     def resolution_factor(self, step: int) -> float:
         """Factor of the image size, 2^-k; 1 from the last doubling on."""
         return 2.0 ** -sum(step < at for at in self._doublings)
@@ -187,34 +176,22 @@ class Schedule:
         """Learning rate of a parameter in this step.
 
         Args:
-            name: a surfel parameter, field_table, field_w1 to field_w3 (or field_mlp for the three together), or
-                exposure.
+            name: a surfel parameter, field_table, field_mlp or exposure.
         """
         rates, gain = self.config.lr, self.short_run_gain
         if self._last_part is not None and self.texels_learn(step) and not name.startswith(("field", "exposure")):
             return self._last_part.lr(name, 0) * self._falling(step)
+        warmup = min(1.0, (step + 1) / max(1, self.scaled(self.config.field_warmup)))
+        factor = warmup if name.startswith("field") else gain
         if name == "means":
-            return gain * self.extent * self._decay(rates.means, step)
-        if name in ("quats", "log_scales", "opacity_logits", "beta_raw"):
-            return gain * float(getattr(rates, name))
+            factor *= self.extent
         if name in VIEW_PARAMETERS:
-            parameter = VIEW_PARAMETERS[name]
-            return gain * parameter.share * self._decay(getattr(rates, parameter.rate), step)
-        if name == "field_table":
-            return self.field_warmup(step) * self._decay(rates.field_table, step)
-        if name in FIELD_MLP:
-            return self.field_warmup(step) * self._decay(rates.field_mlp, step)
-        if name == "exposure":
-            return gain * self._decay(rates.exposure, step)
-        raise KeyError(f"no learning rate is known for a parameter named {name!r}")
-
-    def _decay(self, ends: tuple[float, float], step: int) -> float:
-        """Log-linear from the first value (step 0) to the second (last step)."""
-        first, last = float(ends[0]), float(ends[1])
-        if first <= 0.0 or last <= 0.0:
-            raise ValueError(f"learning rates that decay must be positive, not {first} and {last}")
-        t = min(max(step / max(1, self.max_steps - 1), 0.0), 1.0)
-        return math.exp((1.0 - t) * math.log(first) + t * math.log(last))
+            factor, name = factor * VIEW_PARAMETERS[name].share, VIEW_PARAMETERS[name].rate
+        rate = getattr(rates, name)
+        if not isinstance(rate, tuple):
+            return factor * float(rate)
+        t = min(max(step / max(1, self.max_steps - 1), 0.0), 1.0)  # log-linear from the first rate to the second
+        return factor * math.exp((1.0 - t) * math.log(rate[0]) + t * math.log(rate[1]))
 
 
 def falling(rate: float, step: int, steps: int) -> float:

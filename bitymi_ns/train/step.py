@@ -31,7 +31,7 @@ import time
 
 
 def view_losses(
-    scene: Scene, view: View, schedule: Schedule, step: int, config: TrainConfig, watch: LossWatch | None = None
+    scene: Scene, view: View, schedule: Schedule, step: int, watch: LossWatch
 ) -> tuple[dict[str, Tensor], RenderOutput]:
     """Render a training view and compare it with its photograph.
 
@@ -39,7 +39,7 @@ def view_losses(
         scene: what is learned.
         view: on the scene's device, its picture at the size of its camera.
         schedule, step: which parts of the scene learn.
-        watch: checks the losses of the run; without one a step waits until its own loss is known.
+        watch: checks the losses of the run.
 
     Returns:
         The weighted terms of the loss (their sum is the objective), and the rendered view.
@@ -47,6 +47,7 @@ def view_losses(
     Raises:
         TrainingDiverged: the loss is not finite.
     """
+    config = schedule.config
     device = scene.surfels["means"].device
     background = step_background(config, view, step, device)
     output = scene.render(
@@ -55,7 +56,6 @@ def view_losses(
         field_mode="train" if schedule.field_trains(step) else "frozen",
         maps=(view.depth is not None or view.normal is not None) and schedule.geometry_counts(step),
         overdraw_half=config.loss.overdraw_half if schedule.overdraw_counts(step) else None,
-        beta_alone=config.loss.falloff_weight > 0.0 and config.loss.falloff_gradient == "beta_only",
     )
     shown = output
     if view.correction is not None:
@@ -63,10 +63,7 @@ def view_losses(
         image = None if output.image is None else torch.cat([rgb, output.image[..., 3:]], -1)
         shown = replace(output, rgb=rgb, image=image)
     terms = objective(shown, view.target(background, device), config.loss, view.mask, view.depth, view.normal)
-    own = watch or LossWatch()
-    own.note(scene, step, terms)
-    if watch is None:
-        own.finish(scene)
+    watch.note(scene, step, terms)
     return terms, output
 
 
@@ -109,22 +106,14 @@ class Training:
         Raises:
             ValueError: a training option is out of its range.
         """
-        self.scene, self.optimizers, self.config, self.processes = scene, optimizers, config, processes
+        self.scene, self.optimizers, self.processes = scene, optimizers, processes
         textured = scene.config.texture == "texels"
         pixels = data.covered * data.image_pixels / max(1, len(data.views))
         self.schedule = Schedule(config, max_steps, data.extent, textured, pixels)
-        self.schedule.reset_opacity()
-        for name in optimizers:
-            self.schedule.lr(name, 0)
-        self.strategy = Strategy(
-            config, self.schedule, data.extent, on_resize, data.image_pixels, data.first_surfels, processes
-        )
+        self.strategy = Strategy(self.schedule, on_resize, data.image_pixels, data.first_surfels, processes)
         self.exposure = Exposure(config.exposure, data.exif_stops, data.photographs)
-        self.schedule.lr("exposure", 0)
-        self.guard = RollbackGuard(
-            scene, optimizers, self.strategy, self.schedule, config, announce, self.exposure, processes
-        )
-        self.texels = LearningTexels(scene, self.schedule, config.texels, processes)
+        self.guard = RollbackGuard(scene, optimizers, self.strategy, self.exposure, announce)
+        self.texels = LearningTexels(scene, self.schedule, processes)
         self.watch = LossWatch()
         self.clock = Stopwatch()
         self.step = 0
@@ -178,7 +167,7 @@ class Training:
             self.texels.prepare(self.step, view, self.guard.factor)
             diverged: TrainingDiverged | None = None
             try:
-                terms, output = view_losses(self.scene, view, self.schedule, self.step, self.config, self.watch)
+                terms, output = view_losses(self.scene, view, self.schedule, self.step, self.watch)
             except TrainingDiverged as error:
                 diverged = error
             problem = self.processes.problem(None if diverged is None else str(diverged))

@@ -51,23 +51,15 @@ class Strategy:
     """Keeps the statistics of the projected centres and changes the number of surfels.
 
     Attributes:
-        grad_sum: [N] sum over the views of |gradient of the projected centre|, normalised device coordinates.
-        abs_grad_sum: [N] the same of the gradient whose absolute values were summed over the pixels.
-        visible_count: [N] number of views that saw the surfel since the last densification.
-        max_radius: [N] largest half extent on screen since then, pixels.
+        statistics: [4, N] since the last densification, named by `STATISTICS`: sum over the views of |gradient of the
+            projected centre|, normalised device coordinates; the same of the gradient whose absolute values were summed
+            over the pixels; number of views that saw the surfel; largest half extent on screen, pixels.
         generator: source of every random choice, on the CPU.
     """
 
-    grad_sum: Tensor
-    abs_grad_sum: Tensor
-    visible_count: Tensor
-    max_radius: Tensor
-
     def __init__(
         self,
-        config: TrainConfig,
         schedule: Schedule,
-        extent: float,
         on_resize: ResizeHook | None = None,
         image_pixels: int = 0,
         first_surfels: int = 0,
@@ -75,38 +67,28 @@ class Strategy:
     ) -> None:
         """
         Args:
-            schedule: of the run's events.
-            extent: scene extent in world units.
+            schedule: of the run's events, with its options.
             on_resize: told the name and the new Parameter after each replacement of a surfel parameter.
             image_pixels: of all training images at full size, for `densify.pixels_per_surfel`; 0 = without that bound.
             first_surfels: that training started with, for `densify.growth`.
             processes: of the run.
         """
-        self.config = config
+        self.config = schedule.config
         self.processes = processes
         self.schedule = schedule
-        self.extent = extent
         self.on_resize = on_resize
-        self.most = most_surfels(config, image_pixels, first_surfels)
-        self.generator = torch.Generator().manual_seed(config.seed)
-        self._clear(0, torch.device("cpu"))
-
-    def _clear(self, n: int, device: torch.device) -> None:
-        for name in STATISTICS:
-            setattr(self, name, torch.zeros(n, device=device))
+        self.most = most_surfels(self.config, image_pixels, first_surfels)
+        self.generator = torch.Generator().manual_seed(self.config.seed)
+        self.statistics = torch.zeros(len(STATISTICS), 0)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Everything an exact resume needs: statistics and the state of the generator."""
-        state = {name: getattr(self, name).clone() for name in STATISTICS}
-        return {**state, "generator": self.generator.get_state()}
+        rows = zip(STATISTICS, self.statistics.clone(), strict=True)
+        return {**dict(rows), "generator": self.generator.get_state()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """The inverse of `state_dict`."""
-        sizes = {len(state[name]) for name in STATISTICS}
-        if len(sizes) != 1:
-            raise ValueError(f"the statistics of the strategy differ in length: {sorted(sizes)}")
-        for name in STATISTICS:
-            setattr(self, name, state[name].detach().clone().float())
+        self.statistics = torch.stack([state[name].detach().float() for name in STATISTICS])
         self.generator.set_state(state["generator"].cpu().to(torch.uint8))
 
     def accumulate(self, *outputs: RenderOutput) -> None:
@@ -115,17 +97,15 @@ class Strategy:
         if self.processes.views == 1:
             self._note(*outputs)
             return
-        before = {name: getattr(self, name) for name in STATISTICS}
-        self._clear(0, torch.device("cpu"))
+        before, self.statistics = self.statistics, torch.zeros(len(STATISTICS), 0)
         for output in outputs:
             self._note(output)
-        self.processes.sum(self.grad_sum, self.abs_grad_sum, self.visible_count)
-        self.processes.maximum(self.max_radius)
-        if len(before["grad_sum"]) == 0:
-            return
-        for name, value in before.items():
-            join = torch.maximum if name == "max_radius" else torch.add
-            setattr(self, name, join(value.to(self.grad_sum.device), getattr(self, name)))
+        self.processes.sum(self.statistics[:3])
+        self.processes.maximum(self.statistics[3])
+        if before.shape[1] > 0:
+            before = before.to(self.statistics.device)
+            self.statistics[:3] += before[:3]
+            self.statistics[3] = torch.maximum(before[3], self.statistics[3])
 
     @torch.no_grad()
     def _note(self, output: RenderOutput) -> None:
@@ -133,29 +113,25 @@ class Strategy:
         `visible` [N] and `radii` [N, 2]."""
         projection = output.projection
         n, device = len(projection.radii), projection.radii.device
-        if len(self.grad_sum) == 0:
-            self._clear(n, device)
-        if len(self.grad_sum) != n:
-            raise ValueError(f"the strategy follows {len(self.grad_sum)} surfels, but {n} were rendered")
-        if self.grad_sum.device != device:
-            for name in STATISTICS:
-                setattr(self, name, getattr(self, name).to(device))
+        if self.statistics.shape[1] == 0:
+            self.statistics = torch.zeros(len(STATISTICS), n, device=device)
+        if self.statistics.shape[1] != n:
+            raise ValueError(f"the strategy follows {self.statistics.shape[1]} surfels, but {n} were rendered")
+        self.statistics = self.statistics.to(device)
+        grad_sum, abs_grad_sum, visible_count, max_radius = self.statistics
         height, width = output.rgb.shape[:2]
         if cuda_backend(device):
-            note_centers(projection, width, height, *(getattr(self, name) for name in STATISTICS))
+            note_centers(projection, width, height, grad_sum, abs_grad_sum, visible_count, max_radius)
             return
         visible = projection.visible
-        for total, gradient in (
-            (self.grad_sum, projection.mean2d_grad),
-            (self.abs_grad_sum, projection.mean2d_absgrad),
-        ):
+        for total, gradient in ((grad_sum, projection.mean2d_grad), (abs_grad_sum, projection.mean2d_absgrad)):
             if gradient is not None:  # no fragment at all, nothing to differentiate
                 ndc = (0.5 * width * gradient[:, 0], 0.5 * height * gradient[:, 1])
                 size = torch.hypot(*ndc).nan_to_num(0.0, 0.0, 0.0)
                 total += torch.where(visible, size, 0.0)
-        self.visible_count += visible
-        radius = projection.radii.reshape(n, -1).amax(-1).float()
-        self.max_radius = torch.where(visible, torch.maximum(self.max_radius, radius), self.max_radius)
+        visible_count += visible
+        radius = projection.radii.amax(-1).float()
+        torch.where(visible, torch.maximum(max_radius, radius), max_radius, out=max_radius)
 
     def step(self, step: int, scene: Scene, optimizers: Mapping[str, Optimizer], views: DrawViews) -> dict[str, float]:
         """Do what the schedule asks for after the optimiser update of `step`.
@@ -193,18 +169,19 @@ class Strategy:
         scores = self._scores(scene, views)
         surfels = scene.surfels
         n, device = len(scene), surfels["means"].device
-        if len(self.grad_sum) != n:  # nothing was rendered since the last event
-            self._clear(n, device)
-
-        seen = self.visible_count.clamp(min=1)
+        statistics = self.statistics
+        if statistics.shape[1] != n:  # nothing was rendered since the last event
+            statistics = torch.zeros(len(STATISTICS), n, device=device)
+        grad_sum, abs_grad_sum, visible_count, max_radius = statistics
+        seen = visible_count.clamp(min=1)
         size = surfels["log_scales"].amax(-1).exp()
-        large = size > config.dense * self.extent
+        large = size > config.dense * self.schedule.extent
         wanted = scores.importance > config.importance
-        clone = wanted & ~large & (self.grad_sum / seen >= config.grad_threshold)
-        split = wanted & large & (self.abs_grad_sum / seen >= config.abs_grad_threshold)
+        clone = wanted & ~large & (grad_sum / seen >= config.grad_threshold)
+        split = wanted & large & (abs_grad_sum / seen >= config.abs_grad_threshold)
         if self.most > 0:
             room = max(0, self.most - n)
-            chosen = _strongest(clone | split, scores.importance, self.abs_grad_sum / seen, room)
+            chosen = _strongest(clone | split, scores.importance, abs_grad_sum / seen, room)
             report["held_back"] = int((clone | split).sum()) - int(chosen.sum())
             clone, split = clone & chosen, split & chosen
         clones, splits = clone.nonzero().flatten(), split.nonzero().flatten()
@@ -213,9 +190,9 @@ class Strategy:
         new = {name: torch.cat([p.detach()[clones], children[name]]) for name, p in surfels.items()}
 
         # candidates for pruning are counted among all surfels there are now; only old ones can be drawn
-        radius = self.max_radius if self.schedule.after_first_reset(step) else torch.zeros_like(self.max_radius)
-        old_candidate = self._prunable(surfels["opacity_logits"], surfels["log_scales"], radius)
-        new_candidate = self._prunable(new["opacity_logits"], new["log_scales"], None)
+        old_candidate, new_candidate = self._prunable(surfels), self._prunable(new)
+        if step > self.schedule.reset_every:  # the first opacity reset is over
+            old_candidate |= max_radius > config.prune_screen
         budget = math.floor(config.prune_budget * int(old_candidate[stay].sum() + new_candidate.sum()))
         drawn = self._draw(1.0 / (1e-6 + 1.0 - scores.prune[stay].double()), budget)
         pruned = torch.zeros(n, dtype=torch.bool, device=device)
@@ -226,7 +203,7 @@ class Strategy:
 
         if len(keep) != n or len(clones) + len(splits) > 0:
             replace_rows(surfels, optimizers, keep, new, self.on_resize)
-        self._clear(len(scene), device)
+        self.statistics = torch.zeros(len(STATISTICS), len(scene), device=device)
         cap_opacity(surfels, optimizers, config.opacity_clamp)
         return report | {"cloned": len(clones), "split": len(splits), "pruned": int(pruned.sum())}
 
@@ -245,11 +222,10 @@ class Strategy:
 
     # ---- pruning
 
-    def _prunable(self, opacity_logits: Tensor, log_scales: Tensor, radius: Tensor | None) -> Tensor:
+    def _prunable(self, surfels: Mapping[str, Tensor]) -> Tensor:
         config = self.config.densify
-        candidate = opacity_logits.sigmoid() < config.prune_opacity
-        candidate |= log_scales.amax(-1).exp() > config.prune_world * self.extent
-        return candidate if radius is None else candidate | (radius > config.prune_screen)
+        candidate = surfels["opacity_logits"].sigmoid() < config.prune_opacity
+        return candidate | (surfels["log_scales"].amax(-1).exp() > config.prune_world * self.schedule.extent)
 
     @torch.no_grad()
     def _final_prune(self, scene: Scene, optimizers: Mapping[str, Optimizer], views: DrawViews) -> dict[str, float]:
@@ -260,7 +236,7 @@ class Strategy:
         if config.final_prune_score < 1.0:
             pruned |= self._scores(scene, views).prune > config.final_prune_score
         pruned = self._keep_minimum(pruned, logits, len(scene))
-        self._remove(pruned, scene, optimizers)
+        self.remove(pruned, scene, optimizers)
         return report | {"pruned": int(pruned.sum())}
 
     def _drop_dead(self, scene: Scene, optimizers: Mapping[str, Optimizer]) -> dict[str, float]:
@@ -268,7 +244,7 @@ class Strategy:
         surfels = scene.surfels
         if scene.field is not None and not all(bool(p.isfinite().all()) for p in scene.field.parameters()):
             raise TrainingDiverged(f"the texture field is broken: {describe_broken(scene.field)}")
-        finite = _finite_rows(scene)
+        finite = finite_rows(scene)
         if not bool(finite.any()):
             raise TrainingDiverged(f"no surfel is left whose parameters are all finite: {describe_broken(scene)}")
         logits = surfels["opacity_logits"]
@@ -280,20 +256,8 @@ class Strategy:
             order = torch.where(finite & ~invisible, logits.detach(), math.inf).argsort(stable=True)
             invisible[order[:over]] = True
         pruned = ~finite | self._keep_minimum(invisible, logits, int(finite.sum()), among=finite)
-        self._remove(pruned, scene, optimizers)
+        self.remove(pruned, scene, optimizers)
         return {"not_finite": int((~finite).sum()), "invisible": int((pruned & finite).sum())}
-
-    @torch.no_grad()
-    def broken_share(self, scene: Scene) -> float:
-        """Share of the surfels with a parameter that is not finite."""
-        return float((~_finite_rows(scene)).double().mean()) if len(scene) else 0.0
-
-    @torch.no_grad()
-    def drop_broken(self, scene: Scene, optimizers: Mapping[str, Optimizer]) -> int:
-        """Remove the surfels with a parameter that is not finite; returns how many they were."""
-        broken = ~_finite_rows(scene)
-        self._remove(broken, scene, optimizers)
-        return int(broken.sum())
 
     def _keep_minimum(self, pruned: Tensor, opacity_logits: Tensor, count: int, among: Tensor | None = None) -> Tensor:
         """Take back as much of `pruned` [N] bool, among the rows `among` [N] bool, as `min_surfels` asks for, the most
@@ -322,16 +286,17 @@ class Strategy:
         drawn = views(self.config.densify.views, self.generator)
         return multi_view_scores(scene, drawn, self.config, self.processes)
 
-    def _remove(self, pruned: Tensor, scene: Scene, optimizers: Mapping[str, Optimizer]) -> None:
+    @torch.no_grad()
+    def remove(self, pruned: Tensor, scene: Scene, optimizers: Mapping[str, Optimizer]) -> None:
+        """Remove the surfels `pruned` [N] bool, with their texels and statistics."""
         if not bool(pruned.any()):
             return
         keep = (~pruned).nonzero().flatten()
         replace_rows(scene.surfels, optimizers, keep, on_resize=self.on_resize)
         if isinstance(scene.field, TexelField):
             scene.field.keep(keep)
-        if len(self.grad_sum) == len(pruned):
-            for name in STATISTICS:
-                setattr(self, name, getattr(self, name)[keep.to(self.grad_sum.device)])
+        if self.statistics.shape[1] == len(pruned):
+            self.statistics = self.statistics.index_select(1, keep.to(self.statistics.device))
 
 
 def most_surfels(config: TrainConfig, image_pixels: int, first_surfels: int = 0) -> int:
@@ -348,7 +313,7 @@ def most_surfels(config: TrainConfig, image_pixels: int, first_surfels: int = 0)
     return min((bound for bound in (densify.max_surfels, by_pixels) if bound > 0), default=0)
 
 
-def _finite_rows(scene: Scene) -> Tensor:
+def finite_rows(scene: Scene) -> Tensor:
     """[N] bool: every parameter of the surfel is finite."""
     finite = torch.ones(len(scene), dtype=torch.bool, device=scene.surfels["means"].device)
     for p in scene.surfels.values():

@@ -22,7 +22,7 @@ from bitymi_ns.scene.tile_sizes import coarsened, kernel_parameters, max_project
 from bitymi_ns.scene.visibility import Visibility, visibility
 from bitymi_ns.train.init import tangents
 from bitymi_ns.train.losses import numbers
-from bitymi_ns.train.processes import ALONE, Processes
+from bitymi_ns.train.processes import Processes
 from bitymi_ns.train.views import OnDemand, at_size, spread
 
 if TYPE_CHECKING:
@@ -46,8 +46,8 @@ the time."""
 class LearningTexels:
     """The part of a run in which texels learn."""
 
-    def __init__(self, scene: Scene, schedule: Schedule, options: TexelConfig, processes: Processes = ALONE) -> None:
-        self.scene, self.schedule, self.options, self.processes = scene, schedule, options, processes
+    def __init__(self, scene: Scene, schedule: Schedule, processes: Processes) -> None:
+        self.scene, self.schedule, self.options, self.processes = scene, schedule, schedule.config.texels, processes
         self._rates: list[RemovableHandle] = []
         self._views = 1
 
@@ -135,7 +135,7 @@ def blank_texels(
     surfels = {name: value.detach() for name, value in scene.surfels.items()}
     cameras = [view.camera for view in views]
     bound = scene.config.weight_bound
-    scale = survey_scale(cameras)
+    scale = 0.5 if mean_pixels(cameras) >= 4 * SURVEY_PIXELS else 1.0
     smaller = [camera.scaled(scale) for camera in cameras]
     seen = visibility(surfels, smaller, scene.near, bound, scene.config.prefilter)
     seen = replace(seen, pixels=seen.pixels / scale**2)
@@ -155,11 +155,6 @@ def blank_texels(
 def most_texels(options: TexelConfig, rendered: float) -> float:
     """Most texels of all tiles, for steps that render so many pixels."""
     return max(FEW, rendered / options.rendered_pixels_per_texel)
-
-
-def survey_scale(cameras: Sequence[Camera]) -> float:
-    """Scale of the pictures that coverage is measured at, relative to the photographs."""
-    return 0.5 if cameras and mean_pixels(cameras) >= 4 * SURVEY_PIXELS else 1.0
 
 
 def mean_pixels(cameras: Sequence[Camera]) -> float:

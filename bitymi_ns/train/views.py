@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Generic, Literal, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -15,8 +15,6 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.config import TrainConfig
 
 DOWNSCALED_BYTES = 1 << 28  # cache of downscaled pictures on the CPU; the others are downscaled at every use
-
-
 COVERED_VIEWS = 8  # views sampled for the share of pixels that show something
 
 
@@ -99,16 +97,13 @@ def spread(count: int, most: int) -> list[int]:
 
 def covered_share(views: Sequence[View]) -> float:
     """Share of the pixels that count and are not transparent, in a few of the views."""
-    chosen = spread(len(views), COVERED_VIEWS)
-    return sum(_covered(views[i]) for i in chosen) / max(1, len(chosen))
-
-
-def _covered(view: View) -> float:
-    shows = None if view.image.shape[-1] < 4 else view.image[..., 3] > 0
-    if view.mask is not None:
-        counts = view.mask.reshape(view.mask.shape[:2])
-        shows = counts if shows is None else shows & counts
-    return 1.0 if shows is None else float(shows.float().mean())
+    shares = []
+    for view in (views[i] for i in spread(len(views), COVERED_VIEWS)):
+        shows = view.image[..., -1:] > 0 if view.image.shape[-1] == 4 else torch.ones(1, dtype=torch.bool)
+        if view.mask is not None:
+            shows = shows & view.mask.reshape(*view.mask.shape[:2], 1)
+        shares.append(float(shows.float().mean()))
+    return sum(shares) / max(1, len(shares))
 
 
 def shown(rgb: Tensor, correction: Tensor | None, alpha: Tensor, background: Tensor | None) -> Tensor:
@@ -175,37 +170,25 @@ def nearest(values: Tensor, width: int, height: int) -> Tensor:
     return values if values.shape[:2] == (height, width) else values[rows[:, None], columns]
 
 
-def background_color(
-    kind: Literal["black", "white", "random"], seed: int, step: int, device: torch.device | str = "cpu"
-) -> Tensor | None:
-    """[3] the colour behind the scene in this training step; None = black. Depends on `seed` and `step` alone."""
-    if kind == "black":
-        return None
-    if kind == "white":
-        return torch.ones(3, device=device)
-    if kind == "random":
-        generator = torch.Generator().manual_seed((seed * 1_000_003 + step) & 0x7FFF_FFFF_FFFF_FFFF)
-        return torch.rand(3, generator=generator).to(device, non_blocking=True)
-    raise ValueError(f"background must be black, white or random, not {kind!r}")
-
-
 def background_changes(config: TrainConfig, view: View) -> bool:
     """True where each step on a view has another colour behind the scene."""
     return config.background == "random" or (config.background == "auto" and view.image.shape[-1] == 4)
 
 
 def step_background(config: TrainConfig, view: View, step: int, device: torch.device | str) -> Tensor | None:
-    """[3] the colour behind the scene in a step on a view, `config.background`; None = black."""
-    if background_changes(config, view):
-        return background_color("random", config.seed, step, device)
-    return eval_background(config, device)
+    """[3] the colour behind the scene in a step on a view, `config.background`; None = black. A random one depends on
+    seed and step alone."""
+    if not background_changes(config, view):
+        return eval_background(config, device)
+    generator = torch.Generator().manual_seed((config.seed * 1_000_003 + step) & 0x7FFF_FFFF_FFFF_FFFF)
+    return torch.rand(3, generator=generator).to(device, non_blocking=True)
 
 
 def eval_background(config: TrainConfig, device: torch.device | str) -> Tensor | None:
     """[3] the colour behind the scene where views are judged, None = black: that of training, but `config.alpha_color`
     where it changes, so that no figure depends on the draw."""
     kind = config.background if config.background in ("black", "white") else config.alpha_color
-    return background_color(kind, 0, 0, device)
+    return torch.ones(3, device=device) if kind == "white" else None
 
 
 def over_background(image: Tensor, background: Tensor | None) -> Tensor:
@@ -271,10 +254,6 @@ class DownscaledViews:
 
     def __len__(self) -> int:
         return len(self._views)
-
-    def camera(self, index: int) -> Camera:
-        """The camera of the full-size image of view number `index`, on the device."""
-        return self._full_size(index).camera
 
     def at(self, index: int, factor: float) -> View:
         """View number `index`, its image resized by `factor`, with its correction."""

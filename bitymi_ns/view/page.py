@@ -47,18 +47,17 @@ class PageError(ValueError):
 class Site:
     """Files served."""
 
-    files: Mapping[str, Path]  # path on the server, without the first slash, to the file
-    # the same for what is checked when it is asked for, or lies in no file: to what gives its contents
-    made: Mapping[str, Callable[[], bytes | bytearray]]
+    # path on the server, without the first slash, to what gives the contents
+    files: Mapping[str, Callable[[], bytes | bytearray]]
     left_out: Sequence[str] = ()  # files that the bundle lists, and that are not served
     notes: Callable[[], bytes | None] = lambda: None  # the bundle's notes.json, which comes and goes; None without
 
     def __contains__(self, path: str) -> bool:
-        return path in self.made or path in self.files or path == _NOTES
+        return path in self.files or path == _NOTES
 
     @property
     def paths(self) -> list[str]:
-        return sorted({*self.files, *self.made, *([] if self.notes() is None else [_NOTES])})
+        return sorted({*self.files, *([] if self.notes() is None else [_NOTES])})
 
     def read(self, path: str) -> bytes | bytearray:
         """The contents of one of `paths`.
@@ -72,7 +71,7 @@ class Site:
             if notes is None:
                 raise MissingPart(f"the bundle has no {NOTES}")
             return notes
-        return self.made[path]() if path in self.made else self.files[path].read_bytes()
+        return self.files[path]()
 
 
 def media_type(path: str) -> str:
@@ -80,14 +79,14 @@ def media_type(path: str) -> str:
     return TYPES.get(Path(path).suffix.lower(), "application/octet-stream")
 
 
-def page_files() -> dict[str, Path]:
-    """The built page, by name.
+def page_files() -> dict[str, Callable[[], bytes | bytearray]]:
+    """What gives the files of the built page, by name.
 
     Raises:
         PageError: it was not built.
     """
     folder = Path(str(resources.files("bitymi_ns.view"))) / "page"
-    files = {path.name: path for path in sorted(folder.glob("*")) if path.is_file()}
+    files = {path.name: path.read_bytes for path in sorted(folder.glob("*")) if path.is_file()}
     if "index.html" not in files:
         raise PageError(f"the viewer's page is missing from {folder}: in a checkout, build it with `make web`")
     return files
@@ -103,9 +102,9 @@ def site_of(bundle: Path) -> Site:
     notes_of(bundle)
     shown = _Shown(Path(os.path.realpath(bundle)))
     names = [MANIFEST, *(name for name in shown.info.files if is_known(name))]
-    made = {f"{BUNDLE}{name}": partial(shown.read, name) for name in names}
-    made["view.json"] = partial(_about, bundle)
-    return Site(page_files(), made, left_out(shown.info), partial(notes_of, bundle))
+    parts = {f"{BUNDLE}{name}": partial(shown.read, name) for name in names}
+    files = {**page_files(), **parts, "view.json": partial(_about, bundle)}
+    return Site(files, left_out(shown.info), partial(notes_of, bundle))
 
 
 def single_site(bundle: Path) -> Site:
@@ -117,15 +116,12 @@ def single_site(bundle: Path) -> Site:
     """
     info, files = read_manifest(bundle), page_files()
     empty, named = (_ASKS.format(name).encode() for name in ("", SINGLE))
-    index = files.pop("index.html").read_bytes()
+    index = files["index.html"]()
     if empty not in index:
         raise PageError("the viewer's page is of another version: in a checkout, build it with `make web`")
-    made: dict[str, Callable[[], bytes | bytearray]] = {
-        "index.html": lambda: index.replace(empty, named),
-        SINGLE: lambda: joined(bundle)[0],
-        "view.json": partial(_about, bundle),
-    }
-    return Site(files, made, left_out(info))
+    files["index.html"] = lambda: index.replace(empty, named)
+    files |= {SINGLE: lambda: joined(bundle)[0], "view.json": partial(_about, bundle)}
+    return Site(files, left_out(info))
 
 
 def _about(bundle: Path) -> bytes:

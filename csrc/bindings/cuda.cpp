@@ -47,7 +47,6 @@ template <class S> void bind_operations(nb::module_& m) {
   bind_operation(m, name("bin_fill"), &bin_fill<S>);
   bind_operation(m, name("trace_mark"), &trace_mark<S>);
   bind_operation(m, name("trace_fill"), &trace_fill<S>);
-  bind_operation(m, name("field_tiles"), &field_tiles<S>);
   bind_operation(m, name("picture_loss"), &picture_loss<S>);
   bind_operation(m, name("picture_loss_backward"), &picture_loss_backward<S>);
   bind_operation(m, name("note_centers"), &note_centers<S>);
@@ -96,7 +95,7 @@ void bind_baked(nb::module_& m) {
 void bind_all(nb::module_& m) {
   m.def("device_problem", &device_problem, "device"_a,
         "Reason why the kernels cannot run on a CUDA device, and the remedy; empty when they can.");
-  bind_class<Pairs>(m, "Pairs", kCard, "Index of a fragment list (csrc/cuda/pairs.h).")
+  bind_class<Pairs>(m, "Pairs", kCard, "Index of a fragment list (csrc/cuda/fragment_list.h).")
       .def_prop_ro("pairs", [](const Held<Pairs>& p) { return p.pairs; })
       .def_prop_ro("fragments", [](const Held<Pairs>& p) { return p.fragments; });
   bind_operations<float>(m);
@@ -108,7 +107,7 @@ void bind_all(nb::module_& m) {
   m.attr("TRACE_SUMS") = kTraceSums;
   m.attr("LOSS_SUMS") = kLossSums * kMostSums;
   m.attr("MLP_WORK") = int64_t(kMostBlocks) * kMlpWeights;
-  m.def("exact_size", &exact_size, "entries"_a, "surfels"_a, "frames"_a, "Numbers of exact_work, int64.");
+  m.def("exact_size", &exact_size, "entries"_a, "Numbers of exact_work, int64.");
 }
 }  // namespace
 }  // namespace bt::cuda

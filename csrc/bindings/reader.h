@@ -335,16 +335,11 @@ template <class S> constexpr const char* kSuffix = sizeof(S) == 4 ? "_f32" : "_f
   each(project_forward)       \
   each(project_backward)      \
   each(trace_backward)        \
-  each(composite_forward)     \
-  each(composite_backward)    \
   each(blend_forward)         \
   each(blend_backward)        \
   each(view_color_forward)    \
   each(view_color_backward)   \
-  each(lean_color)            \
   each(field_forward)         \
   each(field_backward)        \
-  each(shade_forward)         \
-  each(shade_backward)        \
   each(ssim)
 // clang-format on

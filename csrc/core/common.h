@@ -11,6 +11,12 @@
 #else
 #define BT_HD inline __attribute__((always_inline))
 #endif
+// Before a loop whose indices nvcc must know: arrays live in registers only then.
+#if defined(__CUDA_ARCH__)
+#define BT_UNROLL _Pragma("unroll")
+#else
+#define BT_UNROLL
+#endif
 
 namespace bt {
 

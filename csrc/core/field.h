@@ -172,16 +172,4 @@ BT_HD void add_weight_gradient(const S* features, const MlpState<S, Row>& state,
   for (int i = 0; i < kInputs; ++i) sums.w1[i] += g.g1 * Row(features[i]);
 }
 
-// World position of a fragment; frame: mean, s_u t_u, s_v t_v.
-template <class S> BT_HD Vec3<S> world_point(const S* frame, S u, S v) {
-  return load3(frame) + u * load3(frame + 3) + v * load3(frame + 6);
-}
-// Adds the gradient of the frame to dframe and writes those of u and v, from that of the point.
-template <class S> BT_HD void world_point_vjp(const S* frame, S u, S v, Vec3<S> dx, S& du, S& dv, S* dframe) {
-  du = dot(dx, load3(frame + 3)), dv = dot(dx, load3(frame + 6));
-  store3(dframe, load3(dframe) + dx);
-  store3(dframe + 3, load3(dframe + 3) + u * dx);
-  store3(dframe + 6, load3(dframe + 6) + v * dx);
-}
-
 }  // namespace bt

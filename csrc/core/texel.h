@@ -39,9 +39,6 @@ template <class S> BT_HD int tile_level(const S* g, int r_u, int r_v, S extent, 
   return level && side <= 2 ? kTileLevels : min_(level, kTileLevels - 1);
 }
 
-// Surfel coordinate of the centre of texel i, eq. (texel centres), rounded as bake/texels.py does.
-template <class S> BT_HD S texel_centre(int i, int r, S extent) { return extent * (S(2 * i + 1) / S(r) - S(1)); }
-
 // The texels on both sides of a position along one axis: `first`, a whole number, and the next, which weighs
 // `fraction`. A tile of one texel has no next: `first` stands for it. Beyond the outer texel centres, not `inside`, the
 // position stands still.
@@ -101,13 +98,9 @@ template <class S> BT_HD TexelCorners<S> texel_corners(S u, S v, const int32_t* 
   return c;
 }
 
-// The texels there, and the vector-Jacobian product of the fetch.
+// The texels there.
 template <class S> BT_HD void load_corners(const S* tile, const TexelCorners<S>& c, Vec3<S>* t) {
   for (int k = 0; k < 4; ++k) t[k] = load3(tile + 3 * c.at[k]);
-}
-// add(k, gradient of corner k).
-template <class S, class F> BT_HD void texel_corner_gradients(const TexelCorners<S>& c, Vec3<S> g, F&& add) {
-  for (int k = 0; k < 4; ++k) add(k, c.weight[k] * g);
 }
 // Gradient of the fetch along u and v from its four texels: 0 from the outer texel centres on; at a centre between
 // them, where the slope jumps, that of the side of larger coordinates.

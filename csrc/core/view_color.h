@@ -93,5 +93,18 @@ template <class S> BT_HD Vec3<S> view_color(const LeanColors<S>& p, int64_t i, V
     return view_color.lean_color(p.span[2 * i + 1], p.base + 3 * i, p.terms + int64_t(p.span[2 * i]) * kWidth, d);
   });
 }
+// View colours of n surfels: whole, or lean where lean.base is not null.
+template <class S> struct ViewColors {
+  ViewColorArrays<const S> whole;
+  LeanColors<S> lean;
+  int64_t lean_terms;  // of all surfels
+
+  template <class R> void fields(R& r, int64_t n) {
+    if (r.has("lean"))
+      lean.fields(r, n, lean_terms);
+    else
+      whole.fields(r, n);
+  }
+};
 
 }  // namespace bt

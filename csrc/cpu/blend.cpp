@@ -1,5 +1,5 @@
-// Shading and blending of surfels with or without texels in one pass over the fragments, and its backward pass: colours
-// and their gradients are never listed. A block at a time; texels fragment by fragment.
+// Shading and blending in one pass over the fragments, and its backward pass: colours and their gradients are never
+// listed. A block at a time; texels fragment by fragment.
 #include "ops/blend.h"
 
 #include <numeric>
@@ -7,8 +7,8 @@
 
 #include "cpu/blocks.h"
 #include "cpu/kernels.h"
-#include "cpu/patch.h"
-#include "cpu/runs.h"
+#include "cpu/surfel_order.h"
+#include "cpu/texel_patch.h"
 
 namespace bt {
 
@@ -44,7 +44,8 @@ template <class S> class SurfelRun {
     }
   }
   // The colours of block k's fragments, 0 in other lanes: what is not finite shows where it is and nowhere else.
-  BT_HD void colors(const BlockPart& part, int64_t k, P* to) const {
+  // `residual`: of the block's first fragment, null: of texels.
+  BT_HD void colors(const BlockPart& part, int64_t k, const S* residual, P* to) const {
     const Four<S> view(patch.view, S(1));
     P r(view.v[0]), g(view.v[1]), b(view.v[2]);
     each_of(textured(k), k, [&](int lane, int j) {
@@ -52,6 +53,12 @@ template <class S> class SurfelRun {
       const auto here = mask_of<S>(1u << lane);  // through memory the vector would wait for its lanes
       r = select(here, P(color.v[0]), r), g = select(here, P(color.v[1]), g), b = select(here, P(color.v[2]), b);
     });
+    if (residual) {
+      S rgb[3][kLanes] = {};
+      for (uint32_t lanes = part.lanes; lanes; lanes &= lanes - 1)
+        for (int c = 0; c < 3; ++c) rgb[c][__builtin_ctz(lanes)] = *residual++;
+      r = shaded(r, load(rgb[0])), g = shaded(g, load(rgb[1])), b = shaded(b, load(rgb[2]));
+    }
     const auto there = mask_of<S>(part.lanes);
     const P none = P(S(0));
     to[0] = select(there, r, none), to[1] = select(there, g, none), to[2] = select(there, b, none);
@@ -114,7 +121,7 @@ template <bool kMaps, class S> void forward(const Forward<S>& a) {
         each_block(layout, surfel.run, [&](int64_t k, int64_t at, const BlockPart& part) {
           const P weight = expand(f.weight + at, part.lanes);
           P colors[3];
-          surfel.colors(part, k, colors);
+          surfel.colors(part, k, a.of.residual ? a.of.residual + 3 * at : nullptr, colors);
           const P depth = kMaps ? expand(f.depth + at, part.lanes) : P(S(0));
           add_blended<kMaps>(weight, colors, surfel.beta, depth, surfel.normal, sums[part.block]);
         });
@@ -148,7 +155,7 @@ void run_backward(const Backward<S>& a, const BlockPicture<S, kChannels<kMaps>>&
     P d[channels], colors[3], dcolors[3];
     for (int c = 0; c < channels; ++c)
       d[c] = select(there, load(dimage.numbers(surfel.run.tile, part.block) + c * kLanes), zero);
-    surfel.colors(part, block, colors);
+    surfel.colors(part, block, a.of.residual ? a.of.residual + 3 * at : nullptr, colors);
     const P depth = kMaps ? expand(f.depth + at, part.lanes) : zero;
     if (a.dweight)
       compress_until(a.dweight + end, a.dweight + at,
@@ -162,10 +169,14 @@ void run_backward(const Backward<S>& a, const BlockPicture<S, kChannels<kMaps>>&
       compress_until(a.ddepth + end, a.ddepth + at, weight * d[5], part.lanes);
       for (int k = 0; k < 3; ++k) sums.normal[k] += weight * d[6 + k];
     }
-    S du[kLanes] = {}, dv[kLanes] = {};
-    if (const uint32_t textured = surfel.textured(block)) {
-      S rgb[3][kLanes];
+    const uint32_t textured = surfel.textured(block);
+    S du[kLanes] = {}, dv[kLanes] = {}, rgb[3][kLanes];
+    if (textured || a.dresidual)
       for (int k = 0; k < 3; ++k) store(rgb[k], dcolors[k]);
+    if (S* to = a.dresidual ? a.dresidual + 3 * at : nullptr)
+      for (uint32_t lanes = part.lanes; lanes; lanes &= lanes - 1)
+        for (int k = 0; k < 3; ++k) *to++ = rgb[k][__builtin_ctz(lanes)];
+    if (textured) {
       surfel.each_of(textured, block, [&](int lane, int j) {
         const Four<S> dcolor(Vec3<S>{rgb[0][lane], rgb[1][lane], rgb[2][lane]}, S(0));
         if (rows) surfel.few().add_gradient(j, dcolor, rows);

@@ -140,19 +140,14 @@ struct SelectBlocks {
 void select_fragments(const SelectBlocks& a);
 
 template <class S> void trace_backward(const TraceBackward<S, TileBlocks>& a);
-template <class S> void composite_forward(const CompositeForward<S, TileBlocks>& a);
-template <class S> void composite_backward(const CompositeBackward<S, TileBlocks>& a);
 void masked_counts(const MaskedCounts<TileBlocks>& a);
 
+// Throws std::invalid_argument for a surfel whose lean terms are not there.
 template <class S> void view_color_forward(const ViewColorForward<S>& a);
 template <class S> void view_color_backward(const ViewColorBackward<S>& a);
-// Throws std::invalid_argument for a surfel whose terms are not there.
-template <class S> void lean_color(const LeanColor<S>& a);
 
 template <class S> void field_forward(const FieldForward<S>& a);
 template <class S> void field_backward(const FieldBackward<S>& a);
-template <class S> void shade_forward(const ShadeForward<S>& a);
-template <class S> void shade_backward(const ShadeBackward<S>& a);
 
 template <class S> void blend_forward(const BlendForward<S, TileBlocks>& a);
 template <class S> void blend_backward(const BlendBackward<S, TileBlocks>& a);

@@ -8,7 +8,7 @@
 #include "cpu/simd.h"
 #include "cpu/texel_alpha.h"
 #include "cpu/threads.h"
-#include "cpu/tiles.h"
+#include "cpu/tile_state.h"
 
 namespace bt {
 
@@ -73,16 +73,10 @@ void trace_forward(const View<S>& view, const AlphaTiles<S>& alpha, int64_t most
         state.template blend<Kernel, true>(view, bins, id, take);
         continue;
       }
-      AlphaPatch<S> patch(alpha, id);
-      state.template blend<Kernel, true>(
-          view, bins, id, take, S(1), [&](Fragment<P>& f, const typename P::M& covered, const P& transmittance) {
-            if (!patch.textured()) return;
-            const uint32_t lanes = bits(covered & (bt::blend(f.sigma, transmittance).weight >= P(alpha.bound)));
-            f.v = marked(f.v, lanes);
-            if (!lanes) return;
-            patch.locate(f.u, f.v);
-            f.sigma = alpha_cut(f.sigma, patch.fetch(lanes));
-          });
+      state.template blend<Kernel, true>(view, bins, id, take, S(1),
+                                         [&](Fragment<P>& f, const typename P::M& covered, const P& transmittance) {
+                                           cut(alpha, id, covered, transmittance, f);
+                                         });
     }
     if (keep) a.used += count, a.used_blocks += blocks;
     found.fetch_add(count, std::memory_order_relaxed);
@@ -179,7 +173,7 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
         const S* g = geom + id * kGeom;
         const S cx = g[kCx] - x0, cy = g[kCy] - y0;
         P d[kGeom], ax = zero, ay = zero;
-        AlphaPatch<S> patch(a.alpha, id);
+        const bool has_alpha = a.alpha.values && a.alpha.size[2 * id] > 0;
         for (int k = 0; k < kColumns; ++k) d[k] = zero;
         d[kArea] = zero;
         each_block(layout, run, [&](int64_t, int64_t at, const BlockPart& of) {
@@ -194,20 +188,20 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
           const P dx = centres.x + P(kBlockOffsets<S>.column[of.block] - cx);
           const P dy = centres.y + P(kBlockOffsets<S>.row[of.block] - cy);
           P ddx, ddy, gu = gradient(duv), gv = gradient(duv ? duv + total : nullptr);
-          if (patch.textured() && marks(expand(f.uv + total + at, of.lanes))) {
-            const P v = expand(f.uv + total + at, of.lanes);
-            const uint32_t lanes = of.lanes & marks(v);
-            patch.locate(expand(f.uv + at, of.lanes), v);
-            const P m = patch.fetch(lanes);
-            S g[kLanes], su[kLanes], sv[kLanes];
-            // neither clamp passes a gradient, that of the product and the kernel's own
-            const auto moves = there & (sigma < P(S(kAlphaMax)));
-            store(g, select(moves, dsigma * sigma / m, zero));
-            store(su, gu), store(sv, gv);
-            patch.add_gradient(lanes, g, texels ? of_texels[part].data() : nullptr, su, sv);
-            gu = load(su), gv = load(sv);
-            dsigma = select(moves & (sigma < m * P(S(kAlphaMax))), dsigma * m, zero);
-            listed = listed / m;
+          if (has_alpha) {
+            const P u = expand(f.uv + at, of.lanes), v = expand(f.uv + total + at, of.lanes);
+            const AlphaPatch<S> patch(a.alpha, id);
+            S all[6][kLanes];  // u, v, sigma as listed, and gradients of sigma, u and v
+            const P* numbers[] = {&u, &v, &listed, &dsigma, &gu, &gv};
+            for (int k = 0; k < 6; ++k) store(all[k], *numbers[k]);
+            each_lane(of.lanes & marks(v), [&](int i) {
+              const TexelCorners<S> corners = patch.corners(all[0][i], all[1][i]);
+              const S dm = alpha_vjp(patch, corners, all[2][i], all[3][i], all[4][i], all[5][i]);
+              if (!texels) return;
+              S* to = of_texels[part].data() + patch.first;
+              for (int k = 0; k < 4; ++k) to[corners.at[k]] += corners.weight[k] * dm;
+            });
+            listed = load(all[2]), dsigma = load(all[3]), gu = load(all[4]), gv = load(all[5]);
           }
           fragment_vjp<Kernel, S, P>(g, near, rim, select(there, dx, zero), select(there, dy, zero), listed,
                                      select(there, dsigma, zero), gu, gv, gradient(ddepth), d, ddx, ddy);

@@ -9,32 +9,33 @@
 
 namespace bt {
 
+namespace {
+template <class S> void check_terms(const ViewColors<S>& colors, int64_t n) {
+  for (int64_t i = 0; i < n; ++i) {
+    const int64_t first = colors.lean.span[2 * i], count = colors.lean.span[2 * i + 1];
+    if (first < 0 || count < 0 || count > kMaxTerms || first + count > colors.lean_terms)
+      throw std::invalid_argument("the terms of surfel " + std::to_string(i) + "'s view colour are not there");
+  }
+}
+}  // namespace
+
 template <class S> void view_color_forward(const ViewColorForward<S>& a) {
-  const ViewColorArrays<const S>& p = a.colors;
-  for_view_color(p.kind, [&](auto kind) {
+  const auto write = [&](auto&& color) {  // color(i, direction)
     parallel_parts(a.to.n, 256, [&](int, int64_t begin, int64_t end) {
       for (int64_t i = begin; i < end; ++i) {
         Vec3<S> c = {S(0), S(0), S(0)};
-        if (a.to.active[i])
-          c = view_color<decltype(kind)>(p.terms, p, i, view_direction(a.to.means + 3 * i, a.to.center).n);
+        if (a.to.active[i]) c = color(i, view_direction(a.to.means + 3 * i, a.to.center).n);
         store3(a.out + 3 * i, c);
       }
     });
-  });
-}
-
-template <class S> void lean_color(const LeanColor<S>& a) {
-  for (int64_t i = 0; i < a.to.n; ++i) {
-    const int64_t first = a.colors.span[2 * i], count = a.colors.span[2 * i + 1];
-    if (first < 0 || count < 0 || count > kMaxTerms || first + count > a.terms)
-      throw std::invalid_argument("the terms of surfel " + std::to_string(i) + "'s view colour are not there");
+  };
+  if (a.colors.lean.base) {
+    check_terms(a.colors, a.to.n);
+    return write([&](int64_t i, Vec3<S> d) { return view_color(a.colors.lean, i, d); });
   }
-  parallel_parts(a.to.n, 256, [&](int, int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-      Vec3<S> c = {S(0), S(0), S(0)};
-      if (a.to.active[i]) c = view_color(a.colors, i, view_direction(a.to.means + 3 * i, a.to.center).n);
-      store3(a.out + 3 * i, c);
-    }
+  const ViewColorArrays<const S>& p = a.colors.whole;
+  for_view_color(p.kind, [&](auto kind) {
+    write([&](int64_t i, Vec3<S> d) { return view_color<decltype(kind)>(p.terms, p, i, d); });
   });
 }
 
@@ -63,7 +64,6 @@ template <class S> void view_color_backward(const ViewColorBackward<S>& a) {
 
 #define BT_INSTANTIATE(S)                                       \
   template void view_color_forward(const ViewColorForward<S>&); \
-  template void lean_color(const LeanColor<S>&);                \
   template void view_color_backward(const ViewColorBackward<S>&);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)

@@ -28,9 +28,7 @@ class AtlasTexture;
 // A baked scene as the kernels read it.
 struct BakedScene : BakedResidual {
   Surfels<float> geometry;
-  ViewColorArrays<const float> colors;
-  LeanColors<float> lean;  // in place of those where lean.base is not null
-  int64_t lean_terms;
+  ViewColors<float> colors;
   const int32_t* tiles;  // [n, 5]: x, y, page, r_u, r_v; r_u = 0: no tile
   // The atlas, and the levels of its tiles (core/texel.h) for views smaller than the photographs; null: none. On the
   // host; Python keeps them.
@@ -43,18 +41,13 @@ struct BakedScene : BakedResidual {
   void fields(R& r) {
     geometry.fields(r);
     const int64_t n = geometry.n;
-    if (r.has("lean"))
-      lean.fields(r, n, lean_terms);
-    else
-      colors.fields(r, n);
+    colors.fields(r, n);
     r.array("tiles", tiles, 5 * n);
     r.maybe_object("texture", levels[0]);
     r.maybe_object("half", levels[1]);
     r.maybe_object("quarter", levels[2]);
     pages_down = 1, page_width = page_height = 0;
-    if (levels[0]) {
-      r.numbers("pages_down", pages_down, "page_width", page_width, "page_height", page_height);
-    }
+    if (levels[0]) r.numbers("pages_down", pages_down, "page_width", page_width, "page_height", page_height);
     BakedResidual::fields(r, n);
     r.number("near", near);
     r.choice("prefilter", prefilter, kPrefilters);

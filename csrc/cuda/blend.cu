@@ -1,5 +1,4 @@
-// Shading and blending of surfels with or without texels, and its backward pass: colours and their gradients never
-// leave the multiprocessor.
+// Shading and blending, and its backward pass: colours and their gradients never leave the multiprocessor.
 //
 // Forward a block takes its tile's list stretch by stretch through shared memory: first every thread works out colours,
 // one fragment after the other, then every lane adds up those of its pixel. So all lanes are busy with the look-ups,
@@ -8,11 +7,10 @@
 // Backward kRunLanes lanes take a pair's fragments in turns, with the tile's part of dimage in shared memory. What a
 // pair adds to its surfel goes to its slot, so that only the sums of texels are added in any order.
 //
-// Bytes per fragment of surfels alone; with texels, which are 4 of 12 bytes more; and what shading and compositing one
-// after the other move of the lists of fragments, colours and gradients:
-//             alone   with texels   one after the other
-//   forward     8         16              36, 44
-//   backward   12         24              68, 84
+// Bytes per fragment of surfels alone; with texels, which are 4 of 12 bytes more; and with a residual of each fragment:
+//             alone   with texels   with residuals
+//   forward     8         16              20
+//   backward   12         24              36
 #include "core/blend.h"
 #include "cuda/kernels.h"
 #include "cuda/texel_sums.h"
@@ -53,6 +51,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
       const TexelPatch<S> patch(of.table, id);
       Vec3<S> c = patch.view;
       if (w >= of.bound && patch.textured()) c = patch.color(patch.corners(u, v));
+      if (of.residual) c = shaded(c, load3(of.residual + 3 * at));
       weights[i] = w, colors[0][i] = c.x, colors[1][i] = c.y, colors[2][i] = c.z;
       if constexpr (kMaps) depths[i] = f.depth[at];
     });
@@ -76,25 +75,28 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
 
 // Outputs of the backward kernel; null: not requested.
 template <class S> struct Gradients {
-  S *weight, *uv, *depth, *partial;
+  S *weight, *uv, *depth, *residual, *partial;
   S* texels;  // sums, where they are not exact
   bool sums_texels;
 };
 
+// The residual colours of fragments: none, those of texels, or one listed for each.
+enum class Residual { kNone, kTexels, kListed };
 // Blocks at a time on a multiprocessor, as many as there are registers for: the look-up of texels and the sums of its
 // gradients take 80 in single precision.
-template <class S, bool kMaps, bool kTexels> constexpr int resident() {
+template <class S, bool kMaps, Residual kResidual> constexpr int resident() {
   if (sizeof(S) == 8) return 1;
-  return kTexels ? (kMaps ? 2 : 3) : (kMaps ? 4 : 5);
+  return kResidual == Residual::kTexels ? (kMaps ? 2 : 3) : (kMaps ? 4 : 5);
 }
 
 // A run is read and written from a multiple of 8 fragments on: memory takes whole sectors of 32 bytes faster than
-// parts. kTexels: there are any.
-template <class S, bool kMaps, bool kTexels, bool kExact>
-__global__ void __launch_bounds__(kTileThreads, resident<S, kMaps, kTexels>())
+// parts.
+template <class S, bool kMaps, Residual kResidual, bool kExact>
+__global__ void __launch_bounds__(kTileThreads, resident<S, kMaps, kResidual>())
     backward_kernel(BlendedSurfels<S, Pairs> of, const S* __restrict__ dimage, Gradients<S> out, ExactSums exact) {
   constexpr int kChannels = kMaps ? kMapChannels : kImageChannels, kSums = blend_sums(kMaps);
   constexpr int kWorkers = kTileThreads / kRunLanes, kWhole = 8;
+  constexpr bool kTexels = kResidual == Residual::kTexels, kListed = kResidual == Residual::kListed;
   __shared__ S gradient[kTileThreads * kChannels];
   const Pairs& p = of.fragments.layout;
   const FragmentArrays<S>& f = of.fragments.f;
@@ -104,7 +106,7 @@ __global__ void __launch_bounds__(kTileThreads, resident<S, kMaps, kTexels>())
   tile.load<kChannels>(dimage, gradient);
   __syncthreads();
   Adder<S, kExact> texel_sums = {};
-  if constexpr (kTexels) texel_sums = texel_adder<kExact>(out.texels, exact);
+  if constexpr (kTexels) texel_sums = adder<kExact>(out.texels, exact);
   const int lane = int(threadIdx.x) % kRunLanes, worker = int(threadIdx.x) / kRunLanes;
   // The runs of a warp take their turns together.
   for (int64_t k = first + worker; k - worker % 2 < end; k += kWorkers) {
@@ -124,17 +126,20 @@ __global__ void __launch_bounds__(kTileThreads, resident<S, kMaps, kTexels>())
       const int64_t i = begin + at;
       const bool mine = at >= 0 && at < count;
       S w = S(0), u = S(0), v = S(0), depth = S(0);
+      Vec3<S> residual = {S(0), S(0), S(0)};
       int pixel = 0;
       if (mine) {
         pixel = f.pixel[i], w = f.weight[i];
         if (kTexels && patch.textured()) u = f.uv[i], v = f.uv[f.total + i];
         if constexpr (kMaps) depth = f.depth[i];
+        if constexpr (kListed) residual = load3(of.residual + 3 * i);
       }
       __syncwarp();  // no load is put off until its number is used: one wait is for all
       const bool textured = kTexels && mine && w >= of.bound && patch.textured();
       TexelCorners<S> corners = {};
       TexelSlopes<S> slopes = {};
       Vec3<S> color = patch.view, dcolor = {S(0), S(0), S(0)};
+      if constexpr (kListed) color = shaded(color, residual);
       if (textured) {
         corners = patch.corners(u, v);
         Vec3<S> t[4];
@@ -154,11 +159,15 @@ __global__ void __launch_bounds__(kTileThreads, resident<S, kMaps, kTexels>())
           BT_UNROLL
           for (int c = 0; c < 3; ++c) sums[4 + c] += w * d[6 + c];
         }
+        if constexpr (kListed)
+          if (out.residual) store3(out.residual + 3 * i, dcolor);
         if (out.uv) out.uv[i] = dot(dcolor, slopes.u), out.uv[f.total + i] = dot(dcolor, slopes.v);
       }
-      if (kTexels && out.sums_texels)
-        add_to_texels(textured ? patch.first + corners.at[0] : int64_t(-1), corners, dcolor, int(threadIdx.x) % kWarp,
-                      texel_sums);
+      if (kTexels && out.sums_texels) {
+        const S d[3] = {dcolor.x, dcolor.y, dcolor.z};
+        add_to_corners(textured ? patch.first + corners.at[0] : int64_t(-1), corners, d, int(threadIdx.x) % kWarp,
+                       texel_sums);
+      }
     }
     const S sum = sum_over_run(sums, lane);
     if (some && lane < kSums) out.partial[int64_t(p.slot[k]) * kSums + lane] = sum;
@@ -177,17 +186,20 @@ template <class S> struct StoreSurfelGradient {
   }
 };
 
-template <class S, bool kMaps, bool kTexels, bool kExact>
+template <class S, bool kMaps, Residual kResidual, bool kExact>
 void run_backward(const BlendBackward<S, Pairs>& a, const ExactSums& exact, Stream stream) {
   const Pairs& p = a.of.fragments.layout;
-  const Gradients<S> out = {a.dweight, a.duv, a.ddepth, a.partial, a.work.sums, a.sums_texels()};
+  const Gradients<S> out = {a.dweight, a.duv, a.ddepth, a.dresidual, a.partial, a.work.sums, a.sums_texels()};
   if (p.pairs)
-    BT_LAUNCH((backward_kernel<S, kMaps, kTexels, kExact>), dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream,
+    BT_LAUNCH((backward_kernel<S, kMaps, kResidual, kExact>), dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream,
               a.of, a.dimage, out, exact);
   fill_zero(a.dgeom, p.surfels * kGeom, stream);
   sum_slots<blend_sums(kMaps)>(p, static_cast<const S*>(a.partial),
                                StoreSurfelGradient<S>{a.of.table.base, a.dgeom, a.dbase}, stream);
-  if (a.sums_texels()) finish_texels<kExact>(a, a.of.table.texels, exact, stream);
+  if (!a.sums_texels()) return;
+  if (a.dtexels) fill_zero(a.dtexels, 3 * a.of.table.texels, stream);
+  each_shown_texel(p, a.of.table, FinishTexel<S, kExact>{a.work.sums, exact, a.share, a.rate, a.dtexels, a.moved},
+                   stream);
 }
 }  // namespace
 
@@ -199,19 +211,23 @@ template <class S> void blend_forward(const BlendForward<S, Pairs>& a, Stream st
     BT_LAUNCH((forward_kernel<S, false>), tiles, threads, 0, stream, a.of, a.image);
 }
 
-template <class S> void blend_backward(const BlendBackward<S, Pairs>& a, Stream stream) {
+template <class S, bool kMaps> void backward(const BlendBackward<S, Pairs>& a, Stream stream) {
   const int64_t entries = a.sums_texels() ? 4 * a.of.table.texels : 0;
-  const bool maps = a.of.maps;
   if (a.work.exact && entries) {
-    const ExactSums exact = begin_exact(a.work.exact, entries, static_cast<const FieldArrays<S>*>(nullptr), 0, false,
+    const ExactSums exact = begin_exact(a.work.exact, entries, static_cast<const FieldArrays<S>*>(nullptr),
                                         a.of.fragments.f.total, a.of.numbers(), a.dimage, stream);
-    maps ? run_backward<S, true, true, true>(a, exact, stream) : run_backward<S, false, true, true>(a, exact, stream);
+    run_backward<S, kMaps, Residual::kTexels, true>(a, exact, stream);
   } else if (a.of.table.texels) {
-    fill_zero(a.work.sums, entries, stream);
-    maps ? run_backward<S, true, true, false>(a, {}, stream) : run_backward<S, false, true, false>(a, {}, stream);
+    if (entries) each_shown_texel(a.of.fragments.layout, a.of.table, ClearTexel<S>{a.work.sums}, stream);
+    run_backward<S, kMaps, Residual::kTexels, false>(a, {}, stream);
+  } else if (a.of.residual) {
+    run_backward<S, kMaps, Residual::kListed, false>(a, {}, stream);
   } else {
-    maps ? run_backward<S, true, false, false>(a, {}, stream) : run_backward<S, false, false, false>(a, {}, stream);
+    run_backward<S, kMaps, Residual::kNone, false>(a, {}, stream);
   }
+}
+template <class S> void blend_backward(const BlendBackward<S, Pairs>& a, Stream stream) {
+  a.of.maps ? backward<S, true>(a, stream) : backward<S, false>(a, stream);
 }
 
 #define BT_INSTANTIATE(S)                                             \

@@ -5,6 +5,8 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "core/common.h"
+
 #if defined(__CUDACC__)
 
 #include <cuda_runtime.h>
@@ -27,13 +29,11 @@ inline void check(cudaError_t error, const char* what) {
     ::bt::cuda::check(cudaGetLastError(), #kernel);                                        \
   } while (0)
 
-// Before a loop whose indices the compiler must know: arrays live in registers only then. Host code has no such pragma.
+// As BT_UNROLL (core/common.h), n times.
 #if defined(__CUDA_ARCH__)
-#define BT_UNROLL _Pragma("unroll")
 #define BT_PRAGMA(text) _Pragma(#text)
 #define BT_UNROLL_BY(n) BT_PRAGMA(unroll n)
 #else
-#define BT_UNROLL
 #define BT_UNROLL_BY(n)
 #endif
 
@@ -55,7 +55,6 @@ inline void check(cudaError_t error, const char* what) {
 #define BT_LAUNCH(kernel, grid, block, shared, stream, ...) \
   ((void)(stream), ::bt::emulator::launch(#kernel, (grid), (block), (shared), [=] { kernel(__VA_ARGS__); }))
 
-#define BT_UNROLL
 #define BT_UNROLL_BY(n)
 
 #define BT_DYNAMIC_SHARED(Type, name) Type* name = static_cast<Type*>(::bt::emulator::dynamic_shared())

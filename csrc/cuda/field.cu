@@ -1,5 +1,4 @@
-// The residual field at points and at texels.
-#include "core/texel.h"
+// The residual field at points.
 #include "cuda/field_device.h"
 
 namespace bt::cuda {
@@ -30,11 +29,7 @@ __global__ void __launch_bounds__(kBackwardWarps<S>* kWarp, kBackwardResident<S>
   load_mlp(field, threadIdx.x, kBackwardWarps<S> * kWarp, shared->mlp);
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
   const int64_t step = int64_t(gridDim.x) * kBackwardWarps<S> * kChunk;
-  Adder<S, kExact> table;
-  if constexpr (kExact)
-    table = {exact.table, exact.range->table};
-  else
-    table = {dtable};
+  const Adder<S, kExact> table = adder<kExact>(dtable, exact);
   WeightSums<S> weights;
   for (int64_t chunk = (int64_t(blockIdx.x) * kBackwardWarps<S> + warp) * kChunk; chunk < n; chunk += step)
     for (int64_t first = chunk; first < chunk + kChunk && first < n; first += kWarp) {
@@ -49,36 +44,25 @@ __global__ void __launch_bounds__(kBackwardWarps<S>* kWarp, kBackwardResident<S>
   store_weight_sums(*shared, weights, warp, lane, partial);
 }
 
-// A warp takes 32 texels of a tile in the order of memory: a row, a part of one, or several short ones.
+// Adds up the blocks' sums of the weights' gradients. 32 columns per block: 8 groups of threads walk down the rows,
+// then the groups are added in order.
+constexpr int kSumThreads = 256, kSumRows = kSumThreads / kWarp;
 template <class S>
-__global__ void __launch_bounds__(kThreads)
-    bake_kernel(int64_t n, int64_t warps, FieldArrays<S> field, const S* __restrict__ frames,
-                const S* __restrict__ extent, const int32_t* __restrict__ tiles, const int64_t* __restrict__ first,
-                int width, int height, S* __restrict__ pages, int32_t* bad) {
-  __shared__ ForwardMlp<S> m;
-  __shared__ ForwardStage<S> stage[kThreads / kWarp];
-  load_mlp(field, threadIdx.x, kThreads, m);
-  const int64_t warp = (int64_t(blockIdx.x) * kThreads + threadIdx.x) / kWarp;
-  if (warp >= warps) return;
-  int64_t low = 0, high = n;  // the last tile that begins at this warp or before it; tiles of no texels are skipped
-  while (high - low > 1) {
-    const int64_t mid = (low + high) / 2;
-    (first[mid] <= warp ? low : high) = mid;
-  }
-  const int32_t* tile = tiles + 5 * low;
-  const int r_u = tile[3], r_v = tile[4], lane = threadIdx.x % kWarp;
-  const int t = int(warp - first[low]) * kWarp + lane;
-  const bool active = t < r_u * r_v;
-  const int i = active ? t % r_u : 0, j = active ? t / r_u : 0;
-  const Vec3<S> x =
-      world_point(frames + low * kFrame, texel_centre(i, r_u, extent[low]), texel_centre(j, r_v, extent[low]));
-  Vec3<S> rho = evaluate(field, m, x, active, lane, stage[threadIdx.x / kWarp]);
-  if (!active) return;
-  if (!finite_(rho.x) || !finite_(rho.y) || !finite_(rho.z)) {
-    rho = {S(0), S(0), S(0)};
-    atomicAdd(bad, 1);
-  }
-  store3(pages + 3 * ((int64_t(tile[2]) * height + tile[1] + j) * width + tile[0] + i), rho);
+__global__ void __launch_bounds__(kSumThreads)
+    sum_weights_kernel(const S* partial, int blocks, int levels, FieldGradients<S> out) {
+  __shared__ S sums[kSumRows][kWarp];
+  const int column = int(blockIdx.x) * kWarp + int(threadIdx.x) % kWarp, group = int(threadIdx.x) / kWarp;
+  S total = S(0);
+  if (column < kMlpWeights)
+    for (int b = group; b < blocks; b += kSumRows) total += partial[int64_t(b) * kMlpWeights + column];
+  sums[group][threadIdx.x % kWarp] = total;
+  __syncthreads();
+  if (group || column >= kMlpWeights) return;
+  for (int g = 1; g < kSumRows; ++g) total += sums[g][threadIdx.x];
+  constexpr int kMatrix = kWidth * kWidth;
+  if (column < levels * kFeatures * kWidth) out.w1[column] = total;
+  if (column >= kMatrix && column < 2 * kMatrix) out.w2[column - kMatrix] = total;
+  if (column >= 2 * kMatrix) out.w3[column - 2 * kMatrix] = total;
 }
 }  // namespace
 
@@ -90,36 +74,27 @@ template <class S> void field_forward(const FieldForward<S>& a, Stream stream) {
 
 template <class S> void field_backward(const FieldBackward<S>& a, Stream stream) {
   const FieldArrays<S>& field = *a.field;
-  const FieldGradients<S>& out = a.dfield;
-  const FieldWork<S>& work = a.work;
+  S* const dtable = a.dfield.table;
+  const int64_t entries = field.table_size();
   const int blocks = backward_blocks<S>(a.n);
   const size_t shared = sizeof(BackwardShared<S>);
-  const dim3 grid(blocks), block(kBackwardWarps<S> * kWarp);
-  if (work.exact) {
-    const ExactSums exact = begin_exact(work.exact, field.table_size(), &field, 0, false, a.n, 3 * a.n, a.drho, stream);
-    const auto kernel = field_backward_kernel<S, true>;
-    BT_ALLOW_SHARED(kernel, shared);
-    BT_LAUNCH(kernel, grid, block, shared, stream, a.n, field, a.x, a.drho, out.table, exact, work.mlp, a.dx);
-    end_exact(exact, field.table_size(), 0, out.table, static_cast<S*>(nullptr), static_cast<S*>(nullptr), stream);
-  } else {
-    const auto kernel = field_backward_kernel<S, false>;
-    fill_zero(out.table, field.table_size(), stream);
-    BT_ALLOW_SHARED(kernel, shared);
-    BT_LAUNCH(kernel, grid, block, shared, stream, a.n, field, a.x, a.drho, out.table, ExactSums(), work.mlp, a.dx);
-  }
-  sum_weights(work.mlp, blocks, field.levels, out, stream);
+  ExactSums exact;
+  if (a.exact)
+    exact = begin_exact(a.exact, entries, &field, a.n, 3 * a.n, a.drho, stream);
+  else
+    fill_zero(dtable, entries, stream);
+  const auto kernel = a.exact ? field_backward_kernel<S, true> : field_backward_kernel<S, false>;
+  BT_ALLOW_SHARED(kernel, shared);
+  BT_LAUNCH(kernel, dim3(blocks), dim3(kBackwardWarps<S> * kWarp), shared, stream, a.n, field, a.x, a.drho, dtable,
+            exact, a.mlp, a.dx);
+  if (a.exact) end_exact(exact, entries, dtable, stream);
+  BT_LAUNCH(sum_weights_kernel<S>, dim3(unsigned(ceil_div(kMlpWeights, kWarp))), dim3(kSumThreads), 0, stream, a.mlp,
+            blocks, field.levels, a.dfield);
 }
 
-template <class S> void field_tiles(const FieldTiles<S>& a, Stream stream) {
-  if (!a.warps) return;
-  BT_LAUNCH(bake_kernel<S>, dim3(unsigned(ceil_div(a.warps * kWarp, kThreads))), dim3(kThreads), 0, stream, a.n,
-            a.warps, *a.field, a.frames, a.extent, a.tiles, a.first, a.width, a.height, a.pages, a.bad);
-}
-
-#define BT_INSTANTIATE(S)                                        \
-  template void field_forward(const FieldForward<S>&, Stream);   \
-  template void field_backward(const FieldBackward<S>&, Stream); \
-  template void field_tiles(const FieldTiles<S>&, Stream);
+#define BT_INSTANTIATE(S)                                      \
+  template void field_forward(const FieldForward<S>&, Stream); \
+  template void field_backward(const FieldBackward<S>&, Stream);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

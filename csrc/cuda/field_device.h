@@ -1,14 +1,15 @@
-// The residual field on CUDA: at points, at the fragments of a view (shading), and at the texels of an atlas.
+// The residual field on CUDA, at points.
 //
 // Work of one look-up with L = 4 levels: 32 entries of 16 bytes gathered from the table (1 KB of 32-byte sectors at
-// worst; the table of at most 8 MB stays in the L2, and neighbouring fragments that share cells find them in the L1),
+// worst; the table of at most 8 MB stays in the L2, and neighbouring points that share cells find them in the L1),
 // and an MLP of 560 multiply-adds, 1,680 with its gradients. What limits the kernels is the number of instructions that
 // they issue, and how many warps there are to wait for memory. So a warp takes 32 look-ups, gathers with a lane per
 // look-up, hands the features over in shared memory, and does the MLP on tensor cores (warp_mlp.h): 24 steps for what
 // are 256 multiply-adds and 64 loads per lane. The backward pass repeats the look-up and adds 32 times 16 bytes to the
-// table's gradient, one vector reduction each, after sums over neighbouring fragments in one cell.
+// table's gradient, one vector reduction each, after sums over neighbouring points in one cell.
 #pragma once
 
+#include "cuda/exact_sums.h"
 #include "cuda/kernels.h"
 #include "cuda/warp.h"
 #include "cuda/warp_mlp.h"
@@ -226,15 +227,11 @@ __device__ Vec3<S> field_vjp(const FieldArrays<S>& f, const WarpMlp<S>& m, Vec3<
 template <class S> constexpr int kBackwardWarps = sizeof(S) == 4 ? 4 : 2;  // a warp's stage is 9 KB, or 18 KB in double
 template <class S> constexpr int kBackwardResident = sizeof(S) == 4 ? 4 : 2;  // blocks at a time on a multiprocessor
 
-constexpr int kChunk = 8 * kWarp;  // consecutive items that a warp takes at a time
-constexpr int kStep = 2 * kWarp;   // and asks memory for at a time
-constexpr int kQueue = kWarp + kStep;
+constexpr int kChunk = 8 * kWarp;  // consecutive points that a warp takes at a time
 
 template <class S> struct BackwardShared {
   WarpMlp<S> mlp;
   Stage<S> stage[kBackwardWarps<S>];
-  uint32_t queue[kBackwardWarps<S>][kQueue];
-  uint32_t taken;  // chunks
 };
 
 // Sums of the block's warps, in their order, to the block's row of `out`.
@@ -253,39 +250,10 @@ __device__ void store_weight_sums(BackwardShared<S>& shared, WeightSums<S>& weig
   for (int k = threadIdx.x; k < kMlpWeights; k += kThreads) out[int64_t(blockIdx.x) * kMlpWeights + k] = sums[k];
 }
 
-// Blocks of a backward pass over n items. A function of n alone: with it the order of all sums is fixed.
-template <class S> int backward_blocks(int64_t n, int most = kMostBlocks) {
+// Blocks of a backward pass over n points. A function of n alone: with it the order of all sums is fixed.
+template <class S> int backward_blocks(int64_t n) {
   const int64_t blocks = ceil_div(n, int64_t(kChunk) * kBackwardWarps<S>);
-  return int(blocks < 1 ? 1 : blocks > most ? most : blocks);
+  return int(blocks < 1 ? 1 : blocks > kMostBlocks ? kMostBlocks : blocks);
 }
-
-// ---- steps around the backward kernels (field_sums.cu)
-
-// In FieldWork::exact after the table: bits of the largest |gradient| and |entry| as doubles, and from them the units
-// of the exact sums, as 1 / unit.
-struct ExactRange {
-  unsigned long long gradient, entry;
-  double table, base, frames;
-};
-static_assert(sizeof(ExactRange) == kExactRange * sizeof(int64_t));
-// Pointers into FieldWork::exact, all null when sums need not be exact.
-struct ExactSums {
-  unsigned long long *table = nullptr, *base = nullptr, *frames = nullptr;
-  ExactRange* range = nullptr;
-};
-// Clears the exact sums in memory of exact_size(entries, surfels, frames) and finds their units, such that no sum of
-// `count` gradients can overflow, none of them larger than the largest of `numbers`. The entries are those of
-// the field's table; without a field, sums of shares of the gradients, of at most 1 each in all. frames tells whether
-// those of the surfels are summed.
-template <class S>
-ExactSums begin_exact(int64_t* memory, int64_t entries, const FieldArrays<S>* field, int64_t surfels, bool frames,
-                      int64_t count, int64_t numbers, const S* gradients, Stream stream);
-// Writes the exact sums as numbers: where not null, dtable [entries], dbase and dframes.
-template <class S>
-void end_exact(const ExactSums& exact, int64_t entries, int64_t surfels, S* dtable, S* dbase, S* dframes,
-               Stream stream);
-// Adds up the blocks' sums of the weights' gradients.
-template <class S>
-void sum_weights(const S* partial, int blocks, int levels, const FieldGradients<S>& out, Stream stream);
 
 }  // namespace bt::cuda

@@ -5,7 +5,7 @@
 #include <string>
 
 #include "cuda/device.h"
-#include "cuda/pairs.h"
+#include "cuda/fragment_list.h"
 #include "ops/appearance.h"
 #include "ops/blend.h"
 #include "ops/field.h"
@@ -109,8 +109,6 @@ template <class S> struct TraceFill {
 template <class S> void trace_fill(const TraceFill<S>& a, Stream stream);
 
 template <class S> void trace_backward(const TraceBackward<S, Pairs>& a, Stream stream);
-template <class S> void composite_forward(const CompositeForward<S, Pairs>& a, Stream stream);
-template <class S> void composite_backward(const CompositeBackward<S, Pairs>& a, Stream stream);
 template <class S> void blend_forward(const BlendForward<S, Pairs>& a, Stream stream);
 template <class S> void blend_backward(const BlendBackward<S, Pairs>& a, Stream stream);
 void masked_counts(const MaskedCounts<Pairs>& a, Stream stream);
@@ -132,15 +130,11 @@ void select_fragments(const SelectPairs& a, Stream stream);
 
 template <class S> void view_color_forward(const ViewColorForward<S>& a, Stream stream);
 template <class S> void view_color_backward(const ViewColorBackward<S>& a, Stream stream);
-template <class S> void lean_color(const LeanColor<S>& a, Stream stream);
 
 template <class S> int64_t ssim_workspace(int height, int width, int channels, bool gradient);
 template <class S> void ssim(const Ssim<S>& a, Stream stream);
 
 template <class S> void field_forward(const FieldForward<S>& a, Stream stream);
 template <class S> void field_backward(const FieldBackward<S>& a, Stream stream);
-template <class S> void shade_forward(const ShadeForward<S>& a, Stream stream);
-template <class S> void shade_backward(const ShadeBackward<S>& a, Stream stream);
-template <class S> void field_tiles(const FieldTiles<S>& a, Stream stream);
 
 }  // namespace bt::cuda

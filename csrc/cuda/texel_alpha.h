@@ -1,12 +1,10 @@
-// Alpha texels on the device (ops/visibility.h): the fetch, and the mark in a fragment's v.
+// Alpha texels on the device: the cut of a fragment's sigma, and the mark in its v.
 #pragma once
 
 #include <cstring>
 
-#include "core/blend.h"
-#include "core/texel.h"
 #include "cuda/device.h"
-#include "ops/visibility.h"
+#include "ops/texel_alpha.h"
 
 namespace bt::cuda {
 
@@ -23,28 +21,6 @@ template <class S> __device__ S with_mark(S v, bool mark) {
   memcpy(&v, &bits, sizeof bits);
   return v;
 }
-
-// The alpha texels of one surfel.
-template <class S> struct AlphaPatch {
-  const int32_t* size;  // r_u, r_v; 0, 0 = no tile
-  const S* tile;
-  int64_t first;
-  S extent;
-
-  __device__ AlphaPatch(const AlphaTiles<S>& tiles, int64_t id)
-      : size(tiles.size + 2 * id),
-        tile(tiles.values + tiles.first[id]),
-        first(tiles.first[id]),
-        extent(tiles.extent[id]) {}
-  __device__ bool textured() const { return size[0] > 0; }
-  __device__ TexelCorners<S> corners(S u, S v) const { return texel_corners(u, v, size, extent); }
-  // m, exactly 1 between texels of 1, and the four texels.
-  __device__ S fetch(const TexelCorners<S>& at, S (&t)[4]) const {
-    BT_UNROLL
-    for (int k = 0; k < 4; ++k) t[k] = tile[at.at[k]];
-    return texel_lerp(t, at.fx, at.fy);
-  }
-};
 
 // Multiplies the sigma of a surfel's fragment, at least 1/255, where its weight would be at least the bound, and marks
 // v. Both passes over a view call it, so that they agree.

@@ -5,7 +5,7 @@
 // list one pair at a time with all lanes busy (in the walk two thirds would idle) and reduce once per pair. Gradients
 // of alpha texels are summed over neighbouring fragments between the same texels, then added in memory.
 #include "core/kernel.h"
-#include "cuda/fast.h"
+#include "cuda/fast_float.h"
 #include "cuda/kernels.h"
 #include "cuda/texel_alpha.h"
 #include "cuda/texel_sums.h"
@@ -35,7 +35,7 @@ __global__ void __launch_bounds__(kTileThreads)
     if (!t.mine) return;
     dsigma[t.i] = plain(blend_vjp(T(t.weight), T(abs_(t.sigma)), T(t.dweight), later));
   };
-  for_each_fragment<4, true>(p, s, load, use);
+  each_fragment_back<4>(p, s, load, use);
 }
 
 // Alpha texels, and where their gradients are added up; `texels` null: nowhere.
@@ -44,38 +44,6 @@ template <class S> struct AlphaGradient {
   S* texels;
   ExactSums exact;
 };
-
-// Gradients of alpha's share of a fragment's sigma: from gs, that of the listed sigma, to that of the kernel's sigma,
-// which takes the place of the listed one; more of gu and gv; and the return value, that of m.
-template <class S>
-__device__ S alpha_vjp(const AlphaPatch<S>& patch, const TexelCorners<S>& at, S& listed, S& gs, S& gu, S& gv) {
-  S t[4];
-  const S m = patch.fetch(at, t), sigma = abs_(listed);
-  // neither clamp passes a gradient, that of the product and the kernel's own; m may be rounded otherwise than when the
-  // fragment was written
-  const bool moves = sigma < S(kAlphaMax), uncut_moves = moves && sigma < m * S(kAlphaMax * (1 - 1e-6));
-  const S dm = moves ? gs * sigma / m : S(0);
-  if (at.inside_u) gu += dm * texel_density(patch.size[0], patch.extent) * texel_slope_u(t, at.fy);
-  if (at.inside_v) gv += dm * texel_density(patch.size[1], patch.extent) * texel_slope_v(t, at.fx);
-  gs = uncut_moves ? gs * m : S(0);
-  listed /= m;
-  return dm;
-}
-
-// Adds the gradients of every lane's four corners, one addition per run of lanes between the same texels; row as in
-// add_to_texels.
-template <class S, bool kExact>
-__device__ void add_to_alpha(int64_t row, const TexelCorners<S>& at, S dm, int lane, const Adder<S, kExact>& to) {
-  S value[4];
-  BT_UNROLL
-  for (int k = 0; k < 4; ++k) value[k] = at.weight[k] * dm;
-  const unsigned run = run_of(row, lane);
-  sum_over_run(run, lane, value);
-  if (row < 0 || count_below(run, lane)) return;
-  BT_UNROLL
-  for (int k = 0; k < 4; ++k)
-    if (value[k] != S(0)) to.add(row + at.at[k] - at.at[0], value[k]);
-}
 
 template <class Kernel, class S, bool kAlpha, bool kExact>
 __global__ void __launch_bounds__(kRunThreads)
@@ -106,16 +74,16 @@ __global__ void __launch_bounds__(kRunThreads)
     if constexpr (kAlpha) {
       const AlphaPatch<S> patch(alpha.tiles, id);
       TexelCorners<S> corners = {};
-      S v = S(0), dm = S(0);
+      S v = S(0), dm[1] = {S(0)};
       if (mine && patch.textured()) v = f.uv[f.total + i];
       const bool is_cut = mine && patch.textured() && is_marked(v);
       if (is_cut) {
         corners = patch.corners(f.uv[i], v);
-        dm = alpha_vjp(patch, corners, listed, gs, gu, gv);
+        dm[0] = alpha_vjp(patch, corners, listed, gs, gu, gv);
       }
       if (alpha.texels)
-        add_to_alpha(is_cut ? patch.first + corners.at[0] : int64_t(-1), corners, dm, int(threadIdx.x) % kWarp,
-                     texel_adder<kExact>(alpha.texels, alpha.exact));
+        add_to_corners(is_cut ? patch.first + corners.at[0] : int64_t(-1), corners, dm, int(threadIdx.x) % kWarp,
+                       adder<kExact>(alpha.texels, alpha.exact));
     }
     if (mine) {
       const int32_t y = row_of(pixel), x = pixel - y * p.width;
@@ -152,8 +120,8 @@ template <class S> void trace_backward(const TraceBackward<S, Pairs>& a, Stream 
   const bool cuts = a.alpha.values && dsigma, exact = cuts && texels && a.exact_alpha;
   AlphaGradient<S> alpha = {a.alpha, a.dtexel_alpha, {}};
   if (exact)
-    alpha.exact = begin_exact(a.exact_alpha, texels, static_cast<const FieldArrays<S>*>(nullptr), 0, false, f.total,
-                              f.total, dsigma, stream);
+    alpha.exact = begin_exact(a.exact_alpha, texels, static_cast<const FieldArrays<S>*>(nullptr), f.total, f.total,
+                              dsigma, stream);
   else
     fill_zero(a.dtexel_alpha, texels, stream);
   if (p.pairs)
@@ -165,8 +133,7 @@ template <class S> void trace_backward(const TraceBackward<S, Pairs>& a, Stream 
       BT_LAUNCH(run, run_blocks(p), dim3(kRunThreads), 0, stream, a.view.geom, a.view.near, a.rim, p, f, alpha, dsigma,
                 a.duv, a.ddepth, a.partial);
     });
-  if (exact)
-    end_exact(alpha.exact, texels, 0, a.dtexel_alpha, static_cast<S*>(nullptr), static_cast<S*>(nullptr), stream);
+  if (exact) end_exact(alpha.exact, texels, a.dtexel_alpha, stream);
   sum_slots<kTraceSums>(p, static_cast<const S*>(a.partial), StoreGeomGradient<S>{a.dgeom, a.absgrad}, stream);
 }
 

@@ -10,26 +10,26 @@ namespace bt::cuda {
 namespace {
 constexpr int kThreads = 128;
 
-template <class S, class ViewColor, int kTerms>
-__global__ void __launch_bounds__(kThreads)
-    forward_kernel(int64_t n, ViewColorArrays<const S> p, const S* __restrict__ means,
-                   const double* __restrict__ center, const uint8_t* __restrict__ active, S* __restrict__ out) {
-  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i >= n) return;
-  Vec3<S> c = {S(0), S(0), S(0)};
-  if (active[i]) c = view_color<ViewColor>(kTerms ? kTerms : p.terms, p, i, view_direction(means + 3 * i, center).n);
-  store3(out + 3 * i, c);
-}
-
+template <class S, class ViewColor, int kTerms> struct WholeColor {
+  ViewColorArrays<const S> p;
+  __device__ Vec3<S> operator()(int64_t i, Vec3<S> d) const {
+    return view_color<ViewColor>(kTerms ? kTerms : p.terms, p, i, d);
+  }
+};
 // A surfel of one colour reads 20 bytes; each further term is 24 (sv).
-template <class S>
+template <class S> struct LeanColor {
+  LeanColors<S> p;
+  __device__ Vec3<S> operator()(int64_t i, Vec3<S> d) const { return view_color(p, i, d); }
+};
+
+template <class S, class Color>
 __global__ void __launch_bounds__(kThreads)
-    lean_kernel(int64_t n, LeanColors<S> p, const S* __restrict__ means, const double* __restrict__ center,
-                const uint8_t* __restrict__ active, S* __restrict__ out) {
+    forward_kernel(int64_t n, Color color, const S* __restrict__ means, const double* __restrict__ center,
+                   const uint8_t* __restrict__ active, S* __restrict__ out) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= n) return;
   Vec3<S> c = {S(0), S(0), S(0)};
-  if (active[i]) c = view_color(p, i, view_direction(means + 3 * i, center).n);
+  if (active[i]) c = color(i, view_direction(means + 3 * i, center).n);
   store3(out + 3 * i, c);
 }
 
@@ -70,19 +70,15 @@ template <class F> void dispatch(int kind, int terms, F&& f) {
 template <class S> void view_color_forward(const ViewColorForward<S>& a, Stream stream) {
   const Directions<S>& to = a.to;
   if (!to.n) return;
-  dispatch(a.colors.kind, a.colors.terms, [&](auto kind, auto terms) {
-    const auto kernel = forward_kernel<S, decltype(kind), decltype(terms)::value>;
-    BT_LAUNCH(kernel, dim3(unsigned(ceil_div(to.n, kThreads))), dim3(kThreads), 0, stream, to.n, a.colors, to.means,
+  const auto write = [&](auto color) {
+    const auto kernel = forward_kernel<S, decltype(color)>;
+    BT_LAUNCH(kernel, dim3(unsigned(ceil_div(to.n, kThreads))), dim3(kThreads), 0, stream, to.n, color, to.means,
               to.center, to.active, a.out);
+  };
+  if (a.colors.lean.base) return write(LeanColor<S>{a.colors.lean});
+  dispatch(a.colors.whole.kind, a.colors.whole.terms, [&](auto kind, auto terms) {
+    write(WholeColor<S, decltype(kind), decltype(terms)::value>{a.colors.whole});
   });
-}
-
-template <class S> void lean_color(const LeanColor<S>& a, Stream stream) {
-  const Directions<S>& to = a.to;
-  if (!to.n) return;
-  const auto kernel = lean_kernel<S>;
-  BT_LAUNCH(kernel, dim3(unsigned(ceil_div(to.n, kThreads))), dim3(kThreads), 0, stream, to.n, a.colors, to.means,
-            to.center, to.active, a.out);
 }
 
 template <class S> void view_color_backward(const ViewColorBackward<S>& a, Stream stream) {
@@ -97,7 +93,6 @@ template <class S> void view_color_backward(const ViewColorBackward<S>& a, Strea
 
 #define BT_INSTANTIATE(S)                                               \
   template void view_color_forward(const ViewColorForward<S>&, Stream); \
-  template void lean_color(const LeanColor<S>&, Stream);                \
   template void view_color_backward(const ViewColorBackward<S>&, Stream);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)

@@ -73,14 +73,4 @@ template <class S> struct Adder<S, true> {
   __device__ S sum(int64_t at) const { return exact_value<S>(to[at], scale); }
 };
 
-// Adds M numbers of every lane to rows of width M, one addition per run of lanes with the same row. Row -1: none.
-template <int M, class S, bool kExact>
-__device__ void add_to_rows(int32_t row, int lane, S (&value)[M], const Adder<S, kExact>& to) {
-  const unsigned run = run_of(row, lane);
-  sum_over_run(run, lane, value);
-  if (row < 0 || count_below(run, lane)) return;
-  BT_UNROLL
-  for (int k = 0; k < M; ++k) to.add(int64_t(row) * M + k, value[k]);
-}
-
 }  // namespace bt::cuda

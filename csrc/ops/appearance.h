@@ -22,7 +22,7 @@ template <class S> struct Directions {
 
 template <class S> struct ViewColorForward {
   Directions<S> to;
-  ViewColorArrays<const S> colors;
+  ViewColors<S> colors;
   S* out;  // [n, 3]
 
   template <class R> void fields(R& r) {
@@ -46,19 +46,6 @@ template <class S> struct ViewColorBackward {
     dcolors.kind = colors.kind, dcolors.terms = colors.terms;
     dcolors.arrays(r, to.n, "da", "db", "dc");
     r.array("dmeans", dmeans, 3 * to.n);
-  }
-};
-
-template <class S> struct LeanColor {
-  Directions<S> to;
-  LeanColors<S> colors;
-  int64_t terms;  // of all surfels
-  S* out;
-
-  template <class R> void fields(R& r) {
-    to.fields(r);
-    colors.fields(r, to.n, terms);
-    r.array("out", out, 3 * to.n);
   }
 };
 

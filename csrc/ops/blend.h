@@ -6,7 +6,7 @@
 
 namespace bt {
 
-// Surfels with texels, or without any (sizes 0, 0), as a view shows them.
+// Surfels as a view shows them, with texels, or without any (sizes 0, 0).
 template <class S, class Layout> struct BlendedSurfels {
   bool maps;
   const S* geom;  // [n, kGeom]
@@ -14,6 +14,7 @@ template <class S, class Layout> struct BlendedSurfels {
   Fragments<S, Layout> fragments;
   S bound;
   TexelTiles<S> table;
+  const S* residual;  // [F, 3] that of each fragment, in place of texels; null: there is none
 
   int64_t numbers() const { return int64_t(width) * height * (maps ? kMapChannels : kImageChannels); }
   template <class R> void fields(R& r) {
@@ -21,11 +22,14 @@ template <class S, class Layout> struct BlendedSurfels {
     table.fields(r);
     r.array("geom", geom, table.n * kGeom);
     fragments.fields(r, table.n, width, height);
+    r.maybe("residual", residual, 3 * fragments.f.total);
+    if (residual && table.texels) r.refuse("the residual is that of texels or of fragments");
   }
 };
 
-// image [height, width, channels]: the sums of core/blend.h of the colours relu(relu(base + 0.5) + texel(u, v)), below
-// `bound` and without a tile relu(base + 0.5). Written.
+// image [height, width, channels]: the sums of core/blend.h, kMapChannels with maps, else kImageChannels, of the
+// colours relu(relu(base + 0.5) + residual). That of texels is texel(u, v), below `bound` and without a tile 0.
+// Written.
 template <class S, class Layout> struct BlendForward {
   BlendedSurfels<S, Layout> of;
   S* image;
@@ -40,13 +44,13 @@ template <class S, class Layout> struct BlendForward {
 constexpr int blend_sums(bool maps) { return maps ? 8 : 4; }
 
 // ddepth [F] (maps only), dgeom [n, kGeom] (beta and normal columns) and dbase [n, 3] are written, and, where not null,
-// dweight [F], duv [2, F] and dtexels [texels, 3]. With `moved` [texels, 3] the texels' gradient g is not kept: texel t
-// of `moved` moves by -rate share[t] g. partial [pairs, blend_sums] and work are working memory.
+// dweight [F], duv [2, F], dresidual [F, 3] and dtexels [texels, 3]. With `moved` [texels, 3] the texels' gradient g is
+// not kept: texel t of `moved` moves by -rate share[t] g. partial [pairs, blend_sums] and work are working memory.
 template <class S, class Layout> struct BlendBackward {
   BlendedSurfels<S, Layout> of;
   const S *dimage, *share;
   S rate;
-  S *partial, *dweight, *duv, *ddepth, *dgeom, *dbase, *dtexels, *moved;
+  S *partial, *dweight, *duv, *ddepth, *dgeom, *dbase, *dresidual, *dtexels, *moved;
   TexelWork<S> work;
 
   bool sums_texels() const { return dtexels || moved; }
@@ -59,6 +63,8 @@ template <class S, class Layout> struct BlendBackward {
     of.maps ? r.array("ddepth", ddepth, total) : r.maybe("ddepth", ddepth, total);
     r.array("dgeom", dgeom, n * kGeom);
     r.array("dbase", dbase, 3 * n);
+    r.maybe("dresidual", dresidual, 3 * total);
+    if (dresidual && !of.residual) r.refuse("there is no residual of fragments");
     r.maybes(3 * of.table.texels, "dtexels", dtexels, "moved", moved);
     r.maybe("share", share, of.table.texels);
     r.number("rate", rate);

@@ -60,13 +60,13 @@ template <class S> struct TexelWork {
   template <class R> void fields(R& r, int64_t texels) {
     sums = nullptr, exact = nullptr;
     if (r.has("exact_work"))
-      r.work("exact_work", exact, exact_size(4 * texels, 0, false));
+      r.work("exact_work", exact, exact_size(4 * texels));
     else if (texels)
       r.work("texel_work", sums, 4 * texels);
   }
 };
 
-// Channels of a baked image of the CPU: rgb, alpha; with maps those of CompositeForward.
+// Channels of a baked image of the CPU: rgb, alpha; with maps those of BlendForward.
 constexpr int kBakedChannels = 4;
 
 // Texels of n surfels.

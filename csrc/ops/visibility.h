@@ -1,10 +1,11 @@
-// Arguments of projection, tracing and blending.
+// Arguments of projection and tracing.
 #pragma once
 
 #include "core/blend.h"
 #include "core/surfel.h"
 #include "ops/arguments.h"
 #include "ops/field.h"
+#include "ops/texel_alpha.h"
 
 namespace bt {
 
@@ -72,27 +73,6 @@ template <class S> struct View {
   }
 };
 
-// Alpha texels: the sigma of a fragment whose weight would be at least `bound` is multiplied by the bilinear fetch at
-// its u and v, and clamped again; the last bit of its listed v is then 1, else 0. Absent: `values` is null.
-template <class S> struct AlphaTiles {
-  int64_t texels;
-  const int64_t* first;  // [n], as in TexelTiles
-  const int32_t* size;   // [n, 2]
-  const S* extent;       // [n]
-  const S* values;       // [texels], from 0 to 2
-  S bound;               // fragments whose weight would be less keep their sigma
-
-  template <class R> void fields(R& r, int64_t n) {
-    values = nullptr, bound = 0;
-    if (!r.has("texel_alpha")) return;
-    r.array("first", first, n);
-    r.array("size", size, 2 * n);
-    r.array("extent", extent, n);
-    r.rows("texel_alpha", values, texels, 1);
-    r.number("alpha_bound", bound);
-  }
-};
-
 // dgeom [n, kGeom] and absgrad [n, 2] are written. dweight, duv, ddepth may be null (zero). dsigma and partial are
 // working memory; the sums of a pair: columns 0 to kBeta of geom, two absolute gradients, one unused, kArea.
 constexpr int kTraceSums = 16;
@@ -112,7 +92,7 @@ template <class S, class Layout> struct TraceBackward {
     alpha.fields(r, view.n);
     const int64_t texels = alpha.values ? alpha.texels : 0;
     r.maybe("dtexel_alpha", dtexel_alpha, texels);
-    r.maybe("exact_work", exact_alpha, exact_size(texels, 0, false));
+    r.maybe("exact_work", exact_alpha, exact_size(texels));
     r.number("rim", rim);
     fragments.fields(r, view.n, view.width, view.height);
     const int64_t total = fragments.f.total;
@@ -123,55 +103,6 @@ template <class S, class Layout> struct TraceBackward {
     r.work("partial", partial, fragments.layout.pairs * kTraceSums);
     r.array("dgeom", dgeom, view.n * kGeom);
     r.array("absgrad", absgrad, view.n * 2);
-  }
-};
-
-// The fragments of a view with their colours.
-template <class S, class Layout> struct ColoredFragments {
-  bool maps;
-  int64_t n;
-  const S* geom;
-  int width, height;
-  Fragments<S, Layout> fragments;
-  const S* colors;  // [F, 3]
-
-  int channels() const { return maps ? kMapChannels : kImageChannels; }
-  int64_t pixels() const { return int64_t(width) * height; }
-  template <class R> void fields(R& r) {
-    r.number("maps", maps);
-    r.rows("geom", geom, n, kGeom);
-    r.numbers("width", width, "height", height);
-    fragments.fields(r, n, width, height);
-    r.array("colors", colors, 3 * fragments.f.total);
-  }
-};
-
-// image [height, width, channels]: the sums of core/blend.h, kMapChannels with maps, else kImageChannels. Written.
-template <class S, class Layout> struct CompositeForward : ColoredFragments<S, Layout> {
-  S* image;
-
-  template <class R> void fields(R& r) {
-    ColoredFragments<S, Layout>::fields(r);
-    r.array("image", image, this->pixels() * this->channels());
-  }
-};
-
-// dweight [F], dcolors [F, 3], ddepth [F] (maps only) and dgeom [n, kGeom] (beta and normal columns) are written;
-// partial is working memory.
-template <class S, class Layout> struct CompositeBackward : ColoredFragments<S, Layout> {
-  const S* dimage;
-  S *partial, *dweight, *dcolors, *ddepth, *dgeom;
-
-  template <class R> void fields(R& r) {
-    ColoredFragments<S, Layout>::fields(r);
-    const int64_t total = this->fragments.f.total;
-    const bool maps = this->maps;
-    r.array("dimage", dimage, this->pixels() * this->channels());
-    r.work("partial", partial, this->fragments.layout.pairs * (maps ? 4 : 1));
-    r.array("dweight", dweight, total);
-    r.array("dcolors", dcolors, 3 * total);
-    maps ? r.array("ddepth", ddepth, total) : r.maybe("ddepth", ddepth, total);
-    r.array("dgeom", dgeom, this->n * kGeom);
   }
 };
 

@@ -11,13 +11,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bitymi_ns.bake import Baked, BakeOptions, Learning, TuneOptions, bake, bake_and_learn
+from bitymi_ns.bake import Baked, BakeOptions, Learning, TuneOptions, bake, bake_and_learn, export
 from bitymi_ns.bake.certificate import certified
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bake.tile_errors import averaged, cells_per_pixel, closest_pixels, listed_errors
 from bitymi_ns.bake.tiles import Shown
 from bitymi_ns.bake.verify import check_field
-from bitymi_ns.bundle import check_files, export
+from bitymi_ns.bundle import check_files
 from bitymi_ns.bundle.sketch import SIZE, estimated_rms, sketch, sketches_of, sketches_text
 from bitymi_ns.bundle.statistics import Certificate
 from bitymi_ns.scene.visibility import visibility

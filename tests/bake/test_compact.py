@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bitymi_ns.bake import Baked, TuneOptions, compact, tune_atlas
+from bitymi_ns.bake import Baked, TuneOptions, compact, export, tune_atlas
 from bitymi_ns.bake.compact import (
     ENOUGH,
     MAX_LAMBDA,
@@ -19,7 +19,7 @@ from bitymi_ns.bake.compact import (
     with_coded_texels,
 )
 from bitymi_ns.bake.precision import PER_BIT
-from bitymi_ns.bundle import check_files, export
+from bitymi_ns.bundle import check_files
 from bitymi_ns.codec.texel_codes import TexelCodeOptions
 from bitymi_ns.train.views import View
 from tests.bake.test_tune import BACKGROUND, photographs, render, waving

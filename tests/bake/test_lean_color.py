@@ -6,11 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional as F
 
-from bitymi_ns.bake import BakeOptions, bake
+from bitymi_ns.bake import BakeOptions, bake, export
 from bitymi_ns.bake.directions import BETWEEN, SPHERE, view_directions
 from bitymi_ns.bake.lean_color import reduce_view_color, view_color_errors
 from bitymi_ns.bake.verify import check_view_color
-from bitymi_ns.bundle import check_files, export, read_bundle
+from bitymi_ns.bundle import check_files, read_bundle
 from bitymi_ns.ops.reference import view_color as reference
 from bitymi_ns.ops.view_color import LEAN, check_lean
 from bitymi_ns.ops.view_kinds import VIEW_COLORS

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bake import BakeOptions, bake, rich_progress
-from bitymi_ns.bundle import export, read_bundle
+from bitymi_ns.bake import BakeOptions, bake, export, rich_progress
+from bitymi_ns.bundle import read_bundle
 from bitymi_ns.train.init import tangents
 
 

@@ -5,8 +5,8 @@ import torch
 
 pytest.importorskip("bitymi_ns._cpu")
 
-from bitymi_ns.bake import BakeOptions, bake
-from bitymi_ns.bundle import export, read_bundle
+from bitymi_ns.bake import BakeOptions, bake, export
+from bitymi_ns.bundle import read_bundle
 from bitymi_ns.ops import VIEW_COLORS
 from bitymi_ns.ops.reference.texel import texel
 from bitymi_ns.scene.config import SceneConfig

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bitymi_ns.bake import BakeOptions, bake
+from bitymi_ns.bake import BakeOptions, bake, export
 from bitymi_ns.bake.verify import check_field, check_view_color
-from bitymi_ns.bundle import check_files, export
+from bitymi_ns.bundle import check_files
 from bitymi_ns.cli import main
 from tests.bundle.damage import amend, change_columns
 

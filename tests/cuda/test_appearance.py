@@ -6,7 +6,7 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.ops.backend import emulated_cuda
-from bitymi_ns.ops.reference.ssim import ssim as reference_ssim
+from tests.ops.golden import reference_ssim
 from tests.ops.test_kernels import relative
 from tests.ops.test_view_color import lean_parameters
 

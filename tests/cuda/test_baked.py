@@ -13,9 +13,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake import bake
-from bitymi_ns.bundle import export, read_bundle
+from bitymi_ns.bake import bake, export
 from bitymi_ns.bundle import read as bundle_read
+from bitymi_ns.bundle import read_bundle
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.ops import baked_cuda
 from bitymi_ns.ops.backend import emulated_cuda, module

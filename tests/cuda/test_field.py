@@ -9,9 +9,8 @@ from bitymi_ns import ops
 from bitymi_ns.bake.field.texels import evaluate_tiles
 from bitymi_ns.codec.packing import pack
 from bitymi_ns.ops.backend import emulated_cuda
-from bitymi_ns.ops.field_tiles import field_tiles
 from bitymi_ns.scene import Camera, HashField
-from tests.ops.golden import SURFEL_KEYS, changed, random_scene
+from tests.ops.golden import SURFEL_KEYS, random_scene
 from tests.ops.test_kernels import make_field, relative
 
 
@@ -60,50 +59,41 @@ def test_no_points_and_points_far_away(device: torch.device) -> None:
 
 
 class Shading:
-    """Fragments of a random view by the CPU kernels, and their colours with all gradients by either kernels."""
+    """A random view of surfels with a field, and its image with all gradients by either kernels."""
 
-    def __init__(self, dtype: torch.dtype, cpu, case=None) -> None:
-        case = case or random_scene(25, 11, width=20, height=18, scale=0.4)
-        camera = Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height)
-        with cpu(), torch.no_grad():
-            self.projection = ops.project(*(case.params[key].to(dtype) for key in SURFEL_KEYS), camera)
-            self.fragments = ops.trace(self.projection)
-        n = len(case.params["means"])
-        self.base = torch.linspace(-0.8, 0.8, 3 * n, dtype=dtype).view(n, 3)
+    def __init__(self, dtype: torch.dtype, case=None) -> None:
+        self.case, self.dtype = case or random_scene(25, 11, width=20, height=18, scale=0.4), dtype
+        self.base = torch.linspace(-0.8, 0.8, 3 * len(self.case.params["means"]), dtype=dtype).view(-1, 3)
         self.field = make_field(True, dtype, log2=6)
 
     def run(self, device: torch.device, mode: str, bound: float = 0.05) -> list[Tensor]:
-        """Colours and gradients of base colours, frames, uv, table and weights; those that the mode has."""
-        f = self.fragments
-        moved = {name: getattr(f, name).to(device) for name in ("weight", "uv", "depth", "sigma")}
-        leaves = [t.to(device).requires_grad_() for t in (self.base.clone(), self.projection.frames.clone())]
-        moved["uv"] = moved["uv"].clone().requires_grad_()
-        fragments = ops.Fragments(
-            **moved,
-            width=f.width,
-            height=f.height,
-            layout=changed(f.layout, lambda t: t.to(device)),
-            surfels=f.surfels,
-        )
+        """Image, and gradients of base colours, frames, uv, table and weights; those that the mode has."""
+        case = self.case
+        camera = Camera(case.viewmat.to(self.dtype), case.K.to(self.dtype), case.width, case.height)
+        with torch.no_grad():
+            projection = ops.project(*(case.params[key].to(device, self.dtype) for key in SURFEL_KEYS), camera)
+            fragments = ops.trace(projection)
+        leaves = [t.to(device).clone().requires_grad_() for t in (self.base, projection.frames)]
+        fragments.uv.requires_grad_()
         params = [w.detach().to(device).requires_grad_(mode in ("learn", "move")) for w in self.field.weights]
-        geometry = None if mode == "plain" else self.field.geometry
-        args = (geometry, () if mode == "plain" else tuple(params), bound, mode == "move")
-        colors = ops.shade(fragments, *leaves, *args)
-        (
-            colors * torch.cos(torch.arange(colors.numel(), device=device).double()).view_as(colors).to(colors)
-        ).sum().backward()
-        grads = [t.grad for t in (*leaves, fragments.uv, *params)]
-        return [t.detach().cpu().double() for t in (colors, *grads) if t is not None]
+        rho = ops.fragment_residual(fragments, leaves[1], self.field.geometry, params, bound, mode == "move")
+        image = ops.blended_image(fragments, projection, leaves[0], residual=rho)
+        along = torch.cos(torch.arange(image.numel(), device=device).double()).view_as(image).to(image)
+        (image * along).sum().backward()
+        order = torch.argsort(fragments.pixel.long() * len(self.base) + fragments.surfel)  # the same by either kernels
+        duv = None if fragments.uv.grad is None else fragments.uv.grad[:, order]
+        grads = [*(t.grad for t in leaves), duv, *(t.grad for t in params)]
+        return [t.detach().cpu().double() for t in (image, *grads) if t is not None]
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
-@pytest.mark.parametrize("mode", ["plain", "frozen", "learn", "move"])
+@pytest.mark.parametrize("mode", ["frozen", "learn", "move"])
 def test_shading_against_the_cpu(mode: str, dtype: torch.dtype, device: torch.device, cpu) -> None:
-    shading = Shading(dtype, cpu)
+    shading = Shading(dtype)
     got = shading.run(device, mode)
     with cpu():
         want = shading.run(torch.device("cpu"), mode)
-    assert len(got) == len(want) == {"plain": 2, "frozen": 2, "learn": 6, "move": 8}[mode]
+    assert len(got) == len(want) == {"frozen": 2, "learn": 6, "move": 8}[mode]
     for a, b in zip(got, want, strict=True):
         assert b.abs().max() > 0
         assert relative(a, b) < (1e-11 if dtype == torch.float64 else 2e-4)
@@ -112,14 +102,13 @@ def test_shading_against_the_cpu(mode: str, dtype: torch.dtype, device: torch.de
 def test_without_fragments(device: torch.device, cpu) -> None:
     case = random_scene(3, 0, width=8, height=8)
     case.params["opacity_logits"].fill_(-20.0)
-    shading = Shading(torch.float32, cpu, case)
-    assert len(shading.fragments) == 0
-    colors, *grads = shading.run(device, "move")
-    assert colors.shape == (0, 3) and not any(g.any() for g in grads)
+    shading = Shading(torch.float32, case)
+    image, *grads = shading.run(device, "move")
+    assert not image.any() and not any(g.any() for g in grads)
 
 
 def test_deterministic_sums_do_not_depend_on_the_order_of_threads(device: torch.device, cpu, exactly) -> None:
-    shading = Shading(torch.float32, cpu)
+    shading = Shading(torch.float32)
     if device.type == "cpu":
         runs = []
         for seed in range(3):
@@ -137,7 +126,7 @@ def test_deterministic_sums_do_not_depend_on_the_order_of_threads(device: torch.
 
 
 def test_deterministic_sums_at_points_and_frozen(device: torch.device, cpu, exactly) -> None:
-    shading = Shading(torch.float64, cpu)
+    shading = Shading(torch.float64)
     got, points_got = (
         shading.run(device, "frozen"),
         value_and_gradients(shading.field.to(device), points(99, device, torch.float64)),
@@ -156,30 +145,7 @@ def test_a_gradient_that_is_not_finite_is_not_hidden_by_deterministic_sums(devic
     assert field.field_table.grad.isnan().any()
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
-def test_bake_of_tiles_against_points(dtype: torch.dtype, device: torch.device, cpu) -> None:
-    """Rows of 4 to 64 texels, tiles of fewer than 32 and surfels without one, each with its own extent."""
-    sides = np.array([[4, 4], [64, 4], [0, 0], [8, 16], [4, 64], [32, 32], [0, 0]])
-    packing = pack(sides)
-    g = torch.Generator().manual_seed(3)
-    frames = torch.randn(len(sides), 9, generator=g, dtype=torch.float64).to(device, dtype)
-    extent = (1 + torch.rand(len(sides), generator=g, dtype=torch.float64)).to(device, dtype)
-    field = make_field(True, dtype).to(device)
-    tiles, pages = torch.from_numpy(packing.tiles), (packing.layers, packing.height, packing.width)
-    texels, bad = field_tiles(frames, extent, tiles, pages, field.geometry, *field.weights)
-    assert int(bad) == 0
-    want = torch.zeros(*pages, 3, dtype=dtype)
-    with cpu():
-        field.cpu()
-        for frame, e, (x, y, layer, r_u, r_v) in zip(frames.cpu(), extent.cpu(), packing.tiles.tolist(), strict=True):
-            u, v = (((torch.arange(r, dtype=dtype) + 0.5) / max(r, 1) * 2 - 1) * e for r in (r_u, r_v))
-            at = frame[:3] + u[None, :, None] * frame[3:6] + v[:, None, None] * frame[6:]
-            want[layer, y : y + r_v, x : x + r_u] = field(at.reshape(-1, 3)).detach().view(r_v, r_u, 3)
-    tolerance = 1e-10 if dtype == torch.float64 else 1e-3
-    torch.testing.assert_close(texels.cpu(), want, rtol=tolerance, atol=tolerance)
-
-
-def test_bake_by_the_kernel_equals_the_bake_by_points(device: torch.device, cpu) -> None:
+def test_bake_of_tiles_on_the_device_and_on_the_cpu(device: torch.device, cpu) -> None:
     g = torch.Generator().manual_seed(1)
     n = 20
     means, quats, scales = torch.randn(n, 3, generator=g), torch.randn(n, 4, generator=g), torch.rand(n, 2, generator=g)

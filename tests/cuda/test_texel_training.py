@@ -1,6 +1,5 @@
 """Scenes of texels on the device: pictures, tiles and whole runs as on the CPU, and what changes their number."""
 
-import copy
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 
@@ -20,6 +19,7 @@ from bitymi_ns.train.texels import blank_texels
 from bitymi_ns.train.views import View
 from tests.ops.golden import random_scene
 from tests.scene.test_texel_field import make
+from tests.train import part_of_a_run
 
 Context = Callable[[], AbstractContextManager[None]]
 HERE = torch.device("cpu")
@@ -122,12 +122,12 @@ def test_a_run_resumes_before_and_after_its_texels_came(device: torch.device) ->
         straight, states = trainer_on(device), []
         for done in range(STEPS):
             if done in (START - 1, START + 3):
-                states.append(copy.deepcopy(straight.state_dict()))
+                states.append(part_of_a_run.state_of(straight))
             straight.advance()
         want = state_of(straight.scene)
         for state in states:
             resumed = trainer_on(device)
-            resumed.load_state_dict(state)
+            part_of_a_run.resume(resumed, state)
             while resumed.step < STEPS:
                 resumed.advance()
             got = state_of(resumed.scene)

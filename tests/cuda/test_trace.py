@@ -61,9 +61,8 @@ def render(
     projection = ops.project(*(leaves[key] for key in SURFEL_KEYS), camera, prefilter=prefilter)
     fragments = ops.trace(projection, rim)
     directions = reference_render.view_directions(leaves["means"], camera.viewmat.to(device))
-    base = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions) + 0.5
-    rows = fragments.surfel.long()
-    image = ops.composite_image(fragments, projection, base.clamp(min=0)[rows], maps)
+    base = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions)
+    image = ops.blended_image(fragments, projection, base, maps=maps)
     # directions by pixel and surfel: they do not depend on the order in which the list has them
     by_fragment = torch.sin(fragments.pixel.double() * 0.7 + fragments.surfel.double() * 1.3).to(dtype)
     by_pixel = torch.cos(torch.arange(image.numel(), device=device).double() * 1.7).to(dtype).view_as(image)
@@ -153,6 +152,24 @@ def test_single_precision(device: torch.device, cpu: CpuContext) -> None:
     for key, value in want.leaves.items():
         error = (got.leaves[key] - value).abs() / value.abs().max()
         assert (error < 1e-4).double().mean() >= 0.97 and error.max() < 1e-2, key
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
+@pytest.mark.parametrize("seed", range(3))
+def test_no_fragment_of_thin_small_and_large_surfels_is_lost(
+    seed: int, dtype: torch.dtype, device: torch.device
+) -> None:
+    """Bounds of the list's own precision (core/footprint.h) against the reference, which tries every pixel."""
+    case = random_scene(100, 100 + seed, width=72, height=56)
+    g = torch.Generator().manual_seed(seed)
+    case.params["log_scales"] += 2.0 * torch.randn(100, 2, generator=g, dtype=torch.float64)
+    case.params["opacity_logits"] -= 2.0  # so that few pixels end before the last surfel
+    fragments = ops.trace(ops.project(*values_of(case, dtype, device), camera_of(case, dtype)))
+    want = reference(case, [case.params[name] for name in SURFEL_KEYS]).weight
+    found = torch.zeros_like(want)
+    found[fragments.pixel.cpu().long(), fragments.surfel.cpu().long()] = fragments.weight.detach().cpu().double()
+    assert (want > 0).sum() > 1000
+    assert ((found > 0) != (want > 0)).double().mean() <= (0 if dtype == torch.float64 else 1e-4)
 
 
 def test_more_surfels_in_a_tile_than_a_warp_has_lanes_and_pixels_that_close(
@@ -262,12 +279,13 @@ def test_wrong_arrays_are_refused(device: torch.device) -> None:
     shifted = torch.zeros(10 * 16 + 1, device=device, dtype=torch.float64)[1:].view(10, 16)
     few, mask = torch.zeros(3, 3, device=device).double(), torch.ones(400, dtype=torch.bool, device="meta")
     camera, frames = projection.camera, projection.frames
+    grid = ops.FieldGeometry(4, False, (0.0, 0.0, 0.0), 1.0)
     for match, call in {
-        "colors must have shape": lambda: ops.composite_image(fragments, projection, few),
-        "colors is on device 'meta'": lambda: ops.composite_image(fragments, projection, far),
+        "residual must have shape": lambda: ops.blended_image(fragments, projection, frames[:, :3], residual=few),
+        "residual is on device 'meta'": lambda: ops.blended_image(fragments, projection, frames[:, :3], residual=far),
         "mask is on device 'meta'": lambda: ops.masked_counts(fragments, mask, 10),
         "log_scales is on device 'meta', it must be on": lambda: ops.project(*moved, camera),
-        "frames is on device 'meta'": lambda: ops.shade(fragments, frames[:, :3], frames.to("meta")),
+        "frames is on device 'meta'": lambda: ops.fragment_residual(fragments, frames.to("meta"), grid, ()),
         "sv_rgb is on device 'meta'": lambda: ops.view_color("sv", sites, leaves[0], camera.exact_center),
         "values is on device 'meta'": lambda: ops.composite(fragments, far),
         "16 bytes": lambda: ops.trace(replace(projection, geom=shifted)),

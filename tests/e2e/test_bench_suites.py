@@ -8,8 +8,9 @@ import pytest
 from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils.eval_utils import eval_setup
 
-from bitymi_ns.measure.bench.engine import CURVE, Layout, read_curve, train_command
-from bitymi_ns.measure.bench.matrix import Row, Run, standard_scenes, suites
+from bitymi_ns.measure.bench.engine import CURVE, config_of, train_command
+from bitymi_ns.measure.bench.matrix import Row, Run, standard_scenes
+from bitymi_ns.measure.report.read import read_jsonl
 from tests.plugin.data.captures import colmap_model
 
 SMALL = (
@@ -29,15 +30,16 @@ def train(work: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Run the command of a training in this process; returns its config.yml."""
     monkeypatch.setattr(sys, "argv", train_command(work, run))
     ns_train.entrypoint()
-    return Layout(work, run).config
+    return config_of(work, run)
 
 
 def test_a_scene_of_mipnerf360(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     colmap_scene(room, tmp_path / "360" / "bonsai")
-    (scene,) = standard_scenes(suites()["mipnerf360"], tmp_path / "360", ["bonsai"])
+    (scene,) = standard_scenes("mipnerf360", tmp_path / "360", ["bonsai"])
     run = Run(scene, Row("small", "bitymi", SMALL), seed=3, steps=2)
     path = train(tmp_path / "work", run, monkeypatch)
-    assert read_curve(path.with_name(CURVE))[-1]["experiment_name"] == "bonsai"
+    _, (curve,), _ = read_jsonl(path.with_name(CURVE))
+    assert curve.scene == "bonsai"
     config, pipeline, _, _ = eval_setup(path, test_mode="test")
     assert config.machine.seed == config.pipeline.model.train.seed == 3
     assert config.pipeline.datamanager.train_cameras_sampling_seed == 3

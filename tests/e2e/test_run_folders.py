@@ -14,7 +14,7 @@ import torch
 from nerfstudio.scripts import train as ns_train
 
 from bitymi_ns.capture.frame import WorldFrame, write_frame
-from bitymi_ns.measure.report import build
+from bitymi_ns.measure.report.page import build
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run import run_folder
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig

@@ -52,7 +52,7 @@ def test_a_run_starts_with_as_many_surfels_as_its_steps_can_place(
 @pytest.mark.parametrize(
     ("option", "value", "message"),
     [
-        ("pipeline.model.scene.sv_sites", 40, "sv_sites must be between 1 and 32"),
+        ("pipeline.model.scene.sv_sites", 40, "out of range .*sv_sites must be less than or equal to 32, not 40"),
         ("pipeline.model.train.freeze_every", 0, "out of range .*freeze_every"),
         ("machine.seed", -1, "--machine.seed must be from 0 to 4294967295, not -1"),
     ],

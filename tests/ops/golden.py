@@ -1,7 +1,7 @@
 """The golden renders and how a case is drawn; scenes that other tests use, too, are in bitymi_ns.measure.stability."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -18,7 +18,6 @@ from bitymi_ns.measure.stability.scenes import (
     quaternions,
     random_scene,
 )
-from bitymi_ns.ops.fragment_list import Layout
 from bitymi_ns.ops.reference import project as reference_project
 from bitymi_ns.ops.reference import trace as reference_trace
 from bitymi_ns.ops.reference.texel import texel
@@ -32,6 +31,7 @@ __all__ = [
     "Golden",
     "SceneCase",
     "camera_of",
+    "composite_colors",
     "crossing_scene",
     "dense",
     "extreme_scenes",
@@ -39,6 +39,7 @@ __all__ = [
     "load_golden",
     "random_scene",
     "reference",
+    "reference_ssim",
     "relative",
     "tiles_reached",
     "traced",
@@ -58,6 +59,16 @@ class Golden(SceneCase):
     loss: float = 0.0
     grads: dict[str, Tensor] = field(default_factory=dict)  # as params
     tile_grads: list[Tensor] | None = None
+
+
+def reference_ssim(a: Tensor, b: Tensor) -> Tensor:
+    """Mean SSIM of two images [H, W, C] in [0, 1] over the pixels whose window lies inside, by torchmetrics; some of
+    its versions average padded windows, too."""
+    from torchmetrics.functional.image.ssim import _ssim_update  # imported by few tests: it takes seconds
+
+    pair = (image.permute(2, 0, 1)[None] for image in (a, b))
+    _, values = _ssim_update(*pair, data_range=1.0, return_full_image=True)
+    return (values[..., 5:-5, 5:-5] if values.shape[-2:] == a.shape[:2] else values).mean()
 
 
 def load_golden(name: str) -> Golden:
@@ -171,15 +182,20 @@ def tiles_reached(weights: Tensor, width: int, height: int) -> Tensor:
     return (padded.view(down, 16, across, 16, -1).amax((1, 3)) > 0).sum((0, 1))
 
 
+def composite_colors(
+    fragments: ops.Fragments, projection: ops.Projection, colors: Tensor, maps: bool = False
+) -> Tensor:
+    """Image of `ops.blended_image` for colours [F, 3] of the fragments, by torch."""
+    geom = projection.geom.index_select(0, fragments.surfel)
+    values = [colors, torch.ones_like(colors[:, :1]), geom[:, 11:12]]
+    values += [fragments.depth[:, None], geom[:, 12:15]] if maps else []
+    return ops.composite(fragments, torch.cat(values, 1))
+
+
 def dense(fragments: ops.Fragments, values: Tensor, n: int) -> Tensor:
     """[P, N] of one number per fragment."""
     out = values.new_zeros(fragments.width * fragments.height, n)
     return out.index_put((fragments.pixel.long(), fragments.surfel.long()), values)
-
-
-def changed(layout: Layout, change: Callable[[Tensor], Tensor]) -> Layout:
-    """A layout whose surfels and pixels are changed: moved to another device, say."""
-    return Layout(layout.handle, layout.arrays, lambda: {name: change(t) for name, t in layout.ids().items()})
 
 
 def reference_colors(

@@ -8,7 +8,15 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.ops import backend
-from tests.ops.golden import SURFEL_KEYS, SceneCase, camera_of, load_golden, random_scene, reference_colors
+from tests.ops.golden import (
+    SURFEL_KEYS,
+    SceneCase,
+    camera_of,
+    composite_colors,
+    load_golden,
+    random_scene,
+    reference_colors,
+)
 
 SIZES = [(4, 8), (1, 1), (8, 4), (0, 0), (4, 4), (16, 4)]
 BOUND = 0.03
@@ -59,8 +67,8 @@ class View:
             listed = fragments if moves else replace(fragments, uv=fragments.uv.detach())
             colors = reference_colors(listed, self.base, **self.given, bound=BOUND)
         else:
-            colors = ops.shade(fragments, self.base, projection.frames)
-        return ops.composite_image(fragments, projection, colors, maps)
+            colors = (self.base + 0.5).relu()[fragments.surfel.long()]
+        return composite_colors(fragments, projection, colors, maps)
 
     def gradients(self, image: Tensor) -> list[Tensor]:
         towards = torch.linspace(-1, 1, image.numel(), dtype=torch.float64).view_as(image).to(image)
@@ -161,5 +169,10 @@ def test_what_does_not_fit_is_refused() -> None:
         ops.blended_image(fragments, projection, view.base, view.given["texels"][1:], view.given["tiles"])
     with pytest.raises(ValueError, match="base must have shape"):
         ops.blended_image(fragments, projection, view.base[1:])
+    rho = torch.zeros(len(fragments), 3)
+    with pytest.raises(ValueError, match="residual must have shape"):
+        ops.blended_image(fragments, projection, view.base, residual=rho[1:])
+    with pytest.raises(ValueError, match="of texels or of fragments"):
+        ops.blended_image(fragments, projection, view.base, **view.given, residual=rho)
     with pytest.raises(ValueError, match="fragments are those of 61 surfels, not of 60"):
         ops.blended_image(replace(fragments, surfels=61), projection, view.base, **view.given)

@@ -11,7 +11,6 @@ from bitymi_ns.ops import backend
 from bitymi_ns.ops.reference import field as reference_field
 from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color
-from bitymi_ns.ops.reference.ssim import ssim as reference_ssim
 from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig
 from bitymi_ns.scene.baked import BakedScene
 from tests.cuda.baked_scenes import front, textured
@@ -22,8 +21,10 @@ from tests.ops.golden import (
     SceneCase,
     atlas_of,
     camera_of,
+    composite_colors,
     load_golden,
     random_scene,
+    reference_ssim,
     relative,
     values_of,
 )
@@ -249,16 +250,15 @@ def test_shading_equals_the_field_module_fragment_by_fragment(move: bool) -> Non
         projection = ops.project(*leaves, camera)
         fragments = ops.trace(projection)
         if fused:
-            colors = ops.shade(
-                fragments, base, projection.frames, field.geometry, field.weights, 0.05, move_surfels=move
-            )
+            rho = ops.fragment_residual(fragments, projection.frames, field.geometry, field.weights, 0.05, move)
+            image = ops.blended_image(fragments, projection, base, maps=True, residual=rho)
         else:
             rows = fragments.surfel.long()
             frames, uv = projection.frames[rows], fragments.uv
             x = frames[:, :3] + uv[0][:, None] * frames[:, 3:6] + uv[1][:, None] * frames[:, 6:9]
             rho = field(x if move else x.detach()) * (fragments.weight.detach()[:, None] >= 0.05)
             colors = ((base[rows] + 0.5).clamp(min=0) + rho).clamp(min=0)
-        image = ops.composite_image(fragments, projection, colors, maps=True)
+            image = composite_colors(fragments, projection, colors, maps=True)
         (image * torch.linspace(-1, 1, image.numel(), dtype=torch.float64).view_as(image)).sum().backward()
         return [image.detach(), base.grad, *(leaf.grad for leaf in leaves), *(w.grad.clone() for w in field.weights)]
 

@@ -1,5 +1,7 @@
 """The entries of `VIEW_COLORS`: each agrees with itself, the kernels and the float64 twin."""
 
+from typing import get_type_hints
+
 import pytest
 import torch
 import yaml
@@ -16,7 +18,8 @@ from bitymi_ns.train.config import LearningRates
 @pytest.mark.parametrize("kind", list(VIEW_COLORS))
 def test_an_entry_agrees_with_itself_the_kernels_and_the_twin(kind: str) -> None:
     entry, n = VIEW_COLORS[kind], 4
-    low, high = entry.option_range
+    at_least, at_most = get_type_hints(SceneConfig, include_extras=True)[entry.option].__metadata__[0].metadata
+    low, high = at_least.ge, at_most.le
     for value in {low, min(high, low + 1), getattr(SceneConfig(), entry.option), high}:
         terms = entry.terms_of(value)
         config = SceneConfig(view_color=kind, **{entry.option: value})

@@ -92,7 +92,7 @@ def test_a_failing_configuration_leaves_nerfstudio_alone(monkeypatch: pytest.Mon
     monkeypatch.setitem(sys.modules, "bitymi_ns.plugin.run.config", None)  # its import raises ImportError
     try:
         with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
+            warnings.simplefilter("default")
             importlib.reload(methods)
         assert sum("not available" in str(w.message) for w in caught) == 1
         specification = methods.bitymi_sh

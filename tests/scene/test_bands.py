@@ -77,18 +77,6 @@ def test_memory_bounds_a_list_where_nothing_else_does(monkeypatch: pytest.Monkey
     assert len(found) > 1 and all(len(f) <= 1500 for f in found)
 
 
-def test_a_beta_map_that_moves_beta_alone() -> None:
-    found = []
-    for most in (0, 1500):
-        scene, camera = bands.make(CPU, most)
-        output = scene.render(camera, beta_alone=True)
-        output.beta.square().sum().backward()
-        moved = {name: p.grad for name, p in scene.surfels.items() if p.grad is not None and (p.grad != 0).any()}
-        found.append({"beta": output.beta.detach(), **moved})
-    assert set(found[0]) == {"beta", "beta_raw"}
-    bands.assert_same(found[1], found[0])
-
-
 def test_training_goes_on() -> None:
     scene, camera = bands.make(CPU, 1500)
     scene = scene.float()

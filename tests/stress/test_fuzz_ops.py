@@ -79,7 +79,7 @@ def test_rendering_any_numbers(params: dict[str, Tensor], camera: Camera, prefil
     assert ((fragments.surfel >= 0) & (fragments.surfel < n)).all()
     assert fragments.uv.abs().max() <= 3.0001 if len(fragments) else True
     base = ops.view_color("sv", leaves, leaves["means"], camera.exact_center, projection.visible)
-    image = ops.composite_image(fragments, projection, ops.shade(fragments, base, projection.frames), maps=True)
+    image = ops.blended_image(fragments, projection, base, maps=True)
     alpha = image[:, 3]
     assert alpha.isfinite().all() and (alpha >= 0).all() and (alpha <= 1.0001).all()
     if finite["sv_sites"] and finite["sv_log_tau"]:
@@ -99,7 +99,7 @@ def test_shapes_and_dtypes_that_do_not_fit_are_refused(data: st.DataObject) -> N
     projection = ops.project(*(params[key] for key in SURFEL_KEYS), camera)
     fragments = ops.trace(projection)
     base = ops.view_color("sv", params, params["means"], camera.exact_center)
-    colors = ops.shade(fragments, base, projection.frames)
+    colors = torch.rand(len(fragments), 3)
     table, w1, w2, w3 = (torch.rand(s) for s in ((2, 64, 4), (8, 16), (16, 16), (16, 3)))
     geometry = FieldGeometry(8, True, (0.0, 0.0, 0.0), 1.0)
     image = torch.rand(20, 15, 3)
@@ -135,12 +135,11 @@ def test_shapes_and_dtypes_that_do_not_fit_are_refused(data: st.DataObject) -> N
             [*(params[key] for key in SV_KEYS), params["means"], camera.exact_center],
             lambda a, b, c, m, o: ops.view_color("sv", dict(zip(SV_KEYS, (a, b, c), strict=True)), m, o),
         ),
-        "shade": ([base, projection.frames], lambda b, f: ops.shade(fragments, b, f)),
-        "shade with a field": (
-            [table, w1, w2, w3],
-            lambda *w: ops.shade(fragments, base, projection.frames, geometry, w),
+        "blend": ([base, colors], lambda b, r: ops.blended_image(fragments, projection, b, residual=r)),
+        "residual of a field": (
+            [projection.frames, table, w1, w2, w3],
+            lambda f, *w: ops.fragment_residual(fragments, f, geometry, w),
         ),
-        "composite_image": ([colors], lambda c: ops.composite_image(fragments, projection, c)),
         "composite": ([colors], lambda c: ops.composite(fragments, c)),
         "field": ([params["means"], table, w1, w2, w3], lambda x, *w: ops.field(x, geometry, *w)),
         "ssim": ([image, image * 0.5], ops.ssim),
@@ -159,11 +158,11 @@ def test_fragments_of_one_scene_are_not_taken_for_those_of_another() -> None:
     projections = [ops.project(*(case.params[key].float() for key in SURFEL_KEYS), camera) for case in (few, many)]
     fragments = ops.trace(projections[1])
     with pytest.raises(ValueError, match="those of 9 surfels, not of 3"):
-        ops.composite_image(fragments, projections[0], torch.rand(len(fragments), 3))
+        ops.blended_image(fragments, projections[0], torch.rand(9, 3))
     with pytest.raises(ValueError, match="those of 9 surfels, not of 3"):
         ops.masked_counts(fragments, torch.ones(192, dtype=torch.bool), 3)
     with pytest.raises(ValueError, match="base must have shape"):
-        ops.shade(fragments, torch.rand(3, 3), projections[1].frames)
+        ops.blended_image(fragments, projections[1], torch.rand(3, 3))
     for radii in (projections[1].radii.double(), projections[1].radii[:-1]):
         with pytest.raises(REFUSED):
             ops.trace(replace(projections[1], radii=radii))
@@ -188,7 +187,7 @@ def test_strided_views_give_what_their_copies_give(seed: int, step: int, double:
         projection = ops.project(transposed, *(leaves[key] for key in SURFEL_KEYS[1:]), camera)
         fragments = ops.trace(projection)
         base = ops.view_color("sv", leaves, transposed, camera.exact_center, projection.visible)
-        image = ops.composite_image(fragments, projection, ops.shade(fragments, base, projection.frames))
+        image = ops.blended_image(fragments, projection, base)
         image.square().sum().backward()
         results.append([image.detach(), transposed.grad, *(leaves[key].grad for key in SURFEL_KEYS[1:])])
     for a, b in zip(*results, strict=True):

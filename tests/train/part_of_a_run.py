@@ -1,5 +1,7 @@
-"""One of the processes of a run, as a program: part_of_a_run.py FOLDER RANK COUNT."""
+"""One of the processes of a run, as a program: part_of_a_run.py FOLDER RANK COUNT; and states of runs, to resume
+them from."""
 
+import copy
 import hashlib
 import sys
 from datetime import timedelta
@@ -28,13 +30,36 @@ def options(exposure: ExposureKind) -> TrainConfig:
     return TrainConfig(densify=densify, background="random", exposure=exposure, texels=TexelConfig(start=18_000))
 
 
+def state_of(trainer: Trainer) -> dict[str, Any]:
+    """Everything that an exact resume needs."""
+    scene, optimizers = trainer.scene.state_dict(), trainer.optimizers
+    return copy.deepcopy(
+        {
+            "step": trainer.step,
+            "scene": {name: value.detach() for name, value in scene.items()},
+            "optimizers": {name: optimizer.state_dict() for name, optimizer in optimizers.items()},
+            "training": trainer.training.state_dict(),
+        }
+    )
+
+
+def resume(trainer: Trainer, state: dict[str, Any]) -> None:
+    """Go on where `state_of` was taken; the run has the same options, views and length."""
+    trainer.scene.make_room(state["scene"])
+    trainer.scene.load_state_dict(state["scene"])
+    for name, optimizer in trainer.optimizers.items():
+        optimizer.load_state_dict(copy.deepcopy(state["optimizers"][name]))
+    trainer.training.load_state_dict(state["training"])
+    trainer.step = state["step"]
+
+
 def train(inputs: dict[str, Any], processes: Processes) -> dict[str, Any]:
     """The run's end, and what it looked like on the way: a digest of all parameters every ten steps."""
     config, field = SceneConfig(texture=inputs["texture"]), None
     if config.texture == "hash":
         field = HashField(config, (0.0, 0.0, 0.0), 1.5, False, 10, torch.Generator().manual_seed(processes.rank))
     trainer = Trainer(
-        Scene(config, inputs["surfels"], field), inputs["views"], options(inputs["exposure"]), STEPS, 3.0, processes
+        Scene(config, inputs["surfels"], field), inputs["views"], options(inputs["exposure"]), STEPS, processes
     )
     digests, reports = [], []
     while trainer.step < STEPS:
@@ -43,7 +68,7 @@ def train(inputs: dict[str, Any], processes: Processes) -> dict[str, Any]:
         if trainer.step % 10 == 0:
             bits = [value.numpy().tobytes() for value in trainer.scene.state_dict().values()]
             digests.append(hashlib.sha256(b"".join(bits)).hexdigest())
-    return {"digests": digests, "reports": reports, "state": trainer.state_dict()}
+    return {"digests": digests, "reports": reports, "state": state_of(trainer)}
 
 
 def main() -> None:

@@ -17,8 +17,7 @@ from bitymi_ns.train.background_points import (
     background_points,
 )
 from bitymi_ns.train.config import DensifyConfig, TrainConfig
-from bitymi_ns.train.domain import scene_for_views
-from bitymi_ns.train.init import surfels_from_points
+from bitymi_ns.train.init import scene_for_views, surfels_from_points
 from bitymi_ns.train.views import View
 
 W, H, DEPTH = 96, 48, 2.0

@@ -75,10 +75,6 @@ def test_error_weight_follows_the_paper(pair):
     rgb, target = pair
     l1 = (rgb - target).abs().sum(-1, keepdim=True)
     torch.testing.assert_close(error_weight(rgb, target, 25.0), torch.exp(-25 * l1))
-    mse = ((rgb - target) ** 2).mean(-1, keepdim=True)
-    torch.testing.assert_close(error_weight(rgb, target, 25.0, "mse"), torch.exp(-25 * mse))
-    with pytest.raises(ValueError, match="falloff_error"):
-        error_weight(rgb, target, 25.0, "l2")
 
 
 def test_falloff_gives_no_gradient_to_the_colours(pair):

@@ -10,6 +10,7 @@ from bitymi_ns.train.config import DensifyConfig, GuardConfig, LearningRates, Tr
 from bitymi_ns.train.divergence import TrainingDiverged, describe_broken
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer
+from tests.train.part_of_a_run import resume, state_of
 
 
 def config_of(factor: float = 1.0, **guard: float) -> TrainConfig:
@@ -185,7 +186,7 @@ def test_a_resumed_run_keeps_its_lowered_rates(begun):
         trainer.scene.field.field_w3[4] = math.nan
     run(trainer, 2)
     resumed = begun(0, every=5)
-    resumed.load_state_dict(trainer.state_dict())
+    resume(resumed, state_of(trainer))
     assert (resumed.training.guard.factor, resumed.training.guard.rollbacks) == (pytest.approx(0.3), 1)
     run(resumed, 10)
     run(trainer, 10)

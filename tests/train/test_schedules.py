@@ -99,12 +99,12 @@ def test_learning_rates():
     assert schedule.lr("means", 29_999) == pytest.approx(4 * 1.6e-6)
     assert schedule.lr("sh_rest", 0) == pytest.approx(schedule.lr("sh_dc", 0) / 20)
     assert schedule.lr("field_table", 0) == pytest.approx(1e-2 / 500)
-    assert schedule.lr("field_w2", 29_999) == pytest.approx(1e-3)
+    assert schedule.lr("field_mlp", 29_999) == pytest.approx(1e-3)
     names = "means quats log_scales opacity_logits beta_raw sv_sites sv_log_tau sv_rgb sh_dc sh_rest sb_base sb_lobes"
-    for name in (names + " sg_base sg_lobes field_table field_w1 field_w2 field_w3 field_mlp").split():
+    for name in (names + " sg_base sg_lobes field_table field_mlp").split():
         assert type(schedule.lr(name, 1234)) is float  # checkpoints must hold no numpy scalars
         assert schedule.lr(name, 1234) > 0
-    with pytest.raises(KeyError, match="colour"):
+    with pytest.raises(AttributeError, match="colour"):
         schedule.lr("colour", 0)
 
 

@@ -10,10 +10,9 @@ import pytest
 import torch
 from PIL import Image
 
-from bitymi_ns.bake import Baked, bake
+from bitymi_ns.bake import Baked, bake, export
 from bitymi_ns.bake.baked import joined
 from bitymi_ns.bake.compact import compacted, with_coded_texels
-from bitymi_ns.bundle import export
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.codec.pages import paged_texels, tile_means
 from bitymi_ns.scene import Camera

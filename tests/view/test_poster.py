@@ -40,8 +40,7 @@ def held_back(site: Site, name: str, until: Path) -> Site:
             time.sleep(0.1)
         return site.read(name)
 
-    files = {path: file for path, file in site.files.items() if path != name}
-    return Site(files, {**site.made, name: late})
+    return Site({**site.files, name: late})
 
 
 def kept(site: Site, asked: list[str]) -> Site:
@@ -54,7 +53,7 @@ def kept(site: Site, asked: list[str]) -> Site:
 
         return read
 
-    return Site({}, {name: noted(name) for name in site.paths})
+    return Site({name: noted(name) for name in site.paths})
 
 
 def shots(bundle: Path, folder: Path, size: tuple[int, int], **options: Any) -> tuple[np.ndarray, np.ndarray, Outcome]:

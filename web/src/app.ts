@@ -1,10 +1,10 @@
 // The viewer: what is shown, drawn when something has changed, and the elements that change it.
 import type { Bundle } from './bundle/load';
 import type { Vec3 } from './bundle/manifest';
-import type { Depths, Look, Renderer } from './render/renderer';
+import type { Depths, DrawOptions, Renderer } from './render/renderer';
 import type { Show } from './render/programs';
 import type { Screen } from './render/screen';
-import { download, element, press, pressed, typing } from './ui/dom';
+import { download, element, onClick, press, pressed, typing } from './ui/dom';
 import { NotesPanel } from './ui/notes_panel';
 import { notify, showError, stopped } from './ui/pages';
 import { PathPanel } from './ui/path_panel';
@@ -13,10 +13,10 @@ import type { Stage } from './ui/stage';
 import { type CaptureCamera, commonTarget, parseCameras } from './view/cameras';
 import { Controls, type Mode } from './view/controls';
 import { Flight } from './view/flight';
-import type { Notes, Viewpoint } from './view/notes';
+import type { Notes } from './view/notes';
 import { Pace } from './view/pace';
 import { DEFAULT_LENS, type Lens, type Pose, View, moved } from './view/pose';
-import { type Shared, fromHash, toHash } from './view/share';
+import { type Shared, type Viewpoint, fromHash, toHash } from './view/share';
 import { extentOf, firstPose } from './view/start';
 import { length, subtract } from './view/vector';
 
@@ -30,6 +30,11 @@ const ASIDES = [
   ['notes', 'close-notes', 'notes-panel'],
 ] as const;
 
+const KEYS: Record<string, string> = {
+  ...{ o: 'orbit', f: 'fly', h: 'home', ',': 'previous', '.': 'next', p: 'beside', t: 'texture', c: 'colors' },
+  ...{ l: 'share', n: 'tools', m: 'notes', k: 'add-keyframe', v: 'play' },
+};
+
 const onPhone = (): boolean => matchMedia('(width <= 720px)').matches; // style.css
 const unsaved = (): void => notify('This view cannot be saved: there is not enough memory for it.');
 
@@ -41,7 +46,7 @@ export class App implements Stage {
   private readonly pace = new Pace();
   private readonly size: number;
   private lens: Lens = DEFAULT_LENS;
-  private first: { pose: Pose; target: Vec3; lens: Lens };
+  private first: Viewpoint;
   private held: Vec3 | null = null;
   private flight: Flight | null = null;
   private show: Show = 'color';
@@ -72,7 +77,7 @@ export class App implements Stage {
     this.controls = new Controls(canvas, this.first.pose, this.first.target, up, size, () => {
       this.path.stop();
       this.flight = null;
-      this.touch();
+      this.changed();
     });
     this.lens = this.first.lens;
     this.path = new PathPanel(this, canvas);
@@ -80,21 +85,17 @@ export class App implements Stage {
     this.bind();
   }
 
-  // The texture has come, or something else that changes the picture.
-  changed(): void {
-    this.touch();
-  }
-
   start(): void {
-    const shared = fromHash(location.hash);
-    if (shared) this.apply(shared);
-    new ResizeObserver(() => this.touch()).observe(this.canvas);
-    addEventListener('hashchange', () => {
-      const given = fromHash(location.hash);
-      if (given) this.apply(given);
-    });
+    this.applyHash();
+    new ResizeObserver(() => this.changed()).observe(this.canvas);
+    addEventListener('hashchange', () => this.applyHash());
     this.canvas.focus();
     requestAnimationFrame((now) => this.tick(now));
+  }
+
+  private applyHash(): void {
+    const shared = fromHash(location.hash);
+    if (shared) this.apply(shared);
   }
 
   private targetOf(pose: Pose): Vec3 {
@@ -108,7 +109,7 @@ export class App implements Stage {
     return { pose, target, lens: this.lens, show: this.show, residuals: pressed(element('texture')) };
   }
 
-  go(pose: Pose, lens: Lens, target?: Vec3): void {
+  go({ pose, lens, target }: Omit<Viewpoint, 'target'> & Partial<Viewpoint>): void {
     this.path.stop();
     this.flight = null;
     this.place(pose, lens, target);
@@ -116,12 +117,12 @@ export class App implements Stage {
 
   fly(to: Viewpoint): void {
     if (matchMedia('(prefers-reduced-motion: reduce)').matches) {
-      this.go(to.pose, to.lens, to.target);
+      this.go(to);
       return;
     }
     this.path.stop();
     this.flight = new Flight(this.shared(), to);
-    this.touch();
+    this.changed();
   }
 
   view(): View {
@@ -129,14 +130,14 @@ export class App implements Stage {
   }
 
   depths(view: View): Promise<Depths> {
-    return this.renderer.depths(view, this.look(view.width === 1));
+    return this.renderer.depths(view, this.options(view.width === 1));
   }
 
   private place(pose: Pose, lens: Lens, target = this.targetOf(pose)): void {
     this.controls.pose = pose;
     this.controls.target = target;
     this.lens = lens;
-    this.touch();
+    this.changed();
   }
 
   fileName(ending: string): string {
@@ -146,17 +147,18 @@ export class App implements Stage {
   apply(shared: Shared): void {
     this.setShow(shared.show);
     press(element('texture'), shared.residuals);
-    this.go(shared.pose, shared.lens, shared.target);
+    this.go(shared);
   }
 
-  private touch(): void {
+  // The texture has come, or something else that changes the picture.
+  changed(): void {
     this.dirty = true;
     this.still = false;
     this.movedAt = performance.now();
     document.documentElement.dataset.frame = 'moving';
   }
 
-  private look(still: boolean): Look {
+  private options(still: boolean): DrawOptions {
     return {
       show: this.show,
       residuals: pressed(element('texture')),
@@ -164,12 +166,8 @@ export class App implements Stage {
       background: this.bundle.info.background,
       layers: still ? STILL_LAYERS : MOVING_LAYERS,
       fine: still,
+      farthest: length(subtract(this.controls.pose.position, this.first.target)) + 1.5 * this.size,
     };
-  }
-
-  // Farthest depth that the map of depths tells apart.
-  private farthest(): number {
-    return length(subtract(this.controls.pose.position, this.first.target)) + 1.5 * this.size;
   }
 
   private tick(now: number): void {
@@ -187,7 +185,7 @@ export class App implements Stage {
   private flyOn(flight: Flight, now: number): void {
     const view = flight.at(now, ...this.pixels());
     if (view) this.place(view.pose, view);
-    else this.go(flight.to.pose, flight.to.lens, flight.to.target);
+    else this.go(flight.to);
   }
 
   // Width and height of the canvas on the screen, as far as the device draws so many.
@@ -201,15 +199,14 @@ export class App implements Stage {
   private async frame(still: boolean): Promise<void> {
     this.drawing = true;
     this.dirty = false;
-    const [width, height] = this.pixels();
-    if (width > 0 && height > 0) {
+    const view = this.view();
+    if (view.width > 0 && view.height > 0) {
       const chosen = element<HTMLSelectElement>('resolution').value;
       // of a film all pictures have one size
       const scale = chosen !== 'auto' ? Number(chosen) : still || this.path.filming ? 1 : this.pace.scale;
       const begin = performance.now();
-      const view = View.contain(this.controls.pose, this.lens, width, height);
       try {
-        await this.screen.draw(view, scale, this.look(still), this.farthest());
+        await this.screen(view, scale, this.options(still));
       } catch (error) {
         showError(error);
         return;
@@ -236,31 +233,31 @@ export class App implements Stage {
   }
 
   private bind(): void {
-    const on = (id: string, run: () => void): void => element(id).addEventListener('click', run);
-    on('orbit', () => this.setMode('orbit'));
-    on('fly', () => this.setMode('fly'));
-    on('home', () => this.goHome());
-    on('previous', () => this.step(-1));
-    on('next', () => this.step(1));
-    on('beside', () => this.toggleBeside());
-    on('texture', () => this.toggle('texture'));
-    on('colors', () => {
+    onClick('orbit', () => this.setMode('orbit'));
+    onClick('fly', () => this.setMode('fly'));
+    onClick('home', () => this.go(this.first));
+    onClick('previous', () => this.jump(this.chosen - 1));
+    onClick('next', () => this.jump(this.chosen + 1));
+    onClick('beside', () => this.toggleBeside());
+    onClick('texture', () => this.toggle('texture'));
+    onClick('colors', () => {
       this.held = this.toggle('colors') ? null : this.controls.pose.position;
     });
-    on('screenshot', () => void this.screenshot().catch(unsaved));
-    on('share', () => void this.share());
-    on('theme', () => this.turnTheme());
-    on('menu', () => this.open('panel', !element('panel').classList.contains('open')));
+    onClick('screenshot', () => void this.screenshot().catch(unsaved));
+    onClick('share', () => void this.share());
+    onClick('theme', () => this.turnTheme());
+    onClick('menu', () => this.open('panel', !element('panel').classList.contains('open')));
     for (const [button, close, aside] of ASIDES) {
-      on(button, () => this.open(aside, element(aside).hidden));
-      on(close, () => {
+      onClick(button, () => this.open(aside, element(aside).hidden));
+      onClick(close, () => {
         this.open(aside, false);
         this.canvas.focus();
       });
     }
-    element('resolution').addEventListener('change', () => this.touch());
-    element('show').addEventListener('change', (e) => this.setShow((e.target as HTMLSelectElement).value as Show));
-    element('camera').addEventListener('change', (e) => this.jump(Number((e.target as HTMLSelectElement).value)));
+    element('resolution').addEventListener('change', () => this.changed());
+    const show = element<HTMLSelectElement>('show');
+    show.addEventListener('change', () => this.setShow(show.value as Show));
+    element('camera').addEventListener('change', () => this.jump(this.chosen));
     addEventListener('keydown', (e) => this.shortcut(e));
     this.fillCameras();
   }
@@ -283,16 +280,14 @@ export class App implements Stage {
       void this.screenshot().catch(unsaved);
     }
     if (e.ctrlKey || e.metaKey || e.altKey) return;
-    const id = { o: 'orbit', f: 'fly', h: 'home', ',': 'previous', '.': 'next', p: 'beside', t: 'texture' }[e.key];
-    const other = { c: 'colors', l: 'share', n: 'tools', m: 'notes', k: 'add-keyframe', v: 'play' }[e.key];
-    const found = id ?? other;
-    if (found && !element(found).hidden) element(found).click();
+    const id = KEYS[e.key] as string | undefined;
+    if (id && !element(id).hidden) element(id).click();
   }
 
   private toggle(id: string): boolean {
     const now = !pressed(element(id));
     press(element(id), now);
-    this.touch();
+    this.changed();
     return now;
   }
 
@@ -306,11 +301,15 @@ export class App implements Stage {
   private setShow(show: Show): void {
     this.show = show;
     element<HTMLSelectElement>('show').value = show;
-    this.touch();
+    this.changed();
   }
 
-  private goHome(): void {
-    this.go(this.first.pose, this.first.lens, this.first.target);
+  // Number of the camera in the list.
+  private get chosen(): number {
+    return Number(element<HTMLSelectElement>('camera').value);
+  }
+  private set chosen(k: number) {
+    element<HTMLSelectElement>('camera').value = String(k);
   }
 
   private fillCameras(): void {
@@ -320,52 +319,35 @@ export class App implements Stage {
     this.cameras.forEach((camera, k) =>
       list.add(new Option(camera.name + (camera.heldOut ? ' · held out' : ''), `${k}`)),
     );
-    const start = this.cameras.findIndex((camera) => camera.heldOut);
-    list.value = String(Math.max(0, start));
-  }
-
-  private step(by: number): void {
-    const list = element<HTMLSelectElement>('camera');
-    const next = (Number(list.value) + by + this.cameras.length) % this.cameras.length;
-    list.value = String(next);
-    this.jump(next);
+    this.chosen = Math.max(
+      0,
+      this.cameras.findIndex((camera) => camera.heldOut),
+    );
   }
 
   private jump(k: number): void {
-    const camera = this.cameras[k];
-    this.go(camera.pose, camera.lens);
+    this.chosen = (k + this.cameras.length) % this.cameras.length;
+    this.go(this.cameras[this.chosen]);
     this.setPhotograph();
   }
 
   private toggleBeside(): void {
-    const shown = this.toggle('beside');
-    if (shown && !this.cameras[Number(element<HTMLSelectElement>('camera').value)].photograph) {
-      this.jumpToPhotograph();
-    }
-    if (shown) this.jump(Number(element<HTMLSelectElement>('camera').value));
-    this.setPhotograph();
-  }
-
-  private jumpToPhotograph(): void {
-    const k = this.cameras.findIndex((camera) => camera.photograph);
-    element<HTMLSelectElement>('camera').value = String(k);
+    if (!this.toggle('beside')) this.setPhotograph();
+    else if (this.cameras[this.chosen].photograph) this.jump(this.chosen);
+    else this.jump(this.cameras.findIndex((camera) => camera.photograph));
   }
 
   private setPhotograph(): void {
-    const camera = this.cameras[Number(element<HTMLSelectElement>('camera').value)];
+    const { photograph } = this.cameras[this.chosen];
     const shown = pressed(element('beside'));
     element('photograph').hidden = !shown;
     if (!shown) return;
     const image = element<HTMLImageElement>('photograph-image');
     image.removeAttribute('src');
-    element('photograph-name').textContent = camera.photograph ? 'Photograph' : 'No photograph of this camera';
-    if (camera.photograph) {
-      const found = this.bundle.photograph(camera.photograph);
-      this.photograph = found;
-      found.then((address) => this.photograph === found && (image.src = address), showError);
-    } else {
-      this.photograph = null;
-    }
+    element('photograph-name').textContent = photograph ? 'Photograph' : 'No photograph of this camera';
+    const found = photograph ? this.bundle.photograph(photograph) : null;
+    this.photograph = found;
+    found?.then((address) => this.photograph === found && (image.src = address), showError);
   }
 
   private turnTheme(): void {
@@ -377,13 +359,12 @@ export class App implements Stage {
   }
 
   private async screenshot(): Promise<void> {
-    const [width, height] = this.pixels();
-    const view = View.contain(this.controls.pose, this.lens, width, height);
-    const image = await this.renderer.read(view, this.look(true), this.farthest());
-    const canvas = new OffscreenCanvas(width, height);
+    const view = this.view();
+    const image = await this.renderer.read(view, this.options(true));
+    const canvas = new OffscreenCanvas(view.width, view.height);
     canvas.getContext('2d')?.putImageData(image, 0, 0);
     download(this.fileName('png'), await canvas.convertToBlob({ type: 'image/png' }));
-    this.touch();
+    this.changed();
   }
 
   private async share(): Promise<void> {

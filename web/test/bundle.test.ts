@@ -17,6 +17,7 @@ const manifest = (changes: object = {}): string =>
     ...changes,
   });
 
+const ATLAS = { format: 'uint8', width: 8, height: 8, layers: 2, offset: 0, scale: 1 };
 const FLOATS = [
   ...['x', 'y', 'z', 'opacity', 'scale_0', 'scale_1', 'rot_0', 'rot_1', 'rot_2', 'rot_3', 'beta'],
   ...['view_base_0', 'view_base_1', 'view_base_2'],
@@ -94,6 +95,8 @@ describe('bundle.json', () => {
     ['a kind that is none', manifest({ surfels: { count: 1, view_color: 'xx' } })],
     ['a count that is no whole number', manifest({ surfels: { count: 1.5, view_color: 'sv' } })],
     ['files that are no objects', manifest({ files: { 'surfels.ply': 3 } })],
+    ['alphas below version 4', manifest({ version: '2.2', atlas: { ...ATLAS, alpha_scale: 1 } })],
+    ['no alphas in version 4', manifest({ version: '4.0', atlas: ATLAS })],
   ])('with %s is refused', (_, text) => {
     expect(() => parseManifest(text)).toThrowError(DamagedBundle);
   });
@@ -134,7 +137,7 @@ describe('surfels.ply', () => {
     expect(() => readSurfels(data, info)).toThrowError(DamagedBundle);
   });
   it('with alphas has them beside the layers of the tiles', () => {
-    const atlas = { format: 'uint8', width: 8, height: 8, layers: 2, offset: 0, scale: 1, alpha_scale: 255 / 128 };
+    const atlas = { ...ATLAS, alpha_scale: 255 / 128 };
     const about = parseManifest(manifest({ version: '4.0', atlas }));
     const rows = (second: number): ArrayBuffer => {
       const each = [0.5, second].map((alpha, i) => [...row(i, 0).slice(0, FLOATS.length), alpha, 0, 0, 0, i, 4, 4]);

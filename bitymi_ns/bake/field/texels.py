@@ -8,11 +8,8 @@ from torch import Tensor
 from bitymi_ns.bake.tiles import texel_centers
 from bitymi_ns.codec.packing import Packing
 from bitymi_ns.codec.pages import size_classes, texel_index
-from bitymi_ns.ops.backend import cuda_backend
 from bitymi_ns.ops.constants import SUPPORT
-from bitymi_ns.ops.field_tiles import field_tiles
 from bitymi_ns.progress import Progress, no_progress
-from bitymi_ns.scene.field import HashField
 from bitymi_ns.train.init import tangents
 
 
@@ -62,8 +59,6 @@ def evaluate_tiles(
         nonfinite: number of texels whose value was not finite.
     """
     axes = tangents(quats) * scales[:, None, :]  # [N, 3, 2]
-    if isinstance(field, HashField) and cuda_backend(means.device):
-        return _evaluate_on_device(field, means, axes, packing, extent, progress)
     tiles = torch.from_numpy(packing.tiles)
     pages = torch.zeros(packing.layers * packing.height * packing.width, 3)
     total = int(tiles[:, 3:].long().prod(dim=1).sum())
@@ -81,17 +76,3 @@ def evaluate_tiles(
             done += len(value)
             progress("evaluating texels", done, total)
     return pages.reshape(packing.layers, packing.height, packing.width, 3), nonfinite
-
-
-def _evaluate_on_device(
-    field: HashField, means: Tensor, axes: Tensor, packing: Packing, extent: float, progress: Progress
-) -> tuple[Tensor, int]:
-    """`evaluate_tiles` in one call, by the kernel that writes straight into the pages."""
-    tiles = torch.from_numpy(packing.tiles)
-    frames = torch.cat([means, axes[:, :, 0], axes[:, :, 1]], dim=1)
-    pages = (packing.layers, packing.height, packing.width)
-    half = means.new_full((len(means),), extent)
-    texels, nonfinite = field_tiles(frames, half, tiles, pages, field.geometry, *field.weights)
-    total = int(tiles[:, 3:].long().prod(dim=1).sum())
-    progress("evaluating texels", total, total)
-    return texels.float().cpu(), int(nonfinite)

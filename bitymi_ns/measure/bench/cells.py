@@ -19,9 +19,9 @@ FILE = "cells.jsonl"
 NAMES = ("suite", "row")  # entries of a key that are labels and do not tell cells apart
 
 
-def identity(key: dict[str, Any]) -> str:
-    """Text that is equal for equal cells."""
-    return json.dumps({name: value for name, value in key.items() if name not in NAMES}, sort_keys=True)
+def identity(key: dict[str, Any], *without: str) -> str:
+    """Text that is equal for equal cells; for those that differ in these entries alone, too."""
+    return json.dumps({name: value for name, value in key.items() if name not in (*NAMES, *without)}, sort_keys=True)
 
 
 def provenance(command: list[str], seconds: float) -> dict[str, Any]:
@@ -97,12 +97,6 @@ class Cells:
         self._known[identity(key)] = cell
 
 
-def without_nan(value: Any) -> Any:
+def without_nan(value: dict[str, Any]) -> dict[str, Any]:
     """Replace numbers that JSON cannot hold by None."""
-    if isinstance(value, dict):
-        return {key: without_nan(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [without_nan(item) for item in value]
-    if isinstance(value, float) and value - value != 0:
-        return None
-    return value
+    return json.loads(json.dumps(value), parse_constant=lambda constant: None)

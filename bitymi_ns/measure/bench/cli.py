@@ -6,23 +6,23 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import tyro
 
 from bitymi_ns.files import check_writable, explained, write_file
 from bitymi_ns.measure import markdown
-from bitymi_ns.measure.bench.cells import Cells
-from bitymi_ns.measure.bench.engine import open_cells, run_chains
+from bitymi_ns.measure.bench.cells import FILE, Cells
+from bitymi_ns.measure.bench.engine import run_chains
 from bitymi_ns.measure.bench.matrix import (
-    FORMATS,
+    Bundle,
+    Format,
     Matrix,
     Row,
     SceneSpec,
-    format_bundles,
     local_scenes,
     read_plan,
     standard_scenes,
-    suites,
 )
 from bitymi_ns.measure.bench.process import BenchError, say
 from bitymi_ns.measure.report.read import add_cells
@@ -41,13 +41,15 @@ class BenchRun:
     scenes: tuple[str, ...] = ()  # Only these scenes of a standard data set.
     methods: tuple[str, ...] = ("bitymi",)  # Methods of ns-train.
     plan: str | None = None
-    """Rows to train instead of --methods: ablation, atlas, overdraw, resolution, or
+    """Rows to train instead of --methods: ablation, atlas, overdraw, rate, resolution, or
     a YAML file of that form."""
     extra: str = ""
     """Further options of ns-train for every run, as one word: --extra="--pipeline.model.scene.weight-bound 0"."""
     seeds: tuple[int, ...] = ()  # Train once for each of these seeds; none = once, with the method's own.
     steps: int | None = None  # Steps of a training; the schedules follow. None = the method's own for this machine.
-    formats: tuple[str, ...] = FORMATS  # Formats of bundles that each trained scene is baked into; none = no baking.
+    formats: tuple[Format, ...] = get_args(
+        Format
+    )  # Formats of bundles that each trained scene is baked into; none = no baking.
     pictures: int = 2  # Number of worst held-out views of each run to draw with errors and decomposition.
     work: Path = Path("outputs/bench")
     """Folder of runs, bundles, logs and finished cells, which are not done again. The command may run several times at
@@ -62,7 +64,7 @@ class BenchRun:
             return local_scenes(self.data)
         if len(self.data) != 1:
             raise BenchError(f"--data is one folder: the one that holds the scenes of {self.suite}")
-        return standard_scenes(suites()[self.suite], self.data[0], self.scenes)
+        return standard_scenes(self.suite, self.data[0], self.scenes)
 
     def matrix(self) -> Matrix:
         """The matrix of these options.
@@ -82,20 +84,21 @@ class BenchRun:
         if not rows:
             raise BenchError("nothing to run: give --methods or --plan")
         rows = [Row(row.name, row.method, (*row.options, *extra)) for row in rows]
-        bundles = format_bundles(self.formats) if bundles is None else bundles
+        if bundles is None:
+            bundles = [Bundle(name, ("--format", name)) for name in dict.fromkeys(self.formats)]
         return Matrix(self._scenes(), rows, self.seeds, self.steps, bundles, self.pictures)
 
     def run(self) -> int:
         """Run the missing cells, then print the table; returns the exit status."""
         matrix, work = self.matrix(), Path(os.path.expanduser(self.work)).resolve()
-        cells = open_cells(work)
+        cells = Cells(work / FILE)
         if self.output is not None:
             with explained(self.output, BenchError):
                 check_writable(self.output)
         try:
             failures = run_chains(work, matrix.chains())
         except KeyboardInterrupt:
-            finished = len(open_cells(work))
+            finished = len(Cells(work / FILE))
             kept = f"{finished} finished cells are in {work}" if finished else "no cell was finished"
             say(f"interrupted; {kept}. Run the same command to continue")
             return INTERRUPTED

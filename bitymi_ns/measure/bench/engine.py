@@ -13,30 +13,27 @@ from bitymi_ns.files import Busy, Lock, reason
 from bitymi_ns.measure.bench.cells import FILE, Cells, provenance, without_nan
 from bitymi_ns.measure.bench.matrix import Run, Stage
 from bitymi_ns.measure.bench.process import BenchError, CommandFailed, run_measured, say, tool
+from bitymi_ns.measure.report.read import PICTURES, read_jsonl
 from bitymi_ns.trust import json_of
 
 CURVE = "training_curve.jsonl"
 Chain = Sequence[Stage]  # the cells of one run; each may need those before it
 
 
-class Layout:
-    """Paths of a run below the work folder."""
+def config_of(work: Path, run: Run) -> Path:
+    """config.yml of a trained run."""
+    return work / "runs" / run.folder / "config.yml"
 
-    def __init__(self, work: Path, run: Run) -> None:
-        self.work, self.run = work, run
 
-    def path(self, what: str, *parts: str) -> Path:
-        """A path of the run below runs, bundles, evals, pictures or logs."""
-        return self.work.joinpath(what, self.run.folder, *parts)
-
-    @property
-    def config(self) -> Path:
-        """config.yml of the trained run."""
-        return self.path("runs", "config.yml")
-
-    def relative(self, path: Path) -> str:
-        """A path as a cell records it."""
-        return path.relative_to(self.work).as_posix()
+def output_of(work: Path, stage: Stage) -> Path:
+    """The folder that a cell leaves; of an evaluation its file."""
+    run = stage.run.folder
+    return {
+        "train": work / "runs" / run,
+        "export": work / "bundles" / run / stage.form,
+        "eval": work / "evals" / run / f"{stage.form}.json",
+        "pictures": work / "pictures" / run,
+    }[stage.kind]
 
 
 def train_command(work: Path, run: Run) -> list[str]:
@@ -57,35 +54,19 @@ def train_command(work: Path, run: Run) -> list[str]:
 
 def stage_command(work: Path, stage: Stage) -> list[str]:
     """Command line of a cell."""
-    at = Layout(work, stage.run)
     if stage.kind == "train":
         return train_command(work, stage.run)
+    config, output = config_of(work, stage.run), str(output_of(work, stage))
     if stage.kind == "export":
         assert stage.bundle is not None
-        command = [tool("ns-export"), "bitymi-atlas", "--load-config", str(at.config)]
-        return [*command, "--output-dir", str(at.path("bundles", stage.form)), *stage.bundle.options]
+        command = [tool("ns-export"), "bitymi-atlas", "--load-config", str(config)]
+        return [*command, "--output-dir", output, *stage.bundle.options]
     if stage.kind == "eval":
-        config = at.config if stage.bundle is None else at.path("bundles", stage.form, "config.yml")
-        result = at.path("evals", f"{stage.form}.json")
-        return [tool("ns-eval"), "--load-config", str(config), "--output-path", str(result)]
-    command = [tool("bitymi"), "bench", "pictures", "--load-config", str(at.config)]
-    return [*command, "--output-dir", str(at.path("pictures")), "--views", str(stage.count)]
-
-
-def prepare(work: Path, stage: Stage) -> Path:
-    """Remove what an earlier attempt left; returns the log file of the cell."""
-    at = Layout(work, stage.run)
-    folder = {
-        "train": at.path("runs"),
-        "export": at.path("bundles", stage.form),
-        "eval": at.path("evals"),
-        "pictures": at.path("pictures"),
-    }[stage.kind]
-    if stage.kind == "eval":  # its folder holds the results of other evaluations
-        folder.mkdir(parents=True, exist_ok=True)
-    else:
-        shutil.rmtree(folder, ignore_errors=True)
-    return at.path("logs", f"{stage.kind}-{stage.form}.log")
+        if stage.bundle is not None:
+            config = work / "bundles" / stage.run.folder / stage.form / "config.yml"
+        return [tool("ns-eval"), "--load-config", str(config), "--output-path", output]
+    command = [tool("bitymi"), "bench", "pictures", "--load-config", str(config)]
+    return [*command, "--output-dir", output, "--views", str(stage.count)]
 
 
 def read_result(work: Path, stage: Stage) -> dict[str, Any]:
@@ -98,35 +79,30 @@ def read_result(work: Path, stage: Stage) -> dict[str, Any]:
     Raises:
         CommandFailed: there are none.
     """
-    at = Layout(work, stage.run)
-    reader: dict[str, Callable[[Layout, Stage], dict[str, Any]]] = {
-        "train": _train, "export": _export, "eval": _evaluation, "pictures": _pictures,
-    }  # fmt: skip
+    readers = {"train": _train, "export": _export, "eval": _evaluation, "pictures": _pictures}
     try:
-        return without_nan(reader[stage.kind](at, stage))
+        figures = readers[stage.kind](output_of(work, stage), stage)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CommandFailed(f"{stage}: the command left no figures that can be read: {error}") from error
+    return without_nan(figures if stage.kind == "eval" else {**figures, "folder": output_of(Path(), stage).as_posix()})
 
 
-def _train(at: Layout, stage: Stage) -> dict[str, Any]:
-    folder = {"folder": at.relative(at.path("runs"))}
+def _train(folder: Path, stage: Stage) -> dict[str, Any]:
     if not stage.run.row.ours:
-        return folder
-    curve = at.path("runs", CURVE)
-    last = read_curve(curve)[-1]
-    figures = {name: last[name] for name in ("seconds", "cpu_seconds", "surfels")}
-    curve_path = {"curve": at.relative(curve)}
-    return {"steps": last["step"], **figures, "fragments": last.get("fragments"), **folder, **curve_path}
+        return {}
+    _, curves, _ = read_jsonl(folder / CURVE)
+    if not curves:
+        raise ValueError(f"{folder / CURVE} holds no point of a training curve")
+    figures = {name: curves[0].last(name) for name in ("seconds", "cpu_seconds", "surfels", "fragments")}
+    return {"steps": curves[0].last("step"), **figures, "curve": f"runs/{stage.run.folder}/{CURVE}"}
 
 
-def _export(at: Layout, stage: Stage) -> dict[str, Any]:
+def _export(folder: Path, stage: Stage) -> dict[str, Any]:
     from bitymi_ns.bundle.read import download_bytes, read_manifest  # imports torch, which other methods do without
 
-    folder = at.path("bundles", stage.form)
     info = read_manifest(folder)
     compact = info.surfels.columns is not None
     return {
-        "folder": at.relative(folder),
         "bytes": download_bytes(folder, info),
         "files": {name: entry.bytes for name, entry in info.files.items()},
         "format": None if info.atlas is None else "compact" if compact else info.atlas.format,
@@ -134,39 +110,15 @@ def _export(at: Layout, stage: Stage) -> dict[str, Any]:
     }
 
 
-def _evaluation(at: Layout, stage: Stage) -> dict[str, Any]:
-    results = json_of(at.path("evals", f"{stage.form}.json").read_text("utf8"))["results"]
+def _evaluation(file: Path, stage: Stage) -> dict[str, Any]:
+    results = json_of(file.read_text("utf8"))["results"]
     if not isinstance(results, dict) or "psnr" not in results:
         raise ValueError("no psnr in it")
     return {"results": results}
 
 
-def _pictures(at: Layout, stage: Stage) -> dict[str, Any]:
-    folder = at.path("pictures")
-    return {"folder": at.relative(folder), "views": len(json_of((folder / "pictures.json").read_text("utf8"))["views"])}
-
-
-def read_curve(path: Path) -> list[dict[str, Any]]:
-    """Read the points of a training curve, by step; a line that a killed run left unfinished is skipped.
-
-    Raises:
-        CommandFailed: there are none.
-    """
-    points = {}
-    for line in path.read_text("utf8").splitlines() if path.is_file() else []:
-        try:
-            point = json_of(line)
-            points[point["step"]] = point
-        except (ValueError, KeyError, TypeError):
-            continue
-    if not points:
-        raise CommandFailed(f"{path} holds no point of a training curve")
-    return [points[step] for step in sorted(points)]
-
-
-def open_cells(work: Path) -> Cells:
-    """The finished cells of a work folder."""
-    return Cells(work / FILE)
+def _pictures(folder: Path, stage: Stage) -> dict[str, Any]:
+    return {"views": len(json_of((folder / PICTURES).read_text("utf8"))["views"])}
 
 
 def _needs(stage: Stage, other: Stage) -> bool:
@@ -208,9 +160,13 @@ def locked(work: Path, run: Run) -> Iterator[Lock]:
 
 
 def _run_stage(work: Path, stage: Stage, cells: Cells, lock: Lock) -> None:
-    command = stage_command(work, stage)
+    command, output = stage_command(work, stage), output_of(work, stage)
+    if stage.kind == "eval":  # its folder holds the results of other evaluations
+        output.parent.mkdir(parents=True, exist_ok=True)
+    else:
+        shutil.rmtree(output, ignore_errors=True)  # of an earlier attempt
     start = time.perf_counter()
-    cost = run_measured(command, prepare(work, stage), lock)
+    cost = run_measured(command, work / "logs" / stage.run.folder / f"{stage.kind}-{stage.form}.log", lock)
     value = {**read_result(work, stage), **cost}
     cells.add(stage.key, value, provenance(command, time.perf_counter() - start))
 
@@ -249,7 +205,7 @@ def run_chains(work: Path, chains: Sequence[Chain]) -> list[str]:
     """
     if not any(chains):
         raise BenchError("nothing to run: there is no scene, or no method")
-    cells = open_cells(work)
+    cells = Cells(work / FILE)
     total = sum(map(len, chains))
     done = total - sum(len(missing(chain, cells)) for chain in chains)
     if done:
@@ -278,8 +234,8 @@ def time_left(stages: Iterable[Stage], cells: Cells) -> str:
         key, seconds = cell["key"], cell.get("made", {}).get("seconds")
         if isinstance(seconds, (int, float)):
             kind = (key.get("cell"), key.get("bundle"))
-            for of in (kind, (*kind, key.get("scene"), key.get("steps"))):
-                known.setdefault(of, []).append(float(seconds))
+            for alike in (kind, (*kind, key.get("scene"), key.get("steps"))):
+                known.setdefault(alike, []).append(seconds)
     total = 0.0
     for stage in stages:
         kind = (stage.kind, stage.bundle.name if stage.bundle else None)

@@ -1,16 +1,16 @@
 """Read the inputs of a report: ns-eval files, training curves, cells, pictures and found poses, and folders that
 are searched for these."""
 
-import json
 import os
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from bitymi_ns.measure.bench.cells import FILE as CELLS
-from bitymi_ns.measure.bench.cells import NAMES, Cells
+from bitymi_ns.measure.bench.cells import Cells, identity
 from bitymi_ns.measure.bench.process import BenchError
 from bitymi_ns.measure.report.records import (
     Curve,
@@ -22,6 +22,7 @@ from bitymi_ns.measure.report.records import (
     finite_numbers,
     link,
 )
+from bitymi_ns.measure.report.tables import COLUMNS
 from bitymi_ns.trust import json_of
 
 PICTURES = "pictures.json"
@@ -31,16 +32,8 @@ SIDE_BY_SIDE = re.compile(r"^eval_img_(?P<index>\d{4,})$", re.IGNORECASE)
 """Stem of a photograph beside its render, as `ns-eval --render-output-path` writes it."""
 
 _SKIPPED = {"__pycache__", "node_modules", "wandb", "nerfstudio_models"}
-_NOT_OF_A_RUN = ("cell", "bundle", "export", "views", *NAMES)
+_NOT_OF_A_RUN = ("cell", "bundle", "export", "views")
 _POSES = {"source", "registered", "given", "reprojection_error", "track_length", "left_out", "seconds"}
-_SHOWN = (
-    ("psnr", 2, "dB"),
-    ("cc_psnr", 2, "dB ccPSNR"),
-    ("ssim", 3, "SSIM"),
-    ("flip", 3, "FLIP"),
-    ("lpips", 3, "LPIPS"),
-    ("lpips_vgg", 3, "LPIPS (VGG)"),
-)
 
 
 # text and JSON
@@ -125,7 +118,7 @@ def read_pictures(path: Path, run: str = "") -> dict[str, list[tuple[str, Path]]
     try:
         for view in data["views"]:
             metrics = finite_numbers(view["metrics"])
-            figures = [f"{metrics[key]:.{digits}f} {text}" for key, digits, text in _SHOWN if key in metrics]
+            figures = [f"{c.title} {c.text(metrics[c.key])}" for c in COLUMNS if c.key in metrics]
             rank = "worst" if view["rank"] == 1 else f"number {view['rank']} from below"
             title = f"{scene}, {method}: view {view['view']}, {rank} of {view['of']}: {', '.join(figures)}"
             files = view["files"].items()
@@ -138,39 +131,6 @@ def read_pictures(path: Path, run: str = "") -> dict[str, list[tuple[str, Path]]
 # cells of a benchmark
 
 
-def _identity(key: dict[str, Any], *without: str) -> str:
-    return json.dumps({k: v for k, v in key.items() if k not in without}, sort_keys=True)
-
-
-class _Run:
-    """The cells of one training."""
-
-    def __init__(self, key: dict[str, Any]) -> None:
-        self.key = key
-        self.id = _identity(key, *_NOT_OF_A_RUN)
-        self.series = _identity(key, *_NOT_OF_A_RUN, "seed")
-        self.scene = str(key.get("scene") or "unnamed scene")
-        self.name = str(key.get("row") or key.get("method") or "unnamed method")
-        self.seed = key.get("seed") if isinstance(key.get("seed"), int) else None
-        self.train: dict[str, Any] = {}
-        self.exports: dict[str, dict[str, Any]] = {}
-        self.evaluations: list[tuple[str, dict[str, float]]] = []
-        self.pictures: str = ""
-
-    def add(self, key: dict[str, Any], value: dict[str, Any]) -> None:
-        kind, bundle = key.get("cell"), str(key.get("bundle") or "")
-        if kind == "train":
-            self.train = value
-        elif kind == "export":
-            self.exports[bundle] = value
-        elif kind == "eval":
-            if not is_evaluation(value) or "psnr" not in value["results"]:
-                raise KeyError("psnr among its results")
-            self.evaluations.append((bundle, finite_numbers(value["results"])))
-        elif kind == "pictures":
-            self.pictures = str(value["folder"])
-
-
 def add_cells(cells: Iterable[dict[str, Any]], path: Path, records: Records) -> None:
     """Add the cells of a benchmark, and the curves and pictures that they name, where these are there.
 
@@ -180,53 +140,51 @@ def add_cells(cells: Iterable[dict[str, Any]], path: Path, records: Records) -> 
     Raises:
         ReportError: one lacks what its kind must have.
     """
-    runs: dict[str, _Run] = {}
+    keys: dict[str, dict[str, Any]] = {}  # of the trainings
+    runs: dict[str, dict[tuple[str, str], dict[str, Any]]] = {}  # their cells: (kind, bundle) -> value
     for cell in cells:
-        run = _Run(cell["key"])
-        run = runs.setdefault(run.id, run)
-        made = cell.get("made")
-        machine = made.get("machine") if isinstance(made, dict) else None
+        key, run = cell["key"], identity(cell["key"], *_NOT_OF_A_RUN)
+        keys.setdefault(run, key)
+        runs.setdefault(run, {})[str(key.get("cell")), str(key.get("bundle") or "")] = cell["value"]
+        machine = (cell.get("made") or {}).get("machine")
         if machine and machine not in records.machines:
             records.machines.append(str(machine))
+    names = {run: str(key.get("row") or key.get("method") or "unnamed method") for run, key in keys.items()}
+    namesakes = Counter((key.get("scene"), names[run], key.get("seed")) for run, key in keys.items())
+    series = {run: identity(key, *_NOT_OF_A_RUN, "seed") for run, key in keys.items()}
+    seeds = Counter(series[run] for run in keys)
+    for run, key in keys.items():
+        name, seed, steps = names[run], key.get("seed"), key.get("steps")
+        if namesakes[key.get("scene"), name, seed] > 1:  # say what else tells them apart
+            name += f", {steps:,} steps" if isinstance(steps, int) else ", own length"
+        suffix = f", seed {seed}" if seeds[series[run]] > 1 and seed is not None else ""
+        scene = str(key.get("scene") or "unnamed scene")
+        trained = Evaluation(scene, name, False, name + suffix, {}, "", path, run, name, series[run], seed)
+        _add_run(trained, suffix, runs[run], records)
+
+
+def _add_run(trained: Evaluation, suffix: str, cells: dict[tuple[str, str], dict[str, Any]], records: Records) -> None:
+    """Add the cells of a training, given what the evaluations of its trained scene have beside their results."""
+    folder, train = trained.source.parent, cells.get(("train", ""), {})
+    figures = finite_numbers(train)
+    times = {f"train_{k}": figures[k] for k in ("seconds", "cpu_seconds", "peak_bytes") if k in figures}
+    for (kind, bundle), value in cells.items():
         try:
-            run.add(cell["key"], cell["value"])
+            if kind == "eval":
+                results = {**value["results"], **times, "psnr": value["results"]["psnr"]}  # the one that must be there
+                results["bundle_bytes"] = cells.get(("export", bundle), {}).get("bytes")
+                group = f"{trained.method}, {bundle}" if bundle else trained.method
+                own = {"baked": bool(bundle), "label": group + suffix, "group": group}
+                records.evaluations.append(replace(trained, results=finite_numbers(results), **own))
+            elif kind == "pictures" and (listed := folder / value["folder"] / PICTURES).is_file():
+                records.worst |= read_pictures(listed, trained.label)
         except (KeyError, TypeError, AttributeError) as error:
-            raise ReportError(f"{path}: the {cell['key'].get('cell')} cell of {run.name} lacks {error}.") from error
-    lengths: dict[tuple, list[_Run]] = {}
-    for run in runs.values():
-        lengths.setdefault((run.scene, run.name, run.seed), []).append(run)
-    for group in (group for group in lengths.values() if len(group) > 1):
-        for run in group:  # of the same name: say what else tells them apart
-            steps = run.key.get("steps")
-            run.name += f", {steps:,} steps" if isinstance(steps, int) else ", own length"
-    seeds: dict[str, set[int | None]] = {}
-    for run in runs.values():
-        seeds.setdefault(run.series, set()).add(run.seed)
-    for run in runs.values():
-        _add_run(run, len(seeds[run.series]) > 1, path, records)
-
-
-def _add_run(run: _Run, several_seeds: bool, path: Path, records: Records) -> None:
-    seed = f", seed {run.seed}" if several_seeds and run.seed is not None else ""
-    trained = finite_numbers(run.train)
-    times = {f"train_{k}": trained[k] for k in ("seconds", "cpu_seconds", "peak_bytes") if k in trained}
-    for bundle, results in run.evaluations:
-        size = finite_numbers(run.exports.get(bundle, {})).get("bytes")
-        group = f"{run.name}, {bundle}" if bundle else run.name
-        results = {**results, **times, **({} if size is None else {"bundle_bytes": size})}
-        records.evaluations.append(
-            Evaluation(
-                run.scene, run.name, bool(bundle), group + seed, results, "", path, run.id, group, run.series, run.seed
-            )
-        )
-    curve = path.parent / str(run.train["curve"]) if run.train.get("curve") else None
+            raise ReportError(f"{trained.source}: the {kind} cell of {trained.method} lacks {error}.") from error
+    curve = folder / str(train["curve"]) if train.get("curve") else None
     if curve is not None and curve.is_file():
         _, curves, notes = read_jsonl(curve)
-        records.curves += [replace(c, scene=run.scene, label=run.name + seed, run=run.id) for c in curves]
+        records.curves += [replace(c, scene=trained.scene, label=trained.label, run=trained.run) for c in curves]
         records.notes += notes
-    listed = path.parent / run.pictures / PICTURES if run.pictures else None
-    if listed is not None and listed.is_file():
-        records.worst |= read_pictures(listed, run.name + seed)
 
 
 # files and folders

@@ -13,7 +13,7 @@ _BUNDLE_SUFFIX = re.compile(r"[-_]?(bundle|baked)$")
 _FORMAT = re.compile(r"(?<![a-z0-9])(fp16|uint8|bc7|compact)(?![a-z0-9])")
 
 
-class ReportError(Exception):
+class ReportError(ValueError):
     """A report cannot be made; the message names the input at fault and what to do."""
 
 

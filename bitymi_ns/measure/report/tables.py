@@ -1,7 +1,7 @@
 """Build the tables of a report; their HTML is in templates/report.html.j2."""
 
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar
 
 from bitymi_ns.capture.report import overview
@@ -36,10 +36,10 @@ class Table:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of numbers: its title, how a value is read and written, and which direction is better."""
+    """A column of numbers: its title, the key of `shown_results`, how a value is written, which direction is better."""
 
     title: str
-    value: Callable[[Evaluation], float | None]
+    key: str
     text: Callable[[float], str]
     better: Literal["up", "down"] | None = None
 
@@ -68,49 +68,42 @@ def count(value: float) -> str:
     return f"{value:,.0f}"
 
 
-def _key(name: str, scale: float = 1.0) -> Callable[[Evaluation], float | None]:
-    def value(row: Evaluation) -> float | None:
-        number = row.get(name)
-        return None if number is None else number * scale
-
-    return value
-
-
-def _trained(name: str, scale: float = 1.0) -> Callable[[Evaluation], float | None]:
-    return lambda row: None if row.baked else _key(name, scale)(row)
-
-
-def _fps(row: Evaluation) -> float | None:
-    milliseconds = row.get("render_ms")
-    return 1000.0 / milliseconds if milliseconds else None
-
-
-def _atlas_mb(row: Evaluation) -> float | None:
-    return row.results.get("atlas_bytes", 0.0) / 1e6 or None  # a trained row has no atlas, not one of 0 MB
+def megabytes(value: float) -> str:
+    """Bytes in units of 10^6."""
+    return significant(value / 1e6)
 
 
 COLUMNS = (
-    Column("PSNR", _key("psnr"), "{:.2f}".format, "up"),
-    Column("± seeds", _key("psnr_seeds"), "{:.2f}".format),
-    Column("ccPSNR", _key("cc_psnr"), "{:.2f}".format, "up"),
-    Column("SSIM", _key("ssim"), "{:.3f}".format, "up"),
-    Column("LPIPS", _key("lpips"), "{:.3f}".format, "down"),
-    Column("LPIPS (VGG)", _key("lpips_vgg"), "{:.3f}".format, "down"),
-    Column("FLIP", _key("flip"), "{:.3f}".format, "down"),
-    Column("Points", _key("surfels"), count, "down"),
-    Column("Fragments / px", _key("fragments_per_pixel"), significant, "down"),
-    Column("ms", _key("render_ms"), significant, "down"),
-    Column("FPS", _fps, significant, "up"),
-    Column("Atlas MB", _atlas_mb, significant, "down"),
-    Column("Bundle MB", _key("bundle_bytes", 1e-6), significant, "down"),
+    Column("PSNR", "psnr", "{:.2f}".format, "up"),
+    Column("± seeds", "psnr_seeds", "{:.2f}".format),
+    Column("ccPSNR", "cc_psnr", "{:.2f}".format, "up"),
+    Column("SSIM", "ssim", "{:.3f}".format, "up"),
+    Column("LPIPS", "lpips", "{:.3f}".format, "down"),
+    Column("LPIPS (VGG)", "lpips_vgg", "{:.3f}".format, "down"),
+    Column("FLIP", "flip", "{:.3f}".format, "down"),
+    Column("Points", "surfels", count, "down"),
+    Column("Fragments / px", "fragments_per_pixel", significant, "down"),
+    Column("ms", "render_ms", significant, "down"),
+    Column("FPS", "frames_per_second", significant, "up"),
+    Column("Atlas MB", "atlas_bytes", megabytes, "down"),
+    Column("Bundle MB", "bundle_bytes", megabytes, "down"),
 )
 TRAINING = (
-    Column("Training s", _trained("train_seconds"), count),
-    Column("Training CPU s", _trained("train_cpu_seconds"), count),
-    Column("Training peak MB", _trained("train_peak_bytes", 1e-6), count),
+    Column("Training s", "train_seconds", count),
+    Column("Training CPU s", "train_cpu_seconds", count),
+    Column("Training peak MB", "train_peak_bytes", lambda value: count(value / 1e6)),
 )
 """Of the training steps alone; the peak is that of ns-train as a whole."""
 
+CURVE_COLUMNS = (
+    Column("Steps", "step", count),
+    Column("Seconds", "seconds", significant),
+    Column("CPU seconds", "cpu_seconds", significant),
+    Column("Last PSNR", "psnr", "{:.2f}".format),
+    Column("Last ccPSNR", "cc_psnr", "{:.2f}".format),
+    Column("Points", "surfels", count),
+    Column("Fragments", "fragments", count),
+)
 STAGES = {False: "Trained scene", True: "Baked bundle"}
 
 NOTES = (
@@ -121,11 +114,15 @@ NOTES = (
 )
 
 
-def _numbers(evaluations: list[Evaluation], training: bool) -> list[Column]:
-    """The columns that at least one row fills."""
-    delta = Column("ΔPSNR", lambda row: psnr_delta(row, evaluations), signed)
-    wanted = (*COLUMNS, *(TRAINING if training else ()), delta)
-    return [c for c in wanted if any(c.value(row) is not None for row in evaluations)]
+def shown_results(row: Evaluation, evaluations: list[Evaluation]) -> dict[str, float]:
+    """The results of an evaluation, with those that follow from them."""
+    results = {k: v for k, v in row.results.items() if not (row.baked and k.startswith("train_"))}
+    if not results.get("atlas_bytes"):  # a trained row has no atlas, not one of 0 MB
+        results.pop("atlas_bytes", None)
+    if milliseconds := results.get("render_ms"):
+        results["frames_per_second"] = 1000.0 / milliseconds
+    delta = psnr_delta(row, evaluations)
+    return results if delta is None else {**results, "psnr_delta": delta}
 
 
 def _rows(evaluations: list[Evaluation], columns: list[Column]) -> list[Row]:
@@ -133,7 +130,7 @@ def _rows(evaluations: list[Evaluation], columns: list[Column]) -> list[Row]:
     texts = []
     best: list[set[int]] = [set() for _ in evaluations]
     for j, column in enumerate(columns, 1):
-        values = [column.value(row) for row in evaluations]
+        values = [row.get(column.key) for row in evaluations]
         written = [MISSING if v is None else column.text(v) for v in values]
         texts.append(written)
         known = [v for v in values if v is not None]
@@ -180,7 +177,7 @@ def mean_table(evaluations: list[Evaluation], columns: list[Column]) -> Table | 
         return None
 
     def mean(rows: list[Evaluation], column: Column) -> str:
-        values = [v for v in map(column.value, rows) if v is not None]
+        values = [row.results[column.key] for row in rows if column.key in row.results]
         return column.text(sum(values) / len(values)) if len(values) == len(rows) else MISSING
 
     kept = sorted(key for key, scenes in covers.items() if scenes == widest)
@@ -192,28 +189,22 @@ def training_table(curves: list[Curve]) -> Table | None:
     """One row per training run: how long, and where it ended."""
     if not curves:
         return None
-    columns: list[tuple[str, Callable[[Curve], float | None], Callable[[float], str]]] = [
-        ("Steps", lambda c: c.last("step"), count),
-        ("Seconds", lambda c: c.last("seconds"), significant),
-        ("CPU seconds", lambda c: c.last("cpu_seconds"), significant),
-        ("Last PSNR", lambda c: c.last("psnr"), "{:.2f}".format),
-        ("Last ccPSNR", lambda c: c.last("cc_psnr"), "{:.2f}".format),
-        ("Points", lambda c: c.last("surfels"), count),
-        ("Fragments", lambda c: c.last("fragments"), count),
-    ]
-    columns = [c for c in columns if any(c[1](curve) is not None for curve in curves)]
+    columns = [c for c in CURVE_COLUMNS if any(curve.last(c.key) is not None for curve in curves)]
     several = len({curve.scene for curve in curves}) > 1
     rows = []
     for curve in sorted(curves, key=lambda c: (c.scene, c.label)):
-        values = [(value(curve), text) for _, value, text in columns]
+        values = [curve.last(c.key) for c in columns]
         name = f"{curve.scene}: {curve.label}" if several and curve.scene else curve.label
-        rows.append(Row((name, *(MISSING if v is None else text(v) for v, text in values))))
-    return Table("Training", ("Run", *(c[0] for c in columns)), tuple(rows))
+        cells = (MISSING if v is None else c.text(v) for c, v in zip(columns, values, strict=True))
+        rows.append(Row((name, *cells)))
+    return Table("Training", ("Run", *(c.title for c in columns)), tuple(rows))
 
 
 def quality_tables(evaluations: list[Evaluation], training: bool = False) -> list[Table]:
     """One table per scene, and their means when there are several scenes; with the cost of training if `training`."""
-    columns = _numbers(evaluations, training)
+    evaluations = [replace(row, results=shown_results(row, evaluations)) for row in evaluations]
+    wanted = (*COLUMNS, *(TRAINING if training else ()), Column("ΔPSNR", "psnr_delta", signed))
+    columns = [c for c in wanted if any(c.key in row.results for row in evaluations)]
     scenes = sorted({row.scene for row in evaluations})
     tables = [scene_table(scene, [e for e in evaluations if e.scene == scene], columns) for scene in scenes]
     mean = mean_table(evaluations, columns)

@@ -69,7 +69,7 @@ CHANNELS = {
     "depth": slice(5, 6),
     "normal": slice(6, 9),
 }
-"""Channels of the image of `ops.composite_image`."""
+"""Channels of the image of `ops.blended_image`."""
 ROUNDING = {torch.float32: 2.0**-24, torch.float64: 2.0**-53}
 NOTHING = 1e-15
 """Images and gradients that are smaller than this everywhere are compared absolutely: beside the others of their scene
@@ -130,8 +130,8 @@ def measure(
     """
     rounded = _map(way.of(case), lambda t: t.to(dtype).double())
     with backend.use():
-        got = _by_kernels(rounded, backend.device, dtype, near, way=way)
-        want = _by_reference(rounded, near, way=way)
+        got = _by_kernels(rounded, backend.device, dtype, near, way)
+        want = _by_reference(rounded, near, way)
         same = got.same(want)
         weights = _loss_weights(want.images)
         grads = _gradients(got, weights, same)
@@ -144,7 +144,7 @@ def measure(
     generator = torch.Generator().manual_seed(0)
     for _ in range(PROBES):
         moved = _map(rounded, lambda t: t * (1 + ROUNDING[dtype] * _signs(t, generator)))
-        other = _by_reference(moved, near, way=way)
+        other = _by_reference(moved, near, way)
         agree = other.same(want)
         probe_forward.append(_image_error(other.images, want.images, agree))
         here, there = (_gradients(result, weights, agree & same) for result in (want, other))
@@ -170,14 +170,11 @@ def _signs(like: Tensor, generator: torch.Generator) -> Tensor:
     return torch.randint(0, 2, like.shape, generator=generator).double() * 2 - 1
 
 
-def _by_kernels(
-    case: SceneCase, device: str, dtype: torch.dtype, near: float, rim: float | None = None, way: Way = PLAIN
-) -> _Result:
-    rim = way.rim if rim is None else rim
+def _by_kernels(case: SceneCase, device: str, dtype: torch.dtype, near: float, way: Way) -> _Result:
     leaves = {key: value.to(device, dtype).clone().requires_grad_() for key, value in case.params.items()}
     camera = Camera(case.viewmat.to(device, dtype), case.K.to(device, dtype), case.width, case.height)
     projection = ops.project(*(leaves[key] for key in SURFEL_KEYS), camera, near, way.prefilter)
-    fragments = ops.trace(projection, rim)
+    fragments = ops.trace(projection, way.rim)
     base = ops.view_color("sv", leaves, leaves["means"], camera.exact_center, projection.visible)
     textured = {"texels": leaves[TEXELS], "tiles": tiles_of(leaves[TEXELS])} if way.texels else {}
     image = ops.blended_image(fragments, projection, base, **textured, maps=True)
@@ -193,14 +190,15 @@ def _by_kernels(
     return _Result({key: image[:, CHANNELS[key]] for key in IMAGES}, blended, low_pass, leaves, between)
 
 
-def _by_reference(case: SceneCase, near: float, rim: float | None = None, way: Way = PLAIN) -> _Result:
-    rim = way.rim if rim is None else rim
+def _by_reference(case: SceneCase, near: float, way: Way) -> _Result:
     leaves = {key: value.clone().requires_grad_() for key, value in case.params.items()}
     directions = reference_render.view_directions(leaves["means"], case.viewmat)
     colors = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions)
     geometry = [leaves[key] for key in SURFEL_KEYS]
     tiles = tile_images(leaves[TEXELS]) if way.texels else None
-    result = reference_render.render(geometry, colors, case, tiles=tiles, near=near, rim=rim, prefilter=way.prefilter)
+    result = reference_render.render(
+        geometry, colors, case, tiles=tiles, near=near, rim=way.rim, prefilter=way.prefilter
+    )
     images = {key: getattr(result, key).reshape(case.width * case.height, -1) for key in IMAGES}
     trace = result.trace
     return _Result(images, trace.blended, trace.low_pass, leaves, cells(trace.uv) if way.texels else None)
@@ -275,10 +273,10 @@ def against_extended(case: SceneCase, backend: Backend | None = None, near: floa
     """
     rounded = _map(case, lambda t: t.float().double())
     if backend is None:
-        got = _by_reference(rounded, near, rim=0.0)
+        got = _by_reference(rounded, near, replace(PLAIN, rim=0.0))
     else:
         with backend.use():
-            got = _by_kernels(rounded, backend.device, torch.float64, near, rim=1e-30)
+            got = _by_kernels(rounded, backend.device, torch.float64, near, replace(PLAIN, rim=1e-30))
     names = ("alpha", "depth", "normal", "beta_map")
     plain = {key: rounded.params[key].numpy() for key in SURFEL_KEYS}
 

@@ -113,16 +113,12 @@ class Row:
     @property
     def verdict(self) -> str:
         """One of the verdicts that the page explains."""
-        e = self.single
-        if not (e.finite and self.double.finite):
+        both = (self.single, self.double)
+        if not all(e.finite for e in both):
             return "**not finite**"
-        if e.drawn == 0:
+        if self.single.drawn == 0:
             return "nothing drawn"
-        pairs = [
-            pair
-            for each in (self.single, self.double)
-            for pair in ((each.forward, each.input_forward), (each.gradient, each.input_gradient))
-        ]
+        pairs = [pair for e in both for pair in ((e.forward, e.input_forward), (e.gradient, e.input_gradient))]
         if all(error <= ACCURATE for error, _ in pairs):
             return "accurate"
         if all(error <= max(ACCURATE, ALLOWANCE * allowed) for error, allowed in pairs):

@@ -3,8 +3,8 @@
 //   sums += transmittance * (sigma * color),   transmittance *= 1 - sigma.
 //
 // What a fragment's weight is, the blending unit does not tell. Where the weight decides (the bound of residual and
-// alpha, the end of a pixel), it is judged by the transmittance that was left before the batch: from above. The more batches, the
-// closer; what it costs in the picture is in docs/viewer.md.
+// alpha, the end of a pixel), it is judged by the transmittance that was left before the batch: from above. The more
+// batches, the closer; what it costs in the picture is in docs/viewer.md.
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> surfels: array<Surfel>;

@@ -50,7 +50,10 @@ fn present(@builtin(position) position: vec4f) -> @location(0) vec4f {
       let depth = s.r / max(covered, 1e-4);
       return vec4f(mix(screen.background.rgb, ramp(1.0 - depth / screen.most), covered), 1.0);
     }
-    case SHOW_NORMAL: { return vec4f(mix(screen.background.rgb, s.rgb / max(covered, 1e-4) * 0.5 + 0.5, covered), 1.0); }
+    case SHOW_NORMAL: {
+      let normal = s.rgb / max(covered, 1e-4);
+      return vec4f(mix(screen.background.rgb, normal * 0.5 + 0.5, covered), 1.0);
+    }
     case SHOW_OVERDRAW: { return vec4f(ramp(s.r / screen.most), 1.0); }
     default: { return vec4f(s.rgb + s.a * screen.background.rgb, 1.0); }
   }

@@ -3,7 +3,7 @@
 Needs the package `wgpu`, which is optional (`pip install 'bitymi-ns[webgpu]'`).
 """
 
-from .device import WebGpuUnavailable, adapters, require
-from .draw import draw
+from .device import WebGpuUnavailable
+from .on_device import draw
 
-__all__ = ["WebGpuUnavailable", "adapters", "draw", "require"]
+__all__ = ["WebGpuUnavailable", "draw"]

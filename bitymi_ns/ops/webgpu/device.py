@@ -31,32 +31,21 @@ def library() -> ModuleType:
         raise WebGpuUnavailable(f"drawing through WebGPU needs the package wgpu ({INSTALL}): {error}") from error
 
 
-def adapters() -> list[str]:
-    """List the adapters that can draw here, first the one that `device` takes; empty if there is none."""
-    return [f"{a.info['device']} ({a.info['backend_type']})" for a in _usable()]
-
-
-def _usable() -> list[Any]:
-    """Adapters, real cards first; those that draw with the processor only are last."""
-    rank = {"DiscreteGPU": 0, "IntegratedGPU": 1, "VirtualGPU": 2, "Unknown": 3, "CPU": 4}
-    found = [a for a in library().gpu.enumerate_adapters_sync() if a.info["backend_type"] != "OpenGL"]
-    return sorted(found, key=lambda a: rank.get(a.info["adapter_type"], 3))
-
-
 @functools.cache
 def device() -> Any:
-    """The device that draws, one per process, with as much of `OPTIONAL` as it has.
+    """The device that draws, one per process, with as much of `OPTIONAL` as it has: a real card before one in software.
 
     Raises:
-        WebGpuUnavailable: there is none.
+        WebGpuUnavailable: there is none; says what to do.
     """
-    found = _usable()
+    rank = {"DiscreteGPU": 0, "IntegratedGPU": 1, "VirtualGPU": 2, "Unknown": 3, "CPU": 4}
+    found = [a for a in library().gpu.enumerate_adapters_sync() if a.info["backend_type"] != "OpenGL"]
     if not found:
         raise WebGpuUnavailable(
             "no graphics device for WebGPU was found: it needs a driver for Vulkan, Metal or Direct3D 12 (on Debian "
             "and Ubuntu: apt install mesa-vulkan-drivers, which also draws without a card)"
         )
-    adapter = found[0]
+    adapter = min(found, key=lambda a: rank.get(a.info["adapter_type"], 3))
     try:
         return adapter.request_device_sync(
             required_features=[name for name in OPTIONAL if name in adapter.features],
@@ -93,18 +82,5 @@ def check_room(array_bytes: int, groups: int, size: tuple[int, int], layers: int
 
 
 def in_software() -> bool:
-    """Return True if the processor draws, which decodes a block of texels for each that it fetches.
-
-    Raises:
-        WebGpuUnavailable: nothing draws.
-    """
+    """True where the processor draws, which decodes a block of texels for each that it fetches."""
     return device().adapter.info["adapter_type"] == "CPU"
-
-
-def require() -> None:
-    """Sees that something can be drawn here.
-
-    Raises:
-        WebGpuUnavailable: it cannot; says what to do.
-    """
-    device()

@@ -1,17 +1,19 @@
-"""A scene in the memory of a graphics device, and drawing it there."""
+"""Drawing a baked scene through WebGPU, as the kernels draw it: the scene in the memory of a graphics device."""
 
 import functools
 import struct
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import Tensor
 
 from ..baked_cuda import decoded
-from ..baked_scene import BakedScene
+from ..baked_scene import BakedScene, check_images, common_size
 from ..project import Camera
 from .arrays import arrays
 from .device import check_room, device, in_software, library
@@ -20,7 +22,15 @@ from .programs import Programs
 SHOW = {"color": 0, "depth": 1, "normal": 2, "overdraw": 3}  # what is blended, by its number in scene.wgsl
 BLOCK, DIGITS, ROUNDS = 1024, 16, 8  # of sort.wgsl: keys per block, digits, rounds of 4 bits
 MOST_LAYERS = 64
-_RECTANGLE = slice(16, 22)  # columns of `Seen` in scene.wgsl
+LAYERS = 16  # batches in which surfels are drawn: docs/viewer.md has what fewer cost in the picture
+_FROM = {
+    "rgb": ("color", slice(0, 3)),
+    "alpha": ("color", slice(3, 4)),
+    "depth": ("depth", slice(0, 1)),
+    "beta": ("depth", slice(1, 2)),
+    "normal": ("normal", slice(0, 3)),
+    "overdraw": ("overdraw", slice(0, 1)),
+}
 _STRIDE = 256  # between the uniforms of batches and of rounds, which devices want so
 
 
@@ -251,20 +261,6 @@ class SceneOnDevice:
         Returns:
             [H, W, 4]: the sums, and what is left of the transmittance.
         """
-        target = self.begin(camera, show, layers, photo_pixel)
-        encoder = self._device.create_command_encoder()
-        sums, _ = target.sums
-        encoder.copy_texture_to_buffer(
-            {"texture": sums},
-            {"buffer": target.read, "bytes_per_row": target.row_bytes, "rows_per_image": camera.height},
-            (camera.width, camera.height, 1),
-        )
-        self._device.queue.submit([encoder.finish()])
-        return self._read(target)
-
-    def begin(self, camera: Camera, show: str, layers: int, photo_pixel: float = 1.0) -> _Target:
-        """Queues the drawing of a view, with the arguments of `draw`, and does not wait for it: what it draws stays on
-        the device."""
         target = self._target_of(camera.width, camera.height)
         if photo_pixel < 1.0 and self._coarser is None:
             self._make_coarser()
@@ -273,17 +269,14 @@ class SceneOnDevice:
         encoder = self._device.create_command_encoder()
         self._encode_sorting(encoder)
         self._encode_drawing(encoder, target, show, layers)
+        sums, _ = target.sums
+        encoder.copy_texture_to_buffer(
+            {"texture": sums},
+            {"buffer": target.read, "bytes_per_row": target.row_bytes, "rows_per_image": camera.height},
+            (camera.width, camera.height, 1),
+        )
         self._device.queue.submit([encoder.finish()])
-        return target
-
-    def rectangles(self) -> npt.NDArray[np.float32]:
-        """Read the rectangles of the latest view's surfels, front to back: [M, 6] axis (a unit vector on the screen),
-        middle, and half the size along the axis and across, in pixels."""
-        queue = self._device.queue
-        count = int(np.frombuffer(queue.read_buffer(self._visible), np.uint32)[0])
-        order = np.frombuffer(queue.read_buffer(self._order[0]), np.uint32)[:count]
-        seen = np.frombuffer(queue.read_buffer(self._seen), np.float32).reshape(-1, 24)
-        return seen[order, _RECTANGLE]
+        return self._read(target)
 
     def _encode_sorting(self, encoder: Any) -> None:
         p, work = self._programs, encoder.begin_compute_pass()
@@ -332,3 +325,44 @@ class SceneOnDevice:
             return used.view(dtype).reshape(height, width, 4).astype(np.float32)
         finally:
             target.read.unmap()
+
+
+def draw(
+    scene: BakedScene,
+    cameras: Sequence[Camera],
+    background: Tensor | None,
+    images: Sequence[str],
+    photo_pixel: float = 1.0,
+    layers: int = LAYERS,
+) -> dict[str, Tensor]:
+    """As `baked.draw`, one view after the other; the images lie on the CPU.
+
+    Raises:
+        WebGpuUnavailable: the package wgpu or a graphics device is missing.
+    """
+    check_images(images)
+    if "packed" in images:
+        raise ValueError("the image 'packed' is drawn on a CUDA device only: draw rgb and alpha")
+    common_size(cameras)
+    texels = (scene.tiles, scene.atlas, scene.blocks, scene.extent, scene.mean_residual, scene.mean_alpha)
+    sources = (*scene.surfels.values(), *texels)
+    scales = f"{scene.offset} {scene.scale} {scene.alpha_scale}"
+    numbers = f"webgpu {scene.near} {scene.weight_bound} {scales} {scene.prefilter}"
+    there = scene.cache.atlas(lambda: SceneOnDevice(scene), *sources, numbers)
+    drawn: dict[str, list[Tensor]] = {name: [] for name in images}
+    for camera in cameras:
+        sums = {
+            show: torch.from_numpy(there.draw(camera, show, layers, photo_pixel))
+            for show in {_FROM[name][0] for name in images}
+        }
+        for name, views in drawn.items():
+            show, channels = _FROM[name]
+            found = sums[show][..., channels]
+            if name == "alpha":
+                found = 1 - found
+            elif name == "overdraw":
+                found = found.round().int()
+            elif name == "rgb" and background is not None:
+                found = found + sums[show][..., 3:4] * background.detach().float().cpu()
+            views.append(found.contiguous())
+    return {name: torch.stack(views) for name, views in drawn.items()}

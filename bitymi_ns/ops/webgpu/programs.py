@@ -61,7 +61,8 @@ class Programs:
         wgpu = library()
         vertex, fragment = wgpu.ShaderStage.VERTEX, wgpu.ShaderStage.FRAGMENT
         make = self.device.create_bind_group_layout
-        filters = self.filters_floats
+        # which the binding of the target's format declares
+        filters = self.format != "rgba32float" or "float32-filterable" in self.device.features
         read = {"type": "read-only-storage"}
         atlas = {"sample_type": "float", "view_dimension": "2d-array"}
         return [
@@ -93,11 +94,6 @@ class Programs:
                 ]
             ),
         ]
-
-    @property
-    def filters_floats(self) -> bool:
-        """Return True if the target's format can be filtered, which its binding declares."""
-        return self.format != "rgba32float" or "float32-filterable" in self.device.features
 
     def _draw(self, color: dict[str, str]) -> Any:
         transmittance = {"operation": "add", "src_factor": "zero", "dst_factor": "one-minus-src-alpha"}

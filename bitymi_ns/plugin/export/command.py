@@ -13,10 +13,10 @@ import torch
 import tyro
 import yaml
 
-from bitymi_ns.bake import BakeOptions, Learning, TuneOptions, bake_and_learn, rich_progress
+from bitymi_ns.bake import BakeOptions, Learning, TuneOptions, bake_and_learn, export, rich_progress
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bake.learn import FEWEST_PASSES
-from bitymi_ns.bundle import Bundle, BundleError, export, read_bundle
+from bitymi_ns.bundle import Bundle, BundleError, read_bundle
 from bitymi_ns.bundle.manifest import MANIFEST, dump
 from bitymi_ns.bundle.parts import CONFIG
 from bitymi_ns.bundle.read import download_bytes

@@ -8,21 +8,23 @@ import os
 import shutil
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from nerfstudio.models.base_model import ModelConfig
 from torch import Tensor
 
 from bitymi_ns.bundle import REMEDY, BundleError, read_bundle
+from bitymi_ns.bundle.manifest import MANIFEST
 from bitymi_ns.bundle.read import download_bytes
 from bitymi_ns.ops import webgpu
 from bitymi_ns.plugin.console import fail
 from bitymi_ns.plugin.run.commands import folder_being_evaluated
 from bitymi_ns.plugin.run.device import kernel_device
-from bitymi_ns.plugin.run.surfel_model import SurfelModel
+from bitymi_ns.plugin.run.surfel_model import SurfelModel, SurfelModelConfig
 from bitymi_ns.scene.baked import FAST, BakedOutput
 from bitymi_ns.scene.baked_renderer import SceneRenderer
 from bitymi_ns.scene.camera import Camera
@@ -32,11 +34,10 @@ RENDERER = "BITYMI_RENDERER"
 
 
 @dataclass
-class BakedModelConfig(ModelConfig):
+class BakedModelConfig(SurfelModelConfig):
     """A scene baked into a bundle."""
 
     _target: type = field(default_factory=lambda: BakedModel)
-    enable_collider: bool = False
     bundle: Path = Path()
     """Folder of the bundle when it was written; a bundle that was moved is found beside its config.yml."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -61,13 +62,15 @@ class BakedModel(SurfelModel):
         except BundleError as error:
             fail(f"{error}. {REMEDY}", error)
         atlas = bundle.info.atlas
-        self._atlas_bytes = 0 if atlas is None else bundle.info.files[atlas.file].bytes
-        self._bundle_bytes = download_bytes(folder, bundle.info)
+        self._sizes = {
+            "surfels": float(len(bundle)),
+            "atlas_bytes": 0.0 if atlas is None else float(bundle.info.files[atlas.file].bytes),
+            "bundle_bytes": float(download_bytes(folder, bundle.info)),
+        }
         bundle.scene.through_webgpu = through_webgpu
         if renderer == "fast":
             bundle.scene.transmittance_min = FAST
         self._renderer = SceneRenderer(bundle.scene)
-        self._count = len(bundle)
 
     def _renderer_name(self) -> str:
         """The renderer of the options; stops where it is unknown, or WebGPU is not available."""
@@ -75,31 +78,23 @@ class BakedModel(SurfelModel):
         if asked not in ("kernels", "fast", "webgpu"):
             fail(f"{RENDERER} must be kernels, fast or webgpu, not {asked!r}")
         if asked == "webgpu":
-            try:
-                webgpu.require()
-            except webgpu.WebGpuUnavailable as error:
-                fail(f"{error}. Or draw with the kernels: leave {RENDERER} and the option renderer as they are.", error)
+            with _webgpu_needed():
+                webgpu.device.device()
         return asked
 
     def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
-        try:
+        with _webgpu_needed():
             drawn = self._renderer.render(camera.to(self.device), background.to(self.device), maps)
-        except webgpu.WebGpuUnavailable as error:
-            fail(f"{error}. Or draw with the kernels: leave {RENDERER} and the option renderer as they are.", error)
         if not self._renderer.scene.through_webgpu:
             return drawn
         return BakedOutput(**{name: None if t is None else t.to(self.device) for name, t in vars(drawn).items()})
-
-    def surfel_count(self) -> int:
-        return self._count
 
     @property
     def background(self) -> Tensor:
         return torch.tensor(self.config.background, device=self.device)
 
-    def size_metrics(self) -> dict[str, float]:
-        sizes = {"atlas_bytes": float(self._atlas_bytes), "bundle_bytes": float(self._bundle_bytes)}
-        return {**super().size_metrics(), **sizes}
+    def sizes(self) -> dict[str, float]:
+        return self._sizes
 
     def to(self, *args: Any, **kwargs: Any) -> BakedModel:
         super().to(*args, **kwargs)
@@ -113,29 +108,29 @@ class BakedModel(SurfelModel):
         return torch.nn.modules.module._IncompatibleKeys([], [])
 
 
-MANIFEST = "bundle.json"
+@contextmanager
+def _webgpu_needed() -> Iterator[None]:
+    try:
+        yield
+    except webgpu.WebGpuUnavailable as error:
+        fail(f"{error}. Or draw with the kernels: leave {RENDERER} and the option renderer as they are.", error)
 
 
 def find_bundle(recorded: Path) -> Path:
     """The folder of the bundle whose config.yml is being loaded."""
-    candidates = [*_loaded_from(), recorded]
+    evaluated = folder_being_evaluated()
+    candidates = [] if evaluated is None else [evaluated]
+    for i, argument in enumerate(sys.argv):
+        name, _, value = argument.partition("=")
+        if name in ("--load-config", "--load_config"):
+            value = value or (sys.argv[i + 1] if i + 1 < len(sys.argv) else "")
+            candidates.append(Path(value).absolute().parent)
+    candidates.append(recorded)
     for folder in candidates:
         if (folder / MANIFEST).is_file() or folder.is_file():
             return folder.absolute()
     tried = ", ".join(str(folder) for folder in dict.fromkeys(candidates))
     fail(f"no bundle found ({MANIFEST} is not in {tried}). Keep config.yml in the bundle's folder.")
-
-
-def _loaded_from() -> list[Path]:
-    """Folders that may hold the config.yml being loaded: of eval_setup, else of the command line."""
-    evaluated = folder_being_evaluated()
-    folders = [] if evaluated is None else [evaluated]
-    for i, argument in enumerate(sys.argv):
-        name, _, value = argument.partition("=")
-        if name in ("--load-config", "--load_config"):
-            value = value or (sys.argv[i + 1] if i + 1 < len(sys.argv) else "")
-            folders.append(Path(value).absolute().parent)
-    return folders
 
 
 def stub_checkpoint_dir(bundle: Path) -> Path:

@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -20,12 +19,9 @@ from bitymi_ns.plugin.data.dataset import capture_fingerprint, warn_of_other_cap
 from bitymi_ns.plugin.data.images import exposure_stops
 from bitymi_ns.plugin.run.memory import state_training
 from bitymi_ns.scene.field import TexelField
-from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train import limits
-from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.domain import views_without_surfels
-from bitymi_ns.train.evaluate import Quality, evenly_spaced, held_out_quality
-from bitymi_ns.train.init import scene_extent
+from bitymi_ns.train.evaluate import evaluate, evenly_spaced
+from bitymi_ns.train.init import scene_extent, views_without_surfels
 from bitymi_ns.train.step import Training
 from bitymi_ns.train.views import OnDemand, TrainingData, View, covered_share
 from bitymi_ns.trust import json_of, no_links
@@ -37,50 +33,40 @@ class TrainingRun:
     `before` -> the data manager's `next_train` -> `losses` -> backward -> `Training.combine` -> optimisers -> `after`.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        config: TrainConfig,
-        attributes: TrainingCallbackAttributes,
-        metadata: Mapping[str, Any],
-        background: Tensor,
-        resume_state: Mapping[str, Any],
-        curve_points: int,
-        curve_views: int,
-    ) -> None:
+    def __init__(self, model: Any, attributes: TrainingCallbackAttributes) -> None:
+        """
+        Args:
+            model: a `BitymiModel`.
+        """
         trainer, pipeline = attributes.trainer, attributes.pipeline
-        if trainer is None or pipeline is None or attributes.optimizers is None:
-            raise ValueError("a training run needs nerfstudio's trainer, pipeline and optimisers")
-        self.scene, self.config, self.background = scene, config, background
+        assert trainer is not None and pipeline is not None and attributes.optimizers is not None
+        self.scene, self.config, self._curve_views = model.scene, model.train_config, model.config.curve_views
+        scene, config, curve_points = self.scene, self.config, model.config.curve_points
         self.datamanager = pipeline.datamanager
         self.total: int = trainer.config.max_num_iterations
         self.first_step: int = trainer._start_step
         self._parameters = attributes.optimizers.parameters
-        self._curve_views = curve_views
         data = TrainingData(
             self.datamanager.train_views,
-            scene_extent(metadata["camera_centers"], scene.surfels["means"]),
-            metadata["train_pixels"],
-            metadata["first_surfels"],
+            scene_extent(model.metadata["camera_centers"], scene.surfels["means"]),
+            model.metadata["train_pixels"],
+            model.metadata["first_surfels"],
             covered_share(self.datamanager.train_views),
             exposure_stops(self.datamanager.train_dataset.files),
             self.datamanager.train_dataset.photographs,
         )
-        optimizers = attributes.optimizers.optimizers
-        try:
-            processes = trainer.processes
-            self.training = Training(scene, data, optimizers, config, self.total, self._on_resize, warn, processes)
-        except ValueError as error:
-            fail(f"a training option is out of range (--pipeline.model.train.*): {error}", error)
+        optimizers, processes = attributes.optimizers.optimizers, trainer.processes
+        self.training = Training(scene, data, optimizers, config, self.total, self._on_resize, warn, processes)
         attributes.optimizers.before_step = self.training.combine
         self.capture = capture_fingerprint(self.datamanager.train_dataset)
         self._random_state: Tensor | None = None
-        if resume_state:
+        if resume_state := model.resume_state:
             self.training.load_state_dict(resume_state)
             self._random_state = resume_state["random"]
             if "capture" in resume_state:  # checkpoints of earlier versions have none
                 warn_of_other_capture(resume_state["capture"], self.capture)
-        self.curve_steps = points(self.total, curve_points)
+        # after which the curve gets a point: evenly spaced, the last step included
+        self.curve_steps = {max(0, round(self.total * (i + 1) / curve_points) - 1) for i in range(curve_points)}
         resumed_from = trainer.config.load_dir or getattr(trainer.config.load_checkpoint, "parent", None)
         self.curve = TrainingCurve(
             trainer.base_dir / FILE, None if resumed_from is None else resumed_from.parent / FILE, self.first_step
@@ -183,7 +169,9 @@ class TrainingRun:
     # the curve
 
     def _add_point(self, step: int) -> None:
-        quality = self._held_out(all_views=step + 1 >= self.total)
+        views = self.datamanager.eval_views
+        rows = evenly_spaced(len(views), 0 if step + 1 >= self.total else self._curve_views)
+        quality = evaluate(self.scene, OnDemand(len(rows), lambda i: views[rows[i]]), self.config)
         point = {
             "step": step + 1,
             "seconds": round(self.training.clock.seconds, 4),
@@ -191,7 +179,7 @@ class TrainingRun:
             "surfels": len(self.scene),
         }
         shown = ""
-        if quality is not None:
+        if not math.isnan(quality.psnr):
             point |= {name: round(value, 4) for name, value in quality._asdict().items()}
             shown = f"{quality.psnr:6.2f} dB held out, "
             writer.put_scalar("Held-out PSNR", torch.tensor(quality.psnr), step)
@@ -200,18 +188,6 @@ class TrainingRun:
             f"step {step + 1:6,d} of {self.total:,}: {shown}{point['surfels']:,} surfels, "
             f"{self.training.clock.seconds:.0f} s of training"
         )
-
-    def _held_out(self, all_views: bool) -> Quality | None:
-        """Means over held-out views at full size; None where no pixel counts."""
-        views = self.datamanager.eval_views
-        rows = evenly_spaced(len(views), 0 if all_views else self._curve_views)
-        quality = held_out_quality(
-            lambda camera: self.scene.render(camera, background=self.background, field_mode="frozen"),
-            OnDemand(len(rows), lambda i: views[rows[i]]),
-            self.background,
-            self.background.device,
-        )
-        return None if math.isnan(quality.psnr) else quality
 
 
 FILE = "training_curve.jsonl"
@@ -248,10 +224,3 @@ def _points_until(path: Path, steps: int) -> list[str]:
         except (ValueError, KeyError, TypeError):
             continue  # cut off when the run was killed
     return kept
-
-
-def points(total: int, count: int) -> frozenset[int]:
-    """The steps after which the curve gets a point: `count` of them, evenly spaced, the last step included."""
-    if count <= 0:
-        return frozenset()
-    return frozenset(max(0, round(total * (i + 1) / count) - 1) for i in range(count))

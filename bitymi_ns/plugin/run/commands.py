@@ -90,9 +90,8 @@ def adopt_viewer(config: Any) -> None:
     """
     for name in VIEWER_SCRIPTS:
         script = sys.modules.get(name)
-        start = getattr(script, "_start_viewer", None)
-        if start is not None:
-            script._start_viewer = _ours_for(config, start)  # type: ignore[union-attr]
+        if hasattr(script, "_start_viewer"):
+            script._start_viewer = _ours_for(config, script._start_viewer)  # type: ignore[union-attr]
 
 
 def _ours_for(config: Any, start: Any) -> Any:
@@ -105,7 +104,8 @@ def _ours_for(config: Any, start: Any) -> Any:
                 dataset = getattr(getattr(pipeline, "datamanager", None), name, None)
                 if dataset is not None:
                     dataset.gray_images = True
-        if shown.viewer.websocket_host == ViewerConfig().websocket_host and not _host_given():
+        given = any(argument.partition("=")[0].replace("_", "-") == HOST_OPTION for argument in sys.argv)
+        if shown.viewer.websocket_host == ViewerConfig().websocket_host and not given:
             shown.viewer.websocket_host = LOOPBACK
         CONSOLE.print("Ctrl-C ends the viewer.")
         try:
@@ -114,7 +114,3 @@ def _ours_for(config: Any, start: Any) -> Any:
             CONSOLE.print("\nThe viewer has ended.")
 
     return start_viewer
-
-
-def _host_given() -> bool:
-    return any(argument.partition("=")[0].replace("_", "-") == HOST_OPTION for argument in sys.argv)

@@ -23,11 +23,12 @@ from bitymi_ns.plugin.data.sfm_poses import has_kept_poses, kept_settings
 from bitymi_ns.plugin.run import checkpoints, run_folder
 from bitymi_ns.plugin.run.bundle_model import BakedModelConfig, find_bundle, stub_checkpoint_dir
 from bitymi_ns.plugin.run.commands import LOOPBACK, adopt_viewer, folder_being_evaluated, moved_capture, refuse_others
-from bitymi_ns.plugin.run.device import default_device_type, has_cuda_kernels, why_not_cuda
+from bitymi_ns.plugin.run.device import has_cuda_kernels, why_not_cuda
 from bitymi_ns.plugin.run.model import PARAMETER_GROUPS, BitymiModelConfig
-from bitymi_ns.plugin.run.preset import Preset, load_preset
+from bitymi_ns.plugin.run.preset import load_preset
 from bitymi_ns.plugin.run.render import adopt_render
 from bitymi_ns.plugin.run.trainer import BitymiPipelineConfig, BitymiTrainer
+from bitymi_ns.ranges import check_ranges
 from bitymi_ns.train.config import AdamConfig
 
 SEEDS = 1 << 32  # end of the range of seeds that numpy takes
@@ -75,7 +76,7 @@ class BitymiTrainerConfig(TrainerConfig):
         if self.machine.device_type != "cpu" and (why := why_not_cuda()):
             warn(f"Training on the CPU instead of {self.machine.device_type}: {why}.")
             self.machine.device_type = "cpu"
-        self._check_machine()
+        self._check_options()
         self._make_paths_absolute()
         self._take_poses_of_resumed()
         if self.load_dir is None and self.load_checkpoint is None:
@@ -85,8 +86,13 @@ class BitymiTrainerConfig(TrainerConfig):
         """The trainer of a process; that of the first starts the others."""
         return super().setup(**{**kwargs, "world_size": self.processes})
 
-    def _check_machine(self) -> None:
+    def _check_options(self) -> None:
         machine = self.machine
+        for options in (self.pipeline.model.scene, self.pipeline.model.train):
+            try:
+                check_ranges(options)
+            except ValueError as error:
+                fail(f"an option is out of range (--pipeline.model.*): {error}", error)
         for name in ("mixed_precision", "use_grad_scaler"):
             if getattr(self, name):
                 fail(
@@ -108,7 +114,7 @@ class BitymiTrainerConfig(TrainerConfig):
     def save_config(self) -> None:
         """Write config.yml and say in a few lines what is going to happen. This is the first that a run writes, so a
         folder that cannot be used shows here. What can be checked before anything is written is checked now."""
-        check_capture(self.pipeline.datamanager)
+        check_capture(self.pipeline.datamanager, read=True)
         folder = self.get_base_dir()
         if self.load_dir is None and self.load_checkpoint is None:
             run_folder.check_unused(folder, self.get_checkpoint_dir())
@@ -212,7 +218,11 @@ class BitymiTrainerConfig(TrainerConfig):
         if evaluated is not None:
             if (evaluated / self.relative_model_dir).is_dir():
                 folder, self.read_from = evaluated / self.relative_model_dir, evaluated
-            self._choose_checkpoint(folder)
+            # in a resumed run the recorded step is that of the run it went on from
+            if self.load_step is None or not checkpoints.path_of(folder, self.load_step).is_file():
+                self.load_step = checkpoints.newest_step(folder)
+            # stop now if it cannot be used: nerfstudio's tools would report that with a traceback
+            checkpoints.load(checkpoints.path_of(folder, self.load_step), model.scene)
             self._take_poses_of(evaluated)
         return folder
 
@@ -229,14 +239,6 @@ class BitymiTrainerConfig(TrainerConfig):
             datamanager.dataparser = BundleCamerasConfig(data=bundle, capture=Path(data))
             datamanager.data = bundle
 
-    def _choose_checkpoint(self, folder: Path) -> None:
-        """Fix the checkpoint that nerfstudio's tools will load, and stop now if it cannot be used: they would report
-        that with a traceback."""
-        # in a resumed run the recorded step is that of the run it went on from
-        if self.load_step is None or not checkpoints.path_of(folder, self.load_step).is_file():
-            self.load_step = checkpoints.newest_step(folder)
-        checkpoints.load(checkpoints.path_of(folder, self.load_step), self.pipeline.model.scene)
-
 
 @dataclass
 class BitymiAdamConfig(OptimizerConfig):
@@ -248,21 +250,17 @@ class BitymiAdamConfig(OptimizerConfig):
     """Update all entries of a tensor in one pass."""
 
 
-def optimizers() -> dict[str, Any]:
-    """nerfstudio's optimiser dictionary: one Adam per parameter group, no scheduler (the model sets the rates)."""
+def method_config(name: str) -> MethodSpecification:
+    """The registry entry of the preset `name`."""
+    preset = load_preset(name)
 
     def adam(group: str) -> BitymiAdamConfig:
         betas = AdamConfig.field_betas if group.startswith("field") else AdamConfig.betas
         return BitymiAdamConfig(lr=1e-3, eps=AdamConfig.eps, betas=betas)
 
-    return {group: {"optimizer": adam(group), "scheduler": None} for group in PARAMETER_GROUPS}
-
-
-def trainer_config(preset: Preset) -> BitymiTrainerConfig:
-    """The configuration of a training run by a preset."""
-    return BitymiTrainerConfig(
+    config = BitymiTrainerConfig(
         method_name=preset.name,
-        machine=MachineConfig(device_type=default_device_type()),  # type: ignore[arg-type]
+        machine=MachineConfig(device_type="cuda" if has_cuda_kernels() else "cpu"),
         steps_per_eval_batch=0,
         steps_per_eval_image=0,
         steps_per_eval_all_images=0,  # the training curve has what these would measure, without its time
@@ -275,14 +273,10 @@ def trainer_config(preset: Preset) -> BitymiTrainerConfig:
             ),
             model=BitymiModelConfig(scene=preset.scene, train=preset.train),
         ),
-        optimizers=optimizers(),
+        # one optimiser per parameter group, no scheduler: the model sets the rates
+        optimizers={group: {"optimizer": adam(group), "scheduler": None} for group in PARAMETER_GROUPS},
         # instead of the table there is a progress bar; profiles of nerfstudio's functions say nothing about ours
         logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False), profiler="none"),
         viewer=ViewerConfig(websocket_host=LOOPBACK, quit_on_train_completion=True),
     )
-
-
-def method_config(name: str) -> MethodSpecification:
-    """The registry entry of the preset `name`."""
-    preset = load_preset(name)
-    return MethodSpecification(config=trainer_config(preset), description=preset.description)
+    return MethodSpecification(config=config, description=preset.description)

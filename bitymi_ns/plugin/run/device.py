@@ -7,7 +7,7 @@ from types import ModuleType
 
 import torch
 
-from bitymi_ns.plugin.console import warn
+from bitymi_ns.plugin.console import warn_once
 
 
 def has_cuda_kernels() -> bool:
@@ -43,11 +43,6 @@ def _device_problem(kernels: ModuleType, index: int) -> str | None:
     return kernels.device_problem(index) or None
 
 
-def default_device_type() -> str:
-    """nerfstudio's name of the device that is used when none is asked for."""
-    return "cuda" if has_cuda_kernels() else "cpu"
-
-
 def kernel_device(device: torch.device | str) -> torch.device:
     """`device`, or the CPU where the kernels cannot run on it (nerfstudio's tools pick a GPU whenever they see one)."""
     device = torch.device(device)
@@ -57,10 +52,5 @@ def kernel_device(device: torch.device | str) -> torch.device:
         )
         if problem is None:
             return device
-        _say_once(f"The scene stays on the CPU: {problem}.")
+        warn_once(f"The scene stays on the CPU: {problem}.")
     return torch.device("cpu")
-
-
-@cache
-def _say_once(message: str) -> None:
-    warn(message)

@@ -45,7 +45,11 @@ class Workers:
         self._cards = config.machine.device_type == "cuda"
         self._scratch = tempfile.TemporaryDirectory()
         self._store = dist.TCPStore(HOST, 0, count, is_master=True, wait_for_workers=False, timeout=TIMEOUT)
-        self._inputs = [(self._of(config, rank), rank, count, self._store.port) for rank in range(1, count)]
+        self._inputs = []
+        for rank in range(1, count):  # the others write nothing that stays, show nothing and evaluate nothing
+            own = copy.deepcopy(config)
+            own.output_dir, own.vis, own.pipeline.model.curve_points = Path(self._scratch.name) / str(rank), "none", 0
+            self._inputs.append((own, rank, count, self._store.port))
         self._processes: list[subprocess.Popen[bytes]] = []
         atexit.register(self.end)
 
@@ -63,18 +67,12 @@ class Workers:
             assert process.stdin is not None
             with suppress(BrokenPipeError), process.stdin:  # one that has ended already is noticed below
                 process.stdin.write(pickle.dumps(inputs))
-        keys = [_here(rank) for rank in range(1, count)]
+        keys = [f"here {rank}" for rank in range(1, count)]
         while not self._store.check(keys):
             if any(process.poll() is not None for process in self._processes):
                 self.explain()
             time.sleep(0.05)
         _join(self._store, 0, count, self._cards)
-
-    def _of(self, config: TrainerConfig, rank: int) -> TrainerConfig:
-        """The configuration of another process: it writes nothing that stays, shows nothing and evaluates nothing."""
-        own = copy.deepcopy(config)
-        own.output_dir, own.vis, own.pipeline.model.curve_points = Path(self._scratch.name) / str(rank), "none", 0
-        return own
 
     def explain(self) -> NoReturn:
         """End the run with what the process said that was lost.
@@ -85,9 +83,9 @@ class Workers:
         until, count = time.monotonic() + PATIENCE, len(self._processes) + 1
         while True:
             for rank, process in enumerate(self._processes, 1):
-                told = self._store.check([_why(rank)])
+                told = self._store.check([f"why {rank}"])
                 if told or process.poll() not in (None, LOST):
-                    why = self._store.get(_why(rank)).decode() if told else f"exit status {process.returncode}"
+                    why = self._store.get(f"why {rank}").decode() if told else f"exit status {process.returncode}"
                     fail(f"process {rank + 1} of the {count} of this run has ended: {why}")
             if time.monotonic() > until:
                 minutes = round(TIMEOUT.total_seconds() / 60)
@@ -114,14 +112,6 @@ class Workers:
             dist.destroy_process_group()
 
 
-def _here(rank: int) -> str:
-    return f"here {rank}"
-
-
-def _why(rank: int) -> str:
-    return f"why {rank}"
-
-
 def _join(store: dist.Store, rank: int, count: int, cards: bool) -> None:
     """Enter torch.distributed's default group: gloo for what decides, and nccl for what lies on cards."""
     backend = "gloo"
@@ -143,7 +133,7 @@ def work() -> None:
     CONSOLE.quiet = True
     store = dist.TCPStore(HOST, port, count, is_master=False, timeout=TIMEOUT)
     try:
-        store.set(_here(rank), "1")
+        store.set(f"here {rank}", "1")
         _join(store, rank, count, config.machine.device_type == "cuda")
         train_loop(rank, count, config)  # with the seed of the first process
         dist.destroy_process_group()
@@ -154,5 +144,5 @@ def work() -> None:
     except BaseException as error:
         message = str(error) if isinstance(error, SystemExit) else traceback.format_exc()
         with suppress(RuntimeError):  # the first process has ended
-            store.set(_why(rank), message)
+            store.set(f"why {rank}", message)
         sys.exit(1)

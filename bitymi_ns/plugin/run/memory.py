@@ -29,8 +29,8 @@ MARGIN = 1.1  # factor by which another view may have more fragments than the co
 PROGRAM = 800e6  # bytes of Python, the libraries, and a capture's cameras and points
 PER_FRAGMENT = 36
 """Bytes: the list, the gradients of weights and coordinates, and the order in which the backward pass takes it."""
-PER_SHADED_FRAGMENT = 32
-"""Bytes more where a field in space shades: whose fragments are and where, colours, and their gradients."""
+PER_SHADED_FRAGMENT = 60
+"""Bytes more where a field in space shades: surfels and pixels of fragments, points, residuals and their gradients."""
 PER_CARD_FRAGMENT = 4 * NUMBERS  # bytes of a fragment on a card, where textures of both kinds take as much
 PER_PIXEL = 400  # bytes: pictures, gradients and maps of a view, and the ten views of the multi-view scores
 PER_SURFEL = 3000
@@ -132,11 +132,6 @@ def state_export(
     _state("The export", needed, cameras, "export with --finetune-memory 0, which takes longer", device)
 
 
-def available_memory() -> float:
-    """Bytes that this process may have, with what it has already: of the machine, within its control group's limit."""
-    return min(psutil.virtual_memory().available + psutil.Process().memory_info().rss, memory_limit())
-
-
 def _per_fragment(scene: Scene) -> float:
     if scene.surfels["means"].device.type == "cuda":
         return PER_CARD_FRAGMENT
@@ -157,7 +152,9 @@ def _state(what: str, needed: float, cameras: Sequence[Camera], advice: str, dev
     card = device.type == "cuda"
     memory, where = ("memory of the card", "the card") if card else ("memory", "this machine")
     say(f"{what} will take about {needed / 1e9:.1f} GB of {memory} for {photographs}.")
-    available = free_memory(device) if card else available_memory()
+    # with what the process has already, within the limit of its control group
+    of_machine = min(psutil.virtual_memory().available + psutil.Process().memory_info().rss, memory_limit())
+    available = free_memory(device) if card else of_machine
     if needed > available:
         warn(
             f"That is more than the {available / 1e9:.1f} GB that {where} has available. Close other programs, or "

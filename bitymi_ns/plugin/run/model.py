@@ -26,13 +26,11 @@ from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train import limits
 from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.domain import build_scene
-from bitymi_ns.train.init import first_surfels_for
+from bitymi_ns.train.init import build_scene, first_surfels_for
 from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.views import View, eval_background
 
-SURFEL_PARAMETERS = (*GEOMETRY, *VIEW_PARAMETERS)
-PARAMETER_GROUPS = (*SURFEL_PARAMETERS, "field_table", "field_mlp")
+PARAMETER_GROUPS = (*GEOMETRY, *VIEW_PARAMETERS, "field_table", "field_mlp")
 """Groups that an optimiser is configured for; a scene has those that its view colour and texture call for."""
 
 
@@ -105,8 +103,8 @@ class BitymiModel(SurfelModel):
         with torch.no_grad():
             return self.scene.render(camera, background=background, field_mode="frozen", maps=maps)
 
-    def surfel_count(self) -> int:
-        return len(self.scene)
+    def sizes(self) -> dict[str, float]:
+        return {"surfels": float(len(self.scene))}
 
     def get_outputs(self, ray_bundle: Any) -> dict[str, Any]:
         """Loss terms of a training view, or pictures of cameras."""
@@ -121,25 +119,15 @@ class BitymiModel(SurfelModel):
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         groups = {name: [parameter] for name, parameter in self.scene.surfels.items()}
         if isinstance(self.scene.field, HashField):
-            named = dict(self.scene.field.named_parameters())
-            groups["field_table"] = [p for n, p in named.items() if n.endswith("table")]
-            groups["field_mlp"] = [p for n, p in named.items() if not n.endswith("table")]
+            table, *mlp = self.scene.field.weights
+            groups |= {"field_table": [table], "field_mlp": mlp}
         return groups
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
         self.measure_time = False
-        self._run = TrainingRun(
-            self.scene,
-            self.train_config,
-            training_callback_attributes,
-            self.metadata,
-            self.background,
-            self.resume_state,
-            self.config.curve_points,
-            self.config.curve_views,
-        )
+        self._run = TrainingRun(self, training_callback_attributes)
         return self._run.callbacks()
 
     def get_loss_dict(
@@ -212,23 +200,16 @@ def new_scene(
     declared = _corners(scene_box) if metadata.get("declares_box") else None
     box = None
     if not bool(torch.isfinite(xyz).all(1).any()):
-        box = _box_for_random_points(scene_box, len(xyz))
-    try:
-        with reporting_time("Making surfels of", len(xyz)):
-            scene, report = build_scene(
-                xyz,
-                rgb,
-                centers,
-                config,
-                train,
-                bounded=metadata.get("has_alpha", False),
-                image_pixels=pixels,
-                box=box,
-                declared=declared,
-                background=find_background() if find_background and train.background_points else None,
+        if len(xyz):
+            fail(
+                f"all {len(xyz)} points of the capture's point cloud are NaN or infinite. Make the cloud again, or "
+                "remove ply_file_path from transforms.json to start from random points."
             )
-    except ValueError as error:
-        fail(str(error), error)
+        box = None if scene_box is None else _corners(scene_box)
+    with reporting_time("Making surfels of", len(xyz)):
+        background = find_background() if find_background and train.background_points else None
+        bounded = metadata.get("has_alpha", False)
+        scene, report = build_scene(xyz, rgb, centers, config, train, bounded, pixels, box, declared, background)
     for sentence in limits.start(report, train, pixels, config):
         say(sentence)
     if report.random:
@@ -258,16 +239,6 @@ def _points(points: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:
     if rgb.shape[:1] != xyz.shape[:1]:
         return xyz, torch.full_like(xyz, 0.5)  # a cloud without colours
     return xyz, rgb.detach().float().reshape(-1, 3) / (255.0 if rgb.dtype == torch.uint8 else 1.0)
-
-
-def _box_for_random_points(scene_box: SceneBox | None, given: int) -> Tensor | None:
-    """[2, 3] corners."""
-    if given:
-        fail(
-            f"all {given} points of the capture's point cloud are NaN or infinite. Make the cloud again, or remove "
-            "ply_file_path from transforms.json to start from random points."
-        )
-    return None if scene_box is None else _corners(scene_box)
 
 
 def _corners(scene_box: SceneBox) -> Tensor:

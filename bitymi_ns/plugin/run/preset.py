@@ -43,20 +43,19 @@ class Preset:
     train: TrainConfig = field(default_factory=TrainConfig)
 
 
-def load_preset(name: str, folder: Path | None = None, changes: Mapping[str, Any] | None = None) -> Preset:
+def load_preset(name: str, folder: Path | None = None) -> Preset:
     """Read the preset `name` from `folder` (default: the installed presets).
 
     Args:
         name: of the file.
         folder: of the files.
-        changes: laid over the file, as it is over its base.
 
     Raises:
         PresetError: the file is missing or is not a valid preset.
     """
     folder = preset_dir() if folder is None else folder
     path = folder / f"{name}.yaml"
-    values = _merged(_read_with_base(path, folder, ()), changes or {})
+    values = _read_with_base(path, folder, ())
     try:
         # as JSON: lists become tuples, while true is no number and 3 no text
         return TypeAdapter(Preset).validate_json(json.dumps({**values, "name": name}, default=str), strict=True)

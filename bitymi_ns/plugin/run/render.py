@@ -55,8 +55,6 @@ def adopt_render() -> None:
         script["media"], script["gzip"] = SimpleNamespace(write_image=write_image), SimpleNamespace(open=open_gzip)
     if kind not in TRAJECTORIES:
         return
-    trajectory = script["_render_trajectory_video"]
-    stock = getattr(trajectory, "stock", {name: script[name] for name in _REPLACED})
 
     def render_trajectory(pipeline: Any, cameras: Cameras, seconds: float, **options: Any) -> None:
         script.update(stock)  # for another method in the same process
@@ -68,27 +66,19 @@ def adopt_render() -> None:
         rate = len(cameras) / seconds if kind == "RenderCameraPath" else float(command.frame_rate)
         write_trajectory(pipeline.model, cameras, command, rate)
 
-    render_trajectory.stock = stock  # type: ignore[attr-defined]
-    script.update(
+    ours = dict(
         install_checks=SimpleNamespace(check_ffmpeg_installed=lambda: None),
         get_crop_from_json=lambda path: None,  # crops are not supported
         get_path_from_json=lambda found: _with_principal_points(stock["get_path_from_json"](found), found),
         get_interpolated_camera_path=lambda **options: _interpolated(stock["get_interpolated_camera_path"], **options),
         get_spiral_path=lambda camera, **options: camera,
-        VanillaDataManager=(stock["VanillaDataManager"], BitymiDataManager),  # those that a spiral is allowed for
         _render_trajectory_video=render_trajectory,
     )
-
-
-_REPLACED = (
-    "install_checks",
-    "get_crop_from_json",
-    "get_path_from_json",
-    "get_interpolated_camera_path",
-    "get_spiral_path",
-    "VanillaDataManager",
-    "_render_trajectory_video",
-)
+    names = (*ours, "VanillaDataManager")
+    stock = getattr(script["_render_trajectory_video"], "stock", {name: script[name] for name in names})
+    ours["VanillaDataManager"] = (stock["VanillaDataManager"], BitymiDataManager)  # those that a spiral is allowed for
+    render_trajectory.stock = stock  # type: ignore[attr-defined]
+    script.update(ours)
 
 
 def _spiral_frames(command: Any) -> int:
@@ -176,7 +166,8 @@ def _interpolated(stock: Any, cameras: Cameras, **options: Any) -> Cameras:
     points = Cameras(cameras.camera_to_worlds, fx=cameras.cx, fy=cameras.cy, cx=cameras.cx, cy=cameras.cy)
     along = stock(cameras=points, **options)  # the same way, with principal points for focal lengths
     path.cx, path.cy = along.fx, along.fy
-    _resize(path, cameras)
+    for name in ("width", "height"):
+        setattr(path, name, torch.full_like(getattr(path, name), int(getattr(cameras, name)[0])))
     return path
 
 
@@ -186,11 +177,6 @@ def _with_principal_points(path: Cameras, found: dict[str, Any]) -> Cameras:
     points = torch.tensor([frame.get("principal_point", (0.5, 0.5)) for frame in found["camera_path"]]).float()
     path.cx, path.cy = found["render_width"] * points[:, :1], found["render_height"] * points[:, 1:]
     return path
-
-
-def _resize(path: Cameras, cameras: Cameras) -> None:
-    for name in ("width", "height"):
-        setattr(path, name, torch.full_like(getattr(path, name), int(getattr(cameras, name)[0])))
 
 
 @torch.no_grad()

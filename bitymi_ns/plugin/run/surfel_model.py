@@ -15,7 +15,7 @@ from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor
 from torch.nn import Parameter
 
-from bitymi_ns.plugin.console import InputError, warn
+from bitymi_ns.plugin.console import InputError, warn_once
 from bitymi_ns.plugin.data.cameras import normal_image, ray_distance, to_camera
 from bitymi_ns.plugin.run.device import kernel_device
 from bitymi_ns.plugin.run.metrics import image_metrics, render_milliseconds
@@ -48,17 +48,13 @@ class SurfelModel(Model):
         """A RenderOutput: rgb, alpha, beta, overdraw, and with maps also depth and normal."""
 
     @abstractmethod
-    def surfel_count(self) -> int:
-        """Number of primitives."""
+    def sizes(self) -> dict[str, float]:
+        """Number of `surfels`, and other sizes that are reported with the image metrics."""
 
     @property
     @abstractmethod
     def background(self) -> Tensor:
         """[3] colour behind the scene in evaluation."""
-
-    def size_metrics(self) -> dict[str, float]:
-        """Sizes that are reported with the image metrics."""
-        return {"surfels": float(self.surfel_count())}
 
     def to(self, *args: Any, **kwargs: Any) -> SurfelModel:
         """Move the model, except to a device that this installation has no kernels for: there it stays on the CPU.
@@ -103,22 +99,16 @@ class SurfelModel(Model):
         would end the thread, and the viewer would show nothing any more.
         """
         if obb_box is not None:
-            self._say_once("Crop boxes are not supported: the whole scene is rendered.")
+            warn_once("Crop boxes are not supported: the whole scene is rendered.")
         try:
             self._last_camera = to_camera(camera, self.device)
             outputs = self.get_outputs(camera)
         except InputError as error:
             if threading.current_thread() is threading.main_thread():
                 raise
-            self._say_once(str(error))
+            warn_once(str(error))
             return self._empty(int(camera.height.flatten()[0]), int(camera.width.flatten()[0]))
         return {name: value for name, value in outputs.items() if isinstance(value, Tensor)}
-
-    def _say_once(self, message: str) -> None:
-        warned: set[str] = self.__dict__.setdefault("_warned", set())
-        if message not in warned:
-            warned.add(message)
-            warn(message)
 
     def _empty(self, height: int, width: int) -> dict[str, Tensor]:
         """The outputs of `get_outputs` where nothing is seen."""
@@ -143,7 +133,7 @@ class SurfelModel(Model):
         target, mask = self.photograph(batch, rgb)
         metrics = image_metrics(rgb, target, mask)
         metrics["fragments_per_pixel"] = float(outputs["overdraw"].mean()) * OVERDRAW_SCALE
-        metrics.update(self.size_metrics())
+        metrics.update(self.sizes())
         camera = getattr(self, "_last_camera", None)
         if self.measure_time and camera is not None and (camera.width, camera.height) == (width, height):
             metrics["render_ms"] = render_milliseconds(
@@ -158,7 +148,7 @@ class SurfelModel(Model):
         return torch.cat([torch.where(alpha > 0, rgb, 0.0).clamp(0.0, 1.0), alpha], dim=-1)
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
-        return {"surfels": torch.tensor(float(self.surfel_count()))}
+        return {"surfels": torch.tensor(self.sizes()["surfels"])}
 
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: Any = None

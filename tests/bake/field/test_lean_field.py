@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from bitymi_ns.bake import BakeOptions, bake
+from bitymi_ns.bake import BakeOptions, bake, export
 from bitymi_ns.bake.field.lean_field import lean_field, level_changes
 from bitymi_ns.bake.verify import check_field
-from bitymi_ns.bundle import check_files, export
+from bitymi_ns.bundle import check_files
 from tests.bake.test_real_scene import real_scene
 
 

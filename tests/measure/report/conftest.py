@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bitymi_ns.measure.report import build
+from bitymi_ns.measure.report.page import build
 
 # scene, method: PSNR, SSIM, FLIP, surfels, milliseconds of the trained renderer
 RUNS = {

@@ -59,7 +59,7 @@ def test_a_frame_with_a_camera_of_its_own(capture: Path, capsys: pytest.CaptureF
     manager = load(capture)
     train = manager.train_dataset
     index = train.image_filenames.index(path)
-    assert train.metadata["lenses"][index].size == (96, 72) and int(train.cameras.width[index - 1]) == 48
+    assert train.metadata["lenses"][index].camera.size == (96, 72) and int(train.cameras.width[index - 1]) == 48
     assert float(train.cameras.fy[index]) == 81.0 and float(train.cameras.fy[index - 1]) != 81.0
     assert [lens.distorts for lens in train.metadata["lenses"][index - 1 : index + 1]] == [False, True]
     message = printed(capsys)

@@ -7,6 +7,7 @@ from types import ModuleType
 import pytest
 import torch
 
+from bitymi_ns.plugin import console
 from bitymi_ns.plugin.run import device
 
 
@@ -21,13 +22,13 @@ def card(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     monkeypatch.setattr(device.importlib.util, "find_spec", lambda name: kernels)
     device._device_problem.cache_clear()
-    device._say_once.cache_clear()
+    console.warn_once.cache_clear()
     yield kernels
     device._device_problem.cache_clear()
 
 
 def test_a_usable_card_is_used(card: ModuleType) -> None:
-    assert device.default_device_type() == "cuda" and device.kernel_device("cuda:0") == torch.device("cuda:0")
+    assert device.has_cuda_kernels() and device.kernel_device("cuda:0") == torch.device("cuda:0")
     assert device.kernel_device("cpu").type == "cpu"
 
 
@@ -49,7 +50,7 @@ def test_why_a_card_is_not_used(card: ModuleType, monkeypatch: pytest.MonkeyPatc
     assert "cannot be loaded" in device.why_not_cuda()
     device._device_problem.cache_clear()
     monkeypatch.setattr(device.importlib.util, "find_spec", lambda name: None)
-    assert "nvcc" in device.why_not_cuda() and device.default_device_type() == "cpu"
+    assert "nvcc" in device.why_not_cuda() and not device.has_cuda_kernels()
 
 
 @pytest.fixture

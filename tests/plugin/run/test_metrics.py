@@ -11,7 +11,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run import metrics
-from bitymi_ns.plugin.run.callbacks import TrainingCurve, points
+from bitymi_ns.plugin.run.callbacks import TrainingCurve
 from bitymi_ns.plugin.run.trainer import BitymiPipeline
 from bitymi_ns.train.step import Stopwatch
 
@@ -86,12 +86,6 @@ def test_the_clock_counts_between_start_and_stop_only() -> None:
     time.sleep(0.02)
     clock.stop()
     assert 1.0 <= clock.seconds < 1.015 and clock.cpu_seconds >= 2.0
-
-
-def test_curve_points_end_with_the_run() -> None:
-    assert sorted(points(100, 4)) == [24, 49, 74, 99]
-    assert max(points(7, 20)) == 6 and min(points(7, 20)) == 0
-    assert points(10, 0) == frozenset()
 
 
 def test_a_resumed_curve_goes_on_where_the_checkpoint_was(tmp_path: Path) -> None:

@@ -38,8 +38,8 @@ class Wall(SurfelModel):
 
     background = torch.zeros(3)
 
-    def surfel_count(self) -> int:
-        return 1
+    def sizes(self) -> dict[str, float]:
+        return {"surfels": 1.0}
 
     def render(self, camera: Camera, background: torch.Tensor, maps: bool) -> Any:
         self.before(len(self.drawn))

@@ -12,26 +12,15 @@ interface Mode {
   index: number;
   index2: number;
 }
-const mode = (
-  subsets: number,
-  partition: number,
-  rotation: number,
-  selector: number,
-  color: number,
-  alpha: number,
-  shared: Mode['shared'],
-  index: number,
-  index2: number,
-): Mode => ({ subsets, partition, rotation, selector, color, alpha, shared, index, index2 });
 const MODES: Mode[] = [
-  mode(3, 4, 0, 0, 4, 0, 'endpoint', 3, 0),
-  mode(2, 6, 0, 0, 6, 0, 'subset', 3, 0),
-  mode(3, 6, 0, 0, 5, 0, 'none', 2, 0),
-  mode(2, 6, 0, 0, 7, 0, 'endpoint', 2, 0),
-  mode(1, 0, 2, 1, 5, 6, 'none', 2, 3),
-  mode(1, 0, 2, 0, 7, 8, 'none', 2, 2),
-  mode(1, 0, 0, 0, 7, 7, 'endpoint', 4, 0),
-  mode(2, 6, 0, 0, 5, 5, 'endpoint', 2, 0),
+  { subsets: 3, partition: 4, rotation: 0, selector: 0, color: 4, alpha: 0, shared: 'endpoint', index: 3, index2: 0 },
+  { subsets: 2, partition: 6, rotation: 0, selector: 0, color: 6, alpha: 0, shared: 'subset', index: 3, index2: 0 },
+  { subsets: 3, partition: 6, rotation: 0, selector: 0, color: 5, alpha: 0, shared: 'none', index: 2, index2: 0 },
+  { subsets: 2, partition: 6, rotation: 0, selector: 0, color: 7, alpha: 0, shared: 'endpoint', index: 2, index2: 0 },
+  { subsets: 1, partition: 0, rotation: 2, selector: 1, color: 5, alpha: 6, shared: 'none', index: 2, index2: 3 },
+  { subsets: 1, partition: 0, rotation: 2, selector: 0, color: 7, alpha: 8, shared: 'none', index: 2, index2: 2 },
+  { subsets: 1, partition: 0, rotation: 0, selector: 0, color: 7, alpha: 7, shared: 'endpoint', index: 4, index2: 0 },
+  { subsets: 2, partition: 6, rotation: 0, selector: 0, color: 5, alpha: 5, shared: 'endpoint', index: 2, index2: 0 },
 ];
 const WEIGHTS: Record<number, number[]> = {
   2: [0, 21, 43, 64],

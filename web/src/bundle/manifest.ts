@@ -211,7 +211,8 @@ export function parseManifest(text: string): Manifest {
   }
   const root = new Reader(json as Json, '');
   const version = root.text('version', /^[0-9]{1,6}\.[0-9]{1,6}$/);
-  if (Number(version.split('.')[0]) > NEWEST_MAJOR) {
+  const major = Number(version.split('.')[0]);
+  if (major > NEWEST_MAJOR) {
     throw new ViewerError(
       'This bundle is newer than the viewer',
       `It has version ${version}; this viewer reads up to ${NEWEST_MAJOR}.x.`,
@@ -229,13 +230,17 @@ export function parseManifest(text: string): Manifest {
       .map(([name, r]) => [name, { bytes: r.whole('bytes', 0, 2 ** 36), sha256: r.text('sha256', /^[0-9a-f]{64}$/) }]),
   );
   const isCompact = files.has('surfels.bin');
+  const texture = root.has('atlas') ? atlas(root.part('atlas'), isCompact, files.get('surfels.bin')?.bytes ?? 0) : null;
+  if (Boolean(texture?.alphaScale) !== (major === 4)) {
+    throw new DamagedBundle('bundle.json: atlas.alpha_scale must be stated in version 4, and in no other.');
+  }
   return {
     version,
     count: surfels.whole('count', 0, 2 ** 28),
     viewColor: surfels.choice('view_color', ['sv', 'sh', 'sb', 'sg']),
     terms: surfels.has('terms') || isCompact ? surfels.whole('terms', 0, 2 ** 31) : null,
     compact: isCompact ? compact(surfels) : null,
-    atlas: root.has('atlas') ? atlas(root.part('atlas'), isCompact, files.get('surfels.bin')?.bytes ?? 0) : null,
+    atlas: texture,
     near: render.number('near', 1e-9, 1e6),
     weightBound: render.number('weight_bound', 0, 1),
     prefilter: render.has('prefilter') ? render.choice('prefilter', ['low_pass', 'pixel']) : 'low_pass',

@@ -48,21 +48,40 @@ export function centred(words: Float32Array, origin: Vec3): void {
   }
 }
 
-function lean(rows: Table, terms: Table, words: Float32Array, kind: ViewKind): Float32Array {
+// Sets the tile of surfel i: its first texel, layer and sides.
+export function setTile(
+  words: Float32Array,
+  i: number,
+  tile: [x: number, y: number, layer: number, u: number, v: number],
+): void {
+  const [x, y, layer, u, v] = tile;
+  const numbers = new Uint32Array(words.buffer, 4 * i * SURFEL_WORDS, SURFEL_WORDS);
+  numbers.set([x, y, u | (v << 16)], WORD.tile);
+  numbers[WORD.layer] = layer;
+}
+
+// Sets where in a list of terms of so many numbers those of each surfel are; returns how many terms there are.
+export function setTerms(words: Float32Array, counts: ArrayLike<number>, width: number): number {
   const numbers = new Uint32Array(words.buffer);
+  let first = 0;
+  for (let i = 0, to = 0; i < counts.length; i++, to += SURFEL_WORDS) {
+    numbers[to + WORD.firstTerm] = first * width;
+    numbers[to + WORD.terms] = counts[i];
+    first += counts[i];
+  }
+  return first;
+}
+
+function lean(rows: Table, terms: Table, words: Float32Array, kind: ViewKind): Float32Array {
   const width = LEAN_WIDTH[kind];
   for (let c = 0; c < 3; c++) rows.into(`view_base_${c}`, words, WORD.base + c, SURFEL_WORDS);
   const counts = new Int32Array(rows.count);
   rows.into('view_terms', counts, 0, 1);
-  let first = 0;
-  for (let i = 0; i < rows.count; i++) {
-    if (counts[i] < 0 || counts[i] > MAX_TERMS)
-      throw new DamagedBundle(`surfels.ply: view_terms is wrong in row ${i}.`);
-    numbers[i * SURFEL_WORDS + WORD.firstTerm] = first * width;
-    numbers[i * SURFEL_WORDS + WORD.terms] = counts[i];
-    first += counts[i];
+  const wrong = counts.findIndex((count) => count < 0 || count > MAX_TERMS);
+  if (wrong >= 0) throw new DamagedBundle(`surfels.ply: view_terms is wrong in row ${wrong}.`);
+  if (setTerms(words, counts, width) !== terms.count) {
+    throw new DamagedBundle('surfels.ply: view_terms does not count the rows of view_term.');
   }
-  if (first !== terms.count) throw new DamagedBundle('surfels.ply: view_terms does not count the rows of view_term.');
   const out = new Float32Array(terms.count * width);
   for (let c = 0; c < width; c++) terms.into(`term_${c}`, out, c, width);
   return out;
@@ -70,7 +89,6 @@ function lean(rows: Table, terms: Table, words: Float32Array, kind: ViewKind): F
 
 // All terms of every surfel: [columns of a term as (name, width)], interleaved term by term.
 function whole(rows: Table, words: Float32Array, parts: [string, number][], base: string | null): Float32Array {
-  const numbers = new Uint32Array(words.buffer);
   const width = parts.reduce((sum, [, w]) => sum + w, 0);
   const count = rows.width(parts[0][0]) / parts[0][1];
   if (parts.some(([name, w]) => rows.width(name) !== count * w)) {
@@ -85,10 +103,7 @@ function whole(rows: Table, words: Float32Array, parts: [string, number][], base
     from += w;
   }
   if (base !== null) for (let c = 0; c < 3; c++) rows.into(`${base}_${c}`, words, WORD.base + c, SURFEL_WORDS);
-  for (let i = 0; i < rows.count; i++) {
-    numbers[i * SURFEL_WORDS + WORD.firstTerm] = i * count * width;
-    numbers[i * SURFEL_WORDS + WORD.terms] = count;
-  }
+  setTerms(words, new Uint32Array(rows.count).fill(count), width);
   return out;
 }
 
@@ -108,23 +123,19 @@ const WHOLE: Record<ViewKind, { parts: [string, number][]; base: string | null; 
 };
 
 function tiles(rows: Table, words: Float32Array, info: Manifest): void {
-  const numbers = new Uint32Array(words.buffer);
   const columns = ['tile_x', 'tile_y', 'tile_layer', 'tile_ru', 'tile_rv'].map((name) => {
     const column = new Int32Array(rows.count);
     rows.into(name, column, 0, 1);
     return column;
   });
   const [width, height, layers] = info.atlas ? [info.atlas.width, info.atlas.height, info.atlas.layers] : [0, 0, 1];
-  for (let i = 0, to = 0; i < rows.count; i++, to += SURFEL_WORDS) {
+  for (let i = 0; i < rows.count; i++) {
     const [x, y, layer, ru, rv] = columns.map((column) => column[i]);
     const fits = x >= 0 && y >= 0 && ru >= 0 && rv >= 0 && x + ru <= width && y + rv <= height;
     if (!fits || layer < 0 || layer >= layers || ru > 0 !== rv > 0) {
       throw new DamagedBundle(`surfels.ply: the tile of surfel ${i} lies outside the atlas.`);
     }
-    numbers[to + WORD.tile] = x;
-    numbers[to + WORD.tile + 1] = y;
-    numbers[to + WORD.layer] = layer;
-    numbers[to + WORD.sides] = ru | (rv << 16);
+    setTile(words, i, [x, y, layer, ru, rv]);
   }
 }
 

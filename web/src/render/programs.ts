@@ -31,8 +31,7 @@ export class Programs {
   private readonly drawing: GPUShaderModule;
   private readonly halving: GPUShaderModule;
   private readonly presenting: GPUShaderModule;
-  private readonly draws = new Map<string, GPURenderPipeline>();
-  private readonly presents = new Map<string, GPURenderPipeline>();
+  private readonly made = new Map<string, GPURenderPipeline>();
 
   constructor(private readonly device: GPUDevice) {
     const module = (label: string, ...parts: string[]): GPUShaderModule =>
@@ -41,11 +40,8 @@ export class Programs {
       device.createComputePipeline({ layout: 'auto', compute: { module: from, entryPoint } });
     this.prepare = compute(module('prepare', scene, viewColor, resize, bounds, prepare), 'prepare');
     const sorting = module('sort', sort);
-    this.sort = {
-      count: compute(sorting, 'count'),
-      scan: compute(sorting, 'scan'),
-      scatter: compute(sorting, 'scatter'),
-    };
+    const sorts = SORT_ENTRIES.map((entry) => [entry, compute(sorting, entry)]);
+    this.sort = Object.fromEntries(sorts) as Record<SortEntry, GPUComputePipeline>;
     this.shareOut = compute(module('share_out', scene, batches, shareOut), 'share_out');
     this.drawing = module('draw', scene, batches, resize, draw);
     this.halving = module('halve', halve);
@@ -83,29 +79,29 @@ export class Programs {
     ];
   }
 
-  draw(format: TargetFormat, how: 'blend' | 'count'): GPURenderPipeline {
-    const key = `${format} ${how}`;
-    let found = this.draws.get(key);
-    if (!found) {
-      found = this.device.createRenderPipeline({
-        layout: this.device.createPipelineLayout({ bindGroupLayouts: this.layouts }),
-        vertex: { module: this.drawing, entryPoint: 'corner' },
-        primitive: { topology: 'triangle-strip' },
-        fragment: {
-          module: this.drawing,
-          entryPoint: 'surfel',
-          targets: [{ format, blend: { color: COLOR[how], alpha: TRANSMITTANCE } }],
-        },
-      });
-      this.draws.set(key, found);
-    }
+  private once(key: string, descriptor: GPURenderPipelineDescriptor): GPURenderPipeline {
+    const found = this.made.get(key) ?? this.device.createRenderPipeline(descriptor);
+    this.made.set(key, found);
     return found;
+  }
+
+  draw(format: TargetFormat, how: 'blend' | 'count'): GPURenderPipeline {
+    return this.once(`draw ${format} ${how}`, {
+      layout: this.device.createPipelineLayout({ bindGroupLayouts: this.layouts }),
+      vertex: { module: this.drawing, entryPoint: 'corner' },
+      primitive: { topology: 'triangle-strip' },
+      fragment: {
+        module: this.drawing,
+        entryPoint: 'surfel',
+        targets: [{ format, blend: { color: COLOR[how], alpha: TRANSMITTANCE } }],
+      },
+    });
   }
 
   // Renders a page at half its size; `alpha`: with colours weighted by alpha.
   halve(format: GPUTextureFormat, alpha: boolean): GPURenderPipeline {
     const entryPoint = `halve${alpha ? '_alpha' : ''}_${format === 'rgba8unorm' ? 'bytes' : 'floats'}`;
-    return this.device.createRenderPipeline({
+    return this.once(entryPoint, {
       layout: 'auto',
       vertex: { module: this.halving, entryPoint: 'page' },
       fragment: { module: this.halving, entryPoint, targets: [{ format }] },
@@ -113,15 +109,10 @@ export class Programs {
   }
 
   present(format: GPUTextureFormat): GPURenderPipeline {
-    let found = this.presents.get(format);
-    if (!found) {
-      found = this.device.createRenderPipeline({
-        layout: 'auto',
-        vertex: { module: this.presenting, entryPoint: 'whole' },
-        fragment: { module: this.presenting, entryPoint: 'present', targets: [{ format }] },
-      });
-      this.presents.set(format, found);
-    }
-    return found;
+    return this.once(`present ${format}`, {
+      layout: 'auto',
+      vertex: { module: this.presenting, entryPoint: 'whole' },
+      fragment: { module: this.presenting, entryPoint: 'present', targets: [{ format }] },
+    });
   }
 }

@@ -87,7 +87,7 @@ export class SceneOnDevice {
     this.drawn = bind(programs.layouts[0], this.frame, stored, seen, order[0], this.visible);
     this.decoded = pages?.format === 'bc7' && !graphics.blocks;
     this.complete = pages !== null || info.atlas === null;
-    this.atlas = this.texture(pages, graphics.blocks);
+    this.atlas = this.texture(pages);
     this.pages = this.boundPages();
   }
 
@@ -104,7 +104,7 @@ export class SceneOnDevice {
 
   // Texels that were not there at first.
   setTexels(pages: Pages): void {
-    this.atlas = this.texture(pages, this.graphics.blocks);
+    this.atlas = this.texture(pages);
     this.coarser = null;
     this.complete = true;
     this.pages = this.boundPages();
@@ -165,14 +165,14 @@ export class SceneOnDevice {
     return buffer;
   }
 
-  private texture(pages: Pages | null, blocks: boolean): GPUTexture {
+  private texture(pages: Pages | null): GPUTexture {
     const { width, height, layers, format } = pages ?? {
       width: 1,
       height: 1,
       layers: [new Uint8Array(4)],
       format: 'uint8' as const,
     };
-    const decode = format === 'bc7' && !blocks;
+    const decode = format === 'bc7' && !this.graphics.blocks;
     const names = { bc7: decode ? 'rgba8unorm' : 'bc7-rgba-unorm', uint8: 'rgba8unorm', fp16: 'rgba16float' } as const;
     const texture = this.device.createTexture({
       size: [width, height, layers.length],

@@ -19,6 +19,14 @@ export function make<K extends keyof HTMLElementTagNameMap>(
   return made;
 }
 
+export const onClick = (id: string, run: () => void): void => element(id).addEventListener('click', run);
+
+// A new button with a name for screen readers where its text is none.
+export const button = (
+  text: string,
+  { run, ...properties }: { title: string; run: () => void; className?: string; ariaLabel?: string },
+): HTMLButtonElement => make('button', { type: 'button', onclick: run, ...properties }, text);
+
 // Whether keys go to an element, and not to the scene.
 export const typing = (target: EventTarget | null): boolean =>
   [HTMLSelectElement, HTMLInputElement, HTMLTextAreaElement].some((kind) => target instanceof kind);

@@ -3,7 +3,7 @@ import { LONGEST_NAME, LONGEST_TEXT, MOST_NOTES, MOST_VIEWS, type Note, type Not
 import { cleared, notesText } from '../view/notes';
 import { View, moved } from '../view/pose';
 import { length, subtract } from '../view/vector';
-import { download, element, make, press, pressed } from './dom';
+import { button, download, element, make, onClick, press, pressed } from './dom';
 import { notify } from './pages';
 import type { Stage } from './stage';
 
@@ -23,14 +23,13 @@ export class NotesPanel {
     private readonly canvas: HTMLCanvasElement,
     private readonly all: Notes,
   ) {
-    const on = (id: string, run: () => void): void => element(id).addEventListener('click', run);
-    on('save-view', () => this.addView());
-    on('add-note', () => this.placing(!pressed(element('add-note'))));
-    on('show-notes', () => {
+    onClick('save-view', () => this.addView());
+    onClick('add-note', () => this.placing(!pressed(element('add-note'))));
+    onClick('show-notes', () => {
       press(element('show-notes'), !pressed(element('show-notes')));
       element('markers').hidden = !pressed(element('show-notes'));
     });
-    on('save-notes', () => {
+    onClick('save-notes', () => {
       download('notes.json', new Blob([notesText(all)], { type: 'application/json' }));
       this.saved = true;
       this.show();
@@ -153,18 +152,21 @@ export class NotesPanel {
 
   private row<T extends Entry>(list: T[], entry: T, text: string, go: () => void): HTMLElement {
     if (this.editing === entry) return make('li', {}, this.field(list, entry, text));
-    const name = make('button', { type: 'button', className: 'name', title: `Go to ${text}`, onclick: go }, text);
-    const edit = make('button', { type: 'button', ariaLabel: `Edit ${text}`, title: 'Edit' }, '✎');
-    edit.onclick = () => {
+    const edit = (): void => {
       this.editing = entry;
       this.show();
     };
-    const remove = make('button', { type: 'button', ariaLabel: `Remove ${text}`, title: 'Remove' }, '×');
-    remove.onclick = () => {
+    const remove = (): void => {
       list.splice(list.indexOf(entry), 1);
       this.changed();
     };
-    return make('li', {}, name, edit, remove);
+    return make(
+      'li',
+      {},
+      button(text, { className: 'name', title: `Go to ${text}`, run: go }),
+      button('✎', { ariaLabel: `Edit ${text}`, title: 'Edit', run: edit }),
+      button('×', { ariaLabel: `Remove ${text}`, title: 'Remove', run: remove }),
+    );
   }
 
   // Where the name of a view or the text of a note is typed: Enter keeps it, Escape what was there.

@@ -1,7 +1,7 @@
 // The path of the camera: its keyframes in a list, playing it, and saving it.
 import { CameraPath, LONGEST, SECONDS, SHORTEST } from '../view/path';
 import type { Pose, View } from '../view/pose';
-import { download, element, make, press, pressed } from './dom';
+import { button, download, element, make, onClick, press, pressed } from './dom';
 import { Film, filmable } from './film';
 import { notify } from './pages';
 import type { Stage } from './stage';
@@ -23,18 +23,17 @@ export class PathPanel {
     private readonly stage: Stage,
     private readonly canvas: HTMLCanvasElement,
   ) {
-    const on = (id: string, run: () => void): void => element(id).addEventListener('click', run);
-    on('add-keyframe', () => this.add());
-    on('smooth', () => this.toggle('smooth'));
-    on('loop', () => this.toggle('loop'));
-    on('play', () => (this.playing ? this.stop() : this.play(false)));
-    on('save-path', () => this.save());
-    on('open-path', () => element('path-file').click());
+    onClick('add-keyframe', () => this.add());
+    onClick('smooth', () => this.toggle('smooth'));
+    onClick('loop', () => this.toggle('loop'));
+    onClick('play', () => (this.playing ? this.stop() : this.play(false)));
+    onClick('save-path', () => this.save());
+    onClick('open-path', () => element('path-file').click());
     element('path-file').addEventListener('change', ({ target }) => {
       const [file] = (target as HTMLInputElement).files ?? [];
       if (file) void this.open(file);
     });
-    on('record', () => (this.playing ? this.stop() : this.play(true)));
+    onClick('record', () => (this.playing ? this.stop() : this.play(true)));
     element('seconds').addEventListener('change', ({ target }) => {
       const { valueAsNumber: seconds } = target as HTMLInputElement;
       if (seconds > 0) this.path.seconds = seconds;
@@ -130,18 +129,16 @@ export class PathPanel {
     const list = element('keyframes');
     list.replaceChildren(
       ...keyframes.map((keyframe, k) => {
-        const go = make('button', { type: 'button', className: 'name', title: 'Go there' }, `Keyframe ${k + 1}`);
-        go.onclick = () => this.stage.go(keyframe.pose, keyframe.lens);
-        const remove = make('button', { type: 'button', ariaLabel: `Remove keyframe ${k + 1}`, title: 'Remove' }, '×');
-        remove.onclick = () => {
+        const go = (): void => this.stage.go({ pose: keyframe.pose, lens: keyframe.lens });
+        const remove = (): void => {
           this.stop();
           keyframes.splice(k, 1);
           this.show();
         };
         const to = (k + 1) % keyframes.length;
-        const row = make('li', {}, go);
+        const row = make('li', {}, button(`Keyframe ${k + 1}`, { className: 'name', title: 'Go there', run: go }));
         if (keyframes.length > 1 && (to || loop)) row.append(secondsOf(k + 1, to + 1, keyframe, () => this.show()));
-        row.append(remove);
+        row.append(button('×', { ariaLabel: `Remove keyframe ${k + 1}`, title: 'Remove', run: remove }));
         return row;
       }),
     );

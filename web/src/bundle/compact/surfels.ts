@@ -1,13 +1,14 @@
-// surfels.bin: docs/baking.md says what the numbers of its columns stand for; bake/surfel_codes.py is their writer.
+// surfels.bin: docs/baking.md says what the numbers of its columns stand for; codec/surfel_codes.py is their writer.
 import { DamagedBundle } from '../../errors';
 import type { CompactSurfels, Manifest, ViewKind } from '../manifest';
-import { KINDS, LEAN_WIDTH, SURFEL_WORDS, type Surfels, WORD, alphaWord, centred, originOf } from '../surfels';
+import { KINDS, LEAN_WIDTH, SURFEL_WORDS, type Surfels, WORD } from '../surfels';
+import { alphaWord, centred, originOf, setTerms, setTile } from '../surfels';
 import { ColumnReader, checkColumns } from './columns';
 import { pack } from './packing';
 
 export const SURFELS_PER_BYTE = 1; // a file that is said to hold more is refused, and so many beside
 export const SPARE_SURFELS = 1 << 12;
-const PLACE_BITS = 17;
+const POSITION_BITS = 17;
 const SHARE = 1 / 1024; // of their ranges: what opacities and betas keep from their ends
 const ALPHA_MIN = 1 / 255;
 const EXTENT = 3; // of surfels without a tile
@@ -16,8 +17,8 @@ const MOST_EXPONENT = 12;
 const MOST_TERMS = 32;
 const BENT = 50; // of sinh: beyond all limits
 const FILE = 'surfels.bin';
-// largest values: bake/limits.py
-const PLACES = 1e9;
+// largest values: codec/limits.py
+const POSITIONS = 1e9;
 const LOG_SCALES = 104;
 const COLORS = 256;
 const EXTENTS: [number, number] = [1e-6, 16];
@@ -123,17 +124,18 @@ class Decoder {
     return name.startsWith('term_') ? this.terms : this.count;
   }
 
-  private places(): void {
+  private positions(): void {
     const { center, scale, low } = this.stated.frame;
     const [differences, step] = [this.column('place')[0], this.step('place')];
     let key = 0;
     for (let i = 0, to = WORD.mean; i < this.count; i++, to += SURFEL_WORDS) {
       key += differences[i];
-      if (differences[i] < 0 || key >= 2 ** (3 * PLACE_BITS)) this.refuse('places do not ascend, or leave their grid');
+      if (differences[i] < 0 || key >= 2 ** (3 * POSITION_BITS))
+        this.refuse('positions do not ascend, or leave their grid');
       const [lower, upper] = [key % 2 ** 24, Math.floor(key / 2 ** 24)];
       for (let a = 0; a < 3; a++) {
         const cell = (thirds(lower >> a) & 0xff) | (thirds(upper >> a) << 8);
-        this.words[to + a] = within(center[a] + scale * sinh(low[a] + step * cell), PLACES);
+        this.words[to + a] = within(center[a] + scale * sinh(low[a] + step * cell), POSITIONS);
       }
     }
   }
@@ -191,13 +193,9 @@ class Decoder {
     if (packing.width !== atlas.width || packing.height !== atlas.height || packing.layers !== atlas.layers) {
       throw new DamagedBundle('bundle.json: width, height and layers of the atlas are not those of its tiles.');
     }
-    for (let i = 0, to = 0; i < this.count; i++, to += SURFEL_WORDS) {
-      if (!u[i]) continue;
-      this.numbers[to + WORD.tile] = packing.x[i];
-      this.numbers[to + WORD.tile + 1] = packing.y[i];
-      this.numbers[to + WORD.layer] = packing.layer[i];
-      this.numbers[to + WORD.sides] = u[i] | (v[i] << 16);
-    }
+    u.forEach((side, i) => {
+      if (side) setTile(this.words, i, [packing.x[i], packing.y[i], packing.layer[i], side, v[i]]);
+    });
   }
 
   private alphas(): void {
@@ -213,14 +211,12 @@ class Decoder {
     const [[counts], shape, colors] = ['view_count', 'term_shape', 'term_color'].map((name) => this.column(name));
     const good = kind === 'sh' ? [0, 3, 8, 15] : Array.from({ length: MOST_TERMS + 1 }, (_, k) => k);
     const width = LEAN_WIDTH[kind];
-    let first = 0;
-    for (let i = 0, to = 0; i < this.count; i++, to += SURFEL_WORDS) {
-      if (!good.includes(counts[i])) this.refuse('a view colour has a number of terms that none can have');
-      this.numbers[to + WORD.firstTerm] = first * width;
-      this.numbers[to + WORD.terms] = counts[i];
-      first += counts[i];
+    if (!counts.every((count) => good.includes(count))) {
+      this.refuse('a view colour has a number of terms that none can have');
     }
-    if (first !== this.terms) this.refuse(`the view colours do not have the ${this.terms} terms of bundle.json`);
+    if (setTerms(this.words, counts, width) !== this.terms) {
+      this.refuse(`the view colours do not have the ${this.terms} terms of bundle.json`);
+    }
     const { at, limits } = SHAPES[kind];
     const colored = at === 0 ? limits.length : 0;
     const out = new Float32Array(this.terms * width);
@@ -233,7 +229,7 @@ class Decoder {
   }
 
   surfels(): Surfels {
-    this.places();
+    this.positions();
     this.rotations();
     this.shapes();
     this.tiles();

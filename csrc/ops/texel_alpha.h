@@ -1,0 +1,70 @@
+// Alpha texels as operations take them, the alpha of a fragment, and the vector-Jacobian product of that.
+#pragma once
+
+#include "core/blend.h"
+#include "core/texel.h"
+#include "ops/arguments.h"
+
+namespace bt {
+
+// Alpha texels: the sigma of a fragment whose weight would be at least `bound` is multiplied by the bilinear fetch at
+// its u and v, and clamped again; the last bit of its listed v is then 1, else 0. Absent: `values` is null.
+template <class S> struct AlphaTiles {
+  int64_t texels;
+  const int64_t* first;  // [n], as in TexelTiles
+  const int32_t* size;   // [n, 2]
+  const S* extent;       // [n]
+  const S* values;       // [texels], from 0 to 2
+  S bound;               // fragments whose weight would be less keep their sigma
+
+  template <class R> void fields(R& r, int64_t n) {
+    values = nullptr, bound = 0;
+    if (!r.has("texel_alpha")) return;
+    r.array("first", first, n);
+    r.array("size", size, 2 * n);
+    r.array("extent", extent, n);
+    r.rows("texel_alpha", values, texels, 1);
+    r.number("alpha_bound", bound);
+  }
+};
+
+// The alpha texels of one surfel.
+template <class S> struct AlphaPatch {
+  const int32_t* size;  // r_u, r_v; 0, 0 = no tile
+  const S* tile;
+  int64_t first;
+  S extent;
+
+  BT_HD AlphaPatch(const AlphaTiles<S>& tiles, int64_t id)
+      : size(tiles.size + 2 * id),
+        tile(tiles.values + tiles.first[id]),
+        first(tiles.first[id]),
+        extent(tiles.extent[id]) {}
+  BT_HD bool textured() const { return size[0] > 0; }
+  BT_HD TexelCorners<S> corners(S u, S v) const { return texel_corners(u, v, size, extent); }
+  // m, exactly 1 between texels of 1, and the four texels.
+  BT_HD S fetch(const TexelCorners<S>& at, S (&t)[4]) const {
+    BT_UNROLL
+    for (int k = 0; k < 4; ++k) t[k] = tile[at.at[k]];
+    return texel_lerp(t, at.fx, at.fy);
+  }
+};
+
+// Gradients of alpha's share of a fragment's sigma: from gs, that of the listed sigma, to that of the kernel's sigma,
+// which takes the place of the listed one; more of gu and gv; and the return value, that of m.
+template <class S>
+BT_HD S alpha_vjp(const AlphaPatch<S>& patch, const TexelCorners<S>& at, S& listed, S& gs, S& gu, S& gv) {
+  S t[4];
+  const S m = patch.fetch(at, t), sigma = abs_(listed);
+  // neither clamp passes a gradient, that of the product and the kernel's own; m may be rounded otherwise than when the
+  // fragment was written
+  const bool moves = sigma < S(kAlphaMax), uncut_moves = moves && sigma < m * S(kAlphaMax * (1 - 1e-6));
+  const S dm = moves ? gs * sigma / m : S(0);
+  if (at.inside_u) gu += dm * texel_density(patch.size[0], patch.extent) * texel_slope_u(t, at.fy);
+  if (at.inside_v) gv += dm * texel_density(patch.size[1], patch.extent) * texel_slope_v(t, at.fx);
+  gs = uncut_moves ? gs * m : S(0);
+  listed /= m;
+  return dm;
+}
+
+}  // namespace bt

@@ -10,24 +10,17 @@ from torch.nn import functional as F
 
 from bitymi_ns.bake.directions import Directions, view_directions
 from bitymi_ns.bake.inputs import BakeInput
-from bitymi_ns.bake.voronoi_fit import fit_sites, least_needed, site_weights
+from bitymi_ns.bake.voronoi_fit import FIT_VIEWS, fewer_sites, site_weights
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.statistics import Kept, Percentiles, ViewColorError
 from bitymi_ns.codec.limits import beyond
 from bitymi_ns.codec.quantise import STEPS
 from bitymi_ns.ops import view_color
 from bitymi_ns.ops.constants import COLOR_BIAS
-from bitymi_ns.ops.sphere import fibonacci_sphere
 from bitymi_ns.ops.view_color import view_base
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, kind_of
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.tile_sizes import kernel_parameters
-
-FIT_STEPS = 6
-FIT_VIEWS = 16  # views of a surfel in the fit; the error is measured in all of them
-OUTSIDE, OUTSIDE_WEIGHT = 12, 0.05
-"""Directions over the whole sphere, and their weight, in the fit: where no view is, the colour follows the trained one
-loosely instead of diverging."""
 
 
 @dataclass
@@ -134,24 +127,16 @@ def _fewer_sites(
     `own` are vectors and colours [n, K, 3] of all its surfels' sites.
     """
     vectors, rgb = own
-    sites = vectors.shape[1]
-    outside = fibonacci_sphere(OUTSIDE).to(vectors).expand(len(vectors), -1, -1)
-    samples = torch.cat([at.thinned(at.unit, FIT_VIEWS), outside], dim=1)
-    weight = F.pad(at.thinned(at.valid, FIT_VIEWS).float(), (0, OUTSIDE), value=OUTSIDE_WEIGHT)
-    colors = site_weights(vectors, samples) @ rgb
-    left = least_needed(vectors, rgb, samples, weight)
-    result = []
-    for number in range(2, sites):
+    fit, result = fewer_sites(at, at.thinned(at.valid, FIT_VIEWS).float(), vectors, rgb), []
+    for number in range(2, vectors.shape[1]):
         if len(rest) == 0:
             break
-        kept = left[number - 1][rest, :, None].expand(-1, -1, 3)
-        v, r = vectors[rest].gather(1, kept), rgb[rest].gather(1, kept)
-        b, r = fit_sites(v[:, 1:] - v[:, :1], r, samples[rest], colors[rest], weight[rest], FIT_STEPS)
-        shown = view_base(site_weights(F.pad(b, (0, 0, 1, 0)), at.unit[rest]) @ r)
-        terms = torch.cat([b, r[:, 1:]], dim=2)
+        color, terms = fit(number, rest)
+        weights = site_weights(F.pad(terms[..., :3], (0, 0, 1, 0)), at.unit[rest])
+        shown = view_base(weights @ torch.cat([color[:, None], terms[..., 3:]], dim=1))
         good = largest_error(shown, target[rest], at.valid[rest]) <= allowed[rest]
-        good &= ~beyond("view_terms", kind, terms).flatten(1).any(1) & ~beyond("view_base", kind, r[:, 0]).any(1)
-        result.append((rest[good], r[good, 0], terms[good]))
+        good &= ~beyond("view_terms", kind, terms).flatten(1).any(1) & ~beyond("view_base", kind, color).any(1)
+        result.append((rest[good], color[good], terms[good]))
         rest = rest[~good]
     v = vectors[rest].double()
     relative = (v[:, 1:] - v[:, :1]).to(rgb)

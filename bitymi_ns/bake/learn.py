@@ -7,13 +7,13 @@ from dataclasses import dataclass, field, replace
 
 from torch import Tensor
 
-from bitymi_ns.bake.baked import Baked
+from bitymi_ns.bake.baked import BakeableScene, Baked
 from bitymi_ns.bake.certificate import certified
 from bitymi_ns.bake.compact import Compact, compacted, with_coded_texels
 from bitymi_ns.bake.field.bake import bake
 from bitymi_ns.bake.field.polish import PolishOptions, polish_scene
 from bitymi_ns.bake.inputs import device_of
-from bitymi_ns.bake.pipeline import BakeableScene, reduced, trained_texels
+from bitymi_ns.bake.pipeline import reduced, trained_texels
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.progress import Progress, no_progress
@@ -89,7 +89,7 @@ def baked_and_reduced(
         baked = trained_texels(scene, options)
     else:
         baked = bake(scene, cameras, options, progress, None if polish is None else polish.pixels_per_texel)
-    if polish is not None and baked.texels is not None:
+    if polish is not None and baked.textured:
         baked = polish_scene(
             baked, photographs, background, polish, learning.train, progress, held_out, device_of(cameras)
         )
@@ -131,7 +131,7 @@ def bake_and_learn(
     baked = baked_and_reduced(scene, cameras, photographs, background, options, learning, progress, held_out)
     if learning.compact is not None:
         baked, coding = compacted(baked, photographs, background, learning.compact, progress, device)
-    if tune is not None and baked.texels is not None:
+    if tune is not None and baked.textured:
         baked = tune_atlas(baked, photographs, background, tune, progress, held_out, coding, device)
     if baked.codes is not None and baked.codes.texels is None:
         baked = with_coded_texels(baked, coding)

@@ -145,26 +145,22 @@ def stage(arguments: argparse.Namespace) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     for file in folder.glob("*/*"):
         file.rename(folder / file.name)
-    with tempfile.TemporaryDirectory() as temporary:
-        tools = Path(arguments.tools or Path(temporary) / "tools")
-        if not tools.exists():
-            subprocess.run([arguments.python, "-m", "venv", str(tools)], check=True)
-            subprocess.run([tools / "bin/python", "-m", "pip", "install", "-q", *TOOLS], check=True)
-        pip = [str(tools / "bin/python"), "-m", "pip", "--disable-pip-version-check"]
-        wheel = [*pip, "wheel", "-q", "--no-build-isolation", "--no-deps", "-w", str(folder), str(ROOT)]
-        options = [
-            "-Ccmake.define.BITYMI_CUDA=ON",
-            f"-Ccmake.define.BITYMI_CUDA_ARCHITECTURES={arguments.architectures}",
-        ]
-        options.append(f"-Cbuild-dir={arguments.build or Path(temporary) / 'build'}")
-        for old in folder.glob("bitymi_ns-*.whl"):
-            old.unlink()
-        subprocess.run([*wheel, *options], check=True)
-        fetched = [*pip, "download", "-q", "--only-binary", ":all:", "-d", str(folder), "-c", f"{ROOT}/constraints.txt"]
-        for name in NEEDED:
-            if not list(folder.glob(f"{name.replace('-', '_')}-*.whl")):
-                with_needs = [] if name == "pydantic" else ["--no-deps"]
-                subprocess.run([*fetched, *with_needs, name], check=True)
+    kept = ROOT / "build" / f"card-{Path(arguments.python).name}"
+    tools, build = kept / "tools", kept / "build"
+    if not tools.exists():
+        subprocess.run([arguments.python, "-m", "venv", str(tools)], check=True)
+        subprocess.run([tools / "bin/python", "-m", "pip", "install", "-q", *TOOLS], check=True)
+    pip = [str(tools / "bin/python"), "-m", "pip", "--disable-pip-version-check"]
+    for old in folder.glob("bitymi_ns-*.whl"):
+        old.unlink()
+    options = ["-Ccmake.define.BITYMI_CUDA=ON", f"-Ccmake.define.BITYMI_CUDA_ARCHITECTURES={arguments.architectures}"]
+    wheel = [*pip, "wheel", "-q", "--no-build-isolation", "--no-deps", "-w", str(folder), str(ROOT)]
+    subprocess.run([*wheel, *options, f"-Cbuild-dir={build}"], check=True)
+    fetched = [*pip, "download", "-q", "--only-binary", ":all:", "-d", str(folder), "-c", f"{ROOT}/constraints.txt"]
+    for name in NEEDED:
+        if not list(folder.glob(f"{name.replace('-', '_')}-*.whl")):
+            with_needs = [] if name == "pydantic" else ["--no-deps"]
+            subprocess.run([*fetched, *with_needs, name], check=True)
     from bitymi_ns.plugin.run import lpips  # where `run` begins there is no such package yet
 
     lpips.load("alex")
@@ -214,40 +210,33 @@ def unpack(staged: Sequence[Path], work: Path) -> dict[str, str]:
     return {**os.environ, **changed}
 
 
-def run_step(step: Step, tree: Path, environment: dict[str, str], log: Path, deadline: float) -> str:
-    """Run a step; returns its line of the summary."""
+def run_step(step: Step, tree: Path, environment: dict[str, str], logs: Path, deadline: float) -> str:
+    """Run a step, with a log for every command; returns its line of the summary."""
     start = time.perf_counter()
     limit = min(step.limit, deadline - time.monotonic())
     if limit < 5:
         return f"| {step.name} | not begun: no time left | |"
-    running = []
+    running, ends = [], []
     with tempfile.TemporaryDirectory() as folder:
+        environment = {**environment, "TMPDIR": folder}
+        if len(step.commands) > 1:
+            environment["OMP_NUM_THREADS"] = str(max(1, (os.cpu_count() or 1) // len(step.commands)))
+        how = {"cwd": tree, "env": environment, "stderr": subprocess.STDOUT, "start_new_session": True}
         for i, command in enumerate(step.commands):
-            output = open(Path(folder) / str(i), "w+")  # noqa: SIM115
-            environment_of = {**environment, "TMPDIR": folder}
-            if len(step.commands) > 1:
-                environment_of["OMP_NUM_THREADS"] = str(max(1, (os.cpu_count() or 1) // len(step.commands)))
+            with (logs / f"{step.name}-{i}.txt").open("w") as log:
+                log.write(f"{' '.join(command)}\n")
+                log.flush()
+                try:
+                    running.append(subprocess.Popen(command, stdout=log, **how))
+                except OSError as error:
+                    return f"| {step.name} | {error} | |"
+        for process in running:
             try:
-                process = subprocess.Popen(
-                    command, cwd=tree, env=environment_of, stdout=output, stderr=output, start_new_session=True
-                )
-            except OSError as error:
-                return f"| {step.name} | {error} | |"
-            running.append((command, process, output))
-        ends = []
-        for command, process, output in running:
-            try:
-                status = str(process.wait(max(1.0, limit - (time.perf_counter() - start))))
+                ends.append(str(process.wait(max(1.0, limit - (time.perf_counter() - start)))))
             except subprocess.TimeoutExpired:
                 os.killpg(process.pid, 9)
                 process.wait()
-                status = "stopped"
-            output.seek(0)
-            text = output.read()
-            output.close()
-            with log.open("a") as file:
-                file.write(f"\n===== {step.name}: {' '.join(command)}\n{text}\n===== status {status}\n")
-            ends.append(status)
+                ends.append("stopped")
     return f"| {step.name} | {', '.join(ends)} | {time.perf_counter() - start:.0f} |"
 
 
@@ -261,11 +250,7 @@ def main() -> int:
     staging.add_argument("folder", type=Path)
     staging.add_argument("--python", default=sys.executable, help="a Python of the machine's version (%(default)s)")
     staging.add_argument("--architectures", default="90", help="compute capabilities of its card (%(default)s)")
-    staging.add_argument(
-        "--tools", type=Path, help="virtual environment with the build tools, made where it is missing"
-    )
     staging.add_argument("--megabytes", type=float, default=45, help="most of a part (%(default)s)")
-    staging.add_argument("--build", type=Path, help="build folder that is kept")
     running = commands.add_parser("run", help="run orders on the machine")
     names = list(orders(Path(), Path()))
     running.add_argument("orders", nargs="+", metavar="ORDER", help=f"{', '.join(names)}; A+B: at the same time")
@@ -284,7 +269,6 @@ def main() -> int:
     deadline = time.monotonic() + arguments.seconds
     results = arguments.output.resolve()
     results.mkdir(parents=True, exist_ok=True)
-    log = results / "log.txt"
     lines = ["| step | exit status | s |", "|---|---|---:|"]
     with tempfile.TemporaryDirectory() as work:
         environment = unpack([folder.resolve() for folder in arguments.stage], Path(work))
@@ -292,7 +276,7 @@ def main() -> int:
             known = orders(results, arguments.data.resolve(), arguments.surfels, arguments.steps)
             steps = [step for name in order.split("+") for step in known[name]]
             for step in steps if "+" not in order else [together(steps)]:
-                lines.append(run_step(step, Path(work) / "tree", environment, log, deadline))
+                lines.append(run_step(step, Path(work) / "tree", environment, results, deadline))
                 print(lines[-1], flush=True)
                 (results / "summary.md").write_text("\n".join(lines) + "\n")
     return 0

@@ -1,30 +1,28 @@
 #!/usr/bin/env python
 """Run nerfstudio's own commands on a capture, as they are typed, and table what each took: train, resume, evaluate,
-export, evaluate, render and view the bundle.
+export, evaluate and render the bundle.
 
 A bare machine lacks much that nerfstudio imports and this plugin never uses there: `STAND_INS` are modules whose every
 use is an error, here too where the real ones are installed, so that a run on any machine shows that none is needed.
 """
 
-import argparse
 import contextlib
 import json
 import os
 import re
 import runpy
+import shlex
 import shutil
-import signal
-import socket
 import subprocess
 import sys
 import threading
-import time
-import urllib.request
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+
+from common import arguments_of, number, page, publish, say, table
+
+from bitymi_ns.measure.bench.process import CommandFailed, run_measured
 
 STAND_INS = ("IPython", "av", "fpsample", "gsplat", "open3d", "pathos", "pillow_heif", "plotly", "pymeshlab")
 STAND_INS += ("rawpy", "tensorly", "xatlas", "yourdfpy")
@@ -88,25 +86,6 @@ def stand_in(folder: Path) -> dict[str, str]:
     return {**os.environ, "PATH": programs, "PYTHONPATH": path, "COLUMNS": "200", "BITYMI_NO_DOWNLOAD": "1"}
 
 
-@dataclass
-class Row:
-    """A command and what it took.
-
-    Attributes:
-        command: as it was typed.
-        status: exit status.
-        seconds: wall clock.
-        host: largest resident memory, MB; the kernel counts this process, until the command starts, as well.
-        card: largest memory in use on the card, MB, that of other programs included; None = there is no card.
-    """
-
-    command: str
-    status: int
-    seconds: float
-    host: float
-    card: float | None
-
-
 def card_memory() -> float | None:
     """Memory in use on the first card, MB."""
     command = ["nvidia-smi", "--query-gpu=memory.used", "--format=csv,noheader,nounits", "--id=0"]
@@ -135,77 +114,29 @@ def watched() -> Iterator[list[float]]:
 
 
 class Commands:
-    """Runs commands one after the other; their output goes to a log.
-
-    Args:
-        folder: of the log.
-        environment: of the commands.
-    """
+    """Runs commands one after the other, in a folder and with an environment; `rows` has what each took."""
 
     def __init__(self, folder: Path, environment: dict[str, str]) -> None:
-        self.rows: list[Row] = []
+        self.rows: list[tuple[str, dict[str, float] | None, float | None]] = []
+        """Command, cost as in `run_measured` or None where it failed, and largest memory in use on the card, MB, that
+        of other programs included; None = no card."""
         self._folder, self._environment = folder, environment
-        self._log = folder / "log.txt"
 
-    def run(self, *words: object, visit: bool = False) -> bool:
-        """Run a command; True where it ended well.
-
-        Args:
-            words: of the command.
-            visit: it serves a page: fetch that, then end it by Ctrl-C.
-        """
-        typed = [str(word) for word in words]
-        start = time.perf_counter()
-        with self._log.open("a") as log, watched() as used:
-            log.write(f"\n===== {' '.join(typed)}\n")
-            log.flush()
-            process = subprocess.Popen(
-                typed, cwd=self._folder, env=self._environment, stdout=log, stderr=log, start_new_session=True
-            )
-            fetched = visit_page(process) if visit else True
-            _, status, usage = os.wait4(process.pid, 0)
-            process.returncode = code = os.waitstatus_to_exitcode(status)
-        # a page that was fetched counts, whatever a server says when it is interrupted
-        code = (0 if fetched else code or 1) if visit else code
-        peak = max(used) if used else None
-        self.rows.append(Row(" ".join(typed), code, time.perf_counter() - start, usage.ru_maxrss / 1024, peak))
-        print(f"{code}  {self.rows[-1].seconds:6.1f} s  {self.rows[-1].command[:150]}", flush=True)
-        return code == 0
+    def run(self, *words: object) -> bool:
+        """Run a command; True where it ended well."""
+        typed, log = [str(word) for word in words], self._folder / f"{len(self.rows)}.log"
+        cost = None
+        with watched() as used:
+            try:
+                cost = run_measured(typed, log, cwd=self._folder, env=self._environment)
+            except CommandFailed as error:
+                say(str(error))
+        self.rows.append((shlex.join(typed), cost, max(used, default=None)))
+        say(f"{'failed' if cost is None else 'ended'}: {self.rows[-1][0][:150]}")
+        return cost is not None
 
 
-PORT = 7017
-PATIENCE = 240.0  # seconds until the viewer answers
 WAITS_STEPS = 60  # of the run in which waits are counted
-
-
-def visit_page(process: subprocess.Popen[Any]) -> bool:
-    """Fetch the page of nerfstudio's viewer and open its socket; ends the process by Ctrl-C. True if both answered."""
-    answered, deadline = False, time.monotonic() + PATIENCE
-    while not answered and time.monotonic() < deadline and not ended(process):
-        time.sleep(0.5)
-        with contextlib.suppress(OSError):
-            page = urllib.request.urlopen(f"http://127.0.0.1:{PORT}/", timeout=5).read()
-            answered = b"<html" in page.lower() and switches_to_socket()
-    os.killpg(process.pid, signal.SIGINT)  # not waited for yet, so the group is there
-    deadline = time.monotonic() + 10.0
-    while not ended(process) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    os.killpg(process.pid, signal.SIGKILL)
-    return answered
-
-
-def ended(process: subprocess.Popen[Any]) -> bool:
-    """True if a process is over; it stays to be waited for."""
-    return os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
-
-
-def switches_to_socket() -> bool:
-    """True where the viewer's port opens a WebSocket, as its page does."""
-    with socket.create_connection(("127.0.0.1", PORT), timeout=5) as connection:
-        lines = ["GET / HTTP/1.1", f"Host: 127.0.0.1:{PORT}", "Upgrade: websocket", "Connection: Upgrade"]
-        lines += ["Sec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==", "Sec-WebSocket-Version: 13", "", ""]
-        connection.sendall("\r\n".join(lines).encode())
-        return b" 101 " in connection.recv(64)
 
 
 def waits(words: Sequence[str]) -> None:
@@ -248,30 +179,24 @@ def all_commands(capture: Path, folder: Path, steps: int, options: Sequence[str]
         commands.run("ns-eval", "--load-config", bundle, "--output-path", "baked.json")
         names = ("--rendered-output-names", "rgb", "depth")
         commands.run("ns-render", "dataset", "--load-config", bundle, "--output-path", "maps", *names)
-        commands.run("ns-viewer", "--load-config", bundle, "--viewer.websocket-port", PORT, visit=True)
-    if commands.rows[0].card is not None:
+    if commands.rows[0][2] is not None:
         short = (*train[1:], "--timestamp", "waits", "--max-num-iterations", WAITS_STEPS, *options)
         commands.run(sys.executable, Path(__file__).resolve(), "--waits", *short)
 
 
-def page(folder: Path, capture: Path, steps: int, rows: Sequence[Row]) -> str:
-    """The table as Markdown."""
-    text = f"`{capture.name}`, {steps} steps; stand-ins for {', '.join(STAND_INS)}.\n\n"
-    text += "| command | exit status | s | MB of host | MB of card |\n|---|---|---:|---:|---:|\n"
-    for row in rows:
-        card = "" if row.card is None else f"{row.card:.0f}"
-        text += f"| `{row.command}` | {row.status} | {row.seconds:.1f} | {row.host:.0f} | {card} |\n"
-    text += "\n| | PSNR | SSIM | LPIPS | surfels |\n|---|---:|---:|---:|---:|\n"
+def tables(folder: Path, commands: Commands) -> str:
+    """Tabulate what the commands took and found, as Markdown."""
+    cells = []
+    for command, cost, card in commands.rows:
+        took = (number(cost["process_seconds"], 1), number(cost["peak_bytes"] / 1e6, 0)) if cost else ("failed", "")
+        cells.append([f"`{command}`", *took, number(card, 0)])
+    quality, digits = [], {"psnr": 2, "ssim": 3, "lpips": 3, "surfels": 0}
     for name in ("trained", "baked"):
         with contextlib.suppress(OSError):
             found = json.loads((folder / f"{name}.json").read_text())["results"]
-            digits = {"psnr": 2, "ssim": 3, "lpips": 3, "surfels": 0}
-            cells = [f"{found[key]:.{n}f}" if key in found else "" for key, n in digits.items()]
-            text += f"| {name} | {' | '.join(cells)} |\n"
-    said = re.findall(r"waits per step: ([\d.]+)", (folder / "log.txt").read_text())
-    return text + (
-        f"\nWaits of the host for the card per step, nerfstudio's own included: {said[-1]}.\n" if said else ""
-    )
+            quality.append([name, *(number(found.get(key), n) for key, n in digits.items())])
+    text = table(("command", "s", "MB of host", "MB of card"), cells)
+    return f"{text}\n\n{table(('', 'PSNR', 'SSIM', 'LPIPS', 'surfels'), quality)}"
 
 
 def main() -> int:
@@ -279,12 +204,12 @@ def main() -> int:
     if sys.argv[1:2] == ["--waits"]:
         waits(sys.argv[2:])
         return 0
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments_of(__doc__)
     parser.add_argument("data", type=Path, help="folder of an undistorted capture with transforms.json")
     parser.add_argument("--steps", type=int, default=3000, help="length of the run (%(default)s)")
     parser.add_argument("--folder", type=Path, required=True, help="of runs, bundle and log; emptied first")
     parser.add_argument("--output", type=Path, help="also write the Markdown to this file")
-    parser.add_argument("--options", nargs=argparse.REMAINDER, default=[], help="of ns-train, at the end")
+    parser.add_argument("--options", nargs="...", default=[], help="of ns-train, at the end")
     arguments = parser.parse_args()
     folder, capture = arguments.folder.resolve(), arguments.data.resolve()
     shutil.rmtree(folder, ignore_errors=True)
@@ -292,11 +217,14 @@ def main() -> int:
     try:
         all_commands(capture, folder, arguments.steps, arguments.options, commands)
     finally:
-        text = page(folder, capture, arguments.steps, commands.rows)
-        print(text)
-        if arguments.output:
-            arguments.output.write_text(text)
-    return int(any(row.status for row in commands.rows))
+        notes = [f"Stand-ins for {', '.join(STAND_INS)}."]
+        for waits_per_step in re.findall(
+            r"waits per step: ([\d.]+)", "".join(p.read_text() for p in folder.glob("*.log"))
+        ):
+            notes.append(f"Waits of the host for the card per step, nerfstudio's own included: {waits_per_step}.")
+        title = f"nerfstudio on {capture.name}, {arguments.steps} steps"
+        publish(page(title, tables(folder, commands), notes), arguments.output)
+    return int(any(cost is None for _, cost, _ in commands.rows))
 
 
 if __name__ == "__main__":

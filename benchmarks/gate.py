@@ -177,44 +177,28 @@ def in_a_process(data: Path, downscale: int) -> dict[str, float]:
         return process.submit(run_job, data, downscale).result()
 
 
-@dataclass(frozen=True)
-class Line:
-    """One figure of one scene beside its baseline."""
-
-    scene: str
-    figure: str
-    before: float | None
-    now: float
-    verdict: str  # "ok", "WORSE", "new" (no baseline) or "not judged" (a time on another kind of processor)
-
-    def cells(self) -> list[str]:
-        """For the table."""
-        limit = LIMITS[self.figure]
-        shown = ["" if value is None else f"{value:,.{limit.digits}f}" for value in (self.before, self.now)]
-        allowed = f"{100 * limit.by:g} %" if limit.relative else f"{limit.by:g}"
-        if self.before is None:
-            change = ""
-        elif limit.relative:
-            change = f"{100 * (self.now / self.before - 1):+.1f} %"
-        else:
-            change = f"{self.now - self.before:+.{limit.digits}f}"
-        return [self.scene, limit.title, *shown, change, allowed, self.verdict]
+Line = tuple[str, str, list[str]]  # figure, verdict, cells of the table
 
 
 def judge(found: Scenes, baseline: Scenes, same_cpu: bool) -> list[Line]:
-    """Every figure against its baseline."""
+    """Every figure against its baseline. Verdicts: "ok", "WORSE", "new" (no baseline) or "not judged" (a time on
+    another kind of processor)."""
     lines = []
     for scene, figures in found.items():
         for key, limit in LIMITS.items():
-            before = baseline.get(scene, {}).get(key)
+            before, now = baseline.get(scene, {}).get(key), figures[key]
             if before is None:
-                verdict = "new"
-            elif limit.timed and not same_cpu:
-                verdict = "not judged"
+                verdict, change = "new", ""
             else:
                 slack = 1.0 if same_cpu else ELSEWHERE
-                verdict = "WORSE" if limit.worse(figures[key], before, slack) else "ok"
-            lines.append(Line(scene, key, before, figures[key], verdict))
+                verdict = "WORSE" if limit.worse(now, before, slack) else "ok"
+                relative = f"{100 * (now / before - 1):+.1f} %" if limit.relative else ""
+                change = relative or f"{now - before:+.{limit.digits}f}"
+                if limit.timed and not same_cpu:
+                    verdict = "not judged"
+            shown = ["" if value is None else f"{value:,.{limit.digits}f}" for value in (before, now)]
+            allowed = f"{100 * limit.by:g} %" if limit.relative else f"{limit.by:g}"
+            lines.append((key, verdict, [scene, limit.title, *shown, change, allowed, verdict]))
     return lines
 
 
@@ -260,13 +244,13 @@ def main() -> None:
     found = measure(options.capture)
     same_cpu = baseline["processor"] == processor()
     lines = judge(found, baseline["scenes"], same_cpu)
-    worse = [line for line in lines if line.verdict == "WORSE"]
-    if worse and all(LIMITS[line.figure].timed for line in worse) and not options.accept:
+    worse = [key for key, verdict, _ in lines if verdict == "WORSE"]
+    if worse and all(LIMITS[key].timed for key in worse) and not options.accept:
         say("gate: slower than the baseline; timed once more, as the machine may have been busy")
         found = quicker(found, measure(options.capture))
         lines = judge(found, baseline["scenes"], same_cpu)
-        worse = [line for line in lines if line.verdict == "WORSE"]
-    rows = [line.cells() for line in lines]
+        worse = [key for key, verdict, _ in lines if verdict == "WORSE"]
+    rows = [cells for *_, cells in lines]
     print(table(("scene", "figure", "baseline", "now", "change", "may be worse by", ""), rows, (0, 1, 6)))
     if not same_cpu:
         print(

@@ -3,9 +3,8 @@
 
 `import torchvision` then fails with "operator torchvision::nms does not exist", and nerfstudio with it. The better cure
 is the matching CPU wheel (https://download.pytorch.org/whl/cpu). Where that fails with just this message, this declares
-the missing operators whenever torchvision is imported with this mismatch; `--remove` deletes the two files."""
+the missing operators whenever torchvision is imported with this mismatch, by two files in site-packages."""
 
-import argparse
 import subprocess
 import sys
 import sysconfig
@@ -73,18 +72,11 @@ def import_error() -> str:
 
 
 def main() -> int:
-    """Apply or remove the remedy; 0 when torchvision imports afterwards."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--remove", action="store_true", help="delete what an earlier run wrote")
-    args = parser.parse_args()
+    """Apply the remedy; 0 when torchvision imports afterwards."""
     if sys.prefix == sys.base_prefix:
         print("torchvision remedy: run this with the Python of a virtual environment", file=sys.stderr)
         return 2
     module, pth = shim_files()
-    if args.remove:
-        for path in (pth, module):
-            path.unlink(missing_ok=True)
-        return 0
     error = import_error()
     if not error:
         print("torchvision imports: nothing to do")

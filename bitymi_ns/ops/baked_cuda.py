@@ -269,47 +269,6 @@ class Workspace:
         return fitted
 
 
-class ListedPairs(NamedTuple):
-    """The lists of a frame."""
-
-    ranges: Tensor  # [tiles, 2] where the list of each screen tile begins and ends, all views one after the other
-    depth: Tensor  # [surfels * views] keys in the order of depth, 2^32 - 1: not visible
-    pairs: Tensor  # row << 8 | mask of the 8 x 4 parts of the tile, tile by tile
-
-    @property
-    def visible(self) -> Tensor:
-        """[surfels * views] which of the surfels are visible."""
-        return self.depth != 0xFFFFFFFF
-
-
-def listed_pairs(workspace: Workspace, surfels: int, views: int, width: int, height: int) -> ListedPairs:
-    """Read the lists that the latest frame, without normals, left in the working memory (`lay_out` of
-    csrc/cuda/baked_frame.cu), on the CPU: for tests and benchmarks."""
-    assert workspace.memory is not None
-    memory, at = workspace.memory.cpu(), 256
-    tiles, rows, slots = tiles_of(views, width, height), surfels * views, workspace.slots
-
-    def take(count: int) -> Tensor:
-        nonlocal at
-        values = memory[at : at + 4 * count].view(torch.int32)
-        at += -(-4 * count // 256) * 256
-        return values
-
-    lists = take(8 * tiles).view(tiles, 8).long() & 0xFFFFFFFF
-    take(24 * rows)
-    depth = take(rows).long() & 0xFFFFFFFF
-    pairs = take(tiles * slots + workspace.capacity).long() & 0xFFFFFFFF
-    counts, rest = torch.where(lists[:, 0] > slots, lists[:, 1], lists[:, 0]), lists[:, 2]
-    ends = counts.cumsum(0)
-    begins = ends - counts
-    tile = torch.repeat_interleave(torch.arange(tiles), counts)
-    index = torch.arange(len(tile)) - begins[tile]  # in the tile's list
-    at_slot = index < slots
-    return ListedPairs(
-        torch.stack([begins, ends], dim=1), depth, pairs[index + torch.where(at_slot, tile * slots, rest[tile])]
-    )
-
-
 def empty_images(names: Sequence[str], views: int, width: int, height: int, device: torch.device) -> dict[str, Tensor]:
     """Memory for images: name -> [views, height, width, channels] (IMAGES)."""
     check_images(names)

@@ -46,7 +46,7 @@ class Layout:
     their first use.
 
     Attributes:
-        handle: the kernels' object: `TileBlocks` (csrc/cpu/blocks.h) or `Pairs` (csrc/cuda/pairs.h).
+        handle: the kernels' object: `TileBlocks` (csrc/cpu/blocks.h) or `Pairs` (csrc/cuda/fragment_list.h).
         arrays: the arrays that it refers to, by name.
     """
 

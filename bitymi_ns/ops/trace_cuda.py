@@ -1,4 +1,4 @@
-"""The fragment list by the CUDA kernels (csrc/cuda/pairs.h describes it).
+"""The fragment list by the CUDA kernels (csrc/cuda/fragment_list.h describes it).
 
 Two numbers decide how much memory is needed, so the host waits for the device twice per view: for the number of pairs
 of surfel and tile, and for the number of fragments.

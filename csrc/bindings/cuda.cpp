@@ -95,7 +95,7 @@ void bind_baked(nb::module_& m) {
 void bind_all(nb::module_& m) {
   m.def("device_problem", &device_problem, "device"_a,
         "Reason why the kernels cannot run on a CUDA device, and the remedy; empty when they can.");
-  bind_class<Pairs>(m, "Pairs", kCard, "Index of a fragment list (csrc/cuda/pairs.h).")
+  bind_class<Pairs>(m, "Pairs", kCard, "Index of a fragment list (csrc/cuda/fragment_list.h).")
       .def_prop_ro("pairs", [](const Held<Pairs>& p) { return p.pairs; })
       .def_prop_ro("fragments", [](const Held<Pairs>& p) { return p.fragments; });
   bind_operations<float>(m);

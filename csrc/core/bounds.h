@@ -4,8 +4,7 @@
 //
 // Always evaluated in double, from the same (rounded) coefficients that the fragments use: the conic of a needle with
 // axis ratio k loses k^2 in its determinant, and a bound that misses a pixel is a hole in the picture. This is what
-// training and the CPU use; plane_bounds.h is for the baked renderer on cards on which doubles are slow. core/outline.h
-// has what both share.
+// the CPU uses; plane_bounds.h is for cards, on which doubles are slow. core/outline.h has what both share.
 #pragma once
 
 #include "core/outline.h"
@@ -20,6 +19,12 @@ template <class T> struct ExtentOf : Outline<T> {
   // qa x^2 + 2 qb x y + qc y^2 + 2 qd x + 2 qe y + qf <= 0
 };
 using Extent = ExtentOf<double>;
+// fn(number of a, the same of b) for all numbers of two extents.
+template <class A, class B, class F> BT_HD void each_number(A& a, B& b, F&& fn) {
+  fn(a.x0, b.x0), fn(a.x1, b.x1), fn(a.y0, b.y0), fn(a.y1, b.y1);
+  fn(a.y_left, b.y_left), fn(a.y_right, b.y_right), fn(a.blur, b.blur);
+  fn(a.qa, b.qa), fn(a.qb, b.qb), fn(a.qc, b.qc), fn(a.qd, b.qd), fn(a.qe, b.qe), fn(a.qf, b.qf);
+}
 // The outermost points of a conic with a box.
 template <class T> BT_HD void find_outermost(ExtentOf<T>& e) {
   e.y_left = -(e.qb * e.x0 + e.qe) / e.qc, e.y_right = -(e.qb * e.x1 + e.qe) / e.qc;
@@ -72,18 +77,6 @@ template <class Kernel, class T> BT_HD Level<T> level_of(const T* g, double shar
   if constexpr (Kernel::kResized)
     l.blur = select(blurred >= almost, low_pass_radius(log_(max_(blurred, one)) + T(room)) / T(sqrt_(sharp)), T(0.0f));
   return l;
-}
-// Arguments of core/kernel.h's `reached` for such a row: r_c^2, and the squared radius of the low pass, 0 where the
-// kernel covers it.
-struct ReachLevels {
-  float r2, blur2;
-};
-template <class Kernel, class S> BT_HD ReachLevels reach_levels(const S* geom, S near, double sharp) {
-  double g[kGeom];
-  for (int c = 0; c < kGeom; ++c) g[c] = double(geom[c]);
-  const Level<double> l = level_of<Kernel>(g, sharp, kFloatRoom);
-  const float blur = covers_low_pass(g, double(near), 1 / sharp) ? 0.0f : float(l.blur);
-  return {float(l.r2), blur * blur};
 }
 // Its conic and the box of that, in doubles; of an image of that size.
 template <class T> BT_HD ExtentOf<T> conic_extent(const T* g, T rc2, T blur, int width, int height) {
@@ -198,15 +191,6 @@ template <class F> BT_HD TileSpan<double> tile_rows(const Extent& e, const F* ge
 template <class T> BT_HD TileSpan<T> tile_columns(const ExtentOf<T>& e, T cx, T cy, T row, int width) {
   const T top = row * T(double(kTile)) - (cy - T(0.5));  // pixel centre i + 0.5 has the offset i + 0.5 - c
   return tile_span(row_interval(e, top, top + T(double(kTile - 1))), cx - T(0.5), width);
-}
-// fn(row, first, last) for every row of tiles in which the surfel can touch those from `first` to `last`.
-template <class F, class Visit>
-BT_HD void for_tile_rows(const Extent& e, const F* geom, int width, int height, Visit&& fn) {
-  const TileSpan<double> rows = tile_rows(e, geom, height);
-  for (int row = int(rows.first); row <= int(rows.last); ++row) {
-    const TileSpan<double> columns = tile_columns(e, double(geom[kCx]), double(geom[kCy]), double(row), width);
-    if (columns.first <= columns.last) fn(row, int(columns.first), int(columns.last));
-  }
 }
 
 }  // namespace bt

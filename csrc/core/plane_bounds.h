@@ -1,5 +1,5 @@
-// Bounds of the pixels that a surfel can touch, like bounds.h, but in the reals of the fragments: for the baked
-// renderer on devices on which doubles are slow. It takes the image of the level set's disc (outline.h) instead of
+// Bounds of the pixels that a surfel can touch, like bounds.h, but in the reals of the fragments: for devices on which
+// doubles are slow. It takes the image of the level set's disc (outline.h) instead of
 // forming a conic. A box and the crossings with a line then follow from sums of squares; no determinant of squared
 // coefficients is taken, so that a needle costs no digits.
 #pragma once
@@ -15,27 +15,16 @@ template <class S> struct LevelSet {
   S blur2;  // 0: the low pass cannot exceed the kernel anywhere
 };
 
-// The same of a row of ResizedKernel, whose low pass has the squared radius 1 / sharp and the height kLowPassHeight.
-template <class S> BT_HD LevelSet<S> level_set(const S* g, S near, S sharp) {
+// Of a row; with ResizedKernel the low pass has the squared radius 1 / sharp and the height kLowPassHeight.
+template <class Kernel, class S> BT_HD LevelSet<S> level_set(const S* g, S near, S sharp) {
   LevelSet<S> l = {false, S(0), S(0)};
-  const S ratio = times_drawn(g[kOpacity]), blurred = ratio * g[kLowPassHeight], almost = S(1) - S(1e-6);
+  const S ratio = times_drawn(g[kOpacity]), almost = S(1) - S(1e-6);
+  const S blurred = Kernel::kResized ? ratio * g[kLowPassHeight] : ratio, wide = Kernel::kResized ? S(1) / sharp : S(1);
   l.visible = max_(ratio, blurred) >= almost;
   if (!l.visible) return l;
   l.r2 = level_radius2(log_(max_(ratio, S(1))) + S(1e-5), g[kBeta], S(4e-6));
   if (!(blurred >= almost)) return l;
-  const S wide = S(1) / sharp;
   l.blur2 = covers_low_pass(g, near, wide) ? S(0) : (log_(max_(blurred, S(1))) + S(1e-5)) * wide;
-  return l;
-}
-
-template <class S> BT_HD LevelSet<S> level_set(const S* g, S near) {
-  LevelSet<S> l = {false, S(0), S(0)};
-  const S ratio = times_drawn(g[kOpacity]);
-  l.visible = ratio >= S(1) - S(1e-6);
-  if (!l.visible) return l;
-  const S level = max_(log_(ratio), S(0)) + S(1e-5);
-  l.r2 = level_radius2(level, g[kBeta], S(4e-6));
-  l.blur2 = covers_low_pass(g, near, S(1)) ? S(0) : level;
   return l;
 }
 

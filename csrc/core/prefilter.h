@@ -70,9 +70,9 @@ template <class S, class T> BT_HD Fragment<T> filtered_fragment(const S* g, S ne
   return f;
 }
 
-// As fragment_vjp (core/kernel.h). 1 - x is bounded from below by what x changes over a pixel: the derivative is then
-// no larger than that of the kernel averaged over the pixel, also at the rim for beta < 1. rim = 0: no bound, the exact
-// derivative.
+// As fragment_vjp (core/kernel.h). 1 - x is bounded from below by what x changes over a pixel: the derivative is
+// then no larger than that of the kernel averaged over the pixel, also at the rim for beta < 1. rim = 0: no bound, the
+// exact derivative.
 template <class S, class T>
 BT_HD void filtered_vjp(const S* g, S near, S rim, T dx, T dy, T dsigma, T du, T dv, T ddepth, T* d, T& ddx, T& ddy) {
   const T zero = T(S(0)), one = T(S(1)), two = T(S(2)), reach = T(S(kSupport));

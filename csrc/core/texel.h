@@ -98,13 +98,9 @@ template <class S> BT_HD TexelCorners<S> texel_corners(S u, S v, const int32_t* 
   return c;
 }
 
-// The texels there, and the vector-Jacobian product of the fetch.
+// The texels there.
 template <class S> BT_HD void load_corners(const S* tile, const TexelCorners<S>& c, Vec3<S>* t) {
   for (int k = 0; k < 4; ++k) t[k] = load3(tile + 3 * c.at[k]);
-}
-// add(k, gradient of corner k).
-template <class S, class F> BT_HD void texel_corner_gradients(const TexelCorners<S>& c, Vec3<S> g, F&& add) {
-  for (int k = 0; k < 4; ++k) add(k, c.weight[k] * g);
 }
 // Gradient of the fetch along u and v from its four texels: 0 from the outer texel centres on; at a centre between
 // them, where the slope jumps, that of the side of larger coordinates.

@@ -34,23 +34,16 @@ BT_HD void find_seen(MaskOf<T> visible, const E& extent, int width, int height, 
   s.seen = s.seen & (cy + y1 >= zero) & (T(height) >= cy + y0);
   s.radii[0] = min_(most, max_(x1, -x0)), s.radii[1] = min_(most, max_(y1, -y0));
 }
-template <class Kernel, class S>
-BT_HD Sight<S> sight(const Pinhole<S>& cam, int width, int height, const SurfelRow<S>& in, S near,
-                     const Resize<S>& to) {
-  Sight<S> s;
-  s.projected = project<Kernel>(cam, in, near, s.geom, s.frame);
-  if constexpr (Kernel::kResized) s.projected = s.projected && resize(to, s.geom);
-  const Extent e = extent<Kernel>(s.geom, width, height, double(to.sharp));
-  find_seen(e.visible, e, width, height, s);
-  return s;
-}
 
 // Writes the rows of surfel i; all 0 where the camera does not see it. False when that is because a parameter is not
-// finite.
-template <class Kernel, class S>
-BT_HD bool project_visible(const Pinhole<S>& cam, int width, int height, const Surfels<S>& in, int64_t i, S near,
-                           const Resize<S>& to, S* geom, S* frames, S* radii) {
-  const Sight<S> s = sight<Kernel>(cam, width, height, surfel_row(in, i), near, to);
+// finite. mark(sight): calls find_seen.
+template <class Kernel, class S, class Mark>
+BT_HD bool project_visible(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, S near, const Resize<S>& to, S* geom,
+                           S* frames, S* radii, Mark&& mark) {
+  Sight<S> s;
+  s.projected = project<Kernel>(cam, surfel_row(in, i), near, s.geom, s.frame);
+  if constexpr (Kernel::kResized) s.projected = s.projected && resize(to, s.geom);
+  mark(s);
   for (int k = 0; k < kGeom; ++k) geom[i * kGeom + k] = s.seen ? s.geom[k] : S(0);
   for (int k = 0; k < kFrame; ++k) frames[i * kFrame + k] = s.seen ? s.frame[k] : S(0);
   for (int k = 0; k < 2; ++k) radii[2 * i + k] = s.seen ? s.radii[k] : S(0);

@@ -7,7 +7,7 @@
 #include "core/texel.h"
 #include "cpu/kernels.h"
 #include "cpu/threads.h"
-#include "cpu/tiles.h"
+#include "cpu/tile_state.h"
 
 namespace bt {
 

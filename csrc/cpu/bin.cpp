@@ -5,7 +5,7 @@
 #include "core/resize.h"
 #include "cpu/kernels.h"
 #include "cpu/threads.h"
-#include "cpu/tiles.h"
+#include "cpu/tile_state.h"
 
 namespace bt {
 
@@ -17,6 +17,19 @@ template <class S> int only_tile(const S* g, const S* radii, const Bins& bins) {
   if (!(column >= S(0) && row >= S(0) && column < S(bins.tiles_x) && row < S(bins.tiles_y))) return -1;
   if (!(x + radii[0] < (column + S(1)) * side - S(1) && y + radii[1] < (row + S(1)) * side - S(1))) return -1;
   return int(row) * bins.tiles_x + int(column);
+}
+
+// Arguments of core/kernel.h's `reached` for such a row: r_c^2, and the squared radius of the low pass, 0 where
+// the kernel covers it.
+struct ReachLevels {
+  float r2, blur2;
+};
+template <class Kernel, class S> BT_HD ReachLevels reach_levels(const S* geom, S near, double sharp) {
+  double g[kGeom];
+  for (int c = 0; c < kGeom; ++c) g[c] = double(geom[c]);
+  const Level<double> l = level_of<Kernel>(g, sharp, kFloatRoom);
+  const float blur = covers_low_pass(g, double(near), 1 / sharp) ? 0.0f : float(l.blur);
+  return {float(l.r2), blur * blur};
 }
 
 // Sorted by depth; those of the same depth keep their order.
@@ -98,10 +111,7 @@ template <class Kernel, class S> class Extents {
       Extent& to = found_[lane];
       to.visible = true;
       to.whole = whole >> lane & 1, to.ellipse = ellipse >> lane & 1, to.thin = thin >> lane & 1;
-      to.x0 = e.x0[lane], to.x1 = e.x1[lane], to.y0 = e.y0[lane], to.y1 = e.y1[lane];
-      to.y_left = e.y_left[lane], to.y_right = e.y_right[lane], to.blur = e.blur[lane];
-      to.qa = e.qa[lane], to.qb = e.qb[lane], to.qc = e.qc[lane];
-      to.qd = e.qd[lane], to.qe = e.qe[lane], to.qf = e.qf[lane];
+      each_number(to, e, [lane](double& one, const Lanes<double>& all) { one = all[lane]; });
       store_levels(lane, {level.r2[lane], blur[lane] * blur[lane]});
     }
   }
@@ -127,48 +137,29 @@ class TileRows {
   // The rows of a surfel; put(k, row, first, last) for all of those that fill the lanes, in the order of the surfels.
   template <class S, class Put> void add(int64_t k, const Extent& e, const S* g, int height, Put&& put) {
     const TileSpan<double> rows = tile_rows(e, g, height);
-    const double column[kColumns] = {double(e.whole),
-                                     double(e.ellipse),
-                                     double(e.thin),
-                                     e.x0,
-                                     e.x1,
-                                     e.y0,
-                                     e.y1,
-                                     e.y_left,
-                                     e.y_right,
-                                     e.blur,
-                                     e.qa,
-                                     e.qb,
-                                     e.qc,
-                                     e.qd,
-                                     e.qe,
-                                     e.qf,
-                                     double(g[kCx]),
-                                     double(g[kCy])};
     for (int row = int(rows.first); row <= int(rows.last); ++row) {
-      for (int c = 0; c < kColumns; ++c) columns_[c][count_] = column[c];
-      row_[count_] = double(row), k_[count_] = k;
+      each_number(extents_, e, [this](P& all, double one) { all.set(count_, one); });
+      whole_ |= uint32_t(e.whole) << count_, ellipse_ |= uint32_t(e.ellipse) << count_;
+      thin_ |= uint32_t(e.thin) << count_;
+      cx_.set(count_, double(g[kCx])), cy_.set(count_, double(g[kCy])), row_.set(count_, double(row)), k_[count_] = k;
       if (++count_ == kLanes) finish(put);
     }
   }
   // The rest.
   template <class Put> void finish(Put&& put) {
-    const auto at = [&](int c) { return bt::load(columns_[c]); };
-    const P zero = P(0.0);
-    ExtentOf<P> e;
-    e.whole = at(0) > zero, e.ellipse = at(1) > zero, e.thin = at(2) > zero;
-    e.x0 = at(3), e.x1 = at(4), e.y0 = at(5), e.y1 = at(6), e.y_left = at(7), e.y_right = at(8), e.blur = at(9);
-    e.qa = at(10), e.qb = at(11), e.qc = at(12), e.qd = at(13), e.qe = at(14), e.qf = at(15);
-    const TileSpan<P> span = tile_columns(e, at(16), at(17), bt::load(row_), width_);
+    extents_.whole = mask_of<double>(whole_), extents_.ellipse = mask_of<double>(ellipse_);
+    extents_.thin = mask_of<double>(thin_);
+    const TileSpan<P> span = tile_columns(extents_, cx_, cy_, row_, width_);
     for (int lane = 0; lane < count_; ++lane)
       put(k_[lane], int(row_[lane]), int(span.first[lane]), int(span.last[lane]));
-    count_ = 0;
+    count_ = 0, whole_ = ellipse_ = thin_ = 0;
   }
 
  private:
   using P = Lanes<double>;
-  static constexpr int kColumns = 18;
-  double columns_[kColumns][kLanes] = {}, row_[kLanes] = {};
+  ExtentOf<P> extents_;
+  uint32_t whole_ = 0, ellipse_ = 0, thin_ = 0;  // of the extents, by lane
+  P cx_ = P(0.0), cy_ = P(0.0), row_ = P(0.0);
   int64_t k_[kLanes];
   int width_, count_ = 0;
 };

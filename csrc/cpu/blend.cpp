@@ -7,8 +7,8 @@
 
 #include "cpu/blocks.h"
 #include "cpu/kernels.h"
-#include "cpu/patch.h"
-#include "cpu/runs.h"
+#include "cpu/surfel_order.h"
+#include "cpu/texel_patch.h"
 
 namespace bt {
 

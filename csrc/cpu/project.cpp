@@ -40,7 +40,7 @@ SurfelRow<P> surfel_lanes(const Surfels<float>& in, int64_t begin, int n) {
   return {{at(0), at(1), at(2)}, {at(3), at(4), at(5), at(6)}, {at(7), at(8)}, at(9), at(10)};
 }
 
-// As core/visibility.h has it for one surfel.
+// As project_visible (core/visibility.h) has it for one surfel.
 template <class Kernel>
 Sight<P> sight(const Pinhole<float>& cam, int width, int height, const SurfelRow<P>& in, float near,
                const Resize<float>& to) {
@@ -90,7 +90,10 @@ template <class S> void project_forward(const ProjectForward<S>& a) {
       else
         for (int64_t i = begin; i < end; ++i)
           broken[thread] +=
-              !project_visible<Kernel>(cam, a.width, a.height, a.surfels, i, a.near, to, a.geom, a.frames, a.radii);
+              !project_visible<Kernel>(cam, a.surfels, i, a.near, to, a.geom, a.frames, a.radii, [&](Sight<S>& s) {
+                const Extent e = extent<Kernel>(s.geom, a.width, a.height, double(to.sharp));
+                find_seen(e.visible, e, a.width, a.height, s);
+              });
     });
   });
   *a.broken += int32_t(std::accumulate(broken.begin(), broken.end(), int64_t(0)));

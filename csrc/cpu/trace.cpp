@@ -8,7 +8,7 @@
 #include "cpu/simd.h"
 #include "cpu/texel_alpha.h"
 #include "cpu/threads.h"
-#include "cpu/tiles.h"
+#include "cpu/tile_state.h"
 
 namespace bt {
 

@@ -8,7 +8,7 @@
 #include "core/shading.h"
 #include "core/view_color.h"
 #include "cuda/baked_pairs.h"
-#include "cuda/primitives.h"
+#include "cuda/sort_scan.h"
 
 namespace bt::cuda {
 
@@ -84,18 +84,10 @@ __global__ void __launch_bounds__(kListThreads, Kernel::kPixel ? 1 : bounded_blo
     const Resize<float> to(f.photo_pixel);
     if constexpr (Kernel::kResized) seen = seen && resize(to, geom);
     if (seen) {
-      LevelSet<float> level;
-      if constexpr (Kernel::kResized)
-        level = level_set(geom, s.near, to.sharp);
-      else if (filtered<Kernel>(geom))
-        level = {filtered_bounds(geom).visible, 0, -geom[kArea]};
-      else
-        level = level_set(geom, s.near);
-      for (int k = 0; k <= kBeta; ++k) row[k] = geom[k];
-      row[kR2] = level.r2, row[kBlur2] = level.blur2;
-      const Footprint of = footprint<Kernel>(row, v.width, v.height);
+      seen = level_row<Kernel>(geom, s.near, to.sharp, row);
+      const Footprint<float> of = footprint<Kernel>(row, v.width, v.height);
       const Interval<float> x = columns_of(of);
-      seen = level.visible && of.top <= of.bottom && (of.bounds.whole || (x.x1 >= 0 && x.x0 <= v.width));
+      seen = seen && of.top <= of.bottom && (of.bounds.whole || (x.x1 >= 0 && x.x0 <= v.width));
       z = geom[kZ];
       if (seen && (of.bounds.whole || most_tiles(of, f) >= kLarge))
         f.memory.large[atomicAdd(f.memory.large_count, 1)] = uint32_t(at);
@@ -152,7 +144,7 @@ template <class Kernel> __global__ void __launch_bounds__(kListThreads, 4) large
   int64_t listed = 0;
   for (int64_t i = int64_t(blockIdx.x) * kListWarps + threadIdx.x / kWarp; i < shares; i += warps) {
     const uint32_t r = m.large[i / kLargeParts];
-    const Footprint of = footprint<Kernel>(m.rows + int64_t(r) * kRow, f.width, f.height);
+    const Footprint<float> of = footprint<Kernel>(m.rows + int64_t(r) * kRow, f.width, f.height);
     for (int ty = of.top + int(i % kLargeParts); ty <= of.bottom; ty += kLargeParts) {
       if (of.bounds.whole) {
         listed += list_reached<Kernel>(f, r, ty, lane);

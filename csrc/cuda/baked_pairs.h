@@ -49,13 +49,13 @@ __device__ int last_at_most(const int* numbers, int count, int i) {
 }
 
 // Room for a footprint in shared memory, where nothing may have a constructor.
-struct alignas(Footprint) FootprintRoom {
-  unsigned char bytes[sizeof(Footprint)];
+struct alignas(Footprint<float>) FootprintRoom {
+  unsigned char bytes[sizeof(Footprint<float>)];
 };
-__device__ Footprint& footprint_in(FootprintRoom& room) { return *reinterpret_cast<Footprint*>(&room); }
+__device__ Footprint<float>& footprint_in(FootprintRoom& room) { return *reinterpret_cast<Footprint<float>*>(&room); }
 
 // At most so many tiles are listed for a surfel that has a box.
-__device__ int most_tiles(const Footprint& of, const BakedFrame& f) {
+__device__ int most_tiles(const Footprint<float>& of, const BakedFrame& f) {
   const Interval<float> x = columns_of(of);
   const int left = pixel_from(x.x0, f.width) / kTile, right = pixel_to(x.x1, f.width) / kTile;
   return (of.bottom - of.top + 1) * max_(right - left + 1, 1);
@@ -102,7 +102,7 @@ __device__ void list_pairs(const BakedFrame& f, FootprintRoom* area, int owned, 
     int pairs = 0, width = 0;
     if (me < taken) {
       const int surfel = last_at_most(first_row, owned, next + me);
-      const Footprint& of = footprint_in(area[surfel]);
+      const Footprint<float>& of = footprint_in(area[surfel]);
       const int ty = of.top + (next + me - first_row[surfel]);
       const TileRow mine = tile_row(of, ty, f.width);
       width = mine.right - mine.left + 1;

@@ -17,7 +17,7 @@
 #include "core/texel.h"
 #include "cuda/atlas_texture.h"
 #include "cuda/baked_sort.h"
-#include "cuda/fast.h"
+#include "cuda/fast_float.h"
 
 namespace bt::cuda {
 

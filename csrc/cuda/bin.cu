@@ -4,9 +4,9 @@
 // the pairs by tile alone. Both are stable, so a tile's pairs end front to back and equal depths keep the surfels'
 // order. There are about six pairs per surfel: the large sort moves 8 bytes per pair through two passes (13 bits for
 // 4,000 tiles) instead of 12 bytes through six (45 bits), and the depth enters with all its bits, in double as well.
-#include "core/kernel.h"
+#include "core/footprint.h"
 #include "cuda/kernels.h"
-#include "cuda/primitives.h"
+#include "cuda/sort_scan.h"
 #include "cuda/warp.h"
 
 namespace bt::cuda {
@@ -54,26 +54,37 @@ struct FillSpace {
         temp(arena.take<char>(temp_size)) {}
 };
 
-// True for a disc that crosses the camera's plane, which has no box whose tiles could be listed.
-template <class Kernel, class S> __device__ bool boxless(const Extent& e, const S* g) {
-  return e.whole && !filtered<Kernel>(g);
-}
-// fn(votes, tile) by all lanes of a warp for the tiles that such a disc reaches: lanes take a tile each, those with a
-// vote have one that is reached.
-template <class Kernel, class S, class F>
-__device__ void for_reached_tiles(const S* g, S near, int width, int height, int lane, F&& fn) {
-  const ReachLevels levels = reach_levels<Kernel>(g, near, 1);
-  const int across = tiles_across(width), tiles = across * tiles_across(height);
-  const S side = S(kTile), half = S(0.5) * (side - S(1));
-  const S half_x = cell_half(half, g[kCx], S(width) + side), half_y = cell_half(half, g[kCy], S(height) + side);
-  for (int first = 0; first < tiles; first += kWarp) {
-    const int tile = first + lane, row = tile / across, column = tile - row * across;
-    const Reached<S> r = reached(g, (S(column) + S(0.5)) * side - g[kCx], (S(row) + S(0.5)) * side - g[kCy], half_x,
-                                 half_y, S(levels.r2), S(levels.blur2));
-    const unsigned votes = __ballot_sync(kFullMask, tile < tiles && (r.support || r.centre));
-    if (votes) fn(votes, tile);
+// The tiles that a surfel can touch.
+template <class Kernel, class S> struct TouchedTiles {
+  S row[kLevelRow];
+  Footprint<S> of;
+  int width, height;
+
+  __device__ TouchedTiles(const View<S>& v, int64_t id) : width(v.width), height(v.height) {
+    level_row<Kernel>(v.geom + id * kGeom, v.near, S(1), row);
+    of = footprint<Kernel>(row, width, height);
   }
-}
+  // True for a disc that crosses the camera's plane, which has no box whose tiles could be listed.
+  __device__ bool boxless() const { return of.bounds.whole; }
+  // fn(row, first, last) for the rows of tiles of one with a box.
+  template <class F> __device__ void each_row(F&& fn) const {
+    for (int ty = of.top; ty <= of.bottom; ++ty) {
+      const TileRow tiles = tile_row(of, ty, width);
+      if (tiles.left <= tiles.right) fn(ty, tiles.left, tiles.right);
+    }
+  }
+  // fn(votes, tile) by all lanes of a warp for the tiles that one without reaches: lanes take a tile each, those with a
+  // vote have one that is reached.
+  template <class F> __device__ void each_reached(int lane, F&& fn) const {
+    const int across = tiles_across(width), tiles = across * tiles_across(height);
+    for (int first = 0; first < tiles; first += kWarp) {
+      const int tile = first + lane, ty = tile / across;
+      const unsigned votes =
+          __ballot_sync(kFullMask, tile < tiles && reached_parts<Kernel>(row, tile - ty * across, ty) != 0);
+      if (votes) fn(votes, tile);
+    }
+  }
+};
 
 template <class Kernel, class S> __global__ void __launch_bounds__(kThreads) count_kernel(View<S> v, CountSpace<S> w) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
@@ -82,16 +93,14 @@ template <class Kernel, class S> __global__ void __launch_bounds__(kThreads) cou
   bool crosses = false;
   int64_t count = 0;
   if (visible) {
-    const S* g = v.geom + i * kGeom;
-    const Extent e = extent<Kernel>(g, v.width, v.height);
-    crosses = boxless<Kernel>(e, g);
-    if (!crosses) for_tile_rows(e, g, v.width, v.height, [&](int, int first, int last) { count += last - first + 1; });
+    const TouchedTiles<Kernel, S> touched(v, i);
+    crosses = touched.boxless();
+    if (!crosses) touched.each_row([&](int, int first, int last) { count += last - first + 1; });
   }
   for (unsigned todo = __ballot_sync(kFullMask, crosses); todo; todo &= todo - 1) {
     const int j = __ffs(int(todo)) - 1;
     int reached = 0;
-    for_reached_tiles<Kernel>(v.geom + (i - lane + j) * kGeom, v.near, v.width, v.height, lane,
-                              [&](unsigned votes, int) { reached += __popc(votes); });
+    TouchedTiles<Kernel, S>(v, i - lane + j).each_reached(lane, [&](unsigned votes, int) { reached += __popc(votes); });
     if (lane == j) count = reached;
   }
   if (i >= v.n) return;
@@ -124,8 +133,9 @@ __global__ void __launch_bounds__(kThreads)
     w.owner[slot] = whose;
   };
   // the tiles of a box by `step` threads, of which this is number `mine`; where the next slot is
-  const auto list_box = [&](const Extent& e, int32_t whose, int64_t at, int64_t end, int mine, int step) {
-    for_tile_rows(e, v.geom + int64_t(whose) * kGeom, v.width, v.height, [&](int row, int first, int last) {
+  using Touched = TouchedTiles<Kernel, S>;
+  const auto list_box = [&](const Touched& touched, int32_t whose, int64_t at, int64_t end, int mine, int step) {
+    touched.each_row([&](int row, int first, int last) {
       for (int column = first + mine; column <= last; column += step) {
         const int64_t slot = at + column - first;
         if (slot >= end) break;
@@ -141,26 +151,24 @@ __global__ void __launch_bounds__(kThreads)
   };
   bool by_warp = false;
   if (count) {
-    const S* g = v.geom + int64_t(id) * kGeom;
-    const Extent e = extent<Kernel>(g, v.width, v.height);
-    by_warp = count > kAlone || boxless<Kernel>(e, g);
-    if (!by_warp) close(id, list_box(e, id, from, from + count, 0, 1), from + count, 0, 1);
+    const Touched touched(v, id);
+    by_warp = count > kAlone || touched.boxless();
+    if (!by_warp) close(id, list_box(touched, id, from, from + count, 0, 1), from + count, 0, 1);
   }
   for (unsigned todo = __ballot_sync(kFullMask, by_warp); todo; todo &= todo - 1) {
     const int j = __ffs(int(todo)) - 1;
     const int32_t whose = __shfl_sync(kFullMask, id, j);
     int64_t at = __shfl_sync(kFullMask, from, j);
     const int64_t end = at + __shfl_sync(kFullMask, count, j);
-    const S* g = v.geom + int64_t(whose) * kGeom;
-    const Extent e = extent<Kernel>(g, v.width, v.height);
-    if (boxless<Kernel>(e, g))
-      for_reached_tiles<Kernel>(g, v.near, v.width, v.height, lane, [&](unsigned votes, int tile) {
+    const Touched touched(v, whose);
+    if (touched.boxless())
+      touched.each_reached(lane, [&](unsigned votes, int tile) {
         const int64_t slot = at + count_below(votes, lane);
         if ((votes >> lane & 1u) && slot < end) put(slot, tile, whose);
         at += __popc(votes);
       });
     else
-      at = list_box(e, whose, at, end, lane, kWarp);
+      at = list_box(touched, whose, at, end, lane, kWarp);
     close(whose, at, end, lane, kWarp);
   }
 }

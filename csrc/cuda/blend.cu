@@ -163,9 +163,11 @@ __global__ void __launch_bounds__(kTileThreads, resident<S, kMaps, kResidual>())
           if (out.residual) store3(out.residual + 3 * i, dcolor);
         if (out.uv) out.uv[i] = dot(dcolor, slopes.u), out.uv[f.total + i] = dot(dcolor, slopes.v);
       }
-      if (kTexels && out.sums_texels)
-        add_to_texels(textured ? patch.first + corners.at[0] : int64_t(-1), corners, dcolor, int(threadIdx.x) % kWarp,
-                      texel_sums);
+      if (kTexels && out.sums_texels) {
+        const S d[3] = {dcolor.x, dcolor.y, dcolor.z};
+        add_to_corners(textured ? patch.first + corners.at[0] : int64_t(-1), corners, d, int(threadIdx.x) % kWarp,
+                       texel_sums);
+      }
     }
     const S sum = sum_over_run(sums, lane);
     if (some && lane < kSums) out.partial[int64_t(p.slot[k]) * kSums + lane] = sum;
@@ -194,7 +196,10 @@ void run_backward(const BlendBackward<S, Pairs>& a, const ExactSums& exact, Stre
   fill_zero(a.dgeom, p.surfels * kGeom, stream);
   sum_slots<blend_sums(kMaps)>(p, static_cast<const S*>(a.partial),
                                StoreSurfelGradient<S>{a.of.table.base, a.dgeom, a.dbase}, stream);
-  if (a.sums_texels()) finish_texels<kExact>(a, a.of.table.texels, exact, stream);
+  if (!a.sums_texels()) return;
+  if (a.dtexels) fill_zero(a.dtexels, 3 * a.of.table.texels, stream);
+  each_shown_texel(p, a.of.table, FinishTexel<S, kExact>{a.work.sums, exact, a.share, a.rate, a.dtexels, a.moved},
+                   stream);
 }
 }  // namespace
 
@@ -213,7 +218,7 @@ template <class S, bool kMaps> void backward(const BlendBackward<S, Pairs>& a, S
                                         a.of.fragments.f.total, a.of.numbers(), a.dimage, stream);
     run_backward<S, kMaps, Residual::kTexels, true>(a, exact, stream);
   } else if (a.of.table.texels) {
-    fill_zero(a.work.sums, entries, stream);
+    if (entries) each_shown_texel(a.of.fragments.layout, a.of.table, ClearTexel<S>{a.work.sums}, stream);
     run_backward<S, kMaps, Residual::kTexels, false>(a, {}, stream);
   } else if (a.of.residual) {
     run_backward<S, kMaps, Residual::kListed, false>(a, {}, stream);

@@ -5,7 +5,7 @@
 #include <string>
 
 #include "cuda/device.h"
-#include "cuda/pairs.h"
+#include "cuda/fragment_list.h"
 #include "ops/appearance.h"
 #include "ops/blend.h"
 #include "ops/field.h"

@@ -1,4 +1,5 @@
 // Projection of all surfels: one thread per surfel.
+#include "core/footprint.h"
 #include "core/visibility.h"
 #include "cuda/kernels.h"
 
@@ -11,8 +12,15 @@ template <class Kernel, class S> __global__ void __launch_bounds__(kThreads) for
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= a.surfels.n) return;
   const Pinhole<S> cam = pinhole(a.viewmat, a.K);
+  const auto mark = [&](Sight<S>& s) {
+    S row[kLevelRow];
+    const bool visible = level_row<Kernel>(s.geom, a.near, S(1), row);
+    auto [bounds, pad] = row_bounds<Kernel>(row, a.width, a.height);
+    bounds.x0 -= pad, bounds.x1 += pad, bounds.y0 -= pad, bounds.y1 += pad;
+    find_seen(visible, bounds, a.width, a.height, s);
+  };
   const bool fine =
-      project_visible<Kernel>(cam, a.width, a.height, a.surfels, i, a.near, Resize<S>(S(1)), a.geom, a.frames, a.radii);
+      project_visible<Kernel>(cam, a.surfels, i, a.near, Resize<S>(S(1)), a.geom, a.frames, a.radii, mark);
   if (!fine) atomicAdd(a.broken, 1);
 }
 

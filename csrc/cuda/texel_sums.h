@@ -3,49 +3,75 @@
 #pragma once
 
 #include "cuda/exact_sums.h"
+#include "cuda/fragment_list.h"
 #include "ops/texel.h"
 
 namespace bt::cuda {
 
-// Adds the gradients of every lane's four corners, one addition per run of lanes between the same texels. Row: that of
-// the first corner in the list of texels, -1 where there is none; sums have rows of four.
-template <class S, bool kExact>
-__device__ void add_to_texels(int64_t row, const TexelCorners<S>& at, Vec3<S> g, int lane, const Adder<S, kExact>& to) {
-  S value[12];
-  texel_corner_gradients(at, g, [&](int k, Vec3<S> d) { store3(value + 3 * k, d); });
+// Adds the gradients of every lane's four corners, g being that of the fetch of M channels; one addition per run of
+// lanes between the same texels. row: that of the first corner in the list of texels, -1 where there is none. Sums of
+// three channels have rows of four.
+template <int M, class S, bool kExact>
+__device__ void add_to_corners(int64_t row, const TexelCorners<S>& at, const S (&g)[M], int lane,
+                               const Adder<S, kExact>& to) {
+  static_assert(M == 1 || M == 3);
+  S value[4 * M];
+  BT_UNROLL
+  for (int i = 0; i < 4 * M; ++i) value[i] = at.weight[i / M] * g[i % M];
   const unsigned run = run_of(row, lane);
   sum_over_run(run, lane, value);
   if (row < 0 || count_below(run, lane)) return;
   BT_UNROLL
   for (int k = 0; k < 4; ++k) {
-    const S d[4] = {value[3 * k], value[3 * k + 1], value[3 * k + 2], S(0)};
-    if (d[0] != S(0) || d[1] != S(0) || d[2] != S(0)) to.add4(4 * (row + at.at[k] - at.at[0]), d);
+    const int64_t texel = row + at.at[k] - at.at[0];
+    const S* d = value + M * k;
+    if constexpr (M == 1) {
+      if (d[0] != S(0)) to.add(texel, d[0]);
+    } else {
+      const S four[4] = {d[0], d[1], d[2], S(0)};
+      if (d[0] != S(0) || d[1] != S(0) || d[2] != S(0)) to.add4(4 * texel, four);
+    }
   }
 }
 
-constexpr int kFinishThreads = 256;
-// Use of the sums: the gradient, or a step of the texels.
-template <class S, bool kExact>
-__global__ void __launch_bounds__(kFinishThreads)
-    finish_texels_kernel(int64_t texels, S* sums, ExactSums exact, const S* __restrict__ share, S rate,
-                         S* __restrict__ dtexels, S* __restrict__ moved) {
-  const int64_t t = int64_t(blockIdx.x) * kFinishThreads + threadIdx.x;
-  if (t >= texels) return;
-  const Adder<S, kExact> of = adder<kExact>(sums, exact);
-  const Vec3<S> g = {of.sum(4 * t), of.sum(4 * t + 1), of.sum(4 * t + 2)};
-  if (dtexels) store3(dtexels + 3 * t, g);
-  if (moved && (g.x != S(0) || g.y != S(0) || g.z != S(0)))
-    store3(moved + 3 * t, texel_step(load3(moved + 3 * t), g, rate, share[t]));
+constexpr int kTexelThreads = 256;
+// fn(texel) for the texels of the surfels that have a pair, which are all that a view can show: a warp per surfel.
+template <class S, class F>
+__global__ void __launch_bounds__(kTexelThreads) shown_texels_kernel(Pairs p, TexelTiles<S> tiles, F fn) {
+  const int64_t r = (int64_t(blockIdx.x) * kTexelThreads + threadIdx.x) / kWarp;
+  if (r >= p.surfels || p.slot_start[r] == p.slot_start[r + 1]) return;
+  const int64_t id = p.order[r], first = tiles.first[id];
+  const int64_t area = int64_t(tiles.size[2 * id]) * tiles.size[2 * id + 1];
+  for (int64_t t = threadIdx.x % kWarp; t < area; t += kWarp) fn(first + t);
+}
+template <class S, class F>
+void each_shown_texel(const Pairs& p, const TexelTiles<S>& tiles, const F& fn, Stream stream) {
+  if (p.surfels)
+    BT_LAUNCH((shown_texels_kernel<S, F>), dim3(unsigned(ceil_div(p.surfels * kWarp, kTexelThreads))),
+              dim3(kTexelThreads), 0, stream, p, tiles, fn);
 }
 
-// `a`: arguments with dtexels, moved, share, rate and work.
-template <bool kExact, class Arguments>
-void finish_texels(const Arguments& a, int64_t texels, const ExactSums& exact, Stream stream) {
-  using S = std::remove_pointer_t<decltype(a.moved)>;
-  const auto finish = finish_texels_kernel<S, kExact>;
-  if (texels)
-    BT_LAUNCH(finish, dim3(unsigned(ceil_div(texels, kFinishThreads))), dim3(kFinishThreads), 0, stream, texels,
-              a.work.sums, exact, a.share, a.rate, a.dtexels, a.moved);
-}
+template <class S> struct ClearTexel {
+  struct alignas(16) Row {
+    S v[4];
+  };
+  S* sums;
+  __device__ void operator()(int64_t t) const { reinterpret_cast<Row*>(sums)[t] = {}; }
+};
+// Use of the sums: the gradient, or a step of the texel.
+template <class S, bool kExact> struct FinishTexel {
+  S* sums;
+  ExactSums exact;
+  const S* share;
+  S rate;
+  S *dtexels, *moved;
+  __device__ void operator()(int64_t t) const {
+    const Adder<S, kExact> of = adder<kExact>(sums, exact);
+    const Vec3<S> g = {of.sum(4 * t), of.sum(4 * t + 1), of.sum(4 * t + 2)};
+    if (dtexels) store3(dtexels + 3 * t, g);
+    if (moved && (g.x != S(0) || g.y != S(0) || g.z != S(0)))
+      store3(moved + 3 * t, texel_step(load3(moved + 3 * t), g, rate, share[t]));
+  }
+};
 
 }  // namespace bt::cuda

@@ -7,9 +7,9 @@
 // with a fragment), trace_fill also by the 28 bytes per fragment that it writes.
 #include "core/kernel.h"
 #include "core/visibility.h"
-#include "cuda/fast.h"
+#include "cuda/fast_float.h"
 #include "cuda/kernels.h"
-#include "cuda/primitives.h"
+#include "cuda/sort_scan.h"
 #include "cuda/texel_alpha.h"
 
 namespace bt::cuda {

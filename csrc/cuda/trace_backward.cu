@@ -5,7 +5,7 @@
 // list one pair at a time with all lanes busy (in the walk two thirds would idle) and reduce once per pair. Gradients
 // of alpha texels are summed over neighbouring fragments between the same texels, then added in memory.
 #include "core/kernel.h"
-#include "cuda/fast.h"
+#include "cuda/fast_float.h"
 #include "cuda/kernels.h"
 #include "cuda/texel_alpha.h"
 #include "cuda/texel_sums.h"
@@ -35,7 +35,7 @@ __global__ void __launch_bounds__(kTileThreads)
     if (!t.mine) return;
     dsigma[t.i] = plain(blend_vjp(T(t.weight), T(abs_(t.sigma)), T(t.dweight), later));
   };
-  for_each_fragment<4, true>(p, s, load, use);
+  each_fragment_back<4>(p, s, load, use);
 }
 
 // Alpha texels, and where their gradients are added up; `texels` null: nowhere.
@@ -44,21 +44,6 @@ template <class S> struct AlphaGradient {
   S* texels;
   ExactSums exact;
 };
-
-// Adds the gradients of every lane's four corners, one addition per run of lanes between the same texels; row as in
-// add_to_texels.
-template <class S, bool kExact>
-__device__ void add_to_alpha(int64_t row, const TexelCorners<S>& at, S dm, int lane, const Adder<S, kExact>& to) {
-  S value[4];
-  BT_UNROLL
-  for (int k = 0; k < 4; ++k) value[k] = at.weight[k] * dm;
-  const unsigned run = run_of(row, lane);
-  sum_over_run(run, lane, value);
-  if (row < 0 || count_below(run, lane)) return;
-  BT_UNROLL
-  for (int k = 0; k < 4; ++k)
-    if (value[k] != S(0)) to.add(row + at.at[k] - at.at[0], value[k]);
-}
 
 template <class Kernel, class S, bool kAlpha, bool kExact>
 __global__ void __launch_bounds__(kRunThreads)
@@ -89,16 +74,16 @@ __global__ void __launch_bounds__(kRunThreads)
     if constexpr (kAlpha) {
       const AlphaPatch<S> patch(alpha.tiles, id);
       TexelCorners<S> corners = {};
-      S v = S(0), dm = S(0);
+      S v = S(0), dm[1] = {S(0)};
       if (mine && patch.textured()) v = f.uv[f.total + i];
       const bool is_cut = mine && patch.textured() && is_marked(v);
       if (is_cut) {
         corners = patch.corners(f.uv[i], v);
-        dm = alpha_vjp(patch, corners, listed, gs, gu, gv);
+        dm[0] = alpha_vjp(patch, corners, listed, gs, gu, gv);
       }
       if (alpha.texels)
-        add_to_alpha(is_cut ? patch.first + corners.at[0] : int64_t(-1), corners, dm, int(threadIdx.x) % kWarp,
-                     adder<kExact>(alpha.texels, alpha.exact));
+        add_to_corners(is_cut ? patch.first + corners.at[0] : int64_t(-1), corners, dm, int(threadIdx.x) % kWarp,
+                       adder<kExact>(alpha.texels, alpha.exact));
     }
     if (mine) {
       const int32_t y = row_of(pixel), x = pixel - y * p.width;

@@ -5,11 +5,11 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.ops import baked_cuda
-from bitymi_ns.ops.baked_cuda import Stage, Workspace, listed_pairs, slots_per_tile
+from bitymi_ns.ops.baked_cuda import Stage, Workspace, slots_per_tile
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from tests.bake.conftest import make_surfels
-from tests.cuda.baked_scenes import FLIP, camera_of, front, most, scene_of
+from tests.cuda.baked_scenes import FLIP, camera_of, front, listed_pairs, most, scene_of
 from tests.ops.golden import SURFEL_KEYS, crossing_scene, random_scene, reference, tiles_reached
 
 

@@ -35,11 +35,13 @@ def test_projection_and_its_gradients(name: str, dtype: torch.dtype, device: tor
     tolerance = 1e-10 if dtype == torch.float64 else 1e-4
     for i, (a, b) in enumerate(zip(got, want, strict=True)):
         assert torch.isfinite(a).all()
-        if i == RADII:  # box of the level set: the conic of a needle is ill-conditioned, its padding is 0.01 pixels
+        if (
+            i == RADII
+        ):  # half extents of the level set, from planes in single precision here, from a conic in double there
             # one that ends far outside of the image, next to the camera's plane, depends on every rounding
             a, b = (t.clamp(max=8.0 * max(case.width, case.height)) for t in (a, b))
-            beyond = (a - b).abs() - 1e-3 * b  # a card fuses products and sums
-            assert beyond.max() <= (0.02 if device.type == "cuda" else 0.01), beyond.max()
+            wider, narrower = (a - b - 1e-3 * b).max(), (b - a - 1e-3 * b).max()
+            assert wider <= 0.1 and narrower <= (0.02 if device.type == "cuda" else 0.01), (wider, narrower)
         else:
             assert (a - b).abs().max() <= tolerance * b.abs().max()
 

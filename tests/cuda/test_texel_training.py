@@ -172,7 +172,7 @@ def test_surfels_that_are_pruned_take_their_texels_along(device: torch.device) -
         scene.surfels["opacity_logits"][3] = -20.0
         before = scene.render(camera).rgb
     left = len(field.texels) - int(field.size[3].prod())
-    trainer.training.strategy._remove(torch.arange(n, device=device) == 3, scene, trainer.optimizers)
+    trainer.training.strategy.remove(torch.arange(n, device=device) == 3, scene, trainer.optimizers)
     assert len(scene) == len(field.size) == n - 1 and len(field.texels) == len(field.share) == field.tiles.count == left
     with torch.no_grad():
         torch.testing.assert_close(scene.render(camera).rgb, before, rtol=0, atol=1e-6)

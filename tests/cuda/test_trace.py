@@ -154,6 +154,24 @@ def test_single_precision(device: torch.device, cpu: CpuContext) -> None:
         assert (error < 1e-4).double().mean() >= 0.97 and error.max() < 1e-2, key
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
+@pytest.mark.parametrize("seed", range(3))
+def test_no_fragment_of_thin_small_and_large_surfels_is_lost(
+    seed: int, dtype: torch.dtype, device: torch.device
+) -> None:
+    """Bounds of the list's own precision (core/footprint.h) against the reference, which tries every pixel."""
+    case = random_scene(100, 100 + seed, width=72, height=56)
+    g = torch.Generator().manual_seed(seed)
+    case.params["log_scales"] += 2.0 * torch.randn(100, 2, generator=g, dtype=torch.float64)
+    case.params["opacity_logits"] -= 2.0  # so that few pixels end before the last surfel
+    fragments = ops.trace(ops.project(*values_of(case, dtype, device), camera_of(case, dtype)))
+    want = reference(case, [case.params[name] for name in SURFEL_KEYS]).weight
+    found = torch.zeros_like(want)
+    found[fragments.pixel.cpu().long(), fragments.surfel.cpu().long()] = fragments.weight.detach().cpu().double()
+    assert (want > 0).sum() > 1000
+    assert ((found > 0) != (want > 0)).double().mean() <= (0 if dtype == torch.float64 else 1e-4)
+
+
 def test_more_surfels_in_a_tile_than_a_warp_has_lanes_and_pixels_that_close(
     device: torch.device, cpu: CpuContext
 ) -> None:

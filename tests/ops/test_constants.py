@@ -37,7 +37,7 @@ STATED = {
     "moments of SSIM": (r"\[4\] \+= k\w \*", ["ssim.h"]),
     "mask of a hash": (r"log2_size\) - 1u", ["field.h"]),
     "where a camera stands": (r"-\(double\(\w\[k\]\) \*", ["camera.h"]),
-    "reals as sort keys": (r"\? ~bits", ["primitives.h"]),
+    "reals as sort keys": (r"\? ~bits", ["sort_scan.h"]),
     "temperature": (r"min_\(.*kLogTauMax", ["view_kinds.h"]),
     "golden angle": (r"3\.0 - (math\.sqrt\(5|5\.0)", ["sphere.py"]),
 }

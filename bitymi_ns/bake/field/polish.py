@@ -59,7 +59,6 @@ class _Polish:
             view_color=drawn.view_color,  # type: ignore[arg-type]
             weight_bound=drawn.weight_bound,
             prefilter=drawn.prefilter,  # type: ignore[arg-type]
-            texture_moves_surfels=True,
         )
         tiles = self.texels.tiles
         self.field = TexelField(tiles.size, tiles.extent, self.texels.values)

@@ -97,12 +97,6 @@ class Cells:
         self._known[identity(key)] = cell
 
 
-def without_nan(value: Any) -> Any:
+def without_nan(value: dict[str, Any]) -> dict[str, Any]:
     """Replace numbers that JSON cannot hold by None."""
-    if isinstance(value, dict):
-        return {key: without_nan(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [without_nan(item) for item in value]
-    if isinstance(value, float) and value - value != 0:
-        return None
-    return value
+    return json.loads(json.dumps(value), parse_constant=lambda constant: None)

@@ -12,8 +12,8 @@ import tyro
 
 from bitymi_ns.files import check_writable, explained, write_file
 from bitymi_ns.measure import markdown
-from bitymi_ns.measure.bench.cells import Cells
-from bitymi_ns.measure.bench.engine import open_cells, run_chains
+from bitymi_ns.measure.bench.cells import FILE, Cells
+from bitymi_ns.measure.bench.engine import run_chains
 from bitymi_ns.measure.bench.matrix import (
     Bundle,
     Format,
@@ -23,7 +23,6 @@ from bitymi_ns.measure.bench.matrix import (
     local_scenes,
     read_plan,
     standard_scenes,
-    suites,
 )
 from bitymi_ns.measure.bench.process import BenchError, say
 from bitymi_ns.measure.report.read import add_cells
@@ -42,7 +41,7 @@ class BenchRun:
     scenes: tuple[str, ...] = ()  # Only these scenes of a standard data set.
     methods: tuple[str, ...] = ("bitymi",)  # Methods of ns-train.
     plan: str | None = None
-    """Rows to train instead of --methods: ablation, atlas, overdraw, resolution, or
+    """Rows to train instead of --methods: ablation, atlas, overdraw, rate, resolution, or
     a YAML file of that form."""
     extra: str = ""
     """Further options of ns-train for every run, as one word: --extra="--pipeline.model.scene.weight-bound 0"."""
@@ -65,7 +64,7 @@ class BenchRun:
             return local_scenes(self.data)
         if len(self.data) != 1:
             raise BenchError(f"--data is one folder: the one that holds the scenes of {self.suite}")
-        return standard_scenes(suites()[self.suite], self.data[0], self.scenes)
+        return standard_scenes(self.suite, self.data[0], self.scenes)
 
     def matrix(self) -> Matrix:
         """The matrix of these options.
@@ -92,14 +91,14 @@ class BenchRun:
     def run(self) -> int:
         """Run the missing cells, then print the table; returns the exit status."""
         matrix, work = self.matrix(), Path(os.path.expanduser(self.work)).resolve()
-        cells = open_cells(work)
+        cells = Cells(work / FILE)
         if self.output is not None:
             with explained(self.output, BenchError):
                 check_writable(self.output)
         try:
             failures = run_chains(work, matrix.chains())
         except KeyboardInterrupt:
-            finished = len(open_cells(work))
+            finished = len(Cells(work / FILE))
             kept = f"{finished} finished cells are in {work}" if finished else "no cell was finished"
             say(f"interrupted; {kept}. Run the same command to continue")
             return INTERRUPTED

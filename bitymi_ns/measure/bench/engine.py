@@ -121,11 +121,6 @@ def _pictures(folder: Path, stage: Stage) -> dict[str, Any]:
     return {"views": len(json_of((folder / PICTURES).read_text("utf8"))["views"])}
 
 
-def open_cells(work: Path) -> Cells:
-    """The finished cells of a work folder."""
-    return Cells(work / FILE)
-
-
 def _needs(stage: Stage, other: Stage) -> bool:
     """True if `stage` cannot be done without `other`, of the same run."""
     if other.kind == "train":
@@ -210,7 +205,7 @@ def run_chains(work: Path, chains: Sequence[Chain]) -> list[str]:
     """
     if not any(chains):
         raise BenchError("nothing to run: there is no scene, or no method")
-    cells = open_cells(work)
+    cells = Cells(work / FILE)
     total = sum(map(len, chains))
     done = total - sum(len(missing(chain, cells)) for chain in chains)
     if done:

@@ -161,13 +161,12 @@ Format = Literal["fp16", "uint8", "bc7", "compact"]  # of `ns-export bitymi-atla
 
 @dataclass(frozen=True)
 class Suite:
-    """A standard data set; `scenes` maps each scene to the folder of its images."""
+    """A standard data set: an entry of suites.yaml."""
 
-    name: str
     title: str
-    layout: str
-    hold_out: int
-    scenes: dict[str, str]
+    scenes: dict[str, int]  # with the factor by which their images are smaller than those that COLMAP saw
+    needed: list[str]  # files and folders of a scene
+    parser: str  # dataparser with its options
 
 
 def _read(path: Path) -> Any:
@@ -184,7 +183,7 @@ def _read(path: Path) -> Any:
 def suites() -> dict[str, Suite]:
     """The standard data sets by name."""
     entries = _read(Path(__file__).with_name("suites.yaml"))
-    return {name: Suite(name=name, **entry) for name, entry in entries.items()}
+    return {name: Suite(**entry) for name, entry in entries.items()}
 
 
 def local_scenes(folders: Sequence[Path]) -> list[SceneSpec]:
@@ -214,35 +213,28 @@ def local_scenes(folders: Sequence[Path]) -> list[SceneSpec]:
     return scenes
 
 
-def standard_scenes(suite: Suite, root: Path, only: Sequence[str] = ()) -> list[SceneSpec]:
+def standard_scenes(name: str, root: Path, only: Sequence[str] = ()) -> list[SceneSpec]:
     """Scenes of a standard data set below its folder.
 
     Raises:
         BenchError: the folder, or a scene of it, does not have the layout.
     """
+    suite, scenes = suites()[name], []
     unknown = sorted(set(only) - set(suite.scenes))
     if unknown:
-        raise BenchError(f"{suite.name} has no scene {', '.join(unknown)}; it has {', '.join(suite.scenes)}")
-    root = Path(os.path.expanduser(root)).resolve()
-    return [_standard_scene(suite, name, root / name) for name in only or suite.scenes]
-
-
-def _standard_scene(suite: Suite, name: str, folder: Path) -> SceneSpec:
-    images = suite.scenes[name]
-    needed = [images, "sparse/0"] if suite.layout == "colmap" else ["transforms_train.json", "transforms_test.json"]
-    missing = [part for part in needed if not (folder / part).exists()]
-    if missing:
-        raise BenchError(
-            f"{folder} is not {suite.title}'s {name}: there is no {' and no '.join(missing)}. --data is the folder "
-            f"that holds the scenes; --scenes {name} ... chooses some of them"
-        )
-    if suite.layout == "blender":
-        return SceneSpec(name, folder, suite.name, ("blender-data",))
-    base, _, factor = images.partition("_")
-    parser = ["colmap", "--images-path", base, "--colmap-path", "sparse/0"]
-    parser += ["--downscale-factor", factor or "1", "--downscale-rounding-mode", "round"]
-    parser += ["--eval-mode", "interval", "--eval-interval", str(suite.hold_out)]
-    return SceneSpec(name, folder, suite.name, tuple(parser))
+        raise BenchError(f"{name} has no scene {', '.join(unknown)}; it has {', '.join(suite.scenes)}")
+    for scene in only or suite.scenes:
+        folder, factor = Path(os.path.expanduser(root)).resolve() / scene, suite.scenes[scene]
+        images = "images" if factor == 1 else f"images_{factor}"
+        needed = [part.format(images=images) for part in suite.needed]
+        missing = [part for part in needed if not (folder / part).exists()]
+        if missing:
+            raise BenchError(
+                f"{folder} is not {suite.title}'s {scene}: there is no {' and no '.join(missing)}. --data is the "
+                f"folder that holds the scenes; --scenes {scene} ... chooses some of them"
+            )
+        scenes.append(SceneSpec(scene, folder, name, tuple(suite.parser.format(factor=factor).split())))
+    return scenes
 
 
 Words = list[str | int | float]

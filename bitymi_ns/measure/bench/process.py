@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from bitymi_ns.files import Lock
@@ -25,7 +25,13 @@ class CommandFailed(BenchError):
     """A command ended with a non-zero status; the message has the end of its log."""
 
 
-def run_measured(command: Sequence[str], log: Path, lock: Lock | None = None) -> dict[str, float]:
+def run_measured(
+    command: Sequence[str],
+    log: Path,
+    lock: Lock | None = None,
+    cwd: Path | None = None,
+    env: Mapping[str, str] = os.environ,
+) -> dict[str, float]:
     """Run a command with its output in a file; an interrupt ends the command first, then this call.
 
     OpenMP threads wait without spinning, so that CPU seconds count work.
@@ -34,6 +40,7 @@ def run_measured(command: Sequence[str], log: Path, lock: Lock | None = None) ->
         log: file for its output.
         lock: inherited by the command and naming it: when this process is killed while the command goes on, the lock
             outlives it.
+        cwd, env: working folder and environment of the command; default: those of this process.
 
     Returns:
         `process_seconds`, `process_cpu_seconds` and `peak_bytes` of the command with all threads and children.
@@ -47,7 +54,8 @@ def run_measured(command: Sequence[str], log: Path, lock: Lock | None = None) ->
         try:
             process = subprocess.Popen(
                 command,
-                env={**os.environ, "OMP_WAIT_POLICY": "passive"},
+                cwd=cwd,
+                env={**env, "OMP_WAIT_POLICY": "passive"},
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=subprocess.STDOUT,

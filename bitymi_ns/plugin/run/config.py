@@ -218,7 +218,11 @@ class BitymiTrainerConfig(TrainerConfig):
         if evaluated is not None:
             if (evaluated / self.relative_model_dir).is_dir():
                 folder, self.read_from = evaluated / self.relative_model_dir, evaluated
-            self._choose_checkpoint(folder)
+            # in a resumed run the recorded step is that of the run it went on from
+            if self.load_step is None or not checkpoints.path_of(folder, self.load_step).is_file():
+                self.load_step = checkpoints.newest_step(folder)
+            # stop now if it cannot be used: nerfstudio's tools would report that with a traceback
+            checkpoints.load(checkpoints.path_of(folder, self.load_step), model.scene)
             self._take_poses_of(evaluated)
         return folder
 
@@ -234,14 +238,6 @@ class BitymiTrainerConfig(TrainerConfig):
         if data is not None and not Path(data).exists() and has_cameras(bundle):
             datamanager.dataparser = BundleCamerasConfig(data=bundle, capture=Path(data))
             datamanager.data = bundle
-
-    def _choose_checkpoint(self, folder: Path) -> None:
-        """Fix the checkpoint that nerfstudio's tools will load, and stop now if it cannot be used: they would report
-        that with a traceback."""
-        # in a resumed run the recorded step is that of the run it went on from
-        if self.load_step is None or not checkpoints.path_of(folder, self.load_step).is_file():
-            self.load_step = checkpoints.newest_step(folder)
-        checkpoints.load(checkpoints.path_of(folder, self.load_step), self.pipeline.model.scene)
 
 
 @dataclass

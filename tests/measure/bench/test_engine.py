@@ -13,7 +13,7 @@ from bitymi_ns.cli import main
 from bitymi_ns.files import Lock
 from bitymi_ns.measure.bench import engine
 from bitymi_ns.measure.bench.cells import Cells, identity
-from bitymi_ns.measure.bench.engine import open_cells, run_chains, time_left
+from bitymi_ns.measure.bench.engine import run_chains, time_left
 from bitymi_ns.measure.bench.matrix import Matrix, Row, Stage
 from bitymi_ns.measure.bench.process import BenchError, CommandFailed, run_measured, tool
 
@@ -221,7 +221,7 @@ def test_places_that_cannot_be_written_are_found_first(
 def test_runs_of_different_settings_have_different_folders(matrix: Matrix) -> None:
     runs = matrix.runs()
     assert len({run.folder for run in runs}) == 4
-    assert open_cells(Path("/nowhere")).get(Stage(runs[0], "train").key) is None
+    assert Cells(Path("/nowhere/cells.jsonl")).get(Stage(runs[0], "train").key) is None
 
 
 def test_the_time_left_is_that_of_the_cells_most_alike(matrix: Matrix, tmp_path: Path) -> None:

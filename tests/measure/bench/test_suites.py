@@ -13,14 +13,9 @@ from bitymi_ns.presets import preset_names
 
 def make_suite(root: Path, name: str) -> Path:
     """The folders that a standard data set has."""
-    for scene, images in suites()[name].scenes.items():
-        if suites()[name].layout == "colmap":
-            (root / scene / images).mkdir(parents=True)
-            (root / scene / "sparse" / "0").mkdir(parents=True)
-        else:
-            (root / scene).mkdir(parents=True)
-            for split in ("train", "val", "test"):
-                (root / scene / f"transforms_{split}.json").write_text("{}")
+    for scene, factor in suites()[name].scenes.items():
+        for part in suites()[name].needed:
+            (root / scene / part.format(images=f"images_{factor}" if factor > 1 else "images")).mkdir(parents=True)
     return root
 
 
@@ -28,13 +23,13 @@ def test_standard_suites_are_the_published_ones() -> None:
     found = suites()
     counts = {"mipnerf360": 9, "tanksandtemples": 2, "nerf-synthetic": 8}
     assert {name: len(suite.scenes) for name, suite in found.items()} == counts
-    images = found["mipnerf360"].scenes
-    assert {s for s, folder in images.items() if folder == "images_2"} == {"bonsai", "counter", "kitchen", "room"}
-    assert {s for s, f in images.items() if f == "images_4"} == {"bicycle", "flowers", "garden", "stump", "treehill"}
+    factors = found["mipnerf360"].scenes
+    assert {s for s, factor in factors.items() if factor == 2} == {"bonsai", "counter", "kitchen", "room"}
+    assert {s for s, factor in factors.items() if factor == 4} == {"bicycle", "flowers", "garden", "stump", "treehill"}
 
 
 def test_mipnerf360_is_read_by_the_colmap_parser(tmp_path: Path) -> None:
-    bicycle, room = standard_scenes(suites()["mipnerf360"], make_suite(tmp_path, "mipnerf360"), ["bicycle", "room"])
+    bicycle, room = standard_scenes("mipnerf360", make_suite(tmp_path, "mipnerf360"), ["bicycle", "room"])
     parser = " ".join(bicycle.parser)
     assert parser.startswith("colmap --images-path images --colmap-path sparse/0 --downscale-factor 4")
     assert "--eval-mode interval --eval-interval 8" in parser and "--downscale-rounding-mode round" in parser
@@ -42,18 +37,18 @@ def test_mipnerf360_is_read_by_the_colmap_parser(tmp_path: Path) -> None:
 
 
 def test_other_suites(tmp_path: Path) -> None:
-    train, truck = standard_scenes(suites()["tanksandtemples"], make_suite(tmp_path / "a", "tanksandtemples"))
+    train, truck = standard_scenes("tanksandtemples", make_suite(tmp_path / "a", "tanksandtemples"))
     assert "--downscale-factor 1" in " ".join(train.parser) and truck.name == "truck"
-    scenes = standard_scenes(suites()["nerf-synthetic"], make_suite(tmp_path / "b", "nerf-synthetic"))
+    scenes = standard_scenes("nerf-synthetic", make_suite(tmp_path / "b", "nerf-synthetic"))
     assert len(scenes) == 8 and scenes[0].parser == ("blender-data",)
 
 
 def test_a_folder_of_another_layout_is_named(tmp_path: Path) -> None:
     (tmp_path / "bicycle" / "images_4").mkdir(parents=True)
     with pytest.raises(BenchError, match=r"not Mip-NeRF 360's bicycle: there is no sparse/0"):
-        standard_scenes(suites()["mipnerf360"], tmp_path, ["bicycle"])
+        standard_scenes("mipnerf360", tmp_path, ["bicycle"])
     with pytest.raises(BenchError, match="has no scene fox; it has bicycle"):
-        standard_scenes(suites()["mipnerf360"], tmp_path, ["fox"])
+        standard_scenes("mipnerf360", tmp_path, ["fox"])
 
 
 def test_local_captures(capture: Callable[[str], Path], tmp_path: Path) -> None:
@@ -77,6 +72,7 @@ def test_plans_name_methods_that_there_are(name: str) -> None:
     rows, bundles = read_plan(name)
     assert {row.method for row in rows} <= set(preset_names()) and len({row.name for row in rows}) == len(rows) > 2
     assert bundles is not None and len(bundles) == (name == "overdraw")
+    assert len(read_plan("rate")[1] or ()) == 4
     rows, bundles = read_plan("atlas")
     assert len(rows) == 1 and bundles is not None and [b.name for b in bundles][:2] == ["paper-rule", "local-voxel"]
     assert all("--format bc7" in " ".join(b.options) for b in bundles)

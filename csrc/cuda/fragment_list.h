@@ -92,19 +92,19 @@ template <class S> __device__ inline void load_shape(const S* row, S* g) {
   g[kArea] = row[kArea];
 }
 
-// Visits the pairs of a tile that have a fragment in the calling warp, front to back or back to front. Every lane calls
+// Visits the pairs of a tile that have a fragment in the calling warp, back to front. Every lane calls
 // load(k, surfel, mine, i) and later use(what load gave): `mine` says whether the lane's pixel has a fragment of pair
 // k, i is its offset in the list. kAhead loads are under way before the first is used: a warp has about ten fragments
 // of a pair, far too few bytes to keep the memory busy one at a time. Warps go their own way: nothing waits for the
 // block.
-template <int kAhead, bool kBack, class Load, class Use>
-__device__ inline void for_each_fragment(const Pairs& p, const TileThread& s, Load&& load, Use&& use) {
+template <int kAhead, class Load, class Use>
+__device__ inline void each_fragment_back(const Pairs& p, const TileThread& s, Load&& load, Use&& use) {
   const int64_t begin = p.tile_pairs[blockIdx.x], end = p.tile_pairs[blockIdx.x + 1];
   const int64_t batches = ceil_div(end - begin, kWarp);
   const unsigned below = (1u << s.lane) - 1;
   for (int64_t b = 0; b < batches; ++b) {
     // one lane per pair: marks, and where the warp's fragments begin
-    const int64_t first = begin + kWarp * (kBack ? batches - 1 - b : b), own = first + s.lane;
+    const int64_t first = begin + kWarp * (batches - 1 - b), own = first + s.lane;
     uint32_t mark = 0;
     int32_t id = 0;
     int64_t from = 0;
@@ -118,7 +118,7 @@ __device__ inline void for_each_fragment(const Pairs& p, const TileThread& s, Lo
       BT_UNROLL
       for (int a = 0; a < kAhead; ++a) {
         const bool some = todo != 0;
-        const int j = !some ? 0 : kBack ? kWarp - 1 - __clz(int(todo)) : __ffs(int(todo)) - 1;
+        const int j = some ? kWarp - 1 - __clz(int(todo)) : 0;
         if (some) todo &= ~(1u << j);
         const unsigned taken = __shfl_sync(kFullMask, mark, j);
         const int64_t i = __shfl_sync(kFullMask, from, j) + __popc(taken & below);

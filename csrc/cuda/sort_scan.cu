@@ -1,4 +1,4 @@
-#include "cuda/primitives.h"
+#include "cuda/sort_scan.h"
 
 #if defined(__CUDACC__)
 #include <cub/device/device_radix_sort.cuh>

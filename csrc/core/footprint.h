@@ -1,0 +1,142 @@
+// The tiles that a surfel can touch, and their parts of 8 x 4 pixels, by the bounds of plane_bounds.h.
+#pragma once
+
+#include "core/kernel.h"
+#include "core/plane_bounds.h"
+
+namespace bt {
+
+constexpr int kBands = 4, kBandRows = kTile / kBands;  // of a tile
+
+// A row of geom up to kBeta with its level set.
+enum LevelColumn {
+  kR2 = kBeta + 1,  // u^2 + v^2 <= r2
+  kBlur2,  // and d^2 <= blur2; 0: the low pass does not show; -kArea where PixelKernel filters the surfel. With
+           // ResizedKernel it also says how high the low pass is: 1/255 is left of it there
+  kLevelRow
+};
+// Fills it; false where nothing of the surfel is visible.
+template <class Kernel, class S> BT_HD bool level_row(const S* geom, S near, S sharp, S* row) {
+  for (int k = 0; k <= kBeta; ++k) row[k] = geom[k];
+  if (filtered<Kernel>(geom)) {
+    row[kR2] = S(0), row[kBlur2] = -geom[kArea];
+    return filtered_bounds(geom).visible;
+  }
+  const LevelSet<S> level = level_set<Kernel>(geom, near, sharp);
+  row[kR2] = level.r2, row[kBlur2] = level.blur2;
+  return level.visible;
+}
+template <class Kernel, class S> BT_HD bool filtered_row(const S* row) { return Kernel::kPixel && row[kBlur2] < S(0); }
+// Of the pixels that it can touch; `pad` is by what an ellipse may be rounded.
+template <class S> struct RowBounds {
+  PlaneBounds<S> bounds;
+  S pad;
+};
+template <class Kernel, class S> BT_HD RowBounds<S> row_bounds(const S* row, int width, int height) {
+  RowBounds<S> b;
+  if (filtered_row<Kernel>(row)) {
+    S geom[kGeom];
+    for (int k = 0; k < kGeom; ++k) geom[k] = k <= kBeta ? row[k] : S(0);
+    geom[kArea] = -row[kBlur2];
+    b.bounds = filtered_bounds(geom).bounds;
+  } else {
+    b.bounds = plane_bounds(row, row[kR2], row[kBlur2], width, height);
+  }
+  b.pad = S(kBoundPad) + S(1e-6) * (abs_(row[kCx]) + abs_(row[kCy]));
+  return b;
+}
+
+template <class S> struct Footprint : RowBounds<S> {
+  S cx, cy;
+  int top, bottom;  // rows of tiles, none when top > bottom
+};
+template <class S> BT_HD int pixel_from(S x, int most) {  // first pixel centre right of x, 0 to most
+  const S i = -floor_(S(0.5) - x);
+  return i > 0 ? (i < most ? int(i) : most) : 0;
+}
+template <class S> BT_HD int pixel_to(S x, int most) {  // last pixel centre left of x, -1 to most - 1
+  const S i = floor_(x - S(0.5));
+  return i < most - 1 ? (i >= 0 ? int(i) : -1) : most - 1;
+}
+template <class Kernel, class S> BT_HD Footprint<S> footprint(const S* row, int width, int height) {
+  Footprint<S> f;
+  static_cast<RowBounds<S>&>(f) = row_bounds<Kernel>(row, width, height);
+  f.cx = row[kCx], f.cy = row[kCy];
+  const PlaneBounds<S>& e = f.bounds;
+  Interval<S> y;
+  if (e.ellipse) y.add(e.y0 - f.pad, e.y1 + f.pad);
+  if (e.blur > 0) y.add(-e.blur, e.blur);
+  const int first = e.whole ? 0 : pixel_from(f.cy + y.x0, height),
+            last = e.whole ? height - 1 : pixel_to(f.cy + y.x1, height);
+  f.top = first / kTile, f.bottom = last / kTile;
+  if (first > last) f.top = 0, f.bottom = -1;
+  return f;
+}
+
+// Interval of the pixels that it can touch; of a footprint that is not everywhere.
+template <class S> BT_HD Interval<S> columns_of(const Footprint<S>& f) {
+  const Interval<S> x = columns_of(f.bounds);
+  const S pad = f.bounds.ellipse ? f.pad : S(0);
+  return {f.cx + x.x0 - pad, f.cx + x.x1 + pad};
+}
+
+// A row of tiles: the pixels that can be touched in each of its bands of four rows, and the tiles of these; of a
+// footprint with a box.
+struct TileRow {
+  int from[kBands], to[kBands];  // pixels, none when from > to
+  int left, right;               // tiles, none when left > right
+};
+template <class S> BT_HD TileRow tile_row(const Footprint<S>& f, int ty, int width) {
+  TileRow r;
+  const PlaneBounds<S>& e = f.bounds;
+  int from = width, to = -1;
+  Interval<S> upper;  // crossings with the line above a band; below it those of the next
+  if (e.ellipse) add_crossings(e, ty * kTile - f.cy, upper);
+  for (int band = 0; band < kBands; ++band) {
+    const S lo = ty * kTile + band * kBandRows - f.cy, hi = lo + kBandRows;
+    Interval<S> x;
+    if (e.ellipse) {
+      Interval<S> lower;
+      add_crossings(e, hi, lower);
+      x.add(min_(upper.x0, lower.x0), max_(upper.x1, lower.x1));
+      upper = lower;
+      add_outermost(true, e, lo, hi, f.pad + S(kBoundSlack) * (e.y1 - e.y0), x);
+      x.x0 -= f.pad, x.x1 += f.pad;
+    }
+    add_low_pass(true, e, lo, hi, x);
+    r.from[band] = x.empty() ? width : pixel_from(f.cx + x.x0, width);
+    r.to[band] = x.empty() ? -1 : pixel_to(f.cx + x.x1, width);
+    if (r.from[band] <= r.to[band]) from = min_(from, r.from[band]), to = max_(to, r.to[band]);
+  }
+  r.left = from / kTile, r.right = to / kTile;
+  if (from > to) r.left = 0, r.right = -1;
+  return r;
+}
+// Bit 2 band + half is set when the surfel reaches these 8 x 4 pixels of tile tx.
+BT_HD uint32_t part_mask(const TileRow& r, int tx) {
+  uint32_t mask = 0;
+  const int x = tx * kTile, half = kTile / 2;
+  for (int band = 0; band < kBands; ++band) {
+    mask |= uint32_t(r.from[band] < x + half && r.to[band] >= x) << (2 * band);
+    mask |= uint32_t(r.from[band] < x + 2 * half && r.to[band] >= x + half) << (2 * band + 1);
+  }
+  return mask;
+}
+// The same for a disc without a box that crosses the camera's plane: the parts that its level set or its low pass
+// reaches. All of those of a disc seen through a pixel.
+template <class Kernel, class S> BT_HD uint32_t reached_parts(const S* row, int tx, int ty) {
+  if (filtered_row<Kernel>(row)) return (1u << 2 * kBands) - 1;
+  constexpr S kPartWidth = kTile / 2;
+  const S x = tx * kTile - row[kCx], y = ty * kTile - row[kCy];
+  const S half_x = cell_half(S(0.5) * (kPartWidth - 1), row[kCx], abs_(x) + kTile),
+          half_y = cell_half(S(0.5) * (kBandRows - 1), row[kCy], abs_(y) + kTile);
+  uint32_t mask = 0;
+  for (int part = 0; part < 2 * kBands; ++part) {
+    const Reached<S> r = reached(row, x + (S(part % 2) + S(0.5)) * kPartWidth, y + (S(part / 2) + S(0.5)) * kBandRows,
+                                 half_x, half_y, row[kR2], row[kBlur2]);
+    mask |= uint32_t(r.support || r.centre) << part;
+  }
+  return mask;
+}
+
+}  // namespace bt

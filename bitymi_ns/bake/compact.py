@@ -20,7 +20,6 @@ from bitymi_ns.codec.texel_codes import (
     SceneCodes,
     TexelCodeOptions,
     TexelCoder,
-    TexelCodes,
     residual_codes,
 )
 from bitymi_ns.progress import Progress, no_progress
@@ -35,6 +34,7 @@ TEXEL_SHARE = 0.5  # lambda of the texels, which are tuned after it, as a share 
 ENOUGH = 0.002
 """Share of the error (0.009 dB) that may be added even where a size is asked for: finer is not worth bytes."""
 LEAST_ERROR = 1e-7  # mean square error that is always allowed, of colours from 0 to 1: 70 dB
+LEAST_TEXEL_BYTES = 1000  # that are left for the texels where a size is asked for
 _SEARCH = 7
 _CPU = torch.device("cpu")
 _FAST = 9
@@ -159,7 +159,8 @@ class Coder:
         rounded = replace(rounded.with_constants(constants), alpha_codes=coded if self._alphas is not None else None)
         size, shown = kept.surfels.nbytes(), rounded
         if coded is not None:
-            size, shown = size + coded.nbytes(_FAST), _with_texels(rounded, coded)
+            size += coded.nbytes(_FAST)
+            shown = replace(rounded, texels=rounded.cut(coded.texels())).with_constants(coded.constants)
         scene = shown.unquantised()
         pictures = self._pictures.of(scene)
         return RatePoint(rounded, coding, scene, size, self._pictures.square(pictures), self._pictures.psnr(pictures))
@@ -220,24 +221,14 @@ def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> 
     else:
         allowed = coder.allowed(options.share)
         found, _ = _search(coder, lambda point: point.error <= allowed, progress, most=MAX_LAMBDA)
-    baked, coding = kept_at(coder, found)
+    baked, coding = found.baked, found.coding
+    assert baked.codes is not None
     if options.most_bytes is not None:
-        assert baked.codes is not None
         coding = replace(coding, most_bytes=options.most_bytes - baked.codes.surfels.nbytes())
-    return baked, coding
-
-
-def kept_at(coder: Coder, point: RatePoint) -> tuple[Baked, TexelCodeOptions]:
-    """Bake of a point with its statistics, and how its texels are to be coded."""
-    rounded = point.baked
-    assert rounded.codes is not None
-    mse = point.error - coder.error if coder.measured else None
-    rounding = Rounding(mse=mse if mse is None else max(0.0, mse), steps=dict(rounded.codes.surfels.steps))
-    statistics = rounded.statistics.but(rounding=rounding, error=None, certificate=None, view_color=_thinned(rounded))
-    return replace(rounded, statistics=statistics), point.coding
-
-
-LEAST_TEXEL_BYTES = 1000
+    mse = max(0.0, found.error - coder.error) if coder.measured else None
+    rounding = Rounding(mse=mse, steps=dict(baked.codes.surfels.steps))
+    statistics = baked.statistics.but(rounding=rounding, error=None, certificate=None, view_color=_thinned(baked))
+    return replace(baked, statistics=statistics), coding
 
 
 def _search(
@@ -286,8 +277,3 @@ def _thinned(baked: Baked) -> ViewColorError | None:
         one_color=int((surfels["view_span"][:, 1] == 0).sum()),
         bytes=stated.bytes and stated.bytes.but(after=4 * (4 * len(baked.rows) + terms.numel())),
     )
-
-
-def _with_texels(baked: Baked, coded: TexelCodes) -> Baked:
-    """The bake as it is drawn with coded texels."""
-    return replace(baked, texels=baked.cut(coded.texels())).with_constants(coded.constants)

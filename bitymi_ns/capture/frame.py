@@ -59,11 +59,8 @@ def read_frame(folder: Path) -> WorldFrame | None:
 def local_positions(
     gps: Mapping[str, tuple[float, float, float]],
 ) -> tuple[dict[str, list[float]], tuple[float, float, float] | None]:
-    """Convert GPS positions to east, north and up in metres from their middle, and return that middle.
-
-    Args:
-        gps: latitude, longitude and altitude by name.
-    """
+    """Convert GPS positions (latitude, longitude and altitude by name) to east, north and up in metres from their
+    middle, and return that middle."""
     if not gps:
         return {}, None
     middle = np.median(np.array(list(gps.values())), axis=0)
@@ -94,7 +91,6 @@ def move_to_world(
     cameras. Scale and north are by GPS where that is enough.
 
     Args:
-        model: cameras and points.
         gps: latitude, longitude and altitude by name.
         ups: unit vectors away from the ground by name, in the cameras' axes (x right, y down, z forward).
     """

@@ -71,7 +71,7 @@ class BitymiDataset(InputDataset):
             return np.full((*declared[::-1], 3), 128, np.uint8)
         lens = self._lens(image_idx)
         read = self._read_shared if lens.face else read_image
-        image = lens.undistort(read(path, lens.stored, lens.size))
+        image = lens.undistort(read(path, lens.stored, lens.camera.size))
         image = self._scaled(image, Image.Resampling.BILINEAR)
         if image.size != declared:
             fail(wrong_size(path, image.size, declared))
@@ -187,11 +187,7 @@ class CachedImages(Sequence):
 
 
 def drop_blank_views(outputs: DataparserOutputs, split: str) -> DataparserOutputs:
-    """Leave out the views whose masks exclude every pixel.
-
-    Args:
-        outputs: of a parser.
-        split: "training" or "held-out", for messages.
+    """Leave out the views whose masks exclude every pixel; `split` is "training" or "held-out".
 
     Raises:
         InputError: no training view is left.

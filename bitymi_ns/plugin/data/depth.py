@@ -98,16 +98,8 @@ class _Seen(NamedTuple):
 def with_depth(
     outputs: DataparserOutputs, kind: DepthKind = "auto", unit: float | None = None, add_points: bool = True
 ) -> DataparserOutputs:
-    """Fit the depth maps of training views to the scene, and add points from them to those of the capture.
-
-    Args:
-        outputs: training views of limited size, with lenses.
-        kind: of the maps.
-        unit: see `read_depth`.
-        add_points: extend the points of the capture to one for PIXELS_PER_POINT pixels.
-
-    Returns:
-        The outputs with a `DepthFit` or None for each view, where depth is used at all.
+    """Fit the depth maps of training views of limited size to the scene, and add points from them to those of the
+    capture: one for PIXELS_PER_POINT pixels. Metadata gets `FittedMaps` for each view, where depth is used at all.
 
     Raises:
         InputError: a map cannot be read, or has another shape than its photograph.
@@ -188,14 +180,8 @@ def _unproject(pixels: npt.NDArray[np.intp], view: _Seen) -> Floats:
 
 
 def _fits(seen: Sequence[_Seen], xyz: Floats, kind: DepthKind, unit: float) -> list[DepthFit | None] | None:
-    """Fit each map to points of the scene, or take it as metric where there are none; None = depth is of no use.
-
-    Args:
-        seen: views with depth.
-        xyz: [N, 3] points.
-        kind: of the maps.
-        unit: units of the scene per metre, by the capture.
-    """
+    """Fit each map to points [N, 3] of the scene, or take it as metric where there are none, with `unit` units of the
+    scene per metre; None = depth is of no use."""
     if not any(each.values.any() for each in seen):
         warn("The depth maps have no valid pixel: depth is not used.")
         return None
@@ -337,7 +323,7 @@ def _new_points(seen: Sequence[_Seen], files: Sequence[Path], count: int) -> tup
         agree, through, _ = _votes(xyz, i, seen)
         kept = agree >= through
         lens = seen[i].lens
-        image = lens.undistort(read_image(files[i], lens.stored, lens.size).convert("RGB"))
+        image = lens.undistort(read_image(files[i], lens.stored, lens.camera.size).convert("RGB"))
         return xyz[kept], np.asarray(image).reshape(-1, 3)[draws[i][kept]], 1.0 / (1.0 + agree[kept])
 
     with ThreadPoolExecutor(THREADS) as pool:

@@ -13,8 +13,9 @@ import numpy as np
 import numpy.typing as npt
 from PIL import EpsImagePlugin, Image, UnidentifiedImageError
 
+from bitymi_ns.capture import masks
 from bitymi_ns.capture.exif import exposure_settings
-from bitymi_ns.capture.masks import has_transparency, mask_pixels
+from bitymi_ns.capture.masks import has_transparency
 from bitymi_ns.capture.photos import eight_bits, in_srgb
 from bitymi_ns.capture.recognise import open_picture
 from bitymi_ns.plugin.console import fail, listed, warn
@@ -101,10 +102,14 @@ def check_sizes(paths: Sequence[Path]) -> None:
     with ThreadPoolExecutor(THREADS) as pool:
         large = [path for path, refused in zip(paths, pool.map(too_large, paths), strict=True) if refused]
     if large:
-        fail(
-            f"{listed(large)} has more than {MAX_PIXELS:,} pixels. Make it smaller, and w, h, fl_x, fl_y, cx and cy "
-            "of its camera with it."
-        )
+        fail(_too_large(large))
+
+
+def _too_large(paths: Sequence[Path]) -> str:
+    return (
+        f"{listed(paths)} has more than {MAX_PIXELS:,} pixels. Make it smaller, and w, h, fl_x, fl_y, cx and cy of its "
+        "camera with it."
+    )
 
 
 def check_orientation(paths: Sequence[Path]) -> None:
@@ -125,7 +130,6 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
     Deep grey images are scaled to 8 bits, where PIL would clip them to white.
 
     Args:
-        path: image file.
         stored: width and height that it must have; None = any.
         wanted: width and height to which it will be downscaled. A JPEG may then be decoded at a half, a quarter or an
             eighth of its size, but no smaller than this.
@@ -143,6 +147,8 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
             return picture.convert("RGBA" if has_transparency(file) else "RGB")
     except FileNotFoundError as error:
         fail(f"the image {path} is missing, but the capture has a pose for it", error)
+    except Image.DecompressionBombError as error:
+        fail(_too_large([path]), error)
     except UNREADABLE as error:
         fail(f"the image {path} cannot be read: {error}. Replace it or remove it from the capture.", error)
 
@@ -150,8 +156,7 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
 def read_mask(path: Path) -> Image.Image:
     """Read a mask as a 1-bit image, True where pixels count; see `mask_pixels`."""
     try:
-        with open_picture(path) as file:
-            return Image.fromarray(mask_pixels(file))
+        return masks.read_mask(path)
     except FileNotFoundError as error:
         fail(f"the mask {path} is missing", error)
     except UNREADABLE as error:
@@ -224,11 +229,7 @@ def duplicates(train: Sequence[Any], held_out: Sequence[Any]) -> list[Pair]:
 
 
 def _digest(path: Path) -> bytes:
-    digest = hashlib.sha256()
-    with open(path, "rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.digest()
+    return hashlib.sha256(path.read_bytes()).digest()
 
 
 def warn_of_duplicates(pairs: Sequence[Pair], train: Sequence[Path], held_out: Sequence[Path]) -> None:

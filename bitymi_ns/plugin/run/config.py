@@ -114,7 +114,7 @@ class BitymiTrainerConfig(TrainerConfig):
     def save_config(self) -> None:
         """Write config.yml and say in a few lines what is going to happen. This is the first that a run writes, so a
         folder that cannot be used shows here. What can be checked before anything is written is checked now."""
-        check_capture(self.pipeline.datamanager)
+        check_capture(self.pipeline.datamanager, read=True)
         folder = self.get_base_dir()
         if self.load_dir is None and self.load_checkpoint is None:
             run_folder.check_unused(folder, self.get_checkpoint_dir())

@@ -289,8 +289,8 @@ class ExposureGains(NamedTuple):
 
     log_gains: Tensor  # [V, 3] float32 natural logarithm of each photograph's gain per channel; each channel has mean 0
     points: Tensor  # [V] int64, how many points each photograph was judged by
-    # share of the median distance of observations from their point's colour, in logarithms, that gains explain, on points
-    # that they were not found on; NaN = cannot be told, because there are too few or they agree
+    # share of the median distance of observations from their point's colour, in logarithms, that gains explain, on
+    # points that they were not found on; NaN = cannot be told, because there are too few or they agree
     explained: float
 
 

@@ -200,7 +200,7 @@ def test_what_a_device_has_learned_can_be_baked(device: torch.device, cpu: Conte
         trainer.advance()
     scene = trainer.scene
     baked = trained_texels(scene, BakeOptions())
-    assert baked.texels is not None and baked.texels.device == baked.scene.tiles.device == HERE
+    assert baked.textured and baked.texels.device == baked.scene.tiles.device == HERE
     camera = scene_and_views()[1][0].camera
     with torch.no_grad():
         want = scene.render(camera.to(device)).rgb.cpu()

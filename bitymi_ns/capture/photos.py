@@ -69,11 +69,7 @@ def natural(name: str) -> list[tuple[int, int, str]]:
 def photo_folder(source: Path) -> Path:
     """Return the folder of the photographs of a capture: itself, or `images` in it."""
     images = source / "images"
-    return images if images.is_dir() and not _photos_in(source) else source
-
-
-def _photos_in(folder: Path) -> list[Path]:
-    return [path for path in folder.iterdir() if is_photograph(path)]
+    return images if images.is_dir() and not any(map(is_photograph, source.iterdir())) else source
 
 
 def find_photos(folder: Path) -> list[str]:

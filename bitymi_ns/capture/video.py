@@ -3,6 +3,7 @@
 import math
 import os
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
 import av
@@ -54,17 +55,12 @@ def extract_frames(video: Path, work: Path, count: int | None, progress: Progres
     chosen = choose(np.array(motion), np.array(sharp), wanted)
     numbers = {seen[i] for i in chosen}
     with complete_folder(target) as folder:
-        written = 0
         shape = _shape_of_pixels(video)
-        for number, frame, turn in _frames(video):
-            if number in numbers:
-                _upright(frame, turn, shape).save(
-                    folder / f"frame_{number:06d}.jpg", quality=JPEG_QUALITY, subsampling=0
-                )
-                written += 1
-                progress("writing frames", written, len(numbers))
-                if written == len(numbers):
-                    break
+        wanted_frames = islice((each for each in _frames(video) if each[0] in numbers), len(numbers))
+        for written, (number, frame, turn) in enumerate(wanted_frames, 1):
+            image = _upright(frame, turn, shape)
+            image.save(folder / f"frame_{number:06d}.jpg", quality=JPEG_QUALITY, subsampling=0)
+            progress("writing frames", written, len(numbers))
     return target
 
 

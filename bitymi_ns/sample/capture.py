@@ -143,12 +143,13 @@ def generate(
     def check() -> None:
         if output_dir.exists() and not output_dir.is_dir():
             raise FileExistsError(f"{output_dir} is a file; choose another output folder")
-        if output_dir.exists() and any(output_dir.iterdir()) and not overwrite:
+        if not output_dir.exists() or not any(output_dir.iterdir()):
+            return
+        if not overwrite:
             raise FileExistsError(f"{output_dir} already holds files; choose another folder or pass --overwrite")
-        if output_dir.exists() and any(output_dir.iterdir()) and not _is_sample(output_dir):
+        if not _is_sample(output_dir):
             raise FileExistsError(f"{output_dir} is not a sample capture and is not replaced; choose another folder")
-        if output_dir.exists() and any(output_dir.iterdir()):
-            keep(output_dir, _files_of(output_dir))
+        keep(output_dir, _files_of(output_dir))
 
     with complete_folder(output_dir, check) as new:
         _write(new, views, width, height, seed, points, progress)

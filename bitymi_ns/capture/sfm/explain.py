@@ -27,6 +27,11 @@ SHOOT = (
     "shows with the one before"
 )
 
+FROM_ONE_SPOT = (
+    "the photographs were taken from one spot: the camera only turned, which tells nothing of depth. Step sideways "
+    f"between photographs, as if the scene were on a turntable. {SHOOT}"
+)
+
 
 @dataclass(frozen=True)
 class ViewGraph:
@@ -97,13 +102,6 @@ def why_none(job: Job, graph: ViewGraph) -> NoPoses:
     return NoPoses(
         f"{len(parts[0])} of {count} photographs overlap, but no poses explain what they show: the scene may have "
         f"moved between them, or the camera hardly did. {SHOOT}"
-    )
-
-
-def from_one_spot() -> NoPoses:
-    return NoPoses(
-        "the photographs were taken from one spot: the camera only turned, which tells nothing of depth. Step sideways "
-        f"between photographs, as if the scene were on a turntable. {SHOOT}"
     )
 
 

@@ -62,7 +62,7 @@ def find(job: Job, stages: Stages) -> tuple[pycolmap.Reconstruction, dict[str, o
         raise explain.why_none(job, graph)
     angle = explain.parallax(model)
     if angle < explain.PARALLAX:
-        raise explain.from_one_spot()
+        raise NoPoses(explain.FROM_ONE_SPOT)
     placed = {image.name for image in model.images.values() if image.has_pose}
     model.extract_colors_for_all_images(job.images)
     return model, {
@@ -81,7 +81,7 @@ def _mapped(job: Job, database: Path, stages: Stages) -> tuple[explain.ViewGraph
     graph = explain.view_graph(database)
     parts = graph.components()
     if explain.only_turned(job, database):
-        raise explain.from_one_spot()
+        raise NoPoses(explain.FROM_ONE_SPOT)
     if not parts or len(parts[0]) < LEAST:
         return graph, None
     return graph, mapping.reconstruct(job, database, len(parts[0]), stages)

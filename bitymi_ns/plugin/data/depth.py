@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -16,7 +15,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 
 from bitymi_ns.plugin.console import say, warn
 from bitymi_ns.plugin.data.depth_files import MAPS, MapFiles, Values, read_depth, read_normal
-from bitymi_ns.plugin.data.images import THREADS, read_image
+from bitymi_ns.plugin.data.images import in_threads, read_image
 from bitymi_ns.plugin.data.initial_points import GREY
 from bitymi_ns.plugin.data.lens import Lens, Pinhole
 from bitymi_ns.train.views import spread
@@ -135,8 +134,7 @@ def _read_maps(outputs: DataparserOutputs, rows: Sequence[int], unit: float | No
         lens: lens.downscaled(min(1.0, SIDE / max(lens.pinhole.width, lens.pinhole.height)))
         for lens in dict.fromkeys(lenses[i] for i in rows)
     }
-    with ThreadPoolExecutor(THREADS) as pool:
-        values = list(pool.map(lambda i: read_depth(maps[i], small[lenses[i]], unit), rows))
+    values = in_threads(lambda i: read_depth(maps[i], small[lenses[i]], unit), rows)
     poses = outputs.cameras.camera_to_worlds.double().numpy()
     return [
         _Seen(each, small[lenses[i]], poses[i, :, 3], poses[i, :, :3] * (1.0, -1.0, -1.0))
@@ -326,8 +324,7 @@ def _new_points(seen: Sequence[_Seen], files: Sequence[Path], count: int) -> tup
         image = lens.undistort(read_image(files[i], lens.stored, lens.camera.size).convert("RGB"))
         return xyz[kept], np.asarray(image).reshape(-1, 3)[draws[i][kept]], 1.0 / (1.0 + agree[kept])
 
-    with ThreadPoolExecutor(THREADS) as pool:
-        parts = list(pool.map(of_view, range(len(seen))))
+    parts = in_threads(of_view, range(len(seen)))
     xyz, rgb, weight = (np.concatenate([part[k] for part in parts]) for k in range(3))
     if len(xyz) <= count:
         return xyz, rgb

@@ -4,7 +4,7 @@ photographs."""
 import hashlib
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -21,7 +21,7 @@ from bitymi_ns.capture.recognise import open_picture
 from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.train.exposure import exif_stops
 
-T = TypeVar("T")
+S, T = TypeVar("S"), TypeVar("T")
 ORIENTATION = 0x0112  # EXIF tag that asks viewers to turn a photograph; 1 = as it is stored
 MAX_PIXELS = 1_000_000_000  # photographs with more pixels are refused; phones take some of 200 million
 THREADS = 4
@@ -34,6 +34,12 @@ def set_up_pillow() -> None:
     Ghostscript on files that are PostScript whatever their name."""
     EpsImagePlugin.gs_binary = False
     Image.MAX_IMAGE_PIXELS = MAX_PIXELS // 2  # PIL refuses twice as many
+
+
+def in_threads(function: Callable[[S], T], items: Iterable[S]) -> list[T]:
+    """Apply a function that reads files to each item, in a few threads."""
+    with ThreadPoolExecutor(THREADS) as pool:
+        return list(pool.map(function, items))
 
 
 def from_header(path: Path, read: Callable[[Image.Image], T], default: T) -> T:
@@ -73,8 +79,7 @@ def exposure_stops(paths: Sequence[Path]) -> list[float]:
     A lens without electronics writes no f-number, and some cameras no ISO: what no photograph has counts as equal for
     all. Photographs that lack what most have cannot be compared with these, and are NaN.
     """
-    with ThreadPoolExecutor(THREADS) as pool:
-        found = list(pool.map(lambda path: from_header(path, exposure_settings, None), paths))
+    found = in_threads(lambda path: from_header(path, exposure_settings, None), paths)
     kinds = Counter(tuple(value is not None for value in each) for each in found if each is not None)
     if not kinds:
         return [math.nan] * len(paths)
@@ -99,8 +104,7 @@ def check_sizes(paths: Sequence[Path]) -> None:
         except (OSError, SyntaxError, ValueError):
             return False  # other faults are reported where the file is read
 
-    with ThreadPoolExecutor(THREADS) as pool:
-        large = [path for path, refused in zip(paths, pool.map(too_large, paths), strict=True) if refused]
+    large = [path for path, refused in zip(paths, in_threads(too_large, paths), strict=True) if refused]
     if large:
         fail(_too_large(large))
 
@@ -114,8 +118,7 @@ def _too_large(paths: Sequence[Path]) -> str:
 
 def check_orientation(paths: Sequence[Path]) -> None:
     """Warn of photographs with an EXIF orientation: they are used as they are stored."""
-    with ThreadPoolExecutor(THREADS) as pool:
-        turned = [path for path, value in zip(paths, pool.map(orientation, paths), strict=True) if value != 1]
+    turned = [path for path, value in zip(paths, in_threads(orientation, paths), strict=True) if value != 1]
     if turned:
         warn(
             f"{listed(turned)} has an EXIF tag that asks viewers to turn the photograph. It is used as it is stored, "

@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from bitymi_ns.capture.types import SfmSettings
 from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data.colmap_model import Model
 from bitymi_ns.plugin.data.colmap_views import Origin, Source, find_masks, make_source
-from bitymi_ns.plugin.data.images import THREADS, image_size
+from bitymi_ns.plugin.data.images import image_size, in_threads
 from bitymi_ns.trust import Refused, json_of, leads_inside
 
 MODEL = Path("sparse/0")
@@ -200,11 +199,9 @@ def _check_photographs(source: Source, kept: Path) -> None:
 
 def _other_sizes(model: Model, files: list[Path]) -> list[str]:
     """Photographs with another size than their cameras, with both sizes; unreadable ones do not count."""
-    with ThreadPoolExecutor(THREADS) as pool:
-        sizes = list(pool.map(image_size, files))
     changed = []
-    for image, file, size in zip(model.images, files, sizes, strict=True):
+    for image, file, size in zip(model.images, files, in_threads(image_size, files), strict=True):
         camera = model.cameras[image.camera_id]
-        if size is not None and size != (camera.width, camera.height):
+        if size is not None and size != camera.size:
             changed.append(f"{file}: {size[0]} x {size[1]} pixels, {camera.width} x {camera.height} then")
     return changed

@@ -24,6 +24,8 @@ COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 DISTORTION = (*COEFFICIENTS, "distortion_params")
 FOCALS = {"x": ("fl_x", "camera_angle_x", "x_fov"), "y": ("fl_y", "camera_angle_y", "y_fov")}
 """Entries that state a focal length: in pixels, or by the view angle in radians, or in degrees."""
+STATED_BY = {"fl_x": FOCALS["x"], "fl_y": (*FOCALS["y"], *FOCALS["x"][1:])}
+"""Entries that serve as another; an angle of one side is that of square pixels."""
 
 
 def load_transforms(path: Path, own_format: bool) -> dict[str, Any]:
@@ -93,11 +95,7 @@ def _check_intrinsics(path: Path, meta: dict[str, Any]) -> None:
     """Fail where neither a frame nor the file states an entry of nerfstudio's cameras."""
     frames = meta["frames"]
     for key in INTRINSICS:
-        keys = (key,)
-        if key == "fl_x":
-            keys = FOCALS["x"]
-        elif key == "fl_y":
-            keys = (*FOCALS["y"], *FOCALS["x"][1:])  # an angle of one side is that of square pixels
+        keys = STATED_BY.get(key, (key,))
         lacking = [frame["file_path"] for frame in frames if not any(key in meta or key in frame for key in keys)
                    and (key in ("w", "h") or not is_equirectangular(meta, frame))]  # fmt: skip
         if lacking:

@@ -3,7 +3,6 @@ those of wide cameras several."""
 
 import dataclasses
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +18,7 @@ from nerfstudio.data.scene_box import SceneBox
 from bitymi_ns.capture.camera import SPHERICAL_MODEL, ColmapCamera
 from bitymi_ns.plugin.console import fail, listed, say
 from bitymi_ns.plugin.data.depth_files import MAPS, MapFiles
-from bitymi_ns.plugin.data.images import THREADS, image_size
+from bitymi_ns.plugin.data.images import image_size, in_threads
 from bitymi_ns.plugin.data.lens import Lens, Pinhole, colmap_distortion, lenses_of
 from bitymi_ns.plugin.data.point_files import Points
 from bitymi_ns.plugin.data.pose_checks import check_spread, far_from_origin
@@ -225,12 +224,7 @@ def pinhole_cameras(pinholes: Sequence[Pinhole], poses: torch.Tensor) -> Cameras
 
 def make_lenses(photographs: Sequence[Photograph], downscale: int = 1, need_photos: bool = True) -> list[list[Lens]]:
     """Make the lenses of each photograph, equal ones once; see `make_views`."""
-    sizes: list[tuple[int, int] | None] = [None] * len(photographs)
-    copies = [i for i, photograph in enumerate(photographs) if photograph.downscaled]
-    if copies and need_photos:
-        with ThreadPoolExecutor(THREADS) as pool:
-            for i, size in zip(copies, pool.map(image_size, [photographs[i].file for i in copies]), strict=True):
-                sizes[i] = size
+    sizes = in_threads(lambda each: image_size(each.file) if each.downscaled and need_photos else None, photographs)
     made: dict[tuple[Any, ...], list[Lens]] = {}
     lenses, messages = [], []
     for photograph, size in zip(photographs, sizes, strict=True):

@@ -181,7 +181,7 @@ def _optimise(
     options = run.options
     before = run.psnr(validation, progress)
     stopping = EarlyStopping(options.steps, options.checks, options.patience, before, run.state())
-    share, attempts = 1.0 / (run.texels.coverage(views, progress) + options.prior), 0  # [T]
+    share, attempts = 1.0 / (run.texels.coverage(views, progress)[0] + options.prior), 0  # [T]
     for number in range(options.steps):
         view = views[training_order(len(views), options.seed, number)]
         if not run.step(number, view, share):

@@ -45,7 +45,7 @@ def python(script: str, *words: str) -> list[str]:
 def sanitizer(tool: str, *sections: str) -> list[str]:
     """A command that runs kernels under a tool of compute-sanitizer."""
     command = ["compute-sanitizer", "--tool", tool, "--error-exitcode", "9", "--print-limit", "20"]
-    return [*command, *python("card_smoke.py", "--sections", *sections)]
+    return [*command, *python("gpu_kernels.py", "--sections", *sections)]
 
 
 def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | None = None) -> dict[str, list[Step]]:
@@ -61,7 +61,6 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
     length = [] if steps is None else ["--steps", str(steps)]
     pytest = [sys.executable, "-m", "pytest", "-q", "-rfEs", "--tb=short"]
     bundles = results / "bundles"
-    ncu = ["ncu", "--profile-from-start", "off", "--set", "detailed", "--clock-control", "none", "--page", "details"]
     large = ("--surfels", "150000", "--size", "1297x840")
     kept = sorted(str(file.parent) for file in bundles.glob("**/bundle.json"))
     bundled = ["--bundles", *kept] if kept else []
@@ -79,11 +78,8 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
         "check": [
             Step("block textures", [[sys.executable, "-c", BLOCKS]], 60),
             Step("tests", [[*pytest, "--timeout=90", "tests/cuda", "-k", "not emulated"]], 240),
-            Step("kernels", [python("card_smoke.py", *large, "--times", "20")], 90),
-            Step("sanitizers", [sanitizer(tool, *PROFILED) for tool in SANITIZERS], 150),
-        ],
-        "profile": [
-            Step("profile", [[*ncu, *python("card_smoke.py", *large, "--profile", "--sections", *PROFILED)]], 400)
+            Step("kernels", [python("gpu_kernels.py", *large, "--times", "20")], 90),
+            Step("sanitizers", [sanitizer(tool, *CHECKED) for tool in SANITIZERS], 150),
         ],
         "train": of_each(
             "", 600, lambda name: [page(name, "gpu_train.py", data / name, "--keep", bundles / name, *length)]
@@ -108,7 +104,7 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
         "kernels": [
             Step(
                 f"kernels of bundles, {size}",
-                [python("card_smoke.py", "--sections", "--size", size, "--times", "20", *bundled)],
+                [python("gpu_kernels.py", "--sections", "--size", size, "--times", "20", *bundled)],
                 60,
             )
             for size in ("1297x840", "3840x2160")
@@ -135,7 +131,7 @@ def together(steps: Sequence[Step]) -> Step:
 
 
 BLOCKS = "from bitymi_ns import _cuda; print(repr(_cuda.device_problem(0)), _cuda.draws_bc7())"
-PROFILED = ("baked", "training", "texels")  # sections of card_smoke.py
+CHECKED = ("baked", "training", "texels")  # sections of gpu_kernels.py
 SANITIZERS = ("memcheck", "racecheck", "initcheck", "synccheck")
 
 

@@ -58,8 +58,8 @@ class Sfm:
     options: tyro.conf.OmitArgPrefixes[SfmOptions] = SfmOptions()
 
     def run(self) -> None:
-        from bitymi_ns.capture import find_poses
         from bitymi_ns.capture.nerfstudio import write_capture
+        from bitymi_ns.capture.poses import find_poses
         from bitymi_ns.progress import rich_progress
 
         with rich_progress() as progress:
@@ -91,8 +91,6 @@ class Report:
     def run(self) -> None:
         from bitymi_ns.measure.report import page
 
-        if not self.inputs:
-            raise ValueError("nothing to report: name at least one JSON file that ns-eval wrote")
         say(f"Wrote {page.build(self.inputs, self.output_dir, self.title)}")
 
 
@@ -101,14 +99,12 @@ class Stability:
     """Measure what float32 costs on extreme scenes and write the page of it, with a plot beside it."""
 
     output: Path = Path("docs/stability.md")  # Markdown file to write; the plot gets its name with .png.
-    backend: str = "cpu"  # Kernels to measure.
+    backend: Literal["cpu", "cuda", "emulated"] = "cpu"  # Kernels to measure.
 
     def run(self) -> None:
         from bitymi_ns.measure.stability import page
         from bitymi_ns.measure.stability.errors import BACKENDS, missing
 
-        if self.backend not in BACKENDS:
-            raise ValueError(f"there is no backend '{self.backend}': choose one of {', '.join(BACKENDS)}")
         if why := missing(BACKENDS[self.backend]):
             raise ValueError(f"the backend '{self.backend}' cannot be used here: {why}")
         with explained(self.output, ValueError):

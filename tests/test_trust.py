@@ -12,12 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bitymi_ns import files
-from bitymi_ns.capture import CaptureError
 from bitymi_ns.capture.cache import content_key, home, keep_work_folder, user_cache, work_folder
 from bitymi_ns.capture.nerfstudio import write_capture
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import Job
-from bitymi_ns.capture.types import Poses
+from bitymi_ns.capture.types import CaptureError, Poses
 from bitymi_ns.files import reason
 from bitymi_ns.measure.bench.cells import Cells
 from bitymi_ns.measure.bench.process import BenchError, run_measured

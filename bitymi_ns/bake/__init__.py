@@ -3,7 +3,7 @@
 from bitymi_ns.bake.baked import Baked, export
 from bitymi_ns.bake.field.bake import bake
 from bitymi_ns.bake.field.polish import PolishOptions, polish_scene
-from bitymi_ns.bake.learn import Learning, bake_and_learn, baked_and_reduced
+from bitymi_ns.bake.learn import Learning, bake_and_learn
 from bitymi_ns.bake.pipeline import reduced
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
 from bitymi_ns.bundle.bake_options import BakeOptions
@@ -18,7 +18,6 @@ __all__ = [
     "TuneOptions",
     "bake",
     "bake_and_learn",
-    "baked_and_reduced",
     "export",
     "polish_scene",
     "reduced",

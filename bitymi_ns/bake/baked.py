@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -18,14 +18,23 @@ from bitymi_ns.bundle.statistics import AtlasCost, Statistics
 from bitymi_ns.bundle.write import write_bundle
 from bitymi_ns.codec.limits import RESIDUAL_LIMIT
 from bitymi_ns.codec.packing import Packing, pack
-from bitymi_ns.codec.pages import listed_texels, paged_texels, tile_means
+from bitymi_ns.codec.pages import paged_texels, tile_means
 from bitymi_ns.codec.quantise import EncodedAtlas, Range, choose_range, decode_pages, encode
-from bitymi_ns.codec.scene_texels import texel_alpha
 from bitymi_ns.codec.texel_codes import SceneCodes, TexelCodes
-from bitymi_ns.ops import TexelAlpha
+from bitymi_ns.ops import TexelAlpha, TexelTiles
+from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
+
+
+class BakeableScene(Protocol):
+    """The part of a scene that the bake uses."""
+
+    surfels: Mapping[str, Tensor]
+    field: Any  # a residual field, a `TexelField`, or None
+    near: float
+    config: Any  # weight_bound, prefilter
 
 
 @dataclass
@@ -37,18 +46,38 @@ class Baked:
     scene: BakedScene
     rows: Tensor  # [N] int64, their rows in the scene
     packing: Packing  # where the tiles lie; `scene.tiles` are the same memory
-    # [layers, height, width, C] float32 before quantisation: residual colours and, where C = 4, alpha; None without any
-    texels: Tensor | None
+    # [T, C] float32 before quantisation, in the order of `ops.TexelTiles`: residual colours and, where C = 4, alpha; a
+    # surfel without a tile has one, its constant
+    texels: Tensor
     atlas: EncodedAtlas | None  # the encoded atlas, None without texture
     options: BakeOptions  # what it was baked with
     # what was left out, what it cost, and the error of the quantisation
     statistics: Statistics = field(default_factory=Statistics)
     codes: SceneCodes | None = None  # integer codes of the surfels, and of the texels once coded; None = not compact
-    # [T, C] the texels of which the codes were made, in the order of `ops.TexelTiles`; None = `texels`
+    # [T, C] the texels of which the codes were made; None = `texels`
     uncoded: Tensor | None = None
     alpha_codes: TexelCodes | None = None  # codes whose alphas those of the bundle keep; None = not coded, or opaque
     # [N] transmittance in front of the surfels, by which errors of their tiles count; None = 1
     in_front: Tensor | None = None
+
+    @classmethod
+    def of(
+        cls, scene: BakeableScene, surfels: Mapping[str, Tensor], rows: Tensor, tiles: Tiles, options: BakeOptions
+    ) -> Baked:
+        """A bake of surfels, rows [N] of a scene, and their tiles, not encoded yet.
+
+        Raises:
+            ValueError: the atlas would be too large.
+        """
+        baked = BakedScene(
+            {name: value.cpu() for name, value in surfels.items()},
+            kind_of(scene.surfels),
+            torch.zeros(0, 5, dtype=torch.int32),
+            near=scene.near,
+            weight_bound=scene.config.weight_bound,
+            prefilter=scene.config.prefilter,
+        )
+        return cls(baked, rows.cpu(), pack(()), tiles.texels, None, options).with_tiles(tiles)
 
     def with_statistics(self, **changes: Any) -> Baked:
         """Copy with other statistics."""
@@ -67,43 +96,39 @@ class Baked:
         return self.scene.extent
 
     @property
-    def constants(self) -> Tensor:
-        """[N, C] mean residual and, where C = 4, mean alpha of every tile; those of a surfel without a tile."""
-        alpha = self.scene.mean_alpha
-        return self.mean_residual if alpha is None else joined(self.mean_residual, alpha)
+    def sizes(self) -> Tensor:
+        """[N, 2] int32 sides of the tiles; (0, 0) = none."""
+        return torch.from_numpy(self.packing.tiles[:, 3:])
+
+    @property
+    def textured(self) -> bool:
+        """True where any surfel has a tile."""
+        return self.packing.texels > 0
 
     def with_constants(self, constants: Tensor) -> Baked:
         """Copy with other means [N, C], or [N, 3] to keep those of alpha."""
         return replace(self, scene=with_means(self.scene, constants))
 
-    @property
-    def listed(self) -> Tensor:
-        """[T, C] the texels in the order of `ops.TexelTiles`: a surfel without a tile has one, its constant."""
-        assert self.texels is not None
-        return listed_texels(self.texels, self.packing, self.constants)
-
     @cached_property
     def alpha(self) -> TexelAlpha | None:
         """Opacities of the texels; None = opaque texels."""
-        return None if self.texels is None or self.scene.mean_alpha is None else texel_alpha(self.unquantised())
+        if self.texels.shape[1] == 3:
+            return None
+        tiles = TexelTiles.of_sizes(self.sizes.clamp(min=1), self.extent.float())
+        return TexelAlpha(tiles, self.texels[:, 3].contiguous(), self.scene.weight_bound)
 
     def cut(self, colors: Tensor) -> Tensor:
         """[T, C] texels of residual colours [T, 3], with the alphas of the bake where it has such."""
         return colors if self.alpha is None else joined(colors, self.alpha.values)
 
-    @property
-    def tiles(self) -> Tiles:
-        """Tiles of the surfels."""
-        return Tiles(self.packing, self.texels, self.extent, self.constants)
-
     def unquantised(self) -> BakedScene:
         """The scene with its texels as 32-bit floats."""
-        if self.texels is None:
+        if not self.textured:
             return self.scene
-        if self.scene.mean_alpha is not None:
-            return replace(self.scene, atlas=self.texels.contiguous(), alpha_scale=1.0)
-        rgba = torch.cat([self.texels, torch.ones_like(self.texels[..., :1])], -1).contiguous()
-        return replace(self.scene, atlas=rgba)
+        pages = paged_texels(self.texels, self.packing)
+        if pages.shape[3] == 4:
+            return replace(self.scene, atlas=pages, alpha_scale=1.0)
+        return replace(self.scene, atlas=torch.cat([pages, torch.ones_like(pages[..., :1])], -1))
 
     def stored(self) -> BakedScene:
         """The scene with its texels as a bundle has them."""
@@ -121,40 +146,37 @@ class Baked:
         return replace(self, scene=replace(self.scene, surfels=given))
 
     def with_tiles(self, tiles: Tiles) -> Baked:
-        """Copy with other tiles of its N surfels, not encoded yet."""
-        scene = replace(self.scene, tiles=torch.from_numpy(tiles.packing.tiles), extent=tiles.extent)
-        scene = with_means(scene, tiles.constants)
-        return replace(self, scene=scene, packing=tiles.packing, texels=tiles.texels, atlas=None)
+        """Copy with other tiles of its N surfels, packed, not encoded yet."""
+        packing = pack(tiles.sizes, self.options.page_width, self.options.page_rows)
+        scene = replace(self.scene, tiles=torch.from_numpy(packing.tiles), extent=tiles.extent)
+        scene = with_means(scene, tile_means(tiles.texels, tiles.sizes))
+        return replace(self, scene=scene, packing=packing, texels=tiles.texels, atlas=None)
 
     def only(self, kept: Tensor) -> Baked:
         """Copy with the surfels of the mask `kept` [N] and their tiles, packed again, not encoded yet."""
         if bool(kept.all()):
             return self
         surfels = {name: value[kept] for name, value in self.scene.surfels.items()}
-        before = replace(self.packing, tiles=self.packing.tiles[kept.numpy()])
-        packing = pack(before.tiles[:, 3:], self.options.page_width, self.options.page_rows)
-        texels = None
-        if self.texels is not None and packing.texels:
-            texels = paged_texels(listed_texels(self.texels, before, self.constants[kept]), packing)
+        listed = kept.repeat_interleave(self.sizes.long().clamp(min=1).prod(dim=1))
         in_front = None if self.in_front is None else self.in_front[kept]
         some = replace(self, scene=replace(self.scene, surfels=surfels), rows=self.rows[kept], in_front=in_front)
-        return some.with_tiles(Tiles(packing, texels, self.extent[kept], self.constants[kept]))
+        return some.with_tiles(Tiles(self.sizes[kept], self.extent[kept], self.texels[listed]))
 
     def with_texels(self, texels: Tensor) -> Baked:
-        """Copy with other texels, not encoded yet."""
-        if self.texels is None or texels.shape != self.texels.shape:
+        """Copy with other texels [T, C], or [T, 3] to keep the alphas, not encoded yet."""
+        texels = self.cut(texels.detach().float().cpu()) if texels.shape[-1] == 3 else texels.detach().float().cpu()
+        if not self.textured or texels.shape != self.texels.shape:
             raise ValueError(f"texels of shape {tuple(texels.shape)} do not fit the bake")
-        texels = texels.detach().float().cpu().contiguous()
-        means = tile_means(texels, self.packing, self.constants)
         # no error: the field is no longer what the texels are meant to hold
         statistics = self.statistics.but(atlas=None, error=None, certificate=None)
-        return replace(self.with_constants(means), texels=texels, atlas=None, statistics=statistics)
+        means = tile_means(texels, self.sizes)
+        return replace(self.with_constants(means), texels=texels.contiguous(), atlas=None, statistics=statistics)
 
     def encoded(self, progress: Progress = no_progress) -> Baked:
         """Copy with its texels quantised and encoded, where that is not done."""
-        if self.texels is None or self.atlas is not None:
+        if not self.textured or self.atlas is not None:
             return self
-        return self.with_atlas(encoded_pages(self.texels, self.packing, self.options, progress))
+        return self.with_atlas(encoded_texels(self.texels, self.packing, self.options, progress))
 
     def with_atlas(self, atlas: EncodedAtlas) -> Baked:
         """Copy with an encoded atlas."""
@@ -163,13 +185,9 @@ class Baked:
     def with_texel_codes(self, codes: TexelCodes, uncoded: Tensor) -> Baked:
         """Copy with the residual colours of the codes of its tiles, which were made of `uncoded` [T, 3]."""
         assert self.codes is not None
-        alphas = codes.alphas()
-        listed = codes.texels() if alphas is None else joined(codes.texels(), alphas)
-        texels = paged_texels(listed, self.packing)
-        value_range = choose_range(
-            texels.numpy(), self.packing, self.options.range, self.options.range_samples, self.options.seed
-        )
-        atlas = replace(encode(texels.numpy(), self.packing, "uint8", value_range), encoder="cosine transform")
+        alphas, options = codes.alphas(), replace(self.options, format="uint8")
+        texels = codes.texels() if alphas is None else joined(codes.texels(), alphas)
+        atlas = replace(encoded_texels(texels, self.packing, options), encoder="cosine transform")
         return replace(
             self.with_constants(codes.constants),
             texels=texels,
@@ -223,18 +241,20 @@ def with_means(scene: BakedScene, constants: Tensor) -> BakedScene:
     return replace(scene, mean_residual=constants[:, :3].contiguous(), mean_alpha=constants[:, 3].contiguous())
 
 
-def encoded_pages(
+def encoded_texels(
     texels: Tensor,
     packing: Packing,
     options: BakeOptions,
     progress: Progress = no_progress,
     value_range: Range | None = None,
 ) -> EncodedAtlas:
-    """Pages [layers, height, width, C] as the options say, in a range of values that is not theirs to choose where one
-    is given."""
+    """Texels [T, C] in pages, as the options say, and in a range of values that they choose where none is stated."""
     if options.format != "fp16" and value_range is None:
-        value_range = choose_range(texels.numpy(), packing, options.range, options.range_samples, options.seed)
-    return encode(texels.numpy(), packing, options.format, value_range, options.bc7_profile, progress=progress)
+        sizes = torch.from_numpy(packing.tiles[:, 3:]).long()
+        of_tiles = (sizes[:, 0] > 0).repeat_interleave(sizes.clamp(min=1).prod(dim=1))
+        value_range = choose_range(texels[of_tiles].numpy(), options.range, options.range_samples, options.seed)
+    pages = paged_texels(texels, packing).numpy()
+    return encode(pages, packing, options.format, value_range, options.bc7_profile, progress=progress)
 
 
 def atlas_cost(packing: Packing, atlas: EncodedAtlas) -> AtlasCost:

@@ -24,17 +24,14 @@ def certified(baked: Baked, cameras: Sequence[Camera]) -> Baked:
         baked: encoded, on the CPU.
     """
     scene, options = baked.scene, baked.options
-    if baked.texels is None or baked.atlas is None or options.tolerance == 0 or baked.statistics.certificate:
+    if baked.atlas is None or options.tolerance == 0 or baked.statistics.certificate:
         return baked
     stored = listed_texels(torch.from_numpy(baked.atlas.decoded()[..., :3]), baked.packing, baked.mean_residual)
-    before = baked.uncoded
-    if before is None:
-        before = baked.listed
-    before = before[:, :3]
+    before = (baked.texels if baked.uncoded is None else baked.uncoded)[:, :3]
     pixels = closest_pixels(scene.surfels, cameras, options.extent, scene.near) if cameras else None
     opacity, beta = kernel_parameters(scene.surfels, baked.in_front)
     shown = Shown(opacity, beta, baked.extent, scene.weight_bound, pixels=pixels)
-    errors, seen = listed_errors(stored - before, torch.from_numpy(baked.packing.tiles[:, 3:]), shown)
+    errors, seen = listed_errors(stored - before, baked.sizes, shown)
     rms = STEPS * float((stored - before).double().square().mean().sqrt())
     certificate = Certificate.of(errors[seen], options.tolerance, "texels").but(
         texel_rms=round(rms, 4), marks=sketches_text(before, stored)

@@ -14,15 +14,12 @@ from bitymi_ns.bake.texel_list import TexelList
 from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bake.view_color_rate import color_choices
 from bitymi_ns.bundle.statistics import Rounding, ViewColorError
-from bitymi_ns.codec.packing import pack
-from bitymi_ns.codec.pages import paged_texels
 from bitymi_ns.codec.surfel_codes import code_surfels
 from bitymi_ns.codec.texel_codes import (
     RESIDUAL_STEP,
     SceneCodes,
     TexelCodeOptions,
     TexelCoder,
-    TexelCodes,
     residual_codes,
 )
 from bitymi_ns.progress import Progress, no_progress
@@ -37,6 +34,7 @@ TEXEL_SHARE = 0.5  # lambda of the texels, which are tuned after it, as a share 
 ENOUGH = 0.002
 """Share of the error (0.009 dB) that may be added even where a size is asked for: finer is not worth bytes."""
 LEAST_ERROR = 1e-7  # mean square error that is always allowed, of colours from 0 to 1: 70 dB
+LEAST_TEXEL_BYTES = 1000  # that are left for the texels where a size is asked for
 _SEARCH = 7
 _CPU = torch.device("cpu")
 _FAST = 9
@@ -105,7 +103,7 @@ class Coder:
         options.check()
         self._baked, self._pictures = baked, Pictures(views, background, options.views, device)
         scene = baked.unquantised()
-        self._sizes = torch.from_numpy(baked.packing.tiles[:, 3:]).long()
+        self._sizes = baked.sizes.long()
         drawn = self._pictures.of(scene)
         self.error, self.psnr = self._pictures.square(drawn), self._pictures.psnr(drawn)
         rows = validation_split(len(views), options.val_every if len(views) >= FEWEST_VIEWS else 0)[1]
@@ -115,7 +113,7 @@ class Coder:
         reduced = replace(scene, surfels={**scene.surfels, **self._colors.at(START)})
         self._noise = column_noise(reduced, self._sizes, self._pictures, progress)
         self._tiles = self._texels = self._weights = self._alphas = None
-        if baked.texels is not None:
+        if baked.textured:
             texels = TexelList(baked, device)
             self._tiles, self._texels = texels.tiles, texels.values.cpu()
             self._alphas = None if baked.alpha is None else baked.alpha.values
@@ -140,9 +138,8 @@ class Coder:
             surfels |= self._colors.at(lmbda)
         steps = self._noise.steps(lmbda / self._numbers if self.measured else 0.0)
         codes, order = code_surfels(surfels, baked.scene.view_color, self._sizes, baked.extent, steps)
-        packing = pack(codes.sizes, baked.options.page_width, baked.options.page_rows)
         residual = baked.mean_residual[order]
-        texels = pages = coded = None
+        listed, coded = residual, None
         coding = TexelCodeOptions(step=min(1000.0, max(0.01, 255 * math.sqrt(TEXEL_SHARE * 12 * lmbda / PER_BIT))))
         constants = residual
         if self._texels is not None:
@@ -153,16 +150,17 @@ class Coder:
                 listed = joined(texels, coder.code_alpha(self._alphas[moved]))
                 assert coder.alpha is not None
                 constants = joined(residual, coder.alpha.means)
-            pages, coded = paged_texels(listed, packing), coder.code(texels)
+            coded = coder.code(texels)
         pages_of = (baked.options.page_width, baked.options.page_rows)
         kept = SceneCodes(codes, None, residual_codes(residual), RESIDUAL_STEP, *pages_of)
         in_front = None if baked.in_front is None else baked.in_front[order]
         rounded = replace(baked, rows=baked.rows[order], codes=kept, in_front=in_front).with_surfels(codes.surfels())
-        rounded = rounded.with_tiles(Tiles(packing, pages, codes.extent(baked.options.extent), constants))
-        rounded = replace(rounded, alpha_codes=coded if self._alphas is not None else None)
+        rounded = rounded.with_tiles(Tiles(self._sizes[order], codes.extent(baked.options.extent), listed))
+        rounded = replace(rounded.with_constants(constants), alpha_codes=coded if self._alphas is not None else None)
         size, shown = kept.surfels.nbytes(), rounded
         if coded is not None:
-            size, shown = size + coded.nbytes(_FAST), _with_texels(rounded, coded)
+            size += coded.nbytes(_FAST)
+            shown = replace(rounded, texels=rounded.cut(coded.texels())).with_constants(coded.constants)
         scene = shown.unquantised()
         pictures = self._pictures.of(scene)
         return RatePoint(rounded, coding, scene, size, self._pictures.square(pictures), self._pictures.psnr(pictures))
@@ -223,24 +221,14 @@ def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> 
     else:
         allowed = coder.allowed(options.share)
         found, _ = _search(coder, lambda point: point.error <= allowed, progress, most=MAX_LAMBDA)
-    baked, coding = kept_at(coder, found)
+    baked, coding = found.baked, found.coding
+    assert baked.codes is not None
     if options.most_bytes is not None:
-        assert baked.codes is not None
         coding = replace(coding, most_bytes=options.most_bytes - baked.codes.surfels.nbytes())
-    return baked, coding
-
-
-def kept_at(coder: Coder, point: RatePoint) -> tuple[Baked, TexelCodeOptions]:
-    """Bake of a point with its statistics, and how its texels are to be coded."""
-    rounded = point.baked
-    assert rounded.codes is not None
-    mse = point.error - coder.error if coder.measured else None
-    rounding = Rounding(mse=mse if mse is None else max(0.0, mse), steps=dict(rounded.codes.surfels.steps))
-    statistics = rounded.statistics.but(rounding=rounding, error=None, certificate=None, view_color=_thinned(rounded))
-    return replace(rounded, statistics=statistics), point.coding
-
-
-LEAST_TEXEL_BYTES = 1000
+    mse = max(0.0, found.error - coder.error) if coder.measured else None
+    rounding = Rounding(mse=mse, steps=dict(baked.codes.surfels.steps))
+    statistics = baked.statistics.but(rounding=rounding, error=None, certificate=None, view_color=_thinned(baked))
+    return replace(baked, statistics=statistics), coding
 
 
 def _search(
@@ -270,11 +258,10 @@ def _search(
 def with_coded_texels(baked: Baked, options: TexelCodeOptions | None = None) -> Baked:
     """A bake with rounded surfels whose texels, all of which count the same, are coded as well."""
     assert baked.codes is not None
-    if baked.texels is None:
+    if not baked.textured:
         return baked
-    texels, options = baked.listed[:, :3].contiguous(), options or TexelCodeOptions()
-    sizes = torch.from_numpy(baked.packing.tiles[:, 3:])
-    coder = TexelCoder(sizes, torch.ones(len(texels)), options, baked.alpha_codes)
+    texels, options = baked.texels[:, :3].contiguous(), options or TexelCodeOptions()
+    coder = TexelCoder(baked.sizes, torch.ones(len(texels)), options, baked.alpha_codes)
     coded = coder.code(texels) if options.most_bytes is None else coder.fit(texels, options.most_bytes)
     return baked.with_texel_codes(coded, texels)
 
@@ -290,9 +277,3 @@ def _thinned(baked: Baked) -> ViewColorError | None:
         one_color=int((surfels["view_span"][:, 1] == 0).sum()),
         bytes=stated.bytes and stated.bytes.but(after=4 * (4 * len(baked.rows) + terms.numel())),
     )
-
-
-def _with_texels(baked: Baked, coded: TexelCodes) -> Baked:
-    """The bake as it is drawn with coded texels."""
-    texels = baked.cut(coded.texels())
-    return replace(baked, texels=paged_texels(texels, baked.packing)).with_constants(coded.constants)

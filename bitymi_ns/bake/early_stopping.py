@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 from torch import Tensor
 
@@ -15,14 +15,6 @@ S = TypeVar("S")
 FEWEST_VIEWS = 4  # with fewer views there are no validation views, and nothing is optimised
 
 
-class StoppingOptions(Protocol):
-    """Options that decide when validation views are evaluated."""
-
-    steps: int
-    checks: int
-    patience: int
-
-
 class EarlyStopping(Generic[S]):
     """Best state by the PSNR of validation views.
 
@@ -33,14 +25,17 @@ class EarlyStopping(Generic[S]):
         done: steps before the last evaluation.
     """
 
-    def __init__(self, options: StoppingOptions, psnr: float, first: S) -> None:
+    def __init__(self, steps: int, checks: int, patience: int, psnr: float, first: S) -> None:
         """
         Args:
+            steps: at most.
+            checks: evaluations over the run.
+            patience: evaluations without a gain after which it ends.
             psnr: of the views before the first step, dB; NaN without any.
             first: the state then.
         """
-        self._steps, self._patience = options.steps, options.patience
-        self._every = -(-options.steps // options.checks)
+        self._steps, self._patience = steps, patience
+        self._every = -(-steps // checks)
         self.best, self.curve, self.done = first, [] if math.isnan(psnr) else [(0, psnr)], 0
 
     def due(self, done: int) -> bool:

@@ -1,7 +1,6 @@
 """Lean view colours: a surfel keeps the fewest sites that hold its colour, or one colour."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -10,37 +9,17 @@ from torch.nn import functional as F
 
 from bitymi_ns.bake.directions import Directions, view_directions
 from bitymi_ns.bake.inputs import BakeInput
-from bitymi_ns.bake.voronoi_fit import fit_sites, least_needed, site_weights
+from bitymi_ns.bake.voronoi_fit import FIT_VIEWS, fewer_sites, site_weights
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.statistics import Kept, Percentiles, ViewColorError
 from bitymi_ns.codec.limits import beyond
 from bitymi_ns.codec.quantise import STEPS
 from bitymi_ns.ops import view_color
 from bitymi_ns.ops.constants import COLOR_BIAS
-from bitymi_ns.ops.sphere import fibonacci_sphere
-from bitymi_ns.ops.view_color import view_base
+from bitymi_ns.ops.view_color import LEAN, view_base
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, kind_of
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.tile_sizes import kernel_parameters
-
-FIT_STEPS = 6
-FIT_VIEWS = 16  # views of a surfel in the fit; the error is measured in all of them
-OUTSIDE, OUTSIDE_WEIGHT = 12, 0.05
-"""Directions over the whole sphere, and their weight, in the fit: where no view is, the colour follows the trained one
-loosely instead of diverging."""
-
-
-@dataclass
-class LeanColor:
-    """View colours of N surfels, of which only what is needed is left (`ops.view_color.LEAN`)."""
-
-    base: Tensor  # [N, 3] float32
-    span: Tensor  # [N, 2] int32 first term and number of terms
-    terms: Tensor  # [T, lean_width of the kind] float32, those of one surfel after those of the one before
-
-    def parameters(self) -> dict[str, Tensor]:
-        """By the names that the renderers use."""
-        return {"view_base": self.base, "view_span": self.span, "view_terms": self.terms}
 
 
 def centers_of(cameras: Sequence[Any], like: Tensor) -> Tensor:
@@ -76,8 +55,9 @@ def reduce_view_color(
     opacity: Tensor,
     tolerance: float,
     progress: Progress = no_progress,
-) -> LeanColor:
-    """The fewest sites, down to one constant colour, that keep every surfel's colour within a tolerance.
+) -> dict[str, Tensor]:
+    """Lean view colours (`ops.view_color.LEAN`): the fewest sites, down to one constant colour, that keep a surfel's
+    colour within a tolerance.
 
     The error is the largest one over all directions of `view_directions` and the channels, of max(f_view + 0.5, 0),
     times the largest blending weight that the surfel can have. One colour is tried first, the middle between the
@@ -123,7 +103,7 @@ def reduce_view_color(
     terms = means.new_zeros(int(count.sum()), entry.lean_width)
     for rows, values in parts:
         terms[first[rows, None] + torch.arange(values.shape[1], device=means.device)] = values
-    return LeanColor(base, torch.stack([first, count], dim=1).int(), terms)
+    return dict(zip(LEAN, (base, torch.stack([first, count], dim=1).int(), terms), strict=True))
 
 
 def _fewer_sites(
@@ -134,24 +114,16 @@ def _fewer_sites(
     `own` are vectors and colours [n, K, 3] of all its surfels' sites.
     """
     vectors, rgb = own
-    sites = vectors.shape[1]
-    outside = fibonacci_sphere(OUTSIDE).to(vectors).expand(len(vectors), -1, -1)
-    samples = torch.cat([at.thinned(at.unit, FIT_VIEWS), outside], dim=1)
-    weight = F.pad(at.thinned(at.valid, FIT_VIEWS).float(), (0, OUTSIDE), value=OUTSIDE_WEIGHT)
-    colors = site_weights(vectors, samples) @ rgb
-    left = least_needed(vectors, rgb, samples, weight)
-    result = []
-    for number in range(2, sites):
+    fit, result = fewer_sites(at, at.thinned(at.valid, FIT_VIEWS).float(), vectors, rgb), []
+    for number in range(2, vectors.shape[1]):
         if len(rest) == 0:
             break
-        kept = left[number - 1][rest, :, None].expand(-1, -1, 3)
-        v, r = vectors[rest].gather(1, kept), rgb[rest].gather(1, kept)
-        b, r = fit_sites(v[:, 1:] - v[:, :1], r, samples[rest], colors[rest], weight[rest], FIT_STEPS)
-        shown = view_base(site_weights(F.pad(b, (0, 0, 1, 0)), at.unit[rest]) @ r)
-        terms = torch.cat([b, r[:, 1:]], dim=2)
+        color, terms = fit(number, rest)
+        weights = site_weights(F.pad(terms[..., :3], (0, 0, 1, 0)), at.unit[rest])
+        shown = view_base(weights @ torch.cat([color[:, None], terms[..., 3:]], dim=1))
         good = largest_error(shown, target[rest], at.valid[rest]) <= allowed[rest]
-        good &= ~beyond("view_terms", kind, terms).flatten(1).any(1) & ~beyond("view_base", kind, r[:, 0]).any(1)
-        result.append((rest[good], r[good, 0], terms[good]))
+        good &= ~beyond("view_terms", kind, terms).flatten(1).any(1) & ~beyond("view_base", kind, color).any(1)
+        result.append((rest[good], color[good], terms[good]))
         rest = rest[~good]
     v = vectors[rest].double()
     relative = (v[:, 1:] - v[:, :1]).to(rgb)
@@ -187,20 +159,19 @@ def view_color_errors(
 
 
 def describe(
-    kind: str, surfels: Mapping[str, Tensor], lean: LeanColor, error: Tensor, tolerance: float
+    kind: str, surfels: Mapping[str, Tensor], lean: Mapping[str, Tensor], error: Tensor, tolerance: float
 ) -> ViewColorError:
     """Statistics of a reduction."""
-    entry = VIEW_COLORS[kind]
-    before = sum(each[0].numel() for each in entry.of(surfels)) if len(lean.base) else 0
+    (base, span, terms), entry = (lean[name] for name in LEAN), VIEW_COLORS[kind]
+    before = sum(each[0].numel() for each in entry.of(surfels)) if len(base) else 0
     sites = 1 + entry.terms(surfels) - entry.base_terms  # the base of a lean colour, and its terms
-    after = 4 * (4 * len(lean.base) + lean.terms.numel())
     return ViewColorError(
         kind=kind,
         tolerance=tolerance,
         unit="8-bit steps, largest over the directions and channels, weighted by the blending weight",
-        sites=Kept(before=sites * len(lean.base), after=len(lean.base) + len(lean.terms)),
-        one_color=int((lean.span[:, 1] == 0).sum()),
-        bytes=Kept(before=4 * before * len(lean.base), after=after),
+        sites=Kept(before=sites * len(base), after=len(base) + len(terms)),
+        one_color=int((span[:, 1] == 0).sum()),
+        bytes=Kept(before=4 * before * len(base), after=4 * (4 * len(base) + terms.numel())),
         error=Percentiles.of(error),
     )
 
@@ -216,6 +187,6 @@ def kept_view_colors(
     opacity, _ = kernel_parameters(surfels, inputs.transmittance)
     at = (inputs.seen, centers_of(inputs.cameras, means), opacity)
     lean = reduce_view_color(surfels, kind, *at, options.tolerance, progress)
-    error = view_color_errors(kind, surfels, lean.parameters(), means, *at)
+    error = view_color_errors(kind, surfels, lean, means, *at)
     kept = {name: value for name, value in surfels.items() if name not in VIEW_COLORS[kind].names}
-    return kept | lean.parameters(), describe(kind, surfels, lean, error, options.tolerance)
+    return kept | lean, describe(kind, surfels, lean, error, options.tolerance)

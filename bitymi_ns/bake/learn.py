@@ -7,13 +7,13 @@ from dataclasses import dataclass, field, replace
 
 from torch import Tensor
 
-from bitymi_ns.bake.baked import Baked
+from bitymi_ns.bake.baked import BakeableScene, Baked
 from bitymi_ns.bake.certificate import certified
 from bitymi_ns.bake.compact import Compact, compacted, with_coded_texels
 from bitymi_ns.bake.field.bake import bake
 from bitymi_ns.bake.field.polish import PolishOptions, polish_scene
 from bitymi_ns.bake.inputs import device_of
-from bitymi_ns.bake.pipeline import BakeableScene, reduced, trained_texels
+from bitymi_ns.bake.pipeline import reduced, trained_texels
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.progress import Progress, no_progress
@@ -71,33 +71,6 @@ class Learning:
         return cls(polish, tune, train, compact)
 
 
-def baked_and_reduced(
-    scene: BakeableScene,
-    cameras: Sequence[Camera],
-    photographs: Sequence[View],
-    background: Tensor,
-    options: BakeOptions,
-    learning: Learning,
-    progress: Progress = no_progress,
-    held_out: Sequence[View] = (),
-) -> Baked:
-    """Bake trained texels, or a field with or without a polish, and reduce tiles and view colours; the first stages of
-    `bake_and_learn`, with its arguments."""
-    polish = learning.polish
-    trained = isinstance(scene.field, TexelField)
-    if trained:
-        baked = trained_texels(scene, options)
-    else:
-        baked = bake(scene, cameras, options, progress, None if polish is None else polish.pixels_per_texel)
-    if polish is not None and baked.texels is not None:
-        baked = polish_scene(
-            baked, photographs, background, polish, learning.train, progress, held_out, device_of(cameras)
-        )
-    if polish is not None or trained:
-        baked = reduced(baked, cameras, progress)
-    return baked
-
-
 def bake_and_learn(
     scene: BakeableScene,
     cameras: Sequence[Camera],
@@ -128,10 +101,18 @@ def bake_and_learn(
     tune, coding, device = learning.tune, None, device_of(cameras)
     if learning.compact is not None:  # its texels are decoded to 8 bits: nothing has to be encoded to state their error
         options = replace(options, format="uint8")
-    baked = baked_and_reduced(scene, cameras, photographs, background, options, learning, progress, held_out)
+    polish, trained = learning.polish, isinstance(scene.field, TexelField)
+    if trained:
+        baked = trained_texels(scene, options)
+    else:
+        baked = bake(scene, cameras, options, progress, None if polish is None else polish.pixels_per_texel)
+    if polish is not None and baked.textured:
+        baked = polish_scene(baked, photographs, background, polish, learning.train, progress, held_out, device)
+    if polish is not None or trained:
+        baked = reduced(baked, cameras, progress)
     if learning.compact is not None:
         baked, coding = compacted(baked, photographs, background, learning.compact, progress, device)
-    if tune is not None and baked.texels is not None:
+    if tune is not None and baked.textured:
         baked = tune_atlas(baked, photographs, background, tune, progress, held_out, coding, device)
     if baked.codes is not None and baked.codes.texels is None:
         baked = with_coded_texels(baked, coding)

@@ -1,35 +1,21 @@
 """First stages of the bake of trained texels: all of them as tiles, and reduced to a tolerance."""
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Protocol
 
 import torch
-from torch import Tensor
 
-from bitymi_ns.bake.baked import Baked, joined, with_means
+from bitymi_ns.bake.baked import BakeableScene, Baked, joined
 from bitymi_ns.bake.inputs import BakeInput, device_of, drawable, photo_resolution, visible
 from bitymi_ns.bake.lean_color import kept_view_colors
 from bitymi_ns.bake.reduce import reduced_tiles
+from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.statistics import KeptSurfels, KeptTexels, Statistics
-from bitymi_ns.codec.packing import pack
-from bitymi_ns.codec.pages import paged_texels, tile_means
-from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.progress import Progress, no_progress
-from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
-
-
-class BakeableScene(Protocol):
-    """The part of a scene that the bake uses."""
-
-    surfels: Mapping[str, Tensor]
-    field: Any  # a residual field, a `TexelField`, or None
-    near: float
-    config: Any  # weight_bound, prefilter
 
 
 @torch.no_grad()
@@ -52,28 +38,18 @@ def trained_texels(scene: BakeableScene, options: BakeOptions) -> Baked:
     field, rows = copy.deepcopy(scene.field).cpu(), rows.cpu()
     field.keep(rows)
     bare = field.size.long().prod(1) == 1  # their one texel is their constant
-    packing = pack(torch.where(bare[:, None], 0, field.size), options.page_width, options.page_rows)
-    listed = field.texels.detach().float()
+    texels = field.texels.detach().float()
     if field.alpha is not None:
-        listed = joined(listed, field.alpha.detach().float())
-    pages, constants = paged_texels(listed, packing), torch.where(bare[:, None], listed[field.tiles.first], 0.0)
-    baked = BakedScene(
-        surfels,
-        kind_of(surfels),
-        torch.from_numpy(packing.tiles),
-        extent=field.extent.float(),
-        near=scene.near,
-        weight_bound=scene.config.weight_bound,
-        prefilter=scene.config.prefilter,
-    )
-    baked = with_means(baked, tile_means(pages, packing, constants))
+        texels = joined(texels, field.alpha.detach().float())
+    tiles = Tiles(torch.where(bare[:, None], 0, field.size), field.extent.float(), texels)
+    baked = Baked.of(scene, surfels, rows, tiles, options)
     statistics = Statistics(
         surfels=KeptSurfels(
             trained=len(scene.surfels["means"]), kept=len(rows), left_out=left_out, without_tile=int(bare.sum())
         ),
-        texels=KeptTexels(learned=packing.texels, kept=packing.texels),
+        texels=KeptTexels(learned=baked.packing.texels, kept=baked.packing.texels),
     )
-    return Baked(baked, rows, packing, pages if packing.texels else None, None, options, statistics)
+    return replace(baked, statistics=statistics)
 
 
 @torch.no_grad()
@@ -104,8 +80,9 @@ def reduced(baked: Baked, cameras: Sequence[Camera], progress: Progress = no_pro
         raise ValueError("no surfel is left to bake")
     lean, view_color = kept_view_colors(inputs, options, progress)
     result = baked.only(kept)
-    if options.tolerance > 0 and result.texels is not None:
-        result = result.with_tiles(reduced_tiles(result.tiles, inputs, options, progress))
+    if options.tolerance > 0 and result.textured:
+        tiles = Tiles(result.sizes, result.extent, result.texels)
+        result = result.with_tiles(reduced_tiles(tiles, inputs, options, progress))
     in_front = None if inputs.transmittance is None else inputs.transmittance.cpu()
     result = replace(result.with_surfels(lean), in_front=in_front)
     result = replace(result, scene=replace(result.scene, photographed=photo_resolution(inputs)))
@@ -120,6 +97,6 @@ def reduced(baked: Baked, cameras: Sequence[Camera], progress: Progress = no_pro
     )
     if statistics.texels is not None:
         statistics = statistics.but(texels=statistics.texels.but(kept=result.packing.texels))
-    if result.texels is None:
+    if not result.textured:
         statistics = statistics.but(atlas=None)
     return replace(result, statistics=statistics)

@@ -99,46 +99,33 @@ def column_noise(
     """
     assert scene.extent is not None
     codes, order = code_surfels(scene.surfels, scene.view_color, sizes, scene.extent, REFERENCE)
-    plain, drawn = permuted(scene, order), pictures.of(scene)
+    moved = {name: getattr(scene, name) for name in ("tiles", "extent", "mean_residual", "mean_alpha")}
+    moved = {name: None if value is None else value[order].contiguous() for name, value in moved.items()}
+    plain, drawn = replace(scene, surfels=reordered(scene.surfels, order), **moved), pictures.of(scene)
+    rounded, tiled = codes.surfels(), torch.from_numpy(codes.sizes[:, 0] > 0)
+    extent = torch.where(tiled, codes.extent(1.0), plain.extent)
     noise, counts = {}, {}
     for done, name in enumerate(REFERENCE):
         column = codes.codes[name]
         counts[name] = len(column) * (3 if name == "place" else column.shape[1])
-        rounded = _with_column(plain, codes, name)
-        error = pictures.square(pictures.of(rounded), drawn) if len(column) and pictures.views else 0.0
+        if name == "extent":
+            changed = replace(plain, extent=extent)
+        else:
+            changed = replace(plain, surfels={**plain.surfels, **_column(plain, codes, rounded, name)})
+        error = pictures.square(pictures.of(changed), drawn) if len(column) and pictures.views else 0.0
         noise[name] = error / codes.steps[name] ** 2
         progress("rounding the surfels", done + 1, len(REFERENCE))
     return ColumnNoise(noise, counts)
 
 
-def rounded_scene(scene: BakedScene, codes: SurfelCodes) -> BakedScene:
-    """A scene whose surfels, in the order of the codes, have the values of the codes; tiles are as they are."""
-    assert scene.extent is not None
-    tiled = codes.codes["size"][:, 0] > 0
-    extent = torch.where(torch.from_numpy(tiled), codes.extent(float(scene.extent.max())), scene.extent)
-    return replace(scene, surfels=codes.surfels(), extent=extent)
-
-
-def permuted(scene: BakedScene, order: Tensor) -> BakedScene:
-    """The scene with its surfels in another order [N]."""
-    moved = {name: getattr(scene, name) for name in ("tiles", "extent", "mean_residual", "mean_alpha")}
-    moved = {name: None if value is None else value[order].contiguous() for name, value in moved.items()}
-    return replace(scene, surfels=reordered(scene.surfels, order), **moved)
-
-
-def _with_column(scene: BakedScene, codes: SurfelCodes, column: str) -> BakedScene:
-    """The scene with one column rounded."""
-    rounded = rounded_scene(scene, codes)
-    if column == "extent":
-        return replace(scene, extent=rounded.extent)
-    name, values = PARAMETERS.get(column, column), rounded.surfels
-    if column in ("term_shape", "term_color"):
-        name = "view_terms"
-        at = term_numbers(codes.kind)[column == "term_shape"]
-        terms = scene.surfels[name].clone()
-        terms[:, at] = values[name][:, at]
-        values = {name: terms}
-    return replace(scene, surfels={**scene.surfels, name: values[name]})
+def _column(scene: BakedScene, codes: SurfelCodes, rounded: Mapping[str, Tensor], column: str) -> dict[str, Tensor]:
+    """The parameter of a column with the rounded numbers of the column."""
+    if column not in ("term_shape", "term_color"):
+        name = PARAMETERS.get(column, column)
+        return {name: rounded[name]}
+    at, terms = term_numbers(codes.kind)[column == "term_shape"], scene.surfels["view_terms"].clone()
+    terms[:, at] = rounded["view_terms"][:, at]
+    return {"view_terms": terms}
 
 
 def _step(name: str, error: float, noise: float) -> float:

@@ -11,8 +11,7 @@ from bitymi_ns.bake.inputs import BakeInput
 from bitymi_ns.bake.tile_errors import weighted_rms
 from bitymi_ns.bake.tiles import Shown, Tiles, TileValues, tile_values
 from bitymi_ns.bundle.bake_options import BakeOptions
-from bitymi_ns.codec.packing import Packing, pack
-from bitymi_ns.codec.pages import texel_index, tile_means
+from bitymi_ns.codec.pages import first_texels
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.tile_sizes import kernel_parameters
 
@@ -68,16 +67,14 @@ class Reduced:
     parts: list[tuple[Tensor, Tensor]] = field(default_factory=list)
     nonfinite: int = 0  # number of points at which the field was not finite (taken as 0 there)
 
-    def pages(self, packing: Packing) -> Tensor:
-        """The texels in the atlas: [layers, height, width, C] float32 on the CPU, 0 outside the tiles."""
-        channels = self.constant.shape[1]
-        pages = torch.zeros(packing.layers * packing.height * packing.width, channels)
-        tiles = torch.from_numpy(packing.tiles)
-        for rows, texels in self.parts:
-            size = (texels.shape[3], texels.shape[2])
-            at = texel_index(tiles[rows], size, packing.width, packing.height)
-            pages[at.reshape(-1)] = texels.permute(0, 2, 3, 1).reshape(-1, channels)
-        return pages.reshape(packing.layers, packing.height, packing.width, channels)
+    def tiles(self, shown: Shown, extent: float) -> Tiles:
+        """The tiles, in their list; those of which nothing is shown have a half side `extent`."""
+        first = first_texels(self.sizes)
+        texels = self.constant.repeat_interleave(self.sizes.long().clamp(min=1).prod(dim=1), dim=0)
+        for rows, values in self.parts:
+            own = values.permute(0, 2, 3, 1).flatten(1, 2)
+            texels[first[rows, None] + torch.arange(own.shape[1])] = own
+        return Tiles(self.sizes, torch.where(shown.extent > 0, shown.extent, extent).cpu(), texels, self.nonfinite)
 
 
 @torch.no_grad()
@@ -165,23 +162,14 @@ def reduced_tiles(tiles: Tiles, inputs: BakeInput, options: BakeOptions, progres
     """Resample every tile to the smallest grid within the tolerance; no tile where one colour is.
 
     Args:
-        tiles: of N surfels, with texels.
+        tiles: of N surfels.
         inputs: the surfels, and what the views see of them; their device does the work.
     """
-    assert tiles.texels is not None
     opacity, beta = kernel_parameters(inputs.surfels, inputs.transmittance)
-    shown = Shown(opacity, beta, tiles.extent.to(opacity.device), inputs.weight_bound)
-    parts = tile_values(tiles.texels.to(opacity.device), tiles.packing, shown, options.chunk)
-    smaller = reduce_tiles(parts, shown, options.tolerance, options.r_min, progress, tiles.texels.shape[3])
-    bare = torch.from_numpy(tiles.packing.tiles)[:, 3] == 0
-    smaller.constant[bare] = tiles.constants[bare]
-    return packed_tiles(smaller, shown, options)
-
-
-def packed_tiles(reduced: Reduced, shown: Shown, options: BakeOptions) -> Tiles:
-    """Pack the chosen tiles into pages."""
-    packing = pack(reduced.sizes, options.page_width, options.page_rows)
-    texels = reduced.pages(packing)
-    extent = torch.where(shown.extent > 0, shown.extent, options.extent).cpu()
-    means = tile_means(texels, packing, reduced.constant)
-    return Tiles(packing, texels if packing.texels else None, extent, means, reduced.nonfinite)
+    device, channels = opacity.device, tiles.texels.shape[1]
+    shown = Shown(opacity, beta, tiles.extent.to(device), inputs.weight_bound)
+    parts = tile_values(tiles.texels.to(device), tiles.sizes.to(device), shown, options.chunk)
+    smaller = reduce_tiles(parts, shown, options.tolerance, options.r_min, progress, channels)
+    bare = tiles.sizes[:, 0] == 0
+    smaller.constant[bare] = tiles.texels[first_texels(tiles.sizes)[bare]]
+    return smaller.tiles(shown, options.extent)

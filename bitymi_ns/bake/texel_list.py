@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.baked import Baked
-from bitymi_ns.codec.pages import paged_texels
 from bitymi_ns.ops import Projection, TexelTiles, add_texel_coverage, fitting_lists, project
 from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.progress import Progress, no_progress
@@ -22,7 +21,6 @@ class TexelList:
         tiles: where the texels lie.
         values: [T, 3] residual colours as baked, on the device.
         alpha: opacities of the texels on the device, which stand still; None = opaque texels.
-        sizes: [N, 2] int32 sides of the tiles, on the CPU; (0, 0) = none.
     """
 
     def __init__(self, baked: Baked, device: torch.device | str = "cpu") -> None:
@@ -34,22 +32,13 @@ class TexelList:
         Raises:
             ValueError: there is no atlas.
         """
-        if baked.texels is None:
+        if not baked.textured:
             raise ValueError("a scene without texture has no texels to tune")
-        self._baked, self.device = baked, torch.device(device)
+        self.device = torch.device(device)
         self.scene = baked.scene.to(device)
-        self.sizes = torch.from_numpy(baked.packing.tiles[:, 3:])
-        self.tiles = TexelTiles.of_sizes(self.sizes.clamp(min=1).to(device), baked.extent.float().to(device))
-        self.values = baked.listed[:, :3].contiguous().to(device)
+        self.tiles = TexelTiles.of_sizes(baked.sizes.clamp(min=1).to(device), baked.extent.float().to(device))
+        self.values = baked.texels[:, :3].contiguous().to(device, copy=True)
         self.alpha = None if baked.alpha is None else baked.alpha.to(device)
-
-    def baked(self, texels: Tensor) -> Baked:
-        """The bake with these texels [T, 3], to be `encoded`."""
-        texels = self._baked.cut(texels.cpu())
-        pages = paged_texels(texels, self._baked.packing, self._baked.texels)
-        bare = self.sizes[:, 0] == 0
-        constants = torch.where(bare[:, None], texels[self.tiles.first.cpu()], self._baked.constants)
-        return self._baked.with_constants(constants).with_texels(pages)
 
     def projection(self, camera: Camera) -> Projection:
         """Of the surfels into a view."""

@@ -1,14 +1,14 @@
 """Errors of texels as the closest training view shows them: times the blending weight, averaged over its pixels."""
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 
 import torch
 from torch import Tensor
 
 from bitymi_ns.bake.tiles import Shown, weights
-from bitymi_ns.codec.pages import size_classes
+from bitymi_ns.codec.pages import first_texels, listed_tiles
 from bitymi_ns.codec.quantise import STEPS
-from bitymi_ns.ops import TexelTiles
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.tile_sizes import max_projected_extent
 from bitymi_ns.train.init import tangents
@@ -49,17 +49,14 @@ def listed_errors(difference: Tensor, sizes: Tensor, shown: Shown, chunk: int = 
         bool, whether any fragment of the surfel gets a residual.
     """
     errors, seen = torch.zeros(len(sizes)), torch.zeros(len(sizes), dtype=torch.bool)
-    first = TexelTiles.of_sizes(sizes.clamp(min=1), shown.extent).first
-    bare = torch.nonzero(sizes[:, 0] == 0).squeeze(1)
-    classes = size_classes(torch.cat([sizes.new_zeros(len(sizes), 3), sizes], dim=1))
-    for r_u, r_v, members in [*classes, (*_CONSTANT, bare)]:
-        for rows in members.split(max(1, chunk // (r_u * r_v))):
-            inside = torch.arange(r_u * r_v) if members is not bare else torch.zeros(r_u * r_v, dtype=torch.long)
-            values = difference[first[rows, None] + inside].view(-1, r_v, r_u, 3).permute(0, 3, 1, 2)
-            weight, extent = weights(shown, rows, (r_u, r_v)), shown.extent[rows]
-            pixels = None if shown.pixels is None else shown.pixels[rows]
-            errors[rows] = seen_rms(values, weight, cells_per_pixel(pixels, extent, (r_u, r_v)))
-            seen[rows] = (weight > 0).flatten(1).any(1)
+    first, bare = first_texels(sizes), torch.nonzero(sizes[:, 0] == 0).squeeze(1)
+    constants = (
+        (_CONSTANT, rows, first[rows, None, None].expand(-1, *_CONSTANT)) for rows in bare.split(max(1, chunk // 64))
+    )
+    for size, rows, index in chain(listed_tiles(sizes, chunk), constants):
+        weight = weights(shown, rows, size)
+        errors[rows] = seen_rms(difference[index].permute(0, 3, 1, 2), weight, cells_per_pixel(shown, rows, size))
+        seen[rows] = (weight > 0).flatten(1).any(1)
     return errors, seen
 
 
@@ -76,18 +73,14 @@ def closest_pixels(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], ext
     return max_projected_extent(*at, cameras, extent, near)[0] / (2.0 * extent)
 
 
-def cells_per_pixel(pixels: Tensor | None, extent: Tensor, size: tuple[int, int]) -> Tensor:
-    """[n, 2] cells of a grid over a tile that a pixel covers along u and v, from 1 to the side of the grid.
-
-    Args:
-        pixels: [n, 2] of `closest_pixels`; None = not known: a pixel covers one cell.
-        extent: [n] half sides of the tiles, scale units.
-        size: (u, v) cells.
-    """
+def cells_per_pixel(shown: Shown, rows: Tensor, size: tuple[int, int]) -> Tensor:
+    """[n, 2] cells of a grid of (u, v) cells over the tiles `rows` that a pixel of the closest view covers along u and
+    v, from 1 to the side of the grid; 1 where that is not known."""
+    extent = shown.extent[rows]
     sides = torch.tensor(size, dtype=torch.float32, device=extent.device).expand(len(extent), 2)
-    if pixels is None:
+    if shown.pixels is None:
         return torch.ones_like(sides)
-    covered = sides / (2.0 * extent[:, None] * pixels).clamp(min=1e-9)
+    covered = sides / (2.0 * extent[:, None] * shown.pixels[rows]).clamp(min=1e-9)
     return torch.minimum(covered.clamp(min=1.0), sides)
 
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from bitymi_ns.codec.packing import Packing, pack
-from bitymi_ns.codec.pages import size_classes, texel_index
+from bitymi_ns.codec.pages import listed_tiles
 from bitymi_ns.ops.constants import SUPPORT
 
 
@@ -17,16 +16,11 @@ from bitymi_ns.ops.constants import SUPPORT
 class Tiles:
     """Tiles of N surfels on the CPU."""
 
-    packing: Packing  # layout of the atlas
-    texels: Tensor | None  # [layers, height, width, C] float32: residual colour and, where C = 4, alpha; None = no tile
+    sizes: Tensor  # [N, 2] sides (r_u, r_v), texels; (0, 0) = no tile
     extent: Tensor  # [N] half side in scale units
-    constants: Tensor  # [N, C] mean of every tile; the residual, and alpha, of a surfel without one
+    # [T, C] in the order of `ops.TexelTiles`, residual colours and, where C = 4, alpha; a surfel without a tile has one
+    texels: Tensor
     nonfinite: int = 0  # points at which the field was not finite
-
-    @classmethod
-    def none(cls, count: int, extent: float) -> Tiles:
-        """No tile for any of `count` surfels."""
-        return cls(pack(torch.zeros(count, 2)), None, torch.full((count,), extent), torch.zeros(count, 3))
 
 
 @dataclass
@@ -80,19 +74,14 @@ def weights(shown: Shown, rows: Tensor, count: tuple[int, int]) -> Tensor:
     return torch.where((rest > 0) & (weight >= shown.weight_bound), weight, torch.zeros_like(weight))
 
 
-@torch.no_grad()
-def tile_values(texels: Tensor, packing: Packing, shown: Shown, chunk: int = 1 << 18) -> Iterator[TileValues]:
+def tile_values(texels: Tensor, sizes: Tensor, shown: Shown, chunk: int = 1 << 18) -> Iterator[TileValues]:
     """Texels of the tiles, in chunks of tiles of one size.
 
     Args:
-        texels: [layers, height, width, C] in the layout of `packing`, on the device of `shown`.
-        packing: N tiles; surfels without one are left out.
+        texels: [T, C] in the order of `ops.TexelTiles`, on the device of `shown`.
+        sizes: [N, 2] sides of the tiles there; surfels without one are left out.
         shown: N rows.
         chunk: texels taken at once (a tile is never split).
     """
-    tiles, flat = torch.from_numpy(packing.tiles).to(texels.device), texels.reshape(-1, texels.shape[3])
-    for r_u, r_v, members in size_classes(tiles):
-        for rows in members.split(max(1, chunk // (r_u * r_v))):
-            at = texel_index(tiles[rows], (r_u, r_v), packing.width, packing.height)
-            values = flat[at].permute(0, 3, 1, 2).contiguous()
-            yield TileValues(rows, (r_u, r_v), values, weights(shown, rows, (r_u, r_v)), 0)
+    for size, rows, index in listed_tiles(sizes, chunk):
+        yield TileValues(rows, size, texels[index].permute(0, 3, 1, 2).contiguous(), weights(shown, rows, size), 0)

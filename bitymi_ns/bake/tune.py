@@ -11,12 +11,12 @@ from pydantic import NonNegativeInt
 from torch import Tensor
 
 from bitymi_ns.bake.baked import Baked
-from bitymi_ns.bake.codings import C, Coding, Cosines, CosineTexels, Pages, PageTexels
+from bitymi_ns.bake.codings import Coded, Cosines, Pages
 from bitymi_ns.bake.early_stopping import FEWEST_VIEWS, EarlyStopping, gain, validation_split
 from bitymi_ns.bake.texel_list import TexelList
 from bitymi_ns.bake.tuning_views import TuningViews
 from bitymi_ns.bundle.statistics import FineTuning
-from bitymi_ns.codec.texel_codes import TexelCodeOptions, TexelCoder
+from bitymi_ns.codec.texel_codes import TexelCodeOptions, TexelCoder, TexelCodes
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.ranges import Count, Positive, PositiveCount, Share, check_ranges
 from bitymi_ns.train.config import TexelSteps
@@ -103,37 +103,31 @@ def tune_atlas(
     )
     validation, tuned = (TuningViews(texels, part, background, budget) for part in (held_back, trained))
     before = validation.psnr(texels.values, progress)  # first: these views are kept first
-    stopping = EarlyStopping(options, before, texels.values)
+    stopping = EarlyStopping(options.steps, options.checks, options.patience, before, texels.values)
     squares = None if baked.codes is None else torch.zeros_like(texels.values)
     covered = torch.zeros_like(texels.values)
     texels.add_coverage(trained, covered, squares, progress)
     share = 1.0 / (covered[:, 0] + options.prior)  # [T]
     _descend(texels.values.clone(), tuned, validation, share, stopping, options, progress)
     held_out = TuningViews(texels, eval_views, background, MemoryBudget(0))
-    coder = _coding(baked, texels, squares, coding or TexelCodeOptions())
-    untuned = held_out.psnr(coder.first(texels.values.cpu()).texels()) if eval_views else None
+    coder: Cosines | Pages = Pages(baked)
+    if squares is not None:
+        coding = coding or TexelCodeOptions()
+        coder = Cosines(TexelCoder(baked.sizes, squares[:, 0].cpu(), coding, baked.alpha_codes), coding)
+    untuned = held_out.psnr(coder.first(texels.values.cpu()).texels) if eval_views else None
     coded = _coded(tuned, validation, share, stopping.best, coder, options, progress)
     spent = time.perf_counter() - started, time.process_time() - cpu_started
     statistics = stopping.statistics(len(tuned), len(validation), *spent).but(
         steps=stopping.done + options.coded_steps,
         steps_asked=options.steps + options.coded_steps,
         error_before=baked.statistics.error,
-        psnr_held_out=None if untuned is None else gain(untuned, held_out.psnr(coded.texels())),
+        psnr_held_out=None if untuned is None else gain(untuned, held_out.psnr(coded.texels)),
     )
-    if isinstance(coded, CosineTexels):
-        result = baked.with_texel_codes(coded.codes, coded.listed)
+    if isinstance(coded.stored, TexelCodes):
+        result = baked.with_texel_codes(coded.stored, coded.listed)
     else:
-        result = texels.baked(coded.listed).with_atlas(coded.atlas)
+        result = baked.with_texels(coded.listed).with_atlas(coded.stored)
     return replace(result, statistics=result.statistics.but(finetune=statistics))
-
-
-def _coding(
-    baked: Baked, texels: TexelList, squares: Tensor | None, options: TexelCodeOptions
-) -> Coding[CosineTexels] | Coding[PageTexels]:
-    """Coding of the texels: by their squared coverage [T, 3], or as pages where there is none."""
-    if squares is not None:
-        return Cosines(TexelCoder(texels.sizes, squares[:, 0].cpu(), options, baked.alpha_codes), options)
-    return Pages(baked, texels.tiles.first.cpu())
 
 
 def _descend(
@@ -160,16 +154,16 @@ def _coded(
     validation: TuningViews,
     share: Tensor,
     texels: Tensor,
-    coding: Coding[C],
+    coding: Cosines | Pages,
     options: TuneOptions,
     progress: Progress,
-) -> C:
+) -> Coded:
     """Optimise texels [T, 3] through their coding: the image is that of the stored texels, and its gradient moves the
     texels behind them. Returns the coded texels that show the validation views best."""
     coded = coding.first(texels.cpu())
-    texels = coded.texels().to(texels.device, copy=True)
+    texels = coded.texels.to(texels.device, copy=True)
     psnr = validation.psnr(texels, progress)
-    stopping = EarlyStopping(replace(options, steps=max(1, options.coded_steps)), psnr, coded)
+    stopping = EarlyStopping(max(1, options.coded_steps), options.checks, options.patience, psnr, coded)
     shift = torch.zeros_like(texels)
     for step in range(options.coded_steps):
         rate, view = (
@@ -181,7 +175,7 @@ def _coded(
         last = step + 1 == options.coded_steps
         if (step + 1) % options.coded_every == 0 or last:
             coded = coding.again(texels.cpu())
-            shown = coded.texels().to(texels.device)
+            shown = coded.texels.to(texels.device)
             shift = shown - texels
             if stopping.due(step + 1) or last:
                 stopping.update(step + 1, validation.psnr(shown), lambda coded=coded: coded)

@@ -5,15 +5,14 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.field.bake import plan_of
 from bitymi_ns.bake.field.errors import tile_errors
-from bitymi_ns.bake.field.plan import Field
+from bitymi_ns.bake.field.plan import Field, make_plan
 from bitymi_ns.bake.inputs import BakeInput
 from bitymi_ns.bake.lean_color import centers_of, view_color_errors
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.read import Bundle
 from bitymi_ns.bundle.verify import SLACK_STEPS, Check, steps_text
-from bitymi_ns.codec.scene_texels import texel_alpha
+from bitymi_ns.codec.scene_texels import scene_texels, texel_alpha
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.tile_sizes import kernel_parameters
@@ -42,11 +41,10 @@ def check_field(bundle: Bundle, field: Field, cameras: Sequence[Camera]) -> Chec
         field = field.only(first, count)
     options = statistics.options or BakeOptions()
     inputs = BakeInput(bundle.scene.surfels, cameras, render.near, render.weight_bound, bundle.scene.prefilter)
-    plan = plan_of(field, inputs.with_visibility(options), options)
+    plan = make_plan(inputs.with_visibility(options), field, options, whole=options.tolerance == 0)
     tiled = bundle.scene.tiles[:, 3] > 0
     plan.extent = torch.where(tiled, bundle.scene.extent, plan.extent)
-    residuals = None if bundle.scene.atlas is None else bundle.scene.residuals().numpy()
-    found = tile_errors(field, plan, bundle.scene.tiles.numpy(), bundle.scene.mean_residual, residuals)
+    found = tile_errors(field, plan, bundle.scene.tiles[:, 3:], scene_texels(bundle.scene))
     lines, ok = [], True
     for what, measured, bound in (("rms", found.rms, stated.rms.p100), ("largest", found.largest, stated.largest.p100)):
         largest = float(measured.amax())

@@ -9,14 +9,13 @@ from torch.nn import functional as F
 
 from bitymi_ns.bake.directions import Directions, view_directions
 from bitymi_ns.bake.inputs import device_of
-from bitymi_ns.bake.lean_color import FIT_STEPS, FIT_VIEWS, OUTSIDE, OUTSIDE_WEIGHT, centers_of, shown_at
-from bitymi_ns.bake.voronoi_fit import fit_sites, least_needed, site_weights
+from bitymi_ns.bake.lean_color import centers_of, shown_at
+from bitymi_ns.bake.voronoi_fit import FIT_VIEWS, fewer_sites
 from bitymi_ns.codec.limits import beyond
 from bitymi_ns.codec.scene_texels import texel_alpha
 from bitymi_ns.ops import fitting_lists, project
 from bitymi_ns.ops.constants import COLOR_BIAS
 from bitymi_ns.ops.project import GEOMETRY
-from bitymi_ns.ops.sphere import fibonacci_sphere
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, ViewColor
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
@@ -133,7 +132,7 @@ def color_choices(scene: BakedScene, cameras: Sequence[Camera], progress: Progre
             target = shown_at(kind, {**own, "view_terms": surfels["view_terms"]}, at.unit)
             fewer = range(1, count) if entry.sites is not None else range(0)
             sites = (base[rows, count], terms[count][rows])
-            for number, b, t in [_one_color(target, weight, entry), *_fewer(at, weight, target, sites, fewer)]:
+            for number, b, t in [_one_color(target, weight, entry), *_fewer(at, weight, sites, fewer)]:
                 shown = shown_at(kind, _lean(b, t), at.unit)
                 found = ((shown - target).square().sum(2) * weight).sum(1)
                 bad = beyond("view_base", kind, b).any(1) | beyond("view_terms", kind, t).flatten(1).any(1)
@@ -174,26 +173,16 @@ def _one_color(target: Tensor, weight: Tensor, entry: ViewColor) -> tuple[int, T
 
 
 def _fewer(
-    at: Directions, weight: Tensor, target: Tensor, own: tuple[Tensor, Tensor], numbers: range
+    at: Directions, weight: Tensor, own: tuple[Tensor, Tensor], numbers: range
 ) -> list[tuple[int, Tensor, Tensor]]:
     """(number of terms, base [n, 3], terms [n, number, 6]) of fitted sites, of the base and the terms there are."""
     if not numbers:
         return []
     base, terms = own
     vectors, rgb = F.pad(terms[..., :3], (0, 0, 1, 0)), torch.cat([base[:, None], terms[..., 3:]], dim=1)
-    outside = fibonacci_sphere(OUTSIDE).to(vectors).expand(len(vectors), -1, -1)
-    samples = torch.cat([at.thinned(at.unit, FIT_VIEWS), outside], dim=1)
     counts = at.thinned(weight, FIT_VIEWS)
-    counts = counts / counts.mean(1, keepdim=True).clamp(min=1e-20)
-    counts = F.pad(counts, (0, OUTSIDE), value=OUTSIDE_WEIGHT)
-    colors = site_weights(vectors, samples) @ rgb
-    left, found = least_needed(vectors, rgb, samples, counts), []
-    for number in numbers:
-        kept = left[number][:, :, None].expand(-1, -1, 3)
-        v, r = vectors.gather(1, kept), rgb.gather(1, kept)
-        b, r = fit_sites(v[:, 1:] - v[:, :1], r, samples, colors, counts, FIT_STEPS)
-        found.append((number, r[:, 0], torch.cat([b, r[:, 1:]], dim=2)))
-    return found
+    fit = fewer_sites(at, counts / counts.mean(1, keepdim=True).clamp(min=1e-20), vectors, rgb)
+    return [(number, *fit(number + 1, slice(None))) for number in numbers]
 
 
 def _lean(base: Tensor, terms: Tensor) -> dict[str, Tensor]:

@@ -1,8 +1,19 @@
 """Spherical Voronoi colours with fewer sites: which sites may go, and the least-squares fit of those that are left."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 from torch.nn import functional as F
+
+from bitymi_ns.bake.directions import Directions
+from bitymi_ns.ops.sphere import fibonacci_sphere
+
+FIT_STEPS = 6
+FIT_VIEWS = 16  # views of a surfel in the fit; the error is measured in all of them
+OUTSIDE, OUTSIDE_WEIGHT = 12, 0.05
+"""Directions over the whole sphere, and their weight, in the fit: where no view is, the colour follows the trained one
+loosely instead of diverging."""
 
 
 def site_weights(vectors: Tensor, directions: Tensor) -> Tensor:
@@ -96,3 +107,31 @@ def fit_sites(
         w, error, cost = take(new_w, w), take(new_error, error), take(new_cost, cost)
         damping = torch.where(better, 0.3 * damping, 8.0 * damping)
     return vectors, rgb
+
+
+def fewer_sites(
+    at: Directions, weight: Tensor, vectors: Tensor, rgb: Tensor
+) -> Callable[[int, Tensor | slice], tuple[Tensor, Tensor]]:
+    """Fits of the sites that are hardest to do without.
+
+    Args:
+        at: directions of n surfels.
+        weight: [n, D'] of those that `Directions.thinned` leaves.
+        vectors, rgb: [n, K, 3] of all sites.
+
+    Returns:
+        a function of a number of sites below K, and of rows, to base [m, 3] and terms [m, number - 1, 6].
+    """
+    outside = fibonacci_sphere(OUTSIDE).to(vectors).expand(len(vectors), -1, -1)
+    samples = torch.cat([at.thinned(at.unit, FIT_VIEWS), outside], dim=1)
+    weight = F.pad(weight, (0, OUTSIDE), value=OUTSIDE_WEIGHT)
+    colors = site_weights(vectors, samples) @ rgb
+    left = least_needed(vectors, rgb, samples, weight)
+
+    def fit(number: int, rows: Tensor | slice) -> tuple[Tensor, Tensor]:
+        kept = left[number - 1][rows, :, None].expand(-1, -1, 3)
+        v, r = vectors[rows].gather(1, kept), rgb[rows].gather(1, kept)
+        b, r = fit_sites(v[:, 1:] - v[:, :1], r, samples[rows], colors[rows], weight[rows], FIT_STEPS)
+        return r[:, 0], torch.cat([b, r[:, 1:]], dim=2)
+
+    return fit

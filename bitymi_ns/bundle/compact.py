@@ -217,7 +217,11 @@ def _check_codes(name: str, codes: Codes, info: Surfels) -> None:
 
 
 def _parts(data: memoryview, columns: Sequence[Column]) -> Iterator[memoryview]:
-    return streams.frames(data, [sum(map(sum, column.planes)) for column in columns])
+    at = 0
+    for column in columns:
+        size = sum(map(sum, column.planes))
+        yield data[at : at + size]
+        at += size
 
 
 def _check_size(columns: Sequence[Column], size: int) -> None:

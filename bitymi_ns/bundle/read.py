@@ -27,7 +27,7 @@ from bitymi_ns.bundle.manifest import (
 )
 from bitymi_ns.bundle.parts import MANIFEST_LIMIT, MissingPart, Parts, parts_of
 from bitymi_ns.bundle.sizes import HEAD, SCENE_FILES, check_head, check_memory, enough_memory
-from bitymi_ns.bundle.surfel_table import TERMS, from_columns, mean_alphas, mean_residuals, tile_extents
+from bitymi_ns.bundle.surfel_table import TERMS, from_columns
 from bitymi_ns.codec.bc7_encode import Profile, bc7_blocks
 from bitymi_ns.codec.limits import ALPHA_LIMIT, RESIDUAL_LIMIT
 from bitymi_ns.codec.packing import Packing
@@ -213,18 +213,12 @@ def _ply_contents(folder: Path, info: Manifest, files: Mapping[str, bytearray], 
     path = folder / SURFELS
     try:
         elements = ply.parse_ply(files[SURFELS])
-        columns = elements["vertex"]
-        surfels, tiles = from_columns(columns, info.surfels.view_color, elements.get(TERMS))
-        found = {
-            "surfels": surfels,
-            "tiles": tiles.contiguous(),
-            "extent": tile_extents(columns, info.atlas.extent if info.atlas else SUPPORT),
-            "mean_residual": mean_residuals(columns),
-            "mean_alpha": mean_alphas(columns) if info.has_alpha else None,
-        }
+        extent = info.atlas.extent if info.atlas else SUPPORT
+        kind, terms = info.surfels.view_color, elements.get(TERMS)
+        found = from_columns(elements["vertex"], kind, terms, extent, info.has_alpha)
     except ply.PlyError as error:
         raise BundleError(f"{path}: {error}") from error
-    _check_tiles(tiles, info, path)
+    _check_tiles(found["tiles"], info, path)
     if info.atlas is None:
         return found
     try:

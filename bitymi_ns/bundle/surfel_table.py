@@ -11,6 +11,7 @@ the terms themselves, surfel after surfel, are rows of a second element, `view_t
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +21,7 @@ from torch import Tensor
 from bitymi_ns.bundle.ply import PlyError
 from bitymi_ns.codec.limits import ALPHA_LIMIT, EXTENTS, UNIT_SLACK, beyond, limit_of
 from bitymi_ns.ops import view_color
-from bitymi_ns.ops.constants import MAX_TERMS, SH_C0
+from bitymi_ns.ops.constants import MAX_TERMS, SH_C0, SUPPORT
 from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.sphere import fibonacci_sphere
 from bitymi_ns.ops.view_color import LEAN, check_lean
@@ -122,26 +123,6 @@ def term_columns(surfels: Mapping[str, Tensor]) -> dict[str, npt.NDArray]:
     return {name: ordered[:, i].numpy() for i, name in enumerate(_numbered("term", terms.shape[1]))}
 
 
-def tile_extents(columns: Mapping[str, npt.NDArray], default: float) -> Tensor:
-    """[N] float32 half sides of the tiles in scale units; `default` where the file has no such column.
-
-    Raises:
-        PlyError: a value is out of range, or the column has the wrong type.
-    """
-    if EXTENT_COLUMN not in columns:
-        return torch.full((len(columns["x"]),), default)
-    return _bounded(columns, EXTENT_COLUMN, *EXTENTS)
-
-
-def mean_alphas(columns: Mapping[str, npt.NDArray]) -> Tensor:
-    """[N] float32 mean alphas.
-
-    Raises:
-        PlyError: a value is out of range, or the column is missing or has the wrong type.
-    """
-    return _bounded(columns, ALPHA_COLUMN, 0.0, ALPHA_LIMIT)
-
-
 def _bounded(columns: Mapping[str, npt.NDArray], name: str, low: float, high: float) -> Tensor:
     values = _stack(columns, (name,))[:, 0].contiguous()
     bad = ~((values >= low) & (values <= high))
@@ -149,20 +130,6 @@ def _bounded(columns: Mapping[str, npt.NDArray], name: str, low: float, high: fl
         row = int(torch.nonzero(bad)[0])
         raise PlyError(f"{name} is {values[row]:g} in row {row}; it must be from {low:g} to {high:g}")
     return values
-
-
-def mean_residuals(columns: Mapping[str, npt.NDArray]) -> Tensor:
-    """[N, 3] float32 mean residuals, 0 where the file has no such columns.
-
-    Raises:
-        PlyError: a value is beyond its limit (`limits.LIMITS`), or a column has the wrong type.
-    """
-    names = COLUMNS["mean_residual"]
-    if names[0] not in columns:
-        return torch.zeros(len(columns["x"]), 3)
-    residuals = _stack(columns, names)
-    _check_limits({"mean_residual": residuals}, "")
-    return residuals
 
 
 def first_problem(surfels: Mapping[str, Tensor], kind: str) -> str | None:
@@ -192,18 +159,24 @@ def _check_limits(surfels: Mapping[str, Tensor], kind: str) -> None:
 
 
 def from_columns(
-    columns: Mapping[str, npt.NDArray], kind: str, terms: Mapping[str, npt.NDArray] | None = None
-) -> tuple[dict[str, Tensor], Tensor]:
+    columns: Mapping[str, npt.NDArray],
+    kind: str,
+    terms: Mapping[str, npt.NDArray] | None = None,
+    extent: float = SUPPORT,
+    has_alpha: bool = False,
+) -> dict[str, Any]:
     """Surfels and tiles from the columns of surfels.ply.
 
     Args:
         columns: of the element `vertex`.
         kind: a name of `ops.VIEW_COLORS`.
         terms: columns of the element `view_term`, for lean view colours; None = the file has none.
+        extent: half side of the tiles in scale units where the file has no column of it.
+        has_alpha: mean alphas are needed.
 
     Returns:
-        surfels: the per-surfel parameters, float32 (quaternions have length 1).
-        tiles: [N, 5] int32.
+        by the names of `BakedScene`: surfels, the per-surfel parameters, float32 (quaternions have length 1); tiles
+        [N, 5] int32; extent [N]; mean_residual [N, 3], 0 where the file has no such columns; mean_alpha [N] or None.
 
     Raises:
         PlyError: a column is missing or has the wrong type, the view colour has the wrong number of columns, or a value
@@ -223,7 +196,18 @@ def from_columns(
     turned = (surfels["quats"].norm(dim=1) - 1.0).abs() > UNIT_SLACK
     if turned.any():
         raise PlyError(f"rot_0 to rot_3 have not the length 1 in row {int(torch.nonzero(turned)[0])}")
-    return surfels, tiles
+    residual = torch.zeros(count, 3)
+    if COLUMNS["mean_residual"][0] in columns:
+        residual = _stack(columns, COLUMNS["mean_residual"])
+        _check_limits({"mean_residual": residual}, kind)
+    stated = EXTENT_COLUMN in columns
+    return {
+        "surfels": surfels,
+        "tiles": tiles.contiguous(),
+        "extent": _bounded(columns, EXTENT_COLUMN, *EXTENTS) if stated else torch.full((count,), extent),
+        "mean_residual": residual,
+        "mean_alpha": _bounded(columns, ALPHA_COLUMN, 0.0, ALPHA_LIMIT) if has_alpha else None,
+    }
 
 
 def _full_from_columns(columns: Mapping[str, npt.NDArray], kind: str, count: int) -> dict[str, Tensor]:

@@ -125,12 +125,13 @@ def write_bundle(
     try:
         with complete_folder(folder, lambda: check_target(folder, overwrite)) as new:
             if codes is None or interchange:
-                write_surfels(new / SURFELS, scene, _has_alpha(atlas))
+                _write_surfels(new / SURFELS, scene, _has_alpha(atlas))
             if codes is None and atlas is not None:
                 ktx2.write_ktx2(new / ATLAS, atlas.payload, atlas.format, atlas.width, atlas.height, GENERATOR)
             for name, data in parts.items():
                 (new / name).write_bytes(data)
-            shown = None if poster is None else encode_poster(poster, most_bytes(_scene_bytes(new, parts)))
+            of_scene = sum(map(len, parts.values())) or sum(path.stat().st_size for path in new.iterdir())
+            shown = None if poster is None else encode_poster(poster, most_bytes(of_scene))
             for name, data in {**({POSTER: shown} if shown else {}), **(extra_files or {})}.items():
                 (new / name).write_bytes(data)
             info["files"] = {path.name: _fingerprint(path) for path in sorted(new.iterdir())}
@@ -149,12 +150,7 @@ def write_bundle(
     return folder
 
 
-def _scene_bytes(folder: Path, parts: Mapping[str, bytes]) -> int:
-    """Bytes of surfels and texels: of the two files of a compact bundle, or of the files so far."""
-    return sum(map(len, parts.values())) if parts else sum(path.stat().st_size for path in folder.iterdir())
-
-
-def write_surfels(path: Path, scene: BakedScene, has_alpha: bool) -> None:
+def _write_surfels(path: Path, scene: BakedScene, has_alpha: bool) -> None:
     """Write the surfels of a scene on the CPU, with or without their mean alphas, as a PLY file, which viewers of
     Gaussian splats open, too."""
     means = scene.mean_residual, scene.extent, scene.view_color, scene.mean_alpha if has_alpha else None

@@ -23,13 +23,8 @@ VERSION = 5  # increased where the same photographs and options give other poses
 
 
 def content_key(inputs: Iterable[tuple[str, Path]], settings: object) -> str:
-    """Hash files and settings to a key.
-
-    Args:
-        inputs: the files, each with its name in the capture. That, its size and its time of change count; how the
-            path to it is written does not.
-        settings: plain values.
-    """
+    """Hash files, each with its name in the capture, and settings (plain values) to a key. Names, sizes and times of
+    change count; how the paths are written does not."""
     stats = [(name, path.stat()) for name, path in inputs]
     content = [VERSION, [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats], settings]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
@@ -37,14 +32,8 @@ def content_key(inputs: Iterable[tuple[str, Path]], settings: object) -> str:
 
 @contextmanager
 def work_folder(photographs: Path, key: str, tell: Tell, kind: Kind = "poses") -> Iterator[Path]:
-    """Make and lock the folder of this key for one process: in `.bitymi` beside the photographs, or
-    in the user's cache folder where nothing can be written there, or others can write there.
-
-    Args:
-        photographs: their folder, or a video.
-        key: see `content_key`.
-        tell: told why it is the cache folder, where that is not plain from its permissions.
-        kind: what it is for.
+    """Make and lock the folder of this key for one process: in `.bitymi` beside the photographs (or a video), or in the
+    user's cache folder where nothing can be written there, or others can write there; `tell` is told of the latter.
 
     Raises:
         CaptureError: another process is at work there, or neither can be written.
@@ -98,14 +87,9 @@ def finished(photographs: Path, key: str, mark: str, kind: Kind = "poses") -> Pa
 
 
 def replace_stale(work: Path, photographs: Path, contents: str) -> None:
-    """State the source of a work folder, and remove folders of an earlier state of that source: their key cannot recur.
-    Those with other options stay, because runs were trained on them; so do those that a process uses.
-
-    Args:
-        work: held by this process.
-        photographs: their folder, or a video.
-        contents: the key of the files alone.
-    """
+    """State the source of a work folder, which this process holds, and remove folders of an earlier state of that
+    source: their key cannot recur. Those with other options stay, because runs were trained on them; so do those that a
+    process uses. `contents` is the key of the files alone."""
     source = os.path.relpath(os.path.realpath(photographs), os.path.realpath(work))  # still so when both are moved
     write_file(work / OF, json.dumps({"source": source, "contents": contents}).encode())
     for other in work.parent.glob(f"{work.name.partition('-')[0]}-*"):

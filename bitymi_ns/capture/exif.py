@@ -54,12 +54,8 @@ def read_exif(image: Image.Image) -> Exif:
 
 
 def focal_length(detail: Mapping[int, object], size: tuple[int, int]) -> tuple[float | None, str]:
-    """Compute the focal length in pixels, and why a stated one is not used.
-
-    Args:
-        detail: the Exif IFD.
-        size: width and height of the stored image in pixels.
-    """
+    """Compute the focal length in pixels from the Exif IFD and the stored image's width and height, and why a stated
+    one is not used."""
     long, short = max(size), min(size)
     film = number(detail.get(ExifTags.Base.FocalLengthIn35mmFilm))
     millimetres = number(detail.get(ExifTags.Base.FocalLength))

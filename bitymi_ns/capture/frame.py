@@ -59,11 +59,8 @@ def read_frame(folder: Path) -> WorldFrame | None:
 def local_positions(
     gps: Mapping[str, tuple[float, float, float]],
 ) -> tuple[dict[str, list[float]], tuple[float, float, float] | None]:
-    """Convert GPS positions to east, north and up in metres from their middle, and return that middle.
-
-    Args:
-        gps: latitude, longitude and altitude by name.
-    """
+    """Convert GPS positions (latitude, longitude and altitude by name) to east, north and up in metres from their
+    middle, and return that middle."""
     if not gps:
         return {}, None
     middle = np.median(np.array(list(gps.values())), axis=0)
@@ -94,7 +91,6 @@ def move_to_world(
     cameras. Scale and north are by GPS where that is enough.
 
     Args:
-        model: cameras and points.
         gps: latitude, longitude and altitude by name.
         ups: unit vectors away from the ground by name, in the cameras' axes (x right, y down, z forward).
     """
@@ -102,15 +98,15 @@ def move_to_world(
     local, origin = local_positions(gps)
     centers = {i.name: i.projection_center() for i in model.images.values() if i.has_pose}
     names = [name for name in centers if name in local]
-    found = _by_gps(np.array([centers[n] for n in names]), np.array([local[n] for n in names])) if names else None
-    if found is not None:
-        similarity, error = found
+    placed, positions = np.array([centers[n] for n in names]), np.array([local[n] for n in names])
+    similarity = _by_gps(placed, positions)
+    if similarity is not None:
         source, by_phones = "gps", None if up is None else similarity.rotation.matrix() @ up
         if by_phones is not None and by_phones @ UP > STEEPEST:
             turn = pycolmap.Rotation3d(_smallest_turn(by_phones, np.array(UP)))
             source, similarity = "gravity", pycolmap.Sim3d(1.0, turn, np.zeros(3)) * similarity
-            error = _error(similarity, centers, local, names)
         model.transform(similarity)
+        error = _gps_error(similarity, placed, positions)
         return WorldFrame(source, 1.0, origin, error, len(local), similarity.matrix().tolist())
     similarity = _by_up(model, np.array(list(centers.values())), _of_cameras(model) if up is None else up)
     model.transform(similarity)
@@ -118,12 +114,9 @@ def move_to_world(
     return WorldFrame(source, None, None, None, len(local), similarity.matrix().tolist())
 
 
-def _error(
-    similarity: pycolmap.Sim3d, centers: Mapping[str, np.ndarray], local: Mapping[str, list[float]], names: list[str]
-) -> float:
-    """Median distance in metres between cameras and their GPS positions."""
-    moved = similarity * np.array([centers[name] for name in names])
-    return float(np.median(np.linalg.norm(moved - np.array([local[name] for name in names]), axis=1)))
+def _gps_error(similarity: pycolmap.Sim3d, centers: np.ndarray, positions: np.ndarray) -> float:
+    """Median distance in metres between cameras [n, 3], moved by a similarity, and their GPS positions [n, 3]."""
+    return float(np.median(np.linalg.norm((similarity * centers) - positions, axis=1)))
 
 
 def _by_gravity(model: pycolmap.Reconstruction, ups: Mapping[str, tuple[float, float, float]]) -> np.ndarray | None:
@@ -151,9 +144,9 @@ def _smallest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     return np.eye(3) + cross + cross @ cross / (1 + cosine)
 
 
-def _by_gps(centers: np.ndarray, positions: np.ndarray) -> tuple[pycolmap.Sim3d, float] | None:
-    """Align centers [n, 3] with positions [n, 3] in metres; returns the similarity and its median error, or None where
-    positions are too few, too close together, on one line, or of another shape."""
+def _by_gps(centers: np.ndarray, positions: np.ndarray) -> pycolmap.Sim3d | None:
+    """Align centers [n, 3] with positions [n, 3] in metres; None where positions are too few, too close together, on
+    one line, or of another shape."""
     if len(positions) < 3:
         return None
     spread = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False) / np.sqrt(len(positions))
@@ -167,8 +160,7 @@ def _by_gps(centers: np.ndarray, positions: np.ndarray) -> tuple[pycolmap.Sim3d,
     if found is None:
         return None
     similarity = found["tgt_from_src"] if isinstance(found, dict) else found  # as pycolmap 4.1 and 4.2 have it
-    error = float(np.median(np.linalg.norm((similarity * centers) - positions, axis=1)))
-    return (similarity, error) if error < SAME_SHAPE * spread[0] else None
+    return similarity if _gps_error(similarity, centers, positions) < SAME_SHAPE * spread[0] else None
 
 
 def _of_cameras(model: pycolmap.Reconstruction) -> np.ndarray:

@@ -4,18 +4,17 @@ import os
 import shutil
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from PIL import Image
 
 from bitymi_ns.capture.cache import content_key, finished, replace_stale, work_folder
-from bitymi_ns.capture.masks import mask_pixels
+from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.capture.photos import check_names, eight_bits, in_srgb, is_plain
+from bitymi_ns.capture.prepare import colmap_mask, emptied
 from bitymi_ns.capture.recognise import open_picture
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
@@ -23,7 +22,6 @@ from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import Tell, explained, write_file
 from bitymi_ns.progress import Progress, no_progress
 
-T = TypeVar("T")
 DONE = "points"  # file that is written when the model is whole
 
 
@@ -32,30 +30,16 @@ class KnownView:
     """A photograph whose camera is known."""
 
     file: Path
-    model: str  # COLMAP's camera model
-    width: int
-    height: int
-    params: tuple[float, ...]  # parameters of the camera model, in pixels of the file
+    camera: ColmapCamera  # in pixels of the file
     world_to_camera: np.ndarray  # [3,4] rotation and translation, OpenCV axes (x right, y down, z forward)
     mask: Path | None = None  # picture that is black where no point is to be found; see `masks.mask_pixels`
-
-    @property
-    def camera(self) -> tuple[str, int, int, tuple[float, ...]]:
-        """Key that photographs of one camera share."""
-        return self.model, self.width, self.height, self.params
 
 
 def triangulate(
     capture: Path, views: Sequence[KnownView], progress: Progress | None = None, tell: Tell = warnings.warn
 ) -> Path:
-    """Triangulate points from photographs whose cameras are known; the cameras stay as they are. Kept and continued as
-    `find_poses` does.
-
-    Args:
-        capture: folder in which the result is kept.
-        views: the photographs with their cameras.
-        progress: told the stage and how far it is.
-        tell: told where the points are kept, if not beside the photographs although these can be written.
+    """Triangulate points from photographs whose cameras are known; the cameras stay as they are. Kept in the folder
+    `capture` and continued as by `find_poses`.
 
     Returns:
         folder of a COLMAP model (cameras.bin, images.bin, points3D.bin) in the world of the given poses, in which the
@@ -94,15 +78,12 @@ def triangulate(
 
 
 def _job(stated: Sequence[str], views: Sequence[KnownView], work: Path) -> Job:
-    links, masks = work / "links", work / "masks"
-    for folder in (links, masks):
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir()
-    groups: dict[tuple[str, int, int, tuple[float, ...]], list[str]] = defaultdict(list)
+    links, masks = emptied(work / "links"), emptied(work / "masks")
+    groups: dict[ColmapCamera, list[str]] = defaultdict(list)
     names, poses = {}, {}
     for i, (name, view) in enumerate(zip(stated, views, strict=True)):
         suffix = view.file.suffix.lower()
-        converted = _read(view.file, partial(_converted, file=view.file))
+        converted = _converted(view.file)
         plain = f"{i:06d}{suffix if converted is None else '.png'}"
         if converted is None:
             (links / plain).symlink_to(view.file.resolve())
@@ -112,14 +93,12 @@ def _job(stated: Sequence[str], views: Sequence[KnownView], work: Path) -> Job:
         names[plain] = name
         poses[plain] = np.asarray(view.world_to_camera, float)[:3].tolist()
         if view.mask is not None and view.mask.is_file():
-            mask = _read(view.mask, lambda image: Image.fromarray(mask_pixels(image)))
-            size = (view.width, view.height)
-            mask.resize(size, Image.Resampling.NEAREST).convert("L").save(masks / f"{plain}.png")
+            colmap_mask(view.mask, view.file.name, view.camera.size).save(masks / f"{plain}.png")
     return Job(
         work=str(work.resolve()),
         images=str(links.resolve()),
         masks=str(masks.resolve()) if any(masks.iterdir()) else None,
-        cameras=[CameraGroup(m, w, h, list(params), True, members) for (m, w, h, params), members in groups.items()],
+        cameras=[CameraGroup(camera, True, members) for camera, members in groups.items()],
         order=list(names),
         names=names,
         sequence=False,
@@ -128,15 +107,10 @@ def _job(stated: Sequence[str], views: Sequence[KnownView], work: Path) -> Job:
     )
 
 
-def _converted(image: Image.Image, file: Path) -> Image.Image | None:
+def _converted(file: Path) -> Image.Image | None:
     """Convert a photograph for COLMAP; None = COLMAP reads the file itself."""
-    return None if is_plain(image, file) else in_srgb(eight_bits(image)).convert("RGB")
-
-
-def _read(path: Path, convert: Callable[[Image.Image], T]) -> T:
-    """Apply `convert` to an opened image."""
     try:
-        with open_picture(path) as image:
-            return convert(image)
+        with open_picture(file) as image:
+            return None if is_plain(image, file) else in_srgb(eight_bits(image)).convert("RGB")
     except Exception as error:
-        raise CaptureError(f"{path} cannot be read as a picture: save it anew") from error
+        raise CaptureError(f"{file} cannot be read as a picture: save it anew") from error

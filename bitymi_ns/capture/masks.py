@@ -9,7 +9,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from bitymi_ns.capture.photos import COPY
-from bitymi_ns.capture.recognise import PHOTOGRAPHS
+from bitymi_ns.capture.recognise import PHOTOGRAPHS, open_picture
 from bitymi_ns.capture.types import CaptureError
 
 USUAL_FOLDERS = ("images", "input", "image", "photos", "photographs", "rgb", "color")
@@ -22,17 +22,12 @@ PROPORTIONS = 0.02  # relative difference of aspect ratios that counts as roundi
 
 def mask_folder(photographs: Path, data: Path, stated: Path | None = None, downscale: int = 1) -> Path | None:
     """Find the folder of a capture's masks: the stated one; else `masks` beside the folder of the photographs, in that
-    folder, or in that of the data, the first of them that is there.
+    folder, or in that of the data, the first of them that is there. A folder of masks that are smaller by `downscale`,
+    as `masks_2`, counts, too.
 
     Beside a folder that is the data, or holds it, lie other things than the capture. There `masks` is used if the
     folder has a usual name for the photographs of a capture: `bed/masks` for `bed/images`, but not `all/masks` for
     `all/bed`.
-
-    Args:
-        photographs: their folder.
-        data: folder that the user names as the capture.
-        stated: folder that the user names as that of the masks.
-        downscale: a folder of masks that are smaller by this factor, as `masks_2`, counts, too.
 
     Raises:
         CaptureError: the stated one does not exist.
@@ -67,6 +62,12 @@ def mask_of(masks: Path, name: str) -> Path | None:
     found = next((masks / c for c in candidates if (masks / c).is_file()), None)
     is_copy = found is None and name.endswith(COPY) and stem.lower().endswith(PHOTOGRAPHS)
     return mask_of(masks, stem) if is_copy else found
+
+
+def read_mask(path: Path) -> Image.Image:
+    """Read a mask as a 1-bit image, True where pixels count; see `mask_pixels`. Raises Pillow's errors."""
+    with open_picture(path) as image:
+        return Image.fromarray(mask_pixels(image))
 
 
 def mask_pixels(image: Image.Image) -> npt.NDArray[np.bool_]:

@@ -1,4 +1,8 @@
-"""Photographs for structure from motion: find them, and read size, EXIF, thumbnail and sharpness of each."""
+"""Photographs for structure from motion: find them, and read size, EXIF, thumbnail and sharpness of each.
+
+360-degree (equirectangular) pictures are detected by metadata or content. An aspect ratio of 2 alone is no evidence:
+phones take such photographs, too.
+"""
 
 import os
 import re
@@ -10,10 +14,11 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 from PIL import ExifTags, Image, ImageCms, ImageOps
 
+from bitymi_ns.capture.camera import is_full_sphere
 from bitymi_ns.capture.exif import Exif, exposure_exif, read_exif
-from bitymi_ns.capture.panorama_detection import has_panorama_metadata, looks_panoramic
 from bitymi_ns.capture.recognise import is_photograph, open_picture, photographs_below
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.progress import Progress
@@ -30,6 +35,15 @@ SHARPNESS_SIZE = 1024  # longer side at which sharpness is measured, pixels
 BLURRED = 0.5  # a photograph is blurred if its sharpness is below this share of the set's median
 DUPLICATE_SHIFT = 0.1
 """Two photographs are duplicates if they differ by less than a shift by this many pixels of their thumbnails."""
+
+HEADER = 1 << 17  # bytes at the start of a file that are searched for metadata
+SPHERICAL = re.compile(rb"GPano:ProjectionType|ProjectionType[^a-z]{1,8}(equirectangular|cylindrical)", re.IGNORECASE)
+"""XMP entries of panoramas (Google Photo Sphere)."""
+ALIKE = 0.6  # correlation of the details of the left and right edge from which on they match
+SMOOTH = 15  # rows of the moving average that is subtracted to leave the detail
+DETAIL = 1.5  # least standard deviation of detail, grey levels: edges of a bare background always match
+POLE = 0.35
+"""Largest standard deviation of the first and last row, each one point of the sphere, relative to the picture's."""
 
 
 @dataclass(frozen=True)
@@ -55,11 +69,7 @@ def natural(name: str) -> list[tuple[int, int, str]]:
 def photo_folder(source: Path) -> Path:
     """Return the folder of the photographs of a capture: itself, or `images` in it."""
     images = source / "images"
-    return images if images.is_dir() and not _photos_in(source) else source
-
-
-def _photos_in(folder: Path) -> list[Path]:
-    return [path for path in folder.iterdir() if is_photograph(path)]
+    return images if images.is_dir() and not any(map(is_photograph, source.iterdir())) else source
 
 
 def find_photos(folder: Path) -> list[str]:
@@ -150,6 +160,31 @@ def read_photo(folder: Path, name: str) -> Photo:
     return Photo(name, path, width, height, exif, plain, thumb, sharpness(detail), panorama)
 
 
+def has_panorama_metadata(path: Path) -> bool:
+    """Test the metadata of a file for a spherical or cylindrical projection."""
+    try:
+        with open(path, "rb") as file:
+            return SPHERICAL.search(file.read(HEADER)) is not None
+    except OSError:
+        return False
+
+
+def looks_panoramic(grey: npt.NDArray[np.float32]) -> bool:
+    """Test if left and right edge continue each other, and the first and last row are constant, in grey levels [h, w]
+    to 255 of the whole picture, reduced to some hundreds of pixels."""
+    height, width = grey.shape
+    if height < 32 or not is_full_sphere(width, height):
+        return False
+    if max(grey[0].std(), grey[-1].std()) > POLE * grey.std():
+        return False
+    kernel = np.full(SMOOTH, 1.0 / SMOOTH)
+    columns = grey[:, [0, -1]].T.astype(np.float64)
+    detail = [column[SMOOTH // 2 : -(SMOOTH // 2)] - np.convolve(column, kernel, "valid") for column in columns]
+    if min(each.std() for each in detail) < DETAIL:
+        return False
+    return bool(np.corrcoef(detail)[0, 1] > ALIKE)
+
+
 def eight_bits(image: Image.Image) -> Image.Image:
     """Scale deep grey modes to 8 bits; EXIF orientation is kept.
 
@@ -220,11 +255,8 @@ def _reduced(image: Image.Image, size: int) -> Image.Image:
 
 
 def sharpness(grey: np.ndarray) -> float:
-    """Root mean square of the Laplacian over that of the gradient: low where fine detail is missing.
-
-    Args:
-        grey: [h,w] float32.
-    """
+    """Root mean square of the Laplacian over that of the gradient of [h,w] float32: low where fine detail is
+    missing."""
     right, down = np.diff(grey, axis=1), np.diff(grey, axis=0)
     gradient = float(np.mean(right**2) + np.mean(down**2))
     laplacian = float(np.mean(np.diff(right, axis=1) ** 2) + np.mean(np.diff(down, axis=0) ** 2))
@@ -269,11 +301,8 @@ def duplicates(photos: Sequence[Photo]) -> dict[str, str]:
 
 
 def shift(first: np.ndarray, second: np.ndarray) -> float:
-    """Root mean square difference of two images over that of their gradient: the shift in pixels that would explain it.
-
-    Args:
-        first, second: [h,w] float32 grey levels.
-    """
+    """Root mean square difference of two images [h,w] float32 over that of their gradient: the shift in pixels that
+    would explain it."""
     gradient = np.mean(np.diff(first, axis=0) ** 2) + np.mean(np.diff(first, axis=1) ** 2)
     difference = np.mean((first - second) ** 2)
     return float(np.sqrt(difference / gradient)) if gradient > 0 else (0.0 if difference == 0 else np.inf)

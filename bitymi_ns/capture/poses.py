@@ -1,5 +1,6 @@
 """Structure from motion: camera poses of photographs or of the frames of a video."""
 
+import json
 import os
 import shutil
 import statistics
@@ -7,18 +8,18 @@ import time
 import warnings
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import pycolmap
-from pydantic import BaseModel
+from pydantic import TypeAdapter
 
-from bitymi_ns.capture import prepare
 from bitymi_ns.capture.cache import content_key, replace_stale, work_folder
+from bitymi_ns.capture.camera import SPHERICAL_MODEL, ColmapCamera, is_full_sphere
 from bitymi_ns.capture.frame import local_positions, move_to_world, write_frame
 from bitymi_ns.capture.masks import mask_folder
-from bitymi_ns.capture.panorama_detection import SPHERICAL_MODEL, is_full_sphere
 from bitymi_ns.capture.photos import Photo, blurred, check_names, duplicates, find_photos, photo_folder, read_photos
+from bitymi_ns.capture.prepare import IMAGES, colmap_masks, emptied, upright_photos
 from bitymi_ns.capture.recognise import VIDEOS, is_model
 from bitymi_ns.capture.report import write_report
 from bitymi_ns.capture.sfm import process
@@ -27,6 +28,7 @@ from bitymi_ns.capture.types import CaptureError, Poses, SfmOptions
 from bitymi_ns.capture.video import extract_frames
 from bitymi_ns.files import Tell, complete_folder, explained, write_file
 from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.trust import json_of
 
 GUESSED_FOCAL = 1.2  # initial focal length where it is unknown, in units of the longer side; COLMAP's own
 TELLING = 0.25  # share of 360-degree pictures among photographs of one size from which on all of them count as such
@@ -44,7 +46,6 @@ def find_poses(
 
     Args:
         source: a folder of photographs, a folder that holds them in `images` (and masks in `masks`), or a video.
-        options: how; None = the defaults.
         warn: called with the location of the result, if not beside writable photographs.
 
     Raises:
@@ -101,31 +102,20 @@ def _few(count: int) -> str:
     )
 
 
-class _Kept(BaseModel, extra="forbid"):
-    """Content of poses.json, which marks a result as complete."""
-
-    made: bool  # the photographs of the model are copies or frames in the work folder
-    left_out: dict[str, str]
-    registered: int
-    given: int
-    reprojection_error: float
-    track_length: float
-    seconds: dict[str, float]
-    contradicted: float = 0.0  # results of earlier versions have none
-
-
 def _finished(work: Path, folder: Path) -> Poses | None:
-    """Read the poses of an earlier run; None where there are none, or they are damaged."""
+    """Read the poses of an earlier run by poses.json, which marks a result as complete; None where there are none, or
+    they are damaged."""
     result = work / "result"
     try:
-        kept = _Kept.model_validate_json((result / "poses.json").read_bytes())
-    except (OSError, ValueError):
+        kept = json_of((result / "poses.json").read_bytes())
+        made = kept.pop("made")  # the photographs of the model are copies or frames in the work folder
+        images = work / IMAGES if made else Path(os.path.abspath(folder))
+        values = {**kept, "model": result / SPARSE, "images": images, "report": result}
+        poses = TypeAdapter(Poses).validate_python(values)
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
         return None
-    images = work / prepare.IMAGES if kept.made else Path(os.path.abspath(folder))
-    whole = images.is_dir() and all(path.exists() for path in images.rglob("*")) if kept.made else True
-    if not whole or not is_model(result / SPARSE):
-        return None
-    return Poses(model=result / SPARSE, images=images, report=result, **kept.model_dump(exclude={"made"}))
+    whole = images.is_dir() and all(path.exists() for path in images.rglob("*")) if made else True
+    return poses if whole and is_model(result / SPARSE) else None
 
 
 def _find(
@@ -150,7 +140,7 @@ def _find(
         raise CaptureError(_too_few_left(source, folder, photos, left_out, twins, video))
     photos = ordered(photos)
     started = time.monotonic()
-    images, used = prepare.upright_photos(photos, folder, work, tell)
+    images, used = upright_photos(photos, folder, work, tell)
     job = make_job(photos, images, used, masks, options, work, sequence=video)
     seconds["preparing"] = time.monotonic() - started
     result = process.run(job, source, tell)
@@ -221,28 +211,20 @@ def make_job(
     work: Path,
     sequence: bool,
 ) -> Job:
-    """Make the job for these photographs, with links to them under names without spaces for COLMAP's lists.
-
-    Args:
-        photos: in their order.
-        images, used: folder of the upright photographs, and their names in it.
-        masks: folder of the masks, or None.
-        options: how the poses are found.
-        work: gets the links and the masks.
-        sequence: whether neighbours overlap, as a video's frames do.
-    """
-    links = work / "links"
-    shutil.rmtree(links, ignore_errors=True)
-    links.mkdir()
+    """Make the job for these photographs in their order, with links to them in the work folder under names without
+    spaces for COLMAP's lists. `images` is the folder of the upright photographs, `used` their names in it; neighbours
+    overlap in a `sequence`, as a video's frames do."""
+    links, mask_files = emptied(work / "links"), emptied(work / "masks")
     plain = {photo.name: f"{i:06d}{Path(used[photo.name]).suffix.lower()}" for i, photo in enumerate(photos)}
     for photo in photos:
         (links / plain[photo.name]).symlink_to((images / used[photo.name]).resolve())
-    mask_files = prepare.colmap_masks(photos, plain, masks, work) if masks is not None else None
+    if masks is not None:
+        colmap_masks(photos, plain, masks, mask_files)
     positions, _ = local_positions({p.name: p.exif.position for p in photos if p.exif.position is not None})
     return Job(
         work=str(work.resolve()),
         images=str(links.resolve()),
-        masks=None if mask_files is None else str(mask_files.resolve()),
+        masks=None if masks is None else str(mask_files.resolve()),
         cameras=[camera_group(members, [plain[p.name] for p in members], options) for members in by_camera(photos)],
         order=[plain[photo.name] for photo in photos],
         names={plain[photo.name]: used[photo.name] for photo in photos},
@@ -268,14 +250,14 @@ def camera_group(photos: Sequence[Photo], names: list[str], options: SfmOptions)
     """Initial camera of these photographs."""
     width, height = photos[0].width, photos[0].height
     if photos[0].panorama:
-        return CameraGroup(SPHERICAL_MODEL, width, height, [float(width), float(height)], True, names)
+        return CameraGroup(ColmapCamera(SPHERICAL_MODEL, width, height, (float(width), float(height))), True, names)
     stated = [photo.exif.focal_length for photo in photos]
     focal = options.focal_length or (statistics.median(stated) if all(stated) else None)
     model = "SIMPLE_RADIAL" if options.camera_model == "auto" else options.camera_model
     camera = pycolmap.Camera.create_from_model_name(
         0, model, focal or GUESSED_FOCAL * max(width, height), width, height
     )
-    return CameraGroup(model, width, height, camera.params.tolist(), focal is not None, names)
+    return CameraGroup(ColmapCamera(model, width, height, tuple(camera.params.tolist())), focal is not None, names)
 
 
 def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence[Photo], job: Job) -> Poses:
@@ -300,15 +282,14 @@ def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence
         }
         for c in model.cameras.values()
     ]
-    keys = ("left_out", "registered", "given", "reprojection_error", "track_length", "seconds", "contradicted")
+    kept = {each.name: values[each.name] for each in fields(Poses) if each.name in values}
     with complete_folder(work / "result") as result:
         sparse = result / SPARSE
         sparse.mkdir(parents=True)
         model.write_binary(sparse)
         write_frame(result, frame)
         write_report(result, values, model)
-        kept = _Kept(made=images == work / prepare.IMAGES, **{key: values[key] for key in keys})
-        write_file(result / "poses.json", kept.model_dump_json().encode())
+        write_file(result / "poses.json", json.dumps({"made": images == work / IMAGES, **kept}).encode())
     for name in ("links", "masks", MODEL):
         shutil.rmtree(work / name, ignore_errors=True)
     process.forget(work)

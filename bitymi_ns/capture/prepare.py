@@ -1,16 +1,16 @@
 """Photographs and masks in forms that both COLMAP and nerfstudio read."""
 
 import os
+import shutil
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from PIL import Image
 
-from bitymi_ns.capture.masks import in_proportion, mask_of, mask_pixels
+from bitymi_ns.capture.masks import in_proportion, mask_of, read_mask
 from bitymi_ns.capture.photos import COPY, Photo, upright
-from bitymi_ns.capture.recognise import open_picture
 from bitymi_ns.capture.types import CaptureError
-from bitymi_ns.files import complete_file, complete_folder
+from bitymi_ns.files import complete_folder
 from bitymi_ns.progress import Progress
 
 JPEG_QUALITY = 97
@@ -20,16 +20,9 @@ IMAGES = "images"  # subfolder of the work folder for upright copies, or the fra
 def upright_photos(
     photos: Sequence[Photo], folder: Path, work: Path, progress: Progress
 ) -> tuple[Path, dict[str, str]]:
-    """Make a folder in which every photograph is upright and in a format that everything reads.
-
-    Args:
-        photos: the photographs to be used.
-        folder: the one they stand in.
-        work: gets `images` where some have to be converted; the others are links in it.
-
-    Returns:
-        the folder, which is `folder` itself where no photograph needs a copy, and the names in it by photograph.
-    """
+    """Return a folder in which every photograph is upright and in a format that everything reads, and the names in it
+    by photograph: `folder` itself where no photograph needs a copy, else `images` in the work folder, with links to the
+    others."""
     if all(photo.plain for photo in photos):
         return folder, {photo.name: photo.name for photo in photos}
     names = {photo.name: photo.name if photo.plain else photo.name + COPY for photo in photos}
@@ -50,43 +43,38 @@ def upright_photos(
     return target, names
 
 
-def colmap_masks(photos: Iterable[Photo], names: dict[str, str], masks: Path, work: Path) -> Path:
-    """Write the masks as COLMAP reads them, grey PNGs of the size of the upright photographs, and return their folder.
+def emptied(folder: Path) -> Path:
+    """Make a folder, or remove what is in it."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return folder
 
-    A photograph without a mask is used as a whole.
 
-    Args:
-        photos: the photographs.
-        names: what COLMAP calls each.
-        masks: folder of the masks.
-        work: gets the folder.
+def colmap_masks(photos: Iterable[Photo], names: dict[str, str], masks: Path, target: Path) -> None:
+    """Write the masks as COLMAP reads them, grey PNGs of the size of the upright photographs, to `target`, by COLMAP's
+    `names` of the photographs. A photograph without a mask is used as a whole.
 
     Raises:
         CaptureError: a mask cannot be read, or has another aspect than its photograph, or there is none at all.
     """
-    target = work / "masks"
     found = [(photo, path) for photo in photos if (path := mask_of(masks, photo.name)) is not None]
     if not found:
         raise CaptureError(
             f"no mask in {masks} belongs to a photograph: give them the photographs' names, as photo.png for photo.jpg"
         )
-    target.mkdir(exist_ok=True)
     for photo, path in found:
-        with complete_file(target / f"{names[photo.name]}.png") as file:
-            _read_mask(path, photo).save(file, "PNG")
-    return target
+        colmap_mask(path, photo.name, (photo.width, photo.height)).save(target / f"{names[photo.name]}.png")
 
 
-def _read_mask(path: Path, photo: Photo) -> Image.Image:
+def colmap_mask(path: Path, name: str, size: tuple[int, int]) -> Image.Image:
+    """Read the mask of a photograph, by its `name` and `size`, as COLMAP has it."""
     try:
-        with open_picture(path) as image:
-            mask = Image.fromarray(mask_pixels(image))
+        mask = read_mask(path)
     except Exception as error:
         raise CaptureError(f"the mask {path} cannot be read: save it anew, or remove it") from error
-    size = (photo.width, photo.height)
     if not in_proportion(mask.size, size):
         raise CaptureError(
-            f"the mask {path} has {mask.width} x {mask.height} pixels, its photograph {photo.name} stands upright with "
-            f"{photo.width} x {photo.height}: save it in the same proportions"
+            f"the mask {path} has {mask.width} x {mask.height} pixels, its photograph {name} stands upright with "
+            f"{size[0]} x {size[1]}: save it in the same proportions"
         )
     return mask.resize(size, Image.Resampling.NEAREST).convert("L")

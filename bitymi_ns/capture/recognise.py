@@ -106,7 +106,8 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
     if not fitting:
         raise NotRecognised(_nothing(data, format, candidates))
     (chosen, path), *_ = fitting
-    others = tuple(each for each in candidates if each[1] != path and _is_another(chosen, each[0]))
+    # photographs lie beside every capture: they are another capture only beside a video
+    others = tuple(each for each in candidates if each[1] != path and (each[0] != "photographs" or chosen == "video"))
     poses = tuple(unread.poses_in(folder)) if chosen in ("photographs", "video") else ()
     return Found(chosen, path, path if chosen == "blender" else folder, others, poses)
 
@@ -122,11 +123,6 @@ def _capture_within(folder: Path, format: Format | Literal["auto"]) -> Path | No
         if any(format in ("auto", each) for each, _ in candidates):
             found.append(path)
     return found[0] if len(found) == 1 else None
-
-
-def _is_another(chosen: Format, other: Format) -> bool:
-    """Photographs lie beside every capture: they are another capture only beside a video."""
-    return other != "photographs" or chosen == "video"
 
 
 def _of_file(file: Path) -> Iterator[tuple[Format, Path]]:
@@ -341,7 +337,8 @@ def _colmap_given(data: Path, colmap_path: Path) -> Found:
 def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> str:
     """Message for a path that is no capture."""
     if format != "auto":
-        there = f" It holds {_listed(data, candidates)}: leave --format out." if candidates else ""
+        held = ", ".join(f"{_seen_from(path, data)} ({found})" for found, path in candidates[:3])
+        there = f" It holds {held}: leave --format out." if candidates else ""
         return f"{data} holds nothing of the format {format}.{there}"
     if not data.is_dir():
         if data.suffix.lower() in (".zip", ".tar", ".7z", ".gz", ".rar"):
@@ -370,10 +367,6 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
         f"{data} holds nothing to train on: no transforms.json, no transforms_train.json, no COLMAP model (sparse/0), "
         f"no photographs and no video.{hint}"
     )
-
-
-def _listed(data: Path, candidates: list[tuple[Format, Path]]) -> str:
-    return ", ".join(f"{_seen_from(path, data)} ({format})" for format, path in candidates[:3])
 
 
 def _seen_from(path: Path, folder: Path) -> str:

@@ -22,13 +22,7 @@ MOST_POINTS = 20_000  # points in the plot; excess points are dropped at random
 
 
 def write_report(folder: Path, values: Mapping[str, object], model: pycolmap.Reconstruction) -> None:
-    """Write the report without frame.json.
-
-    Args:
-        folder: an existing folder.
-        values: content of report.json.
-        model: cameras and points, z up.
-    """
+    """Write the report without frame.json: `values` as report.json, and cameras and points of a model with z up."""
     from matplotlib import style
 
     write_file(folder / VALUES, (json.dumps(values, indent=2, ensure_ascii=False) + "\n").encode())

@@ -3,6 +3,7 @@
 import math
 import os
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
 import av
@@ -31,16 +32,8 @@ LEAST_SURVEYED = 60  # frames surveyed at least, where there are so many: all of
 
 
 def extract_frames(video: Path, work: Path, count: int | None, progress: Progress) -> Path:
-    """Write frames of a video as JPEGs.
-
-    Args:
-        video: the file.
-        work: gets the folder `images`.
-        count: how many frames; None = one per STRIDE of motion.
-        progress: told how far it is.
-
-    Returns:
-        the folder, which is whole or not there.
+    """Write `count` frames of a video, or one per STRIDE of motion, as JPEGs to the folder `images` in the work folder,
+    which is whole or not there.
 
     Raises:
         CaptureError: it cannot be read, or nothing moves in it.
@@ -62,28 +55,18 @@ def extract_frames(video: Path, work: Path, count: int | None, progress: Progres
     chosen = choose(np.array(motion), np.array(sharp), wanted)
     numbers = {seen[i] for i in chosen}
     with complete_folder(target) as folder:
-        written = 0
         shape = _shape_of_pixels(video)
-        for number, frame, turn in _frames(video):
-            if number in numbers:
-                _upright(frame, turn, shape).save(
-                    folder / f"frame_{number:06d}.jpg", quality=JPEG_QUALITY, subsampling=0
-                )
-                written += 1
-                progress("writing frames", written, len(numbers))
-                if written == len(numbers):
-                    break
+        wanted_frames = islice((each for each in _frames(video) if each[0] in numbers), len(numbers))
+        for written, (number, frame, turn) in enumerate(wanted_frames, 1):
+            image = _upright(frame, turn, shape)
+            image.save(folder / f"frame_{number:06d}.jpg", quality=JPEG_QUALITY, subsampling=0)
+            progress("writing frames", written, len(numbers))
     return target
 
 
 def choose(motion: np.ndarray, sharp: np.ndarray, count: int) -> list[int]:
-    """Choose the sharpest frame of each of `count` stretches of equal motion.
-
-    Args:
-        motion: [n] motion from the start to each frame, not decreasing.
-        sharp: [n] sharpness.
-        count: stretches; those without a frame give none.
-    """
+    """Choose the sharpest frame of each of `count` stretches of equal motion, by motion from the start [n], not
+    decreasing, and sharpness [n]; stretches without a frame give none."""
     stretch = np.minimum((motion / motion[-1] * count).astype(int), count - 1)
     return [int(i) for s in np.unique(stretch) for i in [np.flatnonzero(stretch == s)[sharp[stretch == s].argmax()]]]
 

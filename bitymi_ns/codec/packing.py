@@ -28,24 +28,6 @@ class Packing:
         return int(self.tiles[:, 3:].astype(np.int64).prod(axis=1).sum())
 
 
-@dataclass
-class _Shelf:
-    y: int
-    used: int  # texels of its width that are taken
-
-
-def page_width_for(texels: int, widest: int, page_width: int) -> int:
-    """The page width: `page_width`, or a smaller power of two when a square of that side holds everything."""
-    width = max(GRID, widest)
-    while width < page_width and width * width < texels:
-        width *= 2
-    return width
-
-
-def _round_up(value: int, step: int) -> int:
-    return -(-value // step) * step
-
-
 def pack(resolution: npt.ArrayLike, page_width: int = 4096, max_rows: int = 8192, max_layers: int = 2048) -> Packing:
     """Pack tiles by Shelf-First-Fit-Decreasing (paper, section Texture Baking).
 
@@ -70,22 +52,25 @@ def pack(resolution: npt.ArrayLike, page_width: int = 4096, max_rows: int = 8192
     if area == 0:
         return Packing(tiles, GRID, GRID, 1, 0.0)
     tallest = int(sizes[:, 1].max())
-    width = page_width_for(area, int(sizes[:, 0].max()), page_width)
+    width = max(GRID, int(sizes[:, 0].max()))
+    while width < page_width and width * width < area:  # narrower where a square of that side holds everything
+        width *= 2
 
     placed = np.flatnonzero(sizes[:, 0])
     order = placed[np.lexsort((placed, -sizes[placed, 0], -sizes[placed, 1]))]
     ordered = sizes[order]
     starts = np.flatnonzero(np.r_[True, np.any(ordered[1:] != ordered[:-1], axis=1)])
     origins = np.zeros((len(order), 2), dtype=np.int64)
-    shelves: list[_Shelf] = []  # the shelves with room left, first opened first
+    shelves: list[list[int]] = []  # (y, taken width) of the shelves with room left, first opened first
     rows = 0
     for start, stop in zip(starts, np.r_[starts[1:], len(order)], strict=True):
         r_u, r_v = (int(r) for r in ordered[start])
         for shelf in shelves:
-            count = min(stop - start, (width - shelf.used) // r_u)
-            origins[start : start + count, 0] = shelf.used + r_u * np.arange(count)
-            origins[start : start + count, 1] = shelf.y
-            shelf.used += count * r_u
+            y, used = shelf
+            count = min(stop - start, (width - used) // r_u)
+            origins[start : start + count, 0] = used + r_u * np.arange(count)
+            origins[start : start + count, 1] = y
+            shelf[1] += int(count) * r_u
             start += count
         if start < stop:
             index = np.arange(stop - start)
@@ -94,8 +79,8 @@ def pack(resolution: npt.ArrayLike, page_width: int = 4096, max_rows: int = 8192
             origins[start:stop, 1] = rows + index // per_shelf * r_v
             opened = -(-len(index) // per_shelf)
             rows += opened * r_v
-            shelves.append(_Shelf(rows - r_v, (len(index) - (opened - 1) * per_shelf) * r_u))
-        shelves = [shelf for shelf in shelves if shelf.used < width]
+            shelves.append([rows - r_v, (len(index) - (opened - 1) * per_shelf) * r_u])
+        shelves = [shelf for shelf in shelves if shelf[1] < width]
 
     layers = -(-rows // max_rows)
     if layers > max_layers:
@@ -104,7 +89,7 @@ def pack(resolution: npt.ArrayLike, page_width: int = 4096, max_rows: int = 8192
             "lower r_max, cap tiles by the training views, or widen the pages"
         )
     step = max(ROWS, tallest) if rows >= ROWS else GRID
-    height = _round_up(-(-rows // layers), step)
+    height = -(-rows // layers // step) * step
     tiles[order, 0] = origins[:, 0]
     tiles[order, 1] = origins[:, 1] % height
     tiles[order, 2] = origins[:, 1] // height

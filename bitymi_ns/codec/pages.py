@@ -1,4 +1,7 @@
-"""Indices of texels in the pages of an atlas, and texels as a list and as pages."""
+"""Texels as a list, tile after tile as in `ops.TexelTiles`, and as pages of an atlas.
+
+In the list a surfel without a tile has one texel, its constant.
+"""
 
 from collections.abc import Iterator
 
@@ -10,23 +13,43 @@ from bitymi_ns.codec.packing import Packing
 from bitymi_ns.ops.baked_scene import alpha_means
 
 
-def size_classes(tiles: Tensor) -> list[tuple[int, int, Tensor]]:
-    """Tiles grouped by size.
-
-    Args:
-        tiles: [N, 5] int32 (x, y, layer, r_u, r_v).
+def size_classes(sizes: Tensor) -> list[tuple[int, int, Tensor]]:
+    """Surfels grouped by the sizes [N, 2] (r_u, r_v) of their tiles.
 
     Returns:
         a list of (r_u, r_v, rows [M] int64), sizes ascending; surfels without a tile are left out.
     """
     # as one number each: torch.unique of rows sorts them many times as slowly
-    keys, inverse = torch.unique((tiles[:, 3].long() << 32) + tiles[:, 4].long(), return_inverse=True)
-    sizes = torch.stack([keys >> 32, keys & 0xFFFFFFFF], dim=1)
+    keys, inverse = torch.unique((sizes[:, 0].long() << 32) + sizes[:, 1].long(), return_inverse=True)
+    found = torch.stack([keys >> 32, keys & 0xFFFFFFFF], dim=1)
     return [
         (int(r_u), int(r_v), torch.nonzero(inverse == i).squeeze(1))
-        for i, (r_u, r_v) in enumerate(sizes.tolist())
+        for i, (r_u, r_v) in enumerate(found.tolist())
         if r_u > 0 and r_v > 0
     ]
+
+
+def listed_tiles(sizes: Tensor, chunk: int = 1 << 20) -> Iterator[tuple[tuple[int, int], Tensor, Tensor]]:
+    """Tiles of a texel list, in chunks of one size; surfels without a tile, which have one texel, are left out.
+
+    Args:
+        sizes: [N, 2] (r_u, r_v) of the tiles.
+        chunk: texels at once (a tile is never split).
+
+    Yields:
+        (r_u, r_v), rows [n] int64 of the surfels, rows [n, r_v, r_u] int64 of their texels.
+    """
+    first = first_texels(sizes)
+    for r_u, r_v, members in size_classes(sizes):
+        inside = torch.arange(r_u * r_v, device=sizes.device).view(r_v, r_u)
+        for rows in members.split(max(1, chunk // (r_u * r_v))):
+            yield (r_u, r_v), rows, first[rows, None, None] + inside
+
+
+def first_texels(sizes: Tensor) -> Tensor:
+    """[N] int64 row of the first texel of every surfel in the list, of the sizes [N, 2] of the tiles."""
+    area = sizes.long().clamp(min=1).prod(dim=1)
+    return area.cumsum(0) - area
 
 
 def texel_index(tiles: Tensor, size: tuple[int, int], width: int, height: int) -> Tensor:
@@ -46,29 +69,21 @@ def texel_index(tiles: Tensor, size: tuple[int, int], width: int, height: int) -
     return origin[:, None, None] + (j[:, None] * width + i[None, :])
 
 
-def tile_means(texels: Tensor, packing: Packing, constant: Tensor | None = None, chunk: int = 1 << 20) -> Tensor:
-    """[N, C] mean of every tile of `texels` [layers, height, width, C]; without a tile `constant` [N, C], or 0.
-    Colours are weighted by alpha, where there is a fourth channel and not all of it is 0."""
-    tiles = torch.from_numpy(packing.tiles)
-    flat = texels.reshape(-1, texels.shape[3])
-    means = torch.zeros(len(tiles), texels.shape[3]) if constant is None else constant.clone()
-    for r_u, r_v, rows in size_classes(tiles):
-        for part in rows.split(max(1, chunk // (r_u * r_v))):
-            index = texel_index(tiles[part], (r_u, r_v), packing.width, packing.height)
-            values = flat[index]
-            means[part] = alpha_means(values, (1, 2)) if values.shape[3] == 4 else values.mean(dim=(1, 2))
+def tile_means(texels: Tensor, sizes: Tensor) -> Tensor:
+    """[N, C] mean of every tile of a texel list [T, C], of sizes [N, 2]; of a surfel without a tile its texel. Colours
+    are weighted by alpha, where there is a fourth channel and not all of it is 0."""
+    means = texels[first_texels(sizes)]
+    for _, rows, index in listed_tiles(sizes):
+        values = texels[index]
+        means[rows] = alpha_means(values, (1, 2)) if values.shape[3] == 4 else values.mean(dim=(1, 2))
     return means
 
 
 def _texel_rows(packing: Packing) -> Iterator[tuple[Tensor, Tensor]]:
-    """Rows of a texel list (`ops.TexelTiles`: a surfel without a tile has one texel) and rows of the flattened pages of
-    the same texels, a pair for each tile size."""
+    """Rows of the texel list and of the flattened pages of the same texels, a pair for each chunk of tiles."""
     tiles = torch.from_numpy(packing.tiles)
-    area = tiles[:, 3:].long().clamp(min=1).prod(dim=1)
-    first = area.cumsum(0) - area
-    for r_u, r_v, rows in size_classes(tiles):
-        listed = first[rows, None] + torch.arange(r_u * r_v)
-        paged = texel_index(tiles[rows], (r_u, r_v), packing.width, packing.height)
+    for size, rows, listed in listed_tiles(tiles[:, 3:]):
+        paged = texel_index(tiles[rows], size, packing.width, packing.height)
         yield listed.reshape(-1), paged.reshape(-1)
 
 
@@ -81,10 +96,10 @@ def listed_texels(pages: Tensor, packing: Packing, constants: Tensor) -> Tensor:
     return texels
 
 
-def paged_texels(texels: Tensor, packing: Packing, elsewhere: Tensor | float = 0.0) -> Tensor:
-    """Pages [layers, height, width, ...] of a texel list [T, ...]; outside of tiles a number, or texels of pages."""
-    size, rest = (packing.layers, packing.height, packing.width), texels.shape[1:]
-    pages = elsewhere.clone() if isinstance(elsewhere, Tensor) else texels.new_full((*size, *rest), elsewhere)
+def paged_texels(texels: Tensor, packing: Packing, elsewhere: float = 0.0) -> Tensor:
+    """Pages [layers, height, width, ...] of a texel list [T, ...], with a number outside of tiles."""
+    rest = texels.shape[1:]
+    pages = texels.new_full((packing.layers, packing.height, packing.width, *rest), elsewhere)
     for listed, paged in _texel_rows(packing):
         pages.view(-1, *rest)[paged] = texels[listed]
     return pages
@@ -95,6 +110,6 @@ def covered_blocks(tiles: np.ndarray, width: int, height: int, layers: int) -> n
     blocks = torch.from_numpy(np.ascontiguousarray(tiles)).clone()
     blocks[:, [0, 1, 3, 4]] //= 4
     mask = torch.zeros(layers * (height // 4) * (width // 4), dtype=torch.bool)
-    for r_u, r_v, rows in size_classes(blocks):
+    for r_u, r_v, rows in size_classes(blocks[:, 3:]):
         mask[texel_index(blocks[rows], (r_u, r_v), width // 4, height // 4).reshape(-1)] = True
     return mask.reshape(layers, height // 4, width // 4).numpy()

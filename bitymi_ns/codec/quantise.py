@@ -74,24 +74,8 @@ class EncodedAtlas:
         )
 
 
-def sample_texels(
-    texels: npt.NDArray[np.float32], packing: Packing, count: int = 1 << 18, seed: int = 0
-) -> npt.NDArray[np.float32]:
-    """A bootstrap sample of colours, with replacement, uniform over the texels of all tiles: [count, 3]; [0, 3] without
-    tiles."""
-    area = packing.tiles[:, 3].astype(np.int64) * packing.tiles[:, 4]
-    ends = np.cumsum(area)
-    if len(ends) == 0 or ends[-1] == 0:
-        return np.zeros((0, 3), dtype=np.float32)
-    drawn = np.random.default_rng(seed).integers(0, ends[-1], count)
-    tile = np.searchsorted(ends, drawn, side="right")
-    x, y, layer, r_u, _ = packing.tiles[tile].astype(np.int64).T
-    inside = drawn - (ends[tile] - area[tile])
-    return texels[layer, y + inside // r_u, x + inside % r_u, :3]
-
-
 def choose_range(
-    texels: npt.NDArray[np.float32], packing: Packing, rule: RangeRule = "sigma6", samples: int = 1 << 18, seed: int = 0
+    texels: npt.NDArray[np.float32], rule: RangeRule = "sigma6", samples: int = 1 << 18, seed: int = 0
 ) -> Range:
     """The quantisation range of an atlas, one (offset, scale) for the three channels of its colours.
 
@@ -99,24 +83,23 @@ def choose_range(
     value, nothing clipped. auto: whichever of the two has the smaller mean squared 8-bit error on the sample.
 
     Args:
-        texels: [layers, height, width, C] float32.
-        packing: where the tiles lie; values outside tiles are not looked at.
+        texels: [T, C] float32 of the tiles.
         rule: see above.
-        samples: size of the bootstrap sample.
+        samples: size of the bootstrap sample, uniform over the texels, with replacement.
         seed: of the sample.
     """
-    sample = sample_texels(texels, packing, samples, seed)
-    if len(sample) == 0:
+    if len(texels) == 0:
         return Range(0.0, 1.0, rule if rule != "auto" else "sigma6")
+    sample = texels[np.random.default_rng(seed).integers(0, len(texels), samples), :3]
     if rule == "auto":
-        candidates = [choose_range(texels, packing, each, samples, seed) for each in ("sigma6", "minmax")]
+        candidates = [choose_range(texels, each, samples, seed) for each in ("sigma6", "minmax")]
         return min(candidates, key=lambda each: _mean_square(each.from_unorm8(each.to_unorm8(sample)) - sample))
     if rule == "sigma6":
         values = sample.astype(np.float64)
         mean, spread = float(values.mean()), 6.0 * float(values.std())
         low, high = mean - spread, mean + spread
     elif rule == "minmax":
-        low, high = _extremes(texels, packing)
+        low, high = float(texels[:, :3].min()), float(texels[:, :3].max())
     else:
         raise ValueError(f"the range rule must be sigma6, minmax or auto, not {rule!r}")
     low, high = (float(np.clip(end, -RESIDUAL_LIMIT, RESIDUAL_LIMIT)) for end in (low, high))
@@ -148,11 +131,11 @@ def encode(
         raise ValueError(f"the atlas format must be bc7, uint8 or fp16, not {format!r}")
     layers, height, width, channels = texels.shape
     alpha_scale = 0.0 if channels == 3 else 1.0 if format == "fp16" else ALPHA_SCALE
+    owned = covered_blocks(packing.tiles, width, height, layers)
     if format == "fp16":
         value_range = Range(0.0, 1.0, "none")
     elif value_range is None:
-        value_range = choose_range(texels, packing)
-    owned = covered_blocks(packing.tiles, width, height, layers)
+        value_range = choose_range(texels[owned.repeat(4, axis=1).repeat(4, axis=2)])
     encoder = bc7_encoder(profile, channels == 4) if format == "bc7" else None
 
     def strip(layer: int, top: int) -> tuple[bytes, int, float]:
@@ -251,17 +234,6 @@ def _quantised(values: npt.NDArray[np.float32], format: Format, value_range: Ran
     if alpha is not None:
         rgba[..., 3] = alpha_bytes(alpha)
     return rgba
-
-
-def _extremes(texels: npt.NDArray[np.float32], packing: Packing) -> tuple[float, float]:
-    layers, height, width, _ = texels.shape
-    low, high = np.inf, -np.inf
-    for page, owned in zip(texels, covered_blocks(packing.tiles, width, height, layers), strict=True):
-        blocks = page[..., :3].reshape(height // 4, 4, width // 4, 4, 3)
-        if owned.any():
-            low = min(low, float(blocks.min(axis=(1, 3, 4))[owned].min()))
-            high = max(high, float(blocks.max(axis=(1, 3, 4))[owned].max()))
-    return low, high
 
 
 def _mean_square(difference: npt.NDArray[np.float32]) -> float:

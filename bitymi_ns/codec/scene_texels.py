@@ -13,6 +13,8 @@ from bitymi_ns.scene.baked import BakedScene
 def scene_texels(scene: BakedScene) -> Tensor:
     """[T, 3] residual colours of a scene on the CPU; a surfel without a tile has one, its mean residual."""
     assert scene.mean_residual is not None
+    if scene.atlas is None and scene.blocks is None:
+        return scene.mean_residual
     return _listed(scene, scene.residuals(), scene.mean_residual)
 
 

@@ -1,6 +1,6 @@
 """Columns of integers as Zstandard frames, one for each byte plane of each number, of known sizes."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -79,11 +79,3 @@ def plane_bytes(frame: memoryview, size: int) -> npt.NDArray[np.uint8]:
     if len(data) != size:
         raise StreamError(f"a frame holds {len(data)} bytes, {size} are wanted")
     return np.frombuffer(data, np.uint8)
-
-
-def frames(view: memoryview, sizes: Sequence[int]) -> Iterator[memoryview]:
-    """Parts of `view` of these sizes, one after the other."""
-    at = 0
-    for size in sizes:
-        yield view[at : at + size]
-        at += size

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bitymi_ns.codec import streams
 from bitymi_ns.codec.limits import ALPHA_ONE, RESIDUAL_LIMIT
-from bitymi_ns.codec.pages import size_classes
+from bitymi_ns.codec.pages import first_texels, size_classes
 from bitymi_ns.codec.surfel_codes import SurfelCodes
 
 BLOCK = 8  # side of the largest block that is transformed, texels
@@ -74,10 +74,9 @@ class Blocks:
 
 def blocks_of(sizes: Tensor) -> list[Blocks]:
     """The blocks of tiles of the sizes [N, 2], by (b_u, b_v)."""
-    area = sizes.long().clamp(min=1).prod(dim=1)
-    first, number = area.cumsum(0) - area, (sizes[:, 0] > 0).long().cumsum(0) - 1
+    first, number = first_texels(sizes), (sizes[:, 0] > 0).long().cumsum(0) - 1
     found: dict[tuple[int, int], list[tuple[Tensor, Tensor]]] = {}
-    for r_u, r_v, rows in size_classes(torch.cat([sizes.new_zeros(len(sizes), 3), sizes], dim=1)):
+    for r_u, r_v, rows in size_classes(sizes):
         b_u, b_v = min(r_u, BLOCK), min(r_v, BLOCK)
         tile = torch.arange(r_u * r_v).view(r_v // b_v, b_v, r_u // b_u, b_u).transpose(1, 2).reshape(-1, b_v, b_u)
         texels = first[rows, None, None, None] + tile

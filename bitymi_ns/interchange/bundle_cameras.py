@@ -3,7 +3,7 @@
 import io
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -22,7 +22,9 @@ _Number = Annotated[float, Field(ge=-1e9, le=1e9)]
 _Size = Annotated[int, Field(ge=1, le=1 << 20)]
 
 
-class _Row(BaseModel):
+class CameraRow(BaseModel):
+    """A camera of a capture: the name of its photograph, whether that was held out, and the camera."""
+
     name: str
     held_out: bool
     width: _Size
@@ -34,7 +36,9 @@ class _Row(BaseModel):
     viewmat: Annotated[list[_Number], Field(min_length=16, max_length=16)]
     photograph: str | None = None
 
+    @property
     def camera(self) -> Camera:
+        """Camera of the view."""
         K = torch.tensor([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
         return Camera(torch.tensor(self.viewmat).view(4, 4), K, self.width, self.height)
 
@@ -48,14 +52,6 @@ class BundleCameras:
 
     train: list[Camera] = field(default_factory=list)  # the training cameras
     held_out: list[View] = field(default_factory=list)  # photographs that training did not see, with their cameras
-
-
-class NamedCamera(NamedTuple):
-    """A camera of a capture: the name of its photograph, whether that was held out, and the camera."""
-
-    name: str
-    held_out: bool
-    camera: Camera
 
 
 def read_cameras(folder: str | Path, info: Manifest) -> BundleCameras:
@@ -73,18 +69,18 @@ def read_cameras(folder: str | Path, info: Manifest) -> BundleCameras:
     with parts_of(folder) as parts:
         rows = _rows(parts, info)
         held_out = [_view(parts, info, row) for row in rows if row.held_out and row.photograph is not None]
-    return BundleCameras([row.camera() for row in rows if not row.held_out], held_out)
+    return BundleCameras([row.camera for row in rows if not row.held_out], held_out)
 
 
-def named_cameras(folder: str | Path, info: Manifest) -> list[NamedCamera]:
+def named_cameras(folder: str | Path, info: Manifest) -> list[CameraRow]:
     """The cameras of the capture that a bundle was made of, as cameras.json has them; see `read_cameras`."""
     if CAMERAS not in info.files:
         return []
     with parts_of(folder) as parts:
-        return [NamedCamera(row.name, row.held_out, row.camera()) for row in _rows(parts, info)]
+        return _rows(parts, info)
 
 
-def _rows(parts: Parts, info: Manifest) -> list[_Row]:
+def _rows(parts: Parts, info: Manifest) -> list[CameraRow]:
     """Rows of cameras.json; the first malformed one is refused."""
     path = parts.bundle / CAMERAS
     try:
@@ -97,7 +93,7 @@ def _rows(parts: Parts, info: Manifest) -> list[_Row]:
     rows = []
     for number, row in enumerate(found):
         try:
-            rows.append(_Row.model_validate(row))
+            rows.append(CameraRow.model_validate(row))
         except ValidationError as error:
             first = error.errors(include_url=False, include_input=False)[0]
             where = ".".join(map(str, ("cameras", number, *first["loc"])))
@@ -105,9 +101,9 @@ def _rows(parts: Parts, info: Manifest) -> list[_Row]:
     return rows
 
 
-def _view(parts: Parts, info: Manifest, row: _Row) -> View:
+def _view(parts: Parts, info: Manifest, row: CameraRow) -> View:
     """A photograph, which may be smaller than its camera's image."""
-    name, camera = row.photograph or "", row.camera()
+    name, camera = row.photograph or "", row.camera
     check_file_name(name, CAMERAS)
     if name not in info.files:
         raise BundleError(f"{parts.bundle / CAMERAS} names the photograph {name}, which is no file of the bundle")

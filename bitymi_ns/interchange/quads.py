@@ -67,7 +67,7 @@ def quads_of(scene: BakedScene, color: Tensor, level: float) -> Quads:
     packing = pack(size.numpy())
     tiles = torch.from_numpy(packing.tiles)
     pages = torch.zeros(packing.layers * packing.height * packing.width, 4, dtype=torch.uint8)
-    for r_u, r_v, rows in size_classes(tiles):
+    for r_u, r_v, rows in size_classes(tiles[:, 3:]):
         for part in rows.split(max(1, _CHUNK // (r_u * r_v))):
             texels = _texels(scene, color, kept[part], (r_u, r_v), radius[part], extent[part], level)
             pages[texel_index(tiles[part], (r_u, r_v), packing.width, packing.height)] = texels

@@ -66,6 +66,6 @@ def _owners(quads: Quads) -> Tensor:
     size = (corners[:, 2] - corners[:, 0]).round().long() + 1
     tiles = torch.cat([first, quads.page[:, None], size], dim=1)
     owner = torch.full((pages * height * width,), -1)
-    for r_u, r_v, rows in size_classes(tiles):
+    for r_u, r_v, rows in size_classes(tiles[:, 3:]):
         owner[texel_index(tiles[rows], (r_u, r_v), width, height)] = rows[:, None, None].expand(-1, r_v, r_u)
     return owner

@@ -44,19 +44,18 @@ class NoSurface(ValueError):
     """The cameras see no surface that could be fused; the message says why."""
 
 
-@dataclass(frozen=True)
+@dataclass(kw_only=True)
 class SurfaceOptions:
-    """Options of the extraction of a surface.
-
-    Attributes:
-        resolution: voxels along the longest side of the box, at least 16.
-        triangles: budget; a mesh with more is simplified by quadric error metrics; 0 = no limit.
-        watertight: close the mesh by a Poisson reconstruction from its vertices and normals.
-    """
+    """Options of the extraction of a surface."""
 
     resolution: Annotated[int, Field(ge=16, le=4096)] = 256
+    """Voxels along the longest side of the box that holds what the cameras see, 16 to 4096. Time and memory grow with
+    its square."""
     triangles: Annotated[int, Field(ge=0, le=10**8)] = 500_000
+    """Budget of triangles, met by simplification (quadric error metrics); 0 = no limit."""
     watertight: bool = False
+    """Close the mesh by a Poisson reconstruction: for printing and simulation. Invents surface where nothing was
+    seen."""
 
 
 @torch.no_grad()
@@ -130,7 +129,7 @@ def extract_surface(
     render: Callable[[Camera], Tensor],
     cameras: Sequence[Camera],
     near: float,
-    options: SurfaceOptions = SurfaceOptions(),  # noqa: B008 - frozen
+    options: SurfaceOptions | None = None,
     prefilter: Prefilter = "low_pass",
     progress: Progress = no_progress,
     alpha: TexelAlpha | None = None,
@@ -153,6 +152,7 @@ def extract_surface(
     """
     import open3d
 
+    options = options or SurfaceOptions()
     check_ranges(options)
     small = [camera.within(BOX_SIDE) for camera in cameras]
     depths = []

@@ -90,7 +90,7 @@ def weighted_residuals(scene: BakedScene, chunk: int = 1 << 20) -> Tensor | None
     beta = kernel_parameters(scene.surfels)[1]
     _, height, width, _ = scene.atlas.shape
     flat, alphas = scene.residuals().reshape(-1, 3), scene.alphas()
-    for r_u, r_v, rows in size_classes(scene.tiles):
+    for r_u, r_v, rows in size_classes(scene.tiles[:, 3:]):
         for part in rows.split(max(1, chunk // (r_u * r_v))):
             u, v = (texel_centers(r, extent[part, None]) for r in (r_u, r_v))
             rest = (1 - (u[:, None, :].square() + v[:, :, None].square()) / SUPPORT**2).clamp(min=0)

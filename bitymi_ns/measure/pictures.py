@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bitymi_ns.files import reason
 from bitymi_ns.measure.report.pictures import ERROR_CAPTION, ERROR_SCALE, heat
+from bitymi_ns.measure.report.read import PICTURES
 from bitymi_ns.ops import blended_image, fragment_residual
 from bitymi_ns.ops.constants import COLOR_BIAS
 from bitymi_ns.plugin.console import fail, say
@@ -23,7 +24,6 @@ from bitymi_ns.scene.baked import as_bytes
 from bitymi_ns.scene.field import TexelField
 
 RESIDUAL_GAIN = 4.0  # residuals are small; the pictures of them are brightened by this factor
-FILE = "pictures.json"
 
 KINDS = {
     "photo": "photograph",
@@ -97,7 +97,7 @@ def draw_worst(load_config: Path, output_dir: Path, views: int) -> None:
     """
     if views < 1:
         fail(f"--views must be at least 1, not {views}")
-    require_writable(output_dir / FILE)
+    require_writable(output_dir / PICTURES)
     config, pipeline = load_trained(load_config)
     model, datamanager = pipeline.model, pipeline.datamanager
     count = len(datamanager.eval_dataset)
@@ -124,5 +124,5 @@ def draw_worst(load_config: Path, output_dir: Path, views: int) -> None:
         listed.append({"view": index, "rank": rank + 1, "of": count, "metrics": figures, "files": files})
     about = {"scene": config.experiment_name, "method": config.method_name}
     text = json.dumps({"bitymi_pictures": 1, **about, "captions": KINDS, "views": listed}, indent=1)
-    replace_file(output_dir / FILE, text.encode("utf8"))
+    replace_file(output_dir / PICTURES, text.encode("utf8"))
     say(f"Wrote {len(listed)} views to {output_dir}")

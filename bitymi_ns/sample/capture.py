@@ -2,10 +2,10 @@
 
 import json
 import os
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import nullcontext
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image as PILImage
 
 from bitymi_ns.files import complete_folder
+from bitymi_ns.progress import no_progress, rich_progress
 from bitymi_ns.sample.room import Hits, Room
 from bitymi_ns.trust import json_of, keep
 
@@ -107,14 +108,10 @@ def sparse_points(
 
 def write_ply(path: Path, points: NDArray[np.float32], colors: NDArray[np.uint8]) -> None:
     """Binary little-endian PLY of points [n, 3] with colors [n, 3]."""
-    record = np.dtype([(n, "<f4") for n in ("x", "y", "z")] + [(n, "u1") for n in ("red", "green", "blue")])
-    rows = np.empty(len(points), record)
-    for k, name in enumerate(("x", "y", "z")):
-        rows[name] = points[:, k]
-    for k, name in enumerate(("red", "green", "blue")):
-        rows[name] = colors[:, k]
-    kinds = {"x": "float", "y": "float", "z": "float"}
-    properties = "".join(f"property {kinds.get(n, 'uchar')} {n}\n" for n in record.names)
+    rows = np.empty(len(points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    rows["xyz"], rows["rgb"] = points, colors
+    names = ["float x", "float y", "float z", "uchar red", "uchar green", "uchar blue"]
+    properties = "".join(f"property {name}\n" for name in names)
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
     path.write_bytes(header.encode("ascii") + rows.tobytes())
 
@@ -146,12 +143,13 @@ def generate(
     def check() -> None:
         if output_dir.exists() and not output_dir.is_dir():
             raise FileExistsError(f"{output_dir} is a file; choose another output folder")
-        if output_dir.exists() and any(output_dir.iterdir()) and not overwrite:
+        if not output_dir.exists() or not any(output_dir.iterdir()):
+            return
+        if not overwrite:
             raise FileExistsError(f"{output_dir} already holds files; choose another folder or pass --overwrite")
-        if output_dir.exists() and any(output_dir.iterdir()) and not _is_sample(output_dir):
+        if not _is_sample(output_dir):
             raise FileExistsError(f"{output_dir} is not a sample capture and is not replaced; choose another folder")
-        if output_dir.exists() and any(output_dir.iterdir()):
-            keep(output_dir, _files_of(output_dir))
+        keep(output_dir, _files_of(output_dir))
 
     with complete_folder(output_dir, check) as new:
         _write(new, views, width, height, seed, points, progress)
@@ -178,13 +176,13 @@ def _write(folder: Path, views: int, width: int, height: int, seed: int, points:
     path = camera_path(views, width, height, seed)
     names = [f"images/frame_{k + 1:05d}.png" for k in range(views)]
 
-    with _progress(progress, views) as advance:
-        room = Room(seed)
+    with rich_progress() if progress else nullcontext(no_progress) as tell:
+        room, done = Room(seed), count(1)
 
         def frame(k: int) -> NDArray[np.uint8]:
             image = render(room, path[k])
             PILImage.fromarray(image).save(folder / names[k])
-            advance()
+            tell("Rendering the sample room", next(done), views)
             return image
 
         with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:  # numpy works outside the interpreter lock
@@ -203,10 +201,7 @@ def _write(folder: Path, views: int, width: int, height: int, seed: int, points:
         "fl_y": FOCAL * width,
         "cx": width / 2,
         "cy": height / 2,
-        "k1": 0.0,
-        "k2": 0.0,
-        "p1": 0.0,
-        "p2": 0.0,
+        **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
         "ply_file_path": CLOUD,
         "frames": [
             {"file_path": name, "transform_matrix": view.camera_to_world.tolist()}
@@ -214,16 +209,3 @@ def _write(folder: Path, views: int, width: int, height: int, seed: int, points:
         ],
     }
     (folder / CAPTURE).write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
-
-
-@contextmanager
-def _progress(show: bool, total: int) -> Iterator:
-    """A function to call once per finished frame; draws a bar when `show`."""
-    if not show:
-        yield lambda: None
-        return
-    from rich.progress import Progress
-
-    with Progress() as bar:
-        task = bar.add_task("Rendering the sample room", total=total)
-        yield lambda: bar.advance(task)

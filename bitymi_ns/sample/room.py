@@ -63,6 +63,17 @@ class Hits:
     surface: np.ndarray  # [n] int8, which surface
     part: np.ndarray  # [n] int8, which bar or pole
 
+    def candidates(self, o: Vec, inverse: Vec, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Indices of the rays that pass through an axis-aligned box before their hits."""
+        near, far = _slab(o, inverse, low, high)
+        return np.flatnonzero((near < far) & (far > NEAR) & (near < self.t))
+
+    def shorten(self, index: np.ndarray, t: Image, meets: np.ndarray, surface: int, part: int = 0) -> None:
+        """Replace the hits of rays that meet a surface at a smaller t."""
+        closer = meets & (t > NEAR) & (t < self.t[index])
+        chosen = index[closer]
+        self.t[chosen], self.surface[chosen], self.part[chosen] = t[closer], surface, part
+
 
 def _dot(a: Vec, b: Vec) -> Image:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
@@ -77,6 +88,12 @@ def _slab(o: Vec, inverse: Vec, low: np.ndarray, high: np.ndarray) -> tuple[Imag
         near = small if near is None else np.maximum(near, small)
         far = large if far is None else np.minimum(far, large)
     return near, far
+
+
+def _entry(a: Image, b: Image, c: Image) -> tuple[Image, np.ndarray]:
+    """Smaller root t of a t^2 + 2 b t + c, and where there is one."""
+    root = b * b - a * c
+    return (-b - np.sqrt(np.maximum(root, 0))) / a, root > 0
 
 
 def _take(v: Vec, index: np.ndarray) -> Vec:
@@ -144,77 +161,59 @@ class Room:
         """Test for an occluder (a big object or a pole) between o and o + d; [n] bool."""
         t = np.full(d[0].shape, 1.0, np.float32)
         hits = Hits(t, np.zeros(t.shape, np.int8), np.zeros(t.shape, np.int8))
-        self._objects(o, d, hits, with_bars=True)
+        self._objects(o, d, hits)
         return hits.t < np.float32(0.999)
 
-    def _objects(self, o: Vec, d: Vec, hits: Hits, with_bars: bool = True) -> None:
+    def _objects(self, o: Vec, d: Vec, hits: Hits) -> None:
         """Shorten `hits` to what stands in the room."""
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             inverse = tuple(np.float32(1) / a for a in d)
             self._hit_sphere(o, d, inverse, hits, SPHERE_CENTRE, SPHERE_RADIUS, SPHERE)
             self._hit_sphere(o, d, inverse, hits, KNOB_CENTRE, KNOB_RADIUS, KNOB)
             self._hit_box(o, d, inverse, hits)
-            near, far = _slab(o, inverse, *PLINTH)
-            closer = (near < far) & (near > NEAR) & (near < hits.t)
-            hits.t[closer], hits.surface[closer] = near[closer], PLINTH_ID
+            self._hit_boxes(o, inverse, hits, PLINTH_ID, PLINTH[0][None], PLINTH[1][None])
             for part, pole in enumerate(POLES):
                 self._hit_pole(o, d, inverse, hits, part, *pole)
-            if with_bars:
-                for group in (slice(0, UPRIGHTS + RUNGS), slice(UPRIGHTS + RUNGS, None)):
-                    self._hit_bars(o, inverse, hits, group)
+            for first, last in ((0, UPRIGHTS + RUNGS), (UPRIGHTS + RUNGS, len(self.bars_low))):
+                self._hit_boxes(o, inverse, hits, BARS, self.bars_low[first:last], self.bars_high[first:last], first)
 
     def _hit_sphere(
         self, o: Vec, d: Vec, inverse: Vec, hits: Hits, centre: np.ndarray, radius: np.float32, surface: int
     ) -> None:
-        near, far = _slab(o, inverse, centre - radius, centre + radius)
-        index = np.flatnonzero((near < far) & (far > NEAR) & (near < hits.t))
+        index = hits.candidates(o, inverse, centre - radius, centre + radius)
         o, d = _take(o, index), _take(d, index)
         oc = tuple(o[a] - centre[a] for a in range(3))
-        a, b, c = _dot(d, d), _dot(oc, d), _dot(oc, oc) - radius * radius
-        root = b * b - a * c
-        t = (-b - np.sqrt(np.maximum(root, 0))) / a
-        closer = (root > 0) & (t > NEAR) & (t < hits.t[index])
-        hits.t[index[closer]], hits.surface[index[closer]] = t[closer], surface
+        hits.shorten(index, *_entry(_dot(d, d), _dot(oc, d), _dot(oc, oc) - radius * radius), surface)
 
     def _hit_box(self, o: Vec, d: Vec, inverse: Vec, hits: Hits) -> None:
         reach = np.float32([np.hypot(BOX_HALF[0], BOX_HALF[1])] * 2 + [BOX_HALF[2]])
-        near, far = _slab(o, inverse, BOX_CENTRE - reach, BOX_CENTRE + reach)
-        index = np.flatnonzero((near < far) & (far > NEAR) & (near < hits.t))
+        index = hits.candidates(o, inverse, BOX_CENTRE - reach, BOX_CENTRE + reach)
         o, d = _to_box(_take(o, index), True), _to_box(_take(d, index), False)
         near, far = _slab(o, tuple(np.float32(1) / a for a in d), -BOX_HALF, BOX_HALF)
-        closer = (near < far) & (near > NEAR) & (near < hits.t[index])
-        hits.t[index[closer]], hits.surface[index[closer]] = near[closer], BOX
+        hits.shorten(index, near, near < far, BOX)
 
     def _hit_pole(
         self, o: Vec, d: Vec, inverse: Vec, hits: Hits, part: int, x: float, y: float, radius: float, height: float
     ) -> None:
         low, high = np.float32([x - radius, y - radius, 0]), np.float32([x + radius, y + radius, height])
-        near, far = _slab(o, inverse, low, high)
-        index = np.flatnonzero((near < far) & (far > NEAR) & (near < hits.t))
+        index = hits.candidates(o, inverse, low, high)
         o, d = _take(o, index), _take(d, index)
         ox, oy = o[0] - np.float32(x), o[1] - np.float32(y)
         a = d[0] * d[0] + d[1] * d[1]
         b = ox * d[0] + oy * d[1]
-        root = b * b - a * (ox * ox + oy * oy - np.float32(radius * radius))
-        t = (-b - np.sqrt(np.maximum(root, 0))) / a
+        t, meets = _entry(a, b, ox * ox + oy * oy - np.float32(radius * radius))
         z = o[2] + t * d[2]
-        closer = (root > 0) & (t > NEAR) & (t < hits.t[index]) & (z > 0) & (z < height)
-        chosen = index[closer]
-        hits.t[chosen], hits.surface[chosen], hits.part[chosen] = t[closer], POLE, part
+        hits.shorten(index, t, meets & (z > 0) & (z < height), POLE, part)
 
-    def _hit_bars(self, o: Vec, inverse: Vec, hits: Hits, group: slice) -> None:
-        lows, highs = self.bars_low[group], self.bars_high[group]
-        near, far = _slab(o, inverse, lows.min(axis=0), highs.max(axis=0))
-        index = np.flatnonzero((near < far) & (far > NEAR) & (near < hits.t))
+    def _hit_boxes(
+        self, o: Vec, inverse: Vec, hits: Hits, surface: int, lows: np.ndarray, highs: np.ndarray, first: int = 0
+    ) -> None:
+        """Hit axis-aligned boxes, corners [m, 3], that are parts `first` and following of a surface."""
+        index = hits.candidates(o, inverse, lows.min(axis=0), highs.max(axis=0))
         o, inverse = _take(o, index), _take(inverse, index)
-        best, part = hits.t[index], np.full(index.shape, -1, np.int8)
         for k in range(len(lows)):
             near, far = _slab(o, inverse, lows[k], highs[k])
-            closer = (near < far) & (near > NEAR) & (near < best)
-            best[closer], part[closer] = near[closer], k + (group.start or 0)
-        closer = part >= 0
-        chosen = index[closer]
-        hits.t[chosen], hits.surface[chosen], hits.part[chosen] = best[closer], BARS, part[closer]
+            hits.shorten(index, near, near < far, surface, first + k)
 
     def hit(self, o: Vec, d: Vec) -> Hits:
         """First hits of rays that start inside the room."""

@@ -51,9 +51,3 @@ class SceneConfig:
     on a GPU as many as its memory holds, on the CPU 2^25, which take 1.5 GB."""
     rim: Annotated[float, Field(ge=1e-8, le=1)] = 1e-3
     """Lower bound of 1 - x in the derivative of the Beta kernel, which diverges at the rim for beta < 1; 1e-8 to 1."""
-
-    @property
-    def residual_moves_surfels(self) -> bool:
-        """True if the gradient of the residual reaches the surfels. A surfel takes its own texels along, so that they
-        tell it where to go."""
-        return self.texture_moves_surfels or self.texture == "texels"

@@ -3,42 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from bitymi_ns.ops import (
-    Fragments,
-    Projection,
-    TexelAlpha,
-    TexelDescent,
-    TexelTiles,
-    blended_image,
-    fragment_residual,
-)
+from bitymi_ns.ops import Fragments, TexelAlpha, TexelDescent, TexelTiles, fragment_residual
 from bitymi_ns.ops.constants import FEATURES, WIDTH
 from bitymi_ns.ops.field import FieldGeometry, field
 
 from .config import SceneConfig
-
-
-class Shading(NamedTuple):
-    """Options of compositing a view from its fragments.
-
-    Attributes:
-        bound: fragments of weight below this have no residual.
-        learns: whether the residual gets gradients.
-        moves_surfels: whether the residual's gradient with respect to place reaches the surfels.
-        maps: also depth and normals.
-        read: what `snapshot` gave, for a view that is drawn in parts.
-    """
-
-    bound: float
-    learns: bool
-    moves_surfels: bool
-    maps: bool
-    read: Tensor | None = None
 
 
 def _version(buffer: Tensor) -> int:
@@ -53,13 +27,17 @@ def _is_of(cached: tuple[Tensor, int, Any] | None, buffer: Tensor) -> bool:
 class ResidualField(nn.Module):
     """Residual colours of fragments, beside the surfels' view colours."""
 
-    def image(self, fragments: Fragments, projection: Projection, base: Tensor, how: Shading) -> Tensor:
-        """[H * W, C] what `blended_image` gives for colours ReLU(ReLU(f_view + 0.5) + residual).
+    def residual(
+        self, fragments: Fragments, frames: Tensor, bound: float, learns: bool, read: Tensor | None = None
+    ) -> dict[str, Any]:
+        """Arguments of `blended_image` for the residual of a view.
 
         Args:
-            fragments: of an H x W view.
-            base: [N, 3] f_view of every surfel.
-            how: it is made.
+            fragments: of the view.
+            frames: [N, 3, 3] of its `Projection`.
+            bound: fragments of weight below this have no residual.
+            learns: whether it gets gradients.
+            read: what `snapshot` gave, for a view that is drawn in parts.
         """
         raise NotImplementedError
 
@@ -99,6 +77,7 @@ class HashField(ResidualField):
     ) -> None:
         super().__init__()
         self.levels, self.min_resolution = config.levels, config.min_resolution
+        self._moves_surfels = config.texture_moves_surfels
 
         def uniform(bound: float, *shape: int) -> nn.Parameter:
             return nn.Parameter((torch.rand(*shape, generator=generator) * 2 - 1) * bound)
@@ -148,10 +127,12 @@ class HashField(ResidualField):
         """Table and MLP weights, in the order the operations take them."""
         return self.field_table, self.field_w1, self.field_w2, self.field_w3
 
-    def image(self, fragments: Fragments, projection: Projection, base: Tensor, how: Shading) -> Tensor:
-        weights = self.weights if how.learns else tuple(w.detach() for w in self.weights)
-        rho = fragment_residual(fragments, projection.frames, self.geometry, weights, how.bound, how.moves_surfels)
-        return blended_image(fragments, projection, base, maps=how.maps, residual=rho)
+    def residual(
+        self, fragments: Fragments, frames: Tensor, bound: float, learns: bool, read: Tensor | None = None
+    ) -> dict[str, Any]:
+        weights = self.weights if learns else tuple(w.detach() for w in self.weights)
+        moves = learns and self._moves_surfels
+        return {"residual": fragment_residual(fragments, frames, self.geometry, weights, bound, moves)}
 
     def forward(self, x: Tensor) -> Tensor:
         """Residual colour [M, 3] at world positions [M, 3]."""
@@ -231,13 +212,15 @@ class TexelField(ResidualField):
         self.alpha = None if self.alpha is None else nn.Parameter(self.alpha.detach()[old])
         self.share, self.size, self.extent = self.share[old], self.size[rows], self.extent[rows]
 
-    def image(self, fragments: Fragments, projection: Projection, base: Tensor, how: Shading) -> Tensor:
-        descent = self.descent if how.learns else None
-        texels = self.texels if how.learns and descent is None else self.texels.detach()
-        if descent is not None and how.read is not None:
-            texels, descent = how.read, replace(descent, moved=texels)
-        given = (texels, self.tiles, how.bound, how.maps, how.moves_surfels, descent)
-        return blended_image(fragments, projection, base, *given)
+    def residual(
+        self, fragments: Fragments, frames: Tensor, bound: float, learns: bool, read: Tensor | None = None
+    ) -> dict[str, Any]:
+        descent = self.descent if learns else None
+        texels = self.texels if learns and descent is None else self.texels.detach()
+        if descent is not None and read is not None:
+            texels, descent = read, replace(descent, moved=texels)
+        # a surfel takes its own texels along, so that they tell it where to go
+        return {"texels": texels, "tiles": self.tiles, "bound": bound, "move_surfels": learns, "descent": descent}
 
     def opacity(self, bound: float, learns: bool) -> TexelAlpha | None:
         if self.alpha is None:

@@ -30,7 +30,7 @@ from bitymi_ns.ops.project import GEOMETRY
 
 from .camera import Camera
 from .config import SceneConfig
-from .field import ResidualField, Shading, TexelField
+from .field import ResidualField, TexelField
 
 NEAR = 0.02  # nearest depth that is drawn, for cameras of extent 1
 
@@ -186,11 +186,8 @@ class Scene(nn.Module):
 
         def draw(part: Projection, most: int | None) -> tuple[Tensor, Fragments]:
             fragments = trace(part, self.config.rim, most)
-            if field is None:
-                image = blended_image(fragments, part, base, maps=maps)
-            else:
-                moves = learns and self.config.residual_moves_surfels
-                image = field.image(fragments, part, base, Shading(bound, learns, moves, maps, read))
+            residual = {} if field is None else field.residual(fragments, part.frames, bound, learns, read)
+            image = blended_image(fragments, part, base, maps=maps, **residual)
             if overdraw_half is not None:
                 image = torch.cat([image, soft_overdraw(fragments, overdraw_half).unsqueeze(1)], 1)
             return image, fragments

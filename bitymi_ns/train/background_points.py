@@ -55,7 +55,10 @@ def background_points(points: Tensor, views: Sequence[View], seed: int) -> Backg
     points = points[points.isfinite().all(-1)]
     chosen = [views[i] for i in spread(len(views), MOST_VIEWS)]
     cameras = [view.camera.to("cpu") for view in chosen]
-    seen = [_in_picture(camera, points) for camera in cameras]
+    seen = []  # pixel coordinates x, y and camera z, each [V], of the points in each picture
+    for camera in cameras:
+        *projected, inside = camera.project(points)
+        seen.append([values[inside] for values in projected])
     medians = torch.stack([z.median() if len(z) >= FEW else torch.tensor(math.nan) for _, _, z in seen])
     counts = torch.tensor([float(len(z)) for _, _, z in seen])[medians.isfinite()]
     if len(counts) == 0:
@@ -110,12 +113,6 @@ class _Grid(NamedTuple):
     def at(self, x: Tensor, y: Tensor) -> Tensor:
         """`nearest` at pixels [V] within the picture."""
         return self.nearest.view(-1)[self._index(x, y)]
-
-
-def _in_picture(camera: Camera, points: Tensor) -> list[Tensor]:
-    """Pixel coordinates x, y and camera z, each [V], of those of the points [M, 3] that lie in the picture."""
-    *projected, inside = camera.project(points)
-    return [values[inside] for values in projected]
 
 
 def _behind(view: View, camera: Camera, grid: _Grid, median: float, generator: torch.Generator) -> BackgroundPoints:

@@ -367,11 +367,9 @@ def views_without_surfels(scene: Scene, cameras: Sequence[Camera]) -> list[int]:
 
 def _sees(camera: Camera, means: Tensor, radii: Tensor, near: float) -> bool:
     camera = camera.to(means.device)
-    x, y, z = camera.local(means).unbind(-1)
-    K = camera.K
-    depth = z.clamp(min=near)
+    x, y, z, _ = camera.project(means, near)
     seen = z > near - radii
-    for along, focal, middle, size in ((x, K[0, 0], K[0, 2], camera.width), (y, K[1, 1], K[1, 2], camera.height)):
-        at, reach = focal * along / depth + middle, focal * radii / depth
+    for at, focal, size in ((x, camera.K[0, 0], camera.width), (y, camera.K[1, 1], camera.height)):
+        reach = focal * radii / z.clamp(min=near)
         seen &= (at > -reach) & (at < size + reach)
     return bool(seen.any())

@@ -11,15 +11,19 @@ from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
 
 from bitymi_ns.scene.field import HashField
-from bitymi_ns.train.config import AdamConfig
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
 
 
-def adam(parameters: list[torch.nn.Parameter], betas: tuple[float, float] = AdamConfig.betas) -> Adam:
+EPS = 1e-15  # added to the root of the second moment
+BETAS = (0.9, 0.999)  # decay of the running averages, of the surfels' parameters
+FIELD_BETAS = (0.9, 0.99)  # of the texture field's, whose gradients are sparse, and large early on
+
+
+def adam(parameters: list[torch.nn.Parameter], betas: tuple[float, float] = BETAS) -> Adam:
     """Fused Adam with the method's epsilon."""
-    return Adam(parameters, lr=0.0, betas=betas, eps=AdamConfig.eps, fused=True)
+    return Adam(parameters, lr=0.0, betas=betas, eps=EPS, fused=True)
 
 
 def surfel_optimizers(scene: Scene) -> dict[str, Adam]:
@@ -32,8 +36,8 @@ def make_optimizers(scene: Scene) -> dict[str, Adam]:
     optimizers = surfel_optimizers(scene)
     if isinstance(scene.field, HashField):
         table, *mlp = scene.field.weights
-        optimizers["field_table"] = adam([table], AdamConfig.field_betas)
-        optimizers["field_mlp"] = adam(mlp, AdamConfig.field_betas)
+        optimizers["field_table"] = adam([table], FIELD_BETAS)
+        optimizers["field_mlp"] = adam(mlp, FIELD_BETAS)
     return optimizers
 
 
@@ -139,8 +143,6 @@ def replace_rows(
         new: rows to append, by name, each [m, ...]; all names of `surfels`, or None for no new rows.
         on_resize: told of every new Parameter.
     """
-    if new is not None and set(new) != set(surfels):
-        raise ValueError(f"new surfels need exactly {sorted(surfels)}, not {sorted(new)}")
     for name in list(surfels.keys()):
         old = surfels[name]
         rows = old.detach()[keep]
@@ -151,25 +153,16 @@ def replace_rows(
         parameter = Parameter(rows.contiguous(), requires_grad=old.requires_grad)
         optimizer = optimizers.get(name)
         if optimizer is not None:
-            _swap(optimizer, name, old, parameter, keep, added)
+            state = optimizer.state.pop(old, {})
+            optimizer.param_groups[0]["params"] = [parameter]
+            for key, value in state.items():
+                if isinstance(value, Tensor) and value.shape == old.shape:
+                    state[key] = torch.cat([value[keep], value.new_zeros(added, *value.shape[1:])])
+            if state:
+                optimizer.state[parameter] = state
         surfels[name] = parameter
         if on_resize is not None:
             on_resize(name, parameter)
-
-
-def _swap(optimizer: Optimizer, name: str, old: Parameter, new: Parameter, keep: Tensor, added: int) -> None:
-    groups = optimizer.param_groups
-    if len(groups) != 1 or len(groups[0]["params"]) != 1 or groups[0]["params"][0] is not old:
-        raise ValueError(f"the optimiser of {name} must hold one group with exactly the scene's parameter")
-    state = optimizer.state.pop(old, None)
-    groups[0]["params"] = [new]
-    if not state:
-        return
-    for key, value in state.items():
-        if isinstance(value, Tensor) and value.shape == old.shape:
-            zeros = value.new_zeros(added, *value.shape[1:])
-            state[key] = torch.cat([value[keep], zeros])
-    optimizer.state[new] = state
 
 
 @torch.no_grad()

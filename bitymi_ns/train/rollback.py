@@ -34,12 +34,12 @@ from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.divergence import TrainingDiverged, describe_broken
 from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.optimizers import replace_rows
+from bitymi_ns.train.strategy import Strategy, finite_rows
 from bitymi_ns.train.views import DownscaledViews, spread, step_background
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
     from bitymi_ns.train.exposure import Exposure
-    from bitymi_ns.train.strategy import Strategy
 
 WORSE = 1.25
 """A window is bad when its mean loss is this many times that of the best window, or early on that of blank views."""
@@ -229,12 +229,14 @@ class RollbackGuard:
 
     def _mend(self, step: int, cause: str) -> dict[str, float]:
         """Drop a few surfels that are not finite; go back where there are more, or the field is broken."""
+        broken = ~finite_rows(self.scene)
+        dropped = float(broken.sum())
         field_broken = self.scene.field is not None and describe_broken(self.scene.field)
-        if field_broken or self.strategy.broken_share(self.scene) > BROKEN_SHARE:
+        if field_broken or dropped > BROKEN_SHARE * len(self.scene):
             return self._go_back(step, cause)
-        dropped = self.strategy.drop_broken(self.scene, self.optimizers)
-        self.announce(f"step {step}: {dropped} surfels were no longer finite and were dropped")
-        return {"not_finite": float(dropped), "surfels": float(len(self.scene))}
+        self.strategy.remove(broken, self.scene, self.optimizers)
+        self.announce(f"step {step}: {dropped:.0f} surfels were no longer finite and were dropped")
+        return {"not_finite": dropped, "surfels": float(len(self.scene))}
 
     def _go_back(self, step: int, cause: str) -> dict[str, float]:
         options = self.config.guard

@@ -150,10 +150,6 @@ class Schedule:
     def _falling(self, step: int) -> float:
         return falling(1.0, step - self.texels_start, self.texel_steps)
 
-    def field_warmup(self, step: int) -> float:
-        """Factor of the field's learning rate: rises linearly to 1 over the first `field_warmup` steps."""
-        return min(1.0, (step + 1) / max(1, self.scaled(self.config.field_warmup)))
-
     def resolution_factor(self, step: int) -> float:
         """Factor of the image size, 2^-k; 1 from the last doubling on."""
         return 2.0 ** -sum(step < at for at in self._doublings)
@@ -185,7 +181,8 @@ class Schedule:
         rates, gain = self.config.lr, self.short_run_gain
         if self._last_part is not None and self.texels_learn(step) and not name.startswith(("field", "exposure")):
             return self._last_part.lr(name, 0) * self._falling(step)
-        factor = self.field_warmup(step) if name.startswith("field") else gain
+        warmup = min(1.0, (step + 1) / max(1, self.scaled(self.config.field_warmup)))
+        factor = warmup if name.startswith("field") else gain
         if name == "means":
             factor *= self.extent
         if name in VIEW_PARAMETERS:

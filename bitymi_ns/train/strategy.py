@@ -6,7 +6,7 @@ At each densification, in this order:
 - surfels with many bad pixels and a large gradient are cloned or split;
 - up to half of the candidates for pruning, drawn at random, are removed;
 - opacities are clamped.
-Between 60 and 90 % of the run, four final prunes remove what is transparent or in the way. docs/training.md states the
+Between 60 and 90 % of the run, four final prunes remove what is transparent. docs/training.md states the
 published rules.
 """
 
@@ -31,7 +31,7 @@ from bitymi_ns.train.init import tangents
 from bitymi_ns.train.optimizers import ResizeHook, cap_opacity, replace_rows
 from bitymi_ns.train.processes import ALONE, Processes
 from bitymi_ns.train.schedules import Schedule
-from bitymi_ns.train.score import Scores, multi_view_scores
+from bitymi_ns.train.score import multi_view_scores
 from bitymi_ns.train.views import View
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ class Strategy:
                 scene.surfels, optimizers, self.schedule.reset_opacity(), forget_all=True
             )
         if step in self.schedule.final_prune_steps:
-            report |= self._final_prune(scene, optimizers, views)
+            report |= self._final_prune(scene, optimizers)
         if report:
             report["surfels"] = len(scene)
         return report
@@ -166,7 +166,7 @@ class Strategy:
     ) -> dict[str, float]:
         config = self.config.densify
         report = self._drop_dead(scene, optimizers)
-        scores = self._scores(scene, views)
+        scores = multi_view_scores(scene, views(config.views, self.generator), self.config, self.processes)
         surfels = scene.surfels
         n, device = len(scene), surfels["means"].device
         statistics = self.statistics
@@ -228,15 +228,12 @@ class Strategy:
         return candidate | (surfels["log_scales"].amax(-1).exp() > config.prune_world * self.schedule.extent)
 
     @torch.no_grad()
-    def _final_prune(self, scene: Scene, optimizers: Mapping[str, Optimizer], views: DrawViews) -> dict[str, float]:
-        config = self.config.densify
+    def _final_prune(self, scene: Scene, optimizers: Mapping[str, Optimizer]) -> dict[str, float]:
         report = self._drop_dead(scene, optimizers)
         logits = scene.surfels["opacity_logits"]
-        pruned = logits.sigmoid() < config.final_prune_opacity
-        if config.final_prune_score < 1.0:
-            pruned |= self._scores(scene, views).prune > config.final_prune_score
+        pruned = logits.sigmoid() < self.config.densify.final_prune_opacity
         pruned = self._keep_minimum(pruned, logits, len(scene))
-        self._remove(pruned, scene, optimizers)
+        self.remove(pruned, scene, optimizers)
         return report | {"pruned": int(pruned.sum())}
 
     def _drop_dead(self, scene: Scene, optimizers: Mapping[str, Optimizer]) -> dict[str, float]:
@@ -244,7 +241,7 @@ class Strategy:
         surfels = scene.surfels
         if scene.field is not None and not all(bool(p.isfinite().all()) for p in scene.field.parameters()):
             raise TrainingDiverged(f"the texture field is broken: {describe_broken(scene.field)}")
-        finite = _finite_rows(scene)
+        finite = finite_rows(scene)
         if not bool(finite.any()):
             raise TrainingDiverged(f"no surfel is left whose parameters are all finite: {describe_broken(scene)}")
         logits = surfels["opacity_logits"]
@@ -256,20 +253,8 @@ class Strategy:
             order = torch.where(finite & ~invisible, logits.detach(), math.inf).argsort(stable=True)
             invisible[order[:over]] = True
         pruned = ~finite | self._keep_minimum(invisible, logits, int(finite.sum()), among=finite)
-        self._remove(pruned, scene, optimizers)
+        self.remove(pruned, scene, optimizers)
         return {"not_finite": int((~finite).sum()), "invisible": int((pruned & finite).sum())}
-
-    @torch.no_grad()
-    def broken_share(self, scene: Scene) -> float:
-        """Share of the surfels with a parameter that is not finite."""
-        return float((~_finite_rows(scene)).double().mean()) if len(scene) else 0.0
-
-    @torch.no_grad()
-    def drop_broken(self, scene: Scene, optimizers: Mapping[str, Optimizer]) -> int:
-        """Remove the surfels with a parameter that is not finite; returns how many they were."""
-        broken = ~_finite_rows(scene)
-        self._remove(broken, scene, optimizers)
-        return int(broken.sum())
 
     def _keep_minimum(self, pruned: Tensor, opacity_logits: Tensor, count: int, among: Tensor | None = None) -> Tensor:
         """Take back as much of `pruned` [N] bool, among the rows `among` [N] bool, as `min_surfels` asks for, the most
@@ -294,11 +279,9 @@ class Strategy:
         race = torch.empty(len(weights), dtype=torch.float64).exponential_(generator=self.generator).to(weights.device)
         return (race / weights).topk(k, largest=False).indices
 
-    def _scores(self, scene: Scene, views: DrawViews) -> Scores:
-        drawn = views(self.config.densify.views, self.generator)
-        return multi_view_scores(scene, drawn, self.config, self.processes)
-
-    def _remove(self, pruned: Tensor, scene: Scene, optimizers: Mapping[str, Optimizer]) -> None:
+    @torch.no_grad()
+    def remove(self, pruned: Tensor, scene: Scene, optimizers: Mapping[str, Optimizer]) -> None:
+        """Remove the surfels `pruned` [N] bool, with their texels and statistics."""
         if not bool(pruned.any()):
             return
         keep = (~pruned).nonzero().flatten()
@@ -323,7 +306,7 @@ def most_surfels(config: TrainConfig, image_pixels: int, first_surfels: int = 0)
     return min((bound for bound in (densify.max_surfels, by_pixels) if bound > 0), default=0)
 
 
-def _finite_rows(scene: Scene) -> Tensor:
+def finite_rows(scene: Scene) -> Tensor:
     """[N] bool: every parameter of the surfel is finite."""
     finite = torch.ones(len(scene), dtype=torch.bool, device=scene.surfels["means"].device)
     for p in scene.surfels.values():

@@ -135,7 +135,7 @@ def blank_texels(
     surfels = {name: value.detach() for name, value in scene.surfels.items()}
     cameras = [view.camera for view in views]
     bound = scene.config.weight_bound
-    scale = survey_scale(cameras)
+    scale = 0.5 if mean_pixels(cameras) >= 4 * SURVEY_PIXELS else 1.0
     smaller = [camera.scaled(scale) for camera in cameras]
     seen = visibility(surfels, smaller, scene.near, bound, scene.config.prefilter)
     seen = replace(seen, pixels=seen.pixels / scale**2)
@@ -155,11 +155,6 @@ def blank_texels(
 def most_texels(options: TexelConfig, rendered: float) -> float:
     """Most texels of all tiles, for steps that render so many pixels."""
     return max(FEW, rendered / options.rendered_pixels_per_texel)
-
-
-def survey_scale(cameras: Sequence[Camera]) -> float:
-    """Scale of the pictures that coverage is measured at, relative to the photographs."""
-    return 0.5 if cameras and mean_pixels(cameras) >= 4 * SURVEY_PIXELS else 1.0
 
 
 def mean_pixels(cameras: Sequence[Camera]) -> float:

@@ -48,7 +48,7 @@ def test_bakes_show_what_was_trained(trained) -> None:
     scene, camera = trained
     want = rgb(scene, camera)
     baked = trained_texels(scene, BakeOptions())
-    assert baked.texels.shape[3] == 4 and baked.scene.mean_alpha[0] == 0.5
+    assert baked.texels.shape[1] == 4 and baked.scene.mean_alpha[0] == 0.5
     torch.testing.assert_close(rgb(baked.unquantised(), camera), want, rtol=1e-5, atol=1e-5)
     opaque = replace(baked.unquantised(), alpha_scale=0.0, mean_alpha=None)
     assert psnr(rgb(opaque, camera), want) < 25  # alpha decides the picture

@@ -61,7 +61,8 @@ def test_a_pixel_averages_what_it_covers(size: tuple[int, int], shares: tuple[fl
 
 def test_a_pixel_covers_from_one_cell_to_the_whole_tile() -> None:
     pixels = torch.tensor([[10.0, 1.0], [0.0, 0.25]])
-    cells = cells_per_pixel(pixels, torch.tensor([1.0, 2.0]), (8, 16))
+    shown = Shown(torch.ones(2), torch.ones(2), torch.tensor([1.0, 2.0]), 0.0, pixels=pixels)
+    cells = cells_per_pixel(shown, torch.arange(2), (8, 16))
     assert cells.tolist() == [[1.0, 8.0], [8.0, 16.0]]
     values = torch.rand(2, 3, 16, 8)
     assert torch.equal(averaged(values, torch.ones(2, 2)), values)

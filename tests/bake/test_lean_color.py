@@ -35,7 +35,7 @@ def exact_errors(kind, params, lean, means, seen, centers, opacity):
     for view, center in zip(seen, centers, strict=True):
         d = F.normalize(means.double() - center, dim=1)
         a = getattr(reference, kind)(*full, d)
-        b = reference.lean(kind, lean.base.double(), lean.span, lean.terms.double(), d)
+        b = reference.lean(kind, lean["view_base"].double(), lean["view_span"], lean["view_terms"].double(), d)
         error = 255 * ((a + 0.5).relu() - (b + 0.5).relu()).abs().amax(1) * opacity
         found = torch.where(view, torch.maximum(found, error), found)
     return found
@@ -49,9 +49,9 @@ def test_the_bound_holds_in_every_view(surfels, kind, seed, tolerance, spread):
     means, opacity = params["means"], params["opacity_logits"].sigmoid()
     seen, centers = views(n, seed=seed, spread=spread)
     lean = reduce_view_color(params, kind, seen, centers, opacity, tolerance)
-    check_lean(kind, lean.parameters(), n)
+    check_lean(kind, lean, n)
     assert float(exact_errors(kind, params, lean, means, seen, centers, opacity).amax()) <= tolerance + 0.01
-    stated = view_color_errors(kind, params, lean.parameters(), means, seen, centers, opacity)
+    stated = view_color_errors(kind, params, lean, means, seen, centers, opacity)
     assert float(stated.amax()) <= tolerance + 0.01  # also between the views, and all around an unseen surfel
 
 
@@ -78,16 +78,16 @@ def test_a_colour_that_no_view_sees_change_is_one_colour(surfels):
     params = surfels(n, "sv")
     params["sv_rgb"] = params["sv_rgb"][:, :1].expand(-1, 7, -1) + 1e-4 * params["sv_rgb"]
     lean = reduce_view_color(params, "sv", *views(n), torch.ones(n), 1.0)
-    assert (lean.span[:, 1] == 0).all() and lean.terms.shape == (0, 6)
-    torch.testing.assert_close(lean.base, params["sv_rgb"].mean(1), atol=2e-3, rtol=0)
+    assert (lean["view_span"][:, 1] == 0).all() and lean["view_terms"].shape == (0, 6)
+    torch.testing.assert_close(lean["view_base"], params["sv_rgb"].mean(1), atol=2e-3, rtol=0)
     for kind, lobes in (("sh", "sh_rest"), ("sg", "sg_lobes")):
         params = surfels(n, kind)
         params[lobes] = params[lobes] * 1e-5
         lean = reduce_view_color(params, kind, *views(n), torch.ones(n), 1.0)
-        assert (lean.span[:, 1] == 0).all()
+        assert (lean["view_span"][:, 1] == 0).all()
         d = F.normalize(params["means"].double() - views(n)[1][0], dim=1)
         a = getattr(reference, kind)(*(params[name].double() for name in VIEW_COLORS[kind].names), d)
-        b = reference.lean(kind, lean.base.double(), lean.span, lean.terms.double(), d)
+        b = reference.lean(kind, lean["view_base"].double(), lean["view_span"], lean["view_terms"].double(), d)
         torch.testing.assert_close(a.clamp(min=-0.5), b, atol=4e-3, rtol=0)
 
 
@@ -99,7 +99,7 @@ def test_sites_that_agree_are_merged(surfels):
     for name in VIEW_COLORS["sv"].names:
         params[name] = params[name][:, group].contiguous()
     lean = reduce_view_color(params, "sv", *views(n), torch.ones(n), 0.05)
-    assert (lean.span[:, 1] <= 1).all()
+    assert (lean["view_span"][:, 1] <= 1).all()
 
 
 def test_without_room_all_sites_are_kept_and_nothing_changes(surfels):
@@ -109,10 +109,10 @@ def test_without_room_all_sites_are_kept_and_nothing_changes(surfels):
     seen, centers = views(n, spread=5.0)
     lean = reduce_view_color(params, "sv", seen, centers, torch.ones(n), 1e-3)
     rest = torch.arange(n) != 1
-    assert (lean.span[rest, 1] == 6).all()
+    assert (lean["view_span"][rest, 1] == 6).all()
     d = F.normalize(torch.randn(n, 3, generator=torch.Generator().manual_seed(1)), dim=1).double()
     want = reference.sv(*(params[name].double() for name in VIEW_COLORS["sv"].names), d)
-    got = reference.lean("sv", lean.base.double(), lean.span, lean.terms.double(), d)
+    got = reference.lean("sv", lean["view_base"].double(), lean["view_span"], lean["view_terms"].double(), d)
     torch.testing.assert_close(got[rest], want[rest], atol=1e-5, rtol=1e-5)
 
 

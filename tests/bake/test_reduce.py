@@ -1,6 +1,7 @@
 """Tiles are as small as the tolerance allows, and no smaller."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -8,6 +9,7 @@ import torch
 from bitymi_ns.bake import BakeOptions, bake
 from bitymi_ns.bake.field.plan import make_plan
 from bitymi_ns.bake.field.references import references
+from bitymi_ns.bake.inputs import BakeInput
 from bitymi_ns.bake.reduce import fit, interpolation
 from bitymi_ns.ops.reference.texel import texel, texel_centers
 from bitymi_ns.scene.tile_sizes import kernel_parameters, visible_extent
@@ -104,8 +106,8 @@ def test_the_error_is_the_one_that_independent_points_show(discs):
     made, axes = discs()
     made.field = PlaneField(axes[:, 0], 25.0)
     baked = bake(made, options=replace(OPTIONS, tolerance=1.0))
-    x, y, layer, r_u, r_v = baked.packing.tiles[0].tolist()
-    tile = baked.texels[layer, y : y + r_v, x : x + r_u]
+    r_u, r_v = baked.sizes[0].tolist()
+    tile = baked.texels[: r_u * r_v].view(r_v, r_u, 3)
     extent = float(baked.extent[0])
     uv = (torch.rand(200_000, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1) * extent
     uv = uv[uv.norm(dim=1) < extent]
@@ -132,8 +134,12 @@ def test_texels_out_of_sight_do_not_widen_the_range(discs):
 def test_what_is_hidden_counts_less(discs):
     made, axes = discs()
     made.field = PlaneField(axes[:, 0], 25.0)
-    clear = make_plan(made.surfels, made.field, OPTIONS, weight_bound=BOUND)
-    hidden = make_plan(made.surfels, made.field, OPTIONS, transmittance=torch.full((8,), 0.1), weight_bound=BOUND)
-    assert (hidden.extent < clear.extent).all()
-    out_of_sight = make_plan(made.surfels, made.field, OPTIONS, transmittance=torch.zeros(8), weight_bound=BOUND)
-    assert not out_of_sight.extent.any() and not list(references(made.field, out_of_sight))
+    inputs = BakeInput(made.surfels, (), 0.2, BOUND, "low_pass")
+
+    def plan(transmittance):
+        views = SimpleNamespace(in_front=torch.full((8,), transmittance))
+        return make_plan(replace(inputs, views=views), made.field, OPTIONS)
+
+    clear = make_plan(inputs, made.field, OPTIONS)
+    assert (plan(0.1).extent < clear.extent).all()
+    assert not plan(0.0).extent.any() and not list(references(made.field, plan(0.0)))

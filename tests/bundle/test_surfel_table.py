@@ -5,9 +5,7 @@ import torch
 from bitymi_ns.bundle.ply import PlyError
 from bitymi_ns.bundle.surfel_table import (
     from_columns,
-    mean_residuals,
     mean_view_color,
-    tile_extents,
     to_columns,
 )
 from bitymi_ns.ops import VIEW_COLORS
@@ -21,7 +19,8 @@ TILES = np.arange(25, dtype=np.int32).reshape(5, 5)
 def test_surfels_survive_the_columns(surfels, kind):
     params = surfels(5, kind)
     columns = to_columns(params, TILES)
-    found, tiles = from_columns(columns, kind)
+    read = from_columns(columns, kind)
+    found, tiles = read["surfels"], read["tiles"]
     np.testing.assert_array_equal(tiles.numpy(), TILES)
     assert set(found) == set(params)
     for name, value in params.items():
@@ -72,25 +71,25 @@ def test_extreme_temperatures_leave_the_colour_finite(surfels):
 def test_degree_zero_and_one_site_keep_their_shapes(surfels):
     params = surfels(5, "sh")
     params["sh_rest"] = params["sh_rest"][:, :0]
-    assert from_columns(to_columns(params, TILES), "sh")[0]["sh_rest"].shape == (5, 0, 3)
+    assert from_columns(to_columns(params, TILES), "sh")["surfels"]["sh_rest"].shape == (5, 0, 3)
     params = surfels(5, "sv")
     params = {name: value[:, :1] if name.startswith("sv_") else value for name, value in params.items()}
-    assert from_columns(to_columns(params, TILES), "sv")[0]["sv_sites"].shape == (5, 1, 3)
+    assert from_columns(to_columns(params, TILES), "sv")["surfels"]["sv_sites"].shape == (5, 1, 3)
 
 
 def test_extents_and_mean_residuals_are_optional_columns(surfels):
     params = surfels(5)
-    plain = to_columns(params, TILES)
-    assert tile_extents(plain, 3.0).tolist() == [3.0] * 5 and not mean_residuals(plain).any()
+    plain = from_columns(to_columns(params, TILES), "sv")
+    assert plain["extent"].tolist() == [3.0] * 5 and not plain["mean_residual"].any() and plain["mean_alpha"] is None
     extent, residual = torch.linspace(0.5, 3.0, 5), torch.randn(5, 3)
     columns = to_columns(params, TILES, residual, extent)
-    assert torch.equal(tile_extents(columns, 3.0), extent) and torch.equal(mean_residuals(columns), residual)
-    columns["tile_extent"] = np.float32([1, 0, 1, 1, 1])
+    found = from_columns(columns, "sv")
+    assert torch.equal(found["extent"], extent) and torch.equal(found["mean_residual"], residual)
     with pytest.raises(PlyError, match="tile_extent is 0 in row 1; it must be from 1e-06 to 16"):
-        tile_extents(columns, 3.0)
+        from_columns(columns | {"tile_extent": np.float32([1, 0, 1, 1, 1])}, "sv")
     del columns["residual_2"]
     with pytest.raises(PlyError, match="residual_2 is missing"):
-        mean_residuals(columns)
+        from_columns(columns, "sv")
 
 
 def test_missing_or_extra_columns_are_refused(surfels):

@@ -10,11 +10,13 @@ import pytest
 from PIL import Image
 
 from bitymi_ns import files
-from bitymi_ns.capture import KnownView, SfmOptions, find_poses, triangulate
 from bitymi_ns.capture.cache import keep_work_folder
+from bitymi_ns.capture.camera import ColmapCamera
+from bitymi_ns.capture.known import KnownView, triangulate
+from bitymi_ns.capture.poses import find_poses
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import Job
-from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.capture.types import CaptureError, SfmOptions
 
 
 @pytest.fixture
@@ -84,9 +86,9 @@ def triangulated(photographs: Path, monkeypatch: pytest.MonkeyPatch) -> Callable
     monkeypatch.setattr(process, "run", lambda job, *told: runs.append(job))
 
     def find(**masks: Path) -> Path:
-        pinhole = (64.0, 64.0, 32.0, 24.0)
+        camera = ColmapCamera("PINHOLE", 64, 48, (64.0, 64.0, 32.0, 24.0))
         files = sorted(photographs.glob("*.png"))
-        views = [KnownView(file, "PINHOLE", 64, 48, pinhole, np.eye(4)[:3], **masks) for file in files]
+        views = [KnownView(file, camera, np.eye(4)[:3], **masks) for file in files]
         before = len(runs)
         model = triangulate(photographs, views)
         find.anew = len(runs) > before  # type: ignore[attr-defined]

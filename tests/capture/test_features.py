@@ -7,6 +7,7 @@ import pycolmap
 import pytest
 from PIL import Image
 
+from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.capture.sfm import features
 from bitymi_ns.capture.sfm.job import CameraGroup, Job
 
@@ -18,14 +19,15 @@ def job(tmp_path: Path) -> Job:
     names = [f"{i:06d}.png" for i in range(4)]
     for i, name in enumerate(names):
         Image.fromarray(np.roll(noise, i, axis=1)).save(tmp_path / name)
-    cameras = [CameraGroup("SIMPLE_PINHOLE", 80, 60, [90.0 + i, 40, 30], True, names[i::2]) for i in range(2)]
-    return Job(str(tmp_path), str(tmp_path), None, cameras, names, {name: name for name in names}, False, {})
+    cameras = [ColmapCamera("SIMPLE_PINHOLE", 80, 60, (90.0 + i, 40.0, 30.0)) for i in range(2)]
+    groups = [CameraGroup(camera, True, names[i::2]) for i, camera in enumerate(cameras)]
+    return Job(str(tmp_path), str(tmp_path), None, groups, names, {name: name for name in names}, False, {})
 
 
 def test_a_run_that_was_killed_between_its_cameras_goes_on(job: Job, tmp_path: Path) -> None:
     database = tmp_path / "database.db"
     with pycolmap.Database.open(database) as opened:
-        opened.write_camera(features.camera_of(job.cameras[0]))
+        opened.write_camera(job.cameras[0].camera.colmap)
     for _ in range(2):
         features.extract(job, database, lambda *told, **more: None)
     with pycolmap.Database.open(database) as opened:

@@ -9,8 +9,11 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from bitymi_ns.capture import CaptureError, KnownView, SfmOptions, find_poses, triangulate
-from bitymi_ns.capture.panorama_detection import SPHERICAL_MODEL, has_panorama_metadata, looks_panoramic
+from bitymi_ns.capture.camera import SPHERICAL_MODEL, ColmapCamera
+from bitymi_ns.capture.known import KnownView, triangulate
+from bitymi_ns.capture.photos import has_panorama_metadata, looks_panoramic
+from bitymi_ns.capture.poses import find_poses
+from bitymi_ns.capture.types import CaptureError, SfmOptions
 from bitymi_ns.sample.room import Room
 
 XMP = (
@@ -135,7 +138,7 @@ def test_points_are_triangulated_from_panoramas_with_poses(tmp_path: Path, monke
         centre = np.array([-1.0 + 0.4 * i, -1.3 + 0.1 * i * i, 1.3])
         Image.fromarray(panorama(0.0, 512, tuple(centre.tolist()))[:, ::-1]).save(tmp_path / f"{i}.png")
         pose = np.column_stack([axes, -axes @ centre])
-        views.append(KnownView(tmp_path / f"{i}.png", SPHERICAL_MODEL, 1024, 512, (1024.0, 512.0), pose))
+        views.append(KnownView(tmp_path / f"{i}.png", ColmapCamera(SPHERICAL_MODEL, 1024, 512, (1024.0, 512.0)), pose))
     model = pycolmap.Reconstruction(triangulate(tmp_path, views))
     xyz = np.array([point.xyz for point in model.points3D.values()])
     inside = ((xyz > np.array([-3.05, -2.55, -0.05])) & (xyz < np.array([3.05, 2.55, 2.65]))).all(1)

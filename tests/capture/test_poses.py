@@ -12,10 +12,12 @@ import pycolmap
 import pytest
 from PIL import ExifTags, Image
 
-from bitymi_ns.capture import CaptureError, KnownView, SfmOptions, SfmSettings, find_poses, triangulate
+from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.capture.exif import Exif
+from bitymi_ns.capture.known import KnownView, triangulate
 from bitymi_ns.capture.photos import Photo
-from bitymi_ns.capture.poses import _finished, _what, by_camera, camera_group, make_job, ordered
+from bitymi_ns.capture.poses import _finished, _what, by_camera, camera_group, find_poses, make_job, ordered
+from bitymi_ns.capture.types import CaptureError, SfmOptions, SfmSettings
 from bitymi_ns.cli import main
 from bitymi_ns.sample.capture import View, render
 from bitymi_ns.sample.room import Room
@@ -118,7 +120,8 @@ def test_names_that_are_not_utf8_are_refused_before_the_work(copied: Copy, tmp_p
     with pytest.raises(CaptureError, match="is not UTF-8: rename it"):
         find_poses(folder, progress=never)
     with pytest.raises(CaptureError, match="is not UTF-8: rename it"):
-        known = [KnownView(folder / f"photo_{i}.png", "PINHOLE", 9, 9, (9, 9, 5, 5), np.eye(4)[:3]) for i in (1, 2)]
+        camera = ColmapCamera("PINHOLE", 9, 9, (9, 9, 5, 5))
+        known = [KnownView(folder / f"photo_{i}.png", camera, np.eye(4)[:3]) for i in (1, 2)]
         triangulate(folder, known, never)
 
 
@@ -190,8 +193,8 @@ def test_points_are_triangulated_for_known_poses(arc: Path, views: list[View], c
         pose = np.vstack([view.camera_to_world[:3], [0, 0, 0, 1]]).astype(float)
         pose[:3, 1:3] *= -1
         inverse = np.linalg.inv(pose)[:3]
-        pinhole = (view.focal, view.focal, 144.0, 108.0)
-        known.append(KnownView(folder / f"photo_{i + 1}.png", "PINHOLE", 288, 216, pinhole, inverse))
+        camera = ColmapCamera("PINHOLE", 288, 216, (view.focal, view.focal, 144.0, 108.0))
+        known.append(KnownView(folder / f"photo_{i + 1}.png", camera, inverse))
     model = pycolmap.Reconstruction(triangulate(folder, known))
     points = np.array([point.xyz for point in model.points3D.values()])
     assert len(points) > 50
@@ -274,10 +277,10 @@ def photo(name: str, size: tuple[int, int] = (400, 300), **exif: object) -> Phot
 
 def test_photographs_share_a_camera_and_a_focal_length_that_all_of_them_state() -> None:
     both = [photo("a", focal_length=350.0), photo("b", focal_length=352.0)]
-    assert camera_group(both, [], SfmOptions()).params[0] == 351 and camera_group(both, [], SfmOptions()).prior
+    assert camera_group(both, [], SfmOptions()).camera.params[0] == 351 and camera_group(both, [], SfmOptions()).prior
     one = [photo("a", focal_length=350.0), photo("b")]
-    assert camera_group(one, [], SfmOptions()).params[0] == 480 and not camera_group(one, [], SfmOptions()).prior
-    assert camera_group(one, [], SfmOptions(focal_length=300.0)).params[0] == 300
+    assert camera_group(one, [], SfmOptions()).camera.params[0] == 480 and not camera_group(one, [], SfmOptions()).prior
+    assert camera_group(one, [], SfmOptions(focal_length=300.0)).camera.params[0] == 300
     cameras = {"a": "x", "b": "x", "c": "y", "d": "x"}
     photos = [photo(name, (300, 400) if name == "d" else (400, 300), camera=c) for name, c in cameras.items()]
     assert [[p.name for p in group] for group in by_camera(photos)] == [["a", "b"], ["c"], ["d"]]
@@ -304,8 +307,8 @@ def test_every_setting_reaches_the_job(tmp_path: Path) -> None:
     photos = [photo("a.jpg", focal_length=350.0)]
     job = make_job(photos, tmp_path, {"a.jpg": "a.jpg"}, None, SfmOptions(**OTHER), tmp_path, sequence=False)
     assert (job.matching, job.mapper, job.max_image_size, job.max_features) == ("sequential", "global", 800, 1234)
-    (camera,) = job.cameras
-    assert camera.model == "OPENCV" and camera.params[:2] == [321.0, 321.0] and not job.opencv_if_better
+    camera = job.cameras[0].camera
+    assert camera.model == "OPENCV" and camera.params[:2] == (321.0, 321.0) and not job.opencv_if_better
 
 
 def test_photographs_are_in_the_order_of_their_times() -> None:

@@ -7,7 +7,7 @@ import pytest
 from PIL import EpsImagePlugin, Image
 
 from bitymi_ns.capture.photos import read_photo
-from bitymi_ns.capture.prepare import _read_mask
+from bitymi_ns.capture.prepare import colmap_mask
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.measure.report.pictures import open_image
 from bitymi_ns.plugin.console import InputError
@@ -35,7 +35,7 @@ def disguised(tmp_path: Path) -> Path:
 
 READERS: dict[str, Callable[[Path], object]] = {
     "photograph": lambda path: read_photo(path.parent, path.name),
-    "mask of a photograph": lambda path: _read_mask(path, None),
+    "mask of a photograph": lambda path: colmap_mask(path, path.name, (64, 48)),
     "image": read_image,
     "mask": read_mask,
     "picture of a report": open_image,

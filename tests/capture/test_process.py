@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from bitymi_ns.capture import find_poses
+from bitymi_ns.capture.poses import find_poses
 from bitymi_ns.capture.sfm.process import rows
 
 Copy = Callable[[str], Path]

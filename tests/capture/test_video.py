@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bitymi_ns.capture import CaptureError, SfmOptions, find_poses
+from bitymi_ns.capture.poses import find_poses
+from bitymi_ns.capture.types import CaptureError, SfmOptions
 from bitymi_ns.capture.video import PER_SECOND, _survey, choose, displacement, extract_frames
 
 

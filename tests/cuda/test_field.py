@@ -1,13 +1,10 @@
 """The residual field by the CUDA kernels: at points, at fragments and at texels."""
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from bitymi_ns import ops
-from bitymi_ns.bake.field.texels import evaluate_tiles
-from bitymi_ns.codec.packing import pack
 from bitymi_ns.ops.backend import emulated_cuda
 from bitymi_ns.scene import Camera, HashField, SceneConfig
 from tests.ops.golden import SURFEL_KEYS, random_scene
@@ -167,20 +164,3 @@ def test_a_gradient_that_is_not_finite_is_not_hidden_by_deterministic_sums(devic
     rho = field(points(40, device, torch.float32))
     rho.backward(torch.full_like(rho, float("nan")))
     assert field.field_table.grad.isnan().any()
-
-
-def test_bake_of_tiles_on_the_device_and_on_the_cpu(device: torch.device, cpu) -> None:
-    g = torch.Generator().manual_seed(1)
-    n = 20
-    means, quats, scales = torch.randn(n, 3, generator=g), torch.randn(n, 4, generator=g), torch.rand(n, 2, generator=g)
-    packing = pack(2 ** np.random.default_rng(1).integers(2, 5, (n, 2)))
-    field = make_field(True, torch.float32)
-    with torch.no_grad():
-        field.field_table[0, 3] = float("nan")
-    done = []
-    arguments = (means.to(device), quats.to(device), scales.to(device), packing, 2.5)
-    got, bad = evaluate_tiles(field.to(device), *arguments, progress=lambda what, at, total: done.append((at, total)))
-    with cpu():
-        want, want_bad = evaluate_tiles(field.cpu(), means, quats, scales, packing, 2.5)
-    assert bad == want_bad > 0 and done[-1][0] == done[-1][1] == packing.tiles[:, 3:].prod(1).sum()
-    assert ((got - want).abs() < 1e-3).float().mean() > 0.999

@@ -172,7 +172,7 @@ def test_surfels_that_are_pruned_take_their_texels_along(device: torch.device) -
         scene.surfels["opacity_logits"][3] = -20.0
         before = scene.render(camera).rgb
     left = len(field.texels) - int(field.size[3].prod())
-    trainer.training.strategy._remove(torch.arange(n, device=device) == 3, scene, trainer.optimizers)
+    trainer.training.strategy.remove(torch.arange(n, device=device) == 3, scene, trainer.optimizers)
     assert len(scene) == len(field.size) == n - 1 and len(field.texels) == len(field.share) == field.tiles.count == left
     with torch.no_grad():
         torch.testing.assert_close(scene.render(camera).rgb, before, rtol=0, atol=1e-6)
@@ -200,7 +200,7 @@ def test_what_a_device_has_learned_can_be_baked(device: torch.device, cpu: Conte
         trainer.advance()
     scene = trainer.scene
     baked = trained_texels(scene, BakeOptions())
-    assert baked.texels is not None and baked.texels.device == baked.scene.tiles.device == HERE
+    assert baked.textured and baked.texels.device == baked.scene.tiles.device == HERE
     camera = scene_and_views()[1][0].camera
     with torch.no_grad():
         want = scene.render(camera.to(device)).rgb.cpu()

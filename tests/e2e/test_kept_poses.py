@@ -15,7 +15,6 @@ from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
-import bitymi_ns.capture
 from bitymi_ns.capture.frame import WorldFrame, write_frame
 from bitymi_ns.capture.types import SfmSettings
 from bitymi_ns.plugin.console import InputError
@@ -82,9 +81,9 @@ def shoot(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callab
     def make(upright: bool = False, sfm: SfmSettings | None = None, **options: Any) -> Shot:
         shot = Shot(room, tmp_path, upright, **options)
         shot.config.pipeline.datamanager.dataparser.sfm = sfm or SfmSettings()
-        monkeypatch.setattr(bitymi_ns.capture, "find_poses", shot.find_poses, raising=False)
+        monkeypatch.setattr("bitymi_ns.capture.poses.find_poses", shot.find_poses)
         ns_train.main(shot.config)
-        monkeypatch.setattr(bitymi_ns.capture, "find_poses", never)
+        monkeypatch.setattr("bitymi_ns.capture.poses.find_poses", never)
         return shot
 
     return make
@@ -105,14 +104,14 @@ def test_evaluation_has_the_poses_of_the_training(
     shoot: Callable[..., Shot], upright: bool, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shot = shoot(upright)
-    monkeypatch.setattr(bitymi_ns.capture, "find_poses", shot.find_poses)
+    monkeypatch.setattr("bitymi_ns.capture.poses.find_poses", shot.find_poses)
     kept = shot.run / POSES
     kept.rename(shot.run / "aside")  # as a run of an earlier version, which finds them again
     _, before = load_trained(shot.run / "config.yml")
     trained, world = seen(before), world_of(before.datamanager).described()
     held_out = before.datamanager.eval_view(0)[1]["image"]
     (shot.run / "aside").rename(kept)
-    monkeypatch.setattr(bitymi_ns.capture, "find_poses", never)
+    monkeypatch.setattr("bitymi_ns.capture.poses.find_poses", never)
 
     shot.spoil()
     capsys.readouterr()
@@ -140,7 +139,7 @@ def test_pictures_that_can_go_take_no_space_where_they_can_be_linked(
         raise OSError(errno.EXDEV, "Invalid cross-device link")
 
     monkeypatch.setattr(os, "link", refused)
-    monkeypatch.setattr(bitymi_ns.capture, "find_poses", shot.find_poses)
+    monkeypatch.setattr("bitymi_ns.capture.poses.find_poses", shot.find_poses)
     shot.config.max_num_iterations = 1
     ns_train.main(shot.config)
     assert copy.read_bytes() == (shot.images / copy.name).read_bytes()
@@ -290,5 +289,5 @@ def test_poses_that_are_damaged_are_named_and_new_and_earlier_runs_find_their_ow
     rewrite(shot.run, lambda config: vars(config.pipeline.datamanager.dataparser).pop("poses"))  # an earlier version
     with pytest.raises(pytest.fail.Exception, match="poses are found anew"):
         eval_setup(shot.run / "config.yml")
-    monkeypatch.setattr(bitymi_ns.capture, "find_poses", shot.find_poses)
+    monkeypatch.setattr("bitymi_ns.capture.poses.find_poses", shot.find_poses)
     eval_setup(shot.run / "config.yml")

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("nerfstudio")
 
-import bitymi_ns.capture
+from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.sample import generate
 from tests.plugin.data.captures import colmap_model
 
@@ -18,9 +18,9 @@ def no_triangulation(monkeypatch: pytest.MonkeyPatch) -> None:
     """Captures without points start from random ones: COLMAP would take seconds in each test that has such a one."""
 
     def triangulate(*given: Any) -> Path:
-        raise bitymi_ns.capture.CaptureError("not in this test")
+        raise CaptureError("not in this test")
 
-    monkeypatch.setattr(bitymi_ns.capture, "triangulate", triangulate, raising=False)
+    monkeypatch.setattr("bitymi_ns.capture.known.triangulate", triangulate)
 
 
 @pytest.fixture(scope="session")

@@ -3,8 +3,6 @@ import math
 import pytest
 import torch
 
-from bitymi_ns.bake.field.texels import tile_points
-from bitymi_ns.bake.tiles import texel_centers
 from bitymi_ns.scene.tile_sizes import (
     coarsened,
     max_projected_extent,
@@ -65,19 +63,6 @@ def test_surfels_behind_the_camera_or_far_outside_the_image_are_unseen(camera):
     pixels, views = max_projected_extent(means, tangents(FACING.expand(4, 4)), torch.full((4, 2), 0.1), [camera(6.0)])
     assert views.tolist() == [0, 0, 0, 1]  # the last one's centre is outside, its edge is not
     assert (pixels[:3] == 0).all() and (pixels[3] > 0).all()
-
-
-def test_tile_points_run_u_along_rows():
-    quats = torch.randn(5, 4, generator=torch.Generator().manual_seed(0))
-    means, scales = torch.randn(5, 3), torch.rand(5, 2)
-    axes = tangents(quats)
-    torch.testing.assert_close(axes.transpose(1, 2) @ axes, torch.eye(2).expand(5, 2, 2))
-    points = tile_points(means, axes * scales[:, None], (8, 4), 3.0)
-    assert points.shape == (5, 4, 8, 3)
-    u, v = (5 + 0.5) / 8 * 6 - 3, (1 + 0.5) / 4 * 6 - 3
-    expected = means + u * scales[:, :1] * axes[..., 0] + v * scales[:, 1:] * axes[..., 1]
-    torch.testing.assert_close(points[:, 1, 5], expected)
-    torch.testing.assert_close(texel_centers(4, torch.tensor([3.0])), torch.tensor([-2.25, -0.75, 0.75, 2.25]))
 
 
 def test_coarsened_halves_the_longer_side_until_it_fits():

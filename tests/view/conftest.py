@@ -14,7 +14,7 @@ from bitymi_ns.bake import Baked, bake, export
 from bitymi_ns.bake.baked import joined
 from bitymi_ns.bake.compact import compacted, with_coded_texels
 from bitymi_ns.bundle.bake_options import BakeOptions
-from bitymi_ns.codec.pages import paged_texels, tile_means
+from bitymi_ns.codec.pages import tile_means
 from bitymi_ns.scene import Camera
 from tests.bake.conftest import make_surfels
 from tests.bake.test_real_scene import real_scene
@@ -31,10 +31,8 @@ def view() -> Camera:
 def with_alpha(baked: Baked) -> Baked:
     """The bake with random alphas from 0 to 2."""
     random = torch.Generator().manual_seed(0)
-    alphas, means = (2 * torch.rand(count, generator=random) for count in (len(baked.listed), len(baked.rows)))
-    pages = paged_texels(joined(baked.listed, alphas), baked.packing)
-    constants = tile_means(pages, baked.packing, joined(baked.mean_residual, means))
-    return replace(baked, texels=pages, atlas=None).with_constants(constants)
+    texels = joined(baked.texels, 2 * torch.rand(len(baked.texels), generator=random))
+    return replace(baked, texels=texels, atlas=None).with_constants(tile_means(texels, baked.sizes))
 
 
 @lru_cache

@@ -1,7 +1,7 @@
 // The viewer: what is shown, drawn when something has changed, and the elements that change it.
 import type { Bundle } from './bundle/load';
 import type { Vec3 } from './bundle/manifest';
-import type { Depths, Look, Renderer } from './render/renderer';
+import type { Depths, DrawOptions, Renderer } from './render/renderer';
 import type { Show } from './render/programs';
 import type { Screen } from './render/screen';
 import { download, element, onClick, press, pressed, typing } from './ui/dom';
@@ -13,10 +13,10 @@ import type { Stage } from './ui/stage';
 import { type CaptureCamera, commonTarget, parseCameras } from './view/cameras';
 import { Controls, type Mode } from './view/controls';
 import { Flight } from './view/flight';
-import type { Notes, Viewpoint } from './view/notes';
+import type { Notes } from './view/notes';
 import { Pace } from './view/pace';
 import { DEFAULT_LENS, type Lens, type Pose, View, moved } from './view/pose';
-import { type Shared, fromHash, toHash } from './view/share';
+import { type Shared, type Viewpoint, fromHash, toHash } from './view/share';
 import { extentOf, firstPose } from './view/start';
 import { length, subtract } from './view/vector';
 
@@ -46,7 +46,7 @@ export class App implements Stage {
   private readonly pace = new Pace();
   private readonly size: number;
   private lens: Lens = DEFAULT_LENS;
-  private first: { pose: Pose; target: Vec3; lens: Lens };
+  private first: Viewpoint;
   private held: Vec3 | null = null;
   private flight: Flight | null = null;
   private show: Show = 'color';
@@ -109,7 +109,7 @@ export class App implements Stage {
     return { pose, target, lens: this.lens, show: this.show, residuals: pressed(element('texture')) };
   }
 
-  go(pose: Pose, lens: Lens, target?: Vec3): void {
+  go({ pose, lens, target }: Omit<Viewpoint, 'target'> & Partial<Viewpoint>): void {
     this.path.stop();
     this.flight = null;
     this.place(pose, lens, target);
@@ -117,7 +117,7 @@ export class App implements Stage {
 
   fly(to: Viewpoint): void {
     if (matchMedia('(prefers-reduced-motion: reduce)').matches) {
-      this.go(to.pose, to.lens, to.target);
+      this.go(to);
       return;
     }
     this.path.stop();
@@ -130,7 +130,7 @@ export class App implements Stage {
   }
 
   depths(view: View): Promise<Depths> {
-    return this.renderer.depths(view, this.look(view.width === 1));
+    return this.renderer.depths(view, this.options(view.width === 1));
   }
 
   private place(pose: Pose, lens: Lens, target = this.targetOf(pose)): void {
@@ -147,7 +147,7 @@ export class App implements Stage {
   apply(shared: Shared): void {
     this.setShow(shared.show);
     press(element('texture'), shared.residuals);
-    this.go(shared.pose, shared.lens, shared.target);
+    this.go(shared);
   }
 
   // The texture has come, or something else that changes the picture.
@@ -158,7 +158,7 @@ export class App implements Stage {
     document.documentElement.dataset.frame = 'moving';
   }
 
-  private look(still: boolean): Look {
+  private options(still: boolean): DrawOptions {
     return {
       show: this.show,
       residuals: pressed(element('texture')),
@@ -166,12 +166,8 @@ export class App implements Stage {
       background: this.bundle.info.background,
       layers: still ? STILL_LAYERS : MOVING_LAYERS,
       fine: still,
+      farthest: length(subtract(this.controls.pose.position, this.first.target)) + 1.5 * this.size,
     };
-  }
-
-  // Farthest depth that the map of depths tells apart.
-  private farthest(): number {
-    return length(subtract(this.controls.pose.position, this.first.target)) + 1.5 * this.size;
   }
 
   private tick(now: number): void {
@@ -189,7 +185,7 @@ export class App implements Stage {
   private flyOn(flight: Flight, now: number): void {
     const view = flight.at(now, ...this.pixels());
     if (view) this.place(view.pose, view);
-    else this.go(flight.to.pose, flight.to.lens, flight.to.target);
+    else this.go(flight.to);
   }
 
   // Width and height of the canvas on the screen, as far as the device draws so many.
@@ -210,7 +206,7 @@ export class App implements Stage {
       const scale = chosen !== 'auto' ? Number(chosen) : still || this.path.filming ? 1 : this.pace.scale;
       const begin = performance.now();
       try {
-        await this.screen(view, scale, this.look(still), this.farthest());
+        await this.screen(view, scale, this.options(still));
       } catch (error) {
         showError(error);
         return;
@@ -239,7 +235,7 @@ export class App implements Stage {
   private bind(): void {
     onClick('orbit', () => this.setMode('orbit'));
     onClick('fly', () => this.setMode('fly'));
-    onClick('home', () => this.go(this.first.pose, this.first.lens, this.first.target));
+    onClick('home', () => this.go(this.first));
     onClick('previous', () => this.jump(this.chosen - 1));
     onClick('next', () => this.jump(this.chosen + 1));
     onClick('beside', () => this.toggleBeside());
@@ -331,8 +327,7 @@ export class App implements Stage {
 
   private jump(k: number): void {
     this.chosen = (k + this.cameras.length) % this.cameras.length;
-    const camera = this.cameras[this.chosen];
-    this.go(camera.pose, camera.lens);
+    this.go(this.cameras[this.chosen]);
     this.setPhotograph();
   }
 
@@ -365,7 +360,7 @@ export class App implements Stage {
 
   private async screenshot(): Promise<void> {
     const view = this.view();
-    const image = await this.renderer.read(view, this.look(true), this.farthest());
+    const image = await this.renderer.read(view, this.options(true));
     const canvas = new OffscreenCanvas(view.width, view.height);
     canvas.getContext('2d')?.putImageData(image, 0, 0);
     download(this.fileName('png'), await canvas.convertToBlob({ type: 'image/png' }));

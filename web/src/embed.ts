@@ -1,6 +1,6 @@
 // The page in the frame of another page, and the messages between them: docs/viewer.md describes them.
 import { BESIDE } from './bundle/source';
-import { type Camera, type Shared, cameraOf, sharedOf } from './view/share';
+import { type Camera, type Shared, cameraOf, viewpointOf } from './view/share';
 
 const PREFIX = 'bitymi/1/';
 
@@ -80,7 +80,7 @@ export class Embed {
     } else if (type === `${PREFIX}get-camera`) {
       this.send('camera', { id, camera: cameraOf(this.viewer.shared()) });
     } else if (type === `${PREFIX}set-camera`) {
-      const found = sharedOf(camera as Camera);
+      const found = viewpointOf(camera as Camera);
       if (found) this.viewer.apply({ ...this.viewer.shared(), ...found });
       else refuse('camera must have position, right, forward, target and lens.');
     } else if (type === `${PREFIX}list-views`) {

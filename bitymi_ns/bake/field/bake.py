@@ -5,27 +5,22 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from torch import Tensor
 
-from bitymi_ns.bake.baked import Baked, atlas_cost, encoded_pages
+from bitymi_ns.bake.baked import BakeableScene, Baked, atlas_cost, encoded_texels
 from bitymi_ns.bake.field.errors import tile_errors
 from bitymi_ns.bake.field.lean_field import lean_field
 from bitymi_ns.bake.field.plan import Field, Plan, make_plan, paper_texels
 from bitymi_ns.bake.field.references import references
-from bitymi_ns.bake.field.texels import evaluate_tiles
 from bitymi_ns.bake.inputs import BakeInput, drawable, photo_resolution, visible
 from bitymi_ns.bake.lean_color import kept_view_colors
-from bitymi_ns.bake.pipeline import BakeableScene
-from bitymi_ns.bake.reduce import Reduced, packed_tiles, reduce_tiles
+from bitymi_ns.bake.reduce import Reduced, reduce_tiles
 from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.statistics import KeptSurfels, Statistics
 from bitymi_ns.codec.packing import pack
-from bitymi_ns.codec.pages import tile_means
+from bitymi_ns.codec.pages import first_texels, listed_texels
 from bitymi_ns.codec.quantise import EncodedAtlas
-from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.progress import Progress, no_progress
-from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.tile_sizes import coarsened
@@ -59,7 +54,8 @@ def bake(
     options.check()
     started = time.perf_counter()
     rows, left_out = drawable(scene.surfels)
-    candidates = _inputs(scene, rows, cameras)
+    surfels = {name: value.detach()[rows].float() for name, value in scene.surfels.items()}
+    candidates = BakeInput(surfels, cameras, scene.near, scene.config.weight_bound, scene.config.prefilter)
     inputs, seen = visible(candidates, options, progress)
     if seen is not None:
         left_out, rows = left_out.but(unseen=int((~seen).sum())), rows[seen]
@@ -68,8 +64,10 @@ def bake(
         raise ValueError(f"no surfel is left to bake of {trained}: left out {left_out.model_dump()}")
     statistics = Statistics(surfels=KeptSurfels(trained=trained, kept=len(rows), left_out=left_out))
     field = scene.field
+    atlas = None
     if field is None:
-        tiles, atlas = Tiles.none(len(rows), options.extent), None
+        extent = torch.full((len(rows),), options.extent)
+        tiles = Tiles(torch.zeros(len(rows), 2, dtype=torch.int32), extent, torch.zeros(len(rows), 3))
     else:
         paper = paper_texels(candidates.surfels, field, options)
         tiles, atlas, statistics = _textured(field, inputs, paper, statistics, options, pixels_per_texel, progress)
@@ -77,32 +75,11 @@ def bake(
         surfels, view_color = kept_view_colors(inputs, options, progress)
     else:
         surfels, view_color = dict(inputs.surfels), None
-    baked = BakedScene(
-        {name: value.cpu() for name, value in surfels.items()},
-        kind_of(scene.surfels),
-        torch.from_numpy(tiles.packing.tiles),
-        extent=tiles.extent,
-        mean_residual=tiles.constants,
-        near=inputs.near,
-        weight_bound=inputs.weight_bound,
-        prefilter=getattr(scene.config, "prefilter", "low_pass"),
-        photographed=photo_resolution(inputs),
-    )
+    baked = Baked.of(scene, surfels, rows, tiles, options)
+    baked.scene.photographed = photo_resolution(inputs)
     statistics = statistics.but(view_color=view_color, seconds=round(time.perf_counter() - started, 3))
     in_front = None if inputs.transmittance is None else inputs.transmittance.cpu()
-    return Baked(baked, rows.cpu(), tiles.packing, tiles.texels, atlas, options, statistics, in_front=in_front)
-
-
-def _inputs(scene: BakeableScene, rows: Tensor, cameras: Sequence[Camera]) -> BakeInput:
-    surfels = {name: value.detach()[rows].float() for name, value in scene.surfels.items()}
-    weight_bound = float(getattr(scene.config, "weight_bound", 0.0))
-    return BakeInput(surfels, cameras, scene.near, weight_bound, getattr(scene.config, "prefilter", "low_pass"))
-
-
-def plan_of(field: Field, inputs: BakeInput, options: BakeOptions) -> Plan:
-    """Plan of the tiles: without a tolerance by the paper's rule, else of what can be seen."""
-    at = (inputs.cameras, inputs.transmittance, inputs.near, inputs.weight_bound)
-    return make_plan(inputs.surfels, field, options, *at, whole=options.tolerance == 0)
+    return replace(baked, atlas=atlas, statistics=statistics, in_front=in_front)
 
 
 def _textured(
@@ -115,31 +92,28 @@ def _textured(
     progress: Progress,
 ) -> tuple[Tiles, EncodedAtlas | None, Statistics]:
     """Tiles of a scene with a field, the atlas where any surfel needs one, and the statistics of both."""
-    if pixels_per_texel is not None:
-        at = (inputs.cameras, inputs.transmittance, inputs.near, inputs.weight_bound)
-        plan, levels = make_plan(inputs.surfels, field, options, *at), None
-        if inputs.views is not None:
-            limit = coarsened(plan.limit, inputs.views.pixels / pixels_per_texel, options.r_min)
-            plan = replace(plan, limit=limit)
-        tiles = _fine_tiles(field, plan, options, progress)
-        counts, atlas, errors = plan.texels.but(polished=tiles.packing.texels), None, None
+    levels, atlas, errors = None, None, None
+    reduces = pixels_per_texel is None and options.tolerance > 0
+    if reduces and isinstance(field, HashField):
+        at = (inputs.surfels, inputs.transmittance, inputs.weight_bound)
+        field, levels = lean_field(field, *at, options.tolerance)
+    plan = make_plan(inputs, field, options, whole=pixels_per_texel is None and not reduces)
+    if pixels_per_texel is not None and inputs.views is not None:
+        plan = replace(plan, limit=coarsened(plan.limit, inputs.views.pixels / pixels_per_texel, options.r_min))
+    if reduces:
+        parts = references(field, plan, options.chunk)
+        tiles = reduce_tiles(parts, plan, options.tolerance, options.r_min, progress).tiles(plan, options.extent)
     else:
-        levels = None
-        if options.tolerance > 0 and isinstance(field, HashField):
-            at = (inputs.surfels, inputs.transmittance, inputs.weight_bound)
-            field, levels = lean_field(field, *at, options.tolerance)
-        plan = plan_of(field, inputs, options)
-        if options.tolerance == 0:
-            tiles = _exact_tiles(field, plan, inputs, options, progress)
-        else:
-            parts = references(field, plan, options.chunk)
-            reduced = reduce_tiles(parts, plan, options.tolerance, options.r_min, progress)
-            tiles = packed_tiles(reduced, plan, options)
-        atlas = None if tiles.texels is None else encoded_pages(tiles.texels, tiles.packing, options, progress)
-        stored = None if atlas is None else atlas.decoded()
-        errors = tile_errors(field, plan, tiles.packing.tiles, tiles.constants, stored, options.chunk, progress)
-        counts = plan.texels
-    packing = tiles.packing
+        tiles = _fine_tiles(field, plan, options, progress)
+    packing, counts = pack(tiles.sizes, options.page_width, options.page_rows), plan.texels
+    if pixels_per_texel is not None:
+        counts = counts.but(polished=packing.texels)
+    else:
+        stored = tiles.texels
+        if packing.texels:
+            atlas = encoded_texels(tiles.texels, packing, options, progress)
+            stored = listed_texels(torch.from_numpy(atlas.decoded()), packing, tiles.texels[first_texels(tiles.sizes)])
+        errors = tile_errors(field, plan, tiles.sizes, stored, options.chunk, progress)
     assert statistics.surfels is not None
     return (
         tiles,
@@ -155,16 +129,6 @@ def _textured(
     )
 
 
-def _exact_tiles(field: Field, plan: Plan, inputs: BakeInput, options: BakeOptions, progress: Progress) -> Tiles:
-    """The paper's tiles: the field at the texel centres of one tile per surfel."""
-    p = inputs.surfels
-    packing = pack(plan.limit.cpu(), options.page_width, options.page_rows)
-    geometry = (p["means"], p["quats"], p["log_scales"].exp())
-    texels, nonfinite = evaluate_tiles(field, *geometry, packing, options.extent, options.chunk, progress)
-    extent = torch.full((len(plan),), options.extent)
-    return Tiles(packing, texels, extent, tile_means(texels, packing), nonfinite)
-
-
 def _fine_tiles(field: Field, plan: Plan, options: BakeOptions, progress: Progress) -> Tiles:
     """Tiles of the plan's limits, one for every surfel of which any view shows a residual."""
     reduced, done = Reduced(torch.zeros(len(plan), 2, dtype=torch.int32), torch.zeros(len(plan), 3)), 0
@@ -174,4 +138,4 @@ def _fine_tiles(field: Field, plan: Plan, options: BakeOptions, progress: Progre
         reduced.nonfinite += part.nonfinite
         done += len(part.rows)
         progress("evaluating texels", done, len(plan))
-    return packed_tiles(reduced, plan, options)
+    return reduced.tiles(plan, options.extent)

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -11,7 +10,7 @@ from bitymi_ns.bake.field.references import references
 from bitymi_ns.bake.reduce import read_at
 from bitymi_ns.bake.tile_errors import cells_per_pixel, seen_rms, weighted_rms
 from bitymi_ns.bundle.statistics import Certificate, Percentiles, TileError
-from bitymi_ns.codec.pages import size_classes, texel_index
+from bitymi_ns.codec.pages import first_texels, size_classes
 from bitymi_ns.codec.quantise import STEPS
 from bitymi_ns.progress import Progress, no_progress
 
@@ -43,9 +42,8 @@ class TileErrors:
 def tile_errors(
     field: Field,
     plan: Plan,
-    tiles: npt.NDArray,
-    mean_residual: Tensor,
-    residuals: npt.NDArray | None,
+    sizes: Tensor,
+    texels: Tensor,
     chunk: int = 1 << 18,
     progress: Progress = no_progress,
 ) -> TileErrors:
@@ -53,28 +51,21 @@ def tile_errors(
 
     Args:
         plan: what the tiles have to hold; its extents must be those of the tiles.
-        tiles: [N, 5] int32.
-        mean_residual: [N, 3] the residual of the surfels without a tile.
-        residuals: [layers, height, width, 3] the atlas as a renderer reads it, None without tiles.
+        sizes: [N, 2] sides of the tiles.
+        texels: [T, 3] as a renderer reads them, in the order of `ops.TexelTiles`.
         chunk: points evaluated at once.
     """
     rms, largest, seen = (torch.zeros(len(plan)) for _ in range(3))
-    rectangles = torch.as_tensor(tiles)
-    flat = None if residuals is None else torch.as_tensor(residuals).reshape(-1, 3)
-    done = 0
+    first, done = first_texels(sizes), 0
     for part in references(field, plan, chunk):
         rows = part.rows.cpu()
-        rebuilt = mean_residual[rows][:, :, None, None].expand(part.values.shape).clone()
-        if flat is not None:
-            for r_u, r_v, at in size_classes(rectangles[rows]):
-                index = texel_index(rectangles[rows[at]], (r_u, r_v), residuals.shape[2], residuals.shape[1])
-                stored = flat[index].permute(0, 3, 1, 2).contiguous()
-                rebuilt[at] = read_at(stored, part.size)
+        rebuilt = texels[first[rows]][:, :, None, None].expand(part.values.shape).clone()
+        for r_u, r_v, at in size_classes(sizes[rows]):
+            index = first[rows[at], None, None] + torch.arange(r_u * r_v).view(r_v, r_u)
+            rebuilt[at] = read_at(texels[index].permute(0, 3, 1, 2).contiguous(), part.size)
         difference = rebuilt.to(part.values) - part.values
         rms[rows] = weighted_rms(difference, part.weight).cpu()
-        pixels = None if plan.pixels is None else plan.pixels[part.rows]
-        cells = cells_per_pixel(pixels, plan.extent[part.rows], part.size)
-        seen[rows] = seen_rms(difference, part.weight, cells).cpu()
+        seen[rows] = seen_rms(difference, part.weight, cells_per_pixel(plan, part.rows, part.size)).cpu()
         weighted = STEPS * difference.abs().amax(1) * part.weight
         largest[rows] = weighted.flatten(1).amax(1).cpu()
         done += len(rows)

@@ -1,17 +1,17 @@
 """Plan of the tiles of a field: extents, weights of errors, and the finest useful grids."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from bitymi_ns.bake.inputs import BakeInput
 from bitymi_ns.bake.tile_errors import closest_pixels
 from bitymi_ns.bake.tiles import Shown
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.statistics import KeptTexels
-from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.tile_sizes import kernel_parameters, nyquist_resolution, visible_extent, voxel_along_axes
 from bitymi_ns.train.init import tangents
 
@@ -41,47 +41,34 @@ class Plan(Shown):
     probes: Tensor  # [N, 2] int32, the grid on which the field is evaluated (along u, v), at least the Nyquist rate
     limit: Tensor  # [N, 2] int32, the finest tile of use, at most `probes`
     texels: KeptTexels  # number of texels by the rules before the tolerance
+    whole: bool  # the field is evaluated in all of the square; else beyond the disc of radius `extent` at its rim
 
     def __len__(self) -> int:
         return len(self.means)
 
 
-def make_plan(
-    surfels: Mapping[str, Tensor],
-    field: Field,
-    options: BakeOptions,
-    cameras: Sequence[Camera] = (),
-    transmittance: Tensor | None = None,
-    near: float = 0.2,
-    weight_bound: float = 0.0,
-    whole: bool = False,
-) -> Plan:
+def make_plan(inputs: BakeInput, field: Field, options: BakeOptions, whole: bool = False) -> Plan:
     """Extents and grids of all tiles.
 
     Args:
-        surfels: per-surfel parameters, N rows, all finite and drawable.
+        inputs: surfels that are all finite and drawable, and the training views, for the cap and the weights.
         field: the residual field, for its voxel size.
         options: sizes.
-        cameras: training views, for the cap.
-        transmittance: [N] of `Visibility`, None = 1.
-        near: nearest drawn depth.
-        weight_bound: fragments of smaller weight get no residual.
         whole: every tile has the extent of the options and is probed at the texels of the rule; else it covers what
             reaches the weight bound and is probed at the Nyquist rate.
     """
+    surfels = inputs.surfels
     means, scales = surfels["means"], surfels["log_scales"].exp()
     axes = tangents(surfels["quats"])
-    opacity, beta = kernel_parameters(surfels, transmittance)
+    opacity, beta = kernel_parameters(surfels, inputs.transmittance)
     extent = torch.full_like(opacity, options.extent)
     if not whole:
-        extent = torch.minimum(extent, visible_extent(opacity, beta, weight_bound))
+        extent = torch.minimum(extent, visible_extent(opacity, beta, inputs.weight_bound))
+    geometry = getattr(field, "geometry", None)
+    center = None if geometry is None else torch.tensor(geometry.mid, dtype=torch.float32)
     voxel = torch.cat([field.voxel_size(part) for part in means.split(options.chunk)])
-    delta = (
-        voxel_along_axes(voxel, axes, means, _center(field))
-        if options.local_voxel
-        else voxel.amin().expand(scales.shape)
-    )
-    closest = closest_pixels(surfels, cameras, options.extent, near) if cameras else None
+    delta = voxel_along_axes(voxel, axes, means, center) if options.local_voxel else voxel.amin().expand(scales.shape)
+    closest = closest_pixels(surfels, inputs.cameras, options.extent, inputs.near) if inputs.cameras else None
     pixels = None if closest is None or not options.cap_by_views else closest * (2.0 * options.extent)
 
     def grids(share: Tensor, pixels: Tensor | None) -> Tensor:
@@ -98,7 +85,8 @@ def make_plan(
         within_visible_part=_texels(limit),
     )
     edges = axes * scales[:, None, :]
-    return Plan(opacity, beta, extent, weight_bound, means, edges, probes, limit, counts, pixels=closest)
+    tiles = (means, edges, probes, limit, counts, whole)
+    return Plan(opacity, beta, extent, inputs.weight_bound, *tiles, pixels=closest)
 
 
 def paper_texels(surfels: Mapping[str, Tensor], field: Field, options: BakeOptions) -> int:
@@ -118,9 +106,3 @@ def paper_texels(surfels: Mapping[str, Tensor], field: Field, options: BakeOptio
 def _texels(sizes: Tensor) -> int:
     """Texels of all tiles of sizes [N, 2]."""
     return int(sizes.long().prod(1).sum())
-
-
-def _center(field: Field) -> Tensor | None:
-    """[3] centre of the field's contraction, world frame, if it tells."""
-    geometry = getattr(field, "geometry", None)
-    return None if geometry is None else torch.tensor(geometry.mid, dtype=torch.float32)

@@ -59,7 +59,6 @@ class _Polish:
             view_color=drawn.view_color,  # type: ignore[arg-type]
             weight_bound=drawn.weight_bound,
             prefilter=drawn.prefilter,  # type: ignore[arg-type]
-            texture_moves_surfels=True,
         )
         tiles = self.texels.tiles
         self.field = TexelField(tiles.size, tiles.extent, self.texels.values)
@@ -174,7 +173,7 @@ def polish_scene(
         error_before=baked.statistics.error, psnr_held_out=gain(before, run.psnr(eval_views)) if eval_views else None
     )
     texels = run.field.texels.detach()
-    result = run.texels.baked(texels).with_surfels(dict(run.scene.surfels))
+    result = baked.with_texels(texels).with_surfels(dict(run.scene.surfels))
     return replace(result, statistics=result.statistics.but(polish=statistics))
 
 
@@ -183,7 +182,8 @@ def _optimise(
 ) -> EarlyStopping[dict[str, Any]]:
     """The state that shows the validation views best, and the evaluations."""
     options = run.options
-    stopping = EarlyStopping(options, run.psnr(validation, progress), run.state())
+    before = run.psnr(validation, progress)
+    stopping = EarlyStopping(options.steps, options.checks, options.patience, before, run.state())
     share, attempts = 1.0 / (run.texels.coverage(views, progress) + options.prior), 0  # [T]
     for number in range(options.steps):
         view = views[training_order(len(views), options.seed, number)]

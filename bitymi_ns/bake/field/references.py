@@ -15,8 +15,8 @@ def references(field: Field, plan: Plan, chunk: int = 1 << 18) -> Iterator[TileV
 
     The field is evaluated at the probes and fitted by least squares on the finest useful grid. With as many probes as
     texels the result is the field's values at the texel centres. With more probes, detail that no view resolves is
-    averaged out instead of aliased. Beyond the disc of radius `extent` nothing is seen. There the field is read at the
-    nearest point of the disc, so values stay smooth and within the range of what is seen.
+    averaged out instead of aliased. Beyond the disc of radius `extent` nothing is seen. Unless the plan is whole, the
+    field is read there at the nearest point of the disc: values stay smooth and within the range of what is seen.
 
     Args:
         plan: N tiles; those of extent 0 are left out.
@@ -30,8 +30,10 @@ def references(field: Field, plan: Plan, chunk: int = 1 << 18) -> Iterator[TileV
                 continue
             extent = plan.extent[rows]
             u, v = grid((pu, pv), extent)
-            inward = (extent[:, None, None] / torch.hypot(u, v).clamp(min=1e-12)).clamp(max=1.0)
-            uv = torch.stack([u * inward, v * inward], dim=-1).flatten(1, 2)  # [n, pv pu, 2]
+            if not plan.whole:
+                inward = (extent[:, None, None] / torch.hypot(u, v).clamp(min=1e-12)).clamp(max=1.0)
+                u, v = u * inward, v * inward
+            uv = torch.stack([u, v], dim=-1).flatten(1, 2)  # [n, pv pu, 2]
             x = plan.means[rows, None] + uv @ plan.edges[rows].transpose(1, 2)  # [n, pv pu, 3]
             value = field(x.reshape(-1, 3)).float()
             bad = ~torch.isfinite(value).all(dim=1)

@@ -7,7 +7,7 @@ import pycolmap
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from bitymi_ns.capture.sfm.refine import MAX_ERROR
+from bitymi_ns.capture.sfm.job import MAX_ERROR
 
 LINK = 15
 """Points that two photographs see together, from which on they link each other; COLMAP's least number of inliers of a
@@ -35,14 +35,8 @@ def drop_unlinked(model: pycolmap.Reconstruction) -> None:
 
 
 def contradicted(model: pycolmap.Reconstruction, database: Path, pixel: float) -> float:
-    """Share of the verified matches between placed photographs that their poses contradict: the rays pass each other by
-    more than `MAX_ERROR` pixels, or meet behind a camera.
-
-    Args:
-        model: poses and cameras, with the image numbers of the database.
-        database: features and verified matches.
-        pixel: side of a pixel of the images on which features were found, in pixels of the photographs.
-    """
+    """Share of the verified matches of a database between placed photographs that their poses contradict: the rays pass
+    each other by more than `MAX_ERROR` pixels of `Job.pixel`, or meet behind a camera."""
     placed = {i: image for i, image in model.images.items() if image.has_pose}
     total = against = 0
     with pycolmap.Database.open(database) as opened:
@@ -69,13 +63,9 @@ def pixels_per_radian(camera: pycolmap.Camera) -> float:
 
 
 def _rays_meet(a: np.ndarray, b: np.ndarray, move: pycolmap.Rigid3d, limit: float) -> np.ndarray:
-    """Test [n] which pairs of unit rays [n,3] of two cameras meet in front of both.
-
-    Args:
-        a, b: in the axes of the first and the second camera.
-        move: from the first camera to the second.
-        limit: largest angle between a ray and the plane of the other one and both centres, radians.
-    """
+    """Test [n] which pairs of unit rays [n,3], each in the axes of its camera, meet in front of both cameras. `move` is
+    from the first camera to the second, `limit` the largest angle in radians between a ray and the plane of the other
+    one and both centres."""
     a, step = a @ move.rotation.matrix().T, move.translation
     normal = np.cross(np.broadcast_to(step, a.shape), a)
     off = np.abs((normal * b).sum(1)) / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)

@@ -1,13 +1,14 @@
 """Reasons why photographs have no pose, with advice on what to photograph differently."""
 
-from collections import Counter, defaultdict
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pycolmap
+from scipy.cluster.hierarchy import DisjointSet
 
-from bitymi_ns.capture.panorama_detection import SPHERICAL_MODEL
+from bitymi_ns.capture.camera import SPHERICAL_MODEL
 from bitymi_ns.capture.sfm.job import CameraGroup, Job, NoPoses
 
 FEW_FEATURES = 60  # a photograph with fewer features shows hardly any detail
@@ -26,6 +27,11 @@ SHOOT = (
     "shows with the one before"
 )
 
+FROM_ONE_SPOT = (
+    "the photographs were taken from one spot: the camera only turned, which tells nothing of depth. Step sideways "
+    f"between photographs, as if the scene were on a turntable. {SHOOT}"
+)
+
 
 @dataclass(frozen=True)
 class ViewGraph:
@@ -36,20 +42,10 @@ class ViewGraph:
 
     def components(self) -> list[set[str]]:
         """Sets of photographs that hang together, the largest first; those alone are not among them."""
-        beside = defaultdict(set)
+        sets = DisjointSet(self.features)
         for first, second in self.inliers:
-            beside[first].add(second)
-            beside[second].add(first)
-        left = set(beside)
-        found = []
-        while left:
-            part, edge = set(), {next(iter(left))}
-            while edge:
-                part |= edge
-                edge = {other for name in edge for other in beside[name]} - part
-            left -= part
-            found.append(part)
-        return sorted(found, key=len, reverse=True)
+            sets.merge(first, second)
+        return sorted((part for part in sets.subsets() if len(part) > 1), key=len, reverse=True)
 
 
 def view_graph(database: Path) -> ViewGraph:
@@ -66,13 +62,7 @@ def view_graph(database: Path) -> ViewGraph:
 
 
 def left_out(graph: ViewGraph, placed: set[str], title: dict[str, str]) -> dict[str, str]:
-    """Explain by name why photographs have no pose.
-
-    Args:
-        graph: of all photographs.
-        placed: those that have a pose.
-        title: names of the photographs for messages.
-    """
+    """Explain by name (`title`) why photographs have no pose; `placed` ones have."""
     best: Counter[str] = Counter()
     with_placed: Counter[str] = Counter()
     for (first, second), count in graph.inliers.items():
@@ -115,13 +105,6 @@ def why_none(job: Job, graph: ViewGraph) -> NoPoses:
     )
 
 
-def from_one_spot() -> NoPoses:
-    return NoPoses(
-        "the photographs were taken from one spot: the camera only turned, which tells nothing of depth. Step sideways "
-        f"between photographs, as if the scene were on a turntable. {SHOOT}"
-    )
-
-
 def parallax(model: pycolmap.Reconstruction) -> float:
     """Median over the points of the widest angle between two rays to them, in degrees."""
     centers = {image.image_id: image.projection_center() for image in model.images.values() if image.has_pose}
@@ -152,8 +135,7 @@ def only_turned(job: Job, database: Path) -> bool:
         pair_of = [
             (groups[images[i].name], points[i][column]) for i, column in zip((first, second), matches.T, strict=True)
         ]
-        group = pair_of[0][0]
-        limit = ROTATED * max(1.0, max(group.width, group.height) / job.max_image_size)
+        limit = ROTATED * max(1.0, max(pair_of[0][0].camera.size) / job.max_image_size)
         for guess in GUESSES[: 1 if all(each.prior for each, _ in pair_of) else None]:
             (a, focal), (b, _) = (_rays(*each, guess) for each in pair_of)
             if np.mean(_turn_errors(a, b, focal) < limit) > MOST:
@@ -165,11 +147,11 @@ def only_turned(job: Job, database: Path) -> bool:
 def _rays(group: CameraGroup, points: np.ndarray, guess: float) -> tuple[np.ndarray, float]:
     """Unit rays [n,3] of points [n,2] in pixels, and pixels per radian; `guess` of the focal length, in units of the
     longer side, where it is not known."""
-    if group.model == SPHERICAL_MODEL:
-        camera = pycolmap.Camera(model=group.model, width=group.width, height=group.height, params=group.params)
-        return camera.cam_ray_from_img(points.astype(float)), group.width / (2.0 * np.pi)
-    focal = group.params[0] if group.prior else guess * max(group.width, group.height)
-    rays = np.column_stack([(points - np.array([group.width, group.height]) / 2) / focal, np.ones(len(points))])
+    camera = group.camera
+    if camera.model == SPHERICAL_MODEL:
+        return camera.colmap.cam_ray_from_img(points.astype(float)), camera.width / (2.0 * np.pi)
+    focal = camera.params[0] if group.prior else guess * max(camera.size)
+    rays = np.column_stack([(points - np.array(camera.size) / 2) / focal, np.ones(len(points))])
     return rays / np.linalg.norm(rays, axis=1, keepdims=True), focal
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pycolmap
 
-from bitymi_ns.capture.panorama_detection import SPHERICAL_MODEL
+from bitymi_ns.capture.camera import SPHERICAL_MODEL
 from bitymi_ns.capture.sfm.job import CameraGroup, Job, StageProgress
 
 SMALL = 1000
@@ -45,19 +45,15 @@ def camera_ids(job: Job, database: Path) -> list[int]:
     """The groups' cameras in the database; those that an earlier run has not come to are written."""
     with pycolmap.Database.open(database) as opened:
         for group in job.cameras[opened.num_cameras() :]:
-            opened.write_camera(camera_of(group))
+            camera = group.camera.colmap
+            camera.has_prior_focal_length = group.prior
+            opened.write_camera(camera)
         return [camera.camera_id for camera in opened.read_all_cameras()]
-
-
-def camera_of(group: CameraGroup) -> pycolmap.Camera:
-    camera = pycolmap.Camera(model=group.model, width=group.width, height=group.height, params=group.params)
-    camera.has_prior_focal_length = group.prior
-    return camera
 
 
 def _reader(job: Job, group: CameraGroup, camera_id: int) -> pycolmap.ImageReaderOptions:
     options = pycolmap.ImageReaderOptions()
-    options.camera_model = group.model
+    options.camera_model = group.camera.model
     options.existing_camera_id = camera_id
     if job.masks is not None:
         options.mask_path = job.masks
@@ -66,9 +62,9 @@ def _reader(job: Job, group: CameraGroup, camera_id: int) -> pycolmap.ImageReade
 
 def _extraction(job: Job, group: CameraGroup) -> pycolmap.FeatureExtractionOptions:
     options = pycolmap.FeatureExtractionOptions()
-    scale = SPHERICAL_SCALE if group.model == SPHERICAL_MODEL else 1
+    scale = SPHERICAL_SCALE if group.camera.model == SPHERICAL_MODEL else 1
     options.max_image_size = job.max_image_size * scale
     options.sift.max_num_features = job.max_features
-    side = min(max(group.width, group.height), options.max_image_size)
+    side = min(max(group.camera.size), options.max_image_size)
     options.sift.first_octave = -1 if side < SMALL * scale else 0
     return options

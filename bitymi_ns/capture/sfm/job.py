@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import json
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Protocol
+
+from bitymi_ns.capture.camera import ColmapCamera
 
 DATABASE = "database.db"
 PAIRS = "pairs.txt"
 MODEL = "model"  # names in the work folder: COLMAP's database, the pairs to match, and the resulting model
 
+MAX_ERROR = 4.0
+"""Observations farther off, in pixels of the images on which features were found, are dropped; COLMAP's own limit."""
 SERIAL = 100
 """Number of photographs up to which one thread maps, so that runs are equal. For 50, two threads are no faster."""
 
@@ -24,10 +32,7 @@ class StageProgress(Protocol):
 class CameraGroup:
     """Photographs taken by one camera at one focal length."""
 
-    model: str
-    width: int
-    height: int
-    params: list[float]  # in COLMAP's order, pixels of the photographs
+    camera: ColmapCamera  # in pixels of the photographs
     prior: bool  # True if the focal length is known, and not just an initial guess
     names: list[str]  # photographs, relative to the folder of images
 
@@ -60,13 +65,29 @@ class Job:
         of equal photographs differ by rounding, and in time by more."""
         return 1 if len(self.order) <= SERIAL else -1
 
+    @property
+    def pixel(self) -> float:
+        """Side of a pixel of the images on which features are found, in pixels of the photographs."""
+        return max(1.0, max(max(group.camera.size) for group in self.cameras) / self.max_image_size)
+
+    @contextmanager
+    def scratch(self) -> Iterator[Path]:
+        """An empty folder in the work folder, removed afterwards."""
+        folder = Path(self.work) / "scratch"
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
     def text(self) -> str:
         return json.dumps(asdict(self))
 
     @staticmethod
     def parse(text: str) -> Job:
         values = json.loads(text)
-        values["cameras"] = [CameraGroup(**group) for group in values["cameras"]]
+        values["cameras"] = [CameraGroup(ColmapCamera(*g["camera"]), g["prior"], g["names"]) for g in values["cameras"]]
         return Job(**values)
 
 

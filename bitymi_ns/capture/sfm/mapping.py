@@ -1,42 +1,44 @@
-"""Camera poses from compared photographs: all at once first, one after the other where that falls short."""
+"""Camera poses from compared photographs: all at once first, one after the other where that falls short, and the last
+bundle adjustment; points for photographs whose cameras are known."""
 
+import copy
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 
+from bitymi_ns.capture.sfm import features, pairs
 from bitymi_ns.capture.sfm.consistency import contradicted, drop_unlinked
-from bitymi_ns.capture.sfm.job import Job, StageProgress
-from bitymi_ns.capture.sfm.refine import refined
+from bitymi_ns.capture.sfm.job import DATABASE, MAX_ERROR, Job, NoPoses, StageProgress
 from bitymi_ns.capture.types import CONTRADICTED
 
+Mapper = Callable[[Job, Path, Path, StageProgress], dict[int, pycolmap.Reconstruction]]
+"""Maps the features and matches of a database with a folder for its files; returns connected components."""
 ENOUGH = 0.9
 """The global mapper's poses are taken as they are if they are of this share of the photographs that hang together."""
 GOOD_ERROR = 1.0
 """... and their reprojection error is below so many pixels of the photographs as features were found on them, and few
 matches contradict them."""
 
+MIN_ANGLE = 1.5  # degrees between rays below which a point has no depth to be trusted; COLMAP's own limit
+GAIN = 0.03
+"""OPENCV replaces SIMPLE_RADIAL if it lowers the reprojection error by this share: its four terms are there to be
+misused by few observations."""
+OBSERVATIONS_PER_CAMERA = 2000  # a camera with fewer observations keeps the simple model
+LEAST_POINTS = 10  # fewer points are none to start from
+
 
 def reconstruct(job: Job, database: Path, connected: int, tell: StageProgress) -> pycolmap.Reconstruction | None:
-    """The best model of the photographs, or None where there is none.
-
-    Args:
-        database: features and verified matches.
-        connected: size of the largest set of photographs that hang together by verified pairs.
-        tell: told the stage.
-    """
+    """The best model of the photographs, or None where there is none; `connected` of them hang together by verified
+    pairs."""
     found = None
     if job.mapper in ("auto", "global"):
-        found = _best(
-            _in_folder(job, "global", lambda folder: _global(job, database, folder, tell)), job, database, tell
-        )
+        found = _mapped(_global, job, database, tell)
         if job.mapper == "global" or (found is not None and _satisfies(found, job, database, connected)):
             return found
-    other = _best(
-        _in_folder(job, "incremental", lambda folder: _incremental(job, database, folder, tell)), job, database, tell
-    )
-    return better(job, database, found, other)
+    return better(job, database, found, _mapped(_incremental, job, database, tell))
 
 
 def better(job: Job, database: Path, *models: pycolmap.Reconstruction | None) -> pycolmap.Reconstruction | None:
@@ -46,43 +48,26 @@ def better(job: Job, database: Path, *models: pycolmap.Reconstruction | None) ->
     equal = [model for model in found if model.num_reg_images() == most]
     if len(equal) < 2:  # no matches need to be read
         return equal[0] if equal else None
-    return min(equal, key=lambda model: contradicted(model, database, pixel(job)))
-
-
-def pixel(job: Job) -> float:
-    """Side of a pixel of the images on which features were found, in pixels of the photographs."""
-    return max(1.0, max(max(group.width, group.height) for group in job.cameras) / job.max_image_size)
+    return min(equal, key=lambda model: contradicted(model, database, job.pixel))
 
 
 def _satisfies(model: pycolmap.Reconstruction, job: Job, database: Path, connected: int) -> bool:
     return (
         model.num_reg_images() >= ENOUGH * connected
-        and model.compute_mean_reprojection_error() <= GOOD_ERROR * pixel(job)
-        and contradicted(model, database, pixel(job)) <= CONTRADICTED
+        and model.compute_mean_reprojection_error() <= GOOD_ERROR * job.pixel
+        and contradicted(model, database, job.pixel) <= CONTRADICTED
     )
 
 
-def _in_folder(
-    job: Job, name: str, make: Callable[[Path], dict[int, pycolmap.Reconstruction]]
-) -> dict[int, pycolmap.Reconstruction]:
-    folder = Path(job.work) / name
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
-    try:
-        return make(folder)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def _best(
-    models: dict[int, pycolmap.Reconstruction], job: Job, database: Path, tell: StageProgress
-) -> pycolmap.Reconstruction | None:
-    """The largest component, refined, of the cameras that its points link."""
+def _mapped(mapper: Mapper, job: Job, database: Path, tell: StageProgress) -> pycolmap.Reconstruction | None:
+    """The largest component of a mapper's, refined, of the cameras that its points link."""
+    with job.scratch() as folder:
+        models = mapper(job, database, folder, tell)
     largest = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
     if largest is None or largest.num_points3D() == 0:
         return None
     tell("refining cameras and points", 0, 1)
-    model = refined(largest, job, pixel(job))
+    model = refined(largest, job)
     drop_unlinked(model)
     tell("refining cameras and points", 1, 1)
     return model
@@ -125,3 +110,89 @@ def _incremental(job: Job, database: Path, folder: Path, tell: StageProgress) ->
     )
     tell(stage, total, total)
     return models
+
+
+def refined(model: pycolmap.Reconstruction, job: Job) -> pycolmap.Reconstruction:
+    """Drop what does not fit, adjust all cameras and points of a mapper's `model` in place, and drop again."""
+    _filter(model, job.pixel)
+    if model.num_points3D() == 0:
+        return model
+    _adjust(model, job)
+    _filter(model, job.pixel)
+    if job.opencv_if_better and model.compute_num_observations() >= OBSERVATIONS_PER_CAMERA * model.num_cameras():
+        freer = copy.deepcopy(model)
+        for camera in freer.cameras.values():
+            if camera.model_name == "SIMPLE_RADIAL":
+                focal, cx, cy, k = camera.params
+                camera.model = pycolmap.CameraModelId.OPENCV
+                camera.params = [focal, focal, cx, cy, k, 0.0, 0.0, 0.0]
+        _adjust(freer, job)
+        if freer.compute_mean_reprojection_error() < (1 - GAIN) * model.compute_mean_reprojection_error():
+            _filter(freer, job.pixel)
+            return freer
+    return model
+
+
+def _adjust(model: pycolmap.Reconstruction, job: Job) -> None:
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.solver_options.num_threads = job.threads
+    options.ceres.solver_options.max_num_iterations = 50
+    options.ceres.solver_options.function_tolerance = 1e-5
+    pycolmap.bundle_adjustment(model, options)
+    model.update_point_3d_errors()
+
+
+def _filter(model: pycolmap.Reconstruction, pixel: float) -> None:
+    pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR * pixel, MIN_ANGLE)
+    model.update_point_3d_errors()
+
+
+def triangulate(job: Job, tell: StageProgress) -> pycolmap.Reconstruction:
+    """Triangulate points from a job's photographs with their poses as they are.
+
+    Raises:
+        NoPoses: the photographs do not show the same from the poses given.
+    """
+    database = Path(job.work) / DATABASE
+    features.extract(job, database, tell)
+    pairs.match(job, database, tell)
+    tell("triangulating", 0, 1)
+    model = _known(job, database)
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = 0
+    options.num_threads = options.mapper.num_threads = job.threads
+    options.mapper.filter_max_reproj_error *= job.pixel
+    options.triangulation.complete_max_reproj_error *= job.pixel
+    options.triangulation.merge_max_reproj_error *= job.pixel
+    with job.scratch() as scratch:
+        model = pycolmap.triangulate_points(model, database, job.images, scratch, options=options)
+    tell("triangulating", 1, 1)
+    if model.num_points3D() < LEAST_POINTS:
+        raise NoPoses(
+            f"only {model.num_points3D()} points can be triangulated from the given poses: the poses may belong to "
+            "other photographs, or be camera to world where world to camera is meant, or have other axes"
+        )
+    # The poses are written back as given: the triangulation leaves them as they are, but for rounding.
+    for image in model.images.values():
+        image.frame.rig_from_world = _pose(job.poses[image.name])
+    return model
+
+
+def _pose(matrix: list[list[float]]) -> pycolmap.Rigid3d:
+    values = np.array(matrix)
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(values[:, :3]), values[:, 3])
+
+
+def _known(job: Job, database: Path) -> pycolmap.Reconstruction:
+    """A model of the cameras and poses, with the numbers that the database has for them."""
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database) as opened:
+        for camera in opened.read_all_cameras():
+            model.add_camera_with_trivial_rig(camera)
+        for image in opened.read_all_images():
+            points = opened.read_keypoints(image.image_id)[:, :2].astype(np.float64)
+            known = pycolmap.Image(image.name, points, image.camera_id, image.image_id)
+            model.add_image_with_trivial_frame(known, _pose(job.poses[image.name]))
+    return model

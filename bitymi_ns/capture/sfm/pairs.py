@@ -24,25 +24,12 @@ SEQUENCE_NEIGHBOURS = 6
 SEQUENCE_SHARE = 0.8  # photographs are a sequence if so many neighbours in their order are among the most alike
 
 
-def match(job: Job, database: Path, tell: StageProgress) -> None:
-    """Choose pairs, and compare those that have not been compared yet."""
+def match(job: Job, database: Path, tell: StageProgress, every: bool = False) -> None:
+    """Choose pairs, or `every` one, and compare those that have not been compared yet."""
     listed = Path(job.work) / PAIRS
-    if not listed.exists():
-        names = job.order
-        pairs = choose(job, database, tell)
-        write_file(listed, "".join(f"{names[i]} {names[j]}\n" for i, j in pairs).encode())
-    compare(listed, database, tell)
-
-
-def match_rest(job: Job, database: Path, tell: StageProgress) -> None:
-    """Compare all with all."""
-    listed = Path(job.work) / PAIRS
-    write_file(listed, "".join(f"{first} {second}\n" for first, second in combinations(job.order, 2)).encode())
-    compare(listed, database, tell)
-
-
-def compare(listed: Path, database: Path, tell: StageProgress) -> None:
-    """Compare the pairs of a list; those in the database are passed over."""
+    if every or not listed.exists():
+        pairs = list(combinations(range(len(job.order)), 2)) if every else choose(job, database, tell)
+        write_file(listed, "".join(f"{job.order[i]} {job.order[j]}\n" for i, j in pairs).encode())
     options = pycolmap.ImportedPairingOptions()
     options.match_list_path = listed
     total = len(listed.read_text("utf8").splitlines())
@@ -108,11 +95,8 @@ def likeness(job: Job, database: Path, tell: StageProgress) -> np.ndarray:
 
 
 def nearest(alike: np.ndarray, neighbours: int) -> set[tuple[int, int]]:
-    """For each photograph those most alike, and a tree of the best pairs, so that no part stands alone.
-
-    Args:
-        alike: [n,n] symmetric, 0 or more; 0 = nothing shared.
-    """
+    """For each photograph those most alike, and a tree of the best pairs, so that no part stands alone; `alike` [n,n]
+    is symmetric, 0 = nothing shared."""
     pairs = set()
     for i, row in enumerate(alike):
         best = np.argsort(-row, kind="stable")[:neighbours]

@@ -7,7 +7,8 @@ import shutil
 import sqlite3
 import subprocess
 import threading
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from bitymi_ns import interpreter
@@ -22,20 +23,13 @@ LITTLE_SPACE = 50_000_000  # bytes; where less is left, the disk is what stopped
 
 
 def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:
-    """Run a job to its end.
-
-    Args:
-        source: the photographs or the video, for messages.
-        progress: told the stage and how far it is.
-
-    Returns:
-        what the worker found.
+    """Run a job to its end, and return what the worker found; `source` is for messages.
 
     Raises:
         CaptureError: there are no poses, or COLMAP ended otherwise.
     """
     work = Path(job.work)
-    watch = _Watch(work / DATABASE, progress)
+    watching = ExitStack()
     with open(work / LOG, "wb", opener=no_links) as log:
         process = subprocess.Popen(
             interpreter.command("bitymi_ns.capture.sfm.worker", "main"),
@@ -58,44 +52,39 @@ def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:
                     raise CaptureError(f"no {wanted} can be found in {source}: {line['failure']}")
                 if "result" in line:
                     return line["result"]
-                watch.end()
+                watching.close()
                 progress(line["stage"], line["done"], line["total"])
                 if line["counts"]:
-                    watch.begin(line["counts"], line["stage"], line["total"])
+                    watched = _watched(work / DATABASE, line["counts"], progress, line["stage"], line["total"])
+                    watching.enter_context(watched)
         except BrokenPipeError:
             pass
         finally:
-            watch.end()
+            watching.close()
             process.kill()
             process.wait()
     raise CaptureError(_why_ended(work, source, process.returncode))
 
 
-class _Watch:
-    """Tells how many rows a table of COLMAP's database has while COLMAP fills it.
+@contextmanager
+def _watched(database: Path, table: str, progress: Progress, stage: str, total: int) -> Iterator[None]:
+    """Tell how many rows a table of COLMAP's database has while COLMAP fills it.
 
     From this process, because two copies of SQLite in one, COLMAP's and Python's, undo each other's locks on a file.
     """
+    ended = threading.Event()
 
-    def __init__(self, database: Path, progress: Progress) -> None:
-        self._database, self._progress = database, progress
-        self._ended = threading.Event()
-        self._thread: threading.Thread | None = None
+    def watch() -> None:
+        while not ended.wait(0.5):
+            progress(stage, min(rows(database, table), total), total)
 
-    def begin(self, table: str, stage: str, total: int) -> None:
-        self._ended.clear()
-        self._thread = threading.Thread(target=self._run, args=(table, stage, total), daemon=True)
-        self._thread.start()
-
-    def end(self) -> None:
-        if self._thread is not None:
-            self._ended.set()
-            self._thread.join()
-            self._thread = None
-
-    def _run(self, table: str, stage: str, total: int) -> None:
-        while not self._ended.wait(0.5):
-            self._progress(stage, min(rows(self._database, table), total), total)
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 def rows(database: Path, table: str) -> int:

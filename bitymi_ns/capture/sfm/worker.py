@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from bitymi_ns.capture.sfm import consistency, explain, features, mapping, pairs, triangulation
+from bitymi_ns.capture.sfm import consistency, explain, features, mapping, pairs
 from bitymi_ns.capture.sfm.job import DATABASE, MODEL, Job, NoPoses
 from bitymi_ns.files import complete_folder
 
@@ -42,8 +42,8 @@ def send(**line: object) -> None:
     print(json.dumps(line), file=sys.__stdout__, flush=True)
 
 
-def find(job: Job, stages: Stages) -> dict[str, object]:
-    """Find the poses of a job's photographs, and write the model.
+def find(job: Job, stages: Stages) -> tuple[pycolmap.Reconstruction, dict[str, object]]:
+    """Find the poses of a job's photographs; returns the model, and statistics.
 
     Raises:
         NoPoses: there are none.
@@ -55,26 +55,25 @@ def find(job: Job, stages: Stages) -> dict[str, object]:
     registered = model.num_reg_images() if model is not None else 0
     chosen = pairs.FEW < len(job.order) <= pairs.WORTH_ALL and job.matching == "auto"
     if chosen and registered < mapping.ENOUGH * len(job.order):
-        pairs.match_rest(job, database, stages)
+        pairs.match(job, database, stages, every=True)
         graph, again = _mapped(job, database, stages)
         model = mapping.better(job, database, model, again)
     if model is None or model.num_reg_images() < LEAST:
         raise explain.why_none(job, graph)
     angle = explain.parallax(model)
     if angle < explain.PARALLAX:
-        raise explain.from_one_spot()
+        raise NoPoses(explain.FROM_ONE_SPOT)
     placed = {image.name for image in model.images.values() if image.has_pose}
     model.extract_colors_for_all_images(job.images)
-    return {
+    return model, {
         "registered": len(placed),
         "reprojection_error": model.compute_mean_reprojection_error(),
         "track_length": model.compute_mean_track_length(),
         "points": model.num_points3D(),
         "parallax_degrees": angle,
-        "contradicted": consistency.contradicted(model, database, mapping.pixel(job)),
+        "contradicted": consistency.contradicted(model, database, job.pixel),
         "pairs": len(graph.inliers),
         "left_out": explain.left_out(graph, placed, job.names),
-        **write(model, job),
     }
 
 
@@ -82,30 +81,25 @@ def _mapped(job: Job, database: Path, stages: Stages) -> tuple[explain.ViewGraph
     graph = explain.view_graph(database)
     parts = graph.components()
     if explain.only_turned(job, database):
-        raise explain.from_one_spot()
+        raise NoPoses(explain.FROM_ONE_SPOT)
     if not parts or len(parts[0]) < LEAST:
         return graph, None
     return graph, mapping.reconstruct(job, database, len(parts[0]), stages)
 
 
-def write(model: pycolmap.Reconstruction, job: Job) -> dict[str, object]:
-    """Write a model under the names that people gave the photographs; those without a pose are left out of it."""
-    for image in model.images.values():
-        image.name = job.names[image.name]
-    with complete_folder(Path(job.work) / MODEL) as folder:
-        model.write_binary(folder)
-    return {"cameras": {str(i): [c.model_name, *c.params.tolist()] for i, c in model.cameras.items()}}
-
-
 def main() -> None:
-    """Run one job."""
+    """Run one job, and write its model under the names that people gave the photographs."""
     job = Job.parse(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
     pycolmap.logging.minloglevel = 1  # warnings and errors
     np.seterr(all="ignore")
     stages = Stages()
     try:
-        result = triangulation.triangulate(job, stages) if job.poses else find(job, stages)
+        model, result = (mapping.triangulate(job, stages), {}) if job.poses else find(job, stages)
+        for image in model.images.values():
+            image.name = job.names[image.name]
+        with complete_folder(Path(job.work) / MODEL) as folder:
+            model.write_binary(folder)
         stages("writing", 1, 1)
         send(result={**result, "seconds": {k: v for k, v in stages.seconds.items() if k != "starting"}})
     except NoPoses as failure:

@@ -69,8 +69,7 @@ def open_image(path: Path) -> Image.Image:
 
 def encode(image: Image.Image, caption: str) -> Picture:
     """Scale an image down if it is wide, and encode it."""
-    if image.width > MAX_WIDTH:
-        image = image.resize((MAX_WIDTH, max(1, round(image.height * MAX_WIDTH / image.width))), Image.LANCZOS)
+    image.thumbnail((MAX_WIDTH, image.height), Image.LANCZOS)
     buffer, mime = io.BytesIO(), "image/png"
     image.save(buffer, "PNG")
     if buffer.tell() > MAX_PNG_BYTES and image.mode == "RGB":

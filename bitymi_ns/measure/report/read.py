@@ -22,6 +22,7 @@ from bitymi_ns.measure.report.records import (
     finite_numbers,
     link,
 )
+from bitymi_ns.measure.report.tables import COLUMNS
 from bitymi_ns.trust import json_of
 
 PICTURES = "pictures.json"
@@ -33,14 +34,6 @@ SIDE_BY_SIDE = re.compile(r"^eval_img_(?P<index>\d{4,})$", re.IGNORECASE)
 _SKIPPED = {"__pycache__", "node_modules", "wandb", "nerfstudio_models"}
 _NOT_OF_A_RUN = ("cell", "bundle", "export", "views")
 _POSES = {"source", "registered", "given", "reprojection_error", "track_length", "left_out", "seconds"}
-_SHOWN = (
-    ("psnr", 2, "dB"),
-    ("cc_psnr", 2, "dB ccPSNR"),
-    ("ssim", 3, "SSIM"),
-    ("flip", 3, "FLIP"),
-    ("lpips", 3, "LPIPS"),
-    ("lpips_vgg", 3, "LPIPS (VGG)"),
-)
 
 
 # text and JSON
@@ -125,7 +118,7 @@ def read_pictures(path: Path, run: str = "") -> dict[str, list[tuple[str, Path]]
     try:
         for view in data["views"]:
             metrics = finite_numbers(view["metrics"])
-            figures = [f"{metrics[key]:.{digits}f} {text}" for key, digits, text in _SHOWN if key in metrics]
+            figures = [f"{c.title} {c.text(metrics[c.key])}" for c in COLUMNS if c.key in metrics]
             rank = "worst" if view["rank"] == 1 else f"number {view['rank']} from below"
             title = f"{scene}, {method}: view {view['view']}, {rank} of {view['of']}: {', '.join(figures)}"
             files = view["files"].items()

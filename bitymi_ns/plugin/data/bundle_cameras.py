@@ -13,7 +13,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserCo
 from bitymi_ns.bundle import BundleError
 from bitymi_ns.bundle.parts import CAMERAS
 from bitymi_ns.bundle.read import read_manifest
-from bitymi_ns.interchange.bundle_cameras import NamedCamera, named_cameras
+from bitymi_ns.interchange.bundle_cameras import CameraRow, named_cameras
 from bitymi_ns.plugin.console import fail
 from bitymi_ns.plugin.data.lens import Pinhole
 from bitymi_ns.plugin.data.views import NO_PHOTOS, OPENCV_AXES, Views, pinhole_cameras
@@ -66,9 +66,9 @@ def has_cameras(bundle: Path) -> bool:
         fail(str(error), error)
 
 
-def _cameras(rows: Sequence[NamedCamera]) -> Cameras:
+def _cameras(rows: Sequence[CameraRow]) -> Cameras:
     poses, pinholes = [], []
-    for _, _, camera in rows:
+    for camera in (row.camera for row in rows):
         poses.append((torch.linalg.inv(camera.viewmat.double()) @ torch.from_numpy(OPENCV_AXES)).float())
         K = camera.K.tolist()
         pinholes.append(Pinhole(K[0][0], K[1][1], K[0][2], K[1][2], camera.width, camera.height))

@@ -17,11 +17,8 @@ POSSIBLE_VIEW = (0.01, 178.0)  # view angles, degrees; outside, the focal length
 
 
 def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Camera:
-    """Convert one nerfstudio camera (OpenGL axes: x right, y up, z backward) to world-to-camera in OpenCV axes.
-
-    Args:
-        cameras: a single camera, of shape () or (1,).
-        device: of the result; None = that of the camera.
+    """Convert one nerfstudio camera, of shape () or (1,) (OpenGL axes: x right, y up, z backward), to world-to-camera
+    in OpenCV axes, on its device unless another is stated.
 
     Raises:
         InputError: it is not a perspective camera, or it has lens distortion.
@@ -56,12 +53,8 @@ def to_cameras(cameras: Cameras, device: torch.device | str | None = None) -> li
 
 
 def check_cameras(cameras: Sequence[Cameras], names: Sequence[object]) -> None:
-    """Fail or warn at pinhole cameras that see nothing, or at focal lengths that do not go with the picture size.
-
-    Args:
-        cameras: of the training and of the held-out views.
-        names: of all their photographs, for messages.
-    """
+    """Fail or warn at pinhole cameras, of the training and of the held-out views, that see nothing, or at focal lengths
+    that do not go with the picture size."""
 
     def column(name: str) -> Tensor:
         return torch.cat([getattr(some, name).flatten() for some in cameras]).double()

@@ -1,14 +1,12 @@
 """Checks of a capture before any time is spent on it, and errors of nerfstudio's loaders in plain words."""
 
 import math
-import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
@@ -17,19 +15,14 @@ from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataPar
 from nerfstudio.data.dataparsers.minimal_dataparser import MinimalDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.dataparsers.sdfstudio_dataparser import SDFStudioDataParserConfig
+from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image, UnidentifiedImageError
 
-from bitymi_ns.capture.recognise import Format, Found
+from bitymi_ns.capture.recognise import Format
 from bitymi_ns.plugin.console import fail
-from bitymi_ns.plugin.data.bundle_cameras import BundleCamerasConfig
-from bitymi_ns.plugin.data.colmap_model import read_model
-from bitymi_ns.plugin.data.colmap_views import mask_files
-from bitymi_ns.plugin.data.dataparser import SCANNED, BitymiDataParserConfig
-from bitymi_ns.plugin.data.images import MAX_PIXELS, check_sizes
-from bitymi_ns.plugin.data.names import check_photographs_exist
-from bitymi_ns.plugin.data.point_files import ply_fault, point_count
-from bitymi_ns.plugin.data.pose_checks import check_spread
-from bitymi_ns.plugin.data.scanner_views import scanner_photographs
+from bitymi_ns.plugin.data.colmap_model import forget_model
+from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
+from bitymi_ns.plugin.data.images import MAX_PIXELS
 from bitymi_ns.plugin.data.transforms import HOW_TO_GET_ONE
 from bitymi_ns.plugin.run.commands import folder_being_evaluated, how_to_say_where
 from bitymi_ns.trust import json_of
@@ -70,16 +63,9 @@ def bitymi_parser(config: DataParserConfig) -> DataParserConfig:
     return BitymiDataParserConfig(format=format, **options)
 
 
-def check_capture(config: FullImageDatamanagerConfig, need_photos: bool = True) -> int:
-    """Check that there is a usable capture where the configuration points; parsers of nerfstudio are replaced by
-    `bitymi_parser`.
-
-    Args:
-        config: of the data manager.
-        need_photos: False = photographs may be missing.
-
-    Returns:
-        the number of its points as far as it is known before they are read, else 0.
+def check_capture(config: FullImageDatamanagerConfig, read: bool = False) -> None:
+    """Check that there is a capture where the data manager's configuration points; parsers of nerfstudio are replaced
+    by `bitymi_parser`. With `read`, views with poses are read as well; they say nothing, as they will be read again.
 
     Raises:
         InputError: there is none.
@@ -89,13 +75,17 @@ def check_capture(config: FullImageDatamanagerConfig, need_photos: bool = True) 
     if not data.exists():
         made = "" if folder_being_evaluated() else f" {HOW_TO_GET_ONE}"
         fail(f"the capture {data} does not exist. {how_to_say_where()}{made}")
-    if isinstance(dataparser, BundleCamerasConfig):
-        return 0
     _check_options(dataparser)
-    if not isinstance(dataparser, BitymiDataParserConfig):
-        return 0
-    dataparser.data = data
-    return _check_found(dataparser, dataparser.find(), need_photos)
+    if isinstance(dataparser, BitymiDataParserConfig):
+        dataparser.data = data
+        if read and dataparser.find().format not in ("photographs", "video"):
+            quiet, CONSOLE.quiet = CONSOLE.quiet, True
+            try:
+                with reporting_input_errors(config):
+                    dataparser.setup().get_dataparser_outputs("train")
+            finally:
+                CONSOLE.quiet = quiet
+                forget_model()
 
 
 def _check_options(dataparser: DataParserConfig) -> None:
@@ -109,46 +99,6 @@ def _check_options(dataparser: DataParserConfig) -> None:
     ):
         if used and hasattr(dataparser, name) and not within(value := getattr(dataparser, name)):
             fail(f"--{name.replace('_', '-')} is {value}, but has to be {what}. Correct it, or leave it out.")
-
-
-def _check_found(dataparser: BitymiDataParserConfig, found: Found, need_photos: bool) -> int:
-    """Check a capture in a known format; returns the number of its points."""
-    if found.format in ("photographs", "video"):
-        return 0  # there are no poses yet
-    if found.format in SCANNED:
-        photographs = scanner_photographs(found, need_photos)
-        if need_photos:
-            check_sizes([photograph.file for photograph in photographs])
-        return 0
-    own = dataparser.points == "auto"
-    if found.format == "colmap":
-        source = dataparser.source(found, need_photos)
-        model = read_model(source.folder)
-        if need_photos:
-            files = source.files(model)
-            check_photographs_exist(found.path, files)
-            check_sizes(files)
-            mask_files(source, model)
-        return len(model.xyz) if own else 0
-    read = dataparser.transforms(found, "transforms_train.json", need_photos, verbose=False)
-    if need_photos:
-        check_photographs_exist(read.path, read.files)
-        check_sizes(read.files)
-    if dataparser.auto_scale_poses and found.format == "nerfstudio":
-        check_spread(np.array([photograph.pose[:3, 3] for photograph in read.photographs]), str(read.path))
-    if found.format == "blender":
-        name, hint = dataparser.ply_path, "leave --ply-path out"
-    else:
-        name, hint = read.meta.get("ply_file_path"), f"remove ply_file_path from {read.path}"
-    if not own or name is None:
-        return 0
-    if not isinstance(name, (str, Path)) or not str(name):
-        fail(f"{read.path}: ply_file_path is {name!r}, not the name of a file. Correct it or remove it.")
-    file = found.folder / name
-    fault = ply_fault(file) if file.is_file() else "does not exist"
-    if fault is not None:
-        fail(f"the point cloud {file} {fault}. Put it there again, or {hint} to start from random points.")
-    return point_count(file)
 
 
 def declares_box(dataparser: DataParserConfig) -> bool:
@@ -180,18 +130,7 @@ def reporting_input_errors(config: Any) -> Iterator[None]:
             f"the capture {_folder_of(config)} has a photograph of more than {MAX_PIXELS:,} pixels: make it smaller",
             error,
         )
-    except (
-        AssertionError,
-        OSError,
-        EOFError,
-        LookupError,
-        ValueError,
-        TypeError,
-        AttributeError,
-        ArithmeticError,
-        RuntimeError,
-        struct.error,
-    ) as error:
+    except Exception as error:
         detail = " ".join(str(error).split()).rstrip(".") or type(error).__name__
         if isinstance(error, KeyError):
             detail = f"the entry {detail} is missing"

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.capture.recognise import image_count
 from bitymi_ns.files import encoding_of
 from bitymi_ns.plugin.console import fail, listed, warn
@@ -24,15 +25,6 @@ from bitymi_ns.plugin.data.point_files import color_bytes, ply_fault, read_point
 
 FORMS = (".txt", ".bin")
 CAMERA_SENSOR = int(pycolmap.SensorType.CAMERA)
-
-
-class ModelCamera(NamedTuple):
-    """Camera: COLMAP camera model, width and height of its pictures in pixels, and parameters."""
-
-    model: str
-    width: int
-    height: int
-    params: tuple[float, ...]
 
 
 class ModelImage(NamedTuple):
@@ -49,7 +41,7 @@ class ModelImage(NamedTuple):
 class Model(NamedTuple):
     """COLMAP model."""
 
-    cameras: dict[int, ModelCamera]  # by number
+    cameras: dict[int, ColmapCamera]  # by number
     images: list[ModelImage]  # sorted by name
     xyz: npt.NDArray[np.float64]  # [N, 3] float64 points
     rgb: npt.NDArray[np.uint8]  # [N, 3] uint8 colors; [0, 3] where they have none
@@ -106,6 +98,9 @@ def _read_model(folder: Path, stamps: tuple[Any, ...]) -> Model:
     return Model(cameras, sorted(images.values(), key=lambda image: Path(image.name)), xyz, rgb, without_colors)
 
 
+forget_model = _read_model.cache_clear
+
+
 def _file(folder: Path, name: str) -> Path:
     """Choose the text or binary file. All are of one form where one is complete: a single file of the other form is of
     another time."""
@@ -117,7 +112,7 @@ def _file(folder: Path, name: str) -> Path:
     return next((file for form in preferred if (file := folder / f"{name}{form}").is_file()), folder / f"{name}.bin")
 
 
-def _warn_of_other_form(folder: Path, cameras: dict[int, ModelCamera], images: int) -> None:
+def _warn_of_other_form(folder: Path, cameras: dict[int, ColmapCamera], images: int) -> None:
     """Warn where a binary model beside the text that is read differs from it."""
     if _file(folder, "images").suffix != ".txt" or not (folder / "images.bin").is_file():
         return
@@ -158,7 +153,7 @@ def parameter_count(model: str) -> int | None:
     return len(pycolmap.Camera.create_from_model_name(1, model, 1.0, 1, 1).params)
 
 
-def _check_cameras(path: Path, cameras: dict[int, ModelCamera]) -> None:
+def _check_cameras(path: Path, cameras: dict[int, ColmapCamera]) -> None:
     """Fail at parameters that are not finite, or not as many as the camera model has."""
     for number, camera in cameras.items():
         count = parameter_count(camera.model)
@@ -176,7 +171,7 @@ def _check_cameras(path: Path, cameras: dict[int, ModelCamera]) -> None:
             )
 
 
-def _check_images(path: Path, images: dict[int, ModelImage], cameras: dict[int, ModelCamera]) -> None:
+def _check_images(path: Path, images: dict[int, ModelImage], cameras: dict[int, ColmapCamera]) -> None:
     """Fail at images without a usable pose or camera, and at two images of one name."""
     if not images:
         fail(f"{path} lists no images: COLMAP found no poses. Give another model with `--colmap-path`.")
@@ -235,12 +230,12 @@ class _Binary:
             raise ValueError("has more than it states")
 
 
-def _cameras_binary(path: Path) -> Iterator[tuple[int, ModelCamera]]:
+def _cameras_binary(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
     file = _Binary(path)
     for _ in range(file.take("Q")[0]):
         number, kind, width, height = file.take("IiQQ")
         name = pycolmap.CameraModelId(kind).name
-        yield number, ModelCamera(name, width, height, file.take(f"{parameter_count(name)}d"))
+        yield number, ColmapCamera(name, width, height, file.take(f"{parameter_count(name)}d"))
     file.end()
 
 
@@ -284,12 +279,12 @@ def _lines(path: Path) -> Iterator[str]:
                 yield line.strip()
 
 
-def _cameras_text(path: Path) -> Iterator[tuple[int, ModelCamera]]:
+def _cameras_text(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
     for line in filter(None, _lines(path)):
         number, model, width, height, *params = line.split()
         if parameter_count(model) is None:
             raise ValueError(f"COLMAP has no camera model {model}")
-        yield int(number), ModelCamera(model, int(width), int(height), tuple(map(float, params)))
+        yield int(number), ColmapCamera(model, int(width), int(height), tuple(map(float, params)))
 
 
 def _images_text(path: Path) -> Iterator[tuple[int, ModelImage]]:

@@ -51,18 +51,24 @@ class Source:
     origin: Origin | None = None  # input of structure from motion; None = the capture came with the model
 
     @property
+    def model(self) -> Model:
+        """The model; see `read_model`."""
+        return read_model(self.folder)
+
+    @property
     def image_folder(self) -> Path:
         """Folder of the files that are read."""
         return self.copies or self.photographs
 
-    def files(self, model: Model) -> list[Path]:
+    def files(self) -> list[Path]:
         """Find the files of the model's images; missing ones under the names that the model has for them."""
-        names = [image.name for image in model.images]
+        names = [image.name for image in self.model.images]
         finder = FileFinder(self.image_folder)
         return [path or finder.missing(name) for path, name in zip(finder.find_all(names), names, strict=True)]
 
-    def describe(self, model: Model) -> str:
+    def describe(self) -> str:
         """Describe it in a line for the user."""
+        model = self.model
         used = {image.camera_id for image in model.images}
         kinds = Counter(model.cameras[number].model for number in used)
         cameras = " and ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
@@ -83,15 +89,13 @@ def find_source(
     downscale: int = 1,
     need_photos: bool = True,
 ) -> Source:
-    """Find a model's photographs and masks.
+    """Find a model's photographs and masks; photographs may be missing where they are not needed.
 
     Args:
         folder: of the model.
         capture: folder to which the paths are relative, and below which photographs are searched; where it is that of
             the model, the folders above it, too.
-        images_path, masks_path: where they are, if that is known.
         downscale: use photographs that are smaller by this factor.
-        need_photos: False = photographs may be missing.
 
     Raises:
         InputError: no folder has the model's photographs, or the masks are incomplete.
@@ -170,13 +174,7 @@ def _photo_folder(
 
 
 def find_masks(photographs: Path, capture: Path, stated: Path | None, downscale: int = 1) -> Path | None:
-    """Find the folder of masks; see `mask_folder`.
-
-    Args:
-        photographs: folder of the photographs.
-        capture: folder of the data.
-        stated: folder of masks, relative to the capture; None = find it.
-        downscale: photographs that are smaller by this factor may be used.
+    """Find the folder of masks, or the stated one relative to the capture; see `mask_folder`.
 
     Raises:
         InputError: the stated one does not exist.
@@ -187,7 +185,7 @@ def find_masks(photographs: Path, capture: Path, stated: Path | None, downscale:
         fail(f"{error}. Give it, seen from {capture}, with --masks-path.", error)
 
 
-def mask_files(source: Source, model: Model) -> list[Path] | None:
+def mask_files(source: Source) -> list[Path] | None:
     """Find the masks of the model's images, by the names of the photographs; None without masks.
 
     Raises:
@@ -195,7 +193,7 @@ def mask_files(source: Source, model: Model) -> list[Path] | None:
     """
     if source.masks is None:
         return None
-    names = [_name_in(source.image_folder, path) for path in source.files(model)]
+    names = [_name_in(source.image_folder, path) for path in source.files()]
     found = {name: mask_of(source.masks, name) for name in names}
     missing = [name for name, file in found.items() if file is None]
     if missing:
@@ -210,10 +208,10 @@ def _name_in(folder: Path, path: Path) -> str:
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name
 
 
-def warn_of_left_out(source: Source, model: Model) -> None:
+def warn_of_left_out(source: Source) -> None:
     """Report photographs that the model lacks, and those that have other names than it states."""
-    files = source.files(model)
-    other = renamed_message([image.name for image in model.images], files, source.image_folder)
+    files = source.files()
+    other = renamed_message([image.name for image in source.model.images], files, source.image_folder)
     if other:
         say(f"The COLMAP model {source.folder}: {other}")
     used = {_name_in(source.image_folder, path) for path in files}
@@ -230,15 +228,9 @@ def warn_of_left_out(source: Source, model: Model) -> None:
 
 
 def model_photographs(source: Source, need_photos: bool) -> list[Photograph]:
-    """Return the photographs of a model in the order of their names, with cameras and poses.
-
-    Args:
-        source: model and photographs.
-        need_photos: False = photographs may be missing.
-    """
-    model = read_model(source.folder)
-    files = source.files(model)
-    masks = mask_files(source, model) if need_photos else None
+    """Return the photographs of a model in the order of their names, with cameras and poses."""
+    model, files = source.model, source.files()
+    masks = mask_files(source) if need_photos else None
     return [
         Photograph(
             file=file,

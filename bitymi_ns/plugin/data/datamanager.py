@@ -27,7 +27,6 @@ from bitymi_ns.plugin.data.dataset import PHOTOGRAPH_BYTES, BitymiDataset, Cache
 from bitymi_ns.plugin.data.depth import with_depth
 from bitymi_ns.plugin.data.initial_points import reading_points
 from bitymi_ns.plugin.data.names import check_photographs_exist
-from bitymi_ns.plugin.data.point_files import reporting_time
 from bitymi_ns.plugin.data.pose_checks import check_outliers, check_point_unit, warn_of_mirrored
 from bitymi_ns.plugin.data.views import LONGEST_SIDE, NO_PHOTOS, limit_size, with_lenses
 from bitymi_ns.train.background_points import background_points
@@ -102,8 +101,8 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         self._budget = MemoryBudget(PHOTOGRAPH_BYTES)
         self.step_view: Callable[[int], View] = lambda index: self.train_views[index]
         images.set_up_pillow()
-        points = check_capture(config, need_photos=test_mode != "inference")
-        with reporting_input_errors(config), reporting_time("Reading", points), reading_points(test_mode == "val"):
+        check_capture(config)
+        with reporting_input_errors(config), reading_points(test_mode == "val"):
             super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
         self._check_images(test_mode)
         if test_mode == "val":

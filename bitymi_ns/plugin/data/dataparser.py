@@ -1,7 +1,7 @@
 """`bitymi-data`, the methods' default parser: recognizes the format of a folder or file, reads it as photographs with
 cameras and poses, and splits these by one rule for all formats."""
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -76,7 +76,7 @@ BLENDER_SIDE = 1.5  # half the side of the box of a Blender data set, as in nerf
 
 
 @dataclass
-class BitymiDataParserConfig(DataParserConfig):
+class BitymiDataParserConfig(FrameOptions, DataParserConfig):
     """Reads what --data holds: a transforms.json of nerfstudio or instant-ngp, a COLMAP project, a Blender data set,
     an export of Polycam, Record3D or an RGB-D camera, a folder of photographs, or a video."""
 
@@ -115,16 +115,6 @@ class BitymiDataParserConfig(DataParserConfig):
     """Share of the photographs to train on, with --eval-mode fraction."""
     eval_names: tuple[str, ...] = ()
     """Names of photographs to hold out, or a text file (.txt) with one per line; overrides --eval-mode."""
-    scale_factor: float = 1.0
-    """Factor on the positions of the cameras."""
-    scene_scale: float = 1.0
-    """Half the side of the box of random points."""
-    orientation_method: Literal["pca", "up", "vertical", "none"] = "up"
-    """Orientation of the capture: up = the cameras' mean up is z."""
-    center_method: Literal["poses", "focus", "none"] = "poses"
-    """Origin: the middle of the cameras, or the point that they look at."""
-    auto_scale_poses: bool = True
-    """Scale the capture so that the cameras fit into a box from -1 to 1."""
     sfm: SfmSettings = SfmSettings()  # noqa: RUF009 - it is frozen
     """Structure from motion for photographs and videos."""
     poses: tyro.conf.Suppress[Path | None] = None
@@ -158,15 +148,11 @@ class BitymiDataParserConfig(DataParserConfig):
         """Replace the name of a file of names by its content, so that config.yml stands on its own."""
         self.eval_names = splits.read_names(self.eval_names)
 
-    def transforms(self, found: Found, name: str, need_photos: bool, verbose: bool = True) -> Transforms:
+    def transforms(self, found: Found, name: str, need_photos: bool) -> Transforms:
         """Read a JSON file of a nerfstudio, instant-ngp or Blender capture; `name` of the file for the latter. See
         `read_transforms`."""
         path = found.folder / name if found.format == "blender" else found.path
-        return read_transforms(path, found.format == "nerfstudio", self.downscale_factor or 1, need_photos, verbose)
-
-    def frame_options(self) -> FrameOptions:
-        """Return the options on the frame of the capture."""
-        return FrameOptions(**{each.name: getattr(self, each.name) for each in fields(FrameOptions)})
+        return read_transforms(path, found.format == "nerfstudio", self.downscale_factor or 1, need_photos)
 
     def source(self, found: Found, need_photos: bool = True) -> Source:
         """Find the COLMAP model and its photographs, by structure from motion for photographs without poses."""
@@ -250,7 +236,7 @@ class BitymiDataParser(DataParser):
         read = config.transforms(found, "", need_photos)
         if need_photos:
             check_photographs_exist(read.path, read.files)
-        meta, frame = read.meta, config.frame_options()
+        meta, frame = read.meta, config
         if found.format == "instant-ngp":  # whose scale is that of its bounding box
             half = 0.5 * float(meta.get("aabb_scale", 1))
             frame = FrameOptions(NGP_SCALE, "none", "none", auto_scale_poses=False, scene_scale=half)
@@ -263,8 +249,9 @@ class BitymiDataParser(DataParser):
         what = f"{found.path} ({found.format}, {len(read.photographs)} photographs)"
         own = None
         if config.points == "auto":
-            if meta.get("ply_file_path"):
-                own = read_colored_points(found.folder / meta["ply_file_path"], read.photographs)
+            if "ply_file_path" in meta:
+                hint = f"remove ply_file_path from {read.path}"
+                own = read_colored_points(found.folder / meta["ply_file_path"], hint, read.photographs)
             elif model is not None:
                 own = model_points(read_model(model), np.eye(4) if applied is None else applied)
                 own = with_colors(own, read_model(model).without_colors, read.photographs, model)
@@ -290,18 +277,19 @@ class BitymiDataParser(DataParser):
         source = config.source(found, need_photos)
         self.poses_report = source.report or self.poses_report
         self.sfm_source = None if source.origin is None else source
-        model = read_model(source.folder)
-        self._report(found, source.describe(model))
+        model = source.model
+        if need_photos and found.format == "colmap":
+            check_photographs_exist(found.path, source.files())
+        self._report(found, source.describe())
         if need_photos:
-            warn_of_left_out(source, model)
+            warn_of_left_out(source)
         photographs, where = model_photographs(source, need_photos), str(source.folder)
         own = model_points(model, TO_NERFSTUDIO)
         if need_photos and points_wanted() and config.points == "auto":
             own = with_colors(own, model.without_colors, photographs, source.folder)
             check_conventions(own, photographs, COLMAP_CONVENTIONS, where, TO_NERFSTUDIO)
         points = initial_points(own, config.points, photographs, found.folder, where)
-        frame = config.frame_options()
-        views = make_views(photographs, frame, points, where, source.downscale, need_photos, applied=TO_NERFSTUDIO)
+        views = make_views(photographs, config, points, where, source.downscale, need_photos, applied=TO_NERFSTUDIO)
         return views, _list_files(found.folder)
 
     def _scanned(self, found: Found) -> tuple[Views, NameLists]:
@@ -314,7 +302,7 @@ class BitymiDataParser(DataParser):
             say(f"Not taken for photographs: {listed(others)}.")
         points = initial_points(None, config.points, photographs, found.folder, str(found.path))
         downscale = config.downscale_factor or 1
-        return make_views(photographs, config.frame_options(), points, str(found.path), downscale, need_photos), {}
+        return make_views(photographs, config, points, str(found.path), downscale, need_photos), {}
 
     def _blender(self, found: Found) -> dict[str, DataparserOutputs]:
         """Read the capture's own split. Where one of its two files of held-out views is missing, or all its photographs
@@ -330,7 +318,9 @@ class BitymiDataParser(DataParser):
                 parts[name] = _existing(part) if need_photos else part.photographs
         there = [name for name in ("val", "test") if parts.get(name)]
         self._report(found, f"{train.path} (blender, {len(train.photographs)} photographs)")
-        own = None if config.ply_path is None else read_colored_points(found.path / config.ply_path, train.photographs)
+        own = None
+        if config.ply_path is not None and config.points == "auto":
+            own = read_colored_points(found.path / config.ply_path, "leave --ply-path out", train.photographs)
         frame = FrameOptions(config.scale_factor, "none", "none", auto_scale_poses=False, scene_scale=BLENDER_SIDE)
         if config.scale_factor == 1.0:  # else the user has chosen it
             frame = fit_scale(frame, train.photographs, str(train.path))

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.data.depth import FITTED
-from bitymi_ns.plugin.data.images import THREADS, ImageSummary, read_image, read_mask, summarize, wrong_size
+from bitymi_ns.plugin.data.images import ImageSummary, in_threads, read_image, read_mask, summarize, wrong_size
 from bitymi_ns.plugin.data.lens import Lens
 from bitymi_ns.plugin.data.pose_checks import rotations
 from bitymi_ns.plugin.data.views import NO_PHOTOS, photograph_files, select_views
@@ -71,7 +71,7 @@ class BitymiDataset(InputDataset):
             return np.full((*declared[::-1], 3), 128, np.uint8)
         lens = self._lens(image_idx)
         read = self._read_shared if lens.face else read_image
-        image = lens.undistort(read(path, lens.stored, lens.size))
+        image = lens.undistort(read(path, lens.stored, lens.camera.size))
         image = self._scaled(image, Image.Resampling.BILINEAR)
         if image.size != declared:
             fail(wrong_size(path, image.size, declared))
@@ -187,11 +187,7 @@ class CachedImages(Sequence):
 
 
 def drop_blank_views(outputs: DataparserOutputs, split: str) -> DataparserOutputs:
-    """Leave out the views whose masks exclude every pixel.
-
-    Args:
-        outputs: of a parser.
-        split: "training" or "held-out", for messages.
+    """Leave out the views whose masks exclude every pixel; `split` is "training" or "held-out".
 
     Raises:
         InputError: no training view is left.
@@ -199,8 +195,7 @@ def drop_blank_views(outputs: DataparserOutputs, split: str) -> DataparserOutput
     masks = outputs.mask_filenames
     if not masks:
         return outputs
-    with ThreadPoolExecutor(THREADS) as pool:
-        boxes = list(pool.map(lambda i: view_mask(outputs, i).getbbox(), range(len(masks))))
+    boxes = in_threads(lambda i: view_mask(outputs, i).getbbox(), range(len(masks)))
     blank = [i for i, box in enumerate(boxes) if box is None]
     if not blank:
         return outputs

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -16,7 +15,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 
 from bitymi_ns.plugin.console import say, warn
 from bitymi_ns.plugin.data.depth_files import MAPS, MapFiles, Values, read_depth, read_normal
-from bitymi_ns.plugin.data.images import THREADS, read_image
+from bitymi_ns.plugin.data.images import in_threads, read_image
 from bitymi_ns.plugin.data.initial_points import GREY
 from bitymi_ns.plugin.data.lens import Lens, Pinhole
 from bitymi_ns.train.views import spread
@@ -98,16 +97,8 @@ class _Seen(NamedTuple):
 def with_depth(
     outputs: DataparserOutputs, kind: DepthKind = "auto", unit: float | None = None, add_points: bool = True
 ) -> DataparserOutputs:
-    """Fit the depth maps of training views to the scene, and add points from them to those of the capture.
-
-    Args:
-        outputs: training views of limited size, with lenses.
-        kind: of the maps.
-        unit: see `read_depth`.
-        add_points: extend the points of the capture to one for PIXELS_PER_POINT pixels.
-
-    Returns:
-        The outputs with a `DepthFit` or None for each view, where depth is used at all.
+    """Fit the depth maps of training views of limited size to the scene, and add points from them to those of the
+    capture: one for PIXELS_PER_POINT pixels. Metadata gets `FittedMaps` for each view, where depth is used at all.
 
     Raises:
         InputError: a map cannot be read, or has another shape than its photograph.
@@ -143,8 +134,7 @@ def _read_maps(outputs: DataparserOutputs, rows: Sequence[int], unit: float | No
         lens: lens.downscaled(min(1.0, SIDE / max(lens.pinhole.width, lens.pinhole.height)))
         for lens in dict.fromkeys(lenses[i] for i in rows)
     }
-    with ThreadPoolExecutor(THREADS) as pool:
-        values = list(pool.map(lambda i: read_depth(maps[i], small[lenses[i]], unit), rows))
+    values = in_threads(lambda i: read_depth(maps[i], small[lenses[i]], unit), rows)
     poses = outputs.cameras.camera_to_worlds.double().numpy()
     return [
         _Seen(each, small[lenses[i]], poses[i, :, 3], poses[i, :, :3] * (1.0, -1.0, -1.0))
@@ -188,14 +178,8 @@ def _unproject(pixels: npt.NDArray[np.intp], view: _Seen) -> Floats:
 
 
 def _fits(seen: Sequence[_Seen], xyz: Floats, kind: DepthKind, unit: float) -> list[DepthFit | None] | None:
-    """Fit each map to points of the scene, or take it as metric where there are none; None = depth is of no use.
-
-    Args:
-        seen: views with depth.
-        xyz: [N, 3] points.
-        kind: of the maps.
-        unit: units of the scene per metre, by the capture.
-    """
+    """Fit each map to points [N, 3] of the scene, or take it as metric where there are none, with `unit` units of the
+    scene per metre; None = depth is of no use."""
     if not any(each.values.any() for each in seen):
         warn("The depth maps have no valid pixel: depth is not used.")
         return None
@@ -337,11 +321,10 @@ def _new_points(seen: Sequence[_Seen], files: Sequence[Path], count: int) -> tup
         agree, through, _ = _votes(xyz, i, seen)
         kept = agree >= through
         lens = seen[i].lens
-        image = lens.undistort(read_image(files[i], lens.stored, lens.size).convert("RGB"))
+        image = lens.undistort(read_image(files[i], lens.stored, lens.camera.size).convert("RGB"))
         return xyz[kept], np.asarray(image).reshape(-1, 3)[draws[i][kept]], 1.0 / (1.0 + agree[kept])
 
-    with ThreadPoolExecutor(THREADS) as pool:
-        parts = list(pool.map(of_view, range(len(seen))))
+    parts = in_threads(of_view, range(len(seen)))
     xyz, rgb, weight = (np.concatenate([part[k] for part in parts]) for k in range(3))
     if len(xyz) <= count:
         return xyz, rgb

@@ -75,15 +75,12 @@ def _channels_differ(values: npt.NDArray[np.generic]) -> bool:
 
 
 def read_depth(files: MapFiles, lens: Lens, unit: float | None = None) -> Values:
-    """Read camera z [H, W] for the pinhole picture of a lens; 0 = unknown.
+    """Read camera z [H, W] for the pinhole picture of a photograph's lens; 0 = unknown. The map is resized to the
+    photograph and undistorted by nearest neighbors.
 
     Integers count millimetres; 0 and the largest one are unknown. Floating-point numbers are metres; those that are not
-    finite, not above 0, or 65,504 and more are unknown. So is what has confidence 0.
-
-    Args:
-        files: with a depth.
-        lens: of the photograph. The map is resized to it and undistorted by nearest neighbors.
-        unit: metres of a unit; None = as above.
+    finite, not above 0, or 65,504 and more are unknown. So is what has confidence 0. `unit` is another length of a unit
+    in metres.
 
     Raises:
         InputError: a file cannot be read, or has another shape than the photograph.

@@ -4,7 +4,7 @@ photographs."""
 import hashlib
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -13,14 +13,15 @@ import numpy as np
 import numpy.typing as npt
 from PIL import EpsImagePlugin, Image, UnidentifiedImageError
 
+from bitymi_ns.capture import masks
 from bitymi_ns.capture.exif import exposure_settings
-from bitymi_ns.capture.masks import has_transparency, mask_pixels
+from bitymi_ns.capture.masks import has_transparency
 from bitymi_ns.capture.photos import eight_bits, in_srgb
 from bitymi_ns.capture.recognise import open_picture
 from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.train.exposure import exif_stops
 
-T = TypeVar("T")
+S, T = TypeVar("S"), TypeVar("T")
 ORIENTATION = 0x0112  # EXIF tag that asks viewers to turn a photograph; 1 = as it is stored
 MAX_PIXELS = 1_000_000_000  # photographs with more pixels are refused; phones take some of 200 million
 THREADS = 4
@@ -33,6 +34,12 @@ def set_up_pillow() -> None:
     Ghostscript on files that are PostScript whatever their name."""
     EpsImagePlugin.gs_binary = False
     Image.MAX_IMAGE_PIXELS = MAX_PIXELS // 2  # PIL refuses twice as many
+
+
+def in_threads(function: Callable[[S], T], items: Iterable[S]) -> list[T]:
+    """Apply a function that reads files to each item, in a few threads."""
+    with ThreadPoolExecutor(THREADS) as pool:
+        return list(pool.map(function, items))
 
 
 def from_header(path: Path, read: Callable[[Image.Image], T], default: T) -> T:
@@ -72,8 +79,7 @@ def exposure_stops(paths: Sequence[Path]) -> list[float]:
     A lens without electronics writes no f-number, and some cameras no ISO: what no photograph has counts as equal for
     all. Photographs that lack what most have cannot be compared with these, and are NaN.
     """
-    with ThreadPoolExecutor(THREADS) as pool:
-        found = list(pool.map(lambda path: from_header(path, exposure_settings, None), paths))
+    found = in_threads(lambda path: from_header(path, exposure_settings, None), paths)
     kinds = Counter(tuple(value is not None for value in each) for each in found if each is not None)
     if not kinds:
         return [math.nan] * len(paths)
@@ -98,19 +104,21 @@ def check_sizes(paths: Sequence[Path]) -> None:
         except (OSError, SyntaxError, ValueError):
             return False  # other faults are reported where the file is read
 
-    with ThreadPoolExecutor(THREADS) as pool:
-        large = [path for path, refused in zip(paths, pool.map(too_large, paths), strict=True) if refused]
+    large = [path for path, refused in zip(paths, in_threads(too_large, paths), strict=True) if refused]
     if large:
-        fail(
-            f"{listed(large)} has more than {MAX_PIXELS:,} pixels. Make it smaller, and w, h, fl_x, fl_y, cx and cy "
-            "of its camera with it."
-        )
+        fail(_too_large(large))
+
+
+def _too_large(paths: Sequence[Path]) -> str:
+    return (
+        f"{listed(paths)} has more than {MAX_PIXELS:,} pixels. Make it smaller, and w, h, fl_x, fl_y, cx and cy of its "
+        "camera with it."
+    )
 
 
 def check_orientation(paths: Sequence[Path]) -> None:
     """Warn of photographs with an EXIF orientation: they are used as they are stored."""
-    with ThreadPoolExecutor(THREADS) as pool:
-        turned = [path for path, value in zip(paths, pool.map(orientation, paths), strict=True) if value != 1]
+    turned = [path for path, value in zip(paths, in_threads(orientation, paths), strict=True) if value != 1]
     if turned:
         warn(
             f"{listed(turned)} has an EXIF tag that asks viewers to turn the photograph. It is used as it is stored, "
@@ -125,7 +133,6 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
     Deep grey images are scaled to 8 bits, where PIL would clip them to white.
 
     Args:
-        path: image file.
         stored: width and height that it must have; None = any.
         wanted: width and height to which it will be downscaled. A JPEG may then be decoded at a half, a quarter or an
             eighth of its size, but no smaller than this.
@@ -143,6 +150,8 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
             return picture.convert("RGBA" if has_transparency(file) else "RGB")
     except FileNotFoundError as error:
         fail(f"the image {path} is missing, but the capture has a pose for it", error)
+    except Image.DecompressionBombError as error:
+        fail(_too_large([path]), error)
     except UNREADABLE as error:
         fail(f"the image {path} cannot be read: {error}. Replace it or remove it from the capture.", error)
 
@@ -150,8 +159,7 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
 def read_mask(path: Path) -> Image.Image:
     """Read a mask as a 1-bit image, True where pixels count; see `mask_pixels`."""
     try:
-        with open_picture(path) as file:
-            return Image.fromarray(mask_pixels(file))
+        return masks.read_mask(path)
     except FileNotFoundError as error:
         fail(f"the mask {path} is missing", error)
     except UNREADABLE as error:
@@ -224,11 +232,7 @@ def duplicates(train: Sequence[Any], held_out: Sequence[Any]) -> list[Pair]:
 
 
 def _digest(path: Path) -> bytes:
-    digest = hashlib.sha256()
-    with open(path, "rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.digest()
+    return hashlib.sha256(path.read_bytes()).digest()
 
 
 def warn_of_duplicates(pairs: Sequence[Pair], train: Sequence[Path], held_out: Sequence[Path]) -> None:

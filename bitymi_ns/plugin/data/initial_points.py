@@ -15,10 +15,8 @@ from scipy.spatial.transform import Rotation
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.plugin.console import fail, say, warn
 from bitymi_ns.plugin.data.colmap_model import read_model
-from bitymi_ns.plugin.data.cube_faces import colmap_camera
 from bitymi_ns.plugin.data.images import image_size, read_image
-from bitymi_ns.plugin.data.lens import rescaled
-from bitymi_ns.plugin.data.point_files import Points, read_points
+from bitymi_ns.plugin.data.point_files import Points, ply_fault, read_points
 from bitymi_ns.plugin.data.views import OPENCV_AXES, Photograph, Pose
 from bitymi_ns.ply import PlyError
 from bitymi_ns.train.views import spread
@@ -64,15 +62,8 @@ def points_wanted() -> bool:
 def initial_points(
     own: Points | None, choice: Choice, photographs: Sequence[Photograph], folder: Path, source: str
 ) -> Points | None:
-    """Choose the points to start from; None = random ones.
-
-    Args:
-        own: points of the capture; None = it has none.
-        choice: which are wanted.
-        photographs: from which points are triangulated.
-        folder: of the capture, where triangulated points are kept.
-        source: of the poses, for messages.
-    """
+    """Choose the points to start from: the capture's `own`, or triangulated ones, which are kept in its `folder`; None
+    = random ones. `source` of the poses is for messages."""
     if choice == "random":
         return None
     if own is not None and len(own.xyz) and choice == "auto":
@@ -82,7 +73,7 @@ def initial_points(
 
 def triangulated(photographs: Sequence[Photograph], folder: Path, source: str) -> Points | None:
     """Triangulate points from photographs with poses; None (with a warning) where that is not possible."""
-    from bitymi_ns.capture import KnownView, triangulate  # slow to import, and seldom needed
+    from bitymi_ns.capture.known import KnownView, triangulate  # slow to import, and seldom needed
     from bitymi_ns.progress import rich_progress
 
     middle = np.mean([photograph.pose[:3, 3] for photograph in photographs], axis=0)
@@ -91,14 +82,12 @@ def triangulated(photographs: Sequence[Photograph], folder: Path, source: str) -
     views = []
     for photograph in photographs:
         camera = photograph.camera
-        size = (camera.width, camera.height)
-        stored = (image_size(photograph.file) or size) if photograph.downscaled else size
+        stored = (photograph.downscaled and image_size(photograph.file)) or camera.size
         c2w = photograph.pose @ OPENCV_AXES
         rotation = (mirror @ c2w[:3, :3]).T
         translation = -rotation @ mirror @ (c2w[:3, 3] - middle)
-        params = rescaled(camera.model, camera.params, size, stored)
         pose = np.column_stack([rotation, translation])
-        views.append(KnownView(photograph.file, camera.model, *stored, params, pose, photograph.mask))
+        views.append(KnownView(photograph.file, camera.rescaled(*stored), pose, photograph.mask))
     say(f"{source} has no points: they are triangulated from the photographs, once. --points random does without.")
     try:
         if any(mirrored) and not all(mirrored):
@@ -112,8 +101,12 @@ def triangulated(photographs: Sequence[Photograph], folder: Path, source: str) -
     return Points(model.xyz @ mirror + middle, model.rgb)
 
 
-def read_colored_points(path: Path, photographs: Sequence[Photograph]) -> Points:
-    """Read the points of a PLY file, with colors from the photographs where it has none; see `with_colors`."""
+def read_colored_points(path: Path, without: str, photographs: Sequence[Photograph]) -> Points:
+    """Read the points of a PLY file, with colors from the photographs where it has none; see `with_colors`. `without`
+    says how to do without it."""
+    fault = ply_fault(path) if path.is_file() else "does not exist"
+    if fault is not None:
+        fail(f"the point cloud {path} {fault}. Put it there again, or {without} to start from random points.")
     try:
         points, without_colors = read_points(path)
     except PlyError as error:
@@ -122,14 +115,8 @@ def read_colored_points(path: Path, photographs: Sequence[Photograph]) -> Points
 
 
 def with_colors(points: Points, without: str, photographs: Sequence[Photograph], source: Path) -> Points:
-    """Color points that have no colors by the photographs, where a scene starts from them.
-
-    Args:
-        points: in the frame of the photographs.
-        without: why they have no colors; empty where they have.
-        photographs: see `color_points`.
-        source: of the points, for the message.
-    """
+    """Color points in the frame of the photographs that have no colors, for the reason `without`, by `color_points`,
+    where a scene starts from them."""
     if not without and not points.rgb.any():
         without = "its own are all black"
     if not without or not len(points.xyz) or not points_wanted():
@@ -159,13 +146,13 @@ def sample_colors(
     camera = photograph.camera
     colors = np.full((len(xyz), 3), np.nan, np.float32)
     local = (xyz - photograph.pose[:3, 3]) @ photograph.pose[:3, :3] * [1.0, -1.0, -1.0]
-    lens = colmap_camera(camera.model, camera.params, (camera.width, camera.height))
+    lens = camera.colmap
     front = np.flatnonzero(lens.is_spherical() | (local[:, 2] > 0.0))
     if not len(front):
         return colors
     pixels = lens.img_from_cam(local[front] / np.abs(local[front, 2:]).clip(min=1e-12))
     height, width = image.shape[:2]
-    pixels = np.nan_to_num(pixels * [width / camera.width, height / camera.height], nan=-1.0, posinf=-1.0, neginf=-1.0)
+    pixels = np.nan_to_num(pixels * np.divide((width, height), camera.size), nan=-1.0, posinf=-1.0, neginf=-1.0)
     inside = ((pixels >= 0.0) & (pixels < (width, height))).all(1)
     x, y = pixels[inside].astype(int).T
     colors[front[inside]] = image[y, x]
@@ -217,15 +204,9 @@ def check_conventions(
     source: str,
     frame: Pose | None = None,
 ) -> None:
-    """Warn where the points are not seen by the poses as they are read, but would be by another convention.
-
-    Args:
-        points: in the frame of the poses.
-        photographs: with their poses.
-        conventions: `JSON_CONVENTIONS` or `COLMAP_CONVENTIONS`.
-        source: of the poses, for messages.
-        frame: [4, 4] from the frame in which the poses were written to that of the photographs; None = the same.
-    """
+    """Warn where the points are not seen by the poses as they are read, but would be by another of these conventions.
+    `frame` [4, 4] is from the frame in which the poses were written to that of points and photographs; None = the
+    same."""
     rgb = points.rgb if len(points.rgb) == len(points.xyz) else np.zeros((len(points.xyz), 3), np.uint8)
     kept = np.flatnonzero(np.isfinite(points.xyz).all(1))
     kept = kept[:: max(1, len(kept) // CHECK_POINTS)]

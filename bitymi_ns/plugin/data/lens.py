@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -16,10 +16,10 @@ import pycolmap
 from nerfstudio.cameras.cameras import CameraType
 from PIL import Image
 
+from bitymi_ns.capture.camera import SPHERICAL_MODEL, ColmapCamera, is_full_sphere
 from bitymi_ns.capture.masks import in_proportion
-from bitymi_ns.capture.panorama_detection import SPHERICAL_MODEL, is_full_sphere
 from bitymi_ns.plugin.console import fail, warn
-from bitymi_ns.plugin.data.cube_faces import FACES, colmap_camera, covered, resample, windows
+from bitymi_ns.plugin.data.cube_faces import FACES, covered, resample, windows
 from bitymi_ns.plugin.data.images import wrong_size
 
 MAX_VIEW_ANGLE = 110.0
@@ -28,18 +28,15 @@ ever less of the photograph: wider cameras become faces of a cube."""
 NODE_STEP = 4
 """Pixels between the nodes at which the distortion is evaluated; linear interpolation between them is accurate to far
 less than a pixel."""
-RADIAL_SAMPLES = 32
-"""Samples along a ray for testing that the distortion does not fold the picture."""
 EDGE_SAMPLES = 64
-"""Rays per picture edge for the same test."""
+"""Rays per picture edge for testing what the photograph shows."""
 CACHED_MAPS = 4
 """Lenses whose remapping tables are cached; 72 MB for 12 megapixels."""
 DOUBTFUL_AREA, ABSURD_AREA = 0.25, 0.05
 """Share of a photograph's area that undistorting leaves, below which to warn or to fail."""
 
 
-@dataclass(frozen=True)
-class Pinhole:
+class Pinhole(NamedTuple):
     """Pinhole camera in pixels, with (0, 0) at the upper left corner of the picture."""
 
     fx: float
@@ -62,18 +59,14 @@ class Lens:
     """Maps a photograph, or a face of the cube around a wide camera, to the picture of a pinhole camera.
 
     Attributes:
-        model: COLMAP camera model.
-        params: its parameters, for pictures of `size`.
-        size: width and height to which a photograph is downscaled first.
+        camera: of the photograph, in the size to which it is downscaled first.
         stored: width and height of the image file.
         pinhole: camera of the result.
         face: of the cube; empty = the photograph is one picture.
         whole: the photograph covers all of the result; else `coverage` is its mask.
     """
 
-    model: str
-    params: tuple[float, ...]
-    size: tuple[int, int]
+    camera: ColmapCamera
     stored: tuple[int, int]
     pinhole: Pinhole
     face: str = ""
@@ -82,7 +75,7 @@ class Lens:
     @property
     def distorts(self) -> bool:
         """True if undistorting moves pixels."""
-        return bool(self.face) or _distorts(_camera(self))
+        return bool(self.face) or _distorts(self.camera.colmap)
 
     @property
     def turn(self) -> npt.NDArray[np.float64]:
@@ -98,12 +91,12 @@ class Lens:
         to = self.pinhole
         x, y = (np.arange(to.width) + 0.5 - to.cx) / to.fx, (np.arange(to.height) + 0.5 - to.cy) / to.fy
         rays = np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), -1)
-        return covered(self.model, self.params, self.size, self.face, rays)
+        return covered(self.camera, self.face, rays)
 
     def undistort(self, image: Image.Image) -> Image.Image:
-        """Undistort an 8-bit image of any mode, decoded at `stored` or less, but not below `size`."""
-        if image.size != self.size:
-            image = image.resize(self.size, Image.Resampling.BOX)
+        """Undistort an 8-bit image of any mode, decoded at `stored` or less, but not below the size of `camera`."""
+        if image.size != self.camera.size:
+            image = image.resize(self.camera.size, Image.Resampling.BOX)
         if not self.distorts:
             return image
         return Image.fromarray(self._moved(np.asarray(image), cv2.INTER_LINEAR), image.mode)
@@ -122,7 +115,7 @@ class Lens:
         size = (values.shape[1], values.shape[0])
         if not in_proportion(size, self.stored):
             fail(wrong_size(path, size, self.stored))
-        values = cv2.resize(values, self.size, interpolation=cv2.INTER_NEAREST_EXACT)
+        values = cv2.resize(values, self.camera.size, interpolation=cv2.INTER_NEAREST_EXACT)
         if self.distorts:
             values = self._moved(values, cv2.INTER_NEAREST)
         return values
@@ -130,31 +123,24 @@ class Lens:
     def _moved(self, pixels: npt.NDArray[Any], interpolation: int) -> npt.NDArray[Any]:
         if self.face:
             nearest = interpolation == cv2.INTER_NEAREST
-            return resample(pixels, self.model, self.params, self.face, astuple(self.pinhole), nearest)
+            return resample(pixels, self.camera, self.face, self.pinhole, nearest)
         return cv2.remap(pixels, *_maps(self), interpolation, borderMode=cv2.BORDER_REPLICATE)
 
     def downscaled(self, factor: float) -> Lens:
         """Return the same lens for pictures scaled by `factor`."""
-        size = (max(1, round(self.size[0] * factor)), max(1, round(self.size[1] * factor)))
         of = self.pinhole
         width, height = max(1, round(of.width * factor)), max(1, round(of.height * factor))
         x, y = width / of.width, height / of.height
-        return replace(
-            self,
-            params=rescaled(self.model, self.params, self.size, size),
-            size=size,
-            pinhole=Pinhole(of.fx * x, of.fy * y, of.cx * x, of.cy * y, width, height),
-        )
+        pinhole = Pinhole(of.fx * x, of.fy * y, of.cx * x, of.cy * y, width, height)
+        camera = self.camera.rescaled(*(max(1, round(side * factor)) for side in self.camera.size))
+        return replace(self, camera=camera, pinhole=pinhole)
 
 
-def lenses_of(
-    model: str, params: tuple[float, ...], width: int, height: int, stored: tuple[int, int], label: str
-) -> tuple[list[Lens], list[str]]:
-    """Choose the pinhole cameras for a camera model: one, or for cameras of more than MAX_VIEW_ANGLE faces of a cube.
+def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tuple[list[Lens], list[str]]:
+    """Choose the pinhole cameras for a camera: one, or for cameras of more than MAX_VIEW_ANGLE faces of a cube.
 
     Args:
-        model: COLMAP camera model.
-        params: its parameters, for pictures of `width` x `height`.
+        colmap: for the size to which photographs are downscaled.
         stored: width and height of the image files, which may be larger.
         label: names the camera in messages.
 
@@ -164,14 +150,15 @@ def lenses_of(
     Raises:
         InputError: the camera cannot be used.
     """
-    camera = colmap_camera(model, params, (width, height))
+    model, width, height, params = colmap
+    camera = colmap.colmap
     if camera.is_spherical():
         if not is_full_sphere(width, height):
             fail(
                 f"{label} is {model}, but its photographs have {width} x {height} pixels: pictures of all directions "
                 "are twice as wide as high. Correct the camera model, or pad the photographs to that shape."
             )
-        return _faces(model, params, (width, height), stored, label)
+        return _faces(colmap, stored, label)
     focal = (camera.focal_length_x, camera.focal_length_y)
     if not np.isfinite(params).all() or min(focal) <= 0.0 or min(width, height) < 1:
         fail(
@@ -181,8 +168,8 @@ def lenses_of(
     center = (camera.principal_point_x, camera.principal_point_y)
     if not _distorts(camera):
         pinhole = Pinhole(*focal, *center, width, height)
-        return [Lens(model, params, (width, height), stored, pinhole)], []
-    left, right, top, bottom = _window(camera)
+        return [Lens(colmap, stored, pinhole)], []
+    left, right, top, bottom = _window(colmap)
     w, h = int((left + right) * focal[0]), int((top + bottom) * focal[1])
     share = w * h / (width * height)
     if share < ABSURD_AREA or min(w, h) < 1:
@@ -196,31 +183,30 @@ def lenses_of(
     pinhole = Pinhole(*focal, left * focal[0], top * focal[1], w, h)
     across, down = pinhole.view
     if max(across, down) > MAX_VIEW_ANGLE - 0.5:
-        return _faces(model, params, (width, height), stored, label)
+        return _faces(colmap, stored, label)
     messages = []
     if camera.is_perspective_fisheye():
         messages.append(
             f"{label} is {model}: its photographs are used as pinhole pictures of {across:.0f} x {down:.0f} degrees "
             f"({w} x {h} pixels); what they show beyond is not used."
         )
-    return [Lens(model, params, (width, height), stored, pinhole)], messages
+    return [Lens(colmap, stored, pinhole)], messages
 
 
-def _faces(
-    model: str, params: tuple[float, ...], size: tuple[int, int], stored: tuple[int, int], label: str
-) -> tuple[list[Lens], list[str]]:
+def _faces(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tuple[list[Lens], list[str]]:
     """Lenses of the faces of the cube that a wide camera covers, with its focal length; see `lenses_of`."""
-    camera = colmap_camera(model, params, size)
-    around = size[0] / (2.0 * math.pi)
+    camera = colmap.colmap
+    around = colmap.width / (2.0 * math.pi)
     fx, fy = (around, around) if camera.is_spherical() else (camera.focal_length_x, camera.focal_length_y)
     lenses = []
-    for face, window in windows(model, params, size).items():
-        left, right, top, bottom, whole = window
+    for face, (left, right, top, bottom, whole) in windows(colmap).items():
         w, h = max(1, round((right - left) * fx)), max(1, round((bottom - top) * fy))
         u, v = w / (right - left), h / (bottom - top)
-        lenses.append(Lens(model, params, size, stored, Pinhole(u, v, -left * u, -top * v, w, h), face, whole))
+        lenses.append(Lens(colmap, stored, Pinhole(u, v, -left * u, -top * v, w, h), face, whole))
     named = ", ".join(f"{lens.face} {lens.pinhole.width} x {lens.pinhole.height}" for lens in lenses)
-    return lenses, [f"{label} is {model}: each of its photographs becomes {len(lenses)} pinhole pictures ({named})."]
+    return lenses, [
+        f"{label} is {colmap.model}: each of its photographs becomes {len(lenses)} pinhole pictures ({named})."
+    ]
 
 
 def colmap_distortion(kind: CameraType, values: Sequence[float], label: str) -> tuple[str, tuple[float, ...]]:
@@ -263,27 +249,12 @@ def colmap_distortion(kind: CameraType, values: Sequence[float], label: str) -> 
     return ("OPENCV", (k1, k2, p1, p2)) if any((k1, k2, p1, p2)) else ("PINHOLE", ())
 
 
-def rescaled(model: str, params: Sequence[float], size: tuple[int, int], new: tuple[int, int]) -> tuple[float, ...]:
-    """Rescale the parameters of a COLMAP camera from pictures of `size` (width, height) to pictures of `new`."""
-    if new == size:
-        return tuple(params)
-    if model == SPHERICAL_MODEL:
-        return tuple(map(float, new))
-    camera = colmap_camera(model, params, size)
-    camera.rescale(*new)
-    return tuple(camera.params)
-
-
-def _camera(lens: Lens) -> pycolmap.Camera:
-    return colmap_camera(lens.model, lens.params, lens.size)
-
-
 def _distorts(camera: pycolmap.Camera) -> bool:
     # pycolmap tests the coefficients alone, of which fisheye models need none
     return camera.is_perspective_fisheye() or not camera.is_undistorted()
 
 
-def _window(camera: pycolmap.Camera) -> tuple[float, float, float, float]:
+def _window(camera: ColmapCamera) -> tuple[float, float, float, float]:
     """Largest extent of the pinhole picture to the left, right, top and bottom of the axis, in focal lengths.
 
     It shows nothing that the photograph does not: neither beyond its edges, nor where the model folds the picture. Each
@@ -317,16 +288,9 @@ def _largest(fits: Callable[[float], bool]) -> float:
     return low
 
 
-def _is_seen(camera: pycolmap.Camera, rays: npt.NDArray[np.float64]) -> bool:
-    """Test that the photograph shows all rays (x, y, 1), [N, 2], and that pixels move outwards along each of them."""
-    t = np.linspace(0.0, 1.0, RADIAL_SAMPLES + 1)[1:]
-    points = (t[:, None, None] * rays).reshape(-1, 2)
-    pixels = camera.img_from_cam(np.concatenate([points, np.ones((len(points), 1))], 1)).reshape(len(t), -1, 2)
-    if not np.isfinite(pixels).all():
-        return False
-    inside = (pixels >= 0.0).all() and (pixels <= (camera.width, camera.height)).all()
-    away = np.linalg.norm(pixels - (camera.principal_point_x, camera.principal_point_y), axis=-1)
-    return bool(inside and (np.diff(away, axis=0) > 0.0).all())
+def _is_seen(camera: ColmapCamera, rays: npt.NDArray[np.float64]) -> bool:
+    """Test that the photograph shows all rays (x, y, 1), [N, 2], unfolded."""
+    return bool(covered(camera, "front", np.concatenate([rays, np.ones((len(rays), 1))], 1)).all())
 
 
 @lru_cache(maxsize=CACHED_MAPS)
@@ -335,7 +299,7 @@ def _maps(lens: Lens) -> tuple[npt.NDArray[np.int16], npt.NDArray[np.uint16]]:
     to = lens.pinhole
     x, y = (np.arange(0, size + NODE_STEP, NODE_STEP) + 0.5 for size in (to.width, to.height))
     rays = np.stack(np.meshgrid((x - to.cx) / to.fx, (y - to.cy) / to.fy), -1).reshape(-1, 2)
-    nodes = _camera(lens).img_from_cam(np.concatenate([rays, np.ones((len(rays), 1))], 1)) - 0.5
+    nodes = lens.camera.colmap.img_from_cam(np.concatenate([rays, np.ones((len(rays), 1))], 1)) - 0.5
     nodes = nodes.reshape(len(y), len(x), 2).astype(np.float32)
     scale = np.array([[1.0 / NODE_STEP, 0.0, 0.0], [0.0, 1.0 / NODE_STEP, 0.0]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

@@ -1,11 +1,9 @@
-"""Point clouds in files: PLY positions and colors, validated, and the point count of PLY and COLMAP files.
+"""Point clouds in PLY files: positions and colors, validated.
 
 The PLY reader that nerfstudio uses returns uninitialized memory for points that the file lacks, and divides every color
 by 255, also those in [0, 1].
 """
 
-import re
-import struct
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -120,22 +118,6 @@ def _fits(word: str, kind: np.dtype) -> bool:
         return np.iinfo(kind).min <= int(word) <= np.iinfo(kind).max
     except ValueError:
         return False
-
-
-def point_count(path: Path) -> int:
-    """Read the point count from the header of a PLY file, points3D.bin or points3D.txt; 0 where it states none."""
-    try:
-        if path.suffix == ".bin":
-            with open(path, "rb") as file:
-                return int(struct.unpack("<Q", file.read(8))[0])
-        if path.suffix == ".txt":
-            with open(path, "rb") as file:
-                stated = re.search(rb"Number of points: (\d+)", file.read(1000))
-            return int(stated[1]) if stated else 0
-        points = read_header(path).elements.get(VERTEX)
-        return 0 if points is None else points.count
-    except (OSError, struct.error, PlyError):
-        return 0
 
 
 @contextmanager

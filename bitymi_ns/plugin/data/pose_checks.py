@@ -1,13 +1,9 @@
-"""Checks of a capture's poses: rotations (or mirrored ones), positions that belong together, and points in their unit;
-and the rotation and translation that orient a capture."""
+"""Checks of poses: rotations (or mirrored ones), positions that belong together, and points in their unit."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
-from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
 
 from bitymi_ns.plugin.console import fail, listed, warn
 
@@ -20,22 +16,12 @@ OTHER_UNIT = 150.0
 """Distance of points relative to that between cameras, or their extent as a part of the picture, in another unit."""
 
 
-def rotations(
-    matrices: npt.NDArray[np.float64], names: Sequence[object], source: str, verbose: bool = True
-) -> npt.NDArray[np.float64]:
-    """Recover rotations from the 3 x 3 parts of poses.
+def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source: str) -> npt.NDArray[np.float64]:
+    """Recover rotations from the 3 x 3 parts [N, 3, 3] of poses, camera to world; rows that need no change stay equal.
 
     A factor common to a matrix is divided out, and rounding is undone by the nearest rotation. Mirrored rotations
-    (determinant -1) stay mirrored: captures may be mirrored as a whole.
-
-    Args:
-        matrices: [N, 3, 3], camera to world.
-        names: of the N frames, for messages.
-        source: file or capture, for messages.
-        verbose: report what was changed.
-
-    Returns:
-        [N, 3, 3]; rows that need no change are equal to the input.
+    (determinant -1) stay mirrored: captures may be mirrored as a whole. Names of the frames and `source` are for
+    messages.
 
     Raises:
         InputError: a matrix is not finite, zero or sheared.
@@ -61,7 +47,7 @@ def rotations(
     rounded = error > EXACT
     u, _, v = np.linalg.svd(unit[rounded])
     result[rounded] = u @ v
-    if verbose and scaled.any():
+    if scaled.any():
         low, high = scale[scaled].min(), scale[scaled].max()
         factor = f"{low:.4g}" if high - low <= EXACT * high else f"{low:.4g} to {high:.4g}"
         warn(
@@ -69,7 +55,7 @@ def rotations(
             f"{listed([names[i] for i in scaled.nonzero()[0]])}. The factor is divided out; positions stay as they are."
         )
     only_rounded = rounded & ~scaled
-    if verbose and only_rounded.any():
+    if only_rounded.any():
         warn(
             f"{source}: rotations are off by up to {error[only_rounded].max():.1g} in the poses of "
             f"{listed([names[i] for i in only_rounded.nonzero()[0]])}. The nearest ones are used."
@@ -127,15 +113,11 @@ def far_from_origin(centers: npt.NDArray[np.float64]) -> bool:
 def check_point_unit(
     points: npt.NDArray[np.float64], centers: npt.NDArray[np.float64], widths: npt.NDArray[np.float64]
 ) -> None:
-    """Warn where the points seem to be in another unit than the poses.
+    """Warn where the points [N, 3] seem to be in another unit than the camera positions [M, 3], finite; `widths` [M] of
+    the pictures are in focal lengths.
 
-    They are then far beyond the cameras, or all in a spot of the picture: both leave training next to nothing to start
-    from. Medians and percentiles are used because clouds and captures have outliers.
-
-    Args:
-        points: [N, 3] of the cloud.
-        centers: [M, 3] camera positions, finite.
-        widths: [M] of the pictures, in focal lengths.
+    Points are then far beyond the cameras, or all in a spot of the picture: both leave training next to nothing to
+    start from. Medians and percentiles are used because clouds and captures have outliers.
     """
     points = points[:: max(1, len(points) // 100_000)]
     points = points[np.isfinite(points).all(1)]
@@ -161,12 +143,3 @@ def check_point_unit(
 
 def _rounded(ratio: float) -> str:
     return f"{ratio:,.0f}" if ratio < 1e6 else f"{ratio:.0e}"
-
-
-def orient(poses: torch.Tensor, method: Any, center_method: Any) -> torch.Tensor:
-    """Compute the transform [3, 4] by which nerfstudio orients and centers poses [N, 4, 4].
-
-    Its poses are not used: for `pca`, nerfstudio 1.1.5 turns a capture that comes out upside down, but of its cameras
-    the second and the third alone. The transform is right.
-    """
-    return auto_orient_and_center_poses(poses, method, center_method)[1]

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from bitymi_ns.capture.camera import ColmapCamera
+from bitymi_ns.capture.masks import in_proportion
 from bitymi_ns.capture.photos import natural
 from bitymi_ns.capture.recognise import POLYCAM, Found, is_photograph
 from bitymi_ns.plugin.console import fail, listed, warn
-from bitymi_ns.plugin.data.colmap_model import ModelCamera
 from bitymi_ns.plugin.data.depth_files import maps_beside
 from bitymi_ns.plugin.data.images import image_size
-from bitymi_ns.plugin.data.lens import rescaled
 from bitymi_ns.plugin.data.names import check_photographs_exist
 from bitymi_ns.plugin.data.pose_checks import rotations
 from bitymi_ns.plugin.data.views import OPENCV_AXES, Photograph
@@ -27,14 +27,11 @@ Y_UP = np.array([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0
 
 
 def scanner_photographs(found: Found, need_photos: bool) -> list[Photograph]:
-    """Read the photographs of such a capture, with cameras and poses, in the order of their names.
-
-    Args:
-        found: of the format polycam, record3d or pose-files.
-        need_photos: False = photographs may be missing.
+    """Read the photographs of a polycam, record3d or pose-files capture, with cameras and poses, in the order of their
+    names.
 
     Raises:
-        InputError: a file is damaged, or photographs are missing.
+        InputError: a file is damaged, or photographs that are needed are missing.
     """
     readers: dict[str, Callable[[Path], list[Row]]] = {
         "polycam": _polycam, "record3d": _record3d, "pose-files": _pose_files
@@ -58,15 +55,13 @@ def scanner_photographs(found: Found, need_photos: bool) -> list[Photograph]:
         pose = pose.copy()
         pose[:3, :3] = rotation
         size = image_size(path) or stated or (1, 1)
-        if stated is not None and stated != size:
-            if abs(stated[0] / stated[1] / (size[0] / size[1]) - 1.0) > 0.02:
-                fail(
-                    f"{path} has {size[0]} x {size[1]} pixels, but its camera is for {stated[0]} x {stated[1]}, which "
-                    "is another shape. Export it again."
-                )
-            pinhole = rescaled("PINHOLE", pinhole, stated, size)
-        camera, label = ModelCamera("PINHOLE", *size, tuple(pinhole)), f"the camera of {path}"
-        result.append(Photograph(path, camera, pose, label, maps=maps))
+        camera = ColmapCamera("PINHOLE", *(stated or size), pinhole)
+        if not in_proportion(camera.size, size):
+            fail(
+                f"{path} has {size[0]} x {size[1]} pixels, but its camera is for {camera.width} x {camera.height}, "
+                "which is another shape. Export it again."
+            )
+        result.append(Photograph(path, camera.rescaled(*size), pose, f"the camera of {path}", maps=maps))
     return result
 
 

@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +14,9 @@ from bitymi_ns.capture.photos import photo_folder
 from bitymi_ns.capture.recognise import Found, passed_over
 from bitymi_ns.capture.types import SfmSettings
 from bitymi_ns.plugin.console import fail, listed, say, warn
-from bitymi_ns.plugin.data.colmap_model import Model, read_model
+from bitymi_ns.plugin.data.colmap_model import Model
 from bitymi_ns.plugin.data.colmap_views import Origin, Source, find_masks, make_source
-from bitymi_ns.plugin.data.images import THREADS, image_size
+from bitymi_ns.plugin.data.images import image_size, in_threads
 from bitymi_ns.trust import Refused, json_of, leads_inside
 
 MODEL = Path("sparse/0")
@@ -50,18 +49,14 @@ class KeptPoses:
 
 
 def find_sfm_source(found: Found, masks_path: Path | None, downscale: int, settings: SfmSettings) -> Source:
-    """Run structure from motion on a folder of photographs or a video, or find the model of an earlier run.
-
-    Args:
-        found: photographs, or a video.
-        masks_path: folder of masks, relative to the capture; None = find it.
-        downscale: train on photographs that are smaller by this factor.
-        settings: of structure from motion.
+    """Run structure from motion on a folder of photographs or a video, or find the model of an earlier run. Photographs
+    are used smaller by `downscale`; `masks_path` is relative to the capture, None = find it.
 
     Raises:
         InputError: no poses can be found; says what to photograph differently.
     """
-    from bitymi_ns.capture import CaptureError, SfmOptions, find_poses  # slow to import, and seldom needed
+    from bitymi_ns.capture.poses import find_poses  # slow to import, and seldom needed
+    from bitymi_ns.capture.types import CaptureError, SfmOptions
     from bitymi_ns.progress import rich_progress
 
     masks = _masks(found, masks_path)
@@ -92,20 +87,14 @@ def find_sfm_source(found: Found, masks_path: Path | None, downscale: int, setti
 def kept_source(found: Found, kept: KeptPoses, masks_path: Path | None, downscale: int, need_photos: bool) -> Source:
     """Return the COLMAP model that a run was trained with; see `find_sfm_source`.
 
-    Args:
-        found: see `KeptPoses.found`.
-        kept: poses of the run.
-        masks_path, downscale: see `find_sfm_source`.
-        need_photos: False = photographs may be missing.
-
     Raises:
-        InputError: photographs of the model are missing, or have another size than they had.
+        InputError: photographs of the model that are needed are missing, or have another size than they had.
     """
     masks = _masks(found, masks_path, downscale)
     source = make_source(kept.model, kept.images(found.folder), masks, downscale, kept.left_out)
     if need_photos:
         _check_photographs(source, kept.folder)
-    count = len(read_model(source.folder).images)
+    count = len(source.model.images)
     say(f"Poses of {count} photographs of {found.path} as the run was trained with them, of {kept.folder}.")
     return replace(source, report=kept.folder, origin=kept.origin)
 
@@ -175,7 +164,7 @@ def write_kept_poses(folder: Path, source: Source, origin: Origin) -> None:
     """
     shutil.copytree(source.folder, folder / MODEL)
     if origin.photographs is None:
-        for image in read_model(source.folder).images:
+        for image in source.model.images:
             if not leads_inside(image.name):
                 raise Refused(f"{source.folder} names {image.name!r}, which leads out of its folder", folder)
             _link(source.photographs / image.name, folder / IMAGES / image.name)
@@ -196,10 +185,9 @@ def _link(file: Path, target: Path) -> None:
 
 def _check_photographs(source: Source, kept: Path) -> None:
     """Fail where photographs of kept poses are missing, or have another size than their cameras."""
-    model = read_model(source.folder)
-    files = source.files(model)
+    files = source.files()
     missing = [file.readlink() if file.is_symlink() else file for file in files if not file.is_file()]
-    changed = [] if source.copies is not None else _other_sizes(model, files)
+    changed = [] if source.copies is not None else _other_sizes(source.model, files)
     what = [f"{len(missing)} are missing ({listed(missing)})"] if missing else []
     what += [f"{len(changed)} have another size ({listed(changed)})"] if changed else []
     if what:
@@ -211,11 +199,9 @@ def _check_photographs(source: Source, kept: Path) -> None:
 
 def _other_sizes(model: Model, files: list[Path]) -> list[str]:
     """Photographs with another size than their cameras, with both sizes; unreadable ones do not count."""
-    with ThreadPoolExecutor(THREADS) as pool:
-        sizes = list(pool.map(image_size, files))
     changed = []
-    for image, file, size in zip(model.images, files, sizes, strict=True):
+    for image, file, size in zip(model.images, files, in_threads(image_size, files), strict=True):
         camera = model.cameras[image.camera_id]
-        if size is not None and size != (camera.width, camera.height):
+        if size is not None and size != camera.size:
             changed.append(f"{file}: {size[0]} x {size[1]} pixels, {camera.width} x {camera.height} then")
     return changed

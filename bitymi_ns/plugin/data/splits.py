@@ -69,12 +69,7 @@ def by_mode(names: Sequence[Path], mode: Mode, interval: int, fraction: float) -
 
 
 def by_names(names: Sequence[Path], wanted: Sequence[str], source: str) -> Split:
-    """Hold out the photographs of these names.
-
-    Args:
-        names: of all photographs, with their folders.
-        wanted: names, each with as many folders as make it unambiguous.
-        source: of the wanted names, for messages.
+    """Hold out the photographs of the wanted names, each with as many folders as make it unambiguous.
 
     Raises:
         InputError: one of them is the name of no photograph, or of several.
@@ -96,12 +91,8 @@ def by_lists(names: Sequence[Path], lists: NameLists) -> Split:
 
 
 def find(names: Sequence[Path], wanted: Sequence[str], source: str, any_folder: bool = False) -> list[int]:
-    """Find the indices of photographs by names that may differ in case, Unicode form, or extension.
-
-    Args:
-        names, wanted, source: see `by_names`.
-        any_folder: wanted names may have leading folders that the photographs do not lie in.
-    """
+    """Find the indices of photographs by names that may differ in case, Unicode form, or extension, and with
+    `any_folder` have leading folders that the photographs do not lie in; see `by_names`."""
     forms: list[Callable[[str], tuple[str, ...]]] = [
         lambda name: PurePath(name.replace("\\", "/")).parts,
         folded,

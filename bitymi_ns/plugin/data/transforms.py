@@ -24,15 +24,13 @@ COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 DISTORTION = (*COEFFICIENTS, "distortion_params")
 FOCALS = {"x": ("fl_x", "camera_angle_x", "x_fov"), "y": ("fl_y", "camera_angle_y", "y_fov")}
 """Entries that state a focal length: in pixels, or by the view angle in radians, or in degrees."""
+STATED_BY = {"fl_x": FOCALS["x"], "fl_y": (*FOCALS["y"], *FOCALS["x"][1:])}
+"""Entries that serve as another; an angle of one side is that of square pixels."""
 
 
-def load_transforms(path: Path, own_format: bool, verbose: bool = True) -> dict[str, Any]:
-    """Load a file and check its frames, poses and lists of names; poses become rotations.
-
-    Args:
-        path: JSON file in any Unicode encoding, with or without byte order mark.
-        own_format: it is in nerfstudio's format, in which each camera is stated in full.
-        verbose: report what was corrected.
+def load_transforms(path: Path, own_format: bool) -> dict[str, Any]:
+    """Load a file in any Unicode encoding, with or without byte order mark, and check its frames, poses and lists of
+    names; poses become rotations. nerfstudio's own format states each camera in full.
 
     Raises:
         InputError: the file cannot be used; names the frame.
@@ -47,11 +45,10 @@ def load_transforms(path: Path, own_format: bool, verbose: bool = True) -> dict[
     _check_frames(path, meta, own_format)
     if own_format:
         _check_intrinsics(path, meta)
-        if verbose:
-            _warn_of_contradictions(path, meta)
+        _warn_of_contradictions(path, meta)
     _check_applied(path, meta)
     _check_lists(path, meta)
-    _correct_poses(path, meta["frames"], verbose)
+    _correct_poses(path, meta["frames"])
     _check_repeated(path, meta["frames"])
     return meta
 
@@ -98,11 +95,7 @@ def _check_intrinsics(path: Path, meta: dict[str, Any]) -> None:
     """Fail where neither a frame nor the file states an entry of nerfstudio's cameras."""
     frames = meta["frames"]
     for key in INTRINSICS:
-        keys = (key,)
-        if key == "fl_x":
-            keys = FOCALS["x"]
-        elif key == "fl_y":
-            keys = (*FOCALS["y"], *FOCALS["x"][1:])  # an angle of one side is that of square pixels
+        keys = STATED_BY.get(key, (key,))
         lacking = [frame["file_path"] for frame in frames if not any(key in meta or key in frame for key in keys)
                    and (key in ("w", "h") or not is_equirectangular(meta, frame))]  # fmt: skip
         if lacking:
@@ -215,7 +208,7 @@ def colmap_points(path: Path) -> Path | None:
     return None if not isinstance(meta, dict) or meta.get("ply_file_path") is not None else model
 
 
-def _correct_poses(path: Path, frames: list[dict[str, Any]], verbose: bool) -> None:
+def _correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
     """Fail at matrices that are no poses; recover rotations, see `rotations`."""
     names = [frame["file_path"] for frame in frames]
     poses = []
@@ -234,7 +227,7 @@ def _correct_poses(path: Path, frames: list[dict[str, Any]], verbose: bool) -> N
             )
         poses.append(pose)
     matrices = np.stack(poses)
-    matrices[:, :3, :3] = rotations(matrices[:, :3, :3], names, str(path), verbose)
+    matrices[:, :3, :3] = rotations(matrices[:, :3, :3], names, str(path))
     for frame, pose in zip(frames, matrices, strict=True):
         frame["transform_matrix"] = pose.tolist()
 

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 
-from bitymi_ns.capture.panorama_detection import SPHERICAL_MODEL
+from bitymi_ns.capture.camera import SPHERICAL_MODEL, ColmapCamera
 from bitymi_ns.plugin.console import fail, listed, say, warn
-from bitymi_ns.plugin.data.colmap_model import ModelCamera
 from bitymi_ns.plugin.data.depth_files import MAP_FILES, MapFiles
 from bitymi_ns.plugin.data.images import image_size
 from bitymi_ns.plugin.data.lens import colmap_distortion
@@ -65,22 +64,14 @@ class Transforms:
         return [photograph.file for photograph in self.photographs]
 
 
-def read_transforms(
-    path: Path, own_format: bool, downscale: int = 1, need_photos: bool = True, verbose: bool = True
-) -> Transforms:
-    """Read and check a file, and find its photographs.
-
-    Args:
-        path: JSON file.
-        own_format: it is in nerfstudio's format, in which every frame states its camera.
-        downscale: use copies that are smaller by this factor, where there are some.
-        need_photos: False = photographs may be missing.
-        verbose: report what was corrected, found elsewhere, or is not used.
+def read_transforms(path: Path, own_format: bool, downscale: int = 1, need_photos: bool = True) -> Transforms:
+    """Read and check a JSON file, see `load_transforms`, and find its photographs, or copies that are smaller by
+    `downscale`. Photographs may be missing where they are not needed.
 
     Raises:
         InputError: the file cannot be used, or lacks photographs.
     """
-    meta = load_transforms(path, own_format, verbose)
+    meta = load_transforms(path, own_format)
     frames = meta["frames"]
     for holder in (meta, *frames):
         for key in EQUAL_AREA:
@@ -93,16 +84,17 @@ def read_transforms(
     names = [frame["file_path"] for frame in frames]
     files = _find_photographs(path, names, need_photos)
     masks = _find_masks(path.parent, [frame.get("mask_path") for frame in frames], files, need_photos)
-    maps = _find_maps(path, frames, need_photos and verbose)
+    maps = _find_maps(path, frames, need_photos)
     cloud = meta.get("ply_file_path")
-    if isinstance(cloud, str) and cloud and not (path.parent / cloud).is_file():
+    if cloud is not None and (not isinstance(cloud, str) or not cloud):
+        fail(f"{path}: ply_file_path is {cloud!r}, not the name of a file. Correct it or remove it.")
+    if cloud and not (path.parent / cloud).is_file():
         there = FileFinder(path.parent, extensions=(".ply",)).find(cloud)
         meta["ply_file_path"] = cloud if there is None else there.relative_to(path.parent).as_posix()
-    if verbose and need_photos:
+    if need_photos:
         _report_files(path, names, files, masks)
-    if verbose:
-        _report_unused(path, meta, own_format)
-    made: dict[ModelCamera, ModelCamera] = {}
+    _report_unused(path, meta, own_format)
+    made: dict[ColmapCamera, ColmapCamera] = {}
     photographs = []
     for frame, file, mask, beside in zip(frames, files, masks, maps, strict=True):
         camera = _camera(path, meta, frame, file)
@@ -167,7 +159,7 @@ def _find_masks(
     return [None if name is None else paths[name] for name in names]
 
 
-def _find_maps(path: Path, frames: Sequence[dict[str, Any]], verbose: bool) -> list[MapFiles]:
+def _find_maps(path: Path, frames: Sequence[dict[str, Any]], need_photos: bool) -> list[MapFiles]:
     """Find the maps of depth and normals, with a warning on those that are missing."""
     finder = FileFinder(path.parent, outside=True, extensions=MAP_FILES)
     found: dict[str, list[Path | None]] = {}
@@ -175,7 +167,7 @@ def _find_maps(path: Path, frames: Sequence[dict[str, Any]], verbose: bool) -> l
         names = [frame.get(key) for frame in frames]
         found[key] = [None if name is None else finder.find(name) for name in names]
         lacking = [name for name, file in zip(names, found[key], strict=True) if name is not None and file is None]
-        if lacking and verbose:
+        if lacking and need_photos:
             warn(f"{path}: {len(lacking)} files of {key} are missing, and not used: {listed(lacking)}.")
     return [MapFiles(depth, normal=normal) for depth, normal in zip(*found.values(), strict=True)]
 
@@ -216,7 +208,7 @@ def _downscaled(photographs: list[Photograph], folder: Path, downscale: int) -> 
             for each, copy in zip(photographs, found, strict=True) if copy is not None]  # fmt: skip
 
 
-def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path) -> ModelCamera:
+def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path) -> ColmapCamera:
     """Convert the camera of a frame to COLMAP's terms."""
     name = frame["file_path"]
 
@@ -242,7 +234,7 @@ def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path)
                 f"{path}: {name} is EQUIRECTANGULAR, but its cx and cy are {middle[0]:g} and {middle[1]:g}, not the "
                 f"middle of its {width} x {height} pixels. Remove them, or shift the picture and turn the pose."
             )
-        return ModelCamera(SPHERICAL_MODEL, int(width), int(height), (float(width), float(height)))
+        return ColmapCamera(SPHERICAL_MODEL, int(width), int(height), (float(width), float(height)))
     sides = {"x": width, "y": height}
     focal: dict[str, float] = {}
     for axis, keys in FOCALS.items():
@@ -257,7 +249,7 @@ def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path)
     fx, fy = focal.get("x", focal.get("y", 0.0)), focal.get("y", focal.get("x", 0.0))
     pinhole = (fx, fy, width / 2.0 if cx is None else cx, height / 2.0 if cy is None else cy)
     model, coefficients = _distortion(path, meta, frame)
-    return ModelCamera(model, int(width), int(height), (*pinhole, *coefficients))
+    return ColmapCamera(model, int(width), int(height), (*pinhole, *coefficients))
 
 
 def _focal_length(path: Path, key: str, value: float, side: float) -> float:

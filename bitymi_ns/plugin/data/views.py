@@ -3,7 +3,6 @@ those of wide cameras several."""
 
 import dataclasses
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -11,18 +10,18 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 import torch
+from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 
-from bitymi_ns.capture.panorama_detection import SPHERICAL_MODEL
+from bitymi_ns.capture.camera import SPHERICAL_MODEL, ColmapCamera
 from bitymi_ns.plugin.console import fail, listed, say
-from bitymi_ns.plugin.data.colmap_model import ModelCamera
 from bitymi_ns.plugin.data.depth_files import MAPS, MapFiles
-from bitymi_ns.plugin.data.images import THREADS, image_size
-from bitymi_ns.plugin.data.lens import Lens, Pinhole, colmap_distortion, lenses_of, rescaled
+from bitymi_ns.plugin.data.images import image_size, in_threads
+from bitymi_ns.plugin.data.lens import Lens, Pinhole, colmap_distortion, lenses_of
 from bitymi_ns.plugin.data.point_files import Points
-from bitymi_ns.plugin.data.pose_checks import check_spread, far_from_origin, orient
+from bitymi_ns.plugin.data.pose_checks import check_spread, far_from_origin
 
 Pose = npt.NDArray[np.float64]
 OPENCV_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -39,7 +38,7 @@ class Photograph:
     """A photograph with its camera."""
 
     file: Path  # image file
-    camera: ModelCamera  # in pixels of the photograph before any downscaling
+    camera: ColmapCamera  # in pixels of the photograph before any downscaling
     pose: Pose  # [4, 4] float64, camera to world in nerfstudio's axes (camera: x right, y up, z backward)
     label: str  # names the camera in messages
     mask: Path | None = None  # mask file; None = none
@@ -48,27 +47,26 @@ class Photograph:
     maps: MapFiles = MapFiles()  # depth and normals
 
 
-@dataclass(frozen=True)
+@dataclass
 class FrameOptions:
     """Orientation, centering and scaling of a capture, as in nerfstudio's parsers."""
 
     scale_factor: float = 1.0
+    """Factor on the positions of the cameras."""
     orientation_method: Literal["pca", "up", "vertical", "none"] = "up"
+    """Orientation of the capture: up = the cameras' mean up is z."""
     center_method: Literal["poses", "focus", "none"] = "poses"
+    """Origin: the middle of the cameras, or the point that they look at."""
     auto_scale_poses: bool = True
+    """Scale the capture so that the cameras fit into a box from -1 to 1."""
     scene_scale: float = 1.0
+    """Half the side of the box of random points."""
 
 
 def fit_scale(frame: FrameOptions, photographs: Sequence[Photograph], source: str) -> FrameOptions:
-    """Reduce the scale of a capture whose cameras lie far outside of the scene box.
-
-    In millimetres they would, and random points would all fall on one spot of the pictures.
-
-    Args:
-        frame: default of the format, without auto_scale_poses.
-        photographs: of the capture.
-        source: of their poses, for the message.
-    """
+    """Reduce the scale of a capture whose cameras lie far outside of the scene box: in millimetres they would, and
+    random points would all fall on one spot of the pictures. `frame` is the format's default, without
+    auto_scale_poses."""
     centers = np.stack([photograph.pose[:3, 3] for photograph in photographs])
     spread = float(np.median(np.linalg.norm(centers - centers.mean(0), axis=1)))
     ratio = spread * frame.scale_factor / frame.scene_scale
@@ -108,13 +106,10 @@ def make_views(
 
     Args:
         photographs: at least two.
-        frame: how to orient, center and scale them.
         points: in the frame of the poses; None = none.
-        source: of the poses, for messages.
         downscale: use photographs that are smaller by this factor.
         need_photos: open downscaled copies for their size; else they may be missing.
-        applied: [4, 4] that was applied to the capture already, before `photographs` state it.
-        applied_scale: the same for a scale.
+        applied, applied_scale: [4, 4] and scale that were applied to the capture before `photographs` state it.
         alpha_color: behind transparent pixels.
 
     Raises:
@@ -183,21 +178,20 @@ def photograph_files(outputs: DataparserOutputs) -> list[Path]:
 
 
 def training_frame(poses: Pose, frame: FrameOptions, source: str) -> tuple[Pose, float]:
-    """Compute the transform [3, 4] that orients and centers a capture, and the scale that follows it.
+    """Compute the transform [3, 4] that orients and centers poses [N, 4, 4] camera to world, and the scale that follows
+    it.
 
     Both are nerfstudio's, but the capture is centered in float64 first: UTM or ECEF positions have seven digits before
     the point, which is all that float32 has.
-
-    Args:
-        poses: [N, 4, 4] camera to world.
-        frame: options.
-        source: of the poses, for messages.
     """
     middle = poses[:, :3, 3].mean(0)
     local = poses.copy()
     local[:, :3, 3] -= middle
-    transform = orient(torch.from_numpy(local.astype(np.float32)), frame.orientation_method, frame.center_method)
-    transform = transform.double().numpy()[:3].copy()
+    # the transform alone: for `pca`, nerfstudio 1.1.5 turns cameras that come out upside down, but two of them only
+    _, oriented = auto_orient_and_center_poses(
+        torch.from_numpy(local.astype(np.float32)), frame.orientation_method, frame.center_method
+    )
+    transform = oriented.double().numpy()[:3].copy()
     u, _, v = np.linalg.svd(transform[:, :3])  # far from the origin, the rounding of a rotation is a displacement
     transform[:, :3] = u @ v
     far = frame.center_method == "none" and far_from_origin(poses[:, :3, 3])
@@ -230,17 +224,12 @@ def pinhole_cameras(pinholes: Sequence[Pinhole], poses: torch.Tensor) -> Cameras
 
 def make_lenses(photographs: Sequence[Photograph], downscale: int = 1, need_photos: bool = True) -> list[list[Lens]]:
     """Make the lenses of each photograph, equal ones once; see `make_views`."""
-    sizes: list[tuple[int, int] | None] = [None] * len(photographs)
-    copies = [i for i, photograph in enumerate(photographs) if photograph.downscaled]
-    if copies and need_photos:
-        with ThreadPoolExecutor(THREADS) as pool:
-            for i, size in zip(copies, pool.map(image_size, [photographs[i].file for i in copies]), strict=True):
-                sizes[i] = size
+    sizes = in_threads(lambda each: image_size(each.file) if each.downscaled and need_photos else None, photographs)
     made: dict[tuple[Any, ...], list[Lens]] = {}
     lenses, messages = [], []
     for photograph, size in zip(photographs, sizes, strict=True):
         camera = photograph.camera
-        full = (camera.width, camera.height)
+        full = camera.size
         small = full if downscale == 1 else (max(1, round(full[0] / downscale)), max(1, round(full[1] / downscale)))
         if size is not None and max(abs(size[0] - small[0]), abs(size[1] - small[1])) > 1:
             fail(
@@ -252,8 +241,7 @@ def make_lenses(photographs: Sequence[Photograph], downscale: int = 1, need_phot
         key = (camera, used, photograph.downscaled)
         if key not in made:
             stored = used if photograph.downscaled else full
-            params = rescaled(camera.model, camera.params, full, used)
-            made[key], lost = lenses_of(camera.model, params, *used, stored, photograph.label)
+            made[key], lost = lenses_of(camera.rescaled(*used), stored, photograph.label)
             messages += lost
         lenses.append(made[key])
     for message in messages[:3]:
@@ -280,7 +268,7 @@ def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
         model, coefficients = colmap_distortion(CameraType(int(cameras.camera_type[i])), values, f"of {file}")
         pinhole = [float(getattr(cameras, name)[i]) for name in ("fx", "fy", "cx", "cy")]
         size = (int(cameras.width[i]), int(cameras.height[i]))
-        camera = ModelCamera(model, *size, size if model == SPHERICAL_MODEL else (*pinhole, *coefficients))
+        camera = ColmapCamera(model, *size, size if model == SPHERICAL_MODEL else (*pinhole, *coefficients))
         photographs.append(Photograph(file, camera, np.eye(4), f"the camera of {file}"))
     lenses, of, poses = _split(make_lenses(photographs), cameras.camera_to_worlds.double().numpy())
     outputs = select_views(outputs, of)

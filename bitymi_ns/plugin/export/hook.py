@@ -55,15 +55,19 @@ def extended(commands: Any) -> Any:
     return Union[(*members, *ours)]  # noqa: UP007 - built at run time
 
 
-class _Forwarding:
-    """Behaves like another object except where a subclass says otherwise."""
+class _TyroProxy:
+    """tyro, or its `extras`, but for the functions that take the union of commands."""
 
     def __init__(self, target: Any, module: ModuleType) -> None:
-        self._target = target
-        self._module = module
+        self._target, self._module = target, module
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._target, name)
+        found = getattr(self._target, name)
+        if name == "extras":
+            return _TyroProxy(found, self._module)
+        if name in ("cli", "get_parser"):
+            return lambda f, *args, **kwargs: found(self._with_ours(f), *args, **kwargs)
+        return found
 
     def _with_ours(self, f: Any) -> Any:
         if f is not getattr(self._module, "Commands", None):
@@ -73,20 +77,6 @@ class _Forwarding:
         except Exception as error:  # noqa: BLE001 - nerfstudio's own commands have to go on working
             warnings.warn(f"bitymi-ns: `ns-export {COMMAND}` is not available: {error}", stacklevel=3)
             return f
-
-
-class _TyroProxy(_Forwarding):
-    def cli(self, f: Any, *args: Any, **kwargs: Any) -> Any:
-        return self._target.cli(self._with_ours(f), *args, **kwargs)
-
-    @property
-    def extras(self) -> _ExtrasProxy:
-        return _ExtrasProxy(self._target.extras, self._module)
-
-
-class _ExtrasProxy(_Forwarding):
-    def get_parser(self, f: Any, *args: Any, **kwargs: Any) -> Any:
-        return self._target.get_parser(self._with_ours(f), *args, **kwargs)
 
 
 class _ExporterFinder(importlib.abc.MetaPathFinder):

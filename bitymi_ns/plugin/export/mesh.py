@@ -46,36 +46,28 @@ class Source:
 
 
 @dataclass(kw_only=True)
-class ExportMesh:
+class ExportMesh(SurfaceOptions):
     """Extract the surface as a triangle mesh with vertex colors: TSDF fusion of median depths (open3d)."""
 
     load_config: Path  # config.yml of a trained scene or of a bundle.
     output_dir: Path  # Folder of the mesh: mesh.ply, mesh.glb or mesh.obj.
     format: Literal["ply", "glb", "obj"] = "ply"  # Of the file.
-    resolution: int = SurfaceOptions.resolution
-    """Voxels along the longest side of the box that holds what the cameras see, 16 to 4096. Time and memory grow with
-    its square."""
-    triangles: int = SurfaceOptions.triangles  # Budget of triangles, met by simplification; 0 = no limit.
-    watertight: bool = False
-    """Close the mesh by a Poisson reconstruction: for printing and simulation. Invents surface where nothing was
-    seen."""
     frame: Frame = "capture"
     """Frame of the vertices: the capture's own, with its unit of length, or the scene's, in which nerfstudio trains."""
     overwrite: bool = False  # Replace a mesh that is there already.
 
     def main(self) -> None:
         """Run the export."""
-        options = SurfaceOptions(self.resolution, self.triangles, self.watertight)
         path = self.output_dir / f"{NAME}.{self.format}"
         try:
-            check_ranges(options)
+            check_ranges(self)
         except ValueError as error:
             fail(f"--{error}.", error)
         try:
             with reserved(self.output_dir, warn):
                 self._check_target()
                 source = from_bundle(self.load_config.parent) if self._is_bundle else from_run(self.load_config)
-                self._write(source, options, path)
+                self._write(source, path)
         except BundleError as error:
             fail(str(error), error)
         except NoSurface as error:
@@ -101,14 +93,14 @@ class ExportMesh:
         if there and not self.overwrite:
             fail(f"{self.output_dir} holds a mesh already: choose another --output-dir, or add --overwrite True.")
 
-    def _write(self, source: Source, options: SurfaceOptions, path: Path) -> None:
+    def _write(self, source: Source, path: Path) -> None:
         import open3d
 
         to = to_capture(source.world) if self.frame == "capture" else None
         step = max(1, -(-len(source.cameras) // MOST_VIEWS))
         cameras = source.cameras[::step]
         with rich_progress() as progress:
-            drawn = (cameras, source.near, options, source.prefilter, progress, source.alpha)
+            drawn = (cameras, source.near, self, source.prefilter, progress, source.alpha)
             mesh = extract_surface(source.surfels, source.render, *drawn)
         if to is not None:
             vertices = torch.from_numpy(np.asarray(mesh.vertices))

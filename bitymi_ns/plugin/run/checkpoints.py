@@ -106,7 +106,7 @@ def load(path: Path, scene: SceneConfig) -> dict[str, Any]:
         )
         fail(
             f"the checkpoint {path} is damaged (cut off or altered), or another program wrote it: "
-            f"{_first_line(error)}. {way_out}.",
+            f"{(str(error).strip() or type(error).__name__).splitlines()[0].rstrip('.')}. {way_out}.",
             error,
         )
     if (
@@ -156,8 +156,3 @@ def _check_scene(parameters: Mapping[str, Any], scene: SceneConfig, path: Path) 
     ]
     if broken:
         warn(f"The checkpoint {path} holds numbers that are not finite, in {listed(broken)}: expect holes, or black.")
-
-
-def _first_line(error: BaseException) -> str:
-    lines = str(error).strip().splitlines()
-    return lines[0].rstrip(".") if lines else type(error).__name__

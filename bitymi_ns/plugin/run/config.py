@@ -29,7 +29,7 @@ from bitymi_ns.plugin.run.preset import load_preset
 from bitymi_ns.plugin.run.render import adopt_render
 from bitymi_ns.plugin.run.trainer import BitymiPipelineConfig, BitymiTrainer
 from bitymi_ns.ranges import check_ranges
-from bitymi_ns.train.config import AdamConfig
+from bitymi_ns.train.optimizers import BETAS, EPS, FIELD_BETAS
 
 SEEDS = 1 << 32  # end of the range of seeds that numpy takes
 
@@ -114,7 +114,7 @@ class BitymiTrainerConfig(TrainerConfig):
     def save_config(self) -> None:
         """Write config.yml and say in a few lines what is going to happen. This is the first that a run writes, so a
         folder that cannot be used shows here. What can be checked before anything is written is checked now."""
-        check_capture(self.pipeline.datamanager)
+        check_capture(self.pipeline.datamanager, read=True)
         folder = self.get_base_dir()
         if self.load_dir is None and self.load_checkpoint is None:
             run_folder.check_unused(folder, self.get_checkpoint_dir())
@@ -218,7 +218,11 @@ class BitymiTrainerConfig(TrainerConfig):
         if evaluated is not None:
             if (evaluated / self.relative_model_dir).is_dir():
                 folder, self.read_from = evaluated / self.relative_model_dir, evaluated
-            self._choose_checkpoint(folder)
+            # in a resumed run the recorded step is that of the run it went on from
+            if self.load_step is None or not checkpoints.path_of(folder, self.load_step).is_file():
+                self.load_step = checkpoints.newest_step(folder)
+            # stop now if it cannot be used: nerfstudio's tools would report that with a traceback
+            checkpoints.load(checkpoints.path_of(folder, self.load_step), model.scene)
             self._take_poses_of(evaluated)
         return folder
 
@@ -235,20 +239,12 @@ class BitymiTrainerConfig(TrainerConfig):
             datamanager.dataparser = BundleCamerasConfig(data=bundle, capture=Path(data))
             datamanager.data = bundle
 
-    def _choose_checkpoint(self, folder: Path) -> None:
-        """Fix the checkpoint that nerfstudio's tools will load, and stop now if it cannot be used: they would report
-        that with a traceback."""
-        # in a resumed run the recorded step is that of the run it went on from
-        if self.load_step is None or not checkpoints.path_of(folder, self.load_step).is_file():
-            self.load_step = checkpoints.newest_step(folder)
-        checkpoints.load(checkpoints.path_of(folder, self.load_step), self.pipeline.model.scene)
-
 
 @dataclass
 class BitymiAdamConfig(OptimizerConfig):
     """Adam; the learning rate is set at every step from the preset's schedule."""
 
-    betas: tuple[float, float] = AdamConfig.betas
+    betas: tuple[float, float] = BETAS
     """Decay of the running averages."""
     fused: bool = True
     """Update all entries of a tensor in one pass."""
@@ -259,8 +255,7 @@ def method_config(name: str) -> MethodSpecification:
     preset = load_preset(name)
 
     def adam(group: str) -> BitymiAdamConfig:
-        betas = AdamConfig.field_betas if group.startswith("field") else AdamConfig.betas
-        return BitymiAdamConfig(lr=1e-3, eps=AdamConfig.eps, betas=betas)
+        return BitymiAdamConfig(lr=1e-3, eps=EPS, betas=FIELD_BETAS if group.startswith("field") else BETAS)
 
     config = BitymiTrainerConfig(
         method_name=preset.name,

@@ -45,7 +45,11 @@ class Workers:
         self._cards = config.machine.device_type == "cuda"
         self._scratch = tempfile.TemporaryDirectory()
         self._store = dist.TCPStore(HOST, 0, count, is_master=True, wait_for_workers=False, timeout=TIMEOUT)
-        self._inputs = [(self._of(config, rank), rank, count, self._store.port) for rank in range(1, count)]
+        self._inputs = []
+        for rank in range(1, count):  # the others write nothing that stays, show nothing and evaluate nothing
+            own = copy.deepcopy(config)
+            own.output_dir, own.vis, own.pipeline.model.curve_points = Path(self._scratch.name) / str(rank), "none", 0
+            self._inputs.append((own, rank, count, self._store.port))
         self._processes: list[subprocess.Popen[bytes]] = []
         atexit.register(self.end)
 
@@ -69,12 +73,6 @@ class Workers:
                 self.explain()
             time.sleep(0.05)
         _join(self._store, 0, count, self._cards)
-
-    def _of(self, config: TrainerConfig, rank: int) -> TrainerConfig:
-        """The configuration of another process: it writes nothing that stays, shows nothing and evaluates nothing."""
-        own = copy.deepcopy(config)
-        own.output_dir, own.vis, own.pipeline.model.curve_points = Path(self._scratch.name) / str(rank), "none", 0
-        return own
 
     def explain(self) -> NoReturn:
         """End the run with what the process said that was lost.

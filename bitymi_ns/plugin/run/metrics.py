@@ -25,24 +25,19 @@ def image_metrics(image: Tensor, reference: Tensor, mask: Tensor | None = None) 
         mask: [H, W, 1] bool; pixels where it is False are the same in both for every metric and left out of psnr
             and cc_psnr.
     """
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
     image, reference = image.detach().float().clamp(0.0, 1.0), reference.detach().float().clamp(0.0, 1.0)
     if mask is not None:
         mask = mask.to(image.device).bool().reshape(*image.shape[:2], 1)
         image, reference = image * mask, reference * mask
     result = {"psnr": psnr(image, reference, mask), "cc_psnr": cc_psnr(image, reference, mask)}
-    result["ssim"] = ssim(image, reference)
+    pair = [x.permute(2, 0, 1)[None] for x in (image, reference)]
+    result["ssim"] = float(structural_similarity_index_measure(*pair, data_range=1.0))
     found = flip(image, reference)
     if found is not None:
         result["flip"] = found
     return result | lpips_metrics(image, reference)
-
-
-def ssim(image: Tensor, reference: Tensor) -> float:
-    """Structural similarity, by torchmetrics (11 x 11 Gaussian window, sigma 1.5, data range 1)."""
-    from torchmetrics.functional.image import structural_similarity_index_measure
-
-    pair = [x.permute(2, 0, 1)[None] for x in (image, reference)]
-    return float(structural_similarity_index_measure(*pair, data_range=1.0))
 
 
 def flip(image: Tensor, reference: Tensor) -> float | None:

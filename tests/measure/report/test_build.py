@@ -90,7 +90,7 @@ def test_a_benchmark(work: Path, tmp_path: Path) -> None:
     Checker(page)
     for text in (
         "bitymi (2 seeds)", "−0.100", "Worst views", "the photo",
-        "view 4, worst of 7: 21.50 dB, 0.200 FLIP", "Abacus, 10 beads", "gone.png is not an image",
+        "view 4, worst of 7: PSNR 21.50, FLIP 0.200", "Abacus, 10 beads", "gone.png is not an image",
     ):  # fmt: skip
         assert text in page
     assert (1200, 675) in [image.size for image in pictures(page)]

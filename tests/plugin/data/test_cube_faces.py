@@ -10,18 +10,14 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from PIL import Image
 
+from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.plugin.data.cube_faces import FACES
 from bitymi_ns.plugin.data.lens import Lens, lenses_of
 
-PANORAMA = ("EQUIRECTANGULAR", (256.0, 128.0), 256, 128, (256, 128))
+PANORAMA = ColmapCamera("EQUIRECTANGULAR", 256, 128, (256.0, 128.0))
 RADIUS = 100.0
-FISHEYE = (
-    "OPENCV_FISHEYE",
-    (RADIUS / (0.5 * math.pi),) * 2 + (RADIUS, RADIUS, 0.0, 0.0, 0.0, 0.0),
-    200,
-    200,
-    (200, 200),
-)
+FOCAL = RADIUS / (0.5 * math.pi)
+FISHEYE = ColmapCamera("OPENCV_FISHEYE", 200, 200, (FOCAL, FOCAL, RADIUS, RADIUS, 0.0, 0.0, 0.0, 0.0))
 
 
 def rays_of(lens: Lens) -> np.ndarray:
@@ -34,14 +30,14 @@ def rays_of(lens: Lens) -> np.ndarray:
 
 def directions(lens: Lens, width: int, height: int) -> np.ndarray:
     """Photograph of a scene whose color is the direction, [height, width, 3]."""
-    camera = pycolmap.Camera(model=lens.model, width=width, height=height, params=list(lens.params))
+    camera = lens.camera.colmap
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = camera.cam_ray_from_img(np.stack([x, y], -1).reshape(-1, 2)).reshape(height, width, 3)
     return np.nan_to_num((rays * 0.5 + 0.5) * 255.0).round().clip(0, 255).astype(np.uint8)
 
 
 def test_a_panorama_becomes_six_faces_that_show_each_direction_once() -> None:
-    lenses, told = lenses_of(*PANORAMA, "camera 1")
+    lenses, told = lenses_of(PANORAMA, PANORAMA.size, "camera 1")
     assert [lens.face for lens in lenses] == list(FACES) and all(lens.whole for lens in lenses)
     assert "camera 1 is EQUIRECTANGULAR: each of its photographs becomes 6 pinhole pictures (front 81 x 81" in told[0]
     solid = 0.0
@@ -65,9 +61,9 @@ def test_directions_are_those_of_nerfstudios_equirectangular_camera() -> None:
 
 
 def test_a_fisheye_of_180_degrees_is_used_to_more_than_nine_tenths() -> None:
-    lenses, _ = lenses_of(*FISHEYE, "camera 1")
+    lenses, _ = lenses_of(FISHEYE, FISHEYE.size, "camera 1")
     assert [lens.face for lens in lenses] == ["front", "right", "left", "up", "down"]
-    camera = pycolmap.Camera(model=FISHEYE[0], width=200, height=200, params=list(FISHEYE[1]))
+    camera = FISHEYE.colmap
     x, y = np.meshgrid(np.arange(200) + 0.5, np.arange(200) + 0.5)
     circle = np.hypot(x - 100.0, y - 100.0) < RADIUS
     used = np.zeros((200, 200), bool)
@@ -89,8 +85,8 @@ def test_a_fisheye_of_180_degrees_is_used_to_more_than_nine_tenths() -> None:
 
 
 def test_faces_that_the_photograph_covers_in_part_have_a_mask() -> None:
-    wide = ("OPENCV_FISHEYE", (65.0, 65.0, 100.0, 50.0, 0.0, 0.0, 0.0, 0.0), 200, 100, (200, 100))
-    lenses, _ = lenses_of(*wide, "camera 1")
+    wide = ColmapCamera("OPENCV_FISHEYE", 200, 100, (65.0, 65.0, 100.0, 50.0, 0.0, 0.0, 0.0, 0.0))
+    lenses, _ = lenses_of(wide, wide.size, "camera 1")
     assert [lens.face for lens in lenses] == ["front", "right", "left"]
     front = lenses[0]
     assert not front.whole and 0.8 < front.coverage.mean() < 1.0
@@ -103,16 +99,16 @@ def test_faces_that_the_photograph_covers_in_part_have_a_mask() -> None:
 
 
 def test_a_face_is_the_same_one_in_a_smaller_photograph() -> None:
-    for lens in lenses_of(*PANORAMA, "camera 1")[0] + lenses_of(*FISHEYE, "camera 1")[0]:
+    for lens in lenses_of(PANORAMA, PANORAMA.size, "camera 1")[0] + lenses_of(FISHEYE, FISHEYE.size, "camera 1")[0]:
         small = lens.downscaled(0.5)
         assert small.face == lens.face and small.stored == lens.stored
-        assert small.size == (lens.size[0] // 2, lens.size[1] // 2)
+        assert small.camera.size == (lens.camera.width // 2, lens.camera.height // 2)
         assert small.pinhole.view == pytest.approx(lens.pinhole.view, abs=0.5)
 
 
 def test_where_the_distortion_folds_the_picture_nothing_is_used() -> None:
-    folding = ("OPENCV_FISHEYE", (60.0, 60.0, 100.0, 100.0, -0.2, 0.0, 0.0, 0.0), 200, 200, (200, 200))
+    folding = ColmapCamera("OPENCV_FISHEYE", 200, 200, (60.0, 60.0, 100.0, 100.0, -0.2, 0.0, 0.0, 0.0))
     angle = 1.0 / math.sqrt(0.6)  # at which theta - 0.2 theta^3 is largest
-    for lens in lenses_of(*folding, "camera 1")[0]:
+    for lens in lenses_of(folding, folding.size, "camera 1")[0]:
         mask = lens.coverage
         assert (np.arccos(rays_of(lens)[..., 2])[mask] <= angle).all() and mask.mean() > 0.3

@@ -352,8 +352,8 @@ def test_parsers_of_other_formats_are_undistorted_by_lenses(capture: Path) -> No
         ours = load_any(capture)
         read = with_lenses(stock(capture, eval_mode="interval").get_dataparser_outputs("train"))
         for one, other in zip(read.metadata["lenses"], ours.train_dataset.metadata["lenses"], strict=True):
-            assert one.model == other.model and one.pinhole.width == other.pinhole.width
-            assert one.params == pytest.approx(other.params, rel=1e-6)
+            assert one.camera.model == other.camera.model and one.pinhole.width == other.pinhole.width
+            assert one.camera.params == pytest.approx(other.camera.params, rel=1e-6)
 
 
 def test_a_list_of_names_is_kept_in_the_configuration(tmp_path: Path) -> None:

@@ -140,7 +140,7 @@ def as_binary_by_colmap(folder: Path, model: Any) -> None:
 
 @pytest.mark.parametrize("model", ["FULL_OPENCV", "OPENCV_FISHEYE"])
 def test_camera_models_of_colmap(project: Path, model: str) -> None:
-    params = " ".join(map(str, camera_of(model, 40.0, (48, 36))))
+    params = " ".join(map(str, camera_of(model, 40.0, (48, 36)).params))
     change_model(project, "cameras.txt", ("PINHOLE 48 36 40 40 24 18", f"{model} 48 36 {params}"))
     view = load_any(project).train_views[0]
     assert view.image.shape[:2] == (view.camera.height, view.camera.width) and view.image.float().std() > 1

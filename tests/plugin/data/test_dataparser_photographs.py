@@ -10,7 +10,6 @@ import pytest
 import yaml
 from PIL import Image
 
-import bitymi_ns.capture
 from bitymi_ns.capture.types import CaptureError, SfmOptions, SfmSettings
 from tests.plugin.data.captures import expect, found_poses, load_any, load_with, printed
 from tests.plugin.data.test_dataparser import parsed
@@ -29,7 +28,7 @@ def finder(project: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, S
         doubtful = {"contradicted": 0.27} if source.name == "walk.mp4" else {}
         return found_poses(project / "sparse/0", project / "images", project / "report", **doubtful)
 
-    monkeypatch.setattr(bitymi_ns.capture, "find_poses", find_poses, raising=False)
+    monkeypatch.setattr("bitymi_ns.capture.poses.find_poses", find_poses)
     progress = types.ModuleType("bitymi_ns.progress")
     progress.rich_progress = lambda: nullcontext(lambda step, done, total: print(step))  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "bitymi_ns.progress", progress)

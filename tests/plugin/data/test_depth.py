@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.data.depth import DepthFit, _affine, _mode
 from bitymi_ns.plugin.data.depth_files import MAPS, MapFiles, maps_beside, read_depth
@@ -207,7 +208,7 @@ def test_maps_of_scanners(tmp_path) -> None:
     cv2.imwrite(str(tmp_path / "confidence/7.png"), confidence)
     (files,) = maps_beside([tmp_path / "images/7.jpg"])
     assert files == MapFiles(tmp_path / "depth/7.png", tmp_path / "confidence/7.png")
-    (lens,), _ = lenses_of("PINHOLE", (100.0, 100.0, 64.0, 48.0), 128, 96, (128, 96), "")
+    (lens,), _ = lenses_of(ColmapCamera("PINHOLE", 128, 96, (100.0, 100.0, 64.0, 48.0)), (128, 96), "")
     read = read_depth(files, lens)
     assert read.shape == (96, 128) and not read[:2].any() and not read[-4:].any()
     assert np.allclose(read[2:-4], 1.5)
@@ -231,7 +232,8 @@ def test_color_pictures_in_a_scanners_depth_folder_are_not_used(tmp_path, capsys
 
 
 def test_distorted_photographs_have_their_depth_moved(tmp_path) -> None:
-    (lens,), _ = lenses_of("OPENCV", (60.0, 60.0, 32.0, 24.0, 0.1, 0.02, 0.0, 0.0), 64, 48, (64, 48), "a camera")
+    camera = ColmapCamera("OPENCV", 64, 48, (60.0, 60.0, 32.0, 24.0, 0.1, 0.02, 0.0, 0.0))
+    (lens,), _ = lenses_of(camera, camera.size, "a camera")
     columns = np.broadcast_to(np.arange(1.0, 65.0), (48, 64))
     np.save(tmp_path / "depth.npy", columns)
     read = read_depth(MapFiles(tmp_path / "depth.npy"), lens)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
+from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.data.images import read_image
@@ -81,9 +82,10 @@ def test_a_negative_side_is_refused(capture: Path) -> None:
 
 
 def test_a_lens_is_reduced_with_its_photographs() -> None:
-    (whole,), _ = lenses_of("SIMPLE_RADIAL", (800.0, 480.0, 360.0, 0.1), 960, 720, (960, 720), "camera 1")
+    camera = ColmapCamera("SIMPLE_RADIAL", 960, 720, (800.0, 480.0, 360.0, 0.1))
+    (whole,), _ = lenses_of(camera, camera.size, "camera 1")
     half = whole.downscaled(0.5)
-    assert half.size == (480, 360) and half.stored == (960, 720)
+    assert half.camera.size == (480, 360) and half.stored == (960, 720)
     assert half.pinhole.view == pytest.approx(whole.pinhole.view, abs=0.2)
     grey = Image.fromarray(np.tile(np.linspace(0, 255, 960).astype(np.uint8), (720, 1))).convert("RGB")
     a, b = (np.asarray(each.undistort(grey)).astype(float) for each in (whole, half))

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import bitymi_ns.capture
 from bitymi_ns.capture import known
 from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
@@ -20,6 +19,7 @@ from tests.plugin.data.captures import edit, edit_frames, load_any, printed, wri
 from tests.plugin.data.test_true_captures import ALL, blender, colmap, move
 
 SIZE = (200, 150)
+TRIANGULATE = known.triangulate  # before fixtures replace it
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def arc(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def triangulating(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bitymi_ns.capture, "triangulate", known.triangulate, raising=False)
+    monkeypatch.setattr("bitymi_ns.capture.known.triangulate", TRIANGULATE)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -100,7 +100,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[list[known.KnownView]]:
         (model / "points3D.txt").write_text("1 0 0 0.5 200 10 10 0.5\n2 0.1 0 0.5 200 10 10 0.5\n")
         return model
 
-    monkeypatch.setattr(bitymi_ns.capture, "triangulate", triangulate, raising=False)
+    monkeypatch.setattr("bitymi_ns.capture.known.triangulate", triangulate)
     return calls
 
 
@@ -113,7 +113,7 @@ def test_every_format_without_points(capture: Path, form: Any, asked: list[Any])
         edit(place, lambda meta: meta.pop("ply_file_path", None))
     assert len(load_any(capture).train_dataparser_outputs.metadata["points3D_xyz"]) == 2
     (views,) = asked
-    assert len(views) == 12 and views[3].model == "PINHOLE" and (views[3].width, views[3].height) == (48, 36)
+    assert len(views) == 12 and views[3].camera.model == "PINHOLE" and views[3].camera.size == (48, 36)
     assert "points3D_xyz" not in load_any(capture, points="random").train_dataparser_outputs.metadata
     config = BitymiDataManagerConfig(data=capture, dataparser=BitymiDataParserConfig())
     for mode in ("test", "inference"):  # the scene is there already

@@ -10,21 +10,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.plugin.data.images import read_image
 from bitymi_ns.plugin.data.lens import MAX_VIEW_ANGLE, Lens, lenses_of
 from tests.plugin.data.captures import expect, printed
 
 SIZE = (96, 72)
+RADIAL = ColmapCamera("SIMPLE_RADIAL", *SIZE, (80.0, 48.0, 36.0, 0.1))
 MODELS = [name for name in pycolmap.CameraModelId.__members__ if name not in ("INVALID", "EQUIRECTANGULAR")]
 
 
-def camera_of(model: str, f: float, size: tuple[int, int] = SIZE, first: float = 0.02) -> tuple[float, ...]:
-    """Parameters with a slight distortion, where the model has any."""
+def camera_of(model: str, f: float, size: tuple[int, int] = SIZE, first: float = 0.02) -> ColmapCamera:
+    """A camera with a slight distortion, where the model has any."""
     camera = pycolmap.Camera.create_from_model_name(1, model, f, *size)
     params, extra = np.array(camera.params), camera.extra_params_idxs()
     if extra:
         params[extra[0]] = {"FOV": 0.5, "EUCM": 0.5}.get(model, first)
-    return tuple(params.tolist())
+    return ColmapCamera(model, *size, tuple(params.tolist()))
 
 
 def picture(one: Lens) -> np.ndarray:
@@ -38,8 +40,8 @@ def picture(one: Lens) -> np.ndarray:
 @pytest.mark.parametrize("f", [30.0, 120.0])
 @pytest.mark.parametrize("model", MODELS)
 def test_pixels_come_from_where_the_camera_saw_their_rays(model: str, f: float) -> None:
-    lenses, _ = lenses_of(model, camera_of(model, f), *SIZE, SIZE, "camera 1")
-    camera = pycolmap.Camera(model=model, width=SIZE[0], height=SIZE[1], params=list(lenses[0].params))
+    lenses, _ = lenses_of(camera_of(model, f), SIZE, "camera 1")
+    camera = lenses[0].camera.colmap
     for one in lenses:
         to = one.pinhole
         assert max(to.view) <= MAX_VIEW_ANGLE + 0.01 or not one.distorts
@@ -58,34 +60,33 @@ def test_pixels_come_from_where_the_camera_saw_their_rays(model: str, f: float) 
 @settings(max_examples=25, deadline=None)
 def test_windows_are_as_large_as_they_can_be(k: float, center: float, f: float) -> None:
     """Their edge touches that of the photograph, within a few pixels, unless they are as wide as allowed."""
-    params = (f, center * SIZE[0], 0.5 * SIZE[1], k)
-    (one, *_), _ = lenses_of("SIMPLE_RADIAL", params, *SIZE, SIZE, "camera 1")
+    camera = ColmapCamera("SIMPLE_RADIAL", *SIZE, (f, center * SIZE[0], 0.5 * SIZE[1], k))
+    (one, *_), _ = lenses_of(camera, SIZE, "camera 1")
     to = one.pinhole
     x, y = np.meshgrid([0.0, to.width], [0.0, to.height])
     x, y = np.append(x, [to.cx, to.cx, 0.0, to.width]), np.append(y, [0.0, to.height, to.cy, to.cy])
     rays = np.stack([(x - to.cx) / to.fx, (y - to.cy) / to.fy, np.ones_like(x)], -1)
-    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=SIZE[0], height=SIZE[1], params=list(params))
-    seen = camera.img_from_cam(rays)
+    seen = camera.colmap.img_from_cam(rays)
     margin = min(seen.min(), (np.array(SIZE) - seen).min())
     assert -0.01 < margin < 2.5 or max(to.view) > MAX_VIEW_ANGLE - 3.0
 
 
 def test_a_pinhole_is_left_as_it_is() -> None:
     for model in ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "OPENCV", "FULL_OPENCV"):
-        (one, *_), told = lenses_of(model, camera_of(model, 80.0, first=0.0), *SIZE, SIZE, "camera 1")
+        (one, *_), told = lenses_of(camera_of(model, 80.0, first=0.0), SIZE, "camera 1")
         assert not one.distorts and told == [] and (one.pinhole.width, one.pinhole.height) == SIZE
         image = Image.fromarray(np.random.default_rng(0).integers(0, 255, (72, 96, 4), np.uint8))
         assert one.undistort(image) is image
 
 
 def test_a_fisheye_needs_no_coefficients() -> None:
-    (one,), told = lenses_of("SIMPLE_FISHEYE", (60.0, 48.0, 36.0), *SIZE, SIZE, "camera 1 of x")
+    (one,), told = lenses_of(ColmapCamera("SIMPLE_FISHEYE", *SIZE, (60.0, 48.0, 36.0)), SIZE, "camera 1 of x")
     assert one.distorts and one.turn.tolist() == np.eye(4).tolist()
     assert "camera 1 of x is SIMPLE_FISHEYE: its photographs are used as pinhole pictures of" in told[0]
 
 
 def test_masks_go_with_their_photographs() -> None:
-    (one, *_), _ = lenses_of("SIMPLE_RADIAL", (80.0, 48.0, 36.0, 0.1), *SIZE, (192, 144), "camera 1")
+    (one, *_), _ = lenses_of(RADIAL, (192, 144), "camera 1")
     mask = np.zeros((144, 192), bool)
     mask[:, 96:] = True
     out = np.asarray(one.undistort_mask(Image.fromarray(mask), Path("m.png")))
@@ -94,17 +95,17 @@ def test_masks_go_with_their_photographs() -> None:
 
 
 def test_larger_photographs_are_averaged_down() -> None:
-    (one, *_), _ = lenses_of("PINHOLE", (80.0, 80.0, 48.0, 36.0), *SIZE, (192, 144), "camera 1")
+    (one, *_), _ = lenses_of(ColmapCamera("PINHOLE", *SIZE, (80.0, 80.0, 48.0, 36.0)), (192, 144), "camera 1")
     stripes = np.tile(np.array([0, 255], np.uint8), (144, 96))[..., None].repeat(3, -1)
     out = np.asarray(one.undistort(Image.fromarray(stripes)))
     assert out.shape == (72, 96, 3) and np.abs(out.astype(int) - 127).max() <= 1
 
 
 def test_a_photograph_of_another_size_is_named(tmp_path: Path) -> None:
-    (one, *_), _ = lenses_of("SIMPLE_RADIAL", (80.0, 48.0, 36.0, 0.1), *SIZE, SIZE, "camera 1")
+    (one, *_), _ = lenses_of(RADIAL, SIZE, "camera 1")
     Image.new("RGB", (10, 20)).save(tmp_path / "b.png")
     with expect("b.png has 10 x 20 pixels, but its camera is for 96 x 72"):
-        read_image(tmp_path / "b.png", one.stored, one.size)
+        read_image(tmp_path / "b.png", one.stored, one.camera.size)
     with expect("m.png has 10 x 20 pixels, but its camera is for 96 x 72"):
         one.undistort_mask(Image.new("1", (10, 20)), Path("m.png"))
 
@@ -122,9 +123,9 @@ def test_a_photograph_of_another_size_is_named(tmp_path: Path) -> None:
 )
 def test_cameras_that_cannot_be_used(model: str, params: tuple[float, ...], message: str) -> None:
     with expect(message):
-        lenses_of(model, params, *SIZE, SIZE, "camera 1")
+        lenses_of(ColmapCamera(model, *SIZE, params), SIZE, "camera 1")
 
 
 def test_little_that_is_left_is_said(capsys: pytest.CaptureFixture[str]) -> None:
-    lenses_of("SIMPLE_RADIAL", (80.0, 48.0, 36.0, -6.0), *SIZE, SIZE, "camera 1")
+    lenses_of(RADIAL._replace(params=(80.0, 48.0, 36.0, -6.0)), SIZE, "camera 1")
     assert "of camera 1. The lens distortion may be wrong" in printed(capsys)

@@ -9,11 +9,10 @@ import torch
 
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.data import datamanager as module
-from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManagerConfig
-from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
+from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.data.dataset import RECENT, BitymiDataset
 from bitymi_ns.sample import generate
-from tests.plugin.data.captures import edit
+from tests.plugin.data.captures import edit, load_any
 
 WIDTH, HEIGHT = 48, 36
 PICTURE = WIDTH * HEIGHT * 3
@@ -26,12 +25,6 @@ def many(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("captures") / "many"
     generate(folder, views=TRAIN + HELD_OUT, width=WIDTH, height=HEIGHT, seed=0, points=50)
     return folder
-
-
-def load(capture: Path) -> BitymiDataManager:
-    return BitymiDataManagerConfig(data=capture, dataparser=BitymiDataParserConfig()).setup(
-        device="cpu", test_mode="val"
-    )
 
 
 @pytest.fixture
@@ -69,12 +62,12 @@ def test_only_so_many_pictures_are_held(many: Path, alive: Any, monkeypatch: pyt
     monkeypatch.setattr(module, "PHOTOGRAPH_BYTES", 6 * PICTURE)
     pictures, _ = alive
     # what is kept, the latest of both sets, and the one in the caller's hand
-    assert look_at_all(load(many), pictures) <= 6 + 2 * RECENT + 1
+    assert look_at_all(load_any(many), pictures) <= 6 + 2 * RECENT + 1
 
 
 def test_a_small_capture_is_read_once(many: Path, alive: Any) -> None:
     pictures, reads = alive
-    assert look_at_all(load(many), pictures) == len(reads) == TRAIN + HELD_OUT
+    assert look_at_all(load_any(many), pictures) == len(reads) == TRAIN + HELD_OUT
 
 
 @pytest.mark.parametrize("distortion", [{}, {"k1": 0.05, "p1": 0.01}])
@@ -85,9 +78,9 @@ def test_pixels_and_cameras_are_the_same(
     capture.symlink_to(many) if not distortion else generate(capture, views=12, width=WIDTH, height=HEIGHT, points=50)
     if distortion:
         edit(capture, lambda meta: meta.update(distortion))
-    kept = load(capture)
+    kept = load_any(capture)
     monkeypatch.setattr(module, "PHOTOGRAPH_BYTES", 0)
-    read = load(capture)
+    read = load_any(capture)
     for split in ("cached_train", "cached_eval"):
         for a, b in zip(getattr(kept, split), getattr(read, split), strict=True):
             assert a["image_idx"] == b["image_idx"] and torch.equal(a["image"], b["image"])
@@ -101,7 +94,7 @@ def test_pixels_and_cameras_are_the_same(
 
 def test_one_step_reads_its_photograph_once(many: Path, alive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "PHOTOGRAPH_BYTES", 0)
-    manager = load(many)
+    manager = load_any(many)
     _ = manager.cached_train
     _, reads = alive
     before = len(reads)
@@ -117,4 +110,4 @@ def test_a_photograph_that_cannot_be_read_is_noticed_at_the_start(
     path = sorted((capture / "images").iterdir())[3]
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(InputError, match="cannot be read"):
-        _ = load(capture).cached_train
+        _ = load_any(capture).cached_train

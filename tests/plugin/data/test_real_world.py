@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-import bitymi_ns.capture
 from bitymi_ns.bundle import check_files, check_world
 from bitymi_ns.bundle.manifest import Manifest
 from bitymi_ns.capture.frame import WorldFrame, write_frame
@@ -43,7 +42,7 @@ def photographs(capture: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     write_frame(capture / "found", frame())
 
     found = found_poses(capture / "found/sparse/0", capture / "images", capture / "found", left_out={}, given=12)
-    monkeypatch.setattr(bitymi_ns.capture, "find_poses", lambda *arguments: found, raising=False)
+    monkeypatch.setattr("bitymi_ns.capture.poses.find_poses", lambda *arguments: found)
     folder = capture.parent / "photographs"
     shutil.copytree(capture / "images", folder)
     return folder

@@ -6,7 +6,6 @@ from typing import Any
 import pytest
 from PIL import Image
 
-import bitymi_ns.capture
 from bitymi_ns.capture.recognise import recognise
 from bitymi_ns.capture.types import CaptureError, SfmSettings
 from bitymi_ns.plugin.console import InputError
@@ -37,7 +36,7 @@ def test_poses_are_found_with_the_masks_of_the_training(
         asked.append(options.masks)
         raise CaptureError("not now")
 
-    monkeypatch.setattr(bitymi_ns.capture, "find_poses", find_poses)
+    monkeypatch.setattr("bitymi_ns.capture.poses.find_poses", find_poses)
     for folder in (photographs, "bed/masks", "bed/mine", "bed/all/masks"):
         (tmp_path / folder).mkdir(parents=True, exist_ok=True)
     Image.new("RGB", (8, 6)).save(tmp_path / photographs / "a.png")

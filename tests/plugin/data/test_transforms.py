@@ -1,8 +1,6 @@
 """What stands in transforms.json beside poses, well meant or not."""
 
-import json
 import math
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +10,6 @@ from PIL import Image
 
 from bitymi_ns.capture.recognise import recognise
 from bitymi_ns.plugin.console import InputError, say, warn
-from bitymi_ns.plugin.data import point_files
 from tests.plugin.data.captures import (
     edit,
     edit_frames,
@@ -62,7 +59,7 @@ def test_a_frame_with_a_camera_of_its_own(capture: Path, capsys: pytest.CaptureF
     manager = load(capture)
     train = manager.train_dataset
     index = train.image_filenames.index(path)
-    assert train.metadata["lenses"][index].size == (96, 72) and int(train.cameras.width[index - 1]) == 48
+    assert train.metadata["lenses"][index].camera.size == (96, 72) and int(train.cameras.width[index - 1]) == 48
     assert float(train.cameras.fy[index]) == 81.0 and float(train.cameras.fy[index - 1]) != 81.0
     assert [lens.distorts for lens in train.metadata["lenses"][index - 1 : index + 1]] == [False, True]
     message = printed(capsys)
@@ -141,26 +138,6 @@ def test_entries_that_cannot_be_used_are_named(capture: Path, change: Any, messa
 def test_numbers_in_quotes(capture: Path) -> None:
     edit(capture, lambda meta: meta.update(w="48.0", h=36.0, fl_x=str(meta["fl_x"])))
     assert len(load(capture).cached_train) == 10
-
-
-def test_large_clouds_are_announced_and_timed(
-    capture: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    load(capture)
-    assert "This may take minutes" not in printed(capsys)
-    monkeypatch.setattr(point_files, "MANY_POINTS", 200)
-    load(capture)
-    message = printed(capsys)
-    assert "Reading 200 points. This may take minutes." in message and "Reading 200 points took" in message
-
-
-def test_points_are_counted_before_they_are_read(tmp_path: Path) -> None:
-    (tmp_path / "points3D.bin").write_bytes(struct.pack("<Q", 5_000_000))
-    (tmp_path / "points3D.txt").write_text("# 3D point list\n# Number of points: 123, mean track length: 3\n")
-    (tmp_path / "a.ply").write_text("ply\nformat ascii 1.0\nelement vertex 7\nend_header\n")
-    (tmp_path / "b.ply").write_text(json.dumps({}))
-    counts = [point_files.point_count(tmp_path / n) for n in ("points3D.bin", "points3D.txt", "a.ply", "b.ply", "gone")]
-    assert counts == [5_000_000, 123, 7, 0, 0]
 
 
 def test_doubtful_focal_lengths_are_said(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 import pytest
 import torch
 from nerfstudio.cameras.camera_utils import fisheye624_project
@@ -176,9 +175,9 @@ def test_a_camera_model_wherever_it_stands(
     edit(place, change)
     manager = load_any(place)
     lenses = [lens for data in (manager.train_dataset, manager.eval_dataset) for lens in data.metadata["lenses"]]
-    fisheyes = [lens for lens in lenses if lens.model == "OPENCV_FISHEYE"]
+    fisheyes = [lens for lens in lenses if lens.camera.model == "OPENCV_FISHEYE"]
     assert len(fisheyes) == (6 if which == "some frames" else 12)
-    assert fisheyes[0].params[4:] == (0.01, 0.0, 0.0, 0.001)
+    assert fisheyes[0].camera.params[4:] == (0.01, 0.0, 0.0, 0.001)
     assert "is OPENCV_FISHEYE: its photographs are used as pinhole pictures" in printed(capsys)
 
 
@@ -202,10 +201,10 @@ def test_aria_s_camera(capture: Path) -> None:
     camera = {"camera_model": "FISHEYE624", "fl_x": 20.0, "fl_y": 20.0, "distortion_params": params}
     edit(capture, lambda meta: meta.update(camera))
     lens = load_any(capture).train_dataset.metadata["lenses"][0]
-    assert lens.model == "RAD_TAN_THIN_PRISM_FISHEYE"
+    assert lens.camera.model == "RAD_TAN_THIN_PRISM_FISHEYE"
     rays = torch.tensor([[0.1, 0.2, 1.0], [-0.5, 0.3, 1.0], [0.4, -0.6, 1.0]])
-    theirs = fisheye624_project(rays[None], torch.tensor([[20.0, *lens.params[2:4], *params]]))[0]
-    ours = pycolmap.Camera(model=lens.model, width=48, height=36, params=list(lens.params)).img_from_cam(rays.numpy())
+    theirs = fisheye624_project(rays[None], torch.tensor([[20.0, *lens.camera.params[2:4], *params]]))[0]
+    ours = lens.camera.colmap.img_from_cam(rays.numpy())
     np.testing.assert_allclose(ours, theirs.numpy(), atol=1e-3)
 
 

@@ -2,13 +2,13 @@
 
 import pytest
 
-from bitymi_ns.plugin.export import compact_options
-from bitymi_ns.plugin.export.compact_options import CompactOptions
+from bitymi_ns.plugin.export import command
+from bitymi_ns.plugin.export.command import CompactOptions
 
 
 def test_a_bundle_much_smaller_than_was_asked_for_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
-    monkeypatch.setattr(compact_options, "say", said.append)
+    monkeypatch.setattr(command, "say", said.append)
     CompactOptions(target_mb=1.5).state_size(1_400_000)
     CompactOptions().state_size(1)
     assert not said

@@ -6,13 +6,14 @@ import type { Graphics } from './device';
 import { type Programs, SHOW, type Show, type TargetFormat } from './programs';
 import { type SceneOnDevice, STRIDE, group } from './scene';
 
-export interface Look {
+export interface DrawOptions {
   show: Show;
   residuals: boolean;
   held: Vec3 | null; // from where view colours are seen; null: from the camera
   background: Vec3;
   layers: number; // batches: draw.wgsl
   fine: boolean; // in single precision, where the device blends it
+  farthest: number; // depth of the last colour of the map of depths
 }
 
 interface Target {
@@ -34,7 +35,7 @@ export interface Depths {
 
 const MOST_SAMPLES = 4; // per pixel, along each axis, of a picture that stays
 const MOST_PIXELS = 1 << 22; // of a target
-export const MOST_OVERDRAW = 64; // of the last colour of the map
+const MOST_OVERDRAW = 64; // of the last colour of the map
 
 export class Renderer {
   private target: Target | null = null;
@@ -77,16 +78,16 @@ export class Renderer {
     return this.target;
   }
 
-  private samplingOf(view: View, width: number, height: number, look: Look): Sampling {
+  private samplingOf(view: View, width: number, height: number, options: DrawOptions): Sampling {
     const { photographed } = this.scene.info;
     if (!photographed?.length) return { samples: 1, photoPixel: 1 };
-    const most = look.fine
+    const most = options.fine
       ? Math.max(1, Math.min(MOST_SAMPLES, Math.floor(this.largestSide / Math.max(width, height))))
       : 1;
     return samplingOf(sizeOf(photographed, view), width * height, most, MOST_PIXELS);
   }
 
-  private setFrame(view: View, width: number, height: number, photoPixel: number, look: Look): void {
+  private setFrame(view: View, width: number, height: number, photoPixel: number, options: DrawOptions): void {
     const { info, surfels, atlasSize, alphaScale, count } = this.scene;
     const data = new ArrayBuffer(160);
     const [f, u] = [new Float32Array(data), new Uint32Array(data)];
@@ -94,31 +95,31 @@ export class Renderer {
     [right, down, forward].forEach((row, k) => f.set(row, 4 * k));
     const relative = (at: Vec3): number[] => at.map((x, c) => x - surfels.origin[c]);
     f.set([...relative(view.pose.position), alphaScale], 12);
-    f.set(relative(look.held ?? view.pose.position), 16);
+    f.set(relative(options.held ?? view.pose.position), 16);
     f.set([view.fx, view.fy, view.cx, view.cy], 20);
     f.set([width, height, info.near, info.weightBound], 24);
     f.set([info.atlas?.offset ?? 0, info.atlas?.scale ?? 1, ...atlasSize], 28);
-    u.set([count, surfels.kind, info.prefilter === 'pixel' ? 1 : 0, look.layers], 32);
-    u.set([SHOW[look.show], look.residuals ? 1 : 0], 36);
+    u.set([count, surfels.kind, info.prefilter === 'pixel' ? 1 : 0, options.layers], 32);
+    u.set([SHOW[options.show], options.residuals ? 1 : 0], 36);
     f[38] = photoPixel;
     u[39] = this.scene.detail;
     this.graphics.device.queue.writeBuffer(this.scene.frame, 0, data);
   }
 
-  private encode(encoder: GPUCommandEncoder, view: View, look: Look): Target {
+  private encode(encoder: GPUCommandEncoder, view: View, options: DrawOptions): Target {
     const { width: pixelsAcross, height: pixelsDown } = view;
     const { scene, programs } = this;
-    const { samples, photoPixel } = this.samplingOf(view, pixelsAcross, pixelsDown, look);
+    const { samples, photoPixel } = this.samplingOf(view, pixelsAcross, pixelsDown, options);
     const [width, height] = [samples * pixelsAcross, samples * pixelsDown];
-    const format = look.fine && this.graphics.floats ? 'rgba32float' : 'rgba16float';
+    const format = options.fine && this.graphics.floats ? 'rgba32float' : 'rgba16float';
     const target = this.targetOf(width, height, samples, format);
     if (photoPixel < 1) scene.makeCoarser();
-    this.setFrame(view.scaledTo(width, height), width, height, photoPixel, look);
+    this.setFrame(view.scaledTo(width, height), width, height, photoPixel, options);
     encoder.clearBuffer(scene.visible);
     scene.encodeSorting(encoder);
-    const pipeline = programs.draw(target.format, look.show === 'overdraw' ? 'count' : 'blend');
+    const pipeline = programs.draw(target.format, options.show === 'overdraw' ? 'count' : 'blend');
     const attachment = target.sums.createView();
-    for (let k = 0; k < look.layers; k++) {
+    for (let k = 0; k < options.layers; k++) {
       if (k) encoder.copyTextureToTexture({ texture: target.sums }, { texture: target.before }, [width, height]);
       const work = encoder.beginRenderPass({
         colorAttachments: [
@@ -135,19 +136,13 @@ export class Renderer {
     return target;
   }
 
-  private encodePresent(
-    encoder: GPUCommandEncoder,
-    target: Target,
-    to: GPUTexture,
-    look: Look,
-    farthest: number,
-  ): void {
+  private encodePresent(encoder: GPUCommandEncoder, target: Target, to: GPUTexture, options: DrawOptions): void {
     const { device } = this.graphics;
     const pipeline = this.programs.present(to.format);
     const data = new ArrayBuffer(48);
-    new Float32Array(data).set([...look.background, 1, to.width, to.height]);
-    new Uint32Array(data)[6] = SHOW[look.show];
-    new Float32Array(data)[7] = look.show === 'overdraw' ? MOST_OVERDRAW : farthest;
+    new Float32Array(data).set([...options.background, 1, to.width, to.height]);
+    new Uint32Array(data)[6] = SHOW[options.show];
+    new Float32Array(data)[7] = options.show === 'overdraw' ? MOST_OVERDRAW : options.farthest;
     new Uint32Array(data)[8] = target.samples;
     device.queue.writeBuffer(this.screen, 0, data);
     const bound = group(device, pipeline.getBindGroupLayout(0), [this.screen, target.sums.createView(), this.smooth]);
@@ -161,20 +156,20 @@ export class Renderer {
   }
 
   // Draws a view for a screen, at `scale` of the screen's resolution; ends when it is drawn.
-  draw(view: View, to: GPUTexture, scale: number, look: Look, farthest: number): Promise<undefined> {
+  draw(view: View, to: GPUTexture, scale: number, options: DrawOptions): Promise<undefined> {
     const { queue } = this.graphics.device;
     const encoder = this.graphics.device.createCommandEncoder();
     const [width, height] = [to.width, to.height].map((side) => Math.max(1, Math.round(side * scale)));
-    const target = this.encode(encoder, view.scaledTo(width, height), look);
-    this.encodePresent(encoder, target, to, look, farthest);
+    const target = this.encode(encoder, view.scaledTo(width, height), options);
+    this.encodePresent(encoder, target, to, options);
     queue.submit([encoder.finish()]);
     return queue.onSubmittedWorkDone();
   }
 
   // Draws the depths of a view.
-  async depths(view: View, look: Look): Promise<Depths> {
+  async depths(view: View, options: DrawOptions): Promise<Depths> {
     const encoder = this.graphics.device.createCommandEncoder();
-    const { width, height, format, sums } = this.encode(encoder, view, { ...look, show: 'depth' });
+    const { width, height, format, sums } = this.encode(encoder, view, { ...options, show: 'depth' });
     const bytes = format === 'rgba32float' ? 16 : 8; // of a pixel
     const rows = await this.rowsOf(encoder, sums, bytes);
     const depth = new Float32Array(width * height);
@@ -190,13 +185,13 @@ export class Renderer {
   }
 
   // Draws a view to RGBA bytes.
-  async read(view: View, look: Look, farthest: number): Promise<ImageData> {
+  async read(view: View, options: DrawOptions): Promise<ImageData> {
     const { device } = this.graphics;
     const size: [number, number] = [view.width, view.height];
     const usage = GPUTextureUsage.RENDER_ATTACHMENT | GPUTextureUsage.COPY_SRC;
     const to = device.createTexture({ size, format: 'rgba8unorm', usage });
     const encoder = device.createCommandEncoder();
-    this.encodePresent(encoder, this.encode(encoder, view, look), to, look, farthest);
+    this.encodePresent(encoder, this.encode(encoder, view, options), to, options);
     const image = new ImageData(...size);
     (await this.rowsOf(encoder, to, 4)).forEach((row, y) => image.data.set(row, 4 * view.width * y));
     to.destroy();

@@ -129,7 +129,7 @@ export class PathPanel {
     const list = element('keyframes');
     list.replaceChildren(
       ...keyframes.map((keyframe, k) => {
-        const go = (): void => this.stage.go(keyframe.pose, keyframe.lens);
+        const go = (): void => this.stage.go({ pose: keyframe.pose, lens: keyframe.lens });
         const remove = (): void => {
           this.stop();
           keyframes.splice(k, 1);

@@ -1,13 +1,11 @@
 // What the panels see and change of what is shown.
-import type { Vec3 } from '../bundle/manifest';
 import type { Depths } from '../render/renderer';
-import type { Viewpoint } from '../view/notes';
-import type { Lens, Pose, View } from '../view/pose';
-import type { Shared } from '../view/share';
+import type { View } from '../view/pose';
+import type { Shared, Viewpoint } from '../view/share';
 
 export interface Stage {
   shared(): Shared;
-  go(pose: Pose, lens: Lens, target?: Vec3): void;
+  go(to: Omit<Viewpoint, 'target'> & Partial<Viewpoint>): void; // by default the target is one ahead
   fly(to: Viewpoint): void; // on the way there, as long as the reader does not move the camera
   pixels(): [number, number]; // of the canvas
   view(): View; // that the canvas shows

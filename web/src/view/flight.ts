@@ -1,5 +1,5 @@
 // The way from one view to another.
-import type { Viewpoint } from './notes';
+import type { Viewpoint } from './share';
 import { CameraPath } from './path';
 import type { View } from './pose';
 

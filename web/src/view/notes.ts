@@ -1,8 +1,6 @@
 // Saved views and notes of a scene: notes.json beside the bundle, as bitymi_ns/bundle/notes.py describes it.
 import type { Vec3 } from '../bundle/manifest';
-import { type Shared, cameraOf, sharedOf } from './share';
-
-export type Viewpoint = Pick<Shared, 'pose' | 'lens' | 'target'>;
+import { type Viewpoint, cameraOf, viewpointOf } from './share';
 
 export interface SavedView {
   name: string;
@@ -67,7 +65,7 @@ export function parseNotes(text: string): Notes {
     const found = textOf(name, `${where}.name`, LONGEST_NAME);
     if (names.has(found)) refuse(`${where}.name`, 'is there twice');
     names.add(found);
-    return { name: found, viewpoint: sharedOf(camera) ?? refuse(where, 'must be a camera') };
+    return { name: found, viewpoint: viewpointOf(camera) ?? refuse(where, 'must be a camera') };
   });
   const notes = rows(root.notes, 'notes', MOST_NOTES).map((each, k) => {
     const { text: words, position } = keysOf(each, `notes.${k}`, ['text', 'position']);

@@ -2,7 +2,7 @@
 import type { Vec3 } from '../bundle/manifest';
 import { type Lens, type Pose, View } from './pose';
 import { type Quat, difference, exponential, poseOf, product, quatOf, slerp } from './rotation';
-import { lensOf, sharedOf } from './share';
+import { lensOf, viewpointOf } from './share';
 import { add, dot, length, subtract, times } from './vector';
 
 export interface Keyframe {
@@ -146,7 +146,7 @@ function keyframeOf(row: Record<string, unknown>, k: number, usual: number): Key
     const f = height / 2 / Math.tan((Math.PI / 360) * Number(fov));
     lens = [f, f, width / 2, height / 2, width, height];
   }
-  const found = sharedOf({ position, right, forward: times(-1, back), target: position, lens });
+  const found = viewpointOf({ position, right, forward: times(-1, back), target: position, lens });
   if (!found || !(dot(found.pose.down, up) < -0.9)) throw new Error(`keyframe ${k + 1} is no camera.`);
   return { ...found, seconds: (own === true ? secondsOf(seconds) : null) ?? usual };
 }

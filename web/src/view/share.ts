@@ -4,10 +4,14 @@ import { SHOW, type Show } from '../render/programs';
 import type { Lens, Pose } from './pose';
 import { cross, dot, length } from './vector';
 
-export interface Shared {
+// A camera and the point that it turns around.
+export interface Viewpoint {
   pose: Pose;
   lens: Lens;
   target: Vec3;
+}
+
+export interface Shared extends Viewpoint {
   show: Show;
   residuals: boolean;
 }
@@ -41,7 +45,7 @@ export interface Camera {
   lens: number[];
 }
 
-export const cameraOf = ({ pose, lens, target }: Pick<Shared, 'pose' | 'lens' | 'target'>): Camera => ({
+export const cameraOf = ({ pose, lens, target }: Viewpoint): Camera => ({
   position: pose.position,
   right: pose.right,
   forward: pose.forward,
@@ -52,7 +56,7 @@ export const cameraOf = ({ pose, lens, target }: Pick<Shared, 'pose' | 'lens' | 
 const FARTHEST = 1e9;
 
 // The view of a camera from elsewhere, or null where it is none.
-export function sharedOf(camera: unknown): Pick<Shared, 'pose' | 'lens' | 'target'> | null {
+export function viewpointOf(camera: unknown): Viewpoint | null {
   const given = (camera ?? {}) as Partial<Record<keyof Camera, unknown>>;
   const good = (list: unknown, count: number): list is number[] =>
     Array.isArray(list) && list.length === count && list.every((x) => Number.isFinite(x) && Math.abs(x) <= FARTHEST);
@@ -74,16 +78,9 @@ export function fromHash(hash: string): Shared | null {
   const given = new URLSearchParams(hash.replace(/^#/, ''));
   const [position, axes] = [numbers(given.get('p'), 3), numbers(given.get('r'), 6)];
   const [right, forward] = [axes?.slice(0, 3), axes?.slice(3)];
-  const found = sharedOf({
-    ...{ position, right, forward },
-    ...{ target: numbers(given.get('t'), 3), lens: numbers(given.get('l'), 6) },
-  });
-  const show = given.get('show') ?? 'color';
-  return (
-    found && {
-      ...found,
-      show: show in SHOW ? (show as Show) : 'color',
-      residuals: given.get('texture') !== 'off',
-    }
-  );
+  const [target, lens] = [numbers(given.get('t'), 3), numbers(given.get('l'), 6)];
+  const found = viewpointOf({ position, right, forward, target, lens });
+  const asked = given.get('show') ?? 'color';
+  const show = asked in SHOW ? (asked as Show) : 'color';
+  return found && { ...found, show, residuals: given.get('texture') !== 'off' };
 }

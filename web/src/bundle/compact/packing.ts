@@ -1,4 +1,4 @@
-// Where tiles lie in the pages of an atlas, which follows from their sizes: bitymi_ns/bake/packing.py says how.
+// Where tiles lie in the pages of an atlas, which follows from their sizes: bitymi_ns/codec/packing.py says how.
 import { DamagedBundle } from '../../errors';
 
 const GRID = 4;

@@ -1,4 +1,4 @@
-// surfels.bin: docs/baking.md says what the numbers of its columns stand for; bake/surfel_codes.py is their writer.
+// surfels.bin: docs/baking.md says what the numbers of its columns stand for; codec/surfel_codes.py is their writer.
 import { DamagedBundle } from '../../errors';
 import type { CompactSurfels, Manifest, ViewKind } from '../manifest';
 import { KINDS, LEAN_WIDTH, SURFEL_WORDS, type Surfels, WORD } from '../surfels';
@@ -8,7 +8,7 @@ import { pack } from './packing';
 
 export const SURFELS_PER_BYTE = 1; // a file that is said to hold more is refused, and so many beside
 export const SPARE_SURFELS = 1 << 12;
-const PLACE_BITS = 17;
+const POSITION_BITS = 17;
 const SHARE = 1 / 1024; // of their ranges: what opacities and betas keep from their ends
 const ALPHA_MIN = 1 / 255;
 const EXTENT = 3; // of surfels without a tile
@@ -17,8 +17,8 @@ const MOST_EXPONENT = 12;
 const MOST_TERMS = 32;
 const BENT = 50; // of sinh: beyond all limits
 const FILE = 'surfels.bin';
-// largest values: bake/limits.py
-const PLACES = 1e9;
+// largest values: codec/limits.py
+const POSITIONS = 1e9;
 const LOG_SCALES = 104;
 const COLORS = 256;
 const EXTENTS: [number, number] = [1e-6, 16];
@@ -124,17 +124,18 @@ class Decoder {
     return name.startsWith('term_') ? this.terms : this.count;
   }
 
-  private places(): void {
+  private positions(): void {
     const { center, scale, low } = this.stated.frame;
     const [differences, step] = [this.column('place')[0], this.step('place')];
     let key = 0;
     for (let i = 0, to = WORD.mean; i < this.count; i++, to += SURFEL_WORDS) {
       key += differences[i];
-      if (differences[i] < 0 || key >= 2 ** (3 * PLACE_BITS)) this.refuse('places do not ascend, or leave their grid');
+      if (differences[i] < 0 || key >= 2 ** (3 * POSITION_BITS))
+        this.refuse('positions do not ascend, or leave their grid');
       const [lower, upper] = [key % 2 ** 24, Math.floor(key / 2 ** 24)];
       for (let a = 0; a < 3; a++) {
         const cell = (thirds(lower >> a) & 0xff) | (thirds(upper >> a) << 8);
-        this.words[to + a] = within(center[a] + scale * sinh(low[a] + step * cell), PLACES);
+        this.words[to + a] = within(center[a] + scale * sinh(low[a] + step * cell), POSITIONS);
       }
     }
   }
@@ -228,7 +229,7 @@ class Decoder {
   }
 
   surfels(): Surfels {
-    this.places();
+    this.positions();
     this.rotations();
     this.shapes();
     this.tiles();

@@ -1,8 +1,7 @@
 #!/usr/bin/env python
-"""Run each CUDA kernel once on a scene of a size of choice, for sanitizers and profilers.
+"""Run each CUDA kernel once on a scene of a size of choice, for sanitizers.
 
-`--sections baked training` chooses; `--profile` marks one warm run of them for a profiler that waits for the mark (ncu
---profile-from-start off), `--times` prints the device's time by kernel over a number of runs.
+`--sections baked training` chooses; `--times` prints the device's time by kernel over a number of runs.
 """
 
 import sys
@@ -78,7 +77,6 @@ def main() -> int:
     parser.add_argument("--size", default="96x64", metavar="WxH", help="image size (%(default)s)")
     parser.add_argument("--sections", nargs="*", choices=list(SECTIONS), default=list(SECTIONS))
     parser.add_argument("--bundles", nargs="+", type=Path, default=[], help="draw these as well")
-    parser.add_argument("--profile", action="store_true", help="warm up, then mark one run")
     parser.add_argument("--times", type=int, default=0, metavar="RUNS", help="time by kernel over so many runs")
     arguments = parser.parse_args()
     width, height = (int(part) for part in arguments.size.split("x"))
@@ -87,26 +85,20 @@ def main() -> int:
     made |= {folder.name: partial(bundled, folder) for folder in arguments.bundles}
     for name, make in made.items():
         run = make(width, height, device)
-        if not arguments.profile and not arguments.times:
+        if arguments.times:
+            print_times(name, run, arguments.times)
+        else:
             run()
             torch.cuda.synchronize()
             print(f"{name}: done", flush=True)
-            continue
-        for _ in range(5):
-            run()
-        torch.cuda.synchronize()
-        if arguments.profile:
-            torch.cuda.profiler.start()
-            run()
-            torch.cuda.synchronize()
-            torch.cuda.profiler.stop()
-        if arguments.times:
-            print_times(name, run, arguments.times)
     return 0
 
 
 def print_times(name: str, run: Callable[[], object], runs: int) -> None:
-    """Device time of every kernel, of the longest first, per run."""
+    """Device time of every kernel after a warm-up, of the longest first, per run."""
+    for _ in range(5):
+        run()
+    torch.cuda.synchronize()
     activities = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
     with torch.profiler.profile(activities=activities) as profile:
         for _ in range(runs):

@@ -88,29 +88,27 @@ class BakedRenderer:
     def run(self, stages: Stage = Stage.ALL) -> None:
         """Begins the frame of the latest cameras; single stages, for timing them, are never taken from the graph."""
         with on_device(self._viewmats.device):  # a graph is recorded on a stream of the current one
-            self._run(stages)
+            if not self._use_graph or stages != Stage.ALL:
+                self._draw(stages)
+                return
+            if self._graph is None:
+                self._record()
+            self._graph.replay()
 
-    def _run(self, stages: Stage) -> None:
-        if not self._use_graph or stages != Stage.ALL:
-            self._draw(stages)
-            return
-        if self._graph is None:
-            self._draw(Stage.ALL)  # before recording: first calls load kernels
-            torch.cuda.synchronize(self._viewmats.device)
-            self._graph = torch.cuda.CUDAGraph()
-            # a texture that is freed waits for the device, which is an error while a graph is recorded.
-            collects = gc.isenabled()
-            gc.disable()
-            try:
-                with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
-                    self._draw(Stage.ALL)
-            except BaseException:
-                self._graph = None  # half a recording
-                raise
-            finally:
-                if collects:
-                    gc.enable()
-        self._graph.replay()
+    def _record(self) -> None:
+        self._draw(Stage.ALL)  # before recording: first calls load kernels
+        torch.cuda.synchronize(self._viewmats.device)
+        graph = torch.cuda.CUDAGraph()
+        # a texture that is freed waits for the device, which is an error while a graph is recorded.
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+                self._draw(Stage.ALL)
+        finally:
+            if collects:
+                gc.enable()
+        self._graph = graph
 
     def complete(self) -> bool:
         """True where the working memory was large enough for the latest frame; waits for it."""

@@ -62,9 +62,6 @@ class DensifyConfig:
     reset_opacity: PositiveShare = 0.01  # Opacity after a reset, at most. Very short runs reset to a higher one.
     final_prune_steps: tuple[int, ...] = (18_000, 21_000, 24_000, 27_000)  # Steps of the final prunes.
     final_prune_opacity: Share = 0.1  # Final prunes remove surfels below this opacity.
-    final_prune_score: Threshold = 1.0
-    """Final prunes remove surfels whose multi-view error score (0 to 1) is above this; 1 = none. FastGS's 0.9 removes
-    those that cover most bad pixels, the largest of a background among them, when nothing can close the hole."""
     min_interval: Count = 100
     """Fewest steps between densifications, however short the run: surfels need time to settle first."""
     pixels_per_surfel: NonNegative = 150.0
@@ -102,18 +99,6 @@ class LearningRates:
         rates = {name: value for name, value in vars(self).items() if not name.startswith("short_run")}
         scaled = {k: tuple(factor * x for x in v) if isinstance(v, tuple) else factor * v for k, v in rates.items()}
         return replace(self, **scaled)
-
-
-@dataclass
-class AdamConfig:
-    """Adam's constants."""
-
-    eps: float = 1e-15
-    """Added to the root of the second moment."""
-    betas: tuple[float, float] = (0.9, 0.999)
-    """Decay of the running averages, of the surfels' parameters."""
-    field_betas: tuple[float, float] = (0.9, 0.99)
-    """Decay of the texture field's averages: its gradients are sparse, and large early on."""
 
 
 @dataclass

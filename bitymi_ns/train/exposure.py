@@ -289,15 +289,9 @@ class ExposureGains(NamedTuple):
 
     log_gains: Tensor  # [V, 3] float32 natural logarithm of each photograph's gain per channel; each channel has mean 0
     points: Tensor  # [V] int64, how many points each photograph was judged by
-    # median over the observations of one half of the points of how far they are from their point's colour, in natural
-    # logarithms; NaN where there were too few
-    before: float
-    after: float  # the same once the gains found on the other half of the points are taken out
-
-    @property
-    def explained(self) -> float:
-        """Share of the disagreement that gains explain, on points that they were not found on; NaN = cannot be told."""
-        return 1.0 - self.after / self.before if self.before > 0.0 else math.nan
+    # share of the median distance of observations from their point's colour, in logarithms, that gains explain, on
+    # points that they were not found on; NaN = cannot be told, because there are too few or they agree
+    explained: float
 
 
 @torch.no_grad()
@@ -319,10 +313,10 @@ def estimate_gains(points: Tensor, views: Sequence[View], near: float) -> Exposu
     logs = logs[:, logs.isfinite().all(-1).sum(0) >= FEWEST_PHOTOGRAPHS]
     count = logs.isfinite().all(-1).sum(1)
     half, other = logs[:, ::2], logs[:, 1::2]
-    before = after = math.nan
-    if int(other.isfinite().sum()) >= FEWEST_TESTED:
-        before, after = _disagreement(other), _disagreement(other - _log_gains(half)[:, None])
-    return ExposureGains(_log_gains(logs), count, before, after)
+    explained = math.nan
+    if int(other.isfinite().sum()) >= FEWEST_TESTED and (before := _disagreement(other)) > 0.0:
+        explained = 1.0 - _disagreement(other - _log_gains(half)[:, None]) / before
+    return ExposureGains(_log_gains(logs), count, explained)
 
 
 def _log_colors(view: View, points: Tensor, count: int, near: float) -> Tensor:

@@ -11,15 +11,19 @@ from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
 
 from bitymi_ns.scene.field import HashField
-from bitymi_ns.train.config import AdamConfig
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
 
 
-def adam(parameters: list[torch.nn.Parameter], betas: tuple[float, float] = AdamConfig.betas) -> Adam:
+EPS = 1e-15  # added to the root of the second moment
+BETAS = (0.9, 0.999)  # decay of the running averages, of the surfels' parameters
+FIELD_BETAS = (0.9, 0.99)  # of the texture field's, whose gradients are sparse, and large early on
+
+
+def adam(parameters: list[torch.nn.Parameter], betas: tuple[float, float] = BETAS) -> Adam:
     """Fused Adam with the method's epsilon."""
-    return Adam(parameters, lr=0.0, betas=betas, eps=AdamConfig.eps, fused=True)
+    return Adam(parameters, lr=0.0, betas=betas, eps=EPS, fused=True)
 
 
 def surfel_optimizers(scene: Scene) -> dict[str, Adam]:
@@ -32,8 +36,8 @@ def make_optimizers(scene: Scene) -> dict[str, Adam]:
     optimizers = surfel_optimizers(scene)
     if isinstance(scene.field, HashField):
         table, *mlp = scene.field.weights
-        optimizers["field_table"] = adam([table], AdamConfig.field_betas)
-        optimizers["field_mlp"] = adam(mlp, AdamConfig.field_betas)
+        optimizers["field_table"] = adam([table], FIELD_BETAS)
+        optimizers["field_mlp"] = adam(mlp, FIELD_BETAS)
     return optimizers
 
 

@@ -6,7 +6,7 @@ At each densification, in this order:
 - surfels with many bad pixels and a large gradient are cloned or split;
 - up to half of the candidates for pruning, drawn at random, are removed;
 - opacities are clamped.
-Between 60 and 90 % of the run, four final prunes remove what is transparent or in the way. docs/training.md states the
+Between 60 and 90 % of the run, four final prunes remove what is transparent. docs/training.md states the
 published rules.
 """
 
@@ -31,7 +31,7 @@ from bitymi_ns.train.init import tangents
 from bitymi_ns.train.optimizers import ResizeHook, cap_opacity, replace_rows
 from bitymi_ns.train.processes import ALONE, Processes
 from bitymi_ns.train.schedules import Schedule
-from bitymi_ns.train.score import Scores, multi_view_scores
+from bitymi_ns.train.score import multi_view_scores
 from bitymi_ns.train.views import View
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ class Strategy:
                 scene.surfels, optimizers, self.schedule.reset_opacity(), forget_all=True
             )
         if step in self.schedule.final_prune_steps:
-            report |= self._final_prune(scene, optimizers, views)
+            report |= self._final_prune(scene, optimizers)
         if report:
             report["surfels"] = len(scene)
         return report
@@ -166,7 +166,7 @@ class Strategy:
     ) -> dict[str, float]:
         config = self.config.densify
         report = self._drop_dead(scene, optimizers)
-        scores = self._scores(scene, views)
+        scores = multi_view_scores(scene, views(config.views, self.generator), self.config, self.processes)
         surfels = scene.surfels
         n, device = len(scene), surfels["means"].device
         statistics = self.statistics
@@ -228,13 +228,10 @@ class Strategy:
         return candidate | (surfels["log_scales"].amax(-1).exp() > config.prune_world * self.schedule.extent)
 
     @torch.no_grad()
-    def _final_prune(self, scene: Scene, optimizers: Mapping[str, Optimizer], views: DrawViews) -> dict[str, float]:
-        config = self.config.densify
+    def _final_prune(self, scene: Scene, optimizers: Mapping[str, Optimizer]) -> dict[str, float]:
         report = self._drop_dead(scene, optimizers)
         logits = scene.surfels["opacity_logits"]
-        pruned = logits.sigmoid() < config.final_prune_opacity
-        if config.final_prune_score < 1.0:
-            pruned |= self._scores(scene, views).prune > config.final_prune_score
+        pruned = logits.sigmoid() < self.config.densify.final_prune_opacity
         pruned = self._keep_minimum(pruned, logits, len(scene))
         self.remove(pruned, scene, optimizers)
         return report | {"pruned": int(pruned.sum())}
@@ -281,10 +278,6 @@ class Strategy:
         k = min(k, int((weights > 0).sum()))
         race = torch.empty(len(weights), dtype=torch.float64).exponential_(generator=self.generator).to(weights.device)
         return (race / weights).topk(k, largest=False).indices
-
-    def _scores(self, scene: Scene, views: DrawViews) -> Scores:
-        drawn = views(self.config.densify.views, self.generator)
-        return multi_view_scores(scene, drawn, self.config, self.processes)
 
     @torch.no_grad()
     def remove(self, pruned: Tensor, scene: Scene, optimizers: Mapping[str, Optimizer]) -> None:

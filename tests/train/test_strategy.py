@@ -309,11 +309,6 @@ def test_final_prune_removes_the_transparent(bench):
     assert (report["pruned"], report["surfels"]) == (1, 9)
     assert b.asked == []  # no view is drawn for scores that nobody asks for
     assert len(b.optimizers["means"].state[b.scene.surfels["means"]]["exp_avg"]) == 9
-    b = bench(10, final_prune_score=0.9)
-    b.set("opacity_logits", 0, -2.3)
-    b.prune[7], b.prune[8] = 0.91, 0.9
-    report = b.step(FINAL)
-    assert b.x == [1, 2, 3, 4, 5, 6, 8, 9] and (report["pruned"], report["surfels"]) == (2, 8)
 
 
 @pytest.mark.parametrize(("n", "least", "left"), [(10, 4, 4), (10, 100, 10), (10, 0, 1)])

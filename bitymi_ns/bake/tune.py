@@ -21,7 +21,7 @@ from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.ranges import Count, Positive, PositiveCount, Share, check_ranges
 from bitymi_ns.train.config import TexelSteps
 from bitymi_ns.train.schedules import falling
-from bitymi_ns.train.views import MemoryBudget, OnDemand, View, training_order
+from bitymi_ns.train.views import MemoryBudget, View, training_order
 
 
 @dataclass
@@ -97,10 +97,7 @@ def tune_atlas(
     started, cpu_started = time.perf_counter(), time.process_time()
     texels = TexelList(baked, device)
     budget = MemoryBudget(options.cache_bytes)
-    held_back, trained = (
-        OnDemand(len(rows), lambda i, rows=rows: views[rows[i]])
-        for rows in validation_split(len(views), options.val_every)
-    )
+    held_back, trained = validation_split(views, options.val_every)
     validation, tuned = (TuningViews(texels, part, background, budget) for part in (held_back, trained))
     before = validation.psnr(texels.values, progress)  # first: these views are kept first
     stopping = EarlyStopping(options.steps, options.checks, options.patience, before, texels.values)

@@ -117,7 +117,7 @@ class Coder:
             texels = TexelList(baked, device)
             self._tiles, self._texels = texels.tiles, texels.values.cpu()
             self._alphas = None if baked.alpha is None else baked.alpha.values
-            self._weights = texels.coverage(trained, progress, squared=True).cpu()
+            self._weights = texels.coverage(trained, progress, (2,))[0].cpu()
 
     @property
     def measured(self) -> bool:

@@ -55,7 +55,7 @@ class BakeInput:
 
     def with_visibility(self, options: BakeOptions, progress: Progress = no_progress) -> BakeInput:
         """Add the visibility, where there are cameras and the options need it."""
-        if not self.cameras or not options.needs_visibility:
+        if not self.cameras or not (options.drop_unseen or options.tolerance > 0):
             return self
         drawn = (self.near, self.weight_bound, self.prefilter)
         return replace(self, views=visibility(self.surfels, self.cameras, *drawn, progress, self.alpha))

@@ -104,16 +104,14 @@ def tune_atlas(
     validation, tuned = (TuningViews(texels, part, background, budget) for part in (held_back, trained))
     before = validation.psnr(texels.values, progress)  # first: these views are kept first
     stopping = EarlyStopping(options.steps, options.checks, options.patience, before, texels.values)
-    squares = None if baked.codes is None else torch.zeros_like(texels.values)
-    covered = torch.zeros_like(texels.values)
-    texels.add_coverage(trained, covered, squares, progress)
-    share = 1.0 / (covered[:, 0] + options.prior)  # [T]
+    covered, *squares = texels.coverage(trained, progress, (1,) if baked.codes is None else (1, 2))
+    share = 1.0 / (covered + options.prior)  # [T]
     _descend(texels.values.clone(), tuned, validation, share, stopping, options, progress)
     held_out = TuningViews(texels, eval_views, background, MemoryBudget(0))
     coder: Cosines | Pages = Pages(baked)
-    if squares is not None:
+    if squares:
         coding = coding or TexelCodeOptions()
-        coder = Cosines(TexelCoder(baked.sizes, squares[:, 0].cpu(), coding, baked.alpha_codes), coding)
+        coder = Cosines(TexelCoder(baked.sizes, squares[0].cpu(), coding, baked.alpha_codes), coding)
     untuned = held_out.psnr(coder.first(texels.values.cpu()).texels) if eval_views else None
     coded = _coded(tuned, validation, share, stopping.best, coder, options, progress)
     spent = time.perf_counter() - started, time.process_time() - cpu_started

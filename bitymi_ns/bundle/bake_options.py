@@ -51,11 +51,6 @@ class BakeOptions:
     chunk: int = 1 << 18
     """Texels evaluated at once."""
 
-    @property
-    def needs_visibility(self) -> bool:
-        """True where visibility in the training views decides what is kept and how errors are weighted."""
-        return self.drop_unseen or self.tolerance > 0
-
     def check(self) -> None:
         """Refuse values out of range."""
         if not EXTENTS[0] <= self.extent <= EXTENTS[1]:

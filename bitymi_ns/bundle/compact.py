@@ -1,6 +1,6 @@
 """The two files of a compact bundle: surfels.bin and texels.bin, columns of integers that bundle.json describes."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -39,13 +39,10 @@ def encode_surfels(
     if alpha is not None:
         columns["alpha"] = alpha[:, None]
     steps = {**codes.steps, "residual": residual_step}
-    described, data = [], []
-    for name in _surfel_columns(codes.kind, alpha is not None)[0]:
-        compressed = streams.compress(columns[name])
-        described.append({"name": name, "step": steps.get(name), "low": compressed.low, "planes": compressed.planes})
-        data.append(compressed.data)
+    names = _surfel_columns(codes.kind, alpha is not None)[0]
+    described, data = _compressed({name: columns[name] for name in names}, steps)
     frame = {"center": codes.frame.center, "scale": codes.frame.scale, "low": codes.frame.low}
-    return {"frame": frame, "columns": described}, b"".join(data)
+    return {"frame": frame, "columns": described}, data
 
 
 def decode_surfels(
@@ -76,14 +73,18 @@ def decode_surfels(
 
 def encode_texels(codes: TexelCodes) -> tuple[dict[str, Any], bytes]:
     """Entries of bundle.json for texels.bin, and the file."""
-    described, data = [], []
-    for name, values in codes.columns.items():
-        compressed = streams.compress(values)
-        step = codes.alpha.step if codes.alpha is not None and name.startswith("alpha_") else None
-        described.append({"name": name, "step": step, "low": compressed.low, "planes": compressed.planes})
-        data.append(compressed.data)
+    columns, alpha = codes.columns, codes.alpha
+    steps = {} if alpha is None else {name: alpha.step for name in columns if name.startswith("alpha_")}
+    described, data = _compressed(columns, steps)
     count = int(codes.sizes.clamp(min=1).prod(dim=1)[codes.sizes[:, 0] > 0].sum())
-    return {"texels": count, "step": codes.step, "columns": described}, b"".join(data)
+    return {"texels": count, "step": codes.step, "columns": described}, data
+
+
+def _compressed(columns: Mapping[str, Codes], steps: Mapping[str, float]) -> tuple[list[dict[str, Any]], bytes]:
+    """Entries of columns in bundle.json, and their bytes."""
+    found = {name: streams.compress(values) for name, values in columns.items()}
+    entries = [{"name": name, "step": steps.get(name), "low": c.low, "planes": c.planes} for name, c in found.items()]
+    return entries, b"".join(c.data for c in found.values())
 
 
 def decode_texels(

@@ -93,7 +93,8 @@ def choose_range(
     sample = texels[np.random.default_rng(seed).integers(0, len(texels), samples), :3]
     if rule == "auto":
         candidates = [choose_range(texels, each, samples, seed) for each in ("sigma6", "minmax")]
-        return min(candidates, key=lambda each: _mean_square(each.from_unorm8(each.to_unorm8(sample)) - sample))
+        lost = [each.from_unorm8(each.to_unorm8(sample)) - sample for each in candidates]
+        return candidates[int(np.argmin([np.square(each.astype(np.float64)).mean() for each in lost]))]
     if rule == "sigma6":
         values = sample.astype(np.float64)
         mean, spread = float(values.mean()), 6.0 * float(values.std())
@@ -234,7 +235,3 @@ def _quantised(values: npt.NDArray[np.float32], format: Format, value_range: Ran
     if alpha is not None:
         rgba[..., 3] = alpha_bytes(alpha)
     return rgba
-
-
-def _mean_square(difference: npt.NDArray[np.float32]) -> float:
-    return float(np.square(difference.astype(np.float64)).mean())

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from bitymi_ns.bundle import ply
 from bitymi_ns.interchange import harmonics
-from bitymi_ns.interchange.fetch import fetch_texels
 from bitymi_ns.interchange.frame import Similarity
+from bitymi_ns.interchange.quads import fetch_texels
 from bitymi_ns.ops.constants import ALPHA_MAX, SUPPORT
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.tile_sizes import kernel_parameters

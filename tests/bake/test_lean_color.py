@@ -10,7 +10,6 @@ from bitymi_ns.bake import BakeOptions, bake, export
 from bitymi_ns.bake.directions import BETWEEN, SPHERE, view_directions
 from bitymi_ns.bake.lean_color import reduce_view_color, view_color_errors
 from bitymi_ns.bake.verify import check_view_color
-from bitymi_ns.bake.voronoi_fit import fit_sites, site_weights
 from bitymi_ns.bundle import check_files, read_bundle
 from bitymi_ns.ops.reference import view_color as reference
 from bitymi_ns.ops.view_color import LEAN, check_lean
@@ -114,18 +113,6 @@ def test_without_room_all_sites_are_kept_and_nothing_changes(surfels):
     want = reference.sv(*(params[name].double() for name in VIEW_COLORS["sv"].names), d)
     got = reference.lean("sv", lean["view_base"].double(), lean["view_span"], lean["view_terms"].double(), d)
     torch.testing.assert_close(got[rest], want[rest], atol=1e-5, rtol=1e-5)
-
-
-def test_a_fit_from_a_wrong_start_finds_two_sites(surfels):
-    g = torch.Generator().manual_seed(0)
-    v, rgb = torch.randn(8, 2, 3, generator=g), torch.rand(8, 2, 3, generator=g)
-    d = F.normalize(torch.randn(8, 60, 3, generator=g), dim=2)
-    target = site_weights(v, d) @ rgb
-    start = (v[:, 1:] - v[:, :1]) * 0.5, rgb + 0.1
-    b, r = fit_sites(*start, d, target, torch.ones(8, 60), 20)
-    torch.testing.assert_close(site_weights(F.pad(b, (0, 0, 1, 0)), d) @ r, target, atol=2e-3, rtol=0)
-    unit = VIEW_COLORS["sv"].sites(v, torch.full((8, 2), 2.0), rgb)[0].norm(dim=2)
-    torch.testing.assert_close(unit, torch.full((8, 2), 2.0).exp())
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from bitymi_ns.bake import BakeOptions, bake
-from bitymi_ns.bake.field.plan import make_plan
-from bitymi_ns.bake.field.references import references
+from bitymi_ns.bake.field.plan import make_plan, references
 from bitymi_ns.bake.inputs import BakeInput
 from bitymi_ns.bake.reduce import fit, interpolation
 from bitymi_ns.ops.reference.texel import texel, texel_centers

@@ -113,7 +113,7 @@ def test_its_pictures_are_the_renderers(truth: Baked, prefilter: str) -> None:
 
 def test_texels_that_no_view_sees_stay_and_the_hardly_seen_hardly_move(wrong: Baked, views: list[View]) -> None:
     scene = TexelList(wrong)
-    seen = scene.coverage([v for i, v in enumerate(views) if i % 4])
+    (seen,) = scene.coverage([v for i, v in enumerate(views) if i % 4])
     tuned = texels_of(tune_atlas(wrong, views, BACKGROUND, OPTIONS))
     moved = (tuned - 0.1).abs().amax(1)
     last = scene.tiles.first[59]
@@ -125,16 +125,15 @@ def test_texels_that_no_view_sees_stay_and_the_hardly_seen_hardly_move(wrong: Ba
 
 def test_coverage_of_several_views_is_their_sum(wrong: Baked, views: list[View]) -> None:
     texels = TexelList(wrong)
-    both, squares, want = (torch.zeros_like(texels.values) for _ in range(3))
-    texels.add_coverage(views[:5], both, squares)
-    covered = texels.coverage(views[:5])
-    assert torch.equal(both[:, 0], covered) and torch.equal(texels.coverage(views[:5], squared=True), squares[:, 0])
-    for view in views[:5]:
-        texels.add_coverage([view], want, None)
-    assert torch.equal(both, want) and covered.max() > 1 and (squares <= both).all()
+    covered, squares = texels.coverage(views[:5], powers=(1, 2))
+    assert torch.equal(texels.coverage(views[:5])[0], covered)
+    assert torch.equal(texels.coverage(views[:5], powers=(2,))[0], squares)
+    want = sum(texels.coverage([view])[0] for view in views[:5])
+    torch.testing.assert_close(covered, want)
+    assert covered.max() > 1 and (squares <= covered).all()
     hidden = torch.zeros(40, 48, 1, dtype=torch.bool)  # masked pixels are not seen
     masked = [views[0], *(View(v.camera, v.image, hidden) for v in views[1:3])]
-    assert torch.equal(*(texels.coverage(each) for each in (views[:1], masked)))
+    assert torch.equal(*(texels.coverage(each)[0] for each in (views[:1], masked)))
 
 
 @pytest.mark.parametrize("patience", [2, 99])
@@ -190,29 +189,6 @@ def test_memory_for_the_views_does_not_change_the_result(wrong: Baked, views: li
     few = replace(OPTIONS, steps=8)
     results = [tune_atlas(wrong, views, BACKGROUND, replace(few, cache_bytes=b)) for b in (0, 200_000, 1 << 30)]
     assert all(torch.equal(r.texels, results[0].texels) for r in results)
-
-
-def test_the_views_set_aside_are_kept_first(wrong: Baked, views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
-    set_aside, trace = list(tuning_views(wrong, views[::4])), TuningViews._traced
-    traced, kept = [], []
-
-    def counted(self: TuningViews, view: View) -> TuningView:
-        traced.append(next(i for i, v in enumerate(views) if v.image is view.image))
-        return trace(self, view)
-
-    def keep(self: MemoryBudget, nbytes: int) -> bool:
-        fits = take(self, nbytes)
-        kept.append(nbytes if fits else 0)
-        return fits
-
-    take = MemoryBudget.reserve
-    monkeypatch.setattr(TuningViews, "_traced", counted)
-    monkeypatch.setattr(MemoryBudget, "reserve", keep)
-    budget = sum(view.nbytes for view in set_aside)
-    tune_atlas(wrong, views, BACKGROUND, replace(OPTIONS, steps=24, cache_bytes=budget))
-    assert all(traced.count(i) == 1 for i in range(0, 12, 4)), "looked at most often, and traced once"
-    assert 0 < sum(kept) <= budget
-    assert all(traced.count(i) > 1 for i in (1, 5, 9))  # at every step
 
 
 def test_a_view_with_many_fragments_is_traced_in_bands(

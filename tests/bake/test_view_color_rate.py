@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bitymi_ns.bake.view_color_rate import choice_bytes, color_choices, shown_weights
+from bitymi_ns.bake.view_color_rate import color_choices, shown_weights
 from bitymi_ns.ops.view_color import check_lean
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene.baked import BakedScene
@@ -52,20 +52,6 @@ def test_the_price_decides_from_all_terms_to_none(colored, cameras, kind: str) -
     assert counts[0] <= len(scene.surfels["view_terms"])
 
 
-@pytest.mark.parametrize("kind", sorted(VIEW_COLORS))
-def test_the_bytes_that_are_stated_are_those_that_are_held(colored, cameras, kind: str) -> None:
-    scene = colored(kind)
-    most = int(scene.surfels["view_span"][:, 1].max())
-    choices = color_choices(scene, cameras)
-    held = [choices.error, choices.base, *choices.terms.values()]
-    if VIEW_COLORS[kind].sites is None:  # which keeps as many numbers as surfels have
-        held = [choices.error, choices.base, choices.terms[0], choices.terms[most]]
-    assert choice_bytes(kind, COUNT, 0, most) == sum(values.nbytes for values in held)
-    weights = shown_weights(scene, cameras)
-    of_views = choice_bytes(kind, COUNT, len(cameras), most) - choice_bytes(kind, COUNT, 0, most)
-    assert of_views == weights.nbytes + 2 * (weights > 0).nbytes
-
-
 def test_weights_are_those_of_the_fragments(colored, cameras) -> None:
     """A surfel whose colour is changed by e changes the pictures by about its weights times e^2."""
     scene = colored("sv")
@@ -80,16 +66,6 @@ def test_weights_are_those_of_the_fragments(colored, cameras) -> None:
     for view, camera in enumerate(cameras):
         change = (b.render(camera, BACKGROUND).rgb - a.render(camera, BACKGROUND).rgb).square().sum()
         assert float(change) == pytest.approx(3 * 0.01 * float(weights[view, row]), rel=0.05, abs=1e-4)
-
-
-def test_what_costs_nothing_is_left_out_and_what_shows_is_kept(colored, cameras) -> None:
-    scene = colored("sv")
-    choices = color_choices(scene, cameras)
-    seen = shown_weights(scene, cameras).sum(0) > 1.0
-    counts = choices.at(1e-9)["view_span"][:, 1]
-    assert int(counts[~seen].sum()) <= int(scene.surfels["view_span"][~seen, 1].sum())
-    assert bool((choices.error[seen][:, 0] >= 0).all())
-    assert bool((counts <= scene.surfels["view_span"][:, 1]).all())
 
 
 def test_views_that_pass_close_by_count_though_they_look_elsewhere(colored, cameras) -> None:

@@ -49,8 +49,13 @@ PLACED = {
 }
 
 
-@pytest.mark.parametrize("name", ["bundle.json", "surfels.bin", "texels.bin", "preview.jpg"])
-@pytest.mark.parametrize("what", PLACED)
+@pytest.mark.parametrize(
+    "what, name",
+    [
+        *((what, "surfels.bin") for what in PLACED),
+        *((what, name) for what in ("pipe", "sparse") for name in ("bundle.json", "texels.bin", "preview.jpg")),
+    ],
+)
 def test_what_is_no_regular_file_of_the_stated_size_is_refused_by_all_that_read_bundles(
     what: str, name: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -20,8 +20,7 @@ def names_beside(folder):
     return sorted(path.name for path in folder.parent.iterdir())
 
 
-@pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
-@pytest.mark.parametrize("format", ["bc7", "uint8", "fp16", None])
+@pytest.mark.parametrize("kind, format", [("sv", "bc7"), ("sh", "uint8"), ("sb", "fp16"), ("sg", None)])
 def test_what_is_written_is_read(surfels, tmp_path, kind, format):
     params, tiles, texels, atlas = make(
         surfels, tmp_path / "b", kind, format, near=0.3, weight_bound=0.02, background=(1, 0.5, 0)

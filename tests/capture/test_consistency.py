@@ -7,7 +7,6 @@ import pycolmap
 import pytest
 
 from bitymi_ns.capture.sfm.consistency import contradicted, drop_unlinked
-from bitymi_ns.capture.types import CONTRADICTED, Poses
 
 
 @pytest.fixture
@@ -58,10 +57,3 @@ def test_cameras_that_share_no_points_with_the_others_lose_their_pose(
                 made.delete_observation(image, feature)
     drop_unlinked(made)
     assert {image.image_id for image in made.images.values() if image.has_pose} == {4, 5, 6, 7, 8}
-
-
-def test_doubt_is_said_with_what_to_do(tmp_path: Path) -> None:
-    values = (tmp_path, tmp_path, tmp_path, {}, 3, 3, 0.3, 3.0, {})
-    assert not Poses(*values).doubt and not Poses(*values, CONTRADICTED).doubt
-    assert "27% of what photographs have in common contradicts their poses" in Poses(*values, 0.27).doubt
-    assert str(tmp_path / "cameras.png") in Poses(*values, 0.27).doubt

@@ -121,15 +121,6 @@ def test_those_of_less_than_all_directions_are_refused(tmp_path: Path, monkeypat
         find_poses(tmp_path / "walk", SfmOptions(camera_model="EQUIRECTANGULAR"))
 
 
-def test_one_spot_is_told_from_a_walk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    (tmp_path / "spot").mkdir()
-    for i in range(4):
-        Image.fromarray(panorama(0.7 * i, 256, centre=(0.5, -0.4, 1.3))).save(tmp_path / f"spot/{i}.png")
-    with pytest.raises(CaptureError, match="taken from one spot"):
-        find_poses(tmp_path / "spot")
-
-
 def test_points_are_triangulated_from_panoramas_with_poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     axes = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])  # the middle column looks along -x

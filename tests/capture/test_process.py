@@ -92,19 +92,6 @@ def test_a_full_disk_is_named(copied: Copy) -> None:
     assert find_poses(folder).registered == 8
 
 
-def test_a_second_run_at_the_same_time_is_told(copied: Copy) -> None:
-    folder = copied("busy")
-    run = started(folder)
-    try:
-        wait_for(lambda: database(folder) is not None)
-        run.send_signal(signal.SIGSTOP)  # so that it is not done before the other has begun
-        second = subprocess.run([*COMMAND, str(folder)], capture_output=True, text=True)
-        assert second.returncode == 1 and f"process {run.pid} is at work there" in second.stderr
-    finally:
-        run.kill()
-        run.communicate()
-
-
 def test_a_read_only_folder_is_no_hindrance(copied: Copy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = copied("read only")
     real = Path.mkdir

@@ -50,7 +50,7 @@ def test_large_surfels(count: int, device: torch.device, cpu) -> None:
     assert ((got[0] != want).double().mean() < 2e-3) and (got[0] - want).abs().max() <= 1
 
 
-@pytest.mark.parametrize("seed, prefilter", [*((i, "low_pass") for i in range(6)), (0, "pixel"), (1, "pixel")])
+@pytest.mark.parametrize("seed, prefilter", [(0, "low_pass"), (1, "low_pass"), (0, "pixel")])
 def test_no_pixel_of_thin_small_and_large_surfels_is_lost(seed: int, prefilter: str, device: torch.device, cpu) -> None:
     """The bounds in single precision (core/plane_bounds.h) against the CPU's in double: the same fragments."""
     case = random_scene(150, 100 + seed, width=72, height=56)
@@ -64,8 +64,7 @@ def test_no_pixel_of_thin_small_and_large_surfels_is_lost(seed: int, prefilter: 
     assert ((got != want).double().mean() < 2e-3) and (got - want).abs().max() <= 1
 
 
-@pytest.mark.parametrize("width, height", [(96, 80), (300, 200)])
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed, width, height", [(0, 96, 80), (1, 300, 200)])
 def test_discs_across_the_camera_plane_are_listed_where_they_show(
     seed: int, width: int, height: int, device: torch.device, cpu
 ) -> None:
@@ -113,7 +112,7 @@ def test_a_frame_that_does_not_fit_is_drawn_again(device: torch.device, cpu, few
 
 
 @pytest.mark.parametrize("views", [1, 3])
-@pytest.mark.parametrize("count", [1, 31, 33, 65, 128, 300, 600, 1024, 1025, 3000])
+@pytest.mark.parametrize("count", [1, 33, 300, 1025, 3000])
 def test_lists_of_all_lengths_are_in_order(count: int, views: int, device: torch.device, cpu) -> None:
     """Up to several runs of what a block sorts at once, with ties in depth, beside tiles without a surfel."""
     surfels = make_surfels(count, seed=30)

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.ops.backend import emulated_cuda
-from bitymi_ns.scene import Camera, HashField, SceneConfig
+from bitymi_ns.scene import Camera, HashField
 from tests.ops.golden import SURFEL_KEYS, random_scene
 from tests.ops.test_kernels import make_field, relative
 
@@ -43,20 +43,6 @@ def test_values_and_gradients_against_the_cpu(
         want = value_and_gradients(field.cpu(), x.cpu())
     for a, b in zip(got, want, strict=True):
         assert relative(a, b) < (1e-11 if dtype == torch.float64 else 2e-4)
-
-
-def test_fewer_levels(device: torch.device, cpu) -> None:
-    for levels in (1, 3):
-        config = SceneConfig(min_resolution=8, levels=levels)
-        field = HashField(config, (0.0, 0.0, 0.0), 1.0, True, 6, torch.Generator().manual_seed(0)).double()
-        with torch.no_grad():
-            field.field_w3.uniform_(-1, 1, generator=torch.Generator().manual_seed(1))
-        x = points(40, device, torch.float64)
-        got = value_and_gradients(field.to(device), x)
-        with cpu():
-            want = value_and_gradients(field.cpu(), x.cpu())
-        for a, b in zip(got, want, strict=True):
-            assert relative(a, b) < 1e-11
 
 
 def test_no_points_and_points_far_away(device: torch.device) -> None:
@@ -108,16 +94,6 @@ def test_shading_against_the_cpu(mode: str, dtype: torch.dtype, device: torch.de
     for a, b in zip(got, want, strict=True):
         assert b.abs().max() > 0
         assert relative(a, b) < (1e-11 if dtype == torch.float64 else 2e-4)
-
-
-@pytest.mark.parametrize("bound", [0.0, 2.0])
-def test_weight_bounds_that_let_all_or_nothing_through(bound: float, device: torch.device, cpu) -> None:
-    shading = Shading(torch.float64)
-    got = shading.run(device, "move", bound)
-    with cpu():
-        want = shading.run(torch.device("cpu"), "move", bound)
-    for a, b in zip(got, want, strict=True):
-        assert relative(a, b) < 1e-11
 
 
 def test_without_fragments(device: torch.device, cpu) -> None:

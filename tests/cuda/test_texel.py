@@ -65,22 +65,6 @@ def test_coverage(masked: bool, device: torch.device) -> None:
     check_coverage(Case(device=device), masked)
 
 
-def test_what_was_learned_of_one_view_is_there_for_the_next(device: torch.device) -> None:
-    """Many steps towards an image end at texels that give it."""
-    case = Case(device=device)
-    texels, base, covered = torch.zeros_like(case.texels), torch.zeros_like(case.base), torch.zeros_like(case.texels)
-    ops.add_texel_coverage([case.fragments], case.tiles, None, 0.02, covered)
-    share = 1 / (covered[:, 0] + 0.1)
-    with torch.no_grad():
-        wanted = case.image(base, 0.3 * case.texels, bound=0.02)
-    errors = []
-    for _ in range(40):
-        image = case.image(base, texels, bound=0.02, descent=ops.TexelDescent(share, 1.0))
-        image.backward(image.detach() - wanted)
-        errors.append(float((image.detach() - wanted).square().sum()))
-    assert errors[-1] < 0.05 * errors[0] and errors == sorted(errors, reverse=True)
-
-
 def test_tensors_of_another_device_are_refused(device: torch.device) -> None:
     if device.type != "cuda":
         pytest.skip("all tensors are on the CPU")

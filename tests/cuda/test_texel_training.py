@@ -13,7 +13,6 @@ from bitymi_ns.bake.view_color_rate import ColorChoices, color_choices
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.ops import Bands
 from bitymi_ns.scene import Camera, Scene, SceneConfig
-from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.config import DensifyConfig, TexelConfig, TrainConfig
 from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.texels import blank_texels
@@ -140,74 +139,6 @@ def test_a_run_resumes_before_and_after_its_texels_came(device: torch.device) ->
                     torch.testing.assert_close(got[name], value, rtol=1e-3, atol=1e-3)
     finally:
         torch.use_deterministic_algorithms(False)
-
-
-def test_a_run_goes_on_on_the_cpu(device: torch.device, cpu: Context) -> None:
-    trainer = trainer_on(device)
-    for _ in range(START + 2):
-        trainer.advance()
-    state = part_of_a_run.state_of(trainer)
-    with cpu():
-        other = trainer_on(HERE)
-        part_of_a_run.resume(other, state)
-        assert all(
-            torch.equal(a, b)
-            for a, b in zip(state_of(trainer.scene).values(), state_of(other.scene).values(), strict=True)
-        )
-        while other.step < STEPS:
-            other.advance()
-    while trainer.step < STEPS:
-        trainer.advance()
-    assert other.loss == pytest.approx(trainer.loss, rel=2e-3) and len(other.scene) == len(trainer.scene)
-
-
-def test_surfels_that_are_pruned_take_their_texels_along(device: torch.device) -> None:
-    trainer = trainer_on(device)
-    for _ in range(START + 1):
-        trainer.advance()
-    scene, field, n = trainer.scene, trainer.scene.field, len(trainer.scene)
-    assert isinstance(field, TexelField) and field.texels.device.type == device.type
-    camera = scene_and_views()[1][0].camera.to(device)
-    with torch.no_grad():
-        scene.surfels["opacity_logits"][3] = -20.0
-        before = scene.render(camera).rgb
-    left = len(field.texels) - int(field.size[3].prod())
-    trainer.training.strategy.remove(torch.arange(n, device=device) == 3, scene, trainer.optimizers)
-    assert len(scene) == len(field.size) == n - 1 and len(field.texels) == len(field.share) == field.tiles.count == left
-    with torch.no_grad():
-        torch.testing.assert_close(scene.render(camera).rgb, before, rtol=0, atol=1e-6)
-    trainer.advance()
-
-
-def test_a_run_that_diverges_goes_back_to_its_texels(device: torch.device) -> None:
-    trainer = trainer_on(device)
-    for _ in range(STEPS - 1):  # behind the final prunes
-        trainer.advance()
-    scene = trainer.scene
-    with torch.no_grad():
-        scene.field.texels[7] = float("nan")
-        scene.surfels["means"][:] = float("nan")
-    with pytest.warns(UserWarning, match="back to the state"):
-        trainer.advance()
-    assert all(torch.isfinite(p).all() for p in scene.parameters())
-    assert scene.field.texels.device.type == device.type
-    assert len(scene.field.size) == len(scene) and len(scene.field.texels) == scene.field.tiles.count
-
-
-def test_what_a_device_has_learned_can_be_baked(device: torch.device, cpu: Context) -> None:
-    trainer = trainer_on(device)
-    for _ in range(START + 3):
-        trainer.advance()
-    scene = trainer.scene
-    baked = trained_texels(scene, BakeOptions())
-    assert baked.textured and baked.texels.device == baked.scene.tiles.device == HERE
-    camera = scene_and_views()[1][0].camera
-    with torch.no_grad():
-        want = scene.render(camera.to(device)).rgb.cpu()
-    with cpu():
-        got = baked.unquantised().render(camera).rgb
-    assert want.any() and scene.field.texels.abs().max() > 0.05
-    torch.testing.assert_close(got, want, rtol=1e-4, atol=1e-5)
 
 
 def test_what_is_left_out_of_a_bake_is_that_of_the_cpu(device: torch.device, cpu: Context) -> None:

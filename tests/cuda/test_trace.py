@@ -199,15 +199,6 @@ def test_equal_depths_keep_the_order_of_the_surfels(device: torch.device) -> Non
     assert ((step == 1) | (runs[1:] == 0)).all()  # 0, 1, 2, ... again in every tile
 
 
-@pytest.mark.parametrize("name", GOLDEN_NAMES)
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
-def test_all_tiles_that_were_counted_are_listed(name: str, dtype: torch.dtype, device: torch.device) -> None:
-    case = load_golden(name)
-    projection = ops.project(*values_of(case, dtype, device), camera_of(case, dtype))
-    bins = trace_cuda.tile_lists(projection.geom, projection)
-    assert int(bins.differing) == 0 and len(bins.slot) == bins.tile_pairs[-1] > 0
-
-
 @pytest.mark.parametrize("fewer", ["listed", "counted"])
 def test_lists_that_differ_from_the_counts_stay_in_their_slots(fewer: str, device: torch.device) -> None:
     """Were a surfel's tiles counted for an image that is wider, or less wide, than that for which they are listed."""
@@ -275,17 +266,6 @@ def test_gradients_of_weight_uv_and_depth_alone(device: torch.device, cpu: CpuCo
         want = run(torch.device("cpu"))
     for a, b in zip(got, want, strict=True):
         assert relative(a, b) < 1e-10
-
-
-def test_masked_counts(device: torch.device) -> None:
-    case = random_scene(40, 4, 37, 29)
-    fragments = render(case, torch.float32, device, rim=1e-3).fragments
-    generator = torch.Generator().manual_seed(0)
-    for share in (0.5, 0.01, 0.0):
-        mask = (torch.rand(37 * 29, generator=generator) < share).to(device)
-        counts = ops.masked_counts(fragments, mask, 40)
-        on_mask = fragments.surfel[mask[fragments.pixel.long()]].long()
-        assert torch.equal(counts.long(), torch.bincount(on_mask, minlength=40))
 
 
 def test_wrong_arrays_are_refused(device: torch.device) -> None:

@@ -9,7 +9,7 @@ from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils.eval_utils import eval_setup
 
 from bitymi_ns.measure.bench.engine import CURVE, config_of, train_command
-from bitymi_ns.measure.bench.matrix import Row, Run, local_scenes, standard_scenes
+from bitymi_ns.measure.bench.matrix import Row, Run, standard_scenes
 from bitymi_ns.measure.report.read import read_jsonl
 from tests.plugin.data.captures import colmap_model
 
@@ -48,10 +48,3 @@ def test_a_scene_of_mipnerf360(room: Path, tmp_path: Path, monkeypatch: pytest.M
     assert held_out == every[::8]
     camera, batch = pipeline.datamanager.eval_view(0)
     assert batch["image"].shape[:2] == (36, 48) == (int(camera.height), int(camera.width))
-
-
-def test_a_capture_of_ones_own(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (scene,) = local_scenes([room])
-    path = train(tmp_path / "work", Run(scene, Row("small", "bitymi", SMALL), steps=2), monkeypatch)
-    config, pipeline, _, _ = eval_setup(path, test_mode="test")
-    assert config.max_num_iterations == 2 and len(pipeline.datamanager.eval_dataset) == 2

@@ -10,13 +10,12 @@ from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 
 
-@pytest.mark.parametrize("factor", [10.0, 1000.0])
 def test_a_diverging_run_says_so_and_leaves_a_finite_scene(
-    start: Callable[..., BitymiTrainerConfig], factor: float, capsys: pytest.CaptureFixture[str]
+    start: Callable[..., BitymiTrainerConfig], capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = start()
     train = config.pipeline.model.train
-    train.lr = train.lr.times(factor)
+    train.lr = train.lr.times(1000.0)
     config.max_num_iterations = 100
     message = ""
     try:
@@ -25,8 +24,7 @@ def test_a_diverging_run_says_so_and_leaves_a_finite_scene(
         message = str(error)
         assert "training cannot go on" in message and "lower learning rates" in message
     said = " ".join((capsys.readouterr().out + message).split())
-    if factor >= 1000:
-        assert "training diverged" in said
+    assert "training diverged" in said
     for path in sorted(config.get_checkpoint_dir().glob("*.ckpt")):
         state = torch.load(path, weights_only=True)["pipeline"]
         for name, value in state.items():

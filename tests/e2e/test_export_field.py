@@ -1,13 +1,11 @@
 """Exports of runs whose texture is a field: baked, polished, fine-tuned, compared with the field."""
 
 import json
-from functools import partial
 from pathlib import Path
 
 import pytest
 
 from bitymi_ns.bake import TuneOptions
-from bitymi_ns.bake import learn as bake_learn
 from bitymi_ns.bundle import check_files
 from bitymi_ns.cli import main
 from bitymi_ns.plugin.console import InputError
@@ -42,19 +40,6 @@ def test_the_scene_is_polished_and_fine_tuned(
     assert all(check.ok for check in found.values())
     assert "the surfels learned after the bake" in found["error of the view colours"].detail
     assert "the texels were changed" in found["error against the field"].detail
-
-
-def test_a_fine_tuning_that_ends_early_says_so(
-    field_run: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    wild = partial(TuneOptions, rate=50.0, patience=2, coded_steps=0)
-    monkeypatch.setattr(bake_learn, "TuneOptions", wild)
-    run_export(field_run, tmp_path / "b", tolerance=TOLERANCE, finetune_steps=40, compare=False)
-    out = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    steps = json.loads((tmp_path / "b" / "bundle.json").read_text())["statistics"]["finetune"]["steps"]
-    assert steps < 40
-    assert f"stopped early at step {steps} of 40: no gain on the validation views for" in out
-    assert "tuning texels ━" in out and "100%" in out.split("tuning texels")[-1][:80]
 
 
 def test_exact_keeps_everything_and_a_tolerance_states_what_it_saves(

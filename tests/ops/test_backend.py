@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from bitymi_ns import KernelsUnavailable, _cpu_features, cli
+from bitymi_ns import _cpu_features
 from bitymi_ns.ops import backend
 
 BUILT = {"_cpu": "fma avx2", "_cpu_x86_64_v4": "fma avx2 avx512f"}
@@ -55,16 +55,6 @@ def test_an_old_cpu_gets_a_message_and_nothing_is_loaded(tmp_path: Path) -> None
     message, loaded = done.stdout.splitlines()
     assert f"compiled for a CPU with {lacked}, which this one lacks: install" in message
     assert loaded == "['bitymi_ns._cpu_features']"
-
-
-@pytest.mark.skipif(not _cpu_features.FEATURES["_cpu"], reason="compiled for every CPU of its kind")
-def test_an_old_cpu_gets_a_message_from_the_commands(monkeypatch, capsys) -> None:
-    def refuse(self: object) -> int:
-        raise KernelsUnavailable("this CPU lacks avx2: install again")
-
-    monkeypatch.setattr("bitymi_ns.cli.Sample.run", refuse)
-    assert cli.main(["sample", "--output-dir", "/nowhere"]) == 1
-    assert capsys.readouterr().err == "bitymi: this CPU lacks avx2: install again\n"
 
 
 @pytest.mark.parametrize(

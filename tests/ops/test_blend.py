@@ -89,37 +89,6 @@ def test_it_is_shading_and_compositing(textured: bool, moves: bool, maps: bool, 
         torch.testing.assert_close(mine, theirs, rtol=tolerance, atol=tolerance * float(theirs.abs().max()))
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
-@pytest.mark.parametrize("maps", [False, True], ids=["image", "maps"])
-def test_a_residual_of_each_fragment(maps: bool, dtype: torch.dtype) -> None:
-    view = View(random_scene(60, 3, width=70, height=40), dtype, False)
-    g = torch.Generator().manual_seed(0)
-    count = len(view.fragments()[0])
-    rho = (torch.rand(count, 3, generator=g, dtype=torch.float64) - 0.6).to(dtype).requires_grad_()
-    view.leaves.append(rho)
-
-    def image(fused: bool) -> Tensor:
-        fragments, projection = view.fragments()
-        if fused:
-            return ops.blended_image(fragments, projection, view.base, maps=maps, residual=rho)
-        colors = ((view.base + 0.5).relu()[fragments.surfel.long()] + rho).relu()
-        return composite_colors(fragments, projection, colors, maps)
-
-    got, want = image(True), image(False)
-    tolerance = 1e-11 if dtype == torch.float64 else 2e-4
-    torch.testing.assert_close(got, want, rtol=0.01 * tolerance, atol=0.01 * tolerance)
-    for mine, theirs in zip(view.gradients(got), view.gradients(want), strict=True):
-        assert theirs.abs().max() > 1e-3
-        torch.testing.assert_close(mine, theirs, rtol=tolerance, atol=tolerance * float(theirs.abs().max()))
-
-
-def test_texels_that_do_not_learn_have_no_gradient_and_move_surfels() -> None:
-    case = random_scene(60, 3, width=70, height=40)
-    fixed, learning = View(case, torch.float64, True, learns=False), View(case, torch.float64, True)
-    mine, theirs = fixed.gradients(fixed.image()), learning.gradients(learning.image())
-    assert all(torch.equal(a, b) for a, b in zip(mine, theirs, strict=False)) and len(mine) == len(theirs) - 1
-
-
 def test_a_descent_moves_the_texels_by_their_gradient() -> None:
     case = random_scene(60, 3, width=70, height=40)
     learning, moving = View(case, torch.float64, True), View(case, torch.float64, True, learns=False)

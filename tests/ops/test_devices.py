@@ -1,11 +1,9 @@
 """Operations that one kind of device has no kernel for say so."""
 
-from types import SimpleNamespace
-
 import pytest
 import torch
 
-from bitymi_ns.ops import baked, baked_cpu, baked_cuda, trace_cpu, trace_cuda
+from bitymi_ns.ops import baked, trace_cpu, trace_cuda
 from bitymi_ns.ops.backend import emulated_cuda, kernel, module
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
@@ -13,30 +11,6 @@ from tests.cuda.conftest import why_not_emulated
 from tests.ops.golden import SURFEL_KEYS, camera_of, random_scene, traced
 
 emulated = pytest.mark.skipif(why_not_emulated() is not None, reason=str(why_not_emulated()))
-
-
-def test_the_cuda_renderer_refuses_the_cpu() -> None:
-    cpu = torch.device("cpu")
-    scene = SimpleNamespace(tiles=torch.zeros(0, 5, dtype=torch.int32))
-    for call in (
-        lambda: baked_cuda.AtlasTexture(torch.zeros(1, 4, 4, 4), False, cpu),
-        lambda: baked_cuda.Workspace(cpu),
-        lambda: baked_cuda.compiled(scene),
-        lambda: baked_cuda.frame(None, torch.eye(4), torch.eye(3), None, {}, None),
-        lambda: baked_cuda.draw(scene, [], None, ("rgb",)),
-    ):
-        with pytest.raises(RuntimeError, match=r"baked_cuda\.\S+ runs on a CUDA device only, .* `baked.draw`"):
-            call()
-
-
-@emulated
-def test_the_cpu_renderer_refuses_a_cuda_device() -> None:
-    with emulated_cuda(), pytest.raises(RuntimeError, match=r"gather runs on the CPU only, .* `baked.draw`"):
-        baked_cpu.gather(None, torch.zeros(0, 5, dtype=torch.int32))
-    scene = SimpleNamespace(tiles=torch.zeros(0, 5, dtype=torch.int32))
-    for call in (lambda: baked_cpu.frame(scene, None, False), lambda: baked_cpu.draw(scene, [], None, ("rgb",))):
-        with emulated_cuda(), pytest.raises(RuntimeError, match=r"runs on the CPU only, .* `baked.draw`"):
-            call()
 
 
 @emulated

@@ -1,11 +1,9 @@
 """The residual field's float64 reference against nerfstudio's hash encoding and closed forms."""
 
-import math
-
 import pytest
 import torch
 
-from bitymi_ns.ops.reference.field import contract, encode, field, hash_index, mlp
+from bitymi_ns.ops.reference.field import contract, encode, field, hash_index
 
 
 def rand(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -39,23 +37,6 @@ def test_hash_is_uint32_arithmetic() -> None:
             assert int(hash_index(torch.tensor([[x, y, z]]), size)) == expected
 
 
-def test_encoding_at_a_corner_is_the_tables_row_and_constant_tables_are_constant() -> None:
-    table = rand(2, 2**10, 4)
-    corner = torch.tensor([[3, 5, 7]])
-    out = encode(corner.double() / 16, table, 16)
-    assert torch.equal(out[0, :4], table[0, hash_index(corner, 2**10)[0]])
-    assert torch.equal(out[0, 4:], table[1, hash_index(2 * corner, 2**10)[0]])
-    flat = torch.full((3, 2**10, 2), 0.7, dtype=torch.float64)
-    assert torch.allclose(encode(rand(50, 3), flat, 16), torch.tensor(0.7, dtype=torch.float64))
-
-
-def test_encoding_is_continuous_across_a_cell_boundary() -> None:
-    table = rand(1, 2**10, 4)
-    boundary = torch.tensor([[0.25, 0.5, 0.75]], dtype=torch.float64)
-    at, below = encode(boundary, table, 16), encode(boundary - 1e-12, table, 16)
-    assert torch.allclose(at, below, atol=1e-9)
-
-
 def test_contraction() -> None:
     mid, half = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64), 3.0
     direction = torch.nn.functional.normalize(rand(20, 3) - 0.5, dim=-1)
@@ -75,9 +56,3 @@ def test_gradients() -> None:
     x = torch.cat([rand(4, 3, seed=4), 3 * rand(4, 3, seed=5) + 1])
     inputs = [t.requires_grad_() for t in (x, table, w1, w2, w3)]
     assert torch.autograd.gradcheck(lambda *a: field(*a, mid, 1.5, 4), inputs, atol=1e-6)
-
-
-def test_mlp_has_no_biases() -> None:
-    zeros = torch.zeros(2, 16, dtype=torch.float64)
-    assert torch.equal(mlp(zeros, rand(16, 16), rand(16, 16), rand(16, 3)), torch.zeros(2, 3, dtype=torch.float64))
-    assert math.isclose(float(mlp(*(torch.ones(1, 1).double(),) * 4)), 1.0)

@@ -46,14 +46,6 @@ def test_coverage_depth_and_normals_agree_with_the_reference(scale: float, photo
     assert overdraw.sum() > 0
 
 
-def test_the_photographs_size_is_drawn_as_it_was() -> None:
-    case = random_scene(200, 5, scale=0.1)
-    projection = ops.project(*(case.params[name].float() for name in SURFEL_KEYS), camera_of(case, torch.float32))
-    fragments = ops.trace(projection, 0.0)
-    alpha = torch.zeros(case.width * case.height).index_add(0, fragments.pixel.long(), fragments.weight)
-    torch.testing.assert_close(drawn(case, 1.0)[..., 3].flatten(), alpha, rtol=1e-5, atol=1e-6)
-
-
 @pytest.mark.parametrize("size", [3.0, 0.4, 0.05])
 @pytest.mark.parametrize("beta", [0.3, 2.0, 3.8])
 def test_a_disc_keeps_what_it_covers_when_it_is_drawn_smaller(size: float, beta: float) -> None:

@@ -104,14 +104,6 @@ def test_cameras_stand_in_the_room_upright_and_clear(meta: dict) -> None:
     assert {LANDSCAPE, SPHERE} <= set(np.concatenate([first_hits(room, v, np.arange(3072))[1].surface for v in [view]]))
 
 
-def test_pictures_have_detail_and_range(images: np.ndarray) -> None:
-    grey = images.astype(np.float32).mean(axis=3)
-    assert (grey.std(axis=(1, 2)) > 25).all()
-    assert np.abs(np.diff(grey, axis=2)).mean() > 5, "high-frequency texture"
-    assert 60 < grey.mean() < 160
-    assert (images == 255).all(axis=3).mean() < 0.05, "little is burnt out"
-
-
 def test_sphere_mirrors() -> None:
     """A point of the sphere, seen from two sides, has two colours; a point of the floor has one."""
     room = Room(0)
@@ -138,21 +130,6 @@ def test_same_seed_same_capture(tmp_path: Path) -> None:
     assert len(files[0]) == 5
     assert files[0] == files[1]
     assert files[0] != files[2]
-
-
-def test_nerfstudio_reads_it(capture: Path, cloud: tuple[np.ndarray, np.ndarray]) -> None:
-    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-
-    config = NerfstudioDataParserConfig(data=capture, eval_mode="interval", eval_interval=8, load_3D_points=True)
-    parser = config.setup()
-    train, test = parser.get_dataparser_outputs("train"), parser.get_dataparser_outputs("test")
-    assert (len(train.image_filenames), len(test.image_filenames)) == (10, 2)
-    assert all(name.exists() for name in train.image_filenames)
-    assert float(train.cameras.fx[0]) == pytest.approx(0.8 * WIDTH)
-    assert train.metadata["points3D_xyz"].shape == (3000, 3)
-    # nerfstudio's world is a rotated, moved and scaled one; the parser says how
-    moved = cloud[0] @ train.dataparser_transform[:3, :3].numpy().T + train.dataparser_transform[:3, 3].numpy()
-    assert np.allclose(moved * train.dataparser_scale, train.metadata["points3D_xyz"], atol=1e-4)
 
 
 def test_refuses_to_replace_what_is_there(tmp_path: Path) -> None:

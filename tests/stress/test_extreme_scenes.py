@@ -1,13 +1,11 @@
 """Numbers that misbehave: finite in, finite out, forward and backward; errors as stated."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
 from bitymi_ns import ops
 from bitymi_ns.measure.stability.errors import Backend, against_extended, measure
-from bitymi_ns.measure.stability.page import ACCURATE, ALLOWANCE, ALLOWED, Case, cases
+from bitymi_ns.measure.stability.page import ACCURATE, ALLOWANCE, Case, cases
 from bitymi_ns.measure.stability.scenes import (
     PLAIN,
     SURFEL_KEYS,
@@ -15,14 +13,15 @@ from bitymi_ns.measure.stability.scenes import (
     WAYS,
     SceneCase,
     Sweep,
-    extreme_scenes,
     random_scene,
 )
 from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig
 
 CASES = cases()
 NAMES = [case.name for case in CASES]
-EVERY = [case for way in (PLAIN, *WAYS) for case in cases(way)]
+LONG = "thousands_on_one_pixel"
+"""Measured one way: it takes as long as all the others together, and lists are the same whatever colours them."""
+EVERY = [case for way in (PLAIN, *WAYS) for case in cases(way) if way is PLAIN or case.name != LONG]
 
 
 def scene_and_camera(case: SceneCase, backend: Backend, dtype: torch.dtype, **options) -> tuple[Scene, Camera]:
@@ -85,17 +84,6 @@ def test_far_from_the_origin_only_the_rounding_of_positions_shows(backend: Backe
     assert errors.forward < 1e-5 and errors.gradient < 2e-5 and errors.flipped == 0
 
 
-def test_opaque_surfels_keep_their_gradient(backend: Backend) -> None:
-    """At o = 1 - 1e-7 the logit's gradient is o (1 - o), of which float32 has no figure left unless from the logit."""
-    sweep = next(sweep for sweep in SWEEPS if sweep.name == "opacity")
-    assert measure(sweep.make(1e-7), backend).gradient < 1e-5
-
-
-def test_a_voronoi_site_that_takes_all_has_accurate_gradients(backend: Backend) -> None:
-    errors = measure(CASES[NAMES.index("temperature_1e4")].scene, backend)
-    assert errors.gradient < 5e-5
-
-
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("name", SURFEL_KEYS)
 def test_a_row_that_is_not_finite_is_dropped_and_counted(name: str, value: float, backend: Backend) -> None:
@@ -126,22 +114,3 @@ def test_view_colors_at_extreme_temperatures_and_directions(backend: Backend) ->
     color.sum().backward()
     assert color.isfinite().all() and means.grad.isfinite().all()
     assert all(leaf.grad.isfinite().all() for leaf in leaves.values())
-
-
-def test_an_empty_scene_and_an_empty_view(backend: Backend) -> None:
-    case = random_scene(5, 0)
-    background = torch.tensor([0.2, 0.4, 0.6], device=backend.device)
-    none = replace(case, params={key: tensor[:0] for key, tensor in case.params.items()})
-    away = replace(case, viewmat=case.viewmat.clone())
-    away.viewmat[2, 3] -= 100.0  # everything is behind the camera
-    for view in (none, away):
-        scene, camera = scene_and_camera(view, backend, torch.float32, texture="none")
-        output = scene.render(camera, background, maps=True)
-        assert torch.equal(output.rgb, background.expand_as(output.rgb)) and len(output.fragments) == 0
-        output.rgb.sum().backward()
-        assert all(p.grad is None or not p.grad.any() for p in scene.surfels.values())
-
-
-def test_the_list_of_cases_has_no_stale_names() -> None:
-    names = {scene.name for scene in extreme_scenes()}
-    assert set(ALLOWED) <= names

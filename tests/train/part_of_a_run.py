@@ -1,9 +1,8 @@
-"""One of the processes of a run, as a program: part_of_a_run.py FOLDER RANK COUNT [STEP AT WHICH IT ENDS]; and states
-of runs, to resume them from."""
+"""One of the processes of a run, as a program: part_of_a_run.py FOLDER RANK COUNT; and states of runs, to resume
+them from."""
 
 import copy
 import hashlib
-import os
 import sys
 from datetime import timedelta
 from pathlib import Path
@@ -54,7 +53,7 @@ def resume(trainer: Trainer, state: dict[str, Any]) -> None:
     trainer.step = state["step"]
 
 
-def train(inputs: dict[str, Any], processes: Processes, ends: int = STEPS) -> dict[str, Any]:
+def train(inputs: dict[str, Any], processes: Processes) -> dict[str, Any]:
     """The run's end, and what it looked like on the way: a digest of all parameters every ten steps."""
     config, field = SceneConfig(texture=inputs["texture"]), None
     if config.texture == "hash":
@@ -64,8 +63,6 @@ def train(inputs: dict[str, Any], processes: Processes, ends: int = STEPS) -> di
     )
     digests, reports = [], []
     while trainer.step < STEPS:
-        if trainer.step == ends:
-            os._exit(1)
         *_, report = trainer.advance()
         reports.append(report)
         if trainer.step % 10 == 0:
@@ -76,14 +73,13 @@ def train(inputs: dict[str, Any], processes: Processes, ends: int = STEPS) -> di
 
 def main() -> None:
     folder, rank, count = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
-    ends = int(sys.argv[4]) if len(sys.argv) > 4 else STEPS
     torch.set_num_threads(1)
     inputs = torch.load(folder / "inputs.pt", weights_only=False)
     dist.init_process_group(
         "gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=count, timeout=timedelta(seconds=60)
     )
     try:
-        result = train(inputs, Processes.joined(), ends)
+        result = train(inputs, Processes.joined())
     except ProcessLost as error:
         print(error, file=sys.stderr)
         dist.destroy_process_group()

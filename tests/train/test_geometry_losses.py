@@ -135,11 +135,3 @@ def test_depth_moves_surfels_to_the_surface(make_scene, views) -> None:
     assert off_the_surface(with_it, known) < 0.7 * off_the_surface(without, known)
     assert all(("depth" in each) == (step % 2 == 0) for step, each in enumerate(terms))
     assert not any("depth" in each for each in plain)
-
-
-def test_without_maps_or_weight_nothing_changes(make_scene, views) -> None:
-    plain, _ = run(make_scene, views, 12)
-    other, _ = run(make_scene, with_depth(views, make_scene), 12, depth_weight=0.0, normal_weight=0.0)
-    weighted, _ = run(make_scene, views, 12, depth_weight=1.0, normal_weight=1.0)
-    for name, values in plain.surfels.items():
-        assert torch.equal(values, other.surfels[name]) and torch.equal(values, weighted.surfels[name])

@@ -125,8 +125,3 @@ def test_extent():
     assert scene_extent(one, torch.tensor([[0.0, 0, 0], [7, 0, 0], [4, 0, 0]])) == pytest.approx(2.0)
     assert scene_extent(one) == 1.0
     assert scene_extent(torch.zeros(0, 3)) == 1.0
-
-
-def test_surfels_render_in_front_of_their_camera(cameras, ball):
-    surfels, _ = start(*ball, torch.stack([c.center for c in cameras]), TrainConfig(init_opacity=0.9))
-    assert Scene(SceneConfig(), surfels, None).render(cameras[0]).alpha[24, 24] > 0.9

@@ -48,7 +48,7 @@ def test_a_healthy_run_is_left_alone(make_scene, views):
     torch.testing.assert_close(log[5], log[0], rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("factor", [10.0, 100.0, 10_000.0])
+@pytest.mark.parametrize("factor", [10.0, 10_000.0])
 def test_rates_that_are_too_high_end_in_a_recovered_scene_or_a_message(make_scene, views, factor):
     scene, config = make_scene(), config_of(factor)
     start, *_ = evaluate(scene, views, config)

@@ -57,7 +57,6 @@ def drive(
     steps: Sequence[Sequence[Any]],
     viewport: tuple[int, int] = (320, 240),
     touch: bool = False,
-    scheme: str = "light",
     ratio: float = 1.0,
     patience: float = 90.0,
 ) -> Outcome:
@@ -68,7 +67,6 @@ def drive(
         "steps": [[str(x) if isinstance(x, Path) else x for x in step] for step in steps],
         "viewport": {"width": viewport[0], "height": viewport[1]},
         "touch": touch,
-        "scheme": scheme,
         "ratio": ratio,
         "patience": patience,
     }

@@ -89,10 +89,9 @@ const actionsOf = (context, page) => ({
   ask: ([expression]) => page.evaluate(expression),
 });
 
-const run = async (browser, { steps, viewport, touch, scheme, ratio, patience }) => {
+const run = async (browser, { steps, viewport, touch, ratio, patience }) => {
   const context = await browser.newContext({
-    ...{ viewport, hasTouch: touch, isMobile: touch },
-    ...{ colorScheme: scheme, deviceScaleFactor: ratio },
+    ...{ viewport, hasTouch: touch, isMobile: touch, deviceScaleFactor: ratio },
   });
   context.setDefaultTimeout(1000 * patience);
   const page = await context.newPage();

@@ -52,7 +52,7 @@ def page_of(site: Site, *before: list[object], path: str = "") -> tuple[str, str
     "format, seen, share, alpha",
     [
         *(("fp16", False, 1.0, False), ("bc7", True, 1.0, False)),
-        *(("bc7", True, 0.25, False), ("compact", True, 0.5, False)),
+        ("bc7", True, 0.25, False),
         *(("bc7", False, 1.0, True), ("compact", True, 0.25, True)),
     ],
 )
@@ -127,19 +127,14 @@ def test_a_browser_without_webgpu_gets_a_page_that_says_so(bundle: Path) -> None
     assert "no WebGPU" in text and "Update the browser" in text
 
 
-@pytest.mark.parametrize("damage", ["truncated", "altered", "missing", "newer"])
+@pytest.mark.parametrize("damage", ["altered", "newer"])
 def test_a_damaged_bundle_gets_a_page_that_says_so(damage: str, bundle: Path) -> None:
     """On a server that sends files as they are: nothing but the browser could see it."""
     site, name, data = site_of(bundle), "bundle/surfels.ply", (bundle / "surfels.ply").read_bytes()
     newer = json.dumps({**json.loads((bundle / "bundle.json").read_text()), "version": "9.0"}).encode()
 
-    def missing() -> bytes:
-        raise OSError
-
     sent: dict[str, dict[str, Callable[[], bytes]]] = {
-        "truncated": {name: lambda: data[:-40]},
         "altered": {name: lambda: data[:-4] + bytes([data[-4] ^ 1]) + data[-3:]},
-        "missing": {name: missing},
         "newer": {"bundle/bundle.json": lambda: newer},
     }
     state, text = page_of(Site({**site.files, **sent[damage]}))

@@ -73,10 +73,9 @@ def shots(bundle: Path, folder: Path, size: tuple[int, int], **options: Any) -> 
     "size, options",
     [
         (SCREEN, {}),
-        ((300, 140), {"scheme": "dark"}),
         ((150, 260), {"touch": True}),
     ],
-    ids=["like the photograph", "wide, dark", "phone"],
+    ids=["like the photograph", "phone"],
 )
 def test_it_is_there_before_the_surfels_and_where_their_picture_will_be(
     size: tuple[int, int], options: dict[str, Any], tmp_path: Path
@@ -137,15 +136,6 @@ def test_a_damaged_poster_is_not_shown_and_the_scene_is(damage: str, tmp_path: P
     del info["files"][POSTER]
     (bundle / "bundle.json").write_bytes(signed(info))
     assert difference(tmp_path / "p.png", bundle)[0] < MEAN
-
-
-def test_a_page_that_stops_shows_none(tmp_path: Path) -> None:
-    bundle = write(tmp_path / "b", "uint8", compact=True, poster=True)
-    hide = "Object.defineProperty(Navigator.prototype, 'gpu', { value: undefined })"
-    with served(site_of(bundle)) as address:
-        steps = [["init", hide], ["goto", address], ["settle"], ["ask", SHOWN], ["ask", "document.body.innerText"]]
-        found = drive(steps, SCREEN)
-    assert found.results[-2] is False and "no WebGPU" in found.results[-1]
 
 
 def test_it_is_a_range_of_one_file(tmp_path: Path) -> None:

@@ -9,8 +9,7 @@ import torch
 from bitymi_ns.bake.baked import BakeableScene, Baked, atlas_cost, encoded_texels
 from bitymi_ns.bake.field.errors import tile_errors
 from bitymi_ns.bake.field.lean_field import lean_field
-from bitymi_ns.bake.field.plan import Field, Plan, make_plan, paper_texels
-from bitymi_ns.bake.field.references import references
+from bitymi_ns.bake.field.plan import Field, Plan, make_plan, paper_texels, references
 from bitymi_ns.bake.inputs import BakeInput, drawable, photo_resolution, visible
 from bitymi_ns.bake.lean_color import kept_view_colors
 from bitymi_ns.bake.reduce import Reduced, reduce_tiles

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.field.plan import Field, Plan
-from bitymi_ns.bake.field.references import references
+from bitymi_ns.bake.field.plan import Field, Plan, references
 from bitymi_ns.bake.reduce import read_at
 from bitymi_ns.bake.tile_errors import cells_per_pixel, seen_rms, weighted_rms
 from bitymi_ns.bundle.statistics import Certificate, Percentiles, TileError

@@ -72,31 +72,28 @@ class _Polish:
 
     def shown(self, view: View, background: Tensor | None) -> Tensor:
         """[H, W, 3] the scene as a view's photograph shows it, over a colour [3]."""
-        output = self.scene.render(view.camera.to(self.device), background)
+        output = self.scene.render(view.camera, background)
         return view.shown(output.rgb, output.alpha, background)
 
     @torch.no_grad()
     def psnr(self, views: Sequence[View], progress: Progress = no_progress) -> float:
         """Mean dB over the views of which any pixel counts."""
         pictures = (
-            (self.shown(view, self.background), view.target(self.background, self.device), self._mask(view))
-            for view in views
+            (self.shown(view, self.background), view.target(self.background, self.device), view.mask)
+            for view in (view.to(self.device) for view in views)
         )
         return evaluate(pictures, len(views), progress)
 
-    def _mask(self, view: View) -> Tensor | None:
-        return None if view.mask is None else view.mask.to(self.device)
-
     def step(self, number: int, view: View, share: Tensor) -> bool:
         """A step on one view; False = it is not finite, and was not done."""
-        options = self.options
+        options, view = self.options, view.to(self.device)
         for name, optimizer in self.optimizers.items():
             set_rate(optimizer, self.factor * falling(self.schedule.lr(name, 0), number, options.steps))
         forget_gradients(self.optimizers.values())
         background = self.background
         if background_changes(self.train, view):
             background = step_background(self.train, view, number, self.device)
-        mask, target = self._mask(view), view.target(background, self.device)
+        mask, target = view.mask, view.target(background, self.device)
         # the loss is a mean, the step wants a sum
         rate = self.factor * falling(options.rate, number, options.steps) * numbers(target, mask)
         self.field.descent = TexelDescent(share, rate)
@@ -184,7 +181,7 @@ def _optimise(
     options = run.options
     before = run.psnr(validation, progress)
     stopping = EarlyStopping(options.steps, options.checks, options.patience, before, run.state())
-    share, attempts = 1.0 / (run.texels.coverage(views, progress) + options.prior), 0  # [T]
+    share, attempts = 1.0 / (run.texels.coverage(views, progress)[0] + options.prior), 0  # [T]
     for number in range(options.steps):
         view = views[training_order(len(views), options.seed, number)]
         if not run.step(number, view, share):

@@ -57,10 +57,3 @@ def test_a_bake_of_fewer_levels_is_the_same_and_is_verified(surfels, camera, tmp
     assert torch.equal(again.texels, baked.texels)
     exact = bake(scene, [camera()], BakeOptions(format="uint8", r_max=16, tolerance=0.0))
     assert exact.statistics.field is None
-
-
-def test_levels_that_are_not_there_are_refused(surfels):
-    field = real_scene(surfels, 1).field
-    for first, count in ((0, 0), (0, 5), (-1, 2), (3, 2)):
-        with pytest.raises(ValueError, match="4 levels"):
-            field.only(first, count)

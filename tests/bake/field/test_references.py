@@ -1,7 +1,6 @@
 import torch
 
-from bitymi_ns.bake.field.plan import make_plan
-from bitymi_ns.bake.field.references import references
+from bitymi_ns.bake.field.plan import make_plan, references
 from bitymi_ns.bake.inputs import BakeInput
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.train.init import tangents

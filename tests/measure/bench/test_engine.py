@@ -1,7 +1,6 @@
 """The matrix engine: what is done, what is skipped, and what a failure or a kill costs."""
 
 import json
-import os
 import re
 import subprocess
 import time
@@ -154,13 +153,6 @@ def test_a_command_that_leaves_nothing_is_a_failure(fakes, matrix: Matrix, tmp_p
     assert "evaluation (trained)" in failure and "no figures" in failure
 
 
-def test_two_benchmarks_do_not_work_on_one_run(fakes, matrix: Matrix, tmp_path: Path) -> None:
-    work, chain = tmp_path / "work", matrix.chains()[0]
-    with engine.locked(work, chain[0].run):
-        (failure,) = run_chains(work, [chain])
-    assert f"process {os.getpid()} is at work there" in failure and fakes.calls() == []
-
-
 def test_methods_of_others_are_trained_and_evaluated_only(fakes, matrix: Matrix, tmp_path: Path) -> None:
     other = Matrix(matrix.scenes[:1], [Row("splatfacto", "splatfacto")], (), 100, matrix.bundles, 1)
     assert run_chains(tmp_path / "work", other.chains()) == []
@@ -194,17 +186,6 @@ def test_empty_matrix_and_missing_tools(tmp_path: Path, monkeypatch: pytest.Monk
         tool("ns-nothing")
     with pytest.raises(CommandFailed, match="cannot be started"):
         run_measured([str(tmp_path / "nothing")], tmp_path / "log")
-
-
-def test_no_file_is_named_that_is_not_there(
-    fakes, matrix: Matrix, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    work = tmp_path / "work"
-    words = ["bench", "local", "--data", str(matrix.scenes[0].data), "--steps", "10", "--work", str(work)]
-    fakes.fail("ns-train")
-    assert main(words) == 1
-    told = capsys.readouterr().err
-    assert "No cell was finished." in told and "cells.jsonl" not in told
 
 
 @pytest.mark.parametrize("option", ["--work", "--output"])

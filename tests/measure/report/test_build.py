@@ -62,16 +62,6 @@ def test_the_page_is_whole_and_needs_no_other_file(page: str, results: Path) -> 
     assert len(plots) == PLOTS and all(image.convert("L").getextrema() != (255, 255) for image in plots)
 
 
-def test_the_order_of_the_page(page: str) -> None:
-    headings = [
-        "Worst view of 7", "Median view of 7", "Best view of 7", "Quality and speed", "<h2>Training</h2>",
-        "<h2>Camera poses</h2>", "Error against training time", "Error against rendering time", "Error against size",
-        "<h2>Left out</h2>",
-    ]  # fmt: skip
-    at = [page.index(heading) for heading in headings]
-    assert at == sorted(at) and "Pareto front" in page
-
-
 def test_found_poses_are_shown_once_for_all_runs_of_a_capture(page: str) -> None:
     for text in ("0.73", "4.26", "12,345", "finding features", "12.3", "56.8", "/photos/garden", "too dark"):
         assert text in page

@@ -2,10 +2,8 @@
 
 from pathlib import Path
 
-import pytest
-
 from bitymi_ns.measure.report.records import evaluation_from
-from bitymi_ns.measure.report.tables import Row, Table, quality_tables, significant, to_markdown
+from bitymi_ns.measure.report.tables import Row, Table, quality_tables, to_markdown
 from tests.measure.report.pages import page_of
 
 
@@ -42,13 +40,6 @@ def test_means_only_over_what_covers_the_same_scenes():
     assert [t.title for t in scenes] == ["a", "b"]
     assert mean.title == "Mean of 2 scenes" and "a, b" in mean.note
     assert [row.cells for row in mean.rows if not row.section] == [("bitymi", "21.00")]
-
-
-@pytest.mark.parametrize(
-    ("value", "text"), [(0.0, "0"), (0.0012345, "0.0012"), (0.1234, "0.123"), (3.14159, "3.14"), (61.72, "61.7")]
-)
-def test_significant(value: float, text: str):
-    assert significant(value) == text
 
 
 def test_names_cannot_break_the_table():

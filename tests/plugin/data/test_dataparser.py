@@ -316,14 +316,6 @@ def test_it_is_what_the_presets_read_with() -> None:
     assert given == BitymiDataParserConfig(data=Path("x"), eval_names=("a b.jpg", "\u00e4.jpg"), downscale_factor=4)
 
 
-def test_nerfstudios_own_parsers_can_still_be_named() -> None:
-    own = parsed("nerfstudio-data", "--data", "x")
-    assert own == NerfstudioDataParserConfig(data=Path("x"), eval_mode="interval", load_3D_points=True)
-    assert isinstance(parsed("colmap", "--data", "x"), ColmapDataParserConfig)
-    assert isinstance(parsed("blender-data", "--data", "x"), BlenderDataParserConfig)
-    assert isinstance(parsed("instant-ngp-data", "--data", "x"), InstantNGPDataParserConfig)
-
-
 def test_nerfstudios_parsers_are_read_by_ours(blender: Path) -> None:
     options = bitymi_parser(NerfstudioDataParserConfig(data=blender, eval_mode="all", scale_factor=2.0))
     own = dict(points="random", depth_unit_scale_factor=1e-3)  # nerfstudio's defaults

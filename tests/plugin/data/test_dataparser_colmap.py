@@ -1,20 +1,14 @@
 """The presets' parser: what it makes of COLMAP models."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-import pycolmap
 import pytest
 import torch
-from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from PIL import Image
 
-from bitymi_ns.plugin.data.colmap_model import read_model
 from bitymi_ns.train.views import View
 from tests.plugin.data.captures import (
     as_binary,
@@ -27,7 +21,6 @@ from tests.plugin.data.captures import (
     save_masks,
 )
 from tests.plugin.data.test_dataparser import sides
-from tests.plugin.data.test_lens import camera_of
 
 LEFT = 255 * (np.arange(48) < 24)
 
@@ -73,19 +66,6 @@ def test_poses_and_points_are_those_of_nerfstudios_parser(
     assert torch.equal(a.metadata["points3D_rgb"], b.metadata["points3D_rgb"])
 
 
-def test_the_transform_leads_back_to_the_models_frame(project: Path) -> None:
-    manager = load_any(project)
-    outputs = manager.train_dataparser_outputs
-    model = read_model(project / "sparse/0")
-    back = outputs.transform_poses_to_original_space(outputs.cameras.camera_to_worlds)
-    for path, pose in zip(outputs.image_filenames, back, strict=True):
-        image = next(image for image in model.images if image.name == path.name)
-        rotation, place = pose[:, :3].double().numpy(), pose[:, 3].double().numpy()
-        w2c = pycolmap.Rigid3d(pycolmap.Rotation3d(image.qvec[[1, 2, 3, 0]]), image.tvec)
-        assert np.allclose(rotation.T, w2c.rotation.matrix(), atol=1e-5)
-        assert np.allclose(-rotation.T @ place, image.tvec, atol=1e-4)
-
-
 @pytest.fixture
 def mixed(tmp_path: Path) -> Path:
     return mixed_project(tmp_path)
@@ -106,65 +86,6 @@ def test_cameras_of_several_kinds_and_sizes_in_one_capture(mixed: Path, capsys: 
     assert manager.train_dataset.metadata["train_pixels"] == sum(
         view.image.shape[0] * view.image.shape[1] for view in manager.train_views
     )
-
-
-def test_names_with_spaces_and_letters_of_all_kinds_are_whole_in_both_forms(mixed: Path) -> None:
-    text = read_model(mixed / "sparse/0")
-    as_binary_by_colmap(mixed / "sparse/0", text)
-    binary = read_model(mixed / "sparse/0")
-    assert [image.name for image in binary.images] == [image.name for image in text.images]
-    assert binary.images[0].name == "cam1/IMG 0 \u00fc.jpg"
-    assert binary.cameras == text.cameras
-    for a, b in zip(binary.images, text.images, strict=True):
-        assert np.allclose(a.qvec, b.qvec) and np.allclose(a.tvec, b.tvec)
-    assert np.array_equal(np.sort(binary.xyz, 0), np.sort(text.xyz, 0)) and np.array_equal(binary.rgb, text.rgb)
-
-
-def as_binary_by_colmap(folder: Path, model: Any) -> None:
-    """Write a model as COLMAP's own library does."""
-    whole = pycolmap.Reconstruction()
-    for number, camera in model.cameras.items():
-        given = pycolmap.Camera(model=camera.model, width=camera.width, height=camera.height, params=camera.params)
-        given.camera_id = number
-        whole.add_camera_with_trivial_rig(given)
-    for number, image in enumerate(model.images, 1):
-        one = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=number)
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(image.qvec[[1, 2, 3, 0]]), image.tvec)
-        whole.add_image_with_trivial_frame(one, pose)
-    for xyz, rgb in zip(model.xyz, model.rgb, strict=True):
-        whole.add_point3D(xyz, pycolmap.Track(), rgb)
-    for path in folder.iterdir():
-        path.unlink()
-    whole.write_binary(str(folder))
-
-
-@pytest.mark.parametrize("model", ["FULL_OPENCV", "OPENCV_FISHEYE"])
-def test_camera_models_of_colmap(project: Path, model: str) -> None:
-    params = " ".join(map(str, camera_of(model, 40.0, (48, 36)).params))
-    change_model(project, "cameras.txt", ("PINHOLE 48 36 40 40 24 18", f"{model} 48 36 {params}"))
-    view = load_any(project).train_views[0]
-    assert view.image.shape[:2] == (view.camera.height, view.camera.width) and view.image.float().std() > 1
-
-
-def test_undistorted_as_nerfstudio_does_it(project: Path) -> None:
-    """The same scene point has the same colour in both pictures; they differ in how much they crop alone."""
-    change_model(
-        project, "cameras.txt", ("PINHOLE 48 36 40 40 24 18", "OPENCV 48 36 40 41 23 19 0.08 -0.01 0.002 -0.001")
-    )
-    ours = load_any(project).train_views[3]
-    path = load_any(project).train_dataset.image_filenames[3]
-    K = np.array([[40.0, 0.0, 23.0], [0.0, 41.0, 19.0], [0.0, 0.0, 1.0]])
-    camera = Cameras(torch.eye(4)[None, :3], 40.0, 41.0, 23.0, 19.0, 48, 36)[0]
-    batch = {"image": torch.from_numpy(np.array(Image.open(path).convert("RGB")))}
-    distortion = np.array([0.08, -0.01, 0.0, 0.0, 0.002, -0.001])
-    K, image, _ = _undistort_image(camera, distortion, batch, batch["image"].numpy(), K)
-    a, b = ours.camera, replace(ours.camera, K=torch.from_numpy(K))
-    x, y = np.meshgrid(np.arange(8, 40, 2) + 0.5, np.arange(8, 28, 2) + 0.5)
-    rays = np.stack([(x - float(a.K[0, 2])) / float(a.K[0, 0]), (y - float(a.K[1, 2])) / float(a.K[1, 1])], -1)
-    there = rays * [float(b.K[0, 0]), float(b.K[1, 1])] + [float(b.K[0, 2]), float(b.K[1, 2])] - 0.5
-    one = ours.image.numpy()[y.astype(int), x.astype(int)].astype(float)
-    other = cv2.remap(image, there.astype(np.float32), None, cv2.INTER_LINEAR).astype(float)
-    assert np.median(np.abs(one - other)) < 2.0 and np.abs(one - other).mean() < 5.0
 
 
 # reduced photographs and masks
@@ -189,15 +110,6 @@ def test_reduced_photographs_of_another_size(project: Path) -> None:
     (project / "images_4/frame_00003.png").unlink()
     with expect(r"1 of 12 photographs of .* are missing:\s+.*images_4/frame_00003.png"):
         load_any(project, downscale_factor=4)
-
-
-def test_photographs_are_reduced_where_no_folder_has_smaller_ones(
-    project: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    manager = load_any(project, downscale_factor=2)
-    assert f"photographs {project}/images, reduced 2 times as they are read" in printed(capsys)
-    assert manager.cached_train[0]["image"].shape == (18, 24, 3)
-    assert float(manager.train_dataset.cameras.fx[0]) == 20.0
 
 
 @pytest.mark.parametrize(("ending", "reduction"), [(".png", 1), (".png.png", 2)])

@@ -11,7 +11,6 @@ import torch
 
 from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
-from bitymi_ns.plugin.data.depth import DepthFit, _affine, _mode
 from bitymi_ns.plugin.data.depth_files import MAPS, MapFiles, maps_beside, read_depth
 from bitymi_ns.plugin.data.lens import lenses_of
 from bitymi_ns.sample.capture import View, first_hits, generate
@@ -240,14 +239,3 @@ def test_distorted_photographs_have_their_depth_moved(tmp_path) -> None:
     assert read.shape == (lens.pinhole.height, lens.pinhole.width)
     assert set(np.unique(read)) <= set(np.arange(1.0, 65.0))  # nearest: no blends
     assert (np.diff(read[len(read) // 2]) >= 0).all()
-
-
-def test_fits_ignore_hidden_points() -> None:
-    rng = np.random.default_rng(0)
-    z = rng.uniform(1.0, 5.0, 400)
-    seen = np.where(np.arange(400) < 180, z * rng.uniform(0.2, 0.7, 400), z)  # the others are behind something
-    assert _mode(z / seen) == pytest.approx(1.0, abs=0.01)
-    fit, share = _affine(0.5 * seen + 0.3, z, inverse=False)
-    assert fit is not None and fit.scale == pytest.approx(2.0, rel=0.02) and share > 0.5
-    assert np.allclose(DepthFit(2.0, -0.6).z(np.array([0.8, 0.0, -1.0])), [1.0, 0.0, 0.0])
-    assert _affine(np.full(400, 2.0), z, inverse=False)[0] is None

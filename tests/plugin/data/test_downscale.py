@@ -13,7 +13,7 @@ from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManag
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.data.images import read_image
 from bitymi_ns.plugin.data.lens import lenses_of
-from tests.plugin.data.captures import add_masks, expect
+from tests.plugin.data.captures import expect
 
 
 def load(capture: Path, longest_side: int) -> BitymiDataManager:
@@ -49,13 +49,6 @@ def test_odd_sizes_keep_the_rays_of_the_corners(capture: Path) -> None:
             for c in (a, b)
         ]
         assert rays[0] == pytest.approx(rays[1], abs=1e-5)
-
-
-def test_masks_go_with_their_photographs(capture: Path) -> None:
-    add_masks(capture, 255 * (np.arange(48) >= 24))
-    view = load(capture, 24).train_views[0]
-    assert view.mask is not None and view.mask.shape == (18, 24, 1)
-    assert not view.mask[:, :12].any() and view.mask[:, 12:].all()
 
 
 def test_a_photograph_of_another_size_is_named_by_its_size_in_the_file(capture: Path) -> None:

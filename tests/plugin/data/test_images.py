@@ -13,7 +13,6 @@ import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
-from bitymi_ns.plugin.data import images
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.data.images import ImageSummary, read_image, read_mask, summarize
 from tests.plugin.data.captures import add_masks, edit, expect, images_of, load, load_with, printed
@@ -184,17 +183,6 @@ def test_a_frame_that_is_listed_twice(capture: Path, capsys: pytest.CaptureFixtu
     assert f"{first} = {first}" in printed(capsys)
     load(capture, eval_mode="all")
     assert "held-out photographs are" not in printed(capsys)
-
-
-def test_only_files_of_equal_size_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    paths = [tmp_path / name for name in "abcd"]
-    for path, data in zip(paths, (b"one", b"other", b"two", b"one"), strict=True):
-        path.write_bytes(data)
-    read: list[str] = []
-    digest = images._digest
-    monkeypatch.setattr(images, "_digest", lambda path: read.append(path.name) or digest(path))
-    assert images.duplicate_files(paths[:2], paths[2:]) == [(0, 1)]
-    assert sorted(read) == ["a", "c", "d"]
 
 
 def with_orientation(path: Path, image: Image.Image, value: int) -> None:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.plugin.data import point_files
 from bitymi_ns.plugin.data.point_files import ply_fault, read_points
 from bitymi_ns.plugin.run.model import new_scene
 from bitymi_ns.scene.config import SceneConfig
@@ -76,22 +75,6 @@ def test_other_files(tmp_path: Path) -> None:
     assert "cannot be read" in str(ply_fault(tmp_path))
     path.write_bytes(write(path, bytes(45)).read_bytes().replace(b" z\n", b" q\n"))
     assert ply_fault(path) == "gives no z of its points (property float z)"
-
-
-def test_making_surfels_of_many_points_is_announced_and_timed(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    points = (torch.rand(60, 3), torch.rand(60, 3))
-
-    def printed() -> str:
-        new_scene(points, None, SceneConfig(texture="none"), TrainConfig(), {})
-        return " ".join(capsys.readouterr().out.split())
-
-    assert printed() == ""
-    monkeypatch.setattr(point_files, "MANY_POINTS", 60)
-    message = printed()
-    assert "Making surfels of 60 points. This may take minutes." in message
-    assert "Making surfels of 60 points took" in message
 
 
 def test_a_handful_of_points_is_doubted(capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,7 +14,7 @@ from bitymi_ns.bundle.manifest import Manifest
 from bitymi_ns.capture.frame import WorldFrame, write_frame
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.export.trained import world_of
-from bitymi_ns.plugin.run.run_folder import POSES, keep_poses_report
+from bitymi_ns.plugin.run.run_folder import keep_poses_report
 from tests.bake.conftest import surfels
 from tests.bake.scenes import write
 from tests.plugin.data.captures import colmap_model, found_poses, images_of, load_any
@@ -106,21 +106,6 @@ def test_a_capture_that_came_with_its_poses_states_neither(
     stated = bundled(manager, surfels, tmp_path / "bundle").world.model_dump()
     assert set(stated) == {"transform", "scale"}
     assert torch.tensor(stated["transform"]).shape == (3, 4)
-
-
-def test_the_report_stays_with_the_run(tmp_path: Path) -> None:
-    report, run = tmp_path / "poses-123", tmp_path / "run"
-    report.mkdir()
-    run.mkdir()
-    keep_poses_report(run, None)
-    keep_poses_report(run, report)
-    assert not list(run.iterdir())
-    for name in ("report.json", "cameras.png", "poses.json"):
-        (report / name).write_text(name)
-    write_frame(report, frame())
-    for _ in range(2):  # a resumed run writes it again
-        keep_poses_report(run, report)
-    assert sorted(path.name for path in (run / POSES).iterdir()) == ["cameras.png", "frame.json", "report.json"]
 
 
 def test_a_report_that_cannot_be_kept_does_not_stop_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

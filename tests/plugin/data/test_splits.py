@@ -17,13 +17,6 @@ def test_every_eighth_by_name() -> None:
     )
 
 
-def test_ordinals() -> None:
-    numbers = (1, 2, 3, 4, 10, 11, 12, 13, 20, 21, 22, 23, 101, 111, 112, 1013)
-    text = "1st 2nd 3rd 4th 10th 11th 12th 13th 20th 21st 22nd 23rd 101st 111th 112th 1013th"
-    assert " ".join(map(splits.ordinal, numbers)) == text
-    assert "every 21st by name" in splits.by_mode(NAMES, "interval", 21, 0.9).describe(NAMES)
-
-
 def test_the_other_rules() -> None:
     assert splits.by_mode(NAMES, "all", 8, 0.9).held_out == list(range(20))
     assert len(splits.by_mode(NAMES, "fraction", 8, 0.9).train) == 18
@@ -58,10 +51,6 @@ def test_names_from_a_file(tmp_path: Path) -> None:
         splits.read_names([str(tmp_path / "gone.txt")])
 
 
-def test_nothing_held_out_is_said() -> None:
-    assert "none is held out" in splits.Split([0, 1], [], "by lists").describe(NAMES[:2])
-
-
 def test_names_in_another_case_or_with_another_ending() -> None:
     assert splits.find(TWINS, ["RIGHT/A.JPG", "b c.png", "a\u0308", "Left\\a"], "the lists") == [2, 1, 3, 0]
     with expect("a.png is the name of 2 photographs"):
@@ -73,9 +62,3 @@ def test_names_of_another_machine() -> None:
     assert splits.find(TWINS, names, "the lists", any_folder=True) == [0, 2, 1]
     with expect("2 of 3 names are of no photograph"):  # a name that a user gives is meant as it is
         splits.find(TWINS, names, "--eval-names")
-
-
-def test_a_file_of_names_with_a_byte_order_mark(tmp_path: Path) -> None:
-    path = tmp_path / "held out.txt"
-    path.write_text("00.jpg\n08.jpg\n", "utf-16")
-    assert splits.read_names([str(path)]) == ("00.jpg", "08.jpg")

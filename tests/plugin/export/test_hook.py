@@ -3,27 +3,16 @@
 import importlib
 import sys
 from types import ModuleType
-from typing import Annotated, Union, get_args
+from typing import Union, get_args
 
 import pytest
 
 pytest.importorskip("nerfstudio")
 
-import tyro
 
 from bitymi_ns.plugin.export import hook
-from bitymi_ns.plugin.export.command import ExportAtlas
 
 First, Second = (type(name, (), {}) for name in ("First", "Second"))
-
-
-def test_the_union_grows_by_one_member_and_keeps_its_markers() -> None:
-    commands = tyro.conf.FlagConversionOff[Union[First, Annotated[Second, tyro.conf.subcommand(name="b")]]]  # noqa: UP007
-    result = hook.extended(commands)
-    assert get_args(result)[1:] == get_args(commands)[1:]
-    members = get_args(get_args(result)[0])
-    assert len(members) == 4 and members[:2] == get_args(get_args(commands)[0])
-    assert get_args(members[2])[0] is ExportAtlas
 
 
 def test_only_the_exporters_own_union_is_extended() -> None:

@@ -52,21 +52,6 @@ def test_quality_is_stated_as_it_is_and_after_a_fit_of_the_colours(monkeypatch: 
     assert metrics.image_metrics(spoilt, reference)["cc_psnr"] < 30
 
 
-def test_lpips_that_cannot_be_had_is_left_out_with_one_warning(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def offline(backbone: str) -> None:
-        raise metrics.lpips.LpipsUnavailable("pip is offline")
-
-    monkeypatch.setattr(metrics, "_lpips_missing", [])
-    monkeypatch.setattr(metrics.lpips, "load", offline)
-    metrics.lpips._on_device.cache_clear()
-    for _ in range(2):
-        assert "lpips" not in metrics.image_metrics(*pair())
-    output = " ".join(capsys.readouterr().out.split())
-    assert output.count("LPIPS is left out") == 1 and "pip is offline" in output
-
-
 def test_the_lpips_whose_weights_are_there_is_stated(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,13 +1,10 @@
 """Presets state what differs from the declared defaults, and errors name the file and the key."""
 
-import ast
-import inspect
 from pathlib import Path
 
 import pytest
 import yaml
 
-from bitymi_ns.bake import BakeOptions
 from bitymi_ns.plugin.run.preset import Preset, PresetError, load_preset
 from bitymi_ns.presets import preset_dir, preset_names
 from bitymi_ns.scene.config import SceneConfig
@@ -40,37 +37,6 @@ def test_a_preset_describes_itself_and_states_no_default_again(name: str) -> Non
     values = yaml.safe_load((preset_dir() / f"{name}.yaml").read_text("utf8"))
     base = values.pop("base", None)
     assert repeated(values, Preset(name) if base is None else load_preset(base)) == []
-
-
-def documented(cls: type) -> list[str]:
-    """Options without a line that says what they are, which the command line's help would lack."""
-    (tree,) = ast.parse(inspect.cleandoc("\n" + inspect.getsource(cls))).body
-    assert isinstance(tree, ast.ClassDef)
-    pairs = zip(tree.body, [*tree.body[1:], None], strict=True)
-    return [
-        ast.unparse(node.target)
-        for node, after in pairs
-        if isinstance(node, ast.AnnAssign)
-        and not (isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant))
-    ]
-
-
-@pytest.mark.parametrize("cls", [SceneConfig, BakeOptions])
-def test_every_option_is_documented_where_it_is_declared(cls: type) -> None:
-    assert documented(cls) == []
-
-
-def test_the_variants_differ_where_they_should() -> None:
-    base = load_preset("bitymi")
-    quality = load_preset("bitymi-quality")
-    assert quality.train.loss.falloff_weight == 0.0 and base.train.loss.falloff_weight == 0.005
-    assert quality.scene == base.scene
-    fast = load_preset("bitymi-fast")
-    assert fast.train.loss.overdraw_weight > 0.0 == base.train.loss.overdraw_weight
-    assert fast.scene == base.scene and fast.train.densify == base.train.densify
-    assert [load_preset(f"bitymi-{c}").scene.view_color for c in ("sh", "sb", "sg")] == ["sh", "sb", "sg"]
-    assert load_preset("bitymi-notexture").scene.texture == "none"
-    assert load_preset("bitymi-field").scene.texture == "hash"
 
 
 def write(folder: Path, text: str, name: str = "mine") -> Path:

@@ -106,8 +106,7 @@ class Coder:
         self._sizes = baked.sizes.long()
         drawn = self._pictures.of(scene)
         self.error, self.psnr = self._pictures.square(drawn), self._pictures.psnr(drawn)
-        rows = validation_split(len(views), options.val_every if len(views) >= FEWEST_VIEWS else 0)[1]
-        trained = [views[row] for row in rows]
+        trained = list(validation_split(views, options.val_every if len(views) >= FEWEST_VIEWS else 0)[1])
         self._numbers = self._pictures.numbers / max(1, self._pictures.views) * len(trained)
         self._colors = color_choices(scene, [view.camera.to(device) for view in trained], progress)
         reduced = replace(scene, surfels={**scene.surfels, **self._colors.at(START)})
@@ -117,7 +116,7 @@ class Coder:
             texels = TexelList(baked, device)
             self._tiles, self._texels = texels.tiles, texels.values.cpu()
             self._alphas = None if baked.alpha is None else baked.alpha.values
-            self._weights = texels.coverage(trained, progress, squared=True).cpu()
+            self._weights = texels.coverage(trained, progress, (2,))[0].cpu()
 
     @property
     def measured(self) -> bool:

@@ -1,7 +1,7 @@
 """Early stopping: the state of an optimisation that shows its validation views best."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Generic, TypeVar
 
 from torch import Tensor
@@ -9,6 +9,7 @@ from torch import Tensor
 from bitymi_ns.bundle.statistics import FineTuning, Gain
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.train.losses import mean_psnr, psnr
+from bitymi_ns.train.views import OnDemand, View
 
 S = TypeVar("S")
 
@@ -102,8 +103,10 @@ def gain(before: float, after: float) -> Gain:
     return Gain(before=round(before, 4), after=round(after, 4))
 
 
-def validation_split(count: int, every: int) -> tuple[list[int], list[int]]:
-    """Indices of the validation views, every `every`-th or with 0 none, and of the views that are trained on."""
-    if every == 0:
-        return [], list(range(count))
-    return list(range(0, count, every)), [i for i in range(count) if i % every]
+def validation_split(views: Sequence[View], every: int) -> tuple[Sequence[View], Sequence[View]]:
+    """The validation views, every `every`-th or with 0 none, and those that are trained on; each is read when it is
+    asked for."""
+    rows = range(len(views))
+    parts = [i for i in rows if every and i % every == 0], [i for i in rows if not every or i % every]
+    held, trained = (OnDemand(len(part), lambda i, part=part: views[part[i]]) for part in parts)
+    return held, trained

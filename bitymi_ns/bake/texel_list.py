@@ -47,30 +47,22 @@ class TexelList:
         projection.alpha = self.alpha
         return projection
 
-    def coverage(self, views: Sequence[View], progress: Progress = no_progress, squared: bool = False) -> Tensor:
+    def coverage(
+        self, views: Sequence[View], progress: Progress = no_progress, powers: Sequence[int] = (1,)
+    ) -> list[Tensor]:
         """Coverage of every texel, in pixels.
 
         Args:
-            squared: square the blending weights.
+            powers: of the blending weights, 1 and 2.
 
         Returns:
-            [T] sum over views and fragments of the blending weight, or its square, times the bilinear weight, in pixels
-            that count; 0 where no view sees it.
+            for each power [T], the sum over views and fragments of the power of the blending weight times the bilinear
+            weight, in pixels that count; 0 where no view sees it.
         """
-        total = torch.zeros_like(self.values)
-        self.add_coverage(views, None if squared else total, total if squared else None, progress)
-        return total[:, 0]
-
-    def add_coverage(
-        self, views: Sequence[View], total: Tensor | None, squares: Tensor | None, progress: Progress = no_progress
-    ) -> None:
-        """Add the same of both kinds.
-
-        Args:
-            total: [T, 3], added to, alike in all columns; None = not wanted.
-            squares: [T, 3], added to: that of the blending weights' squares. None = not wanted.
-        """
+        totals = {power: torch.zeros_like(self.values) for power in powers}
         for done, view in enumerate(views, start=1):
             lists = fitting_lists(self.projection(view.camera))
-            add_texel_coverage(lists, self.tiles, view.mask, self.scene.weight_bound, total, squares)
+            to = (totals.get(1), totals.get(2))
+            add_texel_coverage(lists, self.tiles, view.mask, self.scene.weight_bound, *to)
             progress("tracing the training views", done, len(views))
+        return [total[:, 0] for total in totals.values()]

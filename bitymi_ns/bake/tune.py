@@ -21,7 +21,7 @@ from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.ranges import Count, Positive, PositiveCount, Share, check_ranges
 from bitymi_ns.train.config import TexelSteps
 from bitymi_ns.train.schedules import falling
-from bitymi_ns.train.views import MemoryBudget, OnDemand, View, training_order
+from bitymi_ns.train.views import MemoryBudget, View, training_order
 
 
 @dataclass
@@ -97,23 +97,18 @@ def tune_atlas(
     started, cpu_started = time.perf_counter(), time.process_time()
     texels = TexelList(baked, device)
     budget = MemoryBudget(options.cache_bytes)
-    held_back, trained = (
-        OnDemand(len(rows), lambda i, rows=rows: views[rows[i]])
-        for rows in validation_split(len(views), options.val_every)
-    )
+    held_back, trained = validation_split(views, options.val_every)
     validation, tuned = (TuningViews(texels, part, background, budget) for part in (held_back, trained))
     before = validation.psnr(texels.values, progress)  # first: these views are kept first
     stopping = EarlyStopping(options.steps, options.checks, options.patience, before, texels.values)
-    squares = None if baked.codes is None else torch.zeros_like(texels.values)
-    covered = torch.zeros_like(texels.values)
-    texels.add_coverage(trained, covered, squares, progress)
-    share = 1.0 / (covered[:, 0] + options.prior)  # [T]
+    covered, *squares = texels.coverage(trained, progress, (1,) if baked.codes is None else (1, 2))
+    share = 1.0 / (covered + options.prior)  # [T]
     _descend(texels.values.clone(), tuned, validation, share, stopping, options, progress)
     held_out = TuningViews(texels, eval_views, background, MemoryBudget(0))
     coder: Cosines | Pages = Pages(baked)
-    if squares is not None:
+    if squares:
         coding = coding or TexelCodeOptions()
-        coder = Cosines(TexelCoder(baked.sizes, squares[:, 0].cpu(), coding, baked.alpha_codes), coding)
+        coder = Cosines(TexelCoder(baked.sizes, squares[0].cpu(), coding, baked.alpha_codes), coding)
     untuned = held_out.psnr(coder.first(texels.values.cpu()).texels) if eval_views else None
     coded = _coded(tuned, validation, share, stopping.best, coder, options, progress)
     spent = time.perf_counter() - started, time.process_time() - cpu_started

@@ -26,6 +26,7 @@ from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.sphere import fibonacci_sphere
 from bitymi_ns.ops.view_color import LEAN, check_lean
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, kind_of
+from bitymi_ns.scene.baked import BakedScene
 
 FLAT_LOG_SCALE = -31.0
 TILE_COLUMNS = ("tile_x", "tile_y", "tile_layer", "tile_ru", "tile_rv")
@@ -61,30 +62,20 @@ def mean_view_color(surfels: Mapping[str, Tensor], kind: str | None = None) -> T
     return torch.stack(parts).mean(0)
 
 
-def to_columns(
-    surfels: Mapping[str, Tensor],
-    tiles: npt.NDArray[np.int32],
-    mean_residual: Tensor | None = None,
-    extent: Tensor | None = None,
-    kind: str | None = None,
-    mean_alpha: Tensor | None = None,
-) -> dict[str, npt.NDArray]:
+def to_columns(scene: BakedScene, has_alpha: bool = False) -> dict[str, npt.NDArray]:
     """The columns of surfels.ply; those of the terms of lean view colours are `term_columns`.
 
     Args:
-        surfels: the per-surfel parameters of docs/overview.md, N rows each.
-        tiles: [N, 5] int32.
-        mean_residual: [N, 3] mean of each tile, added to the colour shown by other viewers; None = 0, no column.
-        extent: [N] half side of each tile in scale units; None = no column.
-        kind: a name of `ops.VIEW_COLORS`; None = the one whose parameters are there.
-        mean_alpha: [N] mean alpha of each tile; None = no column.
+        scene: of N surfels. Its mean residuals are added to the colour shown by other viewers; they and the extents get
+            columns where they are stated.
+        has_alpha: mean alphas get a column.
     """
-    kind = kind or kind_of(surfels)
+    kind, surfels, tiles = scene.view_color, scene.surfels, scene.tiles.numpy()
     lean = "view_terms" in surfels
     surfels = {name: _plain(value) for name, value in surfels.items()}
     color = mean_view_color(surfels, kind)
-    if mean_residual is not None:
-        color = color + mean_residual
+    if scene.mean_residual is not None:
+        color = color + scene.mean_residual
     color = color.nan_to_num(0.0).clamp(-0.5, 0.5) / SH_C0  # (mean colour - 0.5) / SH_C0
     quats = torch.nn.functional.normalize(surfels["quats"], dim=1)
     flat = torch.full((len(quats), 1), FLAT_LOG_SCALE)
@@ -103,13 +94,13 @@ def to_columns(
     if lean:
         columns[COUNT_COLUMN] = surfels["view_span"][:, 1].numpy()
     columns |= {name: tiles[:, i] for i, name in enumerate(TILE_COLUMNS)}
-    if extent is not None:
-        columns[EXTENT_COLUMN] = extent.detach().float().cpu().numpy()
-    if mean_residual is not None:
-        residual = mean_residual.detach().float().cpu().numpy()
+    if scene.extent is not None:
+        columns[EXTENT_COLUMN] = _plain(scene.extent).numpy()
+    if scene.mean_residual is not None:
+        residual = _plain(scene.mean_residual).numpy()
         columns |= {name: residual[:, i] for i, name in enumerate(COLUMNS["mean_residual"])}
-    if mean_alpha is not None:
-        columns[ALPHA_COLUMN] = mean_alpha.detach().float().cpu().numpy()
+    if has_alpha:
+        columns[ALPHA_COLUMN] = _plain(scene.mean_alpha).numpy()
     return columns
 
 

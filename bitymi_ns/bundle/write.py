@@ -125,7 +125,9 @@ def write_bundle(
     try:
         with complete_folder(folder, lambda: check_target(folder, overwrite)) as new:
             if codes is None or interchange:
-                _write_surfels(new / SURFELS, scene, _has_alpha(atlas))
+                comments = [GENERATOR, "2D Beta surfels; see bundle.json"]
+                terms = {TERMS: term_columns(surfels)} if "view_terms" in surfels else None
+                ply.write_ply(new / SURFELS, to_columns(scene, _has_alpha(atlas)), comments, terms)
             if codes is None and atlas is not None:
                 ktx2.write_ktx2(new / ATLAS, atlas.payload, atlas.format, atlas.width, atlas.height, GENERATOR)
             for name, data in parts.items():
@@ -148,15 +150,6 @@ def write_bundle(
         why = reason(error, folder)
         raise BundleError(f"{folder} cannot be written{needs}: {why}. Nothing was left behind") from error
     return folder
-
-
-def _write_surfels(path: Path, scene: BakedScene, has_alpha: bool) -> None:
-    """Write the surfels of a scene on the CPU, with or without their mean alphas, as a PLY file, which viewers of
-    Gaussian splats open, too."""
-    means = scene.mean_residual, scene.extent, scene.view_color, scene.mean_alpha if has_alpha else None
-    columns = to_columns(scene.surfels, scene.tiles.numpy(), *means)
-    terms = {TERMS: term_columns(scene.surfels)} if "view_terms" in scene.surfels else None
-    ply.write_ply(path, columns, [GENERATOR, "2D Beta surfels; see bundle.json"], terms)
 
 
 def _compact_parts(codes: SceneCodes, info: dict[str, Any]) -> dict[str, bytes]:

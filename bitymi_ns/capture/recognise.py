@@ -209,10 +209,8 @@ def models_in(data: Path) -> list[Path]:
 
     def rank(model: Path) -> tuple[int, str, int, str]:
         usual = [Path(name) for name in MODELS]
-        beside = usual.index(model) if model in usual else len(usual)
-        if model.name.isdigit():  # stands where the first of its neighbours would
-            first = model.with_name("0")
-            beside = usual.index(first) if first in usual else len(usual)
+        first = model.with_name("0") if model.name.isdigit() else model  # it stands where that would
+        beside = usual.index(first) if first in usual else len(usual)
         return beside, str(model.parent), -image_count(data / model), str(model)
 
     return sorted(models, key=rank)

@@ -43,7 +43,7 @@ def backward_memory(fragments: Fragments, maps: bool, texels: int) -> dict[str, 
 class _BlendedImage(torch.autograd.Function):
     @staticmethod
     def forward(ctx, weight, depth, uv, geom, base, texels, residual, fragments, tiles, bound, maps, descent):
-        g, b, t, arrays = dense(geom, geom), dense(base, geom), dense(texels, geom), fragments.arrays_for_layout
+        g, b, t, arrays = dense(geom, geom), dense(base, geom), dense(texels, geom), fragments.arrays
         r = None if residual is None else dense(residual, geom)
         image = geom.new_empty(fragments.width * fragments.height, MAP_CHANNELS if maps else IMAGE_CHANNELS)
         ctx.arguments = {"maps": maps, **fragments.view, **tiles.arrays, "bound": bound}
@@ -58,18 +58,19 @@ class _BlendedImage(torch.autograd.Function):
         arrays = dict(zip(ctx.names, rest, strict=True))
         weighs, _, moves, _, _, learns, residual_learns, *_ = ctx.needs_input_grad
         out = {"dweight": torch.empty_like(arrays["weight"]) if weighs else None, "dgeom": torch.empty_like(geom)}
-        out |= {"dbase": torch.empty_like(base), "dtexels": torch.empty_like(texels) if learns else None}
+        out |= {"dbase": torch.empty_like(base)}
         out |= {"duv": torch.empty_like(arrays["uv"]) if moves else None}
         out |= {"dresidual": torch.empty_like(residual) if residual_learns else None}
         out |= {"ddepth": torch.empty_like(arrays["depth"]) if ctx.arguments["maps"] else None}
-        step = {"rate": 0.0} if ctx.descent is None else ctx.descent.arguments(texels)
+        # a gradient is a step of length -1 from 0
+        dtexels = torch.zeros_like(texels) if learns else None
+        descent = TexelDescent(texels.new_ones(len(texels)), -1.0, dtexels) if learns else ctx.descent
+        step = {"rate": 0.0} if descent is None else descent.arguments(texels)
         inputs = {"geom": geom, "base": base, "texels": texels, "residual": residual, "dimage": dense(dimage, geom)}
-        sums_texels = learns or ctx.descent is not None
-        work = backward_memory(ctx.fragments, ctx.arguments["maps"], len(texels) if sums_texels else 0)
+        work = backward_memory(ctx.fragments, ctx.arguments["maps"], 0 if descent is None else len(texels))
         kernel("blend_backward", geom)(**ctx.arguments, **arrays, **inputs, **step, **work, **out)
-        names = ("dweight", "ddepth", "duv", "dgeom", "dbase", "dtexels", "dresidual")
-        gradients = (out[name] for name in names)
-        return *gradients, None, None, None, None, None
+        gradients = (out[name] for name in ("dweight", "ddepth", "duv", "dgeom", "dbase"))
+        return *gradients, dtexels, out["dresidual"], None, None, None, None, None
 
 
 def _check(fragments: Fragments, base: Tensor, texels: Tensor, tiles: TexelTiles, descent: TexelDescent | None) -> None:

@@ -54,9 +54,9 @@ def _add(
     surfels = fragments.surfels
     base, geom = total.new_zeros(surfels, 3), total.new_zeros(surfels, GEOM)
     dimage = torch.nn.functional.pad(counts[:, None].expand(-1, 3), (0, IMAGE_CHANNELS - 3))
-    step = {"texels": total, "moved": total, "share": share, "rate": -1.0, "dtexels": None}
+    step = {"texels": total, "moved": total, "share": share, "rate": -1.0}
     kernel("blend_backward", total)(
-        **{**fragments.arrays_for_layout, "weight": weight},
+        **{**fragments.arrays, "weight": weight},
         **tiles.arrays,
         **step,
         **backward_memory(fragments, False, len(total)),

@@ -56,13 +56,8 @@ class Fragments:
 
     @property
     def arrays(self) -> dict[str, Tensor]:
-        """The list without the graph, for kernels that do not take the layout; by the names of `FragmentArrays`
-        (csrc/ops/arguments.h)."""
-        return {**self._numbers, **self.layout.ids()}
-
-    @property
-    def arrays_for_layout(self) -> dict[str, Tensor]:
-        """The same for kernels that take the layout, from which those of the CPU know surfels and pixels."""
+        """The list without the graph, by the names of `FragmentArrays` (csrc/ops/arguments.h); the kernels of the CPU
+        know surfels and pixels from the layout."""
         return _for_layout(self._numbers, self.layout)
 
     @property

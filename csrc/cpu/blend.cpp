@@ -285,7 +285,7 @@ void backward_by_surfel(const Backward<S>& a, const BlockPicture<S, kChannels<kM
     const int64_t id = listed.surfel(order[first]);
     const TexelPatch<S> patch(a.of.table, id);
     thread_local std::vector<S> own;  // gradients of the texels, rows of four
-    const int64_t area = a.sums_texels() ? int64_t(patch.size[0]) * patch.size[1] : 0;
+    const int64_t area = a.moved ? int64_t(patch.size[0]) * patch.size[1] : 0;
     own.assign(4 * area, S(0));
     Sums<Lanes<S>> sums;
     for (int64_t k = first; k < last; ++k) {
@@ -294,8 +294,6 @@ void backward_by_surfel(const Backward<S>& a, const BlockPicture<S, kChannels<kM
       run_backward<kMaps>(a, dimage, surfel, area ? own.data() : nullptr, sums);
     }
     surfel_backward(a, id, total<kMaps>(sums));
-    if (a.dtexels)
-      for (int64_t t = 0; t < area; ++t) store3(a.dtexels + 3 * (patch.first + t), load3(own.data() + 4 * t));
     if (a.moved)
       for (int64_t t = 0; t < area; ++t) {
         S* texel = a.moved + 3 * (patch.first + t);
@@ -326,7 +324,6 @@ template <bool kMaps, class S> void backward(const Backward<S>& a) {
   const TexelTiles<S>& table = a.of.table;
   std::fill(a.dgeom, a.dgeom + table.n * kGeom, S(0));
   std::fill(a.dbase, a.dbase + 3 * table.n, S(0));
-  if (a.dtexels) std::fill(a.dtexels, a.dtexels + 3 * table.texels, S(0));
   const BlockPicture<S, kChannels<kMaps>> dimage(a.dimage, a.of.width, a.of.height);
   const ListedRuns listed(a.of.fragments.layout);
   const std::vector<int64_t> order = by_surfel(listed, table.n);

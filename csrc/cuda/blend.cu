@@ -189,17 +189,15 @@ template <class S> struct StoreSurfelGradient {
 template <class S, bool kMaps, Residual kResidual, bool kExact>
 void run_backward(const BlendBackward<S, Pairs>& a, const ExactSums& exact, Stream stream) {
   const Pairs& p = a.of.fragments.layout;
-  const Gradients<S> out = {a.dweight, a.duv, a.ddepth, a.dresidual, a.partial, a.work.sums, a.sums_texels()};
+  const Gradients<S> out = {a.dweight, a.duv, a.ddepth, a.dresidual, a.partial, a.work.sums, a.moved != nullptr};
   if (p.pairs)
     BT_LAUNCH((backward_kernel<S, kMaps, kResidual, kExact>), dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream,
               a.of, a.dimage, out, exact);
   fill_zero(a.dgeom, p.surfels * kGeom, stream);
   sum_slots<blend_sums(kMaps)>(p, static_cast<const S*>(a.partial),
                                StoreSurfelGradient<S>{a.of.table.base, a.dgeom, a.dbase}, stream);
-  if (!a.sums_texels()) return;
-  if (a.dtexels) fill_zero(a.dtexels, 3 * a.of.table.texels, stream);
-  each_shown_texel(p, a.of.table, FinishTexel<S, kExact>{a.work.sums, exact, a.share, a.rate, a.dtexels, a.moved},
-                   stream);
+  if (a.moved)
+    each_shown_texel(p, a.of.table, MoveTexel<S, kExact>{a.work.sums, exact, a.share, a.rate, a.moved}, stream);
 }
 }  // namespace
 
@@ -212,7 +210,7 @@ template <class S> void blend_forward(const BlendForward<S, Pairs>& a, Stream st
 }
 
 template <class S, bool kMaps> void backward(const BlendBackward<S, Pairs>& a, Stream stream) {
-  const int64_t entries = a.sums_texels() ? 4 * a.of.table.texels : 0;
+  const int64_t entries = a.moved ? 4 * a.of.table.texels : 0;
   if (a.work.exact && entries) {
     const ExactSums exact = begin_exact(a.work.exact, entries, static_cast<const FieldArrays<S>*>(nullptr),
                                         a.of.fragments.f.total, a.of.numbers(), a.dimage, stream);

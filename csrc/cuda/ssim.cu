@@ -4,6 +4,7 @@
 // H200; what is read twice, at the rims of tiles, comes from the L2.
 #include "core/ssim.h"
 #include "cuda/kernels.h"
+#include "cuda/warp.h"
 
 namespace bt::cuda {
 
@@ -68,12 +69,8 @@ __global__ void __launch_bounds__(kThreads<S>)
     for (int j = 0; j < 3; ++j)
       parts[((int64_t(channel) * 3 + j) * rows + y0 + y + i) * columns + x0 + x] = share * d[j];
   }
-  total[thread] = own;
-  for (int half = kThreads<S> / 2; half; half /= 2) {
-    __syncthreads();
-    if (thread < half) total[thread] += total[thread + half];
-  }
-  if (thread == 0) sums[(int64_t(channel) * gridDim.y + blockIdx.y) * gridDim.x + blockIdx.x] = total[0];
+  const double sum = block_sum<kThreads<S>>(own, total);
+  if (thread == 0) sums[(int64_t(channel) * gridDim.y + blockIdx.y) * gridDim.x + blockIdx.x] = sum;
 }
 
 // Adds up the blocks in an order that depends on their number alone.
@@ -81,15 +78,10 @@ constexpr int kSumThreads = 256;
 template <class S>
 __global__ void __launch_bounds__(kSumThreads) mean_kernel(int64_t n, const double* sums, double count, S* value) {
   __shared__ double total[kSumThreads];
-  const int thread = int(threadIdx.x);
   double own = 0;
-  for (int64_t i = thread; i < n; i += kSumThreads) own += sums[i];
-  total[thread] = own;
-  for (int half = kSumThreads / 2; half; half /= 2) {
-    __syncthreads();
-    if (thread < half) total[thread] += total[thread + half];
-  }
-  if (thread == 0) *value = count > 0 ? S(total[0] / count) : S(1);
+  for (int64_t i = threadIdx.x; i < n; i += kSumThreads) own += sums[i];
+  const double sum = block_sum<kSumThreads>(own, total);
+  if (threadIdx.x == 0) *value = count > 0 ? S(sum / count) : S(1);
 }
 
 template <class S> struct Parts {

@@ -58,18 +58,17 @@ template <class S> struct ClearTexel {
   S* sums;
   __device__ void operator()(int64_t t) const { reinterpret_cast<Row*>(sums)[t] = {}; }
 };
-// Use of the sums: the gradient, or a step of the texel.
-template <class S, bool kExact> struct FinishTexel {
+// A step of the texel by its sums.
+template <class S, bool kExact> struct MoveTexel {
   S* sums;
   ExactSums exact;
   const S* share;
   S rate;
-  S *dtexels, *moved;
+  S* moved;
   __device__ void operator()(int64_t t) const {
     const Adder<S, kExact> of = adder<kExact>(sums, exact);
     const Vec3<S> g = {of.sum(4 * t), of.sum(4 * t + 1), of.sum(4 * t + 2)};
-    if (dtexels) store3(dtexels + 3 * t, g);
-    if (moved && (g.x != S(0) || g.y != S(0) || g.z != S(0)))
+    if (g.x != S(0) || g.y != S(0) || g.z != S(0))
       store3(moved + 3 * t, texel_step(load3(moved + 3 * t), g, rate, share[t]));
   }
 };

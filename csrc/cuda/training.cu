@@ -3,6 +3,7 @@
 
 #include "core/common.h"
 #include "cuda/training.h"
+#include "cuda/warp.h"
 
 namespace bt::cuda {
 
@@ -29,17 +30,9 @@ template <class S> BT_HD Error<S> error_at(const Picture<S>& p, int64_t i) {
   return e;
 }
 
-// In an order that depends on the numbers of threads and blocks alone. Thread 0 has the sums.
+// Thread 0 gets the sums of the block.
 __device__ void add_up(double (&own)[kLossSums], double (*total)[kThreads]) {
-  const int thread = int(threadIdx.x);
-  for (int k = 0; k < kLossSums; ++k) total[k][thread] = own[k];
-  for (int half = kThreads / 2; half; half /= 2) {
-    __syncthreads();
-    if (thread < half)
-      for (int k = 0; k < kLossSums; ++k) total[k][thread] += total[k][thread + half];
-  }
-  if (thread == 0)
-    for (int k = 0; k < kLossSums; ++k) own[k] = total[k][0];
+  for (int k = 0; k < kLossSums; ++k) own[k] = block_sum<kThreads>(own[k], total[k]);
 }
 
 template <class S> BT_HD bool counts(const Picture<S>& p, int64_t i) { return !p.mask || p.mask[i]; }

@@ -33,6 +33,18 @@ template <int M, class S> __device__ void sum_over_run(unsigned run, int lane, S
   }
 }
 
+// The sum of the values of a block of kThreads, a power of two, to thread 0, always in the same order. `shared` has
+// room for all of them.
+template <int kThreads> __device__ double block_sum(double own, double* shared) {
+  const int thread = int(threadIdx.x);
+  shared[thread] = own;
+  for (int half = kThreads / 2; half; half /= 2) {
+    __syncthreads();
+    if (thread < half) shared[thread] += shared[thread + half];
+  }
+  return shared[thread];
+}
+
 // The sum of integers in units of 1 / scale as a number.
 template <class S> __device__ S exact_value(unsigned long long sum, double scale) {
   return S(double(static_cast<long long>(sum)) / scale);

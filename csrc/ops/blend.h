@@ -44,16 +44,15 @@ template <class S, class Layout> struct BlendForward {
 constexpr int blend_sums(bool maps) { return maps ? 8 : 4; }
 
 // ddepth [F] (maps only), dgeom [n, kGeom] (beta and normal columns) and dbase [n, 3] are written, and, where not null,
-// dweight [F], duv [2, F], dresidual [F, 3] and dtexels [texels, 3]. With `moved` [texels, 3] the texels' gradient g is
-// not kept: texel t of `moved` moves by -rate share[t] g. partial [pairs, blend_sums] and work are working memory.
+// dweight [F], duv [2, F] and dresidual [F, 3]. The gradient g of texels moves those of `moved` [texels, 3], which may
+// be those that are read: texel t by -rate share[t] g. partial [pairs, blend_sums] and work are working memory.
 template <class S, class Layout> struct BlendBackward {
   BlendedSurfels<S, Layout> of;
   const S *dimage, *share;
   S rate;
-  S *partial, *dweight, *duv, *ddepth, *dgeom, *dbase, *dresidual, *dtexels, *moved;
+  S *partial, *dweight, *duv, *ddepth, *dgeom, *dbase, *dresidual, *moved;
   TexelWork<S> work;
 
-  bool sums_texels() const { return dtexels || moved; }
   template <class R> void fields(R& r) {
     of.fields(r);
     const int64_t total = of.fragments.f.total, n = of.table.n;
@@ -65,12 +64,12 @@ template <class S, class Layout> struct BlendBackward {
     r.array("dbase", dbase, 3 * n);
     r.maybe("dresidual", dresidual, 3 * total);
     if (dresidual && !of.residual) r.refuse("there is no residual of fragments");
-    r.maybes(3 * of.table.texels, "dtexels", dtexels, "moved", moved);
+    r.maybe("moved", moved, 3 * of.table.texels);
     r.maybe("share", share, of.table.texels);
     r.number("rate", rate);
     r.work("partial", partial, of.fragments.layout.pairs * blend_sums(of.maps));
-    work.fields(r, sums_texels() ? of.table.texels : 0);
-    check_moved(r, moved, share, dtexels);
+    work.fields(r, moved ? of.table.texels : 0);
+    if (moved && !share) r.refuse("texels move by a share of each");
   }
 };
 

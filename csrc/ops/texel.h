@@ -25,11 +25,6 @@ template <class S> struct TexelTiles {
     r.rows("texels", values, texels, 3);
   }
 };
-// A backward pass that moves texels, those that it reads or others in their stead, moves them by a share of each and
-// keeps no gradient of them.
-template <class R, class S> void check_moved(R& r, const S* moved, const S* share, const S* dtexels) {
-  if (moved && (!share || dtexels)) r.refuse("texels move by a share of each, and their gradient is not kept");
-}
 // The texels of one surfel.
 template <class S> struct TexelPatch {
   const int32_t* size;  // r_u, r_v; 0, 0 = no tile

@@ -113,7 +113,7 @@ def test_its_pictures_are_the_renderers(truth: Baked, prefilter: str) -> None:
 
 def test_texels_that_no_view_sees_stay_and_the_hardly_seen_hardly_move(wrong: Baked, views: list[View]) -> None:
     scene = TexelList(wrong)
-    seen = scene.coverage([v for i, v in enumerate(views) if i % 4])
+    (seen,) = scene.coverage([v for i, v in enumerate(views) if i % 4])
     tuned = texels_of(tune_atlas(wrong, views, BACKGROUND, OPTIONS))
     moved = (tuned - 0.1).abs().amax(1)
     last = scene.tiles.first[59]
@@ -125,16 +125,15 @@ def test_texels_that_no_view_sees_stay_and_the_hardly_seen_hardly_move(wrong: Ba
 
 def test_coverage_of_several_views_is_their_sum(wrong: Baked, views: list[View]) -> None:
     texels = TexelList(wrong)
-    both, squares, want = (torch.zeros_like(texels.values) for _ in range(3))
-    texels.add_coverage(views[:5], both, squares)
-    covered = texels.coverage(views[:5])
-    assert torch.equal(both[:, 0], covered) and torch.equal(texels.coverage(views[:5], squared=True), squares[:, 0])
-    for view in views[:5]:
-        texels.add_coverage([view], want, None)
-    assert torch.equal(both, want) and covered.max() > 1 and (squares <= both).all()
+    covered, squares = texels.coverage(views[:5], powers=(1, 2))
+    assert torch.equal(texels.coverage(views[:5])[0], covered)
+    assert torch.equal(texels.coverage(views[:5], powers=(2,))[0], squares)
+    want = sum(texels.coverage([view])[0] for view in views[:5])
+    torch.testing.assert_close(covered, want)
+    assert covered.max() > 1 and (squares <= covered).all()
     hidden = torch.zeros(40, 48, 1, dtype=torch.bool)  # masked pixels are not seen
     masked = [views[0], *(View(v.camera, v.image, hidden) for v in views[1:3])]
-    assert torch.equal(*(texels.coverage(each) for each in (views[:1], masked)))
+    assert torch.equal(*(texels.coverage(each)[0] for each in (views[:1], masked)))
 
 
 @pytest.mark.parametrize("patience", [2, 99])

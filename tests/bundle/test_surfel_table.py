@@ -10,15 +10,22 @@ from bitymi_ns.bundle.surfel_table import (
 )
 from bitymi_ns.ops import VIEW_COLORS
 from bitymi_ns.ops.constants import SH_C0
+from bitymi_ns.ops.view_kinds import kind_of
+from bitymi_ns.scene.baked import BakedScene
 
 KINDS = ["sv", "sh", "sb", "sg"]
 TILES = np.arange(25, dtype=np.int32).reshape(5, 5)
 
 
+def columns_of(params, tiles=TILES, **means):
+    """The columns of surfels and their tiles."""
+    return to_columns(BakedScene(params, kind_of(params), torch.from_numpy(tiles), **means))
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_surfels_survive_the_columns(surfels, kind):
     params = surfels(5, kind)
-    columns = to_columns(params, TILES)
+    columns = columns_of(params)
     read = from_columns(columns, kind)
     found, tiles = read["surfels"], read["tiles"]
     np.testing.assert_array_equal(tiles.numpy(), TILES)
@@ -29,7 +36,7 @@ def test_surfels_survive_the_columns(surfels, kind):
 
 
 def test_the_columns_begin_with_those_of_gaussian_splatting(surfels):
-    columns = to_columns(surfels(5), TILES)
+    columns = columns_of(surfels(5))
     names = list(columns)
     assert names[:15] == (
         "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3 beta".split()
@@ -42,10 +49,10 @@ def test_the_columns_begin_with_those_of_gaussian_splatting(surfels):
 def test_viewers_see_the_mean_colour_with_the_mean_of_the_tile(surfels):
     params = surfels(5, "sh")
     params["sh_dc"] = torch.tensor([[0.1, 0.2, -0.3]]).expand(5, 3) / SH_C0
-    columns = to_columns(params, TILES, torch.full((5, 3), 0.25))
+    columns = columns_of(params, mean_residual=torch.full((5, 3), 0.25))
     shown = [0.5 + SH_C0 * columns[f"f_dc_{i}"][0] for i in range(3)]
     assert shown == pytest.approx([0.85, 0.95, 0.45])
-    bright = to_columns(params, TILES, torch.full((5, 3), 9.0))
+    bright = columns_of(params, mean_residual=torch.full((5, 3), 9.0))
     assert 0.5 + SH_C0 * bright["f_dc_0"][0] == pytest.approx(1.0)
 
 
@@ -64,25 +71,25 @@ def test_extreme_temperatures_leave_the_colour_finite(surfels):
         params = surfels(3, kind)
         extremes = torch.tensor([-80.0, 0.0, 9.0]).reshape(3, *[1] * (params[name].dim() - 1))
         params[name] = extremes.expand_as(params[name])
-        columns = to_columns(params, TILES[:3])
+        columns = columns_of(params, TILES[:3])
         assert all(np.isfinite(columns[f"f_dc_{i}"]).all() for i in range(3))
 
 
 def test_degree_zero_and_one_site_keep_their_shapes(surfels):
     params = surfels(5, "sh")
     params["sh_rest"] = params["sh_rest"][:, :0]
-    assert from_columns(to_columns(params, TILES), "sh")["surfels"]["sh_rest"].shape == (5, 0, 3)
+    assert from_columns(columns_of(params), "sh")["surfels"]["sh_rest"].shape == (5, 0, 3)
     params = surfels(5, "sv")
     params = {name: value[:, :1] if name.startswith("sv_") else value for name, value in params.items()}
-    assert from_columns(to_columns(params, TILES), "sv")["surfels"]["sv_sites"].shape == (5, 1, 3)
+    assert from_columns(columns_of(params), "sv")["surfels"]["sv_sites"].shape == (5, 1, 3)
 
 
 def test_extents_and_mean_residuals_are_optional_columns(surfels):
     params = surfels(5)
-    plain = from_columns(to_columns(params, TILES), "sv")
+    plain = from_columns(columns_of(params), "sv")
     assert plain["extent"].tolist() == [3.0] * 5 and not plain["mean_residual"].any() and plain["mean_alpha"] is None
     extent, residual = torch.linspace(0.5, 3.0, 5), torch.randn(5, 3)
-    columns = to_columns(params, TILES, residual, extent)
+    columns = columns_of(params, mean_residual=residual, extent=extent)
     found = from_columns(columns, "sv")
     assert torch.equal(found["extent"], extent) and torch.equal(found["mean_residual"], residual)
     with pytest.raises(PlyError, match="tile_extent is 0 in row 1; it must be from 1e-06 to 16"):
@@ -93,7 +100,7 @@ def test_extents_and_mean_residuals_are_optional_columns(surfels):
 
 
 def test_missing_or_extra_columns_are_refused(surfels):
-    good = to_columns(surfels(5), TILES)
+    good = columns_of(surfels(5))
     for name in ("x", "rot_3", "beta", "tile_ru"):
         with pytest.raises(PlyError, match=f"{name} is missing"):
             from_columns({k: v for k, v in good.items() if k != name}, "sv")

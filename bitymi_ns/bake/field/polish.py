@@ -25,7 +25,7 @@ from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.losses import numbers, photometric
 from bitymi_ns.train.optimizers import forget_gradients, set_rate, step, surfel_optimizers
 from bitymi_ns.train.schedules import Schedule, falling
-from bitymi_ns.train.views import OnDemand, View, background_changes, step_background, training_order
+from bitymi_ns.train.views import View, background_changes, step_background, training_order
 
 
 @dataclass
@@ -157,10 +157,7 @@ def polish_scene(
     if len(views) < FEWEST_VIEWS:
         return replace(baked, statistics=baked.statistics.but(polish=FineTuning(steps=0, views=len(views))))
     started, cpu_started = time.perf_counter(), time.process_time()
-    validation, trained = (
-        OnDemand(len(rows), lambda i, rows=rows: views[rows[i]])
-        for rows in validation_split(len(views), options.val_every)
-    )
+    validation, trained = validation_split(views, options.val_every)
     run = _Polish(baked, views, background, options, train or TrainConfig(), device)
     before = run.psnr(eval_views) if eval_views else math.nan
     stopping = _optimise(run, trained, validation, progress)
@@ -181,7 +178,7 @@ def _optimise(
     options = run.options
     before = run.psnr(validation, progress)
     stopping = EarlyStopping(options.steps, options.checks, options.patience, before, run.state())
-    share, attempts = 1.0 / (run.texels.coverage(views, progress) + options.prior), 0  # [T]
+    share, attempts = 1.0 / (run.texels.coverage(views, progress)[0] + options.prior), 0  # [T]
     for number in range(options.steps):
         view = views[training_order(len(views), options.seed, number)]
         if not run.step(number, view, share):

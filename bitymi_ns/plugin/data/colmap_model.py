@@ -330,5 +330,4 @@ def _points_text(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.ui
     values = np.array(rows).reshape(len(rows), -1)
     if values.shape[1] < 6:
         return values[:, :3].reshape(-1, 3), np.zeros((0, 3), np.uint8), "its points have none" * bool(rows)
-    rgb = color_bytes(values[:, 3:], bool((values[:, 3:] % 1.0).any()))
-    return (values[:, :3], np.zeros((0, 3), np.uint8), rgb) if isinstance(rgb, str) else (values[:, :3], rgb, "")
+    return values[:, :3], *color_bytes(values[:, 3:], bool((values[:, 3:] % 1.0).any()))

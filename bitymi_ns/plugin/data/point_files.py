@@ -49,21 +49,22 @@ def read_points(path: Path) -> tuple[Points, str]:
     values = np.stack([rows[name] for name in names], -1)
     if values.dtype == np.uint8:
         return Points(xyz, values), ""
-    rgb = color_bytes(values.astype(np.float64), values.dtype.kind == "f")
-    return (Points(xyz, np.zeros((0, 3), np.uint8)), rgb) if isinstance(rgb, str) else (Points(xyz, rgb), "")
+    rgb, without = color_bytes(values.astype(np.float64), values.dtype.kind == "f")
+    return Points(xyz, rgb), without
 
 
-def color_bytes(values: npt.NDArray[np.float64], floating: bool) -> npt.NDArray[np.uint8] | str:
-    """Convert colors [N, 3] to bytes by the smallest white (1, 255 or 65535) that bounds them, or return why that
-    cannot be done. `floating`: white may be 1."""
+def color_bytes(values: npt.NDArray[np.float64], floating: bool) -> tuple[npt.NDArray[np.uint8], str]:
+    """Convert colors [N, 3] to bytes by the smallest white (1, 255 or 65535) that bounds them, or to none [0, 3] and
+    why that cannot be done. `floating`: white may be 1."""
+    none = np.zeros((0, 3), np.uint8)
     if not len(values):
-        return np.zeros((0, 3), np.uint8)
+        return none, ""
     values[~np.isfinite(values)] = 0.0
     low, high = values.min(), values.max()
     white = next((white for white in ((1.0, 255.0) if floating else (255.0, 65535.0)) if high <= white), None)
     if white is None or low < 0.0:
-        return f"its colors lie between {low:g} and {high:g}, which is neither 0 to 1 nor 0 to 255 nor 0 to 65535"
-    return np.uint8(values * (255.0 / white) + 0.5)
+        return none, f"its colors lie between {low:g} and {high:g}, which is neither 0 to 1 nor 0 to 255 nor 0 to 65535"
+    return np.uint8(values * (255.0 / white) + 0.5), ""
 
 
 def ply_fault(path: Path) -> str | None:

@@ -154,15 +154,12 @@ def _check_applied(path: Path, meta: dict[str, Any]) -> None:
     """Check the transform [3, 4] and the scale that were applied to the capture as a whole."""
     if "applied_transform" in meta:
         transform = _matrix(meta["applied_transform"])
-        if transform is None:
+        singular = "maps the capture to a plane, a line or a point, which cannot be undone"
+        if transform is None or abs(np.linalg.det(transform[:3, :3])) < 1e-12:
+            fault = "is not a matrix of 3 x 4 finite numbers" if transform is None else singular
             fail(
-                f"{path}: applied_transform is not a matrix of 3 x 4 finite numbers. Correct it, or remove it: then "
-                "exports are in the frame of this file."
-            )
-        if abs(np.linalg.det(transform[:3, :3])) < 1e-12:
-            fail(
-                f"{path}: applied_transform maps the capture to a plane, a line or a point, which cannot be undone. "
-                "Correct it, or remove it: then exports are in the frame of this file."
+                f"{path}: applied_transform {fault}. Correct it, or remove it: then exports are in the frame of this "
+                "file."
             )
         meta["applied_transform"] = transform[:3].tolist()
     if "applied_scale" in meta:

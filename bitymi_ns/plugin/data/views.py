@@ -297,10 +297,8 @@ def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> Datap
     large = [size for size in sizes if longest and max(size) > longest]
     if not large:
         return outputs
-    small = {
-        lens: lens.downscaled(longest / max(size)) if longest < max(size) else lens
-        for lens, size in dict(zip(lenses, sizes, strict=True)).items()
-    }
+    sized = dict(zip(lenses, sizes, strict=True))
+    small = {lens: lens.downscaled(min(1.0, longest / max(size))) for lens, size in sized.items()}
     lenses = [small[lens] for lens in lenses]
     if verbose:
         width, height = max(large, key=max)

@@ -164,8 +164,9 @@ def test_it_gives_up_without_a_gain_and_its_progress_ends_with_it(
     assert (wrong.texels == 0.1).all()
 
 
-def test_the_texels_kept_are_those_of_the_best_look(
-    wrong: Baked, views: list[View], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("coded", [False, True])
+def test_the_texels_kept_are_those_of_the_best_evaluation(
+    wrong: Baked, views: list[View], monkeypatch: pytest.MonkeyPatch, coded: bool
 ) -> None:
     """Of a run that first gains and then loses, its rate rising instead of falling."""
     seen: list[tuple[float, Tensor]] = []
@@ -177,12 +178,21 @@ def test_the_texels_kept_are_those_of_the_best_look(
 
     monkeypatch.setattr(TuningViews, "psnr", noted)
     monkeypatch.setattr("math.cos", lambda angle: 20.0 * angle**6 - 0.9)
-    tuned = tune_atlas(wrong, views, BACKGROUND, replace(OPTIONS, patience=99))
-    del seen[-1]  # of what is stored
+    options = replace(OPTIONS, patience=99)
+    if coded:
+        wrong = replace(wrong, options=replace(wrong.options, format="uint8"))
+        options = replace(options, steps=0, coded_steps=60, coded_rate=OPTIONS.rate)
+    tuned = tune_atlas(wrong, views, BACKGROUND, options)
+    if not coded:
+        del seen[-1]  # of what is stored
     best = max(range(len(seen)), key=lambda i: seen[i][0])
     assert 0 < best < len(seen) - 1 and seen[-1][0] < seen[best][0] - 0.5
-    assert tuned.statistics.finetune.psnr_held_in.after == pytest.approx(seen[best][0], abs=1e-4)
-    torch.testing.assert_close(texels_of(tuned), seen[best][1], rtol=0, atol=0)
+    if coded:
+        kept = listed_texels(torch.from_numpy(tuned.atlas.decoded()), tuned.packing, tuned.mean_residual)
+    else:
+        kept = texels_of(tuned)
+        assert tuned.statistics.finetune.psnr_held_in.after == pytest.approx(seen[best][0], abs=1e-4)
+    torch.testing.assert_close(kept, seen[best][1], rtol=0, atol=0)
 
 
 def test_memory_for_the_views_does_not_change_the_result(wrong: Baked, views: list[View]) -> None:

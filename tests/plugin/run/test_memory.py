@@ -9,6 +9,8 @@ import torch
 
 from bitymi_ns.plugin.run import memory
 from bitymi_ns.scene import Camera, Scene
+from bitymi_ns.scene.field import TexelField
+from bitymi_ns.train import texels
 from bitymi_ns.train.config import TexelConfig
 from tests.scene import bands
 
@@ -41,6 +43,10 @@ def test_one_line_says_what_will_be_taken(
     monkeypatch.setattr(memory, "PROGRAM", 1e15)
     state(scene[0], [scene[1]] * 20, 0)
     assert "GB that this machine has available" in said(capsys)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=10**16))
+    monkeypatch.setattr(memory, "memory_limit", lambda: 2e9)
+    state(scene[0], [scene[1]] * 20, 0)
+    assert "more than the 2.0 GB that this machine has available" in said(capsys)
 
 
 class OnCard:
@@ -75,6 +81,55 @@ def test_a_card_is_compared_with_its_own_memory(
         assert ("more than the 1.0 GB that the card has available" in text) == (free == 10**9)
         needed.append(gigabytes(text))
     assert needed[0] > 1 and needed[1] <= needed[0]  # views with more fragments than it holds are drawn in bands
+
+
+def test_it_grows_with_fragments_up_to_the_bound_and_not_with_views(
+    scene: tuple[Scene, Camera], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one, camera = scene
+    with torch.no_grad():
+        count = len(one.render(camera).fragments)
+    assert memory.most_fragments(one, [camera] * 5) == int(memory.MARGIN * count)
+    assert memory.most_fragments(one, [camera], 1000) == 1000
+    monkeypatch.setattr(memory, "PER_FRAGMENT", 1e6)
+    memory.state_training(one, [camera], 0)
+    assert gigabytes(said(capsys)) == pytest.approx(0.8 + 1e-3 * memory.MARGIN * count, abs=0.1)
+    monkeypatch.setattr(texels, "FEW", 0)
+    options = TexelConfig(pixels_per_texel=2.0, rendered_pixels_per_texel=10.0)
+    for to_come, views in ((1000, memory.VIEWS_OF_TEXELS / 2.0), (20, 2.0)):
+        monkeypatch.setattr(memory, "PER_TEXEL", 0)
+        memory.state_training(one, [camera], 0, options, to_come)
+        monkeypatch.setattr(memory, "PER_TEXEL", 1e6)
+        memory.state_training(one, [camera], 0, options, to_come)
+        few, many = said(capsys).split("Training will take")[1:]
+        most = memory.SMALLEST**2 * len(one) + views * camera.width * camera.height
+        assert gigabytes(many) - gigabytes(few) == pytest.approx(1e-3 * most, rel=0.1)
+    large = Camera(camera.viewmat, camera.K, 4000, 4000)  # photographs alone: more than are kept
+    monkeypatch.setattr(memory, "most_fragments", lambda *_: 0)
+    needed = []
+    for views in (100, 1000):
+        memory.state_training(one, [large] * views, 0)
+        memory.state_export(one, [large] * views, 1e9)
+        needed.append(said(capsys).split(" for ")[0])
+    assert needed[0] == needed[1]
+
+
+def test_an_export_grows_with_learning_surfels_kept_views_and_texels(
+    scene: tuple[Scene, Camera], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one, camera = scene
+
+    def taken(*arguments: float, views: int = 1) -> float:
+        memory.state_export(one, [camera] * views, *arguments)
+        return gigabytes(said(capsys))
+
+    assert taken(0, 1_000_000) - taken(0, 0) == pytest.approx(1e-3 * memory.PER_SURFEL, abs=0.11)
+    kept = 2.0 - memory.PHOTOGRAPH_BYTES / 1e9
+    assert taken(2e9, views=10) - taken(2e9, views=300_000) == pytest.approx(kept, abs=0.11)
+    monkeypatch.setattr(memory, "PER_BAKED_TEXEL", 1e6)
+    before = taken(0)
+    one.field = TexelField.blank(len(one), 5000, one.surfels["means"].detach())
+    assert taken(0) - before == pytest.approx(5.0, abs=0.11)
 
 
 @pytest.mark.parametrize(("compact", "bytes_each"), [(False, 2), (True, 6)])

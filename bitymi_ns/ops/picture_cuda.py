@@ -22,7 +22,7 @@ class _PictureLosses(torch.autograd.Function):
         alike, dalike = similarity(rgb, wanted, ctx.needs_input_grad[0])
         photometric, falloff, counted = (image.new_empty(()) for _ in range(3))
         sums = torch.empty(module(image.device).LOSS_SUMS, dtype=torch.float64, device=image.device)
-        ctx.arguments = {"gamma": gamma, "squared": False, "share": share, "weight": weight}
+        ctx.arguments = {"gamma": gamma, "share": share, "weight": weight}
         kernel("picture_loss", image)(
             image=pixels,
             target=wanted,

@@ -19,14 +19,12 @@ template <class S> struct Error {
 };
 template <class S> BT_HD Error<S> error_at(const Picture<S>& p, int64_t i) {
   Error<S> e;
-  S squares = S(0);
   e.l1 = S(0);
   for (int k = 0; k < 3; ++k) {
     e.d[k] = p.image[i * kImageChannels + k] - p.target[3 * i + k];
     e.l1 += e.d[k] < S(0) ? -e.d[k] : e.d[k];
-    squares += e.d[k] * e.d[k];
   }
-  e.omega = S(exp(-p.gamma * (p.squared ? squares / S(3) : e.l1)));
+  e.omega = S(exp(-p.gamma * e.l1));
   return e;
 }
 

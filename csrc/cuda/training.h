@@ -10,19 +10,18 @@ namespace bt::cuda {
 
 // image [pixels, kImageChannels]: rgb, alpha and beta; target [pixels, 3]; mask [pixels], not 0 where the pixel counts,
 // null: all count. The losses that `train.losses.objective` describes: l1 is the mean of |rgb - target|, right that of
-// omega beta, omega = exp(-gamma e), e = |rgb - target| summed over rgb, or with `squared` the mean of the squares.
+// omega beta, omega = exp(-gamma e), e = |rgb - target| summed over rgb.
 template <class S> struct Picture {
   int64_t pixels;
   const S *image, *target;
   const uint8_t* mask;
   S gamma;
-  bool squared;
 
   template <class R> void fields(R& r) {
     r.rows("image", image, pixels, kImageChannels);
     r.array("target", target, 3 * pixels);
     r.maybe("mask", mask, pixels);
-    r.numbers("gamma", gamma, "squared", squared);
+    r.numbers("gamma", gamma);
   }
 };
 

@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 import pillow_heif
 from PIL import Image
 
-from bitymi_ns.capture import unread
+from bitymi_ns.capture import ignored_files
 from bitymi_ns.files import encoding_of
 from bitymi_ns.trust import json_of
 
@@ -108,7 +108,7 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
     (chosen, path), *_ = fitting
     # photographs lie beside every capture: they are another capture only beside a video
     others = tuple(each for each in candidates if each[1] != path and (each[0] != "photographs" or chosen == "video"))
-    poses = tuple(unread.poses_in(folder)) if chosen in ("photographs", "video") else ()
+    poses = tuple(ignored_files.poses_in(folder)) if chosen in ("photographs", "video") else ()
     return Found(chosen, path, path if chosen == "blender" else folder, others, poses)
 
 
@@ -251,7 +251,7 @@ def _folders_in(folder: Path) -> list[Path]:
 
 
 def _may_hold_photographs(name: str) -> bool:
-    return not name.startswith(".") and name.lower() not in unread.FOLDERS
+    return not name.startswith(".") and name.lower() not in ignored_files.FOLDERS
 
 
 def _has_photographs(folder: Path, below: bool = False) -> bool:
@@ -283,7 +283,7 @@ def passed_over(folder: Path) -> list[str]:
     found = []
     for parent, below, names in os.walk(folder):
         for name in sorted(below):
-            what = unread.FOLDERS.get(name.lower()) or _copies(name, below)
+            what = ignored_files.FOLDERS.get(name.lower()) or _copies(name, below)
             if what and _pictures(Path(parent, name)):
                 found.append(f"{Path(parent, name).relative_to(folder)} ({_pictures(Path(parent, name))} {what})")
         below[:] = sorted(name for name in below if _may_hold_photographs(name) and not _copies(name, below))
@@ -292,8 +292,8 @@ def passed_over(folder: Path) -> list[str]:
             if is_picture(path) and not is_photograph(path):
                 found.append(f"{path.relative_to(folder)} ({_beside(path)})")
         read = [name for name in names if is_picture(Path(parent, name))]
-        for ending, count in unread.pictures_among(names, read).items():
-            found.append(f"{count} {ending} of {parent} ({unread.PICTURES[ending]}, which is not read)")
+        for ending, count in ignored_files.pictures_among(names, read).items():
+            found.append(f"{count} {ending} of {parent} ({ignored_files.PICTURES[ending]}, which is not read)")
     return found
 
 
@@ -312,7 +312,7 @@ def is_photograph(path: Path) -> bool:
 def _beside(path: Path) -> str:
     """Describe an image that is no photograph, by its name; empty = a photograph."""
     stem = path.stem.lower()
-    return "a depth map" if stem.endswith((".depth", "_depth", "-depth")) else unread.FILES.get(stem, "")
+    return "a depth map" if stem.endswith((".depth", "_depth", "-depth")) else ignored_files.FILES.get(stem, "")
 
 
 def is_picture(path: Path) -> bool:
@@ -354,10 +354,10 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
     several = captures_in(data)
     if several:
         hint = f" It holds {len(several)} captures: give one of them, as {several[0]}."
-    counts = unread.pictures_among([path.name for path in data.rglob("*")], [])
+    counts = ignored_files.pictures_among([path.name for path in data.rglob("*")], [])
     if counts and not several:
         most = max(counts, key=counts.__getitem__)
-        hint = f" It holds {counts[most]} files {most} ({unread.PICTURES[most]}): save them as JPEG or TIFF."
+        hint = f" It holds {counts[most]} files {most} ({ignored_files.PICTURES[most]}): save them as JPEG or TIFF."
     archive = next((path for path in sorted(data.iterdir()) if path.suffix.lower() in (".zip", ".tar", ".7z")), None)
     if archive is not None and not several:
         hint = f" Unpack {archive.name} first."

@@ -14,7 +14,7 @@ from PIL import ExifTags, Image
 
 from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.capture.exif import Exif
-from bitymi_ns.capture.known import KnownView, triangulate
+from bitymi_ns.capture.known_poses import KnownView, triangulate
 from bitymi_ns.capture.photos import Photo
 from bitymi_ns.capture.poses import _finished, _what, by_camera, camera_group, find_poses, make_job, ordered
 from bitymi_ns.capture.types import CaptureError, SfmOptions, SfmSettings

@@ -20,7 +20,7 @@ def no_triangulation(monkeypatch: pytest.MonkeyPatch) -> None:
     def triangulate(*given: Any) -> Path:
         raise CaptureError("not in this test")
 
-    monkeypatch.setattr("bitymi_ns.capture.known.triangulate", triangulate)
+    monkeypatch.setattr("bitymi_ns.capture.known_poses.triangulate", triangulate)
 
 
 @pytest.fixture(scope="session")

@@ -14,7 +14,7 @@ from bitymi_ns.capture.recognise import is_photograph, photographs_below
 from bitymi_ns.capture.types import CaptureError, SfmSettings
 from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data.colmap_model import Model, ModelImage, read_model
-from bitymi_ns.plugin.data.names import FileFinder, renamed_message
+from bitymi_ns.plugin.data.find_files import FileFinder, renamed_message
 from bitymi_ns.plugin.data.point_files import Points
 from bitymi_ns.plugin.data.views import OPENCV_AXES, Photograph, Pose
 from bitymi_ns.trust import leads_inside

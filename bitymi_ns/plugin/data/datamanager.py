@@ -25,8 +25,8 @@ from bitymi_ns.plugin.data.capture_checks import check_capture, declares_box, re
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.data.dataset import PHOTOGRAPH_BYTES, BitymiDataset, CachedImages, drop_blank_views
 from bitymi_ns.plugin.data.depth import with_depth
+from bitymi_ns.plugin.data.find_files import check_photographs_exist
 from bitymi_ns.plugin.data.initial_points import reading_points
-from bitymi_ns.plugin.data.names import check_photographs_exist
 from bitymi_ns.plugin.data.pose_checks import check_outliers, check_point_unit, warn_of_mirrored
 from bitymi_ns.plugin.data.views import LONGEST_SIDE, NO_PHOTOS, limit_size, with_lenses
 from bitymi_ns.train.background_points import background_points

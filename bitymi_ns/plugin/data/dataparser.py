@@ -27,6 +27,7 @@ from bitymi_ns.plugin.data.colmap_views import (
     warn_of_left_out,
 )
 from bitymi_ns.plugin.data.depth import DepthKind
+from bitymi_ns.plugin.data.find_files import check_photographs_exist
 from bitymi_ns.plugin.data.initial_points import (
     COLMAP_CONVENTIONS,
     JSON_CONVENTIONS,
@@ -37,7 +38,6 @@ from bitymi_ns.plugin.data.initial_points import (
     read_colored_points,
     with_colors,
 )
-from bitymi_ns.plugin.data.names import check_photographs_exist
 from bitymi_ns.plugin.data.scanner_views import scanner_photographs
 from bitymi_ns.plugin.data.sfm_poses import KeptPoses, find_sfm_source, kept_source, read_kept_poses
 from bitymi_ns.plugin.data.splits import NameLists, Split

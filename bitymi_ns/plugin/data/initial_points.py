@@ -73,7 +73,7 @@ def initial_points(
 
 def triangulated(photographs: Sequence[Photograph], folder: Path, source: str) -> Points | None:
     """Triangulate points from photographs with poses; None (with a warning) where that is not possible."""
-    from bitymi_ns.capture.known import KnownView, triangulate  # slow to import, and seldom needed
+    from bitymi_ns.capture.known_poses import KnownView, triangulate  # slow to import, and seldom needed
     from bitymi_ns.progress import rich_progress
 
     middle = np.mean([photograph.pose[:3, 3] for photograph in photographs], axis=0)

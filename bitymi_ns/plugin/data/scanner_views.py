@@ -14,8 +14,8 @@ from bitymi_ns.capture.photos import natural
 from bitymi_ns.capture.recognise import POLYCAM, Found, is_photograph
 from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.data.depth_files import maps_beside
+from bitymi_ns.plugin.data.find_files import check_photographs_exist
 from bitymi_ns.plugin.data.images import image_size
-from bitymi_ns.plugin.data.names import check_photographs_exist
 from bitymi_ns.plugin.data.pose_checks import rotations
 from bitymi_ns.plugin.data.views import OPENCV_AXES, Photograph
 from bitymi_ns.trust import json_of

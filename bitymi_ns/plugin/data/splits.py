@@ -11,7 +11,7 @@ from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_filenam
 
 from bitymi_ns.files import encoding_of
 from bitymi_ns.plugin.console import fail, listed
-from bitymi_ns.plugin.data.names import folded, without_extension
+from bitymi_ns.plugin.data.find_files import folded, without_extension
 
 Mode = Literal["fraction", "filename", "interval", "all"]
 NameLists = dict[str, list[str]]  # names of photographs by split: train, val, test

@@ -17,9 +17,9 @@ from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 from bitymi_ns.capture.camera import SPHERICAL_MODEL, ColmapCamera
 from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data.depth_files import MAP_FILES, MapFiles
+from bitymi_ns.plugin.data.find_files import FileFinder, renamed_message
 from bitymi_ns.plugin.data.images import image_size
 from bitymi_ns.plugin.data.lens import colmap_distortion
-from bitymi_ns.plugin.data.names import FileFinder, renamed_message
 from bitymi_ns.plugin.data.splits import NameLists
 from bitymi_ns.plugin.data.transforms import (
     COEFFICIENTS,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bitymi_ns.capture import known
+from bitymi_ns.capture import known_poses
 from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.data.point_files import read_points
@@ -19,7 +19,7 @@ from tests.plugin.data.captures import edit, edit_frames, load_any, printed, wri
 from tests.plugin.data.test_true_captures import ALL, blender, colmap, move
 
 SIZE = (200, 150)
-TRIANGULATE = known.triangulate  # before fixtures replace it
+TRIANGULATE = known_poses.triangulate  # before fixtures replace it
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def arc(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def triangulating(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bitymi_ns.capture.known.triangulate", TRIANGULATE)
+    monkeypatch.setattr("bitymi_ns.capture.known_poses.triangulate", TRIANGULATE)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -87,11 +87,11 @@ def test_what_cannot_be_triangulated(
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[list[known.KnownView]]:
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[list[known_poses.KnownView]]:
     """Triangulation gives a model of two points; what it was asked for."""
-    calls: list[list[known.KnownView]] = []
+    calls: list[list[known_poses.KnownView]] = []
 
-    def triangulate(home: Path, views: list[known.KnownView], *told: Any) -> Path:
+    def triangulate(home: Path, views: list[known_poses.KnownView], *told: Any) -> Path:
         calls.append(views)
         model = home / "triangulated"
         model.mkdir(exist_ok=True)
@@ -100,7 +100,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[list[known.KnownView]]:
         (model / "points3D.txt").write_text("1 0 0 0.5 200 10 10 0.5\n2 0.1 0 0.5 200 10 10 0.5\n")
         return model
 
-    monkeypatch.setattr("bitymi_ns.capture.known.triangulate", triangulate)
+    monkeypatch.setattr("bitymi_ns.capture.known_poses.triangulate", triangulate)
     return calls
 
 

@@ -137,7 +137,7 @@ def test_masks_of_points_are_not_written_through_links(
 
 
 def test_photographs_that_are_none_give_no_points(photographs: Path, triangulated: Any) -> None:
-    with pytest.raises(CaptureError, match=r"precious.png cannot be read as a picture"):
+    with pytest.raises(CaptureError, match=r"precious.png cannot be read"):
         mask = photographs.parent / "precious.png"
         Image.new("RGB", (64, 48)).save(mask, "EPS")
         triangulated(mask=mask)

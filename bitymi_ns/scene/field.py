@@ -34,7 +34,7 @@ class ResidualField(nn.Module):
 
         Args:
             fragments: of the view.
-            frames: [N, 3, 3] of its `Projection`.
+            frames: [N, 9] of its `Projection`.
             bound: fragments of weight below this have no residual.
             learns: whether it gets gradients.
             read: what `snapshot` gave, for a view that is drawn in parts.

@@ -270,7 +270,12 @@ def build_scene(
 
     Returns:
         The scene on the CPU, and what became of the points.
+
+    Raises:
+        ValueError: an option is out of range.
     """
+    check_ranges(scene_config)
+    check_ranges(train_config)
     surfels, report = surfels_from_points(points, colours, camera_centers, train_config, scene_config, box, background)
     means = surfels["means"][: len(surfels["means"]) - report.background]  # the others would make the field coarse
     near = NEAR * scene_extent(camera_centers, means)
@@ -303,8 +308,6 @@ def scene_for_views(
     Raises:
         ValueError: an option is out of range.
     """
-    check_ranges(scene_config)
-    check_ranges(train_config)
     centers = torch.stack([view.camera.center.cpu() for view in views]) if views else torch.zeros(0, 3)
     pixels = sum(view.camera.width * view.camera.height for view in views)
     bounded = any(view.image.shape[-1] == 4 for view in views)

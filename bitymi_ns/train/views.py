@@ -99,7 +99,7 @@ def covered_share(views: Sequence[View]) -> float:
     """Share of the pixels that count and are not transparent, in a few of the views."""
     shares = []
     for view in (views[i] for i in spread(len(views), COVERED_VIEWS)):
-        shows = view.image[..., -1:] > 0 if view.image.shape[-1] == 4 else torch.ones(1, dtype=torch.bool)
+        shows = view.image[..., -1:] > 0 if view.image.shape[-1] == 4 else torch.ones((), dtype=torch.bool)
         if view.mask is not None:
             shows = shows & view.mask.reshape(*view.mask.shape[:2], 1)
         shares.append(float(shows.float().mean()))

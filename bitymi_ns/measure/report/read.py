@@ -146,16 +146,17 @@ def add_cells(cells: Iterable[dict[str, Any]], path: Path, records: Records) -> 
         key, run = cell["key"], identity(cell["key"], *_NOT_OF_A_RUN)
         keys.setdefault(run, key)
         runs.setdefault(run, {})[str(key.get("cell")), str(key.get("bundle") or "")] = cell["value"]
-        machine = (cell.get("made") or {}).get("machine")
+        made = cell.get("made")
+        machine = made.get("machine") if isinstance(made, dict) else None
         if machine and machine not in records.machines:
             records.machines.append(str(machine))
     names = {run: str(key.get("row") or key.get("method") or "unnamed method") for run, key in keys.items()}
-    namesakes = Counter((key.get("scene"), names[run], key.get("seed")) for run, key in keys.items())
+    namesakes = Counter((str(key.get("scene")), names[run], str(key.get("seed"))) for run, key in keys.items())
     series = {run: identity(key, *_NOT_OF_A_RUN, "seed") for run, key in keys.items()}
     seeds = Counter(series[run] for run in keys)
     for run, key in keys.items():
         name, seed, steps = names[run], key.get("seed"), key.get("steps")
-        if namesakes[key.get("scene"), name, seed] > 1:  # say what else tells them apart
+        if namesakes[str(key.get("scene")), name, str(seed)] > 1:  # say what else tells them apart
             name += f", {steps:,} steps" if isinstance(steps, int) else ", own length"
         suffix = f", seed {seed}" if seeds[series[run]] > 1 and seed is not None else ""
         scene = str(key.get("scene") or "unnamed scene")
@@ -171,7 +172,9 @@ def _add_run(trained: Evaluation, suffix: str, cells: dict[tuple[str, str], dict
     for (kind, bundle), value in cells.items():
         try:
             if kind == "eval":
-                results = {**value["results"], **times, "psnr": value["results"]["psnr"]}  # the one that must be there
+                if "psnr" not in finite_numbers(value["results"]):
+                    raise KeyError("psnr among its results")
+                results = {**value["results"], **times}
                 results["bundle_bytes"] = cells.get(("export", bundle), {}).get("bytes")
                 group = f"{trained.method}, {bundle}" if bundle else trained.method
                 own = {"baked": bool(bundle), "label": group + suffix, "group": group}

@@ -28,6 +28,7 @@ ever less of the photograph: wider cameras become faces of a cube."""
 NODE_STEP = 4
 """Pixels between the nodes at which the distortion is evaluated; linear interpolation between them is accurate to far
 less than a pixel."""
+RADIAL_SAMPLES = 32  # samples of each ray that is tested for folding
 EDGE_SAMPLES = 64
 """Rays per picture edge for testing what the photograph shows."""
 CACHED_MAPS = 4
@@ -289,8 +290,15 @@ def _largest(fits: Callable[[float], bool]) -> float:
 
 
 def _is_seen(camera: ColmapCamera, rays: npt.NDArray[np.float64]) -> bool:
-    """Test that the photograph shows all rays (x, y, 1), [N, 2], unfolded."""
-    return bool(covered(camera, "front", np.concatenate([rays, np.ones((len(rays), 1))], 1)).all())
+    """Test that the photograph shows all rays (x, y, 1), [N, 2], and that pixels move outwards along each of them."""
+    lens, t = camera.colmap, np.linspace(0.0, 1.0, RADIAL_SAMPLES + 1)[1:]
+    points = (t[:, None, None] * rays).reshape(-1, 2)
+    pixels = lens.img_from_cam(np.concatenate([points, np.ones((len(points), 1))], 1)).reshape(len(t), -1, 2)
+    if not np.isfinite(pixels).all():
+        return False
+    inside = (pixels >= 0.0).all() and (pixels <= camera.size).all()
+    away = np.linalg.norm(pixels - (lens.principal_point_x, lens.principal_point_y), axis=-1)
+    return bool(inside and (np.diff(away, axis=0) > 0.0).all())
 
 
 @lru_cache(maxsize=CACHED_MAPS)

@@ -176,6 +176,10 @@ def test_runs_that_differ_in_length_are_told_apart(tmp_path: Path) -> None:
     [
         ("{}", r"line 2, is not a finished cell"),
         ('{"key": {"cell": "eval"}, "value": {}}', r"the eval cell of .* lacks 'results'"),
+        (
+            '{"key": {"cell": "eval", "scene": ["a"]}, "made": "x", "value": {"results": {"psnr": "bad"}}}',
+            r"lacks 'psnr among its results'",
+        ),
         ('{"key": {"cell": "pictures"}, "value": {}}', r"the pictures cell of .* lacks 'folder'"),
         ("nonsense", r"line 2, is not a finished cell"),
     ],

@@ -6,7 +6,7 @@ import torch
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.init import build_scene, default_table_size, field_domain, scene_for_views
+from bitymi_ns.train.init import build_scene, default_table_size, field_domain
 
 CENTERS = torch.tensor([[3.0, 0.0, 1.0], [-1.0, 0.0, 1.0]])
 
@@ -78,4 +78,4 @@ def test_the_table_grows_with_the_photographs_between_two_bounds(cloud) -> None:
 )
 def test_options_out_of_range_are_named(cloud, name, value) -> None:
     with pytest.raises(ValueError, match=f"{name} must be .*, not {value}"):
-        scene_for_views([], *cloud, SceneConfig(**{name: value}), TrainConfig())
+        build(cloud, **{name: value})

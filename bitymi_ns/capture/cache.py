@@ -33,7 +33,7 @@ def content_key(inputs: Iterable[tuple[str, Path]], settings: object) -> str:
 @contextmanager
 def work_folder(photographs: Path, key: str, tell: Tell, kind: Kind = "poses") -> Iterator[Path]:
     """Make and lock the folder of this key for one process: in `.bitymi` beside the photographs (or a video), or in the
-    user's cache folder where nothing can be written there, or others can write there; `tell` is told of the latter.
+    user's cache folder where nothing can be written there, or others can write there, which `tell` reports.
 
     Raises:
         CaptureError: another process is at work there, or neither can be written.

@@ -172,13 +172,13 @@ def _add_run(trained: Evaluation, suffix: str, cells: dict[tuple[str, str], dict
     for (kind, bundle), value in cells.items():
         try:
             if kind == "eval":
-                if "psnr" not in finite_numbers(value["results"]):
+                size = cells.get(("export", bundle), {}).get("bytes")
+                results = finite_numbers({**value["results"], **times, "bundle_bytes": size})
+                if "psnr" not in results:
                     raise KeyError("psnr among its results")
-                results = {**value["results"], **times}
-                results["bundle_bytes"] = cells.get(("export", bundle), {}).get("bytes")
                 group = f"{trained.method}, {bundle}" if bundle else trained.method
                 own = {"baked": bool(bundle), "label": group + suffix, "group": group}
-                records.evaluations.append(replace(trained, results=finite_numbers(results), **own))
+                records.evaluations.append(replace(trained, results=results, **own))
             elif kind == "pictures" and (listed := folder / value["folder"] / PICTURES).is_file():
                 records.worst |= read_pictures(listed, trained.label)
         except (KeyError, TypeError, AttributeError) as error:

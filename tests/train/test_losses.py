@@ -18,6 +18,7 @@ from bitymi_ns.train.losses import (
     photometric,
     psnr,
 )
+from tests.stand_in_card import CARD, noted_reads
 
 
 @pytest.fixture
@@ -160,3 +161,10 @@ def test_an_affine_change_of_colours_is_undone() -> None:
     assert math.isnan(cc_psnr(image, image, torch.zeros(8, 9, dtype=torch.bool)))
     broken = torch.where(torch.arange(9)[None, :, None] == 2, math.nan, image)
     assert torch.equal(color_corrected(broken, image).isnan(), broken.isnan())
+
+
+def test_of_a_picture_on_a_card_only_sums_are_read() -> None:
+    image, target = torch.rand(2, 20, 30, 3, generator=torch.Generator().manual_seed(0))
+    with noted_reads() as reads:
+        found = cc_psnr(image.to(CARD), target.to(CARD))
+    assert reads == [28, 1] and found == pytest.approx(cc_psnr(image, target), abs=1e-6)

@@ -218,27 +218,21 @@ def color_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) -> T
         image, target: [H, W, 3] in [0, 1].
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
     """
-    middle = image.shape[1] // 2
-    left, right = slice(0, middle), slice(middle, None)
-    return torch.cat([_mapped_by(image, target, mask, of, by) for of, by in ((left, right), (right, left))], 1)
-
-
-def _mapped_by(image: Tensor, target: Tensor, mask: Tensor | None, of: slice, by: slice) -> Tensor:
-    """The columns `of` an image after the affine map that brings those of `by` nearest to the target."""
-    ones = torch.ones_like(image[..., :1])
-    colors = torch.cat([image, ones], -1).double()  # [H, W, 4]
-    both = torch.cat([colors, target - image], -1)[:, by].flatten(0, 1)  # [P, 7] double
+    colors = torch.cat([image, torch.ones_like(image[..., :1])], -1).double()  # [H, W, 4]
+    both = torch.cat([colors, target - image], -1)  # [H, W, 7] double
     if mask is not None:
-        both = both[mask.reshape(image.shape[:2])[:, by].flatten().bool()]
+        both = torch.where(mask.reshape(*image.shape[:2], 1).bool(), both, 0.0)
+    left, right = slice(image.shape[1] // 2), slice(image.shape[1] // 2, None)
     # normal equations; no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic
     # algorithms
-    sums = torch.stack([(both[:, i : i + 1] * both).sum(0) for i in range(4)]).cpu()  # [4, 7]
-    if not bool(sums.isfinite().all()):
-        return image[:, of]
-    ridge = SAME_COLOR**2 * max(1, len(both)) * torch.eye(4, dtype=sums.dtype)
-    affine = torch.linalg.solve(sums[:, :4] + ridge, sums[:, 4:]).to(colors)  # [4, 3]
-    change = sum(colors[:, of, i : i + 1] * affine[i] for i in range(4))
-    return (image[:, of] + change).clamp(0.0, 1.0).to(image)
+    sums = [[(both[:, by, i : i + 1] * both[:, by]).sum((0, 1)) for i in range(4)] for by in (right, left)]
+    sums = torch.stack([torch.stack(rows) for rows in sums]).cpu().nan_to_num(0.0, 0.0, 0.0)  # [2, 4, 7]
+    fitted = []
+    for of, by in zip((left, right), sums, strict=True):
+        ridge = SAME_COLOR**2 * by[3, 3].clamp(min=1.0) * torch.eye(4, dtype=by.dtype)  # by[3, 3] pixels
+        affine = torch.linalg.solve(by[:, :4] + ridge, by[:, 4:]).to(colors)  # [4, 3]
+        fitted.append(image[:, of] + sum(colors[:, of, i : i + 1] * affine[i] for i in range(4)))
+    return torch.cat(fitted, 1).clamp(0.0, 1.0).to(image)
 
 
 def fitted_psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:

@@ -16,6 +16,7 @@ from bitymi_ns.train.losses import (
     photometric,
     psnr,
 )
+from tests.stand_in_card import CARD, noted_reads
 
 
 @pytest.fixture
@@ -164,3 +165,10 @@ def test_colours_that_a_half_does_not_show_keep_their_contrast(contrast: float) 
     image[:, :10] = 0.4 + contrast * (image[:, :10] - 0.5)
     target = image + noise
     assert fitted_psnr(image, target) > psnr(image, target) - 1.0
+
+
+def test_of_a_picture_on_a_card_only_sums_are_read() -> None:
+    image, target = torch.rand(2, 20, 30, 3, generator=torch.Generator().manual_seed(0))
+    with noted_reads() as reads:
+        found = fitted_psnr(image.to(CARD), target.to(CARD))
+    assert reads == [56, 1] and found == pytest.approx(fitted_psnr(image, target), abs=1e-6)

@@ -25,7 +25,7 @@ from bitymi_ns.plugin.run.model import BitymiModel
 from bitymi_ns.scene.baked import BakedScene, as_bytes
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import HashField
-from bitymi_ns.train.losses import cc_psnr, psnr
+from bitymi_ns.train.losses import fitted_psnr, psnr
 
 _PSNR_SLACK = 0.1  # dB
 
@@ -85,7 +85,7 @@ def compare(model: BitymiModel, datamanager: Any, scene: BakedScene) -> HeldOut:
     the affine fit of each view's colours to its photograph; and the lowest of the bundle against the trained scene."""
     rows = held_out_psnr(model, datamanager, scene, len(datamanager.eval_dataset))
     names = ("psnr_baked_against_neural", "psnr_neural_against_photos", "psnr_baked_against_photos")
-    names += ("cc_psnr_neural_against_photos", "cc_psnr_baked_against_photos")
+    names += ("fitted_psnr_neural_against_photos", "fitted_psnr_baked_against_photos")
     means = (round(sum(column) / len(rows), 4) for column in zip(*rows, strict=True))
     worst = round(min(row[0] for row in rows), 4)
     return HeldOut(views=len(rows), **dict(zip(names, means, strict=True)), psnr_baked_against_neural_worst=worst)
@@ -102,7 +102,7 @@ def held_out_psnr(model: BitymiModel, datamanager: Any, scene: BakedScene, views
         neural = model.render(view.camera, background, maps=False).rgb.clamp(0.0, 1.0)
         baked = scene.render(view.camera, background).rgb.clamp(0.0, 1.0)
         photo = view.target(background, model.device)
-        of_photo = [measure(rgb, photo, view.mask) for measure in (psnr, cc_psnr) for rgb in (neural, baked)]
+        of_photo = [measure(rgb, photo, view.mask) for measure in (psnr, fitted_psnr) for rgb in (neural, baked)]
         rows.append([psnr(baked, neural, view.mask), *of_photo])
     return rows
 

@@ -20,10 +20,55 @@ template <class S> uint32_t marks(Lanes<S> v) {
   return bits(Lanes<S>(convert<V>(same_bits<I>(v.v) & 1)) > Lanes<S>(S(0.5)));
 }
 
-// fn(lane) for a set of lanes.
-template <class F> void each_lane(uint32_t lanes, F&& fn) {
-  for (; lanes; lanes &= lanes - 1) fn(__builtin_ctz(lanes));
-}
+// The alpha texels under some of a block's fragments, 1 under others.
+template <class S> class AlphaLanes {
+ public:
+  using P = Lanes<S>;
+  AlphaLanes(const AlphaPatch<S>& patch, P u, P v, uint32_t lanes)
+      : lanes_(lanes),
+        patch_(patch),
+        x_(texel_axis(u, patch.size[0], patch.extent)),
+        y_(texel_axis(v, patch.size[1], patch.extent)) {
+    S t[4][kLanes];
+    for (auto& corner : t) store(corner, P(S(1)));
+    store_integers(first_, y_.first * P(S(patch.size[0])) + x_.first);
+    each_corner([&](int lane, int corner, int32_t at) { t[corner][lane] = patch.tile[at]; });
+    for (int k = 0; k < 4; ++k) t_[k] = load(t[k]);
+  }
+  P sigma(P uncut) const {
+    return select(mask_of<S>(lanes_), alpha_cut(uncut, texel_lerp(t_, x_.fraction, y_.fraction)), uncut);
+  }
+  // See alpha_vjp. Adds the gradients of the texels to those of their tile, null: there are none.
+  void gradient(P& listed, P& gs, P& gu, P& gv, S* to) const {
+    P of[] = {listed, gs, gu, gv};
+    const P dm = alpha_vjp(patch_, t_, x_, y_, of[0], of[1], of[2], of[3]);
+    P* const all[] = {&listed, &gs, &gu, &gv};
+    for (int k = 0; k < 4; ++k) *all[k] = select(mask_of<S>(lanes_), of[k], *all[k]);
+    if (!to) return;
+    P weight[4];
+    S by_corner[4][kLanes];
+    texel_weights(x_.fraction, y_.fraction, weight);
+    for (int k = 0; k < 4; ++k) store(by_corner[k], weight[k] * dm);
+    each_corner([&](int lane, int corner, int32_t at) { to[at] += by_corner[corner][lane]; });
+  }
+
+ private:
+  // fn(lane, corner, texel)
+  template <class F> BT_HD void each_corner(F&& fn) const {
+    const TexelSteps next(patch_.size);
+    for (uint32_t lanes = lanes_; lanes; lanes &= lanes - 1) {
+      const int lane = __builtin_ctz(lanes);
+      const int32_t at = first_[lane], below = at + next.down;
+      fn(lane, 0, at), fn(lane, 1, at + next.right), fn(lane, 2, below), fn(lane, 3, below + next.right);
+    }
+  }
+
+  uint32_t lanes_;
+  const AlphaPatch<S>& patch_;
+  TexelAxis<P> x_, y_;
+  int32_t first_[kLanes];
+  P t_[4];
+};
 // The sigma of a block's fragments, multiplied by alpha where the weight reaches the bound, and the mark.
 template <class S>
 void cut(const AlphaTiles<S>& tiles, int64_t id, const typename Lanes<S>::M& covered, Lanes<S> transmittance,
@@ -32,11 +77,7 @@ void cut(const AlphaTiles<S>& tiles, int64_t id, const typename Lanes<S>::M& cov
   if (!patch.textured()) return;
   const uint32_t lanes = bits(covered & (blend(f.sigma, transmittance).weight >= Lanes<S>(tiles.bound)));
   f.v = marked(f.v, lanes);
-  if (!lanes) return;
-  S u[kLanes], v[kLanes], sigma[kLanes], t[4];
-  store(u, f.u), store(v, f.v), store(sigma, f.sigma);
-  each_lane(lanes, [&](int i) { sigma[i] = alpha_cut(sigma[i], patch.fetch(patch.corners(u[i], v[i]), t)); });
-  f.sigma = load(sigma);
+  if (lanes) f.sigma = AlphaLanes<S>(patch, f.u, f.v, lanes).sigma(f.sigma);
 }
 
 }  // namespace bt

@@ -155,7 +155,8 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
   const P zero = P(S(0));
   // Arrays to read, and how far ahead they are prefetched: runs are read from the list's end, each from its start,
   // which the processor does not foresee.
-  const S* columns[] = {f.sigma, f.weight, dweight, duv, duv ? duv + total : nullptr, ddepth};
+  const S* columns[] = {f.sigma, f.weight, dweight, duv, duv ? duv + total : nullptr, ddepth,
+                        a.alpha.values ? f.uv : nullptr, a.alpha.values ? f.uv + total : nullptr};
   constexpr int64_t kSoon = 256, kBlocksSoon = 6;
   // a part's own sums: 15 numbers per surfel (12 columns of geom, the area, and the two absolute gradients)
   constexpr int kColumns = kBeta + 1, kSums = kColumns + 3;
@@ -191,17 +192,9 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
           if (has_alpha) {
             const P u = expand(f.uv + at, of.lanes), v = expand(f.uv + total + at, of.lanes);
             const AlphaPatch<S> patch(a.alpha, id);
-            S all[6][kLanes];  // u, v, sigma as listed, and gradients of sigma, u and v
-            const P* numbers[] = {&u, &v, &listed, &dsigma, &gu, &gv};
-            for (int k = 0; k < 6; ++k) store(all[k], *numbers[k]);
-            each_lane(of.lanes & marks(v), [&](int i) {
-              const TexelCorners<S> corners = patch.corners(all[0][i], all[1][i]);
-              const S dm = alpha_vjp(patch, corners, all[2][i], all[3][i], all[4][i], all[5][i]);
-              if (!texels) return;
-              S* to = of_texels[part].data() + patch.first;
-              for (int k = 0; k < 4; ++k) to[corners.at[k]] += corners.weight[k] * dm;
-            });
-            listed = load(all[2]), dsigma = load(all[3]), gu = load(all[4]), gv = load(all[5]);
+            S* of_tile = texels ? of_texels[part].data() + patch.first : nullptr;
+            if (const uint32_t lanes = of.lanes & marks(v))
+              AlphaLanes<S>(patch, u, v, lanes).gradient(listed, dsigma, gu, gv, of_tile);
           }
           fragment_vjp<Kernel, S, P>(g, near, rim, select(there, dx, zero), select(there, dy, zero), listed,
                                      select(there, dsigma, zero), gu, gv, gradient(ddepth), d, ddx, ddy);

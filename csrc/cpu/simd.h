@@ -237,14 +237,6 @@ template <int which, class Half, class V> BT_HD Half half(V v) {
   return r;
 #endif
 }
-// Lanes 3 to 6 of eight.
-template <class S> BT_HD Quad<S> from_third(Oct<S> v) {
-#if __has_builtin(__builtin_shufflevector)
-  return __builtin_shufflevector(v, v, 3, 4, 5, 6);
-#else
-  return Quad<S>{v[3], v[4], v[5], v[6]};
-#endif
-}
 // The lanes added to four: halves to halves.
 template <class S, class V> BT_HD Quad<S> folded(const V& v) {
   if constexpr (std::is_same_v<V, Quad<S>>)

@@ -1,6 +1,8 @@
 // Alpha texels under the fragments of a block: the cut of their sigma, and the mark in their v.
 #pragma once
 
+#include <algorithm>
+
 #include "core/prefilter.h"
 #include "cpu/simd.h"
 #include "ops/texel_alpha.h"
@@ -20,6 +22,19 @@ template <class S> uint32_t marks(Lanes<S> v) {
   return bits(Lanes<S>(convert<V>(same_bits<I>(v.v) & 1)) > Lanes<S>(S(0.5)));
 }
 
+// Prefetches where the tile of a surfel lies that comes later, and what most tiles have of one that comes soon; also of
+// the gradients `of_texels`, null: there are none.
+template <class S> BT_HD void prefetch_tile(const AlphaTiles<S>& tiles, int64_t id) {
+  __builtin_prefetch(tiles.first + id), __builtin_prefetch(tiles.size + 2 * id), __builtin_prefetch(tiles.extent + id);
+}
+template <class S> BT_HD void prefetch_texels(const AlphaTiles<S>& tiles, int64_t id, const S* of_texels) {
+  constexpr int kLine = 64 / sizeof(S), kMost = 4 * kLine;
+  const int64_t first = tiles.first[id], area = int64_t(tiles.size[2 * id]) * tiles.size[2 * id + 1];
+  for (int64_t t = first; t < first + std::min<int64_t>(area, kMost); t += kLine) {
+    __builtin_prefetch(tiles.values + t);
+    if (of_texels) __builtin_prefetch(of_texels + t, 1);
+  }
+}
 // The alpha texels under some of a block's fragments, 1 under others.
 template <class S> class AlphaLanes {
  public:
@@ -56,11 +71,10 @@ template <class S> class AlphaLanes {
   // fn(lane, corner, texel)
   template <class F> BT_HD void each_corner(F&& fn) const {
     const TexelSteps next(patch_.size);
-    for (uint32_t lanes = lanes_; lanes; lanes &= lanes - 1) {
-      const int lane = __builtin_ctz(lanes);
+    each_lane(lanes_, [&](int lane) {
       const int32_t at = first_[lane], below = at + next.down;
       fn(lane, 0, at), fn(lane, 1, at + next.right), fn(lane, 2, below), fn(lane, 3, below + next.right);
-    }
+    });
   }
 
   uint32_t lanes_;

@@ -73,6 +73,10 @@ void trace_forward(const View<S>& view, const AlphaTiles<S>& alpha, int64_t most
         state.template blend<Kernel, true>(view, bins, id, take);
         continue;
       }
+      if (k + 2 * kAhead < bins.start[tile + 1]) {
+        prefetch_tile<S>(alpha, bins.surfels[k + 2 * kAhead]);
+        prefetch_texels<S>(alpha, bins.surfels[k + kAhead], nullptr);
+      }
       state.template blend<Kernel, true>(view, bins, id, take, S(1),
                                          [&](Fragment<P>& f, const typename P::M& covered, const P& transmittance) {
                                            cut(alpha, id, covered, transmittance, f);
@@ -155,8 +159,14 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
   const P zero = P(S(0));
   // Arrays to read, and how far ahead they are prefetched: runs are read from the list's end, each from its start,
   // which the processor does not foresee.
-  const S* columns[] = {f.sigma, f.weight, dweight, duv, duv ? duv + total : nullptr, ddepth,
-                        a.alpha.values ? f.uv : nullptr, a.alpha.values ? f.uv + total : nullptr};
+  const S* columns[] = {f.sigma,
+                        f.weight,
+                        dweight,
+                        duv,
+                        duv ? duv + total : nullptr,
+                        ddepth,
+                        a.alpha.values ? f.uv : nullptr,
+                        a.alpha.values ? f.uv + total : nullptr};
   constexpr int64_t kSoon = 256, kBlocksSoon = 6;
   // a part's own sums: 15 numbers per surfel (12 columns of geom, the area, and the two absolute gradients)
   constexpr int kColumns = kBeta + 1, kSums = kColumns + 3;
@@ -169,8 +179,13 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
       P behind[kBlocks];  // per pixel: sum of w dL/dw over the fragments behind
       std::fill(behind, behind + kBlocks, zero);
       each_run_back(layout, tile, [&](const BlockRun& run) {
-        const int64_t id = run.surfel, next = BlockPart(layout, std::max<int64_t>(run.first - kBlocksSoon, 0)).surfel;
+        const auto ahead = [&](int64_t by) { return BlockPart(layout, std::max<int64_t>(run.first - by, 0)).surfel; };
+        const int64_t id = run.surfel, next = ahead(kBlocksSoon);
         __builtin_prefetch(geom + next * kGeom), __builtin_prefetch(sums.data() + next * kSums, 1);
+        if (a.alpha.values) {
+          prefetch_tile(a.alpha, ahead(2 * kBlocksSoon));
+          prefetch_texels<S>(a.alpha, next, texels ? of_texels[part].data() : nullptr);
+        }
         const S* g = geom + id * kGeom;
         const S cx = g[kCx] - x0, cy = g[kCy] - y0;
         P d[kGeom], ax = zero, ay = zero;

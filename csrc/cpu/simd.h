@@ -75,6 +75,9 @@ BT_HD bool any_(const LaneTypes<double>::M& m) { return bits(m) != 0; }
 template <class S> BT_HD Lanes<S> select(typename Lanes<S>::M m, Lanes<S> yes, Lanes<S> no) {
   return choose(m, yes.v, no.v);
 }
+template <class S> BT_HD Vec3<Lanes<S>> select(typename Lanes<S>::M m, Vec3<Lanes<S>> yes, Vec3<Lanes<S>> no) {
+  return {select(m, yes.x, no.x), select(m, yes.y, no.y), select(m, yes.z, no.z)};
+}
 template <class S> BT_HD Lanes<S> max_(Lanes<S> a, Lanes<S> b) { return larger(a.v, b.v); }
 template <class S> BT_HD Lanes<S> min_(Lanes<S> a, Lanes<S> b) { return smaller(a.v, b.v); }
 

@@ -36,6 +36,7 @@ template <class S> class SurfelRun {
   const PatchFragments<S>& few() const { return few_; }
   // Those of block k's fragments that show texels, by lane.
   BT_HD uint32_t textured(int64_t k) const { return patch.textured() ? textured_[k - run.first] : 0; }
+  bool any_textured() const { return any_textured_; }
   // Of block k's first fragment among `few`.
   BT_HD int number(int64_t k) const { return int(k - run.first) * kLanes; }
   // The colours of block k's fragments, 0 in other lanes: what is not finite shows where it is and nowhere else.
@@ -66,7 +67,7 @@ template <class S> class SurfelRun {
     const FragmentArrays<S>& f = of.fragments.f;
     each_block(of.fragments.layout, run, [&](int64_t k, int64_t at, const BlockPart& part) {
       const uint32_t lanes = part.lanes & bits(expand(f.weight + at, part.lanes) >= P(of.bound));
-      textured_[k - run.first] = lanes;
+      textured_[k - run.first] = lanes, any_textured_ |= lanes != 0;
       if (!lanes) return;
       few_.locate(number(k), expand(f.uv + at, part.lanes), expand(f.uv + f.total + at, part.lanes));
       if (prefetch) each_lane(lanes, [&](int lane) { few_.prefetch(number(k) + lane); });
@@ -74,6 +75,7 @@ template <class S> class SurfelRun {
   }
 
   uint32_t textured_[kBlocks];  // of each block of the run; not written where the surfel has no texels
+  bool any_textured_ = false;
   PatchFragments<S> few_;
 };
 // Prefetches what a SurfelRun reads of its surfel.
@@ -292,15 +294,16 @@ void backward_by_surfel(const Backward<S>& a, const BlockPicture<S, kChannels<kM
     const TexelPatch<S> patch(a.of.table, id);
     thread_local std::vector<S> own;  // gradients of the texels, rows of four
     const int64_t area = a.moved ? int64_t(patch.size[0]) * patch.size[1] : 0;
-    own.assign(4 * area, S(0));
+    bool moves = false;
     Sums<Lanes<S>> sums;
     for (int64_t k = first; k < last; ++k) {
       prefetch_next(a, dimage, listed, order, k);
       const SurfelRun<S> surfel(a.of, listed.run(order[k]), false);
-      run_backward<kMaps>(a, dimage, surfel, area ? own.data() : nullptr, sums);
+      if (!moves && area && surfel.any_textured()) moves = true, own.assign(4 * area, S(0));
+      run_backward<kMaps>(a, dimage, surfel, moves ? own.data() : nullptr, sums);
     }
     surfel_backward(a, id, total<kMaps>(sums));
-    if (area) move_texels(own.data(), area, a.rate, a.share + patch.first, a.moved + 3 * patch.first);
+    if (moves) move_texels(own.data(), area, a.rate, a.share + patch.first, a.moved + 3 * patch.first);
   });
 }
 // Run after run, which is faster where there are no texels: what a pass reads follows each other.

@@ -35,20 +35,43 @@ template <class S> BT_HD void prefetch_texels(const AlphaTiles<S>& tiles, int64_
     if (of_texels) __builtin_prefetch(of_texels + t, 1);
   }
 }
-// The alpha texels under some of a block's fragments, 1 under others.
+// Two texels side by side by lane, the left one at first[lane] of a tile; where there are not both, the left one twice.
+template <class S>
+BT_HD void load_sides(const S* tile, const int32_t* first, bool both, Lanes<S>& left, Lanes<S>& right) {
+#if defined(__AVX2__)
+  if constexpr (std::is_same_v<S, float>) {
+    if (both) {
+      const auto two = [&](int lane) {
+        const __m128 one = _mm_castsi128_ps(_mm_loadl_epi64((const __m128i*)(tile + first[lane])));
+        return _mm_loadh_pi(one, (const __m64*)(tile + first[lane + 1]));
+      };
+      const auto four = [&](int lane) {
+        return _mm256_insertf128_ps(_mm256_castps128_ps256(two(lane)), two(lane + 4), 1);
+      };
+      const __m256 a = four(0), b = four(2), c = four(8), d = four(10);
+      left = joined(_mm256_shuffle_ps(a, b, 0x88), _mm256_shuffle_ps(c, d, 0x88));
+      right = joined(_mm256_shuffle_ps(a, b, 0xdd), _mm256_shuffle_ps(c, d, 0xdd));
+      return;
+    }
+  }
+#endif
+  for (int lane = 0; lane < kLanes; ++lane)
+    left.set(lane, tile[first[lane]]), right.set(lane, tile[first[lane] + int(both)]);
+}
+// The alpha texels under some of a block's fragments; those under others are not told.
 template <class S> class AlphaLanes {
  public:
   using P = Lanes<S>;
   AlphaLanes(const AlphaPatch<S>& patch, P u, P v, uint32_t lanes)
       : lanes_(lanes),
         patch_(patch),
+        next_(patch.size),
         x_(texel_axis(u, patch.size[0], patch.extent)),
         y_(texel_axis(v, patch.size[1], patch.extent)) {
-    S t[4][kLanes];
-    for (auto& corner : t) store(corner, P(S(1)));
-    store_integers(first_, y_.first * P(S(patch.size[0])) + x_.first);
-    each_corner([&](int lane, int corner, int32_t at) { t[corner][lane] = patch.tile[at]; });
-    for (int k = 0; k < 4; ++k) t_[k] = load(t[k]);
+    const P first = y_.first * P(S(patch.size[0])) + x_.first;
+    store_integers(first_, select(mask_of<S>(lanes), first, P(S(0))));
+    load_sides(patch.tile, first_, next_.right, t_[0], t_[1]);
+    load_sides(patch.tile + next_.down, first_, next_.right, t_[2], t_[3]);
   }
   P sigma(P uncut) const {
     return select(mask_of<S>(lanes_), alpha_cut(uncut, texel_lerp(t_, x_.fraction, y_.fraction)), uncut);
@@ -64,21 +87,17 @@ template <class S> class AlphaLanes {
     S by_corner[4][kLanes];
     texel_weights(x_.fraction, y_.fraction, weight);
     for (int k = 0; k < 4; ++k) store(by_corner[k], weight[k] * dm);
-    each_corner([&](int lane, int corner, int32_t at) { to[at] += by_corner[corner][lane]; });
-  }
-
- private:
-  // fn(lane, corner, texel)
-  template <class F> BT_HD void each_corner(F&& fn) const {
-    const TexelSteps next(patch_.size);
     each_lane(lanes_, [&](int lane) {
-      const int32_t at = first_[lane], below = at + next.down;
-      fn(lane, 0, at), fn(lane, 1, at + next.right), fn(lane, 2, below), fn(lane, 3, below + next.right);
+      S *above = to + first_[lane], *below = above + next_.down;
+      above[0] += by_corner[0][lane], above[next_.right] += by_corner[1][lane];
+      below[0] += by_corner[2][lane], below[next_.right] += by_corner[3][lane];
     });
   }
 
+ private:
   uint32_t lanes_;
   const AlphaPatch<S>& patch_;
+  TexelSteps next_;
   TexelAxis<P> x_, y_;
   int32_t first_[kLanes];
   P t_[4];

@@ -153,6 +153,9 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
   const int most =
       int(std::max<int64_t>(1, std::min<int64_t>(64, (int64_t(1) << 28) / std::max(n * kGeom + texels, int64_t(1)))));
   std::vector<std::vector<S>> partial(std::max(num_threads(), 1)), of_texels(partial.size());
+  parallel_parts(texels, 1 << 16, [&](int, int64_t begin, int64_t end) {
+    std::fill(a.dtexel_alpha + begin, a.dtexel_alpha + end, S(0));
+  });
   std::fill(dgeom, dgeom + n * kGeom, S(0));
   std::fill(absgrad, absgrad + 2 * n, S(0));
   const BlockCentres<S> centres;
@@ -173,7 +176,8 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
   const int parts = parallel_tiles(layout.start, layout.tiles, most, [&](int part, int64_t first, int64_t last) {
     std::vector<S>& sums = partial[part];
     sums.assign(n * kSums, S(0));
-    of_texels[part].assign(texels, S(0));
+    of_texels[part].assign(part ? texels : 0, S(0));  // the first part adds to the result itself
+    S* const dtexels = !texels ? nullptr : part ? of_texels[part].data() : a.dtexel_alpha;
     for (int64_t tile = first; tile < last; ++tile) {
       const S x0 = S(tile % tiles_x * kTile), y0 = S(tile / tiles_x * kTile);
       P behind[kBlocks];  // per pixel: sum of w dL/dw over the fragments behind
@@ -184,7 +188,7 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
         __builtin_prefetch(geom + next * kGeom), __builtin_prefetch(sums.data() + next * kSums, 1);
         if (a.alpha.values) {
           prefetch_tile(a.alpha, ahead(2 * kBlocksSoon));
-          prefetch_texels<S>(a.alpha, next, texels ? of_texels[part].data() : nullptr);
+          prefetch_texels<S>(a.alpha, next, dtexels);
         }
         const S* g = geom + id * kGeom;
         const S cx = g[kCx] - x0, cy = g[kCy] - y0;
@@ -207,7 +211,7 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
           if (has_alpha) {
             const P u = expand(f.uv + at, of.lanes), v = expand(f.uv + total + at, of.lanes);
             const AlphaPatch<S> patch(a.alpha, id);
-            S* of_tile = texels ? of_texels[part].data() + patch.first : nullptr;
+            S* of_tile = dtexels ? dtexels + patch.first : nullptr;
             if (const uint32_t lanes = of.lanes & marks(v))
               AlphaLanes<S>(patch, u, v, lanes).gradient(listed, dsigma, gu, gv, of_tile);
           }
@@ -233,8 +237,7 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
     }
   });
   parallel_parts(texels, 1 << 16, [&](int, int64_t begin, int64_t end) {
-    std::fill(a.dtexel_alpha + begin, a.dtexel_alpha + end, S(0));
-    for (int p = 0; p < parts; ++p)
+    for (int p = 1; p < parts; ++p)
       for (int64_t t = begin; t < end; ++t) a.dtexel_alpha[t] += of_texels[p][t];
   });
 }

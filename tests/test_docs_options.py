@@ -15,7 +15,7 @@ ROOTS: dict[str, Any] = {
     "--pipeline.model.train.": TrainConfig(),
     "ns-export ... --": BakeOptions(),
 }
-ELSEWHERE = {"--machine.num-devices", "--max-num-iterations", "--pipeline.model.train.first-surfels"}
+ELSEWHERE = {"--machine.num-devices", "--machine.seed", "--max-num-iterations", "--pipeline.model.train.first-surfels"}
 ELSEWHERE |= {
     f"ns-export ... --{name}"
     for name in "exact finetune-steps format photographs polish-steps compact-error target-mb".split()

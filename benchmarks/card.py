@@ -246,7 +246,7 @@ def main() -> int:
     staging.add_argument("folder", type=Path)
     staging.add_argument("--python", default=sys.executable, help="a Python of the machine's version (%(default)s)")
     staging.add_argument("--architectures", default="90", help="compute capabilities of its card (%(default)s)")
-    staging.add_argument("--megabytes", type=float, default=45, help="most of a part (%(default)s)")
+    staging.add_argument("--megabytes", type=float, default=38, help="most of a part (%(default)s)")
     running = commands.add_parser("run", help="run orders on the machine")
     names = list(orders(Path(), Path()))
     running.add_argument("orders", nargs="+", metavar="ORDER", help=f"{', '.join(names)}; A+B: at the same time")

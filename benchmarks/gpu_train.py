@@ -51,7 +51,7 @@ def main() -> int:
     log = fit(scene, capture.train, capture.held_out, config, steps, eval_steps=sorted(due))
     peak = torch.cuda.max_memory_allocated(device) if device.type == "cuda" else 0
     curve = [
-        [number(e.step, 0), number(e.seconds, 1), number(e.surfels, 0), number(e.psnr), number(e.cc_psnr)]
+        [number(e.step, 0), number(e.seconds, 1), number(e.surfels, 0), number(e.psnr), number(e.fitted_psnr)]
         for e in log.entries
     ]
     say(", ".join(f"{value} {name}" for name, value in zip(CURVE, curve[-1], strict=True)))

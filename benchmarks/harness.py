@@ -21,7 +21,7 @@ from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import TexelConfig
-from bitymi_ns.train.losses import cc_psnr, psnr
+from bitymi_ns.train.losses import fitted_psnr, psnr
 from bitymi_ns.train.texels import blank_texels
 from bitymi_ns.train.views import View
 
@@ -117,7 +117,7 @@ def quality(
     values = []
     for view in (view.to(device) for view in views):
         rgb, target = draw(view.camera).float().clamp(0, 1), view.target(background, device)
-        values.append((psnr(rgb, target, view.mask), cc_psnr(rgb, target, view.mask), float(ops.ssim(rgb, target))))
+        values.append((psnr(rgb, target, view.mask), fitted_psnr(rgb, target, view.mask), float(ops.ssim(rgb, target))))
     return tuple(statistics.fmean(column) for column in zip(*values, strict=True))
 
 

@@ -1,4 +1,5 @@
-"""Certificate of a bake: the error of the stored texels against those before quantisation, as training views see it."""
+"""Certificate of a bake: the error of the stored residual colours against those before quantisation, as training views
+see it. Alphas are not covered."""
 
 from collections.abc import Sequence
 
@@ -17,8 +18,8 @@ from bitymi_ns.scene.tile_sizes import kernel_parameters
 
 @torch.no_grad()
 def certified(baked: Baked, cameras: Sequence[Camera]) -> Baked:
-    """Measure the error of the stored texels and state it in the statistics. A bake that has a certificate already,
-    against the field, or no texels, or no tolerance, is returned as it is.
+    """Measure the error of the stored texels' colours and state it in the statistics. A bake that has a certificate
+    already, against the field, or no texels, or no tolerance, is returned as it is.
 
     Args:
         baked: encoded, on the CPU.

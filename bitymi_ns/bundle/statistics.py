@@ -73,7 +73,7 @@ class TileError(Part):
 
 class Certificate(Part):
     """Counts of surfels whose stored residual is within the tolerance, as the closest training view shows it: weighted
-    by the blending weight, averaged over a pixel, root mean square over the tile."""
+    by the blending weight, averaged over a pixel, root mean square over the tile. Alphas do not count."""
 
     against: Literal["field", "texels"]  # reference: the field, or the trained texels before quantisation
     tolerance: NotNegative
@@ -203,8 +203,8 @@ class HeldOut(Part):
     psnr_baked_against_neural: Decibels = None
     psnr_neural_against_photos: Decibels = None
     psnr_baked_against_photos: Decibels = None
-    cc_psnr_neural_against_photos: Decibels = None  # after the affine fit of each view's colours to its photograph
-    cc_psnr_baked_against_photos: Decibels = None
+    fitted_psnr_neural_against_photos: Decibels = None  # after the affine fit of each view's colours to its photograph
+    fitted_psnr_baked_against_photos: Decibels = None
     psnr_baked_against_neural_worst: Decibels = None
 
 

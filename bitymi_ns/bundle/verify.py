@@ -103,14 +103,14 @@ def check_world(stated: WorldFrame, world: World) -> Check:
 
 
 def check_certificate(bundle: Bundle) -> list[Check]:
-    """Check the texels by the sketches of the certificate: that they are those measured, and as near to the texels
+    """Check the texels' colours by the sketches of the certificate: that they are those measured, and as near to those
     before quantisation as stated; nothing to check without a certificate."""
     stated, atlas = bundle.info.statistics.certificate, bundle.info.atlas
     if stated is None:
         return []
     worst, count = stated.worst, stated.within + stated.beyond
     detail = f"{stated.within:,} of {count:,} surfels within {stated.tolerance:g} steps of the {stated.against} as seen"
-    detail += f", at most {steps_text(worst)}"
+    detail += f" in colour, at most {steps_text(worst)}"
     if count > len(bundle) or (worst is not None and (worst > stated.tolerance) != (stated.beyond > 0)):
         return [Check("certificate", False, f"{detail}: these numbers contradict each other")]
     if stated.marks is None or stated.texel_rms is None or atlas is None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 
 from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.losses import cc_psnr, mean_psnr, psnr
+from bitymi_ns.train.losses import fitted_psnr, mean_psnr, psnr
 from bitymi_ns.train.views import View, eval_background
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ class Quality(NamedTuple):
 
     psnr: float  # dB, over the views of which any pixel counts
     fragments: float  # blended fragments per view
-    cc_psnr: float  # dB after the affine fit of each view's colours (`losses.color_corrected`), over the same views
+    fitted_psnr: float  # dB after the affine fit of each view's colours (`losses.color_fitted`), over the same views
 
 
 def evenly_spaced(count: int, most: int) -> list[int]:
@@ -39,13 +39,13 @@ def evaluate(scene: Scene, views: Sequence[View], config: TrainConfig) -> Qualit
     """
     device = scene.surfels["means"].device
     background = eval_background(config, device)
-    values, corrected, fragments = [], [], []
+    values, fitted, fragments = [], [], []
     for view in (view.to(device) for view in views):
         output = scene.render(view.camera, background=background, field_mode="frozen")
         rgb, target = output.rgb.clamp(0.0, 1.0), view.target(background, device)
         values.append(psnr(rgb, target, view.mask))
-        corrected.append(cc_psnr(rgb, target, view.mask))
+        fitted.append(fitted_psnr(rgb, target, view.mask))
         fragments.append(len(output.fragments))
         del output  # with its fragments, before the next view makes its own
     mean_fragments = sum(fragments) / len(fragments) if fragments else math.nan
-    return Quality(mean_psnr(values), mean_fragments, mean_psnr(corrected))
+    return Quality(mean_psnr(values), mean_fragments, mean_psnr(fitted))

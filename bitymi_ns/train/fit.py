@@ -33,7 +33,7 @@ class LogEntry:
     fragments: float  # Blended fragments per view, mean over the evaluation views.
     loss: float  # Objective of the last training step.
     psnr: float  # dB, mean over the evaluation views at full size; NaN without such views.
-    cc_psnr: float  # PSNR in dB after the affine fit of each view's colours (`losses.color_corrected`).
+    fitted_psnr: float  # PSNR in dB after the affine fit of each view's colours (`losses.color_fitted`).
 
 
 @dataclass
@@ -133,7 +133,7 @@ def fit(
             quality = evaluate(scene, eval_views, config)
             times, loss = (clock.seconds, clock.cpu_seconds), trainer.loss
             log.entries.append(
-                LogEntry(trainer.step, *times, len(scene), quality.fragments, loss, quality.psnr, quality.cc_psnr)
+                LogEntry(trainer.step, *times, len(scene), quality.fragments, loss, quality.psnr, quality.fitted_psnr)
             )
         if callback is not None:
             callback(trainer, terms, output, report)

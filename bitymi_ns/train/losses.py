@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 DEPTH_EDGE = 0.1
 """Relative difference of depth between neighbouring pixels that is an edge. Photographs blend both sides of it, depth
 maps do not, and those of sensors are least reliable there."""
+SAME_COLOR = 0.01  # standard deviation of colours along an axis from which a fit of colours changes their contrast
 SSIM_WINDOW = 11  # side of the SSIM window in pixels; images narrower than this have no valid window
 
 
@@ -206,35 +207,37 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     return min(100.0, -10.0 * math.log10(max(float(error.sum()) / error.numel(), 1e-10)))
 
 
-def color_corrected(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """[H, W, 3] the image after the affine map of its colours that brings it nearest to the target, clamped to [0, 1].
+def color_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """[H, W, 3] the image, each half's colours mapped by the affine fit of the other half, clamped to [0, 1].
 
-    The customary comparison where photographs differ in exposure and white balance: matrix [3, 3] and offset [3] are
-    those of least squares over the pixels that count, fitted for each view alone. An image that is not finite there is
-    returned as it is.
+    For held-out views whose photographs differ in exposure and white balance: matrix [3, 3] and offset [3] are those of
+    least squares over the pixels that count of the half that is not judged by them. A half whose other half is not
+    finite, or does not count, is left as it is.
 
     Args:
         image, target: [H, W, 3] in [0, 1].
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
     """
-    colors = torch.cat([image.reshape(-1, 3), torch.ones_like(image[..., :1]).reshape(-1, 1)], -1).double()
-    both = torch.cat([colors, target.reshape(-1, 3)], -1)  # [HW, 7] double
+    colors = torch.cat([image, torch.ones_like(image[..., :1])], -1).double()  # [H, W, 4]
+    both = torch.cat([colors, target - image], -1)  # [H, W, 7] double
     if mask is not None:
-        both = both[mask.reshape(-1).bool()]
+        both = torch.where(mask.reshape(*image.shape[:2], 1).bool(), both, 0.0)
+    left, right = slice(image.shape[1] // 2), slice(image.shape[1] // 2, None)
     # normal equations; no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic
     # algorithms
-    sums = torch.stack([(both[:, i : i + 1] * both).sum(0) for i in range(4)]).cpu()  # [4, 7]
-    if not bool(sums.isfinite().all()):
-        return image
-    # the pseudoinverse: a picture of one colour leaves the matrix open
-    affine = (torch.linalg.pinv(sums[:, :4], hermitian=True) @ sums[:, 4:]).to(colors)  # [4, 3]
-    fitted = sum((colors[:, i : i + 1] * affine[i] for i in range(1, 4)), colors[:, :1] * affine[0])
-    return fitted.clamp(0.0, 1.0).to(image).view_as(image)
+    sums = [[(both[:, by, i : i + 1] * both[:, by]).sum((0, 1)) for i in range(4)] for by in (right, left)]
+    sums = torch.stack([torch.stack(rows) for rows in sums]).cpu().nan_to_num(0.0, 0.0, 0.0)  # [2, 4, 7]
+    fitted = []
+    for of, by in zip((left, right), sums, strict=True):
+        ridge = SAME_COLOR**2 * by[3, 3].clamp(min=1.0) * torch.eye(4, dtype=by.dtype)  # by[3, 3] pixels
+        affine = torch.linalg.solve(by[:, :4] + ridge, by[:, 4:]).to(colors)  # [4, 3]
+        fitted.append(image[:, of] + sum(colors[:, of, i : i + 1] * affine[i] for i in range(4)))
+    return torch.cat(fitted, 1).clamp(0.0, 1.0).to(image)
 
 
-def cc_psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """`psnr` of the `color_corrected` image; what is left when exposure and white balance do not count."""
-    return psnr(color_corrected(image, target, mask), target, mask)
+def fitted_psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """`psnr` of the `color_fitted` image; what is left when exposure and white balance do not count."""
+    return psnr(color_fitted(image, target, mask), target, mask)
 
 
 def mean_psnr(values: Sequence[float]) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -100,7 +100,7 @@ class Processes:
     # sums
 
     def sum(self, *tensors: Tensor) -> None:
-        """Replaces tensors by their sums over the processes, the same bits in all of them."""
+        """Replaces tensors by their sums over the processes, the same bits in all, in one buffer of each dtype."""
         self._reduce(tensors, dist.ReduceOp.SUM)
 
     def maximum(self, tensor: Tensor) -> None:
@@ -142,13 +142,18 @@ class Processes:
         self.maximum(found)
         return found.tolist()
 
+    @torch.no_grad()
     def _reduce(self, tensors: Sequence[Tensor], how: Any) -> None:
         if self.count == 1:
             return
-        # all are waited for, also when one fails: what is left to gloo's threads aborts Python as it ends
-        with _answering(), ExitStack() as works:
-            for tensor in tensors:
-                works.callback(dist.all_reduce(tensor, how, async_op=True).wait)
+        for dtype in dict.fromkeys(tensor.dtype for tensor in tensors):
+            some = [tensor for tensor in tensors if tensor.dtype == dtype]
+            flat = torch.cat([tensor.reshape(-1) for tensor in some])
+            with _answering():
+                dist.all_reduce(flat, how)
+            parts = flat.split([tensor.numel() for tensor in some])
+            for tensor, part in zip(some, parts, strict=True):
+                tensor.copy_(part.view_as(tensor))
 
 
 ALONE = Processes()

@@ -188,7 +188,8 @@ class Training:
         if self.processes.views > 1:
             groups = (group for optimizer in self.optimizers.values() for group in optimizer.param_groups)
             learned = [parameter for group in groups for parameter in group["params"]]
-            self.processes.average_gradients([*learned, *self.texels.gathered], len(self.scene))
+            self.processes.average_gradients(learned, len(self.scene))
+            self.texels.average()
             self.exposure.average(self.processes)
         self.texels.step()
 

@@ -97,7 +97,7 @@ class LearningTexels:
             self._rates.append(field.alpha.register_hook(lambda gradient: gradient * alpha_rate))
 
     @property
-    def gathered(self) -> list[Parameter]:
+    def _stepped(self) -> list[Parameter]:
         """Colours and alphas of the texels that `step` moves."""
         field = self.scene.field
         if not isinstance(field, TexelField):
@@ -106,10 +106,30 @@ class LearningTexels:
         return colors if field.alpha is None else [*colors, field.alpha]
 
     @torch.no_grad()
+    def average(self) -> None:
+        """Make the gradients those of the mean loss of all views of the step. Processes exchange those of the
+        texels alone that are not 0 in all of them."""
+        stepped = self._stepped
+        for values in stepped:
+            if values.grad is None:
+                values.grad = torch.zeros_like(values)
+        gradients = [values.grad.view(len(values), -1) for values in stepped]
+        if self.processes.count > 1 and stepped:
+            moved = sum(gradient.any(1).to(torch.uint8) for gradient in gradients)
+            self.processes.maximum(moved)
+            rows = moved.nonzero().flatten()
+            sums = [gradient.index_select(0, rows) for gradient in gradients]
+            self.processes.sum(*sums)
+            for gradient, total in zip(gradients, sums, strict=True):
+                gradient.index_copy_(0, rows, total)
+        if gradients:
+            torch._foreach_div_(gradients, float(self.processes.views))
+
+    @torch.no_grad()
     def step(self) -> None:
         """Moves them by the mean of what each view of the step would have moved them by."""
         field = self.scene.field
-        for values in self.gathered:
+        for values in self._stepped:
             if values.grad is not None:
                 share = field.share if values is field.alpha else field.share[:, None]
                 values.addcmul_(share, values.grad, value=-1.0)

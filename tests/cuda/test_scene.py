@@ -35,3 +35,16 @@ def test_a_training_step_equals_that_of_the_cpu(name: str, texture: bool, mode: 
     assert any("field" in key for key in got) == (mode == "train")
     for key, value in want.items():
         assert (got[key] - value).abs().max() <= 1e-9 * value.abs().max(), key
+
+
+def test_masked_counts_equal_those_of_the_cpu(device: torch.device, cpu) -> None:
+    case = random_scene(40, 5, 33, 21)
+    mask = torch.rand(33 * 21, generator=torch.Generator().manual_seed(0)) < 0.5
+
+    def counts(device: torch.device) -> Tensor:
+        scene, camera = scene_of(case, device, False)
+        return ops.masked_counts(scene.render(camera).fragments, mask.to(device), 40).cpu()
+
+    got = counts(device)
+    with cpu():
+        assert torch.equal(got, counts(torch.device("cpu"))) and got.any()

@@ -43,7 +43,7 @@ def test_a_resumed_run_goes_on_with_its_corrections(
     assert table.shape == (10, 3) and table.abs().max() > 0.02
     torch.testing.assert_close(table.mean(0), torch.zeros(3), atol=1e-6, rtol=0)
     last = json.loads((whole.get_base_dir() / FILE).read_text().splitlines()[-1])
-    assert last["cc_psnr"] > last["psnr"]
+    assert last["fitted_psnr"] > last["psnr"]
 
     resumed = start(data=uneven, name="resumed")
     resumed.pipeline.model.train.exposure = "gain"
@@ -64,6 +64,6 @@ def test_a_resumed_run_goes_on_with_its_corrections(
     torch.testing.assert_close(torch.stack(given), table.exp())
     bundle = json.loads((tmp_path / "bundle" / "bundle.json").read_text())
     held_out = bundle["statistics"]["held_out"]
-    assert held_out["cc_psnr_neural_against_photos"] > held_out["psnr_neural_against_photos"]
-    assert held_out["cc_psnr_baked_against_photos"] > held_out["psnr_baked_against_photos"]
+    assert held_out["fitted_psnr_neural_against_photos"] > held_out["psnr_neural_against_photos"]
+    assert held_out["fitted_psnr_baked_against_photos"] > held_out["psnr_baked_against_photos"]
     assert "after a fit of the colours" in " ".join(capsys.readouterr().out.split())

@@ -188,7 +188,7 @@ def test_training_learns_the_exposures(make_scene, views, uneven) -> None:
         learned = [shown(grey, trainer.training.exposure.of(i), torch.ones(1, 1, 1), None) for i in range(6)]
         logs = torch.stack([image.mean() / 0.5 for image in learned]).log()
         torch.testing.assert_close(logs, torch.tensor([0.3, -0.2, 0.1, -0.3, 0.25, -0.15]), atol=0.1, rtol=0)
-        assert results[kind].cc_psnr > results["off"].cc_psnr + 0.5
+        assert results[kind].fitted_psnr > results["off"].fitted_psnr + 0.5
         assert results[kind].psnr > results["off"].psnr - 0.1
 
 

@@ -12,10 +12,12 @@ from bitymi_ns.train import texels
 from bitymi_ns.train.config import DensifyConfig, TexelConfig, TrainConfig
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer, fit
+from bitymi_ns.train.processes import Processes
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.texels import (
     LEAST_SHARE,
     SMALLEST,
+    LearningTexels,
     blank_texels,
     coverage,
     single_view_coverage,
@@ -100,6 +102,37 @@ def test_there_are_no_more_texels_than_a_run_can_use(textured, views, monkeypatc
         else:
             assert torch.equal(bound.size, free.size)
     assert len(blank_texels(scene, views, len(views), options, to_come=0).texels) <= smallest
+
+
+@pytest.mark.parametrize("alpha", [False, True])
+def test_processes_exchange_the_gradients_of_texels_that_a_view_moves(alpha: bool, textured, monkeypatch) -> None:
+    """Two processes: this one moves texels 0 and 2, the other one texels 2 and 5."""
+    reduced = []
+
+    def reduce(self: Processes, tensors: list[torch.Tensor], how: object) -> None:
+        reduced.append(sum(tensor.nbytes for tensor in tensors))
+        if tensors[0].dtype == torch.uint8:
+            tensors[0].copy_(torch.tensor([1, 0, 1, 0, 0, 1]))
+        else:
+            for tensor in tensors:
+                tensor[1:] += 1.0
+
+    monkeypatch.setattr(Processes, "_reduce", reduce)
+    scene, one = textured(), torch.ones(6, 1)
+    scene.field = TexelField(one[:, :1].expand(6, 2), one[:, 0], torch.zeros(6, 3), 0 * one[:, 0] + 0.1)
+    scene.field.alpha = torch.nn.Parameter(one[:, 0].clone()) if alpha else None
+    learning = LearningTexels(scene, Schedule(config(), 600, 2.0, texels=True), Processes(0, 2))
+    own = torch.tensor([4.0, 0, 2, 0, 0, 0])
+    scene.field.texels.grad = own[:, None].expand(6, 3).clone()
+    if alpha:
+        scene.field.alpha.grad = own.clone()
+    learning.average()
+    want = torch.tensor([2.0, 0, 1.5, 0, 0, 0.5])
+    assert reduced == [6, 3 * (16 if alpha else 12)]
+    assert torch.equal(scene.field.texels.grad, want[:, None].expand(6, 3))
+    assert not alpha or torch.equal(scene.field.alpha.grad, want)
+    learning.step()
+    assert torch.equal(scene.field.texels.detach()[:, 0], -0.1 * want) and scene.field.texels.grad is None
 
 
 def test_coverage_is_the_gradient_of_the_summed_picture(textured, views) -> None:

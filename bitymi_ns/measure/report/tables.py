@@ -76,11 +76,13 @@ def megabytes(value: float) -> str:
 COLUMNS = (
     Column("PSNR", "psnr", "{:.2f}".format, "up"),
     Column("± seeds", "psnr_seeds", "{:.2f}".format),
-    Column("ccPSNR", "cc_psnr", "{:.2f}".format, "up"),
     Column("SSIM", "ssim", "{:.3f}".format, "up"),
     Column("LPIPS", "lpips", "{:.3f}".format, "down"),
     Column("LPIPS (VGG)", "lpips_vgg", "{:.3f}".format, "down"),
     Column("FLIP", "flip", "{:.3f}".format, "down"),
+    Column("PSNR fitted", "fitted_psnr", "{:.2f}".format, "up"),
+    Column("SSIM fitted", "fitted_ssim", "{:.3f}".format, "up"),
+    Column("LPIPS fitted", "fitted_lpips", "{:.3f}".format, "down"),
     Column("Points", "surfels", count, "down"),
     Column("Fragments / px", "fragments_per_pixel", significant, "down"),
     Column("ms", "render_ms", significant, "down"),
@@ -100,7 +102,7 @@ CURVE_COLUMNS = (
     Column("Seconds", "seconds", significant),
     Column("CPU seconds", "cpu_seconds", significant),
     Column("Last PSNR", "psnr", "{:.2f}".format),
-    Column("Last ccPSNR", "cc_psnr", "{:.2f}".format),
+    Column("Last PSNR fitted", "fitted_psnr", "{:.2f}".format),
     Column("Points", "surfels", count),
     Column("Fragments", "fragments", count),
 )
@@ -109,8 +111,8 @@ STAGES = {False: "Trained scene", True: "Baked bundle"}
 NOTES = (
     "ms: rendering alone, warmed up; FPS = 1000 / ms (the fps of ns-eval also times metrics and files, so it is not "
     "shown). 1 MB = 10⁶ bytes. ΔPSNR: baked minus trained, in dB. ± seeds: standard deviation of the PSNR over seeds. "
-    "ccPSNR: after an affine fit of each view's colours to its photograph, so that exposure and white balance do not "
-    "count. Bold: best of its scene."
+    "Fitted: each half of a view after the affine map of its colours that fits the other half to the photograph, so "
+    "that exposure and white balance do not count. Bold: best of its scene."
 )
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.measure.stability.scenes import (
+    ALPHAS,
     PLAIN,
     SURFEL_KEYS,
     SV_KEYS,
@@ -174,6 +175,8 @@ def _by_kernels(case: SceneCase, device: str, dtype: torch.dtype, near: float, w
     leaves = {key: value.to(device, dtype).clone().requires_grad_() for key, value in case.params.items()}
     camera = Camera(case.viewmat.to(device, dtype), case.K.to(device, dtype), case.width, case.height)
     projection = ops.project(*(leaves[key] for key in SURFEL_KEYS), camera, near, way.prefilter)
+    if way.alpha:
+        projection.alpha = ops.TexelAlpha(tiles_of(leaves[TEXELS]), leaves[ALPHAS].squeeze(1), 0.0)
     fragments = ops.trace(projection, way.rim)
     base = ops.view_color("sv", leaves, leaves["means"], camera.exact_center, projection.visible)
     textured = {"texels": leaves[TEXELS], "tiles": tiles_of(leaves[TEXELS])} if way.texels else {}
@@ -195,7 +198,8 @@ def _by_reference(case: SceneCase, near: float, way: Way) -> _Result:
     directions = reference_render.view_directions(leaves["means"], case.viewmat)
     colors = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions)
     geometry = [leaves[key] for key in SURFEL_KEYS]
-    tiles = tile_images(leaves[TEXELS]) if way.texels else None
+    texels = [leaves[key] for key in (TEXELS, ALPHAS) if key in leaves]
+    tiles = tile_images(torch.cat(texels, 1)) if texels else None
     result = reference_render.render(
         geometry, colors, case, tiles=tiles, near=near, rim=way.rim, prefilter=way.prefilter
     )

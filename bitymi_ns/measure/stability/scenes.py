@@ -260,7 +260,7 @@ SWEEPS: tuple[Sweep, ...] = (
 
 
 RIM = 1e-3  # bound of the kernel's derivative at the rim, the default of a scene, for the gradients on both sides
-TEXELS = "texels"  # name of the texels among the parameters of a case
+TEXELS, ALPHAS = "texels", "texel_alpha"  # names of the texels and their alphas among the parameters of a case
 TILE = (8, 4)  # sides of a tile of a case, texels along u and v
 ON_A_TEXEL = 1e-6
 """Coordinates that are nearer than this to a texel's centre, as a share of the tile, may lie on either side of it."""
@@ -273,6 +273,7 @@ class Way:
     name: str  # short, for tables and tests
     # every surfel has a tile of random texels; the gradient reaches them and, through the fetch, u and v
     texels: bool = False
+    alpha: bool = False  # the texels have random alphas from 0 to 2, without a weight bound
     prefilter: Prefilter = "low_pass"  # as in `ops.project`
     # bound of the derivative at the rim on both sides, `Scene.rim`. Through a pixel the bound is another one, that of
     # the kernel averaged over the pixel, which the reference does not have: 0 turns it off
@@ -283,12 +284,19 @@ class Way:
         if not self.texels:
             return case
         n = len(case.params["means"])
-        random = torch.randn(n * TILE[0] * TILE[1], 3, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
-        return replace(case, params={**case.params, TEXELS: 0.2 * random})
+        g = torch.Generator().manual_seed(7)
+        texels = {TEXELS: 0.2 * torch.randn(n * TILE[0] * TILE[1], 3, generator=g, dtype=torch.float64)}
+        if self.alpha:
+            texels[ALPHAS] = 2.0 * torch.rand(len(texels[TEXELS]), 1, generator=g, dtype=torch.float64)
+        return replace(case, params={**case.params, **texels})
 
 
 PLAIN = Way("plain")
-WAYS = (Way(TEXELS, texels=True), Way("pixel", prefilter="pixel", rim=0.0))  # the modes beside the plain one
+WAYS = (
+    Way(TEXELS, texels=True),
+    Way("alpha", texels=True, alpha=True),
+    Way("pixel", prefilter="pixel", rim=0.0),
+)  # the modes beside the plain one
 
 
 def tiles_of(texels: Tensor) -> TexelTiles:
@@ -299,8 +307,8 @@ def tiles_of(texels: Tensor) -> TexelTiles:
 
 
 def tile_images(texels: Tensor) -> list[Tensor]:
-    """The same as one image [r_v, r_u, 3] per surfel."""
-    return list(texels.view(-1, TILE[1], TILE[0], 3).unbind())  # one backward pass for all of them
+    """Texels [T, C] as one image [r_v, r_u, C] per surfel."""
+    return list(texels.view(-1, TILE[1], TILE[0], texels.shape[1]).unbind())  # one backward pass for all of them
 
 
 def cells(uv: Tensor) -> Tensor:

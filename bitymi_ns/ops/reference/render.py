@@ -39,6 +39,17 @@ def view_directions(means: Tensor, viewmat: Tensor) -> Tensor:
     return unit(means + viewmat[:3, :3].T @ viewmat[:3, 3])
 
 
+def fetched(tiles: Sequence[Tensor], uv: Tensor, where: Tensor) -> Tensor:
+    """Texels [P, N, C] of the tiles [r_v, r_u, C] of N surfels at coordinates [P, N, 2]; 0 but `where` [P, N]."""
+    values = uv.new_zeros(*where.shape, tiles[0].shape[-1] if tiles else 3)
+    for size in {tile.shape for tile in tiles}:  # tiles of one size at once
+        of = torch.tensor([i for i, tile in enumerate(tiles) if tile.shape == size])
+        pixel, row = where[:, of].nonzero(as_tuple=True)
+        found = texel(torch.stack([tiles[i] for i in of.tolist()]), uv[pixel, of[row]], row)
+        values = values.index_put((pixel, of[row]), found)
+    return values
+
+
 def render(
     geometry: Sequence[Tensor],
     colors: Tensor,
@@ -57,24 +68,21 @@ def render(
         colors: [N, 3] view-dependent colour f_view(d) of each surfel, without the 0.5.
         camera: viewmat, K, see `project`, and the size of the image in pixels.
         background: [3], None = black.
-        tiles: one texture tile [r_v, r_u, 3] per surfel.
+        tiles: one texture tile [r_v, r_u, 3] per surfel; [r_v, r_u, 4] with factors of sigma.
         residual: residual colour field, world positions [M, 3] to colours [M, 3]; instead of `tiles`.
         near: see `project`.
         rim, prefilter: see `trace`.
     """
     width, height = camera.width, camera.height
     p = project(*geometry, camera.viewmat, camera.K, near)
-    t = trace(p, width, height, near, rim, prefilter)
+    factor = None
+    if tiles is not None and any(tile.shape[-1] == 4 for tile in tiles):
+        factor = lambda uv, where: fetched(tiles, uv, where)[..., 3]  # noqa: E731
+    t = trace(p, width, height, near, rim, prefilter, factor=factor)
     base = torch.relu(colors + 0.5)  # [N, 3]
     color = base.expand(width * height, -1, -1)  # [P, N, 3]
     if tiles is not None:
-        texture = torch.zeros_like(color)
-        for size in {tile.shape for tile in tiles}:  # tiles of one size at once
-            of = torch.tensor([i for i, tile in enumerate(tiles) if tile.shape == size])
-            pixel, row = t.blended[:, of].nonzero(as_tuple=True)
-            fetched = texel(torch.stack([tiles[i] for i in of.tolist()]), t.uv[pixel, of[row]], row)
-            texture = texture.index_put((pixel, of[row]), fetched)
-        color = torch.relu(color + texture)
+        color = torch.relu(color + fetched(tiles, t.uv, t.blended)[..., :3])
     if residual is not None:
         pixel, surfel = t.blended.nonzero(as_tuple=True)
         u, v = t.uv[pixel, surfel, :, None].unbind(1)  # [F, 1]

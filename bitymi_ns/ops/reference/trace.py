@@ -1,5 +1,6 @@
 """Weights of surfels at pixels: every pixel against every surfel, in float64."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -107,6 +108,7 @@ def trace(
     rim: float = 0.0,
     prefilter: str = "low_pass",
     photo_pixel: float = 1.0,
+    factor: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> Trace:
     """Intersections, effective opacities and front-to-back weights of all surfels in all pixels.
 
@@ -118,7 +120,8 @@ def trace(
     centres' depths (equal depths: by index); the one that would take the transmittance below 1e-4 is not blended, and
     ends the pixel. `rim` bounds 1 - x from below in the kernel's derivative, as the kernels do; values do not change.
     With the prefilter `pixel`, G is the kernel averaged over a pixel instead (`_filtered`), without a bound at the rim.
-    Without it, `photo_pixel` is the side of a photograph's pixel in pixels of the view (`_resized`).
+    Without it, `photo_pixel` is the side of a photograph's pixel in pixels of the view (`_resized`). Sigma is
+    multiplied by `factor`, up to 0.99: [P, N] of uv [P, N, 2] and where it is asked for, [P, N] bool.
     """
     pixels = pixel_centers(width, height)  # [P, 2]
     M = projection.M
@@ -147,6 +150,10 @@ def trace(
     sigma = (projection.opacity * torch.where(low_pass, blur, kernel)).clamp(max=ALPHA_MAX)
 
     covered = projection.valid & (sigma >= ALPHA_MIN)
+    uv = torch.where(low_pass[..., None], uv.clamp(-SUPPORT, SUPPORT), uv)
+    if factor is not None:
+        sigma = (sigma * factor(uv, covered)).clamp(max=ALPHA_MAX)
+        covered = covered & (sigma >= ALPHA_MIN)
     order = torch.argsort(projection.depth, stable=True)
     sigma_sorted = torch.where(covered, sigma, 0.0)[:, order]
     after = torch.cumprod(1 - sigma_sorted, dim=1)  # [P, N] transmittance behind each surfel, were all blended
@@ -159,7 +166,7 @@ def trace(
     back = torch.argsort(order)
     return Trace(
         weight=weight_sorted[:, back],
-        uv=torch.where(low_pass[..., None], uv.clamp(-SUPPORT, SUPPORT), uv),
+        uv=uv,
         depth=torch.where(low_pass, projection.depth, depth),
         low_pass=low_pass,
         blended=blended_sorted[:, back],

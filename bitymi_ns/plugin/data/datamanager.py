@@ -23,7 +23,7 @@ from bitymi_ns.plugin.data.bundle_cameras import BundleCamerasConfig
 from bitymi_ns.plugin.data.cameras import check_cameras, to_camera
 from bitymi_ns.plugin.data.capture_checks import check_capture, declares_box, reporting_input_errors
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
-from bitymi_ns.plugin.data.dataset import PHOTOGRAPH_BYTES, BitymiDataset, CachedImages, drop_blank_views
+from bitymi_ns.plugin.data.dataset import BitymiDataset, CachedImages, drop_blank_views, photograph_bytes
 from bitymi_ns.plugin.data.depth import with_depth
 from bitymi_ns.plugin.data.find_files import check_photographs_exist
 from bitymi_ns.plugin.data.initial_points import reading_points
@@ -72,6 +72,7 @@ class BitymiDataManagerConfig(FullImageDatamanagerConfig):
     eval_num_images_to_sample_from: tyro.conf.Suppress[int] = -1
     eval_num_times_to_repeat_images: tyro.conf.Suppress[int] = -1
     eval_image_indices: tyro.conf.Suppress[tuple[int, ...] | None] = (0,)
+    cache_images: tyro.conf.Suppress[Literal["cpu", "gpu"]] = "cpu"
     images_on_gpu: tyro.conf.Suppress[bool] = False
     masks_on_gpu: tyro.conf.Suppress[bool] = False
 
@@ -98,7 +99,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         local_rank: int = 0,
         **kwargs: Any,
     ) -> None:
-        self._budget = MemoryBudget(PHOTOGRAPH_BYTES)
+        self._budget = MemoryBudget(photograph_bytes(torch.device(device)))
         self.step_view: Callable[[int], View] = lambda index: self.train_views[index]
         images.set_up_pillow()
         check_capture(config)
@@ -232,12 +233,11 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
 
     def _load_images(  # type: ignore[override]
         self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
-    ) -> Sequence[dict[str, torch.Tensor]]:
+    ) -> CachedImages:
+        """Cache a split in memory of the host; what of it lies on a card is a run's to decide (`DownscaledViews`)."""
         dataset = self.train_dataset if split == "train" else self.eval_dataset
         with reporting_input_errors(self.config):
-            if torch.device(self.device).type == "cpu":
-                return CachedImages(dataset, self.config.cache_images_type, self._budget, f"Reading the {split} images")
-            return super()._load_images(split, cache_images_device)
+            return CachedImages(dataset, self.config.cache_images_type, self._budget, f"Reading the {split} images")
 
     def get_train_rays_per_batch(self) -> int:
         """Return the pixels of the first training view, without reading it."""
@@ -268,13 +268,17 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
 
     @property
     def train_views(self) -> OnDemand[View]:
-        """Training views at full size, each read when it is asked for."""
-        return OnDemand(len(self.train_dataset), lambda i: _view(*self.train_view(i)))
+        """Training views at full size, each read when it is asked for, with pictures in memory of the host."""
+        return OnDemand(len(self.train_dataset), lambda i: self._view(self.train_dataset, i, self.cached_train[i]))
 
     @property
     def eval_views(self) -> OnDemand[View]:
-        """Held-out views at full size, each read when it is asked for."""
-        return OnDemand(len(self.eval_dataset), lambda i: _view(*self.eval_view(i)))
+        """Held-out views likewise."""
+        return OnDemand(len(self.eval_dataset), lambda i: self._view(self.eval_dataset, i, self.cached_eval[i]))
+
+    def _view(self, dataset: BitymiDataset, index: int, batch: dict[str, Any]) -> View:
+        camera = to_camera(dataset.cameras[index : index + 1], self.device)
+        return View(camera, batch["image"], batch.get("mask"), depth=batch.get("depth"), normal=batch.get("normal"))
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict[str, Any]]:
         """Return the held-out views in turn, without drawing from a shared random generator."""
@@ -293,9 +297,3 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
 
     def _batch(self, cached: dict[str, Any]) -> dict[str, Any]:
         return {**cached, "image": cached["image"].to(self.device)}
-
-
-def _view(cameras: Cameras, batch: dict[str, Any]) -> View:
-    return View(
-        to_camera(cameras), batch["image"], batch.get("mask"), depth=batch.get("depth"), normal=batch.get("normal")
-    )

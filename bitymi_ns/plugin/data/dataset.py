@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+import psutil
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
@@ -16,6 +17,7 @@ from PIL import Image
 from rich.progress import track
 from torch import Tensor
 
+from bitymi_ns.bundle.sizes import memory_limit
 from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.data.depth import FITTED
 from bitymi_ns.plugin.data.images import ImageSummary, in_threads, read_image, read_mask, summarize, wrong_size
@@ -25,7 +27,9 @@ from bitymi_ns.plugin.data.views import NO_PHOTOS, photograph_files, select_view
 from bitymi_ns.plugin.run.commands import MOVED
 from bitymi_ns.train.views import MemoryBudget, nearest, over_background
 
-PHOTOGRAPH_BYTES = 1 << 28  # memory for the images of a capture, training and held-out views together
+PHOTOGRAPH_BYTES = 1 << 28
+"""Memory for the images of a capture, training and held-out views together, where a step on the CPU takes far longer
+than reading one."""
 PREFETCH = 4  # images that are read together at the start
 RECENT = 2
 """Images beyond the budget that stay cached until the next ones are read: one step asks for a view more than once."""
@@ -135,6 +139,14 @@ class BitymiDataset(InputDataset):
             return image
         size = (int(image.width * self.scale_factor), int(image.height * self.scale_factor))
         return image.resize(size, resample=resample)
+
+
+def photograph_bytes(device: torch.device) -> int:
+    """Memory of the host for the images of a capture. For a card half of what is available: a step there takes less
+    time than reading a photograph."""
+    if device.type == "cpu":
+        return PHOTOGRAPH_BYTES
+    return max(PHOTOGRAPH_BYTES, int(min(psutil.virtual_memory().available, memory_limit()) / 2))
 
 
 def view_mask(outputs: DataparserOutputs, index: int) -> Image.Image:

@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import torch
 import tyro
 import yaml
 
@@ -256,9 +255,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
         )
         bundle = read_bundle(self.output_dir)
         if self.compare and len(datamanager.eval_dataset):
-            scene = bundle.scene
-            held_out = compare(model, datamanager, lambda c: scene.render(c, background=torch.tensor(background)).rgb)
-            bundle.info.statistics.held_out = held_out
+            bundle.info.statistics.held_out = compare(model, datamanager, bundle.scene)
             replace_file(self.output_dir / MANIFEST, dump(bundle.info))
         print_summary(self.output_dir, bundle.info)
         self.state_size(download_bytes(self.output_dir, bundle.info))

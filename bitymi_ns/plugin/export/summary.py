@@ -56,7 +56,7 @@ def print_summary(folder: Path, info: Manifest) -> None:
         table.add_row("Held-out views", f"{held_out.views}")
         table.add_row("Bundle against trained scene", decibels(held_out.psnr_baked_against_neural))
         for name, form in (("Trained scene", "neural"), ("Bundle", "baked")):
-            plain, fitted = (getattr(held_out, f"{kind}_{form}_against_photos") for kind in ("psnr", "cc_psnr"))
+            plain, fitted = (getattr(held_out, f"{kind}_{form}_against_photos") for kind in ("psnr", "fitted_psnr"))
             table.add_row(
                 f"{name} against photographs", f"{decibels(plain)}, {decibels(fitted)} after a fit of the colours"
             )
@@ -90,7 +90,7 @@ def print_savings(table: Table, info: Manifest) -> None:
     table.add_row("Atlas bytes", f"{rule:,} -> {stored:,} ({100 * stored / max(1, rule):.1f} %)")
     certificate = statistics.certificate
     if certificate is not None:
-        count, of = certificate.within + certificate.beyond, {"field": "the field", "texels": "what was learned"}
+        count, of = certificate.within + certificate.beyond, {"field": "the field", "texels": "the learned colours"}
         table.add_row("As stored and seen", f"{certificate.within:,} of {count:,} surfels within the tolerance")
         worst = "no number" if certificate.worst is None else f"at most {certificate.worst:.2f} steps"
         table.add_row("", f"({certificate.tolerance:g} steps from {of[certificate.against]}; {worst})")

@@ -3,7 +3,6 @@
 import copy
 import io
 import pickle
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +22,10 @@ from bitymi_ns.capture.frame import UP, read_frame
 from bitymi_ns.plugin.console import fail
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.run.model import BitymiModel
-from bitymi_ns.scene.baked import as_bytes
+from bitymi_ns.scene.baked import BakedScene, as_bytes
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import HashField
-from bitymi_ns.train.losses import cc_psnr, psnr
+from bitymi_ns.train.losses import fitted_psnr, psnr
 
 _PSNR_SLACK = 0.1  # dB
 
@@ -81,33 +80,30 @@ def preview(model: BitymiModel, camera: Camera, format: str = "PNG") -> bytes:
 
 
 @torch.no_grad()
-def compare(model: BitymiModel, datamanager: Any, render_baked: Callable[[Camera], torch.Tensor]) -> HeldOut:
+def compare(model: BitymiModel, datamanager: Any, scene: BakedScene) -> HeldOut:
     """PSNR in dB over the held-out views: means of bundle, trained scene and photographs against each other, also after
     the affine fit of each view's colours to its photograph; and the lowest of the bundle against the trained scene."""
-    rows = held_out_psnr(model, datamanager, render_baked, len(datamanager.eval_dataset))
+    rows = held_out_psnr(model, datamanager, scene, len(datamanager.eval_dataset))
     names = ("psnr_baked_against_neural", "psnr_neural_against_photos", "psnr_baked_against_photos")
-    names += ("cc_psnr_neural_against_photos", "cc_psnr_baked_against_photos")
+    names += ("fitted_psnr_neural_against_photos", "fitted_psnr_baked_against_photos")
     means = (round(sum(column) / len(rows), 4) for column in zip(*rows, strict=True))
     worst = round(min(row[0] for row in rows), 4)
     return HeldOut(views=len(rows), **dict(zip(names, means, strict=True)), psnr_baked_against_neural_worst=worst)
 
 
 @torch.no_grad()
-def held_out_psnr(
-    model: BitymiModel, datamanager: Any, render_baked: Callable[[Camera], torch.Tensor], views: int
-) -> list[list[float]]:
+def held_out_psnr(model: BitymiModel, datamanager: Any, scene: BakedScene, views: int) -> list[list[float]]:
     """Rows of the first `views` held-out views: PSNR of bundle against trained scene, trained scene against photograph,
-    bundle against photograph, and the last two after the affine fit of the colours."""
+    bundle against photograph, and the last two after the affine fit of the colours. All on the device of the model."""
     rows = []
-    background = model.background
+    scene, background = scene.to(model.device), model.background
     for index in range(min(views, len(datamanager.eval_views))):
-        view = datamanager.eval_views[index]
-        neural = model.render(view.camera, background, maps=False).rgb.clamp(0.0, 1.0).cpu()
-        baked = render_baked(view.camera.to("cpu")).clamp(0.0, 1.0)
-        photo = view.target(background.cpu(), "cpu")
-        mask = None if view.mask is None else view.mask.cpu()
-        of_photo = [measure(rgb, photo, mask) for measure in (psnr, cc_psnr) for rgb in (neural, baked)]
-        rows.append([psnr(baked, neural, mask), *of_photo])
+        view = datamanager.eval_views[index].to(model.device)
+        neural = model.render(view.camera, background, maps=False).rgb.clamp(0.0, 1.0)
+        baked = scene.render(view.camera, background).rgb.clamp(0.0, 1.0)
+        photo = view.target(background, model.device)
+        of_photo = [measure(rgb, photo, view.mask) for measure in (psnr, fitted_psnr) for rgb in (neural, baked)]
+        rows.append([psnr(baked, neural, view.mask), *of_photo])
     return rows
 
 
@@ -130,8 +126,7 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
     if isinstance(model.scene.field, HashField):
         checks.append(check_field(bundle, copy.deepcopy(model.scene.field).cpu(), train))
     if len(datamanager.eval_dataset):
-        scene, background = bundle.scene, model.background.cpu()
-        rows = held_out_psnr(model, datamanager, lambda c: scene.render(c, background=background).rgb, views)
+        rows = held_out_psnr(model, datamanager, bundle.scene, views)
         worst, photos = min(row[0] for row in rows), sum(row[2] - row[1] for row in rows) / len(rows)
         stated = bundle.info.statistics.held_out and bundle.info.statistics.held_out.psnr_baked_against_neural_worst
         detail = f"at least {worst:.2f} dB in {len(rows)} views"

@@ -265,11 +265,7 @@ def method_config(name: str) -> MethodSpecification:
         steps_per_eval_all_images=0,  # the training curve has what these would measure, without its time
         mixed_precision=False,
         pipeline=BitymiPipelineConfig(
-            datamanager=BitymiDataManagerConfig(
-                dataparser=BitymiDataParserConfig(),
-                cache_images_type="uint8",
-                cache_images="gpu" if has_cuda_kernels() else "cpu",
-            ),
+            datamanager=BitymiDataManagerConfig(dataparser=BitymiDataParserConfig()),
             model=BitymiModelConfig(scene=preset.scene, train=preset.train),
         ),
         # one optimiser per parameter group, no scheduler: the model sets the rates

@@ -1,7 +1,7 @@
 """Image quality and honest render times."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bitymi_ns.plugin.console import warn, warn_once
 from bitymi_ns.plugin.run import lpips
-from bitymi_ns.train.losses import cc_psnr, psnr
+from bitymi_ns.train.losses import color_fitted, psnr
 
 LPIPS = {"lpips": "alex", "lpips_vgg": "vgg"}
 """Names of LPIPS in the results, by the backbone: the conventions of nerfstudio and gsplat, and of 3DGS."""
@@ -17,27 +17,34 @@ _lpips_missing: list[str] = []
 
 
 def image_metrics(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> dict[str, float]:
-    """psnr, cc_psnr (after an affine fit of the colours), ssim, flip (where its package is installed), and lpips and
-    lpips_vgg (where their weights can be had).
+    """psnr, ssim, flip (where its package is installed), and lpips and lpips_vgg (where their weights can be had); and
+    fitted_psnr, fitted_ssim and fitted_lpips of the `color_fitted` image.
 
     Args:
         image, reference: [H, W, 3] in [0, 1].
-        mask: [H, W, 1] bool; pixels where it is False are the same in both for every metric and left out of psnr
-            and cc_psnr.
+        mask: [H, W, 1] bool; pixels where it is False are the same in both for every metric and left out of both
+            PSNR and the fit.
     """
-    from torchmetrics.functional.image import structural_similarity_index_measure
-
     image, reference = image.detach().float().clamp(0.0, 1.0), reference.detach().float().clamp(0.0, 1.0)
     if mask is not None:
         mask = mask.to(image.device).bool().reshape(*image.shape[:2], 1)
         image, reference = image * mask, reference * mask
-    result = {"psnr": psnr(image, reference, mask), "cc_psnr": cc_psnr(image, reference, mask)}
-    pair = [x.permute(2, 0, 1)[None] for x in (image, reference)]
-    result["ssim"] = float(structural_similarity_index_measure(*pair, data_range=1.0))
+    result = _similarity(image, reference, mask, tuple(LPIPS))
     found = flip(image, reference)
     if found is not None:
         result["flip"] = found
-    return result | lpips_metrics(image, reference)
+    fitted = color_fitted(image, reference, mask)
+    fitted = fitted if mask is None else fitted * mask
+    return result | {f"fitted_{k}": v for k, v in _similarity(fitted, reference, mask, ("lpips",)).items()}
+
+
+def _similarity(image: Tensor, reference: Tensor, mask: Tensor | None, distances: Sequence[str]) -> dict[str, float]:
+    """psnr, ssim, and those of the distances (names of `LPIPS`) that can be had."""
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
+    pair = [x.permute(2, 0, 1)[None] for x in (image, reference)]
+    ssim = float(structural_similarity_index_measure(*pair, data_range=1.0))
+    return {"psnr": psnr(image, reference, mask), "ssim": ssim, **lpips_metrics(image, reference, distances)}
 
 
 def flip(image: Tensor, reference: Tensor) -> float | None:
@@ -53,15 +60,15 @@ def flip(image: Tensor, reference: Tensor) -> float | None:
     return float(mean)
 
 
-def lpips_metrics(image: Tensor, reference: Tensor) -> dict[str, float]:
-    """`LPIPS` of two images, without those whose weights cannot be had (one warning per process says why); empty for
-    images of fewer than 32 pixels along a side."""
+def lpips_metrics(image: Tensor, reference: Tensor, names: Sequence[str]) -> dict[str, float]:
+    """Distances of two images by their names in `LPIPS`, without those whose weights cannot be had (one warning per
+    process says why); empty for images of fewer than 32 pixels along a side."""
     found: dict[str, float] = {}
-    for name, backbone in LPIPS.items() if min(image.shape[:2]) >= lpips.LEAST_SIDE else ():
+    for name in names if min(image.shape[:2]) >= lpips.LEAST_SIDE else ():
         if name in _lpips_missing:  # they are fetched together: the next is not there either
             break
         try:
-            found[name] = lpips.lpips(image, reference, backbone)
+            found[name] = lpips.lpips(image, reference, LPIPS[name])
         except lpips.LpipsUnavailable as error:
             _lpips_missing.append(name)
             warn(f"{name.upper()} is left out: {error}.")

@@ -17,14 +17,14 @@ from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManag
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 
 
-def load(data: Path, **dataparser: Any) -> BitymiDataManager:
+def load(data: Path, device: Any = "cpu", **dataparser: Any) -> BitymiDataManager:
     """The data manager of a capture in nerfstudio's format, every eighth view held out."""
-    return load_with(data, BitymiDataParserConfig(format="nerfstudio", **dataparser))
+    return load_with(data, BitymiDataParserConfig(format="nerfstudio", **dataparser), device)
 
 
-def load_with(data: Path, dataparser: Any) -> BitymiDataManager:
+def load_with(data: Path, dataparser: Any, device: Any = "cpu") -> BitymiDataManager:
     """The data manager of a capture in another format."""
-    return BitymiDataManagerConfig(data=data, dataparser=dataparser).setup(device="cpu", test_mode="val")
+    return BitymiDataManagerConfig(data=data, dataparser=dataparser).setup(device=device, test_mode="val")
 
 
 def load_any(data: Path, **options: Any) -> BitymiDataManager:

@@ -6,6 +6,7 @@ from nerfstudio.cameras.cameras import Cameras
 
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.data.cameras import normal_image, ray_distance, to_camera
+from tests.stand_in_card import CARD, noted_reads
 
 
 def rotation(generator: torch.Generator) -> torch.Tensor:
@@ -55,3 +56,11 @@ def test_distorted_cameras_are_refused() -> None:
     with pytest.raises(InputError, match="lens distortion"):
         to_camera(cameras(distortion_params=torch.tensor([[0.1, 0, 0, 0, 0, 0]])))
     to_camera(cameras(distortion_params=torch.zeros(1, 6)))
+
+
+def test_a_camera_on_a_card_is_read_at_once() -> None:
+    with noted_reads() as reads:
+        there, here = to_camera(cameras().to(CARD)), to_camera(cameras(), CARD)
+    assert len(reads) == 1
+    for camera in (there, here):
+        assert torch.equal(camera.viewmat, to_camera(cameras()).viewmat) and type(camera.K) is not torch.Tensor

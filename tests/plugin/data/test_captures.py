@@ -1,21 +1,24 @@
 """What the data manager makes of captures, good and bad."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import psutil
 import pytest
 import torch
 from PIL import Image
 
+from bitymi_ns.plugin.data import dataset
 from bitymi_ns.plugin.run.model import train_config_for
 from bitymi_ns.train.config import TrainConfig
 from tests.plugin.data.captures import edit, expect, images_of, load, printed
+from tests.stand_in_card import CARD
 
 
 def test_every_eighth_image_is_held_out_and_cached_without_cuda(capture: Path) -> None:
     manager = load(capture)
     assert (len(manager.train_dataset), len(manager.eval_dataset)) == (10, 2)
-    manager.config.cache_images = "cpu"
     image = manager.cached_train[0]["image"]
     assert image.shape == (36, 48, 3) and image.dtype == torch.uint8
 
@@ -34,6 +37,21 @@ def test_a_batch_does_not_share_its_dictionary_with_the_cache(capture: Path) -> 
     manager = load(capture)
     manager.train_view(0)[1]["image"] = None
     assert manager.cached_train[0]["image"] is not None
+
+
+def test_photographs_of_a_run_on_a_card_stay_in_memory_of_the_host(
+    capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dataset, "PHOTOGRAPH_BYTES", 0)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=40_000))
+    manager = load(capture)
+    assert not manager.cached_train._kept
+    manager = load(capture, CARD)
+    for views, cached in ((manager.train_views, manager.cached_train), (manager.eval_views, manager.cached_eval)):
+        view = views[0]
+        assert view.image.device.type == "cpu" and view.image.dtype == torch.uint8
+        assert view.camera.K.device == CARD and cached[0]["image"].device.type == "cpu"
+    assert len(manager.cached_train._kept) == 20_000 // (36 * 48 * 3)
 
 
 def add_alpha(paths: list[Path], alpha: int) -> None:

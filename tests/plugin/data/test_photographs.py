@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bitymi_ns.plugin.console import InputError
-from bitymi_ns.plugin.data import datamanager as module
+from bitymi_ns.plugin.data import dataset as module
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.data.dataset import RECENT, BitymiDataset
 from bitymi_ns.sample import generate

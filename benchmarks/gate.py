@@ -52,6 +52,7 @@ class Limit:
 LIMITS = {
     "psnr_trained": Limit("PSNR trained, dB", "more", 0.05, relative=False, digits=3),
     "psnr_baked": Limit("PSNR baked, dB", "more", 0.05, relative=False, digits=3),
+    "lpips_baked": Limit("LPIPS baked", "less", 0.03, digits=4),
     "bundle_bytes": Limit("bundle, bytes", "less", 0.03),
     "surfels": Limit("surfels", "less", 0.03),
     "fragments_per_pixel": Limit("fragments per pixel", "less", 0.03, digits=2),
@@ -112,6 +113,7 @@ def run_seed(capture: "Capture", seed: int, calibration: Calibration) -> dict[st
 
     from bitymi_ns.bake import BakeOptions, Learning, TuneOptions, bake_and_learn, export
     from bitymi_ns.bundle import read_bundle
+    from bitymi_ns.plugin.run.lpips import lpips
     from bitymi_ns.scene.config import SceneConfig
     from bitymi_ns.train.config import TrainConfig
     from bitymi_ns.train.evaluate import evaluate
@@ -137,14 +139,17 @@ def run_seed(capture: "Capture", seed: int, calibration: Calibration) -> dict[st
         export(baked, bundle)
         size = sum(path.stat().st_size for path in bundle.iterdir())
         drawn = read_bundle(bundle).scene
-    quality, units = [], []
+    quality, distances, units = [], [], []
     for view in capture.views:
         image, unit = calibration.timed(partial(drawn.render, view.camera, background))
         units.append(unit)
-        quality.append(psnr(image.rgb.clamp(0.0, 1.0), view.target(background, "cpu")))
+        pair = image.rgb.clamp(0.0, 1.0), view.target(background, "cpu")
+        quality.append(psnr(*pair))
+        distances.append(lpips(*pair, "alex"))
     return {
         "psnr_trained": trained,
         "psnr_baked": statistics.fmean(quality),
+        "lpips_baked": statistics.fmean(distances),
         "bundle_bytes": size,
         "surfels": len(scene),
         "fragments_per_pixel": fragments / (cameras[0].width * cameras[0].height),

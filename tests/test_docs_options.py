@@ -16,7 +16,7 @@ ROOTS: dict[str, Any] = {
     "--": TrainConfig().densify,  # of its options, the short names
     "ns-export ... --": BakeOptions(),
 }
-ELSEWHERE = {"--machine.num-devices", "--max-num-iterations", "--pipeline.model.train.first-surfels"}
+ELSEWHERE = {"--machine.num-devices", "--machine.seed", "--max-num-iterations", "--pipeline.model.train.first-surfels"}
 ELSEWHERE |= {
     f"ns-export ... --{name}"
     for name in "exact finetune-steps format photographs polish-steps compact-error target-mb".split()

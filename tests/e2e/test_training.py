@@ -64,6 +64,18 @@ def test_options_out_of_range(start: Start, option: str, value: Any, message: st
         ns_train.main(config)
 
 
+@pytest.mark.parametrize(("machine", "of_views", "of_training"), [(42, 42, 0), (7, 7, 7), (7, 5, 3)])
+def test_the_seed_of_the_machine_is_that_of_every_choice(
+    start: Start, machine: int, of_views: int, of_training: int
+) -> None:
+    config = start()
+    config.machine.seed, pipeline = machine, config.pipeline
+    if machine != of_views:
+        pipeline.datamanager.train_cameras_sampling_seed, pipeline.model.train.seed = of_views, of_training
+    config.set_timestamp()
+    assert (pipeline.datamanager.train_cameras_sampling_seed, pipeline.model.train.seed) == (of_views, of_training)
+
+
 @pytest.mark.parametrize("method", ["bitymi-fast", "bitymi-sh", "bitymi-sb", "bitymi-sg", "bitymi-notexture"])
 def test_every_method_trains_and_loads_again(start: Start, method: str) -> None:
     config = start(method=method)

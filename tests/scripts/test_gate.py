@@ -11,8 +11,8 @@ import pytest
 
 FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
 GOOD = {
-    "psnr_trained": 20.0, "psnr_baked": 21.0, "bundle_bytes": 1000.0, "surfels": 100.0, "fragments_per_pixel": 10.0,
-    "peak_mb": 500.0, "train": 80.0, "bake": 40.0, "frame": 0.5,
+    "psnr_trained": 20.0, "psnr_baked": 21.0, "lpips_baked": 0.1, "bundle_bytes": 1000.0, "surfels": 100.0,
+    "fragments_per_pixel": 10.0, "peak_mb": 500.0, "train": 80.0, "bake": 40.0, "frame": 0.5,
 }  # fmt: skip
 
 
@@ -48,6 +48,7 @@ def test_equal_and_better_pass(gate: ModuleType, monkeypatch: pytest.MonkeyPatch
     [
         ("psnr_trained", 19.96, 19.94),
         ("psnr_baked", 20.96, 20.94),
+        ("lpips_baked", 0.102, 0.104),
         ("bundle_bytes", 1029.0, 1031.0),
         ("surfels", 102.9, 103.1),
         ("fragments_per_pixel", 10.29, 10.31),
@@ -63,7 +64,7 @@ def test_each_limit(
     baseline = tmp_path / "gate.json"
     run(gate, monkeypatch, baseline, {}, accept=True)
     run(gate, monkeypatch, baseline, {figure: passes})
-    with pytest.raises(SystemExit, match="1 of 9 figures are worse"):
+    with pytest.raises(SystemExit, match="1 of 10 figures are worse"):
         run(gate, monkeypatch, baseline, {figure: fails}, {figure: fails})
     assert capsys.readouterr().out.count("WORSE") == 1
 
@@ -74,14 +75,14 @@ def test_times_are_taken_again_and_not_judged_elsewhere(
     baseline = tmp_path / "gate.json"
     run(gate, monkeypatch, baseline, {}, accept=True)
     assert run(gate, monkeypatch, baseline, {"train": 200.0}, {}) == 2
-    with pytest.raises(SystemExit, match="1 of 9"):
+    with pytest.raises(SystemExit, match="1 of 10"):
         run(gate, monkeypatch, baseline, {"train": 200.0, "psnr_trained": 21.0}, {"train": 120.0})
     stated = json.loads(baseline.read_text())
     baseline.write_text(json.dumps({**stated, "processor": "another one"}))
     assert run(gate, monkeypatch, baseline, {"train": 200.0, "psnr_trained": 19.91}) == 1
-    with pytest.raises(SystemExit, match="1 of 9"):
+    with pytest.raises(SystemExit, match="1 of 10"):
         run(gate, monkeypatch, baseline, {"psnr_trained": 19.89})
-    with pytest.raises(SystemExit, match="1 of 9"):
+    with pytest.raises(SystemExit, match="1 of 10"):
         run(gate, monkeypatch, baseline, {"surfels": 200.0})
     stated["settings"]["steps"] += 1
     baseline.write_text(json.dumps(stated))

@@ -73,6 +73,7 @@ class BitymiTrainerConfig(TrainerConfig):
         super().set_timestamp()
         if not 0 <= self.machine.seed < SEEDS:
             fail(f"--machine.seed must be from 0 to {SEEDS - 1}, not {self.machine.seed}")
+        self._seed_by_machine()
         if self.machine.device_type != "cpu" and (why := why_not_cuda()):
             warn(f"Training on the CPU instead of {self.machine.device_type}: {why}.")
             self.machine.device_type = "cpu"
@@ -85,6 +86,14 @@ class BitymiTrainerConfig(TrainerConfig):
     def setup(self, **kwargs: Any) -> Any:
         """The trainer of a process; that of the first starts the others."""
         return super().setup(**{**kwargs, "world_size": self.processes})
+
+    def _seed_by_machine(self) -> None:
+        """Have a --machine.seed that is not the default seed all that has a seed of its own and was not given one."""
+        seed, pipeline = self.machine.seed, self.pipeline
+        if seed != MachineConfig().seed:
+            for owner, name in ((pipeline.datamanager, "train_cameras_sampling_seed"), (pipeline.model.train, "seed")):
+                if getattr(owner, name) == type(owner).__dataclass_fields__[name].default:
+                    setattr(owner, name, seed)
 
     def _check_options(self) -> None:
         machine = self.machine

@@ -131,7 +131,7 @@ def together(steps: Sequence[Step]) -> Step:
 
 
 BLOCKS = "from bitymi_ns import _cuda; print(repr(_cuda.device_problem(0)), _cuda.draws_bc7())"
-CHECKED = ("baked", "training", "texels")  # sections of gpu_kernels.py
+CHECKED = ("baked", "training", "texels", "listed")  # sections of gpu_kernels.py
 SANITIZERS = ("memcheck", "racecheck", "initcheck", "synccheck")
 
 

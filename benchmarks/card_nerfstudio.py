@@ -17,7 +17,7 @@ import subprocess
 import sys
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from common import arguments_of, number, page, publish, say, table
@@ -114,13 +114,17 @@ def watched() -> Iterator[list[float]]:
 
 
 class Commands:
-    """Runs commands one after the other, in a folder and with an environment; `rows` has what each took."""
+    """Runs commands one after the other, in a folder and with an environment; `rows` has what each took.
 
-    def __init__(self, folder: Path, environment: dict[str, str]) -> None:
+    Args:
+        after: called after each, so that a run that is stopped leaves what it had.
+    """
+
+    def __init__(self, folder: Path, environment: dict[str, str], after: Callable[[], None] = lambda: None) -> None:
         self.rows: list[tuple[str, dict[str, float] | None, float | None]] = []
         """Command, cost as in `run_measured` or None where it failed, and largest memory in use on the card, MB, that
         of other programs included; None = no card."""
-        self._folder, self._environment = folder, environment
+        self._folder, self._environment, self._after = folder, environment, after
 
     def run(self, *words: object) -> bool:
         """Run a command; True where it ended well."""
@@ -133,6 +137,7 @@ class Commands:
                 say(str(error))
         self.rows.append((shlex.join(typed), cost, max(used, default=None)))
         say(f"{'failed' if cost is None else 'ended'}: {self.rows[-1][0][:150]}")
+        self._after()
         return cost is not None
 
 
@@ -213,17 +218,17 @@ def main() -> int:
     arguments = parser.parse_args()
     folder, capture = arguments.folder.resolve(), arguments.data.resolve()
     shutil.rmtree(folder, ignore_errors=True)
-    commands = Commands(folder, stand_in(folder / "stand-ins"))
-    try:
-        all_commands(capture, folder, arguments.steps, arguments.options, commands)
-    finally:
+    title = f"nerfstudio on {capture.name}, {arguments.steps} steps"
+
+    def write() -> None:
+        logs = "".join(path.read_text() for path in folder.glob("*.log"))
         notes = [f"Stand-ins for {', '.join(STAND_INS)}."]
-        for waits_per_step in re.findall(
-            r"waits per step: ([\d.]+)", "".join(p.read_text() for p in folder.glob("*.log"))
-        ):
-            notes.append(f"Waits of the host for the card per step, nerfstudio's own included: {waits_per_step}.")
-        title = f"nerfstudio on {capture.name}, {arguments.steps} steps"
+        for per_step in re.findall(r"waits per step: ([\d.]+)", logs):
+            notes.append(f"Waits of the host for the card per step, nerfstudio's own included: {per_step}.")
         publish(page(title, tables(folder, commands), notes), arguments.output)
+
+    commands = Commands(folder, stand_in(folder / "stand-ins"), write)
+    all_commands(capture, folder, arguments.steps, arguments.options, commands)
     return int(any(cost is None for _, cost, _ in commands.rows))
 
 

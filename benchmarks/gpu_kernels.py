@@ -47,9 +47,10 @@ def training(n: int, width: int, height: int, device: torch.device) -> Callable[
     return training_step(lambda: scene.render(camera, field_mode="train").rgb, loss, list(scene.parameters()))
 
 
-def texels(n: int, width: int, height: int, device: torch.device) -> Callable[[], object]:
-    """A training step in which texels learn: SSIM, Adam of the surfels."""
+def texels(n: int, width: int, height: int, device: torch.device, most: int = 0) -> Callable[[], object]:
+    """A training step in which texels learn: SSIM, Adam of the surfels. most: bound of a list, 0 = there is none."""
     scene, camera = with_texels(n, width, height, device)
+    scene.config.max_fragments = most
     loss = photo_loss(torch.rand(height, width, 3, device=device))
     return training_step(lambda: scene.render(camera, field_mode="train").rgb, loss, list(scene.surfels.parameters()))
 
@@ -67,7 +68,8 @@ def exact(n: int, width: int, height: int, device: torch.device) -> Callable[[],
     return run
 
 
-SECTIONS = {"baked": baked, "images": images, "training": training, "texels": texels, "deterministic": exact}
+SECTIONS = {"baked": baked, "images": images, "training": training, "texels": texels}
+SECTIONS |= {"listed": partial(texels, most=1 << 30), "deterministic": exact}
 
 
 def main() -> int:

@@ -13,6 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 ROOTS: dict[str, Any] = {
     "--pipeline.model.scene.": load_preset("bitymi").scene,
     "--pipeline.model.train.": TrainConfig(),
+    "--": TrainConfig().densify,  # of its options, the short names
     "ns-export ... --": BakeOptions(),
 }
 ELSEWHERE = {"--machine.num-devices", "--machine.seed", "--max-num-iterations", "--pipeline.model.train.first-surfels"}

@@ -11,6 +11,7 @@ from .coverage import add_texel_coverage
 from .field import FieldGeometry, field, fragment_residual
 from .fragment_list import TooManyFragments
 from .project import Prefilter, Projection, project
+from .rasterize_cuda import rasterized, rasterizes
 from .ssim import ssim
 from .texel import TexelAlpha, TexelDescent, TexelTiles
 from .trace import Fragments, masked_counts, select, trace
@@ -38,6 +39,8 @@ __all__ = [
     "fragment_residual",
     "masked_counts",
     "project",
+    "rasterized",
+    "rasterizes",
     "refused",
     "select",
     "soft_overdraw",

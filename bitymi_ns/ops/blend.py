@@ -73,18 +73,31 @@ class _BlendedImage(torch.autograd.Function):
         return *gradients, dtexels, out["dresidual"], None, None, None, None, None
 
 
-def _check(fragments: Fragments, base: Tensor, texels: Tensor, tiles: TexelTiles, descent: TexelDescent | None) -> None:
-    """Raise a ValueError where inputs do not belong together; see `blended_image`."""
+def checked_texels(
+    like: Tensor,
+    surfels: int,
+    base: Tensor,
+    texels: Tensor | None,
+    tiles: TexelTiles | None,
+    move_surfels: bool,
+    descent: TexelDescent | None,
+) -> tuple[Tensor, TexelTiles, bool, TexelDescent | None]:
+    """Texels, tiles, move_surfels and descent of `blended_image`, filled in where there are none; raises a ValueError
+    where they do not belong together, to `base` of so many surfels or to the device of `like`."""
+    if texels is None or tiles is None:
+        tiles = _no_tiles(surfels, base.dtype, base.device)
+        texels, move_surfels, descent = base.new_zeros(0, 3), False, None
     named = {} if descent is None else descent.arguments(texels)
     named.pop("rate", None)
-    on_same_device(fragments.weight, base=base, texels=texels, **tiles.arrays, **named)
+    on_same_device(like, base=base, texels=texels, **tiles.arrays, **named)
     if tiles.count != texels.shape[0] or texels.shape[1:] != (3,):
         raise ValueError(f"the tiles hold {tiles.count} texels, texels has the shape {list(texels.shape)}")
     check_shapes(base=(base, (len(tiles.first), 3)))
-    if fragments.surfels != len(base):
-        raise ValueError(f"the fragments are those of {fragments.surfels} surfels, not of {len(base)}")
+    if surfels != len(base):
+        raise ValueError(f"the fragments are those of {surfels} surfels, not of {len(base)}")
     if descent is not None and (texels.requires_grad or not texels.is_contiguous()):
         raise ValueError("texels that the backward pass moves are dense and ask for no gradient")
+    return texels, tiles, move_surfels, descent
 
 
 def blended_image(
@@ -142,10 +155,9 @@ def blended_image(
         check_shapes(residual=(residual, (len(fragments), 3)))
         if texels is not None:
             raise ValueError("the residual is that of texels or of fragments, not both")
-    if texels is None or tiles is None:
-        tiles = _no_tiles(fragments.surfels, base.dtype, base.device)
-        texels, move_surfels, descent = base.new_zeros(0, 3), False, None
-    _check(fragments, base, texels, tiles, descent)
+    texels, tiles, move_surfels, descent = checked_texels(
+        fragments.weight, fragments.surfels, base, texels, tiles, move_surfels, descent
+    )
     uv = fragments.uv if move_surfels else fragments.uv.detach()
     if descent is not None and not base.requires_grad:
         base = base.detach().requires_grad_()  # so that there is a backward pass, whatever else learns

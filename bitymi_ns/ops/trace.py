@@ -203,7 +203,12 @@ def masked_counts(fragments: Fragments, mask: Tensor, n: int) -> Tensor:
         raise ValueError(f"the fragments are those of {fragments.surfels} surfels, not of {n}")
     if mask.numel() != fragments.width * fragments.height:
         raise ValueError(f"the mask has {mask.numel()} pixels, the view {fragments.width * fragments.height}")
+    return counted(fragments.view, mask, n)
+
+
+def counted(view: dict[str, Any], mask: Tensor, n: int) -> Tensor:
+    """The same by layout and size of the image, as of `Fragments.view`."""
     counts = torch.zeros(n, dtype=torch.int32, device=mask.device)
     flat = mask.reshape(-1).to(torch.uint8).contiguous()
-    function("masked_counts", counts.device)(**fragments.view, mask=flat, counts=counts)
+    function("masked_counts", counts.device)(**view, mask=flat, counts=counts)
     return counts

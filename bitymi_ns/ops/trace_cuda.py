@@ -1,7 +1,7 @@
 """The fragment list by the CUDA kernels (csrc/cuda/fragment_list.h describes it).
 
 Two numbers decide how much memory is needed, so the host waits for the device twice per view: for the number of pairs
-of surfel and tile, and for the number of fragments.
+of surfel and tile, and for the number of fragments. Pictures need the first alone (rasterize_cuda.py).
 """
 
 from dataclasses import dataclass
@@ -98,16 +98,17 @@ def blended(geom: Tensor, projection: Projection, bins: Bins) -> Layout:
         tile_pairs=bins.tile_pairs,
         workspace=workspace("trace_mark", geom, pairs=pairs),
     )
-    return _layout(marks | bins.layout, camera.width, camera.height)
+    return layout_of(marks | bins.layout, camera.width, camera.height)
 
 
-def _layout(arrays: dict[str, Tensor], width: int, height: int, ids: dict[str, Tensor] | None = None) -> Layout:
-    """Of the arrays of `Pairs`, and of surfel and pixel [F] int32, which may be still to be written."""
-    offsets = arrays["offsets"]
-    count = int(offsets[-1])
-    with on_device(offsets.device):
-        handle = module(offsets.device).Pairs(**arrays, width=width, height=height, fragments=count)
-    return Layout(handle, arrays, lambda: empty_ids(offsets, count) if ids is None else ids)
+def layout_of(arrays: dict[str, Tensor], width: int, height: int, ids: dict[str, Tensor] | None = None) -> Layout:
+    """Of the arrays of `Pairs`, and of surfel and pixel [F] int32, which may be still to be written. Waits for the
+    number of fragments where there are offsets; without them they have no list."""
+    masks = arrays["masks"]
+    count = int(arrays["offsets"][-1]) if "offsets" in arrays else -1
+    with on_device(masks.device):
+        handle = module(masks.device).Pairs(**arrays, width=width, height=height, fragments=count)
+    return Layout(handle, arrays, lambda: empty_ids(masks, count) if ids is None else ids)
 
 
 def free_memory(device: torch.device) -> int:
@@ -178,7 +179,7 @@ def select(layout: Layout, keep: Tensor, width: int, height: int) -> Layout:
     function("select_fragments", keep.device)(layout=layout.handle, keep=keep, masks=masks, counts=counts)
     offsets, kept = torch.nn.functional.pad(counts.cumsum(0), (1, 0)), keep.bool()
     ids = {name: value[kept] for name, value in layout.ids().items()}
-    return _layout(layout.arrays | {"masks": masks, "offsets": offsets}, width, height, ids)
+    return layout_of(layout.arrays | {"masks": masks, "offsets": offsets}, width, height, ids)
 
 
 def backward_memory(geom: Tensor, layout: Layout, texel_alpha: Tensor | None) -> dict[str, Tensor]:

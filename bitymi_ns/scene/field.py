@@ -39,7 +39,14 @@ class ResidualField(nn.Module):
             learns: whether it gets gradients.
             read: what `snapshot` gave, for a view that is drawn in parts.
         """
-        raise NotImplementedError
+        found = self.texture(bound, learns, read)
+        if found is None:
+            raise NotImplementedError
+        return found
+
+    def texture(self, bound: float, learns: bool, read: Tensor | None = None) -> dict[str, Any] | None:
+        """The same where it does not depend on the fragments; None where it does."""
+        return None
 
     def opacity(self, bound: float, learns: bool) -> TexelAlpha | None:
         """Opacities of texels, with gradients or without; None = all of a surfel is as opaque as it is. See
@@ -212,9 +219,7 @@ class TexelField(ResidualField):
         self.alpha = None if self.alpha is None else nn.Parameter(self.alpha.detach()[old])
         self.share, self.size, self.extent = self.share[old], self.size[rows], self.extent[rows]
 
-    def residual(
-        self, fragments: Fragments, frames: Tensor, bound: float, learns: bool, read: Tensor | None = None
-    ) -> dict[str, Any]:
+    def texture(self, bound: float, learns: bool, read: Tensor | None = None) -> dict[str, Any]:
         descent = self.descent if learns else None
         texels = self.texels if learns and descent is None else self.texels.detach()
         if descent is not None and read is not None:

@@ -20,6 +20,8 @@ from bitymi_ns.ops import (
     blended_image,
     by_bands,
     project,
+    rasterized,
+    rasterizes,
     refused,
     soft_overdraw,
     trace,
@@ -163,7 +165,8 @@ class Scene(nn.Module):
     ) -> RenderOutput:
         """Renders a view: visibility, then shading, then compositing.
 
-        A view with more fragments than `config.max_fragments`, or than memory holds, is drawn in bands of tiles.
+        On a card surfels and texels are drawn without a list of fragments, where neither maps nor the overdraw are
+        asked for. A view with more fragments than `config.max_fragments`, or than memory holds, is drawn in bands.
 
         Args:
             background: [3] colour behind the scene; None = black.
@@ -182,6 +185,11 @@ class Scene(nn.Module):
         if self.field is not None:
             projection.alpha = self.field.opacity(bound, learns)
         base = self.base_color(projection)
+        if not maps and overdraw_half is None and not self.config.max_fragments and rasterizes(base.device):
+            texture = {} if field is None else field.texture(bound, learns)
+            if texture is not None and (field is not None or projection.alpha is None):
+                image, marks = rasterized(projection, base, **texture, rim=self.config.rim)
+                return RenderOutput.of_image(image, projection, marks, background, maps)
         read: Tensor | None = None
 
         def draw(part: Projection, most: int | None) -> tuple[Tensor, Fragments]:

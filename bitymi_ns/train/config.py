@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
+import tyro
 from pydantic import Field
 
 from bitymi_ns.ranges import MOST, Count, NonNegative, Positive, PositiveCount, PositiveShare, Share, Threshold
@@ -69,7 +70,9 @@ class DensifyConfig:
     growth: NonNegative = 4.0
     """... but not before there are so many times the surfels that training started with, however few the pixels: a
     scene that cannot grow cannot put surfels where its errors are."""
-    max_surfels: Count = 0  # Hard cap on the number of surfels; 0 = none.
+    max_surfels: Annotated[Count, tyro.conf.arg(aliases=("--max-surfels",))] = 0
+    """Most surfels at any time; 0 = no limit. Once they are reached, those that the final prunes would remove make room
+    for those whose errors are largest."""
     min_surfels: Count = 100  # No prune leaves fewer surfels than this.
 
 

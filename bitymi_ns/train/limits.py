@@ -46,11 +46,10 @@ def start(points: PointReport, config: TrainConfig, image_pixels: int, scene: Sc
     if points.over_cap:
         most, first = config.densify.max_surfels, config.first_surfels
         by_steps = first is not None and (most <= 0 or first < most)
-        option, most = ("first-surfels", first) if by_steps else ("densify.max-surfels", most)
+        option, most = ("pipeline.model.train.first-surfels", first) if by_steps else ("max-surfels", most)
         what = f"{points.random:,} random points" if points.random else f"{points.given:,} points of the capture"
         found.append(
-            f"Training starts from {most:,} surfels: {points.over_cap:,} of {what} are left out at random "
-            f"(--pipeline.model.train.{option})."
+            f"Training starts from {most:,} surfels: {points.over_cap:,} of {what} are left out at random (--{option})."
         )
     size = default_table_size(image_pixels)
     if scene.texture == "hash" and scene.log2_table_size is None and table_size_of(image_pixels) > size:
@@ -64,13 +63,11 @@ def start(points: PointReport, config: TrainConfig, image_pixels: int, scene: Sc
 def held_back(count: int, most: int, config: TrainConfig) -> str:
     """Densification wanted `count` more surfels than the `most` there may be."""
     densify = config.densify
-    option = "max-surfels" if most == densify.max_surfels else "pixels-per-surfel, growth"
     rule = f"one for {densify.pixels_per_surfel:g} pixels of all photographs or {densify.growth:g} times the first"
-    why = "" if most == densify.max_surfels else f", {rule},"
-    return (
-        f"Densification stops at {most:,} surfels{why} and would have made {count:,} more now "
-        f"(--pipeline.model.train.densify.{option})."
-    )
+    why, option = f", {rule},", "pipeline.model.train.densify.pixels-per-surfel, growth"
+    if most == densify.max_surfels:
+        why, option = "", "max-surfels"
+    return f"Densification stops at {most:,} surfels{why} and would have made {count:,} more now (--{option})."
 
 
 def _count(n: int, name: str) -> str:

@@ -3,7 +3,8 @@ thresholds are those of `config.DensifyConfig`.
 
 At each densification, in this order:
 - surfels that can never be seen again are removed (a value that is not finite, or an opacity of 1/255 or less);
-- surfels with many bad pixels and a large gradient are cloned or split;
+- surfels with many bad pixels and a large gradient are cloned or split, the most important ones first where not all
+  fit; faint surfels make room for them;
 - up to half of the candidates for pruning, drawn at random, are removed;
 - opacities are clamped.
 Between 60 and 90 % of the run, four final prunes remove what is transparent. docs/training.md states the
@@ -146,6 +147,8 @@ class Strategy:
             What was done, by name; empty when nothing was due.
         """
         report: dict[str, float] = {}
+        if 0 < self.config.densify.max_surfels < len(scene):  # it was loaded from elsewhere
+            report |= self._drop_dead(scene, optimizers)
         if step in self.schedule.densify_steps:
             report |= self._densify(step, scene, optimizers, views)
         if step in self.schedule.reset_steps:
@@ -179,10 +182,13 @@ class Strategy:
         wanted = scores.importance > config.importance
         clone = wanted & ~large & (grad_sum / seen >= config.grad_threshold)
         split = wanted & large & (abs_grad_sum / seen >= config.abs_grad_threshold)
+        replaced = torch.zeros_like(clone)
         if self.most > 0:
-            room = max(0, self.most - n)
-            chosen = _strongest(clone | split, scores.importance, abs_grad_sum / seen, room)
-            report["held_back"] = int((clone | split).sum()) - int(chosen.sum())
+            count, room = int((clone | split).sum()), max(0, self.most - n)
+            faint = ~(clone | split) & self._faint(surfels)
+            replaced = _lowest(surfels["opacity_logits"], faint, count - room)
+            chosen = _strongest(clone | split, scores.importance, abs_grad_sum / seen, room + int(replaced.sum()))
+            report |= {"replaced": int(replaced.sum()), "held_back": count - int(chosen.sum())}
             clone, split = clone & chosen, split & chosen
         clones, splits = clone.nonzero().flatten(), split.nonzero().flatten()
         stay = (~split).nonzero().flatten()
@@ -197,7 +203,7 @@ class Strategy:
         drawn = self._draw(1.0 / (1e-6 + 1.0 - scores.prune[stay].double()), budget)
         pruned = torch.zeros(n, dtype=torch.bool, device=device)
         pruned[stay[drawn]] = True
-        pruned &= old_candidate
+        pruned = pruned & old_candidate | replaced
         pruned = self._keep_minimum(pruned, surfels["opacity_logits"], n + len(clones) + len(splits), among=~split)
         keep = (~pruned & ~split).nonzero().flatten()
 
@@ -227,12 +233,15 @@ class Strategy:
         candidate = surfels["opacity_logits"].sigmoid() < config.prune_opacity
         return candidate | (surfels["log_scales"].amax(-1).exp() > config.prune_world * self.schedule.extent)
 
+    def _faint(self, surfels: Mapping[str, Tensor]) -> Tensor:
+        """[N] bool: the surfels that a final prune would remove."""
+        return surfels["opacity_logits"].sigmoid() < self.config.densify.final_prune_opacity
+
     @torch.no_grad()
     def _final_prune(self, scene: Scene, optimizers: Mapping[str, Optimizer]) -> dict[str, float]:
         report = self._drop_dead(scene, optimizers)
         logits = scene.surfels["opacity_logits"]
-        pruned = logits.sigmoid() < self.config.densify.final_prune_opacity
-        pruned = self._keep_minimum(pruned, logits, len(scene))
+        pruned = self._keep_minimum(self._faint(scene.surfels), logits, len(scene))
         self.remove(pruned, scene, optimizers)
         return report | {"pruned": int(pruned.sum())}
 
@@ -247,11 +256,9 @@ class Strategy:
         logits = surfels["opacity_logits"]
         # no fragment anywhere, hence no gradient: they stay invisible for good
         invisible = finite & (logits.sigmoid() <= ALPHA_MIN)
-        over = int(finite.sum() - invisible.sum()) - self.config.densify.max_surfels
-        if self.config.densify.max_surfels > 0 and over > 0:
-            # only a scene loaded from elsewhere is over the cap: the faintest go
-            order = torch.where(finite & ~invisible, logits.detach(), math.inf).argsort(stable=True)
-            invisible[order[:over]] = True
+        if self.config.densify.max_surfels > 0:
+            over = int(finite.sum() - invisible.sum()) - self.config.densify.max_surfels
+            invisible |= _lowest(logits, finite & ~invisible, over)
         pruned = ~finite | self._keep_minimum(invisible, logits, int(finite.sum()), among=finite)
         self.remove(pruned, scene, optimizers)
         return {"not_finite": int((~finite).sum()), "invisible": int((pruned & finite).sum())}
@@ -264,12 +271,8 @@ class Strategy:
         lowest = max(1, self.config.densify.min_surfels)
         if self.config.densify.max_surfels > 0:
             lowest = min(lowest, self.config.densify.max_surfels)
-        missing = min(lowest - (count - int(pruned.sum())), int(pruned.sum()))
-        if missing > 0:
-            order = torch.where(pruned, opacity_logits.detach(), -math.inf).argsort(descending=True, stable=True)
-            pruned = pruned.clone()
-            pruned[order[:missing]] = False
-        return pruned
+        missing = lowest - (count - int(pruned.sum()))
+        return pruned & ~_lowest(-opacity_logits, pruned, missing)
 
     def _draw(self, weights: Tensor, k: int) -> Tensor:
         """[min(k, number of positive weights)] different rows, drawn one after the other in proportion to `weights`:
@@ -293,7 +296,7 @@ class Strategy:
 
 
 def most_surfels(config: TrainConfig, image_pixels: int, first_surfels: int = 0) -> int:
-    """The number of surfels at which densification stops; 0 = never.
+    """The number of surfels that densification does not exceed; 0 = no bound.
 
     Args:
         image_pixels: of all training images at full size.
@@ -312,6 +315,14 @@ def finite_rows(scene: Scene) -> Tensor:
     for p in scene.surfels.values():
         finite &= p.detach().reshape(len(p), -1).isfinite().all(-1)
     return finite
+
+
+def _lowest(values: Tensor, among: Tensor, k: int) -> Tensor:
+    """[N] bool: at most `k` of the rows `among` [N] bool, those with the lowest `values` [N]."""
+    rows = among.nonzero().flatten()
+    chosen = torch.zeros_like(among)
+    chosen[rows[values.detach()[rows].argsort(stable=True)[: max(0, k)]]] = True
+    return chosen
 
 
 def _strongest(wanted: Tensor, importance: Tensor, gradient: Tensor, k: int) -> Tensor:

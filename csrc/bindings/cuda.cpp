@@ -47,6 +47,8 @@ template <class S> void bind_operations(nb::module_& m) {
   bind_operation(m, name("bin_fill"), &bin_fill<S>);
   bind_operation(m, name("trace_mark"), &trace_mark<S>);
   bind_operation(m, name("trace_fill"), &trace_fill<S>);
+  bind_operation(m, name("rasterize_forward"), &rasterize_forward<S>);
+  bind_operation(m, name("rasterize_backward"), &rasterize_backward<S>);
   bind_operation(m, name("picture_loss"), &picture_loss<S>);
   bind_operation(m, name("picture_loss_backward"), &picture_loss_backward<S>);
   bind_operation(m, name("note_centers"), &note_centers<S>);

@@ -28,16 +28,16 @@ template <class R> void check_pairs(R& r, int64_t pairs) {
 }
 
 struct Pairs {
-  int width, height;          // of the image
-  int64_t surfels, pairs;     // counts
-  const int32_t* surfel;      // [pairs] list order
-  const int32_t* slot;        // [pairs] list order
-  const uint32_t* masks;      // [kTileWarps, pairs] list order
-  const int64_t* offsets;     // [pairs + 1] list order
-  const int64_t* tile_pairs;  // [tiles + 1]
-  const int32_t* order;       // [surfels] front to back
-  const int64_t* slot_start;  // [surfels + 1]
-  int64_t fragments;
+  int width, height;                      // of the image
+  int64_t surfels, pairs;                 // counts
+  const int32_t* surfel;                  // [pairs] list order
+  const int32_t* slot;                    // [pairs] list order
+  const uint32_t* masks;                  // [kTileWarps, pairs] list order
+  const int64_t* offsets;                 // [pairs + 1] list order; null: the fragments are not listed
+  const int64_t* tile_pairs;              // [tiles + 1]
+  const int32_t* order;                   // [surfels] front to back
+  const int64_t* slot_start;              // [surfels + 1]
+  int64_t fragments;                      // -1: not listed, so that no list belongs to it
   static constexpr bool kHasIds = false;  // kernels read them from the list
   int64_t tiles() const { return tiles_of(width, height); }
   bool fits(int64_t n, int wide, int high) const { return n == surfels && wide == width && high == height; }
@@ -49,7 +49,8 @@ struct Pairs {
     check_pairs(r, pairs);
     r.array("slot", slot, pairs);
     r.array("masks", masks, kTileWarps * pairs);
-    r.array("offsets", offsets, pairs + 1);
+    r.maybe("offsets", offsets, pairs + 1);
+    if (!offsets != (fragments < 0)) r.refuse("a list of fragments has offsets");
     r.array("tile_pairs", tile_pairs, tiles() + 1);
     r.rows("order", order, surfels, 1);
     r.array("slot_start", slot_start, surfels + 1);
@@ -91,6 +92,15 @@ template <class S> __device__ inline void load_shape(const S* row, S* g) {
 #endif
   g[kArea] = row[kArea];
 }
+
+// Puts the sums of a surfel's pairs: columns of geom, those of the absolute gradients between.
+template <class S> struct StoreGeomGradient {
+  S *dgeom, *absgrad;
+  __device__ void operator()(int64_t surfel, int column, S sum) const {
+    dgeom[surfel * kGeom + column] = column < kShape || column == kArea ? sum : S(0);
+    if (column >= kShape && column < kShape + 2) absgrad[2 * surfel + column - kShape] = sum;
+  }
+};
 
 // Visits the pairs of a tile that have a fragment in the calling warp, back to front. Every lane calls
 // load(k, surfel, mine, i) and later use(what load gave): `mine` says whether the lane's pixel has a fragment of pair

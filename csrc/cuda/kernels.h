@@ -128,6 +128,85 @@ struct SelectPairs {
 };
 void select_fragments(const SelectPairs& a, Stream stream);
 
+// The picture of a view without a list of fragments: `trace` and `blend` in one, opaque or with alpha texels, without
+// maps. Written: image [height, width, kImageChannels], as of BlendForward, and what the backward pass takes: masks and
+// cuts [kTileWarps, pairs] and each pixel's transmittance [height, width]. cuts may be null.
+template <class S> struct RasterizeForward {
+  View<S> view;
+  AlphaTiles<S> alpha;
+  TexelTiles<S> table;
+  S bound;
+  int64_t pairs;
+  const int32_t* surfel;
+  const int64_t* tile_pairs;
+  uint32_t *masks, *cuts;
+  S *image, *transmittance;
+
+  template <class R> void fields(R& r) {
+    view.fields(r);
+    alpha.fields(r, view.n);
+    table.fields(r);
+    if (table.n != view.n || (alpha.values && alpha.texels != table.texels))
+      r.refuse("the tiles belong to other surfels or other alphas");
+    r.number("bound", bound);
+    r.rows("surfel", surfel, pairs, 1);
+    check_pairs(r, pairs);
+    r.array("tile_pairs", tile_pairs, tiles_of(view.width, view.height) + 1);
+    r.array("masks", masks, kTileWarps * pairs);
+    r.maybe("cuts", cuts, kTileWarps * pairs);
+    const int64_t pixels = int64_t(view.width) * view.height;
+    r.array("image", image, pixels * kImageChannels);
+    r.array("transmittance", transmittance, pixels);
+  }
+};
+template <class S> void rasterize_forward(const RasterizeForward<S>& a, Stream stream);
+
+// Gradients as of TraceBackward and BlendBackward, without those of fragments. moves: coordinates on texels move
+// surfels. texel_sums [texels, 4]: working memory where texels move or their alphas have gradients.
+template <class S> struct RasterizeBackward {
+  View<S> view;
+  S rim;
+  AlphaTiles<S> alpha;
+  TexelTiles<S> table;
+  S bound;
+  Pairs layout;
+  const uint32_t* cuts;
+  const S *transmittance, *dimage, *share;
+  S rate;
+  int moves;
+  S *partial, *color_partial, *texel_sums, *dgeom, *absgrad, *dbase, *moved, *dtexel_alpha;
+
+  template <class R> void fields(R& r) {
+    view.fields(r);
+    r.number("rim", rim);
+    alpha.fields(r, view.n);
+    table.fields(r);
+    r.number("bound", bound);
+    take(r, "layout", layout);
+    if (table.n != view.n || !layout.fits(view.n, view.width, view.height) ||
+        (alpha.values && alpha.texels != table.texels))
+      r.refuse("layout, surfels and tiles do not belong together");
+    r.maybe("cuts", cuts, kTileWarps * layout.pairs);
+    if (alpha.values && !cuts) r.refuse("alpha texels need cuts");
+    const int64_t pixels = int64_t(view.width) * view.height;
+    r.array("transmittance", transmittance, pixels);
+    r.array("dimage", dimage, pixels * kImageChannels);
+    r.maybe("share", share, table.texels);
+    r.numbers("rate", rate, "moves", moves);
+    r.work("partial", partial, layout.pairs * kTraceSums);
+    r.work("color_partial", color_partial, layout.pairs * 4);
+    r.array("dgeom", dgeom, view.n * kGeom);
+    r.array("absgrad", absgrad, view.n * 2);
+    r.array("dbase", dbase, view.n * 3);
+    r.maybe("moved", moved, 3 * table.texels);
+    r.maybe("dtexel_alpha", dtexel_alpha, alpha.values ? alpha.texels : 0);
+    r.maybe("texel_work", texel_sums, 4 * table.texels);
+    if (moved && !share) r.refuse("texels move by a share of each");
+    if ((moved || dtexel_alpha) && !texel_sums) r.refuse("gradients of texels need working memory");
+  }
+};
+template <class S> void rasterize_backward(const RasterizeBackward<S>& a, Stream stream);
+
 template <class S> void view_color_forward(const ViewColorForward<S>& a, Stream stream);
 template <class S> void view_color_backward(const ViewColorBackward<S>& a, Stream stream);
 

@@ -23,15 +23,16 @@ template <class S> __device__ S with_mark(S v, bool mark) {
 }
 
 // Multiplies the sigma of a surfel's fragment, at least 1/255, where its weight would be at least the bound, and marks
-// v. Both passes over a view call it, so that they agree.
-template <class S> __device__ void cut(const AlphaTiles<S>& tiles, int64_t id, S transmittance, S u, S& v, S& sigma) {
+// v; true where it did. Both passes over a view call it, so that they agree.
+template <class S> __device__ bool cut(const AlphaTiles<S>& tiles, int64_t id, S transmittance, S u, S& v, S& sigma) {
   const AlphaPatch<S> patch(tiles, id);
-  if (!patch.textured()) return;
+  if (!patch.textured()) return false;
   const bool reaches = blend(sigma, transmittance).weight >= tiles.bound;
   v = with_mark(v, reaches);
-  if (!reaches) return;
+  if (!reaches) return false;
   S t[4];
   sigma = alpha_cut(sigma, patch.fetch(patch.corners(u, v), t));
+  return true;
 }
 
 }  // namespace bt::cuda

@@ -1,5 +1,6 @@
-// Sums of the texels' gradients over fragments, and what becomes of them. Rows of four numbers per texel, the last 0,
-// so that a texel takes one vector reduction (warp.h); or integers, for sums that do not depend on the order.
+// Sums of the texels' gradients over fragments, and what becomes of them. Rows of four numbers per texel, the last that
+// of alpha or 0, so that a texel takes one vector reduction (warp.h); or integers, for sums that do not depend on the
+// order.
 #pragma once
 
 #include "cuda/exact_sums.h"
@@ -14,7 +15,7 @@ namespace bt::cuda {
 template <int M, class S, bool kExact>
 __device__ void add_to_corners(int64_t row, const TexelCorners<S>& at, const S (&g)[M], int lane,
                                const Adder<S, kExact>& to) {
-  static_assert(M == 1 || M == 3);
+  static_assert(M == 1 || M == 3 || M == 4);
   S value[4 * M];
   BT_UNROLL
   for (int i = 0; i < 4 * M; ++i) value[i] = at.weight[i / M] * g[i % M];
@@ -28,8 +29,8 @@ __device__ void add_to_corners(int64_t row, const TexelCorners<S>& at, const S (
     if constexpr (M == 1) {
       if (d[0] != S(0)) to.add(texel, d[0]);
     } else {
-      const S four[4] = {d[0], d[1], d[2], S(0)};
-      if (d[0] != S(0) || d[1] != S(0) || d[2] != S(0)) to.add4(4 * texel, four);
+      const S four[4] = {d[0], d[1], d[2], M == 4 ? d[M - 1] : S(0)};
+      if (d[0] != S(0) || d[1] != S(0) || d[2] != S(0) || four[3] != S(0)) to.add4(4 * texel, four);
     }
   }
 }

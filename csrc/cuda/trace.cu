@@ -5,12 +5,9 @@
 // the masks, a scan gives every fragment its offset, trace_fill writes the fragments there. The second pass evaluates
 // marked pairs alone. trace_mark is bound by arithmetic (about 100 operations per lane and pair, a third of the lanes
 // with a fragment), trace_fill also by the 28 bytes per fragment that it writes.
-#include "core/kernel.h"
-#include "core/visibility.h"
-#include "cuda/fast_float.h"
 #include "cuda/kernels.h"
+#include "cuda/mark.h"
 #include "cuda/sort_scan.h"
-#include "cuda/texel_alpha.h"
 
 namespace bt::cuda {
 
@@ -27,75 +24,12 @@ struct MarkSpace {
         temp(arena.take<char>(temp_size)) {}
 };
 
-// True where the support or the low pass of a surfel without a box may reach the warp's pixels.
-template <class Kernel, class S> __device__ bool reached_by_warp(const S* g, const TileThread& s) {
-  if (filtered<Kernel>(g)) return true;
-  const S x = S(s.left) + S(0.5 * kWarpWidth) - g[kCx], y = S(s.top) + S(0.5 * kWarpHeight) - g[kCy];
-  const Reached<S> r = reached(g, x, y, cell_half(S(0.5 * (kWarpWidth - 1)), g[kCx], abs_(x) + S(kTile)),
-                               cell_half(S(0.5 * (kWarpHeight - 1)), g[kCy], abs_(y) + S(kTile)), S(kSupport2),
-                               S(kLowPassReach * kLowPassReach));
-  return r.support || r.centre;
-}
-
 template <class Kernel, class S, bool kAlpha>
 __global__ void __launch_bounds__(kTileThreads)
-    mark_kernel(const S* geom, const S* radii, S near, int width, int height, AlphaTiles<S> alpha, int64_t pairs,
-                const int32_t* surfel, const int64_t* tile_pairs, uint32_t* masks) {
-  using T = FastFloatOr<S>;
-  const TileThread s = tile_thread(width);
-  const int64_t end = tile_pairs[blockIdx.x + 1];
-  int64_t first = tile_pairs[blockIdx.x];
-  uint32_t* row = masks + s.warp * pairs;
-  const S x = pixel_centre<S>(s.x), y = pixel_centre<S>(s.y);
-  bool open = s.x < width && s.y < height;  // the pixel still takes light
-  S transmittance = S(1);
-  for (; first < end && __any_sync(kFullMask, open); first += kWarp) {
-    // one lane per pair: does its box meet the warp's pixels, or do these reach it where it has none?
-    const int64_t own = first + s.lane;
-    int32_t id = 0;
-    bool meets = false;
-    if (own < end) {
-      id = surfel[own];
-      const S cx = geom[int64_t(id) * kGeom + kCx], cy = geom[int64_t(id) * kGeom + kCy];
-      const S rx = radii[2 * int64_t(id)], ry = radii[2 * int64_t(id) + 1];
-      // the centre of a disc without a box may lie further away than its radii say
-      if (max_(rx, ry) >= S(kBoxless))
-        meets = reached_by_warp<Kernel>(geom + int64_t(id) * kGeom, s);
-      else
-        meets = cx + rx >= S(s.left) && cx - rx <= S(s.left + kWarpWidth) && cy + ry >= S(s.top) &&
-                cy - ry <= S(s.top + kWarpHeight);
-    }
-    unsigned todo = __ballot_sync(kFullMask, meets);
-    uint32_t mark = 0;
-    while (todo) {
-      const int j = __ffs(int(todo)) - 1;
-      todo &= todo - 1;
-      S g[kGeom];
-      const int64_t drawn = __shfl_sync(kFullMask, id, j);
-      load_shape(geom + drawn * kGeom, g);
-      const T dx = T(x - g[kCx]), dy = T(y - g[kCy]);
-      // a cheap test first: an open pixel in the support or near the centre
-      const bool close = near_centre(dx, dy);
-      const bool reached = filtered<Kernel>(g) ? in_support(filtered_hit<S, T>(g, dx, dy))
-                                               : close || in_support(planes<S, T>(g, dx, dy));
-      if (!__any_sync(kFullMask, open && reached)) continue;
-      const Fragment<T> f = fragment<Kernel>(g, near, dx, dy, __any_sync(kFullMask, close));
-      S sigma = plain(f.sigma);
-      if constexpr (kAlpha) {
-        S v = plain(f.v);
-        if (open && sigma >= S(kAlphaMin)) cut(alpha, drawn, transmittance, plain(f.u), v, sigma);
-      }
-      const S behind = blend(sigma, transmittance).behind;
-      const BlendTest<S> v = blend_test(open, sigma, behind, S(kTransmittanceMin));
-      open = open && !v.ends;
-      if (v.takes) transmittance = behind;
-      const unsigned taken = __ballot_sync(kFullMask, v.takes);
-      if (s.lane == j) mark = taken;
-      if (!__any_sync(kFullMask, open)) todo = 0;
-    }
-    if (own < end) row[own] = mark;
-  }
-  for (int64_t k = first + s.lane; k < end; k += kWarp) row[k] = 0;
+    mark_kernel(View<S> view, AlphaTiles<S> alpha, int64_t pairs, const int32_t* surfel, const int64_t* tile_pairs,
+                uint32_t* masks) {
+  mark_pairs<Kernel, kAlpha>(view, alpha, pairs, surfel, tile_pairs, masks, static_cast<uint32_t*>(nullptr),
+                             tile_thread(view.width), [](int64_t, const S*, const Fragment<FastFloatOr<S>>&, S) {});
 }
 
 // Pairs behind those of the tiles have no masks.
@@ -227,8 +161,8 @@ template <class S> void trace_mark(const TraceMark<S>& a, Stream stream) {
     with_kernel(v.prefilter, [&](auto kernel) {
       const auto mark =
           a.alpha.values ? mark_kernel<decltype(kernel), S, true> : mark_kernel<decltype(kernel), S, false>;
-      BT_LAUNCH(mark, dim3(unsigned(tiles)), dim3(kTileThreads), 0, stream, v.geom, v.radii, v.near, v.width, v.height,
-                a.alpha, pairs, a.surfel, a.tile_pairs, a.masks);
+      BT_LAUNCH(mark, dim3(unsigned(tiles)), dim3(kTileThreads), 0, stream, v, a.alpha, pairs, a.surfel, a.tile_pairs,
+                a.masks);
     });
   BT_LAUNCH(size_kernel, dim3(unsigned(ceil_div(pairs + 1, kThreads))), dim3(kThreads), 0, stream, pairs,
             a.tile_pairs + tiles, a.masks, w.counts);

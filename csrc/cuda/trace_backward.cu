@@ -101,13 +101,6 @@ __global__ void __launch_bounds__(kRunThreads)
   if (r.some) partial[int64_t(p.slot[r.k]) * kTraceSums + r.lane] = sum;
 }
 
-template <class S> struct StoreGeomGradient {
-  S *dgeom, *absgrad;
-  __device__ void operator()(int64_t surfel, int column, S sum) const {
-    dgeom[surfel * kGeom + column] = column < kShape || column == kArea ? sum : S(0);
-    if (column >= kShape && column < kShape + 2) absgrad[2 * surfel + column - kShape] = sum;
-  }
-};
 }  // namespace
 
 template <class S> void trace_backward(const TraceBackward<S, Pairs>& a, Stream stream) {

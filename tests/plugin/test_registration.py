@@ -31,10 +31,13 @@ def test_every_method_is_registered_under_its_name(name: str) -> None:
 
 def test_a_method_parses_from_the_command_line() -> None:
     default = methods.bitymi.config
-    args = "--pipeline.model.train.loss.falloff-weight 0.001 --vis none --pipeline.model.scene.levels 3"
+    args = (
+        "--pipeline.model.train.loss.falloff-weight 0.001 --vis none --pipeline.model.scene.levels 3 --max-surfels 5000"
+    )
     parsed = tyro.cli(type(default), default=default, args=args.split())
     assert parsed.pipeline.model.train.loss.falloff_weight == 0.001
     assert parsed.pipeline.model.scene.levels == 3
+    assert parsed.pipeline.model.train.densify.max_surfels == 5000
     assert parsed.vis == "none" and not parsed.is_viewer_enabled()
     assert parsed.max_num_iterations is None
     dataparser = parsed.pipeline.datamanager.dataparser  # the split of 3DGS

@@ -39,11 +39,13 @@ def test_stand_ins_are_imported_and_their_use_is_an_error(card: ModuleType, tmp_
 
 
 def test_commands_are_tabled_with_what_they_left(card: ModuleType, tmp_path: Path) -> None:
-    commands = card.Commands(tmp_path, card.stand_in(tmp_path / "stand-ins"))
+    written: list[int] = []
+    environment = card.stand_in(tmp_path / "stand-ins")
+    commands = card.Commands(tmp_path, environment, lambda: written.append(len(commands.rows)))
     assert commands.run(sys.executable, "-c", "x = bytearray(200_000_000)")
     assert not commands.run(sys.executable, "-c", "raise SystemExit(3)")
     (_, cost, _), (_, failed, _) = commands.rows
-    assert cost["peak_bytes"] > 200e6 and failed is None
+    assert cost["peak_bytes"] > 200e6 and failed is None and written == [1, 2]
     (tmp_path / "baked.json").write_text(json.dumps({"results": {"psnr": 28.149, "lpips": 0.08}}))
     text = card.tables(tmp_path, commands)
     assert "| baked | 28.15 |  | 0.080 |  |" in text and "| failed |  |" in text

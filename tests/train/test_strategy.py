@@ -274,11 +274,32 @@ def test_the_tighter_bound_holds(cap, per_surfel, pixels, first, most):
     assert most_surfels(TrainConfig(), 263 * 979 * 543) > 2 * 159_000
 
 
-def test_a_scene_over_the_cap_loses_its_faintest(bench):
-    b = bench(20, max_surfels=12)
+@pytest.mark.parametrize("step", [1, DENSIFY, FINAL])
+@pytest.mark.parametrize("cap", [1, 12, 19])
+def test_a_scene_over_the_cap_loses_its_faintest_at_once(bench, step, cap):
+    b = bench(20, max_surfels=cap, min_surfels=100)
     b.set("opacity_logits", slice(0, 20), torch.linspace(-2, 2, 20))
-    b.step(DENSIFY)
-    assert b.x == list(range(8, 20))
+    b.step(step)
+    assert b.x == list(range(20 - cap, 20))
+
+
+def test_faint_surfels_make_room_for_important_ones_at_the_cap(bench):
+    b = bench(40, max_surfels=42, prune_budget=0.0)
+    b.set("opacity_logits", slice(0, 8), torch.linspace(-3.0, -2.3, 8))  # all below 0.1
+    b.importance[2:30] = torch.arange(28) + 10
+    b.see(1.0, 1.0)
+    report = b.step(DENSIFY)
+    # 28 want to grow, there is room for two, and 0 and 1 alone are faint and do not want to grow
+    assert (report["replaced"], report["cloned"], report["held_back"]) == (2, 4, 24)
+    assert b.x == [*range(2, 40), 26, 27, 28, 29]
+    check(b)
+    b = bench(40, max_surfels=42, prune_budget=0.0)  # no more of them than are needed, the faintest
+    b.set("opacity_logits", slice(0, 8), torch.linspace(-2.3, -3.0, 8))
+    b.importance[30:35] = 9
+    b.see(1.0, 1.0)
+    report = b.step(DENSIFY)
+    assert (report["replaced"], report["cloned"], report["held_back"]) == (3, 5, 0)
+    assert b.x == [*range(5), *range(8, 40), *range(30, 35)]
 
 
 def test_broken_rows_go_and_invisible_ones_too(bench):

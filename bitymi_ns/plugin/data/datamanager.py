@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal
@@ -99,7 +99,6 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         local_rank: int = 0,
         **kwargs: Any,
     ) -> None:
-        self._budget = MemoryBudget(photograph_bytes(torch.device(device)))
         self.step_view: Callable[[int], View] = lambda index: self.train_views[index]
         images.set_up_pillow()
         check_capture(config)
@@ -230,6 +229,10 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         fingerprints = [[None if each.empty else each.fingerprint for each in some] for some in summaries]
         pairs = [pair for pair in images.duplicates(*fingerprints) if pair[1] not in reported]
         images.warn_of_duplicates(pairs, train.image_filenames, held_out.image_filenames)
+
+    @cached_property
+    def _budget(self) -> MemoryBudget:
+        return MemoryBudget(photograph_bytes(torch.device(self.device), self.world_size))
 
     def _load_images(  # type: ignore[override]
         self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]

@@ -141,12 +141,12 @@ class BitymiDataset(InputDataset):
         return image.resize(size, resample=resample)
 
 
-def photograph_bytes(device: torch.device) -> int:
-    """Memory of the host for the images of a capture. For a card half of what is available: a step there takes less
-    time than reading a photograph."""
+def photograph_bytes(device: torch.device, processes: int = 1) -> int:
+    """Memory of the host for the images of a capture in one of the processes of a run. With cards half of what is
+    available for all: a step there takes less time than reading a photograph."""
     if device.type == "cpu":
         return PHOTOGRAPH_BYTES
-    return max(PHOTOGRAPH_BYTES, int(min(psutil.virtual_memory().available, memory_limit()) / 2))
+    return max(PHOTOGRAPH_BYTES, int(min(psutil.virtual_memory().available, memory_limit()) / (2 * processes)))
 
 
 def view_mask(outputs: DataparserOutputs, index: int) -> Image.Image:

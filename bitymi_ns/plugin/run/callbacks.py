@@ -87,7 +87,8 @@ class TrainingRun:
         cameras = OnDemand(len(train), lambda i: to_camera(train[i : i + 1], "cpu"))
         learns = scene.config.texture == "texels"
         texels, to_come = config.texels if learns else None, self.training.texels.views_to_come
-        state_training(scene, cameras, self.training.strategy.most, texels, to_come, processes.count)
+        most, overdraw = self.training.strategy.most, config.loss.overdraw_weight > 0
+        state_training(scene, cameras, most, texels, to_come, processes.count, overdraw)
         self.datamanager.step_view = self.training.view
 
     def _check_start(self) -> None:

@@ -31,7 +31,9 @@ PER_FRAGMENT = 36
 """Bytes: the list, the gradients of weights and coordinates, and the order in which the backward pass takes it."""
 PER_SHADED_FRAGMENT = 60
 """Bytes more where a field in space shades: surfels and pixels of fragments, points, residuals and their gradients."""
-PER_CARD_FRAGMENT = 4 * NUMBERS  # bytes of a fragment on a card, where textures of both kinds take as much
+PER_CARD_FRAGMENT = 4 * NUMBERS  # bytes of a fragment on a card in lists of training
+PER_PASSING_FRAGMENT = 36
+"""Bytes on a card where lists are read and dropped, of the coverage of texels: pictures are drawn without."""
 PER_PIXEL = 400  # bytes: pictures, gradients and maps of a view, and the ten views of the multi-view scores
 PER_SURFEL = 3000
 """Bytes in training: parameters, gradients, Adam's averages and the two states that a run could go back to."""
@@ -73,6 +75,7 @@ def state_training(
     texels: TexelConfig | None = None,
     to_come: int = 0,
     processes: int = 1,
+    overdraw: bool = False,
 ) -> None:
     """Print the memory estimate of a training run.
 
@@ -83,6 +86,7 @@ def state_training(
         texels: of those that will learn; None = none will.
         to_come: views that they learn from, counted with repetition.
         processes: of the run, each of which takes as much.
+        overdraw: whether its loss counts.
     """
     (pixels, total), device = _pixels(cameras), scene.surfels["means"].device
     card = device.type == "cuda"
@@ -91,7 +95,7 @@ def state_training(
         kept = min(photograph_budget(device), 9 * total)
     else:
         kept = PROGRAM + min(PHOTOGRAPH_BYTES, 3 * total) + min(DOWNSCALED_BYTES, 6 * total)
-    needed = kept + PER_PIXEL * pixels + _per_fragment(scene) * fragments
+    needed = kept + PER_PIXEL * pixels + _per_fragment(scene, overdraw) * fragments
     surfels = max(len(scene), most_surfels)
     needed += PER_SURFEL * surfels
     if texels is not None:
@@ -132,9 +136,9 @@ def state_export(
     _state("The export", needed, cameras, "export with --finetune-memory 0, which takes longer", device)
 
 
-def _per_fragment(scene: Scene) -> float:
+def _per_fragment(scene: Scene, overdraw: bool = False) -> float:
     if scene.surfels["means"].device.type == "cuda":
-        return PER_CARD_FRAGMENT
+        return PER_CARD_FRAGMENT if overdraw or scene.config.texture == "hash" else PER_PASSING_FRAGMENT
     return PER_FRAGMENT + PER_SHADED_FRAGMENT * (scene.config.texture == "hash")
 
 

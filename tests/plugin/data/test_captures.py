@@ -46,12 +46,14 @@ def test_photographs_of_a_run_on_a_card_stay_in_memory_of_the_host(
     monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=40_000))
     manager = load(capture)
     assert not manager.cached_train._kept
-    manager = load(capture, CARD)
+    shared, manager = load(capture, CARD), load(capture, CARD)
     for views, cached in ((manager.train_views, manager.cached_train), (manager.eval_views, manager.cached_eval)):
         view = views[0]
         assert view.image.device.type == "cpu" and view.image.dtype == torch.uint8
         assert view.camera.K.device == CARD and cached[0]["image"].device.type == "cpu"
     assert len(manager.cached_train._kept) == 20_000 // (36 * 48 * 3)
+    shared.world_size = 2  # processes
+    assert len(shared.cached_train._kept) == 10_000 // (36 * 48 * 3)
 
 
 def add_alpha(paths: list[Path], alpha: int) -> None:

@@ -1,0 +1,146 @@
+"""Pictures of views by the CUDA kernels without lists of fragments (csrc/cuda/rasterize.cu).
+
+Of every fragment two bits are kept, in masks of the pairs of surfel and tile; the backward pass finds the rest again,
+tile by tile. So a view of any number of fragments is drawn at once, and the host waits once, for the number of pairs.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from .backend import cuda_backend, dense, kernel, module, require
+from .bands import Bands
+from .blend import checked_texels
+from .constants import IMAGE_CHANNELS
+from .fragment_list import Layout
+from .project import Projection
+from .texel import TexelDescent, TexelTiles
+from .trace import counted
+from .trace_cuda import layout_of, tile_lists
+
+
+def rasterizes(device: torch.device) -> bool:
+    """Return True where `rasterized` draws: on CUDA devices, unless torch is asked for deterministic algorithms.
+    Gradients of alpha texels have no bound before they are known, so that sums in integers take a list."""
+    return cuda_backend(device) and not torch.are_deterministic_algorithms_enabled()
+
+
+@dataclass(frozen=True)
+class Marks(Bands):
+    """The fragments of a view of which masks were kept. Their numbers are found again for every question."""
+
+    layout: Layout  # pairs and masks
+
+    def __len__(self) -> int:
+        camera = self.projection.camera
+        every = torch.ones(camera.width * camera.height, dtype=torch.bool, device=self.projection.geom.device)
+        return int(self.masked_counts(every, len(self.projection.geom)).sum())
+
+    def masked_counts(self, mask: Tensor, n: int) -> Tensor:
+        """As the function `masked_counts`."""
+        camera = self.projection.camera
+        return counted({"layout": self.layout.handle, "width": camera.width, "height": camera.height}, mask, n)
+
+
+class _Rasterized(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, geom, base, texels, texel_alpha, projection, tiles, bound, rim, moves, descent):
+        g, b, t = dense(geom, geom), dense(base, geom), dense(texels, geom)
+        camera, bins = projection.camera, tile_lists(g, projection)
+        pairs, pixels = len(bins.surfel), camera.width * camera.height
+        masks = torch.empty(module(g.device).TILE_WARPS, pairs, dtype=torch.int32, device=g.device)
+        cuts = torch.empty_like(masks) if projection.alpha is not None else None
+        image, transmittance = g.new_empty(pixels, IMAGE_CHANNELS), g.new_empty(pixels)
+        ctx.arguments = {**projection.view(g), **projection.alpha_arrays, **tiles.arrays, "bound": bound}
+        kernel("rasterize_forward", g)(
+            **ctx.arguments,
+            base=b,
+            texels=t,
+            surfel=bins.surfel,
+            tile_pairs=bins.tile_pairs,
+            masks=masks,
+            cuts=cuts,
+            image=image,
+            transmittance=transmittance,
+        )
+        layout = layout_of({"masks": masks, **bins.layout}, camera.width, camera.height)
+        ctx.save_for_backward(g, b, t, texel_alpha, cuts, transmittance)
+        ctx.layout, ctx.projection, ctx.rim, ctx.moves, ctx.descent = layout, projection, rim, moves, descent
+        return image, layout
+
+    @staticmethod
+    def backward(ctx, dimage, _layout):
+        geom, base, texels, texel_alpha, cuts, transmittance = ctx.saved_tensors
+        pairs, kernels = ctx.layout.handle.pairs, module(geom.device)
+        out = {
+            "dgeom": torch.empty_like(geom),
+            "absgrad": geom.new_empty(len(geom), 2),
+            "dbase": torch.empty_like(base),
+        }
+        dtexels = torch.zeros_like(texels) if ctx.needs_input_grad[2] else None
+        # a gradient is a step of length -1 from 0
+        descent = ctx.descent if dtexels is None else TexelDescent(texels.new_ones(len(texels)), -1.0, dtexels)
+        step = {"rate": 0.0} if descent is None else descent.arguments(texels)
+        work = {"partial": geom.new_empty(pairs, kernels.TRACE_SUMS), "color_partial": geom.new_empty(pairs, 4)}
+        dalpha = torch.empty_like(texel_alpha) if ctx.needs_input_grad[3] else None
+        if descent is not None or dalpha is not None:
+            work["texel_work"] = geom.new_empty(4 * len(texels))
+        kernel("rasterize_backward", geom)(
+            **ctx.arguments,
+            **step,
+            **work,
+            **out,
+            base=base,
+            texels=texels,
+            layout=ctx.layout.handle,
+            rim=ctx.rim,
+            moves=ctx.moves,
+            cuts=cuts,
+            transmittance=transmittance,
+            dimage=dense(dimage, geom),
+            dtexel_alpha=dalpha,
+        )
+        ctx.projection.take_mean2d(out["dgeom"][:, :2], out["absgrad"])
+        return out["dgeom"], out["dbase"], dtexels, dalpha, None, None, None, None, None, None
+
+
+def rasterized(
+    projection: Projection,
+    base: Tensor,
+    texels: Tensor | None = None,
+    tiles: TexelTiles | None = None,
+    bound: float = 0.0,
+    move_surfels: bool = True,
+    descent: TexelDescent | None = None,
+    rim: float = 1e-3,
+) -> tuple[Tensor, Marks]:
+    """Draw a view: `trace` and `blended_image` without maps, in one kernel, and in one more backwards.
+
+    Differentiable in `projection.geom`, its alpha texels, `base` and `texels`. The backward pass fills
+    `projection.mean2d_grad` and `projection.mean2d_absgrad`. Only sums of texels depend on the order of threads.
+
+    Args:
+        projection: of `project`, on a device where `rasterizes`; geom [N, 16].
+        base, texels, tiles, bound, move_surfels, descent: as in `blended_image`.
+        rim: as in `trace`.
+
+    Returns:
+        [H * W, 5] rgb, alpha, sum w beta, as of `blended_image`; and the view's fragments.
+
+    Raises:
+        RuntimeError: 2^31 pairs of surfel and tile or more, or the device is not a CUDA device.
+        ValueError: the tiles are not those of these texels, surfels and alpha texels; or texels that ask for a gradient
+            are to be moved; or tensors lie on several devices.
+    """
+    geom = projection.geom
+    require("rasterized", "cuda", geom.device, "call `trace` and `blended_image`")
+    texels, tiles, move_surfels, descent = checked_texels(geom, len(geom), base, texels, tiles, move_surfels, descent)
+    if descent is not None and not base.requires_grad:
+        base = base.detach().requires_grad_()  # so that there is a backward pass, whatever else learns
+    alpha = None if projection.alpha is None else projection.alpha.values
+    if projection.alpha is not None and projection.alpha.tiles.first is not tiles.first:
+        raise ValueError("the alphas of texels lie in other tiles than their colours")
+    image, layout = _Rasterized.apply(geom, base, texels, alpha, projection, tiles, bound, rim, move_surfels, descent)
+    seen = replace(projection, geom=geom.detach(), frames=projection.frames.detach())
+    return image, Marks(seen, ((0, projection.camera.height),), rim, 0, layout)

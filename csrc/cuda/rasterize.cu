@@ -1,0 +1,345 @@
+// The picture of a view in one kernel, and its backward pass in one more: no fragment is written to memory.
+//
+// Forward is the walk of trace_mark with shading and blending in it; what it leaves for the backward pass is a mask per
+// warp and pair, and each pixel's transmittance. Backward a block goes back through its tile's pairs, as many at a time
+// as have room for their fragments in shared memory, in four steps:
+//   - a walk, one lane per pixel, evaluates the fragments again and lists them;
+//   - kRunLanes lanes a turn, most of them busy, shade them, for the gradients of weights and coordinates;
+//   - a walk turns gradients of weights into those of sigma, with the light from behind in a register;
+//   - turns again add up the gradients of surfels, colours and texels.
+// A pair of many fragments takes many turns, of which every run of lanes takes its share; their sums are added in
+// order.
+#include "cuda/kernels.h"
+#include "cuda/mark.h"
+#include "cuda/texel_sums.h"
+
+namespace bt::cuda {
+
+namespace {
+
+template <class Kernel, class S, bool kAlpha>
+__global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 4) forward_kernel(RasterizeForward<S> a) {
+  using T = FastFloatOr<S>;
+  const TileThread s = tile_thread(a.view.width);
+  S sum[kImageChannels];
+  for (int c = 0; c < kImageChannels; ++c) sum[c] = S(0);
+  const S behind = mark_pairs<Kernel, kAlpha>(a.view, a.alpha, a.pairs, a.surfel, a.tile_pairs, a.masks, a.cuts, s,
+                                              [&](int64_t id, const S* g, const Fragment<T>& f, S weight) {
+                                                const TexelPatch<S> patch(a.table, id);
+                                                Vec3<S> c = patch.view;
+                                                if (weight >= a.bound && patch.textured())
+                                                  c = patch.color(patch.corners(plain(f.u), plain(f.v)));
+                                                const S color[3] = {c.x, c.y, c.z};
+                                                add_blended<false>(weight, color, g[kBeta], S(0),
+                                                                   static_cast<const S*>(nullptr), sum);
+                                              });
+  if (s.x >= a.view.width || s.y >= a.view.height) return;
+  const int64_t pixel = int64_t(s.y) * a.view.width + s.x;
+  for (int c = 0; c < kImageChannels; ++c) a.image[pixel * kImageChannels + c] = sum[c];
+  a.transmittance[pixel] = behind;
+}
+
+// The last pairs before `end`, 32 at most, whose fragments are no more than kHeld: a lane has each, the last lane the
+// last. All warps of the block come to the same.
+template <int kHeld> struct LastPairs {
+  static_assert(kHeld >= kTileThreads, "no pair has more than a tile's pixels");
+  int first_lane;       // that has a pair
+  int count;            // of fragments of all
+  int own, begin;       // of the lane's pair: how many, and where they begin among these
+  uint32_t mark, cuts;  // of the lane's pair: the warp's pixels that blend it, and those of which alpha texels cut it
+  int from;             // where the warp's fragments of the lane's pair begin
+
+  // Pairs from `listed` on have no masks.
+  __device__ LastPairs(const Pairs& p, const uint32_t* cut_masks, const TileThread& s, int64_t begin_pair,
+                       int64_t listed, int64_t end)
+      : own(0), mark(0), cuts(0), from(0) {
+    const int64_t k = end - kWarp + s.lane;
+    if (k >= begin_pair && k < listed) {
+      BT_UNROLL
+      for (int w = 0; w < kTileWarps; ++w) {
+        const uint32_t bits = p.masks[w * p.pairs + k];
+        if (w == s.warp) mark = bits, from = own;
+        own += __popc(bits);
+      }
+      if (cut_masks && mark) cuts = cut_masks[s.warp * p.pairs + k];
+    }
+    int behind = own;  // of the lane's pair and all later ones
+    BT_UNROLL
+    for (int step = 1; step < kWarp; step *= 2) {
+      const int other = __shfl_sync(kFullMask, behind, s.lane + step);
+      if (s.lane + step < kWarp) behind += other;
+    }
+    const unsigned taken = __ballot_sync(kFullMask, k >= begin_pair && behind <= kHeld);
+    first_lane = kWarp - __popc(taken);
+    count = __shfl_sync(kFullMask, behind, first_lane);
+    begin = count - behind, from += begin;
+    if (s.lane < first_lane) mark = 0, own = 0;
+  }
+  // use(j, i, mine, cut) for the pairs that have a fragment in the calling warp, back to front: lane j has the pair, i
+  // is the fragment of the lane's pixel, if it is `mine`.
+  template <class Use> __device__ void each_pair_back(const TileThread& s, Use&& use) const {
+    const unsigned below = (1u << s.lane) - 1;
+    unsigned todo = __ballot_sync(kFullMask, mark != 0);
+    while (todo) {
+      const int j = kWarp - 1 - __clz(int(todo));
+      todo &= ~(1u << j);
+      const unsigned taken = __shfl_sync(kFullMask, mark, j), cut = __shfl_sync(kFullMask, cuts, j);
+      use(j, __shfl_sync(kFullMask, from, j) + __popc(taken & below), bool(taken >> s.lane & 1u),
+          bool(cut >> s.lane & 1u));
+    }
+  }
+};
+
+// A fragment's pixel in the tile, and whether channels of its colour are above 0, alpha has cut it, it shows texels.
+enum FragmentBits { kPixel = kTileThreads - 1, kOpenRed = kTileThreads, kCut = 8 * kOpenRed, kTextured = 2 * kCut };
+
+// The fragments of LastPairs, and whose turn it is: kRunLanes of a pair each.
+template <class S> struct Held {
+  static constexpr int kFragments = sizeof(S) == 8 ? 320 : 1024, kTurns = kFragments / kRunLanes + kWarp;
+  static constexpr int kColors = 4;  // sums of a pair for the view colour, the last unused
+  struct alignas(16) Row {
+    S g[kGeom];
+  };
+  Row rows[kWarp];
+  S gradient[kTileThreads * kImageChannels];
+  S weight[kFragments], u[kFragments], v[kFragments], sigma[kFragments];  // sigma as it is listed
+  S dsigma[kFragments], du[kFragments], dv[kFragments];                   // first dL/dweight
+  S sums[kTurns * kTraceSums], color_sums[kTurns * kColors];
+  int32_t bits[kFragments], ids[kWarp], begin[kWarp], count[kWarp], first_turn[kWarp];
+  uint8_t pair[kTurns];
+  int turns;
+
+  // By one warp.
+  __device__ void make_turns(const LastPairs<kFragments>& part, int lane) {
+    const int own = (part.own + kRunLanes - 1) / kRunLanes;
+    int upto = own;
+    BT_UNROLL
+    for (int step = 1; step < kWarp; step *= 2) {
+      const int other = __shfl_up_sync(kFullMask, upto, step);
+      if (lane >= step) upto += other;
+    }
+    first_turn[lane] = upto - own, begin[lane] = part.begin, count[lane] = part.own;
+    for (int t = upto - own; t < upto; ++t) pair[t] = uint8_t(lane);
+    if (lane == kWarp - 1) turns = upto;
+  }
+  // By all threads: take(turn, j, i, mine), the same number of times in all lanes of a warp; `turn` may be behind the
+  // last.
+  template <class Take> __device__ void each_turn(Take&& take) const {
+    constexpr int kWorkers = kTileThreads / kRunLanes;
+    const int lane = int(threadIdx.x) % kRunLanes, worker = int(threadIdx.x) / kRunLanes;
+    for (int turn = worker; turn - worker % 2 < turns; turn += kWorkers) {
+      const bool some = turn < turns;
+      const int j = some ? int(pair[turn]) : kWarp - 1;
+      const int at = some ? (turn - first_turn[j]) * kRunLanes + lane : kFragments;
+      take(turn, j, begin[j] + at, at < count[j]);
+    }
+  }
+  // Writes the sums of the turns of each pair, kColumns of them, to its slot.
+  template <int kColumns>
+  __device__ void put(const S* of_turns, const int32_t* slots, int first_lane, S* partial) const {
+    for (int c = int(threadIdx.x); c < kWarp * kColumns; c += kTileThreads) {
+      const int j = c / kColumns, column = c % kColumns;
+      if (j < first_lane) continue;
+      const int end = first_turn[j] + (count[j] + kRunLanes - 1) / kRunLanes;
+      S sum = S(0);
+      for (int t = first_turn[j]; t < end; ++t) sum += of_turns[t * kColumns + column];
+      partial[int64_t(slots[j]) * kColumns + column] = sum;
+    }
+  }
+};
+
+template <class Kernel, class S, bool kAlpha, bool kTexels>
+__global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 3) backward_kernel(RasterizeBackward<S> a) {
+  using T = FastFloatOr<S>;
+  constexpr int kColors = Held<S>::kColors;
+  __shared__ Held<S> held;
+  const Pairs& p = a.layout;
+  const TileThread s = tile_thread(p.width);
+  const auto [first, last] = block_pairs(p);
+  if (first == last) return;
+  const int64_t listed = p.tile_pairs[blockIdx.x + 1];
+  TilePart(p).load<kImageChannels>(a.dimage, held.gradient);
+  const int tile_left = s.left - s.left % kTile, tile_top = s.top - s.top % kTile;
+  const int lane = int(threadIdx.x) % kRunLanes;
+  S transmittance = S(1);
+  if (s.x < p.width && s.y < p.height) transmittance = a.transmittance[int64_t(s.y) * p.width + s.x];
+  T later = T(S(0));  // sum of w dL/dw
+  int64_t end = last;
+  while (end > first) {
+    const LastPairs<Held<S>::kFragments> part(p, kAlpha ? a.cuts : nullptr, s, first, listed, end);
+    const int64_t lanes = end - kWarp;  // the pair of lane 0
+    end -= kWarp - part.first_lane;
+    if (s.warp == 0) held.make_turns(part, s.lane);
+    constexpr int kLoaders = kTileThreads / kWarp;  // threads per row
+    const int row = int(threadIdx.x) / kLoaders, column = int(threadIdx.x) % kLoaders;
+    if (row >= part.first_lane) {
+      const int32_t id = p.surfel[lanes + row];
+      if (column == 0) held.ids[row] = id;
+      BT_UNROLL
+      for (int c = 0; c < kGeom; c += kLoaders)
+        held.rows[row].g[c + column] = a.view.geom[int64_t(id) * kGeom + c + column];
+    }
+    __syncthreads();
+    part.each_pair_back(s, [&](int j, int i, bool mine, bool is_cut) {
+      S g[kGeom];
+      load_shape(held.rows[j].g, g);
+      const T dx = T(pixel_centre<S>(s.x) - g[kCx]), dy = T(pixel_centre<S>(s.y) - g[kCy]);
+      const Fragment<T> f =
+          fragment<Kernel>(g, a.view.near, dx, dy, __any_sync(kFullMask, mine && near_centre(dx, dy)));
+      if (!mine) return;
+      // the mark found at least that much, perhaps rounded otherwise
+      S sigma = max_(plain(f.sigma), S(kAlphaMin));
+      if (kAlpha && is_cut) {
+        const AlphaPatch<S> patch(a.alpha, held.ids[j]);
+        S t[4];
+        sigma = max_(alpha_cut(sigma, patch.fetch(patch.corners(plain(f.u), plain(f.v)), t)), S(kAlphaMin));
+      }
+      transmittance /= S(1) - sigma;
+      held.weight[i] = sigma * transmittance;
+      held.u[i] = plain(f.u), held.v[i] = plain(f.v);
+      held.sigma[i] = plain(f.low_pass) > S(0) ? -sigma : sigma;
+      held.bits[i] = (s.y - tile_top) * kTile + s.x - tile_left + (is_cut ? kCut : 0);
+    });
+    __syncthreads();
+    held.each_turn([&](int, int j, int i, bool mine) {
+      if (!mine) return;
+      const TexelPatch<S> patch(a.table, held.ids[j]);
+      const S w = held.weight[i];
+      int bits = held.bits[i];
+      const S* d = held.gradient + (bits & kPixel) * kImageChannels;
+      Vec3<S> color = patch.view;
+      if (kTexels && w >= a.bound && patch.textured()) {
+        bits |= kTextured;
+        const TexelCorners<S> corners = patch.corners(held.u[i], held.v[i]);
+        Vec3<S> t[4];
+        load_corners(patch.tile, corners, t);
+        color = shaded(patch.view, texel_mix(t, corners.weight));
+        if (a.moves) {
+          const TexelSlopes<S> slopes = texel_slopes(t, corners, patch.size, patch.extent);
+          const Vec3<S> dcolor = residual_gradient(color, w * load3(d));
+          held.du[i] = dot(dcolor, slopes.u), held.dv[i] = dot(dcolor, slopes.v);
+        }
+      }
+      const S rgb[3] = {color.x, color.y, color.z};
+      BT_UNROLL
+      for (int c = 0; c < 3; ++c)
+        if (rgb[c] > S(0)) bits |= kOpenRed << c;
+      held.dsigma[i] = weight_gradient<false>(d, rgb, held.rows[j].g[kBeta], S(0), static_cast<const S*>(nullptr));
+      held.bits[i] = bits;
+    });
+    __syncthreads();
+    part.each_pair_back(s, [&](int, int i, bool mine, bool) {
+      if (mine) held.dsigma[i] = plain(blend_vjp(T(held.weight[i]), T(abs_(held.sigma[i])), T(held.dsigma[i]), later));
+    });
+    __syncthreads();
+    held.each_turn([&](int turn, int j, int i, bool mine) {
+      const int64_t id = held.ids[j];
+      S g[kGeom];
+      load_shape(held.rows[j].g, g);
+      T sums[kTraceSums], ddx = T(S(0)), ddy = T(S(0));
+      BT_UNROLL
+      for (int c = 0; c < kTraceSums; ++c) sums[c] = T(S(0));
+      int bits = 0;
+      S sigma = S(0), gs = S(0), gu = S(0), gv = S(0), dcolor[kColors] = {S(0), S(0), S(0), S(0)};
+      if (mine) {
+        bits = held.bits[i], sigma = held.sigma[i], gs = held.dsigma[i];
+        const S w = held.weight[i], *d = held.gradient + (bits & kPixel) * kImageChannels;
+        BT_UNROLL
+        for (int c = 0; c < 3; ++c) dcolor[c] = bits & (kOpenRed << c) ? w * d[c] : S(0);
+        sums[kBeta] = T(w * d[4]);
+        if (a.moves && bits & kTextured) gu = held.du[i], gv = held.dv[i];
+      }
+      if constexpr (kTexels) {
+        TexelCorners<S> corners = {};
+        int64_t texel = -1;
+        S of_texels[kAlpha ? 4 : 3] = {};
+        if (bits & (kTextured | kCut)) {
+          const TexelPatch<S> patch(a.table, id);
+          corners = patch.corners(held.u[i], held.v[i]), texel = patch.first + corners.at[0];
+          BT_UNROLL
+          for (int c = 0; c < 3; ++c) of_texels[c] = bits & kTextured ? dcolor[c] : S(0);
+          if constexpr (kAlpha)
+            if (bits & kCut) of_texels[3] = alpha_vjp(AlphaPatch<S>(a.alpha, id), corners, sigma, gs, gu, gv);
+        }
+        if (a.texel_sums)
+          add_to_corners(texel, corners, of_texels, int(threadIdx.x) % kWarp, Adder<S, false>{a.texel_sums});
+      }
+      if (mine) {
+        const int pixel = bits & kPixel;
+        fragment_vjp<Kernel, S, T>(g, a.view.near, a.rim, T(pixel_centre<S>(tile_left + pixel % kTile) - g[kCx]),
+                                   T(pixel_centre<S>(tile_top + pixel / kTile) - g[kCy]), T(sigma), T(gs), T(gu), T(gv),
+                                   T(S(0)), sums, ddx, ddy);
+      }
+      sums[kShape] = abs_(ddx), sums[kShape + 1] = abs_(ddy);
+      S plain_sums[kTraceSums];
+      BT_UNROLL
+      for (int c = 0; c < kTraceSums; ++c) plain_sums[c] = plain(sums[c]);
+      const S sum = sum_over_run(plain_sums, lane), color_sum = sum_over_run(dcolor, lane);
+      if (turn >= held.turns) return;
+      held.sums[turn * kTraceSums + lane] = sum;
+      if (lane < kColors) held.color_sums[turn * kColors + lane] = color_sum;
+    });
+    __syncthreads();
+    held.template put<kTraceSums>(held.sums, p.slot + lanes, part.first_lane, a.partial);
+    held.template put<kColors>(held.color_sums, p.slot + lanes, part.first_lane, a.color_partial);
+    __syncthreads();  // before the next ones are held
+  }
+}
+
+template <class S> struct StoreColorGradient {
+  const S* base;
+  S* dbase;
+  __device__ void operator()(int64_t surfel, int column, S sum) const {
+    if (column == 3) return;
+    const int64_t at = 3 * surfel + column;
+    dbase[at] = base_gradient(base[at], sum);
+  }
+};
+
+// A step of the texel's colour, and the gradient of its alpha.
+template <class S> struct PutTexel {
+  MoveTexel<S, false> color;
+  S* dalpha;
+  __device__ void operator()(int64_t t) const {
+    if (color.moved) color(t);
+    if (dalpha) dalpha[t] = color.sums[4 * t + 3];
+  }
+};
+}  // namespace
+
+template <class S> void rasterize_forward(const RasterizeForward<S>& a, Stream stream) {
+  with_kernel(a.view.prefilter, [&](auto kernel) {
+    using Kernel = decltype(kernel);
+    const auto run = a.alpha.values ? forward_kernel<Kernel, S, true> : forward_kernel<Kernel, S, false>;
+    BT_LAUNCH(run, dim3(unsigned(tiles_of(a.view.width, a.view.height))), dim3(kTileThreads), 0, stream, a);
+  });
+}
+
+template <class S> void rasterize_backward(const RasterizeBackward<S>& a, Stream stream) {
+  const Pairs& p = a.layout;
+  if (a.texel_sums) each_shown_texel(p, a.table, ClearTexel<S>{a.texel_sums}, stream);
+  fill_zero(a.dtexel_alpha, a.dtexel_alpha ? a.alpha.texels : 0, stream);
+  if (p.pairs)
+    with_kernel(a.view.prefilter, [&](auto kernel) {
+      using Kernel = decltype(kernel);
+      const auto run = a.alpha.values   ? backward_kernel<Kernel, S, true, true>
+                       : a.table.texels ? backward_kernel<Kernel, S, false, true>
+                                        : backward_kernel<Kernel, S, false, false>;
+      BT_LAUNCH(run, dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, a);
+    });
+  sum_slots<kTraceSums>(p, static_cast<const S*>(a.partial), StoreGeomGradient<S>{a.dgeom, a.absgrad}, stream);
+  sum_slots<Held<S>::kColors>(p, static_cast<const S*>(a.color_partial), StoreColorGradient<S>{a.table.base, a.dbase},
+                              stream);
+  if (a.texel_sums) {
+    const MoveTexel<S, false> color = {a.texel_sums, {}, a.share, a.rate, a.moved};
+    each_shown_texel(p, a.table, PutTexel<S>{color, a.dtexel_alpha}, stream);
+  }
+}
+
+#define BT_INSTANTIATE(S)                                              \
+  template void rasterize_forward(const RasterizeForward<S>&, Stream); \
+  template void rasterize_backward(const RasterizeBackward<S>&, Stream);
+BT_INSTANTIATE(float)
+BT_INSTANTIATE(double)
+
+}  // namespace bt::cuda

@@ -1,0 +1,210 @@
+"""Pictures without lists of fragments: values and gradients against those of lists, in any order of threads."""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from bitymi_ns import ops
+from bitymi_ns.ops.backend import emulated_cuda
+from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.rasterize_cuda import Marks
+from tests.ops.golden import SceneCase, camera_of, extreme_scenes, load_golden, random_scene
+from tests.ops.test_kernels import relative
+from tests.scene.test_texel_field import make
+
+Context = Callable[[], AbstractContextManager[None]]
+HERE = torch.device("cpu")
+SIZES = [(4, 8), (1, 1), (8, 4), (0, 0), (4, 4), (16, 4)]
+BOUND = 0.03
+
+
+class Learned:
+    """Surfels with view colours, and texels of colour and alpha where asked for, as leaves of a graph.
+
+    Args:
+        case: geometry and camera.
+        texture: none, colors or alphas.
+        extreme: alphas of 0, of 2, of 1 and far below it, and extents that end within the support.
+        moved: a backward pass moves the texels.
+    """
+
+    def __init__(
+        self,
+        case: SceneCase,
+        dtype: torch.dtype,
+        device: torch.device,
+        texture: str = "alphas",
+        prefilter: ops.Prefilter = "low_pass",
+        extreme: bool = False,
+        moved: bool = False,
+    ) -> None:
+        n, g = len(case.params["means"]), torch.Generator().manual_seed(len(case.params["means"]))
+        self.camera, self.prefilter = camera_of(case, dtype), prefilter
+        self.leaves = {name: case.params[name].to(device, dtype).clone().requires_grad_() for name in GEOMETRY}
+        self.base = (torch.rand(n, 3, generator=g, dtype=torch.float64) * 1.4 - 0.9).to(device, dtype)
+        self.leaves["base"] = self.base.requires_grad_()
+        self.texture: dict = {}
+        self.alpha: ops.TexelAlpha | None = None
+        if texture == "none":
+            return
+        size = torch.tensor(SIZES, dtype=torch.int32).repeat(n // len(SIZES) + 1, 1)[:n].to(device)
+        extent = 1 + 2 * torch.rand(n, generator=g, dtype=torch.float64)
+        extent[::2] *= 0.1 if extreme else 1.0
+        tiles = ops.TexelTiles.of_sizes(size, extent.to(device, dtype))
+        texels = (torch.rand(tiles.count, 3, generator=g, dtype=torch.float64) * 1.2 - 0.6).to(device, dtype)
+        self.texture = {"texels": texels, "tiles": tiles, "bound": BOUND}
+        if moved:
+            share = torch.linspace(0.1, 2.0, len(texels), dtype=dtype, device=device)
+            self.texture["descent"] = ops.TexelDescent(share, 0.3)
+        else:
+            self.leaves["texels"] = texels.requires_grad_()
+        if texture == "alphas":
+            values = 2 * torch.rand(tiles.count, generator=g, dtype=torch.float64)
+            if extreme:
+                few = torch.tensor([0.0, 2.0, 1.0, 1e-3, 1e-30], dtype=torch.float64)
+                values = few[torch.randint(len(few), (tiles.count,), generator=g)]
+            self.leaves["alphas"] = values.to(device, dtype).requires_grad_()
+            self.alpha = ops.TexelAlpha(tiles, self.leaves["alphas"], BOUND)
+
+    def draw(self, listed: bool, moves: bool = True) -> dict[str, Tensor]:
+        """The picture, all gradients of a sum over it, and the texels after it."""
+        projection = ops.project(*(self.leaves[name] for name in GEOMETRY), self.camera, prefilter=self.prefilter)
+        projection.alpha = self.alpha
+        how = {**self.texture, "move_surfels": moves}
+        if listed:
+            image = ops.blended_image(ops.trace(projection), projection, self.base, **how)
+        else:
+            image, _ = ops.rasterized(projection, self.base, **how)
+        towards = torch.linspace(-1, 1, image.numel(), dtype=torch.float64).view_as(image).to(image)
+        gradients = torch.autograd.grad(image, list(self.leaves.values()), towards, allow_unused=True)
+        found = {"image": image.detach(), "centres": projection.mean2d_grad, "absolute": projection.mean2d_absgrad}
+        found |= dict(zip(self.leaves, gradients, strict=True))
+        if "descent" in self.texture:
+            found["moved"] = self.texture["texels"]
+        return {name: value.detach().cpu().double() for name, value in found.items()}
+
+
+def compare(got: dict[str, Tensor], want: dict[str, Tensor], tolerance: float) -> None:
+    assert got.keys() == want.keys()
+    for name, value in want.items():
+        assert value.isfinite().all() and relative(got[name], value) < tolerance, name
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
+@pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
+@pytest.mark.parametrize("texture, moves", [("none", True), ("colors", True), ("colors", False), ("alphas", True)])
+def test_pictures_and_gradients_are_those_of_the_cpu(
+    texture: str, moves: bool, prefilter: ops.Prefilter, dtype: torch.dtype, device: torch.device, cpu: Context
+) -> None:
+    """Tiles have more fragments than shared memory holds, and more than 32 surfels; the image ends within one."""
+    case = random_scene(150, 3, width=70, height=40)
+    got = Learned(case, dtype, device, texture, prefilter).draw(False, moves)
+    with cpu():
+        want = Learned(case, torch.float64, HERE, texture, prefilter).draw(True, moves)
+    compare(got, want, 1e-9 if dtype == torch.float64 else 1e-3)
+
+
+def test_the_golden_picture_and_gradients(device: torch.device) -> None:
+    """Against the float64 reference, by which the file was made."""
+    golden = load_golden("textured")
+    size = torch.tensor([[tile.shape[1], tile.shape[0]] for tile in golden.tiles], device=device)
+    tiles = ops.TexelTiles.of_sizes(size, torch.full((len(size),), 3.0, dtype=torch.float64, device=device))
+    texels = torch.cat([tile.reshape(-1, 3) for tile in golden.tiles]).to(device).requires_grad_()
+    params, camera = {name: value.to(device) for name, value in golden.params.items()}, camera_of(golden)
+    base = ops.view_color("sv", params, params["means"], camera.center.to(device))
+    image, _ = ops.rasterized(ops.project(*(params[name] for name in GEOMETRY), camera), base, texels, tiles)
+    rgb = image[:, :3].view(golden.outputs["rgb"].shape)
+    shown = rgb.cpu() + (1 - image[:, 3].cpu().view(*rgb.shape[:2], 1)) * golden.background
+    torch.testing.assert_close(shown, golden.outputs["rgb"], rtol=1e-11, atol=1e-12)
+    (rgb * golden.loss_weights["rgb"].to(device)).sum().backward()
+    want = torch.cat([gradient.reshape(-1, 3) for gradient in golden.tile_grads])
+    torch.testing.assert_close(texels.grad.cpu(), want, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("moved", [False, True], ids=["gradients", "descent"])
+@pytest.mark.parametrize("scene", extreme_scenes(), ids=lambda case: case.name)
+def test_extreme_scenes(scene: SceneCase, moved: bool, device: torch.device, cpu: Context) -> None:
+    got = Learned(scene, torch.float64, device, extreme=True, moved=moved).draw(False)
+    with cpu():
+        want = Learned(scene, torch.float64, HERE, extreme=True, moved=moved).draw(True)
+    compare(got, want, 1e-9)
+
+
+@pytest.mark.parametrize("opacity", [12.0, -5.0, -20.0], ids=["hides all behind", "faint", "shows nothing"])
+def test_surfels_of_one_opacity(opacity: float, device: torch.device) -> None:
+    """A tile has layers of surfels of which only the first are seen, or 1,000 that can hardly be."""
+    case = random_scene(300, 8, width=20, height=20)
+    case.params["opacity_logits"].fill_(opacity)
+    got, want = (Learned(case, torch.float64, device).draw(listed) for listed in (False, True))
+    compare(got, want, 1e-9)
+    assert got["image"].any() == (opacity > -20)
+
+
+def test_only_sums_of_texels_depend_on_the_order_of_threads(device: torch.device) -> None:
+    runs = []
+    for seed in range(4):
+        with emulated_cuda(seed) if device == HERE else nullcontext():
+            runs.append(Learned(random_scene(60, 3, width=70, height=40), torch.float32, device).draw(False))
+    for other in runs[1:]:
+        for name in runs[0].keys() - {"texels", "alphas"}:
+            assert torch.equal(other[name], runs[0][name]), name
+
+
+def test_its_fragments_are_those_of_the_list(device: torch.device) -> None:
+    learned = Learned(random_scene(60, 3, width=70, height=40), torch.float64, device)
+    projection = ops.project(*(learned.leaves[name] for name in GEOMETRY), learned.camera)
+    projection = replace(projection, alpha=learned.alpha)
+    with torch.no_grad():
+        _, marks = ops.rasterized(projection, learned.base, **learned.texture)
+        fragments = ops.trace(projection)
+    mask = torch.arange(70 * 40, device=device) % 3 > 0
+    assert isinstance(marks, ops.Bands) and len(marks) == len(fragments) > 1000
+    assert torch.equal(marks.masked_counts(mask, 60), fragments.masked_counts(mask, 60))
+    assert torch.equal(marks.overdraw(), fragments.overdraw())
+    assert [torch.equal(part.weight, fragments.weight) for part in marks.lists()] == [True]
+
+
+def test_it_draws_on_cards_alone_and_not_where_sums_are_exact(device: torch.device, cpu: Context, exactly) -> None:
+    assert not ops.rasterizes(device)
+    torch.use_deterministic_algorithms(False)
+    learned = Learned(random_scene(6, 3, width=20, height=10), torch.float32, HERE, "none")
+    assert ops.rasterizes(device)
+    with cpu(), pytest.raises(RuntimeError, match="rasterized runs on a CUDA device only"):
+        assert not ops.rasterizes(HERE)
+        learned.draw(False)
+
+
+def test_which_pictures_of_a_scene_need_no_list(device: torch.device) -> None:
+    scene, camera, _ = make(12, alpha=True, width=24, height=18)
+    scene, camera = scene.to(device), camera.to(device)
+    unlisted = [scene.render(camera), scene.render(camera, field_mode="frozen")]
+    lists = [scene.render(camera, maps=True), scene.render(camera, overdraw_half=0.005)]
+    assert all(isinstance(output.fragments, Marks) for output in unlisted)
+    assert all(isinstance(output.fragments, ops.Fragments) for output in lists)
+    for output in (*unlisted, *lists):
+        assert len(output.fragments) == len(lists[0].fragments)
+        torch.testing.assert_close(output.rgb, lists[0].rgb, rtol=1e-9, atol=1e-12)
+    assert isinstance(scene.render(camera, field_mode="off").fragments, ops.Fragments)  # alphas without their colours
+    scene.field.alpha = None
+    assert isinstance(scene.render(camera, field_mode="off").fragments, Marks)
+
+
+def test_alphas_in_other_tiles_are_refused(device: torch.device) -> None:
+    learned = Learned(random_scene(6, 3, width=20, height=10), torch.float32, device)
+    del learned.texture["tiles"]
+    with pytest.raises(ValueError, match="in other tiles than their colours"):
+        learned.draw(False)
+
+
+def test_a_gradient_that_is_not_finite_is_not_hidden(device: torch.device) -> None:
+    learned = Learned(random_scene(60, 3, width=70, height=40), torch.float32, device, "colors")
+    projection = ops.project(*(learned.leaves[name] for name in GEOMETRY), learned.camera)
+    image, _ = ops.rasterized(projection, learned.base, **learned.texture)
+    towards = torch.ones_like(image)
+    towards[int(image[:, 3].argmax()), 0] = float("nan")
+    for gradient in torch.autograd.grad(image, [learned.base, learned.leaves["texels"]], towards):
+        assert gradient.isnan().any()

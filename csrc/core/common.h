@@ -80,22 +80,21 @@ template <class S> BT_HD void store3(S* p, Vec3<S> a) { p[0] = a.x, p[1] = a.y, 
 // 0.
 template <class S> struct Unit {
   Vec3<S> n;
-  S inv;      // 1 / max(|a|, floor)
-  bool full;  // |a| above the floor
+  S inv;           // 1 / max(|a|, floor)
+  MaskOf<S> full;  // |a| above the floor
 };
 template <class S> BT_HD Unit<S> normalize(Vec3<S> a) {
-  const S floor_len = S(1e-12);
+  const S floor_len = S(1e-12), one = S(1.0f), floor_inv = one / floor_len;
   // scaled by the largest entry: |a|^2 neither overflows nor underflows
   const S big = max_(abs_(a.x), max_(abs_(a.y), abs_(a.z)));
-  if (!(big > floor_len)) return {(S(1) / floor_len) * a, S(1) / floor_len, false};
-  const Vec3<S> b = (S(1) / big) * a;
-  const S inv = S(1) / (sqrt_(dot(b, b)));
-  return {inv * b, inv / big, true};
+  const MaskOf<S> full = big > floor_len;
+  const Vec3<S> b = (one / select(full, big, one)) * a;
+  const S inv = one / sqrt_(dot(b, b));
+  return {select(full, inv * b, floor_inv * a), select(full, inv / big, floor_inv), full};
 }
 // d loss / d a from d loss / d n
 template <class S> BT_HD Vec3<S> normalize_vjp(const Unit<S>& u, Vec3<S> dn) {
-  if (!u.full) return u.inv * dn;
-  return u.inv * (dn - dot(dn, u.n) * u.n);
+  return u.inv * select(u.full, dn - dot(dn, u.n) * u.n, dn);
 }
 
 }  // namespace bt

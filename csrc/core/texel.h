@@ -116,8 +116,6 @@ BT_HD TexelSlopes<S> texel_slopes(const Vec3<S>* t, const TexelCorners<S>& c, co
 }
 
 // A texel after a step along its gradient g.
-template <class S> BT_HD Vec3<S> texel_step(Vec3<S> texel, Vec3<S> g, S rate, S share) {
-  return texel + -rate * share * g;
-}
+template <class V, class S> BT_HD V texel_step(V texel, V g, S rate, S share) { return texel + -rate * share * g; }
 
 }  // namespace bt

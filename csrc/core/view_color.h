@@ -8,9 +8,11 @@ namespace bt {
 
 // Direction from the camera's centre, in double: far from the origin its rounding to float32 would turn the
 // direction, while the difference is as exact as the surfel's own position.
+template <class S> BT_HD Vec3<S> from_center(const S* mean, const double* center) {
+  return {S(double(mean[0]) - center[0]), S(double(mean[1]) - center[1]), S(double(mean[2]) - center[2])};
+}
 template <class S> BT_HD Unit<S> view_direction(const S* mean, const double* center) {
-  return normalize(
-      Vec3<S>{S(double(mean[0]) - center[0]), S(double(mean[1]) - center[1]), S(double(mean[2]) - center[2])});
+  return normalize(from_center(mean, center));
 }
 
 constexpr const char* kViewColorNames[] = {SphericalVoronoi::kName, SphericalHarmonics::kName, SphericalBeta::kName,

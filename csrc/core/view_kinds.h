@@ -82,28 +82,27 @@ struct SphericalVoronoi {
     S *dsites = dp.a, *dlog_tau = dp.b, *drgb = dp.c;
     S w[kMaxTerms], tau[kMaxTerms], top = S(-1e30), total = S(0);
     Unit<S> site[kMaxTerms];
-    Vec3<S> c = {S(0), S(0), S(0)};  // relative to the pivot
-    int first = 0;
+    Vec3<S> c = {S(0), S(0), S(0)}, pivot = load3(rgb);  // c relative to the pivot
     for (int k = 0; k < K; ++k) {
       site[k] = normalize(load3(sites + 3 * k));
       tau[k] = temperature(log_tau[k]);
       w[k] = tau[k] * dot(site[k].n, d);
-      if (w[k] > top) top = w[k], first = k;
+      const MaskOf<S> heavier = w[k] > top;
+      top = select(heavier, w[k], top), pivot = select(heavier, load3(rgb + 3 * k), pivot);
     }
-    const Vec3<S> pivot = load3(rgb + 3 * first);
     for (int k = 0; k < K; ++k) {
       w[k] = exp_(w[k] - top);
       total += w[k];
     }
     for (int k = 0; k < K; ++k) {
-      w[k] /= total;
+      w[k] = w[k] / total;
       c = c + w[k] * (load3(rgb + 3 * k) - pivot);
     }
     for (int k = 0; k < K; ++k) {
       store3(drgb + 3 * k, w[k] * dc);
       const S dlogit = w[k] * dot(dc, (load3(rgb + 3 * k) - pivot) - c);
       const S along = dot(site[k].n, d);
-      dlog_tau[k] = log_tau[k] < S(kLogTauMax) ? dlogit * tau[k] * along : S(0);
+      dlog_tau[k] = select(log_tau[k] < S(kLogTauMax), dlogit * tau[k] * along, S(0));
       store3(dsites + 3 * k, normalize_vjp(site[k], (dlogit * tau[k]) * d));
       dd = dd + (dlogit * tau[k]) * site[k].n;
     }

@@ -36,32 +36,24 @@ template <class S> class SurfelRun {
   const PatchFragments<S>& few() const { return few_; }
   // Those of block k's fragments that show texels, by lane.
   BT_HD uint32_t textured(int64_t k) const { return patch.textured() ? textured_[k - run.first] : 0; }
-  // fn(lane, fragment of `few`) for some of block k.
-  template <class F> BT_HD void each_of(uint32_t lanes, int64_t k, F&& fn) const {
-    for (; lanes; lanes &= lanes - 1) {
-      const int lane = __builtin_ctz(lanes);
-      fn(lane, int(k - run.first) * kLanes + lane);
-    }
-  }
+  bool any_textured() const { return any_textured_; }
+  // Of block k's first fragment among `few`.
+  BT_HD int number(int64_t k) const { return int(k - run.first) * kLanes; }
   // The colours of block k's fragments, 0 in other lanes: what is not finite shows where it is and nowhere else.
-  // `residual`: of the block's first fragment, null: of texels.
-  BT_HD void colors(const BlockPart& part, int64_t k, const S* residual, P* to) const {
-    const Four<S> view(patch.view, S(1));
-    P r(view.v[0]), g(view.v[1]), b(view.v[2]);
-    each_of(textured(k), k, [&](int lane, int j) {
-      const Four<S> color = shaded(view, few_.residual(j));
-      const auto here = mask_of<S>(1u << lane);  // through memory the vector would wait for its lanes
-      r = select(here, P(color.v[0]), r), g = select(here, P(color.v[1]), g), b = select(here, P(color.v[2]), b);
-    });
-    if (residual) {
-      S rgb[3][kLanes] = {};
-      for (uint32_t lanes = part.lanes; lanes; lanes &= lanes - 1)
-        for (int c = 0; c < 3; ++c) rgb[c][__builtin_ctz(lanes)] = *residual++;
-      r = shaded(r, load(rgb[0])), g = shaded(g, load(rgb[1])), b = shaded(b, load(rgb[2]));
+  // `residual`: of the block's first fragment, null: of texels. `under`: written where some are textured.
+  BT_HD void colors(const BlockPart& part, int64_t k, const S* residual, BlockTexels<S>& under, P* to) const {
+    P rgb[3] = {P(patch.view.x), P(patch.view.y), P(patch.view.z)};
+    if (const uint32_t lanes = textured(k)) {
+      under = few_.texels(number(k));
+      for (int c = 0; c < 3; ++c) rgb[c] = select(mask_of<S>(lanes), shaded(rgb[c], under.residual(c)), rgb[c]);
     }
-    const auto there = mask_of<S>(part.lanes);
-    const P none = P(S(0));
-    to[0] = select(there, r, none), to[1] = select(there, g, none), to[2] = select(there, b, none);
+    if (residual) {
+      S own[3][kLanes] = {};
+      for (uint32_t lanes = part.lanes; lanes; lanes &= lanes - 1)
+        for (int c = 0; c < 3; ++c) own[c][__builtin_ctz(lanes)] = *residual++;
+      for (int c = 0; c < 3; ++c) rgb[c] = shaded(rgb[c], load(own[c]));
+    }
+    for (int c = 0; c < 3; ++c) to[c] = select(mask_of<S>(part.lanes), rgb[c], P(S(0)));
   }
 
  private:
@@ -75,14 +67,15 @@ template <class S> class SurfelRun {
     const FragmentArrays<S>& f = of.fragments.f;
     each_block(of.fragments.layout, run, [&](int64_t k, int64_t at, const BlockPart& part) {
       const uint32_t lanes = part.lanes & bits(expand(f.weight + at, part.lanes) >= P(of.bound));
-      textured_[k - run.first] = lanes;
+      textured_[k - run.first] = lanes, any_textured_ |= lanes != 0;
       if (!lanes) return;
-      few_.locate(int(k - run.first) * kLanes, expand(f.uv + at, part.lanes), expand(f.uv + f.total + at, part.lanes));
-      if (prefetch) each_of(lanes, k, [&](int, int j) { few_.prefetch(j); });
+      few_.locate(number(k), expand(f.uv + at, part.lanes), expand(f.uv + f.total + at, part.lanes));
+      if (prefetch) each_lane(lanes, [&](int lane) { few_.prefetch(number(k) + lane); });
     });
   }
 
   uint32_t textured_[kBlocks];  // of each block of the run; not written where the surfel has no texels
+  bool any_textured_ = false;
   PatchFragments<S> few_;
 };
 // Prefetches what a SurfelRun reads of its surfel.
@@ -121,7 +114,8 @@ template <bool kMaps, class S> void forward(const Forward<S>& a) {
         each_block(layout, surfel.run, [&](int64_t k, int64_t at, const BlockPart& part) {
           const P weight = expand(f.weight + at, part.lanes);
           P colors[3];
-          surfel.colors(part, k, a.of.residual ? a.of.residual + 3 * at : nullptr, colors);
+          BlockTexels<S> under;
+          surfel.colors(part, k, a.of.residual ? a.of.residual + 3 * at : nullptr, under, colors);
           const P depth = kMaps ? expand(f.depth + at, part.lanes) : P(S(0));
           add_blended<kMaps>(weight, colors, surfel.beta, depth, surfel.normal, sums[part.block]);
         });
@@ -152,10 +146,11 @@ void run_backward(const Backward<S>& a, const BlockPicture<S, kChannels<kMaps>>&
   each_block(a.of.fragments.layout, surfel.run, [&](int64_t block, int64_t at, const BlockPart& part) {
     const auto there = mask_of<S>(part.lanes);
     const P weight = expand(f.weight + at, part.lanes);
-    P d[channels], colors[3], dcolors[3];
+    P d[channels], colors[3], dcolors[3], du = zero, dv = zero;
+    BlockTexels<S> under;
     for (int c = 0; c < channels; ++c)
       d[c] = select(there, load(dimage.numbers(surfel.run.tile, part.block) + c * kLanes), zero);
-    surfel.colors(part, block, a.of.residual ? a.of.residual + 3 * at : nullptr, colors);
+    surfel.colors(part, block, a.of.residual ? a.of.residual + 3 * at : nullptr, under, colors);
     const P depth = kMaps ? expand(f.depth + at, part.lanes) : zero;
     if (a.dweight)
       compress_until(a.dweight + end, a.dweight + at,
@@ -170,26 +165,26 @@ void run_backward(const Backward<S>& a, const BlockPicture<S, kChannels<kMaps>>&
       for (int k = 0; k < 3; ++k) sums.normal[k] += weight * d[6 + k];
     }
     const uint32_t textured = surfel.textured(block);
-    S du[kLanes] = {}, dv[kLanes] = {}, rgb[3][kLanes];
-    if (textured || a.dresidual)
+    S rgb[3][kLanes];
+    if ((textured && rows) || a.dresidual)
       for (int k = 0; k < 3; ++k) store(rgb[k], dcolors[k]);
     if (S* to = a.dresidual ? a.dresidual + 3 * at : nullptr)
       for (uint32_t lanes = part.lanes; lanes; lanes &= lanes - 1)
         for (int k = 0; k < 3; ++k) *to++ = rgb[k][__builtin_ctz(lanes)];
-    if (textured) {
-      surfel.each_of(textured, block, [&](int lane, int j) {
+    const int number = surfel.number(block);
+    if (rows)
+      each_lane(textured, [&](int lane) {
         const Four<S> dcolor(Vec3<S>{rgb[0][lane], rgb[1][lane], rgb[2][lane]}, S(0));
-        if (rows) surfel.few().add_gradient(j, dcolor, rows);
-        if (!a.duv) return;
-        Four<S> texels[4];
-        surfel.few().texels(j, texels);
-        du[lane] = surfel.few().gradient_u(j, texels, dcolor);
-        dv[lane] = surfel.few().gradient_v(j, texels, dcolor);
+        surfel.few().add_gradient(number + lane, dcolor, rows);
       });
-    }
     if (!a.duv) return;
-    compress_until(a.duv + end, a.duv + at, load(du), part.lanes);
-    compress_until(a.duv + f.total + end, a.duv + f.total + at, load(dv), part.lanes);
+    if (textured) {
+      const auto shows = mask_of<S>(textured);
+      du = select(shows, surfel.few().gradient_u(number, under, dcolors), zero);
+      dv = select(shows, surfel.few().gradient_v(number, under, dcolors), zero);
+    }
+    compress_until(a.duv + end, a.duv + at, du, part.lanes);
+    compress_until(a.duv + f.total + end, a.duv + f.total + at, dv, part.lanes);
   });
 }
 
@@ -276,6 +271,19 @@ BT_HD void prefetch_next(const Backward<S>& a, const BlockPicture<S, channels>& 
   }
 }
 
+// Moves texels by their gradients, rows of four of which the last is 0. The store of one also writes a number of the
+// next as it was; loads of what was just stored in part would wait.
+template <class S> void move_texels(const S* rows, int64_t count, S rate, const S* share, S* texels) {
+  constexpr int kTogether = 8;
+  int64_t t = 0;
+  for (; t + kTogether < count; t += kTogether) {
+    Four<S> moved[kTogether];
+    for (int k = 0; k < kTogether; ++k)
+      moved[k] = texel_step(Four<S>::load(texels + 3 * (t + k)), Four<S>::load(rows + 4 * (t + k)), rate, share[t + k]);
+    for (int k = 0; k < kTogether; ++k) moved[k].store(texels + 3 * (t + k));
+  }
+  for (; t < count; ++t) store3(texels + 3 * t, texel_step(load3(texels + 3 * t), load3(rows + 4 * t), rate, share[t]));
+}
 // Surfel after surfel: a thread adds to the texels of its own. Also where they do not learn, so that the gradients of
 // the surfels are the same.
 template <bool kMaps, class S>
@@ -286,19 +294,16 @@ void backward_by_surfel(const Backward<S>& a, const BlockPicture<S, kChannels<kM
     const TexelPatch<S> patch(a.of.table, id);
     thread_local std::vector<S> own;  // gradients of the texels, rows of four
     const int64_t area = a.moved ? int64_t(patch.size[0]) * patch.size[1] : 0;
-    own.assign(4 * area, S(0));
+    bool moves = false;
     Sums<Lanes<S>> sums;
     for (int64_t k = first; k < last; ++k) {
       prefetch_next(a, dimage, listed, order, k);
       const SurfelRun<S> surfel(a.of, listed.run(order[k]), false);
-      run_backward<kMaps>(a, dimage, surfel, area ? own.data() : nullptr, sums);
+      if (!moves && area && surfel.any_textured()) moves = true, own.assign(4 * area, S(0));
+      run_backward<kMaps>(a, dimage, surfel, moves ? own.data() : nullptr, sums);
     }
     surfel_backward(a, id, total<kMaps>(sums));
-    if (a.moved)
-      for (int64_t t = 0; t < area; ++t) {
-        S* texel = a.moved + 3 * (patch.first + t);
-        store3(texel, texel_step(load3(texel), load3(own.data() + 4 * t), a.rate, a.share[patch.first + t]));
-      }
+    if (moves) move_texels(own.data(), area, a.rate, a.share + patch.first, a.moved + 3 * patch.first);
   });
 }
 // Run after run, which is faster where there are no texels: what a pass reads follows each other.

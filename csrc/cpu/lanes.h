@@ -7,6 +7,10 @@
 
 namespace bt {
 
+// fn(lane) for a set of lanes.
+template <class F> BT_HD void each_lane(uint32_t lanes, F&& fn) {
+  for (; lanes; lanes &= lanes - 1) fn(__builtin_ctz(lanes));
+}
 // The mask of the lanes that have a bit in `lanes`.
 template <class M> BT_HD M mask_of_lanes(uint32_t lanes) {
   if constexpr (is_two<M>) {

@@ -75,6 +75,9 @@ BT_HD bool any_(const LaneTypes<double>::M& m) { return bits(m) != 0; }
 template <class S> BT_HD Lanes<S> select(typename Lanes<S>::M m, Lanes<S> yes, Lanes<S> no) {
   return choose(m, yes.v, no.v);
 }
+template <class S> BT_HD Vec3<Lanes<S>> select(typename Lanes<S>::M m, Vec3<Lanes<S>> yes, Vec3<Lanes<S>> no) {
+  return {select(m, yes.x, no.x), select(m, yes.y, no.y), select(m, yes.z, no.z)};
+}
 template <class S> BT_HD Lanes<S> max_(Lanes<S> a, Lanes<S> b) { return larger(a.v, b.v); }
 template <class S> BT_HD Lanes<S> min_(Lanes<S> a, Lanes<S> b) { return smaller(a.v, b.v); }
 
@@ -235,14 +238,6 @@ template <int which, class Half, class V> BT_HD Half half(V v) {
   Half r;
   std::memcpy(&r, reinterpret_cast<const char*>(&v) + which * sizeof r, sizeof r);
   return r;
-#endif
-}
-// Lanes 3 to 6 of eight.
-template <class S> BT_HD Quad<S> from_third(Oct<S> v) {
-#if __has_builtin(__builtin_shufflevector)
-  return __builtin_shufflevector(v, v, 3, 4, 5, 6);
-#else
-  return Quad<S>{v[3], v[4], v[5], v[6]};
 #endif
 }
 // The lanes added to four: halves to halves.

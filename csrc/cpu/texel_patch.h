@@ -1,5 +1,5 @@
-// The texels under fragments of one surfel: their positions for many fragments at a time, their colours as vectors of
-// four.
+// The texels under fragments of one surfel: positions and values of a block's fragments at a time, gradients as vectors
+// of four.
 #pragma once
 
 #include "cpu/blocks.h"
@@ -26,30 +26,53 @@ template <class S> struct Four {
 template <class S> BT_HD Four<S> operator+(Four<S> a, Four<S> b) { return a.v + b.v; }
 template <class S> BT_HD Four<S> operator-(Four<S> a, Four<S> b) { return a.v - b.v; }
 template <class S> BT_HD Four<S> operator*(S k, Four<S> a) { return k * a.v; }
-template <class S> BT_HD auto operator<(Four<S> a, Four<S> b) { return a.v < b.v; }
-template <class S> BT_HD Four<S> select(decltype(Quad<S>{} > Quad<S>{}) m, Four<S> yes, Four<S> no) {
-  return m ? yes.v : no.v;
-}
-template <class S> BT_HD S dot(Four<S> a, Four<S> b) {
-  const Quad<S> p = a.v * b.v;
-  return (p[0] + p[2]) + (p[1] + p[3]);
-}
 
 // Up to so many fragments: those of a surfel in the blocks of a tile.
 constexpr int kFew = kBlocks * kLanes;
 
-// Two texels side by side: their six numbers, or one's, and 0.
-template <class S> BT_HD Oct<S> load_two(const S* p, bool both) {
+// The numbers of two texels side by side by lane, which lie at 3 first[lane] of a tile; of the left one twice where
+// there are not both.
+template <class S> BT_HD void load_pairs(const S* tile, const int32_t* first, bool both, Lanes<S>* to) {
+  const auto pair = [&](int lane) { return tile + 3 * int64_t(first[lane]); };
 #if defined(__AVX2__)
   if constexpr (std::is_same_v<S, float>) {
-    const int right = both ? -1 : 0;
-    return (Oct<S>)_mm256_maskload_ps(p, _mm256_setr_epi32(-1, -1, -1, right, right, right, 0, 0));
+    if (both) {
+      __m256 numbers[6][2];
+      for (int half = 0; half < 2; ++half) {
+        // four numbers of two lanes, which are four apart
+        const auto rows = [&](int lane, int number) {
+          const __m128 low = _mm_loadu_ps(pair(8 * half + lane) + number);
+          return _mm256_insertf128_ps(_mm256_castps128_ps256(low), _mm_loadu_ps(pair(8 * half + lane + 4) + number), 1);
+        };
+        const auto columns = [&](__m256 low, __m256 high, int number) {
+          numbers[number][half] = _mm256_shuffle_ps(low, high, 0x44);
+          numbers[number + 1][half] = _mm256_shuffle_ps(low, high, 0xee);
+        };
+        const __m256 a = rows(0, 0), b = rows(1, 0), c = rows(2, 0), d = rows(3, 0);
+        columns(_mm256_unpacklo_ps(a, b), _mm256_unpacklo_ps(c, d), 0);
+        columns(_mm256_unpackhi_ps(a, b), _mm256_unpackhi_ps(c, d), 2);
+        columns(_mm256_unpackhi_ps(rows(0, 2), rows(1, 2)), _mm256_unpackhi_ps(rows(2, 2), rows(3, 2)), 4);
+      }
+      for (int k = 0; k < 6; ++k) to[k] = joined(numbers[k][0], numbers[k][1]);
+      return;
+    }
   }
 #endif
-  Oct<S> r = {};
-  std::memcpy(&r, p, (both ? 6 : 3) * sizeof(S));
-  return r;
+  for (int lane = 0; lane < kLanes; ++lane)
+    for (int k = 0; k < 6; ++k) to[k].set(lane, pair(lane)[k < 3 || both ? k : k - 3]);
 }
+
+// The four texels around the fragments of a block by lane, mixed along v, and the steps along v between them.
+template <class S> struct BlockTexels {
+  using P = Lanes<S>;
+  P mixed[6], step[6];  // r, g, b of the left ones, of the right ones
+  P fx;
+
+  BT_HD P residual(int c) const { return mixed[c] + fx * slope_u(c); }
+  // The bilinear fetch's slopes, per texel.
+  BT_HD P slope_u(int c) const { return mixed[3 + c] - mixed[c]; }
+  BT_HD P slope_v(int c) const { return step[c] + fx * (step[3 + c] - step[c]); }
+};
 
 // Up to kFew fragments of a surfel that has texels.
 template <class S> class PatchFragments {
@@ -73,17 +96,19 @@ template <class S> class PatchFragments {
     __builtin_prefetch(t), __builtin_prefetch(t + 3 * next_.down);
   }
 
-  // The residual of fragment j: texel_mix, of two texels at a time.
-  BT_HD Four<S> residual(int j) const {
-    const S *t = of_.tile + 3 * int64_t(first_[j]), fy = fy_[j];
-    const bool both = next_.right;
-    const Oct<S> row = (S(1) - fy) * load_two(t, both) + fy * load_two(t + 3 * next_.down, both);
-    constexpr Oct<S> left = {1, 1, 1}, to_right = {-1, -1, -1, 1, 1, 1};
-    const Oct<S> r = row * (left + fx_[j] * to_right);
-    return half<0, Quad<S>>(r) + from_third<S>(r);
+  // The texels around the fragments of a block, numbered from j on.
+  BT_HD BlockTexels<S> texels(int j) const {
+    BlockTexels<S> r;
+    Lanes<S> below[6];
+    load_pairs(of_.tile, first_ + j, next_.right, r.mixed);
+    load_pairs(of_.tile + 3 * next_.down, first_ + j, next_.right, below);
+    const Lanes<S> fy = load(fy_ + j);
+    for (int k = 0; k < 6; ++k) r.step[k] = below[k] - r.mixed[k], r.mixed[k] += fy * r.step[k];
+    r.fx = load(fx_ + j);
+    return r;
   }
-  // Adds the gradients of its texels to rows of four, g that of its colour. Four at a time: a load of eight would wait
-  // for the stores of the fragment before, of which it has a part.
+  // Adds the gradients of fragment j's texels to rows of four, g that of its colour. Four at a time: a load of eight
+  // would wait for the stores of the fragment before, of which it has a part.
   BT_HD void add_gradient(int j, Four<S> g, S* rows) const {
     const Four<S> below = fy_[j] * g, above = g - below, below_right = fx_[j] * below, right = fx_[j] * above;
     S* at = rows + 4 * int64_t(first_[j]);
@@ -91,19 +116,15 @@ template <class S> class PatchFragments {
     add(above - right, at), add(right, at + across);
     add(below - below_right, at + down), add(below_right, at + down + across);
   }
-  // Its texels, each beside an unused number; of one column what would be to its right is 0.
-  BT_HD void texels(int j, Four<S>* to) const {
-    const S* t = of_.tile + 3 * int64_t(first_[j]);
-    const Oct<S> above = load_two(t, next_.right), below = load_two(t + 3 * next_.down, next_.right);
-    to[0] = half<0, Quad<S>>(above), to[1] = from_third<S>(above);
-    to[2] = half<0, Quad<S>>(below), to[3] = from_third<S>(below);
+  // The gradients of the coordinates of a block's fragments, g those of its colours, where they lie within the outer
+  // texel centres; 0 beyond.
+  BT_HD Lanes<S> gradient_u(int j, const BlockTexels<S>& at, const Lanes<S>* g) const {
+    const Lanes<S> slope = g[0] * at.slope_u(0) + g[1] * at.slope_u(1) + g[2] * at.slope_u(2);
+    return select(mask_of<S>(inside_u_[j / kLanes]), Lanes<S>(per_u_) * slope, Lanes<S>(S(0)));
   }
-  // The gradients of its coordinates; see texel_slopes.
-  BT_HD S gradient_u(int j, const Four<S>* texels, Four<S> g) const {
-    return inside_u_[j / kLanes] >> j % kLanes & 1 ? per_u_ * dot(g, texel_slope_u(texels, fy_[j])) : S(0);
-  }
-  BT_HD S gradient_v(int j, const Four<S>* texels, Four<S> g) const {
-    return inside_v_[j / kLanes] >> j % kLanes & 1 ? per_v_ * dot(g, texel_slope_v(texels, fx_[j])) : S(0);
+  BT_HD Lanes<S> gradient_v(int j, const BlockTexels<S>& at, const Lanes<S>* g) const {
+    const Lanes<S> slope = g[0] * at.slope_v(0) + g[1] * at.slope_v(1) + g[2] * at.slope_v(2);
+    return select(mask_of<S>(inside_v_[j / kLanes]), Lanes<S>(per_v_) * slope, Lanes<S>(S(0)));
   }
 
  private:

@@ -73,6 +73,10 @@ void trace_forward(const View<S>& view, const AlphaTiles<S>& alpha, int64_t most
         state.template blend<Kernel, true>(view, bins, id, take);
         continue;
       }
+      if (k + 2 * kAhead < bins.start[tile + 1]) {
+        prefetch_tile<S>(alpha, bins.surfels[k + 2 * kAhead]);
+        prefetch_texels<S>(alpha, bins.surfels[k + kAhead], nullptr);
+      }
       state.template blend<Kernel, true>(view, bins, id, take, S(1),
                                          [&](Fragment<P>& f, const typename P::M& covered, const P& transmittance) {
                                            cut(alpha, id, covered, transmittance, f);
@@ -149,27 +153,43 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
   const int most =
       int(std::max<int64_t>(1, std::min<int64_t>(64, (int64_t(1) << 28) / std::max(n * kGeom + texels, int64_t(1)))));
   std::vector<std::vector<S>> partial(std::max(num_threads(), 1)), of_texels(partial.size());
+  parallel_parts(texels, 1 << 16, [&](int, int64_t begin, int64_t end) {
+    std::fill(a.dtexel_alpha + begin, a.dtexel_alpha + end, S(0));
+  });
   std::fill(dgeom, dgeom + n * kGeom, S(0));
   std::fill(absgrad, absgrad + 2 * n, S(0));
   const BlockCentres<S> centres;
   const P zero = P(S(0));
   // Arrays to read, and how far ahead they are prefetched: runs are read from the list's end, each from its start,
   // which the processor does not foresee.
-  const S* columns[] = {f.sigma, f.weight, dweight, duv, duv ? duv + total : nullptr, ddepth};
+  const S* columns[] = {f.sigma,
+                        f.weight,
+                        dweight,
+                        duv,
+                        duv ? duv + total : nullptr,
+                        ddepth,
+                        a.alpha.values ? f.uv : nullptr,
+                        a.alpha.values ? f.uv + total : nullptr};
   constexpr int64_t kSoon = 256, kBlocksSoon = 6;
   // a part's own sums: 15 numbers per surfel (12 columns of geom, the area, and the two absolute gradients)
   constexpr int kColumns = kBeta + 1, kSums = kColumns + 3;
   const int parts = parallel_tiles(layout.start, layout.tiles, most, [&](int part, int64_t first, int64_t last) {
     std::vector<S>& sums = partial[part];
     sums.assign(n * kSums, S(0));
-    of_texels[part].assign(texels, S(0));
+    of_texels[part].assign(part ? texels : 0, S(0));  // the first part adds to the result itself
+    S* const dtexels = !texels ? nullptr : part ? of_texels[part].data() : a.dtexel_alpha;
     for (int64_t tile = first; tile < last; ++tile) {
       const S x0 = S(tile % tiles_x * kTile), y0 = S(tile / tiles_x * kTile);
       P behind[kBlocks];  // per pixel: sum of w dL/dw over the fragments behind
       std::fill(behind, behind + kBlocks, zero);
       each_run_back(layout, tile, [&](const BlockRun& run) {
-        const int64_t id = run.surfel, next = BlockPart(layout, std::max<int64_t>(run.first - kBlocksSoon, 0)).surfel;
+        const auto ahead = [&](int64_t by) { return BlockPart(layout, std::max<int64_t>(run.first - by, 0)).surfel; };
+        const int64_t id = run.surfel, next = ahead(kBlocksSoon);
         __builtin_prefetch(geom + next * kGeom), __builtin_prefetch(sums.data() + next * kSums, 1);
+        if (a.alpha.values) {
+          prefetch_tile(a.alpha, ahead(2 * kBlocksSoon));
+          prefetch_texels<S>(a.alpha, next, dtexels);
+        }
         const S* g = geom + id * kGeom;
         const S cx = g[kCx] - x0, cy = g[kCy] - y0;
         P d[kGeom], ax = zero, ay = zero;
@@ -191,17 +211,9 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
           if (has_alpha) {
             const P u = expand(f.uv + at, of.lanes), v = expand(f.uv + total + at, of.lanes);
             const AlphaPatch<S> patch(a.alpha, id);
-            S all[6][kLanes];  // u, v, sigma as listed, and gradients of sigma, u and v
-            const P* numbers[] = {&u, &v, &listed, &dsigma, &gu, &gv};
-            for (int k = 0; k < 6; ++k) store(all[k], *numbers[k]);
-            each_lane(of.lanes & marks(v), [&](int i) {
-              const TexelCorners<S> corners = patch.corners(all[0][i], all[1][i]);
-              const S dm = alpha_vjp(patch, corners, all[2][i], all[3][i], all[4][i], all[5][i]);
-              if (!texels) return;
-              S* to = of_texels[part].data() + patch.first;
-              for (int k = 0; k < 4; ++k) to[corners.at[k]] += corners.weight[k] * dm;
-            });
-            listed = load(all[2]), dsigma = load(all[3]), gu = load(all[4]), gv = load(all[5]);
+            S* of_tile = dtexels ? dtexels + patch.first : nullptr;
+            if (const uint32_t lanes = of.lanes & marks(v))
+              AlphaLanes<S>(patch, u, v, lanes).gradient(listed, dsigma, gu, gv, of_tile);
           }
           fragment_vjp<Kernel, S, P>(g, near, rim, select(there, dx, zero), select(there, dy, zero), listed,
                                      select(there, dsigma, zero), gu, gv, gradient(ddepth), d, ddx, ddy);
@@ -225,8 +237,7 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
     }
   });
   parallel_parts(texels, 1 << 16, [&](int, int64_t begin, int64_t end) {
-    std::fill(a.dtexel_alpha + begin, a.dtexel_alpha + end, S(0));
-    for (int p = 0; p < parts; ++p)
+    for (int p = 1; p < parts; ++p)
       for (int64_t t = begin; t < end; ++t) a.dtexel_alpha[t] += of_texels[p][t];
   });
 }

@@ -5,6 +5,7 @@
 #include <string>
 
 #include "cpu/kernels.h"
+#include "cpu/simd.h"
 #include "cpu/threads.h"
 
 namespace bt {
@@ -17,6 +18,50 @@ template <class S> void check_terms(const ViewColors<S>& colors, int64_t n) {
       throw std::invalid_argument("the terms of surfel " + std::to_string(i) + "'s view colour are not there");
   }
 }
+
+// Kinds of which the colours of 16 surfels are computed together.
+template <class Kind, class S>
+constexpr bool kTogether = std::is_same_v<Kind, SphericalVoronoi> && std::is_same_v<S, float>;
+
+using P = Lanes<float>;
+// Up to 16 of the surfels that have a colour; the last one stands for those that are missing.
+struct Together {
+  int64_t ids[kLanes];
+  int count = 0;
+
+  // Numbers of theirs as lanes, and back.
+  void load_rows(const float* from, int64_t width, P* to) const {
+    for (int lane = 0; lane < kLanes; ++lane)
+      for (int64_t k = 0; k < width; ++k) to[k].set(lane, from[ids[lane] * width + k]);
+  }
+  void store_rows(const P* from, int64_t width, float* to) const {
+    for (int lane = 0; lane < count; ++lane)
+      for (int64_t k = 0; k < width; ++k) to[ids[lane] * width + k] = from[k][lane];
+  }
+  Unit<P> directions(const Directions<float>& to) const {
+    P along[3];
+    for (int lane = 0; lane < kLanes; ++lane) {
+      const Vec3<float> d = from_center(to.means + 3 * ids[lane], to.center);
+      along[0].set(lane, d.x), along[1].set(lane, d.y), along[2].set(lane, d.z);
+    }
+    return normalize(load3(along));
+  }
+};
+// fn(Together) for the surfels begin to end - 1 that have a colour.
+template <class F> void each_together(const uint8_t* active, int64_t begin, int64_t end, F&& fn) {
+  Together some;
+  for (int64_t i = begin; i < end; ++i) {
+    if (active[i]) some.ids[some.count++] = i;
+    if (some.count < kLanes && (some.count == 0 || i + 1 < end)) continue;
+    std::fill(some.ids + some.count, some.ids + kLanes, some.ids[some.count - 1]);
+    fn(some);
+    some.count = 0;
+  }
+}
+// Parameters of some surfels or their gradients.
+struct TogetherRow {
+  P a[3 * kMaxTerms], b[kMaxTerms], c[3 * kMaxTerms];
+};
 }  // namespace
 
 template <class S> void view_color_forward(const ViewColorForward<S>& a) {
@@ -35,7 +80,22 @@ template <class S> void view_color_forward(const ViewColorForward<S>& a) {
   }
   const ViewColorArrays<const S>& p = a.colors.whole;
   for_view_color(p.kind, [&](auto kind) {
-    write([&](int64_t i, Vec3<S> d) { return view_color<decltype(kind)>(p.terms, p, i, d); });
+    using Kind = decltype(kind);
+    if constexpr (kTogether<Kind, S>) {
+      const ViewColorWidths w = kind.widths(p.terms);
+      parallel_parts(a.to.n, 256, [&](int, int64_t begin, int64_t end) {
+        TogetherRow own;
+        std::fill(a.out + 3 * begin, a.out + 3 * end, S(0));
+        each_together(a.to.active, begin, end, [&](const Together& some) {
+          some.load_rows(p.a, w.a, own.a), some.load_rows(p.b, w.b, own.b), some.load_rows(p.c, w.c, own.c);
+          P c[3];
+          store3(c, kind.color(p.terms, ViewColorRow<const P>{own.a, own.b, own.c}, some.directions(a.to).n));
+          some.store_rows(c, 3, a.out);
+        });
+      });
+    } else {
+      write([&](int64_t i, Vec3<S> d) { return view_color<Kind>(p.terms, p, i, d); });
+    }
   });
 }
 
@@ -43,6 +103,7 @@ template <class S> void view_color_backward(const ViewColorBackward<S>& a) {
   const ViewColorArrays<const S>& p = a.colors;
   const ViewColorArrays<S>& dp = a.dcolors;
   for_view_color(p.kind, [&](auto kind) {
+    using Kind = decltype(kind);
     const ViewColorWidths w = kind.widths(p.terms);
     parallel_parts(a.to.n, 256, [&](int, int64_t begin, int64_t end) {
       for (int64_t i = begin; i < end; ++i) {
@@ -52,11 +113,26 @@ template <class S> void view_color_backward(const ViewColorBackward<S>& a) {
           std::fill(none.b, none.b + w.b, S(0));
           std::fill(none.c, none.c + w.c, S(0));
           store3(a.dmeans + 3 * i, Vec3<S>{S(0), S(0), S(0)});
-          continue;
+        } else if constexpr (!kTogether<Kind, S>) {
+          const Unit<S> d = view_direction(a.to.means + 3 * i, a.to.center);
+          const Vec3<S> dd = view_color_vjp<Kind>(p.terms, p, i, d.n, load3(a.dout + 3 * i), dp);
+          store3(a.dmeans + 3 * i, normalize_vjp(d, dd));
         }
-        const Unit<S> d = view_direction(a.to.means + 3 * i, a.to.center);
-        const Vec3<S> dd = view_color_vjp<decltype(kind)>(p.terms, p, i, d.n, load3(a.dout + 3 * i), dp);
-        store3(a.dmeans + 3 * i, normalize_vjp(d, dd));
+      }
+      if constexpr (kTogether<Kind, S>) {
+        TogetherRow own, gradients;
+        each_together(a.to.active, begin, end, [&](const Together& some) {
+          some.load_rows(p.a, w.a, own.a), some.load_rows(p.b, w.b, own.b), some.load_rows(p.c, w.c, own.c);
+          const Unit<P> d = some.directions(a.to);
+          P dc[3], dmeans[3];
+          some.load_rows(a.dout, 3, dc);
+          Vec3<P> dd = {P(S(0)), P(S(0)), P(S(0))};
+          kind.color_vjp(p.terms, ViewColorRow<const P>{own.a, own.b, own.c}, d.n, load3(dc),
+                         ViewColorRow<P>{gradients.a, gradients.b, gradients.c}, dd);
+          store3(dmeans, normalize_vjp(d, dd));
+          some.store_rows(gradients.a, w.a, dp.a), some.store_rows(gradients.b, w.b, dp.b);
+          some.store_rows(gradients.c, w.c, dp.c), some.store_rows(dmeans, 3, a.dmeans);
+        });
       }
     });
   });

@@ -252,6 +252,16 @@ template <class V> BT_HD Wide<float> all_narrowed(const V& a) {
     return narrowed_vector(a);
 }
 
+#if defined(__AVX2__)
+BT_HD Wide<float> joined(__m256 low, __m256 high) {
+#if defined(__AVX512F__) && defined(__AVX512DQ__)
+  return (Wide<float>)_mm512_maskz_insertf32x8(__mmask16(0xffff), _mm512_castps256_ps512(low), high, 1);
+#else
+  return {(Vector<float>)low, (Vector<float>)high};
+#endif
+}
+#endif
+
 // One bit per lane of a mask.
 BT_HD uint32_t bits(const MaskOfFloats& m) {
 #if defined(__AVX512F__) && defined(__AVX512DQ__)

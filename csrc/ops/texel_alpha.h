@@ -51,20 +51,27 @@ template <class S> struct AlphaPatch {
 };
 
 // Gradients of alpha's share of a fragment's sigma: from gs, that of the listed sigma, to that of the kernel's sigma,
-// which takes the place of the listed one; more of gu and gv; and the return value, that of m.
+// which takes the place of the listed one; more of gu and gv; and the return value, that of m. t: the four texels.
+template <class S, class T>
+BT_HD T alpha_vjp(const AlphaPatch<S>& patch, const T (&t)[4], const TexelAxis<T>& x, const TexelAxis<T>& y, T& listed,
+                  T& gs, T& gu, T& gv) {
+  const T m = texel_lerp(t, x.fraction, y.fraction), sigma = abs_(listed), zero = T(S(0));
+  // neither clamp passes a gradient, that of the product and the kernel's own; m may be rounded otherwise than when the
+  // fragment was written
+  const MaskOf<T> moves = sigma < T(S(kAlphaMax)), uncut_moves = moves & (sigma < m * T(S(kAlphaMax * (1 - 1e-6))));
+  const T dm = select(moves, gs * sigma / m, zero);
+  gu += select(x.inside, dm * T(texel_density(patch.size[0], patch.extent)) * texel_slope_u(t, y.fraction), zero);
+  gv += select(y.inside, dm * T(texel_density(patch.size[1], patch.extent)) * texel_slope_v(t, x.fraction), zero);
+  gs = select(uncut_moves, gs * m, zero);
+  listed = listed / m;
+  return dm;
+}
 template <class S>
 BT_HD S alpha_vjp(const AlphaPatch<S>& patch, const TexelCorners<S>& at, S& listed, S& gs, S& gu, S& gv) {
   S t[4];
-  const S m = patch.fetch(at, t), sigma = abs_(listed);
-  // neither clamp passes a gradient, that of the product and the kernel's own; m may be rounded otherwise than when the
-  // fragment was written
-  const bool moves = sigma < S(kAlphaMax), uncut_moves = moves && sigma < m * S(kAlphaMax * (1 - 1e-6));
-  const S dm = moves ? gs * sigma / m : S(0);
-  if (at.inside_u) gu += dm * texel_density(patch.size[0], patch.extent) * texel_slope_u(t, at.fy);
-  if (at.inside_v) gv += dm * texel_density(patch.size[1], patch.extent) * texel_slope_v(t, at.fx);
-  gs = uncut_moves ? gs * m : S(0);
-  listed /= m;
-  return dm;
+  patch.fetch(at, t);
+  const TexelAxis<S> x = {S(0), at.fx, at.inside_u}, y = {S(0), at.fy, at.inside_v};
+  return alpha_vjp(patch, t, x, y, listed, gs, gu, gv);
 }
 
 }  // namespace bt

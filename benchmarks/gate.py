@@ -8,6 +8,7 @@ a slower one of the same kind, gives the same figures. `--accept` makes them the
 import argparse
 import itertools
 import json
+import math
 import multiprocessing
 import os
 import resource
@@ -113,7 +114,7 @@ def run_seed(capture: "Capture", seed: int, calibration: Calibration) -> dict[st
 
     from bitymi_ns.bake import BakeOptions, Learning, TuneOptions, bake_and_learn, export
     from bitymi_ns.bundle import read_bundle
-    from bitymi_ns.plugin.run.lpips import lpips
+    from bitymi_ns.plugin.run.lpips import LpipsUnavailable, lpips
     from bitymi_ns.scene.config import SceneConfig
     from bitymi_ns.train.config import TrainConfig
     from bitymi_ns.train.evaluate import evaluate
@@ -145,7 +146,10 @@ def run_seed(capture: "Capture", seed: int, calibration: Calibration) -> dict[st
         units.append(unit)
         pair = image.rgb.clamp(0.0, 1.0), view.target(background, "cpu")
         quality.append(psnr(*pair))
-        distances.append(lpips(*pair, "alex"))
+        try:
+            distances.append(lpips(*pair, "alex"))
+        except LpipsUnavailable:  # `main` says why
+            distances.append(math.nan)
     return {
         "psnr_trained": trained,
         "psnr_baked": statistics.fmean(quality),
@@ -187,7 +191,7 @@ Line = tuple[str, str, list[str]]  # figure, verdict, cells of the table
 
 def judge(found: Scenes, baseline: Scenes, same_cpu: bool) -> list[Line]:
     """Every figure against its baseline. Verdicts: "ok", "WORSE", "new" (no baseline) or "not judged" (a time on
-    another kind of processor)."""
+    another kind of processor, or LPIPS without its weights)."""
     lines = []
     for scene, figures in found.items():
         for key, limit in LIMITS.items():
@@ -199,7 +203,7 @@ def judge(found: Scenes, baseline: Scenes, same_cpu: bool) -> list[Line]:
                 verdict = "WORSE" if limit.worse(now, before, slack) else "ok"
                 relative = f"{100 * (now / before - 1):+.1f} %" if limit.relative else ""
                 change = relative or f"{now - before:+.{limit.digits}f}"
-                if limit.timed and not same_cpu:
+                if limit.timed and not same_cpu or math.isnan(now):
                     verdict = "not judged"
             shown = ["" if value is None else f"{value:,.{limit.digits}f}" for value in (before, now)]
             allowed = f"{100 * limit.by:g} %" if limit.relative else f"{limit.by:g}"
@@ -241,7 +245,13 @@ def main() -> None:
 
     from bitymi_ns.files import write_file
     from bitymi_ns.measure.machine import processor
+    from bitymi_ns.plugin.run import lpips
 
+    try:
+        lpips.load("alex")
+    except lpips.LpipsUnavailable as error:
+        say(f"gate: LPIPS is not judged: {error}")
+        os.environ["BITYMI_NO_DOWNLOAD"] = "1"  # not tried again for every view
     empty = {"settings": SETTINGS, "processor": processor(), "scenes": {}}
     baseline = json.loads(options.baseline.read_text("utf8")) if options.baseline.is_file() else empty
     if not options.accept and baseline["settings"] != SETTINGS:
@@ -263,7 +273,9 @@ def main() -> None:
             f"figures may be worse by {ELSEWHERE:g} times as much, because kernels round differently there."
         )
     if options.accept:
-        rounded = {name: {k: round(v, 5) for k, v in figures.items()} for name, figures in found.items()}
+        rounded = {
+            name: {k: round(v, 5) for k, v in figures.items() if not math.isnan(v)} for name, figures in found.items()
+        }
         # those of other captures stay, as far as they are of the same job on the same kind of machine
         kept = baseline["scenes"] if {**baseline, "scenes": {}} == {**empty, "scenes": {}} else {}
         text = json.dumps({**empty, "scenes": {**kept, **rounded}}, indent=2, sort_keys=True)

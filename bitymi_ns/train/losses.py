@@ -21,6 +21,7 @@ DEPTH_EDGE = 0.1
 """Relative difference of depth between neighbouring pixels that is an edge. Photographs blend both sides of it, depth
 maps do not, and those of sensors are least reliable there."""
 SAME_COLOR = 0.01  # standard deviation of colours along an axis from which a fit of colours changes their contrast
+FITTED = 0.01  # least share of a half's pixels that a fit of colours rests on
 SSIM_WINDOW = 11  # side of the SSIM window in pixels; images narrower than this have no valid window
 
 
@@ -211,8 +212,8 @@ def color_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) -> T
     """[H, W, 3] the image, each half's colours mapped by the affine fit of the other half, clamped to [0, 1].
 
     For held-out views whose photographs differ in exposure and white balance: matrix [3, 3] and offset [3] are those of
-    least squares over the pixels that count of the half that is not judged by them. A half whose other half is not
-    finite, or does not count, is left as it is.
+    least squares over the pixels that count of the half that is not judged by them. A half is left as it is where the
+    other is not finite, or fewer than `FITTED` of its pixels count.
 
     Args:
         image, target: [H, W, 3] in [0, 1].
@@ -226,10 +227,14 @@ def color_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) -> T
     # normal equations; no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic
     # algorithms
     sums = [[(both[:, by, i : i + 1] * both[:, by]).sum((0, 1)) for i in range(4)] for by in (right, left)]
-    sums = torch.stack([torch.stack(rows) for rows in sums]).cpu().nan_to_num(0.0, 0.0, 0.0)  # [2, 4, 7]
+    sums = torch.stack([torch.stack(rows) for rows in sums]).cpu()  # [2, 4, 7]
     fitted = []
     for of, by in zip((left, right), sums, strict=True):
-        ridge = SAME_COLOR**2 * by[3, 3].clamp(min=1.0) * torch.eye(4, dtype=by.dtype)  # by[3, 3] pixels
+        pixels = by[3, 3]
+        if not bool(by.isfinite().all()) or pixels < max(1.0, 0.5 * FITTED * image.shape[0] * image.shape[1]):
+            fitted.append(image[:, of])
+            continue
+        ridge = SAME_COLOR**2 * pixels * torch.eye(4, dtype=by.dtype)
         affine = torch.linalg.solve(by[:, :4] + ridge, by[:, 4:]).to(colors)  # [4, 3]
         fitted.append(image[:, of] + sum(colors[:, of, i : i + 1] * affine[i] for i in range(4)))
     return torch.cat(fitted, 1).clamp(0.0, 1.0).to(image)

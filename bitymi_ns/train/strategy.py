@@ -185,8 +185,10 @@ class Strategy:
         replaced = torch.zeros_like(clone)
         if self.most > 0:
             count, room = int((clone | split).sum()), max(0, self.most - n)
-            faint = ~(clone | split) & self._faint(surfels)
-            replaced = _lowest(surfels["opacity_logits"], faint, count - room)
+            # shortly after an opacity reset every opacity is low, whatever its surfel is worth
+            if self.most == config.max_surfels and not self.schedule.recovering(step):
+                faint = ~(clone | split) & self._faint(surfels)
+                replaced = _lowest(surfels["opacity_logits"], faint, count - room)
             chosen = _strongest(clone | split, scores.importance, abs_grad_sum / seen, room + int(replaced.sum()))
             report |= {"replaced": int(replaced.sum()), "held_back": count - int(chosen.sum())}
             clone, split = clone & chosen, split & chosen

@@ -154,7 +154,11 @@ def test_no_half_is_judged_by_a_fit_of_its_own() -> None:
     torch.testing.assert_close(fitted, torch.where(left, image, 1.3 * image).clamp(max=1.0), atol=2e-3, rtol=0)
     assert fitted_psnr(image, target) < psnr(image, target)
     # the left half counts nowhere, or is not finite: the right one stays as it is
-    for given, mask in ((image, ~left[..., 0].expand(16, 20)), (torch.where(left, math.nan, image), None)):
+    few = ~left[..., 0].expand(16, 20)
+    few = few | (torch.arange(320).view(16, 20) == 21)  # one pixel of the left half
+    broken = image.clone()
+    broken[3, 3, 0] = math.nan
+    for given, mask in ((image, few), (broken, None)):
         assert torch.equal(color_fitted(given, target, mask)[:, 10:], image[:, 10:])
 
 

@@ -302,6 +302,17 @@ def test_faint_surfels_make_room_for_important_ones_at_the_cap(bench):
     assert b.x == [*range(5), *range(8, 40), *range(30, 35)]
 
 
+@pytest.mark.parametrize(("step", "cap"), [(RESET + 500, 42), (DENSIFY, 0)])
+def test_no_surfel_makes_room_after_a_reset_or_at_another_limit(bench, step, cap):
+    b = bench(40, prune_budget=0.0, max_surfels=cap)
+    b.strategy.most = 42
+    b.set("opacity_logits", slice(0, 8), torch.linspace(-3.0, -2.3, 8))
+    b.importance[2:30] = 9
+    b.see(1.0, 1.0)
+    report = b.step(step)
+    assert (report["replaced"], report["cloned"]) == (0, 2)
+
+
 def test_broken_rows_go_and_invisible_ones_too(bench):
     b = bench(10)
     b.set("means", 1, math.nan)

@@ -49,7 +49,7 @@ class RenderOutput:
         depth: [H, W, 1] sum of w z, camera z, not divided by alpha; None without maps.
         normal: [H, W, 3] sum of w n, camera frame (OpenCV), facing the camera; None without maps.
         soft_overdraw: [H, W, 1] fragments per pixel, those of small weight in part; None without `overdraw_half`.
-        fragments: the view's fragments; where they were too many, what is known of them without the list.
+        fragments: the view's; `Bands` where they were too many for a list, `Marks` where it was drawn without one.
         projection: the view's surfels.
         image: [H, W, 5] rgb, alpha and beta in one tensor; None where there are maps or the overdraw.
     """

@@ -13,7 +13,7 @@ from bitymi_ns.bake import BakeOptions, Learning, bake_and_learn, export
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bundle import Bundle, read_bundle
 from bitymi_ns.bundle.parts import CAMERAS
-from bitymi_ns.ops import blended_image, project, trace
+from bitymi_ns.ops import blended_image, can_rasterize, project, rasterize_image, trace
 from bitymi_ns.ops.constants import COLOR_BIAS
 from bitymi_ns.plugin.export.cameras import camera_row
 from bitymi_ns.plugin.run.preset import load_preset
@@ -66,8 +66,12 @@ def rasterize(
     """
     geometry = (means, quats, scales.log(), torch.logit(opacities), torch.logit(betas / 4.0))
     projection = project(*geometry, camera, near)
+    base = colors - COLOR_BIAS
+    if not maps and can_rasterize(means.device):
+        image, marks = rasterize_image(projection, base)
+        return RenderOutput.of_image(image, projection, marks, background, maps)
     fragments = trace(projection)
-    image = blended_image(fragments, projection, colors - COLOR_BIAS, maps=maps)
+    image = blended_image(fragments, projection, base, maps=maps)
     return RenderOutput.of_image(image, projection, fragments, background, maps)
 
 

@@ -11,7 +11,7 @@ from .coverage import add_texel_coverage
 from .field import FieldGeometry, field, fragment_residual
 from .fragment_list import TooManyFragments
 from .project import Prefilter, Projection, project
-from .rasterize_cuda import rasterized, rasterizes
+from .rasterize_cuda import Marks, can_rasterize, rasterize_image
 from .ssim import ssim
 from .texel import TexelAlpha, TexelDescent, TexelTiles
 from .trace import Fragments, masked_counts, select, trace
@@ -23,6 +23,7 @@ __all__ = [
     "Bands",
     "FieldGeometry",
     "Fragments",
+    "Marks",
     "Prefilter",
     "Projection",
     "TexelAlpha",
@@ -33,14 +34,14 @@ __all__ = [
     "band",
     "blended_image",
     "by_bands",
+    "can_rasterize",
     "composite",
     "field",
     "fitting_lists",
     "fragment_residual",
     "masked_counts",
     "project",
-    "rasterized",
-    "rasterizes",
+    "rasterize_image",
     "refused",
     "select",
     "soft_overdraw",

@@ -57,13 +57,14 @@ class Bands:
         return counts
 
 
-def fitting_lists(projection: Projection, most: int = 0) -> Iterator[Fragments]:
+def fitting_lists(projection: Projection, most: int = 0, rim: float = 1e-3) -> Iterator[Fragments]:
     """The fragments of a view, to be read and dropped: as one list on a CUDA device, on the CPU as lists of some
     rows of tiles each; smaller ones where one has too many.
 
     Args:
         projection: of the view.
         most: fragments of a list, as in `trace`.
+        rim: as in `trace`.
 
     Raises:
         TooManyFragments: a single row of tiles has too many.
@@ -73,7 +74,7 @@ def fitting_lists(projection: Projection, most: int = 0) -> Iterator[Fragments]:
 
     @torch.no_grad()  # of the generator, it would hold on to what it has yielded
     def find(top: int, bottom: int) -> Fragments:
-        return trace(projection if bottom - top == height else band(projection, top, bottom), most=most)
+        return trace(projection if bottom - top == height else band(projection, top, bottom), rim, most)
 
     for _, _, fragments in by_bands(split(0, height, parts), find):
         yield fragments

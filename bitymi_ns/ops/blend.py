@@ -8,7 +8,7 @@ from torch import Tensor
 from .backend import check_shapes, cuda_backend, dense, kernel, module, on_same_device
 from .constants import IMAGE_CHANNELS, MAP_CHANNELS
 from .project import Projection
-from .texel import TexelDescent, TexelTiles
+from .texel import TexelDescent, TexelTiles, gradient_or_step
 from .trace import Fragments
 
 
@@ -62,12 +62,9 @@ class _BlendedImage(torch.autograd.Function):
         out |= {"duv": torch.empty_like(arrays["uv"]) if moves else None}
         out |= {"dresidual": torch.empty_like(residual) if residual_learns else None}
         out |= {"ddepth": torch.empty_like(arrays["depth"]) if ctx.arguments["maps"] else None}
-        # a gradient is a step of length -1 from 0
-        dtexels = torch.zeros_like(texels) if learns else None
-        descent = TexelDescent(texels.new_ones(len(texels)), -1.0, dtexels) if learns else ctx.descent
-        step = {"rate": 0.0} if descent is None else descent.arguments(texels)
+        dtexels, step = gradient_or_step(texels, learns, ctx.descent)
         inputs = {"geom": geom, "base": base, "texels": texels, "residual": residual, "dimage": dense(dimage, geom)}
-        work = backward_memory(ctx.fragments, ctx.arguments["maps"], 0 if descent is None else len(texels))
+        work = backward_memory(ctx.fragments, ctx.arguments["maps"], len(texels) if "moved" in step else 0)
         kernel("blend_backward", geom)(**ctx.arguments, **arrays, **inputs, **step, **work, **out)
         gradients = (out[name] for name in ("dweight", "ddepth", "duv", "dgeom", "dbase"))
         return *gradients, dtexels, out["dresidual"], None, None, None, None, None
@@ -82,8 +79,17 @@ def checked_texels(
     move_surfels: bool,
     descent: TexelDescent | None,
 ) -> tuple[Tensor, TexelTiles, bool, TexelDescent | None]:
-    """Texels, tiles, move_surfels and descent of `blended_image`, filled in where there are none; raises a ValueError
-    where they do not belong together, to `base` of so many surfels or to the device of `like`."""
+    """Return texels [T, 3], tiles, move_surfels and descent of `blended_image`, filled in where there are none.
+
+    Args:
+        like: of the device that all have to lie on.
+        surfels: N.
+        base: [N, 3] view colours.
+        texels, tiles, move_surfels, descent: as in `blended_image`.
+
+    Raises:
+        ValueError: as of `blended_image`.
+    """
     if texels is None or tiles is None:
         tiles = _no_tiles(surfels, base.dtype, base.device)
         texels, move_surfels, descent = base.new_zeros(0, 3), False, None

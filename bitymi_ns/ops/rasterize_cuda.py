@@ -4,32 +4,35 @@ Of every fragment two bits are kept, in masks of the pairs of surfel and tile; t
 tile by tile. So a view of any number of fragments is drawn at once, and the host waits once, for the number of pairs.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from .backend import cuda_backend, dense, kernel, module, require
-from .bands import Bands
+from .bands import fitting_lists
 from .blend import checked_texels
 from .constants import IMAGE_CHANNELS
 from .fragment_list import Layout
 from .project import Projection
-from .texel import TexelDescent, TexelTiles
-from .trace import counted
+from .texel import TexelDescent, TexelTiles, gradient_or_step
+from .trace import Fragments, counted
 from .trace_cuda import layout_of, tile_lists
 
 
-def rasterizes(device: torch.device) -> bool:
-    """Return True where `rasterized` draws: on CUDA devices, unless torch is asked for deterministic algorithms.
+def can_rasterize(device: torch.device) -> bool:
+    """Return True where `rasterize_image` runs: on CUDA devices, unless torch is asked for deterministic algorithms.
     Gradients of alpha texels have no bound before they are known, so that sums in integers take a list."""
     return cuda_backend(device) and not torch.are_deterministic_algorithms_enabled()
 
 
 @dataclass(frozen=True)
-class Marks(Bands):
+class Marks:
     """The fragments of a view of which masks were kept. Their numbers are found again for every question."""
 
+    projection: Projection  # of the view
+    rim: float  # as in `trace`
     layout: Layout  # pairs and masks
 
     def __len__(self) -> int:
@@ -37,8 +40,16 @@ class Marks(Bands):
         every = torch.ones(camera.width * camera.height, dtype=torch.bool, device=self.projection.geom.device)
         return int(self.masked_counts(every, len(self.projection.geom)).sum())
 
+    def lists(self) -> Iterator[Fragments]:
+        """The fragments without gradient, from top to bottom: as one list, or in bands where memory asks for it."""
+        return fitting_lists(self.projection, rim=self.rim)
+
+    def overdraw(self) -> Tensor:
+        """[H, W, 1] int32: blended surfels per pixel."""
+        return torch.cat([fragments.overdraw() for fragments in self.lists()])
+
     def masked_counts(self, mask: Tensor, n: int) -> Tensor:
-        """As the function `masked_counts`."""
+        """[n] int32 of a mask [H * W] bool, as the function `masked_counts`."""
         camera = self.projection.camera
         return counted({"layout": self.layout.handle, "width": camera.width, "height": camera.height}, mask, n)
 
@@ -78,13 +89,10 @@ class _Rasterized(torch.autograd.Function):
             "absgrad": geom.new_empty(len(geom), 2),
             "dbase": torch.empty_like(base),
         }
-        dtexels = torch.zeros_like(texels) if ctx.needs_input_grad[2] else None
-        # a gradient is a step of length -1 from 0
-        descent = ctx.descent if dtexels is None else TexelDescent(texels.new_ones(len(texels)), -1.0, dtexels)
-        step = {"rate": 0.0} if descent is None else descent.arguments(texels)
+        dtexels, step = gradient_or_step(texels, ctx.needs_input_grad[2], ctx.descent)
         work = {"partial": geom.new_empty(pairs, kernels.TRACE_SUMS), "color_partial": geom.new_empty(pairs, 4)}
         dalpha = torch.empty_like(texel_alpha) if ctx.needs_input_grad[3] else None
-        if descent is not None or dalpha is not None:
+        if "moved" in step or dalpha is not None:
             work["texel_work"] = geom.new_empty(4 * len(texels))
         kernel("rasterize_backward", geom)(
             **ctx.arguments,
@@ -105,7 +113,7 @@ class _Rasterized(torch.autograd.Function):
         return out["dgeom"], out["dbase"], dtexels, dalpha, None, None, None, None, None, None
 
 
-def rasterized(
+def rasterize_image(
     projection: Projection,
     base: Tensor,
     texels: Tensor | None = None,
@@ -121,7 +129,7 @@ def rasterized(
     `projection.mean2d_grad` and `projection.mean2d_absgrad`. Only sums of texels depend on the order of threads.
 
     Args:
-        projection: of `project`, on a device where `rasterizes`; geom [N, 16].
+        projection: of `project`, on a device where `can_rasterize`; geom [N, 16].
         base, texels, tiles, bound, move_surfels, descent: as in `blended_image`.
         rim: as in `trace`.
 
@@ -134,7 +142,7 @@ def rasterized(
             are to be moved; or tensors lie on several devices.
     """
     geom = projection.geom
-    require("rasterized", "cuda", geom.device, "call `trace` and `blended_image`")
+    require("rasterize_image", "cuda", geom.device, "call `trace` and `blended_image`")
     texels, tiles, move_surfels, descent = checked_texels(geom, len(geom), base, texels, tiles, move_surfels, descent)
     if descent is not None and not base.requires_grad:
         base = base.detach().requires_grad_()  # so that there is a backward pass, whatever else learns
@@ -143,4 +151,4 @@ def rasterized(
         raise ValueError("the alphas of texels lie in other tiles than their colours")
     image, layout = _Rasterized.apply(geom, base, texels, alpha, projection, tiles, bound, rim, move_surfels, descent)
     seen = replace(projection, geom=geom.detach(), frames=projection.frames.detach())
-    return image, Marks(seen, ((0, projection.camera.height),), rim, 0, layout)
+    return image, Marks(seen, rim, layout)

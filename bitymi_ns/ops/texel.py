@@ -98,3 +98,15 @@ class TexelDescent:
     def arguments(self, read: Tensor) -> dict[str, Any]:
         """The kernels' keywords, for a backward pass that reads the texels `read`."""
         return {"moved": read if self.moved is None else self.moved, "share": self.share, "rate": self.rate}
+
+
+def gradient_or_step(
+    texels: Tensor, learns: bool, descent: TexelDescent | None
+) -> tuple[Tensor | None, dict[str, Any]]:
+    """Return what a backward pass does with texels [T, 3]: their gradient [T, 3], to be filled, None where they do not
+    learn; and the kernels' keywords, with `moved` where there is a gradient or a descent."""
+    if not learns:
+        return None, {"rate": 0.0} if descent is None else descent.arguments(texels)
+    dtexels = torch.zeros_like(texels)
+    # a gradient is a step of length -1 from 0
+    return dtexels, TexelDescent(texels.new_ones(len(texels)), -1.0, dtexels).arguments(texels)

@@ -207,7 +207,8 @@ def masked_counts(fragments: Fragments, mask: Tensor, n: int) -> Tensor:
 
 
 def counted(view: dict[str, Any], mask: Tensor, n: int) -> Tensor:
-    """The same by layout and size of the image, as of `Fragments.view`."""
+    """Count as `masked_counts` does, for a mask [H * W] bool of a list with the arguments `view`, as of
+    `Fragments.view`. Returns [n] int32."""
     counts = torch.zeros(n, dtype=torch.int32, device=mask.device)
     flat = mask.reshape(-1).to(torch.uint8).contiguous()
     function("masked_counts", counts.device)(**view, mask=flat, counts=counts)

@@ -102,8 +102,13 @@ def blended(geom: Tensor, projection: Projection, bins: Bins) -> Layout:
 
 
 def layout_of(arrays: dict[str, Tensor], width: int, height: int, ids: dict[str, Tensor] | None = None) -> Layout:
-    """Of the arrays of `Pairs`, and of surfel and pixel [F] int32, which may be still to be written. Waits for the
-    number of fragments where there are offsets; without them they have no list."""
+    """Return the layout of P pairs of surfel and tile. Waits for the number of fragments where there are offsets.
+
+    Args:
+        arrays: of `Bins.layout`, masks [TILE_WARPS, P] int32 and offsets [P + 1] int64; without offsets no list.
+        width, height: of the image, pixels.
+        ids: surfel and pixel [F] int32 of its fragments; None = still to be written.
+    """
     masks = arrays["masks"]
     count = int(arrays["offsets"][-1]) if "offsets" in arrays else -1
     with on_device(masks.device):

@@ -45,7 +45,8 @@ class ResidualField(nn.Module):
         return found
 
     def texture(self, bound: float, learns: bool, read: Tensor | None = None) -> dict[str, Any] | None:
-        """The same where it does not depend on the fragments; None where it does."""
+        """Return texels [T, 3], tiles and the other arguments of `blended_image` by name, where the residual does not
+        depend on the fragments; None where it does. Arguments as in `residual`."""
         return None
 
     def opacity(self, bound: float, learns: bool) -> TexelAlpha | None:

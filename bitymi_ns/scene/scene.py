@@ -14,14 +14,15 @@ from bitymi_ns.ops import (
     VIEW_COLORS,
     Bands,
     Fragments,
+    Marks,
     Projection,
     TooManyFragments,
     band,
     blended_image,
     by_bands,
+    can_rasterize,
     project,
-    rasterized,
-    rasterizes,
+    rasterize_image,
     refused,
     soft_overdraw,
     trace,
@@ -48,7 +49,7 @@ class RenderOutput:
         depth: [H, W, 1] sum of w z, camera z, not divided by alpha; None without maps.
         normal: [H, W, 3] sum of w n, camera frame (OpenCV), facing the camera; None without maps.
         soft_overdraw: [H, W, 1] fragments per pixel, those of small weight in part; None without `overdraw_half`.
-        fragments: the view's fragments; where they were too many, what is known of them without the list.
+        fragments: the view's; `Bands` where they were too many for a list, `Marks` where it was drawn without one.
         projection: the view's surfels.
         image: [H, W, 5] rgb, alpha and beta in one tensor; None where there are maps or the overdraw.
     """
@@ -59,7 +60,7 @@ class RenderOutput:
     depth: Tensor | None
     normal: Tensor | None
     soft_overdraw: Tensor | None
-    fragments: Fragments | Bands
+    fragments: Fragments | Bands | Marks
     projection: Projection
     image: Tensor | None = None
 
@@ -68,7 +69,7 @@ class RenderOutput:
         cls,
         image: Tensor,
         projection: Projection,
-        fragments: Fragments | Bands,
+        fragments: Fragments | Bands | Marks,
         background: Tensor | None,
         maps: bool,
         soft_overdraw: bool = False,
@@ -185,10 +186,10 @@ class Scene(nn.Module):
         if self.field is not None:
             projection.alpha = self.field.opacity(bound, learns)
         base = self.base_color(projection)
-        if not maps and overdraw_half is None and not self.config.max_fragments and rasterizes(base.device):
+        if not maps and overdraw_half is None and not self.config.max_fragments and can_rasterize(base.device):
             texture = {} if field is None else field.texture(bound, learns)
             if texture is not None and (field is not None or projection.alpha is None):
-                image, marks = rasterized(projection, base, **texture, rim=self.config.rim)
+                image, marks = rasterize_image(projection, base, **texture, rim=self.config.rim)
                 return RenderOutput.of_image(image, projection, marks, background, maps)
         read: Tensor | None = None
 

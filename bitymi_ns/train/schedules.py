@@ -111,6 +111,15 @@ class Schedule:
         loss = self.config.loss
         return max(loss.depth_weight, loss.normal_weight) > 0.0 and step % loss.geometry_interval == 0
 
+    def lists_fragments(self, maps: bool) -> bool:
+        """True where a step needs lists of fragments on a card, too: for the overdraw loss, or with depth or normals.
+
+        Args:
+            maps: there are views with depth or normals.
+        """
+        loss = self.config.loss
+        return loss.overdraw_weight > 0.0 or maps and max(loss.depth_weight, loss.normal_weight) > 0.0
+
     def densification_over(self, step: int) -> bool:
         """True where no densification can follow this step, so that its statistics are needed no more."""
         return not self.densify_steps or step > max(self.densify_steps)

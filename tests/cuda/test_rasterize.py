@@ -8,13 +8,16 @@ import pytest
 import torch
 from torch import Tensor
 
+import bitymi_ns
 from bitymi_ns import ops
+from bitymi_ns.ops import Marks, trace_cuda
 from bitymi_ns.ops.backend import emulated_cuda
 from bitymi_ns.ops.project import GEOMETRY
-from bitymi_ns.ops.rasterize_cuda import Marks
 from tests.ops.golden import SceneCase, camera_of, extreme_scenes, load_golden, random_scene
 from tests.ops.test_kernels import relative
 from tests.scene.test_texel_field import make
+from tests.test_api import camera_of as api_camera
+from tests.test_api import surfels
 
 Context = Callable[[], AbstractContextManager[None]]
 HERE = torch.device("cpu")
@@ -78,7 +81,7 @@ class Learned:
         if listed:
             image = ops.blended_image(ops.trace(projection), projection, self.base, **how)
         else:
-            image, _ = ops.rasterized(projection, self.base, **how)
+            image, _ = ops.rasterize_image(projection, self.base, **how)
         towards = torch.linspace(-1, 1, image.numel(), dtype=torch.float64).view_as(image).to(image)
         gradients = torch.autograd.grad(image, list(self.leaves.values()), towards, allow_unused=True)
         found = {"image": image.detach(), "centres": projection.mean2d_grad, "absolute": projection.mean2d_absgrad}
@@ -116,7 +119,7 @@ def test_the_golden_picture_and_gradients(device: torch.device) -> None:
     texels = torch.cat([tile.reshape(-1, 3) for tile in golden.tiles]).to(device).requires_grad_()
     params, camera = {name: value.to(device) for name, value in golden.params.items()}, camera_of(golden)
     base = ops.view_color("sv", params, params["means"], camera.center.to(device))
-    image, _ = ops.rasterized(ops.project(*(params[name] for name in GEOMETRY), camera), base, texels, tiles)
+    image, _ = ops.rasterize_image(ops.project(*(params[name] for name in GEOMETRY), camera), base, texels, tiles)
     rgb = image[:, :3].view(golden.outputs["rgb"].shape)
     shown = rgb.cpu() + (1 - image[:, 3].cpu().view(*rgb.shape[:2], 1)) * golden.background
     torch.testing.assert_close(shown, golden.outputs["rgb"], rtol=1e-11, atol=1e-12)
@@ -154,27 +157,39 @@ def test_only_sums_of_texels_depend_on_the_order_of_threads(device: torch.device
             assert torch.equal(other[name], runs[0][name]), name
 
 
-def test_its_fragments_are_those_of_the_list(device: torch.device) -> None:
+def test_its_fragments_are_those_of_the_list(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
     learned = Learned(random_scene(60, 3, width=70, height=40), torch.float64, device)
     projection = ops.project(*(learned.leaves[name] for name in GEOMETRY), learned.camera)
     projection = replace(projection, alpha=learned.alpha)
     with torch.no_grad():
-        _, marks = ops.rasterized(projection, learned.base, **learned.texture)
+        _, marks = ops.rasterize_image(projection, learned.base, **learned.texture)
         fragments = ops.trace(projection)
     mask = torch.arange(70 * 40, device=device) % 3 > 0
-    assert isinstance(marks, ops.Bands) and len(marks) == len(fragments) > 1000
+    assert isinstance(marks, Marks) and len(marks) == len(fragments) > 1000
     assert torch.equal(marks.masked_counts(mask, 60), fragments.masked_counts(mask, 60))
     assert torch.equal(marks.overdraw(), fragments.overdraw())
     assert [torch.equal(part.weight, fragments.weight) for part in marks.lists()] == [True]
 
+    overdraw, empty_list = fragments.overdraw(), trace_cuda.empty_list
+    fit = max(int(rows.sum()) for rows in overdraw.split(16))  # fragments of a row of tiles
+
+    def small_ones(geom: Tensor, count: int) -> dict[str, Tensor]:
+        if count > fit:
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+        return empty_list(geom, count)
+
+    monkeypatch.setattr(trace_cuda, "empty_list", small_ones)
+    monkeypatch.setattr(trace_cuda, "fragment_capacity", lambda geom: fit)
+    assert len(list(marks.lists())) == 3 and torch.equal(marks.overdraw(), overdraw)
+
 
 def test_it_draws_on_cards_alone_and_not_where_sums_are_exact(device: torch.device, cpu: Context, exactly) -> None:
-    assert not ops.rasterizes(device)
+    assert not ops.can_rasterize(device)
     torch.use_deterministic_algorithms(False)
     learned = Learned(random_scene(6, 3, width=20, height=10), torch.float32, HERE, "none")
-    assert ops.rasterizes(device)
-    with cpu(), pytest.raises(RuntimeError, match="rasterized runs on a CUDA device only"):
-        assert not ops.rasterizes(HERE)
+    assert ops.can_rasterize(device)
+    with cpu(), pytest.raises(RuntimeError, match="rasterize_image runs on a CUDA device only"):
+        assert not ops.can_rasterize(HERE)
         learned.draw(False)
 
 
@@ -193,6 +208,16 @@ def test_which_pictures_of_a_scene_need_no_list(device: torch.device) -> None:
     assert isinstance(scene.render(camera, field_mode="off").fragments, Marks)
 
 
+def test_the_public_function_lists_for_maps_alone(device: torch.device) -> None:
+    values, camera = {name: value.to(device) for name, value in surfels().items()}, api_camera().to(device)
+    drawn, listed = (bitymi_ns.rasterize(**values, camera=camera, maps=maps) for maps in (False, True))
+    assert isinstance(drawn.fragments, Marks) and isinstance(listed.fragments, ops.Fragments)
+    torch.testing.assert_close(drawn.rgb, listed.rgb, rtol=1e-9, atol=1e-12)
+    got, want = (torch.autograd.grad(one.rgb.square().sum(), list(values.values())) for one in (drawn, listed))
+    for name, gradient, expected in zip(values, got, want, strict=True):
+        assert relative(gradient, expected) < 1e-9, name
+
+
 def test_alphas_in_other_tiles_are_refused(device: torch.device) -> None:
     learned = Learned(random_scene(6, 3, width=20, height=10), torch.float32, device)
     del learned.texture["tiles"]
@@ -203,7 +228,7 @@ def test_alphas_in_other_tiles_are_refused(device: torch.device) -> None:
 def test_a_gradient_that_is_not_finite_is_not_hidden(device: torch.device) -> None:
     learned = Learned(random_scene(60, 3, width=70, height=40), torch.float32, device, "colors")
     projection = ops.project(*(learned.leaves[name] for name in GEOMETRY), learned.camera)
-    image, _ = ops.rasterized(projection, learned.base, **learned.texture)
+    image, _ = ops.rasterize_image(projection, learned.base, **learned.texture)
     towards = torch.ones_like(image)
     towards[int(image[:, 3].argmax()), 0] = float("nan")
     for gradient in torch.autograd.grad(image, [learned.base, learned.leaves["texels"]], towards):

@@ -128,6 +128,12 @@ class BitymiDataset(InputDataset):
         found = {} if fitted is None else fitted[image_idx].read(self._lens(image_idx))
         return {name: nearest(torch.from_numpy(values), *size).half() for name, values in found.items()}
 
+    @property
+    def has_maps(self) -> bool:
+        """True where views have depth or normals that are used."""
+        fitted = self._dataparser_outputs.metadata.get(FITTED, ())
+        return any(maps.fit is not None or maps.files.normal is not None for maps in fitted)
+
     def _lens(self, image_idx: int) -> Lens:
         return self._dataparser_outputs.metadata["lenses"][image_idx]
 

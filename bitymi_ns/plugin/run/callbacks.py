@@ -87,8 +87,9 @@ class TrainingRun:
         cameras = OnDemand(len(train), lambda i: to_camera(train[i : i + 1], "cpu"))
         learns = scene.config.texture == "texels"
         texels, to_come = config.texels if learns else None, self.training.texels.views_to_come
-        most, overdraw = self.training.strategy.most, config.loss.overdraw_weight > 0
-        state_training(scene, cameras, most, texels, to_come, processes.count, overdraw)
+        most = self.training.strategy.most
+        lists = self.training.schedule.lists_fragments(self.datamanager.train_dataset.has_maps)
+        state_training(scene, cameras, most, texels, to_come, processes.count, lists)
         self.datamanager.step_view = self.training.view
 
     def _check_start(self) -> None:

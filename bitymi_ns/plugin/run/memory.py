@@ -10,7 +10,7 @@ import torch
 from bitymi_ns.bake.tuning_views import LEAST_KEPT
 from bitymi_ns.bake.view_color_rate import choice_bytes
 from bitymi_ns.bundle.sizes import memory_limit
-from bitymi_ns.ops import project
+from bitymi_ns.ops import can_rasterize, project
 from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.trace_cpu import MOST, count
 from bitymi_ns.ops.trace_cuda import NUMBERS, free_memory
@@ -75,7 +75,7 @@ def state_training(
     texels: TexelConfig | None = None,
     to_come: int = 0,
     processes: int = 1,
-    overdraw: bool = False,
+    lists: bool = False,
 ) -> None:
     """Print the memory estimate of a training run.
 
@@ -86,24 +86,31 @@ def state_training(
         texels: of those that will learn; None = none will.
         to_come: views that they learn from, counted with repetition.
         processes: of the run, each of which takes as much.
-        overdraw: whether its loss counts.
+        lists: its losses need lists of fragments on a card, too.
     """
     (pixels, total), device = _pixels(cameras), scene.surfels["means"].device
     card = device.type == "cuda"
     fragments = most_fragments(scene, cameras, scene.config.max_fragments)
     if card:
+        lists = lists or scene.config.max_fragments > 0 or not can_rasterize(device)
         kept = min(photograph_budget(device), 9 * total)
     else:
         kept = PROGRAM + min(PHOTOGRAPH_BYTES, 3 * total) + min(DOWNSCALED_BYTES, 6 * total)
-    needed = kept + PER_PIXEL * pixels + _per_fragment(scene, overdraw) * fragments
+    needed = kept + PER_PIXEL * pixels + _per_fragment(scene, lists) * fragments
     surfels = max(len(scene), most_surfels)
     needed += PER_SURFEL * surfels
     if texels is not None:
         most = min(VIEWS_OF_TEXELS * pixels / texels.pixels_per_texel, most_texels(texels, to_come * pixels))
         needed += (PER_TEXEL + card * PER_TEXEL_SUM) * (SMALLEST**2 * surfels + most)
         needed += len(cameras) * surfels  # of `Visibility`, a byte for each that is looked through: at most all
-    advice = "draw large views in smaller parts, which takes longer: --pipeline.model.scene.max-fragments"
-    _state("Training", needed if card else processes * needed, cameras, f"{advice} {max(1, fragments // 4)}", device)
+    if card:  # where a bound on fragments would bring lists, which take more memory
+        advice = (
+            f"train fewer surfels (--max-surfels {max(1, surfels // 2)}) or smaller photographs (--downscale-factor 2)"
+        )
+    else:
+        option = f"--pipeline.model.scene.max-fragments {max(1, fragments // 4)}"
+        advice = f"draw large views in smaller parts, which takes longer: {option}"
+    _state("Training", needed if card else processes * needed, cameras, advice, device)
 
 
 def state_export(
@@ -124,7 +131,7 @@ def state_export(
     if finetune_bytes < LEAST_KEPT * len(cameras) * (PER_KEPT_FRAGMENT * fragments + PER_KEPT_PIXEL * pixels):
         finetune_bytes = 0  # too few views would fit
     device = scene.surfels["means"].device
-    needed = PROGRAM * (device.type != "cuda") + kept + PER_PIXEL * pixels + _per_fragment(scene) * fragments
+    needed = PROGRAM * (device.type != "cuda") + kept + PER_PIXEL * pixels + _per_fragment(scene, False) * fragments
     kind = scene.config.view_color
     entry = VIEW_COLORS[kind]
     terms = scene.surfels[entry.parameters[1].name].shape[1] - entry.base_terms
@@ -136,9 +143,9 @@ def state_export(
     _state("The export", needed, cameras, "export with --finetune-memory 0, which takes longer", device)
 
 
-def _per_fragment(scene: Scene, overdraw: bool = False) -> float:
+def _per_fragment(scene: Scene, lists: bool) -> float:
     if scene.surfels["means"].device.type == "cuda":
-        return PER_CARD_FRAGMENT if overdraw or scene.config.texture == "hash" else PER_PASSING_FRAGMENT
+        return PER_CARD_FRAGMENT if lists or scene.config.texture == "hash" else PER_PASSING_FRAGMENT
     return PER_FRAGMENT + PER_SHADED_FRAGMENT * (scene.config.texture == "hash")
 
 

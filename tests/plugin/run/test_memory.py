@@ -1,5 +1,6 @@
 """The statement of the memory that a run will take."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,6 +10,7 @@ import torch
 
 from bitymi_ns.plugin.run import memory
 from bitymi_ns.scene import Camera, Scene
+from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train import texels
 from bitymi_ns.train.config import TexelConfig
@@ -81,6 +83,40 @@ def test_a_card_is_compared_with_its_own_memory(
         assert ("more than the 1.0 GB that the card has available" in text) == (free == 10**9)
         needed.append(gigabytes(text))
     assert needed[0] > 1 and needed[1] <= needed[0]  # views with more fragments than it holds are drawn in bands
+
+
+def test_lists_that_training_makes_on_a_card_count(
+    scene: tuple[Scene, Camera], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(memory, "photograph_budget", lambda device: 0)
+    monkeypatch.setattr(memory, "free_memory", lambda device: 10**12)
+    monkeypatch.setattr(memory, "PER_CARD_FRAGMENT", 10**7)
+    count = memory.most_fragments(scene[0], [scene[1]])
+
+    def gigabytes_of(config: SceneConfig, lists: bool = False) -> float:
+        one = OnCard(scene[0])
+        one.config = config
+        memory.state_training(one, [scene[1]], 0, lists=lists)  # type: ignore[arg-type]
+        return gigabytes(said(capsys))
+
+    plain = replace(scene[0].config, texture="none")
+    assert gigabytes_of(plain) < 1
+    listed = pytest.approx(1e-2 * count, abs=0.1)
+    assert gigabytes_of(plain, lists=True) == listed
+    assert gigabytes_of(replace(plain, texture="hash")) == listed
+    assert gigabytes_of(replace(plain, max_fragments=10**6)) == listed
+    monkeypatch.setattr(memory, "can_rasterize", lambda device: False)
+    assert gigabytes_of(plain) == listed
+
+
+def test_a_card_that_is_too_small_gets_advice_for_cards(
+    scene: tuple[Scene, Camera], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(memory, "photograph_budget", lambda device: 0)
+    monkeypatch.setattr(memory, "free_memory", lambda device: 0)
+    memory.state_training(OnCard(scene[0]), [scene[1]], 1000)  # type: ignore[arg-type]
+    text = said(capsys)
+    assert "--max-surfels 500" in text and "--downscale-factor 2" in text and "max-fragments" not in text
 
 
 def test_it_grows_with_fragments_up_to_the_bound_and_not_with_views(

@@ -71,8 +71,8 @@ class DensifyConfig:
     """... but not before there are so many times the surfels that training started with, however few the pixels: a
     scene that cannot grow cannot put surfels where its errors are."""
     max_surfels: Annotated[Count, tyro.conf.arg(aliases=("--max-surfels",))] = 0
-    """Most surfels at any time; 0 = no limit. Once they are reached, those that the final prunes would remove make room
-    for those whose errors are largest."""
+    """Most surfels at any time; 0 = no limit. Once they are reached, those that have become faint make room for those
+    whose errors are largest."""
     min_surfels: Count = 100  # No prune leaves fewer surfels than this.
 
 

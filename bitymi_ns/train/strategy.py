@@ -79,6 +79,8 @@ class Strategy:
         self.schedule = schedule
         self.on_resize = on_resize
         self.most = most_surfels(self.config, image_pixels, first_surfels)
+        # surfels that have become fainter than they began, and that a final prune would remove
+        self._replaceable = min(self.config.densify.final_prune_opacity, 0.5 * self.config.init_opacity)
         self.generator = torch.Generator().manual_seed(self.config.seed)
         self.statistics = torch.zeros(len(STATISTICS), 0)
 
@@ -187,7 +189,7 @@ class Strategy:
             count, room = int((clone | split).sum()), max(0, self.most - n)
             # shortly after an opacity reset every opacity is low, whatever its surfel is worth
             if self.most == config.max_surfels and not self.schedule.recovering(step):
-                faint = ~(clone | split) & self._faint(surfels)
+                faint = ~(clone | split) & (surfels["opacity_logits"].sigmoid() < self._replaceable)
                 replaced = _lowest(surfels["opacity_logits"], faint, count - room)
             chosen = _strongest(clone | split, scores.importance, abs_grad_sum / seen, room + int(replaced.sum()))
             report |= {"replaced": int(replaced.sum()), "held_back": count - int(chosen.sum())}

@@ -285,7 +285,7 @@ def test_a_scene_over_the_cap_loses_its_faintest_at_once(bench, step, cap):
 
 def test_faint_surfels_make_room_for_important_ones_at_the_cap(bench):
     b = bench(40, max_surfels=42, prune_budget=0.0)
-    b.set("opacity_logits", slice(0, 8), torch.linspace(-3.0, -2.3, 8))  # all below 0.1
+    b.set("opacity_logits", slice(0, 8), torch.linspace(-4.0, -3.1, 8))  # all below 0.05
     b.importance[2:30] = torch.arange(28) + 10
     b.see(1.0, 1.0)
     report = b.step(DENSIFY)
@@ -294,7 +294,7 @@ def test_faint_surfels_make_room_for_important_ones_at_the_cap(bench):
     assert b.x == [*range(2, 40), 26, 27, 28, 29]
     check(b)
     b = bench(40, max_surfels=42, prune_budget=0.0)  # no more of them than are needed, the faintest
-    b.set("opacity_logits", slice(0, 8), torch.linspace(-2.3, -3.0, 8))
+    b.set("opacity_logits", slice(0, 8), torch.linspace(-3.1, -4.0, 8))
     b.importance[30:35] = 9
     b.see(1.0, 1.0)
     report = b.step(DENSIFY)
@@ -306,7 +306,7 @@ def test_faint_surfels_make_room_for_important_ones_at_the_cap(bench):
 def test_no_surfel_makes_room_after_a_reset_or_at_another_limit(bench, step, cap):
     b = bench(40, prune_budget=0.0, max_surfels=cap)
     b.strategy.most = 42
-    b.set("opacity_logits", slice(0, 8), torch.linspace(-3.0, -2.3, 8))
+    b.set("opacity_logits", slice(0, 8), torch.linspace(-4.0, -3.1, 8))
     b.importance[2:30] = 9
     b.see(1.0, 1.0)
     report = b.step(step)

@@ -23,7 +23,8 @@ def test_held_out_views_are_compared_on_the_device_of_the_model() -> None:
         drawn_on.append(camera.K.device)
         return SimpleNamespace(rgb=image.to(CARD))
 
-    scene = SimpleNamespace(to=lambda device: scene, render=lambda camera, background: render(baked, camera))
+    moved = SimpleNamespace(render=lambda camera, background: render(baked, camera))
+    scene = SimpleNamespace(to=lambda device: moved if device == CARD else None)
     with noted_reads() as reads:
         model = SimpleNamespace(device=CARD, background=torch.zeros(3).to(CARD))
         model.render = lambda camera, background, maps: render(neural, camera)

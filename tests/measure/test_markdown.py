@@ -12,7 +12,9 @@ def test_a_value_that_is_missing_is_an_error() -> None:
 
 
 def test_markdown_is_not_escaped() -> None:
-    values = dict.fromkeys(("rim", "probes", "accurate", "steps", "allowance", "picture", "sweeps", "nothing"), "<1")
-    tables = dict.fromkeys(("plain", "texels", "pixel"), "| a | b |")
-    page = rendered("stability.md.j2", backend="<a>", cases=tables, **values)
-    assert "backend `<a>`" in page and "## Cases\n\n| a | b |\n" in page
+    values = dict.fromkeys(
+        ("rim", "probes", "accurate", "steps", "allowance", "picture", "sweeps", "nothing", "verdicts"), "<1"
+    )
+    others = dict.fromkeys(("texels", "alpha", "pixel"), "<2")
+    page = rendered("stability.md.j2", backend="<a>", cases="| a | b |", others=others, **values)
+    assert "backend `<a>`" in page and "\n\n| a | b |\n" in page and "<2" in page

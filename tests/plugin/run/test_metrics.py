@@ -84,9 +84,9 @@ def test_the_clock_counts_between_start_and_stop_only() -> None:
     clock = Stopwatch(1.0, 2.0)
     clock.start()
     clock.stop()
-    time.sleep(0.02)
+    time.sleep(0.5)
     clock.stop()
-    assert 1.0 <= clock.seconds < 1.015 and clock.cpu_seconds >= 2.0
+    assert 1.0 <= clock.seconds < 1.4 and clock.cpu_seconds >= 2.0
 
 
 def test_a_resumed_curve_goes_on_where_the_checkpoint_was(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ thresholds are those of `config.DensifyConfig`.
 At each densification, in this order:
 - surfels that can never be seen again are removed (a value that is not finite, or an opacity of 1/255 or less);
 - surfels with many bad pixels and a large gradient are cloned or split, the most important ones first where not all
-  fit; faint surfels make room for them;
+  fit; at `max_surfels` faint surfels make room for them;
 - up to half of the candidates for pruning, drawn at random, are removed;
 - opacities are clamped.
 Between 60 and 90 % of the run, four final prunes remove what is transparent. docs/training.md states the
@@ -237,15 +237,12 @@ class Strategy:
         candidate = surfels["opacity_logits"].sigmoid() < config.prune_opacity
         return candidate | (surfels["log_scales"].amax(-1).exp() > config.prune_world * self.schedule.extent)
 
-    def _faint(self, surfels: Mapping[str, Tensor]) -> Tensor:
-        """[N] bool: the surfels that a final prune would remove."""
-        return surfels["opacity_logits"].sigmoid() < self.config.densify.final_prune_opacity
-
     @torch.no_grad()
     def _final_prune(self, scene: Scene, optimizers: Mapping[str, Optimizer]) -> dict[str, float]:
         report = self._drop_dead(scene, optimizers)
         logits = scene.surfels["opacity_logits"]
-        pruned = self._keep_minimum(self._faint(scene.surfels), logits, len(scene))
+        pruned = logits.sigmoid() < self.config.densify.final_prune_opacity
+        pruned = self._keep_minimum(pruned, logits, len(scene))
         self.remove(pruned, scene, optimizers)
         return report | {"pruned": int(pruned.sum())}
 

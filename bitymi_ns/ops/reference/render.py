@@ -75,9 +75,8 @@ def render(
     """
     width, height = camera.width, camera.height
     p = project(*geometry, camera.viewmat, camera.K, near)
-    factor = None
-    if tiles is not None and any(tile.shape[-1] == 4 for tile in tiles):
-        factor = lambda uv, where: fetched(tiles, uv, where)[..., 3]  # noqa: E731
+    alphas = tiles is not None and any(tile.shape[-1] == 4 for tile in tiles)
+    factor = (lambda uv, where: fetched(tiles, uv, where)[..., 3]) if alphas else None
     t = trace(p, width, height, near, rim, prefilter, factor=factor)
     base = torch.relu(colors + 0.5)  # [N, 3]
     color = base.expand(width * height, -1, -1)  # [P, N, 3]

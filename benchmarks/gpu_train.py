@@ -49,7 +49,7 @@ def main() -> int:
     scene = scene_for_views(capture.train, capture.points, capture.colours, preset.scene, config).to(device)
     due = {math.ceil(steps * (i + 1) / arguments.points) for i in range(arguments.points)}
     log = fit(scene, capture.train, capture.held_out, config, steps, eval_steps=sorted(due))
-    peak = torch.cuda.max_memory_allocated(device) if device.type == "cuda" else 0
+    peak = torch.cuda.max_memory_allocated(device) / 1e6 if device.type == "cuda" else None
     curve = [
         [number(e.step, 0), number(e.seconds, 1), number(e.surfels, 0), number(e.psnr), number(e.fitted_psnr)]
         for e in log.entries
@@ -66,7 +66,7 @@ def main() -> int:
     background = eval_background(config, device)
     psnr, *_ = quality(lambda camera: baked.render(camera, background).rgb, capture.held_out, device, background)
     size = 0 if made.atlas is None else made.atlas.nbytes
-    figures = [number(peak / 1e6, 0), number(seconds, 1), number(size / 1e6), number(psnr)]
+    figures = [number(peak, 0), number(seconds, 1), number(size / 1e6), number(psnr)]
     camera = capture.held_out[0].camera
     text = (
         f"{len(capture.train)} photographs of {camera.width} x {camera.height}; {len(capture.held_out)} held out.\n\n"

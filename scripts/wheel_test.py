@@ -77,7 +77,7 @@ def expected() -> set[str]:
 
 
 def check_contents(wheel: Path) -> None:
-    """Ends this script where a file is missing from the wheel or superfluous in it."""
+    """End this script where a file is missing from the wheel or superfluous in it."""
     with zipfile.ZipFile(wheel) as archive:
         files = {name for name in archive.namelist() if ".dist-info/" not in name}
     if files != expected():

@@ -62,7 +62,6 @@ def check_room(array_bytes: int, groups: int, size: tuple[int, int], layers: int
         array_bytes: of the largest buffer.
         groups: largest number of groups of threads that are started at once.
         size: width and height of a texture.
-        layers: of it.
 
     Raises:
         WebGpuUnavailable: it does not; says what is too large.

@@ -15,7 +15,7 @@ from bitymi_ns import KernelsUnavailable
 from bitymi_ns.capture.types import SfmOptions
 from bitymi_ns.files import explained
 from bitymi_ns.measure.bench.cli import BenchRun
-from bitymi_ns.trust import printable
+from bitymi_ns.trust import listed, printable
 
 
 def say(text: object, to: TextIO | None = None) -> None:
@@ -189,8 +189,7 @@ class Verify:
 def _say_left_out(names: Sequence[str]) -> None:
     """Names the files of a bundle that are not passed on with it."""
     if names:
-        shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
-        say(f"Left out, because no file of a bundle has such a name: {shown}.", sys.stderr)
+        say(f"Left out, because no file of a bundle has such a name: {listed(names, most=5)}.", sys.stderr)
 
 
 @dataclass

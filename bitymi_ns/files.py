@@ -65,14 +65,15 @@ def reason(error: OSError, path: Path) -> str:
 
 
 @contextmanager
-def explained(path: Path, kind: type[Exception]) -> Iterator[None]:
-    """Turn OSErrors in the block into exceptions of this kind that explain why `path` cannot be written."""
+def explained(path: Path, kind: type[BaseException], then: str = "") -> Iterator[None]:
+    """Turn OSErrors in the block into exceptions of this kind that explain why `path` cannot be written; `then` ends
+    their message."""
     try:
         yield
     except OSError as error:
         if error.errno is None:  # of our own making: it says what is wrong
             raise
-        raise kind(f"{path} cannot be written: {reason(error, path)}") from error
+        raise kind(f"{path} cannot be written: {reason(error, path)}{then}") from error
 
 
 def encoding_of(path: Path) -> str:

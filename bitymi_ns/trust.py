@@ -1,18 +1,20 @@
 """Protection against files of others: links are not followed, folders that others can write to are not used, names stay
-inside a folder, JSON within a nesting depth, and text is printable."""
+inside a folder, JSON within a nesting depth, text is printable, and Python runs no module of the current folder."""
 
 import errno
 import json
 import os
 import re
 import stat
-from collections.abc import Iterable
+import sys
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 UNFINISHED = ".unfinished"  # ends the name of a file on its way, which begins with a dot: a killed process leaves it
 DEEPEST = 100  # levels of JSON that are read
+_CALL = "import sys; sys.path[:] = [folder for folder in sys.path if folder]; from {0} import {1}; sys.exit({1}())"
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
@@ -168,12 +170,8 @@ def keep(folder: Path, made: Iterable[str]) -> None:
     """
     others = strangers(folder, made)
     if others:
-        more = f" and {len(others) - 3} more" if len(others) > 3 else ""
-        raise Refused(
-            f"{folder} also holds {', '.join(others[:3])}{more}, which would be lost: move that away, or choose "
-            "another folder",
-            folder,
-        )
+        lost = f"{folder} also holds {listed(others)}, which would be lost"
+        raise Refused(f"{lost}: move that away, or choose another folder", folder)
 
 
 def inside(folder: Path, name: str) -> Path:
@@ -222,6 +220,12 @@ def printable(text: str) -> str:
     return _CONTROLS.sub(lambda found: found.group().encode("unicode_escape").decode(), text)
 
 
+def listed(names: Sequence[object], most: int = 3) -> str:
+    """The first few names, and how many more there are."""
+    shown = ", ".join(str(name) for name in names[:most])
+    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
+
+
 def is_text(name: str | os.PathLike[str]) -> bool:
     """Test if a file's name is UTF-8, as most files that name it need."""
     try:
@@ -229,3 +233,14 @@ def is_text(name: str | os.PathLike[str]) -> bool:
     except UnicodeEncodeError:
         return False
     return True
+
+
+def python_command(module: str, function: str) -> list[str]:
+    """The command that calls a function of a module in a new process of this Python, without arguments; the function
+    returns the exit code, as that of a console script does. Further words of the command are in `sys.argv`.
+
+    The current folder is not on its search path, as it would be with `-m` or `-c` alone: it may be a capture of
+    somebody else, and a `json.py` in it would be run. `-P` does the same, but Python 3.10 does not know it; `-I` does
+    more, so that the user's own packages would not be found.
+    """
+    return [sys.executable, "-c", _CALL.format(module, function)]

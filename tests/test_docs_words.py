@@ -27,7 +27,7 @@ DOCSTRINGS = (
     "examples/*.py",
     "benchmarks/*.py",
     "scripts/*.py",
-    *(f"bitymi_ns/{name}.py" for name in ("__init__", "api", "cli", "files", "interpreter", "ply", "presets", "trust")),
+    *(f"bitymi_ns/{name}.py" for name in ("__init__", "api", "cli", "files", "ply", "presets", "trust")),
     *(f"bitymi_ns/{name}/*.py" for name in ("bake", "bundle", "capture", "codec", "interchange")),
     *(f"bitymi_ns/{name}/*.py" for name in ("measure", "ops", "sample", "scene")),
 )

@@ -69,7 +69,7 @@ def shown_weights(scene: BakedScene, cameras: Sequence[Camera], progress: Progre
         projection = project(*geometry, camera, scene.near, scene.prefilter)
         projection.alpha = alpha
         for fragments in fitting_lists(projection):
-            found[done].index_add_(0, fragments.surfel.long(), fragments.weight.square())
+            found[done].index_add_(0, fragments.surfel, fragments.weight.square())
             del fragments  # before the next list is made
         progress("tracing the training views", done + 1, len(cameras))
     return found

@@ -13,7 +13,7 @@ from PIL import Image
 
 from bitymi_ns.capture import ignored_files
 from bitymi_ns.files import encoding_of
-from bitymi_ns.trust import json_of
+from bitymi_ns.trust import json_of, listed
 
 Format = Literal[
     "nerfstudio", "instant-ngp", "blender", "colmap", "polycam", "record3d", "pose-files", "photographs", "video"
@@ -71,8 +71,7 @@ class Found:
             elif format == "video" or (path.suffix == ".json" and path.name != "transforms.json"):
                 option = f"--data {path}"
             ways.append(f"{_seen_from(path, self.folder)} (`bitymi-data {option}`)")
-        more = f" and {len(ways) - 3} more" if len(ways) > 3 else ""
-        return f"Not read: {', '.join(ways[:3])}{more}."
+        return f"Not read: {listed(ways)}."
 
 
 def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path: Path | None = None) -> Found:

@@ -4,6 +4,7 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -13,7 +14,7 @@ from torch import Tensor
 from bitymi_ns.bake.lean_color import centers_of
 from bitymi_ns.bundle import Bundle, BundleError
 from bitymi_ns.codec.scene_texels import texel_alpha
-from bitymi_ns.files import complete_folder, reason
+from bitymi_ns.files import complete_folder, explained
 from bitymi_ns.interchange.draw_quads import draw_quads
 from bitymi_ns.interchange.frame import to_capture
 from bitymi_ns.interchange.gaussians import gaussians_of, write_gaussians
@@ -124,33 +125,29 @@ def write_extras(
     colors = _fitted_colors(scene, cameras, progress)
     base = _psnr(lambda camera: scene.render(camera, background).rgb, views, background)
     written: dict[str, Written] = {}
-    try:
-        with complete_folder(folder, lambda: check_extras(kinds, folder, overwrite)) as new:
-            for kind in dict.fromkeys(kinds):
-                path = new / FILES[kind]
-                if kind == "gaussians":
-                    gaussians = gaussians_of(scene, colors.harmonics)
-                    count = len(gaussians)
-                    value = _psnr(
-                        lambda c, g=gaussians: draw_gaussians(g, c, background, scene.near), views, background
-                    )
-                    write_gaussians(path, gaussians if to is None else gaussians.moved(to))
-                else:
-                    quads = quads_of(scene, colors.color, LEVEL)
-                    if not len(quads):
-                        raise BundleError(f"no surfel of the bundle has an opacity above {LEVEL}: there is no mesh")
-                    chosen = [cameras[i].within(COLORED_SIDE) for i in spread(len(cameras), COLORED_VIEWS)]
-                    picture = _picture(scene, background)
-                    quads, count = recolored(quads, picture, chosen, scene.near, progress), len(quads)
-                    value = _psnr(lambda c, q=quads: draw_quads(q, c, background, scene.near), views, background)
-                    up = torch.tensor(bundle.info.world.up or _UP) if to is None else None
-                    path.write_bytes(glb_bytes(quads if to is None else quads.moved(to), up))
-                written[kind] = Written(path.name, path.stat().st_size, count, value, base, len(views))
-            summary = {"frame": frame, "training_views": len(cameras)}
-            summary |= {kind: asdict(each) for kind, each in written.items()}
-            (new / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", "utf8")
-    except OSError as error:
-        raise BundleError(f"{folder} cannot be written: {reason(error, folder)}. Nothing was left behind") from error
+    replaceable = partial(check_extras, kinds, folder, overwrite)
+    with explained(folder, BundleError, ". Nothing was left behind"), complete_folder(folder, replaceable) as new:
+        for kind in dict.fromkeys(kinds):
+            path = new / FILES[kind]
+            if kind == "gaussians":
+                gaussians = gaussians_of(scene, colors.harmonics)
+                count = len(gaussians)
+                value = _psnr(lambda c, g=gaussians: draw_gaussians(g, c, background, scene.near), views, background)
+                write_gaussians(path, gaussians if to is None else gaussians.moved(to))
+            else:
+                quads = quads_of(scene, colors.color, LEVEL)
+                if not len(quads):
+                    raise BundleError(f"no surfel of the bundle has an opacity above {LEVEL}: there is no mesh")
+                chosen = [cameras[i].within(COLORED_SIDE) for i in spread(len(cameras), COLORED_VIEWS)]
+                picture = _picture(scene, background)
+                quads, count = recolored(quads, picture, chosen, scene.near, progress), len(quads)
+                value = _psnr(lambda c, q=quads: draw_quads(q, c, background, scene.near), views, background)
+                up = torch.tensor(bundle.info.world.up or _UP) if to is None else None
+                path.write_bytes(glb_bytes(quads if to is None else quads.moved(to), up))
+            written[kind] = Written(path.name, path.stat().st_size, count, value, base, len(views))
+        summary = {"frame": frame, "training_views": len(cameras)}
+        summary |= {kind: asdict(each) for kind, each in written.items()}
+        (new / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", "utf8")
     return written
 
 

@@ -9,13 +9,12 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from bitymi_ns.files import reason
+from bitymi_ns.files import check_writable, explained, write_file
 from bitymi_ns.measure.report.pictures import ERROR_CAPTION, ERROR_SCALE, heat
 from bitymi_ns.measure.report.read import PICTURES
 from bitymi_ns.ops import blended_image, fragment_residual
 from bitymi_ns.ops.constants import COLOR_BIAS
-from bitymi_ns.plugin.console import fail, say
-from bitymi_ns.plugin.export.target import replace_file, require_writable
+from bitymi_ns.plugin.console import InputError, fail, say
 from bitymi_ns.plugin.export.trained import load_trained
 from bitymi_ns.plugin.run.metrics import image_metrics
 from bitymi_ns.plugin.run.surfel_model import OVERDRAW_SCALE
@@ -97,7 +96,8 @@ def draw_worst(load_config: Path, output_dir: Path, views: int) -> None:
     """
     if views < 1:
         fail(f"--views must be at least 1, not {views}")
-    require_writable(output_dir / PICTURES)
+    with explained(output_dir / PICTURES, InputError, "."):
+        check_writable(output_dir / PICTURES)
     config, pipeline = load_trained(load_config)
     model, datamanager = pipeline.model, pipeline.datamanager
     count = len(datamanager.eval_dataset)
@@ -110,19 +110,17 @@ def draw_worst(load_config: Path, output_dir: Path, views: int) -> None:
         rgb = model.render(view.camera, background, maps=False).rgb.clamp(0.0, 1.0)
         ranked.append((image_metrics(rgb, photo, view.mask), index, view.camera, photo))
     ranked.sort(key=lambda entry: (entry[0]["psnr"], entry[1]))
-    try:
+    shown = []
+    with explained(output_dir, InputError, "."):
         output_dir.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        fail(f"{output_dir} cannot be made: {reason(error, output_dir)}.", error)
-    listed = []
-    for rank, (metrics, index, camera, photo) in enumerate(ranked[:views]):
-        files = {}
-        for kind, image in decompose(model.scene, camera, background, photo).items():
-            files[kind] = f"view{index:04d}-{kind}.png"
-            replace_file(output_dir / files[kind], png(image))
-        figures = {name: round(value, 4) for name, value in metrics.items()}
-        listed.append({"view": index, "rank": rank + 1, "of": count, "metrics": figures, "files": files})
-    about = {"scene": config.experiment_name, "method": config.method_name}
-    text = json.dumps({"bitymi_pictures": 1, **about, "captions": KINDS, "views": listed}, indent=1)
-    replace_file(output_dir / PICTURES, text.encode("utf8"))
-    say(f"Wrote {len(listed)} views to {output_dir}")
+        for rank, (metrics, index, camera, photo) in enumerate(ranked[:views]):
+            files = {}
+            for kind, image in decompose(model.scene, camera, background, photo).items():
+                files[kind] = f"view{index:04d}-{kind}.png"
+                write_file(output_dir / files[kind], png(image))
+            figures = {name: round(value, 4) for name, value in metrics.items()}
+            shown.append({"view": index, "rank": rank + 1, "of": count, "metrics": figures, "files": files})
+        about = {"scene": config.experiment_name, "method": config.method_name}
+        text = json.dumps({"bitymi_pictures": 1, **about, "captions": KINDS, "views": shown}, indent=1)
+        write_file(output_dir / PICTURES, text.encode("utf8"))
+    say(f"Wrote {len(shown)} views to {output_dir}")

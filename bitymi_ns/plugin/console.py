@@ -3,7 +3,7 @@
 import functools
 import re
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
@@ -14,6 +14,7 @@ from rich.markup import escape
 from rich.panel import Panel
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from bitymi_ns.trust import listed as listed
 from bitymi_ns.trust import printable
 
 INTERRUPTED = 130  # exit status after Ctrl-C, by the convention of shells
@@ -123,9 +124,3 @@ def warn(message: str) -> None:
 
 
 warn_once = functools.cache(warn)  # the same message only once in a process
-
-
-def listed(names: Sequence[object], most: int = 3) -> str:
-    """The first few names, and how many more there are."""
-    shown = ", ".join(str(name) for name in names[:most])
-    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"

@@ -11,12 +11,11 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from bitymi_ns import interpreter
 from bitymi_ns.capture.sfm.job import DATABASE, PAIRS, Job
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import size_text
 from bitymi_ns.progress import Progress
-from bitymi_ns.trust import no_links
+from bitymi_ns.trust import no_links, python_command
 
 LOG = "colmap.log"
 LITTLE_SPACE = 50_000_000  # bytes; where less is left, the disk is what stopped COLMAP
@@ -32,7 +31,7 @@ def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:
     watching = ExitStack()
     with open(work / LOG, "wb", opener=no_links) as log:
         process = subprocess.Popen(
-            interpreter.command("bitymi_ns.capture.sfm.worker", "main"),
+            python_command("bitymi_ns.capture.sfm.worker", "main"),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=log,

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from bitymi_ns.files import reason
+from bitymi_ns.files import explained
 from bitymi_ns.measure.bench.process import BenchError
 from bitymi_ns.measure.machine import commit, machine, versions
 from bitymi_ns.trust import json_of, no_links
@@ -83,7 +83,7 @@ class Cells:
         """
         cell = {"key": key, "value": value, "made": origin}
         line = json.dumps(cell, allow_nan=False).encode("utf8") + b"\n"
-        try:
+        with explained(self.path, BenchError, ", with --work"):
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with open(self.path, "a+b", opener=no_links) as file:
                 fcntl.flock(file, fcntl.LOCK_EX)
@@ -92,8 +92,6 @@ class Cells:
                 file.write(line)
                 file.flush()
                 os.fsync(file.fileno())
-        except OSError as error:
-            raise BenchError(f"{self.path} cannot be written: {reason(error, self.path)}, with --work") from error
         self._known[identity(key)] = cell
 
 

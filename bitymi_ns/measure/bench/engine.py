@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from bitymi_ns.files import Busy, Lock, reason
+from bitymi_ns.files import Busy, Lock, explained
 from bitymi_ns.measure.bench.cells import FILE, Cells, provenance, without_nan
 from bitymi_ns.measure.bench.matrix import Run, Stage
 from bitymi_ns.measure.bench.process import BenchError, CommandFailed, run_measured, say, tool
@@ -148,13 +148,12 @@ def locked(work: Path, run: Run) -> Iterator[Lock]:
         CommandFailed: another process holds it.
     """
     path = work / "locks" / f"{run.folder.replace('/', '--')}.lock"
-    try:
+    with explained(work, BenchError, ", with --work"):
         path.parent.mkdir(parents=True, exist_ok=True)
-        lock = Lock(path, say)
-    except Busy as error:
-        raise CommandFailed(f"{run}: {error}") from error
-    except OSError as error:
-        raise BenchError(f"{work} cannot be written: {reason(error, work)}, with --work") from error
+        try:
+            lock = Lock(path, say)
+        except Busy as error:
+            raise CommandFailed(f"{run}: {error}") from error
     with lock:
         yield lock
 

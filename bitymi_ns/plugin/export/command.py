@@ -20,12 +20,13 @@ from bitymi_ns.bundle.manifest import MANIFEST, dump
 from bitymi_ns.bundle.parts import CONFIG
 from bitymi_ns.bundle.poster import most_bytes
 from bitymi_ns.bundle.read import download_bytes
+from bitymi_ns.files import explained, write_file
 from bitymi_ns.interchange import Frame, Kind, check_extras, extras_folder, summary_line, write_extras
-from bitymi_ns.plugin.console import INTERRUPTED, fail, say, warn
+from bitymi_ns.plugin.console import INTERRUPTED, InputError, fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.export.cameras import camera_files
 from bitymi_ns.plugin.export.summary import print_summary
-from bitymi_ns.plugin.export.target import bundle_version, check_room, replace_file, reserve_bundle
+from bitymi_ns.plugin.export.target import bundle_version, check_room, reserve_bundle
 from bitymi_ns.plugin.export.trained import compare, load_trained, preview, world_of
 from bitymi_ns.plugin.run.bundle_model import BakedModelConfig
 from bitymi_ns.plugin.run.memory import state_export
@@ -256,7 +257,8 @@ class ExportAtlas(BakeOptions, CompactOptions):
         bundle = read_bundle(self.output_dir)
         if self.compare and len(datamanager.eval_dataset):
             bundle.info.statistics.held_out = compare(model, datamanager, bundle.scene)
-            replace_file(self.output_dir / MANIFEST, dump(bundle.info))
+            with explained(self.output_dir, InputError, "."):
+                write_file(self.output_dir / MANIFEST, dump(bundle.info))
         print_summary(self.output_dir, bundle.info)
         self.state_size(download_bytes(self.output_dir, bundle.info))
         if self.extras:

@@ -5,35 +5,27 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from bitymi_ns.bundle.bake_options import BakeOptions
-from bitymi_ns.bundle.manifest import MANIFEST, BundleError
+from bitymi_ns.bundle.manifest import MANIFEST
 from bitymi_ns.bundle.parts import check_target
 from bitymi_ns.codec.quantise import BYTES_PER_TEXEL
-from bitymi_ns.files import check_writable, free_bytes, reason, reserved, size_text, write_file
-from bitymi_ns.plugin.console import fail, warn
+from bitymi_ns.files import explained, free_bytes, reserved, size_text
+from bitymi_ns.plugin.console import InputError, fail, warn
 
 SURFEL_BYTES = 60 * 4  # bytes of a surfel's parameters. A checkpoint holds them three times, with Adam's two moments.
 TYPICAL_SIDE = 32  # side of a texture tile in texels, estimated generously: within a tolerance most are far smaller
 
 
-def require_writable(path: Path) -> None:
-    """Stop where a file or folder cannot be written."""
-    try:
-        check_writable(path)
-    except OSError as error:
-        fail(f"{path} cannot be written: {reason(error, path)}.", error)
-
-
 @contextmanager
 def reserve_bundle(folder: Path, overwrite: bool) -> Iterator[None]:
-    """Lock the folder of a bundle; stop where another process has it, or a bundle may not or cannot be written."""
+    """Lock the folder of a bundle; stop where another process has it, or a bundle may not or cannot be written.
+
+    Raises:
+        BundleError: there is a bundle, or other files.
+    """
     with ExitStack() as stack:
-        try:
+        with explained(folder, InputError, " (--output-dir)."):
             stack.enter_context(reserved(folder, warn))
             check_target(folder, overwrite)
-        except OSError as error:
-            fail(f"{folder} cannot be written: {reason(error, folder)} (--output-dir).", error)
-        except BundleError as error:
-            fail(f"{error}.", error)
         yield
 
 
@@ -75,11 +67,3 @@ def bundle_version(folder: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return found.st_ino, found.st_mtime_ns
-
-
-def replace_file(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all."""
-    try:
-        write_file(path, data)
-    except OSError as error:
-        fail(f"{path} could not be written: {reason(error, path)}.", error)

@@ -12,8 +12,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.nn import Parameter
 
-from bitymi_ns.files import reason, write_file
-from bitymi_ns.plugin.console import fail, listed, say, warn
+from bitymi_ns.files import explained, reason, write_file
+from bitymi_ns.plugin.console import InputError, fail, listed, say, warn
 from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.plugin.data.dataset import capture_fingerprint, warn_of_other_capture
 from bitymi_ns.plugin.data.images import exposure_stops
@@ -201,12 +201,10 @@ class TrainingCurve:
     def __init__(self, path: Path, resumed_from: Path | None = None, steps_done: int = 0) -> None:
         self.path = path
         source = resumed_from if resumed_from is not None else path if steps_done > 0 else None
-        try:
+        with explained(path, InputError, "."):
             path.parent.mkdir(parents=True, exist_ok=True)
             kept = _points_until(source, steps_done) if source is not None and source.is_file() else []
             write_file(path, "".join(line + "\n" for line in kept).encode("utf8"))
-        except OSError as error:
-            fail(f"the training curve {path} cannot be written: {reason(error, path)}.", error)
 
     def add(self, point: dict[str, Any]) -> None:
         """Write one point, whole and at once. A full disk costs the point, not the run."""

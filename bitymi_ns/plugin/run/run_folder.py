@@ -6,7 +6,7 @@ from pathlib import Path
 
 from bitymi_ns import files
 from bitymi_ns.capture.report import FILES
-from bitymi_ns.plugin.console import fail, warn
+from bitymi_ns.plugin.console import InputError, fail, warn
 from bitymi_ns.plugin.data.colmap_views import Source
 from bitymi_ns.plugin.data.sfm_poses import write_kept_poses
 from bitymi_ns.trust import check_no_links
@@ -23,17 +23,13 @@ def take(folder: Path) -> None:
     Raises:
         InputError: another process trains into it, or it cannot be written.
     """
-    try:
+    with files.explained(folder, InputError, " (--output-dir)."):
         folder.mkdir(parents=True, exist_ok=True)
-        files.hold(folder / LOCK, warn)
-    except files.Busy as error:
-        fail(
-            f"{folder} is in use: {error}. Or train into another folder: give another --timestamp, --experiment-name "
-            "or --output-dir.",
-            error,
-        )
-    except OSError as error:
-        fail(f"{folder} cannot be written: {files.reason(error, folder)} (--output-dir).", error)
+        try:
+            files.hold(folder / LOCK, warn)
+        except files.Busy as error:
+            other = "give another --timestamp, --experiment-name or --output-dir"
+            fail(f"{folder} is in use: {error}. Or train into another folder: {other}.", error)
     atexit.register(leave, folder)
     files.remove_unfinished(folder)
 

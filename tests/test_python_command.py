@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 import bitymi_ns
-from bitymi_ns import interpreter
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import Job
 from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.trust import python_command
 
 PACKAGE = Path(bitymi_ns.__file__).parent
 
@@ -24,7 +24,7 @@ def hostile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_the_function_is_called_and_no_module_of_the_current_folder(hostile: Path) -> None:
-    command = interpreter.command("getpass", "getuser")
+    command = python_command("getpass", "getuser")
     command[-1] = command[-1].replace("sys.exit(", "print(")
     done = subprocess.run(command, env={"USER": "somebody"}, capture_output=True, text=True, check=True)
     assert done.stdout == "somebody\n" and not (hostile / "ran").exists()
@@ -38,7 +38,7 @@ def test_colmap_is_started_beside_hostile_modules(hostile: Path) -> None:
 
 
 def test_python_is_started_this_way_alone() -> None:
-    here = {"interpreter.py", "measure/bench/process.py"}  # which looks for programs beside Python
+    here = {"trust.py", "measure/bench/process.py"}  # which looks for programs beside Python
     for path in PACKAGE.rglob("*.py"):
         text = path.read_text("utf8")
         starts = "sys.executable" in text and path.relative_to(PACKAGE).as_posix() not in here

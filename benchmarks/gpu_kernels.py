@@ -81,6 +81,10 @@ def main() -> int:
     parser.add_argument("--bundles", nargs="+", type=Path, default=[], help="draw these as well")
     parser.add_argument("--times", type=int, default=0, metavar="RUNS", help="time by kernel over so many runs")
     arguments = parser.parse_args()
+    if not torch.cuda.is_available():
+        parser.error("no CUDA device was found (or torch is a CPU build)")
+    if not arguments.sections and not arguments.bundles:
+        parser.error("there is nothing to run: no section and no bundle is named")
     width, height = (int(part) for part in arguments.size.split("x"))
     device = torch.device("cuda")
     made = {name: partial(SECTIONS[name], arguments.surfels) for name in arguments.sections}

@@ -60,7 +60,13 @@ def run(*command: str | Path, cwd: Path = ROOT) -> None:
 def build(folder: Path) -> Path:
     """The wheel, built in `folder`."""
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check")
-    options = ("-q", "--no-build-isolation", "--no-deps", "--no-index", "-Ccmake.define.BITYMI_CUDA=OFF")
+    options = (
+        "-q",
+        "--no-build-isolation",
+        "--no-deps",
+        "--no-index",
+        "--config-settings=cmake.define.BITYMI_CUDA=OFF",
+    )
     run(*pip, "wheel", *options, f"-Cbuild-dir={folder / 'build'}", "-w", folder, ROOT)
     (wheel,) = folder.glob("bitymi_ns-*.whl")
     return wheel

@@ -63,7 +63,7 @@ def shown_weights(scene: BakedScene, cameras: Sequence[Camera], progress: Progre
     alpha = None if alpha is None else alpha.to(device)
     for done, camera in enumerate(cameras):
         for fragments in fitting_lists(project(*geometry, camera, scene.near, scene.prefilter, alpha=alpha)):
-            found[done].index_add_(0, fragments.surfel.long(), fragments.weight.square())
+            found[done].index_add_(0, fragments.surfel, fragments.weight.square())
             del fragments  # before the next list is made
         progress("tracing the training views", done + 1, len(cameras))
     return found

@@ -25,7 +25,8 @@ def bc7_encoder(profile: Profile, alpha: bool = False) -> Callable[[npt.NDArray[
         import ispc_texcomp
     except ImportError as error:
         raise RuntimeError(
-            "BC7 needs the encoder ispc_texcomp: `pip install ispc_texcomp`, or choose the format uint8 or fp16"
+            "BC7 needs the encoder ispc_texcomp: `pip install ispc_texcomp` (Python 3.11 or later), or choose another "
+            "format"
         ) from error
     if profile not in ("slow", "basic", "fast", "veryfast", "ultrafast"):
         raise ValueError(f"the BC7 profile must be slow, basic, fast, veryfast or ultrafast, not {profile!r}")

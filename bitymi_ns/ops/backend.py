@@ -67,8 +67,8 @@ def cpu_module() -> str:
     if not usable:
         raise KernelsUnavailable(
             f"the CPU kernels were compiled for a CPU with {', '.join(lacking['_cpu'])}, which this one lacks: install "
-            "bitymi-ns again on this machine from its source, with `pip install . -Ccmake.define.BITYMI_MARCH=native` "
-            "(in a checkout: `make clean setup`)"
+            "bitymi-ns again on this machine from its source, with `pip install . "
+            "--config-settings=cmake.define.BITYMI_MARCH=native` (in a checkout: `make clean setup`)"
         )
     return usable[-1]
 
@@ -86,7 +86,7 @@ def load(name: str) -> ModuleType:
         advice = {
             "_cpu": "install the package (`pip install .`, or `make setup` in a checkout)",
             "_cuda": "install the package again where the CUDA toolkit's nvcc is found, or move the tensors to the CPU",
-            "_emulated": "install the package with -Ccmake.define.BITYMI_EMULATED_CUDA=ON",
+            "_emulated": "install the package with --config-settings=cmake.define.BITYMI_EMULATED_CUDA=ON",
         }[name]
         raise KernelsUnavailable(
             f"the compiled module bitymi_ns.{name} is missing: {advice}; the import said: {error}"

@@ -177,7 +177,7 @@ def select(fragments: Fragments, keep: Tensor) -> Fragments:
     check_shapes(keep=(keep, fragments.weight.shape))
     by = trace_cuda if cuda_backend(keep.device) else trace_cpu
     width, height = fragments.width, fragments.height
-    layout = by.select(fragments.layout, keep.to(torch.uint8).contiguous(), width, height)
+    layout = by.select(fragments.layout, keep.contiguous().view(torch.uint8), width, height)
     rows = torch.nonzero(keep).squeeze(1)
     weight, depth, sigma = (t.detach()[rows] for t in (fragments.weight, fragments.depth, fragments.sigma))
     uv = fragments.uv.detach()[:, rows].contiguous()

@@ -182,8 +182,8 @@ def select(layout: Layout, keep: Tensor, width: int, height: int) -> Layout:
     """
     masks, counts = torch.empty_like(layout.arrays["masks"]), torch.empty_like(layout.arrays["offsets"][1:])
     function("select_fragments", keep.device)(layout=layout.handle, keep=keep, masks=masks, counts=counts)
-    offsets, kept = torch.nn.functional.pad(counts.cumsum(0), (1, 0)), keep.bool()
-    ids = {name: value[kept] for name, value in layout.ids().items()}
+    offsets, rows = torch.nn.functional.pad(counts.cumsum(0), (1, 0)), keep.nonzero().squeeze(1)
+    ids = {name: value[rows] for name, value in layout.ids().items()}
     return layout_of(layout.arrays | {"masks": masks, "offsets": offsets}, width, height, ids)
 
 

@@ -15,19 +15,11 @@ constexpr int kListThreads = 128, kListWarps = kListThreads / kWarp;
 constexpr int kLarge = 128;  // tiles from which on a surfel is left to `large_pairs_kernel`
 
 namespace {
-// Sums of the values of the threads before mine.
-__device__ int warp_sum_before(int value, int lane) {
-  int sum = value;
-  for (int by = 1; by < kWarp; by *= 2) {
-    const int left = __shfl_up_sync(kFullMask, sum, by);
-    if (lane >= by) sum += left;
-  }
-  return sum - value;
-}
-// `sums`: kListWarps numbers in shared memory. All threads of the block take part; it ends with a barrier.
+// The sum of the values of the threads before mine. `sums`: kListWarps numbers in shared memory. All threads of the
+// block take part; it ends with a barrier.
 __device__ int block_sum_before(int value, int* sums, int& total) {
   const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
-  int before = warp_sum_before(value, lane);
+  int before = sum_below(value, lane);
   if (lane == kWarp - 1) sums[warp] = before + value;
   __syncthreads();
   total = 0;

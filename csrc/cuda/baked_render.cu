@@ -258,7 +258,7 @@ __global__ void __launch_bounds__(kThreads, kBlocks<kMaps, Kernel, kAlpha>) draw
       const uint32_t from = next < f.slots ? tile * unsigned(f.slots) : f.memory.lists[tile].rest;
       const uint32_t pair = next + lane < count ? f.memory.pairs[from + unsigned(next + lane)] : 0u;
       const unsigned votes = __ballot_sync(kFullMask, (pair & wanted) != 0);
-      if (pair & wanted) queue[waiting + __popc(votes & ((1u << lane) - 1))] = pair;
+      if (pair & wanted) queue[waiting + count_below(votes, lane)] = pair;
       waiting += __popc(votes);
       next += kWarp;
     }

@@ -97,8 +97,8 @@ template <class Kernel, class S> __global__ void __launch_bounds__(kThreads) cou
     crosses = touched.boxless();
     if (!crosses) touched.each_row([&](int, int first, int last) { count += last - first + 1; });
   }
-  for (unsigned todo = __ballot_sync(kFullMask, crosses); todo; todo &= todo - 1) {
-    const int j = __ffs(int(todo)) - 1;
+  for (unsigned todo = __ballot_sync(kFullMask, crosses); todo;) {
+    const int j = take_first(todo);
     int reached = 0;
     TouchedTiles<Kernel, S>(v, i - lane + j).each_reached(lane, [&](unsigned votes, int) { reached += __popc(votes); });
     if (lane == j) count = reached;
@@ -155,8 +155,8 @@ __global__ void __launch_bounds__(kThreads)
     by_warp = count > kAlone || touched.boxless();
     if (!by_warp) close(id, list_box(touched, id, from, from + count, 0, 1), from + count, 0, 1);
   }
-  for (unsigned todo = __ballot_sync(kFullMask, by_warp); todo; todo &= todo - 1) {
-    const int j = __ffs(int(todo)) - 1;
+  for (unsigned todo = __ballot_sync(kFullMask, by_warp); todo;) {
+    const int j = take_first(todo);
     const int32_t whose = __shfl_sync(kFullMask, id, j);
     int64_t at = __shfl_sync(kFullMask, from, j);
     const int64_t end = at + __shfl_sync(kFullMask, count, j);

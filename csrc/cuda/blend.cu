@@ -49,8 +49,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
       const int32_t id = f.surfel[at];
       const S w = f.weight[at], u = textured ? f.uv[at] : S(0), v = textured ? f.uv[f.total + at] : S(0);
       const TexelPatch<S> patch(of.table, id);
-      Vec3<S> c = patch.view;
-      if (w >= of.bound && patch.textured()) c = patch.color(patch.corners(u, v));
+      Vec3<S> c = patch.color(w, of.bound, u, v);
       if (of.residual) c = shaded(c, load3(of.residual + 3 * at));
       weights[i] = w, colors[0][i] = c.x, colors[1][i] = c.y, colors[2][i] = c.z;
       if constexpr (kMaps) depths[i] = f.depth[at];
@@ -142,10 +141,7 @@ __global__ void __launch_bounds__(kTileThreads, resident<S, kMaps, kResidual>())
       if constexpr (kListed) color = shaded(color, residual);
       if (textured) {
         corners = patch.corners(u, v);
-        Vec3<S> t[4];
-        load_corners(patch.tile, corners, t);
-        color = shaded(patch.view, texel_mix(t, corners.weight));
-        if (out.uv) slopes = texel_slopes(t, corners, patch.size, patch.extent);
+        color = patch.color(corners, out.uv != nullptr, slopes);
       }
       if (mine) {
         const S* d = gradient + tile.at(pixel) * kChannels;

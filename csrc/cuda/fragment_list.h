@@ -14,7 +14,7 @@
 #pragma once
 
 #include "core/bounds.h"
-#include "cuda/device.h"
+#include "cuda/warp.h"
 #include "ops/arguments.h"
 
 namespace bt::cuda {
@@ -93,6 +93,27 @@ template <class S> __device__ inline void load_shape(const S* row, S* g) {
   g[kArea] = row[kArea];
 }
 
+// Rows of geom of up to 32 pairs' surfels, in shared memory.
+template <class S> struct SurfelRows {
+  struct alignas(16) Row {
+    S g[kGeom];
+  };
+  Row rows[kWarp];
+  int32_t ids[kWarp];
+
+  // Those of surfel[begin] to surfel[end - 1], by all threads of a tile's block; a barrier has to follow.
+  __device__ void load(const S* geom, const int32_t* surfel, int begin, int end) {
+    constexpr int kLoaders = kTileThreads / kWarp;  // threads per row
+    static_assert(kGeom % kLoaders == 0);
+    const int row = int(threadIdx.x) / kLoaders, column = int(threadIdx.x) % kLoaders;
+    if (row < begin || row >= end) return;
+    const int32_t id = surfel[row];
+    if (column == 0) ids[row] = id;
+    BT_UNROLL
+    for (int c = 0; c < kGeom; c += kLoaders) rows[row].g[c + column] = geom[int64_t(id) * kGeom + c + column];
+  }
+};
+
 // Puts the sums of a surfel's pairs: columns of geom, those of the absolute gradients between.
 template <class S> struct StoreGeomGradient {
   S *dgeom, *absgrad;
@@ -111,7 +132,6 @@ template <int kAhead, class Load, class Use>
 __device__ inline void each_fragment_back(const Pairs& p, const TileThread& s, Load&& load, Use&& use) {
   const int64_t begin = p.tile_pairs[blockIdx.x], end = p.tile_pairs[blockIdx.x + 1];
   const int64_t batches = ceil_div(end - begin, kWarp);
-  const unsigned below = (1u << s.lane) - 1;
   for (int64_t b = 0; b < batches; ++b) {
     // one lane per pair: marks, and where the warp's fragments begin
     const int64_t first = begin + kWarp * (batches - 1 - b), own = first + s.lane;
@@ -128,10 +148,9 @@ __device__ inline void each_fragment_back(const Pairs& p, const TileThread& s, L
       BT_UNROLL
       for (int a = 0; a < kAhead; ++a) {
         const bool some = todo != 0;
-        const int j = some ? kWarp - 1 - __clz(int(todo)) : 0;
-        if (some) todo &= ~(1u << j);
+        const int j = some ? take_last(todo) : 0;
         const unsigned taken = __shfl_sync(kFullMask, mark, j);
-        const int64_t i = __shfl_sync(kFullMask, from, j) + __popc(taken & below);
+        const int64_t i = __shfl_sync(kFullMask, from, j) + count_below(taken, s.lane);
         value[a] = load(first + j, __shfl_sync(kFullMask, id, j), some && (taken >> s.lane & 1u), i);
       }
       BT_UNROLL
@@ -172,13 +191,10 @@ template <int kHeld> class Stretch {
   // After it: use(j, i, mine) for the pairs first + j that have a fragment in the calling warp, front to back: fragment
   // base + i is that of the lane's pixel, if it is `mine`.
   template <class Use> __device__ void each_pair(const TileThread& s, Use&& use) const {
-    const unsigned below = (1u << s.lane) - 1;
-    unsigned todo = __ballot_sync(kFullMask, mark_ != 0);
-    while (todo) {
-      const int j = __ffs(int(todo)) - 1;
-      todo &= todo - 1;
+    for (unsigned todo = __ballot_sync(kFullMask, mark_ != 0); todo;) {
+      const int j = take_first(todo);
       const unsigned taken = __shfl_sync(kFullMask, mark_, j);
-      use(j, __shfl_sync(kFullMask, from_, j) + __popc(taken & below), bool(taken >> s.lane & 1u));
+      use(j, __shfl_sync(kFullMask, from_, j) + count_below(taken, s.lane), bool(taken >> s.lane & 1u));
     }
   }
   // each(i, base + i) by all threads; a warp begins at a multiple of 32 of the list, so that it reads and writes whole

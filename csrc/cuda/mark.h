@@ -52,8 +52,7 @@ __device__ __forceinline__ S mark_pairs(const View<S>& view, const AlphaTiles<S>
     unsigned todo = __ballot_sync(kFullMask, meets);
     uint32_t mark = 0, cut_mark = 0;
     while (todo) {
-      const int j = __ffs(int(todo)) - 1;
-      todo &= todo - 1;
+      const int j = take_first(todo);
       S g[kGeom];
       const int64_t drawn = __shfl_sync(kFullMask, id, j);
       load_shape(view.geom + drawn * kGeom, g);

@@ -26,9 +26,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 4) forward_
   const S behind = mark_pairs<Kernel, kAlpha>(a.view, a.alpha, a.pairs, a.surfel, a.tile_pairs, a.masks, a.cuts, s,
                                               [&](int64_t id, const S* g, const Fragment<T>& f, S weight) {
                                                 const TexelPatch<S> patch(a.table, id);
-                                                Vec3<S> c = patch.view;
-                                                if (weight >= a.bound && patch.textured())
-                                                  c = patch.color(patch.corners(plain(f.u), plain(f.v)));
+                                                const Vec3<S> c = patch.color(weight, a.bound, plain(f.u), plain(f.v));
                                                 const S color[3] = {c.x, c.y, c.z};
                                                 add_blended<false>(weight, color, g[kBeta], S(0),
                                                                    static_cast<const S*>(nullptr), sum);
@@ -44,7 +42,6 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 4) forward_
 template <int kHeld> struct LastPairs {
   static_assert(kHeld >= kTileThreads, "no pair has more than a tile's pixels");
   int first_lane;       // that has a pair
-  int count;            // of fragments of all
   int own, begin;       // of the lane's pair: how many, and where they begin among these
   uint32_t mark, cuts;  // of the lane's pair: the warp's pixels that blend it, and those of which alpha texels cut it
   int from;             // where the warp's fragments of the lane's pair begin
@@ -63,28 +60,18 @@ template <int kHeld> struct LastPairs {
       }
       if (cut_masks && mark) cuts = cut_masks[s.warp * p.pairs + k];
     }
-    int behind = own;  // of the lane's pair and all later ones
-    BT_UNROLL
-    for (int step = 1; step < kWarp; step *= 2) {
-      const int other = __shfl_sync(kFullMask, behind, s.lane + step);
-      if (s.lane + step < kWarp) behind += other;
-    }
-    const unsigned taken = __ballot_sync(kFullMask, k >= begin_pair && behind <= kHeld);
-    first_lane = kWarp - __popc(taken);
-    count = __shfl_sync(kFullMask, behind, first_lane);
-    begin = count - behind, from += begin;
+    const int before = sum_below(own, s.lane), all = __shfl_sync(kFullMask, before + own, kWarp - 1);
+    first_lane = kWarp - __popc(__ballot_sync(kFullMask, k >= begin_pair && all - before <= kHeld));
+    begin = before - __shfl_sync(kFullMask, before, first_lane), from += begin;
     if (s.lane < first_lane) mark = 0, own = 0;
   }
   // use(j, i, mine, cut) for the pairs that have a fragment in the calling warp, back to front: lane j has the pair, i
   // is the fragment of the lane's pixel, if it is `mine`.
   template <class Use> __device__ void each_pair_back(const TileThread& s, Use&& use) const {
-    const unsigned below = (1u << s.lane) - 1;
-    unsigned todo = __ballot_sync(kFullMask, mark != 0);
-    while (todo) {
-      const int j = kWarp - 1 - __clz(int(todo));
-      todo &= ~(1u << j);
+    for (unsigned todo = __ballot_sync(kFullMask, mark != 0); todo;) {
+      const int j = take_last(todo);
       const unsigned taken = __shfl_sync(kFullMask, mark, j), cut = __shfl_sync(kFullMask, cuts, j);
-      use(j, __shfl_sync(kFullMask, from, j) + __popc(taken & below), bool(taken >> s.lane & 1u),
+      use(j, __shfl_sync(kFullMask, from, j) + count_below(taken, s.lane), bool(taken >> s.lane & 1u),
           bool(cut >> s.lane & 1u));
     }
   }
@@ -94,33 +81,24 @@ template <int kHeld> struct LastPairs {
 enum FragmentBits { kPixel = kTileThreads - 1, kOpenRed = kTileThreads, kCut = 8 * kOpenRed, kTextured = 2 * kCut };
 
 // The fragments of LastPairs, and whose turn it is: kRunLanes of a pair each.
-template <class S> struct Held {
+template <class S> struct Held : SurfelRows<S> {
   static constexpr int kFragments = sizeof(S) == 8 ? 320 : 1024, kTurns = kFragments / kRunLanes + kWarp;
   static constexpr int kColors = 4;  // sums of a pair for the view colour, the last unused
-  struct alignas(16) Row {
-    S g[kGeom];
-  };
-  Row rows[kWarp];
   S gradient[kTileThreads * kImageChannels];
   S weight[kFragments], u[kFragments], v[kFragments], sigma[kFragments];  // sigma as it is listed
   S dsigma[kFragments], du[kFragments], dv[kFragments];                   // first dL/dweight
   S sums[kTurns * kTraceSums], color_sums[kTurns * kColors];
-  int32_t bits[kFragments], ids[kWarp], begin[kWarp], count[kWarp], first_turn[kWarp];
+  int32_t bits[kFragments], begin[kWarp], count[kWarp], first_turn[kWarp];
   uint8_t pair[kTurns];
   int turns;
 
   // By one warp.
   __device__ void make_turns(const LastPairs<kFragments>& part, int lane) {
     const int own = (part.own + kRunLanes - 1) / kRunLanes;
-    int upto = own;
-    BT_UNROLL
-    for (int step = 1; step < kWarp; step *= 2) {
-      const int other = __shfl_up_sync(kFullMask, upto, step);
-      if (lane >= step) upto += other;
-    }
-    first_turn[lane] = upto - own, begin[lane] = part.begin, count[lane] = part.own;
-    for (int t = upto - own; t < upto; ++t) pair[t] = uint8_t(lane);
-    if (lane == kWarp - 1) turns = upto;
+    const int first = sum_below(own, lane);
+    first_turn[lane] = first, begin[lane] = part.begin, count[lane] = part.own;
+    for (int t = first; t < first + own; ++t) pair[t] = uint8_t(lane);
+    if (lane == kWarp - 1) turns = first + own;
   }
   // By all threads: take(turn, j, i, mine), the same number of times in all lanes of a warp; `turn` may be behind the
   // last.
@@ -170,15 +148,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 3) backward
     const int64_t lanes = end - kWarp;  // the pair of lane 0
     end -= kWarp - part.first_lane;
     if (s.warp == 0) held.make_turns(part, s.lane);
-    constexpr int kLoaders = kTileThreads / kWarp;  // threads per row
-    const int row = int(threadIdx.x) / kLoaders, column = int(threadIdx.x) % kLoaders;
-    if (row >= part.first_lane) {
-      const int32_t id = p.surfel[lanes + row];
-      if (column == 0) held.ids[row] = id;
-      BT_UNROLL
-      for (int c = 0; c < kGeom; c += kLoaders)
-        held.rows[row].g[c + column] = a.view.geom[int64_t(id) * kGeom + c + column];
-    }
+    held.load(a.view.geom, p.surfel + lanes, part.first_lane, kWarp);
     __syncthreads();
     part.each_pair_back(s, [&](int j, int i, bool mine, bool is_cut) {
       S g[kGeom];
@@ -211,11 +181,9 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 3) backward
       if (kTexels && w >= a.bound && patch.textured()) {
         bits |= kTextured;
         const TexelCorners<S> corners = patch.corners(held.u[i], held.v[i]);
-        Vec3<S> t[4];
-        load_corners(patch.tile, corners, t);
-        color = shaded(patch.view, texel_mix(t, corners.weight));
+        TexelSlopes<S> slopes = {};
+        color = patch.color(corners, a.moves, slopes);
         if (a.moves) {
-          const TexelSlopes<S> slopes = texel_slopes(t, corners, patch.size, patch.extent);
           const Vec3<S> dcolor = residual_gradient(color, w * load3(d));
           held.du[i] = dot(dcolor, slopes.u), held.dv[i] = dot(dcolor, slopes.v);
         }

@@ -52,14 +52,10 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
                                                                : 6)
     fill_kernel(const S* geom, S near, AlphaTiles<S> alpha, Pairs p, FragmentArrays<S> out) {
   using T = FastFloatOr<S>;
-  struct alignas(16) Row {
-    S g[kGeom];
-  };
-  constexpr int kHeld = 4096 / sizeof(S), kLoaders = kTileThreads / kWarp;  // threads per row
-  static_assert(kGeom % kLoaders == 0);
-  __shared__ Row rows[kWarp];
+  constexpr int kHeld = 4096 / sizeof(S);
+  __shared__ SurfelRows<S> held;
   __shared__ int bits[kTileWarps][kWarp];
-  __shared__ int32_t ids[kWarp], surfels[kHeld], pixels[kHeld];
+  __shared__ int32_t surfels[kHeld], pixels[kHeld];
   __shared__ S weights[kHeld], us[kHeld], vs[kHeld], depths[kHeld], sigmas[kHeld];
   const TileThread s = tile_thread(p.width);
   const S x = pixel_centre<S>(s.x), y = pixel_centre<S>(s.y);
@@ -71,18 +67,12 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
     Stretch<kHeld> part(p, s, first, end, bits);
     taken_pairs = part.pairs;
     if (!taken_pairs) return;
-    const int row = int(threadIdx.x) / kLoaders, column = int(threadIdx.x) % kLoaders;
-    if (row < taken_pairs) {
-      const int32_t id = p.surfel[first + row];
-      if (column == 0) ids[row] = id;
-      BT_UNROLL
-      for (int c = 0; c < kGeom; c += kLoaders) rows[row].g[c + column] = geom[int64_t(id) * kGeom + c + column];
-    }
+    held.load(geom, p.surfel + first, 0, taken_pairs);
     __syncthreads();  // the rows are there, and what was held is written
     part.find_own(s);
     part.each_pair(s, [&](int j, int i, bool mine) {
       S g[kGeom];
-      load_shape(rows[j].g, g);
+      load_shape(held.rows[j].g, g);
       const T dx = T(x - g[kCx]), dy = T(y - g[kCy]);
       const Fragment<T> f = fragment<Kernel>(g, near, dx, dy, __any_sync(kFullMask, mine && near_centre(dx, dy)));
       if (!mine) return;
@@ -91,14 +81,14 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
       S sigma = max_(plain(f.sigma), S(kAlphaMin)), v = plain(f.v);
       if constexpr (kAlpha) {
         const S uncut = sigma;
-        cut(alpha, ids[j], transmittance, plain(f.u), v, sigma);
+        cut(alpha, held.ids[j], transmittance, plain(f.u), v, sigma);
         // far less is that of a weight at the bound, which the mark found to be below it
         if (sigma < S(0.5 * kAlphaMin)) sigma = uncut, v = with_mark(v, false);
         sigma = max_(sigma, S(kAlphaMin));
       }
       const Blend<S> b = blend(sigma, transmittance);
       transmittance = b.behind;
-      surfels[i] = ids[j], pixels[i] = pixel;
+      surfels[i] = held.ids[j], pixels[i] = pixel;
       weights[i] = b.weight;
       us[i] = plain(f.u), vs[i] = v;
       depths[i] = plain(f.depth);

@@ -8,6 +8,27 @@ namespace bt::cuda {
 
 // `in` of the lanes below mine.
 __device__ inline int count_below(unsigned in, int lane) { return __popc(in & ((1u << lane) - 1u)); }
+// The sum of the values of the lanes below mine. All 32 lanes take part.
+__device__ inline int sum_below(int value, int lane) {
+  int sum = value;
+  BT_UNROLL
+  for (int step = 1; step < kWarp; step *= 2) {
+    const int other = __shfl_up_sync(kFullMask, sum, step);
+    if (lane >= step) sum += other;
+  }
+  return sum - value;
+}
+// Take the first or the last lane from a mask that has some.
+__device__ inline int take_first(unsigned& lanes) {
+  const int lane = __ffs(int(lanes)) - 1;
+  lanes &= lanes - 1;
+  return lane;
+}
+__device__ inline int take_last(unsigned& lanes) {
+  const int lane = kWarp - 1 - __clz(int(lanes));
+  lanes &= ~(1u << lane);
+  return lane;
+}
 
 // The lanes of my run: neighbours with my key. All 32 lanes take part.
 template <class Key> __device__ unsigned run_of(Key key, int lane) {

@@ -41,9 +41,15 @@ template <class S> struct TexelPatch {
         view(view_base(load3(tiles.base + 3 * id))) {}
   BT_HD bool textured() const { return size[0] > 0; }
   BT_HD TexelCorners<S> corners(S u, S v) const { return texel_corners(u, v, size, extent); }
-  BT_HD Vec3<S> color(const TexelCorners<S>& at) const {
+  // Of a fragment of that weight: texels show from the bound on.
+  BT_HD Vec3<S> color(S weight, S bound, S u, S v) const {
+    TexelSlopes<S> none;
+    return weight >= bound && textured() ? color(corners(u, v), false, none) : view;
+  }
+  BT_HD Vec3<S> color(const TexelCorners<S>& at, bool moves, TexelSlopes<S>& slopes) const {
     Vec3<S> t[4];
     load_corners(tile, at, t);
+    if (moves) slopes = texel_slopes(t, at, size, extent);
     return shaded(view, texel_mix(t, at.weight));
   }
 };

@@ -137,6 +137,28 @@ def test_extreme_scenes(scene: SceneCase, moved: bool, device: torch.device, cpu
     compare(got, want, 1e-9)
 
 
+@pytest.mark.parametrize("texture", ["none", "alphas"])
+@pytest.mark.parametrize("size", [(1, 1), (3, 50), (40, 2)], ids=str)
+@pytest.mark.parametrize("surfels", ["none", "one behind the camera", "40 and one that is not finite"])
+def test_nothing_to_see_and_pictures_smaller_than_a_tile(
+    surfels: str, size: tuple[int, int], texture: str, device: torch.device, cpu: Context
+) -> None:
+    case = random_scene(41, 3, *size)
+    if surfels == "none":
+        case.params = {name: value[:0] for name, value in case.params.items()}
+    elif surfels == "one behind the camera":
+        case.params = {name: value[:1] for name, value in case.params.items()}
+        case.params["means"] = -case.viewmat[:3, :3].T @ (case.viewmat[:3, 3] + torch.tensor([0.0, 0.0, 5.0]).double())
+        case.params["means"] = case.params["means"][None]
+    else:
+        case.params["means"][7, 1] = float("nan")
+    got = Learned(case, torch.float64, device, texture).draw(False)
+    with cpu():
+        want = Learned(case, torch.float64, HERE, texture).draw(True)
+    compare(got, want, 1e-9)
+    assert got["image"].any() == surfels.startswith("40")
+
+
 @pytest.mark.parametrize("opacity", [12.0, -5.0, -20.0], ids=["hides all behind", "faint", "shows nothing"])
 def test_surfels_of_one_opacity(opacity: float, device: torch.device) -> None:
     """A tile has layers of surfels of which only the first are seen, or 1,000 that can hardly be."""

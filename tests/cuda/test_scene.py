@@ -3,6 +3,7 @@
 import pytest
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from bitymi_ns import ops
 from tests.ops.golden import SceneCase, load_golden, random_scene
@@ -48,3 +49,26 @@ def test_masked_counts_equal_those_of_the_cpu(device: torch.device, cpu) -> None
     got = counts(device)
     with cpu():
         assert torch.equal(got, counts(torch.device("cpu"))) and got.any()
+
+
+class Waits(TorchDispatchMode):
+    """Count the operations whose result the host waits for on a card."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.count += func.overloadpacket in (torch.ops.aten._local_scalar_dense, torch.ops.aten.nonzero)
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize(("texture", "maps", "waits"), [(False, False, 1), (False, True, 2), (True, True, 3)])
+def test_a_step_waits_for_no_more_than_the_lengths_of_lists(
+    texture: bool, maps: bool, waits: int, device: torch.device
+) -> None:
+    scene, camera = scene_of(random_scene(40, 5, 33, 21), device, texture)
+    scene.render(camera, maps=maps)  # what is looked up once
+    with Waits() as counted:
+        scene.render(camera, maps=maps).rgb.mean().backward()
+    assert counted.count == waits

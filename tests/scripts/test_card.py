@@ -2,8 +2,11 @@
 
 import importlib
 import json
+import os
+import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import ModuleType
 
@@ -57,3 +60,12 @@ def test_wheels_are_parted_by_size(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         (tmp_path / name).write_bytes(bytes(size))
     parts = importlib.import_module("card").parts(tmp_path, 45)
     assert [[file.name for file in part] for part in parts] == [["e"], ["a", "c"], ["b", "d"]]
+
+
+def test_the_table_of_a_run_says_why_a_command_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    card = importlib.import_module("card")
+    failing = [sys.executable, "-c", "import sys; print('first'); sys.exit('no card | none')"]
+    step = card.Step("both", [failing, [sys.executable, "-c", "print('well')"]], 60)
+    line = card.run_step(step, tmp_path, dict(os.environ), tmp_path, time.monotonic() + 60)
+    assert re.fullmatch(r"\| both \| 1: no card / none, 0 \| \d+ \|", line)

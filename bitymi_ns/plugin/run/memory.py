@@ -34,6 +34,9 @@ PER_SHADED_FRAGMENT = 60
 PER_CARD_FRAGMENT = 4 * NUMBERS  # bytes of a fragment on a card in lists of training
 PER_PASSING_FRAGMENT = 36
 """Bytes on a card where lists are read and dropped, of the coverage of texels: pictures are drawn without."""
+PER_BAKED_FRAGMENT = 48
+"""Bytes on a card in an export, of the fine-tuning: 28 of the list, 1 + 36 of what it chooses of it, 43 % at most were
+measured, and 3 of pairs, which have about thirty each."""
 PER_PIXEL = 400  # bytes: pictures, gradients and maps of a view, and the ten views of the multi-view scores
 PER_SURFEL = 3000
 """Bytes in training: parameters, gradients, Adam's averages and the two states that a run could go back to."""
@@ -96,7 +99,8 @@ def state_training(
         kept = min(photograph_budget(device), 9 * total)
     else:
         kept = PROGRAM + min(PHOTOGRAPH_BYTES, 3 * total) + min(DOWNSCALED_BYTES, 6 * total)
-    needed = kept + PER_PIXEL * pixels + _per_fragment(scene, lists) * fragments
+    needed = kept + PER_PIXEL * pixels
+    needed += _per_fragment(scene, PER_CARD_FRAGMENT if lists else PER_PASSING_FRAGMENT) * fragments
     surfels = max(len(scene), most_surfels)
     needed += PER_SURFEL * surfels
     if texels is not None:
@@ -131,7 +135,8 @@ def state_export(
     if finetune_bytes < LEAST_KEPT * len(cameras) * (PER_KEPT_FRAGMENT * fragments + PER_KEPT_PIXEL * pixels):
         finetune_bytes = 0  # too few views would fit
     device = scene.surfels["means"].device
-    needed = PROGRAM * (device.type != "cuda") + kept + PER_PIXEL * pixels + _per_fragment(scene, False) * fragments
+    needed = PROGRAM * (device.type != "cuda") + kept + PER_PIXEL * pixels
+    needed += _per_fragment(scene, PER_BAKED_FRAGMENT) * fragments
     kind = scene.config.view_color
     entry = VIEW_COLORS[kind]
     terms = scene.surfels[entry.parameters[1].name].shape[1] - entry.base_terms
@@ -143,9 +148,10 @@ def state_export(
     _state("The export", needed, cameras, "export with --finetune-memory 0, which takes longer", device)
 
 
-def _per_fragment(scene: Scene, lists: bool) -> float:
+def _per_fragment(scene: Scene, of_card: float) -> float:
+    """Bytes of a fragment, on a card `of_card` where no field in space shades."""
     if scene.surfels["means"].device.type == "cuda":
-        return PER_CARD_FRAGMENT if lists or scene.config.texture == "hash" else PER_PASSING_FRAGMENT
+        return PER_CARD_FRAGMENT if scene.config.texture == "hash" else of_card
     return PER_FRAGMENT + PER_SHADED_FRAGMENT * (scene.config.texture == "hash")
 
 

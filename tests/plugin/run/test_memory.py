@@ -7,13 +7,26 @@ from types import SimpleNamespace
 import psutil
 import pytest
 import torch
+from torch.multiprocessing.reductions import StorageWeakRef
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
+from bitymi_ns.bake import BakeOptions
+from bitymi_ns.bake.baked import Baked
+from bitymi_ns.bake.texel_list import TexelList
+from bitymi_ns.bake.tiles import Tiles
+from bitymi_ns.bake.tuning_views import TuningViews
+from bitymi_ns.bake.view_color_rate import shown_weights
+from bitymi_ns.ops.backend import emulated_cuda
 from bitymi_ns.plugin.run import memory
 from bitymi_ns.scene import Camera, Scene
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train import texels
 from bitymi_ns.train.config import TexelConfig
+from bitymi_ns.train.views import MemoryBudget, View
+from tests.bake.conftest import make_surfels
+from tests.required import skip_without
 from tests.scene import bands
 
 CPU = torch.device("cpu")
@@ -181,6 +194,56 @@ def test_an_export_holds_what_every_view_shows_of_every_surfel(
     for views in (30_000, 40_000):
         memory.state_training(scene[0], [scene[1]] * views, 0, options, 1000)
     assert stated[3] - stated[2] == 10_000 * len(scene[0])
+
+
+class Peak(TorchDispatchMode):
+    """Count the bytes of the tensors that are made and live at once."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._live: dict[StorageWeakRef, int] = {}
+        self.bytes = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        made = func(*args, **(kwargs or {}))
+        for tensor in tree_leaves(made):
+            if isinstance(tensor, torch.Tensor):
+                self._live[StorageWeakRef(tensor.untyped_storage())] = tensor.untyped_storage().nbytes()
+        self._live = {storage: size for storage, size in self._live.items() if not storage.expired()}
+        self.bytes = max(self.bytes, sum(self._live.values()))
+        return made
+
+
+def test_lists_of_an_export_take_what_is_stated_on_a_card() -> None:
+    try:
+        from bitymi_ns import _emulated  # noqa: F401
+    except ImportError:
+        skip_without("emulated", "built without BITYMI_EMULATED_CUDA")
+    count, size = 40, 64  # faint discs, each larger than the picture
+    surfels = make_surfels(count)
+    surfels["means"] = torch.stack([torch.zeros(count), torch.zeros(count), torch.linspace(3, 4, count)], dim=1)
+    surfels["quats"] = torch.tensor([1.0, 0, 0, 0]).repeat(count, 1)
+    surfels["log_scales"], surfels["opacity_logits"] = torch.full((count, 2), 2.0), torch.full((count,), -3.0)
+    surfels["beta_raw"] = torch.zeros(count)
+    camera = Camera(torch.eye(4), torch.tensor([[64.0, 0, 32], [0, 64.0, 32], [0, 0, 1]]), size, size)
+    bound = 0.0471 * 0.953**16.5  # of the weight of the seventeenth, so that 43 % show a texel
+    stands = SimpleNamespace(
+        surfels=surfels, near=0.2, config=SimpleNamespace(weight_bound=bound, prefilter="low_pass")
+    )
+    tiles = Tiles(torch.full((count, 2), 4), torch.full((count,), 3.0), torch.zeros(16 * count, 3))
+    baked = Baked.of(stands, surfels, torch.arange(count), tiles, BakeOptions(format="fp16"))
+    view = View(camera, torch.zeros(size, size, 3))
+    taken = []
+    with emulated_cuda(seed=1):
+        for use in (
+            lambda: TexelList(baked).coverage([view], powers=(1, 2)),
+            lambda: shown_weights(baked.scene, [camera]),
+            lambda: TuningViews(TexelList(baked), [view], torch.zeros(3), MemoryBudget(0))[0],
+        ):
+            with Peak() as peak:
+                use()
+            taken.append(peak.bytes / (count * size * size))
+    assert max(taken[:2]) < memory.PER_PASSING_FRAGMENT < taken[2] < memory.PER_BAKED_FRAGMENT
 
 
 @pytest.mark.parametrize(

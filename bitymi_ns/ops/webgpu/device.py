@@ -28,7 +28,9 @@ def library() -> ModuleType:
     try:
         return importlib.import_module("wgpu")
     except Exception as error:  # its library may be for another system: what it then raises is not written down
-        raise WebGpuUnavailable(f"drawing through WebGPU needs the package wgpu ({INSTALL}): {error}") from error
+        raise WebGpuUnavailable(
+            f"drawing through WebGPU needs Python 3.11 and the package wgpu ({INSTALL}): {error}"
+        ) from error
 
 
 @functools.cache

@@ -40,8 +40,9 @@ CPU_INDEX   := https://download.pytorch.org/whl/cpu
 CXX_FILES   := $(shell find csrc -name '*.cpp' -o -name '*.h' -o -name '*.cu')
 # The CUDA kernels are built where nvcc is found: for the cards of this machine, for one architecture where there is no
 # card and they can only be compiled. They are also built for the host, so that the tests run them without a card.
-CMAKE_ARGS  := -Ccmake.define.BITYMI_EMULATED_CUDA=ON \
-  $(if $(shell command -v nvidia-smi),,-Ccmake.define.BITYMI_CUDA_ARCHITECTURES=90)
+DEFINE      := --config-settings=cmake.define
+CMAKE_ARGS  := $(DEFINE).BITYMI_EMULATED_CUDA=ON \
+  $(if $(shell command -v nvidia-smi),,$(DEFINE).BITYMI_CUDA_ARCHITECTURES=90)
 
 export OMP_NUM_THREADS ?= $(shell nproc 2>/dev/null || echo 1)
 
@@ -121,8 +122,8 @@ gate gate-accept: setup
 	$(BIN)/python benchmarks/gate.py $(if $(DATA),--capture "$(DATA)") $(if $(filter %-accept,$@),--accept)
 
 wheel: $(VENV)/.stamp-deps
-	$(PIP) wheel -q --no-build-isolation --no-deps -w dist -Ccmake.define.BITYMI_CUDA=$(if $(CUDA),ON,OFF) \
-	  $(if $(CUDA),'-Ccmake.define.BITYMI_CUDA_ARCHITECTURES=$(ARCHITECTURES)') .
+	$(PIP) wheel -q --no-build-isolation --no-deps -w dist $(DEFINE).BITYMI_CUDA=$(if $(CUDA),ON,OFF) \
+	  $(if $(CUDA),'$(DEFINE).BITYMI_CUDA_ARCHITECTURES=$(ARCHITECTURES)') .
 	@ls -l dist/*.whl
 
 wheel-test: setup

@@ -149,7 +149,8 @@ def stage(arguments: argparse.Namespace) -> int:
     pip = [str(tools / "bin/python"), "-m", "pip", "--disable-pip-version-check"]
     for old in folder.glob("bitymi_ns-*.whl"):
         old.unlink()
-    options = ["-Ccmake.define.BITYMI_CUDA=ON", f"-Ccmake.define.BITYMI_CUDA_ARCHITECTURES={arguments.architectures}"]
+    defines = ("BITYMI_CUDA=ON", f"BITYMI_CUDA_ARCHITECTURES={arguments.architectures}")
+    options = [f"--config-settings=cmake.define.{define}" for define in defines]
     wheel = [*pip, "wheel", "-q", "--no-build-isolation", "--no-deps", "-w", str(folder), str(ROOT)]
     subprocess.run([*wheel, *options, f"-Cbuild-dir={build}"], check=True)
     fetched = [*pip, "download", "-q", "--only-binary", ":all:", "-d", str(folder), "-c", f"{ROOT}/constraints.txt"]

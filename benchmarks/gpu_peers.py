@@ -192,7 +192,7 @@ def main() -> int:
     parser.add_argument("--gaussians", type=Path, required=True, help="folder of the trained Gaussians")
     parser.add_argument("--bundles", nargs="*", type=Path, default=[], help="baked scenes of the same capture")
     parser.add_argument("--times", nargs="+", type=int, default=[1, 2], help="sizes, of the photographs' (%(default)s)")
-    parser.add_argument("--output", type=Path, help="also write the Markdown to this file, anew after each row")
+    parser.add_argument("--output", type=Path, help="also write the Markdown to this file, after each row")
     arguments = parser.parse_args()
     if not torch.cuda.is_available():
         parser.error("no CUDA device was found (or torch is a CPU build)")

@@ -18,10 +18,10 @@ from plain_capture import load_capture
 
 from bitymi_ns.bake import BakeOptions, Learning, bake_and_learn, export
 from bitymi_ns.bundle import read_bundle
-from bitymi_ns.plugin.run.preset import load_preset
 from bitymi_ns.train.config import REFERENCE_STEPS
 from bitymi_ns.train.fit import fit
 from bitymi_ns.train.init import scene_for_views
+from bitymi_ns.train.preset import load_preset
 from bitymi_ns.train.views import eval_background
 
 CURVE = ("steps", "training s", "surfels", "PSNR dB", "after affine fit")

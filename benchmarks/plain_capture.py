@@ -14,12 +14,14 @@ from bitymi_ns.ply import read_header, read_rows
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import View
 
+HELD_OUT = 8
+
 
 @dataclass
 class Capture:
     """A capture for training."""
 
-    # train, held_out: views; every `interval`-th photograph is held out, the first one too
+    # train, held_out: views; every `HELD_OUT`-th photograph is held out, the first one too
     train: list[View]
     held_out: list[View]
     points: Tensor  # [M, 3] sparse points
@@ -31,13 +33,12 @@ class Capture:
         return [*self.train, *self.held_out]
 
 
-def load_capture(folder: Path, interval: int = 8, downscale: int = 1) -> Capture:
+def load_capture(folder: Path, downscale: int = 1) -> Capture:
     """Read an undistorted capture, moved and scaled as nerfstudio does it: the mean of the cameras is the origin and
     their largest coordinate 1. The orientation stays.
 
     Args:
         folder: with transforms.json.
-        interval: of the photographs that are held out.
         downscale: whole factor by which photographs are reduced.
 
     Raises:
@@ -62,8 +63,8 @@ def load_capture(folder: Path, interval: int = 8, downscale: int = 1) -> Capture
         views.append(View(_camera(values, pose, middle, scale, *size), picture))
     points, colours = _points(folder / meta["ply_file_path"]) if "ply_file_path" in meta else (torch.zeros(0, 3),) * 2
     points = ((points.double() - middle) * scale).float()
-    held_out = [view for i, view in enumerate(views) if i % interval == 0]
-    train = [view for i, view in enumerate(views) if i % interval]
+    held_out = [view for i, view in enumerate(views) if i % HELD_OUT == 0]
+    train = [view for i, view in enumerate(views) if i % HELD_OUT]
     return Capture(train, held_out, points, colours)
 
 

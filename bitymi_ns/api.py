@@ -13,14 +13,14 @@ from bitymi_ns.bake import BakeOptions, Learning, bake_and_learn, export
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bundle import Bundle, read_bundle
 from bitymi_ns.bundle.parts import CAMERAS
+from bitymi_ns.interchange.bundle_cameras import camera_row
 from bitymi_ns.ops import blended_image, can_rasterize, project, rasterize_image, trace
 from bitymi_ns.ops.constants import COLOR_BIAS
-from bitymi_ns.plugin.export.cameras import camera_row
-from bitymi_ns.plugin.run.preset import load_preset
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import NEAR, RenderOutput, Scene
 from bitymi_ns.train.fit import TrainLog, fit
 from bitymi_ns.train.init import scene_for_views
+from bitymi_ns.train.preset import load_preset
 from bitymi_ns.train.views import View
 
 __all__ = ["Bundle", "Camera", "View", "bake_scene", "rasterize", "read_bundle", "train_scene"]

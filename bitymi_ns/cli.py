@@ -187,7 +187,7 @@ class Verify:
 
 
 def _say_left_out(names: Sequence[str]) -> None:
-    """Names the files of a bundle that are not passed on with it."""
+    """List the files of a bundle that are not written."""
     if names:
         say(f"Left out, because no file of a bundle has such a name: {listed(names, most=5)}.", sys.stderr)
 

@@ -27,7 +27,7 @@ Tell = Callable[[str], None]  # receives a warning for the user
 
 
 class Busy(BlockingIOError):
-    """Another process is at work in the same place; `who` names it, as far as it is known, and says what to do."""
+    """Another process writes the same file or folder; `who` names it, as far as it is known, and says what to do."""
 
     def __init__(self, who: str) -> None:
         super().__init__(errno.EAGAIN, who)
@@ -38,17 +38,17 @@ class Busy(BlockingIOError):
 
 
 _REASONS = {
-    errno.EROFS: "the file system is read-only: give a place on another one",
-    errno.EACCES: "you have no permission to write there: give another place, or change its permissions",
-    errno.EPERM: "the system does not permit writing there: give another place",
-    errno.ENOSPC: "the disk is full: free some space, or give a place on another disk",
-    errno.EDQUOT: "your quota of disk space is used up: free some space, or give a place on another disk",
+    errno.EROFS: "the file system is read-only: write to another one",
+    errno.EACCES: "you have no permission to write there: choose another folder, or change its permissions",
+    errno.EPERM: "the system does not permit writing there: choose another folder",
+    errno.ENOSPC: "the disk is full: free some space, or write to another disk",
+    errno.EDQUOT: "your quota of disk space is used up: free some space, or write to another disk",
     errno.EFBIG: "the file would be larger than this system allows (see `ulimit -f`)",
-    errno.ENAMETOOLONG: "the name is too long: give a shorter one",
-    errno.EISDIR: "it is a folder, not a file: give another name",
-    errno.ELOOP: "a link in its path leads back to itself: give another place",
-    errno.EBUSY: "it is in use by the system, as a mount point is: give a folder in it",
-    errno.EXDEV: "it is a mount point: give a folder in it",
+    errno.ENAMETOOLONG: "the name is too long: choose a shorter one",
+    errno.EISDIR: "it is a folder, not a file: choose another name",
+    errno.ELOOP: "a link in its path leads back to itself: choose another path",
+    errno.EBUSY: "it is in use by the system, as a mount point is: choose a folder in it",
+    errno.EXDEV: "it is a mount point: choose a folder in it",
 }
 
 
@@ -59,8 +59,8 @@ def reason(error: OSError, path: Path) -> str:
     if error.errno in (errno.ENOTDIR, errno.EEXIST, errno.ENOENT):
         there = _nearest(path.absolute())
         if not there.is_dir():
-            return f"{there} is not a folder: give another place"
-        return f"nothing can be made in {there} ({error.strerror}): give another place"
+            return f"{there} is not a folder: choose another path"
+        return f"nothing can be made in {there} ({error.strerror}): choose another folder"
     return _REASONS.get(error.errno or 0) or error.strerror or str(error)
 
 
@@ -71,7 +71,7 @@ def explained(path: Path, kind: type[BaseException], then: str = "") -> Iterator
     try:
         yield
     except OSError as error:
-        if error.errno is None:  # of our own making: it says what is wrong
+        if error.errno is None:  # raised by this package, with a message of its own
             raise
         raise kind(f"{path} cannot be written: {reason(error, path)}{then}") from error
 
@@ -175,9 +175,9 @@ def _holder(path: Path) -> str:
     try:
         process, host = path.read_text("utf8").split()
     except (OSError, ValueError):  # it has been released just now, or has not been named yet
-        return "another process is at work there: wait for it, or end it"
+        return "another process is writing there: wait for it, or end it"
     where = "" if host == socket.gethostname() else f" on {host}"
-    return f"process {process}{where} is at work there: wait for it, or end it (kill {process})"
+    return f"process {process}{where} is writing there: wait for it, or end it (kill {process})"
 
 
 _held: dict[tuple[str, int], Lock] = {}  # locks by file and thread: who has one may take it again

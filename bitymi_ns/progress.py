@@ -12,7 +12,7 @@ class Progress(Protocol):
 
 
 def no_progress(step: str, done: int, total: int) -> None:
-    """Shows nothing."""
+    """Do nothing."""
 
 
 @contextmanager

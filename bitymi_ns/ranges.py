@@ -1,4 +1,4 @@
-"""Ranges of options, stated in the types of their fields."""
+"""Ranges of options, stated in the types of their fields, and what is wrong with data of such types."""
 
 from dataclasses import asdict
 from typing import Annotated, Any
@@ -15,6 +15,12 @@ Count = Annotated[int, Field(ge=0, le=MOST)]
 PositiveCount = Annotated[int, Field(ge=1, le=MOST)]
 
 
+def first_problem(error: ValidationError) -> tuple[str, str]:
+    """The entry of the first fault of some data, its names and numbers joined by dots, and what is wrong with it."""
+    first = error.errors(include_url=False, include_input=False)[0]
+    return ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
+
+
 def check_ranges(options: Any) -> None:
     """Refuse options out of their range, NaN included.
 
@@ -24,6 +30,6 @@ def check_ranges(options: Any) -> None:
     try:
         TypeAdapter(type(options)).validate_python(asdict(options))
     except ValidationError as error:
-        first = error.errors()[0]
-        name, rule = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Input should be ")
-        raise ValueError(f"{name} must be {rule}, not {first['input']}") from error
+        name, rule = first_problem(error)
+        rule = rule.removeprefix("Input should be ")
+        raise ValueError(f"{name} must be {rule}, not {error.errors()[0]['input']}") from error

@@ -66,7 +66,7 @@ def no_links(name: str | os.PathLike[str], flags: int) -> int:
 
 def _check(path: Path, found: os.stat_result) -> None:
     if not stat.S_ISREG(found.st_mode):
-        raise Refused(f"{path} is in the way and is no file: remove it", path)
+        raise Refused(f"{path} exists and is not a regular file: remove it", path)
     if found.st_nlink > 1:
         raise Refused(f"{path} is also the file of another name (a hard link): remove it", path)
     _check_owner(path, found)
@@ -75,7 +75,7 @@ def _check(path: Path, found: os.stat_result) -> None:
 def _check_owner(path: Path, found: os.stat_result) -> None:
     """Refuse files of anybody but the user and the owner of the folder, who could replace them at any time."""
     if found.st_uid not in (os.geteuid(), os.stat(path.parent).st_uid):
-        raise Refused(f"{path} belongs to somebody else: have it removed, or give another place", path)
+        raise Refused(f"{path} belongs to another user: have it removed, or choose another path", path)
 
 
 def is_left(folder: Path) -> bool:
@@ -89,7 +89,7 @@ def is_left(folder: Path) -> bool:
     except FileNotFoundError:
         return False
     if not stat.S_ISDIR(found.st_mode):
-        raise Refused(f"{folder} is in the way and is no folder: remove it", folder)
+        raise Refused(f"{folder} exists and is not a folder: remove it", folder)
     _check_owner(folder, found)
     return True
 
@@ -102,7 +102,7 @@ def own_folder(folder: Path, close: bool = False) -> None:
         close: remove write permission of others from an existing folder, whose content does not matter.
 
     Raises:
-        Refused: what is there belongs to somebody else, can be written by others, or is a link.
+        Refused: what is there belongs to another user, can be written by others, or is a link.
         OSError: it cannot be made.
     """
     with suppress(FileExistsError):
@@ -113,7 +113,7 @@ def own_folder(folder: Path, close: bool = False) -> None:
         if close and stat.S_ISDIR(found.st_mode) and found.st_mode & 0o022 and found.st_uid == os.geteuid():
             os.chmod(folder, stat.S_IMODE(found.st_mode) & ~0o022)
     if not is_own(folder):
-        raise Refused(f"{folder} belongs to somebody else, or others can write to it, or it is a link", folder)
+        raise Refused(f"{folder} belongs to another user, or others can write to it, or it is a link", folder)
 
 
 def is_own(folder: Path) -> bool:
@@ -144,7 +144,6 @@ def strangers(folder: Path, made: Iterable[str]) -> list[str]:
     """List files and folders in a folder that are not among those made by its writer, relative to it.
 
     Args:
-        folder: with what it holds.
         made: names of all files that were made, relative to it.
     """
     named = [PurePosixPath(name) for name in made]

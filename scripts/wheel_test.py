@@ -60,7 +60,13 @@ def run(*command: str | Path, cwd: Path = ROOT) -> None:
 def build(folder: Path) -> Path:
     """The wheel, built in `folder`."""
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check")
-    options = ("-q", "--no-build-isolation", "--no-deps", "--no-index", "-Ccmake.define.BITYMI_CUDA=OFF")
+    options = (
+        "-q",
+        "--no-build-isolation",
+        "--no-deps",
+        "--no-index",
+        "--config-settings=cmake.define.BITYMI_CUDA=OFF",
+    )
     run(*pip, "wheel", *options, f"-Cbuild-dir={folder / 'build'}", "-w", folder, ROOT)
     (wheel,) = folder.glob("bitymi_ns-*.whl")
     return wheel
@@ -77,7 +83,7 @@ def expected() -> set[str]:
 
 
 def check_contents(wheel: Path) -> None:
-    """Ends this script where a file is missing from the wheel or superfluous in it."""
+    """End this script where a file is missing from the wheel or superfluous in it."""
     with zipfile.ZipFile(wheel) as archive:
         files = {name for name in archive.namelist() if ".dist-info/" not in name}
     if files != expected():

@@ -40,7 +40,7 @@ def test_mistakes_are_one_line(
     assert said.startswith(error.format(tmp_path)) and said.count("\n") == 1
 
 
-FULL = "{} cannot be written: the disk is full: free some space, or give a place on another disk\n"
+FULL = "{} cannot be written: the disk is full: free some space, or write to another disk\n"
 
 
 @pytest.mark.parametrize(

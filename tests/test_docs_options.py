@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from bitymi_ns.bake import BakeOptions
-from bitymi_ns.plugin.run.preset import load_preset
 from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.preset import load_preset
 
 ROOT = Path(__file__).resolve().parents[1]
 ROOTS: dict[str, Any] = {

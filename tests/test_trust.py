@@ -132,10 +132,10 @@ def test_files_and_folders_of_others(victim: Path, tmp_path: Path, monkeypatch: 
     stat = os.stat
     elsewhere = os.stat_result([*stat(tmp_path)[:4], os.getuid() + 2, *stat(tmp_path)[5:]])
     monkeypatch.setattr(os, "stat", lambda path, **how: elsewhere if Path(path) == tmp_path else stat(path, **how))
-    with pytest.raises(Refused, match="belongs to somebody else"), open(victim, "a", opener=no_links):
+    with pytest.raises(Refused, match="belongs to another user"), open(victim, "a", opener=no_links):
         pass
     assert not is_own(tmp_path / "own")
-    with pytest.raises(Refused, match="belongs to somebody else"):
+    with pytest.raises(Refused, match="belongs to another user"):
         own_folder(tmp_path / "own", close=True)
 
 

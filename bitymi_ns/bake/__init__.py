@@ -7,14 +7,13 @@ from bitymi_ns.bake.learn import Learning, bake_and_learn
 from bitymi_ns.bake.pipeline import reduced
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
 from bitymi_ns.bundle.bake_options import BakeOptions
-from bitymi_ns.progress import Progress, rich_progress
+from bitymi_ns.progress import rich_progress
 
 __all__ = [
     "BakeOptions",
     "Baked",
     "Learning",
     "PolishOptions",
-    "Progress",
     "TuneOptions",
     "bake",
     "bake_and_learn",

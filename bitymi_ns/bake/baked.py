@@ -214,7 +214,6 @@ def export(
         statistics: added to those of the bake.
         first: camera with which a viewer opens, the first of cameras.json that was held out, or its first: the poster
             is drawn from there; None = the bundle gets no poster.
-        options: further arguments of `write_bundle` by name.
     """
     baked = baked.encoded()
     return write_bundle(

@@ -28,8 +28,8 @@ from bitymi_ns.train.views import View
 
 START = 8.0 / 255**2  # first lambda of the search: squared error per bit, colours from 0 to 1
 MAX_LAMBDA = 4.0 / 255**2
-"""Largest lambda where a share of the error decides: much of a large error, as of exposure, is what no texel mends and
-does not hide that of rounding; and texels learn little behind steps above the 4.2 of 255 that this gives."""
+"""Largest lambda where a share of the error decides: no texel can correct much of a large error, as of exposure, and
+that does not hide the error of rounding; and texels learn little behind steps above the 4.2 of 255 that this gives."""
 TEXEL_SHARE = 0.5  # lambda of the texels, which are tuned after it, as a share of that of everything else
 ENOUGH = 0.002
 """Share of the error (0.009 dB) that may be added even where a size is asked for: finer is not worth bytes."""
@@ -98,7 +98,6 @@ class Coder:
             baked: with lean view colours, on the CPU.
             views: training views; without any the reference steps are taken.
             background: [3] colour behind the scene.
-            device: where views are drawn and weighed.
         """
         options.check()
         self._baked, self._pictures = baked, Pictures(views, background, options.views, device)
@@ -180,10 +179,9 @@ def compacted(
         baked: with lean view colours, on the CPU.
         views: training views; without any the reference steps are taken.
         background: [3] colour behind the scene.
-        device: where views are drawn and weighed.
 
     Raises:
-        ValueError: an option is out of range, or what is asked for cannot be had.
+        ValueError: an option is out of range, or the target cannot be reached.
     """
     options = options or Compact()
     return choose(Coder(baked, views, background, options, progress, device), options, progress)
@@ -214,7 +212,7 @@ def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> 
         if coder.psnr < options.psnr:
             raise ValueError(
                 f"the bake shows the training photographs at {coder.psnr:.2f} dB, so {options.psnr:g} dB cannot be "
-                "had: ask for less, or train for longer"
+                "reached: ask for less, or train for longer"
             )
         found, _ = _search(coder, lambda point: point.psnr >= options.psnr, progress)
     else:

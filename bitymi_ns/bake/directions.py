@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from bitymi_ns.ops.sphere import fibonacci_sphere
+from bitymi_ns.ops.view_kinds import fibonacci_sphere
 
 BETWEEN = 32  # directions between and around those of the views
 SPHERE = 64  # directions over the whole sphere for a surfel that no view sees
@@ -25,7 +25,7 @@ class Directions:
     views: int  # number of the D columns that are for views
     view: Tensor  # [n, views] int64, view of each of these columns
 
-    def thinned(self, values: Tensor, most: int) -> Tensor:
+    def subset(self, values: Tensor, most: int) -> Tensor:
         """Columns of `values` [n, D, ...]: an even choice of at most `most` views, and every other one of the rest."""
         stride = -(-self.views // most) if self.views else 1
         return torch.cat([values[:, : self.views : stride], values[:, self.views :: 2]], dim=1)

@@ -88,8 +88,6 @@ def evaluate(
     Args:
         pictures: rendering and photograph [H, W, 3] of every view, and the mask of the pixels that count; made one by
             one.
-        count: of them.
-        progress: called after each.
     """
     values = []
     for rgb, target, mask in pictures:

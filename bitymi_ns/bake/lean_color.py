@@ -1,6 +1,6 @@
 """Lean view colours: a surfel keeps the fewest sites that hold its colour, or one colour."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -99,10 +99,22 @@ def reduce_view_color(
             parts.append((where, terms))
         done += len(at.rows)
         progress("reducing the view colours", done, len(means))
+    return lean(base, count, entry.lean_width, parts)
+
+
+def lean(base: Tensor, count: Tensor, width: int, parts: Iterable[tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
+    """Lean view colours as a bundle holds them: the terms of all surfels in one list.
+
+    Args:
+        base: [N, 3].
+        count: [N] int64, terms of each surfel.
+        width: numbers of a term.
+        parts: rows [n] of surfels, and their terms [n, number, width].
+    """
     first = count.cumsum(0) - count
-    terms = means.new_zeros(int(count.sum()), entry.lean_width)
+    terms = base.new_zeros(int(count.sum()), width)
     for rows, values in parts:
-        terms[first[rows, None] + torch.arange(values.shape[1], device=means.device)] = values
+        terms[first[rows, None] + torch.arange(values.shape[1], device=base.device)] = values
     return dict(zip(LEAN, (base, torch.stack([first, count], dim=1).int(), terms), strict=True))
 
 
@@ -114,7 +126,7 @@ def _fewer_sites(
     `own` are vectors and colours [n, K, 3] of all its surfels' sites.
     """
     vectors, rgb = own
-    fit, result = fewer_sites(at, at.thinned(at.valid, FIT_VIEWS).float(), vectors, rgb), []
+    fit, result = fewer_sites(at, at.subset(at.valid, FIT_VIEWS).float(), vectors, rgb), []
     for number in range(2, vectors.shape[1]):
         if len(rest) == 0:
             break

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field, replace
 from torch import Tensor
 
 from bitymi_ns.bake.baked import BakeableScene, Baked
-from bitymi_ns.bake.certificate import certified
 from bitymi_ns.bake.compact import Compact, compacted, with_coded_texels
 from bitymi_ns.bake.field.bake import bake
 from bitymi_ns.bake.field.polish import PolishOptions, polish_scene
 from bitymi_ns.bake.inputs import device_of
 from bitymi_ns.bake.pipeline import reduced, trained_texels
+from bitymi_ns.bake.tile_errors import certified
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.progress import Progress, no_progress
@@ -51,7 +51,6 @@ class Learning:
 
         Args:
             scene: trained, with its texture as texels, as a field, or without texture.
-            views: number of training photographs.
             polish_steps: 0 = no polish; None = none for texels, which training has learned; for a field 300, or
                 `FEWEST_PASSES` for each photograph where that is more.
             tune_steps: 0 = no fine-tuning; None = `STEPS_AFTER_LEARNING`, or 400 where a field is not polished.
@@ -90,9 +89,6 @@ def bake_and_learn(
         cameras: of the training views, on the scene's device.
         photographs: the training views, with the corrections that training found.
         background: [3] colour behind the scene, on the CPU.
-        options: tolerance, sizes and formats.
-        learning: see `Learning`.
-        progress: called after every piece of work.
         held_out: views of which the gains are stated; they decide nothing.
 
     Raises:

@@ -34,8 +34,6 @@ class Pictures:
         Args:
             views: training views, of which `most` are taken, spread over all.
             background: [3] colour behind the scene.
-            most: how many.
-            device: where they are drawn.
         """
         chosen = [views[i] for i in range(0, len(views), max(1, math.ceil(len(views) / most)))]
         self._device, self._background = device, background.to(device)
@@ -94,8 +92,6 @@ def column_noise(
     Args:
         scene: with lean view colours, on the CPU, of N surfels.
         sizes: [N, 2] sides of the tiles, texels; (0, 0) = none.
-        pictures: the views.
-        progress: called after every column.
     """
     assert scene.extent is not None
     codes, order = code_surfels(scene.surfels, scene.view_color, sizes, scene.extent, REFERENCE)

@@ -95,8 +95,6 @@ def reduce_tiles(
     is taken, the plan's limit at the latest.
 
     Args:
-        wanted: what the tiles should hold.
-        shown: how much of the tiles is.
         tolerance: largest error, 8-bit steps.
         r_min: smallest side of a tile, a power of two.
         channels: C of the tiles.
@@ -162,7 +160,6 @@ def reduced_tiles(tiles: Tiles, inputs: BakeInput, options: BakeOptions, progres
     """Resample every tile to the smallest grid within the tolerance; no tile where one colour is.
 
     Args:
-        tiles: of N surfels.
         inputs: the surfels, and what the views see of them; their device does the work.
     """
     opacity, beta = kernel_parameters(inputs.surfels, inputs.transmittance)

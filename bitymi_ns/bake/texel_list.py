@@ -27,7 +27,6 @@ class TexelList:
         """
         Args:
             baked: with an atlas.
-            device: where the texels learn.
 
         Raises:
             ValueError: there is no atlas.
@@ -43,9 +42,7 @@ class TexelList:
     def projection(self, camera: Camera) -> Projection:
         """Of the surfels into a view."""
         geometry = (self.scene.surfels[name] for name in GEOMETRY)
-        projection = project(*geometry, camera.to(self.device), self.scene.near, self.scene.prefilter)
-        projection.alpha = self.alpha
-        return projection
+        return project(*geometry, camera.to(self.device), self.scene.near, self.scene.prefilter, alpha=self.alpha)
 
     def coverage(
         self, views: Sequence[View], progress: Progress = no_progress, powers: Sequence[int] = (1,)

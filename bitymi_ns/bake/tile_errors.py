@@ -1,4 +1,5 @@
-"""Errors of texels as the closest training view shows them: times the blending weight, averaged over its pixels."""
+"""Errors of texels as the closest training view shows them: times the blending weight, averaged over its pixels; and
+the certificate of a bake, their errors by quantisation."""
 
 from collections.abc import Mapping, Sequence
 from itertools import chain
@@ -6,11 +7,14 @@ from itertools import chain
 import torch
 from torch import Tensor
 
+from bitymi_ns.bake.baked import Baked
 from bitymi_ns.bake.tiles import Shown, weights
-from bitymi_ns.codec.pages import first_texels, listed_tiles
+from bitymi_ns.bundle.sketch import sketches_text
+from bitymi_ns.bundle.statistics import Certificate
+from bitymi_ns.codec.pages import first_texels, listed_texels, listed_tiles
 from bitymi_ns.codec.quantise import STEPS
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.scene.tile_sizes import max_projected_extent
+from bitymi_ns.scene.tile_sizes import kernel_parameters, max_projected_extent
 from bitymi_ns.train.init import tangents
 
 ALPHA_CONTRAST = 0.25  # of an error of alpha: how far a surfel's colour differs from that behind it, as a rule
@@ -70,7 +74,7 @@ def closest_pixels(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], ext
         near: nearest drawn depth.
     """
     at = (surfels["means"], tangents(surfels["quats"]), surfels["log_scales"].exp())
-    return max_projected_extent(*at, cameras, extent, near)[0] / (2.0 * extent)
+    return max_projected_extent(*at, cameras, extent, near) / (2.0 * extent)
 
 
 def cells_per_pixel(shown: Shown, rows: Tensor, size: tuple[int, int]) -> Tensor:
@@ -104,3 +108,28 @@ def _windows(count: int, width: Tensor) -> Tensor:
     center = torch.minimum(torch.maximum(edge + 0.5, half), count - half)  # [n, count]
     low, high = (center - half)[:, :, None], (center + half)[:, :, None]
     return (torch.minimum(high, edge + 1) - torch.maximum(low, edge)).clamp(min=0) / width[:, None, None]
+
+
+@torch.no_grad()
+def certified(baked: Baked, cameras: Sequence[Camera]) -> Baked:
+    """Certificate of a bake: measure the error of the stored residual colours against those before quantisation, as
+    training views see it, and state it in the statistics; alphas are not covered. A bake that has a certificate
+    already, against the field, or no texels, or no tolerance, is returned as it is.
+
+    Args:
+        baked: encoded, on the CPU.
+    """
+    scene, options = baked.scene, baked.options
+    if baked.atlas is None or options.tolerance == 0 or baked.statistics.certificate:
+        return baked
+    stored = listed_texels(torch.from_numpy(baked.atlas.decoded()[..., :3]), baked.packing, baked.mean_residual)
+    before = (baked.texels if baked.uncoded is None else baked.uncoded)[:, :3]
+    pixels = closest_pixels(scene.surfels, cameras, options.extent, scene.near) if cameras else None
+    opacity, beta = kernel_parameters(scene.surfels, baked.in_front)
+    shown = Shown(opacity, beta, baked.extent, scene.weight_bound, pixels=pixels)
+    errors, seen = listed_errors(stored - before, baked.sizes, shown)
+    rms = STEPS * float((stored - before).double().square().mean().sqrt())
+    certificate = Certificate.of(errors[seen], options.tolerance, "texels").but(
+        texel_rms=round(rms, 4), marks=sketches_text(before, stored)
+    )
+    return baked.with_statistics(certificate=certificate)

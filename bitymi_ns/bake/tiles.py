@@ -74,7 +74,7 @@ def weights(shown: Shown, rows: Tensor, count: tuple[int, int]) -> Tensor:
     return torch.where((rest > 0) & (weight >= shown.weight_bound), weight, torch.zeros_like(weight))
 
 
-def tile_values(texels: Tensor, sizes: Tensor, shown: Shown, chunk: int = 1 << 18) -> Iterator[TileValues]:
+def tile_values(texels: Tensor, sizes: Tensor, shown: Shown, chunk: int) -> Iterator[TileValues]:
     """Texels of the tiles, in chunks of tiles of one size.
 
     Args:

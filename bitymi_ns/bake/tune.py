@@ -38,7 +38,7 @@ class TuneOptions(TexelSteps):
     patience: PositiveCount = 6  # Evaluations without a gain after which the run ends.
     cache_bytes: NonNegativeInt = 1_000_000_000
     """Memory for the fragments of the views, first of the validation views, which are drawn most often; what does not
-    fit is traced anew whenever it is needed."""
+    fit is traced again whenever it is needed."""
     seed: int = 0  # Of the order of the views.
     coded_steps: Count = 120
     """Further steps, which see what is stored of the texels: blocks of BC7, say, or the codes of a compact bundle."""

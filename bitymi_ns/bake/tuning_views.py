@@ -42,10 +42,7 @@ class TuningViews(Sequence[TuningView]):
     def __init__(self, texels: TexelList, views: Sequence[View], background: Tensor, budget: MemoryBudget) -> None:
         """
         Args:
-            texels: of the bake.
-            views: on any device.
             background: [3] colour behind the scene.
-            budget: for the views that are kept.
         """
         self._texels, self._views, self._budget = texels, views, budget
         self._background = background.to(texels.device)
@@ -106,7 +103,6 @@ class TuningViews(Sequence[TuningView]):
         Args:
             view: of this sequence.
             texels: [T, 3], as the baked renderer shows them before any quantisation.
-            descent: how the backward pass moves texels.
         """
         assert self._projection is not None
         drawn = (self._projection, view.base, texels, self._texels.tiles)
@@ -120,10 +116,8 @@ class TuningViews(Sequence[TuningView]):
         """Move texels by the gradient of a view's loss, as a sum over its numbers.
 
         Args:
-            index: of the view.
             texels: [T, 3], moved in place: texel t by -rate share[t] times its gradient.
             share: [T].
-            rate: see there.
             ssim_weight: share of 1 - SSIM in the loss.
             read: [T, 3] texels that the picture shows; None = those that are moved.
         """

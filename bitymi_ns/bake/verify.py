@@ -12,7 +12,7 @@ from bitymi_ns.bake.lean_color import centers_of, view_color_errors
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.read import Bundle
 from bitymi_ns.bundle.verify import SLACK_STEPS, Check, steps_text
-from bitymi_ns.codec.scene_texels import scene_texels, texel_alpha
+from bitymi_ns.codec.pages import scene_texels, texel_alpha
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.tile_sizes import kernel_parameters

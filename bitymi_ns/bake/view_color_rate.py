@@ -9,10 +9,10 @@ from torch.nn import functional as F
 
 from bitymi_ns.bake.directions import Directions, view_directions
 from bitymi_ns.bake.inputs import device_of
-from bitymi_ns.bake.lean_color import centers_of, shown_at
+from bitymi_ns.bake.lean_color import centers_of, lean, shown_at
 from bitymi_ns.bake.voronoi_fit import FIT_VIEWS, fewer_sites
 from bitymi_ns.codec.limits import beyond
-from bitymi_ns.codec.scene_texels import texel_alpha
+from bitymi_ns.codec.pages import texel_alpha
 from bitymi_ns.ops import fitting_lists, project
 from bitymi_ns.ops.constants import COLOR_BIAS
 from bitymi_ns.ops.project import GEOMETRY
@@ -48,13 +48,9 @@ class ColorChoices:
         width = self.terms[0].shape[2]
         bits = BITS_PER_NUMBER * width * torch.arange(self.error.shape[1])
         count = (self.error + lmbda * bits).argmin(dim=1)
-        first = count.cumsum(0) - count
-        terms = self.base.new_zeros(int(count.sum()), width)
-        for number, values in self.terms.items():
-            rows = torch.nonzero(count == number).squeeze(1)
-            terms[first[rows, None] + torch.arange(number)] = values[rows]
-        base = self.base[torch.arange(len(count)), count]
-        return {"view_base": base, "view_span": torch.stack([first, count], dim=1).int(), "view_terms": terms}
+        rows = {number: torch.nonzero(count == number).squeeze(1) for number in self.terms}
+        parts = ((rows[number], values[rows[number]]) for number, values in self.terms.items())
+        return lean(self.base[torch.arange(len(count)), count], count, width, parts)
 
 
 @torch.no_grad()
@@ -66,9 +62,7 @@ def shown_weights(scene: BakedScene, cameras: Sequence[Camera], progress: Progre
     geometry, alpha = [scene.surfels[name].to(device) for name in GEOMETRY], texel_alpha(scene)
     alpha = None if alpha is None else alpha.to(device)
     for done, camera in enumerate(cameras):
-        projection = project(*geometry, camera, scene.near, scene.prefilter)
-        projection.alpha = alpha
-        for fragments in fitting_lists(projection):
+        for fragments in fitting_lists(project(*geometry, camera, scene.near, scene.prefilter, alpha=alpha)):
             found[done].index_add_(0, fragments.surfel, fragments.weight.square())
             del fragments  # before the next list is made
         progress("tracing the training views", done + 1, len(cameras))
@@ -79,8 +73,6 @@ def choice_bytes(kind: str, surfels: int, views: int, most: int) -> int:
     """Memory of `color_choices`, bytes.
 
     Args:
-        kind: of the view colours.
-        surfels, views: how many there are.
         most: lean terms of a surfel.
     """
     entry = VIEW_COLORS[kind]
@@ -180,7 +172,7 @@ def _fewer(
         return []
     base, terms = own
     vectors, rgb = F.pad(terms[..., :3], (0, 0, 1, 0)), torch.cat([base[:, None], terms[..., 3:]], dim=1)
-    counts = at.thinned(weight, FIT_VIEWS)
+    counts = at.subset(weight, FIT_VIEWS)
     fit = fewer_sites(at, counts / counts.mean(1, keepdim=True).clamp(min=1e-20), vectors, rgb)
     return [(number, *fit(number + 1, slice(None))) for number in numbers]
 

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from bitymi_ns.bake.directions import Directions
-from bitymi_ns.ops.sphere import fibonacci_sphere
+from bitymi_ns.ops.view_kinds import fibonacci_sphere
 
 FIT_STEPS = 6
 FIT_VIEWS = 16  # views of a surfel in the fit; the error is measured in all of them
@@ -115,15 +115,14 @@ def fewer_sites(
     """Fits of the sites that are hardest to do without.
 
     Args:
-        at: directions of n surfels.
-        weight: [n, D'] of those that `Directions.thinned` leaves.
+        weight: [n, D'] of those that `Directions.subset` leaves.
         vectors, rgb: [n, K, 3] of all sites.
 
     Returns:
         a function of a number of sites below K, and of rows, to base [m, 3] and terms [m, number - 1, 6].
     """
     outside = fibonacci_sphere(OUTSIDE).to(vectors).expand(len(vectors), -1, -1)
-    samples = torch.cat([at.thinned(at.unit, FIT_VIEWS), outside], dim=1)
+    samples = torch.cat([at.subset(at.unit, FIT_VIEWS), outside], dim=1)
     weight = F.pad(weight, (0, OUTSIDE), value=OUTSIDE_WEIGHT)
     colors = site_weights(vectors, samples) @ rgb
     left = least_needed(vectors, rgb, samples, weight)

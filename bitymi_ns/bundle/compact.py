@@ -30,7 +30,6 @@ def encode_surfels(
     """Entries of bundle.json for surfels.bin, and the file.
 
     Args:
-        codes: of N surfels.
         residual: [N, 3] mean residuals: green, red less green, blue less green.
         residual_step: of these.
         alpha: [N] mean alphas, 128 for 1; None = opaque texels.
@@ -93,10 +92,8 @@ def decode_texels(
     """Decode texels.bin.
 
     Args:
-        info: of bundle.json.
         sizes: [N, 2] sides of the tiles.
         residual, residual_step: of surfels.bin.
-        data: of texels.bin.
         alpha: of surfels.bin, None = opaque texels.
 
     Raises:

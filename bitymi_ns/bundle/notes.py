@@ -9,6 +9,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from bitymi_ns.bundle import strict_json
 from bitymi_ns.bundle.manifest import UNIT_LENGTH, BundleError
 from bitymi_ns.bundle.parts import NOTES, Parts, notes_data, parts_of
+from bitymi_ns.ranges import first_problem
 
 MOST_VIEWS, MOST_NOTES = 200, 500
 LONGEST_NAME, LONGEST_TEXT = 80, 1000
@@ -73,9 +74,8 @@ def parse_notes(data: bytes, source: str = NOTES) -> Notes:
     try:
         found = Notes.model_validate(strict_json.loads(data))
     except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        where = ".".join(map(str, first["loc"])) or "the whole"
-        raise _refusal(source, f"{where}: {first['msg'].removeprefix('Value error, ')}") from error
+        where, what = first_problem(error)
+        raise _refusal(source, f"{where or 'the whole'}: {what}") from error
     except ValueError as error:
         raise _refusal(source, f"it is no JSON in UTF-8 ({error})") from error
     names: set[str] = set()

@@ -132,8 +132,6 @@ def read_file(parts: Parts, info: Manifest, name: str, verify: bool = True, keep
     """The bytes of a file that bundle.json lists.
 
     Args:
-        parts: the bundle.
-        info: bundle.json.
         name: one of `info.files`.
         verify: compare the file with its sha256, while it is read.
         keep: False only checks it, and returns nothing of it.
@@ -185,10 +183,7 @@ def assemble(folder: Path, info: Manifest, files: dict[str, bytearray], decode: 
     """The bundle of what `read_file` read.
 
     Args:
-        folder: the bundle's folder, for messages.
-        info: bundle.json.
         files: contents of the files with surfels and texels, by name.
-        decode: as in `read_bundle`.
 
     Raises:
         BundleError: a file is malformed, or a value is out of range.

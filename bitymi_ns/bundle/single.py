@@ -35,7 +35,6 @@ def write_single(bundle: str | Path, path: str | Path) -> Written:
 
     Args:
         bundle: its folder, or such a file.
-        path: the file to write.
 
     Raises:
         BundleError: there is no bundle, a file is missing or altered, or there is too little memory.

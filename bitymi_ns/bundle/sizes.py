@@ -46,7 +46,7 @@ def check_head(info: Manifest, name: str, head: bytes, size: int) -> None:
 
 @contextmanager
 def enough_memory(bundle: Path, info: Manifest) -> Iterator[None]:
-    """Reports a lack of memory for a bundle's contents as a BundleError with the size of the files."""
+    """Report a lack of memory for a bundle's contents as a BundleError with the size of the files."""
     try:
         yield
     except MemoryError as error:

@@ -14,7 +14,7 @@ def loads(data: bytes | bytearray) -> Any:
     """The value of UTF-8 JSON text.
 
     Raises:
-        ValueError: not JSON, a key that is there twice, NaN or infinity (also as 1e999), or nested too deeply.
+        ValueError: not JSON, a key that occurs twice, NaN or infinity (also as 1e999), or nested too deeply.
     """
     try:
         return json.loads(
@@ -65,7 +65,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, value in pairs:
         if key in found:
-            raise ValueError(f"the key {key[:60]!r} is there twice")
+            raise ValueError(f"the key {key[:60]!r} occurs twice")
         found[key] = value
     return found
 

@@ -23,9 +23,8 @@ from bitymi_ns.codec.limits import ALPHA_LIMIT, EXTENTS, UNIT_SLACK, beyond, lim
 from bitymi_ns.ops import view_color
 from bitymi_ns.ops.constants import MAX_TERMS, SH_C0, SUPPORT
 from bitymi_ns.ops.project import GEOMETRY
-from bitymi_ns.ops.sphere import fibonacci_sphere
 from bitymi_ns.ops.view_color import LEAN, check_lean
-from bitymi_ns.ops.view_kinds import VIEW_COLORS, kind_of
+from bitymi_ns.ops.view_kinds import VIEW_COLORS, fibonacci_sphere, kind_of
 from bitymi_ns.scene.baked import BakedScene
 
 FLAT_LOG_SCALE = -31.0
@@ -186,7 +185,7 @@ def from_columns(
     _check_limits(surfels, kind)
     turned = (surfels["quats"].norm(dim=1) - 1.0).abs() > UNIT_SLACK
     if turned.any():
-        raise PlyError(f"rot_0 to rot_3 have not the length 1 in row {int(torch.nonzero(turned)[0])}")
+        raise PlyError(f"rot_0 to rot_3 are not of length 1 in row {int(torch.nonzero(turned)[0])}")
     residual = torch.zeros(count, 3)
     if COLUMNS["mean_residual"][0] in columns:
         residual = _stack(columns, COLUMNS["mean_residual"])

@@ -14,8 +14,8 @@ from bitymi_ns.bundle.read import Bundle, assemble, manifest_of, read_file
 from bitymi_ns.bundle.sizes import SCENE_FILES, enough_memory
 from bitymi_ns.bundle.sketch import estimated_rms, sketch, sketches_of
 from bitymi_ns.bundle.write import World
+from bitymi_ns.codec.pages import scene_texels
 from bitymi_ns.codec.quantise import STEPS
-from bitymi_ns.codec.scene_texels import scene_texels
 
 SLACK_STEPS = 0.02  # 8-bit steps by which a measured error may exceed the stated one
 _SLACK_CODES = 4.0
@@ -90,7 +90,6 @@ def check_world(stated: WorldFrame, world: World) -> Check:
 
     Args:
         stated: of bundle.json; an earlier version states neither up nor lengths.
-        world: of the run.
     """
     wrong = []
     for key, found in world.described().items():

@@ -90,7 +90,6 @@ def write_bundle(
     """Write a bundle; the folder appears complete or not at all.
 
     Args:
-        folder: the bundle's folder.
         scene: on the CPU, all numbers finite, the view colours all or lean. Its own atlas is not looked at. The mean
             residuals are also a part of the colour that other viewers show. Its mean alphas are written beside an
             atlas with alphas, which needs them.

@@ -113,4 +113,4 @@ def _converted(file: Path) -> Image.Image | None:
         with open_picture(file) as image:
             return None if is_plain(image, file) else in_srgb(eight_bits(image)).convert("RGB")
     except Exception as error:
-        raise CaptureError(f"{file} cannot be read as a picture: save it anew") from error
+        raise CaptureError(f"{file} cannot be read as a picture: save it again") from error

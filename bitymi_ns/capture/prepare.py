@@ -71,7 +71,7 @@ def colmap_mask(path: Path, name: str, size: tuple[int, int]) -> Image.Image:
     try:
         mask = read_mask(path)
     except Exception as error:
-        raise CaptureError(f"the mask {path} cannot be read: save it anew, or remove it") from error
+        raise CaptureError(f"the mask {path} cannot be read: save it again, or remove it") from error
     if not in_proportion(mask.size, size):
         raise CaptureError(
             f"the mask {path} has {mask.width} x {mask.height} pixels, its photograph {name} stands upright with "

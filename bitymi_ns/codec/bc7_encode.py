@@ -1,4 +1,4 @@
-"""The BC7 encoder of atlas pages (ispc_texcomp); `ops.bc7_decode` reads its blocks."""
+"""The BC7 encoder of atlas pages (ispc_texcomp); `ops.baked_scene.decode_bc7` reads its blocks."""
 
 import os
 from collections.abc import Callable
@@ -25,7 +25,8 @@ def bc7_encoder(profile: Profile, alpha: bool = False) -> Callable[[npt.NDArray[
         import ispc_texcomp
     except ImportError as error:
         raise RuntimeError(
-            "BC7 needs the encoder ispc_texcomp: `pip install ispc_texcomp`, or choose the format uint8 or fp16"
+            "BC7 needs the encoder ispc_texcomp: `pip install ispc_texcomp` (Python 3.11 or later), or choose another "
+            "format"
         ) from error
     if profile not in ("slow", "basic", "fast", "veryfast", "ultrafast"):
         raise ValueError(f"the BC7 profile must be slow, basic, fast, veryfast or ultrafast, not {profile!r}")
@@ -39,16 +40,11 @@ def bc7_encoder(profile: Profile, alpha: bool = False) -> Callable[[npt.NDArray[
     return compress
 
 
-def bc7_blocks(
-    pages: npt.NDArray[np.uint8], profile: Profile, alpha: bool = False, threads: int | None = None
-) -> npt.NDArray[np.uint8]:
+def bc7_blocks(pages: npt.NDArray[np.uint8], profile: Profile, alpha: bool = False) -> npt.NDArray[np.uint8]:
     """The BC7 blocks of texels [layers, height, width, 4], sides multiples of 4: [layers, height / 4, width / 4, 16].
 
     Args:
-        pages: RGBA texels.
-        profile: effort of the encoder.
         alpha: alphas are encoded; without, all of them are 255.
-        threads: of the encoder; not given: one per processor. The result does not depend on it.
 
     Raises:
         RuntimeError: the encoder is not installed.
@@ -56,6 +52,6 @@ def bc7_blocks(
     compress = bc7_encoder(profile, alpha)
     layers, height, width, _ = pages.shape
     strips = [page[top : top + STRIP] for page in pages for top in range(0, height, STRIP)]
-    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
         blocks = bytearray().join(pool.map(compress, strips))
     return np.frombuffer(blocks, np.uint8).reshape(layers, height // 4, width // 4, 16)

@@ -40,7 +40,6 @@ def pack(resolution: npt.ArrayLike, page_width: int = 4096, max_rows: int = 8192
         resolution: [N, 2] integers (r_u, r_v), powers of two >= 4; (0, 0) for a surfel without a tile.
         page_width: largest page width in texels, a power of two (smaller atlases get a narrower page).
         max_rows: largest page height; 8192 is the limit of WebGPU and phones.
-        max_layers: largest number of pages.
 
     Raises:
         ValueError: sizes are not powers of two or too wide, or more than `max_layers` pages would be needed.

@@ -13,7 +13,7 @@ from bitymi_ns.codec.bc7_encode import STRIP, Profile, bc7_encoder
 from bitymi_ns.codec.limits import ALPHA_LIMIT, ALPHA_ONE, ALPHA_SCALE, RESIDUAL_LIMIT
 from bitymi_ns.codec.packing import Packing
 from bitymi_ns.codec.pages import covered_blocks
-from bitymi_ns.ops.bc7_decode import decode_bc7
+from bitymi_ns.ops.baked_scene import decode_bc7
 from bitymi_ns.progress import Progress, no_progress
 
 Format = Literal["bc7", "uint8", "fp16"]
@@ -84,9 +84,7 @@ def choose_range(
 
     Args:
         texels: [T, C] float32 of the tiles.
-        rule: see above.
         samples: size of the bootstrap sample, uniform over the texels, with replacement.
-        seed: of the sample.
     """
     if len(texels) == 0:
         return Range(0.0, 1.0, rule if rule != "auto" else "sigma6")

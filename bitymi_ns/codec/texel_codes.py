@@ -172,9 +172,9 @@ def constants(residual: npt.NDArray[np.int64], step: float) -> Tensor:
     return torch.from_numpy(np.clip(values, -RESIDUAL_LIMIT, RESIDUAL_LIMIT).astype(np.float32))
 
 
-def residual_codes(values: Tensor, step: float = RESIDUAL_STEP) -> npt.NDArray[np.int64]:
+def residual_codes(values: Tensor) -> npt.NDArray[np.int64]:
     """[N, 3] integers of residuals."""
-    r, g, b = np.rint(values.double().numpy() / step).astype(np.int64).T
+    r, g, b = np.rint(values.double().numpy() / RESIDUAL_STEP).astype(np.int64).T
     return np.stack([g, r - g, b - g], axis=1)
 
 

@@ -1,9 +1,9 @@
-"""Cameras of a bundle's capture, and the held-out photographs, where it has these."""
+"""Cameras of a bundle's capture (cameras.json), and the held-out photographs, where it has these."""
 
 import io
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from bitymi_ns.bundle import BundleError, strict_json
 from bitymi_ns.bundle.manifest import Manifest, check_file_name
 from bitymi_ns.bundle.parts import CAMERAS, Parts, parts_of
 from bitymi_ns.bundle.read import read_file
+from bitymi_ns.ranges import first_problem
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import View
 
@@ -43,6 +44,19 @@ class CameraRow(BaseModel):
         return Camera(torch.tensor(self.viewmat).view(4, 4), K, self.width, self.height)
 
 
+def camera_row(name: str, camera: Camera, held_out: bool) -> dict[str, Any]:
+    """One camera of cameras.json: intrinsics in pixels, viewmat [16] by rows (world to camera, OpenCV axes)."""
+    K = camera.K.cpu().tolist()
+    return {
+        "name": name,
+        "held_out": held_out,
+        "width": camera.width,
+        "height": camera.height,
+        **{"fx": K[0][0], "fy": K[1][1], "cx": K[0][2], "cy": K[1][2]},
+        "viewmat": camera.viewmat.cpu().flatten().tolist(),
+    }
+
+
 MOST_CAMERAS = 100_000
 
 
@@ -59,7 +73,6 @@ def read_cameras(folder: str | Path, info: Manifest) -> BundleCameras:
 
     Args:
         folder: the bundle's folder, or its one file.
-        info: bundle.json.
 
     Raises:
         BundleError: a file is missing, altered or malformed.
@@ -95,9 +108,8 @@ def _rows(parts: Parts, info: Manifest) -> list[CameraRow]:
         try:
             rows.append(CameraRow.model_validate(row))
         except ValidationError as error:
-            first = error.errors(include_url=False, include_input=False)[0]
-            where = ".".join(map(str, ("cameras", number, *first["loc"])))
-            raise BundleError(f"{path}: {where}: {first['msg']}") from error
+            where, what = first_problem(error)
+            raise BundleError(f"{path}: {'.'.join(filter(None, (f'cameras.{number}', where)))}: {what}") from error
     return rows
 
 

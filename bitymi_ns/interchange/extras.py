@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bitymi_ns.bake.lean_color import centers_of
 from bitymi_ns.bundle import Bundle, BundleError
-from bitymi_ns.codec.scene_texels import texel_alpha
+from bitymi_ns.codec.pages import texel_alpha
 from bitymi_ns.files import complete_folder, explained
 from bitymi_ns.interchange.draw_quads import draw_quads
 from bitymi_ns.interchange.frame import to_capture
@@ -101,12 +101,9 @@ def write_extras(
 
     Args:
         bundle: on the CPU, texels decoded.
-        folder: to write.
-        kinds: gaussians, mesh.
         frame: in which the files are: the scene's, or the capture's own, which bundle.json leads to.
         cameras: of the training photographs: colours are fitted to what they see. Without any, harmonics are fitted
             over the whole sphere, and a mesh keeps the surfels' own colours.
-        held_out: photographs to measure in.
         overwrite: replace a folder of extras.
 
     Returns:
@@ -123,7 +120,11 @@ def write_extras(
     chosen = [held_out[i].to("cpu") for i in spread(len(held_out), MEASURED_VIEWS)]
     views = [at_size(view, view.camera.within(MEASURED_SIDE), "cpu") for view in chosen]
     colors = _fitted_colors(scene, cameras, progress)
-    base = _psnr(lambda camera: scene.render(camera, background).rgb, views, background)
+
+    def picture(camera: Camera) -> Tensor:
+        return scene.render(camera, background).rgb
+
+    base = _psnr(picture, views, background)
     written: dict[str, Written] = {}
     replaceable = partial(check_extras, kinds, folder, overwrite)
     with explained(folder, BundleError, ". Nothing was left behind"), complete_folder(folder, replaceable) as new:
@@ -139,7 +140,6 @@ def write_extras(
                 if not len(quads):
                     raise BundleError(f"no surfel of the bundle has an opacity above {LEVEL}: there is no mesh")
                 chosen = [cameras[i].within(COLORED_SIDE) for i in spread(len(cameras), COLORED_VIEWS)]
-                picture = _picture(scene, background)
                 quads, count = recolored(quads, picture, chosen, scene.near, progress), len(quads)
                 value = _psnr(lambda c, q=quads: draw_quads(q, c, background, scene.near), views, background)
                 up = torch.tensor(bundle.info.world.up or _UP) if to is None else None
@@ -165,10 +165,6 @@ def _fitted_colors(scene: BakedScene, cameras: Sequence[Camera], progress: Progr
     drawn = (scene.near, scene.weight_bound, scene.prefilter, progress, texel_alpha(scene))
     seen = visibility(scene.surfels, chosen, *drawn).seen
     return fit_colors(scene, weighted_residuals(scene), seen, centers_of(cameras, scene.surfels["means"]))
-
-
-def _picture(scene: BakedScene, background: Tensor) -> Callable[[Camera], Tensor]:
-    return lambda camera: scene.render(camera, background).rgb
 
 
 def _psnr(draw: Callable[[Camera], Tensor], views: Sequence[View], background: Tensor) -> float | None:

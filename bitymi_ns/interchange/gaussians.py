@@ -16,7 +16,7 @@ from bitymi_ns.interchange.quads import fetch_texels
 from bitymi_ns.ops.constants import ALPHA_MAX, SUPPORT
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.tile_sizes import kernel_parameters
-from bitymi_ns.train.init import tangents
+from bitymi_ns.train.init import tangents, turned
 
 FLAT_LOG_SCALE = -16.0
 """Third scale of the Gaussians in the scene's frame, whose cameras lie within a unit of the origin."""
@@ -81,7 +81,7 @@ def gaussians_of(scene: BakedScene, coefficients: Tensor) -> Gaussians:
         spread = tangent.exp()
         values, axes = torch.linalg.eigh(spread[:, :, None] * covariance * spread[:, None])
         tangent = 0.5 * values.clamp(min=torch.finfo(torch.float64).tiny).log()
-        quats = _turned(quats, torch.atan2(axes[:, 1, 0], axes[:, 0, 0]).float())
+        quats = turned(quats, torch.atan2(axes[:, 1, 0], axes[:, 0, 0]).float())
         opacity = (opacity * strength).clamp(LEAST_OPACITY, ALPHA_MAX)
     return Gaussians(
         means,
@@ -90,13 +90,6 @@ def gaussians_of(scene: BakedScene, coefficients: Tensor) -> Gaussians:
         torch.logit(opacity).float(),
         coefficients.float(),
     )
-
-
-def _turned(quats: Tensor, angle: Tensor) -> Tensor:
-    """Rotations [N, 4] after a turn about their normals, from the first tangent to the second."""
-    w, x, y, z = quats.unbind(1)
-    c, s = (0.5 * angle).cos(), (0.5 * angle).sin()
-    return torch.stack([w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s], dim=1)
 
 
 def _moments(scene: BakedScene, chunk: int = 1 << 20) -> tuple[Tensor, Tensor, Tensor]:

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.ops import view_color
-from bitymi_ns.ops.sphere import fibonacci_sphere
-from bitymi_ns.ops.view_kinds import entry_of
+from bitymi_ns.ops.view_kinds import entry_of, fibonacci_sphere
 
 TERMS = 16  # harmonics up to degree 3, that of degree 0 included
 _POWERS = [(i, j, n - i - j) for n in (2, 3) for i in range(n + 1) for j in range(n + 1 - i)]  # 6 + 10 = TERMS

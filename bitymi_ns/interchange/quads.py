@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.codec.packing import GRID, pack
-from bitymi_ns.codec.pages import size_classes, texel_index
-from bitymi_ns.codec.scene_texels import texel_alpha
+from bitymi_ns.codec.pages import size_classes, texel_alpha, texel_index
 from bitymi_ns.interchange.frame import Similarity
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.baked import BakedScene

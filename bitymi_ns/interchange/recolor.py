@@ -30,9 +30,7 @@ def recolored(
     that show it. Both means count what was there before as PRIOR pixels.
 
     Args:
-        quads: Q quads.
         picture: draws the scene for a camera, [H, W, 3].
-        cameras: views to draw.
         near: nearest depth that is drawn.
     """
     pages, height, width, _ = quads.pages.shape

@@ -81,8 +81,7 @@ def median_depth(
     Raises:
         TooManyFragments: a single row of screen tiles has more fragments than memory holds.
     """
-    projection = project(*(surfels[name] for name in GEOMETRY), camera, near, prefilter)
-    projection.alpha = alpha
+    projection = project(*(surfels[name] for name in GEOMETRY), camera, near, prefilter, alpha=alpha)
     rows = []
     for fragments in fitting_lists(projection):
         order = fragments.pixel.argsort(stable=True)  # front to back within each pixel, as the fragments of a tile are
@@ -139,11 +138,8 @@ def extract_surface(
     Args:
         surfels: geometry by name (`GEOMETRY`).
         render: [H, W, 3] colors of a view, for the vertices.
-        cameras: of the training views.
         near: nearest depth that is drawn, camera z.
-        options: resolution and budget.
         prefilter: as in `ops.project`.
-        progress: called after every view and step.
         alpha: as in `median_depth`.
 
     Raises:

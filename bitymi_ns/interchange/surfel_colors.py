@@ -12,7 +12,7 @@ from bitymi_ns.bake.tiles import texel_centers
 from bitymi_ns.codec.pages import size_classes, texel_index
 from bitymi_ns.interchange import harmonics
 from bitymi_ns.ops.constants import COLOR_BIAS, SUPPORT
-from bitymi_ns.ops.sphere import fibonacci_sphere
+from bitymi_ns.ops.view_kinds import fibonacci_sphere
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.tile_sizes import kernel_parameters
 

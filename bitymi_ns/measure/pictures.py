@@ -92,7 +92,6 @@ def draw_worst(load_config: Path, output_dir: Path, views: int) -> None:
     Args:
         load_config: config.yml of a trained run.
         output_dir: folder for the files; made if needed.
-        views: how many views.
     """
     if views < 1:
         fail(f"--views must be at least 1, not {views}")

@@ -5,8 +5,7 @@ scene on both, by `baked_cpu` or `baked_cuda`.
 """
 
 from .bands import Bands, band, by_bands, fitting_lists, refused
-from .blend import blended_image
-from .composite import composite, soft_overdraw
+from .blend import blended_image, composite, soft_overdraw
 from .coverage import add_texel_coverage
 from .field import FieldGeometry, field, fragment_residual
 from .fragment_list import TooManyFragments

@@ -1,18 +1,20 @@
-"""Chooses the compiled kernel for a tensor: by its device, then by its dtype."""
+"""The compiled kernel for a tensor, by its device and dtype, and objects of kernels that keep their memory."""
 
 import functools
 import importlib
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
 
 from bitymi_ns import KernelsUnavailable
 
+T = TypeVar("T")
 SUFFIX = {torch.float32: "_f32", torch.float64: "_f64"}
 
 CPUINFO = Path("/proc/cpuinfo")
@@ -65,8 +67,8 @@ def cpu_module() -> str:
     if not usable:
         raise KernelsUnavailable(
             f"the CPU kernels were compiled for a CPU with {', '.join(lacking['_cpu'])}, which this one lacks: install "
-            "bitymi-ns again on this machine from its source, with `pip install . -Ccmake.define.BITYMI_MARCH=native` "
-            "(in a checkout: `make clean setup`)"
+            "bitymi-ns again on this machine from its source, with `pip install . "
+            "--config-settings=cmake.define.BITYMI_MARCH=native` (in a checkout: `make clean setup`)"
         )
     return usable[-1]
 
@@ -84,7 +86,7 @@ def load(name: str) -> ModuleType:
         advice = {
             "_cpu": "install the package (`pip install .`, or `make setup` in a checkout)",
             "_cuda": "install the package again where the CUDA toolkit's nvcc is found, or move the tensors to the CPU",
-            "_emulated": "install the package with -Ccmake.define.BITYMI_EMULATED_CUDA=ON",
+            "_emulated": "install the package with --config-settings=cmake.define.BITYMI_EMULATED_CUDA=ON",
         }[name]
         raise KernelsUnavailable(
             f"the compiled module bitymi_ns.{name} is missing: {advice}; the import said: {error}"
@@ -122,12 +124,10 @@ def module(device: torch.device) -> ModuleType:
 
 
 def require(operation: str, kind: str, device: torch.device, instead: str) -> None:
-    """Refuses a device on which an operation has no kernel.
+    """Refuse a device on which an operation has no kernel.
 
     Args:
-        operation: what was called.
         kind: cpu or cuda, where it has one.
-        device: of the tensors.
         instead: what to do, the end of the message.
 
     Raises:
@@ -203,7 +203,7 @@ def on_device(device: torch.device) -> AbstractContextManager[Any]:
 
 
 def on_same_device(like: Tensor, **tensors: Tensor) -> None:
-    """Checks that tensors lie where `like` does.
+    """Check that tensors lie where `like` does.
 
     Raises:
         ValueError: one does not; names it.
@@ -229,3 +229,23 @@ def dense(tensor: Tensor, like: Tensor) -> Tensor:
     if tensor.dtype != like.dtype or tensor.device != like.device:
         tensor = tensor.to(like)
     return (tensor.detach() if tensor.requires_grad else tensor).contiguous()
+
+
+class Pool(Generic[T]):
+    """Objects of one kind, made where none is idle; one is used by one thread at a time."""
+
+    def __init__(self, make: Callable[[], T]) -> None:
+        self._make = make
+        self._idle: list[T] = []
+        self._lock = threading.Lock()
+
+    @contextmanager
+    def borrow(self) -> Iterator[T]:
+        """An idle object, or a new one. It is idle again where the block ends without an error."""
+        with self._lock:
+            borrowed = self._idle.pop() if self._idle else None
+        if borrowed is None:
+            borrowed = self._make()
+        yield borrowed
+        with self._lock:
+            self._idle.append(borrowed)

@@ -21,7 +21,7 @@ def draw(
     images: Sequence[str],
     photo_pixel: float = 1.0,
 ) -> dict[str, Tensor]:
-    """Draws views of one size. On a CUDA device all in one go; on the CPU and through WebGPU one after the other.
+    """Draw views of one size. On a CUDA device all in one go; on the CPU and through WebGPU one after the other.
 
     Args:
         scene: on the device that draws; anywhere, if it asks for WebGPU.

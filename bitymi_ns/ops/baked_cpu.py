@@ -7,10 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .backend import kernel, module, require
+from .backend import Pool, kernel, module, require
 from .baked_scene import BakedScene, check_images, common_size, residual, tile_levels
 from .constants import BAKED_CHANNELS, MAP_CHANNELS
-from .pool import Pool
 from .project import GEOMETRY, Camera, project
 from .view_color import view_color
 
@@ -48,7 +47,7 @@ def coarser(atlas: Tensor, tiles: Tensor, alpha: bool) -> dict[str, Any]:
 
 
 def frame(scene: BakedScene, camera: Camera, maps: bool, photo_pixel: float = 1.0) -> tuple[Tensor, Tensor | None]:
-    """Draws a view.
+    """Draw a view.
 
     Args:
         scene: of N surfels, on the CPU.
@@ -103,9 +102,7 @@ def draw(
 ) -> dict[str, Tensor]:
     """As `baked.draw`, one view after the other."""
     require("baked_cpu.draw", "cpu", scene.tiles.device, ON_CUDA)
-    check_images(images)
-    if "packed" in images:
-        raise ValueError("the image 'packed' is drawn on a CUDA device only: draw rgb and alpha")
+    check_images(images, on_cuda=False)
     common_size(cameras)
     drawn: dict[str, list[Tensor]] = {name: [] for name in images}
     for camera in cameras:

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from .backend import function, module, on_device, require
-from .baked_scene import IMAGES, LEVELS, BakedScene, check_images, common_size, residual
-from .bc7_decode import decode_bc7
+from .baked_scene import IMAGES, LEVELS, BakedScene, check_images, common_size, decode_bc7, residual
 from .constants import TILE
 from .project import GEOMETRY, Camera
 from .view_color import LEAN, check_lean, check_view_color, lettered
@@ -78,7 +77,6 @@ class AtlasTexture:
         texels: [height, width, 4] uint8, or float16 or float32 (stored as float16); or BC7 blocks
             [height / 4, width / 4, 16] uint8. On the CPU.
         blocks: `texels` are BC7 blocks.
-        device: where the surfels are.
 
     Raises:
         ValueError: there are more texels than a texture has.
@@ -123,7 +121,6 @@ class Atlas(NamedTuple):
             pages: [pages, height, width, 4] texels, or BC7 blocks [pages, height / 4, width / 4, 16], as `AtlasTexture`
                 takes them.
             blocks: they are BC7 blocks; decoded, with a warning, where the device draws none.
-            device: where the surfels are.
         """
         pages = pages.detach().cpu()
         if blocks and not draws_blocks(device):
@@ -207,9 +204,6 @@ def slots_per_tile(capacity: int, tiles: int) -> int:
 class Workspace:
     """Working memory of frames on a device; it grows when a frame is prepared that needs more, and stays.
 
-    Args:
-        device: a CUDA device.
-
     Attributes:
         capacity: pairs of surfel and screen tile that fit, however they are distributed over the tiles.
         slots: of a tile; 0 before the first frame.
@@ -226,7 +220,7 @@ class Workspace:
         self.memory: Tensor | None = None
 
     def resize(self, surfels: int, views: int, width: int, height: int, normals: bool, capacity: int = 0) -> None:
-        """Makes room for frames of this kind with at least `capacity` pairs, or as many as `frame_fitted` found.
+        """Make room for frames of this kind with at least `capacity` pairs, or as many as `frame_fitted` found.
 
         Raises:
             ValueError: more surfels, views or pairs than a frame can have; the message gives the numbers.
@@ -271,7 +265,7 @@ class Workspace:
 
 def empty_images(names: Sequence[str], views: int, width: int, height: int, device: torch.device) -> dict[str, Tensor]:
     """Memory for images: name -> [views, height, width, channels] (IMAGES)."""
-    check_images(names)
+    check_images(names, on_cuda=True)
     shape = (views, height, width)
     return {name: torch.empty(*shape, IMAGES[name][0], dtype=IMAGES[name][1], device=device) for name in names}
 
@@ -298,7 +292,7 @@ def frame(
     stages: Stage = Stage.ALL,
     photo_pixel: float = 1.0,
 ) -> None:
-    """Draws views into `images`. Allocates nothing and does not wait: it can be recorded in a CUDA graph.
+    """Draw views into `images`. Allocates nothing and does not wait: it can be recorded in a CUDA graph.
 
     When more pairs were needed than the workspace has room for, surfels are missing: ask `workspace.complete`, `resize`
     and draw again.

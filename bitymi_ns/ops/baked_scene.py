@@ -4,10 +4,13 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
+import numpy as np
+import numpy.typing as npt
 import torch
+from PIL import Image
 from torch import Tensor
 
-from .pool import Pool
+from .backend import Pool
 from .project import Camera, Prefilter
 
 IMAGES: dict[str, tuple[int, torch.dtype]] = {
@@ -92,11 +95,13 @@ def residual(scene: BakedScene) -> dict[str, Any]:
     return {name: getattr(scene, name) for name in numbers} | dense
 
 
-def check_images(names: Sequence[str]) -> None:
-    """Raises ValueError for an image that does not exist."""
+def check_images(names: Sequence[str], on_cuda: bool) -> None:
+    """Raise ValueError for an image that does not exist, or that is drawn on CUDA devices alone."""
     unknown = [name for name in names if name not in IMAGES]
     if unknown:
         raise ValueError(f"there is no image '{unknown[0]}': choose among {', '.join(IMAGES)}")
+    if "packed" in names and not on_cuda:
+        raise ValueError("the image 'packed' is drawn on a CUDA device only: draw rgb and alpha")
 
 
 def packed(rgb: Tensor, alpha: Tensor) -> Tensor:
@@ -168,3 +173,9 @@ def tile_levels(atlas: Tensor, tiles: Tensor, alpha: bool = False) -> Iterator[t
             return
         fits = (tiles * scaled % (1 << level) == 0).all(1, keepdim=True)
         yield name, atlas.contiguous(), torch.where(fits, tiles >> (level * scaled), 0).contiguous()
+
+
+def decode_bc7(blocks: bytes, width: int, height: int) -> npt.NDArray[np.uint8]:
+    """Texels [height, width, 4] of rows of BC7 blocks from the top, where no texture unit decodes them; the sides are
+    multiples of 4."""
+    return np.array(Image.frombytes("RGBA", (width, height), blocks, "bcn", (7, "BC7")))

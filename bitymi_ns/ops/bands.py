@@ -62,9 +62,7 @@ def fitting_lists(projection: Projection, most: int = 0, rim: float = 1e-3) -> I
     rows of tiles each; smaller ones where one has too many.
 
     Args:
-        projection: of the view.
         most: fragments of a list, as in `trace`.
-        rim: as in `trace`.
 
     Raises:
         TooManyFragments: a single row of tiles has too many.
@@ -82,7 +80,7 @@ def fitting_lists(projection: Projection, most: int = 0, rim: float = 1e-3) -> I
 
 
 def by_bands(waiting: list[tuple[int, int]], draw: Callable[[int, int], T]) -> Iterator[tuple[int, int, T]]:
-    """Draws bands from top to bottom, in smaller ones where that raises `TooManyFragments`.
+    """Draw bands from top to bottom, in smaller ones where that raises `TooManyFragments`.
 
     Args:
         waiting: first and last pixel row (exclusive) of every band.

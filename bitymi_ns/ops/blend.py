@@ -23,8 +23,6 @@ def backward_memory(fragments: Fragments, maps: bool, texels: int) -> dict[str, 
     """Working memory of the backward kernel by name: none on the CPU.
 
     Args:
-        fragments: of the view.
-        maps: as in `blended_image`.
         texels: T of which gradients are added up. On CUDA a row of four numbers each; where torch is asked for
             deterministic algorithms, int64 sums in its place: a sum of integers does not depend on the order.
     """
@@ -136,7 +134,6 @@ def blended_image(
         projection: the view's, of N surfels.
         base: [N, 3] f_view of every surfel.
         texels: [T, 3] residual colours, of the fragments' dtype; None = none.
-        tiles: of the texels.
         bound: fragments of weight below this, and those of surfels without a tile, keep ReLU(f_view + 0.5).
         maps: add depth and normal.
         move_surfels: the gradient of r with respect to u and v reaches the fragments.
@@ -169,3 +166,28 @@ def blended_image(
         base = base.detach().requires_grad_()  # so that there is a backward pass, whatever else learns
     rest = (projection.geom, base, texels, residual, fragments, tiles, bound, maps, descent)
     return _BlendedImage.apply(fragments.weight, fragments.depth, uv, *rest)
+
+
+def soft_overdraw(fragments: Fragments, half: float) -> Tensor:
+    """A count of a pixel's fragments with a gradient: sum of w / (w + half), [H * W].
+
+    Args:
+        fragments: of an H x W view.
+        half: the weight that counts one half, above 0. A fragment far heavier counts 1, one far lighter w / half.
+
+    Raises:
+        ValueError: half is not above 0.
+    """
+    if not half > 0.0:
+        raise ValueError(f"the weight that counts one half must be above 0, not {half}")
+    count = fragments.weight / (fragments.weight + half)
+    return count.new_zeros(fragments.width * fragments.height).index_add(0, fragments.pixel, count)
+
+
+def composite(fragments: Fragments, values: Tensor) -> Tensor:
+    """Sums of w times any values [F, C] per pixel: [H * W, C]."""
+    if values.dim() != 2 or len(values) != len(fragments):
+        raise ValueError(f"values must have a row for each of the {len(fragments)} fragments, not {list(values.shape)}")
+    on_same_device(fragments.weight, values=values)
+    out = values.new_zeros(fragments.width * fragments.height, values.shape[1])
+    return out.index_add(0, fragments.pixel, fragments.weight[:, None] * values)

@@ -76,7 +76,6 @@ def field(x: Tensor, geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Ten
 
     Args:
         x: [M, 3] world positions.
-        geometry: of the grid.
         table: [levels, T, 4] features, T a power of two; cells are hashed by XOR of coordinate times prime.
         w1, w2, w3: [4 levels, 16], [16, 16], [16, 3] weights, input-major.
 

@@ -13,8 +13,6 @@ class TooManyFragments(RuntimeError):
     """A view has more fragments than it may have.
 
     Args:
-        geom: of the view.
-        projection: the view's.
         count, most: fragments that there are, and that there may be; also attributes.
         ids: surfel and pixel are listed, too: 8 bytes beside 5 numbers like those of `geom`.
     """

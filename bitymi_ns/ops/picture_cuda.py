@@ -99,7 +99,7 @@ def note_centers(
     visible_count: Tensor,
     max_radius: Tensor,
 ) -> None:
-    """Adds a view to the statistics of densification, in place: what `train.strategy.Strategy.accumulate` says.
+    """Add a view to the statistics of densification, in place: what `train.strategy.Strategy.accumulate` says.
 
     Args:
         projection: of the view, after its backward pass.

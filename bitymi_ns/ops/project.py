@@ -72,7 +72,7 @@ class Projection:
     alpha: TexelAlpha | None = None
 
     def take_mean2d(self, grad: Tensor, absgrad: Tensor) -> None:
-        """Notes the gradients of the projected centres; those of bands are added up in the whole view."""
+        """Note the gradients of the projected centres; those of bands are added up in the whole view."""
         if self.whole is None:
             self.mean2d_grad, self.mean2d_absgrad = grad, absgrad
         elif self.whole.mean2d_grad is None:
@@ -154,8 +154,9 @@ def project(
     near: float = 0.2,
     prefilter: Prefilter = "low_pass",
     photo_pixel: float = 1.0,
+    alpha: TexelAlpha | None = None,
 ) -> Projection:
-    """Projects surfels into a camera (2DGS ray-splat formulation in coordinates centred on the projected mean).
+    """Project surfels into a camera (2DGS ray-splat formulation in coordinates centred on the projected mean).
 
     Args:
         means: [N, 3] world positions.
@@ -170,6 +171,7 @@ def project(
         photo_pixel: side of a photograph's pixel in pixels of the view (csrc/core/resize.h); another one than 1 is for
             the baked renderer on the CPU, without gradients, and does nothing with the prefilter `pixel`. The last
             column of geom is then the height of the low pass over that of the kernel.
+        alpha: opacities of the surfels' texels; None = opaque texels.
 
     Raises:
         ValueError: shapes or devices do not agree, the camera has skew, or a gradient or a CUDA device is asked for
@@ -186,4 +188,4 @@ def project(
         raise ValueError("cameras with skew (K[0, 1] != 0) are not supported: undistort the images first")
     geometry = (means, quats, log_scales, opacity_logits, beta_raw)
     geom, frames, radii, broken = _Project.apply(camera, near, prefilter, photo_pixel, *geometry)
-    return Projection(geom, frames, radii, camera, near, prefilter, broken, photo_pixel)
+    return Projection(geom, frames, radii, camera, near, prefilter, broken, photo_pixel, alpha=alpha)

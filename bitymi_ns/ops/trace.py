@@ -134,7 +134,7 @@ class _Trace(torch.autograd.Function):
 
 
 def trace(projection: Projection, rim: float = 1e-3, most: int | None = None) -> Fragments:
-    """Finds the fragments of a view: for each pixel the surfels that are blended there, front to back by centre depth.
+    """Find the fragments of a view: for each pixel the surfels that are blended there, front to back by centre depth.
 
     They have sigma = min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))) >= 1/255. A pixel ends before the surfel
     that would take its transmittance below 1e-4. Where the projection has alpha texels, these multiply sigma
@@ -190,7 +190,6 @@ def masked_counts(fragments: Fragments, mask: Tensor, n: int) -> Tensor:
     Args:
         fragments: of a view of H x W pixels.
         mask: [H * W] bool.
-        n: number of surfels.
 
     Returns:
         [n] int32.

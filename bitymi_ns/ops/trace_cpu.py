@@ -6,9 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .backend import function, kernel_class, module, require
+from .backend import Pool, function, kernel_class, module, require
 from .fragment_list import Layout, TooManyFragments, empty_ids, empty_list
-from .pool import Pool
 from .project import Projection
 
 MOST = 1 << 25

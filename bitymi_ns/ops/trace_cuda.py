@@ -128,7 +128,7 @@ def fragment_capacity(geom: Tensor) -> int:
 
 
 def check_capacity(geom: Tensor, projection: Projection, count: int, most: int | None) -> None:
-    """Raises TooManyFragments for a list that is longer than allowed or, with most = 0, than there is memory for.
+    """Raise TooManyFragments for a list that is longer than allowed or, with most = 0, than there is memory for.
 
     The memory is looked up for a list that is longer than all before, and every `LISTS_PER_CHECK` lists."""
     if most == 0 and geom.device.type == "cuda" and count > FEW:
@@ -192,7 +192,6 @@ def backward_memory(geom: Tensor, layout: Layout, texel_alpha: Tensor | None) ->
 
     Args:
         geom: [N, 16] without graph.
-        layout: of the fragments.
         texel_alpha: [T] gradients that are added up, None = none; in int64 where torch is asked for deterministic
             algorithms.
     """

@@ -73,7 +73,7 @@ def check_view_color(kind: str, params: Mapping[str, Tensor], n: int) -> int:
 
 
 def check_lean(kind: str, params: Mapping[str, Tensor], n: int) -> None:
-    """Checks the lean view colours of n surfels; waits for a device.
+    """Check the lean view colours of n surfels; waits for a device.
 
     Raises:
         ValueError: a shape or dtype is wrong, a span lies outside the terms, or harmonics end within a degree.

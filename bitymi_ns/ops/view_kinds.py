@@ -12,7 +12,6 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from .constants import LOG_TAU_MAX, MAX_TERMS, SH_C0
-from .sphere import fibonacci_sphere
 
 Limit = tuple[float, ...]
 """Largest absolute value of a parameter, one for all its numbers or one for each along its last axis."""
@@ -267,3 +266,12 @@ def kind_of(params: Mapping[str, Tensor]) -> str:
         if all(name in params for name in entry.names):
             return kind
     raise ValueError(f"no view colour among the surfels' parameters {sorted(params)}")
+
+
+def fibonacci_sphere(n: int) -> Tensor:
+    """[n, 3] float32 unit vectors spread evenly over the sphere along a Fibonacci spiral."""
+    i = torch.arange(n, dtype=torch.float64)
+    z = 1.0 - (2.0 * i + 1.0) / n
+    phi = i * math.pi * (3.0 - math.sqrt(5.0))
+    r = torch.sqrt(1.0 - z * z)
+    return torch.stack([r * torch.cos(phi), r * torch.sin(phi), z], -1).float()

@@ -49,7 +49,7 @@ def filter_console() -> Iterator[None]:
 
 @contextmanager
 def ignore_torch_warnings() -> Iterator[None]:
-    """Ignore torch's warnings about nerfstudio's code: nobody can heed them here."""
+    """Ignore torch's warnings about nerfstudio's code: no user can act on them."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", category=FutureWarning, module="nerfstudio")
         warnings.filterwarnings("ignore", "Converting a tensor with requires_grad", UserWarning, module="nerfstudio")
@@ -79,10 +79,6 @@ def _dropping(owner: Any, name: str, dropped: Callable[[Any], bool], **always: A
 @contextmanager
 def step_bar(done: int, total: int) -> Iterator[Callable[[int], None]]:
     """A progress bar below whatever else is printed; nothing where the output is not a terminal.
-
-    Args:
-        done: steps that are done already.
-        total: steps in all.
 
     Returns:
         What is to be called with the index of every finished step.

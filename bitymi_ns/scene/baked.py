@@ -136,7 +136,7 @@ class BakedScene:
 
     @torch.no_grad()
     def render(self, camera: Camera, background: Tensor | None = None, maps: bool = False) -> BakedOutput:
-        """Renders a view: texels are fetched bilinearly, clamped to the tile's outer texel centres. A view that shows
+        """Render a view: texels are fetched bilinearly, clamped to the tile's outer texel centres. A view that shows
         the scene smaller or larger than the photographs do is drawn for its size (`sampling`); overdraw is then that of
         all samples of a pixel.
 
@@ -156,7 +156,7 @@ class BakedScene:
     def render_views(
         self, cameras: Sequence[Camera], background: Tensor | None = None, images: Sequence[str] = ("rgb", "alpha")
     ) -> dict[str, Tensor]:
-        """Renders views of one size on a CUDA device, all in one go, with the same samples per pixel.
+        """Render views of one size on a CUDA device, all in one go, with the same samples per pixel.
 
         Args:
             cameras: at least one.

@@ -59,7 +59,7 @@ class BakedRenderer:
     def draw(
         self, cameras: Sequence[Camera], check: bool = True, background: Tensor | None = None
     ) -> dict[str, Tensor]:
-        """Draws the views.
+        """Draw the views.
 
         Args:
             cameras: as many as the renderer has views, of its size.
@@ -86,7 +86,7 @@ class BakedRenderer:
         return self.images
 
     def run(self, stages: Stage = Stage.ALL) -> None:
-        """Begins the frame of the latest cameras; single stages, for timing them, are never taken from the graph."""
+        """Begin the frame of the latest cameras; single stages, for timing them, are never taken from the graph."""
         with on_device(self._viewmats.device):  # a graph is recorded on a stream of the current one
             if not self._use_graph or stages != Stage.ALL:
                 self._draw(stages)
@@ -140,7 +140,7 @@ class SceneRenderer:
 
     @torch.no_grad()
     def render(self, camera: Camera, background: Tensor | None = None, maps: bool = False) -> BakedOutput:
-        """Renders a view; arguments and images are those of `BakedScene.render`."""
+        """Render a view; arguments and images are those of `BakedScene.render`."""
         scene, device = self.scene, self.scene.tiles.device
         # a graph keeps the size of a photograph's pixel: views that show the scene smaller or larger go without one
         if scene.through_webgpu or not cuda_backend(device) or scene.sampling([camera]) != Sampling():

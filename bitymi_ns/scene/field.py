@@ -33,7 +33,6 @@ class ResidualField(nn.Module):
         """Arguments of `blended_image` for the residual of a view.
 
         Args:
-            fragments: of the view.
             frames: [N, 9] of its `Projection`.
             bound: fragments of weight below this have no residual.
             learns: whether it gets gradients.
@@ -66,12 +65,10 @@ class HashField(ResidualField):
     The residual starts at zero: the last layer does. Table entries start at U(-1e-4, 1e-4).
 
     Args:
-        config: levels, resolutions, table size.
         mid: centre of the domain, world.
         half: radius of the uncontracted ball, or half edge of the box, world units.
         contract: contraction of space outside.
         log2_table_size: entries per level, as a power of two.
-        generator: random numbers of the start.
     """
 
     def __init__(
@@ -214,7 +211,7 @@ class TexelField(ResidualField):
 
     @torch.no_grad()
     def keep(self, rows: Tensor) -> None:
-        """Lets go of all surfels but `rows` [n] int64, which are in that order from now on."""
+        """Keep the surfels `rows` [n] int64 alone, in that order."""
         old = self.tiles.rows_of(rows)
         self.texels = nn.Parameter(self.texels.detach()[old])
         self.alpha = None if self.alpha is None else nn.Parameter(self.alpha.detach()[old])

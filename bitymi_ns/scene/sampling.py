@@ -58,12 +58,7 @@ def size_of(photographed: Tensor, camera: Camera) -> float:
 
 
 def sampling_of(size: float, pixels: int) -> Sampling:
-    """Choose the samples per pixel of a view.
-
-    Args:
-        size: of `size_of`.
-        pixels: of the view.
-    """
+    """Choose the samples per pixel of a view."""
     low, high = AS_TRAINED
     if low <= size <= high:
         return Sampling()

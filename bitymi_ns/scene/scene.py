@@ -78,7 +78,6 @@ class RenderOutput:
 
         Args:
             image: [H * W, C] of `ops.blended_image`, and the soft overdraw as last channel where there is one.
-            projection, fragments: of the view.
             background: [3] colour behind the scene; None = black.
             maps: the image has depth and normals.
             soft_overdraw: it has the soft overdraw.
@@ -109,7 +108,6 @@ class Scene(nn.Module):
     """Beta surfels with a view-dependent colour each, and a residual colour field.
 
     Args:
-        config: the representation.
         surfels: initial per-surfel parameters by name (docs/overview.md), first dimension N each.
         field: residual colours: `HashField`, or `TexelField`; None = surfels alone.
         near: nearest drawn depth, camera z, where the configuration does not give it.
@@ -134,7 +132,7 @@ class Scene(nn.Module):
         return self.surfels["means"].shape[0]
 
     def make_room(self, state: Mapping[str, Tensor], prefix: str = "") -> None:
-        """Gives the surfels' parameters the rows, and the field the texels, of a state that is loaded next.
+        """Give the surfels' parameters the rows, and the field the texels, of a state that is loaded next.
 
         Args:
             state: of a scene of the same configuration.
@@ -164,7 +162,7 @@ class Scene(nn.Module):
         maps: bool = False,
         overdraw_half: float | None = None,
     ) -> RenderOutput:
-        """Renders a view: visibility, then shading, then compositing.
+        """Render a view: visibility, then shading, then compositing.
 
         On a card surfels and texels are drawn without a list of fragments, where neither maps nor the overdraw are
         asked for. A view with more fragments than `config.max_fragments`, or than memory holds, is drawn in bands.

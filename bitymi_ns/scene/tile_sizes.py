@@ -112,7 +112,6 @@ def coarsened(sides: Tensor, texels: Tensor, r_min: int = 4) -> Tensor:
     Args:
         sides: [N, 2] int32 (r_u, r_v), powers of two of at least `r_min`.
         texels: [N] how many each may have.
-        r_min: smallest side.
 
     Returns:
         [N, 2] int32.
@@ -129,7 +128,7 @@ def coarsened(sides: Tensor, texels: Tensor, r_min: int = 4) -> Tensor:
 
 def max_projected_extent(
     means: Tensor, axes: Tensor, scales: Tensor, cameras: Sequence[Camera], extent: float = SUPPORT, near: float = 0.2
-) -> tuple[Tensor, Tensor]:
+) -> Tensor:
     """Largest projected size in pixels of every surfel's tile, per tangent axis, over the training views.
 
     The segment from -e s_a to +e s_a along axis a is projected with the Jacobian of the pinhole at the surfel's
@@ -145,10 +144,9 @@ def max_projected_extent(
         near: nearest drawn depth, camera z.
 
     Returns:
-        (max_pixels [N, 2] float32, 0 where unseen; views [N] int32, the number of views that see the surfel).
+        [N, 2] float32 pixels, 0 where unseen.
     """
     max_pixels = torch.zeros_like(scales)  # [N, 2]
-    views = torch.zeros(len(means), dtype=torch.int32, device=means.device)
     steps = axes * (2.0 * extent * scales)[:, None, :]  # [N, 3, 2] whole side of the tile
     for camera in cameras:
         viewmat, K = camera.viewmat.to(means), camera.K.to(means)
@@ -165,8 +163,7 @@ def max_projected_extent(
         seen &= (py > -reach_y) & (py < camera.height + reach_y)
         pixels = torch.where(seen[:, None], torch.hypot(du, dv), torch.zeros_like(du))
         max_pixels = torch.maximum(max_pixels, pixels)
-        views += seen.to(torch.int32)
-    return max_pixels, views
+    return max_pixels
 
 
 def kernel_parameters(surfels: Mapping[str, Tensor], transmittance: Tensor | None = None) -> tuple[Tensor, Tensor]:

@@ -55,7 +55,6 @@ def visibility(
 
     Args:
         surfels: the per-surfel parameters of docs/overview.md, N rows, all of them finite and drawable.
-        cameras: the views.
         near: nearest drawn depth.
         weight_bound: fragments of smaller weight get no residual.
         prefilter: as in `ops.project`.
@@ -68,8 +67,7 @@ def visibility(
     seen = torch.zeros(len(cameras), len(means), dtype=torch.bool, device=means.device)
     for done, camera in enumerate(cameras, start=1):
         here = torch.zeros_like(pixels)
-        projection = project(means, *geometry, camera.to(means.device), near, prefilter)
-        projection.alpha = alpha
+        projection = project(means, *geometry, camera.to(means.device), near, prefilter, alpha=alpha)
         for fragments in fitting_lists(projection):
             lists = (fragments.surfel, fragments.weight, fragments.sigma)
             for surfel, weight, sigma in zip(*(values.split(PART) for values in lists), strict=True):

@@ -96,7 +96,6 @@ class _Grid(NamedTuple):
 
         Args:
             x, y, z: [V] pixel coordinates and camera z.
-            count: points in a usual view.
         """
         longer, shorter = max(camera.width, camera.height), min(camera.width, camera.height)
         side = longer / min(CELLS, max(1.0, math.sqrt(count / POINTS_PER_CELL * longer / shorter)))

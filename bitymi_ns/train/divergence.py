@@ -7,11 +7,10 @@ from collections import deque
 from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
-from torch import nn
 
 TOGETHER = 4  # steps whose losses are sent to the host together
 

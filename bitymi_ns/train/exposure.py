@@ -62,7 +62,6 @@ class Exposure:
     ) -> None:
         """
         Args:
-            kind: the option.
             exif: log2 of the exposure of each training view (`exif_stops`), NaN = unknown; None = of all.
             photographs: number of the photograph of each training view, from 0 on: views of one share its correction;
                 None = each is a photograph of its own.
@@ -76,7 +75,7 @@ class Exposure:
         self._optimizer: SparseAdam | None = None
 
     def start(self, points: Tensor, views: Sequence[View], near: float) -> None:
-        """Decides whether photographs are corrected, and where the corrections start from.
+        """Decide whether photographs are corrected, and where the corrections start from.
 
         Args:
             points: [M, 3] of the scene, at best those of the capture.
@@ -156,7 +155,7 @@ class Exposure:
 
     @torch.no_grad()
     def average(self, processes: Processes) -> None:
-        """Makes the gradients of this process's photographs those of the mean loss of all photographs of the step."""
+        """Make the gradients of this process's photographs those of the mean loss of all photographs of the step."""
         if self.table is None:
             return
         rows = self.table.new_zeros(len(self.table), self.table.shape[1] + 1)
@@ -171,7 +170,7 @@ class Exposure:
             self.table.grad = torch.sparse_coo_tensor(shown[None], values, sizes, check_invariants=False)
 
     def step(self, rate: float) -> None:
-        """Learns from the gradients of a step's loss, which it clears.
+        """Update the corrections by the gradients of a step's loss, and clear these.
 
         Args:
             rate: learning rate, of logarithms and other entries alike.
@@ -199,11 +198,10 @@ class Exposure:
     def load_state_dict(
         self, state: Mapping[str, Any] | None, count: int, device: torch.device | str | None = None
     ) -> None:
-        """Goes on where `state_dict` was taken; what belongs to another option or other photographs is left.
+        """Continue where `state_dict` was taken; what belongs to another option or other photographs is left.
 
         Args:
             state: None = of a run from before there were corrections: `auto` then leaves all as it is.
-            count: number of training views.
             device: where the corrections are wanted, because a checkpoint may have been loaded elsewhere; None = where
                 those of `state` are.
         """
@@ -231,7 +229,6 @@ def corrected(
     Args:
         views: of the run, at full size.
         state: of its `Exposure`; None = it had none.
-        photographs: see `Exposure`.
 
     Raises:
         ValueError: there are more or fewer photographs than the run had.
@@ -275,7 +272,6 @@ def seeds(stops: Sequence[float] | None, count: int) -> Tensor:
 
     Args:
         stops: by `exif_stops` for each photograph, NaN = unknown.
-        count: V.
     """
     if stops is None:
         return torch.zeros(count, 3)
@@ -296,7 +292,7 @@ class ExposureGains(NamedTuple):
 
 @torch.no_grad()
 def estimate_gains(points: Tensor, views: Sequence[View], near: float) -> ExposureGains:
-    """Compares the photographs at the points.
+    """Compare the photographs at the points.
 
     Args:
         points: [M, 3] world positions.

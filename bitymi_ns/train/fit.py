@@ -114,10 +114,7 @@ def fit(
     """Train a scene in place.
 
     Args:
-        scene: what is learned.
         views: training views at full size.
-        eval_views: held-out views for the log.
-        max_steps: length of the run.
         callback: called after each step with the trainer, the loss terms, the view and the strategy's report.
         eval_steps: numbers of steps after which the log gets an entry; the end of the run always gets one.
     """

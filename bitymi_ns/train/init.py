@@ -23,7 +23,7 @@ BETA_RAW = 2.0  # nearly Gaussian kernels at the start: beta = 4 sigmoid(2) = 3.
 MAX_SCALE = 0.25
 """Largest first scale, as a share of the scene extent or of the distance to the nearest camera, whichever is larger."""
 PIXELS_PER_FIRST_SURFEL = 1000  # fewest pixels rendered in a run per first surfel
-FEWEST_FIRST = 5000  # points that are never thinned, however short the run
+FEWEST_FIRST = 5000  # points that are always used, however short the run
 MIN_SCALE = 1e-6  # smallest first scale, as a share of the scene extent
 SAMPLE = 4096  # surfels that are tested first for whether a view sees them: nearly all views see one of them
 CHUNK = 1 << 20  # of the others that are tested together
@@ -45,7 +45,6 @@ def first_surfels_for(steps: int, pixels: float) -> int:
     """The most surfels that a run starts with, where `TrainConfig.first_surfels` is not given.
 
     Args:
-        steps: length of the run.
         pixels: of a training view at full size.
     """
     return max(FEWEST_FIRST, int(steps * pixels / PIXELS_PER_FIRST_SURFEL))
@@ -90,7 +89,7 @@ def surfels_from_points(
     camera with a random turn in its plane, the colour is the point's from every direction. Points that are not finite
     and repeated positions are dropped and counted. With no usable point, `config.random_points` surfels are placed at
     random in `box`. `config.densify.max_surfels` and `config.first_surfels` hold from the start: more points than that
-    are thinned at random. As many of the background points follow as `config.background_points` and
+    are sampled at random. As many of the background points follow as `config.background_points` and
     `config.densify.max_surfels` allow.
 
     Args:
@@ -147,14 +146,14 @@ def surfels_from_points(
     return surfels, report
 
 
-def neighbour_distance(xyz: Tensor, extent: float, neighbours: int = 3) -> Tensor:
+def neighbour_distance(xyz: Tensor, extent: float) -> Tensor:
     """[M] root mean square distance of every point to its nearest neighbours (as many as there are, up to 3).
 
     A point on its own gets a hundredth of the extent.
     """
     from scipy.spatial import cKDTree  # slow to import and needed once per run
 
-    k = min(neighbours, len(xyz) - 1)
+    k = min(3, len(xyz) - 1)
     if k < 1:
         return torch.full((len(xyz),), 0.01 * extent)
     points = xyz.double().numpy()
@@ -219,9 +218,14 @@ def facing(normals: Tensor, angles: Tensor) -> Tensor:
     tilt = torch.stack([1.0 + z, -y, x, zero], -1)  # shortest rotation from (0, 0, 1); vanishes at -z
     flip = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=tilt.dtype, device=tilt.device)
     tilt = torch.where((tilt.norm(dim=-1) < 1e-4)[:, None], flip, tilt)
-    w, i, j, k = (tilt / tilt.norm(dim=-1, keepdim=True)).unbind(-1)
+    return turned(tilt / tilt.norm(dim=-1, keepdim=True), angles)
+
+
+def turned(quats: Tensor, angles: Tensor) -> Tensor:
+    """Rotations [N, 4] after turns [N] about their normals, from the first tangent to the second."""
+    w, x, y, z = quats.unbind(-1)
     cos, sin = torch.cos(angles / 2), torch.sin(angles / 2)
-    return torch.stack([w * cos - k * sin, i * cos + j * sin, j * cos - i * sin, k * cos + w * sin], -1)
+    return torch.stack([w * cos - z * sin, x * cos + y * sin, y * cos - x * sin, z * cos + w * sin], -1)
 
 
 def tangents(quats: Tensor) -> Tensor:
@@ -259,8 +263,6 @@ def build_scene(
         points: [M, 3] world positions; M may be 0.
         colours: [M, 3] in [0, 1].
         camera_centers: [C, 3] world positions of the training cameras.
-        scene_config: the representation.
-        train_config: training options.
         bounded: there is nothing behind the scene (images with alpha): contraction "auto" is then off, as it is for
             scenes with a small `declared` box.
         image_pixels: of all training images together; decides the size of the hash table where none is given.
@@ -303,7 +305,6 @@ def scene_for_views(
         views: training photographs at full size.
         points: [M, 3] world positions; M may be 0.
         colors: [M, 3] in [0, 1].
-        scene_config, train_config: the representation, and training options.
 
     Raises:
         ValueError: an option is out of range.
@@ -350,10 +351,6 @@ def views_without_surfels(scene: Scene, cameras: Sequence[Camera]) -> list[int]:
 
     A surfel counts as seen where the ball around it, as large as its disc, reaches beyond the near plane and into the
     picture.
-
-    Args:
-        scene: as training starts.
-        cameras: of the views.
     """
     means = scene.surfels["means"].detach()
     radii = SUPPORT * scene.surfels["log_scales"].detach().exp().amax(-1)

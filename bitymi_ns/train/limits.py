@@ -10,9 +10,6 @@ def short_run(schedule: Schedule, views: int, field: bool = True, at_once: int =
     """The rules for short runs that are in force, and whether the run sees all of its photographs.
 
     Args:
-        schedule: of the run.
-        views: number of training views.
-        field: whether the texture is a field.
         at_once: views that a step looks at.
     """
     found = []
@@ -40,7 +37,6 @@ def start(points: PointReport, config: TrainConfig, image_pixels: int, scene: Sc
     Args:
         points: what became of the sparse points.
         image_pixels: of all training images together.
-        scene: the representation.
     """
     found = []
     if points.over_cap:

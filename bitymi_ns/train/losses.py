@@ -38,7 +38,6 @@ def objective(
     Args:
         output: the rendered view, [H, W]; with `soft_overdraw` where the overdraw loss is on.
         target: [H, W, 3] the photograph at the same size, over the same background.
-        config: weights.
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
         depth, normal: of the view, see `View`; they count where the view was rendered with maps.
 

@@ -112,7 +112,7 @@ def set_rate(optimizer: Optimizer, rate: float) -> None:
 
 
 def forget_gradients(optimizers: Iterable[Optimizer]) -> None:
-    """Takes the gradients from all parameters, as `zero_grad` of each optimiser would."""
+    """Set the gradients of all parameters to None, as `zero_grad` of each optimiser would."""
     for optimizer in optimizers:
         for group in optimizer.param_groups:
             for parameter in group["params"]:

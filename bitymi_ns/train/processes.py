@@ -100,16 +100,16 @@ class Processes:
     # sums
 
     def sum(self, *tensors: Tensor) -> None:
-        """Replaces tensors by their sums over the processes, the same bits in all, in one buffer of each dtype."""
+        """Replace tensors by their sums over the processes, the same bits in all, in one buffer of each dtype."""
         self._reduce(tensors, dist.ReduceOp.SUM)
 
     def maximum(self, tensor: Tensor) -> None:
-        """Replaces a tensor by its largest values over the processes."""
+        """Replace a tensor by its largest values over the processes."""
         self._reduce([tensor], dist.ReduceOp.MAX)
 
     @torch.no_grad()
     def average_gradients(self, parameters: Sequence[Tensor], surfels: int) -> None:
-        """Replaces gradients that were summed over the views of this process by their means over all views of the step.
+        """Replace gradients that were summed over the views of this process by their means over all views of the step.
 
         A parameter that no view moves keeps having none.
 

@@ -1,7 +1,7 @@
 """Keeps a run from ending in a broken scene: notices divergence, goes back to the last good state, lowers the rates.
 
 What counts as divergence:
-- a loss that is not finite, where a parameter is to blame (broken images are not: nothing here could mend them);
+- a loss that is not finite, where a parameter is to blame (broken images are not: nothing here could correct them);
 - surfels that are not finite, beyond a hundredth of them (fewer are dropped and counted);
 - views drawn worse than blank ones: over a window of steps the mean photometric loss exceeds two others. One is the
   loss of views that show only their own mean colour, the other that of the scene as the run found it. In the first
@@ -109,7 +109,6 @@ class RollbackGuard:
         """Call before each step: keeps the state that the run starts from, and measures the loss of its first scene.
 
         Args:
-            step: index of the step.
             views: the training views. They are compared at full size: small pictures may hold no window of SSIM, and
                 then have smaller losses.
         """
@@ -177,7 +176,6 @@ class RollbackGuard:
         """Call after each step, when optimisers and strategy are done with it.
 
         Args:
-            step: index of the step.
             loss: scalar, photometric loss of the step, without graph. On a CUDA device it is read when a window
                 ends, and so is the next one; on the CPU at once.
             broken: [1] int32, surfels that could not be drawn because they are not finite.

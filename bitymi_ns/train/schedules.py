@@ -148,9 +148,6 @@ class Schedule:
 
         It falls to 0 as a cosine, so texels can move half as far as they would at its start. Few passes over the views
         at `rate` would end before the texels are where the photographs want them.
-
-        Args:
-            step: index of the step.
         """
         texels = self.config.texels
         needed = 2.0 * texels.travel * views / self.texel_steps

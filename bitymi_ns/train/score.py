@@ -61,7 +61,6 @@ def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig, 
     Every fragment that is blended at a bad pixel counts one for its surfel, whatever its weight.
 
     Args:
-        scene: N surfels.
         views: K views, at the size in which they are to be judged; none gives zero scores.
         processes: each renders its share of the views.
     """

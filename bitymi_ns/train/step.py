@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import time
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -27,7 +28,6 @@ from bitymi_ns.train.views import DownscaledViews, TrainingData, View, step_back
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import RenderOutput, Scene
-import time
 
 
 def view_losses(
@@ -36,10 +36,8 @@ def view_losses(
     """Render a training view and compare it with its photograph.
 
     Args:
-        scene: what is learned.
         view: on the scene's device, its picture at the size of its camera.
         schedule, step: which parts of the scene learn.
-        watch: checks the losses of the run.
 
     Returns:
         The weighted terms of the loss (their sum is the objective), and the rendered view.
@@ -96,12 +94,10 @@ class Training:
         """
         Args:
             scene: changed in place.
-            data: what it is learned from.
             optimizers: one per surfel parameter, under its name, and those of the field.
             max_steps: length of the run; the schedules depend on it.
             on_resize: told the name and the new Parameter after each replacement of a surfel parameter.
             announce: told in a sentence whenever the run goes back, or surfels are dropped.
-            processes: of the run.
 
         Raises:
             ValueError: a training option is out of its range.
@@ -158,10 +154,10 @@ class Training:
             set_rate(optimizer, self.guard.factor * self.schedule.lr(name, self.step))
 
     def losses(self, view: View) -> tuple[dict[str, Tensor], RenderOutput]:
-        """`view_losses` of the step's view. Where they are not finite, the guard mends the scene and it is drawn anew.
+        """`view_losses` of the step's view. Where they are not finite, the guard repairs the scene and draws it again.
 
         Raises:
-            TrainingDiverged: nothing can be mended, or it has been tried too often.
+            TrainingDiverged: nothing can be repaired, or it has been tried too often.
         """
         while True:
             self.texels.prepare(self.step, view, self.guard.factor)

@@ -72,7 +72,6 @@ class Strategy:
             on_resize: told the name and the new Parameter after each replacement of a surfel parameter.
             image_pixels: of all training images at full size, for `densify.pixels_per_surfel`; 0 = without that bound.
             first_surfels: that training started with, for `densify.growth`.
-            processes: of the run.
         """
         self.config = schedule.config
         self.processes = processes
@@ -142,7 +141,6 @@ class Strategy:
         Args:
             step: index of the step that just ended.
             scene: its surfel parameters are replaced when their number changes.
-            optimizers: by surfel parameter name.
             views: draws the views for the score.
 
         Returns:
@@ -301,7 +299,6 @@ def most_surfels(config: TrainConfig, image_pixels: int, first_surfels: int = 0)
 
     Args:
         image_pixels: of all training images at full size.
-        first_surfels: that training started with.
     """
     densify = config.densify
     by_pixels = int(image_pixels / densify.pixels_per_surfel) if densify.pixels_per_surfel > 0 else 0

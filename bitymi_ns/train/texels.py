@@ -74,11 +74,7 @@ class LearningTexels:
         return self.processes.views * self.schedule.texel_steps
 
     def prepare(self, step: int, view: View, factor: float) -> None:
-        """Set the step size of the texels for the backward pass of this view.
-
-        Args:
-            factor: of all rates.
-        """
+        """Set the step size of the texels for the backward pass of this view."""
         field = self.scene.field
         if not isinstance(field, TexelField):
             return
@@ -127,7 +123,7 @@ class LearningTexels:
 
     @torch.no_grad()
     def step(self) -> None:
-        """Moves them by the mean of what each view of the step would have moved them by."""
+        """Move colours and alphas by the mean of the steps of all views."""
         field = self.scene.field
         for values in self._stepped:
             if values.grad is not None:
@@ -147,7 +143,6 @@ def blank_texels(
     A surfel of which no view shows a residual has one texel.
 
     Args:
-        scene: its surfels.
         views: sample to measure on, at full size; their pictures do not matter.
         count: of all training views, which these stand for.
         to_come: views that the texels learn from, counted with repetition.
@@ -192,7 +187,6 @@ def single_view_coverage(
     steps a hundred times too long.
 
     Args:
-        surfels: of N rows.
         cameras: the measured views; the others are about as near.
         size: [N, 2] of the tiles.
         extent: [N] half sides of the tiles in scale units.
@@ -205,7 +199,7 @@ def single_view_coverage(
 def tile_pixels(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], extent: Tensor, near: float) -> Tensor:
     """Sides of the tiles of half sides `extent` in the view that shows them largest: pixels [N, 2]."""
     scales, axes = surfels["log_scales"].exp(), tangents(surfels["quats"])
-    return max_projected_extent(surfels["means"], axes, scales, cameras, SUPPORT, near)[0] * (extent / SUPPORT)[:, None]
+    return max_projected_extent(surfels["means"], axes, scales, cameras, SUPPORT, near) * (extent / SUPPORT)[:, None]
 
 
 def tiles_as_seen(
@@ -221,9 +215,6 @@ def tiles_as_seen(
     that shows most of the surfel.
 
     Args:
-        surfels: of N rows.
-        cameras: the views.
-        seen: what they see.
         near: nearest drawn depth.
         weight_bound: fragments of smaller weight get no residual.
         to_come: views that the texels learn from, counted with repetition.

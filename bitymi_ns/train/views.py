@@ -337,7 +337,6 @@ class OnDemand(Sequence, Generic[T]):
     """A sequence whose items are made whenever they are asked for.
 
     Args:
-        count: its length.
         make: gives the item of an index, 0 to count - 1.
     """
 

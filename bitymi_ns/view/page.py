@@ -75,12 +75,12 @@ class Site:
 
 
 def media_type(path: str) -> str:
-    """By the ending of a name; what is not known is never guessed."""
+    """Media type by the extension of a name; unknown ones are bytes."""
     return TYPES.get(Path(path).suffix.lower(), "application/octet-stream")
 
 
 def page_files() -> dict[str, Callable[[], bytes | bytearray]]:
-    """What gives the files of the built page, by name.
+    """Readers of the files of the built page, by name.
 
     Raises:
         PageError: it was not built.
@@ -137,7 +137,7 @@ def _about(bundle: Path) -> bytes:
 
 class _Shown:
     """A bundle that is being served. Its files have the sizes and hashes of its bundle.json whenever they are read; a
-    bundle that is exported anew meanwhile is served as it is then."""
+    bundle that is exported again meanwhile is served as it is then."""
 
     def __init__(self, bundle: Path) -> None:
         self._bundle = bundle
@@ -151,7 +151,7 @@ class _Shown:
         self._as_of = as_of
 
     def _stamp(self) -> tuple[int, ...]:
-        """Changes when bundle.json, or the one file, is written."""
+        """A value that changes when bundle.json, or the one file, is written."""
         path = self._bundle if os.path.isfile(self._bundle) else self._bundle / MANIFEST
         try:
             found = os.stat(path)
@@ -176,11 +176,9 @@ class _Shown:
 
 
 def write_static(site: Site, folder: Path, overwrite: bool = False) -> int:
-    """Writes what is served to a folder, which appears complete or not at all.
+    """Write the files that are served to a folder, which appears complete or not at all.
 
     Args:
-        site: the page and its bundle.
-        folder: where to.
         overwrite: replace a page that was written there before.
 
     Returns:
@@ -198,7 +196,7 @@ def write_static(site: Site, folder: Path, overwrite: bool = False) -> int:
         bundles = (folder / "bundle" / "bundle.json", folder / SINGLE)
         ours = (folder / "index.html").is_file() and any(bundle.is_file() for bundle in bundles)
         if not ours:
-            raise PageError(f"{folder} holds something else than an exported page: choose another folder")
+            raise PageError(f"{folder} holds something other than an exported page: choose another folder")
         if not overwrite:
             raise PageError(f"{folder} is there already: choose another folder, or add --overwrite")
         made = {*site.paths, *page_files(), "view.json", SINGLE}

@@ -93,7 +93,7 @@ class _Handler(BaseHTTPRequestHandler):
         return set(bodies) == {"0"} and len(self.headers.get_all("Host", [])) < 2 and not self.headers.defects
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Refuses a request that is none of ours, and ends the connection."""
+        """Refuse a request that is not supported, and end the connection."""
         self.close_connection = True
         self.request_version = self.protocol_version  # else one that is not understood is answered without a header
         status = HTTPStatus(code)
@@ -149,7 +149,7 @@ def serve(
         request_seconds: after which a request that has not come to its end is left.
 
     Raises:
-        PageError: the address cannot be listened at.
+        PageError: the address cannot be used.
     """
     if not 0 <= port <= 0xFFFF:
         raise PageError(f"the port must be from 0 to 65535, not {port}")
@@ -157,7 +157,7 @@ def serve(
         return _Server(site, host, port, request_seconds)
     except (OSError, ValueError) as error:  # ValueError: a name that none can be
         why = getattr(error, "strerror", None) or error
-        raise PageError(f"{host} port {port} cannot be listened at: {why}") from error
+        raise PageError(f"cannot listen at {host} port {port}: {why}") from error
 
 
 def is_loopback(server: ThreadingHTTPServer) -> bool:

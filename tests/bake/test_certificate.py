@@ -12,9 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bitymi_ns.bake import Baked, BakeOptions, Learning, TuneOptions, bake, bake_and_learn, export
-from bitymi_ns.bake.certificate import certified
 from bitymi_ns.bake.compact import Compact
-from bitymi_ns.bake.tile_errors import averaged, cells_per_pixel, closest_pixels, listed_errors
+from bitymi_ns.bake.tile_errors import averaged, cells_per_pixel, certified, closest_pixels, listed_errors
 from bitymi_ns.bake.tiles import Shown
 from bitymi_ns.bake.verify import check_field
 from bitymi_ns.bundle import check_files

@@ -87,7 +87,7 @@ def test_the_pictures_are_as_good_as_is_asked_for(truth: Baked, views: list[View
         assert rounded.statistics.rounding.mse <= coder.error * (10 ** (loss / 10) - 1) * 1.1
         sizes.append(rounded.codes.surfels.nbytes())
     assert sizes[1] < sizes[0]
-    with pytest.raises(ValueError, match="cannot be had: ask for less"):
+    with pytest.raises(ValueError, match="cannot be reached: ask for less"):
         compacted(truth, views, BACKGROUND, Compact(psnr=coder.psnr + 1))
 
 

@@ -8,7 +8,7 @@ pytest.importorskip("bitymi_ns._cpu")
 from bitymi_ns.bake import BakeOptions, bake, export
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.ops import VIEW_COLORS
-from bitymi_ns.ops.reference.texel import texel
+from bitymi_ns.ops.reference.render import texel
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.scene import Scene

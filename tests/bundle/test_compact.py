@@ -14,9 +14,8 @@ from bitymi_ns.bundle.read import read_manifest
 from bitymi_ns.bundle.sizes import least_memory
 from bitymi_ns.cli import main
 from bitymi_ns.codec.limits import ALPHA_SCALE
-from bitymi_ns.codec.pages import covered_blocks
+from bitymi_ns.codec.pages import covered_blocks, texel_alpha
 from bitymi_ns.codec.quantise import encode
-from bitymi_ns.codec.scene_texels import texel_alpha
 from bitymi_ns.ops.baked_cuda import decoded
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from tests.bundle.compact_scene import FINEST, RANGE, make_codes, pages_of, scene_of, write_compact

@@ -79,7 +79,7 @@ def test_bundles_of_earlier_versions_have_no_digest_and_later_ones_must():
 @pytest.mark.parametrize(
     "text, reason",
     [
-        (b'"count": 3, "count": 3', "the key 'count' is there twice"),
+        (b'"count": 3, "count": 3', "the key 'count' occurs twice"),
         (b'"count": NaN', "NaN is not a finite number"),
         (b'"count": -Infinity', "-Infinity is not a finite number"),
         (b'"count": 1e999', "1e999 is not a finite number"),
@@ -130,7 +130,7 @@ def test_a_key_that_is_there_twice_among_many_is_found_at_once(where: str) -> No
     keys.insert(len(keys) if where == "at the end" else 1, keys[-1] if where == "at the end" else keys[0])
 
     def refused() -> None:
-        with pytest.raises(ValueError, match="the key 'k[0-9]+' is there twice"):
+        with pytest.raises(ValueError, match="the key 'k[0-9]+' occurs twice"):
             strict_json.loads(f"{{{','.join(keys)}}}".encode())
 
     quick(refused)

@@ -198,7 +198,7 @@ def test_rotations_that_are_not_unit_and_texels_beyond_their_limit_are_refused(s
     with pytest.raises(BundleError, match=r"atlas.ktx2: the texel \(5, 3\) of layer 0 is not from -256 to 256"):
         read_bundle(folder)
     change_columns(folder, lambda columns: columns["rot_0"].__setitem__(4, 1.5))
-    with pytest.raises(BundleError, match="rot_0 to rot_3 have not the length 1 in row 4"):
+    with pytest.raises(BundleError, match="rot_0 to rot_3 are not of length 1 in row 4"):
         read_bundle(folder)
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from bitymi_ns import ops
-from bitymi_ns.codec.scene_texels import scene_texels, texel_alpha
+from bitymi_ns.codec.pages import scene_texels, texel_alpha
 from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera

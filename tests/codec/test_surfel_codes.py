@@ -7,9 +7,8 @@ import torch
 from bitymi_ns.codec.limits import EXTENTS, LIMITS
 from bitymi_ns.codec.surfel_codes import POSITION_BITS, REFERENCE, code_surfels, morton_cells, morton_codes, reordered
 from bitymi_ns.measure.stability.scenes import random_scene
-from bitymi_ns.ops.sphere import fibonacci_sphere
 from bitymi_ns.ops.view_color import view_color
-from bitymi_ns.ops.view_kinds import VIEW_COLORS
+from bitymi_ns.ops.view_kinds import VIEW_COLORS, fibonacci_sphere
 from tests.ops.test_view_color import lean_parameters
 
 COUNT = 200

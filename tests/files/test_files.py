@@ -56,7 +56,7 @@ def test_a_kill_at_any_step_leaves_the_old_or_the_new_and_nothing_else(kind: str
 def test_a_folder_has_one_writer_and_the_next_one_cleans_up(tmp_path: Path, call: str) -> None:
     with another_process(call, tmp_path / "b") as process:
         before = names(tmp_path)
-        with pytest.raises(files.Busy, match=f"process {process.pid} is at work there: wait for it, or end it"):
+        with pytest.raises(files.Busy, match=f"process {process.pid} is writing there: wait for it, or end it"):
             with files.complete_folder(tmp_path / "b"):
                 pass
         assert names(tmp_path) == before and ".b.lock" in before
@@ -124,10 +124,10 @@ def a_loop(folder: Path) -> Path:
 @pytest.mark.parametrize(
     ("place", "why"),
     [
-        (below_a_file, "file is not a folder: give another place"),
+        (below_a_file, "file is not a folder: choose another path"),
         (a_loop, "leads back to itself|is not a folder"),
-        (lambda folder: folder / ("x" * 300), "the name is too long: give a shorter one"),
-        (lambda folder: Path("/proc/nothing/b"), "nothing can be made in /proc .*: give another place"),
+        (lambda folder: folder / ("x" * 300), "the name is too long: choose a shorter one"),
+        (lambda folder: Path("/proc/nothing/b"), "nothing can be made in /proc .*: choose another folder"),
         (lambda folder: Path("/sys/b"), "does not permit|no permission|read-only"),
         (lambda folder: Path("/proc"), "mount point"),
     ],
@@ -160,7 +160,7 @@ def test_a_read_only_and_a_full_disk(small_disk: Path) -> None:
     assert names(small_disk) == ["f"] and (small_disk / "f").read_bytes() == b"old"
     assert 0 < files.free_bytes(small_disk / "a" / "b") < 1 << 20
     subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
-    with pytest.raises(ValueError, match="the file system is read-only: give a place on another one"):
+    with pytest.raises(ValueError, match="the file system is read-only: write to another one"):
         with files.explained(small_disk / "b", ValueError):
             files.check_writable(small_disk / "b")
 

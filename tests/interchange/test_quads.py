@@ -11,7 +11,7 @@ from bitymi_ns.interchange.draw_quads import _fetch, draw_quads, nearest
 from bitymi_ns.interchange.glb import glb_bytes
 from bitymi_ns.interchange.quads import Quads, quads_of
 from bitymi_ns.interchange.recolor import recolored
-from bitymi_ns.ops.reference.texel import texel
+from bitymi_ns.ops.reference.render import texel
 from bitymi_ns.scene.tile_sizes import kernel_parameters
 from bitymi_ns.train.init import tangents
 from tests.interchange.glb import read_glb

@@ -20,7 +20,7 @@ from bitymi_ns.measure.stability.scenes import (
 )
 from bitymi_ns.ops.reference import project as reference_project
 from bitymi_ns.ops.reference import trace as reference_trace
-from bitymi_ns.ops.reference.texel import texel
+from bitymi_ns.ops.reference.render import texel
 from bitymi_ns.ops.reference.trace import SUPPORT
 from bitymi_ns.scene import Camera
 

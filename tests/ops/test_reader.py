@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from bitymi_ns.ops.backend import module
-from bitymi_ns.ops.pool import Pool
+from bitymi_ns.ops.backend import Pool, module
 
 kernels = module(torch.device("cpu"))
 

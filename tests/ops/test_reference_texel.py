@@ -2,7 +2,7 @@
 
 import torch
 
-from bitymi_ns.ops.reference.texel import texel, texel_centers
+from bitymi_ns.ops.reference.render import texel, texel_centers
 
 
 def test_at_a_texel_centre_the_texel_itself() -> None:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from bitymi_ns.ops import view_color
-from bitymi_ns.ops.sphere import fibonacci_sphere
+from bitymi_ns.ops.view_kinds import fibonacci_sphere
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import DensifyConfig, TrainConfig

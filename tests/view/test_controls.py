@@ -16,8 +16,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from bitymi_ns.bake import export
 from bitymi_ns.view import site_of
 from tests.view.browser import Outcome, drive, served
+from tests.view.conftest import baked_scene
 
 SCREEN = (900, 500)
 PHONE = (390, 780)
@@ -264,6 +266,15 @@ def test_the_capture_s_cameras_and_the_way_home(bundle: Path) -> None:
             assert view.focal == pytest.approx(rows[k]["fx"])
     assert not np.allclose(seen[9].position, places[0], atol=1e-3)
     assert page[last] == "1"  # home is the first view, not a camera that was chosen
+
+
+def test_keys_for_cameras_do_nothing_without_cameras(tmp_path: Path) -> None:
+    export(baked_scene("bc7", 120, False, False, "sv", 0.0, False, ()), tmp_path / "bare")
+    page = Steps()
+    page.do(["key", ","], ["key", "."])
+    state = page.ask("document.documentElement.dataset.state")
+    page.run(tmp_path / "bare")
+    assert page[state] == "ready"
 
 
 def test_the_photograph_is_beside_the_picture(bundle: Path) -> None:

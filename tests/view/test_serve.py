@@ -93,7 +93,7 @@ def test_the_server_listens_on_the_loopback_address_alone(bundle: Path) -> None:
     server = serve(site_of(bundle))
     try:
         assert server.server_address[0] == "127.0.0.1"
-        with pytest.raises(PageError, match="cannot be listened at"):
+        with pytest.raises(PageError, match="cannot listen at"):
             serve(site_of(bundle), port=server.server_address[1])
     finally:
         server.server_close()
@@ -187,7 +187,7 @@ def test_an_exported_page_is_complete_and_replaces_only_its_like(bundle: Path, t
     other = tmp_path / "other"
     other.mkdir()
     (other / "precious").write_text("x")
-    with pytest.raises(PageError, match="something else"):
+    with pytest.raises(PageError, match="something other"):
         write_static(site_of(bundle), other, overwrite=True)
     assert (other / "precious").read_text() == "x"
 
@@ -332,10 +332,10 @@ def test_every_address_of_this_machine_answers_to_its_name(bundle: Path, host: s
     [
         (["--port", "99999"], "the port must be from 0 to 65535, not 99999"),
         (["--port", "-1"], "the port must be from 0 to 65535, not -1"),
-        (["--host", "192.0.2.1"], "cannot be listened at"),
-        (["--host", "127.0.0.1.5"], "cannot be listened at"),
-        (["--host", "a..b"], "cannot be listened at"),
-        (["--host", "::zz"], "cannot be listened at"),
+        (["--host", "192.0.2.1"], "cannot listen at"),
+        (["--host", "127.0.0.1.5"], "cannot listen at"),
+        (["--host", "a..b"], "cannot listen at"),
+        (["--host", "::zz"], "cannot listen at"),
     ],
 )
 def test_an_address_that_is_none_is_said(bundle: Path, options: list[str], said: str, capsys) -> None:

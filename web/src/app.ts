@@ -3,18 +3,16 @@ import type { Bundle } from './bundle/load';
 import type { Vec3 } from './bundle/manifest';
 import type { Depths, DrawOptions, Renderer } from './render/renderer';
 import type { Show } from './render/programs';
-import type { Screen } from './render/screen';
+import { Pace, type Screen } from './render/screen';
 import { download, element, onClick, press, pressed, typing } from './ui/dom';
 import { NotesPanel } from './ui/notes_panel';
-import { notify, showError, stopped } from './ui/pages';
+import { endPoster, notify, showError, stopped } from './ui/pages';
 import { PathPanel } from './ui/path_panel';
-import { endPoster } from './ui/poster';
 import type { Stage } from './ui/stage';
 import { type CaptureCamera, commonTarget, parseCameras } from './view/cameras';
 import { Controls, type Mode } from './view/controls';
-import { Flight } from './view/flight';
 import type { Notes } from './view/notes';
-import { Pace } from './view/pace';
+import { Flight } from './view/path';
 import { DEFAULT_LENS, type Lens, type Pose, View, moved } from './view/pose';
 import { type Shared, type Viewpoint, fromHash, toHash } from './view/share';
 import { extentOf, firstPose } from './view/start';
@@ -326,6 +324,7 @@ export class App implements Stage {
   }
 
   private jump(k: number): void {
+    if (!this.cameras.length) return; // by a key: the buttons are hidden
     this.chosen = (k + this.cameras.length) % this.cameras.length;
     this.go(this.cameras[this.chosen]);
     this.setPhotograph();

@@ -14,8 +14,7 @@ import { Renderer } from './render/renderer';
 import { SceneOnDevice } from './render/scene';
 import { screenOf } from './render/screen';
 import { element } from './ui/dom';
-import { notify, onError, showError, showProgress, showScene } from './ui/pages';
-import { showPoster } from './ui/poster';
+import { notify, onError, showError, showPoster, showProgress, showScene } from './ui/pages';
 import { type Notes, parseNotes } from './view/notes';
 import { fromHash } from './view/share';
 

@@ -5,7 +5,7 @@ import json
 import random
 from pathlib import Path
 
-from bitymi_ns.ops.bc7_decode import decode_bc7
+from bitymi_ns.ops.baked_scene import decode_bc7
 
 EACH = 64
 

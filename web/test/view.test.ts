@@ -1,7 +1,7 @@
 import { describe, expect, it } from 'vitest';
 import type { Vec3 } from '../src/bundle/manifest';
 import { commonTarget, parseCameras } from '../src/view/cameras';
-import { Pace } from '../src/view/pace';
+import { Pace } from '../src/render/screen';
 import { DEFAULT_LENS, View, look, lookAt, orbit } from '../src/view/pose';
 import { fromHash, toHash } from '../src/view/share';
 import { firstPose } from '../src/view/start';

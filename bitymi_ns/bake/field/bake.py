@@ -41,7 +41,6 @@ def bake(
 
     Args:
         cameras: training views, for the cap on tile sizes and for what they see; with none nothing is left out for it.
-        progress: called after every chunk of work.
         pixels_per_texel: for a bake that is polished next: a tile gets at most a texel for so many pixels that its
             surfel makes up of the view that shows most of it, and is not encoded; view colours stay whole. `reduced`
             then does what the options say. None = as the options say at once.

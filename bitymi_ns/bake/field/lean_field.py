@@ -34,7 +34,6 @@ def level_changes(
 
     Args:
         surfels: per-surfel parameters, N rows.
-        left_out: sets of levels.
         transmittance: [N] of `Visibility`, None = 1.
         weight_bound: fragments of smaller weight get no residual.
 
@@ -79,7 +78,6 @@ def lean_field(
         surfels: per-surfel parameters, N rows.
         transmittance: [N] of `Visibility`, None = 1.
         weight_bound: fragments of smaller weight get no residual.
-        tolerance: of the bake, 8-bit steps.
 
     Returns:
         the field, and what was left out.

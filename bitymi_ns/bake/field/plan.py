@@ -54,7 +54,6 @@ def make_plan(inputs: BakeInput, field: Field, options: BakeOptions, whole: bool
     Args:
         inputs: surfels that are all finite and drawable, and the training views, for the cap and the weights.
         field: the residual field, for its voxel size.
-        options: sizes.
         whole: every tile has the extent of the options and is probed at the texels of the rule; else it covers what
             reaches the weight bound and is probed at the Nyquist rate.
     """
@@ -95,8 +94,6 @@ def paper_texels(surfels: Mapping[str, Tensor], field: Field, options: BakeOptio
 
     Args:
         surfels: means [N, 3], log_scales [N, 2] of all surfels that can be drawn.
-        field: the whole residual field.
-        options: smallest and largest tile.
     """
     scales = surfels["log_scales"].exp()
     finest = torch.stack([field.voxel_size(part).amin() for part in surfels["means"].split(options.chunk)]).amin()

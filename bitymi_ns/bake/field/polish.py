@@ -141,7 +141,6 @@ def polish_scene(
         train: options of the training, for the learning rates, the colours behind the scene, and for what is done when
             a step is not finite.
         eval_views: views of which the gain is stated; they decide nothing.
-        device: where the scene learns.
 
     Returns:
         a new bake with `statistics.polish`, to be `reduced`; `baked` itself without change where there are fewer than 4

@@ -41,7 +41,7 @@ class ViewGraph:
     inliers: dict[tuple[str, str], int]  # matches per pair that fit a common geometry; pairs without are missing
 
     def components(self) -> list[set[str]]:
-        """Sets of photographs that hang together, the largest first; those alone are not among them."""
+        """Connected sets of photographs, the largest first, without single photographs."""
         sets = DisjointSet(self.features)
         for first, second in self.inliers:
             sets.merge(first, second)
@@ -97,7 +97,7 @@ def why_none(job: Job, graph: ViewGraph) -> NoPoses:
         )
     parts = graph.components()
     if not parts or len(parts[0]) < max(3, 0.2 * count):
-        together = f"at most {len(parts[0])} of {count} hang together" if parts else "no two of them show the same"
+        together = f"at most {len(parts[0])} of {count} are connected" if parts else "no two of them show the same"
         return NoPoses(f"the photographs do not overlap: {together}. {SHOOT}")
     return NoPoses(
         f"{len(parts[0])} of {count} photographs overlap, but no poses explain what they show: the scene may have "

@@ -17,7 +17,7 @@ from bitymi_ns.capture.types import CONTRADICTED
 Mapper = Callable[[Job, Path, Path, StageProgress], dict[int, pycolmap.Reconstruction]]
 """Maps the features and matches of a database with a folder for its files; returns connected components."""
 ENOUGH = 0.9
-"""The global mapper's poses are taken as they are if they are of this share of the photographs that hang together."""
+"""The global mapper's poses are taken as they are if they are of this share of the connected photographs."""
 GOOD_ERROR = 1.0
 """... and their reprojection error is below so many pixels of the photographs as features were found on them, and few
 matches contradict them."""
@@ -31,7 +31,7 @@ LEAST_POINTS = 10  # fewer points are none to start from
 
 
 def reconstruct(job: Job, database: Path, connected: int, tell: StageProgress) -> pycolmap.Reconstruction | None:
-    """The best model of the photographs, or None where there is none; `connected` of them hang together by verified
+    """The best model of the photographs, or None where there is none; `connected` of them are connected by verified
     pairs."""
     found = None
     if job.mapper in ("auto", "global"):

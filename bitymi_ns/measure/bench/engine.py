@@ -193,7 +193,6 @@ def run_chains(work: Path, chains: Sequence[Chain]) -> list[str]:
     """Do the missing cells of run after run.
 
     Args:
-        work: folder of runs and finished cells.
         chains: the cells of each run.
 
     Returns:

@@ -37,7 +37,6 @@ def run_measured(
     OpenMP threads wait without spinning, so that CPU seconds count work.
 
     Args:
-        log: file for its output.
         lock: inherited by the command and naming it: when this process is killed while the command goes on, the lock
             outlives it.
         cwd, env: working folder and environment of the command; default: those of this process.

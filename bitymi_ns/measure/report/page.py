@@ -10,7 +10,7 @@ from bitymi_ns import __version__
 from bitymi_ns.capture.report import PICTURE
 from bitymi_ns.files import check_writable, explained, write_file
 from bitymi_ns.measure.markdown import rendered
-from bitymi_ns.measure.report.pictures import ERROR_CAPTION, compare_views, read_pictures, worst_views
+from bitymi_ns.measure.report.pictures import ERROR_CAPTION, compare_views, encode_files, worst_views
 from bitymi_ns.measure.report.plots import Plot, draw_plots
 from bitymi_ns.measure.report.read import collect
 from bitymi_ns.measure.report.records import Records, ReportError, over_seeds
@@ -44,7 +44,7 @@ def compose(records: Records, title: str) -> dict[str, Any]:
     poses = []
     for path, values in found.values():
         caption, picture = "Cameras (red) and points, from above and from the side.", path.with_name(PICTURE)
-        pictures = read_pictures([(caption, picture)] if picture.is_file() else [], notes)
+        pictures = encode_files([(caption, picture)] if picture.is_file() else [], notes)
         poses.append((poses_tables(values), pictures))
     return {
         "title": title,
@@ -82,7 +82,6 @@ def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report"
             `fragments`, `psnr`), cells and pictures of `bitymi bench`, report.json of camera poses, PNG images
             of ns-eval, and folders that are searched for all of these.
         output_dir: folder of the report; created if needed. A report of an earlier call is replaced.
-        title: heading of the page.
 
     Returns:
         The path of index.html.

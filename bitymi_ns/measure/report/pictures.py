@@ -78,7 +78,7 @@ def encode(image: Image.Image, caption: str) -> Picture:
     return Picture(caption, mime, buffer.getvalue(), image.width, image.height)
 
 
-def read_pictures(files: Sequence[tuple[str, Path]], notes: list[str]) -> tuple[Picture, ...]:
+def encode_files(files: Sequence[tuple[str, Path]], notes: list[str]) -> tuple[Picture, ...]:
     """Encode captioned files; those that cannot be read are noted."""
     pictures = []
     for caption, path in files:
@@ -93,7 +93,7 @@ def worst_views(views: Mapping[str, Sequence[tuple[str, Path]]], notes: list[str
     """Encode the pictures of the worst views, one group per view."""
     if len(views) > MAX_WORST:
         notes.append(f"{len(views) - MAX_WORST} more worst views are not shown; the page holds {MAX_WORST}.")
-    read = {title: read_pictures(files, notes) for title, files in list(views.items())[:MAX_WORST]}
+    read = {title: encode_files(files, notes) for title, files in list(views.items())[:MAX_WORST]}
     return [Group(title, tuple((picture,) for picture in pictures)) for title, pictures in read.items() if pictures]
 
 

@@ -104,7 +104,7 @@ def read_jsonl(path: Path) -> tuple[list[Evaluation], list[Curve], list[str]]:
     return evaluations, [curve_from(points, path)] if points else [], notes
 
 
-def read_pictures(path: Path, run: str = "") -> dict[str, list[tuple[str, Path]]]:
+def picture_files(path: Path, run: str = "") -> dict[str, list[tuple[str, Path]]]:
     """Read the worst views that a pictures.json lists, as in `Records`; empty when the file is something else.
 
     Raises:
@@ -180,7 +180,7 @@ def _add_run(trained: Evaluation, suffix: str, cells: dict[tuple[str, str], dict
                 own = {"baked": bool(bundle), "label": group + suffix, "group": group}
                 records.evaluations.append(replace(trained, results=results, **own))
             elif kind == "pictures" and (listed := folder / value["folder"] / PICTURES).is_file():
-                records.worst |= read_pictures(listed, trained.label)
+                records.worst |= picture_files(listed, trained.label)
         except (KeyError, TypeError, AttributeError) as error:
             raise ReportError(f"{trained.source}: the {kind} cell of {trained.method} lacks {error}.") from error
     curve = folder / str(train["curve"]) if train.get("curve") else None
@@ -217,7 +217,7 @@ def _read(path: Path, records: Records) -> bool:
     if path.suffix.lower() == ".png":
         records.images.append(path)
     elif path.name == PICTURES:
-        records.worst |= read_pictures(path)
+        records.worst |= picture_files(path)
     elif path.suffix.lower() == ".jsonl":
         if path.name == CELLS:
             try:

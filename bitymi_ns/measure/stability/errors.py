@@ -124,8 +124,6 @@ def measure(
 
     Args:
         case: scene and camera, float64.
-        backend: what to measure.
-        dtype: of its tensors.
         near: nearest depth that is drawn, camera z.
         way: what is drawn of it, and how.
     """

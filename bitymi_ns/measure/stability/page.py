@@ -138,10 +138,6 @@ def measure_row(label: str, scene: SceneCase, backend: Backend, near: float = 0.
 def write(path: Path, backend: Backend = BACKENDS["cpu"], progress: Callable[[str], None] | None = None) -> list[Row]:
     """Measure all cases and sweeps and write the page and, beside it, the plot `<stem>.png`.
 
-    Args:
-        path: of the Markdown file.
-        backend: kernels to measure.
-
     Returns:
         The rows of the cases and the sweeps.
     """

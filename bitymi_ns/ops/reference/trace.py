@@ -46,6 +46,12 @@ def _power(base: Tensor, exponent: Tensor, floor: float) -> Tensor:
 PIXEL_VARIANCE = 0.25  # pixels^2, along each axis
 
 
+def _jacobian(projection: Projection) -> tuple[Tensor, Tensor]:
+    """J = d pixel / d (u, v) at the centre [N, 2, 2], and its depth [N], 1 where the surfel is not valid."""
+    M, z = projection.M, torch.where(projection.valid, projection.depth, 1.0)
+    return (M[:, :2, :2] - projection.mean2d[:, :, None] * M[:, 2:, :2]) / z[:, None, None], z
+
+
 def _filtered(projection: Projection, pixels: Tensor, near: float) -> tuple[Tensor, Tensor, Tensor]:
     """Kernel times area share [P, N], uv [P, N, 2] and depth [P, N] with the prefilter (docs/numerics.md).
 
@@ -53,14 +59,13 @@ def _filtered(projection: Projection, pixels: Tensor, near: float) -> tuple[Tens
     perspective there is omega = z / depth = 1 - e.a, with the disc's depth z (1 + e.(u, v)). Outside of the disc's
     image, omega is taken at the rim in the direction of a. Then Sigma = omega^2 J J^T + c, c = 2 (beta + 2) / 9 / 4.
     """
-    M, z = projection.M, torch.where(projection.valid, projection.depth, 1.0)
-    J = (M[:, :2, :2] - projection.mean2d[:, :, None] * M[:, 2:, :2]) / z[:, None, None]  # [N, 2, 2]
+    J, z = _jacobian(projection)
     area = torch.linalg.det(J)
     flat = area == 0  # exactly edge-on
     safe = torch.where((flat | ~projection.valid)[:, None, None], torch.eye(2, dtype=J.dtype), J)
     d = pixels[:, None] - projection.mean2d  # [P, N, 2]
     a = torch.linalg.solve(safe, d[..., None])[..., 0]
-    e = M[:, 2, :2] / z[:, None]  # [N, 2]
+    e = projection.M[:, 2, :2] / z[:, None]  # [N, 2]
     tilt = (a * e).sum(-1)  # [P, N]
     length = torch.where(
         (a == 0).all(-1), 0.0, (torch.where((a == 0).all(-1, keepdim=True), 1.0, a) ** 2).sum(-1).sqrt()
@@ -88,8 +93,7 @@ def _resized(projection: Projection, photo_pixel: float) -> tuple[Tensor, Tensor
     """
     variance = max(0.0, (1 - photo_pixel**2) / 12)
     radius2 = photo_pixel**2 + 2 * variance
-    M, z = projection.M, torch.where(projection.valid, projection.depth, 1.0)
-    J = (M[:, :2, :2] - projection.mean2d[:, :, None] * M[:, 2:, :2]) / z[:, None, None]  # [N, 2, 2]
+    J, _ = _jacobian(projection)
     unit = torch.eye(2, dtype=J.dtype).expand_as(J)
     seen = projection.valid & (torch.linalg.det(J) != 0)  # not exactly edge-on
     inverse = torch.linalg.inv(torch.where(seen[:, None, None], J, unit))

@@ -28,7 +28,9 @@ def library() -> ModuleType:
     try:
         return importlib.import_module("wgpu")
     except Exception as error:  # its library may be for another system: what it then raises is not written down
-        raise WebGpuUnavailable(f"drawing through WebGPU needs the package wgpu ({INSTALL}): {error}") from error
+        raise WebGpuUnavailable(
+            f"drawing through WebGPU needs Python 3.11 and the package wgpu ({INSTALL}): {error}"
+        ) from error
 
 
 @functools.cache
@@ -62,7 +64,6 @@ def check_room(array_bytes: int, groups: int, size: tuple[int, int], layers: int
         array_bytes: of the largest buffer.
         groups: largest number of groups of threads that are started at once.
         size: width and height of a texture.
-        layers: of it.
 
     Raises:
         WebGpuUnavailable: it does not; says what is too large.

@@ -251,7 +251,7 @@ class SceneOnDevice:
         self._device.queue.write_buffer(self._frame, 0, data)
 
     def draw(self, camera: Camera, show: str, layers: int, photo_pixel: float = 1.0) -> npt.NDArray[np.float32]:
-        """Draws a view.
+        """Draw a view.
 
         Args:
             show: of `SHOW`.
@@ -340,9 +340,7 @@ def draw(
     Raises:
         WebGpuUnavailable: the package wgpu or a graphics device is missing.
     """
-    check_images(images)
-    if "packed" in images:
-        raise ValueError("the image 'packed' is drawn on a CUDA device only: draw rgb and alpha")
+    check_images(images, on_cuda=False)
     common_size(cameras)
     texels = (scene.tiles, scene.atlas, scene.blocks, scene.extent, scene.mean_residual, scene.mean_alpha)
     sources = (*scene.surfels.values(), *texels)

@@ -111,12 +111,12 @@ class Programs:
 
     @cached_property
     def blend(self) -> Any:
-        """Adds a fragment times the transmittance in front of it."""
+        """Add a fragment times the transmittance in front of it."""
         return self._draw({"operation": "add", "src_factor": "dst-alpha", "dst_factor": "one"})
 
     @cached_property
     def count_fragments(self) -> Any:
-        """Adds fragments as they are."""
+        """Add fragments as they are."""
         return self._draw({"operation": "add", "src_factor": "one", "dst_factor": "one"})
 
     @cached_property
@@ -124,7 +124,7 @@ class Programs:
         return self._module("halve")
 
     def halve(self, format: str, alpha: bool) -> Any:
-        """Renders a page at half its size to a target of this format; `alpha`: with colours weighted by alpha."""
+        """Render a page at half its size to a target of this format; `alpha`: with colours weighted by alpha."""
         entry = f"halve{'_alpha' if alpha else ''}_{'bytes' if format == 'rgba8unorm' else 'floats'}"
         module = self._halve_module
         wgpu = library()

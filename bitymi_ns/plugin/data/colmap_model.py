@@ -142,7 +142,7 @@ def _naming_file(path: Path) -> Iterator[None]:
     except (struct.error, ValueError, LookupError, AssertionError, MemoryError, OverflowError) as error:
         what = "is cut off or damaged" if path.suffix == ".bin" else f"has a line that cannot be read ({error})"
         hint = " Each image has two lines; the second, of its 2D points, may be empty." * (path.name == "images.txt")
-        fail(f"{path} {what}.{hint} Copy the model again, or write it anew from COLMAP.", error)
+        fail(f"{path} {what}.{hint} Copy the model again, or export it from COLMAP again.", error)
 
 
 @functools.cache
@@ -162,7 +162,7 @@ def _check_cameras(path: Path, cameras: dict[int, ColmapCamera]) -> None:
             written = " ".join(f"{value:g}" for value in numbers)
             fail(
                 f"{path}{_line_of(path, number)}: camera {number} ({camera.model} {written}) cannot be used: its size "
-                "has to be positive and all numbers finite. Correct it, or write the model anew from COLMAP."
+                "has to be positive and all numbers finite. Correct it, or export the model from COLMAP again."
             )
         if count is not None and len(camera.params) != count:
             fail(

@@ -92,7 +92,6 @@ def find_source(
     """Find a model's photographs and masks; photographs may be missing where they are not needed.
 
     Args:
-        folder: of the model.
         capture: folder to which the paths are relative, and below which photographs are searched; where it is that of
             the model, the folders above it, too.
         downscale: use photographs that are smaller by this factor.

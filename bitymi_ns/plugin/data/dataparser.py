@@ -191,7 +191,7 @@ class BitymiDataParser(DataParser):
         if found.unread:
             named = listed([f"{path.name} ({program})" for path, program in found.unread])
             warn(
-                f"{found.folder} holds poses that cannot be read: {named}. Poses are found anew from the photographs. "
+                f"{found.folder} holds poses that cannot be read: {named}. Poses are computed from the photographs. "
                 "To have those used, export a COLMAP model, or convert them with `ns-process-data`."
             )
         if found.format == "blender":

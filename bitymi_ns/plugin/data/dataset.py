@@ -168,15 +168,12 @@ def _fill(image: Tensor, mask: Tensor, color: tuple[float, float, float]) -> Ten
 
 
 class CachedImages(Sequence):
-    """Batches of a dataset (image, mask, metadata): kept while the budget lasts, read anew at every use beyond it.
+    """Batches of a dataset (image, mask, metadata): kept while the budget lasts, read at every use beyond it.
 
     All are read once at the start, so that one that cannot be read is noticed then.
 
     Args:
-        dataset: to read.
-        image_type: of the pixels.
         budget: shared with other datasets.
-        description: for the progress bar.
     """
 
     def __init__(
@@ -253,5 +250,5 @@ def warn_of_other_capture(before: Mapping[str, Any], now: Mapping[str, Any]) -> 
         return
     warn(
         f"The run that is continued was trained on another capture: {what}. Photographs that are held out now may have "
-        "been trained on, and what was learned of another scene stays in the picture. Train anew where that matters."
+        "been trained on, and what was learned of another scene stays visible. Where that matters, train a new run."
     )

@@ -147,9 +147,8 @@ def _check_normals(outputs: DataparserOutputs, maps: Sequence[MapFiles]) -> None
     rows = [i for i, files in enumerate(maps) if files.normal is not None]
     for i in [rows[k] for k in spread(len(rows), 8)]:
         lens: Lens = outputs.metadata["lenses"][i]
-        normal, to = read_normal(maps[i], lens), lens.pinhole
-        x, y = (np.arange(to.width) + 0.5 - to.cx) / to.fx, (np.arange(to.height) + 0.5 - to.cy) / to.fy
-        away = normal[..., 0] * x[None, :] + normal[..., 1] * y[:, None] + normal[..., 2] > 0.0
+        normal = read_normal(maps[i], lens)
+        away = (normal * lens.pinhole.rays).sum(-1) > 0.0
         known = normal.any(-1)
         if known.any() and away[known].mean() > 0.2:
             warn(
@@ -304,7 +303,7 @@ def _votes(xyz: Floats, own: int, seen: Sequence[_Seen]) -> npt.NDArray[np.int64
 
 
 def _new_points(seen: Sequence[_Seen], files: Sequence[Path], count: int) -> tuple[Floats, npt.NDArray[np.uint8]]:
-    """Points [N, 3] on what the maps show, with colors [N, 3], evenly thinned to at most `count`.
+    """Points [N, 3] on what the maps show, with colors [N, 3], evenly sampled to at most `count`.
 
     Points that more views see through than agree with are left out. A point is taken from one of the views that agree,
     so that what many of them show gets no more points than the rest.

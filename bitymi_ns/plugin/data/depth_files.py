@@ -119,7 +119,7 @@ def read_normal(files: MapFiles, lens: Lens) -> Values:
     return lens.undistort_map((normal * (1.0, -1.0, -1.0)).astype(np.float32), files.normal)
 
 
-_WITHOUT = "Write it anew, or train without: `bitymi-data --depth off`."
+_WITHOUT = "Write it again, or train without: `bitymi-data --depth off`."
 
 
 def _read(path: Path) -> npt.NDArray[np.generic]:

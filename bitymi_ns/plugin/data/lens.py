@@ -54,6 +54,12 @@ class Pinhole(NamedTuple):
         down = math.atan(self.cy / self.fy) + math.atan((self.height - self.cy) / self.fy)
         return math.degrees(across), math.degrees(down)
 
+    @property
+    def rays(self) -> npt.NDArray[np.float64]:
+        """[H, W, 3] rays through the pixels' centres, of z 1, OpenCV axes."""
+        x, y = (np.arange(self.width) + 0.5 - self.cx) / self.fx, (np.arange(self.height) + 0.5 - self.cy) / self.fy
+        return np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), -1)
+
 
 @dataclass(frozen=True)
 class Lens:
@@ -89,10 +95,7 @@ class Lens:
     @property
     def coverage(self) -> npt.NDArray[np.bool_]:
         """Pixels [h, w] of the result that the photograph shows."""
-        to = self.pinhole
-        x, y = (np.arange(to.width) + 0.5 - to.cx) / to.fx, (np.arange(to.height) + 0.5 - to.cy) / to.fy
-        rays = np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), -1)
-        return covered(self.camera, self.face, rays)
+        return covered(self.camera, self.face, self.pinhole.rays)
 
     def undistort(self, image: Image.Image) -> Image.Image:
         """Undistort an 8-bit image of any mode, decoded at `stored` or less, but not below the size of `camera`."""
@@ -143,7 +146,6 @@ def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tupl
     Args:
         colmap: for the size to which photographs are downscaled.
         stored: width and height of the image files, which may be larger.
-        label: names the camera in messages.
 
     Returns:
         the lenses, and messages on what becomes of the photographs.
@@ -164,7 +166,7 @@ def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tupl
     if not np.isfinite(params).all() or min(focal) <= 0.0 or min(width, height) < 1:
         fail(
             f"{label} ({model}, {width} x {height}, {camera.params_to_string()}) cannot be used: its size and focal "
-            "lengths have to be positive and all parameters finite. Correct it, or write the model anew from COLMAP."
+            "lengths have to be positive and all parameters finite. Correct it, or export the model from COLMAP again."
         )
     center = (camera.principal_point_x, camera.principal_point_y)
     if not _distorts(camera):

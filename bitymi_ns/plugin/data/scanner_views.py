@@ -134,7 +134,7 @@ def _intrinsics(folder: Path) -> tuple[float, ...]:
     if path is None:
         fail(
             f"{folder} has poses, but no file with the camera ({', '.join(names[:4])}). Put one there with the matrix "
-            "fx 0 cx, 0 fy cy, 0 0 1, a row on each line; or have poses found anew: `bitymi-data --format photographs`."
+            "fx 0 cx, 0 fy cy, 0 0 1, a row on each line; or compute the poses: `bitymi-data --format photographs`."
         )
     values = np.loadtxt(path)
     if values.ndim == 2 and min(values.shape) >= 3:

@@ -148,7 +148,7 @@ def kept_settings(folder: Path, requested: SfmSettings) -> SfmSettings:
     if unused:
         warn(
             f"{' and '.join(unused)} {'is' if len(unused) == 1 else 'are'} not used: the run goes on with the poses it "
-            f"was trained with, in {folder}, because what it has learned fits no others. To have poses found anew, "
+            f"was trained with, in {folder}, because what it has learned fits no others. To have poses computed again, "
             "start a new run: leave out --load-dir and --load-checkpoint."
         )
     return settings or requested

@@ -14,7 +14,7 @@ from bitymi_ns.plugin.data.splits import NameLists
 from bitymi_ns.trust import json_of
 
 HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data <photos> --output-dir <capture>`."
-HOW_TO_MEND = "Correct it there (JSON has neither comments nor a comma behind the last entry), or write the file anew."
+HOW_TO_CORRECT = "Correct it there (JSON has neither comments nor a comma behind the last entry), or write it again."
 INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
 FILE_KEYS = ("file_path", "mask_path", "depth_file_path", "normal_file_path")
 LATLONG = ("latlong", "is_latlong")
@@ -40,7 +40,7 @@ def load_transforms(path: Path, own_format: bool) -> dict[str, Any]:
     except FileNotFoundError as error:
         fail(f"{path} does not exist, which this kind of capture needs. {HOW_TO_GET_ONE}", error)
     except (ValueError, OSError) as error:
-        fail(f"{path} cannot be read: {error}. {HOW_TO_MEND if path.is_file() else HOW_TO_GET_ONE}", error)
+        fail(f"{path} cannot be read: {error}. {HOW_TO_CORRECT if path.is_file() else HOW_TO_GET_ONE}", error)
     _drop_nulls(meta)
     _check_frames(path, meta, own_format)
     if own_format:

@@ -235,7 +235,7 @@ def make_lenses(photographs: Sequence[Photograph], downscale: int = 1, need_phot
             fail(
                 f"the image {photograph.file} has {size[0]} x {size[1]} pixels, but its camera is for {full[0]} x "
                 f"{full[1]}, of which 1/{downscale} is {small[0]} x {small[1]}. Make the folder "
-                f"{photograph.file.parent} anew, or leave --downscale-factor out."
+                f"{photograph.file.parent} again, or leave --downscale-factor out."
             )
         used = size or small
         key = (camera, used, photograph.downscaled)

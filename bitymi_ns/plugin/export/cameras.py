@@ -9,6 +9,7 @@ import torch
 from PIL import Image
 
 from bitymi_ns.bundle.parts import CAMERAS
+from bitymi_ns.interchange.bundle_cameras import camera_row
 from bitymi_ns.scene.baked import as_bytes
 from bitymi_ns.scene.camera import Camera
 
@@ -20,8 +21,6 @@ def camera_files(datamanager: Any, train: Sequence[Camera], photographs: bool) -
     whether it was held out; and the photographs of those.
 
     Args:
-        datamanager: of the trained scene.
-        train: the training cameras.
         photographs: also the held-out photographs, as JPEG of at most `MOST_PIXELS` along a side.
     """
     files: dict[str, bytes] = {}
@@ -35,19 +34,6 @@ def camera_files(datamanager: Any, train: Sequence[Camera], photographs: bool) -
             files[row["photograph"]] = _jpeg(view.target(torch.zeros(3), "cpu"))
         rows.append(row)
     return {CAMERAS: (json.dumps({"cameras": rows}) + "\n").encode(), **files}
-
-
-def camera_row(name: str, camera: Camera, held_out: bool) -> dict[str, Any]:
-    """One camera of cameras.json: intrinsics in pixels, viewmat [16] by rows (world to camera, OpenCV axes)."""
-    K = camera.K.cpu().tolist()
-    return {
-        "name": name,
-        "held_out": held_out,
-        "width": camera.width,
-        "height": camera.height,
-        **{"fx": K[0][0], "fy": K[1][1], "cx": K[0][2], "cy": K[1][2]},
-        "viewmat": camera.viewmat.cpu().flatten().tolist(),
-    }
 
 
 def _jpeg(image: torch.Tensor) -> bytes:

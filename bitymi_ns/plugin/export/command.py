@@ -62,8 +62,6 @@ class CompactOptions:
         """Stop where an option is out of its range, or is for another format than that of the bundle.
 
         Args:
-            form: format of the bundle.
-            tolerance: of the bake.
             bc7_profile: that was asked for.
         """
         compact = form == "compact"
@@ -282,11 +280,6 @@ class ExportAtlas(BakeOptions, CompactOptions):
             say(f"In {folder}: {summary_line(each)}")
 
 
-def default_export() -> ExportAtlas:
-    """The options with their defaults; what has none is left open."""
-    return ExportAtlas(load_config=tyro.MISSING, output_dir=tyro.MISSING)
-
-
 def bundle_config(config: Any, folder: Path, background: tuple[float, ...]) -> bytes:
     """The config.yml with which nerfstudio's tools open the bundle.
 
@@ -303,7 +296,7 @@ def bundle_config(config: Any, folder: Path, background: tuple[float, ...]) -> b
 
 def main() -> None:
     """Command line of this module."""
-    tyro.cli(tyro.conf.FlagConversionOff[ExportAtlas], default=default_export()).main()
+    tyro.cli(tyro.conf.FlagConversionOff[ExportAtlas]).main()
 
 
 if __name__ == "__main__":

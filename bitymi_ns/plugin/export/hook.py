@@ -48,8 +48,8 @@ def extended(commands: Any) -> Any:
 
     from bitymi_ns.plugin.export import command, mesh
 
-    atlas = tyro.conf.subcommand(name=COMMAND, description=DESCRIPTION, default=command.default_export())
-    surface = tyro.conf.subcommand(name=MESH_COMMAND, description=MESH_DESCRIPTION, default=mesh.default_export())
+    atlas = tyro.conf.subcommand(name=COMMAND, description=DESCRIPTION)
+    surface = tyro.conf.subcommand(name=MESH_COMMAND, description=MESH_DESCRIPTION)
     ours = (Annotated[command.ExportAtlas, atlas], Annotated[mesh.ExportMesh, surface])
     members = get_args(commands) if get_origin(commands) in (Union, UnionType) else (commands,)
     return Union[(*members, *ours)]  # noqa: UP007 - built at run time

@@ -8,13 +8,12 @@ from typing import Literal
 
 import numpy as np
 import torch
-import tyro
 from torch import Tensor
 
 from bitymi_ns.bundle import BundleError, read_bundle
 from bitymi_ns.bundle.manifest import MANIFEST, WorldFrame
 from bitymi_ns.bundle.strict_json import plain
-from bitymi_ns.codec.scene_texels import texel_alpha
+from bitymi_ns.codec.pages import texel_alpha
 from bitymi_ns.files import complete_folder, reason, reserved, size_text
 from bitymi_ns.interchange import Frame
 from bitymi_ns.interchange.bundle_cameras import named_cameras
@@ -140,8 +139,3 @@ def from_bundle(folder: Path) -> Source:
     cameras = [row.camera for row in rows if not row.held_out] or [row.camera for row in rows]
     drawn = (cameras, scene.near, scene.prefilter, bundle.info.world, texel_alpha(scene))
     return Source(scene.surfels, lambda camera: bundle.render(camera).rgb, *drawn)
-
-
-def default_export() -> ExportMesh:
-    """The options with their defaults; what has none is left open."""
-    return ExportMesh(load_config=tyro.MISSING, output_dir=tyro.MISSING)

@@ -111,9 +111,7 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
     """Check a bundle against the run it was baked from.
 
     Args:
-        bundle: what was read.
         run: config.yml of the run, its folder, or one of its checkpoints.
-        views: held-out views to render.
     """
     if views < 1:
         fail(f"--views must be at least 1, not {views}")

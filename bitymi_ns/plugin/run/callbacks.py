@@ -34,10 +34,6 @@ class TrainingRun:
     """
 
     def __init__(self, model: Any, attributes: TrainingCallbackAttributes) -> None:
-        """
-        Args:
-            model: a `BitymiModel`.
-        """
         trainer, pipeline = attributes.trainer, attributes.pipeline
         assert trainer is not None and pipeline is not None and attributes.optimizers is not None
         self.scene, self.config, self._curve_views = model.scene, model.train_config, model.config.curve_views

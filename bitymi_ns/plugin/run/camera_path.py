@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
 from bitymi_ns.plugin.console import fail, warn
+from bitymi_ns.ranges import first_problem
 
 MOST_PIXELS = 16_384  # along a side of a frame
 SLACK = 1e-3  # of a rotation that was stored with rounding
@@ -47,7 +48,7 @@ class _Path(BaseModel):
 
 
 def check_camera_path(file: Path) -> float:
-    """Stop where a file is no camera path that can be rendered; warn of what is not heeded.
+    """Stop where a file is no camera path that can be rendered; warn of what is ignored.
 
     Returns:
         frames per second.
@@ -61,9 +62,7 @@ def check_camera_path(file: Path) -> float:
     except OSError as error:
         fail(f"the camera path {file} cannot be read: {error.strerror} (--camera-path-filename).", error)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        where = ".".join(map(str, first["loc"]))
-        what = first["msg"].removeprefix("Value error, ")
+        where, what = first_problem(error)
         fail(f"the camera path {file} cannot be used: {where + ': ' if where else ''}{what}. {HELP}", error)
     except ValueError as error:
         fail(f"the camera path {file} is no JSON in UTF-8 ({error}). {HELP}", error)

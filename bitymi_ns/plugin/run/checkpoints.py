@@ -40,7 +40,6 @@ def save(state: dict[str, Any], path: Path, scratch: Path) -> None:
     """Write a checkpoint; a crash or a full disk leaves the previous ones as they were.
 
     Args:
-        state: what to save.
         scratch: a folder of the same file system for the unfinished file; nerfstudio takes every name in the
             checkpoint folder for a checkpoint.
     """

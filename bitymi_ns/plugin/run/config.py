@@ -25,11 +25,11 @@ from bitymi_ns.plugin.run.bundle_model import BakedModelConfig, find_bundle, stu
 from bitymi_ns.plugin.run.commands import LOOPBACK, adopt_viewer, folder_being_evaluated, moved_capture, refuse_others
 from bitymi_ns.plugin.run.device import has_cuda_kernels, why_not_cuda
 from bitymi_ns.plugin.run.model import PARAMETER_GROUPS, BitymiModelConfig
-from bitymi_ns.plugin.run.preset import load_preset
 from bitymi_ns.plugin.run.render import adopt_render
 from bitymi_ns.plugin.run.trainer import BitymiPipelineConfig, BitymiTrainer
 from bitymi_ns.ranges import check_ranges
 from bitymi_ns.train.optimizers import BETAS, EPS, FIELD_BETAS
+from bitymi_ns.train.preset import load_preset
 
 SEEDS = 1 << 32  # end of the range of seeds that numpy takes
 

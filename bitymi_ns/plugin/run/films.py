@@ -35,7 +35,6 @@ def film(path: Path, fps: float) -> Iterator[Add]:
 
     Args:
         path: of the film; an earlier one is replaced at the end.
-        fps: frames per second.
 
     Raises:
         InputError: the frames are too small or too large for H.264.
@@ -68,7 +67,10 @@ def film(path: Path, fps: float) -> Iterator[Add]:
         except av.FFmpegError as error:
             if isinstance(error, OSError) and error.errno:
                 raise OSError(error.errno, error.strerror) from error
-            fail(f"{path}: H.264 cannot have it ({error}). Choose another size, or --output-format images.", error)
+            fail(
+                f"{path}: H.264 cannot encode it ({error}). Choose another size, or --output-format images.",
+                error,
+            )
 
 
 @contextmanager

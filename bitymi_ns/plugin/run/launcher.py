@@ -89,7 +89,7 @@ class Workers:
                     fail(f"process {rank + 1} of the {count} of this run has ended: {why}")
             if time.monotonic() > until:
                 minutes = round(TIMEOUT.total_seconds() / 60)
-                fail(f"the {count} processes of this run do not hear each other any more, or not within {minutes} min")
+                fail(f"the {count} processes of this run lost contact, or did not answer within {minutes} min")
             time.sleep(0.05)
 
     def end(self, orderly: bool = False) -> None:

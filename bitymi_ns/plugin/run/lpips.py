@@ -68,8 +68,6 @@ def distance(pair: Tensor, weights: Mapping[str, Tensor], backbone: str) -> Tens
 
     Args:
         pair: [2, 3, H, W].
-        weights: of `load`.
-        backbone: of `BACKBONES`.
     """
     shift, scale = (pair.new_tensor(v).view(3, 1, 1) for v in ((-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)))
     x, total = (pair - shift) / scale, pair.new_zeros(())
@@ -109,7 +107,7 @@ def load(backbone: str) -> dict[str, npt.NDArray[np.float32]]:
     head_K [channels] of every tap.
 
     Raises:
-        LpipsUnavailable: they cannot be had.
+        LpipsUnavailable: they are not available.
     """
     path = weights_path(backbone)
     if not path.is_file():

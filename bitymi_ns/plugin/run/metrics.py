@@ -61,7 +61,7 @@ def flip(image: Tensor, reference: Tensor) -> float | None:
 
 
 def lpips_metrics(image: Tensor, reference: Tensor, names: Sequence[str]) -> dict[str, float]:
-    """Distances of two images by their names in `LPIPS`, without those whose weights cannot be had (one warning per
+    """Distances of two images by their names in `LPIPS`, without those whose weights are not available (one warning per
     process says why); empty for images of fewer than 32 pixels along a side."""
     found: dict[str, float] = {}
     for name in names if min(image.shape[:2]) >= lpips.LEAST_SIDE else ():

@@ -186,9 +186,6 @@ def new_scene(
 
     Args:
         points: positions [N, 3] and colours [N, 3] (uint8, or empty when the cloud has none).
-        scene_box: where random points are placed.
-        config: the representation.
-        train: training options.
         metadata: what the data manager says about the capture.
         steps: length of the run that is going to be made.
     """

@@ -185,8 +185,6 @@ def spiral(model: SurfelModel, start: Cameras, steps: int, radius: float) -> Cam
     nerfstudio's own spiral takes the camera's axis in the world for the upward one in the camera, and rolls.
 
     Args:
-        start: one camera.
-        steps: number of cameras.
         radius: of the spiral in units of the scene, along all axes of the camera.
     """
     camera = to_camera(start, model.device).within(DEPTH_SIDE)
@@ -210,11 +208,6 @@ def spiral(model: SurfelModel, start: Cameras, steps: int, radius: float) -> Cam
 @torch.no_grad()
 def write_trajectory(model: SurfelModel, cameras: Cameras, command: Any, fps: float) -> None:
     """Render cameras as a film or as frames, whole or not at all.
-
-    Args:
-        cameras: of the frames.
-        command: nerfstudio's command, with its options.
-        fps: frames per second of a film.
 
     Raises:
         InputError: the target cannot be written.

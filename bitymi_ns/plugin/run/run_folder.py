@@ -35,11 +35,7 @@ def take(folder: Path) -> None:
 
 
 def check_unused(folder: Path, checkpoints: Path) -> None:
-    """Stop where a new run would mix with, and in time replace, the checkpoints of an earlier one.
-
-    Args:
-        checkpoints: the folder of its checkpoints.
-    """
+    """Stop where a new run would mix with, and in time replace, the checkpoints of an earlier one."""
     there = sorted(checkpoints.glob("step-*.ckpt"))
     if there:
         fail(

@@ -93,7 +93,7 @@ class SurfelModel(Model):
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Render a camera; a crop box is not supported, which is said.
+        """Render a camera; a crop box is not supported: a warning says so.
 
         In a thread, which is one of the viewer's, a camera that cannot be rendered gives an empty picture: a refusal
         would end the thread, and the viewer would show nothing any more.

@@ -98,7 +98,7 @@ def test_a_killed_benchmark_goes_on_when_its_command_has_ended(
     process.wait()
     assert len(lines(work)) == 2
     again = subprocess.run(words, capture_output=True, text=True, check=False)
-    named = re.search(r"fox, bitymi: process (\d+) is at work there: wait for it, or end it", again.stderr)
+    named = re.search(r"fox, bitymi: process (\d+) is writing there: wait for it, or end it", again.stderr)
     assert again.returncode == 1 and named is not None and int(named[1]) != process.pid
     assert b"ns-export" in Path(f"/proc/{named[1]}/cmdline").read_bytes()  # its export still runs
     fakes.calls()

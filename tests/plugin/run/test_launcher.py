@@ -24,7 +24,7 @@ def others(monkeypatch: pytest.MonkeyPatch) -> launcher.Workers:
 
 
 def test_what_went_wrong_in_another_process_is_told(others: launcher.Workers) -> None:
-    with pytest.raises(InputError, match="the 3 processes of this run do not hear each other .* within 30 min"):
+    with pytest.raises(InputError, match="the 3 processes of this run lost contact, or did not answer within 30 min"):
         others.explain()
     others._processes[1] = process(-9)
     with pytest.raises(InputError, match="process 3 of the 3 of this run has ended: exit status -9"):

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from bitymi_ns.plugin.run.preset import Preset, PresetError, load_preset
 from bitymi_ns.presets import preset_dir, preset_names
 from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.train.preset import Preset, PresetError, load_preset
 
 METHODS = ["bitymi", *(f"bitymi-{name}" for name in ("quality", "fast", "sb", "sg", "sh", "field", "notexture"))]
 

@@ -3,6 +3,9 @@ import type { View } from '../view/pose';
 import type { Graphics } from './device';
 import type { DrawOptions, Renderer } from './renderer';
 
+const FRAME_MILLISECONDS = 1000 / 60;
+const LEAST_SCALE = 0.2;
+
 // Draws a view for the canvas, at `scale` of its resolution; ends when it is drawn.
 export type Screen = (view: View, scale: number, options: DrawOptions) => Promise<unknown>;
 
@@ -31,3 +34,22 @@ function copied(canvas: HTMLCanvasElement, renderer: Renderer): Screen {
 
 export const screenOf = (canvas: HTMLCanvasElement, renderer: Renderer, graphics: Graphics): Screen =>
   graphics.software ? copied(canvas, renderer) : direct(canvas, renderer, graphics.device);
+
+// The share of the screen's resolution that holds 60 frames a second while the camera moves.
+export class Pace {
+  scale = 1;
+  milliseconds = 0; // of a frame, smoothed
+
+  // After a frame that took so long at the present scale.
+  took(milliseconds: number): void {
+    this.milliseconds = this.milliseconds ? 0.7 * this.milliseconds + 0.3 * milliseconds : milliseconds;
+    const wish = this.scale * Math.sqrt((0.85 * FRAME_MILLISECONDS) / Math.max(this.milliseconds, 0.5));
+    const next = Math.min(1, Math.max(LEAST_SCALE, wish));
+    // small steps, and none for small differences: each asks for new targets
+    if (Math.abs(next - this.scale) > 0.08 * this.scale) {
+      const step = 0.5 * (next - this.scale);
+      this.scale += Math.sign(step) * Math.max(Math.abs(step), Math.min(0.05, Math.abs(2 * step)));
+      this.milliseconds = 0;
+    }
+  }
+}

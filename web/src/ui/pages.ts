@@ -1,7 +1,6 @@
-// What stands in the place of the scene: progress, or why there is none.
+// What stands in place of the scene: progress, the poster, or why there is none.
 import { reasonOf } from '../errors';
 import { element } from './dom';
-import { endPoster } from './poster';
 
 const megabytes = (bytes: number): string => (bytes / 1e6).toFixed(1);
 
@@ -43,4 +42,28 @@ export function notify(text: string): void {
   notice.textContent = text;
   notice.hidden = false;
   setTimeout(() => (notice.hidden = true), 8000);
+}
+
+// The poster over the canvas, until there is a picture of the surfels.
+let posterEnded = false;
+
+export async function showPoster(poster: Blob | null): Promise<void> {
+  if (!poster || posterEnded) return;
+  const image = element<HTMLImageElement>('poster');
+  const address = (image.src = URL.createObjectURL(poster));
+  try {
+    await image.decode();
+  } catch {
+    posterEnded = true; // it is no picture
+  }
+  URL.revokeObjectURL(address);
+  if (posterEnded) return;
+  image.hidden = false;
+  if (document.documentElement.dataset.state === 'loading') document.documentElement.dataset.state = 'poster';
+}
+
+// There is a picture of the surfels, or there will be none.
+export function endPoster(): void {
+  posterEnded = true;
+  element('poster').hidden = true;
 }

@@ -2,7 +2,7 @@
 import type { Vec3 } from '../bundle/manifest';
 import { type Lens, type Pose, View } from './pose';
 import { type Quat, difference, exponential, poseOf, product, quatOf, slerp } from './rotation';
-import { lensOf, viewpointOf } from './share';
+import { type Viewpoint, lensOf, viewpointOf } from './share';
 import { add, dot, length, subtract, times } from './vector';
 
 export interface Keyframe {
@@ -17,6 +17,7 @@ export const SECONDS = 2; // of a new segment
 export const RATE = 30; // frames per second of the file
 const MOST_FRAMES = 36_000; // of the file: 20 minutes
 const MOST_KEYFRAMES = 1000; // that are read
+const FLIGHT_SECONDS = 0.8;
 const STEEPEST = 3; // times the slower of two segments: a tangent beyond overshoots
 
 export class CameraPath {
@@ -128,6 +129,26 @@ export class CameraPath {
     this.keyframes = read.map((each, k) => ({ ...each, seconds: read[(k + 1) % read.length].seconds }));
     this.smooth = file?.smoothness_value !== 1;
     this.loop = file?.is_cycle === true;
+  }
+}
+
+// The way from one view to another.
+export class Flight {
+  private readonly path = new CameraPath();
+  private since: number | null = null; // time, ms, of the first view
+
+  constructor(
+    from: Viewpoint,
+    readonly to: Viewpoint,
+  ) {
+    this.path.keyframes = [from, to].map(({ pose, lens }) => ({ pose, lens, seconds: FLIGHT_SECONDS }));
+  }
+
+  // The view at a time, of a picture of so many pixels; null at the end.
+  at(now: number, width: number, height: number): View | null {
+    this.since ??= now;
+    const t = (now - this.since) / (1000 * FLIGHT_SECONDS);
+    return t < 1 ? this.path.at(FLIGHT_SECONDS * t * t * (3 - 2 * t), width, height) : null;
   }
 }
 

@@ -46,10 +46,6 @@ class Preset:
 def load_preset(name: str, folder: Path | None = None) -> Preset:
     """Read the preset `name` from `folder` (default: the installed presets).
 
-    Args:
-        name: of the file.
-        folder: of the files.
-
     Raises:
         PresetError: the file is missing or is not a valid preset.
     """

@@ -216,7 +216,8 @@ def run_step(step: Step, tree: Path, environment: dict[str, str], logs: Path, de
         return f"| {step.name} | not begun: no time left | |"
     running, ends = [], []
     with tempfile.TemporaryDirectory() as folder:
-        environment = {**environment, "TMPDIR": folder}
+        # unbuffered, so that the last line of a log is what was printed last
+        environment = {**environment, "TMPDIR": folder, "PYTHONUNBUFFERED": "1"}
         if len(step.commands) > 1:
             environment["OMP_NUM_THREADS"] = str(max(1, (os.cpu_count() or 1) // len(step.commands)))
         how = {"cwd": tree, "env": environment, "stderr": subprocess.STDOUT, "start_new_session": True}

@@ -1,5 +1,6 @@
 """Runs that are ended, or cannot write."""
 
+import json
 import os
 import resource
 import signal
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from bitymi_ns.capture.poses import find_poses
+from bitymi_ns.capture.sfm.job import Job
 from bitymi_ns.capture.sfm.process import rows
 
 Copy = Callable[[str], Path]
@@ -105,3 +107,23 @@ def test_a_read_only_folder_is_no_hindrance(copied: Copy, tmp_path: Path, monkey
     poses = find_poses(folder)
     assert poses.registered == 8 and tmp_path / "cache" in poses.model.parents
     assert not (folder / ".bitymi").exists()
+
+
+def test_what_libraries_print_is_no_message(tmp_path: Path) -> None:
+    code = """if True:
+        import os
+        from bitymi_ns.capture.sfm import worker
+        def find(job, stages):
+            os.write(1, b"BLAS : Bad memory unallocation!\\n")
+            raise worker.NoPoses("nothing")
+        worker.find = find
+        worker.main()"""
+    job = Job(str(tmp_path), str(tmp_path), None, [], [], {}, False, {})
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as worker:
+        assert worker.stdin is not None and worker.stdout is not None and worker.stderr is not None
+        worker.stdin.write(job.text() + "\n")
+        worker.stdin.flush()
+        assert json.loads(worker.stdout.readline()) == {"failure": "nothing"}
+        assert "BLAS" in worker.stderr.read()

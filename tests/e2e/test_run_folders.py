@@ -59,7 +59,9 @@ def test_a_folder_takes_one_run_at_a_time(start: Start) -> None:
     )
     try:
         assert other.stdout is not None and other.stdout.readline() == "has it\n"
-        with pytest.raises(InputError, match=f"is in use: process {other.pid} is at work(.|\n)*--timestamp") as stop:
+        with pytest.raises(
+            InputError, match=f"is in use: process {other.pid} is writing there(.|\n)*--timestamp"
+        ) as stop:
             ns_train.main(copy.deepcopy(config))
         assert stop.value.code != 0 and [p.name for p in folder.iterdir()] == [".lock"]  # nothing of it is touched
     finally:

@@ -1,7 +1,7 @@
 """The process that runs COLMAP, by `main`: a Job on stdin, lines of JSON on stdout.
 
 A line is {"stage", "done", "total", "counts"}, or at the end {"result"} or {"failure"}. The process ends when its stdin
-does, so that nothing goes on after whoever started it was killed. What COLMAP has to say goes to stderr.
+does, so that nothing goes on after whoever started it was killed. What COLMAP and its libraries print goes to stderr.
 """
 
 import json
@@ -19,6 +19,7 @@ from bitymi_ns.capture.sfm.job import DATABASE, MODEL, Job, NoPoses
 from bitymi_ns.files import complete_folder
 
 LEAST = 3  # fewer placed photographs are no capture
+_messages = sys.__stdout__  # the pipe of messages
 
 
 class Stages:
@@ -39,7 +40,7 @@ class Stages:
 
 
 def send(**line: object) -> None:
-    print(json.dumps(line), file=sys.__stdout__, flush=True)
+    print(json.dumps(line), file=_messages, flush=True)
 
 
 def find(job: Job, stages: Stages) -> tuple[pycolmap.Reconstruction, dict[str, object]]:
@@ -89,6 +90,9 @@ def _mapped(job: Job, database: Path, stages: Stages) -> tuple[explain.ViewGraph
 
 def main() -> None:
     """Run one job, and write its model under the names that people gave the photographs."""
+    global _messages
+    _messages = os.fdopen(os.dup(1), "w", encoding="utf8")
+    os.dup2(2, 1)  # OpenBLAS prints warnings to stdout, among the messages
     job = Job.parse(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
     pycolmap.logging.minloglevel = 1  # warnings and errors

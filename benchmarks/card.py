@@ -149,10 +149,11 @@ def stage(arguments: argparse.Namespace) -> int:
     pip = [str(tools / "bin/python"), "-m", "pip", "--disable-pip-version-check"]
     for old in folder.glob("bitymi_ns-*.whl"):
         old.unlink()
-    defines = ("BITYMI_CUDA=ON", f"BITYMI_CUDA_ARCHITECTURES={arguments.architectures}")
-    options = [f"--config-settings=cmake.define.{define}" for define in defines]
+    architectures = f"cmake.define.BITYMI_CUDA_ARCHITECTURES={arguments.architectures}"
+    settings = ("cmake.define.BITYMI_CUDA=ON", architectures, f"build-dir={build}")
+    options = [f"--config-settings={setting}" for setting in settings]
     wheel = [*pip, "wheel", "-q", "--no-build-isolation", "--no-deps", "-w", str(folder), str(ROOT)]
-    subprocess.run([*wheel, *options, f"-Cbuild-dir={build}"], check=True)
+    subprocess.run([*wheel, *options], check=True)
     fetched = [*pip, "download", "-q", "--only-binary", ":all:", "-d", str(folder), "-c", f"{ROOT}/constraints.txt"]
     for name in NEEDED:
         if not list(folder.glob(f"{name.replace('-', '_')}-*.whl")):
@@ -203,7 +204,7 @@ def unpack(staged: Sequence[Path], work: Path) -> dict[str, str]:
         shutil.copy(file, cache)
     path = os.pathsep.join([str(tree), str(site), *filter(None, [os.environ.get("PYTHONPATH")])])
     programs = os.pathsep.join([str(site / "bin"), os.environ["PATH"]])
-    changed = {"PATH": programs, "PYTHONPATH": path, "PYTHONUNBUFFERED": "1", "XDG_CACHE_HOME": str(cache.parent)}
+    changed = {"PATH": programs, "PYTHONPATH": path, "XDG_CACHE_HOME": str(cache.parent)}
     changed["BITYMI_TESTS_REQUIRE"] = "card"  # else tests/cuda end well where there is none
     return {**os.environ, **changed}
 

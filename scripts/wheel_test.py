@@ -67,7 +67,7 @@ def build(folder: Path) -> Path:
         "--no-index",
         "--config-settings=cmake.define.BITYMI_CUDA=OFF",
     )
-    run(*pip, "wheel", *options, f"-Cbuild-dir={folder / 'build'}", "-w", folder, ROOT)
+    run(*pip, "wheel", *options, f"--config-settings=build-dir={folder / 'build'}", "-w", folder, ROOT)
     (wheel,) = folder.glob("bitymi_ns-*.whl")
     return wheel
 

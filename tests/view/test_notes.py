@@ -14,7 +14,7 @@ from bitymi_ns.view import single_site, site_of, write_static
 from tests.bundle.test_notes import NOTES, text
 from tests.view.browser import drive, plain_server
 from tests.view.conftest import write
-from tests.view.test_controls import PHONE, START, Steps
+from tests.view.steps import PHONE, START, Steps
 from tests.view.test_path import FITS, SECOND, there
 
 VIEWS, REMARKS = (

@@ -7,7 +7,7 @@ import av
 import numpy as np
 import pytest
 
-from tests.view.test_controls import MIDDLE, START, Steps
+from tests.view.steps import MIDDLE, START, Steps
 
 SECOND = START.replace("p=0,-3,0", "p=1,-3,0")
 ROWS = "[...document.querySelectorAll('#keyframes .name')].map((e) => e.textContent).join()"

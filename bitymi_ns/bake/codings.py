@@ -13,6 +13,9 @@ from bitymi_ns.codec.texel_codes import TexelCodeOptions, TexelCoder, TexelCodes
 TO_START = 0.93  # share of the bytes that coded texels may have before their last steps, in which they grow a little
 
 
+TO_FILL = 0.99  # share of the bytes that they are to have after these steps, where they fill them
+
+
 @dataclass(frozen=True)
 class Coded:
     """Texels as they are stored."""
@@ -26,18 +29,22 @@ class Cosines:
     """The codes of a compact bundle, of no more bytes than the options say."""
 
     def __init__(self, coder: TexelCoder, options: TexelCodeOptions) -> None:
-        self._coder, self._most = coder, options.most_bytes
+        self._coder, self._most, self._fill = coder, options.most_bytes, options.fill
 
     def first(self, texels: Tensor) -> Coded:
         """Code texels [T, 3] before the steps."""
-        most = self._most
-        return self._coded(
-            texels, self._coder.code(texels) if most is None else self._coder.fit(texels, most * TO_START)
-        )
+        if self._most is None:
+            return self._coded(texels, self._coder.code(texels))
+        if self._fill:
+            self._coder.aim(self._coder.code(texels), self._most * TO_START)
+        return self._coded(texels, self._coder.fit(texels, self._most * TO_START))
 
     def again(self, texels: Tensor) -> Coded:
         """Code texels between steps, quickly."""
-        return self._coded(texels, self._coder.code(texels, rounds=0))
+        codes = self._coder.code(texels, rounds=0)
+        if self._fill and self._most is not None:
+            self._coder.aim(codes, self._most * TO_FILL)
+        return self._coded(texels, codes)
 
     def last(self, coded: Coded) -> Coded:
         """Final coding of the best texels."""

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.baked import Baked, joined
-from bitymi_ns.bake.early_stopping import FEWEST_VIEWS, validation_split
 from bitymi_ns.bake.precision import PER_BIT, Pictures, column_noise
 from bitymi_ns.bake.texel_list import TexelList
 from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bake.view_color_rate import color_choices
 from bitymi_ns.bundle.statistics import Rounding, ViewColorError
+from bitymi_ns.codec import streams
 from bitymi_ns.codec.surfel_codes import code_surfels
 from bitymi_ns.codec.texel_codes import (
     RESIDUAL_STEP,
@@ -52,14 +52,12 @@ class Compact:
         psnr: as small as it may be for the training photographs to be shown at so many dB, before the texels are tuned;
             None = `share` decides.
         views: training views that are drawn, spread over all.
-        val_every: as in `tune.TuneOptions`: validation views do not weigh texels.
     """
 
     share: float = 0.1
     most_bytes: int | None = None
     psnr: float | None = None
     views: int = 8
-    val_every: int = 8
 
     def check(self) -> None:
         """Refuse values that make no sense."""
@@ -105,9 +103,8 @@ class Coder:
         self._sizes = baked.sizes.long()
         drawn = self._pictures.of(scene)
         self.error, self.psnr = self._pictures.square(drawn), self._pictures.psnr(drawn)
-        trained = list(validation_split(views, options.val_every if len(views) >= FEWEST_VIEWS else 0)[1])
-        self._numbers = self._pictures.numbers / max(1, self._pictures.views) * len(trained)
-        self._colors = color_choices(scene, [view.camera.to(device) for view in trained], progress)
+        self._numbers = self._pictures.numbers / max(1, self._pictures.views) * len(views)
+        self._colors = color_choices(scene, [view.camera.to(device) for view in views], progress)
         reduced = replace(scene, surfels={**scene.surfels, **self._colors.at(START)})
         self._noise = column_noise(reduced, self._sizes, self._pictures, progress)
         self._tiles = self._texels = self._weights = self._alphas = None
@@ -115,7 +112,7 @@ class Coder:
             texels = TexelList(baked, device)
             self._tiles, self._texels = texels.tiles, texels.values.cpu()
             self._alphas = None if baked.alpha is None else baked.alpha.values
-            self._weights = texels.coverage(trained, progress, (2,))[0].cpu()
+            self._weights = texels.coverage(views, progress, (2,))[0].cpu()
 
     @property
     def measured(self) -> bool:
@@ -156,7 +153,9 @@ class Coder:
         rounded = rounded.with_tiles(Tiles(self._sizes[order], codes.extent(baked.options.extent), listed))
         rounded = replace(rounded.with_constants(constants), alpha_codes=coded if self._alphas is not None else None)
         size, shown = kept.surfels.nbytes(), rounded
-        if coded is not None:
+        if coded is None:
+            size += len(streams.compress(kept.residual, _FAST).data)
+        else:
             size += coded.nbytes(_FAST)
             shown = replace(rounded, texels=rounded.cut(coded.texels())).with_constants(coded.constants)
         scene = shown.unquantised()
@@ -221,7 +220,8 @@ def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> 
     baked, coding = found.baked, found.coding
     assert baked.codes is not None
     if options.most_bytes is not None:
-        coding = replace(coding, most_bytes=options.most_bytes - baked.codes.surfels.nbytes())
+        most, binds = options.most_bytes - baked.codes.surfels.nbytes(), found.error > enough
+        coding = replace(coding, most_bytes=most, fill=binds)
     mse = max(0.0, found.error - coder.error) if coder.measured else None
     rounding = Rounding(mse=mse, steps=dict(baked.codes.surfels.steps))
     statistics = baked.statistics.but(rounding=rounding, error=None, certificate=None, view_color=_thinned(baked))

@@ -27,7 +27,7 @@ and at equal bytes 4 to 8 give the same PSNR."""
 SHRINK = 0.6  # soft threshold of an iteration as a share of the step, where all texels of a block are seen alike
 _ATTEMPTS = 16
 _FAST = 9
-_LARGEST_STEP = 50.0
+_SMALLEST_STEP, _LARGEST_STEP = 1e-5, 50.0
 # Brightness, and two differences: an orthonormal basis, so that errors are as large as those of the channels.
 _OPPONENT = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, -1.0], [1.0, -2.0, 1.0]])
 _OPPONENT = _OPPONENT / _OPPONENT.norm(dim=1, keepdim=True)
@@ -41,7 +41,10 @@ class TexelCodeOptions:
     step: float = 7.5
     """Step of a coefficient, in 8-bit steps, of texels that make up one pixel of the views each: of those that make up
     w pixels it is step / sqrt(w)."""
-    most_bytes: int | None = None  # Texels take no more than this: the step grows until they fit. None = it stays.
+    most_bytes: int | None = None
+    """Texels take no more than this, with their residuals and mean alphas: the step grows until they fit. None = it
+    stays."""
+    fill: bool = False  # The step also shrinks while the texels are tuned, until they take nearly `most_bytes`.
 
     def check(self) -> None:
         """Refuse values that make no sense."""
@@ -137,8 +140,11 @@ class TexelCodes:
         return columns
 
     def nbytes(self, level: int = streams.LEVEL) -> int:
-        """Bytes of texels.bin."""
-        return sum(len(streams.compress(column, level).data) for column in self.columns.values())
+        """Bytes of texels.bin, and of residuals and mean alphas in surfels.bin."""
+        columns = [*self.columns.values(), self.residual]
+        if self.alpha is not None:
+            columns.append(self.alpha.mean[:, None])
+        return sum(len(streams.compress(column, level).data) for column in columns)
 
     @property
     def constants(self) -> Tensor:
@@ -220,6 +226,7 @@ class TexelCoder:
         low, high = GRADES
         self.grades = (-torch.log2(mean[tiled])).round().long().clamp(low, high) if first is None else first.grades
         self.alpha: AlphaCodes | None = None if first is None else first.alpha
+        self._packing = 0.0  # bytes as they are written, as a share of those of a fast packing; 0 = not known yet
 
     def fit(self, texels: Tensor, most_bytes: float, rounds: int = SPARSE_ROUNDS) -> TexelCodes:
         """Code texels [T, 3] in at most `most_bytes`, alphas included, with a larger step where that takes it.
@@ -234,6 +241,14 @@ class TexelCoder:
             self._step = min(_LARGEST_STEP, self._step * min(4.0, max(1.06, (found / most_bytes) ** 1.2)))
             codes = self.code(texels, rounds)
         return codes
+
+    def aim(self, codes: TexelCodes, most_bytes: float) -> None:
+        """Change the step of later codes of nearly the same texels, so that they take `most_bytes`."""
+        fast = codes.nbytes(_FAST)
+        if self._packing == 0:
+            self._packing = codes.nbytes() / max(1, fast)
+        ratio = self._packing * fast / most_bytes
+        self._step = min(_LARGEST_STEP, max(_SMALLEST_STEP, self._step * min(2.0, max(0.5, ratio))))
 
     def _sums(self, values: Tensor) -> Tensor:
         """Sums over tiles of [T, ...]."""

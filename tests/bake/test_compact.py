@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -91,13 +92,18 @@ def test_the_pictures_are_as_good_as_is_asked_for(truth: Baked, views: list[View
         compacted(truth, views, BACKGROUND, Compact(psnr=coder.psnr + 1))
 
 
-def test_surfels_and_texels_fit_into_the_bytes_there_are(truth: Baked, views: list[View]) -> None:
+def test_surfels_and_texels_fit_into_the_bytes_there_are(truth: Baked, views: list[View], tmp_path: Path) -> None:
     free, coding = compacted(truth, views, BACKGROUND, Compact(share=0.02))
     most = (free.codes.surfels.nbytes() + with_coded_texels(free, coding).codes.texels.nbytes()) * 7 // 10
     fitted, coding = compacted(truth, views, BACKGROUND, Compact(most_bytes=most))
-    tuned = tune_atlas(fitted, views, BACKGROUND, TuneOptions(steps=4, coded_steps=10, val_every=4), coding=coding)
-    assert fitted.codes.surfels.nbytes() < free.codes.surfels.nbytes()
-    assert most / 2 < tuned.codes.surfels.nbytes() + tuned.codes.texels.nbytes() <= most
+    assert coding.fill and fitted.codes.surfels.nbytes() < free.codes.surfels.nbytes()
+    for fill in (True, False):
+        options = TuneOptions(steps=0, coded_steps=60, val_every=0)
+        tuned = tune_atlas(fitted, views, BACKGROUND, options, coding=replace(coding, fill=fill))
+        bundle = export(tuned, tmp_path / f"fill-{fill}")
+        size = sum((bundle / name).stat().st_size for name in ("surfels.bin", "texels.bin"))
+        assert size == tuned.codes.surfels.nbytes() + tuned.codes.texels.nbytes()
+        assert (0.93 if fill else 0.5) * most < size <= most
     with pytest.raises(ValueError, match="are too few for 60 surfels"):
         compacted(truth, views, BACKGROUND, Compact(most_bytes=300))
 

@@ -63,6 +63,10 @@ class DensifyConfig:
     reset_opacity: PositiveShare = 0.01  # Opacity after a reset, at most. Very short runs reset to a higher one.
     final_prune_steps: tuple[int, ...] = (18_000, 21_000, 24_000, 27_000)  # Steps of the final prunes.
     final_prune_opacity: Share = 0.1  # Final prunes remove surfels below this opacity.
+    prune_error: Share = 0.02
+    """After the last densification, surfels that hardly matter are removed: those whose removal changes the training
+    pictures least, together by at most this share of the pictures' squared error, as which no more than that of 30 dB
+    counts; 0 = none."""
     min_interval: Count = 100
     """Fewest steps between densifications, however short the run: surfels need time to settle first."""
     pixels_per_surfel: NonNegative = 150.0

@@ -45,10 +45,13 @@ class Schedule:
         interval = densify.interval * self._stride(densify.interval, densify.min_interval)
         self.texels_start = min(max_steps, self.scaled(config.texels.start)) if texels else max_steps
         stop = min(densify.stop, config.texels.start) if texels else densify.stop
-        # after these steps surfels are cloned, split and pruned; opacities reset; the finished geometry pruned
+        # after these steps surfels are cloned, split and pruned; opacities reset; surfels that hardly matter, and those
+        # that are transparent, pruned
         self.densify_steps = self._events(_multiples(interval, densify.start, stop))
         self.reset_steps = self._events(_multiples(reset, 0, stop))
         self.reset_every = self.scaled(reset)
+        thins = densify.prune_error > 0 and 0 < stop < REFERENCE_STEPS
+        self.error_prune_steps = self._events([stop] if thins else [])
         self.final_prune_steps = self._events([s for s in densify.final_prune_steps if 0 < s <= REFERENCE_STEPS])
         self._doublings = self._image_doublings(pixels)
         self._last_part: Schedule | None = None

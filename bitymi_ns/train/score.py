@@ -1,4 +1,4 @@
-"""Multi-view error scores of surfels, after FastGS."""
+"""Scores of surfels over many views: errors that they cover, after FastGS, and errors that their removal adds."""
 
 from __future__ import annotations
 
@@ -12,10 +12,15 @@ from torch import Tensor
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.processes import ALONE, Processes
-from bitymi_ns.train.views import View, eval_background
+from bitymi_ns.train.views import View, eval_background, step_background
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
+
+
+MOST_ERROR = 1e-3
+"""Mean square error (30 dB) above which a share of the error says nothing of what may be lost: errors of exposure or of
+what moved do not hide those of a missing surfel."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +74,8 @@ def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig, 
     total = torch.zeros(n, dtype=torch.int64, device=device)
     weighted = torch.zeros(n, dtype=torch.float64, device=device)
     background = eval_background(config, device)
-    for view in (view.to(device) for view in views[processes.rank :: processes.count]):
+    for number in range(processes.rank, len(views), processes.count):
+        view = views[number].to(device)
         target = view.target(background, device)
         output = scene.render(view.camera, background=background, field_mode="frozen")
         rgb = view.shown(output.rgb, output.alpha, background)
@@ -82,3 +88,46 @@ def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig, 
     processes.sum(total, weighted)
     importance = torch.div(total, max(1, len(views)), rounding_mode="floor")
     return Scores(importance, normalise(weighted).float())
+
+
+def removal_errors(
+    scene: Scene, views: Sequence[View], config: TrainConfig, seed: int, processes: Processes = ALONE
+) -> tuple[Tensor, Tensor]:
+    """Estimate the squared change of the views when a surfel is removed, and measure the squared error that they have.
+
+    A picture C is linear in the opacity o of each surfel, so removing it changes the picture by v = -o dC/do. Over
+    independent signs r, E[(r . v)^2] = |v|^2 (Hutchinson 1989), and one backward pass gives r . v of all surfels.
+
+    Args:
+        views: at the size in which they are to be judged.
+        seed: of the signs, and of random backgrounds.
+        processes: each renders its share of the views.
+
+    Returns:
+        [N] float64, summed over pixels that count, channels and views, 0 where no view shows the surfel; and the
+        squared error of the views against the photographs, summed alike, a float64 scalar, at most `MOST_ERROR` in the
+        mean.
+    """
+    logits = scene.surfels["opacity_logits"]
+    device = logits.device
+    by_logit = 1.0 + logits.detach().double().clamp(max=30.0).exp()  # o d/do = (1 + e^logit) d/dlogit
+    added = torch.zeros_like(by_logit)
+    error, numbers = torch.zeros(2, dtype=torch.float64, device=device)  # squares, how many
+    for number in range(processes.rank, len(views), processes.count):
+        view = views[number].to(device)
+        background = step_background(config, view, seed + number, device)
+        target = view.target(background, device)
+        signs = torch.randint(0, 2, target.shape, generator=torch.Generator().manual_seed(seed + number))
+        signs = 2.0 * signs.to(target) - 1.0
+        if view.mask is not None:
+            signs = signs * view.mask.reshape(*target.shape[:2], 1)
+        with torch.enable_grad():
+            output = scene.render(view.camera, background=background, field_mode="frozen")
+            rgb = view.shown(output.rgb, output.alpha, background)
+            (gradient,) = torch.autograd.grad((rgb * signs).sum(), logits)
+        error += (signs * (rgb.detach() - target)).square().sum(dtype=torch.float64)
+        numbers += signs.square().sum(dtype=torch.float64)
+        added += (by_logit * gradient).square()
+        del output, rgb  # with their fragments, before the next view makes its own
+    processes.sum(added, error, numbers)
+    return added, torch.minimum(error, MOST_ERROR * numbers)

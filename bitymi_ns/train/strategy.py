@@ -7,14 +7,15 @@ At each densification, in this order:
   fit; at `max_surfels` faint surfels make room for them;
 - up to half of the candidates for pruning, drawn at random, are removed;
 - opacities are clamped.
-Between 60 and 90 % of the run, four final prunes remove what is transparent. docs/training.md states the
+After the last one, surfels whose removal hardly changes the pictures go, and between 60 and 90 % of the run four final
+prunes remove what is transparent. docs/training.md states the
 published rules.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -32,19 +33,21 @@ from bitymi_ns.train.init import tangents
 from bitymi_ns.train.optimizers import ResizeHook, cap_opacity, replace_rows
 from bitymi_ns.train.processes import ALONE, Processes
 from bitymi_ns.train.schedules import Schedule
-from bitymi_ns.train.score import multi_view_scores
+from bitymi_ns.train.score import multi_view_scores, removal_errors
 from bitymi_ns.train.views import View
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import RenderOutput, Scene
 
-DrawViews = Callable[[int, torch.Generator], list[View]]
+DrawViews = Callable[[int, torch.Generator], Sequence[View]]
 """(k, CPU generator) -> k different training views, or all when there are fewer."""
 
 SPLIT_LONG, SPLIT_WIDE = 0.6, 0.7
 """Scales of the halves of a split surfel, along its long axis and across it, as a share of the surfel's."""
 SPLIT_APART = 0.7  # distance of the halves' centres from the surfel's, in scales of its long axis
 SPLIT_OPACITY = 0.9  # opacity of the halves as a share of the surfel's: they overlap where it is most opaque
+ERROR_VIEWS, FEWEST_ERROR_VIEWS = 0.1, 64
+"""Most views that the errors of removals are measured on, as a share of the run's steps, and at least so many."""
 STATISTICS = ("grad_sum", "abs_grad_sum", "visible_count", "max_radius")
 
 
@@ -155,6 +158,8 @@ class Strategy:
             report["opacity_reset"] = cap_opacity(
                 scene.surfels, optimizers, self.schedule.reset_opacity(), forget_all=True
             )
+        if step in self.schedule.error_prune_steps:
+            report |= self._error_prune(scene, optimizers, views)
         if step in self.schedule.final_prune_steps:
             report |= self._final_prune(scene, optimizers)
         if report:
@@ -234,6 +239,20 @@ class Strategy:
         config = self.config.densify
         candidate = surfels["opacity_logits"].sigmoid() < config.prune_opacity
         return candidate | (surfels["log_scales"].amax(-1).exp() > config.prune_world * self.schedule.extent)
+
+    @torch.no_grad()
+    def _error_prune(self, scene: Scene, optimizers: Mapping[str, Optimizer], views: DrawViews) -> dict[str, float]:
+        report = self._drop_dead(scene, optimizers)
+        most = max(FEWEST_ERROR_VIEWS, round(ERROR_VIEWS * self.schedule.max_steps))
+        seed = int(torch.randint(1 << 31, (), generator=self.generator))
+        added, error = removal_errors(scene, views(most, self.generator), self.config, seed, self.processes)
+        order = added.argsort(stable=True)
+        pruned = torch.zeros(len(scene), dtype=torch.bool, device=added.device)
+        pruned[order] = added[order].cumsum(0) <= self.config.densify.prune_error * error
+        pruned &= added > 0  # views that were not drawn may show the others
+        pruned = self._keep_minimum(pruned, scene.surfels["opacity_logits"], len(scene))
+        self.remove(pruned, scene, optimizers)
+        return report | {"pruned": int(pruned.sum())}
 
     @torch.no_grad()
     def _final_prune(self, scene: Scene, optimizers: Mapping[str, Optimizer]) -> dict[str, float]:

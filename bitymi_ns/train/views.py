@@ -285,10 +285,11 @@ class DownscaledViews:
             self._resident[index] = moved
         return moved
 
-    def draw(self, k: int, generator: torch.Generator, factor: float) -> list[View]:
-        """`k` different views, or all of them when there are fewer; `generator` lives on the CPU."""
-        order = torch.randperm(len(self), generator=generator).tolist()
-        return [self.at(i, factor) for i in order[:k]]
+    def draw(self, k: int, generator: torch.Generator, factor: float) -> Sequence[View]:
+        """`k` different views, or all of them when there are fewer, downscaled when they are used; `generator` lives on
+        the CPU."""
+        order = torch.randperm(len(self), generator=generator).tolist()[:k]
+        return OnDemand(len(order), lambda i: self.at(order[i], factor))
 
 
 def photograph_budget(device: torch.device) -> int:

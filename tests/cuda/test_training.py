@@ -10,6 +10,7 @@ from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.divergence import TrainingDiverged
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer
+from bitymi_ns.train.score import removal_errors
 from bitymi_ns.train.views import View
 from tests.ops.golden import random_scene
 
@@ -66,3 +67,12 @@ def test_a_loss_that_is_not_finite_ends_the_run(device: torch.device) -> None:
     with pytest.raises(TrainingDiverged, match="loss is nan at step 0"):
         trainer.advance()
         trainer.training.watch.finish(scene)
+
+
+def test_removal_errors_equal_those_of_the_cpu(device: torch.device, cpu) -> None:
+    scene, views = scene_and_views()
+    errors, total = removal_errors(scene.to(device), views, TrainConfig(), 7)
+    with cpu():
+        want, want_total = removal_errors(scene.to("cpu"), views, TrainConfig(), 7)
+    assert want.gt(0).any() and total.item() == pytest.approx(want_total.item(), rel=1e-4)
+    torch.testing.assert_close(errors.cpu(), want, rtol=1e-3, atol=1e-6)

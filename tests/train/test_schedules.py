@@ -25,6 +25,7 @@ def test_reference_run_has_the_published_events():
     schedule = Schedule(TrainConfig(), 30_000)
     assert fired(schedule, "densify_steps") == list(range(1000, 15_000, 500))
     assert fired(schedule, "reset_steps") == [3000, 6000, 9000, 12_000]
+    assert fired(schedule, "error_prune_steps") == [15_000]
     assert fired(schedule, "final_prune_steps") == [18_000, 21_000, 24_000, 27_000]
     assert schedule.scaled(12_345) == 12_345
     short = Schedule(TrainConfig(), 3000)
@@ -51,7 +52,7 @@ def test_overdraw_depth_and_normals_need_lists(weights: dict[str, float], maps: 
 
 
 @pytest.mark.parametrize("max_steps", [60, 97, 300, 1000, 1999, 2000, 2500, 3000, 7000, 29_999, 35_000])
-@pytest.mark.parametrize("event", ["densify_steps", "reset_steps", "final_prune_steps"])
+@pytest.mark.parametrize("event", ["densify_steps", "reset_steps", "error_prune_steps", "final_prune_steps"])
 def test_every_event_fires_as_often_as_in_the_reference_run(max_steps, event):
     reference = fired(Schedule(TrainConfig(), 30_000), event)
     steps = fired(Schedule(every_event(), max_steps), event)
@@ -63,7 +64,7 @@ def test_every_event_fires_as_often_as_in_the_reference_run(max_steps, event):
 @pytest.mark.parametrize("max_steps", [1, 2, 3, 10, 59, 300, 2000, 2500, 3001])
 def test_short_runs_stay_inside_the_run_and_reset_as_they_densify(max_steps):
     schedule = Schedule(TrainConfig(), max_steps)
-    for steps in (schedule.densify_steps, schedule.reset_steps, schedule.final_prune_steps):
+    for steps in (schedule.densify_steps, schedule.reset_steps, schedule.error_prune_steps, schedule.final_prune_steps):
         assert all(0 <= s < max_steps for s in steps)
     assert max_steps < 100 or schedule.reset_steps <= schedule.densify_steps
 

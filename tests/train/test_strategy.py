@@ -17,7 +17,7 @@ from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.score import Scores
 from bitymi_ns.train.strategy import Strategy, most_surfels
 
-DENSIFY, RESET, FINAL, LATE_DENSIFY = 1000, 3000, 18_000, 4000
+DENSIFY, RESET, ERROR, FINAL, LATE_DENSIFY = 1000, 3000, 15_000, 18_000, 4000
 LARGE, SMALL = math.log(0.01), math.log(0.0001)  # against dense * extent = 0.001
 
 
@@ -40,12 +40,16 @@ class Bench:
         self.importance = torch.zeros(n, dtype=torch.int64)
         self.prune = torch.zeros(n)
         self.asked = []
+        self.added, self.present = torch.full((n,), 1e3, dtype=torch.float64), torch.tensor(1e3, dtype=torch.float64)
         monkeypatch.setattr(module, "multi_view_scores", self._scores)
+        monkeypatch.setattr(module, "removal_errors", lambda *_: (self.added[self._rows()], self.present))
+
+    def _rows(self):
+        # rows are known by their x: scores stay with their surfels when rows were dropped before
+        return self.scene.surfels["means"][:, 0].detach().nan_to_num(0).round().long()
 
     def _scores(self, scene, views, config, processes):
-        # rows are known by their x: scores stay with their surfels when rows were dropped before
-        rows = scene.surfels["means"][:, 0].detach().nan_to_num(0).round().long()
-        return Scores(self.importance[rows], self.prune[rows])
+        return Scores(self.importance[self._rows()], self.prune[self._rows()])
 
     def views(self, k, generator):
         self.asked.append(k)
@@ -97,7 +101,7 @@ def check(bench):
 def test_nothing_happens_between_events(bench):
     b = bench()
     b.see(1.0, 1.0)
-    for step in (0, 1, 500, 999, 1001, 15_000, 29_999):
+    for step in (0, 1, 500, 999, 1001, 15_001, 29_999):
         assert b.step(step) == {}
     assert len(b.scene) == 40 and b.asked == []
 
@@ -330,6 +334,22 @@ def test_a_scene_without_a_finite_row_is_an_error(bench):
     b.set("quats", slice(0, 3), math.nan)
     with pytest.raises(TrainingDiverged, match=r"quats.*row 0"):
         b.step(DENSIFY)
+
+
+def test_the_error_prune_removes_what_hardly_matters(bench):
+    b = bench(10, prune_error=0.02)
+    b.set("opacity_logits", 3, -9.0)  # can never be seen again
+    b.added[:6] = torch.tensor([5.0, 0.0, 9.0, 1.0, 8.5, 7.0])  # no drawn view shows row 1
+    report = b.step(ERROR)
+    assert b.x == [1, 2, 4, 6, 7, 8, 9]  # 5 + 7 <= 0.02 x 1000 < 5 + 7 + 8.5
+    assert (report["invisible"], report["pruned"], report["surfels"]) == (1, 2, 7)
+    assert b.asked == [3000]
+    b = bench(10, prune_error=0.02, min_surfels=9)
+    b.added[:6] = 1.0
+    assert b.step(ERROR)["pruned"] == 1
+    b = bench(10, prune_error=0.0)
+    b.added[:6] = 1.0
+    assert b.step(ERROR) == {} and b.asked == []
 
 
 def test_final_prune_removes_the_transparent(bench):

@@ -65,8 +65,8 @@ class DensifyConfig:
     final_prune_opacity: Share = 0.1  # Final prunes remove surfels below this opacity.
     prune_error: Share = 0.02
     """After the last densification, surfels that hardly matter are removed: those whose removal changes the training
-    pictures least, together by at most this share of the pictures' squared error, as which no more than that of 30 dB
-    counts; 0 = none."""
+    pictures least, together by at most this share of the pictures' squared error (or of that of pictures at 30 dB,
+    where it is larger); 0 = none."""
     min_interval: Count = 100
     """Fewest steps between densifications, however short the run: surfels need time to settle first."""
     pixels_per_surfel: NonNegative = 150.0

@@ -50,8 +50,8 @@ class Schedule:
         self.densify_steps = self._events(_multiples(interval, densify.start, stop))
         self.reset_steps = self._events(_multiples(reset, 0, stop))
         self.reset_every = self.scaled(reset)
-        thins = densify.prune_error > 0 and 0 < stop < REFERENCE_STEPS
-        self.error_prune_steps = self._events([stop] if thins else [])
+        prunes = densify.prune_error > 0 and 0 < stop < REFERENCE_STEPS
+        self.error_prune_steps = self._events([stop] if prunes else [])
         self.final_prune_steps = self._events([s for s in densify.final_prune_steps if 0 < s <= REFERENCE_STEPS])
         self._doublings = self._image_doublings(pixels)
         self._last_part: Schedule | None = None

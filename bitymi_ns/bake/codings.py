@@ -11,8 +11,6 @@ from bitymi_ns.codec.quantise import EncodedAtlas
 from bitymi_ns.codec.texel_codes import TexelCodeOptions, TexelCoder, TexelCodes
 
 TO_START = 0.93  # share of the bytes that coded texels may have before their last steps, in which they grow a little
-
-
 TO_FILL = 0.99  # share of the bytes that they are to have after these steps, where they fill them
 
 

@@ -117,7 +117,8 @@ def removal_errors(
         view = views[number].to(device)
         background = step_background(config, view, seed + number, device)
         target = view.target(background, device)
-        signs = torch.randint(0, 2, target.shape, generator=torch.Generator().manual_seed(seed + number))
+        generator = torch.Generator().manual_seed(seed + number)
+        signs = torch.randint(0, 2, target.shape, dtype=torch.int8, generator=generator)
         signs = 2.0 * signs.to(target) - 1.0
         if view.mask is not None:
             signs = signs * view.mask.reshape(*target.shape[:2], 1)

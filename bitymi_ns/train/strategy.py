@@ -250,18 +250,19 @@ class Strategy:
         pruned = torch.zeros(len(scene), dtype=torch.bool, device=added.device)
         pruned[order] = added[order].cumsum(0) <= self.config.densify.prune_error * error
         pruned &= added > 0  # views that were not drawn may show the others
-        pruned = self._keep_minimum(pruned, scene.surfels["opacity_logits"], len(scene))
-        self.remove(pruned, scene, optimizers)
-        return report | {"pruned": int(pruned.sum())}
+        return report | self._prune(pruned, scene, optimizers)
 
     @torch.no_grad()
     def _final_prune(self, scene: Scene, optimizers: Mapping[str, Optimizer]) -> dict[str, float]:
         report = self._drop_dead(scene, optimizers)
-        logits = scene.surfels["opacity_logits"]
-        pruned = logits.sigmoid() < self.config.densify.final_prune_opacity
-        pruned = self._keep_minimum(pruned, logits, len(scene))
+        pruned = scene.surfels["opacity_logits"].sigmoid() < self.config.densify.final_prune_opacity
+        return report | self._prune(pruned, scene, optimizers)
+
+    def _prune(self, pruned: Tensor, scene: Scene, optimizers: Mapping[str, Optimizer]) -> dict[str, float]:
+        """Remove as many of `pruned` [N] bool as `min_surfels` allows."""
+        pruned = self._keep_minimum(pruned, scene.surfels["opacity_logits"], len(scene))
         self.remove(pruned, scene, optimizers)
-        return report | {"pruned": int(pruned.sum())}
+        return {"pruned": int(pruned.sum())}
 
     def _drop_dead(self, scene: Scene, optimizers: Mapping[str, Optimizer]) -> dict[str, float]:
         """Remove surfels that are broken or can never be seen again, and those beyond the cap."""

@@ -16,7 +16,7 @@ from tests.view.browser import Outcome, drive, served
 SCREEN = (900, 500)
 PHONE = (390, 780)
 MIDDLE = (420, 180)
-"""A place on the canvas that nothing covers."""
+"""A point on the canvas that nothing covers."""
 QUARTER = (
     "addEventListener('DOMContentLoaded', () => {"
     "const list = document.getElementById('resolution'); if (list) list.value = '0.25'; })"
@@ -28,7 +28,7 @@ START = "#p=0,-3,0&r=1,0,0,0,1,0&t=0,0,0&l=500,500,250,250,500,500"
 
 @dataclass
 class Seen:
-    """A view, as its link says it: places, axes of the camera, focal length."""
+    """A view, as its link says it: position, axes of the camera, target, focal length."""
 
     position: np.ndarray
     right: np.ndarray

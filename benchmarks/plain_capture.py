@@ -1,6 +1,8 @@
-"""Read an undistorted capture with a transforms.json without nerfstudio: photographs, poses and points."""
+"""Read an undistorted capture without nerfstudio, from its transforms.json or Blender's files: photographs, poses and
+points."""
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +28,7 @@ class Capture:
     held_out: list[View]
     points: Tensor  # [M, 3] sparse points
     colours: Tensor  # [M, 3] in [0, 1]
+    white: bool = False  # what is transparent is judged over white, as Blender's captures are
 
     @property
     def views(self) -> list[View]:
@@ -33,19 +36,34 @@ class Capture:
         return [*self.train, *self.held_out]
 
 
-def load_capture(folder: Path, downscale: int = 1) -> Capture:
+def load_capture(path: Path, downscale: int = 1) -> Capture:
     """Read an undistorted capture, moved and scaled as nerfstudio does it: the mean of the cameras is the origin and
     their largest coordinate 1. The orientation stays.
 
     Args:
-        folder: with transforms.json.
+        path: a folder with transforms.json, or such a file; or a folder with Blender's transforms_train.json,
+            transforms_test.json (held out) and *_pc.ply.
         downscale: whole factor by which photographs are reduced.
 
     Raises:
         ValueError: the images have lens distortion, or the point cloud is damaged.
     """
-    meta = json.loads((folder / "transforms.json").read_text("utf8"))
-    frames = sorted(meta["frames"], key=lambda frame: frame["file_path"])
+    folder = path if path.is_dir() else path.parent
+    file = folder / "transforms.json" if path.is_dir() else path
+    blender = not file.exists()
+    if blender:
+        frames, counts = [], []
+        for part in ("train", "test"):
+            meta = json.loads((folder / f"transforms_{part}.json").read_text("utf8"))
+            frames += [{**frame, "file_path": f"{frame['file_path']}.png"} for frame in meta["frames"]]
+            counts.append(len(meta["frames"]))
+        held_out = list(range(counts[0], sum(counts)))
+        cloud = next(iter(sorted(folder.glob("*_pc.ply"))), None)
+    else:
+        meta = json.loads(file.read_text("utf8"))
+        frames = sorted(meta["frames"], key=lambda frame: frame["file_path"])
+        held_out = list(range(0, len(frames), HELD_OUT))
+        cloud = folder / meta["ply_file_path"] if "ply_file_path" in meta else None
     poses = torch.tensor(
         [frame["transform_matrix"] for frame in frames], dtype=torch.float64
     )  # camera to world, OpenGL
@@ -55,17 +73,21 @@ def load_capture(folder: Path, downscale: int = 1) -> Capture:
     for frame, pose in zip(frames, poses, strict=True):
         values = {**meta, **frame}
         if any(float(values.get(k, 0)) for k in ("k1", "k2", "k3", "k4", "p1", "p2")):
-            raise ValueError(f"{folder}: the images have lens distortion; undistort the capture first")
+            raise ValueError(f"{path}: the images have lens distortion; undistort the capture first")
         image = Image.open(folder / frame["file_path"])
+        if blender:
+            w, h = image.size
+            focal = 0.5 * w / math.tan(0.5 * meta["camera_angle_x"])
+            values |= {"w": w, "h": h, "fl_x": focal, "fl_y": focal, "cx": 0.5 * w, "cy": 0.5 * h}
         image = image.convert("RGBA" if "A" in image.mode else "RGB")
         size = (image.width // downscale, image.height // downscale)
         picture = torch.from_numpy(np.array(image if downscale == 1 else image.resize(size, Image.Resampling.BOX)))
         views.append(View(_camera(values, pose, middle, scale, *size), picture))
-    points, colours = _points(folder / meta["ply_file_path"]) if "ply_file_path" in meta else (torch.zeros(0, 3),) * 2
+    points, colours = (torch.zeros(0, 3),) * 2 if cloud is None else _points(cloud)
     points = ((points.double() - middle) * scale).float()
-    held_out = [view for i, view in enumerate(views) if i % HELD_OUT == 0]
-    train = [view for i, view in enumerate(views) if i % HELD_OUT]
-    return Capture(train, held_out, points, colours)
+    kept = set(held_out)
+    train = [view for i, view in enumerate(views) if i not in kept]
+    return Capture(train, [views[i] for i in held_out], points, colours, blender)
 
 
 def _camera(values: dict[str, Any], pose: Tensor, middle: Tensor, scale: float, width: int, height: int) -> Camera:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Literal
 
 import tyro
@@ -87,7 +87,10 @@ class LearningRates:
     short_run_power: Annotated[float, Field(ge=0, le=10)] = 0.35
     """Runs of n < 30,000 steps multiply the rates of the surfels, not of the field, by (30,000 / n) to this power."""
     short_run_max: Positive = 4.0  # The largest such factor: at 7 times the rates the held-out error grows again.
-    means: tuple[Positive, Positive] = (1.6e-4, 1.6e-6)  # Positions, times the scene extent.
+    mean_pixels: tuple[Positive, Positive] = (0.07, 0.0007)
+    """Positions, in pixels of the photographs: the side of a pixel at the surfel, in the nearest view that holds it."""
+    means: tyro.conf.Suppress[tuple[Positive, Positive] | None] = None
+    """Positions, times the scene extent, as in runs recorded before steps were in pixels: replaces `mean_pixels`."""
     quats: NonNegative = 1e-3  # Rotations.
     log_scales: NonNegative = 5e-3  # Logarithms of the tangent scales.
     opacity_logits: NonNegative = 0.025  # Opacities, as logits.
@@ -103,7 +106,7 @@ class LearningRates:
 
     def times(self, factor: float) -> LearningRates:
         """The rates times a factor; the rules for short runs stay as they are."""
-        rates = {name: value for name, value in vars(self).items() if not name.startswith("short_run")}
+        rates = {name: value for name, value in asdict(self).items() if value and not name.startswith("short_run")}
         scaled = {k: tuple(factor * x for x in v) if isinstance(v, tuple) else factor * v for k, v in rates.items()}
         return replace(self, **scaled)
 
@@ -133,6 +136,8 @@ class TexelConfig(TexelSteps):
     opaque texels."""
     surfel_rates: Positive = 0.4
     """Rates of the surfels in that part, as a share of those of a run as long as it; they fall to 0 as a cosine."""
+    mean_rates: Positive = 0.1
+    """The same of their positions: what was drawn before would come apart if they moved as far as in a new run."""
     pixels_per_texel: Positive = 0.25
     """A tile has at most one texel per this many pixels of its surfel (summed blending weight), in the view that shows
     most of it."""

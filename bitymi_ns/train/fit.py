@@ -90,8 +90,7 @@ class Trainer:
             learning = [term for term in terms.values() if term.requires_grad]
             if learning:
                 torch.autograd.backward(learning)
-        self.training.combine()
-        step(self.optimizers.values())
+        step(self.optimizers, self.training.combine())
         report = self.training.finish()
         self._terms = [term.detach() for term in terms.values()]
         self.step += 1

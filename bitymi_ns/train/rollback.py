@@ -14,9 +14,13 @@ What counts as divergence:
 After an opacity reset nothing is judged until half of the time to the next reset has passed: by then opacities can have
 risen again (`Schedule.reset_opacity`). The last window ends with the run.
 
+What the schedule does is no divergence. When texels begin, windows begin anew: the first that is compared with those
+before ends more than a window later.
+
 Going back restores parameters, optimisers and the strategy's statistics as they were at the start of the last good
 window; the step count goes on. All learning rates are then multiplied by `guard.rates`, and by a higher power
-of it each time that the run goes back again without a good window between.
+of it each time that the run goes back again without a good window between. After the first good window they return to
+normal; where the run then diverges again, it cannot bear them, and they stay lowered.
 """
 
 from __future__ import annotations
@@ -56,7 +60,7 @@ class RollbackGuard:
     """Watches one run.
 
     Attributes:
-        factor: of all learning rates; 1 until the run has gone back for the first time.
+        factor: of all learning rates; 1 unless the run has gone back.
         rollbacks: how often it has.
     """
 
@@ -73,6 +77,7 @@ class RollbackGuard:
         self.announce = announce
         self.window = max(self.config.guard.min_window, self.schedule.scaled(self.config.guard.window))
         self.factor, self.rollbacks = 1.0, 0
+        self._returned = False  # lowered rates have been back to normal once
         self._streak = 0  # times in a row, without a good window between
         self._limit, self._best = math.nan, math.inf  # mean losses: of what is blank, of the best window
         self._views: DownscaledViews | None = None
@@ -85,6 +90,7 @@ class RollbackGuard:
         return {
             "factor": self.factor,
             "rollbacks": self.rollbacks,
+            "returned": self._returned,
             "streak": self._streak,
             "limit": self._limit,
             "best": self._best,
@@ -95,7 +101,7 @@ class RollbackGuard:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """The inverse of `state_dict`."""
         self.factor, self.rollbacks = float(state["factor"]), int(state["rollbacks"])
-        self._streak = int(state["streak"])
+        self._returned, self._streak = bool(state.get("returned", False)), int(state["streak"])
         self._limit, self._best = float(state["limit"]), float(state.get("best", math.inf))
         self._sum, self._count = torch.tensor(state["sum"]), int(state["count"])
         self._states = []
@@ -122,9 +128,10 @@ class RollbackGuard:
             self._limit = max(self._loss_of(views, 1.0), self._loss_of(views, 1.0, blank=True))
         self._states = [(step, self._capture())]
 
-    def forget_states(self) -> None:
-        """Forget the states to go back to: the scene is made of other parts from the next step on."""
+    def restart(self) -> None:
+        """Begin windows anew and forget the states to go back to: other parts make the scene from here on."""
         self._states = []
+        self._sum, self._count = torch.zeros_like(self._sum), 0
 
     @torch.no_grad()
     def _loss_of(self, views: DownscaledViews, factor: float, blank: bool = False) -> float:
@@ -219,6 +226,9 @@ class RollbackGuard:
         self._streak = 0
         if whole:
             self._best = min(self._best, mean)
+            if self.factor < 1.0 and not self._returned:
+                self.factor, self._returned = 1.0, True
+                self.announce(f"step {step}: learning rates return to normal")
         self._convert(step)
         if not last and not (enough and mean > self._limit):  # a state that will be good enough later as well
             self._states = self._states[-1:]  # before the next one is made: they are large

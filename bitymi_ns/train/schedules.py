@@ -27,7 +27,7 @@ class Schedule:
         """
         Args:
             max_steps: length of the run in steps.
-            extent: scene extent in world units; the learning rate of the means is in multiples of it.
+            extent: scene extent in world units.
             texels: whether texels learn in the last part of the run.
             pixels: of a photograph that show something, on average.
         """
@@ -56,8 +56,14 @@ class Schedule:
         self._doublings = self._image_doublings(pixels)
         self._last_part: Schedule | None = None
         if self.texels_start < max_steps:
-            slower = replace(config, lr=config.lr.times(config.texels.surfel_rates))
-            self._last_part = Schedule(slower, self.texel_steps, extent)
+            slower = config.lr.times(config.texels.surfel_rates)
+            slower.mean_pixels = config.lr.times(config.texels.mean_rates).mean_pixels
+            self._last_part = Schedule(replace(config, lr=slower), self.texel_steps, extent)
+
+    @property
+    def in_pixels(self) -> bool:
+        """True where the rate of the means is in pixels, see `step_sizes`; in world units otherwise."""
+        return self.config.lr.means is None
 
     @property
     def texel_steps(self) -> int:
@@ -182,7 +188,7 @@ class Schedule:
         return [self.scaled(apart * (i + 1)) for i in range(count)]
 
     def lr(self, name: str, step: int) -> float:
-        """Learning rate of a parameter in this step.
+        """Learning rate of a parameter in this step; of the means in pixels, if `in_pixels`.
 
         Args:
             name: a surfel parameter, field_table, field_mlp or exposure.
@@ -192,7 +198,9 @@ class Schedule:
             return self._last_part.lr(name, 0) * self._falling(step)
         warmup = min(1.0, (step + 1) / max(1, self.scaled(self.config.field_warmup)))
         factor = warmup if name.startswith("field") else gain
-        if name == "means":
+        if name == "means" and self.in_pixels:
+            name = "mean_pixels"
+        elif name == "means":
             factor *= self.extent
         if name in VIEW_PARAMETERS:
             factor, name = factor * VIEW_PARAMETERS[name].share, VIEW_PARAMETERS[name].rate

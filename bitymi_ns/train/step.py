@@ -22,6 +22,7 @@ from bitymi_ns.train.optimizers import ResizeHook, set_rate
 from bitymi_ns.train.processes import ALONE, Processes
 from bitymi_ns.train.rollback import RollbackGuard
 from bitymi_ns.train.schedules import Schedule
+from bitymi_ns.train.step_sizes import StepSizes
 from bitymi_ns.train.strategy import Strategy
 from bitymi_ns.train.texels import LearningTexels
 from bitymi_ns.train.views import DownscaledViews, TrainingData, View, step_background
@@ -111,6 +112,8 @@ class Training:
         self.guard = RollbackGuard(scene, optimizers, self.strategy, self.exposure, announce)
         self.texels = LearningTexels(scene, self.schedule, processes)
         self.watch = LossWatch()
+        cameras = [view.camera for view in data.views] if data.cameras is None else data.cameras
+        self.step_sizes = StepSizes(self.schedule, cameras)
         self.clock = Stopwatch()
         self.step = 0
         self._full_size = data.views
@@ -143,15 +146,16 @@ class Training:
         grows = step > 0 and self.schedule.resolution_factor(step) != self.schedule.resolution_factor(step - 1)
         began = self.texels.begin(step, self.views)
         if began:
-            self.guard.forget_states()
+            self.guard.restart()
         if began or grows:
             give_back_memory()
         self.guard.before(step, self.views)
+        self.step_sizes.measure(self.scene, always=began)
         self._set_rates()
 
     def _set_rates(self) -> None:
         for name, optimizer in self.optimizers.items():
-            set_rate(optimizer, self.guard.factor * self.schedule.lr(name, self.step))
+            set_rate(optimizer, self.guard.factor * self.step_sizes.rate(name, self.step))
 
     def losses(self, view: View) -> tuple[dict[str, Tensor], RenderOutput]:
         """`view_losses` of the step's view. Where they are not finite, the guard repairs the scene and draws it again.
@@ -173,10 +177,14 @@ class Training:
                 return terms, output
             self.watch.forget()
             self.guard.failed(self.step, diverged or TrainingDiverged(problem))
+            self.step_sizes.measure(self.scene)
             self._set_rates()
 
-    def combine(self) -> None:
+    def combine(self) -> dict[str, Tensor]:
         """After the backward passes: the gradients become those of the mean loss of all views of the step.
+
+        Returns:
+            Factors [N] of the surfels' rates, by parameter, for `optimizers.step`.
 
         Raises:
             ProcessesApart, ProcessLost: see `Processes.average_gradients`.
@@ -188,6 +196,7 @@ class Training:
             self.texels.average()
             self.exposure.average(self.processes)
         self.texels.step()
+        return self.step_sizes.factors()
 
     def finish(self) -> dict[str, float]:
         """After the optimisers: densify, prune, look for divergence, stop the clock.
@@ -215,6 +224,8 @@ class Training:
             report = self.guard.failed(step, error)
         else:
             report |= self.guard.after(step, loss, broken)
+        if report:
+            self.step_sizes.measure(self.scene)
         if "rolled_back" in report:
             self.watch.forget()
         self.clock.stop()
@@ -235,6 +246,7 @@ class Training:
             "strategy": self.strategy.state_dict(),
             "guard": self.guard.state_dict(),
             "exposure": self.exposure.state_dict(),
+            "step_sizes": self.step_sizes.state_dict(),
             "seconds": self.clock.seconds,
             "cpu_seconds": self.clock.cpu_seconds,
         }
@@ -246,6 +258,8 @@ class Training:
             self.guard.load_state_dict(state["guard"])
         device = self.scene.surfels["means"].device  # a checkpoint is read on the CPU
         self.exposure.load_state_dict(state.get("exposure"), len(self._full_size), device)
+        if "step_sizes" in state:
+            self.step_sizes.load_state_dict(state["step_sizes"], device)
         self.clock = Stopwatch(state["seconds"], state["cpu_seconds"])
 
 

@@ -72,6 +72,7 @@ class TrainingData:
         covered: share of their pixels that show something (`covered_share`).
         exif_stops: log2 of the exposure of each view (`exposure.exif_stops`), NaN = unknown; None = of all.
         photographs: number of the photograph of each view; None = each is one.
+        cameras: of the views; None = they are asked of the views, which may read their photographs for it.
     """
 
     views: Sequence[View]
@@ -81,6 +82,7 @@ class TrainingData:
     covered: float = 1.0
     exif_stops: Sequence[float] | None = None
     photographs: Sequence[int] | None = None
+    cameras: Sequence[Camera] | None = None
 
 
 def _moved(value: Tensor | None, device: torch.device | str) -> Tensor | None:

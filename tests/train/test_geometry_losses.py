@@ -130,8 +130,8 @@ def test_depth_moves_surfels_to_the_surface(make_scene, views) -> None:
             scene.surfels["means"].mul_(1.1)
         return scene
 
-    without, plain = run(shifted, views)
-    with_it, terms = run(shifted, known, depth_weight=1.0, geometry_interval=2)
+    without, plain = run(shifted, views, 120)
+    with_it, terms = run(shifted, known, 120, depth_weight=1.0, geometry_interval=2)
     assert off_the_surface(with_it, known) < 0.7 * off_the_surface(without, known)
     assert all(("depth" in each) == (step % 2 == 0) for step, each in enumerate(terms))
     assert not any("depth" in each for each in plain)

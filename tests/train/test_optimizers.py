@@ -36,7 +36,7 @@ def test_a_step_together_is_a_step_of_each(left_out: tuple[int, ...]) -> None:
         for given in (together, alone):
             for i, (p, gradient) in enumerate(zip(parameters_of(given), gradients, strict=True)):
                 p.grad = None if number == 2 and i in left_out else gradient.clone()
-        step(together.values())
+        step(together, {})
         for optimizer in alone.values():
             optimizer.step()
         for a, b in zip(parameters_of(together), parameters_of(alone), strict=True):
@@ -49,3 +49,23 @@ def test_a_step_together_is_a_step_of_each(left_out: tuple[int, ...]) -> None:
             assert all(torch.equal(a[row][key], value) for key, value in values.items())
     forget_gradients(together.values())
     assert all(p.grad is None for p in parameters_of(together))
+
+
+def test_steps_of_rows_are_scaled() -> None:
+    """Also the first one, which an optimiser does itself."""
+    scaled, plain = optimizers(), optimizers()
+    factor = torch.linspace(0.0, 3.0, 7)
+    g = torch.Generator().manual_seed(1)
+    for _ in range(3):
+        gradients = [torch.randn(p.shape, generator=g) for p in parameters_of(scaled)]
+        before = {id(p): p.detach().clone() for p in parameters_of(scaled) + parameters_of(plain)}
+        for given in (scaled, plain):
+            for p, gradient in zip(parameters_of(given), gradients, strict=True):
+                p.grad = gradient.clone()
+        step(scaled, {"0": factor, "unknown": factor})
+        step(plain, {})
+        for i, (a, b) in enumerate(zip(parameters_of(scaled), parameters_of(plain), strict=True)):
+            moved = (p.detach() - before[id(p)] for p in (a, b))
+            by = factor[:, None] if i == 0 else 1.0
+            a_moved, b_moved = moved
+            torch.testing.assert_close(a_moved, by * b_moved, rtol=1e-4, atol=1e-6)

@@ -6,6 +6,7 @@ import warnings
 import pytest
 import torch
 
+from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import DensifyConfig, GuardConfig, LearningRates, TrainConfig
 from bitymi_ns.train.divergence import TrainingDiverged, describe_broken
 from bitymi_ns.train.evaluate import evaluate
@@ -75,8 +76,8 @@ def test_a_field_that_breaks_on_the_way_is_restored(begun, views):
         for _ in range(20):
             trainer.advance()
     assert trainer.training.guard.rollbacks == 1 and not describe_broken(scene)
-    rate = trainer.training.schedule.lr("means", 69)
-    assert trainer.optimizers["means"].param_groups[0]["lr"] == pytest.approx(0.3 * rate)
+    rate = trainer.training.schedule.lr("quats", 69)
+    assert trainer.optimizers["quats"].param_groups[0]["lr"] == pytest.approx(0.3 * rate)
     assert (scene.field.field_table - good).abs().max() < 0.5
     run(trainer, 50)
     assert evaluate(scene, views, trainer.config)[0] > 15
@@ -118,6 +119,41 @@ def test_views_drawn_worse_than_before_take_the_run_back(begun, views):
             trainer.advance()
     assert evaluate(scene, views, trainer.config)[0] > damaged + 3 and damaged < good - 3
     assert trainer.training.guard.rollbacks == 1
+
+
+def test_rates_return_to_normal_after_a_good_window_but_once(begun):
+    trainer = begun(50)
+    guard = trainer.training.guard
+
+    def break_the_field() -> None:
+        with torch.no_grad():
+            trainer.scene.field.field_w3[4] = math.nan
+        run(trainer, 1)
+
+    break_the_field()
+    assert guard.factor == pytest.approx(0.3)
+    with pytest.warns(UserWarning, match="learning rates return to normal"):
+        for _ in range(2 * guard.window):
+            trainer.advance()
+    assert guard.factor == 1.0 and guard.rollbacks == 1
+    break_the_field()
+    run(trainer, 120 - trainer.step)
+    assert guard.rollbacks == 2 and guard.factor == pytest.approx(0.3)
+
+
+def test_texels_begin_a_window_of_their_own(make_scene, views):
+    """A rise of the loss when texels begin is compared with what was before only where it lasts."""
+    config = config_of()
+    config.texels.start = 18_000
+    trainer = Trainer(make_scene(texture=False, config=SceneConfig(texture="texels")), views, config, 250)
+    start, guard = trainer.training.schedule.texels_start, trainer.training.guard
+    run(trainer, start)
+    counted, best = guard._count, guard._best
+    assert counted > 0 and math.isfinite(best)
+    run(trainer, 1)
+    assert guard._count == 1 and guard._best == best
+    run(trainer, 250 - trainer.step)
+    assert guard.rollbacks == 0
 
 
 def test_losses_are_compared_across_resolutions(make_scene, views):

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from bitymi_ns.train.config import DensifyConfig, LossConfig, TexelConfig, TrainConfig
+from bitymi_ns.train.config import DensifyConfig, LearningRates, LossConfig, TexelConfig, TrainConfig
 from bitymi_ns.train.schedules import Schedule
 
 
@@ -110,8 +110,12 @@ def test_short_runs_see_small_pictures_for_longer_but_their_texels_full_size():
 
 def test_learning_rates():
     schedule = Schedule(TrainConfig(), 30_000, extent=4.0)
-    assert schedule.lr("means", 0) == pytest.approx(4 * 1.6e-4)
-    assert schedule.lr("means", 29_999) == pytest.approx(4 * 1.6e-6)
+    first, last = LearningRates().mean_pixels
+    assert schedule.in_pixels and schedule.lr("means", 0) == pytest.approx(first)
+    assert schedule.lr("means", 29_999) == pytest.approx(last)
+    recorded = Schedule(TrainConfig(lr=LearningRates(means=(1.6e-4, 1.6e-6))), 30_000, extent=4.0)
+    assert not recorded.in_pixels and recorded.lr("means", 0) == pytest.approx(4 * 1.6e-4)
+    assert recorded.lr("means", 29_999) == pytest.approx(4 * 1.6e-6)
     assert schedule.lr("sh_rest", 0) == pytest.approx(schedule.lr("sh_dc", 0) / 20)
     assert schedule.lr("field_table", 0) == pytest.approx(1e-2 / 500)
     assert schedule.lr("field_mlp", 29_999) == pytest.approx(1e-3)
@@ -126,6 +130,17 @@ def test_learning_rates():
 @pytest.mark.parametrize(("max_steps", "opacity"), [(30_000, 0.01), (3700, 0.01), (1000, 0.01613), (200, 0.2689)])
 def test_resets_leave_time_to_recover(max_steps, opacity):
     assert Schedule(every_event(), max_steps).reset_opacity() == pytest.approx(opacity, rel=1e-3)
+
+
+def test_positions_do_not_start_anew_with_the_texels() -> None:
+    """Other rates of the surfels do, as of a run as long as the texels' part."""
+    for steps in (1000, 30_000):
+        schedule = Schedule(TrainConfig(), steps, texels=True)
+        begin, part = schedule.texels_start, Schedule(TrainConfig(), schedule.texel_steps)
+        assert schedule.lr("quats", begin) == pytest.approx(TexelConfig().surfel_rates * part.lr("quats", 0))
+        assert schedule.lr("means", begin) == pytest.approx(TexelConfig().mean_rates * part.lr("means", 0))
+        assert schedule.lr("means", begin) < 3 * schedule.lr("means", begin - 1)
+        assert schedule.lr("means", steps - 1) < 1e-4 * schedule.lr("means", begin)
 
 
 def test_short_runs_learn_faster() -> None:

@@ -42,6 +42,8 @@ class TrainingRun:
         self.total: int = trainer.config.max_num_iterations
         self.first_step: int = trainer._start_step
         self._parameters = attributes.optimizers.parameters
+        train = self.datamanager.train_dataset.cameras
+        cameras = OnDemand(len(train), lambda i: to_camera(train[i : i + 1], "cpu"))
         data = TrainingData(
             self.datamanager.train_views,
             scene_extent(model.metadata["camera_centers"], scene.surfels["means"]),
@@ -50,6 +52,7 @@ class TrainingRun:
             covered_share(self.datamanager.train_views),
             exposure_stops(self.datamanager.train_dataset.files),
             self.datamanager.train_dataset.photographs,
+            cameras,
         )
         optimizers, processes = attributes.optimizers.optimizers, trainer.processes
         self.training = Training(scene, data, optimizers, config, self.total, self._on_resize, warn, processes)
@@ -79,8 +82,6 @@ class TrainingRun:
         self.datamanager.check_pictures()
         if self.first_step == 0:
             self._check_start()
-        train = self.datamanager.train_dataset.cameras
-        cameras = OnDemand(len(train), lambda i: to_camera(train[i : i + 1], "cpu"))
         learns = scene.config.texture == "texels"
         texels, to_come = config.texels if learns else None, self.training.texels.views_to_come
         most = self.training.strategy.most

@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
 
 from bitymi_ns import files
 from bitymi_ns.plugin.console import INTERRUPTED, fail, filter_console, ignore_torch_warnings, say, step_bar, warn
@@ -35,19 +37,19 @@ class _StopAfterStep(Exception):
 class TogetherOptimizers(Optimizers):
     """nerfstudio's optimisers, one per parameter group, that step together: the same steps in less time."""
 
-    before_step: Callable[[], None] | None = None  # called before each step, with all gradients there
+    # called before each step, with all gradients there; returns the factors of `optimizers.step`
+    before_step: Callable[[], Mapping[str, Tensor]] | None = None
 
     def zero_grad_some(self, param_groups: list[str]) -> None:
         optimizers.forget_gradients(self.optimizers[group] for group in param_groups)
 
     def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
-        if self.before_step is not None:
-            self.before_step()
-        clipped = any(self.config[group]["optimizer"].max_norm is not None for group in param_groups)
-        if clipped or grad_scaler.is_enabled():
-            super().optimizer_scaler_step_some(grad_scaler, param_groups)
-        else:
-            optimizers.step([self.optimizers[group] for group in param_groups])
+        factors = {} if self.before_step is None else self.before_step()
+        for group in param_groups:
+            longest = self.config[group]["optimizer"].max_norm
+            if longest is not None:
+                torch.nn.utils.clip_grad_norm_(self.parameters[group], longest)
+        optimizers.step({group: self.optimizers[group] for group in param_groups}, factors)
 
 
 class BitymiTrainer(Trainer):

@@ -1,0 +1,255 @@
+#!/usr/bin/env python
+"""Compare rules of training on a CPU in long runs and in short ones: no default is chosen from short runs alone.
+
+    python benchmarks/long.py DATA... --rows bitymi "bitymi train.lr.rim=0.1" --runs 10000/4 1500/2 300/1
+
+A run is STEPS/REDUCTION: so many steps on photographs reduced by a whole factor. Long ones take 25 to 60 CPU minutes;
+start several commands with the same --work, they share the runs. Rounding alone moves PSNR by 0.1 dB: give --seeds."""
+
+import contextlib
+import itertools
+import math
+import shlex
+import statistics
+import sys
+import tempfile
+import time
+from argparse import Namespace
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from zlib import crc32
+
+import torch
+import yaml
+from common import arguments_of, number, page, publish, say, table
+from plain_capture import Capture, load_capture
+from torch import Tensor
+
+from bitymi_ns import bake_scene
+from bitymi_ns.files import Busy, Lock
+from bitymi_ns.measure.bench.cells import FILE, Cells, identity, provenance, without_nan
+from bitymi_ns.measure.machine import commit
+from bitymi_ns.ops import ssim
+from bitymi_ns.plugin.run.metrics import lpips_metrics
+from bitymi_ns.train.evaluate import evaluate
+from bitymi_ns.train.fit import Trainer
+from bitymi_ns.train.init import first_surfels_for, scene_for_views
+from bitymi_ns.train.losses import fitted_psnr, photometric, psnr
+from bitymi_ns.train.preset import Preset, load_preset
+from bitymi_ns.train.views import View, eval_background, spread
+
+RUNS = ("10000/4", "1500/2", "300/1")
+WATCHED, EVERY, WATCH = 8, 30, 300
+"""Training views whose loss is watched when texels begin, the steps between, and for how many steps."""
+COLUMNS = {
+    "PSNR": ("psnr", 2),
+    "fitted": ("fitted_psnr", 2),
+    "SSIM": ("ssim", 4),
+    "LPIPS": ("lpips", 4),
+    "before texels": ("before_texels", 2),
+    "loss, peak": ("peak", 2),
+    "back after": ("back_after", 0),
+    "rollbacks": ("rollbacks", 0),
+    "surfels": ("surfels", 0),
+    "fragments per pixel": ("fragments", 1),
+    "bundle dB": ("baked_psnr", 2),
+    "kB": ("kilobytes", 0),
+    "CPU s": ("cpu_seconds", 0),
+}
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training run."""
+
+    data: str
+    row: str
+    steps: int
+    reduction: int
+    seed: int
+    photographs: int
+    bake: bool
+
+    @property
+    def key(self) -> dict[str, Any]:
+        settings = {name: value for name, value in vars(self).items() if name != "row"}  # a cell's `row` is a label
+        return {**settings, "data": Path(self.data).resolve().name, "settings": self.row, "commit": commit()}
+
+
+def preset_of(row: str) -> Preset:
+    """The preset that a row names, with its settings.
+
+    Raises:
+        ValueError: there is no such option.
+    """
+    name, *settings = shlex.split(row)
+    preset = load_preset(name)
+    for setting in settings:
+        path, _, text = setting.partition("=")
+        *parents, leaf = path.split(".")
+        owner: Any = preset
+        for parent in parents:
+            owner = getattr(owner, parent)
+        if leaf not in vars(owner):
+            raise ValueError(f"row '{row}': there is no option {path}")
+        value = yaml.safe_load(text)
+        setattr(owner, leaf, tuple(value) if isinstance(value, list) else value)
+    return preset
+
+
+def quality(rgb: Tensor, target: Tensor) -> dict[str, float]:
+    """Compare a render with a photograph, both [H, W, 3]."""
+    rgb = rgb.clamp(0.0, 1.0)
+    found = {"psnr": psnr(rgb, target), "fitted_psnr": fitted_psnr(rgb, target), "ssim": float(ssim(rgb, target))}
+    return found | lpips_metrics(rgb, target, ("lpips",))
+
+
+def means(rows: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Average figures over views."""
+    return {name: statistics.fmean(row[name] for row in rows) for name in rows[0]}
+
+
+class TexelWatch:
+    """The loss of a few training views from the step before texels begin on."""
+
+    def __init__(self, trainer: Trainer, views: Sequence[View]) -> None:
+        self.trainer, self.views = trainer, [views[i] for i in spread(len(views), WATCHED)]
+        self.losses: list[float] = []
+
+    def note(self) -> None:
+        since = self.trainer.step - self.trainer.training.schedule.texels_start
+        if not 0 <= since <= WATCH or since % EVERY:
+            return
+        scene, config = self.trainer.scene, self.trainer.config
+        background = eval_background(config, "cpu")
+        with torch.no_grad():
+            pairs = [
+                (scene.render(view.camera, background, "frozen").rgb, view.target(background, "cpu"))
+                for view in self.views
+            ]
+        losses = [photometric(*pair, config.loss.ssim_weight) for pair in pairs]
+        self.losses.append(float(torch.stack(losses).mean()))
+
+    def figures(self) -> dict[str, Any]:
+        """The largest loss as a multiple of that before, and after how many steps it is below it again."""
+        if len(self.losses) < 2:
+            return {}
+        before, *after = self.losses
+        back = [i * EVERY for i, loss in enumerate(after, 1) if loss < before]
+        found = {"losses": [round(loss, 5) for loss in self.losses], "peak": max(after) / before}
+        return found | {"back_after": back[0] if back else math.nan}
+
+
+def cut(capture: Capture, photographs: int) -> Capture:
+    """A capture of so many photographs at most, evenly spread; as many are held out as in the whole."""
+    train = [capture.train[i] for i in spread(len(capture.train), photographs)] if photographs else capture.train
+    return Capture(train, capture.held_out, capture.points, capture.colours)
+
+
+def measure(run: Run) -> dict[str, Any]:
+    """Train, and bake if that is asked for."""
+    preset = preset_of(run.row)
+    preset.train.seed = run.seed
+    capture = cut(load_capture(Path(run.data), run.reduction), run.photographs)
+    if capture.white:
+        preset.train.alpha_color = "white"
+    camera = capture.train[0].camera
+    if preset.train.first_surfels is None:
+        preset.train.first_surfels = first_surfels_for(run.steps, camera.width * camera.height)
+    torch.manual_seed(run.seed)
+    scene = scene_for_views(capture.train, capture.points, capture.colours, preset.scene, preset.train)
+    trainer = Trainer(scene, capture.train, preset.train, run.steps)
+    watch, clock, before = TexelWatch(trainer, capture.train), trainer.training.clock, math.nan
+    shown = {run.steps * i // 20 for i in range(1, 20)}
+    while trainer.step < run.steps:
+        if trainer.step == trainer.training.schedule.texels_start:
+            before = evaluate(scene, capture.held_out, preset.train).psnr
+        watch.note()
+        trainer.advance()
+        if trainer.step in shown:
+            say(f"step {trainer.step:,}: loss {trainer.loss:.4f}, {len(scene):,} surfels, {clock.cpu_seconds:.0f} s")
+    background = eval_background(preset.train, "cpu")
+    targets = [view.target(background, "cpu") for view in capture.held_out]
+    rows = []
+    for view, target in zip(capture.held_out, targets, strict=True):
+        with torch.no_grad():
+            output = scene.render(view.camera, background, "frozen")
+        rows.append(quality(output.rgb, target) | {"fragments": len(output.fragments) / (target.numel() / 3)})
+    found = means(rows) | watch.figures()
+    found |= {"before_texels": before, "surfels": len(scene), "rollbacks": trainer.training.guard.rollbacks}
+    found |= {"cpu_seconds": clock.cpu_seconds, "width": camera.width, "height": camera.height}
+    if run.bake:
+        with tempfile.TemporaryDirectory() as folder:
+            bundle = Path(folder) / "bundle"
+            baked = bake_scene(scene, capture.train, bundle, background=background)
+            found["kilobytes"] = sum(path.stat().st_size for path in bundle.iterdir()) / 1e3
+            drawn = (baked.render(view.camera).rgb for view in capture.held_out)
+            figures = means([quality(*pair) for pair in zip(drawn, targets, strict=True)])
+            found |= {f"baked_{name}": value for name, value in figures.items()}
+    return found
+
+
+def tables(runs: Sequence[Run], cells: Cells) -> str:
+    """A table per capture and kind of run: a line per row, the mean over seeds with the PSNR's spread."""
+    parts = []
+    for group, members in itertools.groupby(runs, lambda run: (run.data, run.steps, run.reduction)):
+        lines, size = [], ""
+        for row, seeds in itertools.groupby(members, lambda run: run.row):
+            found = [cell["value"] for run in seeds if (cell := cells.get(run.key)) is not None]
+            if not found:
+                continue
+            size = f"{found[0]['width']} x {found[0]['height']}"
+            line = [row, str(len(found))]
+            for name, digits in COLUMNS.values():
+                values = [value[name] for value in found if value.get(name) is not None]
+                text = number(statistics.fmean(values), digits) if values else ""
+                spread_ = f" ± {statistics.stdev(values):.2f}" if name == "psnr" and len(values) > 1 else ""
+                line.append(text + spread_)
+            lines.append(line)
+        title = f"### {Path(group[0]).name}, {group[1]:,} steps, {size}\n\n"
+        parts.append(title + table(["row", "seeds", *COLUMNS], lines))
+    return "\n\n".join(parts)
+
+
+def main() -> None:
+    arguments = read_arguments()
+    torch.set_num_threads(1)
+    runs = [
+        Run(str(data), row, *(int(x) for x in run.split("/")), seed, arguments.photographs, arguments.bake)
+        for data, run, row, seed in itertools.product(arguments.data, arguments.runs, arguments.rows, arguments.seeds)
+    ]
+    for row in arguments.rows:
+        preset_of(row)
+    arguments.work.mkdir(parents=True, exist_ok=True)
+    cells = Cells(arguments.work / FILE)
+    for i, run in enumerate(runs):
+        with contextlib.suppress(Busy), Lock(arguments.work / f"{crc32(identity(run.key).encode()):08x}.lock"):
+            cells.refresh()
+            if cells.get(run.key) is not None:
+                continue
+            say(f"{i + 1} of {len(runs)}: {run}")
+            start = time.perf_counter()
+            value = measure(run)
+            cells.add(run.key, without_nan(value), provenance(sys.argv, time.perf_counter() - start))
+            say(", ".join(f"{name} {value[of]:.4g}" for name, (of, _) in COLUMNS.items() if of in value))
+    cells.refresh()
+    publish(page("Long and short runs", tables(runs, cells)), arguments.output)
+
+
+def read_arguments() -> Namespace:
+    parser = arguments_of(__doc__)
+    parser.add_argument("data", nargs="+", type=Path, help="folders with a transforms.json, or such files")
+    parser.add_argument("--rows", nargs="+", default=["bitymi"], help="a method each, and its settings: PATH=VALUE ...")
+    parser.add_argument("--runs", nargs="+", default=list(RUNS), help="STEPS/REDUCTION each")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--photographs", type=int, default=0, help="train on so many photographs only; 0 = all")
+    parser.add_argument("--bake", action="store_true", help="also bake: bytes, and quality of the bundle")
+    parser.add_argument("--work", type=Path, default=Path("outputs/long"), help="folder of the finished runs")
+    parser.add_argument("--output", type=Path, help="file for the tables")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()

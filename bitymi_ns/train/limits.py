@@ -1,4 +1,11 @@
-"""Messages for every limit that a run hits."""
+"""Messages for every limit that a run hits, and for what it does otherwise than it recorded."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from typing import Any
 
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
@@ -64,6 +71,46 @@ def held_back(count: int, most: int, config: TrainConfig) -> str:
     if most == densify.max_surfels:
         why, option = "", "max-surfels"
     return f"Densification stops at {most:,} surfels{why} and would have made {count:,} more now (--{option})."
+
+
+def recorded_rules(config: TrainConfig) -> list[str]:
+    """Name the rules of earlier versions that recorded options ask for."""
+    if config.lr.means is None:
+        return []
+    return [
+        "Positions move in shares of the scene's extent, as the recorded lr.means asks for; a new run moves them in "
+        "pixels of the photographs (lr.mean_pixels)."
+    ]
+
+
+def recorded(config: TrainConfig) -> str:
+    """Write the training options as text for a checkpoint."""
+    return json.dumps(asdict(config), sort_keys=True)
+
+
+def other_options(record: str | None, config: TrainConfig) -> list[str]:
+    """Name the options in which a resumed run differs from its record.
+
+    Args:
+        record: of `recorded`; None = the checkpoint has none, as those of earlier versions.
+        config: the options of the resumed run.
+    """
+    if record is None:
+        return []
+    before, now = (dict(_flat(json.loads(text))) for text in (record, recorded(config)))
+    different = [name for name in now if name in before and before[name] != now[name]]
+    if not different:
+        return []
+    named = ", ".join(f"{name.replace('_', '-')} {now[name]} (was {before[name]})" for name in different)
+    return [f"Resumed with other options than were recorded (--pipeline.model.train): {named}."]
+
+
+def _flat(options: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in options.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value
 
 
 def _count(n: int, name: str) -> str:

@@ -68,8 +68,7 @@ class StepSizes:
         """
         self.schedule = schedule
         self.cameras = [cameras[i] for i in spread(len(cameras), MEASURED)]
-        self.footprints = torch.zeros(0)
-        self._typical = 1.0
+        self._set(torch.zeros(0))
 
     def measure(self, scene: Scene, always: bool = True) -> None:
         """Measure the footprints of the surfels that there are now.
@@ -83,7 +82,8 @@ class StepSizes:
 
     def _set(self, footprints: Tensor) -> None:
         self.footprints = footprints
-        self._typical = float(footprints.median())
+        self._typical = float(footprints.median()) if len(footprints) else 1.0
+        self._relative = footprints / self._typical
 
     def rate(self, name: str, step: int) -> float:
         """Return the learning rate of a parameter's optimiser: of the typical surfel, where surfels differ."""
@@ -92,7 +92,7 @@ class StepSizes:
 
     def factors(self) -> dict[str, Tensor]:
         """Return the surfels' rates as multiples [N] of `rate`, by parameter; all others have one rate."""
-        return {"means": self.footprints / self._typical} if self.schedule.in_pixels else {}
+        return {"means": self._relative} if self.schedule.in_pixels else {}
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state for a resumed run."""
@@ -100,5 +100,4 @@ class StepSizes:
 
     def load_state_dict(self, state: Mapping[str, Any], device: torch.device) -> None:
         """Restore what `state_dict` returned."""
-        if len(state["footprints"]):
-            self._set(state["footprints"].to(device))
+        self._set(state["footprints"].to(device))

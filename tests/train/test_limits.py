@@ -2,7 +2,7 @@
 
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train import limits
-from bitymi_ns.train.config import DensifyConfig, TrainConfig
+from bitymi_ns.train.config import DensifyConfig, LearningRates, TrainConfig
 from bitymi_ns.train.init import PointReport
 from bitymi_ns.train.schedules import Schedule
 
@@ -48,3 +48,18 @@ def test_a_bound_that_densification_meets_is_named() -> None:
     capped, by_pixels = limits.held_back(1234, 800, config), limits.held_back(1234, 700, config)
     assert "800 surfels and would have made 1,234 more" in capped and "(--max-surfels)" in capped
     assert "one for 150 pixels of all photographs" in by_pixels and "densify.pixels-per-surfel" in by_pixels
+
+
+def test_a_resumed_run_names_the_options_that_differ() -> None:
+    record = limits.recorded(TrainConfig())
+    assert limits.other_options(record, TrainConfig()) == [] and limits.other_options(None, TrainConfig()) == []
+    other = TrainConfig(densify=DensifyConfig(max_surfels=800), exposure="gain")
+    (sentence,) = limits.other_options(record, other)
+    assert "densify.max-surfels 800 (was 0)" in sentence and "exposure gain (was off)" in sentence
+    assert "quats" not in sentence
+
+
+def test_rules_of_earlier_versions_are_named() -> None:
+    assert limits.recorded_rules(TrainConfig()) == []
+    (sentence,) = limits.recorded_rules(TrainConfig(lr=LearningRates(means=(1.6e-4, 1.6e-6))))
+    assert "shares of the scene's extent" in sentence and "lr.means" in sentence

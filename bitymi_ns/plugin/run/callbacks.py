@@ -72,8 +72,10 @@ class TrainingRun:
         )
         self.names = {"experiment_name": trainer.config.experiment_name, "method_name": trainer.config.method_name}
         self._held_back = False  # whether it was said that densification meets its bound
-        for sentence in limits.short_run(
-            self.training.schedule, len(self.datamanager.train_dataset), scene.config.texture == "hash", processes.views
+        for sentence in (
+            *limits.other_options(model.recorded_options, config),
+            *limits.recorded_rules(config),
+            *limits.short_run(self.training.schedule, len(train), scene.config.texture == "hash", processes.views),
         ):
             say(sentence)
         _ = self.datamanager.cached_train  # read the images now: loading is not training time

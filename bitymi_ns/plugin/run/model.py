@@ -89,6 +89,7 @@ class BitymiModel(SurfelModel):
         self.metadata["first_surfels"] = len(self.scene)  # a checkpoint that is loaded may have another number
         self.trained_for: int | None = None
         self.resume_state: dict[str, Any] = {}
+        self.recorded_options: str | None = None  # of the run that is resumed
         self._run: TrainingRun | None = None
 
     # rendering
@@ -144,6 +145,7 @@ class BitymiModel(SurfelModel):
     def get_extra_state(self) -> dict[str, Any]:
         """Tensors, numbers and text only, so that torch loads it in its safe mode."""
         state: dict[str, Any] = {"version": STATE_VERSION, "scene": json.dumps(dataclasses.asdict(self.config.scene))}
+        state["train"] = limits.recorded(self.train_config)
         state["near"], state["first_surfels"] = self.scene.near, self.metadata["first_surfels"]
         if self._run is not None:
             state["trained_for"] = self._run.total
@@ -154,7 +156,7 @@ class BitymiModel(SurfelModel):
 
     def set_extra_state(self, state: Any) -> None:
         self.trained_for = state.get("trained_for")
-        self.resume_state = state.get("run", {})
+        self.resume_state, self.recorded_options = state.get("run", {}), state.get("train")
         self.metadata["first_surfels"] = state.get("first_surfels", self.metadata["first_surfels"])
         if self.config.scene.near is None:
             self.scene.near = state.get("near", 0.2)  # older checkpoints: what all scenes had

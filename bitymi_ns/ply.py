@@ -5,11 +5,14 @@ import re
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from io import TextIOWrapper
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+
+from bitymi_ns.reading import open_regular
 
 HEADER_LIMIT = 1 << 16  # no header is longer, in bytes
 _TYPES = {
@@ -64,7 +67,7 @@ class Header:
 
 def read_header(path: Path) -> Header:
     """The header of a file; PlyError where it is none."""
-    with open(path, "rb") as file:
+    with open_regular(path) as file:
         return parse_header(file.read(HEADER_LIMIT))
 
 
@@ -161,6 +164,6 @@ def read_rows(path: Path, header: Header, name: str) -> npt.NDArray[np.void]:
 
 def text_lines(path: Path, header: Header, name: str) -> Iterator[tuple[int, str]]:
     """Number, from 1 in the file, and text of each line from an element's first row on; empty ones do not count."""
-    with open(path, encoding="latin-1", newline="\n") as file:
+    with TextIOWrapper(open_regular(path), encoding="latin-1", newline="\n") as file:
         filled = ((number, line) for number, line in enumerate(file, 1) if number > header.lines and line.strip())
         yield from islice(filled, header.ahead(name), None)

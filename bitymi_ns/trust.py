@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 UNFINISHED = ".unfinished"  # ends the name of a file on its way, which begins with a dot: a killed process leaves it
+LONGEST = 1000  # letters of a name that are shown
 DEEPEST = 100  # levels of JSON that are read
 _CALL = "import sys; sys.path[:] = [folder for folder in sys.path if folder]; from {0} import {1}; sys.exit({1}())"
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -220,8 +221,8 @@ def printable(text: str) -> str:
 
 
 def listed(names: Sequence[object], most: int = 3) -> str:
-    """The first few names, and how many more there are."""
-    shown = ", ".join(str(name) for name in names[:most])
+    """The first few names, at most LONGEST letters of each, and how many more there are."""
+    shown = ", ".join(str(name)[:LONGEST] for name in names[:most])
     return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
 
 

@@ -1,6 +1,9 @@
 """The public functions, and the examples that use them."""
 
+import copy
 import importlib.util
+import io
+import pickle
 from pathlib import Path
 from types import ModuleType
 
@@ -11,7 +14,9 @@ from PIL import Image
 
 import bitymi_ns
 from bitymi_ns import sample
+from bitymi_ns.bake.early_stopping import EarlyStopping
 from bitymi_ns.ops.reference.render import render as reference_render
+from bitymi_ns.scene.baked_renderer import SceneRenderer
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -67,13 +72,91 @@ def test_rasterize_gives_values_and_gradients_of_the_float64_reference() -> None
         bitymi_ns.rasterize(**(values | {"quats": values["quats"][:, :3]}), camera=camera)
 
 
+def flat(**changes: float) -> dict[str, torch.Tensor]:
+    """One surfel in float32 that faces the camera."""
+    values = {"opacities": 0.7, "betas": 2.0, **changes}
+    numbers = {name: torch.tensor([value]) for name, value in values.items() if name in ("opacities", "betas")}
+    scales = torch.full((1, 2), values.get("scales", 0.5))
+    place = {"means": torch.tensor([[0.0, 0.0, 4.0]]), "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]])}
+    found = {**place, "scales": scales, **numbers, "colors": torch.ones(1, 3)}
+    return {name: value.requires_grad_() for name, value in found.items()}
+
+
+@pytest.mark.parametrize(
+    ("name", "edge", "near"),
+    [("opacities", 1.0, 0.9999), ("opacities", 0.0, 1e-5), ("betas", 0.0, 1e-5), ("betas", 4.0, 3.9999)],
+)
+def test_opacities_and_betas_at_the_ends_of_their_ranges(name: str, edge: float, near: float) -> None:
+    drawn, gradients = [], []
+    for value in (edge, near):
+        values = flat(**{name: value})
+        image = bitymi_ns.rasterize(**values, camera=camera_of()).rgb
+        image[9, 15].sum().backward()  # off the centre, where the weight is below its bound
+        assert all(bool(each.grad.isfinite().all()) for each in values.values())
+        drawn.append(image.detach())
+        gradients.append(float(values[name].grad))
+    assert torch.allclose(*drawn, atol=1e-3) and (edge == 0.0 and name == "opacities") == (float(drawn[0].max()) < 1e-3)
+    assert gradients[0] == pytest.approx(gradients[1], rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("opacities", 2.0, r"opacities have to be from 0 and to 1: opacities\[0\] is 2"),
+        ("opacities", -0.1, "opacities have to be"),
+        ("opacities", float("nan"), "opacities have to be .* is nan"),
+        ("betas", 4.5, r"betas have to be from 0 and to 4: betas\[0\] is 4.5"),
+        ("scales", -1.0, r"scales have to be above 0 and finite: scales\[0, 0\] is -1"),
+        ("scales", 0.0, "scales have to be above 0"),
+        ("scales", float("inf"), "scales have to be above 0 and finite"),
+    ],
+)
+def test_what_is_out_of_range_is_refused(name: str, value: float, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        bitymi_ns.rasterize(**flat(**{name: value}), camera=camera_of())
+
+
+def test_what_cannot_be_trained_or_baked_is_refused(tmp_path: Path) -> None:
+    view = bitymi_ns.View(camera_of(), torch.zeros(18, 24, 3))
+    none = torch.zeros(0, 3)
+    for views, points, colors, message in (
+        ([], none, none, "no views"),
+        ([view], torch.zeros(4, 2), none, r"points have to be \[M, 3\]"),
+        ([view], torch.zeros(4, 3), torch.zeros(3, 3), r"colors have to be \[M, 3\], as many as points"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            bitymi_ns.train_scene(views, points, colors)
+    with pytest.raises(ValueError, match="nothing to bake from: no views"):
+        bitymi_ns.bake_scene(None, [], tmp_path / "bundle")
+    stopping = EarlyStopping(0, 10, 3, 20.0, "first")
+    assert stopping.due(0) and stopping.best == "first"
+
+
+def test_a_view_moves_with_all_its_maps() -> None:
+    maps = {name: torch.zeros(18, 24, 3) for name in bitymi_ns.View._fields if name not in ("camera", "counted")}
+    moved = bitymi_ns.View(camera_of(), **maps, counted=7).to("meta")
+    assert moved.counted == 7 and all(getattr(moved, name).device.type == "meta" for name in maps)
+
+
 def test_a_scene_is_trained_baked_read_and_rendered_from_arrays(room: Path, tmp_path: Path) -> None:
     psnr = example("train_from_arrays").main(room, tmp_path / "bundle", steps=60, points=300)
     assert psnr > 8.0
     paths = example("render_bundle").main(tmp_path / "bundle", tmp_path / "pictures", most=2)
     assert [Image.open(path).size for path in paths] == [(48, 36)] * 2
     bundle = bitymi_ns.read_bundle(tmp_path / "bundle")
-    assert bundle.render(camera_of()).rgb.shape == (18, 24, 3)
+    drawn = bundle.render(camera_of()).rgb
+    assert drawn.shape == (18, 24, 3)
+    with torch.inference_mode():  # its tensors do not count how often they are written to
+        read = bitymi_ns.read_bundle(tmp_path / "bundle")
+        assert torch.equal(read.render(camera_of()).rgb, drawn)
+    assert torch.equal(read.render(camera_of()).rgb, drawn)
+    held = io.BytesIO()
+    torch.save(bundle, held)
+    held.seek(0)
+    loaded = torch.load(held, weights_only=False)
+    for other in (copy.deepcopy(bundle), pickle.loads(pickle.dumps(bundle)), loaded):
+        assert torch.equal(other.render(camera_of()).rgb, drawn)
+    assert torch.equal(copy.deepcopy(SceneRenderer(bundle.scene)).render(camera_of()).rgb, drawn)
 
 
 @pytest.mark.parametrize("method", ["bitymi-field", "bitymi-notexture"])

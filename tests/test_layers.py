@@ -14,7 +14,7 @@ import bitymi_ns
 
 PACKAGE = Path(bitymi_ns.__file__).parent
 ORDER = ["ops", "scene", "codec", "bundle", "train", "bake", "interchange", "view", "plugin", "measure"]
-BESIDE = ["files", "ply", "presets", "progress", "ranges", "sample", "capture", "trust"]
+BESIDE = ["endings", "files", "ply", "presets", "progress", "ranges", "reading", "sample", "capture", "trust"]
 """ORDER has the innermost first. These stand beside them and import none of them."""
 KNOW_NERFSTUDIO = ("plugin", "host", "measure/pictures.py")
 

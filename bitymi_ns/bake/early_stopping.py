@@ -36,7 +36,7 @@ class EarlyStopping(Generic[S]):
             first: the state then.
         """
         self._steps, self._patience = steps, patience
-        self._every = -(-steps // checks)
+        self._every = max(1, -(-steps // checks))
         self.best, self.curve, self.done = first, [] if math.isnan(psnr) else [(0, psnr)], 0
 
     def due(self, done: int) -> bool:

@@ -2,7 +2,6 @@
 
 import os
 import re
-import stat
 import struct
 import zipfile
 from collections.abc import Iterator
@@ -10,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, BinaryIO
 
+from bitymi_ns import reading
 from bitymi_ns.bundle.manifest import (
     ATLAS,
     COMPACT_SURFELS,
@@ -56,24 +56,17 @@ def passed_on(info: Manifest, data: bytes) -> bytes:
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a file for reading. A pipe or a device is refused before it is opened, also where a link leads to it.
+    """Open a file of a bundle for reading, see `reading.open_regular`.
 
     Raises:
         BundleError: there is no such file, it is something else, or the system refuses it.
     """
     try:
-        regular = stat.S_ISREG(os.stat(path).st_mode)
-        if regular:
-            # should it have become a pipe by now, opening it does not wait for its other end
-            file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
-            regular = stat.S_ISREG(os.fstat(file.fileno()).st_mode)
+        return reading.open_regular(path)
     except (FileNotFoundError, NotADirectoryError) as error:
         raise MissingPart(f"{path} is missing") from error
     except OSError as error:
         raise BundleError(f"{path} cannot be read: {error.strerror}") from error
-    if not regular:
-        raise BundleError(f"{path} is not a regular file")
-    return file
 
 
 class Parts:

@@ -13,7 +13,8 @@ from typing import Literal
 from bitymi_ns import files
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import Tell, write_file
-from bitymi_ns.trust import Refused, check_no_links, is_own, json_of, own_folder
+from bitymi_ns.reading import read_json
+from bitymi_ns.trust import Refused, check_no_links, is_own, own_folder
 
 FOLDER = ".bitymi"
 OF = "of.json"  # file in a work folder with the source and the key of its content
@@ -105,7 +106,7 @@ def _is_stale(other: Path, source: str, contents: str) -> bool:
     if not is_own(other):
         return False
     try:
-        of = json_of((other / OF).read_text("utf8"))
+        of = read_json(other / OF)
         if of["source"] != source or of["contents"] == contents:
             return False
     except (OSError, ValueError, LookupError, TypeError):

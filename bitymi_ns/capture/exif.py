@@ -107,8 +107,12 @@ def exposure_exif(image: Image.Image) -> Image.Exif:
 
 
 def exposure_settings(image: Image.Image) -> tuple[float | None, ...] | None:
-    """Read shutter time (seconds), f-number and ISO of an opened image; None where the time is not stated."""
-    detail = image.getexif().get_ifd(ExifTags.IFD.Exif)
+    """Read shutter time (seconds), f-number and ISO of an opened image; None where the time is not stated, or cannot be
+    read."""
+    try:
+        detail = image.getexif().get_ifd(ExifTags.IFD.Exif)
+    except Exception:  # Pillow raises many kinds on broken EXIF
+        return None
     values = []
     for tag in EXPOSURE:
         value = detail.get(tag)

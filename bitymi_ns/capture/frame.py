@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 
 from bitymi_ns.files import write_file
-from bitymi_ns.trust import json_of
+from bitymi_ns.reading import read_json
 
 EARTH = 6378137.0  # equatorial radius in metres, WGS 84
 FLATTENING = 1 / 298.257223563
@@ -48,7 +48,7 @@ def write_frame(folder: Path, frame: WorldFrame) -> None:
 def read_frame(folder: Path) -> WorldFrame | None:
     """Read frame.json in a folder; None where there is none, or another program's."""
     try:
-        frame = WorldFrame(**json_of((folder / FILE).read_text("utf8")))
+        frame = WorldFrame(**read_json(folder / FILE))
     except (OSError, ValueError, TypeError):
         return None
     length = frame.metres_per_unit

@@ -3,6 +3,8 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from bitymi_ns.reading import read_bytes
+
 RAW = "raw data of a camera"
 PICTURES = {
     **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"), RAW),
@@ -42,8 +44,15 @@ def poses_in(folder: Path) -> Iterator[tuple[Path, str]]:
     for path in sorted(path for path in folder.iterdir() if path.is_file()):
         if path.name.lower() in POSES:
             yield path, POSES[path.name.lower()]
-        elif path.suffix.lower() == ".xml" and METASHAPE in path.read_bytes():
+        elif path.suffix.lower() == ".xml" and _is_metashapes(path):
             yield path, "Metashape"
+
+
+def _is_metashapes(path: Path) -> bool:
+    try:
+        return METASHAPE in read_bytes(path)
+    except OSError:  # it may not be read, and need not be
+        return False
 
 
 def pictures_among(names: Sequence[str], read: Sequence[str]) -> dict[str, int]:

@@ -22,6 +22,7 @@ from bitymi_ns.capture.exif import Exif, exposure_exif, read_exif
 from bitymi_ns.capture.recognise import is_photograph, open_picture, photographs_below
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.progress import Progress
+from bitymi_ns.reading import open_regular
 from bitymi_ns.trust import is_text
 
 PLAIN = {
@@ -163,7 +164,7 @@ def read_photo(folder: Path, name: str) -> Photo:
 def has_panorama_metadata(path: Path) -> bool:
     """Test the metadata of a file for a spherical or cylindrical projection."""
     try:
-        with open(path, "rb") as file:
+        with open_regular(path) as file:
             return SPHERICAL.search(file.read(HEADER)) is not None
     except OSError:
         return False

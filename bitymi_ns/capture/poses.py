@@ -28,7 +28,7 @@ from bitymi_ns.capture.types import CaptureError, Poses, SfmOptions
 from bitymi_ns.capture.video import extract_frames
 from bitymi_ns.files import Tell, complete_folder, explained, write_file
 from bitymi_ns.progress import Progress, no_progress
-from bitymi_ns.trust import json_of
+from bitymi_ns.reading import read_json
 
 GUESSED_FOCAL = 1.2  # initial focal length where it is unknown, in units of the longer side; COLMAP's own
 TELLING = 0.25  # share of 360-degree pictures among photographs of one size from which on all of them count as such
@@ -107,12 +107,12 @@ def _finished(work: Path, folder: Path) -> Poses | None:
     they are damaged."""
     result = work / "result"
     try:
-        kept = json_of((result / "poses.json").read_bytes())
+        kept = read_json(result / "poses.json")
         made = kept.pop("made")  # the photographs of the model are copies or frames in the work folder
         images = work / IMAGES if made else Path(os.path.abspath(folder))
         values = {**kept, "model": result / SPARSE, "images": images, "report": result}
         poses = TypeAdapter(Poses).validate_python(values)
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+    except Exception:  # it is damaged, in whatever way
         return None
     whole = images.is_dir() and all(path.exists() for path in images.rglob("*")) if made else True
     return poses if whole and is_model(result / SPARSE) else None

@@ -3,7 +3,6 @@
 import os
 import struct
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -12,8 +11,8 @@ import pillow_heif
 from PIL import Image
 
 from bitymi_ns.capture import ignored_files
-from bitymi_ns.files import encoding_of
-from bitymi_ns.trust import json_of, listed
+from bitymi_ns.reading import open_regular, open_text, read_bytes, read_json
+from bitymi_ns.trust import listed
 
 Format = Literal[
     "nerfstudio", "instant-ngp", "blender", "colmap", "polycam", "record3d", "pose-files", "photographs", "video"
@@ -38,7 +37,8 @@ INTRINSICS = {"fl_x", "fl_y", "cx", "cy", "w", "h"}
 
 
 def open_picture(file: Path) -> Image.Image:
-    """Open a photograph or mask with Pillow; raises Pillow's errors."""
+    """Open a photograph or mask with Pillow; raises Pillow's errors, and those of `open_regular`."""
+    open_regular(file).close()
     Image.init()  # Pillow knows AVIF from a version on
     return Image.open(file, formats=[name for name in FORMATS_OF_PICTURES if name in Image.OPEN])
 
@@ -152,14 +152,23 @@ def _in_folder(folder: Path) -> Iterator[tuple[Format, Path]]:
 def _transforms_in(folder: Path) -> Iterator[tuple[Format, Path]]:
     """Yield transforms.json and Blender's files; where there is neither, files of other names with the same content."""
     usual = folder / "transforms.json"
-    if usual.is_file():
+    there, splits = (os.path.lexists(path) for path in (usual, folder / SPLITS[0]))  # what is no file is refused later
+    if there:
         yield _kind_of(usual), usual
-    if (folder / SPLITS[0]).is_file():
+    if splits:
         yield "blender", folder
-    elif not usual.is_file():
+    elif not there:
         for path in sorted(folder.glob("*.json")):
-            if path.name not in SPLITS and b'"transform_matrix"' in path.read_bytes():
+            if path.name not in SPLITS and _mentions(path, b'"transform_matrix"'):
                 yield _kind_of(path), path
+
+
+def _mentions(path: Path, word: bytes) -> bool:
+    """Test for a file that can be read and has a word in it."""
+    try:
+        return word in read_bytes(path)
+    except OSError:
+        return False
 
 
 def _scanned(folder: Path) -> Iterator[tuple[Format, Path]]:
@@ -168,10 +177,9 @@ def _scanned(folder: Path) -> Iterator[tuple[Format, Path]]:
     if any((keyframes / i).is_dir() and any((keyframes / c).glob("*.json")) for i, c in POLYCAM):
         yield "polycam", folder
     for name in ("metadata", "metadata.json"):
-        with suppress(OSError):
-            if (folder / name).is_file() and b'"poses"' in (folder / name).read_bytes():
-                yield "record3d", folder
-                break
+        if _mentions(folder / name, b'"poses"'):
+            yield "record3d", folder
+            break
     colour = any((folder / name).is_dir() for name in ("color", "rgb", "images"))
     if (colour and any((folder / "pose").glob("*.txt"))) or any(folder.glob("*.pose.txt")):
         yield "pose-files", folder
@@ -181,7 +189,7 @@ def _kind_of(file: Path) -> Format:
     """Tell a transforms.json of nerfstudio from one of instant-ngp. A file that cannot be read counts as nerfstudio's,
     whose reader reports the error."""
     try:
-        meta = json_of(file.read_bytes())
+        meta = read_json(file)
     except (OSError, ValueError):
         return "nerfstudio"
     if not isinstance(meta, dict) or meta.keys() & NERFSTUDIOS_OWN:
@@ -219,9 +227,9 @@ def image_count(model: Path) -> int:
     """Read the number of images of a model; 0 where it states none."""
     try:
         if (model / "images.bin").is_file():
-            with open(model / "images.bin", "rb") as file:
+            with open_regular(model / "images.bin") as file:
                 return int(struct.unpack("<Q", file.read(8))[0])
-        with open(model / "images.txt", encoding=encoding_of(model / "images.txt"), errors="replace") as text:
+        with open_text(model / "images.txt", errors="replace") as text:
             return sum(1 for line in text if line.strip() and not line.startswith("#")) // 2
     except (OSError, struct.error):
         return 0

@@ -16,6 +16,7 @@ from bitymi_ns.capture.prepare import IMAGES, JPEG_QUALITY
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import complete_folder
 from bitymi_ns.progress import Progress
+from bitymi_ns.reading import open_regular
 
 SMALL = 160  # longer side of frames for measuring motion, pixels
 FINE = 640  # longer side of frames for measuring sharpness, pixels
@@ -139,6 +140,7 @@ def _pace(video: Path) -> tuple[float, float, int]:
 
 def _opened(video: Path) -> av.container.InputContainer:
     try:
+        open_regular(video).close()
         container = av.open(os.path.abspath(video), options=TRUSTED)  # a relative one may begin like an address
     except (av.FFmpegError, OSError, ValueError) as error:
         raise CaptureError(

@@ -231,6 +231,11 @@ def dense(tensor: Tensor, like: Tensor) -> Tensor:
     return (tensor.detach() if tensor.requires_grad else tensor).contiguous()
 
 
+def version_of(tensor: Tensor) -> int:
+    """How often a tensor was written to; -1 for one of inference mode, which does not count."""
+    return -1 if tensor.is_inference() else tensor._version
+
+
 class Pool(Generic[T]):
     """Objects of one kind, made where none is idle; one is used by one thread at a time."""
 

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from .backend import Pool
+from .backend import Pool, version_of
 from .project import Camera, Prefilter
 
 IMAGES: dict[str, tuple[int, torch.dtype]] = {
@@ -38,9 +38,13 @@ class DrawCache:
         self._coarser: Any = None
         self._workspaces: Pool[Any] | None = None
 
+    def __reduce__(self) -> tuple[type, tuple[()]]:
+        """Copies and files of a scene have an empty one: what it holds is made again, and is of one process."""
+        return DrawCache, ()
+
     def atlas(self, make: Callable[[], Any], *sources: Tensor | str | None) -> Any:
         """Return the atlas, made for the first frame and again when a source is another one or was written to."""
-        now = [(t, t._version if isinstance(t, Tensor) else 0) for t in sources]
+        now = [(t, version_of(t) if isinstance(t, Tensor) else 0) for t in sources]
         with self._lock:
             if len(now) != len(self._sources) or any(
                 a is not b and (isinstance(a, Tensor) or a != b) or version != before

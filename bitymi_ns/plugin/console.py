@@ -14,10 +14,10 @@ from rich.markup import escape
 from rich.panel import Panel
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from bitymi_ns.endings import INTERRUPTED as INTERRUPTED
 from bitymi_ns.trust import listed as listed
 from bitymi_ns.trust import printable
 
-INTERRUPTED = 130  # exit status after Ctrl-C, by the convention of shells
 REMARKS = re.compile(
     r"Saving config to|Saving checkpoints to"  # our summary of the run says where
     r"|Mixed precision is disabled|Auto image downscale factor of 1$"

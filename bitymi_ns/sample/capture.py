@@ -14,8 +14,9 @@ from PIL import Image as PILImage
 
 from bitymi_ns.files import complete_folder
 from bitymi_ns.progress import no_progress, rich_progress
+from bitymi_ns.reading import read_json
 from bitymi_ns.sample.room import Hits, Room
-from bitymi_ns.trust import json_of, keep
+from bitymi_ns.trust import keep
 
 FOCAL = 0.80  # focal length in image widths
 TARGET = np.array([0.0, 0.0, 0.72])
@@ -159,7 +160,7 @@ def generate(
 def _is_sample(folder: Path) -> bool:
     """Test if `generate` wrote the folder."""
     try:
-        return json_of((folder / CAPTURE).read_bytes()).get("made_by") == MADE_BY
+        return read_json(folder / CAPTURE).get("made_by") == MADE_BY
     except (OSError, ValueError, AttributeError):
         return False
 

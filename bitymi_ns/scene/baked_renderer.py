@@ -138,6 +138,10 @@ class SceneRenderer:
         self._latest: tuple[int, int, bool, bool] | None = None
         self._lock = threading.Lock()
 
+    def __reduce__(self) -> tuple[type, tuple[BakedScene, int]]:
+        """Copies draw the scene anew: working memory and graphs are of one process."""
+        return SceneRenderer, (self.scene, self._kept)
+
     @torch.no_grad()
     def render(self, camera: Camera, background: Tensor | None = None, maps: bool = False) -> BakedOutput:
         """Render a view; arguments and images are those of `BakedScene.render`."""

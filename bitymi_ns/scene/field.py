@@ -9,19 +9,16 @@ import torch
 from torch import Tensor, nn
 
 from bitymi_ns.ops import Fragments, TexelAlpha, TexelDescent, TexelTiles, fragment_residual
+from bitymi_ns.ops.backend import version_of
 from bitymi_ns.ops.constants import FEATURES, WIDTH
 from bitymi_ns.ops.field import FieldGeometry, field
 
 from .config import SceneConfig
 
 
-def _version(buffer: Tensor) -> int:
-    return -1 if buffer.is_inference() else buffer._version
-
-
 def _is_of(cached: tuple[Tensor, int, Any] | None, buffer: Tensor) -> bool:
     """True where something was computed from a buffer that has neither been replaced nor written to since."""
-    return cached is not None and cached[0] is buffer and cached[1] == _version(buffer)
+    return cached is not None and cached[0] is buffer and cached[1] == version_of(buffer)
 
 
 class ResidualField(nn.Module):
@@ -124,7 +121,7 @@ class HashField(ResidualField):
         if not _is_of(self._geometry, self.domain):
             *mid, half, contract = self.domain.tolist()
             geometry = FieldGeometry(self.min_resolution, bool(contract), tuple(mid), half)
-            self._geometry = (self.domain, _version(self.domain), geometry)
+            self._geometry = (self.domain, version_of(self.domain), geometry)
         return self._geometry[2]
 
     @property
@@ -206,7 +203,7 @@ class TexelField(ResidualField):
     def tiles(self) -> TexelTiles:
         """Tiles of the surfels: sizes and offsets of their texels."""
         if not _is_of(self._tiles, self.size):
-            self._tiles = (self.size, _version(self.size), TexelTiles.of_sizes(self.size, self.extent))
+            self._tiles = (self.size, version_of(self.size), TexelTiles.of_sizes(self.size, self.extent))
         return self._tiles[2]
 
     @torch.no_grad()

@@ -218,7 +218,9 @@ class Exposure:
         self._begin(table[:, _diagonal(table)].to(device or table.device), table.shape[1] > 3)
         assert self.table is not None and self._optimizer is not None
         self.table.data.copy_(table)
-        self._optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
+        groups = self._optimizer.state_dict()["param_groups"]  # its options are those of this run
+        moments = copy.deepcopy(state["optimizer"]["state"])
+        self._optimizer.load_state_dict({"state": moments, "param_groups": groups})
 
 
 def corrected(

@@ -48,8 +48,8 @@ class View(NamedTuple):
 
     def to(self, device: torch.device | str) -> View:
         """The view on a device. Copies to a card go through pinned memory: the host does not wait."""
-        maps = (_moved(value, device) for value in self[1:-1])
-        return View(self.camera.to(device), *maps, self.counted)
+        maps = {name: _moved(value, device) for name, value in self._asdict().items() if isinstance(value, Tensor)}
+        return self._replace(camera=self.camera.to(device), **maps)
 
     def shown(self, rgb: Tensor, alpha: Tensor, background: Tensor | None) -> Tensor:
         """`shown` by this photograph's correction."""

@@ -1,8 +1,11 @@
 """Files that the viewer serves: the built page and the files of a bundle; and their export as a folder."""
 
+from __future__ import annotations
+
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib import resources
@@ -51,13 +54,23 @@ class Site:
     files: Mapping[str, Callable[[], bytes | bytearray]]
     left_out: Sequence[str] = ()  # files that the bundle lists, and that are not served
     notes: Callable[[], bytes | None] = lambda: None  # the bundle's notes.json, which comes and goes; None without
+    bundle: Shown | None = None  # whose files are served, as it is then
 
     def __contains__(self, path: str) -> bool:
-        return path in self.files or path == _NOTES
+        return path in self.files or path == _NOTES or path in self._parts
+
+    @property
+    def _parts(self) -> list[str]:
+        """Paths of the files of the bundle."""
+        return [] if self.bundle is None else [f"{BUNDLE}{name}" for name in self.bundle.names]
 
     @property
     def paths(self) -> list[str]:
-        return sorted({*self.files, *([] if self.notes() is None else [_NOTES])})
+        return sorted({*self.files, *self._parts, *([] if self.notes() is None else [_NOTES])})
+
+    def stamp(self, path: str) -> object:
+        """A value that changes when what is served changes; that of notes is always another one."""
+        return object() if path == _NOTES else None if self.bundle is None else self.bundle.stamp()
 
     def read(self, path: str) -> bytes | bytearray:
         """The contents of one of `paths`.
@@ -71,7 +84,9 @@ class Site:
             if notes is None:
                 raise MissingPart(f"the bundle has no {NOTES}")
             return notes
-        return self.files[path]()
+        if path in self.files or self.bundle is None:
+            return self.files[path]()
+        return self.bundle.read(path.removeprefix(BUNDLE))
 
 
 def media_type(path: str) -> str:
@@ -100,11 +115,9 @@ def site_of(bundle: Path) -> Site:
         BundleError: there is no bundle, or its bundle.json or notes.json is damaged.
     """
     notes_of(bundle)
-    shown = _Shown(Path(os.path.realpath(bundle)))
-    names = [MANIFEST, *(name for name in shown.info.files if is_known(name))]
-    parts = {f"{BUNDLE}{name}": partial(shown.read, name) for name in names}
-    files = {**page_files(), **parts, "view.json": partial(_about, bundle)}
-    return Site(files, left_out(shown.info), partial(notes_of, bundle))
+    shown = Shown(Path(os.path.realpath(bundle)))
+    files = {**page_files(), "view.json": partial(_about, bundle)}
+    return Site(files, left_out(shown.info), partial(notes_of, bundle), shown)
 
 
 def single_site(bundle: Path) -> Site:
@@ -135,7 +148,7 @@ def _about(bundle: Path) -> bytes:
     return json.dumps({"title": title, "notes": notes}).encode()
 
 
-class _Shown:
+class Shown:
     """A bundle that is being served. Its files have the sizes and hashes of its bundle.json whenever they are read; a
     bundle that is exported again meanwhile is served as it is then."""
 
@@ -144,13 +157,24 @@ class _Shown:
         self._read_manifest()
 
     def _read_manifest(self) -> None:
-        as_of = self._stamp()
+        as_of = self.stamp()
         with parts_of(self._bundle, inside=True) as parts:
             self.info: Manifest = manifest_of(parts)
             self._manifest = passed_on(self.info, parts.read(MANIFEST, MANIFEST_LIMIT))
         self._as_of = as_of
 
-    def _stamp(self) -> tuple[int, ...]:
+    @property
+    def names(self) -> list[str]:
+        """Names of the files that are passed on now; those of before where bundle.json cannot be read."""
+        with suppress(BundleError):
+            self._refresh()
+        return [MANIFEST, *(name for name in self.info.files if is_known(name))]
+
+    def _refresh(self) -> None:
+        if self.stamp() != self._as_of:
+            self._read_manifest()
+
+    def stamp(self) -> tuple[int, ...]:
         """A value that changes when bundle.json, or the one file, is written."""
         path = self._bundle if os.path.isfile(self._bundle) else self._bundle / MANIFEST
         try:
@@ -165,8 +189,7 @@ class _Shown:
         Raises:
             BundleError: it is missing, altered, or a link that leads out of the bundle.
         """
-        if self._stamp() != self._as_of:
-            self._read_manifest()
+        self._refresh()
         if name == MANIFEST:
             return self._manifest
         if name not in self.info.files:

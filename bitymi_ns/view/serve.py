@@ -5,9 +5,13 @@ from __future__ import annotations
 import io
 import ipaddress
 import socket
+import threading
 import time
+from contextlib import suppress
+from dataclasses import dataclass, field
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
 from urllib.parse import unquote, urlsplit
 
 from bitymi_ns.bundle.manifest import BundleError
@@ -17,6 +21,8 @@ from .page import POLICY, PageError, Site, media_type
 LOOPBACK = "127.0.0.1"
 LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
 REQUEST_SECONDS, SEND_SECONDS = 20.0, 60.0  # timeouts of receiving a request and of sending a piece of an answer
+MOST_CLIENTS = 64  # connections at a time; a browser opens six
+_BUSY = b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 _PIECE = 1 << 20
 _HEADERS = {
     "Content-Security-Policy": POLICY,
@@ -79,11 +85,14 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.NOT_FOUND, b"there is no such file\n")
             return
         try:
-            data = site.read(name)
+            held = self.server.hold(name)
         except (BundleError, OSError, MemoryError):
             self._send(HTTPStatus.NOT_FOUND, b"the file cannot be read\n")
             return
-        self._send(HTTPStatus.OK, data, media_type(name))
+        try:
+            self._send(HTTPStatus.OK, held.data, media_type(name))
+        finally:
+            self.server.release(held)
 
     do_HEAD = do_GET
 
@@ -118,12 +127,25 @@ class _Handler(BaseHTTPRequestHandler):
         """Log nothing."""
 
 
+@dataclass(eq=False)
+class _Held:
+    """A file that is being sent: one copy for all who read it, however slowly."""
+
+    key: tuple[str, object]
+    reading: threading.Lock = field(default_factory=threading.Lock)
+    data: bytes | bytearray = b""
+    readers: int = 0
+    is_read: bool = False
+
+
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
 
     def __init__(self, site: Site, host: str, port: int, request_seconds: float) -> None:
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         self.site, self.request_seconds = site, request_seconds
+        self._held: dict[tuple[str, object], _Held] = {}
+        self._counting, self._room = threading.Lock(), threading.BoundedSemaphore(MOST_CLIENTS)
         super().__init__((host, port), _Handler)
         self._names = {*LOCAL_NAMES, host.lower(), _shown(self)}
 
@@ -131,6 +153,48 @@ class _Server(ThreadingHTTPServer):
         """True where the Host header is allowed; any is when the server is open to the network."""
         host = host.lower()
         return not is_loopback(self) or host in self._names or host.rpartition(":")[0] in self._names
+
+    def hold(self, name: str) -> _Held:
+        """The contents of a file, kept until as many calls of `release`; raises as `Site.read` does."""
+        key = (name, self.site.stamp(name))
+        with self._counting:
+            held = self._held.setdefault(key, _Held(key))
+            held.readers += 1
+        try:
+            with held.reading:
+                if not held.is_read:
+                    held.data, held.is_read = self.site.read(name), True
+        except BaseException:
+            self.release(held)
+            raise
+        return held
+
+    def release(self, held: _Held) -> None:
+        """Forget a file that nobody is sent any more."""
+        with self._counting:
+            held.readers -= 1
+            if not held.readers:
+                del self._held[held.key]
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer in a thread of its own, as long as there are few."""
+        if not self._room.acquire(blocking=False):
+            with suppress(OSError):
+                request.settimeout(0.0)
+                request.send(_BUSY)
+            self.shutdown_request(request)
+            return
+        try:
+            super().process_request(request, client_address)
+        except BaseException:
+            self._room.release()
+            raise
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._room.release()
 
     def handle_error(self, request: object, client_address: object) -> None:
         """A browser that goes away in the middle of an answer is no error."""

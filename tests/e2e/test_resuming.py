@@ -151,7 +151,12 @@ def test_checkpoints_that_are_missing_or_damaged(trained: BitymiTrainerConfig, s
     state = checkpoint(trained, 59)
     del state["optimizers"]["means"]["param_groups"]
     torch.save(state, config.load_dir / "step-000000059.ckpt")
-    with pytest.raises(InputError, match="step-000000059.ckpt cannot be resumed"):
+    with pytest.raises(InputError, match="step-000000059.ckpt cannot be resumed.*optimizers.means.param_groups is mis"):
+        ns_train.main(copy.deepcopy(config))
+    state = checkpoint(trained, 59)
+    state["optimizers"]["quats"]["state"][0]["exp_avg"] = torch.zeros(3)
+    torch.save(state, config.load_dir / "step-000000059.ckpt")
+    with pytest.raises(InputError, match="optimizers.quats.state.0.exp_avg has to be float32"):
         ns_train.main(config)
 
 

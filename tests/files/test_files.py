@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from bitymi_ns import files
+from bitymi_ns.reading import read_text
 
 WAITS = """
 import sys
@@ -169,6 +170,6 @@ def test_a_read_only_and_a_full_disk(small_disk: Path) -> None:
 def test_text_says_how_it_is_encoded(tmp_path: Path, encoding: str) -> None:
     path = tmp_path / "a.txt"
     path.write_text(("\ufeff" if encoding == "utf-16-le" else "") + "# \u00fc\n", encoding)
-    assert path.read_text(files.encoding_of(path)) == "# \u00fc\n"
+    assert read_text(path) == "# \u00fc\n"
     path.write_bytes(b"")
-    assert path.read_text(files.encoding_of(path)) == ""
+    assert read_text(path) == ""

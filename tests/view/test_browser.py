@@ -84,7 +84,7 @@ def test_the_first_picture_needs_no_texels(tmp_path: Path) -> None:
             time.sleep(0.1)
         return site.read("bundle/texels.bin")
 
-    slow = Site({**site.files, "bundle/texels.bin": late})
+    slow = replace(site, files={**site.files, "bundle/texels.bin": late})
     steps = [["first"], ["save", "#screenshot", first], ["settle"], ["save", "#screenshot", tmp_path / "p.png"]]
     with served(slow) as address:
         found = drive([["goto", address], *steps], SCREEN)
@@ -137,7 +137,7 @@ def test_a_damaged_bundle_gets_a_page_that_says_so(damage: str, bundle: Path) ->
         "altered": {name: lambda: data[:-4] + bytes([data[-4] ^ 1]) + data[-3:]},
         "newer": {"bundle/bundle.json": lambda: newer},
     }
-    state, text = page_of(Site({**site.files, **sent[damage]}))
+    state, text = page_of(replace(site, files={**site.files, **sent[damage]}))
     assert state == "error"
     expected = "newer than the viewer" if damage == "newer" else "damaged"
     assert expected in text and ("Update" in text or "Copy the bundle again" in text)
@@ -211,5 +211,5 @@ def test_a_page_whose_script_does_not_run_says_so(data: bytes | None, bundle: Pa
             raise OSError
         return data
 
-    state, text = page_of(Site({**site.files, "index.js": read}))
+    state, text = page_of(replace(site, files={**site.files, "index.js": read}))
     assert state == "error" and "cannot start" in text and "Reload" in text

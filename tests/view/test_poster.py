@@ -4,6 +4,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,7 @@ def held_back(site: Site, name: str, until: Path) -> Site:
             time.sleep(0.1)
         return site.read(name)
 
-    return Site({**site.files, name: late})
+    return replace(site, files={**site.files, name: late})
 
 
 def kept(site: Site, asked: list[str]) -> Site:

@@ -13,6 +13,7 @@ from typing import Any
 from bitymi_ns.files import explained
 from bitymi_ns.measure.bench.process import BenchError
 from bitymi_ns.measure.machine import commit, machine, versions
+from bitymi_ns.reading import read_bytes
 from bitymi_ns.trust import json_of, no_links
 
 FILE = "cells.jsonl"
@@ -58,7 +59,7 @@ class Cells:
     def refresh(self) -> None:
         """Read the file again. An unfinished last line (of a killed writer) is skipped."""
         self._known: dict[str, dict[str, Any]] = {}
-        text = self.path.read_bytes() if self.path.is_file() else b""
+        text = read_bytes(self.path) if self.path.is_file() else b""
         for number, line in enumerate(text[: text.rfind(b"\n") + 1].splitlines(), 1):
             if not line.strip():
                 continue

@@ -15,6 +15,7 @@ from bitymi_ns.measure.report.plots import Plot, draw_plots
 from bitymi_ns.measure.report.read import collect
 from bitymi_ns.measure.report.records import Records, ReportError, over_seeds
 from bitymi_ns.measure.report.tables import NOTES, poses_tables, quality_tables, training_table
+from bitymi_ns.reading import open_regular
 
 PAGE = "index.html"
 GENERATOR = '<meta name="generator" content="bitymi report">'  # marks a page as ours, so that it may be replaced
@@ -70,8 +71,16 @@ def _check_output(output_dir: Path) -> None:
     if output_dir.exists() and not output_dir.is_dir():
         raise ReportError(f"{output_dir} is a file; give a folder for the report.")
     page = output_dir / PAGE
-    if page.exists() and GENERATOR not in page.read_bytes()[:4096].decode("utf8", "replace"):
+    if page.exists() and not _is_report(page):
         raise ReportError(f"{page} was not made by bitymi report and will not be replaced; give another folder.")
+
+
+def _is_report(page: Path) -> bool:
+    try:
+        with open_regular(page) as file:
+            return GENERATOR in file.read(4096).decode("utf8", "replace")
+    except OSError:
+        return False
 
 
 def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report") -> Path:

@@ -16,6 +16,7 @@ from PIL import Image
 
 from bitymi_ns.measure.report.read import SIDE_BY_SIDE
 from bitymi_ns.measure.report.records import is_bundle_name
+from bitymi_ns.reading import open_regular
 
 ERROR_SCALE = 0.25  # error at which an error map ends: mean absolute difference of the three colours
 ERROR_CAPTION = f"error: mean of |difference| over the colours, 0 (black) to {ERROR_SCALE:g} (yellow)"
@@ -60,10 +61,13 @@ def open_image(path: Path) -> Image.Image:
     Raises:
         OSError: the file is not an image that can be read.
     """
+    open_regular(path).close()
     try:
         with Image.open(path, formats=("PNG", "JPEG")) as opened:
             return opened.convert("RGBA" if "A" in opened.getbands() or "transparency" in opened.info else "RGB")
-    except (SyntaxError, ValueError, Image.DecompressionBombError) as error:  # what Pillow raises on broken PNG chunks
+    except OSError:
+        raise
+    except Exception as error:  # Pillow raises many kinds on broken files
         raise OSError(str(error)) from error
 
 

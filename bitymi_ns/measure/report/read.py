@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from bitymi_ns.measure.bench.cells import FILE as CELLS
 from bitymi_ns.measure.bench.cells import Cells, identity
@@ -23,6 +23,8 @@ from bitymi_ns.measure.report.records import (
     link,
 )
 from bitymi_ns.measure.report.tables import COLUMNS
+from bitymi_ns.reading import read_text as text_of
+from bitymi_ns.reading import reading
 from bitymi_ns.trust import json_of
 
 PICTURES = "pictures.json"
@@ -57,15 +59,12 @@ def read_text(path: Path) -> str:
     Raises:
         ReportError: it is too large, no text, or cannot be read.
     """
-    try:
-        size = path.stat().st_size
-        if size > MAX_BYTES:
-            raise ReportError(f"{path} is too large ({size:,} bytes) for an evaluation or a training curve.")
-        return path.read_text("utf8")
-    except UnicodeDecodeError:
-        raise ReportError(f"{path} is not a text file (it is not UTF-8).") from None
-    except OSError as error:
-        raise ReportError(f"{path} cannot be read: {error.strerror or error}.") from None
+    with reading(path, _refuse, "Write it again, or leave it out."):
+        return text_of(path, MAX_BYTES)
+
+
+def _refuse(message: str, cause: BaseException) -> NoReturn:
+    raise ReportError(message) from cause
 
 
 def read_lines(path: Path) -> tuple[list[Any], list[str]]:

@@ -25,7 +25,7 @@ from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.data.images import MAX_PIXELS
 from bitymi_ns.plugin.data.transforms import HOW_TO_GET_ONE
 from bitymi_ns.plugin.run.commands import folder_being_evaluated, how_to_say_where
-from bitymi_ns.trust import json_of
+from bitymi_ns.reading import read_json, why
 
 STOCK_FORMATS: dict[type[DataParserConfig], Format] = {
     NerfstudioDataParserConfig: "nerfstudio",
@@ -110,7 +110,7 @@ def declares_box(dataparser: DataParserConfig) -> bool:
     elif isinstance(dataparser, InstantNGPDataParserConfig):
         path = dataparser.data if dataparser.data.suffix == ".json" else dataparser.data / "transforms.json"
     if path is not None:
-        return "aabb_scale" in json_of(path.read_bytes())
+        return "aabb_scale" in read_json(path)
     return isinstance(dataparser, (MinimalDataParserConfig, SDFStudioDataParserConfig))
 
 
@@ -130,12 +130,10 @@ def reporting_input_errors(config: Any) -> Iterator[None]:
             f"the capture {_folder_of(config)} has a photograph of more than {MAX_PIXELS:,} pixels: make it smaller",
             error,
         )
-    except (MemoryError, NameError, AssertionError):  # no fault of the capture
+    except (NameError, AssertionError):  # no fault of the capture
         raise
     except Exception as error:
-        detail = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-        if isinstance(error, KeyError):
-            detail = f"the entry {detail} is missing"
+        detail = why(error)
         if isinstance(error, UnidentifiedImageError):
             detail += ". Save the photographs as PNG or JPEG"
         fail(f"the capture {_folder_of(config)} cannot be loaded: {detail}", error)

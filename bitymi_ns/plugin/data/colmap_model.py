@@ -19,11 +19,14 @@ import pycolmap
 
 from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.capture.recognise import image_count
-from bitymi_ns.files import encoding_of
 from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.data.point_files import color_bytes, ply_fault, read_points
+from bitymi_ns.plugin.data.transforms import MAX_SIDE
+from bitymi_ns.reading import open_text, read_bytes, reading
 
 FORMS = (".txt", ".bin")
+MOST_MODEL = 1 << 36  # bytes of a file of a model; 100 million points take a twentieth of it
+TINY = 1e-100  # length of a quaternion that can still be normalised
 CAMERA_SENSOR = int(pycolmap.SensorType.CAMERA)
 
 
@@ -66,11 +69,11 @@ def _read_model(folder: Path, stamps: tuple[Any, ...]) -> Model:
     path = _file(folder, "cameras")
     with _naming_file(path):
         cameras = dict(_cameras_text(path) if path.suffix == ".txt" else _cameras_binary(path))
-    _check_cameras(path, cameras)
+        _check_cameras(path, cameras)
     path = _file(folder, "images")
     with _naming_file(path):
         images = dict(_images_text(path) if path.suffix == ".txt" else _images_binary(path))
-    _check_images(path, images, cameras)
+        _check_images(path, images, cameras)
     path = path.with_stem("frames")
     if path.is_file():  # of COLMAP 4, whose images keep poses of their own
         with _naming_file(path):
@@ -135,14 +138,12 @@ def _warn_of_other_form(folder: Path, cameras: dict[int, ColmapCamera], images: 
 @contextmanager
 def _naming_file(path: Path) -> Iterator[None]:
     """Report errors of parsing a file by its name."""
-    try:
+    if not os.path.lexists(path):
+        fail(f"the COLMAP model lacks {path}. Copy the whole model: cameras, images and points3D.")
+    hint = "It is cut off or damaged. " * (path.suffix == ".bin")
+    hint += "Each image has two lines; the second, of its 2D points, may be empty. " * (path.name == "images.txt")
+    with reading(path, fail, f"{hint}Copy the model again, or export it from COLMAP again."):
         yield
-    except FileNotFoundError as error:
-        fail(f"the COLMAP model lacks {path}. Copy the whole model: cameras, images and points3D.", error)
-    except (struct.error, ValueError, LookupError, AssertionError, MemoryError, OverflowError) as error:
-        what = "is cut off or damaged" if path.suffix == ".bin" else f"has a line that cannot be read ({error})"
-        hint = " Each image has two lines; the second, of its 2D points, may be empty." * (path.name == "images.txt")
-        fail(f"{path} {what}.{hint} Copy the model again, or export it from COLMAP again.", error)
 
 
 @functools.cache
@@ -157,12 +158,12 @@ def _check_cameras(path: Path, cameras: dict[int, ColmapCamera]) -> None:
     """Fail at parameters that are not finite, or not as many as the camera model has."""
     for number, camera in cameras.items():
         count = parameter_count(camera.model)
-        numbers = [camera.width, camera.height, *camera.params]
-        if not np.isfinite(numbers).all() or min(camera.width, camera.height) < 1:
-            written = " ".join(f"{value:g}" for value in numbers)
+        if not all(1 <= side <= MAX_SIDE for side in camera.size) or not np.isfinite(camera.params).all():
+            written = " ".join([*(str(side)[:20] for side in camera.size), *(f"{value:g}" for value in camera.params)])
             fail(
                 f"{path}{_line_of(path, number)}: camera {number} ({camera.model} {written}) cannot be used: its size "
-                "has to be positive and all numbers finite. Correct it, or export the model from COLMAP again."
+                f"has to be from 1 to {MAX_SIDE:,} pixels and all numbers finite. Correct it, or export the model from "
+                "COLMAP again."
             )
         if count is not None and len(camera.params) != count:
             fail(
@@ -182,7 +183,7 @@ def _check_images(path: Path, images: dict[int, ModelImage], cameras: dict[int, 
                 f"{path}: image {number} ({image.name}) was taken by camera {image.camera_id}, but the model has only "
                 f"{listed(sorted(cameras))}. Correct its line, or copy the whole model again."
             )
-        if not np.isfinite([*image.qvec, *image.tvec]).all() or not image.qvec.any():
+        if not np.isfinite([*image.qvec, *image.tvec]).all() or not TINY < np.linalg.norm(image.qvec) < 1.0 / TINY:
             fail(
                 f"{path}{_line_of(path, number)}: the pose of image {number} ({image.name}) is not finite, or its "
                 "rotation is zero. Correct its line or remove the image."
@@ -198,7 +199,7 @@ def _line_of(path: Path, number: int) -> str:
     """Line of a text file that states this camera or image, as ", line N"; empty for a binary file."""
     if path.suffix != ".txt":
         return ""
-    with open(path, encoding="utf8", errors="replace") as file:
+    with open_text(path, errors="replace") as file:
         lines = [i for i, line in enumerate(file, 1) if line.split()[:1] == [str(number)]]
     return f", line {lines[0]}" if lines else ""
 
@@ -207,7 +208,7 @@ class _Binary:
     """Sequential reader of a binary file that fails where it has less or more than it states."""
 
     def __init__(self, path: Path) -> None:
-        self.data, self.offset = path.read_bytes(), 0
+        self.data, self.offset = read_bytes(path, MOST_MODEL), 0
 
     def take(self, format: str) -> tuple[Any, ...]:
         values = struct.unpack_from("<" + format, self.data, self.offset)
@@ -273,7 +274,7 @@ def _points_binary(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.
 
 
 def _lines(path: Path) -> Iterator[str]:
-    with open(path, encoding=encoding_of(path), errors="surrogateescape") as file:
+    with open_text(path, errors="surrogateescape") as file:
         for line in file:
             if not line.startswith("#"):
                 yield line.strip()

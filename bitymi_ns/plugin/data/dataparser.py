@@ -1,10 +1,11 @@
 """`bitymi-data`, the methods' default parser: recognizes the format of a folder or file, reads it as photographs with
 cameras and poses, and splits these by one rule for all formats."""
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import tyro
@@ -14,7 +15,6 @@ from nerfstudio.utils.colors import get_color
 from bitymi_ns.capture.frame import read_frame
 from bitymi_ns.capture.recognise import Format, Found, NotRecognised, passed_over, recognise
 from bitymi_ns.capture.types import SfmSettings
-from bitymi_ns.files import encoding_of
 from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data import splits
 from bitymi_ns.plugin.data.colmap_model import read_model
@@ -41,10 +41,11 @@ from bitymi_ns.plugin.data.initial_points import (
 from bitymi_ns.plugin.data.scanner_views import scanner_photographs
 from bitymi_ns.plugin.data.sfm_poses import KeptPoses, find_sfm_source, kept_source, read_kept_poses
 from bitymi_ns.plugin.data.splits import NameLists, Split
-from bitymi_ns.plugin.data.transforms import colmap_points
+from bitymi_ns.plugin.data.transforms import check_number, colmap_points
 from bitymi_ns.plugin.data.transforms_views import Transforms, read_transforms
 from bitymi_ns.plugin.data.views import (
     FrameOptions,
+    Orientation,
     Photograph,
     Pose,
     Views,
@@ -53,6 +54,7 @@ from bitymi_ns.plugin.data.views import (
     photograph_files,
     select_views,
 )
+from bitymi_ns.reading import read_text, reading
 
 WITH_MODEL = ("colmap", "photographs", "video")  # formats that are read as a COLMAP model
 SCANNED = ("polycam", "record3d", "pose-files")  # formats of scanning programs, with their poses
@@ -238,10 +240,15 @@ class BitymiDataParser(DataParser):
             check_photographs_exist(read.path, read.files)
         meta, frame = read.meta, config
         if found.format == "instant-ngp":  # whose scale is that of its bounding box
-            half = 0.5 * float(meta.get("aabb_scale", 1))
+            half = 0.5 * check_number(read.path, "aabb_scale", meta.get("aabb_scale", 1), "for all frames")
+            if not 0.0 < half < math.inf:
+                fail(f"{read.path}: aabb_scale is {meta['aabb_scale']}, which is no positive number. Correct it.")
             frame = FrameOptions(NGP_SCALE, "none", "none", auto_scale_poses=False, scene_scale=half)
             frame = fit_scale(frame, read.photographs, str(read.path))
         elif "orientation_override" in meta:
+            if meta["orientation_override"] not in get_args(Orientation):
+                allowed = ", ".join(get_args(Orientation))
+                fail(f"{read.path}: orientation_override is {meta['orientation_override']!r}, none of {allowed}.")
             frame = replace(frame, orientation_method=meta["orientation_override"])
             say(f"{read.path} asks for the orientation method {frame.orientation_method}.")
         model = colmap_points(found.path)
@@ -377,5 +384,6 @@ def _list_files(folder: Path) -> NameLists:
     for split, name in (("train", "train"), ("val", "val"), ("val", "validation"), ("test", "test")):
         path = folder / f"{name}_list.txt"
         if path.is_file():
-            lists[split] = [line.strip() for line in path.read_text(encoding_of(path)).splitlines() if line.strip()]
+            with reading(path, fail, "Write one name on each line, in UTF-8."):
+                lists[split] = [line.strip() for line in read_text(path).splitlines() if line.strip()]
     return lists

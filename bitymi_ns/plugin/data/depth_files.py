@@ -1,17 +1,21 @@
 """Depth maps, their confidence, and normal maps in files, as programs and scanners write them."""
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from bitymi_ns.capture.masks import in_proportion
 from bitymi_ns.plugin.console import fail, warn
+from bitymi_ns.plugin.data.images import wrong_size
 from bitymi_ns.plugin.data.lens import Lens
+from bitymi_ns.plugin.data.map_headers import image_shape, read_array
+from bitymi_ns.reading import reading
 from bitymi_ns.train.views import spread
 
 MAP_FILES = (".png", ".tif", ".tiff", ".npy", ".npz", ".exr")
@@ -22,6 +26,10 @@ MAPS = "maps"
 """Metadata key of the `MapFiles` of each view."""
 COLOR_SAMPLES = 8
 """Files of a scanner's depth that are tested for color pictures; all have to be."""
+MOST_LARGER = 8
+"""Sides of a map in those of its photograph, at most: photographs may be reduced copies."""
+MOST_NUMBERS = 1 << 28
+"""Numbers of a map, at most: those of 80 million normals, or 260 million depths."""
 FARTHEST = 65504.0
 """Depth from which on a number stands for "no depth": the largest of half floats, below Blender's 1e10."""
 
@@ -64,8 +72,10 @@ def _is_color(path: Path) -> bool:
     if path.suffix.lower() not in (".png", ".tif", ".tiff"):
         return False
     try:
+        if math.prod(image_shape(path)) > MOST_NUMBERS:
+            return False
         values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
+    except Exception:  # of libraries on damaged files; what is wrong is said where it is read
         return False
     return values is not None and values.ndim == 3 and values.dtype.kind in "iu" and _channels_differ(values)
 
@@ -86,14 +96,14 @@ def read_depth(files: MapFiles, lens: Lens, unit: float | None = None) -> Values
         InputError: a file cannot be read, or has another shape than the photograph.
     """
     assert files.depth is not None
-    stored = _read(files.depth)
+    stored = _read(files.depth, lens.stored)
     if stored.ndim != 2:
         fail(f"the depth map {files.depth} has {stored.shape[2]} channels: write depth as one. {_WITHOUT}")
     whole = stored.dtype.kind in "iu"
     values = stored.astype(np.float32)
     known = np.isfinite(values) & (values > 0.0) & (values < (np.iinfo(stored.dtype).max if whole else FARTHEST))
     if files.confidence is not None:
-        confidence = _read(files.confidence)
+        confidence = _read(files.confidence, lens.stored, alike=False)
         known &= cv2.resize(confidence, stored.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT) != 0
     scale = unit if unit is not None else MILLIMETER if whole else 1.0
     return lens.undistort_map(np.where(known, values * np.float32(scale), np.float32(0.0)), files.depth)
@@ -109,7 +119,7 @@ def read_normal(files: MapFiles, lens: Lens) -> Values:
         InputError: a file cannot be read, or has another shape than the photograph.
     """
     assert files.normal is not None
-    stored = _read(files.normal)
+    stored = _read(files.normal, lens.stored)
     if stored.ndim != 3 or stored.shape[2] < 3:
         fail(f"the normal map {files.normal} has no three channels. {_WITHOUT}")
     normal = stored[..., :3].astype(np.float32)
@@ -122,22 +132,36 @@ def read_normal(files: MapFiles, lens: Lens) -> Values:
 _WITHOUT = "Write it again, or train without: `bitymi-data --depth off`."
 
 
-def _read(path: Path) -> npt.NDArray[np.generic]:
-    """Read an array [H, W] or [H, W, C]; color channels in the order red, green, blue."""
-    try:
+def _read(path: Path, photograph: tuple[int, int], alike: bool = True) -> npt.NDArray[np.generic]:
+    """Read an array [H, W] or [H, W, C]; color channels in the order red, green, blue. Its header is compared with the
+    width and height of the photograph before its numbers are read; `alike`: it must have the shape of that, too."""
+
+    def check(shape: tuple[int, ...]) -> None:
+        if len(shape) not in (2, 3) or min(shape) < 1:
+            fail(f"{path} is no map of numbers, but declares {list(shape)} of them. {_WITHOUT}")
+        size = (shape[1], shape[0])
+        if alike and not in_proportion(size, photograph):
+            fail(wrong_size(path, size, photograph))
+        if max(size[0] / photograph[0], size[1] / photograph[1]) > MOST_LARGER or math.prod(shape) > MOST_NUMBERS:
+            fail(
+                f"{path} declares {' x '.join(map(str, shape))} numbers for a photograph of {photograph[0]} x "
+                f"{photograph[1]} pixels: at most {MOST_LARGER} times its sides, and {MOST_NUMBERS:,}, are read. "
+                f"{_WITHOUT}"
+            )
+
+    with reading(path, fail, _WITHOUT):
         if path.suffix.lower() in (".npy", ".npz"):
-            loaded = np.load(path, allow_pickle=False)
-            values = loaded if isinstance(loaded, np.ndarray) else loaded[loaded.files[0]]
+            values = read_array(path, check)
             values = values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
         else:
+            check(image_shape(path))
             os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")  # OpenCV has the reader, switched off
             values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
             if values is None:
-                raise ValueError("not an image that OpenCV reads" if path.is_file() else "it does not exist")
+                raise ValueError("it is no image that OpenCV reads")
+            check(values.shape)
             if values.ndim == 3:
                 values = values[..., [2, 1, 0] if _channels_differ(values) else 0]  # grey: depth, as a program wrote it
-    except (OSError, ValueError, LookupError, EOFError, BadZipFile, cv2.error) as error:
-        fail(f"{path} cannot be read: {error}. {_WITHOUT}", error)
-    if values.ndim not in (2, 3) or values.dtype.kind not in "iuf" or 0 in values.shape:
-        fail(f"{path} is no map of numbers, but {values.dtype} {list(values.shape)}. {_WITHOUT}")
+    if values.dtype.kind not in "iuf":
+        fail(f"{path} is no map of numbers, but of {values.dtype}. {_WITHOUT}")
     return values.astype(np.float32) if values.dtype.itemsize > 4 or values.dtype == np.float16 else values

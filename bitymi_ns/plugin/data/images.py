@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from PIL import EpsImagePlugin, Image, UnidentifiedImageError
+from PIL import EpsImagePlugin, Image
 
 from bitymi_ns.capture import masks
 from bitymi_ns.capture.exif import exposure_settings
@@ -19,6 +19,7 @@ from bitymi_ns.capture.masks import has_transparency
 from bitymi_ns.capture.photos import eight_bits, in_srgb
 from bitymi_ns.capture.recognise import open_picture
 from bitymi_ns.plugin.console import fail, listed, warn
+from bitymi_ns.reading import reading
 from bitymi_ns.train.exposure import exif_stops
 
 S, T = TypeVar("S"), TypeVar("T")
@@ -26,7 +27,6 @@ ORIENTATION = 0x0112  # EXIF tag that asks viewers to turn a photograph; 1 = as 
 MAX_PIXELS = 1_000_000_000  # photographs with more pixels are refused; phones take some of 200 million
 THREADS = 4
 FINGERPRINT_SIZE = 64  # pixels across, and down, by which photographs are compared
-UNREADABLE = (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError)
 
 
 def set_up_pillow() -> None:
@@ -47,7 +47,7 @@ def from_header(path: Path, read: Callable[[Image.Image], T], default: T) -> T:
     try:
         with open_picture(path) as image:
             return read(image)
-    except UNREADABLE:
+    except Exception:  # Pillow raises many kinds on broken files, and on broken EXIF
         return default
 
 
@@ -101,7 +101,7 @@ def check_sizes(paths: Sequence[Path]) -> None:
                 return False
         except Image.DecompressionBombError:
             return True
-        except (OSError, SyntaxError, ValueError):
+        except Exception:
             return False  # other faults are reported where the file is read
 
     large = [path for path, refused in zip(paths, in_threads(too_large, paths), strict=True) if refused]
@@ -141,7 +141,7 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
         InputError: it is missing, cannot be read, or has another size.
     """
     try:
-        with open_picture(path) as file:
+        with reading(f"the image {path}", fail, _REPLACE, _WORDED), open_picture(path) as file:
             if stored is not None and file.size != stored:
                 fail(wrong_size(path, file.size, stored))
             if wanted is not None:
@@ -152,18 +152,18 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
         fail(f"the image {path} is missing, but the capture has a pose for it", error)
     except Image.DecompressionBombError as error:
         fail(_too_large([path]), error)
-    except UNREADABLE as error:
-        fail(f"the image {path} cannot be read: {error}. Replace it or remove it from the capture.", error)
 
 
 def read_mask(path: Path) -> Image.Image:
     """Read a mask as a 1-bit image, True where pixels count; see `mask_pixels`."""
-    try:
+    if not path.exists():
+        fail(f"the mask {path} is missing")
+    with reading(f"the mask {path}", fail, "Replace it, or remove the masks from the capture."):
         return masks.read_mask(path)
-    except FileNotFoundError as error:
-        fail(f"the mask {path} is missing", error)
-    except UNREADABLE as error:
-        fail(f"the mask {path} cannot be read: {error}. Replace it, or remove the masks from the capture.", error)
+
+
+_REPLACE = "Replace it or remove it from the capture."
+_WORDED = (FileNotFoundError, Image.DecompressionBombError)
 
 
 def wrong_size(path: Path, size: tuple[int, int], declared: tuple[int, int]) -> str:

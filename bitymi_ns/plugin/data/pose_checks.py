@@ -28,9 +28,11 @@ def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source
     """
     result = matrices.copy()
     finite = np.isfinite(matrices).all((1, 2))
-    scale = np.sqrt(np.square(np.where(finite[:, None, None], matrices, 0.0)).sum((1, 2)) / 3.0)
-    usable = finite & (scale > 0.0)
-    unit = np.where(usable[:, None, None], matrices, 1.0) / np.where(usable, scale, 1.0)[:, None, None]
+    largest = np.abs(np.where(finite[:, None, None], matrices, 0.0)).max((1, 2))  # squares of the numbers may overflow
+    usable = finite & (largest > 0.0)
+    unit = np.where(usable[:, None, None], matrices, 1.0) / np.where(usable, largest, 1.0)[:, None, None]
+    length = np.sqrt(np.square(unit).sum((1, 2)) / 3.0)
+    scale, unit = largest * length, unit / length[:, None, None]
     error = np.abs(unit.transpose(0, 2, 1) @ unit - np.eye(3)).max((1, 2))
     for what, wrong in (
         ("is not finite", ~finite),

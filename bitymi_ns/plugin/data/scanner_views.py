@@ -2,6 +2,7 @@
 text file per pose (ScanNet, 7-Scenes)."""
 
 from collections.abc import Callable, Sequence
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,14 @@ from bitymi_ns.plugin.data.depth_files import maps_beside
 from bitymi_ns.plugin.data.find_files import check_photographs_exist
 from bitymi_ns.plugin.data.images import image_size
 from bitymi_ns.plugin.data.pose_checks import rotations
+from bitymi_ns.plugin.data.transforms import MAX_SIDE
 from bitymi_ns.plugin.data.views import OPENCV_AXES, Photograph
-from bitymi_ns.trust import json_of
+from bitymi_ns.reading import read_json, read_text, reading
 
 Row = tuple[Path, npt.NDArray[np.float64], tuple[float, ...], tuple[int, int] | None]
 """Image file, pose [4, 4] in nerfstudio's axes, (fx, fy, cx, cy), and the size these are for; None = the file's."""
+AGAIN = "Export the capture again."
+MOST_POSE = 1 << 20  # bytes of a file with a pose or a camera
 Y_UP = np.array([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """ARKit's world, in which y is up, to one with z up."""
 
@@ -36,14 +40,13 @@ def scanner_photographs(found: Found, need_photos: bool) -> list[Photograph]:
     readers: dict[str, Callable[[Path], list[Row]]] = {
         "polycam": _polycam, "record3d": _record3d, "pose-files": _pose_files
     }  # fmt: skip
-    try:
-        rows = readers[found.format](found.path)
-        for path, pose, pinhole, stated in rows:
-            if not np.isfinite([*pose.ravel(), *pinhole]).all() or min(stated or (1, 1)) < 1:
-                raise ValueError(f"the pose or camera of {path.name} is not finite, or its picture has no pixels")
-    except (OSError, ValueError, LookupError, TypeError, OverflowError) as error:
-        detail = f"the entry {error} is missing" if isinstance(error, KeyError) else str(error)
-        fail(f"{found.path}, read as {found.format}, is damaged: {detail}. Export it again.", error)
+    rows = readers[found.format](found.path)
+    for path, pose, pinhole, stated in rows:
+        if not np.isfinite([*pose.ravel(), *pinhole]).all() or not all(1 <= side <= MAX_SIDE for side in stated or ()):
+            fail(
+                f"{found.path}, read as {found.format}, is damaged: the pose or camera of {path.name} is not finite, "
+                f"or its picture has no pixels. {AGAIN}"
+            )
     if len(rows) < 2:
         fail(f"{found.path}, read as {found.format}, has {len(rows)} photographs with poses: a scene needs many.")
     files = [path for path, *_ in rows]
@@ -71,14 +74,16 @@ def _polycam(folder: Path) -> list[Row]:
     images, cameras = next((keyframes / i, keyframes / c) for i, c in POLYCAM if (keyframes / c).is_dir())
     rows: list[Row] = []
     for path in sorted(cameras.glob("*.json"), key=lambda path: natural(path.name)):
-        values = json_of(path.read_bytes())
-        pose = np.eye(4)
-        pose[:3] = [[float(values[f"t_{i}{j}"]) for j in range(4)] for i in range(3)]
+        with reading(path, fail, AGAIN):
+            values = read_json(path)
+            pose = np.eye(4)
+            pose[:3] = [[float(values[f"t_{i}{j}"]) for j in range(4)] for i in range(3)]
+            size = (int(values["width"]), int(values["height"]))
+            pinhole = tuple(float(values[name]) for name in ("fx", "fy", "cx", "cy"))
         file = next(
             (file for file in images.glob(f"{path.stem}.*") if is_photograph(file)), images / f"{path.stem}.jpg"
         )
-        size = (int(values["width"]), int(values["height"]))
-        rows.append((file, Y_UP @ pose, tuple(float(values[name]) for name in ("fx", "fy", "cx", "cy")), size))
+        rows.append((file, Y_UP @ pose, pinhole, size))
     return rows
 
 
@@ -87,17 +92,21 @@ def _record3d(folder: Path) -> list[Row]:
     from scipy.spatial.transform import Rotation  # slow to import
 
     path = folder / "metadata" if (folder / "metadata").is_file() else folder / "metadata.json"
-    values = json_of(path.read_bytes())
-    K, size = [float(x) for x in values["K"]], (int(values["w"]), int(values["h"]))
-    own: Sequence[Any] = values.get("perFrameIntrinsicCoeffs") or ()
+    with reading(path, fail, AGAIN):
+        values = read_json(path)
+        K, size = [float(x) for x in values["K"]], (int(values["w"]), int(values["h"]))
+        camera = (K[0], K[4], K[6], K[7])
+        own: Sequence[Any] = values.get("perFrameIntrinsicCoeffs") or ()
+        poses: Sequence[Any] = list(values["poses"])
     images = next((folder / name for name in ("rgb", "rgbd", "images") if (folder / name).is_dir()), folder)
     files = {file.stem: file for file in images.iterdir() if is_photograph(file)}
     rows: list[Row] = []
-    for i, each in enumerate(values["poses"]):
-        numbers = [float(x) for x in each]
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = Rotation.from_quat(numbers[:4]).as_matrix(), numbers[4:7]
-        pinhole = tuple(float(x) for x in own[i][:4]) if i < len(own) else (K[0], K[4], K[6], K[7])
+    for i, each in enumerate(poses):
+        with reading(f"{path}: pose {i} (counted from 0)", fail, AGAIN):
+            *quaternion, x, y, z = _numbers(each, 7)
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = Rotation.from_quat(quaternion).as_matrix(), (x, y, z)
+            pinhole = tuple(_numbers(own[i][:4], 4)) if i < len(own) else camera
         if str(i) in files:  # Record3D can export every n-th image
             rows.append((files[str(i)], Y_UP @ pose, pinhole, size))
     return rows
@@ -116,7 +125,8 @@ def _pose_files(folder: Path) -> list[Row]:
         name = path.stem.removesuffix(".pose")
         if name not in files:
             continue
-        pose = np.loadtxt(path).reshape(4, 4)
+        with reading(path, fail, AGAIN):
+            pose = np.loadtxt(StringIO(read_text(path, MOST_POSE))).reshape(4, 4)
         if not np.isfinite(pose).all():
             lost.append(name)
             continue
@@ -136,8 +146,17 @@ def _intrinsics(folder: Path) -> tuple[float, ...]:
             f"{folder} has poses, but no file with the camera ({', '.join(names[:4])}). Put one there with the matrix "
             "fx 0 cx, 0 fy cy, 0 0 1, a row on each line; or compute the poses: `bitymi-data --format photographs`."
         )
-    values = np.loadtxt(path)
-    if values.ndim == 2 and min(values.shape) >= 3:
-        return float(values[0, 0]), float(values[1, 1]), float(values[0, 2]), float(values[1, 2])
-    fx, fy, cx, cy = values.ravel()[:4].tolist()
-    return fx, fy, cx, cy
+    with reading(path, fail, AGAIN):
+        values = np.loadtxt(StringIO(read_text(path, MOST_POSE)))
+        if values.ndim == 2 and min(values.shape) >= 3:
+            return float(values[0, 0]), float(values[1, 1]), float(values[0, 2]), float(values[1, 2])
+        fx, fy, cx, cy = values.ravel()[:4].tolist()
+        return fx, fy, cx, cy
+
+
+def _numbers(values: Any, count: int) -> list[float]:
+    """So many numbers; what is fewer would be repeated, and what is more left out, without a word."""
+    numbers = [float(value) for value in values]
+    if len(numbers) != count:
+        raise ValueError(f"it has {len(numbers)} numbers, not {count}")
+    return numbers

@@ -17,7 +17,8 @@ from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data.colmap_model import Model
 from bitymi_ns.plugin.data.colmap_views import Origin, Source, find_masks, make_source
 from bitymi_ns.plugin.data.images import image_size, in_threads
-from bitymi_ns.trust import Refused, json_of, leads_inside
+from bitymi_ns.reading import read_json, reading
+from bitymi_ns.trust import Refused, leads_inside
 
 MODEL = Path("sparse/0")
 IMAGES = "images"
@@ -118,20 +119,15 @@ def read_kept_poses(folder: Path) -> KeptPoses | None:
     path = folder / ORIGIN
     if not path.is_file():
         return None
-    try:
-        values: dict[str, Any] = json_of(path.read_text("utf8"))
+    which = f"{path}, which says of what the poses of the run were found,"
+    with reading(which, fail, f"Put the folder {folder} back as it was, or train again."):
+        values: dict[str, Any] = read_json(path)
         entries, left_out = dict(values["origin"]), dict(values["left_out"])
         if entries.get("settings") is not None:  # runs of earlier versions do not state them
             entries["settings"] = SfmSettings(**entries["settings"])
         origin = Origin(**entries)
         if origin.kind not in ("photographs", "video"):
             raise ValueError(f"it is of {origin.kind}")
-    except (OSError, ValueError, LookupError, TypeError) as error:
-        fail(
-            f"{path}, which says of what the poses of the run were found, cannot be read ({error}). Put the folder "
-            f"{folder} back as it was, or train again.",
-            error,
-        )
     return KeptPoses(folder, origin, left_out)
 
 

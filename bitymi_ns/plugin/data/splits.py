@@ -9,9 +9,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_filename, get_train_eval_split_fraction
 
-from bitymi_ns.files import encoding_of
 from bitymi_ns.plugin.console import fail, listed
 from bitymi_ns.plugin.data.find_files import folded, without_extension
+from bitymi_ns.reading import read_text, reading
 
 Mode = Literal["fraction", "filename", "interval", "all"]
 NameLists = dict[str, list[str]]  # names of photographs by split: train, val, test
@@ -137,10 +137,8 @@ def read_names(names_or_file: Sequence[str]) -> tuple[str, ...]:
     if len(names_or_file) != 1 or not names_or_file[0].lower().endswith((".txt", ".lst", ".list")):
         return tuple(names_or_file)
     path = Path(os.path.expanduser(names_or_file[0]))
-    try:
-        lines = path.read_text(encoding_of(path)).splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        fail(f"--eval-names: {path} cannot be read: {error}. Give names, or a text file with one per line.", error)
+    with reading(f"--eval-names: {path}", fail, "Give names, or a text file with one per line."):
+        lines = read_text(path).splitlines()
     names = tuple(line.strip() for line in lines if line.strip() and not line.startswith("#"))
     if not names:
         fail(f"--eval-names: {path} lists no names. Write the name of one photograph per line.")

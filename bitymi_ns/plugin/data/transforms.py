@@ -11,7 +11,7 @@ from bitymi_ns.capture.recognise import is_model
 from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.data.pose_checks import rotations
 from bitymi_ns.plugin.data.splits import NameLists
-from bitymi_ns.trust import json_of
+from bitymi_ns.reading import read_json, reading
 
 HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data <photos> --output-dir <capture>`."
 HOW_TO_CORRECT = "Correct it there (JSON has neither comments nor a comma behind the last entry), or write it again."
@@ -35,21 +35,19 @@ def load_transforms(path: Path, own_format: bool) -> dict[str, Any]:
     Raises:
         InputError: the file cannot be used; names the frame.
     """
-    try:
-        meta = json_of(path.read_bytes())
-    except FileNotFoundError as error:
-        fail(f"{path} does not exist, which this kind of capture needs. {HOW_TO_GET_ONE}", error)
-    except (ValueError, OSError) as error:
-        fail(f"{path} cannot be read: {error}. {HOW_TO_CORRECT if path.is_file() else HOW_TO_GET_ONE}", error)
-    _drop_nulls(meta)
-    _check_frames(path, meta, own_format)
-    if own_format:
-        _check_intrinsics(path, meta)
-        _warn_of_contradictions(path, meta)
-    _check_applied(path, meta)
-    _check_lists(path, meta)
-    _correct_poses(path, meta["frames"])
-    _check_repeated(path, meta["frames"])
+    if not os.path.lexists(path):
+        fail(f"{path} does not exist, which this kind of capture needs. {HOW_TO_GET_ONE}")
+    with reading(path, fail, HOW_TO_CORRECT if path.is_file() else HOW_TO_GET_ONE):
+        meta = read_json(path)
+        _drop_nulls(meta)
+        _check_frames(path, meta, own_format)
+        if own_format:
+            _check_intrinsics(path, meta)
+            _warn_of_contradictions(path, meta)
+        _check_applied(path, meta)
+        _check_lists(path, meta)
+        _correct_poses(path, meta["frames"])
+        _check_repeated(path, meta["frames"])
     return meta
 
 
@@ -199,7 +197,7 @@ def colmap_points(path: Path) -> Path | None:
     if not is_model(model):
         return None
     try:
-        meta = json_of(path.read_bytes())
+        meta = read_json(path)
     except (OSError, ValueError):
         return None  # reported where it is read
     return None if not isinstance(meta, dict) or meta.get("ply_file_path") is not None else model
@@ -247,7 +245,7 @@ def _matrix(value: Any) -> np.ndarray | None:
     """Convert 3 x 4 or 4 x 4 finite numbers to [4, 4]; None for anything else."""
     try:
         matrix = np.asarray(value, dtype=np.float64)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         return None
     if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
         return None

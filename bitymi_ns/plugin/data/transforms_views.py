@@ -35,6 +35,7 @@ from bitymi_ns.plugin.data.transforms import (
     take_lists,
 )
 from bitymi_ns.plugin.data.views import Photograph
+from bitymi_ns.reading import reading
 
 EQUAL_AREA = ("equirectangular", "is_equirectangular")
 """Entries of instant-ngp's for pictures of all directions of which rows show equal areas."""
@@ -97,8 +98,9 @@ def read_transforms(path: Path, own_format: bool, downscale: int = 1, need_photo
     made: dict[ColmapCamera, ColmapCamera] = {}
     photographs = []
     for frame, file, mask, beside in zip(frames, files, masks, maps, strict=True):
-        camera = _camera(path, meta, frame, file)
         label = f"the camera of {frame['file_path']} in {path}"
+        with reading(label, fail, "Correct its entries."):
+            camera = _camera(path, meta, frame, file)
         pose = np.array(frame["transform_matrix"])
         photographs.append(Photograph(file, made.setdefault(camera, camera), pose, label, mask, maps=beside))
     photographs.sort(key=lambda photograph: photograph.file)
@@ -267,7 +269,7 @@ def _distortion(path: Path, meta: dict[str, Any], frame: dict[str, Any]) -> tupl
     """Convert camera model and distortion of a frame; see `colmap_distortion`."""
     label = f"of {frame['file_path']}"
     model = stated_model(meta, frame)
-    if model not in CAMERA_MODEL_TO_TYPE:
+    if not isinstance(model, str) or model not in CAMERA_MODEL_TO_TYPE:
         fail(
             f"{path}: the camera_model {model!r} {label} is unknown. nerfstudio knows "
             f"{', '.join(CAMERA_MODEL_TO_TYPE)}; for undistorted photographs write PINHOLE."

@@ -47,13 +47,16 @@ class Photograph:
     maps: MapFiles = MapFiles()  # depth and normals
 
 
+Orientation = Literal["pca", "up", "vertical", "none"]
+
+
 @dataclass
 class FrameOptions:
     """Orientation, centering and scaling of a capture, as in nerfstudio's parsers."""
 
     scale_factor: float = 1.0
     """Factor on the positions of the cameras."""
-    orientation_method: Literal["pca", "up", "vertical", "none"] = "up"
+    orientation_method: Orientation = "up"
     """Orientation of the capture: up = the cameras' mean up is z."""
     center_method: Literal["poses", "focus", "none"] = "poses"
     """Origin: the middle of the cameras, or the point that they look at."""

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import tyro
 import yaml
 
+from bitymi_ns import endings
 from bitymi_ns.bake import BakeOptions, Learning, TuneOptions, bake_and_learn, export, rich_progress
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bake.learn import FEWEST_PASSES
@@ -151,6 +152,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
 
     def main(self) -> None:
         """Run the export."""
+        endings.install()
         earlier = None
         bake_options = self._options()
         try:

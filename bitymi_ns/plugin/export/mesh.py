@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bitymi_ns import endings
 from bitymi_ns.bundle import BundleError, read_bundle
 from bitymi_ns.bundle.manifest import MANIFEST, WorldFrame
 from bitymi_ns.bundle.strict_json import plain
@@ -57,6 +58,7 @@ class ExportMesh(SurfaceOptions):
 
     def main(self) -> None:
         """Run the export."""
+        endings.install()
         path = self.output_dir / f"{NAME}.{self.format}"
         try:
             check_ranges(self)

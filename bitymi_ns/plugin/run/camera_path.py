@@ -1,30 +1,36 @@
-"""Check of the camera paths that `ns-render camera-path` reads, before the scene is loaded."""
+"""Camera paths that `ns-render camera-path` reads: checked before the scene is loaded, and written anew for
+nerfstudio, so that what it reads is what was checked."""
 
-import json
+import atexit
+import math
+import shutil
+import tempfile
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
-from bitymi_ns.plugin.console import fail, warn
+from bitymi_ns.files import explained
+from bitymi_ns.plugin.console import InputError, fail, warn
 from bitymi_ns.ranges import first_problem
+from bitymi_ns.reading import read_json, reading
 
 MOST_PIXELS = 16_384  # along a side of a frame
 SLACK = 1e-3  # of a rotation that was stored with rounding
 HELP = "Record it in the viewer of the run or bundle, or write nerfstudio's format."
 
 
-def _pose(value: list[Any]) -> list[Any]:
+def _pose(value: list[Any]) -> list[float]:
     """The 16 numbers of a matrix [4, 4] by rows: a rotation and a position."""
     try:
         matrix = np.array(value, np.float64).reshape(4, 4)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError("must be 16 numbers, a matrix by rows") from None
     turn = matrix[:3, :3]
     if not (np.isfinite(matrix).all() and np.abs(turn @ turn.T - np.eye(3)).max() < SLACK and np.linalg.det(turn) > 0):
         raise ValueError("must be a rotation and a position: camera to world, x right, y up, z backward")
-    return value
+    return matrix.ravel().tolist()
 
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -38,39 +44,57 @@ class _Frame(BaseModel):
     principal_point: Annotated[list[_Share], Field(min_length=2, max_length=2)] = [0.5, 0.5]
 
 
-class _Path(BaseModel):
+class CameraPath(BaseModel):
+    """A camera path that can be rendered; entries of nerfstudio's format that mean nothing here are left out."""
+
     render_width: _Side
     render_height: _Side
     seconds: _Positive
-    camera_path: Annotated[list[_Frame], Field(min_length=1)]
+    camera_path: list[_Frame]
     camera_type: str = "perspective"
-    crop: Any = None
+
+    @property
+    def rate(self) -> float:
+        """Frames per second."""
+        return len(self.camera_path) / self.seconds
+
+    def written(self) -> Path:
+        """Write the path to a file that lasts as long as this process."""
+        folder = Path(tempfile.gettempdir())
+        with explained(folder, InputError):
+            folder = Path(tempfile.mkdtemp(prefix="bitymi-path-"))
+            atexit.register(shutil.rmtree, folder, ignore_errors=True)
+            file = folder / "camera_path.json"
+            file.write_text(self.model_dump_json(), "utf-8")
+        return file
 
 
-def check_camera_path(file: Path) -> float:
-    """Stop where a file is no camera path that can be rendered; warn of what is ignored.
-
-    Returns:
-        frames per second.
+def read_camera_path(file: Path) -> CameraPath:
+    """Read and check a camera path; warn of what is ignored, or looks like a mistake.
 
     Raises:
-        InputError: naming the file, the field and what is wrong with it.
+        InputError: it cannot be rendered; names the file, the field and what is wrong with it.
     """
+    with reading(f"the camera path {file}", fail, f"{HELP} (--camera-path-filename)"):
+        found = read_json(file)
+    if isinstance(found, dict) and (found.get("seconds") == 0 or found.get("camera_path") == []):
+        fail(f"the camera path {file} has no frames: add a second keyframe, and save it again.")
     try:
-        found = json.loads(file.read_text("utf-8"))
-        path = _Path.model_validate(found)
-    except OSError as error:
-        fail(f"the camera path {file} cannot be read: {error.strerror} (--camera-path-filename).", error)
+        path = CameraPath.model_validate(found)
     except ValidationError as error:
         where, what = first_problem(error)
         fail(f"the camera path {file} cannot be used: {where + ': ' if where else ''}{what}. {HELP}", error)
-    except ValueError as error:
-        fail(f"the camera path {file} is no JSON in UTF-8 ({error}). {HELP}", error)
     if path.camera_type.lower() not in ("perspective", "pinhole"):
         fail(
             f"the camera path {file} is for cameras of type {path.camera_type}: only perspective cameras can be "
             "rendered. Choose perspective in the viewer's render tab and save the path again."
         )
-    if path.crop is not None:
+    if found.get("crop") is not None:
         warn("Crop boxes are not supported: the whole scene is rendered.")
-    return len(path.camera_path) / path.seconds
+    widest = max(frame.fov for frame in path.camera_path)
+    if widest < math.pi:
+        warn(
+            f"The fields of view of {file} are at most {widest:.3g} degrees. If radians were meant, fov has to be "
+            f"{math.degrees(widest):.3g}."
+        )
+    return path

@@ -2,11 +2,8 @@
 
 import dataclasses
 import errno
-import json
-import pickle
+import os
 import zipfile
-import zlib
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +12,15 @@ import torch
 
 from bitymi_ns.files import complete_file, reason
 from bitymi_ns.plugin.console import fail, listed, warn
+from bitymi_ns.plugin.run.checkpoint_schema import EXTRA_STATE, SURFELS, Entry, Misfit, check
+from bitymi_ns.reading import open_regular, reading
 from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.trust import json_of
 
-EXTRA_STATE = "_extra_state"  # torch's name for what a module saves beside its tensors
-SURFELS = "scene.surfels."  # prefix of the surfels' parameters in the model
 STATE_VERSION = 2
 MAY_DIFFER = ("near", "weight_bound", "rim", "texture_moves_surfels", "max_fragments")
 """Scene options that may differ from those that a checkpoint was trained with: they do not decide what its parameters
 mean, only how they are drawn or learned."""
-_READING = (RuntimeError, EOFError, OSError, LookupError, ValueError, TypeError, AttributeError)
-"""Errors of torch.load for damaged files."""
 
 
 def allow_numpy_scalars() -> None:
@@ -92,41 +88,52 @@ def load(path: Path, scene: SceneConfig) -> dict[str, Any]:
         )
     if not path.is_file():
         fail(f"there is no checkpoint {path}")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            altered = archive.testzip()  # torch does not look at the checksums
-        if altered is not None:
-            raise ValueError(f"the checksum of {altered} is wrong")
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except (zipfile.BadZipFile, zlib.error, pickle.UnpicklingError, *_READING) as error:
-        others = sorted(p.name for p in path.parent.glob("step-*.ckpt") if p != path)
-        way_out = (
-            f"Remove it to go back to {others[-1]}" if others else "Copy it again from where it was, or train again"
-        )
-        fail(
-            f"the checkpoint {path} is damaged (cut off or altered), or another program wrote it: "
-            f"{(str(error).strip() or type(error).__name__).splitlines()[0].rstrip('.')}. {way_out}.",
-            error,
-        )
-    if (
-        not isinstance(state, dict)
-        or not {"step", "pipeline", "optimizers"} <= state.keys()
-        or not isinstance(state["step"], int)
-    ):
+    others = sorted(p.name for p in path.parent.glob("step-*.ckpt") if p != path)
+    way_out = f"Remove it to go back to {others[-1]}" if others else "Copy it again from where it was, or train again"
+
+    advice = f"It is damaged (cut off or altered), or another program wrote it. {way_out}."
+    with reading(f"the checkpoint {path}", fail, advice):
+        state = _read(path)
+    if not isinstance(state, dict) or not {"step", "pipeline", "optimizers"} <= state.keys():
         fail(f"{path} is not a nerfstudio checkpoint")
-    _check_scene(state["pipeline"], scene, path)
+    try:
+        _check_kind(state["pipeline"], scene, path)
+        broken = check(state, scene)
+    except Misfit as error:
+        fail(f"the checkpoint {path} was altered, or is not of this method: {error}. {way_out}.", error)
+    if broken:
+        warn(
+            f"The checkpoint {path} holds numbers that are not finite, or too large to be drawn, in {listed(broken)}: "
+            "expect holes, or black."
+        )
     return state
 
 
-def _check_scene(parameters: Mapping[str, Any], scene: SceneConfig, path: Path) -> None:
-    """Stop when the parameters are not those of a scene of this kind."""
-    extra = parameters.get("_model." + EXTRA_STATE)
-    if not isinstance(extra, dict) or f"_model.{SURFELS}means" not in parameters:
+def _read(path: Path) -> Any:
+    """Read an archive of torch in its safe mode; ValueError where its sizes or its checksums are wrong."""
+    with open_regular(path) as file:
+        with zipfile.ZipFile(file) as archive:
+            parts = archive.infolist()
+            size = os.fstat(file.fileno()).st_size
+            if sum(part.file_size for part in parts) > size or any(part.compress_type for part in parts):
+                raise ValueError("its parts are compressed, or larger than the file")
+            altered = archive.testzip()  # torch does not look at the checksums
+        if altered is not None:
+            raise ValueError(f"the checksum of {altered} is wrong")
+        file.seek(0)
+        return torch.load(file, map_location="cpu", weights_only=True)
+
+
+def _check_kind(parameters: Any, scene: SceneConfig, path: Path) -> None:
+    """Stop when the parameters are those of another method, version or preset, which is no fault of the file."""
+    extra = parameters.get("_model." + EXTRA_STATE) if isinstance(parameters, dict) else None
+    if not isinstance(extra, dict) or f"{SURFELS}means" not in parameters:
         fail(f"{path} is not a checkpoint of this method: it holds no surfels. Load it with the method it is from.")
-    if extra.get("version", 0) > STATE_VERSION:
+    version = Entry(extra, f"pipeline.{EXTRA_STATE}").get("version")
+    if version is not None and version.count() > STATE_VERSION:
         fail(f"{path} is from a newer bitymi-ns; update it to load this checkpoint")
     try:
-        there, here = dict(json.loads(extra["scene"])), dataclasses.asdict(scene)
+        there, here = dict(json_of(extra["scene"])), dataclasses.asdict(scene)
     except (ValueError, TypeError, KeyError) as error:
         fail(f"the checkpoint {path} was altered: it does not say what its scene is made of. Train again.", error)
     different = [k for k in there if k in here and k not in MAY_DIFFER and there[k] != here[k]]
@@ -139,19 +146,3 @@ def _check_scene(parameters: Mapping[str, Any], scene: SceneConfig, path: Path) 
             f"{lines}\n"
             "Use the method that it was trained with (see the config.yml beside its nerfstudio_models folder)."
         )
-    rows = {name: len(value) for name, value in parameters.items() if name.startswith("_model." + SURFELS)}
-    if len(set(rows.values())) > 1:
-        counts = ", ".join(f"{count} {name.rpartition('.')[2]}" for name, count in rows.items())
-        fail(
-            f"the checkpoint {path} was altered: its parameters differ in their number of surfels ({counts}). Train "
-            "again."
-        )
-    if not all(rows.values()):
-        fail(f"the checkpoint {path} holds no surfels. Train again.")
-    broken = [
-        name.removeprefix("_model.")
-        for name, value in parameters.items()
-        if isinstance(value, torch.Tensor) and value.is_floating_point() and not bool(value.isfinite().all())
-    ]
-    if broken:
-        warn(f"The checkpoint {path} holds numbers that are not finite, in {listed(broken)}: expect holes, or black.")

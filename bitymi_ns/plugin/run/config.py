@@ -13,6 +13,7 @@ from nerfstudio.engine.optimizers import OptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
+from bitymi_ns import endings
 from bitymi_ns.files import explained, write_file
 from bitymi_ns.plugin.console import InputError, fail, say, warn
 from bitymi_ns.plugin.data.bundle_cameras import BundleCamerasConfig, has_cameras
@@ -212,6 +213,7 @@ class BitymiTrainerConfig(TrainerConfig):
         """
         model, evaluated = self.pipeline.model, folder_being_evaluated()
         if evaluated is not None:
+            endings.install()
             refuse_others()
             adopt_viewer(self)
             adopt_render()

@@ -21,7 +21,7 @@ from bitymi_ns.files import check_writable, explained, size_text
 from bitymi_ns.plugin.console import INTERRUPTED, InputError, fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
-from bitymi_ns.plugin.run.camera_path import MOST_PIXELS, check_camera_path
+from bitymi_ns.plugin.run.camera_path import MOST_PIXELS, read_camera_path
 from bitymi_ns.plugin.run.commands import running_command
 from bitymi_ns.plugin.run.films import RATES, check_frames, film, frames, open_gzip, write_image
 from bitymi_ns.plugin.run.surfel_model import SurfelModel
@@ -127,9 +127,10 @@ def _check(command: Any) -> None:
     if not as_film and hasattr(command, "output_format"):
         check_frames(path)
     if hasattr(command, "camera_path_filename"):
-        rate = check_camera_path(Path(command.camera_path_filename))
-        if as_film and not RATES[0] <= rate <= RATES[1]:
-            fail(f"{command.camera_path_filename} makes {rate:g} frames per second: correct its seconds.")
+        path = read_camera_path(Path(command.camera_path_filename))
+        if as_film and not RATES[0] <= path.rate <= RATES[1]:
+            fail(f"{command.camera_path_filename} makes {path.rate:g} frames per second: correct its seconds.")
+        command.camera_path_filename = path.written()
     elif getattr(command, "seconds", None) is not None and _spiral_frames(command) < 1:
         fail(f"{command.seconds} seconds have no frame at --frame-rate {command.frame_rate}: give more.")
 
@@ -172,8 +173,8 @@ def _interpolated(stock: Any, cameras: Cameras, **options: Any) -> Cameras:
 
 def _with_principal_points(path: Cameras, found: dict[str, Any]) -> Cameras:
     """Give the cameras of a path the `principal_point` of their frames, parts of width and height, which our viewer
-    writes and nerfstudio ignores; 0.5, 0.5 where a frame has none."""
-    points = torch.tensor([frame.get("principal_point", (0.5, 0.5)) for frame in found["camera_path"]]).float()
+    writes and nerfstudio ignores."""
+    points = torch.tensor([frame["principal_point"] for frame in found["camera_path"]]).float()
     path.cx, path.cy = found["render_width"] * points[:, :1], found["render_height"] * points[:, 1:]
     return path
 

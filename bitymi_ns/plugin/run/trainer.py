@@ -22,7 +22,9 @@ from torch import Tensor
 from bitymi_ns import files
 from bitymi_ns.plugin.console import INTERRUPTED, fail, filter_console, ignore_torch_warnings, say, step_bar, warn
 from bitymi_ns.plugin.run import checkpoints, run_folder
+from bitymi_ns.plugin.run.checkpoint_schema import Entry, restore_optimizer
 from bitymi_ns.plugin.run.launcher import Workers
+from bitymi_ns.reading import reading
 from bitymi_ns.train import optimizers
 from bitymi_ns.train.processes import Processes, ProcessesApart, ProcessLost
 
@@ -106,13 +108,12 @@ class BitymiTrainer(Trainer):
     def _restore(self, state: dict[str, Any], path: Path) -> None:
         self._start_step = state["step"] + 1
         self.pipeline.load_pipeline(state["pipeline"], state["step"])
-        try:
-            self.optimizers.load_optimizers(state["optimizers"])
+        with reading(f"{path} cannot be resumed: the state of its optimisers", fail, "Train again."):
+            for name, saved in state["optimizers"].items():
+                restore_optimizer(self.optimizers.optimizers[name], Entry(saved, f"optimizers.{name}"))
             if "schedulers" in state and self.config.load_scheduler:
                 self.optimizers.load_schedulers(state["schedulers"])
             self.grad_scaler.load_state_dict(state["scalers"])
-        except (RuntimeError, LookupError, ValueError, TypeError) as error:
-            fail(f"{path} cannot be resumed: the state of its optimisers does not fit ({error}). Train again.", error)
 
     def train(self) -> None:
         """Train to step `max_num_iterations`. nerfstudio's loop would train that many steps more on a resumed run."""

@@ -118,7 +118,7 @@ def test_a_later_report_replaces_an_earlier_one_and_nothing_else(eval_json, tmp_
         ("empty.json", b"", "is not valid JSON"),
         ("deep.json", b"[" * 100_000, "is not valid JSON"),
         ("list.json", b"[1, 2]", "holds neither an evaluation"),
-        ("binary.json", b"\xff\xfe\x00", "is not a text file"),
+        ("binary.json", b"\xff\xfe\x00", "it is no text in UTF-16-LE"),
         ("empty.jsonl", b"", "holds neither"),
         ("text.jsonl", b"hello\n", r"line 1, is not valid JSON"),
     ],

@@ -68,7 +68,7 @@ def test_points_without_colours_get_them_of_the_photographs(
 
 def test_points_of_two_kinds(project: Path) -> None:
     folder = points(project, "0 0 0.5 200 10 10", "0.1 0 0.5")
-    with expect("points3D.txt has a line that cannot be read .*three coordinates and three colors"):
+    with expect("points3D.txt cannot be read: .*three coordinates and three colors"):
         read_model(folder)
 
 

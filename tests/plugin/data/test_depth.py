@@ -1,7 +1,12 @@
 """Depth and normals of a capture: files, units, fits, initial points, and what is wrong with them."""
 
+import io
 import json
 import os
+import struct
+import tracemalloc
+import zipfile
+import zlib
 from pathlib import Path
 
 import cv2
@@ -147,12 +152,106 @@ def test_without_points_photographs_are_compared(capture, room, capsys, monkeypa
 def test_depth_that_cannot_be_read_is_refused(capture) -> None:
     with expect(r"depth_\d+.npy has 32 x 48 pixels"):
         load(capture(lambda z, _: z[:, ::2]))
+    with expect("no map of numbers, but declares"):
+        load(capture(lambda z, _: z[0]))
     with expect("has 3 channels"):
         load(capture(lambda z, i: np.stack([z, z + 1, z], -1)))
     folder = capture()
     (folder / "depth_3.npy").write_bytes(b"no array")
     with expect("depth_3.npy cannot be read"):
         load(folder)
+
+
+LENS = lenses_of(ColmapCamera("PINHOLE", 64, 64, (60.0, 60.0, 32.0, 32.0)), (64, 64), "a camera")[0][0]
+
+
+def header(shape: str, descr: str = "<f8") -> bytes:
+    """A .npy file without its numbers."""
+    text = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode()
+
+
+def zipped(data: bytes) -> bytes:
+    held = io.BytesIO()
+    with zipfile.ZipFile(held, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("arr_0.npy", data)
+    return held.getvalue()
+
+
+def png(width: int, height: int) -> bytes:
+    """A PNG file of one number that declares others."""
+    data = bytearray(cv2.imencode(".png", np.zeros((1, 1), np.uint16))[1].tobytes())
+    data[16:24] = struct.pack(">2I", width, height)
+    data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
+    return bytes(data)
+
+
+def exr(width: int, height: int, tmp_path: Path) -> bytes:
+    os.environ["OPENCV_IO_ENABLE_OPENEXR"] = "1"
+    cv2.imwrite(str(tmp_path / "one.exr"), np.zeros((1, 1), np.float32))
+    data = bytearray((tmp_path / "one.exr").read_bytes())
+    at = data.index(b"dataWindow\0box2i\0") + 21
+    data[at : at + 16] = struct.pack("<4i", 0, 0, width - 1, height - 1)
+    return bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "message"),
+    [
+        ("a.npy", header("(1000000, 1000000)"), "declares 1000000 x 1000000 numbers for a photograph of 64 x 64"),
+        ("a.npz", zipped(header("(30000, 30000)") + bytes(1 << 20)), "declares 30000 x 30000 numbers"),
+        ("a.npy", header("(520, 520)") + bytes(520 * 520 * 8), "declares 520 x 520 numbers"),  # more than 8 times 64
+        ("a.npy", header("(64, 64, 100000000)"), "declares 64 x 64 x 100000000 numbers"),
+        ("a.npy", header("(64, 32)"), "32 x 64 pixels, but its camera is for 64 x 64"),
+        ("a.npy", header("(64, 64)") + bytes(64), "a.npy cannot be read: it is cut off: it has 64 of 32768 bytes"),
+        ("a.npy", header("(-64, 64)"), "no map of numbers, but declares"),
+        ("a.npy", header("(64, 64)", "|O"), "cannot be read: it holds no numbers, but object"),
+        ("a.npy", header("(" * 3000), "a.npy cannot be read: "),
+        ("a.npz", b"PK\x05\x06" + bytes(18), "a.npz cannot be read: "),
+        ("a.png", png(1 << 14, 1 << 14), "declares 16384 x 16384 numbers|pixels. exceeds limit of"),
+        ("a.png", png(640, 320), "640 x 320 pixels, but its camera is for 64 x 64"),
+        ("a.png", png(64, 64), "a.png cannot be read"),
+        ("a.exr", 1 << 20, "declares 1048576 x 1048576 numbers"),
+        ("a.tif", b"II*\0\x08\0\0\0\x02\0" + struct.pack("<2HIIHHIII", 256, 4, 1, 1 << 20, 257, 4, 1, 1 << 20, 0),
+         "declares 1048576 x 1048576 numbers"),
+        ("a.tif", b"II*\0\xff\xff\xff\x7f", "a.tif cannot be read: "),
+    ],
+)  # fmt: skip
+def test_headers_are_compared_with_the_photograph_before_numbers_are_read(tmp_path, name, data, message) -> None:
+    (tmp_path / name).write_bytes(exr(data, data, tmp_path) if isinstance(data, int) else data)
+    tracemalloc.start()
+    with expect(message):
+        read_depth(MapFiles(tmp_path / name), LENS)
+    assert tracemalloc.get_traced_memory()[1] < 20 << 20
+    tracemalloc.stop()
+    np.save(tmp_path / "depth.npy", np.ones((64, 64)))
+    with expect(f"{name} cannot be read|declares"):
+        (tmp_path / name).write_bytes(png(1 << 20, 1 << 20))
+        read_depth(MapFiles(tmp_path / "depth.npy", confidence=tmp_path / name), LENS)
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.npz", "a.png", "a.exr"])
+def test_maps_that_are_no_files(tmp_path, name) -> None:
+    with expect(f"{name} cannot be read: it does not exist"):
+        read_depth(MapFiles(tmp_path / name), LENS)
+    os.mkfifo(tmp_path / name)
+    with expect(f"{name} cannot be read: it is not a regular file"):
+        read_depth(MapFiles(tmp_path / name), LENS)
+
+
+@pytest.mark.parametrize("ending", [".npy", ".npz", ".png", ".exr", ".tif", ".tiff"])
+def test_maps_of_every_kind_are_read(tmp_path, ending) -> None:
+    os.environ["OPENCV_IO_ENABLE_OPENEXR"] = "1"
+    values = np.arange(1.0, 64 * 64 + 1.0).reshape(64, 64).astype(np.uint16 if ending == ".png" else np.float32)
+    file = tmp_path / f"a{ending}"
+    if ending == ".npy":
+        np.save(file, np.asfortranarray(values))
+    elif ending == ".npz":
+        np.savez_compressed(file, values)
+    else:
+        assert cv2.imwrite(str(file), values)
+    read = read_depth(MapFiles(file), LENS, 1.0)
+    assert np.array_equal(read, values)
 
 
 def test_missing_maps_and_switching_off(capture, capsys) -> None:

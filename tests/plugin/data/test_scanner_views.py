@@ -123,19 +123,21 @@ def test_scans_that_are_damaged(capture: Path, tmp_path: Path) -> None:
     values = json.loads(path.read_text())
     values.pop("t_01")
     path.write_text(json.dumps(values))
-    with expect("read as polycam, is damaged: the entry 't_01' is missing"):
+    with expect("corrected_cameras/3.json cannot be read: the entry 't_01' is missing"):
         load_any(folder)
     for change, why in (
         ({"t_01": float("nan")}, "the pose or camera of 3.png is not finite"),
         ({"t_01": 0.0, "width": 0}, "its picture has no pixels"),
-        ({"t_01": 0.0, "width": float("inf")}, "infinity"),
-        ({"t_01": [[]] * 3}, "float"),
+        ({"t_01": 0.0, "width": 2**62}, "or its picture has no pixels"),
+        ({"t_01": 0.0, "width": float("inf")}, "3.json cannot be read: a number in it is too large"),
+        ({"t_01": 10**400}, "3.json cannot be read: a number in it is too large"),
+        ({"t_01": [[]] * 3}, "3.json cannot be read: float"),
     ):
         path.write_text(json.dumps({**values, **change}))
-        with expect(f"read as polycam, is damaged: .*{why}"):
+        with expect(why):
             load_any(folder)
     path.write_text("[" * 100_000)
-    with expect("read as polycam, is damaged: it is nested too deeply"):
+    with expect("3.json cannot be read: it is nested too deeply"):
         load_any(folder)
     path.unlink()
     (folder / "keyframes/corrected_images/5.png").unlink()

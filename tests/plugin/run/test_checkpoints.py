@@ -3,25 +3,75 @@
 import dataclasses
 import errno
 import json
+import math
+import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
+from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run import checkpoints
+from bitymi_ns.plugin.run.checkpoint_schema import Entry, Misfit, restore_optimizer
 from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.scene.field import HashField, TexelField
+from bitymi_ns.train.exposure import Exposure
+from bitymi_ns.train.optimizers import adam
+from bitymi_ns.train.strategy import STATISTICS
 
 
 def state(scene: SceneConfig, rows: int = 5, step: int = 7) -> dict[str, Any]:
-    """The parts of a checkpoint that are looked at."""
-    pipeline = {
-        "_model.scene.surfels.means": torch.zeros(rows, 3),
-        "_model.scene.surfels.quats": torch.ones(rows, 4),
-        "_model._extra_state": {"version": 1, "scene": json.dumps(dataclasses.asdict(scene))},
+    """A whole checkpoint of a run."""
+    torch.manual_seed(0)
+    kind = VIEW_COLORS[scene.view_color]
+    geometry = {"means": (3,), "quats": (4,), "log_scales": (2,), "opacity_logits": (), "beta_raw": ()}
+    surfels = {name: torch.ones(rows, *row) for name, row in geometry.items()}
+    surfels |= kind.first_values(torch.rand(rows, 3), scene, torch.Generator())
+    pipeline: dict[str, Any] = {f"_model.scene.surfels.{name}": value for name, value in surfels.items()}
+    if scene.texture == "hash":
+        field = HashField(scene, (0.0, 0.0, 0.0), 1.0, True, 4)
+    else:
+        size = torch.tensor([[2, 3]] + [[0, 0]] * (rows - 1))[:rows]
+        field = TexelField(size, torch.ones(rows), torch.zeros(6, 3), torch.ones(6), torch.ones(6))
+    pipeline |= {f"_model.scene.field.{name}": value for name, value in field.state_dict().items()}
+    pipeline["_model.device_indicator_param"] = torch.empty(0)
+    exposure = Exposure("affine", [math.nan] * 3)
+    exposure._begin(torch.zeros(3, 3), affine=True)
+    run = {
+        "strategy": {name: torch.zeros(rows) for name in STATISTICS} | {"generator": torch.Generator().get_state()},
+        "guard": {
+            "factor": 1.0,
+            "rollbacks": 0,
+            "streak": 0,
+            "limit": math.nan,
+            "best": math.inf,
+            "sum": 0.0,
+            "count": 0,
+        },
+        "exposure": exposure.state_dict() | {"decided": True, "finding": "as asked for"},
+        "seconds": 1.0,
+        "cpu_seconds": 1.0,
+        "random": torch.get_rng_state(),
+        "capture": {"views": 3, "names": "a", "poses": "b"},
     }
-    return {"step": step, "pipeline": pipeline, "optimizers": {}, "scalers": {}}
+    extra = {"version": 2, "scene": json.dumps(dataclasses.asdict(scene)), "near": 0.02, "trained_for": 60, "run": run}
+    pipeline["_model._extra_state"] = extra
+    return {
+        "step": step, "pipeline": pipeline, "schedulers": {}, "scalers": {},
+        "optimizers": {name: moved(value).state_dict() for name, value in surfels.items()},
+    }  # fmt: skip
+
+
+def moved(value: torch.Tensor) -> torch.optim.Optimizer:
+    """The optimiser of a parameter after a step."""
+    parameter = torch.nn.Parameter(value.clone())
+    optimizer = adam([parameter])
+    parameter.grad = torch.ones_like(parameter)
+    optimizer.step()
+    return optimizer
 
 
 @pytest.fixture
@@ -58,7 +108,7 @@ def test_every_altered_byte_of_a_tensor_is_noticed(saved: Path) -> None:
     at = whole.index(ones) + 2
     whole[at] ^= 1  # still a number, and no longer the one that was saved
     saved.write_bytes(whole)
-    refused(saved, "damaged.*checksum")
+    refused(saved, "checksum.*damaged")
     earlier = checkpoints.path_of(saved.parent, 3)
     earlier.write_bytes(bytes(whole))
     refused(saved, f"Remove it to go back to {earlier.name}")
@@ -102,15 +152,12 @@ def test_the_folder_above_or_a_folder_for_a_file(saved: Path) -> None:
 
 
 def test_altered_contents(saved: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    newer, uneven = state(SceneConfig())["pipeline"], state(SceneConfig())["pipeline"]
+    newer = state(SceneConfig())["pipeline"]
     newer["_model._extra_state"]["version"] = checkpoints.STATE_VERSION + 1
-    uneven["_model.scene.surfels.quats"] = torch.ones(4, 4)
     for change, message in (
-        ({"step": "seven"}, "is not a nerfstudio checkpoint"),
         ({"pipeline": state(SceneConfig(), rows=0)["pipeline"]}, "holds no surfels"),
         ({"pipeline": {"_model.gauss_params.means": torch.zeros(3, 3)}}, "not a checkpoint of this method"),
         ({"pipeline": newer}, "newer bitymi-ns; update"),
-        ({"pipeline": uneven}, r"altered: .*5 means, 4 quats"),
     ):
         torch.save(state(SceneConfig()) | change, saved)
         refused(saved, message)
@@ -125,4 +172,144 @@ def test_altered_contents(saved: Path, capsys: pytest.CaptureFixture[str]) -> No
     broken["pipeline"]["_model.scene.surfels.quats"][2, 1] = torch.nan
     torch.save(broken, saved)
     checkpoints.load(saved, SceneConfig())
-    assert "numbers that are not finite, in scene.surfels.quats" in " ".join(capsys.readouterr().out.split())
+    assert "not finite, or too large to be drawn, in scene.surfels.quats" in " ".join(capsys.readouterr().out.split())
+
+
+MEANS, SIZE, EXTRA = "_model.scene.surfels.means", "_model.scene.field.size", "_model._extra_state"
+
+
+def at(*keys: object) -> Callable[[dict[str, Any], Any], None]:
+    """Replace the entry of these keys."""
+
+    def replace(whole: dict[str, Any], value: Any) -> None:
+        for key in keys[:-1]:
+            whole = whole[key]
+        whole[keys[-1]] = value
+
+    return replace
+
+
+RUN = ("pipeline", EXTRA, "run")
+WRONG = [
+    (("step",), "seven", "step has to be a whole number, not str"),
+    (("step",), True, "step has to be a number"),
+    (("step",), 10**400, "step has to be from 0 to 1e"),
+    (("pipeline",), [1, 2], "not a checkpoint of this method"),
+    (("optimizers",), None, "optimizers is missing"),
+    (("optimizers",), [1], "optimizers has to be a table of entries"),
+    (("schedulers",), 3, "schedulers has to be a table"),
+    (("pipeline", EXTRA, "version"), "two", "_extra_state.version has to be a whole number"),
+    (("pipeline", EXTRA, "scene"), "[" * 100_000, "does not say what its scene is made of"),
+    (("pipeline", EXTRA, "near"), "0.1", "_extra_state.near has to be a number"),
+    (("pipeline", EXTRA, "trained_for"), -3, "trained_for has to be from 1"),
+    (("pipeline", MEANS), torch.zeros(5, 2), r"scene.surfels.means has to be float32 \[any, 3\], not float32 \[5, 2\]"),
+    (("pipeline", MEANS), torch.ones(5, 3, dtype=torch.int32), "means has to be float32 .*, not int32"),
+    (("pipeline", MEANS), torch.ones(1, 3).expand(5, 3), "means has to be .*not one after the other in memory"),
+    (("pipeline", MEANS), torch.ones(5, 3).to_sparse(), "means has to be float32"),
+    (("pipeline", MEANS), [1.0], "means has to be float32 .*, not list"),
+    (("pipeline", MEANS), torch.full((5, 3), 1e30), "means holds numbers that are too large"),
+    (("pipeline", "_model.scene.surfels.quats"), torch.ones(4, 4), r"quats has to be float32 \[5, 4\], not"),
+    (("pipeline", "_model.scene.surfels.sv_rgb"), None, "sv_rgb is missing"),
+    (("pipeline", "_model.scene.surfels.sv_rgb"), torch.ones(5, 6, 3), r"sv_rgb has to be float32 \[5, 7, 3\]"),
+    (("pipeline", "_model.scene.surfels.more"), torch.ones(5), "surfels.more belongs to no scene of this preset"),
+    (("pipeline", "_model.scene.field.field_table"), torch.ones(4, 15, 4), "of a size that is a power of two"),
+    (("pipeline", "_model.scene.field.domain"), torch.zeros(5).double(), "field.domain is no place in space"),
+    (("pipeline", "_model.device_indicator_param"), "text", "device_indicator_param has to be numbers"),
+    ((*RUN, "random"), torch.zeros(7, dtype=torch.uint8), "run.random is no state of a random generator"),
+    ((*RUN, "strategy", "grad_sum"), torch.zeros(3), r"grad_sum has to be float32 \[5\], not float32 \[3\]"),
+    ((*RUN, "strategy", "max_radius"), torch.zeros(6), r"max_radius has to be float32 \[5\]"),
+    ((*RUN, "guard", "count"), "many", "guard.count has to be a whole number"),
+    ((*RUN, "exposure", "table"), torch.zeros(3, 4), "exposure.table has to be"),
+    ((*RUN, "exposure", "optimizer", "state"), {0: {"exp_avg": torch.zeros(3)}}, "optimizer.state.0.exp_avg has"),
+    ((*RUN, "exposure", "optimizer"), None, "exposure.optimizer is missing"),
+    ((*RUN, "seconds"), math.nan, "run.seconds has to be from 0"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("keys", "value", "message"), WRONG, ids=lambda value: str(value)[:40])
+def test_every_entry_is_checked_by_kind_shape_and_type(saved: Path, keys: Any, value: Any, message: str) -> None:
+    whole = state(SceneConfig())
+    at(*keys)(whole, value)
+    torch.save(whole, saved)
+    refused(saved, message)
+
+
+def test_texels_have_to_fit_their_tiles(saved: Path) -> None:
+    scene = SceneConfig(texture="texels")
+    whole = state(scene)
+    torch.save(whole, saved)
+    assert checkpoints.load(saved, scene)["step"] == 7
+    for name, value in (
+        (SIZE, torch.tensor([[2, 4]] + [[0, 0]] * 4, dtype=torch.int32)),
+        (SIZE, torch.tensor([[-2, -3]] + [[0, 0]] * 4, dtype=torch.int32)),
+        (SIZE, torch.tensor([[65536, 65536]] + [[0, 0]] * 4, dtype=torch.int32)),
+        ("_model.scene.field.alpha", torch.ones(7)),
+    ):
+        torch.save(whole | {"pipeline": whole["pipeline"] | {name: value}}, saved)
+        refused(saved, name.removeprefix("_model."), scene)
+
+
+def test_checkpoints_of_earlier_versions_have_fewer_entries(saved: Path) -> None:
+    whole = state(SceneConfig())
+    extra = whole["pipeline"][EXTRA]
+    for name in ("guard", "exposure", "capture"):
+        del extra["run"][name]
+    for name in ("near", "trained_for"):
+        del extra[name]
+    del whole["schedulers"]
+    torch.save(whole, saved)
+    assert checkpoints.load(saved, SceneConfig())["step"] == 7
+    del extra["run"]
+    torch.save(whole, saved)
+    assert checkpoints.load(saved, SceneConfig())["step"] == 7
+
+
+def test_a_few_numbers_that_cannot_be_drawn_are_a_warning(saved: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole = state(SceneConfig())
+    whole["pipeline"][MEANS][2, 1] = 1e30
+    torch.save(whole, saved)
+    checkpoints.load(saved, SceneConfig())
+    assert "too large to be drawn, in scene.surfels.means" in " ".join(capsys.readouterr().out.split())
+
+
+def test_an_archive_that_declares_more_than_it_holds_is_not_read(saved: Path) -> None:
+    with zipfile.ZipFile(saved) as whole:
+        parts = {part.filename: whole.read(part) for part in whole.infolist()}
+    with zipfile.ZipFile(saved, "w", zipfile.ZIP_DEFLATED) as packed:
+        for name, data in parts.items():
+            packed.writestr(name, data)
+    refused(saved, "compressed, or larger than the file")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda saved: saved["state"][0].update(exp_avg=torch.zeros(3)), r"state.0.exp_avg has to be float32 \[5, 3\]"),
+        (lambda saved: saved["state"][0].update(exp_avg_sq=torch.zeros(1, 3).expand(5, 3)), "0.exp_avg_sq has to be"),
+        (lambda saved: saved["state"][0].update(exp_avg=torch.zeros(5, 3).double()), "0.exp_avg has to be float32"),
+        (lambda saved: saved["state"][0].update(step="three"), "state.0.step has to be"),
+        (lambda saved: saved["state"][0].pop("exp_avg"), "state.0.exp_avg is missing"),
+        (lambda saved: saved["state"].update({7: saved["state"][0]}), "state.7 belongs to no parameter"),
+        (lambda saved: saved.update(state=[1]), "state has to be a table"),
+        (lambda saved: saved["param_groups"][0].update(lr="fast"), "param_groups.0.lr has to be a number"),
+        (lambda saved: saved["param_groups"][0].update(params=[0, 1]), "params has to be the numbers of 1 parameters"),
+        (lambda saved: saved.pop("param_groups"), "param_groups is missing"),
+    ],
+)
+def test_moments_that_do_not_fit_never_reach_compiled_code(change: Callable[[Any], Any], message: str) -> None:
+    value = torch.ones(5, 3)
+    saved = moved(value).state_dict()
+    change(saved)
+    with pytest.raises(Misfit, match=message):
+        restore_optimizer(adam([torch.nn.Parameter(value)]), Entry(saved, "optimizers.means"))
+
+
+def test_options_of_an_optimiser_are_those_of_the_run() -> None:
+    value = torch.ones(5, 3)
+    saved = moved(value).state_dict()
+    saved["param_groups"][0].update(lr=0.5, amsgrad=True, betas="no pair", capturable=True)
+    optimizer = adam([torch.nn.Parameter(value)])
+    restore_optimizer(optimizer, Entry(saved, "optimizers.means"))
+    group = optimizer.param_groups[0]
+    assert (group["lr"], group["amsgrad"], group["betas"]) == (0.5, False, (0.9, 0.999))
+    assert bool(optimizer.state[group["params"][0]]["exp_avg"].any())

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -214,7 +215,14 @@ def test_a_spiral_turns_to_what_the_camera_shows_and_does_not_roll(wall: Wall) -
 
 BAD_PATHS = {
     "render_width: Field required": lambda p: p.pop("render_width"),
-    "camera_path: List should have at least 1 item": lambda p: p.update(camera_path=[]),
+    "has no frames: add a second keyframe": lambda p: p.update(camera_path=[]),
+    "has no frames: add a second keyframe, and": lambda p: p.update(seconds=0, camera_path=p["camera_path"][:1]),
+    "camera_path.0.camera_to_world: must be 16": lambda p: p["camera_path"][0].update(camera_to_world=[10**400] * 16),
+    "camera_path.0.camera_to_world: must be 16 ": lambda p: p["camera_path"][0].update(camera_to_world=[{}] * 16),
+    "render_width: Input should be less than or equal to 16384": lambda p: p.update(render_width=10**400),
+    "seconds: Input should be": lambda p: p.update(seconds=10**400),
+    "camera_path.0.fov: Input should be": lambda p: p["camera_path"][0].update(fov=10**400),
+    "camera_type: Input should be a valid string": lambda p: p.update(camera_type=["fisheye"]),
     "camera_path.1.fov: Field required": lambda p: p["camera_path"][1].pop("fov"),
     "camera_path.0.principal_point.1: Input should be": lambda p: p["camera_path"][0].update(principal_point=[0, 3]),
     "camera_path.0.fov: Input should be less than 180": lambda p: p["camera_path"][0].update(fov=180),
@@ -222,7 +230,7 @@ BAD_PATHS = {
     "camera_path.0.camera_to_world: must be a rotation": lambda p: p["camera_path"][0].update(
         camera_to_world=[2.0, 0, 0, 0, 0, 2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 1]
     ),
-    "seconds: Input should be greater than 0": lambda p: p.update(seconds=0),
+    "seconds: Input should be greater than 0": lambda p: p.update(seconds=-1),
     "seconds: Input should be a finite number": lambda p: p.update(seconds=math.inf),
     "makes 12000 frames per second: correct its seconds": lambda p: p.update(seconds=0.001),
     "render_height: Input should be less than or equal to 16384": lambda p: p.update(render_height=100_000),
@@ -243,16 +251,50 @@ def test_camera_paths_that_cannot_be_used(wall: Wall, camera_path: Any, tmp_path
 def test_files_that_are_no_camera_path_and_one_camera(
     wall: Wall, camera_path: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(InputError, match="gone.json cannot be read: No such file.*--camera-path-filename"):
-        camera_path(camera_path_filename=tmp_path / "gone.json")
-    (tmp_path / "other.json").write_bytes(b"\xff\xfe{")
-    with pytest.raises(InputError, match="other.json is no JSON in UTF-8"):
-        camera_path(camera_path_filename=tmp_path / "other.json")
+    os.mkfifo(tmp_path / "pipe.json")
+    (tmp_path / "link.json").symlink_to(tmp_path / "nothing.json")
+    (tmp_path / "folder.json").mkdir()
+    (tmp_path / "other.json").write_bytes(b"\x80{")
+    (tmp_path / "deep.json").write_bytes(b"[" * 100_000)
+    for name, message in (
+        ("gone", "it does not exist.*--camera-path-filename"),
+        ("pipe", "it is not a regular file"),
+        ("link", "it is a link to nothing"),
+        ("folder", "it is not a regular file"),
+        ("other", "it is no text in UTF-8"),
+        ("deep", "it is nested too deeply"),
+    ):
+        with pytest.raises(InputError, match=f"{name}.json cannot be read: {message}"):
+            camera_path(camera_path_filename=tmp_path / f"{name}.json")
     with pytest.raises(InputError, match="path.json cannot be used: Input should be .*dictionary"):
         camera_path([1, 2])
     monkeypatch.setattr(HeldOut, "count", 1)
     with pytest.raises(InputError, match="there is only one to start from. Choose --pose-source train"):
         render.RenderInterpolated(load_config=tmp_path / "c.yml", output_path=tmp_path / "film.mp4").main()
+
+
+def test_numbers_in_quotes_are_numbers(wall: Wall, camera_path: Any, tmp_path: Path) -> None:
+    found = path_of(2, render_width="32", render_height=24.0, seconds="0.5")
+    frame = found["camera_path"][0]
+    frame.update(fov="60", camera_to_world=[str(x) for x in frame["camera_to_world"]], principal_point=["0.25", 0.75])
+    (tmp_path / "words.json").write_bytes(json.dumps(found).encode("utf-16"))
+    camera_path(camera_path_filename=tmp_path / "words.json")
+    assert [(camera.width, camera.height) for camera in wall.drawn] == [(32, 24)] * 2
+    assert [camera.K[:2, 2].tolist() for camera in wall.drawn] == [[8, 18], [16, 12]]
+    assert decoded(tmp_path / "film.mp4")[0].average_rate == 4
+
+
+def test_a_field_of_view_in_radians_is_a_warning(
+    wall: Wall, camera_path: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = path_of(2)
+    for frame in found["camera_path"]:
+        frame["fov"] = 1.2
+    camera_path(found)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "at most 1.2 degrees. If radians were meant, fov has to be 68.8" in said
+    camera_path()
+    assert "radians" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

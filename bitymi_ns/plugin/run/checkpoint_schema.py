@@ -1,0 +1,277 @@
+"""What a checkpoint holds: names, kinds, shapes and types of its entries, the state of the optimisers included.
+Compiled code trusts sizes, so they are checked before anything else sees them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+from torch.optim import Optimizer
+
+from bitymi_ns.ops.constants import FEATURES, WIDTH
+from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.view_kinds import VIEW_COLORS
+from bitymi_ns.ranges import MOST
+from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.train.strategy import STATISTICS
+
+EXTRA_STATE = "_extra_state"  # torch's name for what a module saves beside its tensors
+SCENE = "_model.scene."  # prefix of the scene's parameters
+SURFELS = f"{SCENE}surfels."
+LARGEST = (
+    1e15  # absolute value of a parameter that can still be drawn: its square is a float32, and so is a sum of them
+)
+_GEOMETRY = dict(zip(GEOMETRY, ((3,), (4,), (2,), (), ()), strict=True))
+
+
+class Misfit(ValueError):
+    """An entry is not what it has to be; the message begins with its name."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A value of a checkpoint, with its name."""
+
+    value: Any
+    name: str = ""
+
+    def refuse(self, must: str) -> NoReturn:
+        raise Misfit(f"{self.name} has to be {must}, not {_kind(self.value)}")
+
+    def get(self, key: object) -> Entry | None:
+        """The entry of this key; None where there is none, or it is None."""
+        value = self.table().get(key)
+        return None if value is None else self._part(key, value)
+
+    def __getitem__(self, key: object) -> Entry:
+        found = self.get(key)
+        if found is None:
+            raise Misfit(f"{self._part(key, None).name} is missing")
+        return found
+
+    def _part(self, key: object, value: Any) -> Entry:
+        return Entry(value, f"{self.name}.{str(key).removeprefix('_model.')}" if self.name else str(key))
+
+    def table(self) -> dict[Any, Any]:
+        if not isinstance(self.value, dict):
+            self.refuse("a table of entries")
+        return self.value
+
+    def parts(self) -> list[Entry]:
+        """All entries of a table."""
+        return [self._part(key, value) for key, value in self.table().items()]
+
+    def text(self) -> str:
+        if not isinstance(self.value, str):
+            self.refuse("text")
+        return self.value
+
+    def number(self, low: float = -math.inf, high: float = math.inf) -> float:
+        """A number, which may be infinite or NaN where no range is given."""
+        if isinstance(self.value, bool) or not isinstance(self.value, (int, float)):
+            self.refuse("a number")
+        if not low <= self.value <= high and (low, high) != (-math.inf, math.inf):
+            raise Misfit(f"{self.name} has to be from {low:g} to {high:g}, not {str(self.value)[:20]}")
+        return self.value
+
+    def count(self, low: int = 0) -> int:
+        if not isinstance(self.value, int):
+            self.refuse("a whole number")
+        return int(self.number(low, MOST))
+
+    def tensor(self, *shape: int | None, dtype: torch.dtype | None = torch.float32) -> Tensor:
+        """Numbers of this shape, of which None is any size, one after the other in memory.
+
+        Tensors in files may have strides with which they declare more than there is."""
+        value = self.value
+        plain = type(value) in (Tensor, Parameter) and value.layout == torch.strided and value.device.type == "cpu"
+        fits = plain and dtype in (None, value.dtype) and value.is_contiguous()
+        if not fits or (dtype is not None and not _fits(value.shape, shape)):
+            sizes = ", ".join("any" if size is None else str(size) for size in shape)
+            self.refuse("numbers" if dtype is None else f"{_name(dtype)} [{sizes}]")
+        return value
+
+
+def _fits(there: torch.Size, shape: tuple[int | None, ...]) -> bool:
+    return len(there) == len(shape) and all(want in (None, size) for size, want in zip(there, shape, strict=True))
+
+
+def _name(dtype: torch.dtype) -> str:
+    return str(dtype).removeprefix("torch.")
+
+
+def _kind(value: Any) -> str:
+    """Describe a value for a message."""
+    if isinstance(value, Tensor):
+        laid_out = value.layout == torch.strided and value.device.type == "cpu"
+        spread = "" if laid_out and value.is_contiguous() else ", not one after the other in memory"
+        return f"{_name(value.dtype)} {list(value.shape)}{spread}"
+    return "nothing" if value is None else f"{type(value).__name__} {str(value)[:30]!r}"
+
+
+def check(state: Mapping[str, Any], scene: SceneConfig) -> list[str]:
+    """Check all entries of a checkpoint of a scene of this kind. Entries of later and earlier versions may be there or
+    not, where they can be done without.
+
+    Returns:
+        names of the entries that hold numbers that are not finite, or too large to be drawn.
+
+    Raises:
+        Misfit: an entry is missing, or not what it has to be.
+    """
+    root = Entry(dict(state))
+    root["step"].count()
+    pipeline = root["pipeline"]
+    parameters = _parameters(pipeline, scene)
+    rows = len(pipeline[f"{SURFELS}means"].value)
+    for part in pipeline.parts():
+        if not part.name.endswith(EXTRA_STATE):
+            part.tensor(dtype=None)
+    extra = pipeline[f"_model.{EXTRA_STATE}"]
+    if (near := extra.get("near")) is not None:
+        near.number(1e-30, 1e30)
+    for name, low in (("first_surfels", 0), ("trained_for", 1)):
+        if (count := extra.get(name)) is not None:
+            count.count(low)
+    if (run := extra.get("run")) is not None and run.table():
+        _check_run(run, rows)
+    for entry in (root["optimizers"], root.get("schedulers"), root.get("scalers")):
+        if entry is not None:
+            entry.table()
+    drawable = {name.removeprefix("_model."): _drawable(value) for name, value in parameters.items()}
+    broken = [name for name, rows in drawable.items() if not bool(rows.all())]
+    if not bool(torch.stack([drawable[f"scene.surfels.{name}"] for name in _GEOMETRY]).all(0).any()):
+        raise Misfit(f"{broken[0]} holds numbers that are too large, or none, for every surfel")
+    return broken
+
+
+def _drawable(values: Tensor) -> Tensor:
+    """[N] rows whose numbers are finite and not too large."""
+    return (values.abs() <= LARGEST).reshape(len(values), -1).all(1)
+
+
+def _parameters(pipeline: Entry, scene: SceneConfig) -> dict[str, Tensor]:
+    """Check the parameters of a scene; by name."""
+    n = len(pipeline[f"{SURFELS}means"].tensor(None, 3))
+    if n == 0:
+        raise Misfit("it holds no surfels")
+    kind = VIEW_COLORS[scene.view_color]
+    view = zip(kind.names, kind.shapes(kind.terms_of(getattr(scene, kind.option))), strict=True)
+    found = {
+        f"{SURFELS}{name}": pipeline[f"{SURFELS}{name}"].tensor(n, *row) for name, row in (*_GEOMETRY.items(), *view)
+    }
+    field = {name: pipeline[f"{SCENE}field.{name}"] for name in _field_names(pipeline, scene)}
+    if "field_table" in field:
+        table = field["field_table"].tensor(scene.levels, None, FEATURES)
+        if table.shape[1] & (table.shape[1] - 1) or table.shape[1] == 0:
+            field["field_table"].refuse("of a size that is a power of two")
+        for name, shape in zip(
+            ("w1", "w2", "w3"), ((len(table) * FEATURES, WIDTH), (WIDTH, WIDTH), (WIDTH, 3)), strict=True
+        ):
+            field[f"field_{name}"].tensor(*shape)
+        domain = field["domain"].tensor(5, dtype=torch.float64)
+        if not bool(domain.isfinite().all()) or not domain[3] > 0:
+            raise Misfit(f"{field['domain'].name} is no place in space")
+    elif field:
+        count = len(field["texels"].tensor(None, 3))
+        sides = field["size"].tensor(n, 2, dtype=torch.int32).long()
+        field["extent"].tensor(n)
+        for name in field.keys() & {"share", "alpha"}:
+            field[name].tensor(count)
+        if bool((sides < 0).any()) or int(sides.prod(1).double().sum()) != count:
+            raise Misfit(f"{field['size'].name} does not add up to the {count} rows of {field['texels'].name}")
+    found.update({f"{SCENE}field.{name}": entry.value for name, entry in field.items()})
+    unknown = [name for name in pipeline.table() if str(name).startswith(SCENE) and name not in found]
+    if unknown:
+        raise Misfit(f"pipeline.{str(unknown[0]).removeprefix('_model.')} belongs to no scene of this preset")
+    return found
+
+
+def _field_names(pipeline: Entry, scene: SceneConfig) -> tuple[str, ...]:
+    if scene.texture == "hash":
+        return "field_table", "field_w1", "field_w2", "field_w3", "domain"
+    if f"{SCENE}field.texels" not in pipeline.table():
+        return ()
+    alpha = ("alpha",) if f"{SCENE}field.alpha" in pipeline.table() else ()
+    return "texels", "size", "extent", "share", *alpha
+
+
+def check_optimizer(optimizer: Entry, parameters: Sequence[Tensor]) -> None:
+    """Check the state of Adam, or one of its kin, for these parameters.
+
+    Raises:
+        Misfit: an entry is missing, or not what it has to be.
+    """
+    groups = optimizer["param_groups"]
+    if not isinstance(groups.value, list) or len(groups.value) != 1:
+        groups.refuse("a list of one group")
+    group = Entry(groups.value[0], f"{groups.name}.0")
+    if group["params"].value != list(range(len(parameters))):
+        group["params"].refuse(f"the numbers of {len(parameters)} parameters")
+    group["lr"].number(0.0, MOST)
+    for number, value in optimizer["state"].table().items():
+        each = Entry(value, f"{optimizer.name}.state.{number}")
+        if not isinstance(number, int) or not 0 <= number < len(parameters):
+            raise Misfit(f"{each.name} belongs to no parameter")
+        for name in ("exp_avg", "exp_avg_sq"):
+            each[name].tensor(*parameters[number].shape)
+        steps = each["step"]  # a plain number of sparse optimisers
+        steps.tensor() if isinstance(steps.value, Tensor) else steps.count()
+        unknown = sorted(map(str, each.table().keys() - {"step", "exp_avg", "exp_avg_sq"}))
+        if unknown:
+            raise Misfit(f"{each.name}.{unknown[0]} is nothing that this optimiser knows")
+
+
+def restore_optimizer(optimizer: Optimizer, saved: Entry) -> None:
+    """Check and load the state of an optimiser of one group. Of its options the learning rate alone is that of the
+    file: the others are those of this run.
+
+    Raises:
+        Misfit: see `check_optimizer`.
+    """
+    check_optimizer(saved, [parameter for group in optimizer.param_groups for parameter in group["params"]])
+    groups = optimizer.state_dict()["param_groups"]
+    groups[0]["lr"] = saved.value["param_groups"][0]["lr"]
+    optimizer.load_state_dict({"state": saved.value["state"], "param_groups": groups})
+
+
+def _check_run(run: Entry, rows: int) -> None:
+    """Check the state of a run beside parameters and optimisers."""
+    strategy = run["strategy"]
+    first = strategy[STATISTICS[0]].tensor(None)
+    if len(first) not in (0, rows):
+        strategy[STATISTICS[0]].refuse(f"float32 [{rows}]")
+    for name in STATISTICS:
+        strategy[name].tensor(len(first))
+    for state in (strategy["generator"], run["random"]):
+        numbers = state.tensor(None, dtype=torch.uint8)
+        try:
+            torch.Generator().set_state(numbers)
+        except RuntimeError as error:
+            raise Misfit(f"{state.name} is no state of a random generator") from error
+    if (guard := run.get("guard")) is not None:
+        for name in ("factor", "limit", "sum"):
+            guard[name].number()
+        for name in ("rollbacks", "streak", "count"):
+            guard[name].count()
+        if (best := guard.get("best")) is not None:
+            best.number()
+    for name in ("seconds", "cpu_seconds"):
+        run[name].number(0.0, 1e12)
+    if (capture := run.get("capture")) is not None:
+        capture["views"].count()
+        capture["names"].text(), capture["poses"].text()
+    if (exposure := run.get("exposure")) is not None:
+        exposure["kind"].text(), exposure["finding"].text()
+        if not isinstance(exposure["decided"].value, bool):
+            exposure["decided"].refuse("true or false")
+        if (table := exposure.get("table")) is not None:
+            columns = table.tensor(None, None).shape[1]
+            if columns not in (3, 12):
+                table.refuse("float32 [any, 3] or [any, 12]")
+            check_optimizer(exposure["optimizer"], [table.value])

@@ -1,0 +1,79 @@
+"""Commands that are interrupted, whose reader goes away, or whose disk is full: one line, no traceback."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from bitymi_ns import endings
+from bitymi_ns.trust import python_command
+
+BITYMI = python_command("bitymi_ns.__main__", "main")
+
+
+def test_a_reader_that_goes_away_is_no_error() -> None:
+    for words in (["--help"], ["sample", "--help"]):
+        with subprocess.Popen([*BITYMI, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+            assert process.stdout is not None and process.stderr is not None
+            process.stdout.close()  # as `| head -c0`
+            said = process.stderr.read().decode()
+        assert process.returncode == endings.NO_READER and said == ""
+
+
+@pytest.mark.parametrize("after", [0.15, 0.6])
+def test_ctrl_c_in_the_first_second(after: float) -> None:
+    """Modules are imported then."""
+    code = (
+        "import sys, time, importlib.abc\n"
+        "class Slow(importlib.abc.MetaPathFinder):\n"
+        "    def find_spec(self, name, path, target=None):\n"
+        "        if name == 'bitymi_ns.cli': print('importing', flush=True); time.sleep(60)\n"
+        "sys.meta_path.insert(0, Slow())\n"
+        "from bitymi_ns.__main__ import main\n"
+        "sys.exit(main())"
+    )
+    command = [sys.executable, "-c", code, "--help"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None and process.stdout.readline() == "importing\n"
+        time.sleep(after)
+        os.kill(process.pid, signal.SIGINT)
+        _, said = process.communicate()
+    assert process.returncode == 130
+    assert said == "bitymi: interrupted; nothing was left half-written\n"
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        ("KeyboardInterrupt", "bitymi: interrupted; nothing was left half-written\n"),
+        ("OSError(28, 'No space', 'a.png')", "bitymi: a.png cannot be written: the disk is full: free some space"),
+        ("OSError(28, 'No space')", "bitymi: a result cannot be written: the disk is full"),
+        ("OSError(30, 'Read-only', 'a')", "bitymi: a cannot be written: the file system is read-only"),
+        ("MemoryError()", "bitymi: there is not enough memory for this"),
+    ],
+)
+def test_commands_of_others_end_in_one_line(error: str, line: str) -> None:
+    """Those of nerfstudio catch nothing."""
+    code = f"from bitymi_ns import endings; endings.install(); endings.install(); raise {error}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stderr.startswith(line) and done.stderr.count("\n") == 1
+    assert done.returncode in (1, -signal.SIGINT)  # which a shell shows as 130
+
+
+def test_faults_of_the_program_keep_their_traceback() -> None:
+    code = "from bitymi_ns import endings; endings.install(); raise ZeroDivisionError"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "Traceback" in done.stderr and done.returncode == 1
+    with pytest.raises(FileNotFoundError):
+        endings.run(lambda: len(Path("/nowhere").read_bytes()))
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has it")
+def test_output_on_a_full_disk() -> None:
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([*BITYMI, "--help"], stdout=full, stderr=subprocess.PIPE, text=True)
+    assert "the disk is full" in done.stderr and "Traceback" not in done.stderr

@@ -1,4 +1,4 @@
-"""How commands end that cannot go on: interrupted, without a reader, space or memory. One line, no traceback."""
+"""End commands that cannot go on, interrupted or without a reader, space or memory, with one line and no traceback."""
 
 import errno
 import os
@@ -17,7 +17,7 @@ _OF_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
 def line_of(error: BaseException) -> str | None:
-    """What to tell the user of an exception that no command expects; None = it is a fault of the program."""
+    """Say what to tell the user of an exception that no command expects; None = it is a fault of the program."""
     if isinstance(error, KeyboardInterrupt):
         return "interrupted; nothing was left half-written"
     if isinstance(error, MemoryError):
@@ -30,7 +30,7 @@ def line_of(error: BaseException) -> str | None:
 def run(command: Callable[[], int]) -> int:
     """Run a command to its end, whatever that is; returns its exit status.
 
-    Where nobody reads its output any more, as behind `| head`, it ends without a word."""
+    Where nobody reads its output any more, as behind `| head`, it ends silently."""
     try:
         try:
             return command()

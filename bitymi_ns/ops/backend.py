@@ -232,7 +232,7 @@ def dense(tensor: Tensor, like: Tensor) -> Tensor:
 
 
 def version_of(tensor: Tensor) -> int:
-    """How often a tensor was written to; -1 for one of inference mode, which does not count."""
+    """Count how often a tensor was written to; -1 for one of inference mode, which does not count."""
     return -1 if tensor.is_inference() else tensor._version
 
 

@@ -139,7 +139,7 @@ class SceneRenderer:
         self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple[type, tuple[BakedScene, int]]:
-        """Copies draw the scene anew: working memory and graphs are of one process."""
+        """Make a renderer of its own for a copy: working memory and graphs are of one process."""
         return SceneRenderer, (self.scene, self._kept)
 
     @torch.no_grad()

@@ -14,7 +14,7 @@ What counts as divergence:
 After an opacity reset nothing is judged until half of the time to the next reset has passed: by then opacities can have
 risen again (`Schedule.reset_opacity`). The last window ends with the run.
 
-What the schedule does is no divergence. When texels begin, windows begin anew: the first that is compared with those
+What the schedule does is no divergence. When texels begin, windows start over: the first that is compared with those
 before ends more than a window later.
 
 Going back restores parameters, optimisers and the strategy's statistics as they were at the start of the last good
@@ -129,7 +129,7 @@ class RollbackGuard:
         self._states = [(step, self._capture())]
 
     def restart(self) -> None:
-        """Begin windows anew and forget the states to go back to: other parts make the scene from here on."""
+        """Start windows over and forget the states to go back to: other parts make the scene from here on."""
         self._states = []
         self._sum, self._count = torch.zeros_like(self._sum), 0
 

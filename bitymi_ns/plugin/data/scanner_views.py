@@ -155,7 +155,7 @@ def _intrinsics(folder: Path) -> tuple[float, ...]:
 
 
 def _numbers(values: Any, count: int) -> list[float]:
-    """So many numbers; what is fewer would be repeated, and what is more left out, without a word."""
+    """Require so many numbers: fewer would be repeated, and more left out, silently."""
     numbers = [float(value) for value in values]
     if len(numbers) != count:
         raise ValueError(f"it has {len(numbers)} numbers, not {count}")

@@ -1,4 +1,4 @@
-"""Camera paths that `ns-render camera-path` reads: checked before the scene is loaded, and written anew for
+"""Camera paths that `ns-render camera-path` reads: checked before the scene is loaded, and written again for
 nerfstudio, so that what it reads is what was checked."""
 
 import atexit

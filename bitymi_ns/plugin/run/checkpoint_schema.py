@@ -1,4 +1,4 @@
-"""What a checkpoint holds: names, kinds, shapes and types of its entries, the state of the optimisers included.
+"""Check what a checkpoint holds: names, kinds, shapes and types of its entries, the state of the optimisers included.
 Compiled code trusts sizes, so they are checked before anything else sees them."""
 
 from __future__ import annotations
@@ -138,6 +138,8 @@ def check(state: Mapping[str, Any], scene: SceneConfig) -> list[str]:
     for name, low in (("first_surfels", 0), ("trained_for", 1)):
         if (count := extra.get(name)) is not None:
             count.count(low)
+    if (options := extra.get("train")) is not None:
+        options.text()
     if (run := extra.get("run")) is not None and run.table():
         _check_run(run, rows)
     for entry in (root["optimizers"], root.get("schedulers"), root.get("scalers")):
@@ -254,6 +256,10 @@ def _check_run(run: Entry, rows: int) -> None:
             torch.Generator().set_state(numbers)
         except RuntimeError as error:
             raise Misfit(f"{state.name} is no state of a random generator") from error
+    if (sizes := run.get("step_sizes")) is not None:
+        footprints = sizes["footprints"].tensor(None)
+        if len(footprints) not in (0, rows) or not bool((footprints > 0).all()):
+            sizes["footprints"].refuse(f"float32 [{rows}], above 0")
     if (guard := run.get("guard")) is not None:
         for name in ("factor", "limit", "sum"):
             guard[name].number()

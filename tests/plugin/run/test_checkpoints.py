@@ -51,13 +51,21 @@ def state(scene: SceneConfig, rows: int = 5, step: int = 7) -> dict[str, Any]:
             "sum": 0.0,
             "count": 0,
         },
+        "step_sizes": {"footprints": torch.ones(rows)},
         "exposure": exposure.state_dict() | {"decided": True, "finding": "as asked for"},
         "seconds": 1.0,
         "cpu_seconds": 1.0,
         "random": torch.get_rng_state(),
         "capture": {"views": 3, "names": "a", "poses": "b"},
     }
-    extra = {"version": 2, "scene": json.dumps(dataclasses.asdict(scene)), "near": 0.02, "trained_for": 60, "run": run}
+    extra = {
+        "version": 2,
+        "scene": json.dumps(dataclasses.asdict(scene)),
+        "near": 0.02,
+        "train": "{}",
+        "trained_for": 60,
+        "run": run,
+    }
     pipeline["_model._extra_state"] = extra
     return {
         "step": step, "pipeline": pipeline, "schedulers": {}, "scalers": {},
@@ -218,6 +226,8 @@ WRONG = [
     ((*RUN, "random"), torch.zeros(7, dtype=torch.uint8), "run.random is no state of a random generator"),
     ((*RUN, "strategy", "grad_sum"), torch.zeros(3), r"grad_sum has to be float32 \[5\], not float32 \[3\]"),
     ((*RUN, "strategy", "max_radius"), torch.zeros(6), r"max_radius has to be float32 \[5\]"),
+    ((*RUN, "step_sizes", "footprints"), torch.zeros(5), r"footprints has to be float32 \[5\], above 0"),
+    ((*RUN, "step_sizes", "footprints"), torch.ones(4), r"footprints has to be float32 \[5\], above 0"),
     ((*RUN, "guard", "count"), "many", "guard.count has to be a whole number"),
     ((*RUN, "exposure", "table"), torch.zeros(3, 4), "exposure.table has to be"),
     ((*RUN, "exposure", "optimizer", "state"), {0: {"exp_avg": torch.zeros(3)}}, "optimizer.state.0.exp_avg has"),
@@ -252,7 +262,7 @@ def test_texels_have_to_fit_their_tiles(saved: Path) -> None:
 def test_checkpoints_of_earlier_versions_have_fewer_entries(saved: Path) -> None:
     whole = state(SceneConfig())
     extra = whole["pipeline"][EXTRA]
-    for name in ("guard", "exposure", "capture"):
+    for name in ("guard", "step_sizes", "exposure", "capture"):
         del extra["run"][name]
     for name in ("near", "trained_for"):
         del extra[name]

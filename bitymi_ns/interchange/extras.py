@@ -78,7 +78,9 @@ def check_extras(kinds: Sequence[str], folder: Path, overwrite: bool) -> None:
     if not (folder / SUMMARY).is_file():
         raise BundleError(f"{folder} holds something other than extras and is not overwritten: choose another folder")
     if not overwrite:
-        raise BundleError(f"{folder} is there already: choose another folder, or add --overwrite")
+        lost = [file for kind, file in FILES.items() if kind not in kinds and (folder / file).exists()]
+        also = f", which also removes {', '.join(lost)} unless you ask for all kinds" if lost else ""
+        raise BundleError(f"{folder} is there already: choose another folder, or add --overwrite{also}")
     try:
         keep(folder, [SUMMARY, *FILES.values()])
     except Refused as error:

@@ -106,7 +106,9 @@ def test_a_bundle_on_its_own_is_written_by_the_command(
     folder = tmp_path / "scene.extras"
     assert extras_folder(with_cameras) == folder and (folder / "mesh.glb").is_file()
     assert cli.main(["extras", str(with_cameras)]) == 1
-    assert "--overwrite" in capsys.readouterr().err
+    assert "--overwrite\n" in capsys.readouterr().err
+    assert cli.main(["extras", str(with_cameras), "--kinds", "gaussians"]) == 1
+    assert "removes mesh.glb unless you ask for all kinds" in " ".join(capsys.readouterr().err.split())
     args = ["extras", str(with_cameras), "--kinds", "gaussians", "--overwrite", "--frame", "capture"]
     assert cli.main(args) == 0
     assert {path.name for path in folder.iterdir()} == {"gaussians.ply", "extras.json"}

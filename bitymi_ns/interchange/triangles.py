@@ -10,7 +10,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 FLAT = 1e-6  # height of a triangle over its longest side, below which it is a line: float32 tells no more
-_ROUNDS = 20  # in which slivers are collapsed, each of which may make others
+_ROUNDS = 20  # in which triangles without area are collapsed, each of which may make others
+_ATTEMPTS = 4  # at closing a mesh so that no triangle without area is left; closed it is after the first
 
 
 @dataclass(frozen=True)
@@ -112,8 +113,8 @@ def closed(mesh: Triangles) -> Triangles:
 def solid(mesh: Triangles, smallest: float) -> Triangles:
     """Clean and close a mesh, with its triangles seen from outside, without parts of less than a share of the triangles
     of the largest part. `open_edges` counts what could not be closed."""
-    for _ in range(_ROUNDS):
-        mesh = closed(cleaned(mesh).without_specks(smallest))
+    for _ in range(_ATTEMPTS):
+        mesh = closed(cleaned(mesh).without_specks(smallest)).without_specks(smallest)  # what the cuts cut off
         if len(cleaned(mesh)) == len(mesh):
             break
     return replace(mesh, faces=mesh.faces[:, ::-1]) if len(mesh) and mesh.volume() < 0 else mesh

@@ -16,9 +16,9 @@ from bitymi_ns.bundle import Bundle, BundleError
 from bitymi_ns.codec.pages import texel_alpha
 from bitymi_ns.files import complete_folder, explained
 from bitymi_ns.interchange.draw_quads import draw_quads
-from bitymi_ns.interchange.frame import to_capture
+from bitymi_ns.interchange.frame import to_capture, up_of
 from bitymi_ns.interchange.gaussians import gaussians_of, write_gaussians
-from bitymi_ns.interchange.glb import glb_bytes
+from bitymi_ns.interchange.glb import quads_glb, upright
 from bitymi_ns.interchange.quads import quads_of
 from bitymi_ns.interchange.recolor import recolored
 from bitymi_ns.interchange.splat import draw_gaussians
@@ -41,7 +41,6 @@ SEEN_SIDE, COLORED_SIDE, MEASURED_SIDE = 400, 800, 400
 """Longer side in pixels of the images for visibility, for the colours of a mesh, and for measuring the files."""
 COLORED_VIEWS, MEASURED_VIEWS = 64, 4
 """Training views that colour a mesh, and held-out views in which the files are measured, at most."""
-_UP = (0.0, 0.0, 1.0)  # nerfstudio's, where the bundle does not know
 
 
 @dataclass(frozen=True)
@@ -55,6 +54,7 @@ class Written:
     psnr: float | None
     psnr_bundle: float | None  # dB of the bundle there
     views: int  # in which this was measured, reduced to `MEASURED_SIDE` pixels
+    note: str = ""  # origin of its positions, where that is not 0
 
 
 def extras_folder(bundle: Path) -> Path:
@@ -78,7 +78,9 @@ def check_extras(kinds: Sequence[str], folder: Path, overwrite: bool) -> None:
     if not (folder / SUMMARY).is_file():
         raise BundleError(f"{folder} holds something other than extras and is not overwritten: choose another folder")
     if not overwrite:
-        raise BundleError(f"{folder} is there already: choose another folder, or add --overwrite")
+        lost = [file for kind, file in FILES.items() if kind not in kinds and (folder / file).exists()]
+        also = f", which also removes {', '.join(lost)} unless you ask for all kinds" if lost else ""
+        raise BundleError(f"{folder} is there already: choose another folder, or add --overwrite{also}")
     try:
         keep(folder, [SUMMARY, *FILES.values()])
     except Refused as error:
@@ -116,6 +118,7 @@ def write_extras(
     folder = Path(folder)
     check_extras(kinds, folder, overwrite)
     to = to_capture(bundle.info.world) if frame == "capture" else None
+    note = to.note if to is not None else ""
     scene, background = bundle.scene, torch.tensor(bundle.info.render.background)
     chosen = [held_out[i].to("cpu") for i in spread(len(held_out), MEASURED_VIEWS)]
     views = [at_size(view, view.camera.within(MEASURED_SIDE), "cpu") for view in chosen]
@@ -134,7 +137,7 @@ def write_extras(
                 gaussians = gaussians_of(scene, colors.harmonics)
                 count = len(gaussians)
                 value = _psnr(lambda c, g=gaussians: draw_gaussians(g, c, background, scene.near), views, background)
-                write_gaussians(path, gaussians if to is None else gaussians.moved(to))
+                write_gaussians(path, gaussians if to is None else gaussians.moved(to), note)
             else:
                 quads = quads_of(scene, colors.color, LEVEL)
                 if not len(quads):
@@ -142,9 +145,9 @@ def write_extras(
                 chosen = [cameras[i].within(COLORED_SIDE) for i in spread(len(cameras), COLORED_VIEWS)]
                 quads, count = recolored(quads, picture, chosen, scene.near, progress), len(quads)
                 value = _psnr(lambda c, q=quads: draw_quads(q, c, background, scene.near), views, background)
-                up = torch.tensor(bundle.info.world.up or _UP) if to is None else None
-                path.write_bytes(glb_bytes(quads if to is None else quads.moved(to), up))
-            written[kind] = Written(path.name, path.stat().st_size, count, value, base, len(views))
+                place = upright(up_of(bundle.info.world, to), None if to is None else to.origin)
+                path.write_bytes(quads_glb(quads if to is None else quads.moved(to), place))
+            written[kind] = Written(path.name, path.stat().st_size, count, value, base, len(views), note)
         summary = {"frame": frame, "training_views": len(cameras)}
         summary |= {kind: asdict(each) for kind, each in written.items()}
         (new / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", "utf8")
@@ -153,7 +156,7 @@ def write_extras(
 
 def summary_line(written: Written) -> str:
     """One line about a written file."""
-    line = f"{written.file}: {written.count:,}, {written.bytes / 1e6:.2f} MB"
+    line = f"{written.file}: {written.count:,}, {written.bytes / 1e6:.2f} MB" + (written.note and f"; {written.note}")
     if written.psnr is None or written.psnr_bundle is None:
         return line
     return f"{line}; {written.psnr:.2f} dB in {written.views} held-out views, the bundle {written.psnr_bundle:.2f} dB"

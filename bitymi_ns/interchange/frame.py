@@ -1,5 +1,6 @@
 """From the scene's frame to the capture's own."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,21 +10,30 @@ from torch import Tensor
 
 from bitymi_ns.bundle.manifest import BundleError, WorldFrame
 
-FARTHEST = 10_000.0
-"""Units of the scene, whose cameras fit into a box from -1 to 1; so far from the origin float32 is off by 1/1,000."""
+FARTHEST = 1_000.0
+"""Units of the scene, whose cameras fit into a box from -1 to 1; so far from the origin float32 is off by 1/30,000."""
+_UP = (0.0, 0.0, 1.0)  # nerfstudio's, where the bundle does not know
 _SLACK = 1e-4  # of a rotation that was stored with rounding
 
 
 @dataclass(frozen=True)
 class Similarity:
-    """x_new = scale * (turn @ x) + shift."""
+    """x_new = scale * (turn @ x) + shift + origin. Positions are given relative to the origin."""
 
     turn: Tensor  # [3, 3] float64, orthogonal; it may mirror
     scale: float  # of lengths
     shift: Tensor  # [3] float64
+    origin: Tensor  # [3] float64; 0 unless the scene lies so far out that float32 could not tell positions
+
+    @property
+    def note(self) -> str:
+        """States the origin; empty where it is 0."""
+        if not bool(self.origin.any()):
+            return ""
+        return "positions are relative to the origin " + " ".join(f"{value:.15g}" for value in self.origin.tolist())
 
     def points(self, points: Tensor) -> Tensor:
-        """[..., 3] points in the new frame, of their type."""
+        """[..., 3] points in the new frame, relative to the origin, of their type."""
         return (self.scale * (points.double() @ self.turn.T) + self.shift).to(points)
 
     def rotations(self, quats: Tensor) -> Tensor:
@@ -39,8 +49,7 @@ def to_capture(place: WorldFrame) -> Similarity:
     """Inverse of x_scene = scale * (transform @ [x_capture, 1]).
 
     Raises:
-        BundleError: the transform is no similarity, so that discs would not stay discs; or it leads so far from the
-            origin that float32 cannot tell positions.
+        BundleError: the transform is no similarity, so that discs would not stay discs.
     """
     transform = torch.tensor(place.transform, dtype=torch.float64)
     matrix, offset = transform[:, :3], transform[:, 3]
@@ -48,17 +57,25 @@ def to_capture(place: WorldFrame) -> Similarity:
     turn = matrix / stretch if stretch > 0 else matrix
     if not bool(((turn @ turn.T - torch.eye(3, dtype=torch.float64)).abs() <= _SLACK).all()):
         raise BundleError(
-            "world.transform of the bundle is no rotation, so that nothing can be moved into the capture's own frame: "
-            "leave it in the scene's"
+            "the transform from the capture's own frame to the scene's is no rotation with one scale, so that nothing "
+            "can be moved back there: choose the scene's frame (--frame scene)"
         )
     u, _, v = torch.linalg.svd(turn)
     turn = u @ v  # the nearest orthogonal one
     scale = 1 / (stretch * place.scale)
-    shift = -(turn.T @ offset) / stretch
-    if float(shift.norm()) > FARTHEST * scale:
-        raise BundleError(
-            f"the capture lies {float(shift.norm()):,.0f} of its units from the origin of its own frame, as "
-            "coordinates of a map do, and the numbers of such files have seven digits: the scene would be blurred. "
-            "Leave it in the scene's frame; world.transform and world.scale of bundle.json say where that lies"
-        )
-    return Similarity(turn.T, scale, shift)
+    shift = -torch.linalg.solve(matrix, offset)
+    step = 10.0 ** math.floor(math.log10(FARTHEST * scale))
+    far = float(shift.norm()) > FARTHEST * scale
+    origin = (shift / step).round() * step if far else torch.zeros_like(shift)
+    return Similarity(turn.T, scale, shift - origin, origin)
+
+
+def up_of(place: WorldFrame, to: Similarity | None) -> Tensor:
+    """[3] up in the scene's frame; in another one the axis that is nearest to it, so that a turn to +y exchanges that
+    frame's coordinates and keeps their values."""
+    up = torch.tensor(place.up or _UP, dtype=torch.float64)
+    if to is None:
+        return up
+    turned = to.turn @ up
+    largest = torch.nn.functional.one_hot(turned.abs().argmax(), 3)
+    return largest * turned.sign()

@@ -123,8 +123,9 @@ def _moments(scene: BakedScene, chunk: int = 1 << 20) -> tuple[Tensor, Tensor, T
     return strength, center, covariance
 
 
-def write_gaussians(path: str | Path, gaussians: Gaussians) -> None:
-    """Write the PLY file that 3DGS writes: f_rest has 15 coefficients of red, then of green, then of blue."""
+def write_gaussians(path: str | Path, gaussians: Gaussians, note: str = "") -> None:
+    """Write the PLY file that 3DGS writes: f_rest has 15 coefficients of red, then of green, then of blue. A note
+    becomes a comment of its header."""
     values = {
         "means": gaussians.means,
         "normals": torch.zeros_like(gaussians.means),
@@ -135,4 +136,4 @@ def write_gaussians(path: str | Path, gaussians: Gaussians) -> None:
         "quats": gaussians.quats,
     }
     columns = {name: values[group][:, i].numpy() for group, names in _NAMES.items() for i, name in enumerate(names)}
-    ply.write_ply(path, columns)
+    ply.write_ply(path, columns, [note] if note else [])

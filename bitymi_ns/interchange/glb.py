@@ -1,4 +1,4 @@
-"""Quads as a binary glTF file, by trimesh."""
+"""Quads and surfaces as a binary glTF file, by trimesh."""
 
 from typing import Any
 
@@ -9,33 +9,36 @@ from PIL import Image
 from torch import Tensor
 
 from bitymi_ns.interchange.quads import MASK, Quads
+from bitymi_ns.interchange.triangles import Triangles
 
 _LINEAR, _CLAMP = 9729, 33071
 _FACES = ((0, 1, 2), (0, 2, 3))
+_COLOR = "_COLOR_0"  # trimesh writes it as it is, and colors as bytes, which are too coarse for linear ones
 
 
-def glb_bytes(quads: Quads, up: Tensor | None = None) -> bytes:
+def upright(up: Tensor, origin: Tensor | None = None) -> np.ndarray:
+    """[4, 4] placement of a file's node: from positions relative to an origin [3], with this direction [3] up, to
+    glTF's, where +y is up."""
+    place = np.eye(4)
+    place[:3, :3] = _to_y(up.double().numpy())
+    if origin is not None:
+        place[:3, 3] = place[:3, :3] @ origin.double().numpy()
+    return place
+
+
+def quads_glb(quads: Quads, place: np.ndarray) -> bytes:
     """The file: a mesh for each page, four vertices and two triangles for each quad, seen from both sides and unlit
     (KHR_materials_unlit), with its page as a PNG. Texels are read without mip levels, which would mix tiles.
 
     Args:
         quads: at least one.
-        up: [3] direction that the node turns to +y, which is up in glTF; None = the node turns nothing.
+        place: of the node, as `upright` returns it.
     """
-    turn = np.eye(4)
-    if up is not None:
-        turn[:3, :3] = _to_y(up.double().numpy())
     scene = trimesh.Scene()
     for page in torch.unique(quads.page).tolist():
         rows = torch.nonzero(quads.page == page).squeeze(1)
-        material = trimesh.visual.material.PBRMaterial(
-            baseColorTexture=Image.fromarray(quads.pages[page].numpy()),
-            metallicFactor=0.0,
-            roughnessFactor=1.0,
-            alphaMode="MASK",
-            alphaCutoff=MASK,
-            doubleSided=True,
-        )
+        texture = Image.fromarray(quads.pages[page].numpy())
+        material = _matte(baseColorTexture=texture, alphaMode="MASK", alphaCutoff=MASK)
         uv = quads.uv[rows].reshape(-1, 2).double().numpy()
         uv[:, 1] = 1.0 - uv[:, 1]  # trimesh counts from the bottom, glTF from the top
         mesh = trimesh.Trimesh(
@@ -44,8 +47,41 @@ def glb_bytes(quads: Quads, up: Tensor | None = None) -> bytes:
             visual=trimesh.visual.TextureVisuals(uv=uv, material=material),
             process=False,
         )
-        scene.add_geometry(mesh, node_name=f"surfels-{page}", geom_name=f"surfels-{page}", transform=turn)
+        scene.add_geometry(mesh, node_name=f"surfels-{page}", geom_name=f"surfels-{page}", transform=place)
     return trimesh.exchange.gltf.export_glb(scene, include_normals=False, tree_postprocessor=_unlit)
+
+
+def surface_glb(mesh: Triangles, normals: np.ndarray, place: np.ndarray) -> bytes:
+    """The file: one mesh with linear vertex colors, lit, seen from both sides.
+
+    Args:
+        normals: [V, 3] of the vertices, of length 1.
+        place: as in `quads_glb`.
+    """
+    linear = np.where(mesh.colors <= 0.04045, mesh.colors / 12.92, ((mesh.colors + 0.055) / 1.055) ** 2.4)
+    shape = trimesh.Trimesh(
+        mesh.vertices,
+        mesh.faces,
+        vertex_normals=normals,
+        vertex_attributes={_COLOR: linear.clip(0.0, 1.0).astype(np.float32)},
+        visual=trimesh.visual.TextureVisuals(material=_matte()),
+        process=False,
+    )
+    scene = trimesh.Scene()
+    scene.add_geometry(shape, node_name="surface", geom_name="surface", transform=place)
+    return trimesh.exchange.gltf.export_glb(scene, include_normals=True, tree_postprocessor=_colored)
+
+
+def _matte(**more: Any) -> trimesh.visual.material.PBRMaterial:
+    """A material that neither shines nor has a back."""
+    return trimesh.visual.material.PBRMaterial(metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True, **more)
+
+
+def _colored(tree: dict[str, Any]) -> None:
+    """Name the vertex colors as glTF does."""
+    for mesh in tree["meshes"]:
+        attributes = mesh["primitives"][0]["attributes"]
+        attributes["COLOR_0"] = attributes.pop(_COLOR)
 
 
 def _unlit(tree: dict[str, Any]) -> None:

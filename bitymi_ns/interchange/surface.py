@@ -15,6 +15,8 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from bitymi_ns.interchange.frame import Similarity
+from bitymi_ns.interchange.triangles import Triangles, cleaned, solid
 from bitymi_ns.ops import Prefilter, TexelAlpha, fitting_lists, project
 from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.progress import Progress, no_progress
@@ -54,8 +56,8 @@ class SurfaceOptions:
     triangles: Annotated[int, Field(ge=0, le=10**8)] = 500_000
     """Budget of triangles, met by simplification (quadric error metrics); 0 = no limit."""
     watertight: bool = False
-    """Close the mesh by a Poisson reconstruction: for printing and simulation. Invents surface where nothing was
-    seen."""
+    """Close the mesh, for printing: a Poisson reconstruction, of which what is open or touches itself is cut away and
+    filled. Invents surface where nothing was seen."""
 
 
 @torch.no_grad()
@@ -132,8 +134,9 @@ def extract_surface(
     prefilter: Prefilter = "low_pass",
     progress: Progress = no_progress,
     alpha: TexelAlpha | None = None,
-) -> open3d.geometry.TriangleMesh:
-    """Fuse the median depths of views into a triangle mesh with vertex colors, in the scene's frame.
+    to: Similarity | None = None,
+) -> Triangles:
+    """Fuse the median depths of views into a triangle mesh with vertex colors.
 
     Args:
         surfels: geometry by name (`GEOMETRY`).
@@ -141,6 +144,7 @@ def extract_surface(
         near: nearest depth that is drawn, camera z.
         prefilter: as in `ops.project`.
         alpha: as in `median_depth`.
+        to: the frame of the mesh; None = the scene's.
 
     Raises:
         NoSurface: there is nothing to fuse.
@@ -182,7 +186,7 @@ def extract_surface(
     mesh = volume.extract_triangle_mesh()
     if not len(mesh.triangles):
         raise NoSurface("the depth maps fuse to no surface: try a smaller --resolution")
-    return _finished(mesh, options, progress)
+    return _finished(mesh, options, progress, to)
 
 
 def _coarsened(camera: Camera, focal: float) -> Camera:
@@ -202,9 +206,9 @@ def _cut(depth: Tensor, camera: Camera, box: Tensor) -> Tensor:
 
 
 def _finished(
-    mesh: open3d.geometry.TriangleMesh, options: SurfaceOptions, progress: Progress
-) -> open3d.geometry.TriangleMesh:
-    """The mesh without specks, closed where asked for, within the budget of triangles."""
+    mesh: open3d.geometry.TriangleMesh, options: SurfaceOptions, progress: Progress, to: Similarity | None
+) -> Triangles:
+    """The mesh in its frame without specks, closed where asked for, within the budget of triangles."""
     import open3d
 
     labels, counts, _ = (np.asarray(part) for part in mesh.cluster_connected_triangles())
@@ -216,12 +220,29 @@ def _finished(
         cloud = open3d.geometry.PointCloud(mesh.vertices)
         cloud.normals, cloud.colors = mesh.vertex_normals, mesh.vertex_colors
         mesh, _ = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=POISSON_DEPTH)
-        progress("closing the mesh", 1, 1)
-    if options.triangles and len(mesh.triangles) > options.triangles:
-        mesh = mesh.simplify_quadric_decimation(options.triangles)
-        progress("simplifying", 1, 1)
-    mesh = mesh.filter_smooth_taubin(SMOOTHING)
-    mesh.remove_degenerate_triangles()
-    mesh.remove_unreferenced_vertices()
-    mesh.compute_vertex_normals()
-    return mesh
+    budget = options.triangles or len(mesh.triangles)
+    few = mesh
+    while True:
+        if len(few.triangles) > budget:
+            few = mesh.simplify_quadric_decimation(budget)
+            progress("simplifying", 1, 1)
+        result = _as_written(few.filter_smooth_taubin(SMOOTHING), to)
+        if options.watertight:
+            result = solid(result, SMALLEST)
+            progress("closing the mesh", 1, 1)
+        if not len(result):
+            raise NoSurface("nothing is left of the mesh: try more --triangles")
+        if not options.triangles or len(result) <= options.triangles:
+            return result
+        budget -= len(result) - options.triangles  # triangles that close holes
+
+
+def _as_written(mesh: open3d.geometry.TriangleMesh, to: Similarity | None) -> Triangles:
+    """The mesh in another frame."""
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles).astype(np.int64)
+    if to is not None:
+        vertices = to.points(torch.from_numpy(vertices)).numpy()
+        if float(torch.linalg.det(to.turn)) < 0:  # a mirror image turns triangles inside out
+            faces = faces[:, ::-1]
+    colors = np.asarray(mesh.vertex_colors).clip(0.0, 1.0)
+    return cleaned(Triangles(vertices.astype(np.float32), faces, colors.astype(np.float32)))

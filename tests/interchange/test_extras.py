@@ -14,6 +14,8 @@ from bitymi_ns.bundle import Bundle, BundleError, read_bundle
 from bitymi_ns.bundle.ply import parse_ply
 from bitymi_ns.bundle.single import write_single
 from bitymi_ns.interchange import extras, extras_folder, read_cameras, write_extras
+from bitymi_ns.interchange.frame import to_capture, up_of
+from bitymi_ns.interchange.glb import upright
 from bitymi_ns.train.views import View
 from tests.bundle.made import make
 from tests.interchange.glb import read_glb
@@ -69,11 +71,30 @@ def test_the_captures_frame_is_reached(bundle: Bundle, tmp_path: Path) -> None:
     def back(points: torch.Tensor) -> torch.Tensor:
         return place.scale * (points @ transform[:, :3].T + transform[:, 3])
 
-    for read, name in ((positions, "gaussians.ply"), (lambda path: read_glb(path).corners, "mesh.glb")):
-        old, new = (read(tmp_path / frame / name) for frame in ("scene", "capture"))
-        if name == "mesh.glb":  # the scene's file is turned to y up; its up is z
-            old = torch.stack([old[..., 0], -old[..., 2], old[..., 1]], -1)
-        assert torch.allclose(back(new), old, atol=2e-5)
+    def unturned(points: torch.Tensor, up: torch.Tensor) -> torch.Tensor:
+        return points @ torch.from_numpy(upright(up)[:3, :3]).float()
+
+    old, new = (positions(tmp_path / frame / "gaussians.ply") for frame in ("scene", "capture"))
+    assert torch.allclose(back(new), old, atol=2e-5)
+    old, new = (read_glb(tmp_path / frame / "mesh.glb").corners for frame in ("scene", "capture"))
+    old = torch.stack([old[..., 0], -old[..., 2], old[..., 1]], -1)  # its up is z
+    assert torch.allclose(back(unturned(new, up_of(place, to_capture(place)))), old, atol=2e-5)
+
+
+def test_far_away_the_files_state_their_origin(bundle: Bundle, tmp_path: Path) -> None:
+    place = bundle.info.world
+    far = [[*row[:3], row[3] + 1e5] for row in place.transform]
+    bundle.info.world = place.model_copy(update={"transform": far})
+    written = write_extras(bundle, tmp_path / "out", frame="capture")
+    to = to_capture(bundle.info.world)
+    header = (tmp_path / "out" / "gaussians.ply").read_bytes().split(b"end_header")[0].decode()
+    assert f"comment {to.note}\n" in header and to.note
+    assert all(to.note in extras.summary_line(each) for each in written.values())
+    assert json.loads((tmp_path / "out" / "extras.json").read_text())["mesh"]["note"] == to.note
+    turn = torch.from_numpy(upright(up_of(bundle.info.world, to))[:3, :3])
+    corners = read_glb(tmp_path / "out" / "mesh.glb").corners.double().mean((0, 1))
+    means = positions(tmp_path / "out" / "gaussians.ply").double().mean(0)
+    assert float((corners - turn @ (means + to.origin)).norm()) < 20.0 < float(to.origin.norm())
 
 
 def test_a_bundle_on_its_own_is_written_by_the_command(
@@ -85,7 +106,9 @@ def test_a_bundle_on_its_own_is_written_by_the_command(
     folder = tmp_path / "scene.extras"
     assert extras_folder(with_cameras) == folder and (folder / "mesh.glb").is_file()
     assert cli.main(["extras", str(with_cameras)]) == 1
-    assert "--overwrite" in capsys.readouterr().err
+    assert "--overwrite\n" in capsys.readouterr().err
+    assert cli.main(["extras", str(with_cameras), "--kinds", "gaussians"]) == 1
+    assert "removes mesh.glb unless you ask for all kinds" in " ".join(capsys.readouterr().err.split())
     args = ["extras", str(with_cameras), "--kinds", "gaussians", "--overwrite", "--frame", "capture"]
     assert cli.main(args) == 0
     assert {path.name for path in folder.iterdir()} == {"gaussians.ply", "extras.json"}

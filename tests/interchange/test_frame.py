@@ -5,10 +5,11 @@ import math
 
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from bitymi_ns.bundle import BundleError
 from bitymi_ns.bundle.manifest import WorldFrame
-from bitymi_ns.interchange.frame import to_capture
+from bitymi_ns.interchange.frame import to_capture, up_of
 from bitymi_ns.interchange.gaussians import gaussians_of
 from bitymi_ns.ops.reference.view_color import sh_basis
 from bitymi_ns.train.init import tangents
@@ -50,12 +51,35 @@ def test_gaussians_go_back_to_the_capture(surfels, mirrored: int, stretch: float
     assert math.isclose(float(moved.log_scales[0, 0] - g.log_scales[0, 0]), -math.log(size), abs_tol=1e-5)
 
 
-def test_a_frame_that_is_bent_or_far_away_is_refused() -> None:
+def test_a_frame_that_is_bent_is_refused() -> None:
     for matrix in (torch.diag(torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64)), torch.zeros(3, 3)):
-        with pytest.raises(BundleError, match=r"world\.transform"):
+        with pytest.raises(BundleError, match=r"no rotation with one scale, .* \(--frame scene\)"):
             to_capture(place(matrix.double(), 1.0))
-    where = place(torch.eye(3, dtype=torch.float64), 0.1)  # coordinates of a map
+
+
+@pytest.mark.parametrize("scale", [0.1, 30.0, 1e-5])
+def test_far_away_positions_are_relative_to_an_origin(scale: float) -> None:
+    where = place(TURN * torch.linalg.det(TURN), scale)
+    offset = torch.tensor([500123.4, -4649876.0, 312.0], dtype=torch.float64) / min(1.0, 30 * scale)
     transform = torch.tensor(where.transform, dtype=torch.float64)
-    transform[:, 3] = -torch.tensor([500123.0, 4649876.0, 312.0], dtype=torch.float64)
-    with pytest.raises(BundleError, match="lies 4,676,694 of its units from the origin .* in the scene's frame"):
-        to_capture(where.model_copy(update={"transform": transform.tolist()}))
+    transform[:, 3] = offset
+    to = to_capture(where.model_copy(update={"transform": transform.tolist()}))
+    points = torch.rand(100, 3)
+    found = to.points(points)
+    assert float(found.abs().max()) <= 1000 * to.scale and to.note == (
+        "positions are relative to the origin " + " ".join(f"{value:.15g}" for value in to.origin.tolist())
+    )
+    again = scale * ((found.double() + to.origin) @ transform[:, :3].T + offset)
+    assert torch.allclose(again, points.double(), atol=2e-4)
+    near = to_capture(place(torch.eye(3, dtype=torch.float64), scale))
+    assert not near.note and not near.origin.any()
+
+
+def test_up_is_an_axis_of_the_captures_frame() -> None:
+    tilted = Rotation.from_euler("xz", [80.0, 10.0], degrees=True).as_matrix()  # of the scene in the capture
+    where = place(torch.from_numpy(tilted.T.copy()), 1.0)
+    assert up_of(where, None).tolist() == [0, 0, 1]
+    up = up_of(where, to_capture(where))
+    assert up.abs().tolist() == [0, 1, 0] and float(up @ tilted[:, 2]) > 0.9
+    known = where.model_copy(update={"up": (0.0, 0.0, -1.0), "up_from": "gps"})
+    assert torch.equal(up_of(known, to_capture(known)), -up)

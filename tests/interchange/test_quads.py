@@ -2,13 +2,14 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import trimesh
 
 from bitymi_ns.bundle import Bundle
 from bitymi_ns.interchange.draw_quads import _fetch, draw_quads, nearest
-from bitymi_ns.interchange.glb import glb_bytes
+from bitymi_ns.interchange.glb import quads_glb, upright
 from bitymi_ns.interchange.quads import Quads, quads_of
 from bitymi_ns.interchange.recolor import recolored
 from bitymi_ns.ops.reference.render import texel
@@ -62,7 +63,7 @@ def test_a_surfel_without_a_tile_has_its_constant(bundle: Bundle, color: torch.T
 
 def test_the_file_opens_elsewhere_and_holds_what_went_in(bundle: Bundle, color: torch.Tensor, tmp_path: Path) -> None:
     quads = quads_of(bundle.scene, color, LEVEL)
-    (tmp_path / "a.glb").write_bytes(glb_bytes(quads))
+    (tmp_path / "a.glb").write_bytes(quads_glb(quads, np.eye(4)))
     found = read_glb(tmp_path / "a.glb")
     assert torch.equal(found.corners, quads.corners) and torch.equal(found.pages, quads.pages)
     assert torch.allclose(found.uv, quads.uv, atol=1e-6) and torch.equal(found.page, quads.page)
@@ -79,7 +80,7 @@ def test_the_file_opens_elsewhere_and_holds_what_went_in(bundle: Bundle, color: 
 def test_up_is_y_in_the_file(up: tuple, tmp_path: Path) -> None:
     corners = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1]]]) + torch.tensor(up)
     quads = Quads(corners, torch.zeros(1, 4, 2), torch.zeros(1).long(), torch.zeros(1, 4, 4, 4, dtype=torch.uint8))
-    (tmp_path / "a.glb").write_bytes(glb_bytes(quads, torch.tensor(up)))
+    (tmp_path / "a.glb").write_bytes(quads_glb(quads, upright(torch.tensor(up))))
     found = read_glb(tmp_path / "a.glb").corners
     assert torch.allclose(found[..., 1], (corners * torch.tensor(up)).sum(-1), atol=1e-5)
     assert torch.allclose(torch.cdist(found[0], found[0]), torch.cdist(corners[0], corners[0]), atol=1e-5)

@@ -5,7 +5,9 @@ import math
 import numpy as np
 import pytest
 import torch
+import trimesh
 
+from bitymi_ns.interchange.frame import Similarity
 from bitymi_ns.interchange.surface import NoSurface, SurfaceOptions, extract_surface, median_depth
 from bitymi_ns.ops import TexelAlpha, TexelTiles
 from bitymi_ns.ranges import check_ranges
@@ -64,12 +66,14 @@ def gray(camera: Camera) -> torch.Tensor:
 
 def test_a_plane_is_fused_where_it_lies() -> None:
     mesh = extract_surface(plane(60), gray, CAMERAS, 0.02, SurfaceOptions(resolution=64))
-    vertices, colors = np.asarray(mesh.vertices), np.asarray(mesh.vertex_colors)
-    assert len(mesh.triangles) > 500 and np.abs(vertices[:, 2]).max() < 2e-3
+    vertices, colors = mesh.vertices, mesh.colors
+    assert len(mesh) > 500 and np.abs(vertices[:, 2]).max() < 2e-3
     assert np.abs(colors - 0.5).max() < 0.01
     x, y = vertices[:, 0], vertices[:, 1]  # what the outermost cameras see, and no more
     assert 0.6 < x.max() < 1.06 and abs(x.max() + x.min()) < 0.1 and 0.4 < y.max() < 1.06
-    assert np.asarray(mesh.vertex_normals)[:, 2].min() > 0.9  # towards the cameras
+    shape = trimesh.Trimesh(vertices, mesh.faces, process=False)
+    assert shape.face_normals[:, 2].min() > 0.9  # towards the cameras
+    assert shape.area_faces.min() > 0.0
 
 
 def test_large_views_are_drawn_no_finer_than_the_voxels_need() -> None:
@@ -83,17 +87,29 @@ def test_large_views_are_drawn_no_finer_than_the_voxels_need() -> None:
     mesh = extract_surface(plane(60), render, large, 0.02, SurfaceOptions(resolution=128))
     width = 64 / 62 * 2 * 2.0 / (2.04 / 128)  # two pixels for a voxel of the box, at the distance of 2
     assert all(abs(w / width - 1.0) < 0.05 and abs(h / w - 0.75) < 0.01 for w, h in sizes)
-    assert np.abs(np.asarray(mesh.vertices)[:, 2]).max() < 2e-3
+    assert np.abs(mesh.vertices[:, 2]).max() < 2e-3
     sizes.clear()
     extract_surface(plane(60), render, large, 0.02, SurfaceOptions(resolution=512))
     assert set(sizes) == {(640, 480)}
 
 
-def test_the_budget_and_the_closed_surface_are_kept() -> None:
+@pytest.mark.parametrize("resolution", [32, 64])
+def test_the_budget_and_the_closed_surface_are_kept(resolution: int) -> None:
     few = extract_surface(plane(40), gray, CAMERAS, 0.02, SurfaceOptions(resolution=64, triangles=200))
-    assert 50 < len(few.triangles) <= 200
-    closed = extract_surface(plane(40), gray, CAMERAS, 0.02, SurfaceOptions(resolution=32, watertight=True))
-    assert closed.is_edge_manifold(allow_boundary_edges=True) and len(closed.triangles) > 100
+    assert 50 < len(few) <= 200
+    options = SurfaceOptions(resolution=resolution, watertight=True, triangles=2000)
+    closed = extract_surface(plane(40), gray, CAMERAS, 0.02, options)
+    shape = trimesh.Trimesh(closed.vertices, closed.faces)
+    assert closed.open_edges() == 0 and 100 < len(closed) <= 2000
+    assert shape.is_watertight and shape.is_winding_consistent and shape.volume > 0
+
+
+def test_a_mirrored_frame_keeps_what_is_outside() -> None:
+    mirror = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
+    zero = torch.zeros(3, dtype=torch.float64)
+    options = SurfaceOptions(resolution=48)
+    mesh = extract_surface(plane(40), gray, CAMERAS, 0.02, options, to=Similarity(mirror, 2.0, zero, zero))
+    assert trimesh.Trimesh(mesh.vertices, mesh.faces).face_normals[:, 2].max() < -0.9
 
 
 def test_a_scene_without_a_surface_says_so() -> None:

@@ -1,12 +1,11 @@
 """`ns-export bitymi-mesh`: the surface of a trained scene or of a bundle as a triangle mesh."""
 
 import json
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,11 +14,12 @@ from bitymi_ns.bundle import BundleError, read_bundle
 from bitymi_ns.bundle.manifest import MANIFEST, WorldFrame
 from bitymi_ns.bundle.strict_json import plain
 from bitymi_ns.codec.pages import texel_alpha
-from bitymi_ns.files import complete_folder, reason, reserved, size_text
+from bitymi_ns.files import reason, reserved, size_text, write_file
 from bitymi_ns.interchange import Frame
 from bitymi_ns.interchange.bundle_cameras import named_cameras
-from bitymi_ns.interchange.frame import to_capture
+from bitymi_ns.interchange.frame import to_capture, up_of
 from bitymi_ns.interchange.surface import NoSurface, SurfaceOptions, extract_surface
+from bitymi_ns.interchange.surface_files import MeshFormat, mesh_bytes
 from bitymi_ns.ops import Prefilter, TexelAlpha
 from bitymi_ns.plugin.console import fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
@@ -51,7 +51,7 @@ class ExportMesh(SurfaceOptions):
 
     load_config: Path  # config.yml of a trained scene or of a bundle.
     output_dir: Path  # Folder of the mesh: mesh.ply, mesh.glb or mesh.obj.
-    format: Literal["ply", "glb", "obj"] = "ply"  # Of the file.
+    format: MeshFormat = "ply"  # Of the file. Those of other formats stay.
     frame: Frame = "capture"
     """Frame of the vertices: the capture's own, with its unit of length, or the scene's, in which nerfstudio trains."""
     overwrite: bool = False  # Replace a mesh that is there already.
@@ -65,54 +65,47 @@ class ExportMesh(SurfaceOptions):
         except ValueError as error:
             fail(f"--{error}.", error)
         try:
-            with reserved(self.output_dir, warn):
-                self._check_target()
+            with reserved(path, warn):
+                self._check_target(path)
                 source = from_bundle(self.load_config.parent) if self._is_bundle else from_run(self.load_config)
-                self._write(source, path)
+                note = self._write(source, path)
         except BundleError as error:
             fail(str(error), error)
         except NoSurface as error:
             fail(f"{self.load_config}: {error}.", error)
         except OSError as error:
-            fail(f"{path} cannot be written: {reason(error, self.output_dir)} (--output-dir).", error)
-        say(f"{path}: {size_text(path.stat().st_size)}, in the {self.frame}'s frame")
+            fail(f"{path} cannot be written: {reason(error, path)} (--output-dir).", error)
+        say(f"{path}: {size_text(path.stat().st_size)}, in the {self.frame}'s frame" + (note and f"; {note}"))
 
     @property
     def _is_bundle(self) -> bool:
         return (self.load_config.parent / MANIFEST).is_file()
 
-    def _check_target(self) -> None:
-        """Stop where the folder holds anything that may not be replaced."""
-        if not self.output_dir.exists():
-            return
-        if not self.output_dir.is_dir():
-            fail(f"{self.output_dir} is no folder: choose another --output-dir.")
-        there = {path.name for path in self.output_dir.iterdir()}
-        own = {f"{NAME}.{ending}" for ending in ("ply", "glb", "obj", "mtl")}
-        if there - own:
-            fail(f"{self.output_dir} holds other files and is not replaced: choose another --output-dir.")
-        if there and not self.overwrite:
-            fail(f"{self.output_dir} holds a mesh already: choose another --output-dir, or add --overwrite True.")
+    def _check_target(self, path: Path) -> None:
+        """Stop where the file is there and may not be replaced."""
+        if os.path.lexists(path) and not self.overwrite:
+            fail(f"{path} is there already: choose another --output-dir, or add --overwrite True.")
 
-    def _write(self, source: Source, path: Path) -> None:
-        import open3d
-
+    def _write(self, source: Source, path: Path) -> str:
+        """Write the mesh; returns what is to be said of its positions."""
         to = to_capture(source.world) if self.frame == "capture" else None
         step = max(1, -(-len(source.cameras) // MOST_VIEWS))
         cameras = source.cameras[::step]
         with rich_progress() as progress:
-            drawn = (cameras, source.near, self, source.prefilter, progress, source.alpha)
+            drawn = (cameras, source.near, self, source.prefilter, progress, source.alpha, to)
             mesh = extract_surface(source.surfels, source.render, *drawn)
-        if to is not None:
-            vertices = torch.from_numpy(np.asarray(mesh.vertices))
-            mesh.vertices = open3d.utility.Vector3dVector(to.points(vertices).numpy())
-            if float(torch.linalg.det(to.turn)) < 0:  # a mirror image turns triangles inside out
-                mesh.triangles = open3d.utility.Vector3iVector(np.asarray(mesh.triangles)[:, ::-1])
-            mesh.compute_vertex_normals()
-        with complete_folder(self.output_dir, self._check_target) as new:
-            if not open3d.io.write_triangle_mesh(str(new / path.name), mesh):
-                raise BundleError(f"open3d could not write {path}")
-        say(f"{len(mesh.vertices):,} vertices, {len(mesh.triangles):,} triangles of {len(cameras)} views")
+        note = "" if to is None else to.note
+        up, origin = up_of(source.world, to), torch.zeros(3) if to is None else to.origin
+        self._check_target(path)
+        write_file(path, mesh_bytes(mesh, self.format, up, origin, note))
+        if self.format == "obj":  # which earlier versions wrote beside it
+            path.with_suffix(".mtl").unlink(missing_ok=True)
+        parts = int(mesh.parts().max()) + 1
+        counts = f"{len(mesh.vertices):,} vertices, {len(mesh):,} triangles, {parts:,} part{'s' if parts > 1 else ''}"
+        say(f"{counts}, of {len(cameras)} views")
+        if self.watertight and (left := mesh.open_edges()):
+            warn(f"{left:,} edges could not be closed, so that the mesh is not watertight: try another --resolution.")
+        return note and note + (" (its node is moved there)" if self.format == "glb" else " (a comment of the file)")
 
 
 def from_run(load_config: Path) -> Source:

@@ -62,7 +62,9 @@ class DensifyConfig:
     min_reset_interval: Count = 1500  # Fewest steps between opacity resets, however short the run.
     reset_opacity: PositiveShare = 0.01  # Opacity after a reset, at most. Very short runs reset to a higher one.
     final_prune_steps: tuple[int, ...] = (18_000, 21_000, 24_000, 27_000)  # Steps of the final prunes.
-    final_prune_opacity: Share = 0.1  # Final prunes remove surfels below this opacity.
+    final_prune_opacity: Share = 0.1  # Final prunes remove surfels below this opacity,
+    final_prune_error: Share = 0.02
+    """... those that change the training pictures least, together by at most this share of their squared error."""
     prune_error: Share = 0.02
     """After the last densification, surfels that hardly matter are removed: those whose removal changes the training
     pictures least, together by at most this share of the pictures' squared error (or of that of pictures at 30 dB,

@@ -8,8 +8,7 @@ At each densification, in this order:
 - up to half of the candidates for pruning, drawn at random, are removed;
 - opacities are clamped.
 After the last one, surfels whose removal hardly changes the pictures go, and between 60 and 90 % of the run four final
-prunes remove what is transparent. docs/training.md states the
-published rules.
+prunes remove what is nearly transparent and not missed. docs/training.md states the published rules.
 """
 
 from __future__ import annotations
@@ -48,6 +47,7 @@ SPLIT_APART = 0.7  # distance of the halves' centres from the surfel's, in scale
 SPLIT_OPACITY = 0.9  # opacity of the halves as a share of the surfel's: they overlap where it is most opaque
 ERROR_VIEWS, FEWEST_ERROR_VIEWS = 0.1, 64
 """Most views that the errors of removals are measured on, as a share of the run's steps, and at least so many."""
+FINAL_VIEWS, FEWEST_FINAL_VIEWS = 0.025, 16  # the same for each of the four final prunes
 STATISTICS = ("grad_sum", "abs_grad_sum", "visible_count", "max_radius")
 
 
@@ -161,7 +161,7 @@ class Strategy:
         if step in self.schedule.error_prune_steps:
             report |= self._error_prune(scene, optimizers, views)
         if step in self.schedule.final_prune_steps:
-            report |= self._final_prune(scene, optimizers)
+            report |= self._final_prune(scene, optimizers, views)
         if report:
             report["surfels"] = len(scene)
         return report
@@ -243,20 +243,33 @@ class Strategy:
     @torch.no_grad()
     def _error_prune(self, scene: Scene, optimizers: Mapping[str, Optimizer], views: DrawViews) -> dict[str, float]:
         report = self._drop_dead(scene, optimizers)
-        most = max(FEWEST_ERROR_VIEWS, round(ERROR_VIEWS * self.schedule.max_steps))
-        seed = int(torch.randint(1 << 31, (), generator=self.generator))
-        added, error = removal_errors(scene, views(most, self.generator), self.config, seed, self.processes)
-        order = added.argsort(stable=True)
-        pruned = torch.zeros(len(scene), dtype=torch.bool, device=added.device)
-        pruned[order] = added[order].cumsum(0) <= self.config.densify.prune_error * error
-        pruned &= added > 0  # views that were not drawn may show the others
+        every = torch.ones(len(scene), dtype=torch.bool, device=scene.surfels["means"].device)
+        drawn = self._error_views(views, ERROR_VIEWS, FEWEST_ERROR_VIEWS)
+        pruned = self._expendable(every, self.config.densify.prune_error, scene, drawn)
         return report | self._prune(pruned, scene, optimizers)
 
     @torch.no_grad()
-    def _final_prune(self, scene: Scene, optimizers: Mapping[str, Optimizer]) -> dict[str, float]:
-        report = self._drop_dead(scene, optimizers)
-        pruned = scene.surfels["opacity_logits"].sigmoid() < self.config.densify.final_prune_opacity
+    def _final_prune(self, scene: Scene, optimizers: Mapping[str, Optimizer], views: DrawViews) -> dict[str, float]:
+        """Remove faint surfels that the pictures do not miss: where opacities have been reset, many of them matter."""
+        report, config = self._drop_dead(scene, optimizers), self.config.densify
+        faint = scene.surfels["opacity_logits"].sigmoid() < config.final_prune_opacity
+        drawn = self._error_views(views, FINAL_VIEWS, FEWEST_FINAL_VIEWS)
+        pruned = self._expendable(faint, config.final_prune_error, scene, drawn)
         return report | self._prune(pruned, scene, optimizers)
+
+    def _error_views(self, views: DrawViews, share: float, fewest: int) -> Sequence[View]:
+        return views(max(fewest, round(share * self.schedule.max_steps)), self.generator)
+
+    def _expendable(self, among: Tensor, share: float, scene: Scene, views: Sequence[View]) -> Tensor:
+        """[N] bool: those of the surfels `among` [N] bool that change the views least, together by at most a share of
+        the views' squared error (`removal_errors`)."""
+        seed = int(torch.randint(1 << 31, (), generator=self.generator))
+        added, error = removal_errors(scene, views, self.config, seed, self.processes)
+        rows = among.nonzero().flatten()
+        rows = rows[added[rows].argsort(stable=True)]
+        chosen = torch.zeros_like(among)
+        chosen[rows] = added[rows].cumsum(0) <= share * error
+        return chosen & (added > 0)  # views that were not drawn may show the others
 
     def _prune(self, pruned: Tensor, scene: Scene, optimizers: Mapping[str, Optimizer]) -> dict[str, float]:
         """Remove as many of `pruned` [N] bool as `min_surfels` allows."""

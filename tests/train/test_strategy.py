@@ -288,21 +288,22 @@ def test_the_error_prune_removes_what_hardly_matters(bench):
     assert b.step(ERROR) == {} and b.asked == []
 
 
-def test_final_prune_removes_the_transparent(bench):
-    b = bench(10)
-    b.set("opacity_logits", 0, -2.3)
+def test_final_prune_removes_the_transparent_that_the_pictures_do_not_miss(bench):
+    b = bench(10, final_prune_error=0.01)
+    b.set("opacity_logits", slice(0, 4), -2.3)
+    b.added[:6] = torch.tensor([6.0, 3.0, 0.0, 4.0, 1.0, 1.0])  # the pictures would miss 0, and 4 and 5 are opaque
     b.prune[7] = 1.0
     report = b.step(FINAL)
-    assert b.x == list(range(1, 10))
-    assert (report["pruned"], report["surfels"]) == (1, 9)
-    assert b.asked == []  # no view is drawn for scores that nobody asks for
-    assert len(b.optimizers["means"].state[b.scene.surfels["means"]]["exp_avg"]) == 9
+    assert b.x == [0, 2, 4, 5, 6, 7, 8, 9]  # 3 + 4 <= 0.01 x 1000 < 3 + 4 + 6; no drawn view shows row 2
+    assert (report["pruned"], report["surfels"]) == (2, 8) and b.asked == [750]
+    assert len(b.optimizers["means"].state[b.scene.surfels["means"]]["exp_avg"]) == 8
 
 
 @pytest.mark.parametrize(("n", "least", "left"), [(10, 4, 4), (10, 100, 10), (10, 0, 1)])
 def test_a_prune_never_empties_the_scene(bench, n, least, left):
     for logit in (-3.0, -9.0):
         b = bench(n, min_surfels=least)
+        b.added[:] = 1.0
         b.set("opacity_logits", slice(0, n), torch.linspace(logit, logit + 0.1, n))
         for step in (FINAL, FINAL + 3000, DENSIFY):
             b.step(step)

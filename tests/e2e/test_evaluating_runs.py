@@ -18,7 +18,9 @@ def test_evaluation_refuses_a_checkpoint_that_is_damaged_or_missing(
     folder = a_run_of(trained, tmp_path)
     newest = folder / "nerfstudio_models" / "step-000000059.ckpt"
     newest.write_bytes(newest.read_bytes()[:1000])
-    with pytest.raises(InputError, match=f"{newest} cannot be read(.|\n)*It is damaged(.|\n)*go back to step-000000040.ckpt"):
+    with pytest.raises(
+        InputError, match=f"{newest} cannot be read(.|\n)*It is damaged(.|\n)*go back to step-000000040.ckpt"
+    ):
         eval_setup(folder / "config.yml")
     newest.unlink()
     assert eval_setup(folder / "config.yml")[3] == 40

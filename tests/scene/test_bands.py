@@ -78,7 +78,7 @@ def test_memory_bounds_a_list_where_nothing_else_does(monkeypatch: pytest.Monkey
 
 
 def test_training_goes_on() -> None:
-    scene, camera = bands.make(CPU, 1500)
+    scene, camera = bands.make(CPU, 3000)
     scene = scene.float()
     camera = type(camera)(camera.viewmat.float(), camera.K.float(), camera.width, camera.height)
     photo = torch.rand(bands.HEIGHT, bands.WIDTH, 3, generator=torch.Generator().manual_seed(2))

@@ -25,8 +25,10 @@ from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.losses import numbers, photometric
 from bitymi_ns.train.optimizers import forget_gradients, set_rate, step, surfel_optimizers
 from bitymi_ns.train.schedules import Schedule, falling
-from bitymi_ns.train.step_sizes import StepSizes
 from bitymi_ns.train.views import View, background_changes, step_background, training_order
+
+MEANS = (1.6e-4, 1.6e-6)
+"""Rates of the positions in shares of the extent, as polishing was measured with: steps in pixels have not been."""
 
 
 @dataclass
@@ -67,9 +69,8 @@ class _Polish:
         self.options, self.background = options, background.to(device)
         centers = torch.stack([view.camera.center.to(device) for view in views])
         extent = scene_extent(centers, drawn.surfels["means"])
-        self.schedule = Schedule(replace(train, lr=train.lr.times(options.share)), options.steps, extent)
-        self.step_sizes = StepSizes(self.schedule, [view.camera for view in views])
-        self.step_sizes.measure(self.scene)
+        rates = replace(train.lr, means=MEANS).times(options.share)
+        self.schedule = Schedule(replace(train, lr=rates), options.steps, extent)
         self.optimizers = surfel_optimizers(self.scene)
         self.train, self.factor = train, 1.0
 
@@ -91,7 +92,7 @@ class _Polish:
         """A step on one view; False = it is not finite, and was not done."""
         options, view = self.options, view.to(self.device)
         for name, optimizer in self.optimizers.items():
-            set_rate(optimizer, self.factor * falling(self.step_sizes.rate(name, 0), number, options.steps))
+            set_rate(optimizer, self.factor * falling(self.schedule.lr(name, 0), number, options.steps))
         forget_gradients(self.optimizers.values())
         background = self.background
         if background_changes(self.train, view):
@@ -106,7 +107,7 @@ class _Polish:
         if not loss.requires_grad:  # nothing of the scene is in the view
             return True
         loss.backward()
-        step(self.optimizers, self.step_sizes.factors())
+        step(self.optimizers, {})
         return True
 
     def state(self) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """Compare rules of training on a CPU in long runs and in short ones: no default is chosen from short runs alone.
 
-    python benchmarks/long.py DATA... --rows bitymi "bitymi train.lr.rim=0.1" --runs 10000/4 1500/2 300/1
+    python benchmarks/long.py DATA... --rows bitymi "bitymi train.texels.mean_rates=0.2" --runs 10000/4 1500/2 300/1
 
 A run is STEPS/REDUCTION: so many steps on photographs reduced by a whole factor. Long ones take 25 to 60 CPU minutes;
 start several commands with the same --work, they share the runs. Rounding alone moves PSNR by 0.1 dB: give --seeds."""
@@ -16,7 +16,7 @@ import tempfile
 import time
 from argparse import Namespace
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -79,7 +79,7 @@ class Run:
 
 
 def preset_of(row: str) -> Preset:
-    """The preset that a row names, with its settings.
+    """Load the preset that a row names, with its settings.
 
     Raises:
         ValueError: there is no such option.
@@ -112,7 +112,7 @@ def means(rows: Sequence[dict[str, float]]) -> dict[str, float]:
 
 
 class TexelWatch:
-    """The loss of a few training views from the step before texels begin on."""
+    """Watches the loss of a few training views from the step before texels begin on."""
 
     def __init__(self, trainer: Trainer, views: Sequence[View]) -> None:
         self.trainer, self.views = trainer, [views[i] for i in spread(len(views), WATCHED)]
@@ -133,7 +133,7 @@ class TexelWatch:
         self.losses.append(float(torch.stack(losses).mean()))
 
     def figures(self) -> dict[str, Any]:
-        """The largest loss as a multiple of that before, and after how many steps it is below it again."""
+        """Return the largest loss as a multiple of that before, and after how many steps it is below it again."""
         if len(self.losses) < 2:
             return {}
         before, *after = self.losses
@@ -143,9 +143,9 @@ class TexelWatch:
 
 
 def cut(capture: Capture, photographs: int) -> Capture:
-    """A capture of so many photographs at most, evenly spread; as many are held out as in the whole."""
-    train = [capture.train[i] for i in spread(len(capture.train), photographs)] if photographs else capture.train
-    return Capture(train, capture.held_out, capture.points, capture.colours)
+    """Keep so many training photographs at most (0 = all), evenly spread; as many are held out as in the whole."""
+    kept = spread(len(capture.train), photographs or len(capture.train))
+    return replace(capture, train=[capture.train[i] for i in kept])
 
 
 def measure(run: Run) -> dict[str, Any]:
@@ -192,7 +192,7 @@ def measure(run: Run) -> dict[str, Any]:
 
 
 def tables(runs: Sequence[Run], cells: Cells) -> str:
-    """A table per capture and kind of run: a line per row, the mean over seeds with the PSNR's spread."""
+    """Write a table per capture and kind of run: a line per row, the mean over seeds with the PSNR's deviation."""
     parts = []
     for group, members in itertools.groupby(runs, lambda run: (run.data, run.steps, run.reduction)):
         lines, size = [], ""

@@ -61,7 +61,7 @@ def test_ctrl_c_in_the_first_second(after: float) -> None:
     ],
 )
 def test_commands_of_others_end_in_one_line(error: str, line: str) -> None:
-    """Those of nerfstudio catch nothing."""
+    """Commands of nerfstudio catch nothing themselves."""
     code = f"from bitymi_ns import endings; endings.install(); endings.install(); raise {error}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stderr.startswith(line) and done.stderr.count("\n") == 1

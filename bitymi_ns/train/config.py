@@ -139,7 +139,7 @@ class TexelConfig(TexelSteps):
     surfel_rates: Positive = 0.4
     """Rates of the surfels in that part, as a share of those of a run as long as it; they fall to 0 as a cosine."""
     mean_rates: Positive = 0.1
-    """The same of their positions: what was drawn before would come apart if they moved as far as in a new run."""
+    """Rates of the positions in that part, likewise: at `surfel_rates` what is drawn already would come apart."""
     pixels_per_texel: Positive = 0.25
     """A tile has at most one texel per this many pixels of its surfel (summed blending weight), in the view that shows
     most of it."""

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from bitymi_ns.train.schedules import Schedule
 
 MEASURED = 64  # most training views that footprints are measured in, evenly spread
-CHUNK = 1 << 18  # pairs of a view and a surfel that are measured together
 
 
 @torch.no_grad()
@@ -33,24 +32,18 @@ def pixel_footprints(means: Tensor, cameras: Sequence[Camera], near: float, exte
         [N] in the dtype of `means`, world units; a surfel that no view holds gets the median of the others.
     """
     nearest = torch.full_like(means[:, 0], torch.inf)
-    viewmats = torch.stack([camera.viewmat for camera in cameras]).to(means)  # [V, 4, 4]
-    K = torch.stack([camera.K for camera in cameras]).to(means)  # [V, 3, 3]
-    sizes = means.new_tensor([(camera.width, camera.height) for camera in cameras])  # [V, 2]
-    for some in torch.arange(len(cameras), device=means.device).split(max(1, CHUNK // max(1, len(means)))):
-        # no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic algorithms
-        local = [
-            (viewmats[some, axis, :3, None] * means.T).sum(1) + viewmats[some, axis, 3:] for axis in range(3)
-        ]  # x, y, z, each [v, N]
-        depth = local[2]
-        inside = depth > near
-        for axis in range(2):
-            at = K[some, axis, axis, None] * local[axis] / depth + K[some, axis, 2, None]
-            inside &= (at >= 0) & (at < sizes[some, axis, None])
-        pixel = 2.0 * depth / (K[some, 0, 0] + K[some, 1, 1])[:, None]
-        nearest = torch.minimum(nearest, torch.where(inside, pixel, torch.inf).amin(0))
+    for camera in cameras:
+        camera = camera.to(means.device)
+        _, _, depth, inside = camera.project(means, near)
+        nearest = torch.where(inside, torch.minimum(nearest, depth / _focal(camera)), nearest)
     held = nearest[nearest.isfinite()]
-    typical = held.median() if len(held) else 2.0 * extent / (K[0, 0, 0] + K[0, 1, 1])
+    typical = held.median() if len(held) else extent / _focal(cameras[0].to(means.device))
     return torch.where(nearest.isfinite(), nearest, typical)
+
+
+def _focal(camera: Camera) -> Tensor:
+    """Average the focal lengths along both axes, pixels: a scalar on the camera's device."""
+    return 0.5 * (camera.K[0, 0] + camera.K[1, 1])
 
 
 class StepSizes:

@@ -13,8 +13,8 @@ MODULES = HERE.parents[1] / "web" / "node_modules"
 
 
 def said_by(script: str, package: str, file: Path) -> Any:
-    """What a script of this folder, which reads a file by a package of npm, prints as JSON; skips the test without
-    it."""
+    """Return what a script of this folder, which reads a file by a package of npm, prints as JSON; skip the test
+    without it."""
     node = shutil.which("node")
     if node is None:
         skip_without("npm", "no node: apt install nodejs npm")

@@ -21,7 +21,7 @@ from tests.train.part_of_a_run import resume, state_of
 
 
 def reference(means: Tensor, cameras: list[Camera], near: float) -> Tensor:
-    """Footprints one by one in float64; inf where no view holds a centre."""
+    """Measure footprints one by one in float64; inf where no view holds a centre."""
     found = []
     for mean in means.double():
         sides = [math.inf]
@@ -82,7 +82,7 @@ def test_a_step_moves_near_and_far_surfels_by_as_many_pixels(make_scene, views: 
 
 
 def scaled(views: list[View], by: float) -> list[View]:
-    """The same photographs of a world that is larger."""
+    """Return the same photographs of a world that is larger."""
     found = []
     for view in views:
         viewmat = view.camera.viewmat.clone()
@@ -105,7 +105,7 @@ def test_the_scale_of_a_capture_changes_nothing(views: list[View], ball: tuple[T
 
 
 def fine(views: list[View], by: float, ball: tuple[Tensor, Tensor]) -> tuple[list[View], Tensor, Tensor]:
-    """The same photographs as of a scene that is small in its capture: cameras farther away with longer lenses, one
+    """Return the photographs as of a scene that is small in its capture: cameras farther away with longer lenses, one
     of them on the other side of the world, so that the extent is large."""
     found = []
     for view in views:

@@ -22,7 +22,6 @@ from bitymi_ns.bundle.notes import notes_of
 from bitymi_ns.bundle.single import write_single
 from bitymi_ns.cli import main
 from bitymi_ns.view import PageError, is_loopback, serve, single_site, site_of, write_static
-from bitymi_ns.view.page import Site
 from tests.bundle.damage import amend
 from tests.bundle.test_notes import NOTES, text
 from tests.view.browser import running, served
@@ -132,9 +131,6 @@ def test_what_is_no_longer_what_bundle_json_says_is_not_sent_at_any_time(bundle:
         site_of(tmp_path)
 
 
-STRANGE = ["a.htm", "a.svg", "a.xhtml", "shell.php", "run.cgi", "index.html", "A.HTM", "photograph-0001.jpg.php", "a"]
-
-
 def test_a_bundle_that_is_exported_again_with_other_files_is_served_as_it_is_then(bundle: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(bundle, tmp_path / "copy"))
     amend(copy, lambda info: info["files"].pop("photograph-0001.jpg"))
@@ -150,60 +146,7 @@ def test_a_bundle_that_is_exported_again_with_other_files_is_served_as_it_is_the
         assert ask(address, "/")[0] == 200
 
 
-def clients(address: str, path: str, count: int) -> list[socket.socket]:
-    """Connections that ask for a file and read nothing of it."""
-    parts = urlsplit(address)
-    found = []
-    for _ in range(count):
-        client = socket.create_connection((parts.hostname, parts.port), timeout=20)
-        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        client.sendall(f"GET {path} HTTP/1.1\r\nHost: {parts.netloc}\r\n\r\n".encode())
-        found.append(client)
-    return found
-
-
-def test_slow_clients_share_one_copy_of_a_file() -> None:
-    made: list[int] = []
-
-    def read() -> bytes:
-        made.append(1)
-        return bytes(16 << 20)
-
-    site = Site({"index.html": lambda: b"", "large": read})
-    server = serve(site)
-    with running(server) as address:
-        waiting = clients(address, "/large", 20)
-        assert [client.recv(8) for client in waiting] == [b"HTTP/1.1"] * 20  # all are being sent it
-        assert len(made) == 1
-        for client in waiting:
-            client.close()
-        for _ in range(100):
-            if not server._held:
-                break
-            time.sleep(0.1)
-        assert not server._held  # nobody keeps it
-        assert ask(address, "/large")[2] == bytes(16 << 20) and len(made) == 2
-
-
-def test_connections_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys.modules["bitymi_ns.view.serve"], "MOST_CLIENTS", 3)
-    with served(Site({"index.html": lambda: b"", "large": lambda: bytes(16 << 20)})) as address:
-        waiting = clients(address, "/large", 3)
-        assert [client.recv(8) for client in waiting] == [b"HTTP/1.1"] * 3
-        said = b""
-        with suppress(ConnectionError):  # the answer is lost where the request comes after the end of the connection
-            said = clients(address, "/", 1)[0].recv(12)
-        assert said in (b"HTTP/1.1 503", b"")
-        waiting.pop().close()
-        for _ in range(100):
-            with suppress(ConnectionError, http.client.HTTPException):
-                if ask(address, "/")[0] == 200:
-                    break
-            time.sleep(0.1)
-        else:
-            pytest.fail("the place of a client that has gone is not free")
-        for client in waiting:
-            client.close()
+STRANGE = ["a.htm", "a.svg", "a.xhtml", "shell.php", "run.cgi", "index.html", "A.HTM", "photograph-0001.jpg.php", "a"]
 
 
 def test_files_that_the_format_does_not_name_are_not_passed_on_and_that_is_said(

@@ -1,0 +1,71 @@
+"""Many clients of the viewer's server at once, slow ones too: one copy of a file for all, a limit on connections."""
+
+import http.client
+import socket
+import sys
+import time
+from contextlib import suppress
+from urllib.parse import urlsplit
+
+import pytest
+
+from bitymi_ns.view import serve
+from bitymi_ns.view.page import Site
+from tests.view.browser import running, served
+from tests.view.test_serve import ask
+
+
+def clients(address: str, path: str, count: int) -> list[socket.socket]:
+    """Connections that ask for a file and read nothing of it."""
+    parts = urlsplit(address)
+    found = []
+    for _ in range(count):
+        client = socket.create_connection((parts.hostname, parts.port), timeout=20)
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        client.sendall(f"GET {path} HTTP/1.1\r\nHost: {parts.netloc}\r\n\r\n".encode())
+        found.append(client)
+    return found
+
+
+def test_slow_clients_share_one_copy_of_a_file() -> None:
+    made: list[int] = []
+
+    def read() -> bytes:
+        made.append(1)
+        return bytes(16 << 20)
+
+    site = Site({"index.html": lambda: b"", "large": read})
+    server = serve(site)
+    with running(server) as address:
+        waiting = clients(address, "/large", 20)
+        assert [client.recv(8) for client in waiting] == [b"HTTP/1.1"] * 20  # all are being sent it
+        assert len(made) == 1
+        for client in waiting:
+            client.close()
+        for _ in range(100):
+            if not server._held:
+                break
+            time.sleep(0.1)
+        assert not server._held  # nobody keeps it
+        assert ask(address, "/large")[2] == bytes(16 << 20) and len(made) == 2
+
+
+def test_connections_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.modules["bitymi_ns.view.serve"], "MOST_CLIENTS", 3)
+    with served(Site({"index.html": lambda: b"", "large": lambda: bytes(16 << 20)})) as address:
+        waiting = clients(address, "/large", 3)
+        assert [client.recv(8) for client in waiting] == [b"HTTP/1.1"] * 3
+        said = b""
+        with suppress(ConnectionError):  # the answer is lost where the request comes after the end of the connection
+            said = clients(address, "/", 1)[0].recv(12)
+        assert said in (b"HTTP/1.1 503", b"")
+        waiting.pop().close()
+        for _ in range(100):
+            with suppress(ConnectionError, http.client.HTTPException):
+                if ask(address, "/")[0] == 200:
+                    break
+            time.sleep(0.1)
+        else:
+            pytest.fail("the place of a client that has gone is not free")
+        for client in waiting:
+            client.close()

@@ -19,6 +19,7 @@ from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.ranges import MOST
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.strategy import STATISTICS
+from bitymi_ns.trust import json_of
 
 EXTRA_STATE = "_extra_state"  # torch's name for what a module saves beside its tensors
 SCENE = "_model.scene."  # prefix of the scene's parameters
@@ -139,7 +140,7 @@ def check(state: Mapping[str, Any], scene: SceneConfig) -> list[str]:
         if (count := extra.get(name)) is not None:
             count.count(low)
     if (options := extra.get("train")) is not None:
-        options.text()
+        _check_options(options)
     if (run := extra.get("run")) is not None and run.table():
         _check_run(run, rows)
     for entry in (root["optimizers"], root.get("schedulers"), root.get("scalers")):
@@ -150,6 +151,13 @@ def check(state: Mapping[str, Any], scene: SceneConfig) -> list[str]:
     if not bool(torch.stack([drawable[f"scene.surfels.{name}"] for name in _GEOMETRY]).all(0).any()):
         raise Misfit(f"{broken[0]} holds numbers that are too large, or none, for every surfel")
     return broken
+
+
+def _check_options(options: Entry) -> None:
+    try:
+        Entry(json_of(options.text()), options.name).table()
+    except ValueError as error:
+        raise Misfit(f"{options.name} has to be a table of options as JSON") from error
 
 
 def _drawable(values: Tensor) -> Tensor:

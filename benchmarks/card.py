@@ -59,6 +59,7 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
         steps: of the runs of `train` and `nerfstudio`; None = the script's default.
     """
     length = [] if steps is None else ["--steps", str(steps)]
+    on_card = ("--runs", f"{steps or REFERENCE_STEPS}/1", "--device", "cuda", "--work", results / "runs")
     pytest = [sys.executable, "-m", "pytest", "-q", "-rfEs", "--tb=short", "-o", "faulthandler_timeout=60"]
     bundles = results / "bundles"
     large = ("--surfels", "150000", "--size", "1297x840")
@@ -82,7 +83,7 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
             Step("sanitizers", [sanitizer(tool, *CHECKED) for tool in SANITIZERS], 150),
         ],
         "train": of_each(
-            "", 600, lambda name: [page(name, "gpu_train.py", data / name, "--keep", bundles / name, *length)]
+            "", 600, lambda name: [page(name, "long.py", data / name, "--keep", bundles / name, *on_card)]
         ),
         "frames": [Step("frames", [page("frames", "gpu.py", "--runs", "100", "--surfels", *surfels, *bundled)], 200)],
         "gaussians": of_each(
@@ -121,6 +122,7 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
     }
 
 
+REFERENCE_STEPS = 30_000  # of a run of `train`
 GAUSSIANS = (300_000, 1_000_000)  # numbers that are trained to compare with
 
 

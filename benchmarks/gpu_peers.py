@@ -2,7 +2,7 @@
 """Compare with gsplat at equal quality on a card: train its Gaussians on the photographs of our bundles by its MCMC
 strategy, with several numbers of Gaussians, and draw both at the held-out cameras: PSNR beside ms per frame.
 
-Our bundles are those that `gpu_train.py --keep` left; `--train` trains the Gaussians first, from the same points, with
+Our bundles are those that `long.py --keep` left; `--train` trains the Gaussians first, from the same points, with
 the rates of gsplat's own example and the regularisation that the strategy asks for."""
 
 import sys

@@ -1,12 +1,15 @@
 #!/usr/bin/env python
-"""Compare rules of training on a CPU in long runs and in short ones: no default is chosen from short runs alone.
+"""Compare rules of training in long runs and in short ones, with the core packages alone (nerfstudio is not used): no
+default is chosen from short runs alone.
 
     python benchmarks/long.py DATA... --rows bitymi "bitymi train.texels.mean_rates=0.2" --runs 10000/4 1500/2 300/1
 
-A run is STEPS/REDUCTION: so many steps on photographs reduced by a whole factor. Long ones take 25 to 60 CPU minutes;
-start several commands with the same --work, they share the runs. Rounding alone moves PSNR by 0.1 dB: give --seeds."""
+A run is STEPS/REDUCTION: so many steps on photographs reduced by a whole factor. On a CPU a long one takes 25 to 60
+minutes of one core, on a card (--device cuda) one or two. Start several commands with the same --work, they share the
+runs. Rounding alone moves PSNR by 0.1 dB: give --seeds."""
 
 import contextlib
+import functools
 import itertools
 import math
 import shlex
@@ -28,6 +31,7 @@ from plain_capture import Capture, load_capture
 from torch import Tensor
 
 from bitymi_ns import bake_scene
+from bitymi_ns.bundle import read_bundle
 from bitymi_ns.files import Busy, Lock
 from bitymi_ns.measure.bench.cells import FILE, Cells, identity, provenance, without_nan
 from bitymi_ns.measure.machine import commit
@@ -54,9 +58,12 @@ COLUMNS = {
     "rollbacks": ("rollbacks", 0),
     "surfels": ("surfels", 0),
     "fragments per pixel": ("fragments", 1),
+    "CPU s": ("cpu_seconds", 0),
+    "s": ("seconds", 0),
+    "card MB": ("peak_megabytes", 0),
     "bundle dB": ("baked_psnr", 2),
     "kB": ("kilobytes", 0),
-    "CPU s": ("cpu_seconds", 0),
+    "bake s": ("bake_seconds", 0),
 }
 
 
@@ -71,11 +78,19 @@ class Run:
     seed: int
     photographs: int
     bake: bool
+    device: str
+    keep: Path | None = None  # folder in which the bundle stays
 
     @property
     def key(self) -> dict[str, Any]:
-        settings = {name: value for name, value in vars(self).items() if name != "row"}  # a cell's `row` is a label
+        names = ("steps", "reduction", "seed", "photographs", "bake")
+        settings = {name: getattr(self, name) for name in names} | {"device": device_name(self.device)}
         return {**settings, "data": Path(self.data).resolve().name, "settings": self.row, "commit": commit()}
+
+
+def device_name(device: str) -> str:
+    """Name the processor: the card's model, or cpu."""
+    return torch.cuda.get_device_name(device) if torch.device(device).type == "cuda" else "cpu"
 
 
 def preset_of(row: str) -> Preset:
@@ -123,10 +138,11 @@ class TexelWatch:
         if not 0 <= since <= WATCH or since % EVERY:
             return
         scene, config = self.trainer.scene, self.trainer.config
-        background = eval_background(config, "cpu")
+        device = scene.surfels["means"].device
+        background = eval_background(config, device)
         with torch.no_grad():
             pairs = [
-                (scene.render(view.camera, background, "frozen").rgb, view.target(background, "cpu"))
+                (scene.render(view.camera.to(device), background, "frozen").rgb, view.target(background, device))
                 for view in self.views
             ]
         losses = [photometric(*pair, config.loss.ssim_weight) for pair in pairs]
@@ -142,6 +158,9 @@ class TexelWatch:
         return found | {"back_after": back[0] if back else math.nan}
 
 
+load = functools.lru_cache(maxsize=1)(load_capture)
+
+
 def cut(capture: Capture, photographs: int) -> Capture:
     """Keep so many training photographs at most (0 = all), evenly spread; as many are held out as in the whole."""
     kept = spread(len(capture.train), photographs or len(capture.train))
@@ -152,14 +171,14 @@ def measure(run: Run) -> dict[str, Any]:
     """Train, and bake if that is asked for."""
     preset = preset_of(run.row)
     preset.train.seed = run.seed
-    capture = cut(load_capture(Path(run.data), run.reduction), run.photographs)
+    capture, device = cut(load(Path(run.data), run.reduction), run.photographs), torch.device(run.device)
     if capture.white:
         preset.train.alpha_color = "white"
     camera = capture.train[0].camera
     if preset.train.first_surfels is None:
         preset.train.first_surfels = first_surfels_for(run.steps, camera.width * camera.height)
     torch.manual_seed(run.seed)
-    scene = scene_for_views(capture.train, capture.points, capture.colours, preset.scene, preset.train)
+    scene = scene_for_views(capture.train, capture.points, capture.colours, preset.scene, preset.train).to(device)
     trainer = Trainer(scene, capture.train, preset.train, run.steps)
     watch, clock, before = TexelWatch(trainer, capture.train), trainer.training.clock, math.nan
     shown = {run.steps * i // 20 for i in range(1, 20)}
@@ -170,22 +189,29 @@ def measure(run: Run) -> dict[str, Any]:
         trainer.advance()
         if trainer.step in shown:
             say(f"step {trainer.step:,}: loss {trainer.loss:.4f}, {len(scene):,} surfels, {clock.cpu_seconds:.0f} s")
-    background = eval_background(preset.train, "cpu")
-    targets = [view.target(background, "cpu") for view in capture.held_out]
+    background = eval_background(preset.train, device)
+    targets = [view.target(background, device) for view in capture.held_out]
     rows = []
     for view, target in zip(capture.held_out, targets, strict=True):
         with torch.no_grad():
-            output = scene.render(view.camera, background, "frozen")
+            output = scene.render(view.camera.to(device), background, "frozen")
         rows.append(quality(output.rgb, target) | {"fragments": len(output.fragments) / (target.numel() / 3)})
     found = means(rows) | watch.figures()
     found |= {"before_texels": before, "surfels": len(scene), "rollbacks": trainer.training.guard.rollbacks}
-    found |= {"cpu_seconds": clock.cpu_seconds, "width": camera.width, "height": camera.height}
+    found |= {"cpu_seconds": clock.cpu_seconds, "seconds": clock.seconds}
+    found |= {"width": camera.width, "height": camera.height}
+    if device.type == "cuda":
+        found["peak_megabytes"] = torch.cuda.max_memory_allocated(device) / 1e6
     if run.bake:
+        say(f"PSNR {found['psnr']:.2f} dB, {len(scene):,} surfels; baking")
         with tempfile.TemporaryDirectory() as folder:
-            bundle = Path(folder) / "bundle"
-            baked = bake_scene(scene, capture.train, bundle, background=background)
+            bundle = (run.keep or Path(folder)) / f"{'-'.join(shlex.split(run.row))}-{run.steps}-{run.seed}"
+            start = time.perf_counter()
+            bake_scene(scene, capture.train, bundle, background=background, overwrite=True)
+            found["bake_seconds"] = time.perf_counter() - start
             found["kilobytes"] = sum(path.stat().st_size for path in bundle.iterdir()) / 1e3
-            drawn = (baked.render(view.camera).rgb for view in capture.held_out)
+            baked = read_bundle(bundle).scene.to(device)
+            drawn = (baked.render(view.camera.to(device), background).rgb for view in capture.held_out)
             figures = means([quality(*pair) for pair in zip(drawn, targets, strict=True)])
             found |= {f"baked_{name}": value for name, value in figures.items()}
     return found
@@ -216,8 +242,9 @@ def tables(runs: Sequence[Run], cells: Cells) -> str:
 def main() -> None:
     arguments = read_arguments()
     torch.set_num_threads(1)
+    rest = (arguments.bake or arguments.keep is not None, arguments.device, arguments.keep)
     runs = [
-        Run(str(data), row, *(int(x) for x in run.split("/")), seed, arguments.photographs, arguments.bake)
+        Run(str(data), row, *(int(x) for x in run.split("/")), seed, arguments.photographs, *rest)
         for data, run, row, seed in itertools.product(arguments.data, arguments.runs, arguments.rows, arguments.seeds)
     ]
     for row in arguments.rows:
@@ -246,6 +273,8 @@ def read_arguments() -> Namespace:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--photographs", type=int, default=0, help="train on so many photographs only; 0 = all")
     parser.add_argument("--bake", action="store_true", help="also bake: bytes, and quality of the bundle")
+    parser.add_argument("--keep", type=Path, help="bake, and keep the bundles in this folder")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda (%(default)s)")
     parser.add_argument("--work", type=Path, default=Path("outputs/long"), help="folder of the finished runs")
     parser.add_argument("--output", type=Path, help="file for the tables")
     return parser.parse_args()

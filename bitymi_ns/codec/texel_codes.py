@@ -15,6 +15,7 @@ from bitymi_ns.codec import streams
 from bitymi_ns.codec.limits import ALPHA_ONE, RESIDUAL_LIMIT
 from bitymi_ns.codec.pages import first_texels, size_classes
 from bitymi_ns.codec.surfel_codes import SurfelCodes
+from bitymi_ns.ops import backend
 
 BLOCK = 8  # side of the largest block that is transformed, texels
 GRADES = (-8, 24)  # range of the grades: a tile's step is the common one times 2^(grade / 2)
@@ -283,26 +284,22 @@ class TexelCoder:
     def _coefficients(self, texels: Tensor, means: Tensor, step: float, rounds: int) -> list[Tensor]:
         """Of every entry of the blocks, int32 [coefficients, B, C], of texels [T, C] and the means [N, C] of tiles."""
         of_tile, steps = means[self._sizes[:, 0] > 0], _steps(step, self.grades)
+        sparse_cosines = backend.kernel("sparse_cosines", texels)
+        options = {
+            "values": texels.contiguous(), "weights": self._weights, "mean": of_tile.contiguous(), "step": steps,
+            "mix": _CHANNELS[texels.shape[1]], "channels": texels.shape[1], "rounds": rounds, "shrink": SHRINK,
+        }  # fmt: skip
         coefficients = []
         for blocks in self._blocks:
-            step_of = steps[blocks.tile, None, None, None]
-            target = texels[blocks.texels] - of_tile[blocks.tile, None, None, :]
-            values = self._sparse(blocks, target, step_of, rounds) / step_of
-            coefficients.append(_ordered(blocks, torch.sign(values) * torch.floor(values.abs() + 0.5)))
+            width, height = blocks.size
+            codes = torch.empty(height * width, len(blocks.tile), texels.shape[1], dtype=torch.int32)
+            order = torch.tensor([k_v * width + k_u for k_v, k_u in blocks.order])
+            sparse_cosines(
+                **options, codes=codes, rows=blocks.texels, tile=blocks.tile, order=order,
+                height=height, width=width, down=_cosines(height), across=_cosines(width),
+            )  # fmt: skip
+            coefficients.append(codes)
         return coefficients
-
-    def _sparse(self, blocks: Blocks, target: Tensor, step: Tensor, rounds: int) -> Tensor:
-        values = _forward(target)
-        weight = self._weights[blocks.texels][..., None]
-        most = weight.amax(dim=(1, 2), keepdim=True)
-        threshold = SHRINK * step * weight.mean(dim=(1, 2), keepdim=True) / most
-        pull = weight / most
-        for _ in range(rounds):
-            values = values + _forward(pull * (target - _inverse(values)))
-            mean = values[:, 0, 0].clone()
-            values = torch.sign(values) * (values.abs() - threshold).clamp(min=0)
-            values[:, 0, 0] = mean
-        return values
 
 
 def _decoded(means: Tensor, coefficients: Sequence[Tensor], sizes: Tensor, steps: Tensor) -> Tensor:
@@ -333,25 +330,6 @@ def _cosines(count: int) -> Tensor:
     rows = np.cos(math.pi * (i + 0.5) * k / count) * math.sqrt(2.0 / count)
     rows[0] /= math.sqrt(2.0)
     return torch.from_numpy(rows.astype(np.float32))
-
-
-def _forward(texels: Tensor) -> Tensor:
-    """[B, k_v, k_u, channel] of [B, b_v, b_u, C]."""
-    v, u = _cosines(texels.shape[1]), _cosines(texels.shape[2])
-    across = torch.einsum("nvuc,lu->nvlc", texels @ _CHANNELS[texels.shape[3]].T, u)
-    return torch.einsum("kv,nvlc->nklc", v, across)
-
-
-def _inverse(values: Tensor) -> Tensor:
-    """[B, b_v, b_u, C] of [B, k_v, k_u, channel]."""
-    v, u = _cosines(values.shape[1]), _cosines(values.shape[2])
-    down = torch.einsum("kv,nklc->nvlc", v, values)
-    return torch.einsum("nvlc,lu->nvuc", down, u) @ _CHANNELS[values.shape[3]]
-
-
-def _ordered(blocks: Blocks, values: Tensor) -> Tensor:
-    rows, columns = zip(*blocks.order, strict=True)
-    return values[:, list(rows), list(columns)].transpose(0, 1).to(torch.int32).contiguous()
 
 
 def _basis(blocks: Blocks) -> Tensor:

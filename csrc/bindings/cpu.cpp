@@ -103,6 +103,7 @@ template <class S> void bind_operations(nb::module_& m) {
 #undef BT_BIND
   bind_tracer<S>(m);
   bind_operation(m, name("baked_forward"), &baked_forward<S>);
+  bind_operation(m, name("sparse_cosines"), &sparse_cosines<S>);
 }
 }  // namespace
 }  // namespace bt

@@ -13,6 +13,7 @@
 #include "cpu/threads.h"
 #include "ops/appearance.h"
 #include "ops/blend.h"
+#include "ops/cosine.h"
 #include "ops/field.h"
 #include "ops/texel.h"
 #include "ops/visibility.h"
@@ -24,6 +25,7 @@ void set_num_threads(int n);
 
 template <class S> void project_forward(const ProjectForward<S>& a);
 template <class S> void project_backward(const ProjectBackward<S>& a);
+template <class S> void sparse_cosines(const SparseCosines<S>& a);
 
 // Per tile, the visible surfels front to back, and of each the squared radius of its kernel's
 // level set, in scale units, and that of the low pass's in pixels, 0 where that is nowhere above the kernel.

@@ -1,0 +1,95 @@
+// Sparse cosine coefficients of blocks of texels: a lane for every block and channel.
+#include "ops/cosine.h"
+
+#include "cpu/kernels.h"
+#include "cpu/simd.h"
+
+namespace bt {
+
+namespace {
+constexpr int kArea = kCosines * kCosines;
+
+template <class S> class BlockLanes {
+  using P = Lanes<S>;
+
+ public:
+  explicit BlockLanes(const SparseCosines<S>& a) : a_(a), area_(a.height * a.width) {}
+
+  // Blocks and channels from `first` on, counted through: as many as there are lanes, or fewer at the end.
+  void run(int64_t first) {
+    const int count = int(std::min<int64_t>(kLanes, a_.blocks * a_.channels - first));
+    gather(first, count);
+    transform(target_, value_, false);
+    for (int round = 0; round < a_.rounds; ++round) {
+      transform(value_, texel_, true);
+      for (int i = 0; i < area_; ++i) texel_[i] = pull_[i] * (target_[i] - texel_[i]);
+      transform(texel_, change_, false);
+      value_[0] = value_[0] + change_[0];
+      for (int i = 1; i < area_; ++i) value_[i] = shrunk(value_[i] + change_[i]);
+    }
+    for (int k = 0; k < area_; ++k) {
+      const P x = value_[a_.order[k]] / step_, whole = floor_(max_(x, -x) + P(S(0.5)));
+      alignas(64) S steps[kLanes];
+      store(steps, select(x < P(S(0)), -whole, whole));
+      int32_t* to = a_.codes + k * a_.blocks * a_.channels + first;
+      for (int lane = 0; lane < count; ++lane) to[lane] = int32_t(steps[lane]);
+    }
+  }
+
+ private:
+  void gather(int64_t first, int count) {
+    alignas(64) S value[kLanes], weight[kLanes], step[kLanes];
+    P most(S(0)), sum(S(0));
+    for (int i = 0; i < area_; ++i) {
+      for (int lane = 0; lane < kLanes; ++lane) {
+        const int64_t item = first + std::min(lane, count - 1), block = item / a_.channels, tile = a_.tile[block];
+        const int64_t row = a_.rows[block * area_ + i];
+        const S* mix = a_.mix + item % a_.channels * a_.channels;
+        value[lane] = 0, weight[lane] = a_.weights[row], step[lane] = a_.step[tile];
+        for (int c = 0; c < a_.channels; ++c)
+          value[lane] += mix[c] * (a_.values[row * a_.channels + c] - a_.mean[tile * a_.channels + c]);
+      }
+      target_[i] = load(value), pull_[i] = load(weight);
+      most = max_(most, pull_[i]), sum = sum + pull_[i];
+    }
+    step_ = load(step);
+    threshold_ = P(a_.shrink / area_) * step_ * sum / most;
+    for (int i = 0; i < area_; ++i) pull_[i] = pull_[i] / most;
+  }
+  P shrunk(P x) const {
+    const P rest = max_(max_(x, -x) - threshold_, P(S(0)));
+    return select(x < P(S(0)), -rest, rest);
+  }
+  // Along u, then along v; `back`: by the transposed matrices.
+  void transform(const P* from, P* to, bool back) {
+    const int h = a_.height, w = a_.width;
+    for (int v = 0; v < h; ++v) product(a_.across, w, back, from + v * w, half_ + v * w, 1);
+    for (int u = 0; u < w; ++u) product(a_.down, h, back, half_ + u, to + u, w);
+  }
+  static void product(const S* matrix, int n, bool back, const P* from, P* to, int apart) {
+    const int by_row = back ? 1 : n, by_column = back ? n : 1;
+    for (int k = 0; k < n; ++k) {
+      P sum = P(matrix[k * by_row]) * from[0];
+      for (int i = 1; i < n; ++i) sum += P(matrix[k * by_row + i * by_column]) * from[i * apart];
+      to[k * apart] = sum;
+    }
+  }
+
+  const SparseCosines<S>& a_;
+  const int area_;
+  P step_, threshold_;
+  P target_[kArea], pull_[kArea], value_[kArea], texel_[kArea], change_[kArea], half_[kArea];
+};
+}  // namespace
+
+template <class S> void sparse_cosines(const SparseCosines<S>& a) {
+  const int64_t groups = (a.blocks * a.channels + kLanes - 1) / kLanes;
+  parallel_parts(groups, 8, [&](int, int64_t begin, int64_t end) {
+    BlockLanes<S> lanes(a);
+    for (int64_t group = begin; group < end; ++group) lanes.run(group * kLanes);
+  });
+}
+template void sparse_cosines(const SparseCosines<float>&);
+template void sparse_cosines(const SparseCosines<double>&);
+
+}  // namespace bt

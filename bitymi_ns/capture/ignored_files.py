@@ -33,9 +33,10 @@ FOLDERS = {
     "thumbnails": "thumbnails", "thumbs": "thumbnails", "sparse": "a model", "colmap": "a model", "dense": "a model",
     "stereo": "a model", "outputs": "outputs of training", "renders": "renders", "@eadir": "thumbnails",
     "segmentation": "segmentations", "segmentations": "segmentations", "semantic": "segmentations",
+    "exports": "exports", "wandb": "pictures of a log", "planar_projections": "pictures made of panoramas",
 }  # fmt: skip
 """Folders of a capture that hold no photographs, by their names in lower case, and what they hold."""
-FILES = {"thumbnail": "a thumbnail", "thumb": "a thumbnail"}
+FILES = {"thumbnail": "a thumbnail", "thumb": "a thumbnail", "material_0": "a texture"}
 """The same for files, without their endings, that lie beside folders of photographs."""
 
 

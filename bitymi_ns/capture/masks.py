@@ -9,7 +9,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from bitymi_ns.capture.photos import COPY
-from bitymi_ns.capture.recognise import PHOTOGRAPHS, open_picture
+from bitymi_ns.capture.pictures import PHOTOGRAPHS, open_picture
 from bitymi_ns.capture.types import CaptureError
 
 USUAL_FOLDERS = ("images", "input", "image", "photos", "photographs", "rgb", "color")

@@ -10,7 +10,8 @@ import pytest
 from PIL import Image
 
 from bitymi_ns.capture.photos import find_photos, photo_folder
-from bitymi_ns.capture.recognise import NotRecognised, image_count, models_in, passed_over, recognise
+from bitymi_ns.capture.pictures import passed_over
+from bitymi_ns.capture.recognise import NotRecognised, image_count, models_in, recognise
 
 POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 FRAME = {"file_path": "images/a.jpg", "transform_matrix": POSE}

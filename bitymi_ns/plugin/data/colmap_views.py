@@ -10,7 +10,8 @@ import numpy as np
 from nerfstudio.data.utils.colmap_parsing_utils import qvec2rotmat
 
 from bitymi_ns.capture.masks import USUAL_FOLDERS, downscaled_masks, mask_folder, mask_of
-from bitymi_ns.capture.recognise import is_photograph, photographs_below
+from bitymi_ns.capture.pictures import is_photograph, photographs_below
+from bitymi_ns.capture.results import result_in
 from bitymi_ns.capture.types import CaptureError, SfmSettings
 from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data.colmap_model import Model, ModelImage, read_model
@@ -137,7 +138,7 @@ def _photo_folder(
     if folder == capture:
         bases += folder.parents[:3]
     folders = [base / name for base in bases for name in USUAL_FOLDERS]
-    folders += [path for path in sorted(capture.iterdir()) if path.is_dir()]
+    folders += [path for path in sorted(capture.iterdir()) if path.is_dir() and not result_in(path)]
     folders += bases
 
     def with_copies(path: Path) -> list[Path]:

@@ -13,7 +13,8 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserCo
 from nerfstudio.utils.colors import get_color
 
 from bitymi_ns.capture.frame import read_frame
-from bitymi_ns.capture.recognise import Format, Found, NotRecognised, passed_over, recognise
+from bitymi_ns.capture.pictures import passed_over
+from bitymi_ns.capture.recognise import Format, Found, NotRecognised, recognise
 from bitymi_ns.capture.types import SfmSettings
 from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data import splits

@@ -9,7 +9,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 
-from bitymi_ns.capture.recognise import PHOTOGRAPHS
+from bitymi_ns.capture.pictures import PHOTOGRAPHS
+from bitymi_ns.capture.results import result_in
 from bitymi_ns.plugin.console import fail, listed
 from bitymi_ns.trust import leads_inside
 
@@ -123,7 +124,7 @@ class FileFinder:
 
     def _walk(self) -> Iterator[Path]:
         for folder, below, files in os.walk(self.folder):
-            below[:] = [name for name in below if not name.startswith(".")]
+            below[:] = [name for name in below if not name.startswith(".") and not result_in(Path(folder, name))]
             yield from (Path(folder, name) for name in files if name.lower().endswith(self.extensions))
 
 

@@ -12,7 +12,8 @@ import numpy.typing as npt
 from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.capture.masks import in_proportion
 from bitymi_ns.capture.photos import natural
-from bitymi_ns.capture.recognise import POLYCAM, Found, is_photograph
+from bitymi_ns.capture.pictures import is_photograph
+from bitymi_ns.capture.recognise import POLYCAM, Found
 from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.data.depth_files import maps_beside
 from bitymi_ns.plugin.data.find_files import check_photographs_exist

@@ -64,7 +64,7 @@ class Sfm:
         from bitymi_ns.progress import rich_progress
 
         if others := passed_over(self.source):
-            say(f"Not taken for photographs in {self.source}: {listed(others)}.", sys.stderr)
+            say(f"Not taken for photographs in {self.source}: {listed(others, most=12)}.", sys.stderr)
         with rich_progress() as progress:
             poses = find_poses(self.source, self.options, progress, lambda text: say(text, sys.stderr))
             if self.output is not None:

@@ -1,6 +1,8 @@
 """Photographs among the pictures of a folder, and what the others are."""
 
 import os
+import re
+from collections import defaultdict
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
@@ -43,10 +45,8 @@ def is_picture(path: Path) -> bool:
 
 def _no_photograph(path: Path) -> str:
     """Describe an image that is no photograph, by its name; empty = a photograph."""
-    stem = path.stem.lower()
-    if stem.startswith(DYNAMIC_MASK):
-        return "a mask of instant-ngp"
-    return "a depth map" if stem.endswith((".depth", "_depth", "-depth")) else ignored_files.FILES.get(stem, "")
+    matching = (what for pattern, what in ignored_files.FILES.items() if re.fullmatch(pattern, path.stem.lower()))
+    return next(matching, "")
 
 
 def no_photographs(folder: Path, beside: Collection[str] = ()) -> str:
@@ -102,23 +102,28 @@ def _skipped(parent: Path, below: Collection[str]) -> dict[str, str]:
 
 def passed_over(folder: Path, used: Collection[Path] | None = None) -> list[str]:
     """Describe the pictures in and below a folder that are not read: those that `photographs_below` leaves out, and
-    with the files that are `used` the other photographs."""
-    found = []
+    with the files that are `used`, the other photographs in folders with these and one level below."""
+    found, holding = [], {above for path in used or () for above in path.parents}
     for parent, below, names in os.walk(folder):
         skipped = _skipped(Path(parent), below)
         for name, what in skipped.items():
             count = 0 if what in ("", "hidden") else _pictures(Path(parent, name), used or ())
             if count:
                 found.append(f"{Path(parent, name).relative_to(folder)} ({count} {what})")
-        below[:] = [name for name, what in skipped.items() if not what]
+        searched = used is None or Path(parent) in holding  # a folder of captures may hold a whole disk
+        below[:] = [name for name, what in skipped.items() if searched and not what]
         read, unnamed = [name for name in names if is_picture(Path(parent, name))], []
+        alike: dict[str, list[Path]] = defaultdict(list)
         for path in (Path(parent, name) for name in sorted(read)):
             if used is not None and path in used:
                 continue
             if what := _no_photograph(path):
-                found.append(f"{path.relative_to(folder)} ({what})")
+                alike[what].append(path.relative_to(folder))
             elif used is not None:
                 unnamed.append(path.name)
+        for what, paths in alike.items():
+            more = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
+            found.append(f"{paths[0]}{more} ({what})")
         if unnamed:
             few = ", ".join(unnamed[:2]) + (", ..." if len(unnamed) > 2 else "")
             found.append(f"{len(unnamed)} pictures of {parent} that nothing names ({few})")

@@ -58,7 +58,7 @@ def find_poses(
     tell = progress or no_progress
     source, folder, names = _what(Path(source))
     check_names(folder, names)
-    masks = mask_folder(folder, source, options.masks) if folder.is_dir() else None
+    masks = mask_folder(folder, source, options.masks) if options.use_masks and folder.is_dir() else None
     if masks is not None and source.is_dir():
         below = masks / folder.relative_to(photo_folder(source))
         masks = below if below.is_dir() else masks
@@ -66,6 +66,7 @@ def find_poses(
     if masks is not None:
         inputs += [(f"masks/{p.relative_to(masks)}", p) for p in sorted(masks.rglob("*")) if p.is_file()]
     settings = {**asdict(options), "masks": masks is not None}
+    del settings["use_masks"]
     with work_folder(folder, content_key(inputs, settings), warn) as work:
         finished = _finished(work, folder)
         if finished is not None:

@@ -22,14 +22,16 @@ from bitymi_ns.reading import open_regular, open_text, read_bytes, read_json
 from bitymi_ns.trust import listed
 
 Format = Literal[
-    "nerfstudio", "instant-ngp", "blender", "colmap", "polycam", "record3d", "pose-files", "photographs", "video"
-]
+    "nerfstudio", "instant-ngp", "blender", "colmap", "polycam", "record3d", "3d-scanner", "stray-scanner",
+    "pose-files", "photographs", "video",
+]  # fmt: skip
 
 MODELS = ("sparse/0", "colmap/sparse/0", "sparse")  # usual folders of a COLMAP model in a capture, the most usual first
 NERFSTUDIOS_OWN = {"ply_file_path", "applied_transform", "camera_model", "orientation_override", "train_filenames"}
 """Entries of a transforms.json that only nerfstudio writes."""
 POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 """Folders of Polycam's images and their cameras, the better ones first."""
+STRAY = ("odometry.csv", "camera_matrix.csv", "rgb.mp4")  # files of Stray Scanner: poses, camera, video
 SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")  # files of a Blender data set
 INTRINSICS = {"fl_x", "fl_y", "cx", "cy", "w", "h"}
 
@@ -99,7 +101,13 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
         raise NotRecognised(_nothing(data, format, candidates))
     (chosen, path), *_ = fitting
     # photographs lie beside every capture: they are another capture only beside a video
-    others = tuple(each for each in candidates if each[1] != path and (each[0] != "photographs" or chosen == "video"))
+    others = tuple(
+        each
+        for each in candidates
+        if each[1] != path
+        and (each[0] != "photographs" or chosen == "video")
+        and (chosen != "stray-scanner" or each[1].name != STRAY[2])
+    )
     poses = tuple(ignored_files.poses_in(folder)) if chosen in ("photographs", "video") else ()
     return Found(chosen, path, path if chosen == "blender" else folder, others, poses)
 
@@ -172,6 +180,11 @@ def _scanned(folder: Path) -> Iterator[tuple[Format, Path]]:
         if _mentions(folder / name, b'"poses"'):
             yield "record3d", folder
             break
+    first = min(folder.glob("frame_*.json"), default=None)
+    if first is not None and _mentions(first, b'"cameraPoseARFrame"'):
+        yield "3d-scanner", folder
+    if (folder / STRAY[0]).is_file() and (folder / STRAY[1]).is_file():
+        yield "stray-scanner", folder
     colour = any((folder / name).is_dir() for name in ("color", "rgb", "images"))
     if (colour and any((folder / "pose").glob("*.txt"))) or any(folder.glob("*.pose.txt")):
         yield "pose-files", folder

@@ -70,7 +70,7 @@ class BitymiTrainerConfig(TrainerConfig):
     """By parameter group. Not in the help: the rates come from --pipeline.model.train.lr."""
 
     def __post_init__(self) -> None:
-        """Refuse a command line that names two captures: nerfstudio uses the first of them, without a word."""
+        """Refuse a command line that names two captures: nerfstudio uses the first of them silently."""
         datamanager = self.pipeline.datamanager
         dataparser = getattr(datamanager, "dataparser", None)
         default = getattr(type(dataparser), "data", None)

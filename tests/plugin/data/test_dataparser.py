@@ -318,7 +318,7 @@ def test_it_is_what_the_presets_read_with() -> None:
 
 @pytest.mark.parametrize("parser", ["bitymi-data", "nerfstudio-data", "blender-data"])
 def test_two_captures_are_refused(tmp_path: Path, parser: str) -> None:
-    """nerfstudio reads the first of them, without a word."""
+    """nerfstudio reads the first of them silently."""
     for first in ("--data", "--pipeline.datamanager.data"):
         with expect(rf"two are given: .*a \({first}\) and .*b \(--data after the name of the parser\). Leave out one"):
             parsed(first, str(tmp_path / "a"), parser, "--data", str(tmp_path / "b"))

@@ -183,7 +183,7 @@ def _scanned(folder: Path) -> Iterator[tuple[Format, Path]]:
     first = min(folder.glob("frame_*.json"), default=None)
     if first is not None and _mentions(first, b'"cameraPoseARFrame"'):
         yield "3d-scanner", folder
-    if (folder / STRAY[0]).is_file() and (folder / STRAY[1]).is_file():
+    if all((folder / name).is_file() for name in STRAY):
         yield "stray-scanner", folder
     colour = any((folder / name).is_dir() for name in ("color", "rgb", "images"))
     if (colour and any((folder / "pose").glob("*.txt"))) or any(folder.glob("*.pose.txt")):

@@ -92,8 +92,8 @@ def test_cameras_of_several_kinds_and_sizes_in_one_capture(mixed: Path, capsys: 
 def test_renders_of_photographs_are_not_taken_for_them(project: Path) -> None:
     """They have the same names, and their folder comes first by name."""
     (project / "shots").mkdir()
-    for name in ("maps/test/rgb", "maps/test/beta"):
-        shutil.copytree(project / "images", project / name)
+    shutil.copytree(project / "images", project / "maps/test/rgb")
+    (project / "maps/test/raw-depth").mkdir()
     (project / "images").rename(project / "shots/day")
     shown = load_any(project).train_dataset.image_filenames
     assert {path.parent for path in shown} == {project / "shots/day"}

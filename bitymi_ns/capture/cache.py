@@ -18,7 +18,8 @@ from bitymi_ns.trust import Refused, check_no_links, is_own, own_folder
 
 FOLDER = ".bitymi"
 OF = "of.json"  # file in a work folder with the source and the key of its content
-Kind = Literal["poses", "points"]  # first part of the name of a work folder: poses, or points of known poses
+Kind = Literal["poses", "points", "frames"]
+"""First part of the name of a work folder: poses, points of known poses, or frames of a video with known poses."""
 IN_USE = ".in-use-"  # prefix of the locks of processes that read from a work folder
 VERSION = 5  # increased where the same photographs and options give other poses than before, to invalidate cached ones
 

@@ -33,10 +33,14 @@ FOLDERS = {
     "thumbnails": "thumbnails", "thumbs": "thumbnails", "sparse": "a model", "colmap": "a model", "dense": "a model",
     "stereo": "a model", "outputs": "outputs of training", "renders": "renders", "@eadir": "thumbnails",
     "segmentation": "segmentations", "segmentations": "segmentations", "semantic": "segmentations",
+    "exports": "exports", "wandb": "pictures of a log", "planar_projections": "pictures made of panoramas",
 }  # fmt: skip
 """Folders of a capture that hold no photographs, by their names in lower case, and what they hold."""
-FILES = {"thumbnail": "a thumbnail", "thumb": "a thumbnail"}
-"""The same for files, without their endings, that lie beside folders of photographs."""
+FILES = {
+    r"thumb(nail)?(_\d+)?": "a thumbnail", r"material_0|textured_output": "a texture", r"dynamic_mask_.*":
+    "a mask of instant-ngp", r"depth_\d+|.*[._-]depth": "a depth map", r"conf_\d+": "a confidence map",
+}  # fmt: skip
+"""The same for files among photographs: patterns of their names in lower case, without their endings."""
 
 
 def poses_in(folder: Path) -> Iterator[tuple[Path, str]]:

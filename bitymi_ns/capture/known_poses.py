@@ -14,8 +14,8 @@ from PIL import Image
 from bitymi_ns.capture.cache import content_key, finished, replace_stale, work_folder
 from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.capture.photos import check_names, eight_bits, in_srgb, is_plain
+from bitymi_ns.capture.pictures import open_picture
 from bitymi_ns.capture.prepare import colmap_mask, emptied
-from bitymi_ns.capture.recognise import open_picture
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
 from bitymi_ns.capture.types import CaptureError

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from bitymi_ns.capture.photos import COPY
-from bitymi_ns.capture.recognise import PHOTOGRAPHS, open_picture
+from bitymi_ns.capture.pictures import DYNAMIC_MASK, PHOTOGRAPHS, open_picture
 from bitymi_ns.capture.types import CaptureError
 
 USUAL_FOLDERS = ("images", "input", "image", "photos", "photographs", "rgb", "color")
@@ -65,9 +65,10 @@ def mask_of(masks: Path, name: str) -> Path | None:
 
 
 def read_mask(path: Path) -> Image.Image:
-    """Read a mask as a 1-bit image, True where pixels count; see `mask_pixels`. Raises Pillow's errors."""
+    """Read a mask as a 1-bit image, True where pixels count; see `mask_pixels`. In masks of instant-ngp's name it is
+    the others that count. Raises Pillow's errors."""
     with open_picture(path) as image:
-        return Image.fromarray(mask_pixels(image))
+        return Image.fromarray(mask_pixels(image) ^ path.name.startswith(DYNAMIC_MASK))
 
 
 def mask_pixels(image: Image.Image) -> npt.NDArray[np.bool_]:

@@ -19,7 +19,7 @@ from PIL import ExifTags, Image, ImageCms, ImageOps
 
 from bitymi_ns.capture.camera import is_full_sphere
 from bitymi_ns.capture.exif import Exif, exposure_exif, read_exif
-from bitymi_ns.capture.recognise import is_photograph, open_picture, photographs_below
+from bitymi_ns.capture.pictures import is_photograph, open_picture, photographs_below
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.progress import Progress
 from bitymi_ns.reading import open_regular

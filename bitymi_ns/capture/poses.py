@@ -19,9 +19,11 @@ from bitymi_ns.capture.camera import SPHERICAL_MODEL, ColmapCamera, is_full_sphe
 from bitymi_ns.capture.frame import local_positions, move_to_world, write_frame
 from bitymi_ns.capture.masks import mask_folder
 from bitymi_ns.capture.photos import Photo, blurred, check_names, duplicates, find_photos, photo_folder, read_photos
+from bitymi_ns.capture.pictures import VIDEOS, videos_in
 from bitymi_ns.capture.prepare import IMAGES, colmap_masks, emptied, upright_photos
-from bitymi_ns.capture.recognise import VIDEOS, is_model
+from bitymi_ns.capture.recognise import is_model
 from bitymi_ns.capture.report import write_report
+from bitymi_ns.capture.results import refusal
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
 from bitymi_ns.capture.types import CaptureError, Poses, SfmOptions
@@ -56,7 +58,7 @@ def find_poses(
     tell = progress or no_progress
     source, folder, names = _what(Path(source))
     check_names(folder, names)
-    masks = mask_folder(folder, source, options.masks) if folder.is_dir() else None
+    masks = mask_folder(folder, source, options.masks) if options.use_masks and folder.is_dir() else None
     if masks is not None and source.is_dir():
         below = masks / folder.relative_to(photo_folder(source))
         masks = below if below.is_dir() else masks
@@ -64,6 +66,7 @@ def find_poses(
     if masks is not None:
         inputs += [(f"masks/{p.relative_to(masks)}", p) for p in sorted(masks.rglob("*")) if p.is_file()]
     settings = {**asdict(options), "masks": masks is not None}
+    del settings["use_masks"]
     with work_folder(folder, content_key(inputs, settings), warn) as work:
         finished = _finished(work, folder)
         if finished is not None:
@@ -80,11 +83,13 @@ def _what(source: Path) -> tuple[Path, Path, list[str]]:
         return source, source, []
     if not source.exists():
         raise CaptureError(f"{source} does not exist: name a folder of photographs, or a video")
+    if why := refusal(source):
+        raise CaptureError(why)
     if not source.is_dir():
         raise CaptureError(f"{source} is neither a folder of photographs nor a video ({', '.join(VIDEOS)})")
     folder = photo_folder(source)
     names = find_photos(folder)
-    videos = sorted(p for p in source.iterdir() if p.suffix.lower() in VIDEOS and not p.name.startswith("."))
+    videos = videos_in(source)
     if not names and len(videos) == 1:
         return videos[0], videos[0], []
     if len(names) < LEAST:

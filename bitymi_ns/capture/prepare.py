@@ -60,7 +60,8 @@ def colmap_masks(photos: Iterable[Photo], names: dict[str, str], masks: Path, ta
     found = [(photo, path) for photo in photos if (path := mask_of(masks, photo.name)) is not None]
     if not found:
         raise CaptureError(
-            f"no mask in {masks} belongs to a photograph: give them the photographs' names, as photo.png for photo.jpg"
+            f"no mask in {masks} belongs to a photograph: give them the photographs' names, as photo.png for "
+            "photo.jpg, or leave masks out (--use-masks False)"
         )
     for photo, path in found:
         colmap_mask(path, photo.name, (photo.width, photo.height)).save(target / f"{names[photo.name]}.png")

@@ -7,40 +7,33 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-import pillow_heif
-from PIL import Image
-
 from bitymi_ns.capture import ignored_files
+from bitymi_ns.capture.pictures import (
+    PHOTOGRAPHS,
+    VIDEOS,
+    folders_in,
+    has_photographs,
+    no_photographs,
+    passed_over,
+    videos_in,
+)
+from bitymi_ns.capture.results import refusal
 from bitymi_ns.reading import open_regular, open_text, read_bytes, read_json
 from bitymi_ns.trust import listed
 
 Format = Literal[
-    "nerfstudio", "instant-ngp", "blender", "colmap", "polycam", "record3d", "pose-files", "photographs", "video"
-]
+    "nerfstudio", "instant-ngp", "blender", "colmap", "polycam", "record3d", "3d-scanner", "stray-scanner",
+    "pose-files", "photographs", "video",
+]  # fmt: skip
 
-pillow_heif.register_heif_opener()  # so that Pillow opens all of these, whoever asks it to
-
-PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".avif", ".jp2")
-FORMATS_OF_PICTURES = (
-    "JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "HEIF", "AVIF", "JPEG2000", "GIF", "PPM", "TGA"
-)  # fmt: skip
-"""Formats of photographs and masks by Pillow's names, whatever the file name. EPS, among others, is excluded: it is a
-program that Ghostscript runs."""
-VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp")
 MODELS = ("sparse/0", "colmap/sparse/0", "sparse")  # usual folders of a COLMAP model in a capture, the most usual first
 NERFSTUDIOS_OWN = {"ply_file_path", "applied_transform", "camera_model", "orientation_override", "train_filenames"}
 """Entries of a transforms.json that only nerfstudio writes."""
 POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 """Folders of Polycam's images and their cameras, the better ones first."""
+STRAY = ("odometry.csv", "camera_matrix.csv", "rgb.mp4")  # files of Stray Scanner: poses, camera, video
 SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")  # files of a Blender data set
 INTRINSICS = {"fl_x", "fl_y", "cx", "cy", "w", "h"}
-
-
-def open_picture(file: Path) -> Image.Image:
-    """Open a photograph or mask with Pillow; raises Pillow's errors, and those of `open_regular`."""
-    open_regular(file).close()
-    Image.init()  # Pillow knows AVIF from a version on
-    return Image.open(file, formats=[name for name in FORMATS_OF_PICTURES if name in Image.OPEN])
 
 
 class NotRecognised(ValueError):
@@ -91,6 +84,8 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
         if format not in ("auto", "colmap"):
             raise NotRecognised(f"--colmap-path is for COLMAP models: leave out --format {format}, or the path.")
         return _colmap_given(data, colmap_path)
+    if why := refusal(data):
+        raise NotRecognised(why)
     folder = data if data.is_dir() else data.parent
     candidates = list(_in_folder(data) if data.is_dir() else _of_file(data))
     fitting = [each for each in candidates if format in ("auto", each[0])]
@@ -106,7 +101,13 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
         raise NotRecognised(_nothing(data, format, candidates))
     (chosen, path), *_ = fitting
     # photographs lie beside every capture: they are another capture only beside a video
-    others = tuple(each for each in candidates if each[1] != path and (each[0] != "photographs" or chosen == "video"))
+    others = tuple(
+        each
+        for each in candidates
+        if each[1] != path
+        and (each[0] != "photographs" or chosen == "video")
+        and (chosen != "stray-scanner" or each[1].name != STRAY[2])
+    )
     poses = tuple(ignored_files.poses_in(folder)) if chosen in ("photographs", "video") else ()
     return Found(chosen, path, path if chosen == "blender" else folder, others, poses)
 
@@ -114,10 +115,10 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
 def _capture_within(folder: Path, format: Format | Literal["auto"]) -> Path | None:
     """Find the one subfolder that is a capture with poses, as archives unpack to; None = none or several, or
     photographs beside it."""
-    if _has_photographs(folder):
+    if has_photographs(folder):
         return None
     found = []
-    for path in sorted(path for path in folder.iterdir() if path.is_dir() and _may_hold_photographs(path.name)):
+    for path in sorted(path for path in folder.iterdir() if path.is_dir() and not no_photographs(path)):
         candidates = [*_transforms_in(path), *_scanned(path)]
         if any(format in ("auto", each) for each, _ in candidates):
             found.append(path)
@@ -145,8 +146,7 @@ def _in_folder(folder: Path) -> Iterator[tuple[Format, Path]]:
     photographs = _photographs_in(folder)
     if photographs is not None:
         yield "photographs", photographs
-    for video in sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEOS and path.is_file()):
-        yield "video", video
+    yield from (("video", video) for video in videos_in(folder))
 
 
 def _transforms_in(folder: Path) -> Iterator[tuple[Format, Path]]:
@@ -180,6 +180,11 @@ def _scanned(folder: Path) -> Iterator[tuple[Format, Path]]:
         if _mentions(folder / name, b'"poses"'):
             yield "record3d", folder
             break
+    first = min(folder.glob("frame_*.json"), default=None)
+    if first is not None and _mentions(first, b'"cameraPoseARFrame"'):
+        yield "3d-scanner", folder
+    if all((folder / name).is_file() for name in STRAY):
+        yield "stray-scanner", folder
     colour = any((folder / name).is_dir() for name in ("color", "rgb", "images"))
     if (colour and any((folder / "pose").glob("*.txt"))) or any(folder.glob("*.pose.txt")):
         yield "pose-files", folder
@@ -238,9 +243,9 @@ def image_count(model: Path) -> int:
 def _photographs_in(folder: Path) -> Path | None:
     """Choose the folder to search for photographs: this one where they lie in it or in its `images`, else the only
     subfolder with photographs, else this one. None = none, or captures of their own."""
-    if _has_photographs(folder) or _has_photographs(folder / "images", below=True):
+    if has_photographs(folder) or has_photographs(folder / "images", below=True):
         return folder
-    holding = [path for path in _folders_in(folder) if _has_photographs(path, below=True)]
+    holding = [path for path in folders_in(folder) if has_photographs(path, below=True)]
     if not holding or captures_in(folder):
         return None
     return _photographs_in(holding[0]) if len(holding) == 1 else folder
@@ -248,83 +253,8 @@ def _photographs_in(folder: Path) -> Path | None:
 
 def captures_in(folder: Path) -> list[Path]:
     """List subfolders that are captures of their own: several of them have `images` with photographs."""
-    found = [path for path in _folders_in(folder) if _has_photographs(path / "images", below=True)]
+    found = [path for path in folders_in(folder) if has_photographs(path / "images", below=True)]
     return found if len(found) > 1 else []
-
-
-def _folders_in(folder: Path) -> list[Path]:
-    names = [path.name for path in folder.iterdir() if path.is_dir()]
-    return sorted(folder / name for name in names if _may_hold_photographs(name) and not _copies(name, names))
-
-
-def _may_hold_photographs(name: str) -> bool:
-    return not name.startswith(".") and name.lower() not in ignored_files.FOLDERS
-
-
-def _has_photographs(folder: Path, below: bool = False) -> bool:
-    if not folder.is_dir():
-        return False
-    return any(True for _ in photographs_below(folder)) if below else any(map(is_photograph, folder.iterdir()))
-
-
-def photographs_below(folder: Path) -> Iterator[Path]:
-    """Yield the photographs in and below a folder, without hidden folders and those of other content."""
-    for parent, below, names in os.walk(folder):
-        below[:] = sorted(name for name in below if _may_hold_photographs(name) and not _copies(name, below))
-        for name in names:
-            path = Path(parent, name)
-            if is_photograph(path):
-                yield path
-
-
-def _copies(name: str, beside: list[str]) -> str:
-    """Describe the copies that a folder holds of images in a folder beside it, by its name; empty = none."""
-    if f"corrected_{name}" in beside:
-        return "raw copies of corrected pictures"
-    original, _, factor = name.rpartition("_")
-    return "reduced copies" if factor in ("2", "4", "8", "16") and original in beside else ""
-
-
-def passed_over(folder: Path) -> list[str]:
-    """Describe the images that `photographs_below` leaves out."""
-    found = []
-    for parent, below, names in os.walk(folder):
-        for name in sorted(below):
-            what = ignored_files.FOLDERS.get(name.lower()) or _copies(name, below)
-            if what and _pictures(Path(parent, name)):
-                found.append(f"{Path(parent, name).relative_to(folder)} ({_pictures(Path(parent, name))} {what})")
-        below[:] = sorted(name for name in below if _may_hold_photographs(name) and not _copies(name, below))
-        for name in sorted(names):
-            path = Path(parent, name)
-            if is_picture(path) and not is_photograph(path):
-                found.append(f"{path.relative_to(folder)} ({_beside(path)})")
-        read = [name for name in names if is_picture(Path(parent, name))]
-        for ending, count in ignored_files.pictures_among(names, read).items():
-            found.append(f"{count} {ending} of {parent} ({ignored_files.PICTURES[ending]}, which is not read)")
-    return found
-
-
-def _pictures(folder: Path) -> int:
-    try:
-        return sum(is_picture(path) for path in folder.iterdir())
-    except OSError:  # it may not be read, and need not be
-        return 0
-
-
-def is_photograph(path: Path) -> bool:
-    """Test for an image that is not a depth map or thumbnail."""
-    return is_picture(path) and not _beside(path)
-
-
-def _beside(path: Path) -> str:
-    """Describe an image that is no photograph, by its name; empty = a photograph."""
-    stem = path.stem.lower()
-    return "a depth map" if stem.endswith((".depth", "_depth", "-depth")) else ignored_files.FILES.get(stem, "")
-
-
-def is_picture(path: Path) -> bool:
-    """Test for a file with the extension of a photograph that is not hidden."""
-    return path.suffix.lower() in PHOTOGRAPHS and not path.name.startswith(".") and path.is_file()
 
 
 def _colmap_given(data: Path, colmap_path: Path) -> Found:
@@ -346,6 +276,8 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
         there = f" It holds {held}: leave --format out." if candidates else ""
         return f"{data} holds nothing of the format {format}.{there}"
     if not data.is_dir():
+        if data.suffix.lower() == ".bitymi":
+            return f"{data} is a bundle in one file, not a capture: give the folder of its photographs."
         if data.suffix.lower() in (".zip", ".tar", ".7z", ".gz", ".rar"):
             return f"{data} is an archive. Unpack it, and give the folder."
         if data.suffix.lower() in PHOTOGRAPHS:
@@ -368,6 +300,8 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
     archive = next((path for path in sorted(data.iterdir()) if path.suffix.lower() in (".zip", ".tar", ".7z")), None)
     if archive is not None and not several:
         hint = f" Unpack {archive.name} first."
+    if not hint and (others := passed_over(data)):
+        hint = f" It holds what is not taken for photographs: {listed(others)}."
     return (
         f"{data} holds nothing to train on: no transforms.json, no transforms_train.json, no COLMAP model (sparse/0), "
         f"no photographs and no video.{hint}"

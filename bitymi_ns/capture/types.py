@@ -46,6 +46,7 @@ class SfmOptions(SfmSettings):
     masks: Path | None = None
     """Folder of masks; features are found where they are not black. None = `masks` beside the photographs or in their
     folder, if there is one."""
+    use_masks: bool = True  # Use masks; else a folder of them is ignored.
 
     def __post_init__(self) -> None:
         least = {"max_image_size": 200, "max_features": 100, "frames": 3, "focal_length": 1}

@@ -10,14 +10,16 @@ import av
 import numpy as np
 from PIL import Image
 
+from bitymi_ns.capture.cache import content_key, finished, work_folder
 from bitymi_ns.capture.hdr import is_hdr, tone_mapped
 from bitymi_ns.capture.photos import sharpness
 from bitymi_ns.capture.prepare import IMAGES, JPEG_QUALITY
 from bitymi_ns.capture.types import CaptureError
-from bitymi_ns.files import complete_folder
+from bitymi_ns.files import Tell, complete_folder, explained, write_file
 from bitymi_ns.progress import Progress
 from bitymi_ns.reading import open_regular
 
+DONE = "frames"  # file that is written when all frames are
 SMALL = 160  # longer side of frames for measuring motion, pixels
 FINE = 640  # longer side of frames for measuring sharpness, pixels
 STRIDE = 0.08  # motion between extracted frames, in units of the longer side: neighbors share about 90 %
@@ -32,9 +34,37 @@ TRUSTED = {
 LEAST_SURVEYED = 60  # frames surveyed at least, where there are so many: all of a clip of a second or two
 
 
-def extract_frames(video: Path, work: Path, count: int | None, progress: Progress) -> Path:
+def frames_with_poses(video: Path, poses: int, progress: Progress, tell: Tell) -> Path:
+    """Write the frames of a video whose camera is known, as they are stored; see `extract_frames`. They are kept beside
+    the video.
+
+    Args:
+        poses: number of frames with a pose.
+
+    Raises:
+        CaptureError: it cannot be read, or has another number of frames.
+    """
+    key = content_key([(video.name, video)], "frames")
+    done = finished(video.parent, key, DONE, "frames")
+    if done is not None:
+        return done / IMAGES
+    total = _pace(video)[2]
+    if abs(total - poses) > max(2, poses // 100):
+        raise CaptureError(
+            f"{video} has {total} frames, but {poses} poses: which belong together is unknown. Export the capture "
+            f"again, or have poses computed: `bitymi-data --data {video}`"
+        )
+    with work_folder(video.parent, key, tell, "frames") as work:
+        with explained(work, CaptureError):
+            extract_frames(video, work, None, progress, upright=False)
+            write_file(work / DONE, b"")
+        return work / IMAGES
+
+
+def extract_frames(video: Path, work: Path, count: int | None, progress: Progress, upright: bool = True) -> Path:
     """Write `count` frames of a video, or one per STRIDE of motion, as JPEGs to the folder `images` in the work folder,
-    which is whole or not there.
+    which is whole or not there: frame_000012.jpg is number 12, counted from 0. They are turned `upright`, or as they
+    are stored.
 
     Raises:
         CaptureError: it cannot be read, or nothing moves in it.
@@ -59,7 +89,7 @@ def extract_frames(video: Path, work: Path, count: int | None, progress: Progres
         shape = _shape_of_pixels(video)
         wanted_frames = islice((each for each in _frames(video) if each[0] in numbers), len(numbers))
         for written, (number, frame, turn) in enumerate(wanted_frames, 1):
-            image = _upright(frame, turn, shape)
+            image = _upright(frame, turn if upright else 0, shape)
             image.save(folder / f"frame_{number:06d}.jpg", quality=JPEG_QUALITY, subsampling=0)
             progress("writing frames", written, len(numbers))
     return target

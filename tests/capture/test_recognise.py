@@ -10,7 +10,8 @@ import pytest
 from PIL import Image
 
 from bitymi_ns.capture.photos import find_photos, photo_folder
-from bitymi_ns.capture.recognise import NotRecognised, image_count, models_in, passed_over, recognise
+from bitymi_ns.capture.pictures import passed_over
+from bitymi_ns.capture.recognise import NotRecognised, image_count, models_in, recognise
 
 POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 FRAME = {"file_path": "images/a.jpg", "transform_matrix": POSE}
@@ -214,6 +215,18 @@ def test_pictures_that_are_no_photographs_are_named(tmp_path: Path) -> None:
     for folder in ("outputs/room/bitymi", "renders", "@eaDir/a.jpg"):
         photograph(tmp_path / folder, "SYNOPHOTO_THUMB_XL.jpg")
     assert find_photos(tmp_path) == ["rgb/1.jpg"]
+
+
+def test_pictures_among_photographs_that_are_none(tmp_path: Path) -> None:
+    for name in ("IMG_1.jpg", "depth_00001.png", "depth_00002.png", "conf_00001.png", "dynamic_mask_IMG_1.png"):
+        Image.new("L", (8, 8)).save(tmp_path / name)
+    Image.new("L", (8, 8)).save(tmp_path / "conf.png")
+    assert find_photos(tmp_path) == ["conf.png", "IMG_1.jpg"]
+    assert passed_over(tmp_path) == [
+        "conf_00001.png (a confidence map)",
+        "depth_00001.png and 1 more (a depth map)",
+        "dynamic_mask_IMG_1.png (a mask of instant-ngp)",
+    ]
 
 
 @pytest.mark.parametrize("wrapped", ["room", "room/room"])

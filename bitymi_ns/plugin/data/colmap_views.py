@@ -9,12 +9,14 @@ from typing import Literal
 import numpy as np
 from nerfstudio.data.utils.colmap_parsing_utils import qvec2rotmat
 
-from bitymi_ns.capture.masks import USUAL_FOLDERS, downscaled_masks, mask_folder, mask_of
-from bitymi_ns.capture.recognise import is_photograph, photographs_below
+from bitymi_ns.capture.masks import USUAL_FOLDERS, downscaled_masks, mask_folder
+from bitymi_ns.capture.pictures import is_photograph, photographs_below
+from bitymi_ns.capture.results import result_in
 from bitymi_ns.capture.types import CaptureError, SfmSettings
 from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data.colmap_model import Model, ModelImage, read_model
 from bitymi_ns.plugin.data.find_files import FileFinder, renamed_message
+from bitymi_ns.plugin.data.mask_files import LEAVE_OUT, masks_named
 from bitymi_ns.plugin.data.point_files import Points
 from bitymi_ns.plugin.data.views import OPENCV_AXES, Photograph, Pose
 from bitymi_ns.trust import leads_inside
@@ -75,7 +77,7 @@ class Source:
         text = f"COLMAP model {self.folder} ({len(model.images)} photographs, {cameras} camera"
         text += f"{'s' if len(used) > 1 else ''}, {len(model.xyz):,} points), photographs {self.image_folder}"
         if self.masks is not None:
-            text += f", masks {self.masks}"
+            text += f", masks {self.masks} ({LEAVE_OUT})"
         if self.downscale > 1 and self.copies is None:
             text += f", reduced {self.downscale} times as they are read"
         return text
@@ -137,7 +139,7 @@ def _photo_folder(
     if folder == capture:
         bases += folder.parents[:3]
     folders = [base / name for base in bases for name in USUAL_FOLDERS]
-    folders += [path for path in sorted(capture.iterdir()) if path.is_dir()]
+    folders += [path for path in sorted(capture.iterdir()) if path.is_dir() and not result_in(path)]
     folders += bases
 
     def with_copies(path: Path) -> list[Path]:
@@ -192,23 +194,15 @@ def mask_files(source: Source) -> list[Path] | None:
     """
     if source.masks is None:
         return None
-    names = [_name_in(source.image_folder, path) for path in source.files()]
-    found = {name: mask_of(source.masks, name) for name in names}
-    missing = [name for name, file in found.items() if file is None]
-    if missing:
-        fail(
-            f"{source.masks} has no mask of {listed(missing)}, but of others. Give every photograph a mask of its name "
-            "with .png (a white picture lets all pixels count), or move the folder away."
-        )
-    return [file for name in names if (file := found[name]) is not None]
+    return masks_named(source.masks, [_name_in(source.image_folder, path) for path in source.files()])
 
 
 def _name_in(folder: Path, path: Path) -> str:
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name
 
 
-def warn_of_left_out(source: Source) -> None:
-    """Report photographs that the model lacks, and those that have other names than it states."""
+def warn_of_left_out(source: Source) -> set[Path]:
+    """Report photographs that the model lacks, and those that have other names than it states. Returns all of these."""
     files = source.files()
     other = renamed_message([image.name for image in source.model.images], files, source.image_folder)
     if other:
@@ -224,6 +218,7 @@ def warn_of_left_out(source: Source) -> None:
             f"{len(unused)} of {len(used) + len(unused)} photographs have no pose in the model and are left out: "
             f"{listed(named)}."
         )
+    return {*files, *(source.photographs / name for name in names)}
 
 
 def model_photographs(source: Source, need_photos: bool) -> list[Photograph]:

@@ -13,7 +13,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserCo
 from nerfstudio.utils.colors import get_color
 
 from bitymi_ns.capture.frame import read_frame
-from bitymi_ns.capture.recognise import Format, Found, NotRecognised, passed_over, recognise
+from bitymi_ns.capture.recognise import Format, Found, NotRecognised, recognise
 from bitymi_ns.capture.types import SfmSettings
 from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data import splits
@@ -27,7 +27,7 @@ from bitymi_ns.plugin.data.colmap_views import (
     warn_of_left_out,
 )
 from bitymi_ns.plugin.data.depth import DepthKind
-from bitymi_ns.plugin.data.find_files import check_photographs_exist
+from bitymi_ns.plugin.data.find_files import check_photographs_exist, name_unused
 from bitymi_ns.plugin.data.initial_points import (
     COLMAP_CONVENTIONS,
     JSON_CONVENTIONS,
@@ -38,26 +38,25 @@ from bitymi_ns.plugin.data.initial_points import (
     read_colored_points,
     with_colors,
 )
+from bitymi_ns.plugin.data.mask_files import check_masks, with_masks
 from bitymi_ns.plugin.data.scanner_views import scanner_photographs
 from bitymi_ns.plugin.data.sfm_poses import KeptPoses, find_sfm_source, kept_source, read_kept_poses
 from bitymi_ns.plugin.data.splits import NameLists, Split
-from bitymi_ns.plugin.data.transforms import check_number, colmap_points
+from bitymi_ns.plugin.data.transforms import applied_transform, check_number, colmap_points
 from bitymi_ns.plugin.data.transforms_views import Transforms, read_transforms
 from bitymi_ns.plugin.data.views import (
     FrameOptions,
     Orientation,
     Photograph,
-    Pose,
     Views,
     fit_scale,
     make_views,
     photograph_files,
     select_views,
 )
-from bitymi_ns.reading import read_text, reading
 
 WITH_MODEL = ("colmap", "photographs", "video")  # formats that are read as a COLMAP model
-SCANNED = ("polycam", "record3d", "pose-files")  # formats of scanning programs, with their poses
+SCANNED = ("polycam", "record3d", "3d-scanner", "stray-scanner", "pose-files")  # with poses of scanners
 OPTION_FORMATS: dict[str, tuple[str, ...]] = {
     "colmap_path": ("colmap",),
     "images_path": ("colmap",),
@@ -80,7 +79,7 @@ BLENDER_SIDE = 1.5  # half the side of the box of a Blender data set, as in nerf
 @dataclass
 class BitymiDataParserConfig(FrameOptions, DataParserConfig):
     """Reads what --data holds: a transforms.json of nerfstudio or instant-ngp, a COLMAP project, a Blender data set,
-    an export of Polycam, Record3D or an RGB-D camera, a folder of photographs, or a video."""
+    an export of Polycam, Record3D, 3D Scanner App, Stray Scanner or an RGB-D camera, photographs, or a video."""
 
     _target: type = field(default_factory=lambda: BitymiDataParser)
     data: Path = Path()
@@ -94,6 +93,8 @@ class BitymiDataParserConfig(FrameOptions, DataParserConfig):
     masks_path: Path | None = None
     """Folder of masks for a COLMAP model or photographs, relative to --data; None = `masks` beside the photographs, in
     their folder or in that of the data."""
+    use_masks: bool = True
+    """Use the masks of the capture: those that it names, or those beside its photographs."""
     colmap_path: Path | None = None
     """Folder of the COLMAP model, relative to --data; None = find it."""
     ply_path: Path | None = None
@@ -154,10 +155,15 @@ class BitymiDataParserConfig(FrameOptions, DataParserConfig):
         """Read a JSON file of a nerfstudio, instant-ngp or Blender capture; `name` of the file for the latter. See
         `read_transforms`."""
         path = found.folder / name if found.format == "blender" else found.path
-        return read_transforms(path, found.format == "nerfstudio", self.downscale_factor or 1, need_photos)
+        own_format, downscale = found.format == "nerfstudio", self.downscale_factor or 1
+        return read_transforms(path, own_format, downscale, need_photos, self.use_masks)
 
     def source(self, found: Found, need_photos: bool = True) -> Source:
         """Find the COLMAP model and its photographs, by structure from motion for photographs without poses."""
+        source = self._source(found, need_photos)
+        return source if self.use_masks else replace(source, masks=None)
+
+    def _source(self, found: Found, need_photos: bool) -> Source:
         downscale = self.downscale_factor or 1
         if found.format == "colmap":
             return find_source(found.path, found.folder, self.images_path, self.masks_path, downscale, need_photos)
@@ -166,7 +172,7 @@ class BitymiDataParserConfig(FrameOptions, DataParserConfig):
             return kept_source(found, kept, self.masks_path, downscale, need_photos)
         if self.poses is not None:
             warn(f"The poses that the run was trained with are no longer in {self.poses}: others can be found now.")
-        return find_sfm_source(found, self.masks_path, downscale, self.sfm)
+        return find_sfm_source(found, self.masks_path, downscale, self.sfm, self.use_masks)
 
 
 class BitymiDataParser(DataParser):
@@ -238,6 +244,7 @@ class BitymiDataParser(DataParser):
         read = config.transforms(found, "", need_photos)
         if need_photos:
             check_photographs_exist(read.path, read.files)
+            check_masks(read.photographs)
         meta, frame = read.meta, config
         if found.format == "instant-ngp":  # whose scale is that of its bounding box
             half = 0.5 * check_number(read.path, "aabb_scale", meta.get("aabb_scale", 1), "for all frames")
@@ -252,7 +259,7 @@ class BitymiDataParser(DataParser):
             frame = replace(frame, orientation_method=meta["orientation_override"])
             say(f"{read.path} asks for the orientation method {frame.orientation_method}.")
         model = colmap_points(found.path)
-        applied = _applied_transform(meta, found.folder)
+        applied = applied_transform(meta, found.folder)
         what = f"{found.path} ({found.format}, {len(read.photographs)} photographs)"
         own = None
         if config.points == "auto":
@@ -264,6 +271,8 @@ class BitymiDataParser(DataParser):
                 own = with_colors(own, read_model(model).without_colors, read.photographs, model)
                 what += f", points of {model}"
         self._report(found, what)
+        if need_photos:
+            name_unused(found.folder, read.named, config.downscale_factor)
         if own is not None and need_photos and points_wanted():
             check_conventions(own, read.photographs, JSON_CONVENTIONS, str(found.path))
         views = make_views(
@@ -288,25 +297,30 @@ class BitymiDataParser(DataParser):
         if need_photos and found.format == "colmap":
             check_photographs_exist(found.path, source.files())
         self._report(found, source.describe())
-        if need_photos:
-            warn_of_left_out(source)
+        named = warn_of_left_out(source) if need_photos else set()
         photographs, where = model_photographs(source, need_photos), str(source.folder)
+        if need_photos:
+            check_masks(photographs)
+        if need_photos and found.format == "colmap":
+            name_unused(found.folder, {*named, *(each.mask for each in photographs)}, config.downscale_factor)
         own = model_points(model, TO_NERFSTUDIO)
         if need_photos and points_wanted() and config.points == "auto":
             own = with_colors(own, model.without_colors, photographs, source.folder)
             check_conventions(own, photographs, COLMAP_CONVENTIONS, where, TO_NERFSTUDIO)
         points = initial_points(own, config.points, photographs, found.folder, where)
         views = make_views(photographs, config, points, where, source.downscale, need_photos, applied=TO_NERFSTUDIO)
-        return views, _list_files(found.folder)
+        return views, splits.list_files(found.folder)
 
     def _scanned(self, found: Found) -> tuple[Views, NameLists]:
         """Read all views of a scanning program."""
         config, need_photos = self.config, self._need_photos
         photographs = scanner_photographs(found, need_photos)
         self._report(found, f"{found.path} ({found.format}, {len(photographs)} photographs with their poses)")
-        others = passed_over(found.path)
-        if others and need_photos:
-            say(f"Not taken for photographs: {listed(others)}.")
+        if need_photos:
+            if config.use_masks:
+                photographs = with_masks(photographs, found.folder)
+            check_masks(photographs)
+            name_unused(found.folder, {file for each in photographs for file in (each.file, each.mask)})
         points = initial_points(None, config.points, photographs, found.folder, str(found.path))
         downscale = config.downscale_factor or 1
         return make_views(photographs, config, points, str(found.path), downscale, need_photos), {}
@@ -319,12 +333,17 @@ class BitymiDataParser(DataParser):
         if need_photos:
             check_photographs_exist(train.path, train.files)
         parts: dict[str, list[Photograph]] = {"train": train.photographs}
+        named = set(train.named)
         for name in ("val", "test"):
             if (found.path / f"transforms_{name}.json").is_file():
                 part = config.transforms(found, f"transforms_{name}.json", need_photos)
                 parts[name] = _existing(part) if need_photos else part.photographs
+                named |= part.named
         there = [name for name in ("val", "test") if parts.get(name)]
         self._report(found, f"{train.path} (blender, {len(train.photographs)} photographs)")
+        if need_photos:
+            check_masks([each for part in parts.values() for each in part])
+            name_unused(found.folder, named, config.downscale_factor)
         own = None
         if config.ply_path is not None and config.points == "auto":
             own = read_colored_points(found.path / config.ply_path, "leave --ply-path out", train.photographs)
@@ -360,14 +379,6 @@ class BitymiDataParser(DataParser):
         say(text.rstrip())
 
 
-def _applied_transform(meta: dict[str, Any], folder: Path) -> Pose | None:
-    """Read [4, 4] that was applied to a nerfstudio capture before its file was written; None = unknown."""
-    rows = meta.get("applied_transform")
-    if rows is None and (folder / "colmap/sparse/0").is_dir():
-        rows = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]  # nerfstudio's tool applied it before it stated that
-    return None if rows is None else np.vstack([np.array(rows, float)[:3], [0.0, 0.0, 0.0, 1.0]])
-
-
 def _existing(part: Transforms) -> list[Photograph]:
     """Photographs of a file of held-out views that exist, with a warning on the others."""
     there = [each for each in part.photographs if each.file.is_file()]
@@ -376,14 +387,3 @@ def _existing(part: Transforms) -> list[Photograph]:
         what = "all" if not there else str(len(lacking))
         warn(f"{part.path} lacks {what} of its {len(part.photographs)} photographs, left out: {listed(lacking)}.")
     return there
-
-
-def _list_files(folder: Path) -> NameLists:
-    """Read train_list.txt, test_list.txt and validation_list.txt, which nerfstudio's COLMAP parser knows."""
-    lists = {}
-    for split, name in (("train", "train"), ("val", "val"), ("val", "validation"), ("test", "test")):
-        path = folder / f"{name}_list.txt"
-        if path.is_file():
-            with reading(path, fail, "Write one name on each line, in UTF-8."):
-                lists[split] = [line.strip() for line in read_text(path).splitlines() if line.strip()]
-    return lists

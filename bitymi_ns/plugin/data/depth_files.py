@@ -51,15 +51,21 @@ class MapFiles:
     normal: Path | None = None
 
 
+def maps_called(folder: Path, depth: str, confidence: str) -> MapFiles:
+    """Find the depth and confidence of a photograph by their names in a folder, without endings."""
+
+    def find(name: str) -> Path | None:
+        files = (folder / f"{name}{ending}" for ending in MAP_FILES)
+        return next((file for file in files if file.is_file()), None)
+
+    return MapFiles(find(depth), find(confidence))
+
+
 def maps_beside(photographs: Sequence[Path]) -> list[MapFiles]:
     """Find the depth and confidence of a scanner's photographs: files of their names in `depth` and `confidence` beside
     their folder (Polycam, Record3D, ScanNet). A folder of color pictures is not used, with a warning."""
 
-    def find(photograph: Path, folder: str) -> Path | None:
-        files = (photograph.parent.parent / folder / f"{photograph.stem}{ending}" for ending in MAP_FILES)
-        return next((file for file in files if file.is_file()), None)
-
-    found = [MapFiles(find(path, "depth"), find(path, "confidence")) for path in photographs]
+    found = [maps_called(path.parent.parent, f"depth/{path.stem}", f"confidence/{path.stem}") for path in photographs]
     depths = [files.depth for files in found if files.depth is not None]
     if depths and all(_is_color(depths[i]) for i in spread(len(depths), COLOR_SAMPLES)):
         warn(f"{depths[0].parent} is not used: it holds color pictures, not depth.")

@@ -9,8 +9,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 
-from bitymi_ns.capture.recognise import PHOTOGRAPHS
-from bitymi_ns.plugin.console import fail, listed
+from bitymi_ns.capture.pictures import PHOTOGRAPHS, passed_over
+from bitymi_ns.capture.results import result_in
+from bitymi_ns.plugin.console import fail, listed, say
 from bitymi_ns.trust import leads_inside
 
 Parts = tuple[str, ...]  # folders and file of a name, folded to one case and one Unicode form
@@ -123,7 +124,7 @@ class FileFinder:
 
     def _walk(self) -> Iterator[Path]:
         for folder, below, files in os.walk(self.folder):
-            below[:] = [name for name in below if not name.startswith(".")]
+            below[:] = [name for name in below if not name.startswith(".") and not result_in(Path(folder, name))]
             yield from (Path(folder, name) for name in files if name.lower().endswith(self.extensions))
 
 
@@ -138,6 +139,17 @@ def check_photographs_exist(source: Path, files: Iterable[Path]) -> None:
         f"{len(missing)} of {len(names)} photographs of {source} are missing:\n  {some}\n"
         "Copy them there, correct the names or remove the frames."
     )
+
+
+def name_unused(folder: Path, used: Iterable[Path | None], downscale: int | None = None) -> None:
+    """Name the pictures of a capture that are not used. Those that are `used` may be replaced by copies that are
+    smaller by `downscale`."""
+    named = frozenset(Path(os.path.normpath(path)) for path in used if path is not None)
+    others = passed_over(Path(os.path.normpath(folder)), named)
+    if downscale is not None:
+        others = [each for each in others if f"_{downscale} (" not in each]
+    if others:
+        say(f"Not taken for photographs in {folder}: {listed(others, most=12)}.")
 
 
 def _hint(folder: Path, file: Path) -> str:

@@ -17,7 +17,7 @@ from bitymi_ns.capture import masks
 from bitymi_ns.capture.exif import exposure_settings
 from bitymi_ns.capture.masks import has_transparency
 from bitymi_ns.capture.photos import eight_bits, in_srgb
-from bitymi_ns.capture.recognise import open_picture
+from bitymi_ns.capture.pictures import open_picture
 from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.reading import reading
 from bitymi_ns.train.exposure import exif_stops

@@ -95,6 +95,8 @@ class Lens:
     @property
     def coverage(self) -> npt.NDArray[np.bool_]:
         """Pixels [h, w] of the result that the photograph shows."""
+        if self.whole:
+            return np.ones((self.pinhole.height, self.pinhole.width), bool)
         return covered(self.camera, self.face, self.pinhole.rays)
 
     def undistort(self, image: Image.Image) -> Image.Image:
@@ -111,7 +113,7 @@ class Lens:
         if mask is None:
             return Image.fromarray(self.coverage)
         pixels = self.undistort_map(np.asarray(mask).astype(np.uint8), path)
-        return Image.fromarray(pixels.astype(bool) & (True if self.whole else self.coverage))
+        return Image.fromarray(pixels.astype(bool) & self.coverage)
 
     def undistort_map(self, values: npt.NDArray[Any], path: Path) -> npt.NDArray[Any]:
         """Undistort uint8 or float32 values [H, W] or [H, W, C] by nearest neighbors. They may have another size than

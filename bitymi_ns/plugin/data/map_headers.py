@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import TiffImagePlugin
 
-from bitymi_ns.capture.recognise import open_picture
+from bitymi_ns.capture.pictures import open_picture
 from bitymi_ns.reading import open_regular
 
 Check = Callable[[tuple[int, ...]], None]

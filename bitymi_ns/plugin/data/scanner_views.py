@@ -1,10 +1,11 @@
-"""Photographs of scanning programs and RGB-D sets: Polycam's raw folder, Record3D's, and folders of color images with a
-text file per pose (ScanNet, 7-Scenes)."""
+"""Photographs of scanning programs and RGB-D sets: Polycam's raw folder, Record3D's, 3D Scanner App's and Stray
+Scanner's, and folders of color images with a text file per pose (ScanNet, 7-Scenes)."""
 
+import csv
 from collections.abc import Callable, Sequence
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -12,18 +13,30 @@ import numpy.typing as npt
 from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.capture.masks import in_proportion
 from bitymi_ns.capture.photos import natural
-from bitymi_ns.capture.recognise import POLYCAM, Found, is_photograph
+from bitymi_ns.capture.pictures import is_photograph
+from bitymi_ns.capture.recognise import POLYCAM, STRAY, Found
+from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.plugin.console import fail, listed, warn
-from bitymi_ns.plugin.data.depth_files import maps_beside
+from bitymi_ns.plugin.data.depth_files import MapFiles, maps_beside, maps_called
 from bitymi_ns.plugin.data.find_files import check_photographs_exist
 from bitymi_ns.plugin.data.images import image_size
 from bitymi_ns.plugin.data.pose_checks import rotations
 from bitymi_ns.plugin.data.transforms import MAX_SIDE
 from bitymi_ns.plugin.data.views import OPENCV_AXES, Photograph
+from bitymi_ns.progress import rich_progress
 from bitymi_ns.reading import read_json, read_text, reading
 
-Row = tuple[Path, npt.NDArray[np.float64], tuple[float, ...], tuple[int, int] | None]
-"""Image file, pose [4, 4] in nerfstudio's axes, (fx, fy, cx, cy), and the size these are for; None = the file's."""
+
+class Row(NamedTuple):
+    """A photograph as a program states it."""
+
+    file: Path
+    pose: npt.NDArray[np.float64]  # [4, 4] in nerfstudio's axes
+    pinhole: tuple[float, ...]  # fx, fy, cx, cy
+    size: tuple[int, int] | None = None  # that these are for; None = the file's
+    maps: MapFiles | None = None  # None = those in folders beside that of the photographs
+
+
 AGAIN = "Export the capture again."
 MOST_POSE = 1 << 20  # bytes of a file with a pose or a camera
 Y_UP = np.array([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -31,17 +44,17 @@ Y_UP = np.array([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0
 
 
 def scanner_photographs(found: Found, need_photos: bool) -> list[Photograph]:
-    """Read the photographs of a polycam, record3d or pose-files capture, with cameras and poses, in the order of their
-    names.
+    """Read the photographs of a scanning program or RGB-D set, with cameras and poses, in the order of their names.
 
     Raises:
         InputError: a file is damaged, or photographs that are needed are missing.
     """
     readers: dict[str, Callable[[Path], list[Row]]] = {
-        "polycam": _polycam, "record3d": _record3d, "pose-files": _pose_files
+        "polycam": _polycam, "record3d": _record3d, "pose-files": _pose_files,
+        "3d-scanner": _scanner_app, "stray-scanner": _stray_scanner,
     }  # fmt: skip
     rows = readers[found.format](found.path)
-    for path, pose, pinhole, stated in rows:
+    for path, pose, pinhole, stated, _ in rows:
         if not np.isfinite([*pose.ravel(), *pinhole]).all() or not all(1 <= side <= MAX_SIDE for side in stated or ()):
             fail(
                 f"{found.path}, read as {found.format}, is damaged: the pose or camera of {path.name} is not finite, "
@@ -54,7 +67,7 @@ def scanner_photographs(found: Found, need_photos: bool) -> list[Photograph]:
         check_photographs_exist(found.path, files)
     parts = rotations(np.stack([pose[:3, :3] for _, pose, *_ in rows]), [file.name for file in files], str(found.path))
     result = []
-    for (path, pose, pinhole, stated), rotation, maps in zip(rows, parts, maps_beside(files), strict=True):
+    for (path, pose, pinhole, stated, own), rotation, beside in zip(rows, parts, maps_beside(files), strict=True):
         pose = pose.copy()
         pose[:3, :3] = rotation
         size = image_size(path) or stated or (1, 1)
@@ -64,7 +77,7 @@ def scanner_photographs(found: Found, need_photos: bool) -> list[Photograph]:
                 f"{path} has {size[0]} x {size[1]} pixels, but its camera is for {camera.width} x {camera.height}, "
                 "which is another shape. Export it again."
             )
-        result.append(Photograph(path, camera.rescaled(*size), pose, f"the camera of {path}", maps=maps))
+        result.append(Photograph(path, camera.rescaled(*size), pose, f"the camera of {path}", maps=own or beside))
     return result
 
 
@@ -83,7 +96,7 @@ def _polycam(folder: Path) -> list[Row]:
         file = next(
             (file for file in images.glob(f"{path.stem}.*") if is_photograph(file)), images / f"{path.stem}.jpg"
         )
-        rows.append((file, Y_UP @ pose, pinhole, size))
+        rows.append(Row(file, Y_UP @ pose, pinhole, size))
     return rows
 
 
@@ -108,7 +121,61 @@ def _record3d(folder: Path) -> list[Row]:
             pose[:3, :3], pose[:3, 3] = Rotation.from_quat(quaternion).as_matrix(), (x, y, z)
             pinhole = tuple(_numbers(own[i][:4], 4)) if i < len(own) else camera
         if str(i) in files:  # Record3D can export every n-th image
-            rows.append((files[str(i)], Y_UP @ pose, pinhole, size))
+            rows.append(Row(files[str(i)], Y_UP @ pose, pinhole, size))
+    return rows
+
+
+def _scanner_app(folder: Path) -> list[Row]:
+    """Read 3D Scanner App's frames: frame_00012.json with a matrix, camera to world, and the camera, both by rows;
+    beside it depth and confidence, and of some frames a picture."""
+    rows = []
+    for path in sorted(folder.glob("frame_*.json"), key=lambda path: natural(path.name)):
+        picture = next((file for file in folder.glob(f"{path.stem}.*") if is_photograph(file)), None)
+        if picture is None:
+            continue
+        with reading(path, fail, AGAIN):
+            values = read_json(path)
+            pose = np.array(_numbers(values["cameraPoseARFrame"], 16)).reshape(4, 4)
+            fx, _, cx, _, fy, cy, *_ = _numbers(values["intrinsics"], 9)
+        number = path.stem.removeprefix("frame_")
+        rows.append(
+            Row(picture, Y_UP @ pose, (fx, fy, cx, cy), maps=maps_called(folder, f"depth_{number}", f"conf_{number}"))
+        )
+    return rows
+
+
+def _stray_scanner(folder: Path) -> list[Row]:
+    """Read Stray Scanner's video, camera matrix and poses: positions and quaternions xyzw in ARKit's world, of cameras
+    with OpenCV axes. Frames that show much the same are left out."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    from bitymi_ns.capture.video import frames_with_poses
+
+    odometry, matrix, video = (folder / name for name in STRAY)
+    with reading(matrix, fail, AGAIN):
+        K = np.loadtxt(StringIO(read_text(matrix, MOST_POSE)), delimiter=",").reshape(3, 3)
+    with reading(odometry, fail, AGAIN):
+        poses = [
+            {str(name).strip(): value for name, value in line.items()}
+            for line in csv.DictReader(StringIO(read_text(odometry)))
+        ]
+    try:
+        with rich_progress() as progress:
+            images = frames_with_poses(video, len(poses), progress, warn)
+    except CaptureError as error:
+        fail(str(error), error)
+    rows = []
+    for file in sorted(images.iterdir()):
+        number = int(file.stem.removeprefix("frame_"))
+        if number >= len(poses):  # the app ended while it wrote
+            continue
+        with reading(f"{odometry}: pose {number} (counted from 0)", fail, AGAIN):
+            x, y, z, *quaternion = (float(poses[number][name]) for name in ("x", "y", "z", "qx", "qy", "qz", "qw"))
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = Rotation.from_quat(quaternion).as_matrix(), (x, y, z)
+            name = f"{int(poses[number]['frame']):06d}"
+        maps = maps_called(folder, f"depth/{name}", f"confidence/{name}")
+        rows.append(Row(file, Y_UP @ pose @ OPENCV_AXES, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), maps=maps))
     return rows
 
 
@@ -130,7 +197,7 @@ def _pose_files(folder: Path) -> list[Row]:
         if not np.isfinite(pose).all():
             lost.append(name)
             continue
-        rows.append((files[name], pose @ OPENCV_AXES, pinhole, None))
+        rows.append(Row(files[name], pose @ OPENCV_AXES, pinhole))
     if lost:
         warn(f"{len(lost)} photographs of {folder} have no pose, and are left out: {listed(lost)}.")
     return rows

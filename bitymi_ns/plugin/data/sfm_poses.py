@@ -11,7 +11,8 @@ from typing import Any
 
 from bitymi_ns.capture.cache import keep_work_folder
 from bitymi_ns.capture.photos import photo_folder
-from bitymi_ns.capture.recognise import Found, passed_over
+from bitymi_ns.capture.pictures import passed_over, videos_in
+from bitymi_ns.capture.recognise import Found
 from bitymi_ns.capture.types import SfmSettings
 from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data.colmap_model import Model
@@ -49,7 +50,9 @@ class KeptPoses:
         return Found(self.origin.kind, folder / self.origin.path, folder)
 
 
-def find_sfm_source(found: Found, masks_path: Path | None, downscale: int, settings: SfmSettings) -> Source:
+def find_sfm_source(
+    found: Found, masks_path: Path | None, downscale: int, settings: SfmSettings, use_masks: bool = True
+) -> Source:
     """Run structure from motion on a folder of photographs or a video, or find the model of an earlier run. Photographs
     are used smaller by `downscale`; `masks_path` is relative to the capture, None = find it.
 
@@ -60,13 +63,18 @@ def find_sfm_source(found: Found, masks_path: Path | None, downscale: int, setti
     from bitymi_ns.capture.types import CaptureError, SfmOptions
     from bitymi_ns.progress import rich_progress
 
-    masks = _masks(found, masks_path)
-    others = passed_over(found.path) if found.format == "photographs" else []
+    masks = _masks(found, masks_path) if use_masks else None
+    if found.format == "photographs":
+        others = passed_over(found.path)
+    else:
+        others = [f"{film.name} (a film of ns-render)" for film in videos_in(found.path.parent, rendered=True)]
     if others:
-        say(f"Not taken for photographs in {found.path}: {listed(others)}.")
+        say(f"Not taken for photographs in {found.folder}: {listed(others, most=12)}.")
     try:
         with rich_progress() as progress:
-            poses = find_poses(found.path, SfmOptions(**asdict(settings), masks=masks), progress, warn)
+            poses = find_poses(
+                found.path, SfmOptions(**asdict(settings), masks=masks, use_masks=use_masks), progress, warn
+            )
         keep_work_folder(poses.report.parent)
     except CaptureError as error:
         fail(str(error), error)

@@ -143,3 +143,14 @@ def read_names(names_or_file: Sequence[str]) -> tuple[str, ...]:
     if not names:
         fail(f"--eval-names: {path} lists no names. Write the name of one photograph per line.")
     return names
+
+
+def list_files(folder: Path) -> NameLists:
+    """Read train_list.txt, test_list.txt and validation_list.txt, which nerfstudio's COLMAP parser knows."""
+    lists = {}
+    for split, name in (("train", "train"), ("val", "val"), ("val", "validation"), ("test", "test")):
+        path = folder / f"{name}_list.txt"
+        if path.is_file():
+            with reading(path, fail, "Write one name on each line, in UTF-8."):
+                lists[split] = [line.strip() for line in read_text(path).splitlines() if line.strip()]
+    return lists

@@ -203,6 +203,14 @@ def colmap_points(path: Path) -> Path | None:
     return None if not isinstance(meta, dict) or meta.get("ply_file_path") is not None else model
 
 
+def applied_transform(meta: dict[str, Any], folder: Path) -> np.ndarray | None:
+    """Read [4, 4] that was applied to a nerfstudio capture before its file was written; None = unknown."""
+    rows = meta.get("applied_transform")
+    if rows is None and (folder / "colmap/sparse/0").is_dir():
+        rows = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]  # nerfstudio's tool applied it before it stated that
+    return None if rows is None else np.vstack([np.array(rows, float)[:3], [0.0, 0.0, 0.0, 1.0]])
+
+
 def _correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
     """Fail at matrices that are no poses; recover rotations, see `rotations`."""
     names = [frame["file_path"] for frame in frames]

@@ -7,7 +7,7 @@ a frame before the top of the file. Entries that nothing reads are reported.
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,13 @@ import numpy as np
 from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 
 from bitymi_ns.capture.camera import SPHERICAL_MODEL, ColmapCamera
+from bitymi_ns.capture.recognise import SPLITS
 from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data.depth_files import MAP_FILES, MapFiles
 from bitymi_ns.plugin.data.find_files import FileFinder, renamed_message
 from bitymi_ns.plugin.data.images import image_size
 from bitymi_ns.plugin.data.lens import colmap_distortion
+from bitymi_ns.plugin.data.mask_files import with_masks
 from bitymi_ns.plugin.data.splits import NameLists
 from bitymi_ns.plugin.data.transforms import (
     COEFFICIENTS,
@@ -58,6 +60,7 @@ class Transforms:
     meta: dict[str, Any]  # its content
     photographs: list[Photograph]  # sorted by file name
     lists: NameLists  # of names for training and evaluation
+    named: frozenset[Path]  # its pictures, masks and maps, before they are replaced by downscaled copies
 
     @property
     def files(self) -> list[Path]:
@@ -65,9 +68,12 @@ class Transforms:
         return [photograph.file for photograph in self.photographs]
 
 
-def read_transforms(path: Path, own_format: bool, downscale: int = 1, need_photos: bool = True) -> Transforms:
+def read_transforms(
+    path: Path, own_format: bool, downscale: int = 1, need_photos: bool = True, use_masks: bool = True
+) -> Transforms:
     """Read and check a JSON file, see `load_transforms`, and find its photographs, or copies that are smaller by
-    `downscale`. Photographs may be missing where they are not needed.
+    `downscale`, and masks, those beside the photographs where it names none; see `with_masks`. Photographs may be
+    missing where they are not needed.
 
     Raises:
         InputError: the file cannot be used, or lacks photographs.
@@ -84,7 +90,8 @@ def read_transforms(path: Path, own_format: bool, downscale: int = 1, need_photo
     lists = take_lists(meta)
     names = [frame["file_path"] for frame in frames]
     files = _find_photographs(path, names, need_photos)
-    masks = _find_masks(path.parent, [frame.get("mask_path") for frame in frames], files, need_photos)
+    masks = _find_masks(path.parent, [frame.get("mask_path") if use_masks else None for frame in frames], files,
+                        need_photos)  # fmt: skip
     maps = _find_maps(path, frames, need_photos)
     cloud = meta.get("ply_file_path")
     if cloud is not None and (not isinstance(cloud, str) or not cloud):
@@ -104,9 +111,13 @@ def read_transforms(path: Path, own_format: bool, downscale: int = 1, need_photo
         pose = np.array(frame["transform_matrix"])
         photographs.append(Photograph(file, made.setdefault(camera, camera), pose, label, mask, maps=beside))
     photographs.sort(key=lambda photograph: photograph.file)
+    if use_masks and need_photos and not any(masks):
+        photographs = with_masks(photographs, path.parent, path.parent if path.name in SPLITS else None)
+    used = [*files, *(each.mask for each in photographs), *(file for each in maps for file in astuple(each))]
     if downscale > 1:
         photographs = _downscaled(photographs, path.parent, downscale)
-    return Transforms(path, meta, photographs, lists)
+    named = frozenset(Path(os.path.normpath(file)) for file in used if file is not None)
+    return Transforms(path, meta, photographs, lists, named)
 
 
 def _report_files(path: Path, names: Sequence[str], files: Sequence[Path], masks: Sequence[Path | None]) -> None:

@@ -144,14 +144,14 @@ def make_views(
         xyz = (points.xyz @ transform[:, :3].T + transform[:, 3]) * scale * applied_scale
         metadata["points3D_xyz"] = torch.from_numpy(xyz.astype(np.float32))
         metadata["points3D_rgb"] = torch.from_numpy(points.rgb)
-    masks = [mask for i in of if (mask := photographs[i].mask) is not None]
+    masks = [photographs[i].mask for i in of]
     side = frame.scene_scale
     return Views(
         image_filenames=view_names(files, lenses),
         cameras=pinhole_cameras([each.pinhole for each in lenses], torch.from_numpy(moved.astype(np.float32))),
         alpha_color=alpha_color,
         scene_box=SceneBox(aabb=torch.tensor([[-side] * 3, [side] * 3], dtype=torch.float32)),
-        mask_filenames=masks or None,
+        mask_filenames=masks if any(masks) else None,  # type: ignore[arg-type]  # some may have none
         dataparser_scale=scale * applied_scale,
         dataparser_transform=torch.from_numpy(transform if applied is None else transform @ applied),
         metadata=metadata,

@@ -69,6 +69,22 @@ class BitymiTrainerConfig(TrainerConfig):
     optimizers: tyro.conf.Suppress[dict[str, Any]] = field(default_factory=dict)
     """By parameter group. Not in the help: the rates come from --pipeline.model.train.lr."""
 
+    def __post_init__(self) -> None:
+        """Refuse a command line that names two captures: nerfstudio uses the first of them silently."""
+        datamanager = self.pipeline.datamanager
+        dataparser = getattr(datamanager, "dataparser", None)
+        default = getattr(type(dataparser), "data", None)
+        own = getattr(dataparser, "data", None)
+        given = {
+            "--data": self.data,
+            "--pipeline.datamanager.data": getattr(datamanager, "data", None),
+            "--data after the name of the parser": None if own == default else own,
+        }
+        stated = {option: path for option, path in given.items() if path is not None}
+        if len({os.path.abspath(os.path.expanduser(path)) for path in stated.values()}) > 1:
+            named = " and ".join(f"{path} ({option})" for option, path in stated.items())
+            fail(f"a run is of one capture, and two are given: {named}. Leave out one of them.")
+
     def set_timestamp(self) -> None:
         """Fix what depends on the moment and the machine. nerfstudio calls this before it writes config.yml."""
         super().set_timestamp()

@@ -13,7 +13,9 @@ from typing import IO, Any
 import numpy as np
 import torch
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
+from bitymi_ns.capture.results import RENDERED
 from bitymi_ns.files import complete_file, complete_folder
 from bitymi_ns.plugin.console import fail
 from bitymi_ns.scene.baked import as_bytes
@@ -61,6 +63,7 @@ def film(path: Path, fps: float) -> Iterator[Add]:
 
     mp4: Any = {"format": "mp4", "options": {"movflags": "+faststart"}}
     with complete_file(path) as file, av.open(os.path.abspath(file.name), "w", **mp4) as container:
+        container.metadata["comment"] = RENDERED.decode()
         try:
             yield add
             container.mux(stream.encode())
@@ -110,7 +113,13 @@ def write_image(path: Path, image: np.ndarray, *, fmt: str, quality: int = 100) 
 
 def _save(file: IO[bytes], image: np.ndarray, form: str, quality: int) -> None:
     encoded = io.BytesIO()  # Pillow does not say why it cannot write to a file
-    Image.fromarray(image).save(encoded, form, **({"quality": quality} if form == "jpeg" else {}))
+    picture = Image.fromarray(image)
+    if form == "jpeg":
+        picture.save(encoded, form, quality=quality, comment=RENDERED)
+    else:
+        text = PngInfo()
+        text.add_text("Comment", RENDERED.decode())
+        picture.save(encoded, form, pnginfo=text)
     file.write(encoded.getbuffer())
 
 

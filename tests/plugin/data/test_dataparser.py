@@ -316,6 +316,18 @@ def test_it_is_what_the_presets_read_with() -> None:
     assert given == BitymiDataParserConfig(data=Path("x"), eval_names=("a b.jpg", "\u00e4.jpg"), downscale_factor=4)
 
 
+@pytest.mark.parametrize("parser", ["bitymi-data", "nerfstudio-data", "blender-data"])
+def test_two_captures_are_refused(tmp_path: Path, parser: str) -> None:
+    """nerfstudio reads the first of them silently."""
+    for first in ("--data", "--pipeline.datamanager.data"):
+        with expect(rf"two are given: .*a \({first}\) and .*b \(--data after the name of the parser\). Leave out one"):
+            parsed(first, str(tmp_path / "a"), parser, "--data", str(tmp_path / "b"))
+    with expect(r"two are given: .*a \(--data\) and .*b \(--pipeline.datamanager.data\)"):
+        parsed("--data", str(tmp_path / "a"), "--pipeline.datamanager.data", str(tmp_path / "b"), parser)
+    same = parsed("--data", str(tmp_path / "a"), parser, "--data", f"{tmp_path}/b/../a")
+    assert same.data == tmp_path / "b/../a"
+
+
 def test_nerfstudios_parsers_are_read_by_ours(blender: Path) -> None:
     options = bitymi_parser(NerfstudioDataParserConfig(data=blender, eval_mode="all", scale_factor=2.0))
     own = dict(points="random", depth_unit_scale_factor=1e-3)  # nerfstudio's defaults

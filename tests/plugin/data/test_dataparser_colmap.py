@@ -1,5 +1,6 @@
 """The presets' parser: what it makes of COLMAP models."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +87,16 @@ def test_cameras_of_several_kinds_and_sizes_in_one_capture(mixed: Path, capsys: 
     assert manager.train_dataset.metadata["train_pixels"] == sum(
         view.image.shape[0] * view.image.shape[1] for view in manager.train_views
     )
+
+
+def test_renders_of_photographs_are_not_taken_for_them(project: Path) -> None:
+    """They have the same names, and their folder comes first by name."""
+    (project / "shots").mkdir()
+    shutil.copytree(project / "images", project / "maps/test/rgb")
+    (project / "maps/test/raw-depth").mkdir()
+    (project / "images").rename(project / "shots/day")
+    shown = load_any(project).train_dataset.image_filenames
+    assert {path.parent for path in shown} == {project / "shots/day"}
 
 
 # reduced photographs and masks

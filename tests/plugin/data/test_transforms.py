@@ -119,7 +119,7 @@ def set_value(key: str, value: Any) -> Any:
         ),
         (
             lambda meta: [f.update(mask_path=f"/home/me/masks/{f['file_path']}") for f in meta["frames"]],
-            "the mask /home/me/masks/images/frame_.* is missing",
+            "12 of 12 masks .* are missing: /home/me/masks/images/frame_",
         ),
         (lambda meta: meta["frames"].insert(1, {"file_path": "a.png"}), "frame 1 .* has no transform_matrix. Add that"),
         (lambda meta: meta["frames"].__setitem__(1, None), "frame 1 .* has no file_path and no transform_matrix"),

@@ -19,8 +19,10 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.scripts import render
 from PIL import Image
 
+from bitymi_ns.capture.results import is_rendered_film, result_in
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
+from bitymi_ns.plugin.run.films import write_image
 from bitymi_ns.plugin.run.render import adopt_render, spiral
 from bitymi_ns.plugin.run.surfel_model import SurfelModel
 from bitymi_ns.scene.camera import Camera
@@ -131,6 +133,7 @@ def test_a_camera_path_becomes_a_film_that_browsers_play(wall: Wall, camera_path
     assert focal == pytest.approx(12 / math.tan(math.radians(30)), rel=1e-5)
     data = (tmp_path / "film.mp4").read_bytes()
     assert data.index(b"moov") < data.index(b"mdat")  # plays before it is there as a whole
+    assert is_rendered_film(tmp_path / "film.mp4")  # and is not taken for a capture
     assert sorted(path.name for path in tmp_path.iterdir()) == ["film.mp4", "path.json"]
 
 
@@ -174,6 +177,10 @@ def test_frames_replace_earlier_frames_and_nothing_else(wall: Wall, camera_path:
     assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == ["00000.png", "00001.png"]
     picture = np.array(Image.open(tmp_path / "frames" / "00000.png"))
     assert picture.shape == (24, 32, 4) and (picture[..., 3] == 255).all()
+    assert result_in(tmp_path / "frames") == "renders of ns-render"
+    (tmp_path / "maps").mkdir()
+    write_image(tmp_path / "maps" / "a.jpg", picture[..., :3], fmt="jpeg")
+    assert result_in(tmp_path / "maps") == "renders of ns-render"
     (tmp_path / "frames" / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match="holds other files than frames and is not replaced"):
         camera_path(**frames)

@@ -1,0 +1,123 @@
+"""What this package and nerfstudio wrote beside photographs is not read as photographs, and is named."""
+
+import json
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from bitymi_ns.bundle.manifest import FORMAT
+from bitymi_ns.capture.photos import find_photos
+from bitymi_ns.capture.pictures import passed_over
+from bitymi_ns.capture.poses import find_poses
+from bitymi_ns.capture.recognise import NotRecognised, recognise
+from bitymi_ns.capture.results import RENDERED, result_in
+from bitymi_ns.capture.types import CaptureError
+
+MANIFEST = json.dumps({"format": FORMAT})
+CONFIG = "!!python/object:nerfstudio.engine.trainer.TrainerConfig\nmethod_name: x\n"
+CAPTURE = json.dumps({"frames": [{"file_path": "images/a.jpg", "transform_matrix": []}]})
+RESULTS = {
+    "scene/preview.jpg": "pictures of a bundle",
+    "scene/photograph-0001.jpg": "pictures of a bundle",
+    "mine/room/bitymi/2026/poses/images/a.jpg": "pictures of a training run",
+    "maps/test/rgb/a.jpg": "renders of ns-render",
+    "maps/test/beta/a.jpg": "renders of ns-render",
+    "frames/00000.jpg": "renders of ns-render",
+    "frames2/00000.png": "renders of ns-render",
+    "compared/eval_img_0000.png": "renders of ns-eval",
+    "worst/view0003-photo.png": "pictures of `bitymi bench pictures`",
+    "processed/images/a.jpg": "pictures of another capture",
+    "processed/images_2/a.jpg": "pictures of another capture",
+    "exports/mesh/material_0.png": "exports",
+}
+MARKS = {
+    "scene/bundle.json": MANIFEST,
+    "mine/room/bitymi/2026/config.yml": CONFIG,
+    "worst/pictures.json": '{"bitymi_pictures": 1}',
+    "processed/transforms.json": CAPTURE,
+}
+
+
+def save(path: Path, **options: object) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", (8, 8)).save(path, **options)
+
+
+@pytest.fixture
+def photographs(tmp_path: Path) -> Path:
+    """A flat folder of three photographs, and every result in it."""
+    folder = tmp_path / "walk"
+    for name in "abc":
+        save(folder / f"{name}.jpg")
+    for name in RESULTS:
+        save(folder / name, **({"comment": RENDERED} if name.startswith("frames/") else {}))
+    data = (folder / "frames2/00000.png").read_bytes()
+    (folder / "frames2/00000.png").write_bytes(data[:33] + b"tEXt" + RENDERED + data[33:])
+    for name, text in MARKS.items():
+        (folder / name).write_text(text)
+    return folder
+
+
+def test_results_beside_photographs_are_named_and_not_read(photographs: Path) -> None:
+    found = recognise(photographs)
+    assert (found.format, found.path) == ("photographs", photographs)
+    assert find_photos(photographs) == ["a.jpg", "b.jpg", "c.jpg"]
+    named = passed_over(photographs)
+    assert sum(int(each.rpartition("(")[2].split()[0]) for each in named) == len(RESULTS)
+    for name, what in RESULTS.items():
+        assert any(each.startswith(name.split("/")[0]) and each.endswith(f"{what})") for each in named), name
+
+
+def test_files_of_these_names_that_are_something_else(tmp_path: Path) -> None:
+    for name, text in (("bundle.json", "{}"), ("config.yml", "iso: 100\n"), ("transforms_eval.json", '{"frames": []}')):
+        save(tmp_path / f"{name}-/a.jpg")
+        (tmp_path / f"{name}-" / name).write_text(text)
+    for name in ("test/rgb/a.jpg", "mixed/eval_img_0001.png", "mixed/train_img_0002.png", "eval/eval_frame_0001.png"):
+        save(tmp_path / name)
+    assert len(find_photos(tmp_path)) == 7 and passed_over(tmp_path) == []
+
+
+@pytest.mark.parametrize(("mark", "text", "message"), [
+    ("bundle.json", MANIFEST, "is a bundle, not a capture: give the folder of its photographs. `bitymi view"),
+    ("config.yml", CONFIG, "is a training run, not a capture: give the folder of its photographs, and --load-dir"),
+])  # fmt: skip
+def test_a_result_is_no_capture(tmp_path: Path, mark: str, text: str, message: str) -> None:
+    for name in "abcd":
+        save(tmp_path / f"{name}.jpg")
+    (tmp_path / mark).write_text(text)
+    with pytest.raises(NotRecognised, match=message):
+        recognise(tmp_path)
+    with pytest.raises(CaptureError, match=message):
+        find_poses(tmp_path)
+    assert len(list(tmp_path.iterdir())) == 5
+    (tmp_path / "room.bitymi").write_bytes(b"PK")
+    with pytest.raises(NotRecognised, match="is a bundle in one file"):
+        recognise(tmp_path / "room.bitymi")
+
+
+def test_a_folder_of_results_alone_says_what_it_holds(photographs: Path) -> None:
+    for name in "abc":
+        (photographs / f"{name}.jpg").unlink()
+    (photographs / "processed/transforms.json").unlink()
+    for path in (photographs / "processed").rglob("*.jpg"):
+        path.unlink()
+    with pytest.raises(NotRecognised, match=r"not taken for photographs: compared \(1 renders of ns-eval\)"):
+        recognise(photographs)
+
+
+def test_a_camera_export_is_no_blender_data_set(tmp_path: Path) -> None:
+    save(tmp_path / "images/a.jpg")
+    (tmp_path / "poses").mkdir()
+    for name in ("transforms_train.json", "transforms_eval.json"):
+        (tmp_path / "poses" / name).write_text(json.dumps([{"file_path": "a.jpg", "transform": []}], indent=4))
+    assert recognise(tmp_path).format == "photographs"
+    assert result_in(tmp_path / "poses")
+
+
+def test_a_film_of_ours_is_no_video_to_train_on(tmp_path: Path) -> None:
+    (tmp_path / "film.mp4").write_bytes(b"ftyp" + RENDERED)
+    (tmp_path / "walk.mp4").write_bytes(b"ftyp")
+    found = recognise(tmp_path)
+    assert (found.path, found.others) == (tmp_path / "walk.mp4", ())
+    assert passed_over(tmp_path) == ["film.mp4 (a film of ns-render)"]

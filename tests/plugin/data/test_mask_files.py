@@ -1,0 +1,155 @@
+"""Masks beside the photographs of any capture are used, with a line that says how to leave them out; what nothing names
+is named."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.plugin.data.captures import (
+    add_masks,
+    colmap_model,
+    edit,
+    edit_frames,
+    expect,
+    images_of,
+    load_any,
+    printed,
+    save_masks,
+)
+from tests.plugin.data.test_scanner_views import polycam
+from tests.plugin.data.test_true_captures import instant_ngp, nerfstudio
+
+LEFT = np.uint8(np.arange(48) < 24)[None].repeat(36, 0) * 255
+
+
+def blender(capture: Path) -> Path:
+    """Photographs in `train`, so that masks are in `masks/train`."""
+    edit(capture, lambda meta: (meta.pop("ply_file_path"), meta.update(camera_angle_x=1.0)))
+    edit_frames(capture, lambda f: f.update(file_path=f["file_path"].replace("images", "train")))
+    (capture / "images").rename(capture / "train")
+    (capture / "transforms.json").rename(capture / "transforms_train.json")
+    if (capture / "masks").is_dir():
+        (capture / "masks").rename(capture / "train masks")
+        (capture / "masks").mkdir()
+        (capture / "train masks").rename(capture / "masks/train")
+    return capture
+
+
+def colmap(capture: Path) -> Path:
+    colmap_model(capture, capture / "sparse/0")
+    (capture / "transforms.json").unlink()
+    return capture
+
+
+def scanned(capture: Path) -> Path:
+    folder = polycam(capture, capture.parent / "scan")
+    if (capture / "masks").is_dir():
+        shutil.copytree(capture / "masks", folder / "keyframes/masks")
+        for i, path in enumerate(sorted((folder / "keyframes/masks").iterdir())):
+            path.rename(path.with_name(f"{i}.png"))
+    return folder
+
+
+@pytest.mark.parametrize("form", [nerfstudio, instant_ngp, blender, colmap, scanned])
+def test_a_folder_of_masks_beside_the_photographs(
+    capture: Path, form: Callable[[Path], Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_masks(capture, LEFT)
+    place = form(capture)
+    mask = load_any(place).cached_train[0]["mask"]
+    assert mask[:, :24].all() and not mask[:, 24:].any()
+    assert "`bitymi-data --use-masks False` leaves masks out" in (text := printed(capsys)) and "masks" in text
+    assert "Not taken for photographs" not in text or "masks (" not in text
+    assert "mask" not in load_any(place, use_masks=False).cached_train[0]
+    assert "masks (12 masks)" in printed(capsys)
+
+
+def test_masks_that_are_black_leave_nothing(capture: Path) -> None:
+    save_masks(capture, 0)
+    with expect("the masks of all 10 training photographs exclude every pixel"):
+        load_any(capture)
+
+
+@pytest.mark.parametrize("form", [nerfstudio, instant_ngp])
+def test_masks_of_instant_ngp(capture: Path, form: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    """They are white where something moves; a photograph without one counts as a whole."""
+    form(capture)
+    for path in images_of(capture)[2:4]:
+        Image.fromarray(LEFT).save(path.with_name(f"dynamic_mask_{path.stem}.png"))
+    train = load_any(capture).cached_train
+    of = {int(batch["image_idx"]): batch["mask"] for batch in train}
+    assert of[0].all() and not of[1][:, :24].any() and of[1][:, 24:].all()
+    text = printed(capsys)
+    assert "2 masks dynamic_mask_*.png beside 12 photographs are used, of which black counts; `bitymi-data" in text
+    assert "Not taken" not in text
+    train = load_any(capture, use_masks=False).cached_train
+    assert "mask" not in train[0] and "(a mask of instant-ngp)" in printed(capsys)
+
+
+def test_a_folder_with_some_of_the_masks_or_of_something_else(
+    capture: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_masks(capture, LEFT)
+    (capture / "masks/frame_00003.png").unlink()
+    with expect("has no mask of frame_00003.png, but of others.*--use-masks False"):
+        load_any(capture)
+    for path in sorted((capture / "masks").iterdir())[1:]:
+        path.unlink()
+    next((capture / "masks").iterdir()).rename(capture / "masks/mask.png")  # as ns-process-data calls that of all
+    assert "mask" not in load_any(capture).cached_train[0]
+    assert "Not taken for photographs" in (text := printed(capsys)) and "masks (1 masks)" in text
+
+
+def test_masks_are_checked_before_points_are_triangulated(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    add_masks(capture, 255)
+    edit(capture, lambda meta: meta.pop("ply_file_path"))
+    monkeypatch.setattr("bitymi_ns.plugin.data.dataparser.initial_points", None)  # not reached
+    mask = capture / "masks/frame_00004.png"
+    for spoil, message in (
+        (lambda: Image.new("L", (36, 48)).save(mask), "frame_00004.png has 36 x 48 pixels.*--use-masks False"),
+        (lambda: mask.write_text("x"), "the mask .*frame_00004.png cannot be read"),
+        (mask.unlink, r"1 of 12 masks .* are missing: .*frame_00004.png. Put them there, .*--use-masks False"),
+    ):
+        spoil()
+        with expect(message):
+            load_any(capture)
+    colmap(capture)
+    with expect("has no mask of frame_00004.png"):
+        load_any(capture)
+
+
+@pytest.mark.parametrize("form", [nerfstudio, instant_ngp, blender, colmap])
+def test_pictures_that_nothing_names_are_named(
+    capture: Path, form: Callable[[Path], Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = form(capture)
+    folder = next(path for path in (capture / "images", capture / "train") if path.is_dir())
+    for name in ("extra.png", "deeper/other.png"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        Image.new("RGB", (8, 8)).save(folder / name)
+    (capture / "scene").mkdir()
+    (capture / "scene/bundle.json").write_text(json.dumps({"format": "bitymi-bundle"}))
+    for name in ("depth/1.png", "notes/board.png", "notes/deep/board.png", "scene/preview.jpg"):
+        (capture / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (8, 8)).save(capture / name)
+    load_any(place)
+    text = printed(capsys)
+    for part in ("depth (1 depth maps)", "scene (1 pictures of a bundle)", "/notes that nothing names (board.png)"):
+        assert part in text, part
+    assert ("are left out: extra.png" if form is colmap else "that nothing names (extra.png)") in text
+    assert "deeper that nothing names (other.png)" in text
+    reduced = capture / "images_2"
+    if form is nerfstudio:
+        reduced.mkdir()
+        for path in images_of(capture):
+            Image.open(path).resize((24, 18)).save(reduced / path.name)
+        load_any(place, downscale_factor=2)
+        assert "images_2" not in printed(capsys)
+        load_any(place)
+        assert "images_2 (13 reduced copies)" in printed(capsys)

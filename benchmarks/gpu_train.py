@@ -57,7 +57,9 @@ def main() -> int:
     say(", ".join(f"{value} {name}" for name, value in zip(CURVE, curve[-1], strict=True)))
     start = time.perf_counter()
     cameras = [view.camera.to(device) for view in capture.train]
-    made = bake_and_learn(scene, cameras, (), eval_background(config, torch.device("cpu")), BakeOptions(), Learning())
+    made = bake_and_learn(
+        scene, cameras, (), eval_background(config, torch.device("cpu")), BakeOptions(format="bc7"), Learning()
+    )
     seconds = time.perf_counter() - start
     with tempfile.TemporaryDirectory() as folder:
         target = (arguments.keep or Path(folder)) / f"{arguments.preset}-{steps}"

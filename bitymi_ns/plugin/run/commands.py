@@ -10,7 +10,9 @@ from typing import Any
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from bitymi_ns.bundle.parts import CONFIG, bundle_at
 from bitymi_ns.plugin.console import fail
+from bitymi_ns.plugin.export.hook import MESH_COMMAND
 
 DATA = "BITYMI_DATA"
 """Environment variable: where a capture is now; most of nerfstudio's commands that read a run have no option for it."""
@@ -59,6 +61,28 @@ def refuse_others() -> None:
     found = running_command()
     if found is not None and type(found[0]).__name__ in REFUSED:
         fail(REFUSED[type(found[0]).__name__])
+
+
+def given_config() -> Path | None:
+    """The --load-config of this process's command line; None without."""
+    for i, argument in enumerate(sys.argv):
+        name, _, value = argument.partition("=")
+        if name in ("--load-config", "--load_config") and (value or i + 1 < len(sys.argv)):
+            return Path(value or sys.argv[i + 1]).absolute()
+    return None
+
+
+def refuse_without_config() -> None:
+    """Stop where nerfstudio is about to load, as its own YAML, a bundle that has none."""
+    path = given_config()
+    bundle = None if path is None else bundle_at(path)
+    if bundle is None or MESH_COMMAND in sys.argv[1:2]:
+        return
+    if bundle.is_file() or not (bundle / CONFIG).is_file():
+        fail(
+            f"{bundle} has no {CONFIG} for nerfstudio's commands: `bitymi unpack {bundle}` writes it as a folder with "
+            "one; give that."
+        )
 
 
 def moved_capture(datamanager: Any) -> None:

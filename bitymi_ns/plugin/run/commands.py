@@ -12,7 +12,6 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from bitymi_ns.bundle.parts import CONFIG, bundle_at
 from bitymi_ns.plugin.console import fail
-from bitymi_ns.plugin.export.hook import MESH_COMMAND
 
 DATA = "BITYMI_DATA"
 """Environment variable: where a capture is now; most of nerfstudio's commands that read a run have no option for it."""
@@ -72,11 +71,15 @@ def given_config() -> Path | None:
     return None
 
 
-def refuse_without_config() -> None:
-    """Stop where nerfstudio is about to load, as its own YAML, a bundle that has none."""
+def refuse_without_config(reader: str) -> None:
+    """Stop where nerfstudio is about to load, as its own YAML, a bundle that has none.
+
+    Args:
+        reader: the command of ours that reads such bundles.
+    """
     path = given_config()
     bundle = None if path is None else bundle_at(path)
-    if bundle is None or MESH_COMMAND in sys.argv[1:2]:
+    if bundle is None or reader in sys.argv[1:2]:
         return
     if bundle.is_file() or not (bundle / CONFIG).is_file():
         fail(

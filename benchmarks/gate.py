@@ -132,7 +132,7 @@ def run_seed(capture: "Capture", seed: int, calibration: Calibration) -> dict[st
     def make() -> Any:
         learning = Learning(tune=TuneOptions.of_learned(SETTINGS["tuning"]), train=config)
         aside = calibration.every(10)
-        return bake_and_learn(scene, cameras, capture.train, background, BakeOptions(), learning, aside)
+        return bake_and_learn(scene, cameras, capture.train, background, BakeOptions(format="bc7"), learning, aside)
 
     baked, baking = calibration.timed(make)
     with tempfile.TemporaryDirectory() as folder:

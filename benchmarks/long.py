@@ -39,7 +39,7 @@ from bitymi_ns.ops import ssim
 from bitymi_ns.plugin.run.metrics import lpips_metrics
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer
-from bitymi_ns.train.init import first_surfels_for, scene_for_views
+from bitymi_ns.train.init import scene_for_views
 from bitymi_ns.train.losses import fitted_psnr, photometric, psnr
 from bitymi_ns.train.preset import Preset, load_preset
 from bitymi_ns.train.views import View, eval_background, spread
@@ -174,11 +174,10 @@ def measure(run: Run) -> dict[str, Any]:
     capture, device = cut(load(Path(run.data), run.reduction), run.photographs), torch.device(run.device)
     if capture.white:
         preset.train.alpha_color = "white"
-    camera = capture.train[0].camera
-    if preset.train.first_surfels is None:
-        preset.train.first_surfels = first_surfels_for(run.steps, camera.width * camera.height)
     torch.manual_seed(run.seed)
-    scene = scene_for_views(capture.train, capture.points, capture.colours, preset.scene, preset.train).to(device)
+    scene = scene_for_views(capture.train, capture.points, capture.colours, preset.scene, preset.train, run.steps).to(
+        device
+    )
     trainer = Trainer(scene, capture.train, preset.train, run.steps)
     watch, clock, before = TexelWatch(trainer, capture.train), trainer.training.clock, math.nan
     shown = {run.steps * i // 20 for i in range(1, 20)}
@@ -198,6 +197,7 @@ def measure(run: Run) -> dict[str, Any]:
         rows.append(quality(output.rgb, target) | {"fragments": len(output.fragments) / (target.numel() / 3)})
     found = means(rows) | watch.figures()
     found |= {"before_texels": before, "surfels": len(scene), "rollbacks": trainer.training.guard.rollbacks}
+    camera = capture.train[0].camera
     found |= {"cpu_seconds": clock.cpu_seconds, "seconds": clock.seconds}
     found |= {"width": camera.width, "height": camera.height}
     if device.type == "cuda":

@@ -1,6 +1,7 @@
 """The console script `bitymi`. What it takes a second to import is imported where Ctrl-C is already met."""
 
 import sys
+import warnings
 
 
 def main() -> int:
@@ -9,6 +10,9 @@ def main() -> int:
         from bitymi_ns import endings
     except KeyboardInterrupt:
         return 130
+
+    # of nerfstudio's use of torch, about which no user can do anything
+    warnings.filterwarnings("ignore", category=FutureWarning, module="nerfstudio")
 
     def command() -> int:
         from bitymi_ns import cli

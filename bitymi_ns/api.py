@@ -1,7 +1,6 @@
 """The public functions: rasterize surfels, train a scene, bake it, read a bundle. None of them needs nerfstudio."""
 
 import copy
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,9 +10,9 @@ from torch import Tensor
 
 from bitymi_ns.bake import BakeOptions, Learning, bake_and_learn, export
 from bitymi_ns.bake.compact import Compact
-from bitymi_ns.bundle import Bundle, read_bundle
+from bitymi_ns.bundle import Bundle, check_target, read_bundle
+from bitymi_ns.bundle.cameras import CapturedCamera, cameras_data
 from bitymi_ns.bundle.parts import CAMERAS
-from bitymi_ns.interchange.bundle_cameras import camera_row
 from bitymi_ns.ops import blended_image, can_rasterize, project, rasterize_image, trace
 from bitymi_ns.ops.constants import COLOR_BIAS
 from bitymi_ns.scene.camera import Camera
@@ -112,7 +111,8 @@ def train_scene(
 
     Args:
         views: photographs with their cameras, at full size.
-        points: [M, 3] world positions of the first surfels, such as a sparse point cloud; M may be 0.
+        points: [M, 3] world positions of the first surfels, such as a sparse point cloud; M may be 0. A short run
+            starts from some of them, chosen at random (`TrainConfig.first_surfels`).
         colors: [M, 3] in [0, 1], of the points.
         steps: length of the run; all schedules scale with it.
         method: preset, the name of a file in method_configs/.
@@ -135,7 +135,7 @@ def train_scene(
             raise ValueError(f"{name} have to be [M, 3], as many as points, not {list(values.shape)}")
     preset = load_preset(method)
     config = replace(copy.deepcopy(preset.train), seed=seed)
-    scene = scene_for_views(views, points, colors, preset.scene, config)
+    scene = scene_for_views(views, points, colors, preset.scene, config, steps)
     scene, views = scene.to(device), [view.to(device) for view in views]
     step_done = None if callback is None else lambda trainer, *_: callback(trainer.step, trainer.loss)
     return scene, fit(scene, views, [view.to(device) for view in eval_views], config, steps, step_done)
@@ -150,7 +150,7 @@ def bake_scene(
     overwrite: bool = False,
     options: BakeOptions | None = None,
 ) -> Bundle:
-    """Bake a trained scene into a compact bundle and read it back: what `ns-export bitymi-atlas` does.
+    """Bake a trained scene into a bundle and read it back: what `ns-export bitymi-atlas` does.
 
     Args:
         scene: of `train_scene`, with its texture as texels, as a field, or without texture.
@@ -158,21 +158,28 @@ def bake_scene(
         folder: of the bundle; appears complete or not at all.
         background: [3] color behind the scene; None = black.
         overwrite: replace a bundle that is there.
+        options: format of the bundle (compact, bc7, uint8 or fp16), tolerance, tiles and others, see `BakeOptions`;
+            None = its defaults, a compact bundle.
 
     Returns:
-        The bundle as read from the folder.
+        The bundle as read from the folder, with the cameras of the views.
 
     Raises:
-        ValueError: there are no views, no surfel is left, or the atlas would be too large.
+        ValueError: there are no views, no surfel is left, the atlas would be too large, or an option is out of range.
         BundleError: the folder exists or cannot be written.
+        RuntimeError: the format is bc7, and its encoder is not installed.
     """
     if len(views) == 0:
         raise ValueError("there is nothing to bake from: no views")
     background = torch.zeros(3) if background is None else background.cpu()
-    learning = Learning.of_scene(scene, len(views), compact=Compact())
+    options = options or BakeOptions()
+    options.check()
+    check_target(folder, overwrite)
+    compact = Compact() if options.bundle_format == "compact" else None
+    learning = Learning.of_scene(scene, len(views), compact=compact)
     cameras = [view.camera for view in views]
-    baked = bake_and_learn(scene, cameras, views, background, options or BakeOptions(), learning)
-    rows = [camera_row(f"{i:04d}", camera, held_out=False) for i, camera in enumerate(cameras)]
-    beside = {CAMERAS: json.dumps({"cameras": rows}).encode()}
-    export(baked, folder, background=background.tolist(), first=cameras[0], loose_files=beside, overwrite=overwrite)
+    baked = bake_and_learn(scene, cameras, views, background, options, learning)
+    listed = cameras_data(CapturedCamera.of(f"{i:04d}", camera, False) for i, camera in enumerate(cameras))
+    where = {"first": cameras[0], "extra_files": {CAMERAS: listed}, "overwrite": overwrite}
+    export(baked, folder, background=background.tolist(), **where)
     return read_bundle(folder)

@@ -101,7 +101,7 @@ class Report:
 class Stability:
     """Measure what float32 costs on extreme scenes and write the page of it, with a plot beside it."""
 
-    output: Path = Path("docs/stability.md")  # Markdown file to write; the plot gets its name with .png.
+    output: Path = Path("stability.md")  # Markdown file to write; the plot gets its name with .png.
     backend: Literal["cpu", "cuda", "emulated"] = "cpu"  # Kernels to measure.
 
     def run(self) -> None:
@@ -220,6 +220,25 @@ class Pack:
 
 
 @dataclass
+class Unpack:
+    """Write a bundle in one file as a folder again, with a config.yml for nerfstudio's commands."""
+
+    bundle: tyro.conf.Positional[Path]  # The one file, or the folder of a bundle that has no config.yml.
+    output: Path | None = None  # Folder to write; not given: beside the file, with its name without .bitymi.
+
+    def run(self) -> None:
+        from bitymi_ns.bundle.read import read_manifest
+        from bitymi_ns.bundle.single import SUFFIX, write_folder
+        from bitymi_ns.plugin.export.nerfstudio_config import CONFIG, config_without_run
+
+        folder = self.output or self.bundle.with_name(self.bundle.name.removesuffix(SUFFIX))
+        config = config_without_run(folder, read_manifest(self.bundle).render.background)
+        with explained(folder, ValueError):
+            _say_left_out(write_folder(self.bundle, folder, {CONFIG: config}))
+        say(f"Wrote {folder}: give {folder / CONFIG} to nerfstudio's commands.")
+
+
+@dataclass
 class Extras:
     """Write a bundle for other programs into a folder beside it: as Gaussian splats, and as a textured mesh."""
 
@@ -238,22 +257,22 @@ class Extras:
         output = self.output or interchange.extras_folder(self.bundle)
         interchange.check_extras(self.kinds, output, self.overwrite)
         bundle = read_bundle(self.bundle)
-        found = interchange.read_cameras(self.bundle, bundle.info)
+        cameras, held_out = interchange.training_cameras(bundle), interchange.read_held_out(self.bundle, bundle)
         with rich_progress() as progress:
             written = interchange.write_extras(
                 bundle,
                 output,
                 self.kinds,
                 frame=self.frame,
-                cameras=found.train,
-                held_out=found.held_out,
+                cameras=cameras,
+                held_out=held_out,
                 overwrite=self.overwrite,
                 progress=progress,
             )
         say(f"Wrote {output}")
         for each in written.values():
             say(interchange.summary_line(each))
-        if not found.train:
+        if not cameras:
             say("The bundle has no cameras.json: colours are those over the whole sphere, the mesh's as they are.")
 
 
@@ -308,6 +327,7 @@ Command = (
     | Annotated[Bench, tyro.conf.subcommand(name="bench")]
     | Annotated[Verify, tyro.conf.subcommand(name="verify")]
     | Annotated[Pack, tyro.conf.subcommand(name="pack")]
+    | Annotated[Unpack, tyro.conf.subcommand(name="unpack")]
     | Annotated[Extras, tyro.conf.subcommand(name="extras")]
     | Annotated[View, tyro.conf.subcommand(name="view")]
 )

@@ -14,7 +14,10 @@ from PIL import Image
 
 import bitymi_ns
 from bitymi_ns import sample
+from bitymi_ns.bake import BakeOptions
 from bitymi_ns.bake.early_stopping import EarlyStopping
+from bitymi_ns.bundle import BundleError
+from bitymi_ns.bundle.manifest import dump
 from bitymi_ns.ops.reference.render import render as reference_render
 from bitymi_ns.scene.baked_renderer import SceneRenderer
 
@@ -157,6 +160,49 @@ def test_a_scene_is_trained_baked_read_and_rendered_from_arrays(room: Path, tmp_
     for other in (copy.deepcopy(bundle), pickle.loads(pickle.dumps(bundle)), loaded):
         assert torch.equal(other.render(camera_of()).rgb, drawn)
     assert torch.equal(copy.deepcopy(SceneRenderer(bundle.scene)).render(camera_of()).rgb, drawn)
+
+
+def test_bundles_of_every_format_with_their_cameras(room: Path, tmp_path: Path) -> None:
+    views = example("train_from_arrays").load_views(room)
+    points = torch.rand(5600, 3) * 2 - 1
+    scene, _ = bitymi_ns.train_scene(views, points, torch.rand(5600, 3), steps=1, method="bitymi-notexture")
+    assert len(scene) <= 5000 * 1.1  # as ns-train starts, with as many at the back as it adds
+    scene, _ = bitymi_ns.train_scene(views, points[:100], torch.rand(100, 3), steps=6)
+    for options, atlas in (
+        (None, "texels.bin"),
+        (BakeOptions(format="bc7"), "atlas.ktx2"),
+        (BakeOptions(format="fp16"), "atlas.ktx2"),
+        (BakeOptions(tolerance=0.0), "atlas.ktx2"),
+    ):
+        baked = bitymi_ns.bake_scene(scene, views, tmp_path / "bundle", options=options, overwrite=True)
+        assert baked.info.atlas.file == atlas and "cameras.json" in baked.info.files
+        assert options is None or options.format in (None, baked.info.atlas.format)
+        assert len(baked.cameras) == len(views) and not any(row.held_out for row in baked.cameras)
+        assert all(torch.equal(row.camera.K, v.camera.K) for row, v in zip(baked.cameras, views, strict=True))
+    for options, message in (
+        (BakeOptions(format="webp"), "no format 'webp': choose among compact, bc7, uint8, fp16"),
+        (BakeOptions(format="compact", tolerance=0.0), "compact bundle needs a tolerance"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            bitymi_ns.bake_scene(scene, views, tmp_path / "bundle", options=options, overwrite=True)
+    with pytest.raises(ValueError, match="no preset 'nerf' in .*, which has bitymi, bitymi-fast"):
+        bitymi_ns.train_scene(views, points, points, method="nerf")
+
+
+def test_a_bundle_of_an_earlier_version_is_replaced(room: Path, tmp_path: Path) -> None:
+    """Its cameras.json was not listed."""
+    views = example("train_from_arrays").load_views(room)
+    scene, _ = bitymi_ns.train_scene(views, torch.rand(50, 3), torch.rand(50, 3), steps=2, method="bitymi-notexture")
+    info = bitymi_ns.bake_scene(scene, views, tmp_path / "bundle").info
+    del info.files["cameras.json"]
+    (tmp_path / "bundle" / "bundle.json").write_bytes(dump(info))
+    assert bitymi_ns.read_bundle(tmp_path / "bundle").cameras == []
+    with pytest.raises(BundleError, match="is a bundle already"):
+        bitymi_ns.bake_scene(scene, views, tmp_path / "bundle")
+    assert bitymi_ns.bake_scene(scene, views, tmp_path / "bundle", overwrite=True).cameras
+    (tmp_path / "bundle" / "letter.txt").write_text("dear")
+    with pytest.raises(BundleError, match="also holds letter.txt"):
+        bitymi_ns.bake_scene(scene, views, tmp_path / "bundle", overwrite=True)
 
 
 @pytest.mark.parametrize("method", ["bitymi-field", "bitymi-notexture"])

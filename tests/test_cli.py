@@ -1,5 +1,7 @@
 """The `bitymi` console script: thin calls, and mistakes answered in one line."""
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +40,16 @@ def test_mistakes_are_one_line(
     assert cli.main([word.format(tmp_path) for word in words]) == 1
     said = capsys.readouterr().err
     assert said.startswith(error.format(tmp_path)) and said.count("\n") == 1
+
+
+def test_what_nobody_can_act_on_is_not_said_and_nothing_is_written_elsewhere(tmp_path: Path) -> None:
+    assert cli.Stability().output == Path("stability.md")  # in the folder where it is called
+    old = "warnings.warn_explicit('old', FutureWarning, 'a.py', 1, '{}.activations')"
+    code = ["import sys, warnings", "from bitymi_ns.__main__ import main", "sys.argv[1:] = ['report']", "main()"]
+    for module, said in (("nerfstudio", False), ("mine", True)):
+        script = "; ".join([*code, old.format(module)])
+        done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=tmp_path)
+        assert "nothing to report" in done.stderr and ("FutureWarning: old" in done.stderr) == said
 
 
 FULL = "{} cannot be written: the disk is full: free some space, or write to another disk\n"

@@ -248,12 +248,12 @@ def encoded_texels(
     value_range: Range | None = None,
 ) -> EncodedAtlas:
     """Texels [T, C] in pages, as the options say, and in a range of values that they choose where none is stated."""
-    if options.format != "fp16" and value_range is None:
+    if options.texel_format != "fp16" and value_range is None:
         sizes = torch.from_numpy(packing.tiles[:, 3:]).long()
         of_tiles = (sizes[:, 0] > 0).repeat_interleave(sizes.clamp(min=1).prod(dim=1))
         value_range = choose_range(texels[of_tiles].numpy(), options.range, options.range_samples, options.seed)
     pages = paged_texels(texels, packing).numpy()
-    return encode(pages, packing, options.format, value_range, options.bc7_profile, progress=progress)
+    return encode(pages, packing, options.texel_format, value_range, options.bc7_profile, progress=progress)
 
 
 def atlas_cost(packing: Packing, atlas: EncodedAtlas) -> AtlasCost:

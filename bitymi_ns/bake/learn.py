@@ -95,8 +95,8 @@ def bake_and_learn(
         ValueError: no surfel is left, an option is out of range, or the atlas would be too large.
     """
     tune, coding, device = learning.tune, None, device_of(cameras)
-    if learning.compact is not None:  # its texels are decoded to 8 bits: nothing has to be encoded to state their error
-        options = replace(options, format="uint8")
+    form = "compact" if learning.compact is not None else options.format
+    options = replace(options, format=replace(options, format=form).texel_format)  # as bundle.json states it
     polish, trained = learning.polish, isinstance(scene.field, TexelField)
     if trained:
         baked = trained_texels(scene, options)

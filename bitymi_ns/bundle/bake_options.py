@@ -1,21 +1,26 @@
 """Options of the bake, which bundle.json states."""
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 from bitymi_ns.codec.bc7_encode import Profile, bc7_encoder
 from bitymi_ns.codec.limits import EXTENTS
 from bitymi_ns.codec.packing import check_page
-from bitymi_ns.codec.quantise import BYTES_PER_TEXEL, STEPS, Format, RangeRule
+from bitymi_ns.codec.quantise import STEPS, Format, RangeRule
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.tile_sizes import check_sides
+
+BundleFormat = Literal["compact", Format]
 
 
 @dataclass
 class BakeOptions:
-    """Options of the bake: tolerance, tiles, atlas format."""
+    """Options of the bake: format of the bundle, tolerance, tiles."""
 
-    format: Format = "bc7"
-    """Texel format: bc7 = 1 byte per texel, uint8 = RGBA, 4 bytes, fp16 = RGBA half floats, 8 bytes."""
+    format: BundleFormat | None = None
+    """compact: surfels and view colours as far as the pictures need them, texels by cosine transform; a sixth to a
+    half of the bytes of bc7, which is surfels.ply and texels of 1 byte each. uint8, fp16: the same with texels of 4
+    and 8 bytes. Not given: compact, or bc7 where everything is kept (a tolerance of 0)."""
     bc7_profile: Profile = "veryfast"
     """Effort of the BC7 encoder; basic and slow gain about 0.3 dB at a quarter and a twelfth of the speed."""
     r_min: int = 4
@@ -51,8 +56,23 @@ class BakeOptions:
     chunk: int = 1 << 18
     """Texels evaluated at once."""
 
+    @property
+    def bundle_format(self) -> BundleFormat:
+        """Format of the bundle, chosen where it is not given."""
+        return self.format or ("compact" if self.tolerance > 0 else "bc7")
+
+    @property
+    def texel_format(self) -> Format:
+        """Format of the atlas in memory; the texels of a compact bundle are decoded to 8 bits, without an encoder."""
+        return "uint8" if self.bundle_format == "compact" else self.bundle_format
+
     def check(self) -> None:
-        """Refuse values out of range."""
+        """Refuse values out of range.
+
+        Raises:
+            ValueError: an option is out of its range.
+            RuntimeError: the encoder of BC7 is not installed.
+        """
         if not EXTENTS[0] <= self.extent <= EXTENTS[1]:
             raise ValueError(f"the extent must be from {EXTENTS[0]:g} to {EXTENTS[1]:g}, not {self.extent}")
         if not 0 <= self.tolerance < STEPS:
@@ -68,7 +88,12 @@ class BakeOptions:
             raise ValueError(
                 f"tiles of r_max = {self.r_max} texels do not fit pages of {self.page_width} x {self.page_rows} texels"
             )
-        if self.format not in BYTES_PER_TEXEL:
-            raise ValueError(f"the atlas format must be bc7, uint8 or fp16, not {self.format!r}")
-        if self.format == "bc7":
+        formats = get_args(BundleFormat)
+        if self.bundle_format not in formats:
+            raise ValueError(f"there is no format {self.format!r}: choose among {', '.join(formats)}")
+        if self.format == "compact" and self.tolerance == 0:
+            raise ValueError("a compact bundle needs a tolerance above 0: choose another format, or another tolerance")
+        if self.texel_format == "bc7":
             bc7_encoder(self.bc7_profile)
+        elif self.bc7_profile != BakeOptions.bc7_profile:
+            raise ValueError(f"bc7_profile is for the format bc7, and this bundle's is {self.bundle_format}")

@@ -160,7 +160,8 @@ def parts_of(bundle: str | Path, inside: bool = False) -> Iterator[Parts]:
             size = _check_directory(file)
             archive = zipfile.ZipFile(file)
         except (*_DAMAGE, ValueError) as error:
-            raise BundleError(f"{path} is not a bundle in one file: {error}") from error
+            why = instead_of(path)
+            raise BundleError(f"{path} is not a bundle{f': {why}' if why else f' in one file: {error}'}") from error
         with archive:
             if len(archive.NameToInfo) != len(archive.filelist):
                 raise BundleError(f"{path} is not a bundle in one file: two parts have one name")
@@ -202,6 +203,35 @@ def notes_data(parts: Parts) -> bytes | None:
         return None
 
 
+def bundle_at(path: Path) -> Path | None:
+    """Find the bundle that a path names: itself, a folder or one file, or what it lies in, as config.yml does; None
+    where it names something else."""
+    return next((place for place in (path, path.parent) if (place / MANIFEST).is_file() or _is_archive(place)), None)
+
+
+def instead_of(path: Path) -> str | None:
+    """Say what a path that is no bundle is, and what to give in its place; None where that is not known."""
+    if not os.path.lexists(path):
+        return "it does not exist"
+    bundle = next((place for place in (path.parent, path / "bundle") if (place / MANIFEST).is_file()), None)
+    if bundle is not None:
+        return f"give {bundle}"
+    for run in (path, path.parent, path.parent.parent):
+        if (run / CONFIG).is_file() and next(run.glob("*/step-*.ckpt"), None) is not None:
+            command = f"ns-export bitymi-atlas --load-config {run / CONFIG} --output-dir bundle"
+            return f"it is a training run, which has to be exported first: {command}"
+    return None
+
+
+def _is_archive(path: Path) -> bool:
+    """True for a file that begins as a bundle in one file does."""
+    try:
+        with reading.open_regular(path) as file:
+            return file.read(4) == b"PK\3\4"
+    except OSError:
+        return False
+
+
 def check_target(folder: str | Path, overwrite: bool = False) -> None:
     """Check that a bundle may be written to a folder, before the work of making one.
 
@@ -232,8 +262,8 @@ def check_target(folder: str | Path, overwrite: bool = False) -> None:
 
 
 def files_of(folder: Path) -> list[str]:
-    """Names of the files of a bundle of any version: bundle.json, those that it lists, and the configuration for
-    nerfstudio's tools.
+    """Names of the files of a bundle of any version: bundle.json, those that it lists, the configuration for
+    nerfstudio's tools, and cameras.json, which the first versions of `bake_scene` wrote without listing it.
 
     Raises:
         BundleError: bundle.json cannot be read.
@@ -241,7 +271,7 @@ def files_of(folder: Path) -> list[str]:
     try:
         with parts_of(folder) as parts:
             listed = json_of(bytes(parts.read(MANIFEST, MANIFEST_LIMIT)))["files"]
-        return [MANIFEST, CONFIG, *map(str, listed)]
+        return [MANIFEST, CONFIG, CAMERAS, *map(str, listed)]
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise BundleError(
             f"{folder / MANIFEST} cannot be read ({error}): which files of {folder} are the bundle is not known. "

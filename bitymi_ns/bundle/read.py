@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bundle import compact, ktx2, ply
+from bitymi_ns.bundle.cameras import CapturedCamera, parse_cameras
 from bitymi_ns.bundle.manifest import (
     ATLAS,
     COMPACT_SURFELS,
@@ -25,7 +26,7 @@ from bitymi_ns.bundle.manifest import (
     parse,
     points_of,
 )
-from bitymi_ns.bundle.parts import MANIFEST_LIMIT, MissingPart, Parts, parts_of
+from bitymi_ns.bundle.parts import CAMERAS, MANIFEST_LIMIT, MissingPart, Parts, instead_of, parts_of
 from bitymi_ns.bundle.sizes import HEAD, SCENE_FILES, check_head, check_memory, enough_memory
 from bitymi_ns.bundle.surfel_table import TERMS, from_columns
 from bitymi_ns.codec.bc7_encode import Profile, bc7_blocks
@@ -47,6 +48,7 @@ LARGE_ATLAS = 64 << 20
 """Bytes of decoded texels of a compact bundle from which on a card gets BC7 blocks of them, a quarter of that. Fewer
 are no burden to any card, and blocks cost time, and some of the quality of texels that were not tuned to them."""
 LOAD_PROFILE: Profile = "veryfast"  # encoder profile of these blocks: the next faster one loses more than twice as much
+CONTENTS = SCENE_FILES | {CAMERAS}  # the files of a bundle that `assemble` takes
 _CHUNK = 1 << 22
 
 
@@ -57,10 +59,13 @@ class Bundle:
     Attributes:
         scene: what it holds, on the CPU; the view colours may be lean (`ops.view_color.LEAN`).
         info: bundle.json.
+        cameras: of the capture, training cameras and held-out ones (`CapturedCamera.camera`); none where the bundle has
+            no cameras.json.
     """
 
     scene: BakedScene
     info: Manifest
+    cameras: Sequence[CapturedCamera] = ()
 
     def __len__(self) -> int:
         return len(self.scene)
@@ -98,7 +103,7 @@ def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True) ->
     with parts_of(folder) as parts:
         info = manifest_of(parts)
         with enough_memory(parts.bundle, info):
-            files = {name: read_file(parts, info, name, verify, name in SCENE_FILES) for name in info.files}
+            files = {name: read_file(parts, info, name, verify, name in CONTENTS) for name in info.files}
             return assemble(parts.bundle, info, files, decode)
 
 
@@ -112,12 +117,20 @@ def read_manifest(folder: str | Path) -> Manifest:
         return manifest_of(parts)
 
 
+def read_cameras(folder: str | Path) -> list[CapturedCamera]:
+    """Read cameras.json of a bundle alone; none where it has no such file. Raises as `read_bundle` does."""
+    with parts_of(folder) as parts:
+        info = manifest_of(parts)
+        return parse_cameras(read_file(parts, info, CAMERAS), parts.bundle / CAMERAS) if CAMERAS in info.files else []
+
+
 def manifest_of(parts: Parts) -> Manifest:
     """Read bundle.json of an open bundle."""
     try:
         data = parts.read(MANIFEST, MANIFEST_LIMIT)
     except MissingPart as error:
-        raise BundleError(f"{parts.bundle} is not a bundle: it has no {MANIFEST}") from error
+        why = instead_of(parts.bundle) or f"it has no {MANIFEST}"
+        raise BundleError(f"{parts.bundle} is not a bundle: {why}") from error
     return parse(data, str(parts.bundle / MANIFEST))
 
 
@@ -183,7 +196,7 @@ def assemble(folder: Path, info: Manifest, files: dict[str, bytearray], decode: 
     """The bundle of what `read_file` read.
 
     Args:
-        files: contents of the files with surfels and texels, by name.
+        files: contents of the files with surfels, texels and cameras, by name.
 
     Raises:
         BundleError: a file is malformed, or a value is out of range.
@@ -200,7 +213,8 @@ def assemble(folder: Path, info: Manifest, files: dict[str, bytearray], decode: 
     )
     if atlas is not None:
         scene.offset, scene.scale, scene.alpha_scale = atlas.offset, atlas.scale, atlas.alpha_scale or 0.0
-    return Bundle(scene, info)
+    cameras = parse_cameras(files[CAMERAS], folder / CAMERAS) if CAMERAS in files else []
+    return Bundle(scene, info, cameras)
 
 
 def _ply_contents(folder: Path, info: Manifest, files: Mapping[str, bytearray], decode: bool) -> dict[str, Any]:

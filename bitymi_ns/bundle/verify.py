@@ -10,8 +10,8 @@ from torch import Tensor
 from bitymi_ns.bundle.manifest import MANIFEST, BundleError, WorldFrame
 from bitymi_ns.bundle.notes import read_notes
 from bitymi_ns.bundle.parts import NOTES, Parts, parts_of
-from bitymi_ns.bundle.read import Bundle, assemble, manifest_of, read_file
-from bitymi_ns.bundle.sizes import SCENE_FILES, enough_memory
+from bitymi_ns.bundle.read import CONTENTS, Bundle, assemble, manifest_of, read_file
+from bitymi_ns.bundle.sizes import enough_memory
 from bitymi_ns.bundle.sketch import estimated_rms, sketch, sketches_of
 from bitymi_ns.bundle.write import World
 from bitymi_ns.codec.pages import scene_texels
@@ -57,7 +57,7 @@ def _check_parts(parts: Parts) -> tuple[Bundle | None, list[Check]]:
         with enough_memory(parts.bundle, info):
             for name, entry in info.files.items():
                 try:
-                    files[name] = read_file(parts, info, name, keep=name in SCENE_FILES)
+                    files[name] = read_file(parts, info, name, keep=name in CONTENTS)
                     checks.append(Check(name, True, f"{entry.bytes:,} bytes, sha256 as stated"))
                 except BundleError as error:
                     checks.append(Check(name, False, str(error)))

@@ -1,14 +1,15 @@
 """Baked scenes for other programs: as 3D Gaussians, and as a textured mesh; and how those would draw them."""
 
-from bitymi_ns.interchange.bundle_cameras import read_cameras
 from bitymi_ns.interchange.extras import Frame, Kind, check_extras, extras_folder, summary_line, write_extras
+from bitymi_ns.interchange.held_out import read_held_out, training_cameras
 
 __all__ = [
     "Frame",
     "Kind",
     "check_extras",
     "extras_folder",
-    "read_cameras",
+    "read_held_out",
     "summary_line",
+    "training_cameras",
     "write_extras",
 ]

@@ -106,6 +106,8 @@ def observed_box(depths: Sequence[Tensor], cameras: Sequence[Camera]) -> Tensor:
     Raises:
         NoSurface: no depth is known.
     """
+    if not cameras:
+        raise NoSurface("there are no cameras that see the surface")
     points = torch.cat([_points(depth, camera) for depth, camera in zip(depths, cameras, strict=True)])
     if not len(points):
         raise NoSurface("no pixel of the cameras' views is covered to one half: there is no surface to fuse")
@@ -154,39 +156,40 @@ def extract_surface(
 
     options = options or SurfaceOptions()
     check_ranges(options)
-    small = [camera.within(BOX_SIDE) for camera in cameras]
-    depths = []
-    for i, camera in enumerate(small):
-        depths.append(median_depth(surfels, camera, near, prefilter, alpha).cpu())
-        progress("finding the box", i + 1, len(small))
-    box = observed_box(depths, small)
-    voxel = float((box[1] - box[0]).max()) / options.resolution
-    volume = open3d.pipelines.integration.ScalableTSDFVolume(
-        voxel, TRUNCATION * voxel, open3d.pipelines.integration.TSDFVolumeColorType.RGB8
-    )
-    for i, camera in enumerate(cameras):
-        inside = _cut(depths[i], small[i], box)
-        far = inside[inside > 0].quantile(FAR).item() if inside.any() else 0.0
-        camera = _coarsened(camera, PIXELS_PER_VOXEL * far / voxel)
-        depth = _cut(median_depth(surfels, camera, near, prefilter, alpha).cpu(), camera, box)
-        rgb = as_bytes(render(camera)).numpy()
-        picture = open3d.geometry.RGBDImage.create_from_color_and_depth(
-            open3d.geometry.Image(np.ascontiguousarray(rgb)),
-            open3d.geometry.Image(np.ascontiguousarray(depth.float().numpy())),
-            depth_scale=1.0,
-            depth_trunc=math.inf,
-            convert_rgb_to_intensity=False,
+    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):  # it warns of what is raised here
+        small = [camera.within(BOX_SIDE) for camera in cameras]
+        depths = []
+        for i, camera in enumerate(small):
+            depths.append(median_depth(surfels, camera, near, prefilter, alpha).cpu())
+            progress("finding the box", i + 1, len(small))
+        box = observed_box(depths, small)
+        voxel = float((box[1] - box[0]).max()) / options.resolution
+        volume = open3d.pipelines.integration.ScalableTSDFVolume(
+            voxel, TRUNCATION * voxel, open3d.pipelines.integration.TSDFVolumeColorType.RGB8
         )
-        K = camera.K.cpu().double()
-        # open3d samples a pixel at its integer coordinates, this package half a pixel further
-        pinhole = (K[0, 0].item(), K[1, 1].item(), K[0, 2].item() - 0.5, K[1, 2].item() - 0.5)
-        intrinsic = open3d.camera.PinholeCameraIntrinsic(camera.width, camera.height, *pinhole)
-        volume.integrate(picture, intrinsic, camera.viewmat.cpu().double().numpy())
-        progress("fusing depth maps", i + 1, len(cameras))
-    mesh = volume.extract_triangle_mesh()
-    if not len(mesh.triangles):
-        raise NoSurface("the depth maps fuse to no surface: try a smaller --resolution")
-    return _finished(mesh, options, progress, to)
+        for i, camera in enumerate(cameras):
+            inside = _cut(depths[i], small[i], box)
+            far = inside[inside > 0].quantile(FAR).item() if inside.any() else 0.0
+            camera = _coarsened(camera, PIXELS_PER_VOXEL * far / voxel)
+            depth = _cut(median_depth(surfels, camera, near, prefilter, alpha).cpu(), camera, box)
+            rgb = as_bytes(render(camera)).numpy()
+            picture = open3d.geometry.RGBDImage.create_from_color_and_depth(
+                open3d.geometry.Image(np.ascontiguousarray(rgb)),
+                open3d.geometry.Image(np.ascontiguousarray(depth.float().numpy())),
+                depth_scale=1.0,
+                depth_trunc=math.inf,
+                convert_rgb_to_intensity=False,
+            )
+            K = camera.K.cpu().double()
+            # open3d samples a pixel at its integer coordinates, this package half a pixel further
+            pinhole = (K[0, 0].item(), K[1, 1].item(), K[0, 2].item() - 0.5, K[1, 2].item() - 0.5)
+            intrinsic = open3d.camera.PinholeCameraIntrinsic(camera.width, camera.height, *pinhole)
+            volume.integrate(picture, intrinsic, camera.viewmat.cpu().double().numpy())
+            progress("fusing depth maps", i + 1, len(cameras))
+        mesh = volume.extract_triangle_mesh()
+        if not len(mesh.triangles):
+            raise NoSurface("the depth maps fuse to no surface: try a smaller --resolution")
+        return _finished(mesh, options, progress, to)
 
 
 def _coarsened(camera: Camera, focal: float) -> Camera:

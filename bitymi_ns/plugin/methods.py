@@ -54,6 +54,12 @@ def _install() -> None:
             "use `python -m bitymi_ns.plugin.export.command` instead",
             stacklevel=1,
         )
+    try:
+        from bitymi_ns.plugin.export.hook import MESH_COMMAND
+        from bitymi_ns.plugin.run.commands import refuse_without_config
+    except Exception:  # noqa: BLE001 - a method that is not available says so
+        return
+    refuse_without_config(MESH_COMMAND)
 
 
 _install()

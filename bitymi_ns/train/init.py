@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -41,13 +41,15 @@ class PointReport:
     background: int = 0  # Surfels placed where the photographs show no point (`background_points`).
 
 
-def first_surfels_for(steps: int, pixels: float) -> int:
-    """The most surfels that a run starts with, where `TrainConfig.first_surfels` is not given.
+def limit_first_surfels(config: TrainConfig, steps: int, pixels: int, views: int) -> TrainConfig:
+    """State the most surfels that a run starts with, where the options do not.
 
     Args:
-        pixels: of a training view at full size.
+        pixels: of all training views together, at full size.
     """
-    return max(FEWEST_FIRST, int(steps * pixels / PIXELS_PER_FIRST_SURFEL))
+    if config.first_surfels is not None or not views:
+        return config
+    return replace(config, first_surfels=max(FEWEST_FIRST, int(steps * pixels / views / PIXELS_PER_FIRST_SURFEL)))
 
 
 def scene_extent(camera_centers: Tensor, points: Tensor | None = None) -> float:
@@ -297,14 +299,20 @@ def build_scene(
 
 
 def scene_for_views(
-    views: Sequence[View], points: Tensor, colors: Tensor, scene_config: SceneConfig, train_config: TrainConfig
+    views: Sequence[View],
+    points: Tensor,
+    colors: Tensor,
+    scene_config: SceneConfig,
+    train_config: TrainConfig,
+    steps: int | None = None,
 ) -> Scene:
-    """`build_scene` for photographs that are in memory.
+    """Build the first scene of photographs that are in memory, see `build_scene`.
 
     Args:
         views: training photographs at full size.
         points: [M, 3] world positions; M may be 0.
         colors: [M, 3] in [0, 1].
+        steps: length of the run, which limits the points that are used; None = all are.
 
     Raises:
         ValueError: an option is out of range.
@@ -312,6 +320,8 @@ def scene_for_views(
     centers = torch.stack([view.camera.center.cpu() for view in views]) if views else torch.zeros(0, 3)
     pixels = sum(view.camera.width * view.camera.height for view in views)
     bounded = any(view.image.shape[-1] == 4 for view in views)
+    if steps is not None:
+        train_config = limit_first_surfels(train_config, steps, pixels, len(views))
     points, colors = points.cpu(), colors.cpu()
     background = background_points(points, views, train_config.seed) if train_config.background_points else None
     return build_scene(points, colors, centers, scene_config, train_config, bounded, pixels, background=background)[0]

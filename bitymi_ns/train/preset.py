@@ -68,7 +68,8 @@ def _read_with_base(path: Path, folder: Path, above: tuple[Path, ...]) -> dict[s
         raise PresetError(f"{path.name}: base: presets refer to each other in a circle")
     if not path.is_file():
         where = f" (named as base of {above[-1].name})" if above else ""
-        raise PresetError(f"there is no preset file {path}{where}; reinstall bitymi-ns")
+        there = ", ".join(sorted(file.stem for file in folder.glob("*.yaml"))) or "none; reinstall bitymi-ns"
+        raise PresetError(f"there is no preset {path.stem!r}{where} in {folder}, which has {there}")
     try:
         values = yaml.load(path.read_text("utf8"), _Loader)
     except yaml.YAMLError as error:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from importlib import resources
 from pathlib import Path
 
@@ -30,11 +31,8 @@ TYPES = {
     ".jpg": "image/jpeg",
     ".webp": "image/webp",
 }
-POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
-    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-)
-"""Nothing of a bundle runs: scripts come from the page alone, and a bundle's files are never sent as such."""
+_POLICY = re.compile(rb'http-equiv="Content-Security-Policy"\s+content="([^"]+)"')
+NOTHING = "default-src 'none'"  # policy of a site without a page
 BUNDLE = "bundle/"
 _NOTES = f"{BUNDLE}{NOTES}"
 SINGLE = "scene.bitymi"  # name of the one file beside an exported page
@@ -67,6 +65,13 @@ class Site:
     @property
     def paths(self) -> list[str]:
         return sorted({*self.files, *self._parts, *([] if self.notes() is None else [_NOTES])})
+
+    @cached_property
+    def policy(self) -> str:
+        """Content-Security-Policy of what is served: that of the page, and no frames. Nothing of a bundle runs: scripts
+        come from the page alone, and a bundle's files are never sent as such."""
+        found = _POLICY.search(self.files["index.html"]()) if "index.html" in self.files else None
+        return f"{found[1].decode() if found else NOTHING}; frame-ancestors 'none'"
 
     def stamp(self, path: str) -> object:
         """A value that changes when what is served changes; that of notes is always another one."""

@@ -16,7 +16,7 @@ from urllib.parse import unquote, urlsplit
 
 from bitymi_ns.bundle.manifest import BundleError
 
-from .page import POLICY, PageError, Site, media_type
+from .page import PageError, Site, media_type
 
 LOOPBACK = "127.0.0.1"
 LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
@@ -25,7 +25,6 @@ MOST_CLIENTS = 64  # connections at a time; a browser opens six
 _BUSY = b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 _PIECE = 1 << 20
 _HEADERS = {
-    "Content-Security-Policy": POLICY,
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -112,7 +111,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_response(status)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(data)))
-        for header, value in _HEADERS.items():
+        for header, value in {**_HEADERS, "Content-Security-Policy": self.server.site.policy}.items():
             self.send_header(header, value)
         if self.close_connection:
             self.send_header("Connection", "close")

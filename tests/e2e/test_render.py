@@ -11,7 +11,6 @@ from nerfstudio.scripts import render
 from PIL import Image
 
 from bitymi_ns.bundle import read_bundle
-from bitymi_ns.interchange.bundle_cameras import named_cameras
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from bitymi_ns.scene.baked import as_bytes
 
@@ -20,7 +19,7 @@ from bitymi_ns.scene.baked import as_bytes
 def camera_path(bundle: Path, tmp_path: Path) -> Path:
     """The bundle's cameras as nerfstudio's camera path: camera to world by rows, x right, y up, z backward."""
     frames = []
-    for row in named_cameras(bundle, read_bundle(bundle).info):
+    for row in read_bundle(bundle).cameras:
         pose = torch.linalg.inv(row.camera.viewmat.double()) @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).double()
         fov = 2 * np.degrees(np.arctan(row.camera.height / 2 / float(row.camera.K[1, 1])))
         frames.append({"camera_to_world": pose.flatten().tolist(), "fov": fov, "aspect": 4 / 3})
@@ -39,7 +38,7 @@ def test_a_camera_path_is_that_of_the_bundle_and_of_its_run(
         files = sorted((tmp_path / name).iterdir())
         pictures[name] = np.stack([np.array(Image.open(file)) for file in files]).astype(int)
     scene = read_bundle(bundle)
-    cameras = [row.camera for row in named_cameras(bundle, scene.info)]
+    cameras = [row.camera for row in scene.cameras]
     drawn = np.stack([as_bytes(scene.render(camera).rgb).numpy() for camera in cameras]).astype(int)
     # a path has the field of view alone: the principal point is in the middle, as the room's cameras have it
     assert np.abs(pictures["bundle"] - drawn).max() <= 2

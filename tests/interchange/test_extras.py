@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,11 @@ import torch
 from PIL import Image
 
 from bitymi_ns import cli
-from bitymi_ns.bundle import Bundle, BundleError, read_bundle
+from bitymi_ns.bundle import Bundle, BundleError, check_files, read_bundle
 from bitymi_ns.bundle.ply import parse_ply
+from bitymi_ns.bundle.read import read_cameras
 from bitymi_ns.bundle.single import write_single
-from bitymi_ns.interchange import extras, extras_folder, read_cameras, write_extras
+from bitymi_ns.interchange import extras, extras_folder, read_held_out, training_cameras, write_extras
 from bitymi_ns.interchange.frame import to_capture, up_of
 from bitymi_ns.interchange.glb import upright
 from bitymi_ns.train.views import View
@@ -117,9 +119,9 @@ def test_a_bundle_on_its_own_is_written_by_the_command(
 def test_cameras_and_photographs_are_read_from_folder_and_file(with_cameras: Path, tmp_path: Path) -> None:
     write_single(with_cameras, tmp_path / "scene.bitymi")
     for bundle in (with_cameras, tmp_path / "scene.bitymi"):
-        found = read_cameras(bundle, read_bundle(bundle).info)
-        assert [camera.width for camera in found.train] == [64, 64] and len(found.held_out) == 1
-        (view,) = found.held_out
+        read = read_bundle(bundle)
+        assert [camera.width for camera in training_cameras(read)] == [64, 64] and len(read.cameras) == 4
+        (view,) = read_held_out(bundle, read)
         assert view.image.shape == (24, 32, 3) and (view.camera.width, view.camera.height) == (32, 24)
         assert float(view.camera.K[0, 0]) == 30.0 and float(view.camera.K[1, 2]) == 12.0
     assert extras_folder(tmp_path / "scene.bitymi") == tmp_path / "scene.extras"
@@ -133,7 +135,7 @@ def test_a_photograph_that_is_a_program_is_refused(surfels, tmp_path: Path) -> N
     files = {"cameras.json": json.dumps({"cameras": [row]}).encode(), "p.jpg": postscript.getvalue()}
     make(surfels, tmp_path / "b", extra_files=files)
     with pytest.raises(BundleError, match="p.jpg cannot be read as a picture: cannot identify"):
-        read_cameras(tmp_path / "b", read_bundle(tmp_path / "b").info)
+        read_held_out(tmp_path / "b", read_bundle(tmp_path / "b"))
 
 
 @pytest.mark.parametrize(
@@ -149,12 +151,13 @@ def test_a_photograph_that_is_a_program_is_refused(surfels, tmp_path: Path) -> N
 )
 def test_a_damaged_list_of_cameras_is_refused(surfels, tmp_path: Path, text: bytes, message: str) -> None:
     make(surfels, tmp_path / "b", extra_files={"cameras.json": text})
-    info = read_bundle(tmp_path / "b").info
     with pytest.raises(BundleError, match=message):
-        read_cameras(tmp_path / "b", info)
+        read_bundle(tmp_path / "b")
+    (*_, contents) = check_files(tmp_path / "b")[1]
+    assert not contents.ok and re.search(message, contents.detail)
     (tmp_path / "b" / "cameras.json").write_bytes(text[:-1] + b"?")
     with pytest.raises(BundleError, match="altered"):
-        read_cameras(tmp_path / "b", info)
+        read_cameras(tmp_path / "b")
 
 
 def test_what_cannot_be_written_is_refused_before_the_work(bundle: Bundle, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import open3d
 import pytest
 import torch
 import trimesh
@@ -74,6 +75,20 @@ def test_a_plane_is_fused_where_it_lies() -> None:
     shape = trimesh.Trimesh(vertices, mesh.faces, process=False)
     assert shape.face_normals[:, 2].min() > 0.9  # towards the cameras
     assert shape.area_faces.min() > 0.0
+
+
+def test_open3d_is_silent_and_cameras_are_needed() -> None:
+    levels = []
+
+    def render(camera: Camera) -> torch.Tensor:
+        levels.append(open3d.utility.get_verbosity_level())
+        return gray(camera)
+
+    before = open3d.utility.get_verbosity_level()
+    extract_surface(plane(60), render, CAMERAS[:2], 0.02, SurfaceOptions(resolution=32))
+    assert set(levels) == {open3d.utility.VerbosityLevel.Error} and open3d.utility.get_verbosity_level() == before
+    with pytest.raises(NoSurface, match="no cameras"):
+        extract_surface(plane(60), gray, [], 0.02)
 
 
 def test_large_views_are_drawn_no_finer_than_the_voxels_need() -> None:

@@ -10,7 +10,7 @@ from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import DensifyConfig, TrainConfig
 from bitymi_ns.train.init import (
     facing,
-    first_surfels_for,
+    limit_first_surfels,
     neighbour_distance,
     scene_extent,
     surfels_from_points,
@@ -119,7 +119,8 @@ def test_the_cap_holds_from_the_start(cloud):
 
 
 def test_extent():
-    assert first_surfels_for(900, 244 * 135) == 29_646 and first_surfels_for(60, 48 * 36) == 5_000
+    for steps, pixels, most in ((900, 244 * 135, 29_646), (60, 48 * 36, 5_000)):
+        assert limit_first_surfels(TrainConfig(), steps, 3 * pixels, 3).first_surfels == most
     assert scene_extent(torch.tensor([[1.0, 0, 0], [-1, 0, 0]])) == pytest.approx(1.1)
     one = torch.tensor([[5.0, 0, 0]])
     assert scene_extent(one, torch.tensor([[0.0, 0, 0], [7, 0, 0], [4, 0, 0]])) == pytest.approx(2.0)

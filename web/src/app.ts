@@ -367,7 +367,7 @@ export class App implements Stage {
   }
 
   private async share(): Promise<void> {
-    history.replaceState(null, '', toHash(this.shared()));
+    history.replaceState(null, '', `${location.pathname}${location.search}${toHash(this.shared())}`);
     try {
       await navigator.clipboard.writeText(location.href);
       notify('The link to this view was copied.');

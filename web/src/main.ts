@@ -97,6 +97,7 @@ async function main(): Promise<void> {
 const embed = new Embed();
 onError((title, message) => embed.failed(title, message));
 document.documentElement.dataset.state = 'loading';
+element('page-late').hidden = true;
 addEventListener('unhandledrejection', ({ reason }) => showError(reason));
 addEventListener('error', ({ error }) => error && showError(error)); // notes of the browser have none
 main().catch(showError);

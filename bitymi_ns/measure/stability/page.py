@@ -1,4 +1,4 @@
-"""Write docs/stability.md: errors of float32, case by case and along each kind of stiffness."""
+"""Write the page of docs/stability.md: errors of float32, case by case and along each kind of stiffness."""
 
 import io
 from collections import Counter

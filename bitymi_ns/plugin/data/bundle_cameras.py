@@ -11,9 +11,9 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 
 from bitymi_ns.bundle import BundleError
+from bitymi_ns.bundle.cameras import CapturedCamera
 from bitymi_ns.bundle.parts import CAMERAS
-from bitymi_ns.bundle.read import read_manifest
-from bitymi_ns.interchange.bundle_cameras import CameraRow, named_cameras
+from bitymi_ns.bundle.read import read_cameras, read_manifest
 from bitymi_ns.plugin.console import fail
 from bitymi_ns.plugin.data.lens import Pinhole
 from bitymi_ns.plugin.data.views import NO_PHOTOS, OPENCV_AXES, Views, pinhole_cameras
@@ -40,8 +40,7 @@ class BundleCameras(DataParser):
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs: Any) -> DataparserOutputs:
         folder = Path(self.config.data)
         try:
-            info = read_manifest(folder)
-            rows = named_cameras(folder, info)
+            info, rows = read_manifest(folder), read_cameras(folder)
             files = {row.name: inside(Path(self.config.capture), row.name) for row in rows}
         except BundleError as error:
             fail(str(error), error)
@@ -61,12 +60,12 @@ class BundleCameras(DataParser):
 def has_cameras(bundle: Path) -> bool:
     """Test if a bundle states the cameras of its capture."""
     try:
-        return bool(named_cameras(bundle, read_manifest(bundle)))
+        return bool(read_cameras(bundle))
     except BundleError as error:
         fail(str(error), error)
 
 
-def _cameras(rows: Sequence[CameraRow]) -> Cameras:
+def _cameras(rows: Sequence[CapturedCamera]) -> Cameras:
     poses, pinholes = [], []
     for camera in (row.camera for row in rows):
         poses.append((torch.linalg.inv(camera.viewmat.double()) @ torch.from_numpy(OPENCV_AXES)).float())

@@ -1,15 +1,14 @@
 """The capture's cameras as a file of the bundle, for viewers; and held-out photographs, if they may be given away."""
 
 import io
-import json
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 from PIL import Image
 
+from bitymi_ns.bundle.cameras import CapturedCamera, cameras_data
 from bitymi_ns.bundle.parts import CAMERAS
-from bitymi_ns.interchange.bundle_cameras import camera_row
 from bitymi_ns.scene.baked import as_bytes
 from bitymi_ns.scene.camera import Camera
 
@@ -17,23 +16,21 @@ MOST_PIXELS = 1600  # longer side of a photograph in a bundle
 
 
 def camera_files(datamanager: Any, train: Sequence[Camera], photographs: bool) -> dict[str, bytes]:
-    """cameras.json: every camera with its name, its image's size, K as fx, fy, cx, cy, viewmat [16] by rows, and
-    whether it was held out; and the photographs of those.
+    """Make cameras.json, and the held-out photographs.
 
     Args:
         photographs: also the held-out photographs, as JPEG of at most `MOST_PIXELS` along a side.
     """
     files: dict[str, bytes] = {}
     names = [path.name for path in datamanager.train_dataset.image_filenames]
-    rows = [camera_row(name, camera, False) for name, camera in zip(names, train, strict=True)]
+    rows = [CapturedCamera.of(name, camera, False) for name, camera in zip(names, train, strict=True)]
     for i, path in enumerate(datamanager.eval_dataset.image_filenames):
         view = datamanager.eval_views[i]
-        row = camera_row(path.name, view.camera.to("cpu"), True)
-        if photographs:
-            row["photograph"] = f"photograph-{i + 1:04d}.jpg"
-            files[row["photograph"]] = _jpeg(view.target(torch.zeros(3), "cpu"))
-        rows.append(row)
-    return {CAMERAS: (json.dumps({"cameras": rows}) + "\n").encode(), **files}
+        photograph = f"photograph-{i + 1:04d}.jpg" if photographs else None
+        if photograph is not None:
+            files[photograph] = _jpeg(view.target(torch.zeros(3), "cpu"))
+        rows.append(CapturedCamera.of(path.name, view.camera, True, photograph))
+    return {CAMERAS: cameras_data(rows), **files}
 
 
 def _jpeg(image: torch.Tensor) -> bytes:

@@ -3,20 +3,18 @@
 Also `python -m bitymi_ns.plugin.export.command`, should a future nerfstudio not take the command in.
 """
 
-import copy
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal
 
 import tyro
-import yaml
 
 from bitymi_ns import endings
 from bitymi_ns.bake import BakeOptions, Learning, TuneOptions, bake_and_learn, export, rich_progress
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bake.learn import FEWEST_PASSES
 from bitymi_ns.bundle import Bundle, BundleError, read_bundle
+from bitymi_ns.bundle.bake_options import BundleFormat
 from bitymi_ns.bundle.manifest import MANIFEST, dump
 from bitymi_ns.bundle.parts import CONFIG
 from bitymi_ns.bundle.poster import most_bytes
@@ -26,10 +24,10 @@ from bitymi_ns.interchange import Frame, Kind, check_extras, extras_folder, summ
 from bitymi_ns.plugin.console import INTERRUPTED, InputError, fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.export.cameras import camera_files
+from bitymi_ns.plugin.export.nerfstudio_config import bundle_config
 from bitymi_ns.plugin.export.summary import print_summary
 from bitymi_ns.plugin.export.target import bundle_version, check_room, reserve_bundle
 from bitymi_ns.plugin.export.trained import compare, load_trained, preview, world_of
-from bitymi_ns.plugin.run.bundle_model import BakedModelConfig
 from bitymi_ns.plugin.run.memory import state_export
 from bitymi_ns.plugin.run.model import BitymiModel
 from bitymi_ns.scene.camera import Camera
@@ -37,7 +35,6 @@ from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.exposure import corrected
 from bitymi_ns.train.views import View
 
-BundleFormat = Literal["compact", "bc7", "uint8", "fp16"]
 _MUCH_SMALLER = 0.9
 MANIFEST_BYTES = 28_000  # upper estimate of bundle.json and config.yml
 
@@ -59,17 +56,9 @@ class CompactOptions:
     """PSNR in dB against the training photographs, before the texels are tuned, in the place of compact_error:
     everything becomes as coarse as it may. Held-out views are shown less well than these."""
 
-    def check_compact(self, form: BundleFormat, tolerance: float, bc7_profile: str) -> None:
-        """Stop where an option is out of its range, or is for another format than that of the bundle.
-
-        Args:
-            bc7_profile: that was asked for.
-        """
+    def check_compact(self, form: BundleFormat) -> None:
+        """Stop where an option is out of its range, or is for another format than that of the bundle."""
         compact = form == "compact"
-        if compact and tolerance == 0:
-            fail("a compact bundle needs a tolerance: leave out --format compact, or --exact and --tolerance 0")
-        if form != "bc7" and bc7_profile != BakeOptions.bc7_profile:
-            fail(f"--bc7-profile is for --format bc7, and this bundle's is {form}")
         for name in ("interchange", "compact_error", "target_mb", "target_psnr"):
             if not compact and getattr(self, name) != getattr(CompactOptions, name):
                 fail(f"--{name.replace('_', '-')} is for --format compact, and this bundle's is {form}")
@@ -119,10 +108,6 @@ class ExportAtlas(BakeOptions, CompactOptions):
     load_config: Path  # config.yml of a trained scene.
     output_dir: Path  # Folder of the bundle.
     overwrite: bool = False  # Replace a bundle that is there already.
-    format: BundleFormat | None = None  # type: ignore[assignment]  # of the bundle; that of the bake is `_options`
-    """compact: surfels and view colours as far as the pictures need them, texels by cosine transform; a sixth to a
-    half of the bytes of bc7, which is surfels.ply and texels of 1 byte each. uint8, fp16: the same with texels of 4
-    and 8 bytes. Not given: compact, or bc7 where everything is kept (--exact, --tolerance 0)."""
     exact: bool = False
     """Keep everything: every tile at the Nyquist rate of the field, no cap by views, no surfel dropped as unseen, all
     sites of the view colours, and texels as the field gives them, without fine-tuning."""
@@ -161,7 +146,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
                 if self.extras:
                     check_extras(self.extras, extras_folder(self.output_dir), self.overwrite)
                 if self.check_room:
-                    check_room(self.output_dir, self.load_config, bake_options, self.exact, self._is_compact)
+                    check_room(self.output_dir, self.load_config, bake_options, self.exact)
                 self._run(bake_options)
         except KeyboardInterrupt:
             there = bundle_version(self.output_dir)
@@ -173,12 +158,9 @@ class ExportAtlas(BakeOptions, CompactOptions):
 
     def _options(self) -> BakeOptions:
         """Options of the bake; stops where one is out of its range, before anything is loaded."""
-        options = BakeOptions(**{f.name: getattr(self, f.name) for f in fields(BakeOptions) if f.name != "format"})
+        options = BakeOptions(**{f.name: getattr(self, f.name) for f in fields(BakeOptions)})
         if self.exact:
             options = replace(options, tolerance=0.0, cap_by_views=False, drop_unseen=False)
-        form = self._form
-        # a compact bundle needs no encoder: its texels are decoded to 8 bits
-        options = replace(options, format="uint8" if form == "compact" else form)
         if self.finetune_steps is not None and self.finetune_steps < 0:
             fail(f"--finetune-steps must not be negative, it is {self.finetune_steps}; 0 = no fine-tuning")
         if self.polish_steps is not None and self.polish_steps < 0:
@@ -189,16 +171,8 @@ class ExportAtlas(BakeOptions, CompactOptions):
             options.check()
         except (ValueError, RuntimeError) as error:  # an option out of range; the BC7 encoder is not installed
             fail(f"the scene cannot be baked: {error}", error)
-        self.check_compact(form, options.tolerance, options.bc7_profile)
+        self.check_compact(options.bundle_format)
         return options
-
-    @property
-    def _form(self) -> BundleFormat:
-        return self.format or ("bc7" if self.exact or self.tolerance == 0 else "compact")
-
-    @property
-    def _is_compact(self) -> bool:
-        return self._form == "compact"
 
     def _learning(self, model: BitymiModel, views: int, compact: Compact | None) -> Learning:
         """Optimisation after the bake for so many training photographs."""
@@ -212,11 +186,12 @@ class ExportAtlas(BakeOptions, CompactOptions):
         config, pipeline = load_trained(self.load_config)
         model, datamanager = pipeline.model, pipeline.datamanager
         views = to_cameras(datamanager.train_dataset.cameras, model.device)
+        compact = options.bundle_format == "compact"
         first = datamanager.eval_views[0].camera if len(datamanager.eval_dataset) else views[0]
-        shown = preview(model, first, "JPEG" if self._is_compact else "PNG")
+        shown = preview(model, first, "JPEG" if compact else "PNG")
         cameras_of = camera_files(datamanager, views, self.photographs)
         beside = len(shown) + sum(map(len, cameras_of.values()))
-        learning = self._learning(model, len(views), self.compact_of(beside) if self._is_compact else None)
+        learning = self._learning(model, len(views), self.compact_of(beside) if compact else None)
         polish, tune, has_learned = learning.polish, learning.tune, isinstance(model.scene.field, TexelField)
         for name, options_of in (("polish", polish), ("finetune", None if polish or has_learned else tune)):
             if options_of is not None and options_of.steps < FEWEST_PASSES * len(views):
@@ -226,7 +201,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
                     f"for each: more may gain (--{name}-steps)."
                 )
         kept, learning_surfels = tune.cache_bytes if tune else 0, len(model.scene) if polish else 0
-        state_export(model.scene, views, kept, learning_surfels, self._is_compact)
+        state_export(model.scene, views, kept, learning_surfels, compact)
         try:
             with rich_progress() as progress:
                 held_out = datamanager.eval_views if self.compare else ()
@@ -247,8 +222,8 @@ class ExportAtlas(BakeOptions, CompactOptions):
             self.output_dir,
             background=background,
             world=world_of(datamanager),
-            statistics={"options": asdict(options), "method": config.method_name},
-            extra_files={"preview.jpg" if self._is_compact else "preview.png": shown, **cameras_of},
+            statistics={"options": asdict(baked.options), "method": config.method_name},
+            extra_files={"preview.jpg" if compact else "preview.png": shown, **cameras_of},
             loose_files={CONFIG: bundle_config(config, self.output_dir, background)},
             overwrite=self.overwrite,
             interchange=self.interchange,
@@ -280,20 +255,6 @@ class ExportAtlas(BakeOptions, CompactOptions):
             )
         for each in written.values():
             say(f"In {folder}: {summary_line(each)}")
-
-
-def bundle_config(config: Any, folder: Path, background: tuple[float, ...]) -> bytes:
-    """The config.yml with which nerfstudio's tools open the bundle.
-
-    It is no part of what bundle.json vouches for: nothing of ours reads it, and its data path may have to be edited
-    when the photographs are moved.
-    """
-    config = copy.deepcopy(config)
-    config.pipeline.model = BakedModelConfig(bundle=folder.absolute(), background=background)  # type: ignore[arg-type]
-    config.load_dir = config.load_step = config.load_checkpoint = config.load_config = None
-    config.optimizers = {}
-    vars(config).pop("read_from", None)
-    return yaml.dump(config).encode("utf8")
 
 
 def main() -> None:

@@ -11,12 +11,12 @@ from torch import Tensor
 
 from bitymi_ns import endings
 from bitymi_ns.bundle import BundleError, read_bundle
-from bitymi_ns.bundle.manifest import MANIFEST, WorldFrame
+from bitymi_ns.bundle.manifest import WorldFrame
+from bitymi_ns.bundle.parts import CAMERAS, bundle_at
 from bitymi_ns.bundle.strict_json import plain
 from bitymi_ns.codec.pages import texel_alpha
 from bitymi_ns.files import reason, reserved, size_text, write_file
-from bitymi_ns.interchange import Frame
-from bitymi_ns.interchange.bundle_cameras import named_cameras
+from bitymi_ns.interchange import Frame, training_cameras
 from bitymi_ns.interchange.frame import to_capture, up_of
 from bitymi_ns.interchange.surface import NoSurface, SurfaceOptions, extract_surface
 from bitymi_ns.interchange.surface_files import MeshFormat, mesh_bytes
@@ -49,7 +49,7 @@ class Source:
 class ExportMesh(SurfaceOptions):
     """Extract the surface as a triangle mesh with vertex colors: TSDF fusion of median depths (open3d)."""
 
-    load_config: Path  # config.yml of a trained scene or of a bundle.
+    load_config: Path  # config.yml of a trained scene or of a bundle, or a bundle in one file.
     output_dir: Path  # Folder of the mesh: mesh.ply, mesh.glb or mesh.obj.
     format: MeshFormat = "ply"  # Of the file. Those of other formats stay.
     frame: Frame = "capture"
@@ -67,7 +67,8 @@ class ExportMesh(SurfaceOptions):
         try:
             with reserved(path, warn):
                 self._check_target(path)
-                source = from_bundle(self.load_config.parent) if self._is_bundle else from_run(self.load_config)
+                bundle = bundle_at(self.load_config)
+                source = from_run(self.load_config) if bundle is None else from_bundle(bundle)
                 note = self._write(source, path)
         except BundleError as error:
             fail(str(error), error)
@@ -76,10 +77,6 @@ class ExportMesh(SurfaceOptions):
         except OSError as error:
             fail(f"{path} cannot be written: {reason(error, path)} (--output-dir).", error)
         say(f"{path}: {size_text(path.stat().st_size)}, in the {self.frame}'s frame" + (note and f"; {note}"))
-
-    @property
-    def _is_bundle(self) -> bool:
-        return (self.load_config.parent / MANIFEST).is_file()
 
     def _check_target(self, path: Path) -> None:
         """Stop where the file is there and may not be replaced."""
@@ -127,10 +124,18 @@ def from_run(load_config: Path) -> Source:
 
 
 def from_bundle(folder: Path) -> Source:
-    """A bundle, from the training cameras that it holds."""
+    """A bundle, a folder or one file, from the training cameras that it holds.
+
+    Raises:
+        BundleError: it cannot be read, or has no cameras.
+    """
     bundle = read_bundle(folder)
     scene = bundle.scene
-    rows = named_cameras(folder, bundle.info)
-    cameras = [row.camera for row in rows if not row.held_out] or [row.camera for row in rows]
+    cameras = training_cameras(bundle) or [row.camera for row in bundle.cameras]
+    if not cameras:
+        raise BundleError(
+            f"{folder} has no cameras ({CAMERAS}) to see the surface from: give the config.yml of the run that it was "
+            "made from"
+        )
     drawn = (cameras, scene.near, scene.prefilter, bundle.info.world, texel_alpha(scene))
     return Source(scene.surfels, lambda camera: bundle.render(camera).rgb, *drawn)

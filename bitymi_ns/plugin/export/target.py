@@ -29,9 +29,9 @@ def reserve_bundle(folder: Path, overwrite: bool) -> Iterator[None]:
         yield
 
 
-def check_room(folder: Path, load_config: Path, options: BakeOptions, exact: bool, compact: bool = False) -> None:
+def check_room(folder: Path, load_config: Path, options: BakeOptions, exact: bool) -> None:
     """Stop where there may be too little room for a bundle."""
-    needed, free = space_needed(load_config, options, exact, compact), free_bytes(folder)
+    needed, free = space_needed(load_config, options, exact), free_bytes(folder)
     if free < needed:
         beside = " beside the earlier one" if folder.exists() else ""
         fail(
@@ -42,7 +42,7 @@ def check_room(folder: Path, load_config: Path, options: BakeOptions, exact: boo
         )
 
 
-def space_needed(load_config: Path, options: BakeOptions, exact: bool, compact: bool = False) -> int:
+def space_needed(load_config: Path, options: BakeOptions, exact: bool) -> int:
     """A generous estimate of the bytes of a run's bundle.
 
     It assumes that the newest checkpoint holds nothing but surfels, each with a tile of 32 x 32 texels, or with the
@@ -51,12 +51,11 @@ def space_needed(load_config: Path, options: BakeOptions, exact: bool, compact: 
     Args:
         load_config: config.yml of the run; without a checkpoint beside it the estimate is 0.
         exact: whether everything is kept.
-        compact: whether the bundle is compact, of which a texel takes less than a byte.
     """
     newest = max(load_config.parent.glob("*/step-*.ckpt"), default=None)
     surfels = newest.stat().st_size // (3 * SURFEL_BYTES) if newest is not None else 0
     side = options.r_max if exact else min(options.r_max, TYPICAL_SIDE)
-    texel = 1 if compact else BYTES_PER_TEXEL[options.format]
+    texel = 1 if options.bundle_format == "compact" else BYTES_PER_TEXEL[options.texel_format]
     return surfels * (SURFEL_BYTES + side * side * texel)
 
 

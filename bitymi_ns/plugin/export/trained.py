@@ -15,7 +15,7 @@ from PIL import Image
 
 from bitymi_ns.bake.verify import check_field, check_view_color
 from bitymi_ns.bundle import Bundle, Check, check_world
-from bitymi_ns.bundle.manifest import MANIFEST
+from bitymi_ns.bundle.parts import bundle_at
 from bitymi_ns.bundle.statistics import HeldOut
 from bitymi_ns.bundle.write import World
 from bitymi_ns.capture.frame import UP, read_frame
@@ -37,7 +37,7 @@ def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
         config.load_step = step
         return config
 
-    if (load_config.parent / MANIFEST).is_file():
+    if bundle_at(load_config) is not None:
         fail(
             f"{load_config} is that of a bundle, which is baked already. Give the config.yml of the training run that "
             "it was made from."

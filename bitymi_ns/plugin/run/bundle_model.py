@@ -6,7 +6,6 @@ from __future__ import annotations
 import atexit
 import os
 import shutil
-import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,7 +21,7 @@ from bitymi_ns.bundle.manifest import MANIFEST
 from bitymi_ns.bundle.read import download_bytes
 from bitymi_ns.ops import webgpu
 from bitymi_ns.plugin.console import fail
-from bitymi_ns.plugin.run.commands import folder_being_evaluated
+from bitymi_ns.plugin.run.commands import folder_being_evaluated, given_config
 from bitymi_ns.plugin.run.device import kernel_device
 from bitymi_ns.plugin.run.surfel_model import SurfelModel, SurfelModelConfig
 from bitymi_ns.scene.baked import FAST, BakedOutput
@@ -120,12 +119,8 @@ def find_bundle(recorded: Path) -> Path:
     """The folder of the bundle whose config.yml is being loaded."""
     evaluated = folder_being_evaluated()
     candidates = [] if evaluated is None else [evaluated]
-    for i, argument in enumerate(sys.argv):
-        name, _, value = argument.partition("=")
-        if name in ("--load-config", "--load_config"):
-            value = value or (sys.argv[i + 1] if i + 1 < len(sys.argv) else "")
-            candidates.append(Path(value).absolute().parent)
-    candidates.append(recorded)
+    given = given_config()
+    candidates += [recorded] if given is None else [given.parent, recorded]
     for folder in candidates:
         if (folder / MANIFEST).is_file() or folder.is_file():
             return folder.absolute()

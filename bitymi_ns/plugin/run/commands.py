@@ -10,6 +10,7 @@ from typing import Any
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from bitymi_ns.bundle.parts import CONFIG, bundle_at
 from bitymi_ns.plugin.console import fail
 
 DATA = "BITYMI_DATA"
@@ -59,6 +60,32 @@ def refuse_others() -> None:
     found = running_command()
     if found is not None and type(found[0]).__name__ in REFUSED:
         fail(REFUSED[type(found[0]).__name__])
+
+
+def given_config() -> Path | None:
+    """The --load-config of this process's command line; None without."""
+    for i, argument in enumerate(sys.argv):
+        name, _, value = argument.partition("=")
+        if name in ("--load-config", "--load_config") and (value or i + 1 < len(sys.argv)):
+            return Path(value or sys.argv[i + 1]).absolute()
+    return None
+
+
+def refuse_without_config(reader: str) -> None:
+    """Stop where nerfstudio is about to load, as its own YAML, a bundle that has none.
+
+    Args:
+        reader: the command of ours that reads such bundles.
+    """
+    path = given_config()
+    bundle = None if path is None else bundle_at(path)
+    if bundle is None or reader in sys.argv[1:2]:
+        return
+    if bundle.is_file() or not (bundle / CONFIG).is_file():
+        fail(
+            f"{bundle} has no {CONFIG} for nerfstudio's commands: `bitymi unpack {bundle}` writes it as a folder with "
+            "one; give that."
+        )
 
 
 def moved_capture(datamanager: Any) -> None:

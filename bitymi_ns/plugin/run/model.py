@@ -3,7 +3,7 @@
 import dataclasses
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
@@ -26,7 +26,7 @@ from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train import limits
 from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.init import build_scene, first_surfels_for
+from bitymi_ns.train.init import build_scene, limit_first_surfels
 from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.views import View, eval_background
 
@@ -192,8 +192,8 @@ def new_scene(
         steps: length of the run that is going to be made.
     """
     centers, pixels = metadata.get("camera_centers", torch.zeros(0, 3)), metadata.get("train_pixels", 0)
-    if train.first_surfels is None and steps is not None and len(centers):
-        train = replace(train, first_surfels=first_surfels_for(steps, pixels / len(centers)))
+    if steps is not None:
+        train = limit_first_surfels(train, steps, pixels, len(centers))
     xyz, rgb = _points(points)
     find_background = metadata.get("background_points")
     declared = _corners(scene_box) if metadata.get("declares_box") else None

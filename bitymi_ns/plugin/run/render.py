@@ -36,6 +36,7 @@ WITHOUT_MAPS = {"rgb", "rgba", "accumulation"}  # outputs for which no maps need
 DEPTH_VIEWS, DEPTH_SIDE, DEPTH_SHARE = 16, 160, 0.01
 """Depth colours of a film span the depths of so many frames of this size, without this share at either end."""
 TURNS = 2  # of a spiral
+FAINT = 1 / 255  # accumulation of a pixel that shows nothing
 _OPTION = " (--output-path)."
 
 
@@ -223,13 +224,16 @@ def write_trajectory(model: SurfelModel, cameras: Cameras, command: Any, fps: fl
     if not images and min(width, height) < 2:
         fail(f"a film of {width} x {height} pixels cannot be written: give a smaller --downscale-factor.")
     planes = _depth_planes(model, views, command) if "depth" in names else {}
+    empty = 0
     try:
         with explained(target, InputError, _OPTION):
             target.parent.mkdir(parents=True, exist_ok=True)
             output = frames(target, command.image_format, command.jpeg_quality) if images else film(target, fps)
             with output as add, rich_progress() as progress:
                 for i, camera in enumerate(views):
-                    add(_picture(model, camera, names, planes, command.colormap_options))
+                    picture, shows = _picture(model, camera, names, planes, command.colormap_options)
+                    add(picture)
+                    empty += not shows
                     progress("rendering", i + 1, len(views))
     except KeyboardInterrupt:
         warn(f"The rendering was interrupted; nothing was written to {target}.")
@@ -238,12 +242,18 @@ def write_trajectory(model: SurfelModel, cameras: Cameras, command: Any, fps: fl
     if not images:
         what += f", {fps:.3g} per second, {size_text(target.stat().st_size)}"
     say(f"{target}: {what}; {time.monotonic() - started:.1f} s")
+    if empty:
+        warn(
+            f"{empty} of {len(views)} frames show nothing of the scene: the cameras look past it, or the path was made "
+            "for another one."
+        )
 
 
 def _picture(
     model: SurfelModel, camera: Any, names: Sequence[str], planes: dict[str, float], options: Any
-) -> np.ndarray:
-    """[H, W, 3 or 4] uint8: the outputs of a camera side by side, as nerfstudio colours them."""
+) -> tuple[np.ndarray, bool]:
+    """Draw the outputs of a camera side by side, as nerfstudio colours them: [H, W, 3 or 4] uint8, and whether anything
+    of the scene is there."""
     outputs = model.outputs_of(camera, maps=not WITHOUT_MAPS.issuperset(names))
     outputs["rgba"] = model.get_rgba_image(outputs)
     parts = []
@@ -254,7 +264,7 @@ def _picture(
         elif name != "rgba":
             image = colormaps.apply_colormap(image, options)
         parts.append(image)
-    return as_bytes(torch.cat(parts, dim=1)).numpy()
+    return as_bytes(torch.cat(parts, dim=1)).numpy(), bool((outputs["accumulation"] > FAINT).any())
 
 
 def _depth_planes(model: SurfelModel, views: Sequence[Any], command: Any) -> dict[str, float]:

@@ -58,7 +58,7 @@ def write(folder: Path, text: str, name: str = "mine") -> Path:
         ("train:\n  loss:\n    ssim_weight: 2.0", r"train\.loss\.ssim_weight: .*less than or equal to 1, found 2"),
         ("- a\n- b", r"mine\.yaml: expected a mapping"),
         ("a: [", r"mine\.yaml: not valid YAML"),
-        ("base: nowhere", r"no preset file .*nowhere\.yaml .*named as base of mine\.yaml"),
+        ("base: nowhere", r"no preset 'nowhere' \(named as base of mine\.yaml\) in .*, which has mine"),
         ("base: mine", r"mine\.yaml: base: presets refer to each other in a circle"),
         ("base: 3", r"mine\.yaml: base: expected the name of a preset"),
     ],

@@ -291,6 +291,27 @@ def test_numbers_in_quotes_are_numbers(wall: Wall, camera_path: Any, tmp_path: P
     assert decoded(tmp_path / "film.mp4")[0].average_rate == 4
 
 
+def test_frames_that_show_nothing_are_counted(
+    wall: Wall, camera_path: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera_path()
+    assert "nothing of the scene" not in capsys.readouterr().out
+    drawn = wall.render
+    wall.drawn.clear()
+
+    def render_some(camera: Camera, background: torch.Tensor, maps: bool) -> Any:
+        found = drawn(camera, background, maps)
+        if len(wall.drawn) > 5:
+            found.rgb, found.alpha = 0 * found.rgb, 0 * found.alpha
+        return found
+
+    wall.render = render_some  # type: ignore[method-assign]
+    camera_path(output_format="images", rendered_output_names=["depth"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert "of 12 frames show nothing of the scene: the cameras look past it" in said
+    assert len(list((tmp_path / "film").iterdir())) == 12
+
+
 def test_a_field_of_view_in_radians_is_a_warning(
     wall: Wall, camera_path: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:

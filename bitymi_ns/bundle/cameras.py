@@ -1,0 +1,89 @@
+"""cameras.json of a bundle: the cameras of the capture that it was made of."""
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated
+
+import torch
+from pydantic import BaseModel, Field, ValidationError
+
+from bitymi_ns.bundle import strict_json
+from bitymi_ns.bundle.manifest import BundleError
+from bitymi_ns.ranges import first_problem
+from bitymi_ns.scene.camera import Camera
+
+MOST_CAMERAS = 100_000
+_Number = Annotated[float, Field(ge=-1e9, le=1e9)]
+_Size = Annotated[int, Field(ge=1, le=1 << 20)]
+_Length = Annotated[float, Field(gt=0, le=1e9)]
+
+
+class CapturedCamera(BaseModel):
+    """A camera of the capture.
+
+    Attributes:
+        name: name of its photograph.
+        held_out: whether training did not see that.
+        width, height, fx, fy, cx, cy: of the photograph, in pixels.
+        viewmat: [16] world to camera by rows, OpenCV axes.
+        photograph: file of the bundle with the photograph, which may be smaller; None = the bundle has none.
+    """
+
+    name: str
+    held_out: bool
+    width: _Size
+    height: _Size
+    fx: _Length
+    fy: _Length
+    cx: _Number
+    cy: _Number
+    viewmat: Annotated[list[_Number], Field(min_length=16, max_length=16)]
+    photograph: str | None = None
+
+    @classmethod
+    def of(cls, name: str, camera: Camera, held_out: bool, photograph: str | None = None) -> "CapturedCamera":
+        """Describe a camera."""
+        (fx, _, cx), (_, fy, cy), _ = camera.K.cpu().tolist()
+        size = {"width": camera.width, "height": camera.height}
+        viewmat = camera.viewmat.cpu().flatten().tolist()
+        of_lens = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+        return cls(name=name, held_out=held_out, **size, **of_lens, viewmat=viewmat, photograph=photograph)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera, on the CPU."""
+        K = torch.tensor([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+        return Camera(torch.tensor(self.viewmat).view(4, 4), K, self.width, self.height)
+
+
+def cameras_data(cameras: Iterable[CapturedCamera]) -> bytes:
+    """Write the bytes of cameras.json."""
+    rows = [camera.model_dump(exclude_none=True) for camera in cameras]
+    return (json.dumps({"cameras": rows}) + "\n").encode()
+
+
+def parse_cameras(data: bytes | bytearray, path: Path) -> list[CapturedCamera]:
+    """Read the bytes of cameras.json.
+
+    Args:
+        path: of the file, for messages.
+
+    Raises:
+        BundleError: it is malformed; names the first entry that is.
+    """
+    try:
+        value = strict_json.loads(data)
+    except ValueError as error:
+        raise BundleError(f"{path} cannot be read as JSON ({error})") from error
+    found = value.get("cameras") if isinstance(value, dict) else None
+    if not isinstance(found, list) or len(found) > MOST_CAMERAS:
+        raise BundleError(f"{path} must have a list cameras, of at most {MOST_CAMERAS:,}")
+    rows = []
+    for number, row in enumerate(found):
+        try:
+            rows.append(CapturedCamera.model_validate(row))
+        except ValidationError as error:
+            where, what = first_problem(error)
+            raise BundleError(f"{path}: {'.'.join(filter(None, (f'cameras.{number}', where)))}: {what}") from error
+    return rows

@@ -1,0 +1,49 @@
+/* global document, location, addEventListener, HTMLScriptElement */
+// Stands in the page itself, whose scripts have to be found first. An address that ends in /fox, without a slash, is that
+// of the folder fox, from which names then start; or, on servers that hide endings, of fox.html: its scripts are asked
+// for there when the folder has none. And it says why the page does not start, where the page's own script cannot.
+(function () {
+  const root = document.documentElement;
+  const name = location.pathname.split('/').pop();
+  const folder = name && !/\.html?$|^index$/.test(name) ? document.createElement('base') : null;
+  if (folder) {
+    folder.setAttribute('href', `./${name}/`);
+    document.head.append(folder);
+  }
+  const asked = new Set();
+
+  function say(text, advice) {
+    root.dataset.state = 'error';
+    document.getElementById('page-title').textContent = 'The viewer cannot start';
+    document.getElementById('page-text').textContent = text;
+    document.getElementById('page-advice').textContent = advice;
+    for (const id of ['page-progress', 'page-late']) document.getElementById(id).hidden = true;
+  }
+  function stopped() {
+    if (document.readyState === 'loading') return addEventListener('DOMContentLoaded', stopped);
+    if (root.dataset.state) return; // the page has started
+    if (location.protocol === 'file:') {
+      say(
+        'This page was opened as a file, and browsers load no viewer from files.',
+        'Open it from a web server: "bitymi view BUNDLE" is one, and so is "python -m http.server" in this folder.',
+      );
+    } else {
+      say(
+        'A script of this page cannot be loaded, or this browser does not read it.',
+        'Reload the page, open it with index.html at the end of its address, or update the browser.',
+      );
+    }
+  }
+  // of the loading of a file, which does not come up to the window, and of what cannot be read
+  function failed({ target }) {
+    if (!folder || !(target.src || target.href) || asked.has(target)) return stopped();
+    folder.remove();
+    const again = document.createElement(target.localName);
+    for (const { name, value } of target.attributes) again.setAttribute(name, value);
+    if (again.src) again.onload = stopped; // of another page's script, which has not started this one
+    asked.add(again);
+    target.replaceWith(again);
+  }
+  addEventListener('error', failed, true);
+  if (!('noModule' in HTMLScriptElement.prototype)) addEventListener('DOMContentLoaded', stopped);
+})();

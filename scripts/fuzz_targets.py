@@ -71,7 +71,7 @@ def _capture(work: Path) -> Path:
 
 
 def transforms(work: Path) -> Target:
-    """transforms.json, up to the views."""
+    """Read transforms.json, up to the views."""
     room = _capture(work)
     (room / "masks").mkdir()
     for path in sorted((room / "images").iterdir())[:2]:
@@ -114,7 +114,7 @@ def _colmap(work: Path, binary: bool) -> Target:
 
 
 def exif_data(work: Path) -> Target:
-    """EXIF of a photograph."""
+    """Read the EXIF of a photograph."""
     tags = Image.Exif()
     tags.update({ExifTags.Base.Make: "Apple", ExifTags.Base.Orientation: 6})
     tags.get_ifd(ExifTags.IFD.Exif).update(
@@ -149,7 +149,7 @@ def exif_data(work: Path) -> Target:
 
 
 def maps(work: Path) -> Target:
-    """Maps of depth and of normals. The first byte says which format."""
+    """Read maps of depth and of normals. The first byte says which format."""
     (lens,), _ = lenses_of(ColmapCamera("PINHOLE", 8, 6, (8.0, 8.0, 4.0, 3.0)), (8, 6), "a")
     endings, seeds = (".npy", ".npz", ".png", ".tiff", ".exr"), []
     for k, values in enumerate((np.ones((6, 8), np.float32), np.ones((6, 8), np.uint16), np.ones((6, 8, 3), "f4"))):
@@ -178,7 +178,7 @@ def maps(work: Path) -> Target:
 
 
 def ply(work: Path) -> Target:
-    """Point clouds."""
+    """Read point clouds."""
     path = _capture(work) / "sparse_pc.ply"
     text = "ply\nformat ascii 1.0\ncomment a\nelement vertex 2\nproperty double x\nproperty float y\nproperty float z\n"
     text += "property uchar red\nproperty uchar green\nproperty uchar blue\nelement face 1\n"
@@ -194,7 +194,7 @@ def ply(work: Path) -> Target:
 
 
 def camera_path(work: Path) -> Target:
-    """Camera paths, as far as nerfstudio's reader of them."""
+    """Read camera paths, as far as nerfstudio's reader of them."""
     from nerfstudio.cameras.camera_paths import get_path_from_json
 
     frame = {"camera_to_world": np.eye(4).flatten().tolist(), "fov": 50.0, "aspect": 1.5, "principal_point": [0.5, 0.5]}
@@ -210,7 +210,7 @@ def camera_path(work: Path) -> Target:
 
 
 def report(work: Path) -> Target:
-    """What `bitymi report` reads. The first file of an input is the name of the second."""
+    """Read what `bitymi report` does. The first file of an input is the name of the second."""
     results = {"psnr": 20.0, "ssim": 0.9, "lpips": 0.1, "psnr_std": 1.0, "num_rays_per_sec": 1e6, "fps": 3.0}
     evaluation = {"experiment_name": "a", "method_name": "bitymi", "checkpoint": "a/b/c.ckpt", "results": results}
     point = {"step": 10, "seconds": 1.0, "cpu_seconds": 2.0, "surfels": 10, "fragments": 5, "psnr": 20.0}
@@ -242,7 +242,7 @@ def report(work: Path) -> Target:
 
 
 def checkpoint(work: Path) -> Target:
-    """Checkpoints, as far as the optimisers. An input is a seed for changes of a whole one: bytes are under a
+    """Read checkpoints, as far as the optimisers. An input is a seed for changes of a whole one: bytes are under a
     checksum."""
     path = checkpoints.path_of(work, 7)
     tensors = [torch.zeros(3), torch.zeros(0), torch.zeros(5, 3, dtype=torch.int32), torch.zeros(1, 1, 1)]

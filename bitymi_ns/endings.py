@@ -14,6 +14,7 @@ from bitymi_ns.trust import printable
 INTERRUPTED = 130  # exit statuses by the convention of shells: 128 and the number of the signal
 NO_READER = 141
 _OF_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+_OF_ANY = (errno.EIO, errno.EMFILE, errno.ENFILE)
 
 
 def line_of(error: BaseException) -> str | None:
@@ -22,8 +23,9 @@ def line_of(error: BaseException) -> str | None:
         return "interrupted; nothing was left half-written"
     if isinstance(error, MemoryError):
         return "there is not enough memory for this; nothing was left half-written"
-    if isinstance(error, OSError) and error.errno in _OF_WRITING:
-        return f"{error.filename or 'a result'} cannot be written: {reason(error, Path(str(error.filename)))}"
+    if isinstance(error, OSError) and error.errno in (*_OF_WRITING, *_OF_ANY):
+        what = "cannot be written" if error.errno in _OF_WRITING else "cannot be read or written"
+        return f"{error.filename or 'a result'} {what}: {reason(error, Path(str(error.filename)))}"
     return None
 
 

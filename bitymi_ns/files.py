@@ -48,6 +48,9 @@ _REASONS = {
     errno.ELOOP: "a link in its path leads back to itself: choose another path",
     errno.EBUSY: "it is in use by the system, as a mount point is: choose a folder in it",
     errno.EXDEV: "it is a mount point: choose a folder in it",
+    errno.EIO: "the disk reports an error of its own: check it, or write to another disk",
+    errno.EMFILE: "too many files are open: allow more (see `ulimit -n`)",
+    errno.ENFILE: "too many files are open on this machine: end other programs",
 }
 
 
@@ -88,6 +91,19 @@ def size_text(size: int) -> str:
 def _nearest(path: Path) -> Path:
     """The path, or the nearest of its parents that exists."""
     return next((p for p in (path, *path.parents) if os.path.lexists(p)), Path("/"))
+
+
+@contextmanager
+def parents_of(path: Path) -> Iterator[None]:
+    """Make the missing parents of a path for the block, and remove those that are empty at its end."""
+    made = [parent for parent in path.parents if not os.path.lexists(parent)]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    finally:
+        for parent in made:
+            with suppress(OSError):
+                parent.rmdir()
 
 
 def _open_locked(path: Path) -> tuple[BinaryIO, bool]:
@@ -210,11 +226,9 @@ def reserved(target: str | Path, tell: Tell = warnings.warn) -> Iterator[Path]:
     place = Path(os.path.realpath(target))
     if os.path.ismount(place):
         raise OSError(errno.EBUSY, os.strerror(errno.EBUSY), str(place))
-    made = [parent for parent in place.parents if not os.path.lexists(parent)]
     lock = place.with_name(f".{place.name}.lock")
     outermost = (str(lock), threading.get_ident()) not in _held
-    try:
-        place.parent.mkdir(parents=True, exist_ok=True)
+    with parents_of(place):
         hold(lock, tell)
         try:
             _settle(place)
@@ -222,10 +236,6 @@ def reserved(target: str | Path, tell: Tell = warnings.warn) -> Iterator[Path]:
         finally:
             if outermost:
                 release(lock)
-    finally:
-        for parent in made:
-            with suppress(OSError):
-                parent.rmdir()
 
 
 def check_writable(target: Path) -> None:
@@ -307,7 +317,7 @@ def complete_file(path: Path, scratch: Path | None = None) -> Iterator[BinaryIO]
     """Open a temporary file that replaces `path` when the block ends without an exception.
 
     Args:
-        path: the file; its folder must exist.
+        path: the file; missing parents are made.
         scratch: a folder of the same file system for the unfinished file; None = that of `path`.
 
     Raises:
@@ -315,24 +325,33 @@ def complete_file(path: Path, scratch: Path | None = None) -> Iterator[BinaryIO]
         OSError: it cannot be written; `reason` says why.
     """
     unfinished = (scratch or path.parent) / f".{path.name}{UNFINISHED}"
-    try:
-        file, _ = _open_locked(unfinished)
-    except BlockingIOError:
-        raise Busy("another process is writing it: wait for it, or end it") from None
-    try:
-        file.truncate(0)
-        yield file
-        file.flush()
-        os.fsync(file.fileno())
-        os.replace(unfinished, path)
-    except BaseException:
-        with suppress(OSError):
-            unfinished.unlink()
-        raise
-    finally:
-        with suppress(OSError):  # what it still has in its buffer is of a write that failed
-            file.close()
-    flush(path.parent)
+    with parents_of(path):
+        try:
+            file, _ = _open_locked(unfinished)
+        except BlockingIOError:
+            raise Busy("another process is writing it: wait for it, or end it") from None
+        try:
+            file.truncate(0)
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+            os.replace(unfinished, path)
+        except BaseException:
+            with suppress(OSError):
+                unfinished.unlink()
+            raise
+        finally:
+            with suppress(OSError):  # what it still has in its buffer is of a write that failed
+                file.close()
+        flush(path.parent)
+
+
+def copy_files(folder: Path, to: Path) -> None:
+    """Copy the files of a folder to a new one; unlike `shutil.copytree`, this ends at the first error, and with it."""
+    to.mkdir(parents=True)
+    for path in sorted(folder.iterdir()):
+        if path.is_file():
+            shutil.copyfile(path, to / path.name)
 
 
 def write_file(path: Path, data: bytes) -> None:

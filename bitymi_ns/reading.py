@@ -27,7 +27,10 @@ def open_regular(path: Path) -> BinaryIO:
     Raises:
         OSError: there is no such file, it is something else, or the system refuses it; `strerror` says which.
     """
-    found = os.stat(path)
+    try:
+        found = os.stat(path)
+    except ValueError:  # a null character
+        raise OSError(errno.EINVAL, "no file can have this name", str(path)) from None
     if stat.S_ISREG(found.st_mode):
         # should it have become a pipe by now, opening it does not wait for its other end
         file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))

@@ -57,6 +57,8 @@ def test_ctrl_c_in_the_first_second(after: float) -> None:
         ("OSError(28, 'No space', 'a.png')", "bitymi: a.png cannot be written: the disk is full: free some space"),
         ("OSError(28, 'No space')", "bitymi: a result cannot be written: the disk is full"),
         ("OSError(30, 'Read-only', 'a')", "bitymi: a cannot be written: the file system is read-only"),
+        ("OSError(5, 'I/O error', 'a')", "bitymi: a cannot be read or written: the disk reports an error of its own"),
+        ("OSError(24, 'Too many', 'a')", "bitymi: a cannot be read or written: too many files are open: allow more"),
         ("MemoryError()", "bitymi: there is not enough memory for this"),
     ],
 )

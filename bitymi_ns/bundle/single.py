@@ -49,10 +49,16 @@ def write_single(bundle: str | Path, path: str | Path) -> Written:
 
 
 def is_single(path: Path) -> bool:
-    """True where a file is a bundle, which another one may replace."""
+    """True where a file is a bundle, which another one may replace.
+
+    Raises:
+        BundleError: the system cannot read it now.
+    """
     try:
         read_manifest(path)
-    except BundleError:
+    except BundleError as error:
+        if isinstance(error.__cause__, OSError):
+            raise
         return False
     return path.is_file()
 

@@ -9,7 +9,7 @@ import pycolmap
 
 from bitymi_ns.capture.report import FILES
 from bitymi_ns.capture.types import Poses
-from bitymi_ns.files import complete_folder
+from bitymi_ns.files import complete_folder, copy_files
 from bitymi_ns.progress import Progress
 from bitymi_ns.trust import inside
 
@@ -40,7 +40,7 @@ def write_capture(poses: Poses, folder: Path, progress: Progress) -> None:
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(poses.images / name, target)
         progress("copying photographs", len(names), len(names))
-        shutil.copytree(poses.model, new / "sparse" / "0")
+        copy_files(poses.model, new / "sparse" / "0")
         model.export_PLY(new / CLOUD)
         (new / "transforms.json").write_text(json.dumps(transforms(model), indent=2, ensure_ascii=False) + "\n", "utf8")
         for name in FILES:

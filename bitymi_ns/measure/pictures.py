@@ -2,6 +2,8 @@
 
 import io
 import json
+import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +11,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from bitymi_ns.files import check_writable, explained, write_file
+from bitymi_ns.files import complete_folder, explained, reserved
 from bitymi_ns.measure.report.pictures import ERROR_CAPTION, ERROR_SCALE, heat
 from bitymi_ns.measure.report.read import PICTURES
 from bitymi_ns.ops import blended_image, fragment_residual
@@ -22,6 +24,7 @@ from bitymi_ns.scene import RenderOutput, Scene
 from bitymi_ns.scene.baked import as_bytes
 from bitymi_ns.scene.field import TexelField
 
+FILE = re.compile(r"view\d{4,}-\w+\.png")  # name of a picture
 RESIDUAL_GAIN = 4.0  # residuals are small; the pictures of them are brightened by this factor
 
 KINDS = {
@@ -85,18 +88,24 @@ def png(image: Tensor) -> bytes:
     return buffer.getvalue()
 
 
+def _check_output(folder: Path) -> None:
+    """Stop where a folder holds anything but earlier pictures, which would be lost."""
+    if folder.is_dir() and not all(FILE.fullmatch(path.name) or path.name == PICTURES for path in folder.iterdir()):
+        fail(f"the folder {folder} holds other files than pictures of a run and is not replaced: choose another one.")
+
+
 @torch.no_grad()
 def draw_worst(load_config: Path, output_dir: Path, views: int) -> None:
     """Write the pictures of the held-out views with the lowest PSNR, and pictures.json, which describes them.
 
     Args:
         load_config: config.yml of a trained run.
-        output_dir: folder for the files; made if needed.
+        output_dir: folder for the files, which replaces an earlier one; it may hold nothing else.
     """
     if views < 1:
         fail(f"--views must be at least 1, not {views}")
-    with explained(output_dir / PICTURES, InputError, "."):
-        check_writable(output_dir / PICTURES)
+    with explained(output_dir, InputError, "."), reserved(output_dir):
+        _check_output(output_dir)
     config, pipeline = load_trained(load_config)
     model, datamanager = pipeline.model, pipeline.datamanager
     count = len(datamanager.eval_dataset)
@@ -110,16 +119,15 @@ def draw_worst(load_config: Path, output_dir: Path, views: int) -> None:
         ranked.append((image_metrics(rgb, photo, view.mask), index, view.camera, photo))
     ranked.sort(key=lambda entry: (entry[0]["psnr"], entry[1]))
     shown = []
-    with explained(output_dir, InputError, "."):
-        output_dir.mkdir(parents=True, exist_ok=True)
+    with explained(output_dir, InputError, "."), complete_folder(output_dir, partial(_check_output, output_dir)) as new:
         for rank, (metrics, index, camera, photo) in enumerate(ranked[:views]):
             files = {}
             for kind, image in decompose(model.scene, camera, background, photo).items():
                 files[kind] = f"view{index:04d}-{kind}.png"
-                write_file(output_dir / files[kind], png(image))
+                (new / files[kind]).write_bytes(png(image))
             figures = {name: round(value, 4) for name, value in metrics.items()}
             shown.append({"view": index, "rank": rank + 1, "of": count, "metrics": figures, "files": files})
         about = {"scene": config.experiment_name, "method": config.method_name}
         text = json.dumps({"bitymi_pictures": 1, **about, "captions": KINDS, "views": shown}, indent=1)
-        write_file(output_dir / PICTURES, text.encode("utf8"))
+        (new / PICTURES).write_text(text, "utf8")
     say(f"Wrote {len(shown)} views to {output_dir}")

@@ -161,7 +161,7 @@ def _is_sample(folder: Path) -> bool:
     """Test if `generate` wrote the folder."""
     try:
         return read_json(folder / CAPTURE).get("made_by") == MADE_BY
-    except (OSError, ValueError, AttributeError):
+    except (FileNotFoundError, ValueError, AttributeError):
         return False
 
 

@@ -108,7 +108,6 @@ class BenchRun:
         text = results_page(f"Benchmark: {self.plan or self.suite}", matrix, cells, failures)
         print(printable(text))
         if self.output is not None:
-            self.output.parent.mkdir(parents=True, exist_ok=True)
             with explained(self.output, BenchError):
                 write_file(self.output, text.encode("utf8"))
         if len(cells):

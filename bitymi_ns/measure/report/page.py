@@ -71,16 +71,13 @@ def _check_output(output_dir: Path) -> None:
     if output_dir.exists() and not output_dir.is_dir():
         raise ReportError(f"{output_dir} is a file; give a folder for the report.")
     page = output_dir / PAGE
-    if page.exists() and not _is_report(page):
+    if page.exists() and GENERATOR not in _beginning(page):
         raise ReportError(f"{page} was not made by bitymi report and will not be replaced; give another folder.")
 
 
-def _is_report(page: Path) -> bool:
-    try:
-        with open_regular(page) as file:
-            return GENERATOR in file.read(4096).decode("utf8", "replace")
-    except OSError:
-        return False
+def _beginning(page: Path) -> str:
+    with open_regular(page) as file:
+        return file.read(4096).decode("utf8", "replace")
 
 
 def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report") -> Path:
@@ -99,11 +96,10 @@ def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report"
         ReportError: an input is missing or broken, nothing usable was found, or the report cannot be written.
     """
     output_dir = Path(os.path.expanduser(output_dir)).absolute()
-    _check_output(output_dir)
     with explained(output_dir, ReportError):
+        _check_output(output_dir)
         check_writable(output_dir)
     text = to_page(compose(collect(list(inputs), output_dir), title))
     with explained(output_dir, ReportError):
-        output_dir.mkdir(exist_ok=True)
         write_file(output_dir / PAGE, text.encode("utf8"))
     return output_dir / PAGE

@@ -157,7 +157,6 @@ def write(path: Path, backend: Backend = BACKENDS["cpu"], progress: Callable[[st
         swept[sweep.name] = [
             measure_row(f"{value:g}", sweep.make(value), backend, sweep.near(value)) for value in sweep.values
         ]
-    path.parent.mkdir(parents=True, exist_ok=True)
     picture = path.with_suffix(".png")
     write_file(picture, _plot(swept))
     write_file(path, _page(backend, named, swept, picture.name).encode())

@@ -299,6 +299,8 @@ def _images_text(path: Path) -> Iterator[tuple[int, ModelImage]]:
             if number is not None and len(words) < 10:
                 raise ValueError(f"the 2D points of image {number} are no triples")
             number, *pose, camera, name = words
+            if len(pose) != 7:
+                raise ValueError(f"image {number} has {len(pose)} numbers for its pose instead of 7")
             numbers = np.array(list(map(float, pose)))
             yield int(number), ModelImage(name, int(camera), numbers[:4], numbers[4:])
 
@@ -306,6 +308,8 @@ def _images_text(path: Path) -> Iterator[tuple[int, ModelImage]]:
 def _frames_text(path: Path) -> Iterator[tuple[int, int]]:
     for line in filter(None, _lines(path)):
         words = line.split()
+        if len(words) < 10:
+            raise ValueError(f"the line of frame {words[0]} is cut off")
         frame, count, data = int(words[0]), int(words[9]), words[10:]
         if len(data) != 3 * count:
             raise ValueError(f"frame {frame} states {count} images and lists {len(data) / 3:g}")

@@ -14,6 +14,7 @@ from bitymi_ns.capture.photos import photo_folder
 from bitymi_ns.capture.pictures import passed_over, videos_in
 from bitymi_ns.capture.recognise import Found
 from bitymi_ns.capture.types import SfmSettings
+from bitymi_ns.files import copy_files
 from bitymi_ns.plugin.console import fail, listed, say, warn
 from bitymi_ns.plugin.data.colmap_model import Model
 from bitymi_ns.plugin.data.colmap_views import Origin, Source, find_masks, make_source
@@ -166,7 +167,7 @@ def write_kept_poses(folder: Path, source: Source, origin: Origin) -> None:
     Raises:
         OSError: something cannot be written, or a name in the model leads out of its folder.
     """
-    shutil.copytree(source.folder, folder / MODEL)
+    copy_files(source.folder, folder / MODEL)
     if origin.photographs is None:
         for image in source.model.images:
             if not leads_inside(image.name):

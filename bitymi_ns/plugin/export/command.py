@@ -19,9 +19,9 @@ from bitymi_ns.bundle.manifest import MANIFEST, dump
 from bitymi_ns.bundle.parts import CONFIG
 from bitymi_ns.bundle.poster import most_bytes
 from bitymi_ns.bundle.read import download_bytes
-from bitymi_ns.files import explained, write_file
+from bitymi_ns.files import reason, write_file
 from bitymi_ns.interchange import Frame, Kind, check_extras, extras_folder, summary_line, write_extras
-from bitymi_ns.plugin.console import INTERRUPTED, InputError, fail, say, warn
+from bitymi_ns.plugin.console import INTERRUPTED, fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.export.cameras import camera_files
 from bitymi_ns.plugin.export.nerfstudio_config import bundle_config
@@ -232,8 +232,11 @@ class ExportAtlas(BakeOptions, CompactOptions):
         bundle = read_bundle(self.output_dir)
         if self.compare and len(datamanager.eval_dataset):
             bundle.info.statistics.held_out = compare(model, datamanager, bundle.scene)
-            with explained(self.output_dir, InputError, "."):
+            try:
                 write_file(self.output_dir / MANIFEST, dump(bundle.info))
+            except OSError as error:
+                why = reason(error, self.output_dir)
+                warn(f"The bundle {self.output_dir} is complete, but does not state how well it shows them: {why}.")
         print_summary(self.output_dir, bundle.info)
         self.state_size(download_bytes(self.output_dir, bundle.info))
         if self.extras:

@@ -1,7 +1,9 @@
 """A training run inside nerfstudio's loop: what it calls before, in and after a step, and the curve of progress."""
 
+import errno
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -201,15 +203,17 @@ class TrainingCurve:
         self.path = path
         source = resumed_from if resumed_from is not None else path if steps_done > 0 else None
         with explained(path, InputError, "."):
-            path.parent.mkdir(parents=True, exist_ok=True)
             kept = _points_until(source, steps_done) if source is not None and source.is_file() else []
             write_file(path, "".join(line + "\n" for line in kept).encode("utf8"))
 
     def add(self, point: dict[str, Any]) -> None:
         """Write one point, whole and at once. A full disk costs the point, not the run."""
         try:
-            with open(self.path, "a", encoding="utf8", opener=no_links) as file:
-                file.write(json.dumps(point) + "\n")
+            with open(self.path, "ab", buffering=0, opener=no_links) as file:
+                line, kept = f"{json.dumps(point)}\n".encode(), file.tell()
+                if file.write(line) < len(line):  # the next point must not follow half a one
+                    file.truncate(kept)
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
             warn(f"A point of the training curve {self.path} could not be written: {reason(error, self.path)}.")
 

@@ -40,7 +40,6 @@ def save(state: dict[str, Any], path: Path, scratch: Path) -> None:
             checkpoint folder for a checkpoint.
     """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         with complete_file(path, scratch) as file:
             torch.save(state, file)
     except (OSError, RuntimeError) as error:

@@ -16,7 +16,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from bitymi_ns.capture.results import RENDERED
-from bitymi_ns.files import complete_file, complete_folder
+from bitymi_ns.files import complete_file, complete_folder, write_file
 from bitymi_ns.plugin.console import fail
 from bitymi_ns.scene.baked import as_bytes
 
@@ -123,8 +123,16 @@ def _save(file: IO[bytes], image: np.ndarray, form: str, quality: int) -> None:
     file.write(encoded.getbuffer())
 
 
+class WholeText(type(Path())):  # type: ignore[misc]
+    """A path to which text is written whole or not at all; stands for that of nerfstudio's ns-eval."""
+
+    def write_text(self, data: str, encoding: str | None = None, *options: Any) -> int:
+        write_file(Path(self), data.encode(encoding or "utf8"))
+        return len(data)
+
+
 @contextmanager
 def open_gzip(path: Path, mode: str) -> Iterator[IO[bytes]]:
     """Open a compressed file for writing, whole or not at all; stands for gzip's function."""
-    with complete_file(Path(path)) as file, gzip.GzipFile(fileobj=file, mode="wb") as compressed:
+    with complete_file(Path(path)) as file, gzip.GzipFile(fileobj=file, mode="wb", mtime=0) as compressed:
         yield compressed  # type: ignore[misc]

@@ -179,9 +179,7 @@ def store(package: Path) -> None:
                 weights[f"head_{i}"] = found[f"NetLinLayer_{i}"]["Conv_0"]["kernel"].reshape(-1)
             buffer = io.BytesIO()
             np.savez(buffer, **checked(weights, backbone))
-            path = weights_path(backbone)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            files.write_file(path, buffer.getvalue())
+            files.write_file(weights_path(backbone), buffer.getvalue())
 
 
 class ArraysOnly(pickle.Unpickler):

@@ -23,7 +23,7 @@ from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.run.camera_path import MOST_PIXELS, read_camera_path
 from bitymi_ns.plugin.run.commands import running_command
-from bitymi_ns.plugin.run.films import RATES, check_frames, film, frames, open_gzip, write_image
+from bitymi_ns.plugin.run.films import RATES, WholeText, check_frames, film, frames, open_gzip, write_image
 from bitymi_ns.plugin.run.surfel_model import SurfelModel
 from bitymi_ns.progress import rich_progress
 from bitymi_ns.scene.baked import as_bytes
@@ -41,7 +41,7 @@ _OPTION = " (--output-path)."
 
 
 def adopt_render() -> None:
-    """Have ns-render, where it is the command that is about to load a scene of ours, write by our rules.
+    """Have ns-render or ns-eval, where it is the command that is about to load a scene of ours, write by our rules.
 
     Raises:
         InputError: an option or the camera path cannot be used.
@@ -53,6 +53,10 @@ def adopt_render() -> None:
     kind = type(command).__name__
     if kind in (*TRAJECTORIES, "DatasetRender"):
         _check(command)
+    if kind == "ComputePSNR":
+        command.output_path = WholeText(command.output_path)
+        with explained(command.output_path, InputError, _OPTION):
+            check_writable(command.output_path)
     if kind == "DatasetRender":
         script["media"], script["gzip"] = SimpleNamespace(write_image=write_image), SimpleNamespace(open=open_gzip)
     if kind not in TRAJECTORIES:
@@ -227,7 +231,6 @@ def write_trajectory(model: SurfelModel, cameras: Cameras, command: Any, fps: fl
     empty = 0
     try:
         with explained(target, InputError, _OPTION):
-            target.parent.mkdir(parents=True, exist_ok=True)
             output = frames(target, command.image_format, command.jpeg_quality) if images else film(target, fps)
             with output as add, rich_progress() as progress:
                 for i, camera in enumerate(views):

@@ -116,3 +116,20 @@ def test_every_camera_of_a_rig_has_its_own_pose_in_a_model(tmp_path: Path, form:
     (turn,) = {round(image.cam_from_world().rotation.angle_to(image.frame.rig_from_world.rotation), 9)
                for image in by_name.values() if image.camera_id == 2}  # fmt: skip
     assert turn > 0.01  # else the poses would say nothing
+
+
+@pytest.mark.parametrize("cut", [3, 5, 6, 7])
+def test_a_pose_of_too_few_numbers(project: Path, cut: int) -> None:
+    """Found by scripts/fuzz.py."""
+    path = project / "sparse/0/images.txt"
+    first, *others = path.read_text().split("\n\n")
+    words = first.split()
+    path.write_text("\n\n".join([" ".join([*words[:cut], *words[8:]]), *others]))
+    with expect(f"images.txt cannot be read: image 1 has {cut - 1} numbers for its pose instead of 7"):
+        load_any(project)
+
+
+def test_a_frame_that_is_cut_off(project: Path) -> None:
+    (project / "sparse/0/frames.txt").write_text("1 1 1 0 0 0\n")
+    with expect("frames.txt cannot be read: the line of frame 1 is cut off"):
+        load_any(project)

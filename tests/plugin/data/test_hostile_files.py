@@ -17,6 +17,7 @@ from bitymi_ns.measure.report.page import build
 from bitymi_ns.measure.report.records import ReportError
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.data.images import exposure_stops
+from bitymi_ns.reading import open_regular
 from tests.plugin.data.captures import edit, edit_frames, expect, load_any
 from tests.plugin.data.test_scanner_views import polycam, record3d, scannet
 
@@ -244,3 +245,13 @@ def test_photographs_that_break_their_decoder_are_named(capture: Path, ending: s
     with expect(f"frame_00004.{ending}"):
         manager = load_any(capture)
         list(manager.train_views), list(manager.eval_views)
+
+
+def test_names_in_a_report_that_no_file_can_have(tmp_path: Path) -> None:
+    """Found by scripts/fuzz.py."""
+    view = {"view": 0, "rank": 1, "of": 1, "metrics": {"psnr": 1.0}, "files": {"final": "a\0.png"}}
+    value = {"bitymi_pictures": 1, "scene": "a", "method": "b", "captions": {"final": "x"}, "views": [view]}
+    (tmp_path / "pictures.json").write_text(json.dumps(value))
+    assert build([tmp_path / "pictures.json"], tmp_path / "report").is_file()  # as without a picture
+    with pytest.raises(OSError, match="no file can have this name"):
+        open_regular(tmp_path / "a\0")

@@ -2,6 +2,7 @@
 
 import json
 import math
+import resource
 import time
 from pathlib import Path
 
@@ -87,6 +88,20 @@ def test_the_clock_counts_between_start_and_stop_only() -> None:
     time.sleep(0.5)
     clock.stop()
     assert 1.0 <= clock.seconds < 1.4 and clock.cpu_seconds >= 2.0
+
+
+def test_a_point_that_a_full_disk_cuts_off_leaves_no_half_line(tmp_path: Path) -> None:
+    curve = TrainingCurve(tmp_path / "new" / "a.jsonl")
+    curve.add({"step": 1})
+    before, limits = curve.path.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + 5, limits[1]))
+    try:
+        curve.add({"step": 2})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert curve.path.read_bytes() == before
+    curve.add({"step": 3})
+    assert [json.loads(line)["step"] for line in curve.path.read_text().splitlines()] == [1, 3]
 
 
 def test_a_resumed_curve_goes_on_where_the_checkpoint_was(tmp_path: Path) -> None:

@@ -17,6 +17,19 @@ export interface Pages {
   layers: Uint8Array[];
 }
 
+const MOST_COLOR = 0x5c00; // 256 as fp16: RESIDUAL_LIMIT of codec/limits.py
+const MOST_ALPHA = 0x4000; // 2
+const MINUS_ZERO = 0x8000;
+
+// The index of the first texel that is beyond the limits, or is no number; -1 = none.
+function firstBeyond(texels: Uint8Array, alpha: boolean): number {
+  const even = texels.byteOffset % 2 ? texels.slice() : texels;
+  const halves = new Uint16Array(even.buffer, even.byteOffset, even.byteLength / 2);
+  return halves.findIndex((bits, i) =>
+    alpha && i % 4 === 3 ? bits > MOST_ALPHA && bits !== MINUS_ZERO : (bits & 0x7fff) > MOST_COLOR,
+  );
+}
+
 export const blockOf = (format: AtlasFormat): { side: number; bytes: number } => BLOCK[format];
 
 export async function parseKtx2(data: ArrayBuffer, stated: Atlas): Promise<Pages> {
@@ -43,6 +56,8 @@ export async function parseKtx2(data: ArrayBuffer, stated: Atlas): Promise<Pages
     throw new DamagedBundle(`atlas.ktx2 is compressed by a scheme (${scheme}) that is not known.`);
   }
   if (texels.byteLength !== size * layers) throw new DamagedBundle('atlas.ktx2 has not the bytes of its texels.');
+  const beyond = format === 'fp16' ? firstBeyond(texels, stated.alphaScale > 0) : -1;
+  if (beyond >= 0) throw new DamagedBundle(`atlas.ktx2: texel ${beyond >> 2} is beyond the limits, or is no number.`);
   const pages = Array.from({ length: layers }, (_, k) => texels.subarray(k * size, (k + 1) * size));
   return { format, width, height, layers: pages };
 }

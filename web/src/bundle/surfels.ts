@@ -7,6 +7,19 @@ export const SURFEL_WORDS = 24;
 export const KINDS = { sv: 0, 'sv sites': 1, sh: 2, sb: 3, sg: 4 } as const; // VIEW_* of view_color.wgsl
 export const LEAN_WIDTH: Record<ViewKind, number> = { sv: 6, sh: 3, sb: 6, sg: 7 };
 const MAX_TERMS = 32;
+// Largest values: codec/limits.py.
+export const MOST = { position: 1e9, logScale: 104, shape: 1e4, color: 256, direction: 1e6, vector: 2e7 } as const;
+export const EXTENTS: [number, number] = [1e-6, 16];
+const UNIT_SLACK = 0.01; // of the length of a rotation
+const of = (size: number, count = 3): number[] => new Array<number>(count).fill(size);
+// Of the numbers of a term.
+export const TERM_LIMITS: Record<ViewKind | 'sv sites', number[]> = {
+  sv: [...of(MOST.vector), ...of(MOST.color)],
+  'sv sites': [...of(MOST.direction), MOST.shape, ...of(MOST.color)],
+  sh: of(MOST.color),
+  sb: [...of(MOST.color), ...of(MOST.shape)],
+  sg: [...of(MOST.direction), MOST.shape, ...of(MOST.color)],
+};
 // First words of what a surfel has.
 export const WORD = {
   mean: 0,
@@ -150,6 +163,36 @@ function alphas(rows: Table, words: Float32Array): void {
   });
 }
 
+const LIMITS: [name: string, first: number, words: number, most: number][] = [
+  ['x, y or z', WORD.mean, 3, MOST.position],
+  ['opacity', WORD.opacity, 1, MOST.shape],
+  ['scale', WORD.logScale, 2, MOST.logScale],
+  ['beta', WORD.beta, 1, MOST.shape],
+  ['residual', WORD.residual, 3, MOST.color],
+  ['view_base', WORD.base, 3, MOST.color],
+];
+
+// Refuses what the package's reader refuses: from_columns of bundle/surfel_table.py.
+function checkLimits(words: Float32Array, terms: Float32Array, ofTerm: number[]): void {
+  const refuse = (name: string, i: number): never => {
+    throw new DamagedBundle(`surfels.ply: ${name} is beyond its limit, or no number, in row ${i}.`);
+  };
+  for (let i = 0, at = 0; at < words.length; i++, at += SURFEL_WORDS) {
+    for (const [name, first, count, most] of LIMITS) {
+      for (let c = first; c < first + count; c++) if (!(Math.abs(words[at + c]) <= most)) refuse(name, i);
+    }
+    const extent = words[at + WORD.extent];
+    if (!(extent >= EXTENTS[0] && extent <= EXTENTS[1])) refuse('tile_extent', i);
+    const length = Math.hypot(...words.subarray(at + WORD.quat, at + WORD.quat + 4));
+    if (!(Math.abs(length - 1) <= UNIT_SLACK)) {
+      throw new DamagedBundle(`surfels.ply: rot_0 to rot_3 are not of length 1 in row ${i}.`);
+    }
+  }
+  const width = ofTerm.length;
+  const wrong = terms.findIndex((x, k) => !(Math.abs(x) <= ofTerm[k % width]));
+  if (wrong >= 0) refuse('a view colour', Math.floor(wrong / width));
+}
+
 export function readSurfels(data: ArrayBuffer, info: Manifest): Surfels {
   const elements = parsePly(data);
   const vertex = elements.get('vertex');
@@ -176,13 +219,7 @@ export function readSurfels(data: ArrayBuffer, info: Manifest): Surfels {
   const terms = term
     ? lean(rows, new Table(data, term, 'view_term'), words, info.viewColor)
     : whole(rows, words, form.parts, form.base);
-  for (let i = 0; i < words.length; i += SURFEL_WORDS) {
-    for (let c = WORD.mean; c < WORD.residual; c++) {
-      if (!Number.isFinite(words[i + c])) {
-        throw new DamagedBundle(`surfels.ply: surfel ${i / SURFEL_WORDS} has a number that is not finite.`);
-      }
-    }
-  }
+  checkLimits(words, terms, TERM_LIMITS[info.viewColor === 'sv' && !term ? 'sv sites' : info.viewColor]);
   const origin = originOf(info);
   centred(words, origin);
   return { count: rows.count, words, terms, kind: term ? KINDS[info.viewColor] : form.kind, origin, means };

@@ -54,8 +54,8 @@ function oneSymbol(data: Uint8Array, at: number): boolean {
   return false;
 }
 
-// A block of literals and sequences: that it has no more of them than it could hold.
-function checkCompressed(data: Uint8Array, begin: number, size: number): void {
+// How many bytes a block of literals and sequences can hold: at least, at most.
+function heldBy(data: Uint8Array, begin: number, size: number): [number, number] {
   const bytes = new Bytes(data, begin, begin + size);
   const first = data[begin];
   const [type, format] = [first & 3, (first >> 2) & 3];
@@ -76,7 +76,9 @@ function checkCompressed(data: Uint8Array, begin: number, size: number): void {
   let sequences = head;
   if (head === 255) sequences = bytes.number(2) + 0x7f00;
   else if (head > 127) sequences = (head - 128) * 256 + bytes.number(1);
-  if (literals + SHORTEST_MATCH * sequences > MOST_IN_BLOCK) throw new Error('a block holds too much');
+  const least = literals + SHORTEST_MATCH * sequences;
+  if (least > MOST_IN_BLOCK) throw new Error('a block holds too much');
+  return [least, sequences ? MOST_IN_BLOCK : literals];
 }
 
 // The number of bytes that a frame declares. Throws where it declares none, or its blocks do not fill it.
@@ -90,16 +92,20 @@ function declared(frame: Uint8Array): number {
   const width = [single, 2, 4, 8][flags >> 6];
   if (!width) throw new Error('it does not declare its size');
   const size = bytes.number(width) + (width === 2 ? 256 : 0);
+  let [least, most] = [0, 0]; // bytes that the blocks hold
   for (let last = 0; !last;) {
     const head = bytes.number(3);
     last = head & 1;
     const [type, held] = [(head >> 1) & 3, head >> 3];
     if (type === 3 || held > MOST_IN_BLOCK) throw new Error('a block is of no kind');
-    if (type === 2) checkCompressed(frame, bytes.at, held);
+    const [low, high] = type === 2 ? heldBy(frame, bytes.at, held) : [held, held];
+    least += low;
+    most += high;
     bytes.skip(type === 1 ? 1 : held);
   }
   bytes.skip(flags & 4);
   if (bytes.at !== frame.length) throw new Error('something follows it');
+  if (size < least || size > most) throw new Error(`its blocks do not hold the ${size} bytes that it declares`);
   return size;
 }
 

@@ -1,7 +1,7 @@
 // surfels.bin: docs/baking.md says what the numbers of its columns stand for; codec/surfel_codes.py is their writer.
 import { DamagedBundle } from '../../errors';
 import type { CompactSurfels, Manifest, ViewKind } from '../manifest';
-import { KINDS, LEAN_WIDTH, SURFEL_WORDS, type Surfels, WORD } from '../surfels';
+import { EXTENTS, KINDS, LEAN_WIDTH, MOST, SURFEL_WORDS, type Surfels, TERM_LIMITS, WORD } from '../surfels';
 import { alphaWord, centred, originOf, setTerms, setTile } from '../surfels';
 import { ColumnReader, checkColumns } from './columns';
 import { pack } from './packing';
@@ -17,17 +17,12 @@ const MOST_EXPONENT = 12;
 const MOST_TERMS = 32;
 const BENT = 50; // of sinh: beyond all limits
 const FILE = 'surfels.bin';
-// largest values: codec/limits.py
-const POSITIONS = 1e9;
-const LOG_SCALES = 104;
-const COLORS = 256;
-const EXTENTS: [number, number] = [1e-6, 16];
 // The numbers of a lean term that are no colours: from where on, and their limits.
 const SHAPES: Record<ViewKind, { at: number; limits: number[] }> = {
-  sv: { at: 0, limits: [2e7, 2e7, 2e7] },
+  sv: { at: 0, limits: TERM_LIMITS.sv.slice(0, 3) },
   sh: { at: 0, limits: [] },
-  sb: { at: 3, limits: [1e4, 1e4, 1e4] },
-  sg: { at: 0, limits: [1e6, 1e6, 1e6, 1e4] },
+  sb: { at: 3, limits: TERM_LIMITS.sb.slice(3) },
+  sg: { at: 0, limits: TERM_LIMITS.sg.slice(0, 4) },
 };
 
 const clip = (x: number, low: number, high: number): number => Math.min(Math.max(x, low), high);
@@ -71,7 +66,7 @@ const red = (of: Float64Array[], at: number, i: number): number => of[at + 1][i]
 const green = (of: Float64Array[], at: number, i: number): number => of[at][i];
 const blue = (of: Float64Array[], at: number, i: number): number => of[at + 2][i] + of[at][i];
 function color(to: Float32Array, first: number, of: Float64Array[], at: number, i: number, step: number): void {
-  [red, green, blue].forEach((channel, c) => (to[first + c] = within(step * channel(of, at, i), COLORS)));
+  [red, green, blue].forEach((channel, c) => (to[first + c] = within(step * channel(of, at, i), MOST.color)));
 }
 
 class Decoder {
@@ -135,7 +130,7 @@ class Decoder {
       const [lower, upper] = [key % 2 ** 24, Math.floor(key / 2 ** 24)];
       for (let a = 0; a < 3; a++) {
         const cell = (thirds(lower >> a) & 0xff) | (thirds(upper >> a) << 8);
-        this.words[to + a] = within(center[a] + scale * sinh(low[a] + step * cell), POSITIONS);
+        this.words[to + a] = within(center[a] + scale * sinh(low[a] + step * cell), MOST.position);
       }
     }
   }
@@ -163,7 +158,7 @@ class Decoder {
     const [residual, base] = [this.column('residual'), this.column('view_base')];
     for (let i = 0, to = 0; i < this.count; i++, to += SURFEL_WORDS) {
       for (let c = 0; c < 2; c++) {
-        this.words[to + WORD.logScale + c] = within(step('log_scales') * scales[c][i], LOG_SCALES);
+        this.words[to + WORD.logScale + c] = within(step('log_scales') * scales[c][i], MOST.logScale);
       }
       this.words[to + WORD.opacity] = logit(step('opacity') * opacity[i], ALPHA_MIN);
       this.words[to + WORD.beta] = logit(step('beta') * beta[i], SHARE);

@@ -1,0 +1,171 @@
+"""Feed the readers of other people's files with damaged ones, guided by the lines that these reach.
+
+    python -m scripts.fuzz TARGET --seconds 600     a target, or `all`, one after the other
+    python -m scripts.fuzz TARGET --input FILE      such an input again, with its traceback
+
+Needs atheris, which is no dependency of anything else: `pip install atheris`, on Linux with Python 3.11 or later.
+
+How a reader refuses a file is documented. Whatever else it raises is a finding: the input is kept in --findings, one
+for each line of the package that it comes from, and the exit status is 1. A crash or a hang of compiled code ends the
+target.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import gc
+import json
+import random
+import struct
+import subprocess
+import sys
+import tempfile
+import traceback
+import types
+from collections.abc import Callable
+from pathlib import Path
+
+import atheris
+import numpy as np
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+
+import bitymi_ns.capture.known_poses
+import bitymi_ns.capture.poses
+from scripts.fuzz_targets import CUT, ODD_VALUES, TARGETS, Target, no_colmap, nodes
+
+ODD_BYTES = [
+    *(struct.pack(form, number) for form in "<d <f".split() for number in (0.0, -1.0, 1e-38, 3e38, np.nan, np.inf)),
+    *(
+        struct.pack(f"{order}{size}", number)
+        for order in "<>"
+        for size in "hiq"
+        for number in (0, 1, -1, -32768, 32767)
+    ),
+    *(struct.pack("<q", number) for number in (2**31, 2**32, 2**62, 2**63 - 1, -(2**63))),
+]
+
+
+def changed_json(data: bytes, dice: random.Random) -> bytes | None:
+    """The same JSON with a few entries removed, exchanged or replaced; None where it is none."""
+    try:
+        value = [json.loads(data)]
+        for _ in range(dice.choice((1, 1, 1, 2, 4))):
+            places = nodes(value)
+            (holder, key), (other, name) = dice.choice(places), dice.choice(places)
+            how = dice.randrange(4)
+            if how == 0 and holder is not value:
+                del holder[key]
+            elif how == 1:
+                holder[key] = json.loads(json.dumps(other[name]))
+            else:
+                holder[key] = dice.choice(ODD_VALUES)
+        return json.dumps(value[0]).encode("utf8", "surrogatepass")
+    except (ValueError, RecursionError, IndexError):
+        return None
+
+
+def changed_numbers(data: bytes, dice: random.Random) -> bytes:
+    """The same bytes with an odd number in the place of others."""
+    packed, at = dice.choice(ODD_BYTES), dice.randrange(len(data) + 1)
+    return data[:at] + packed + data[at + len(packed) :]
+
+
+def mutator(target: Target) -> Callable[[bytes, int, int], bytes]:
+    """Half of the changes are those of libFuzzer, which knows bytes alone."""
+
+    def mutate(data: bytes, most: int, seed: int) -> bytes:
+        dice = random.Random(seed)
+        *before, last = data.split(CUT)
+        found: bytes | None = None
+        if dice.random() < 0.7 and target.json:
+            lines = last.split(b"\n") if b"\n{" in last else [last]
+            k = dice.randrange(len(lines))
+            changed = changed_json(lines[k], dice)
+            found = None if changed is None else b"\n".join([*lines[:k], changed, *lines[k + 1 :]])
+        elif dice.random() < 0.3:
+            return changed_numbers(data, dice)[:most]
+        whole = None if found is None else CUT.join([*before, found])
+        return whole if whole is not None and len(whole) <= most else atheris.Mutate(data, most)
+
+    return mutate
+
+
+def place_of(error: BaseException) -> str:
+    """Name the last line of the package in a traceback, and what was raised there."""
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if "bitymi_ns" in f.filename]
+    where = f"{Path(frames[-1].filename).name}-{frames[-1].lineno}" if frames else "elsewhere"
+    return f"{where}-{type(error).__name__}"
+
+
+def follow() -> None:
+    """Have atheris see which lines of the package an input reaches. Its own hook of imports does not meet packages that
+    are installed for editing."""
+    for each in gc.get_objects():
+        if isinstance(each, types.FunctionType) and str(each.__module__).startswith("bitymi_ns."):
+            with contextlib.suppress(Exception):  # of code that it cannot rewrite
+                atheris.instrument_func(each)
+
+
+def fuzz(name: str, seconds: int, folder: Path, work: Path) -> None:
+    """Fuzz a target; does not return."""
+    target, known = TARGETS[name](work), {path.name for path in folder.iterdir()}
+    follow()
+
+    def one(data: bytes) -> None:
+        try:
+            target.run(data)
+        except target.refusals:
+            pass
+        except Exception as error:
+            file = f"{name}-{place_of(error)}"
+            if file not in known:
+                known.add(file)
+                (folder / file).write_bytes(data)
+                print(f"FOUND {file}: {error}"[:300], file=sys.stderr, flush=True)
+
+    corpus = work / "corpus"
+    corpus.mkdir()
+    for k, seed in enumerate(target.seeds):
+        (corpus / f"seed-{k}").write_bytes(seed)
+    limits = [f"-max_total_time={seconds}", "-timeout=20", "-rss_limit_mb=4096", f"-max_len={1 << 16}"]
+    shown = ["-print_final_stats=1", "-verbosity=0", f"-artifact_prefix={folder}/{name}-"]
+    atheris.Setup([sys.argv[0], *limits, *shown, str(corpus)], one, custom_mutator=mutator(target))
+    atheris.Fuzz()
+
+
+def main() -> int:
+    """Run the command."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("target", choices=[*TARGETS, "all"])
+    parser.add_argument("--seconds", type=int, default=600, help="time for each target")
+    parser.add_argument("--findings", type=Path, default=Path("fuzz-findings"), help="folder for inputs")
+    parser.add_argument("--input", type=Path, nargs="+", help="inputs to run instead")
+    given = parser.parse_args()
+    CONSOLE.quiet = True
+    torch.set_num_threads(1)
+    bitymi_ns.capture.known_poses.triangulate = bitymi_ns.capture.poses.find_poses = no_colmap
+    with tempfile.TemporaryDirectory() as scratch:
+        if given.input is not None:
+            target = TARGETS[given.target](Path(scratch))
+            for path in given.input:
+                try:
+                    target.run(path.read_bytes())
+                    print(f"{path}: read")
+                except target.refusals as error:
+                    print(f"{path}: refused: {error}")
+            return 0
+        given.findings.mkdir(exist_ok=True)
+        if given.target != "all":
+            fuzz(given.target, given.seconds, given.findings, Path(scratch))
+    for name in TARGETS:
+        options = ["--seconds", str(given.seconds), "--findings", str(given.findings)]
+        subprocess.run([sys.executable, "-m", "scripts.fuzz", name, *options], check=False)
+    found = sorted(path.name for path in given.findings.iterdir())
+    print(f"{len(found)} findings in {given.findings}: {', '.join(found)}" if found else "nothing was found")
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,133 @@
+"""What the page and Python's reader think of the same bundle, damaged past its hashes, in a table."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bitymi_ns.bundle import BundleError, ktx2, ply, read_bundle
+from bitymi_ns.view import site_of
+from tests.bundle.damage import amend
+from tests.view.conftest import write
+from tests.view.test_browser import page_of
+
+Damage = Callable[[Path], None]
+COUNT = 120  # surfels of the bundles
+
+
+def column(name: str, value: float, element: str = "vertex") -> Damage:
+    """A number in the second row of surfels.ply."""
+
+    def damage(bundle: Path) -> None:
+        elements = ply.parse_ply((bundle / "surfels.ply").read_bytes())
+        elements[element][name] = elements[element][name].copy()
+        elements[element][name][1] = value
+        ply.write_ply(bundle / "surfels.ply", elements.pop("vertex"), more=elements)
+
+    return damage
+
+
+def rotation(length: float) -> Damage:
+    """The rotation of the second surfel, of another length."""
+
+    def damage(bundle: Path) -> None:
+        for k in range(4):
+            column(f"rot_{k}", length if k == 0 else 0.0)(bundle)
+
+    return damage
+
+
+def texel(value: float, channel: int = 0) -> Damage:
+    """A number of the first texel of atlas.ktx2 in fp16."""
+
+    def damage(bundle: Path) -> None:
+        path = bundle / "atlas.ktx2"
+        image = ktx2.parse_ktx2(path.read_bytes())
+        pages = np.stack([np.frombuffer(page, np.float16) for page in image.payload])
+        pages[0, channel] = value
+        payload = [page.tobytes() for page in pages]
+        ktx2.write_ktx2(path, payload, image.format, image.width, image.height, "a test")
+
+    return damage
+
+
+def frame(held: int) -> Damage:
+    """The first frame of surfels.bin, of one block of equal bytes, which declares a byte for each surfel."""
+
+    def damage(bundle: Path) -> None:
+        data = (bundle / "surfels.bin").read_bytes()
+        header = b"\x28\xb5\x2f\xfd" + bytes([0x20, COUNT]) + (held << 3 | 0b011).to_bytes(3, "little")
+        stated = json.loads((bundle / "bundle.json").read_text())["surfels"]["columns"][0]["planes"][0]
+        made = header + b"\0"
+        (bundle / "surfels.bin").write_bytes(made + data[stated[0] :])
+        stated[0] = len(made)
+
+        def change(info: dict) -> None:
+            info["surfels"]["columns"][0]["planes"][0] = stated
+
+        amend(bundle, change)
+
+    return damage
+
+
+NAN = float("nan")
+TABLE: list[tuple[str, str, Damage, bool]] = [
+    ("nothing", "fp16", lambda bundle: None, True),
+    ("a texel of NaN", "fp16", texel(NAN), False),
+    ("a texel of infinity", "fp16", texel(float("-inf")), False),
+    ("a texel at the limit", "fp16", texel(-256.0), True),
+    ("a texel beyond it", "fp16", texel(257.0), False),
+    ("an alpha of NaN", "fp16 alpha", texel(NAN, 3), False),
+    ("an alpha at the limit", "fp16 alpha", texel(2.0, 3), True),
+    ("an alpha beyond it", "fp16 alpha", texel(2.01, 3), False),
+    ("an alpha of -0", "fp16 alpha", texel(-0.0, 3), True),
+    ("a negative alpha", "fp16 alpha", texel(-0.5, 3), False),
+    ("a rotation of zeros", "bc7", rotation(0.0), False),
+    ("a rotation of length 1.1", "bc7", rotation(1.1), False),
+    ("a rotation of length 1.005", "bc7", rotation(1.005), True),
+    ("a position of NaN", "bc7", column("x", NAN), False),
+    ("a position beyond its limit", "bc7", column("x", 1.1e9), False),
+    ("a scale beyond its limit", "bc7", column("scale_0", 105.0), False),
+    ("an opacity beyond its limit", "bc7", column("opacity", -1.1e4), False),
+    ("an extent of 0", "bc7", column("tile_extent", 0.0), False),
+    ("a residual beyond its limit", "bc7", column("residual_1", 300.0), False),
+    ("a colour beyond its limit", "bc7", column("view_base_2", 300.0), False),
+    ("a term beyond its limit", "bc7", column("term_0", 3e7, "view_term"), False),
+    ("a colour of a term of NaN", "bc7", column("term_4", NAN, "view_term"), False),
+    ("a frame that holds what it declares", "compact", frame(COUNT), True),
+    ("a frame that holds more", "compact", frame(COUNT + 5), False),
+    ("a frame that holds less", "compact", frame(COUNT - 5), False),
+]
+
+
+@pytest.fixture(scope="module")
+def bundles(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("agreement")
+    return {
+        "bc7": write(folder / "bc7", "bc7", COUNT),
+        "fp16": write(folder / "fp16", "fp16", COUNT),
+        "fp16 alpha": write(folder / "alpha", "fp16", COUNT, alpha=True),
+        "compact": write(folder / "compact", "uint8", COUNT, compact=True),
+    }
+
+
+@pytest.mark.parametrize(("name", "form", "damage", "good"), TABLE, ids=[row[0] for row in TABLE])
+def test_the_page_and_python_agree(
+    bundles: dict[str, Path], tmp_path: Path, name: str, form: str, damage: Damage, good: bool
+) -> None:
+    bundle = tmp_path / "b"
+    bundle.mkdir()
+    for path in bundles[form].iterdir():
+        (bundle / path.name).write_bytes(path.read_bytes())
+    damage(bundle)
+    amend(bundle)
+    try:
+        read_bundle(bundle)
+        opened = True
+    except BundleError as error:
+        opened, refusal = False, str(error)
+    state, text = page_of(site_of(bundle))
+    assert (opened, state != "error") == (good, good), (name, opened or refusal, state, text)
+    assert good or "damaged" in text

@@ -77,8 +77,8 @@ class DensifyConfig:
     """... but not before there are so many times the surfels that training started with, however few the pixels: a
     scene that cannot grow cannot put surfels where its errors are."""
     max_surfels: Annotated[Count, tyro.conf.arg(aliases=("--max-surfels",))] = 0
-    """Most surfels at any time; 0 = no limit. Once they are reached, those that have become faint make room for those
-    whose errors are largest."""
+    """Surfels that densification grows to, and most at any time; 0 = as many as the thresholds ask for. Replaces
+    `pixels_per_surfel`. Prunes may leave fewer."""
     min_surfels: Count = 100  # No prune leaves fewer surfels than this.
 
 
@@ -138,7 +138,7 @@ class TexelConfig(TexelSteps):
     opaque texels."""
     surfel_rates: Positive = 0.4
     """Rates of the surfels in that part, as a share of those of a run as long as it; they fall to 0 as a cosine."""
-    mean_rates: Positive = 0.1
+    mean_rates: Positive = 0.2
     """Rates of the positions in that part, likewise: at `surfel_rates` what is drawn already would come apart."""
     pixels_per_texel: Positive = 0.25
     """A tile has at most one texel per this many pixels of its surfel (summed blending weight), in the view that shows

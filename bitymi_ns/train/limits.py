@@ -66,11 +66,11 @@ def start(points: PointReport, config: TrainConfig, image_pixels: int, scene: Sc
 def held_back(count: int, most: int, config: TrainConfig) -> str:
     """Densification wanted `count` more surfels than the `most` there may be."""
     densify = config.densify
-    rule = f"one for {densify.pixels_per_surfel:g} pixels of all photographs or {densify.growth:g} times the first"
-    why, option = f", {rule},", "pipeline.model.train.densify.pixels-per-surfel, growth"
-    if most == densify.max_surfels:
-        why, option = "", "max-surfels"
-    return f"Densification stops at {most:,} surfels{why} and would have made {count:,} more now (--{option})."
+    return (
+        f"Densification stops at {most:,} surfels, one for {densify.pixels_per_surfel:g} pixels of all photographs or "
+        f"{densify.growth:g} times the first, and would have made {count:,} more now (--max-surfels, "
+        "--pipeline.model.train.densify.pixels-per-surfel, growth)."
+    )
 
 
 def recorded_rules(config: TrainConfig) -> list[str]:

@@ -4,7 +4,8 @@ thresholds are those of `config.DensifyConfig`.
 At each densification, in this order:
 - surfels that can never be seen again are removed (a value that is not finite, or an opacity of 1/255 or less);
 - surfels with many bad pixels and a large gradient are cloned or split, the most important ones first where not all
-  fit; at `max_surfels` faint surfels make room for them;
+  fit. With `max_surfels` the number grows to it in equal parts instead: parents are drawn in proportion to their
+  gradient times their bad pixels, and faint surfels make room where more have both;
 - up to half of the candidates for pruning, drawn at random, are removed;
 - opacities are clamped.
 After the last one, surfels whose removal hardly changes the pictures go, and between 60 and 90 % of the run four final
@@ -47,6 +48,7 @@ SPLIT_APART = 0.7  # distance of the halves' centres from the surfel's, in scale
 SPLIT_OPACITY = 0.9  # opacity of the halves as a share of the surfel's: they overlap where it is most opaque
 ERROR_VIEWS, FEWEST_ERROR_VIEWS = 0.1, 64
 """Most views that the errors of removals are measured on, as a share of the run's steps, and at least so many."""
+NO_BAD_PIXEL = 0.1  # what a mean of no bad pixel counts as where parents are drawn for a budget
 FINAL_VIEWS, FEWEST_FINAL_VIEWS = 0.025, 16  # the same for each of the four final prunes
 STATISTICS = ("grad_sum", "abs_grad_sum", "visible_count", "max_radius")
 
@@ -190,13 +192,22 @@ class Strategy:
         replaced = torch.zeros_like(clone)
         if self.most > 0:
             count, room = int((clone | split).sum()), max(0, self.most - n)
-            # shortly after an opacity reset every opacity is low, whatever its surfel is worth
-            if self.most == config.max_surfels and not self.schedule.recovering(step):
-                faint = ~(clone | split) & (surfels["opacity_logits"].sigmoid() < self._replaceable)
-                replaced = _lowest(surfels["opacity_logits"], faint, count - room)
-            chosen = _strongest(clone | split, scores.importance, abs_grad_sum / seen, room + int(replaced.sum()))
-            report |= {"replaced": int(replaced.sum()), "held_back": count - int(chosen.sum())}
-            clone, split = clone & chosen, split & chosen
+            gradient = abs_grad_sum / seen
+            if config.max_surfels > 0:
+                room //= sum(step <= later for later in self.schedule.densify_steps)
+                # shortly after an opacity reset every opacity is low, whatever its surfel is worth
+                if not self.schedule.recovering(step):
+                    faint = ~(clone | split) & (surfels["opacity_logits"].sigmoid() < self._replaceable)
+                    replaced = _lowest(surfels["opacity_logits"], faint, count - room)
+                weights = gradient.double() * (scores.importance + NO_BAD_PIXEL) * ~replaced
+                chosen = torch.zeros_like(clone)
+                chosen[self._draw(weights, room + int(replaced.sum()))] = True
+                clone, split = chosen & ~large, chosen & large
+                report |= {"replaced": int(replaced.sum())}
+            else:
+                chosen = _strongest(clone | split, scores.importance, gradient, room)
+                clone, split = clone & chosen, split & chosen
+                report |= {"held_back": count - int(chosen.sum())}
         clones, splits = clone.nonzero().flatten(), split.nonzero().flatten()
         stay = (~split).nonzero().flatten()
         children = self._halves(surfels, splits)
@@ -334,10 +345,9 @@ def most_surfels(config: TrainConfig, image_pixels: int, first_surfels: int = 0)
         image_pixels: of all training images at full size.
     """
     densify = config.densify
-    by_pixels = int(image_pixels / densify.pixels_per_surfel) if densify.pixels_per_surfel > 0 else 0
-    if by_pixels > 0:
-        by_pixels = max(by_pixels, int(densify.growth * first_surfels))
-    return min((bound for bound in (densify.max_surfels, by_pixels) if bound > 0), default=0)
+    if densify.max_surfels > 0 or densify.pixels_per_surfel == 0 or image_pixels == 0:
+        return densify.max_surfels
+    return max(int(image_pixels / densify.pixels_per_surfel), int(densify.growth * first_surfels))
 
 
 def finite_rows(scene: Scene) -> Tensor:

@@ -44,10 +44,9 @@ def test_points_that_do_not_fit_are_announced() -> None:
 
 
 def test_a_bound_that_densification_meets_is_named() -> None:
-    config = TrainConfig(densify=DensifyConfig(max_surfels=800))
-    capped, by_pixels = limits.held_back(1234, 800, config), limits.held_back(1234, 700, config)
-    assert "800 surfels and would have made 1,234 more" in capped and "(--max-surfels)" in capped
-    assert "one for 150 pixels of all photographs" in by_pixels and "densify.pixels-per-surfel" in by_pixels
+    sentence = limits.held_back(1234, 700, TrainConfig())
+    assert "700 surfels, one for 150 pixels of all photographs" in sentence and "would have made 1,234 more" in sentence
+    assert "densify.pixels-per-surfel" in sentence and "--max-surfels" in sentence
 
 
 def test_a_resumed_run_names_the_options_that_differ() -> None:

@@ -72,7 +72,7 @@ def test_frames_are_those_of_the_cpu_renderer(
     assert mean < MEAN and largest < 12 / 255
 
 
-@pytest.mark.parametrize("share, least", [(0.25, 47.0), (0.125, 48.5)])
+@pytest.mark.parametrize("share, least", [(0.25, 47.0), (0.125, 45.7)])
 def test_far_views_are_averages_of_near_ones(share: float, least: float, tmp_path: Path) -> None:
     bundle = write(tmp_path / "b", "uint8", compact=True, seen=True, alpha=True, larger=0.7)
     with served(site_of(bundle)) as address:

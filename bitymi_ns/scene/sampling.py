@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from .camera import Camera
 
@@ -14,10 +13,13 @@ AS_TRAINED = (0.75, 1.5)
 near and from far."""
 SMALLEST, LARGEST = 0.5, 2.0
 """Views beyond these sizes are drawn for what they are; in between it changes over, so that nothing jumps."""
-ONE_SAMPLE, SAMPLE = 0.6, 0.42
-"""A photograph's pixel is at least as many samples wide, as far as MOST_SAMPLES and MOST_PIXELS allow: with one sample
-per pixel, and with several, whose mean forgives more."""
-MOST_SAMPLES = 4  # samples per pixel, along each axis
+ONE_SAMPLE, TWO_SAMPLES = 0.6, 1 / 3
+"""Views from these sizes on have one sample per pixel, and two along each axis."""
+SAMPLE = 0.58
+"""In smaller views a photograph's pixel is at least as many samples wide, as far as MOST_SAMPLES and MOST_PIXELS allow.
+Wider samples lose the edges that alpha texels of several surfels share: the mean transmittance of a stack is not the
+product of its means."""
+MOST_SAMPLES = 6  # samples per pixel, along each axis
 MOST_PIXELS = 1 << 24  # samples of a view: beyond, it has fewer samples per pixel
 FARTHEST = (1.0 / 64, 64.0)
 
@@ -62,7 +64,7 @@ def sampling_of(size: float, pixels: int) -> Sampling:
     low, high = AS_TRAINED
     if low <= size <= high:
         return Sampling()
-    wanted = 1 if size >= ONE_SAMPLE else max(2, math.ceil(SAMPLE / size))
+    wanted = 1 if size >= ONE_SAMPLE else 2 if size >= TWO_SAMPLES else max(3, math.ceil(SAMPLE / size))
     samples = max(1, min(wanted, MOST_SAMPLES, math.isqrt(MOST_PIXELS // max(pixels, 1))))
     shown = samples * size
     if samples > 1:
@@ -86,9 +88,10 @@ def averaged(images: dict[str, Tensor], samples: int) -> dict[str, Tensor]:
     """
     if samples == 1:
         return images
-    area = samples * samples
     out = {}
     for name, image in images.items():
-        mean = avg_pool2d(image.movedim(3, 1).float(), samples).movedim(1, 3)
-        out[name] = mean.contiguous() if image.is_floating_point() else (mean * area).round().to(image.dtype)
+        total = image
+        for axis in (1, 2):  # one after the other: torch would walk both in strides
+            total = total.unflatten(axis, (-1, samples)).sum(axis + 1, dtype=image.dtype)
+        out[name] = total / samples**2 if image.is_floating_point() else total
     return out

@@ -1,5 +1,6 @@
 """Scenes and bounds of the tests of the baked renderer."""
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -9,6 +10,8 @@ from torch import Tensor
 from bitymi_ns.ops.baked_cuda import Workspace, tiles_of
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
+from bitymi_ns.scene.sampling import averaged
+from bitymi_ns.train.losses import psnr
 from tests.bake.conftest import make_surfels
 from tests.ops.golden import SceneCase
 
@@ -56,6 +59,55 @@ def cut_out(count: int, seed: int, dtype: torch.dtype = torch.uint8) -> BakedSce
     scene.atlas[..., 3] = (128 * m).round().to(torch.uint8) if dtype == torch.uint8 else m
     mean = (3 * torch.rand(count, generator=g) - 0.5).clamp(0, 2)
     return replace(scene, alpha_scale=255 / 128 if dtype == torch.uint8 else 1.0, mean_alpha=mean)
+
+
+FAR = [(True, 0.25, 43.0), (True, 0.125, 47.0), (False, 0.25, 59.0), (False, 0.125, 60.0)]
+"""Whether `layered` has alpha texels, the share of its size, and the least PSNR there against the average of its
+picture of full size."""
+
+
+def layered(alpha: bool) -> tuple[BakedScene, Camera]:
+    """Make four layers of a tilted wall of surfels, and a camera that sees them as photographed. With `alpha` texels of
+    all layers are cut out along the same edges, finer than a pixel of a far view."""
+    across, side, scale, tilt = 6, 16, 0.22, 0.5
+    count = 4 * across**2
+    scene, i = textured(count, 0), torch.arange(count)
+    x, y = (1.6 * ((i % across + 0.5) / across * 2 - 1), 1.2 * ((i // across % across + 0.5) / across * 2 - 1))
+    means = torch.stack([x, y, 0.01 * (i // across**2)], 1)
+    surfels = {
+        **scene.surfels,
+        "means": means,
+        "quats": torch.tensor([[math.cos(tilt / 2), 0, math.sin(tilt / 2), 0]]).repeat(count, 1),
+        "log_scales": torch.full((count, 2), math.log(scale)),
+        "opacity_logits": torch.full((count,), 1.5),
+    }
+    u = scale * (6 * (torch.arange(side) + 0.5) / side - 3)
+    column, row = x[:, None] + math.cos(tilt) * u, y[:, None] + u  # [count, side]: where the texels are
+    texels = torch.zeros(side, count, side, 4)
+    texels[..., :3] = 0.5 + 0.4 * torch.sin(9 * column)[None, :, :, None]
+    texels[..., 3] = torch.sin(18 * column) + torch.sin(15 * row).T[:, :, None] > 0
+    camera = front(240, 176)
+    lens = torch.tensor([4.0, 4, 1])[:, None]
+    camera = replace(camera, K=torch.where(camera.K.diag().diag() > 0, lens * camera.K, camera.K))
+    rate = math.sqrt(float(camera.K[0, 0] * camera.K[1, 1])) / float(camera.viewmat[2, 3])
+    made = replace(
+        scene,
+        surfels=surfels,
+        tiles=torch.stack([side * i, 0 * i, 0 * i, 0 * i + side, 0 * i + side], 1).int(),
+        atlas=(255 * texels.reshape(1, side, side * count, 4)).round().to(torch.uint8),
+        extent=None,
+        mean_residual=torch.zeros(count, 3),
+        mean_alpha=torch.ones(count),
+        alpha_scale=255 / 128 if alpha else 0.0,
+        photographed=torch.cat([means, torch.full((count, 1), rate)], 1),
+    )
+    return made, camera
+
+
+def to_average(scene: BakedScene, camera: Camera, share: float) -> float:
+    """Measure the PSNR of a view of that share of a camera's size against the average of the view of full size."""
+    full = scene.render(camera).rgb
+    return psnr(scene.render(camera.scaled(share)).rgb, averaged({"rgb": full[None]}, round(1 / share))["rgb"][0])
 
 
 def front(width: int = 60, height: int = 44, distance: float = 4.0) -> Camera:

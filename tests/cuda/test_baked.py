@@ -28,7 +28,18 @@ from bitymi_ns.scene.baked_renderer import BakedRenderer, SceneRenderer
 from tests.bake.conftest import make_surfels
 from tests.bake.test_real_scene import real_scene
 from tests.bundle.compact_scene import make_codes, write_compact
-from tests.cuda.baked_scenes import FLIP, camera_of, cut_out, front, most, scene_of, textured
+from tests.cuda.baked_scenes import (
+    FAR,
+    FLIP,
+    camera_of,
+    cut_out,
+    front,
+    layered,
+    most,
+    scene_of,
+    textured,
+    to_average,
+)
 from tests.ops.golden import SceneCase, atlas_of, extreme_scenes, load_golden, random_scene
 from tests.ops.test_view_color import lean_parameters
 
@@ -113,6 +124,12 @@ def test_alpha_texels(dtype: torch.dtype, prefilter: str, photo_pixel: float, de
             step = 0.5 if name == "overdraw" else STEP * max(1.0, float(b.abs().max()))
             assert ((a - b).abs() <= step).double().mean() >= 0.998, (name, changed)
         assert (got["rgb"].cpu() - want["rgb"]).abs().max() < most(device, 8e-3, 2 * TEXEL + FLIP)
+
+
+@pytest.mark.parametrize("alpha, share, least", FAR)
+def test_far_views_are_averages_of_near_ones(alpha: bool, share: float, least: float, device: torch.device) -> None:
+    scene, camera = layered(alpha)
+    assert to_average(scene.to(device), camera, share) > least
 
 
 def test_opaque_alpha_texels_change_nothing(device: torch.device) -> None:

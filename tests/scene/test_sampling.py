@@ -1,6 +1,7 @@
 """How large a view shows what was photographed, and how it is drawn then."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,8 +10,18 @@ from hypothesis import strategies as st
 
 from bitymi_ns.ops.baked import draw
 from bitymi_ns.scene import Camera
-from bitymi_ns.scene.sampling import LARGEST, MOST_PIXELS, MOST_SAMPLES, ONE_SAMPLE, averaged, sampling_of, size_of
-from tests.cuda.baked_scenes import front, textured
+from bitymi_ns.scene.sampling import (
+    LARGEST,
+    MOST_PIXELS,
+    MOST_SAMPLES,
+    ONE_SAMPLE,
+    SAMPLE,
+    Sampling,
+    averaged,
+    sampling_of,
+    size_of,
+)
+from tests.cuda.baked_scenes import FAR, front, layered, textured, to_average
 
 POINTS = torch.tensor([[0.0, 0, 0, 15.0], [0.5, 0.1, 0, 15.0], [-0.4, 0.2, 0, 15.0]])
 
@@ -31,8 +42,8 @@ def test_samples_are_close_enough_and_few_enough(size: float, pixels: int) -> No
     how = sampling_of(size, pixels)
     assert 1 <= how.samples <= MOST_SAMPLES and how.photo_pixel > 0
     assert how.samples == 1 or how.samples**2 * pixels <= MOST_PIXELS
-    if pixels < 1e6 and size >= 0.1:
-        assert how.photo_pixel >= 0.37
+    if pixels < 1e5 and size >= SAMPLE / MOST_SAMPLES:
+        assert how.photo_pixel >= SAMPLE - 1e-9
     if how.samples > 1:
         assert how.photo_pixel < 2 * ONE_SAMPLE
     elif pixels < 1e6:
@@ -65,8 +76,8 @@ def test_a_view_is_drawn_for_its_size() -> None:
     assert all(torch.equal(getattr(same, name), getattr(plain, name)) for name in ("rgb", "alpha", "depth", "overdraw"))
     small = camera.scaled(0.25)
     how = scene.sampling([small])
-    assert how.samples == 2 and how.photo_pixel == pytest.approx(0.5, rel=0.25)
-    wanted = averaged(draw(scene, [small.scaled(2)], None, ("rgb", "overdraw"), how.photo_pixel), 2)
+    assert how.samples == 3 and how.photo_pixel == pytest.approx(0.75, rel=0.25)
+    wanted = averaged(draw(scene, [small.scaled(3)], None, ("rgb", "overdraw"), how.photo_pixel), 3)
     got = scene.render(small, maps=True)
     torch.testing.assert_close(got.rgb, wanted["rgb"][0])
     assert torch.equal(got.overdraw, wanted["overdraw"][0]) and got.depth.shape == (22, 30, 1)
@@ -82,3 +93,11 @@ def test_small_views_are_close_to_averages_of_large_ones() -> None:
         direct = draw(scene, [small], None, ("rgb",))["rgb"][0]
         error, before = (float((image - truth).square().mean()) for image in (scene.render(small).rgb, direct))
         assert error < 0.35 * before, share
+
+
+@pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
+@pytest.mark.parametrize("alpha, share, least", FAR)
+def test_far_views_are_averages_where_layers_share_edges(alpha: bool, share: float, least: float, prefilter) -> None:
+    scene, camera = layered(alpha)
+    assert scene.sampling([camera]) == Sampling()
+    assert to_average(replace(scene, prefilter=prefilter), camera, share) > least

@@ -132,14 +132,14 @@ def test_resets_leave_time_to_recover(max_steps, opacity):
     assert Schedule(every_event(), max_steps).reset_opacity() == pytest.approx(opacity, rel=1e-3)
 
 
-def test_positions_do_not_start_anew_with_the_texels() -> None:
+def test_positions_move_less_than_the_rest_when_texels_begin() -> None:
     """Other rates of the surfels do, as of a run as long as the texels' part."""
     for steps in (1000, 30_000):
         schedule = Schedule(TrainConfig(), steps, texels=True)
         begin, part = schedule.texels_start, Schedule(TrainConfig(), schedule.texel_steps)
         assert schedule.lr("quats", begin) == pytest.approx(TexelConfig().surfel_rates * part.lr("quats", 0))
         assert schedule.lr("means", begin) == pytest.approx(TexelConfig().mean_rates * part.lr("means", 0))
-        assert schedule.lr("means", begin) < 3 * schedule.lr("means", begin - 1)
+        assert schedule.lr("means", begin) < 5 * schedule.lr("means", begin - 1)
         assert schedule.lr("means", steps - 1) < 1e-4 * schedule.lr("means", begin)
 
 

@@ -107,10 +107,11 @@ describe('the pace', () => {
 describe('views of other sizes', () => {
   // what bitymi_ns.scene.sampling gives for a thousand pixels
   it.each([
-    [1 / 64, 4, 0.0625],
-    [0.1, 4, 0.4],
-    [0.25, 2, 0.5],
-    [0.3, 2, 0.6],
+    [1 / 64, 6, 0.09375],
+    [0.1, 6, 0.6],
+    [0.25, 3, 0.75],
+    [0.3, 3, 0.9],
+    [0.34, 2, 0.68],
     [0.5, 2, 1],
     [0.59, 2, 1.18],
     [0.6, 1, 0.682859316],
@@ -121,13 +122,13 @@ describe('views of other sizes', () => {
     [1.9, 1, 1.76748927],
     [3, 1, 3],
   ])('of %d are drawn as the package draws them', (size, samples, photoPixel) => {
-    const found = samplingOf(size, 1000, 4, 1 << 24);
+    const found = samplingOf(size, 1000, 6, 1 << 24);
     expect(found.samples).toBe(samples);
     expect(found.photoPixel).toBeCloseTo(photoPixel, 8);
   });
   it('have no more samples than there is room for', () => {
-    expect(samplingOf(0.05, 1 << 22, 4, 1 << 24)).toEqual({ samples: 2, photoPixel: 0.1 });
-    expect(samplingOf(0.05, 1 << 24, 4, 1 << 24).samples).toBe(1);
+    expect(samplingOf(0.05, 1 << 22, 6, 1 << 24)).toEqual({ samples: 2, photoPixel: 0.1 });
+    expect(samplingOf(0.05, 1 << 24, 6, 1 << 24).samples).toBe(1);
   });
   it('are told by the points in the picture', () => {
     const view = new View(lookAt([0, 0, -4], [0, 0, 0], [0, -1, 0]), 60, 60, 30, 20, 60, 40);

@@ -23,7 +23,7 @@ from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.ops.webgpu import device, on_device
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
-from tests.cuda.baked_scenes import camera_of, front, scene_of, textured
+from tests.cuda.baked_scenes import FAR, camera_of, front, layered, scene_of, textured, to_average
 from tests.ops.golden import (
     GOLDEN_NAMES,
     SURFEL_KEYS,
@@ -263,6 +263,12 @@ def test_levels_of_blocks_and_of_tiles_without_a_mean(as_a_card: None) -> None:
     scene = encoded(photographed(textured(60, 0), camera))
     for each in (scene, replace(scene, mean_residual=None)):
         assert check(each, camera.scaled(0.3)).max() < 2 * STEP
+
+
+@pytest.mark.parametrize("alpha, share, least", FAR)
+def test_far_views_are_averages_of_near_ones(alpha: bool, share: float, least: float) -> None:
+    scene, camera = layered(alpha)
+    assert to_average(replace(scene, through_webgpu=True), camera, share) > least
 
 
 def test_what_was_changed_is_drawn_anew() -> None:

@@ -33,7 +33,7 @@ export interface Depths {
   depth: Float32Array;
 }
 
-const MOST_SAMPLES = 4; // per pixel, along each axis, of a picture that stays
+const MOST_SAMPLES = 6; // per pixel, along each axis, of a picture that stays
 const MOST_PIXELS = 1 << 22; // of a target
 const MOST_OVERDRAW = 64; // of the last colour of the map
 

@@ -3,8 +3,8 @@ import type { View } from './pose';
 
 const AS_TRAINED = [0.75, 1.5]; // views between these sizes are drawn as in training
 const [SMALLEST, LARGEST] = [0.5, 2]; // beyond, for what they are; in between it changes over
-// a photograph's pixel is at least so many samples wide, with one sample per pixel and with several
-const [ONE_SAMPLE, SAMPLE] = [0.6, 0.42];
+const [ONE_SAMPLE, TWO_SAMPLES] = [0.6, 1 / 3]; // from these sizes on one sample per pixel, and two along each axis
+const SAMPLE = 0.58; // in smaller views a photograph's pixel is at least so many samples wide
 const FARTHEST = [1 / 64, 64];
 
 export interface Sampling {
@@ -29,7 +29,7 @@ export function samplingOf(size: number, pixels: number, mostSamples: number, mo
   const [low, high] = AS_TRAINED;
   if (low <= size && size <= high) return { samples: 1, photoPixel: 1 };
   const room = Math.floor(Math.sqrt(mostPixels / Math.max(pixels, 1)));
-  const wanted = size >= ONE_SAMPLE ? 1 : Math.max(2, Math.ceil(SAMPLE / size));
+  const wanted = size >= ONE_SAMPLE ? 1 : size >= TWO_SAMPLES ? 2 : Math.max(3, Math.ceil(SAMPLE / size));
   const samples = Math.max(1, Math.min(wanted, mostSamples, room));
   let photoPixel = samples * size;
   if (samples > 1) return { samples, photoPixel };

@@ -1,7 +1,6 @@
 """Checkpoint files: written whole or not at all, read with errors that say what to do."""
 
 import dataclasses
-import errno
 import os
 import zipfile
 from pathlib import Path
@@ -55,7 +54,7 @@ def _of_the_system(error: BaseException) -> OSError:
     behind: BaseException | None = error
     while behind is not None and not isinstance(behind, OSError):
         behind = behind.__context__
-    return behind or OSError(errno.EIO, "the disk took only a part of it")
+    return behind or OSError(0, "the disk took only a part of it")
 
 
 def newest_step(folder: Path) -> int:

@@ -198,7 +198,7 @@ def test_a_failed_swap_puts_the_old_bundle_back(surfels, tmp_path, monkeypatch):
         return rename(self, to)
 
     monkeypatch.setattr(type(target), "rename", fail_for_the_new_one)
-    with pytest.raises(BundleError, match="Input/output error"):
+    with pytest.raises(BundleError, match="the disk reports an error"):
         make(surfels, target, overwrite=True)
     monkeypatch.undo()
     assert read_bundle(target).scene.view_color == "sg" and names_beside(target) == ["b"]

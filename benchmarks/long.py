@@ -46,6 +46,8 @@ WATCHED, EVERY, WATCH = 8, 30, 300
 COLUMNS = {
     "PSNR": ("psnr", 2),
     "fitted": ("fitted_psnr", 2),
+    "carried": ("carried_psnr", 2),
+    "refined": ("refined_psnr", 2),
     "SSIM": ("ssim", 4),
     "LPIPS": ("lpips", 4),
     "before texels": ("before_texels", 2),
@@ -71,6 +73,7 @@ class Run:
     seed: int
     photographs: int
     bake: bool
+    align: bool
 
     @property
     def key(self) -> dict[str, Any]:
@@ -95,6 +98,8 @@ def preset_of(row: str) -> Preset:
         if leaf not in vars(owner):
             raise ValueError(f"row '{row}': there is no option {path}")
         value = yaml.safe_load(text)
+        if isinstance(value, bool) and isinstance(getattr(owner, leaf), str):
+            value = text  # YAML's on and off
         setattr(owner, leaf, tuple(value) if isinstance(value, list) else value)
     return preset
 
@@ -178,6 +183,9 @@ def measure(run: Run) -> dict[str, Any]:
             output = scene.render(view.camera, background, "frozen")
         rows.append(quality(output.rgb, target) | {"fragments": len(output.fragments) / (target.numel() / 3)})
     found = means(rows) | watch.figures()
+    if run.align or trainer.training.poses.refined:
+        judged = evaluate(scene, capture.held_out, preset.train, trainer.training.poses)
+        found |= {"carried_psnr": judged.carried_psnr, "refined_psnr": judged.refined_psnr}
     found |= {"before_texels": before, "surfels": len(scene), "rollbacks": trainer.training.guard.rollbacks}
     found |= {"cpu_seconds": clock.cpu_seconds, "width": camera.width, "height": camera.height}
     if run.bake:
@@ -217,7 +225,15 @@ def main() -> None:
     arguments = read_arguments()
     torch.set_num_threads(1)
     runs = [
-        Run(str(data), row, *(int(x) for x in run.split("/")), seed, arguments.photographs, arguments.bake)
+        Run(
+            str(data),
+            row,
+            *(int(x) for x in run.split("/")),
+            seed,
+            arguments.photographs,
+            arguments.bake,
+            arguments.align,
+        )
         for data, run, row, seed in itertools.product(arguments.data, arguments.runs, arguments.rows, arguments.seeds)
     ]
     for row in arguments.rows:
@@ -246,6 +262,7 @@ def read_arguments() -> Namespace:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--photographs", type=int, default=0, help="train on so many photographs only; 0 = all")
     parser.add_argument("--bake", action="store_true", help="also bake: bytes, and quality of the bundle")
+    parser.add_argument("--align", action="store_true", help="align held-out poses of rows without refinement, too")
     parser.add_argument("--work", type=Path, default=Path("outputs/long"), help="folder of the finished runs")
     parser.add_argument("--output", type=Path, help="file for the tables")
     return parser.parse_args()

@@ -50,6 +50,8 @@ WATCHED, EVERY, WATCH = 8, 30, 300
 COLUMNS = {
     "PSNR": ("psnr", 2),
     "fitted": ("fitted_psnr", 2),
+    "carried": ("carried_psnr", 2),
+    "refined": ("refined_psnr", 2),
     "SSIM": ("ssim", 4),
     "LPIPS": ("lpips", 4),
     "before texels": ("before_texels", 2),
@@ -78,12 +80,13 @@ class Run:
     seed: int
     photographs: int
     bake: bool
+    align: bool
     device: str
     keep: Path | None = None  # folder in which the bundle stays
 
     @property
     def key(self) -> dict[str, Any]:
-        names = ("steps", "reduction", "seed", "photographs", "bake")
+        names = ("steps", "reduction", "seed", "photographs", "bake", "align")
         settings = {name: getattr(self, name) for name in names} | {"device": device_name(self.device)}
         return {**settings, "data": Path(self.data).resolve().name, "settings": self.row, "commit": commit()}
 
@@ -110,6 +113,8 @@ def preset_of(row: str) -> Preset:
         if leaf not in vars(owner):
             raise ValueError(f"row '{row}': there is no option {path}")
         value = yaml.safe_load(text)
+        if isinstance(value, bool) and isinstance(getattr(owner, leaf), str):
+            value = text  # YAML's on and off
         setattr(owner, leaf, tuple(value) if isinstance(value, list) else value)
     return preset
 
@@ -196,6 +201,9 @@ def measure(run: Run) -> dict[str, Any]:
             output = scene.render(view.camera.to(device), background, "frozen")
         rows.append(quality(output.rgb, target) | {"fragments": len(output.fragments) / (target.numel() / 3)})
     found = means(rows) | watch.figures()
+    if run.align or trainer.training.poses.refined:
+        judged = evaluate(scene, capture.held_out, preset.train, trainer.training.poses)
+        found |= {"carried_psnr": judged.carried_psnr, "refined_psnr": judged.refined_psnr}
     found |= {"before_texels": before, "surfels": len(scene), "rollbacks": trainer.training.guard.rollbacks}
     camera = capture.train[0].camera
     found |= {"cpu_seconds": clock.cpu_seconds, "seconds": clock.seconds}
@@ -207,7 +215,9 @@ def measure(run: Run) -> dict[str, Any]:
         with tempfile.TemporaryDirectory() as folder:
             bundle = (run.keep or Path(folder)) / f"{'-'.join(shlex.split(run.row))}-{run.steps}-{run.seed}"
             start = time.perf_counter()
-            bake_scene(scene, capture.train, bundle, background=background, overwrite=True)
+            poses = trainer.training.poses
+            views = [view._replace(camera=poses.of(i, view.camera)) for i, view in enumerate(capture.train)]
+            bake_scene(scene, views, bundle, background=background, overwrite=True)
             found["bake_seconds"] = time.perf_counter() - start
             found["kilobytes"] = sum(path.stat().st_size for path in bundle.iterdir()) / 1e3
             baked = read_bundle(bundle).scene.to(device)
@@ -242,7 +252,7 @@ def tables(runs: Sequence[Run], cells: Cells) -> str:
 def main() -> None:
     arguments = read_arguments()
     torch.set_num_threads(1)
-    rest = (arguments.bake or arguments.keep is not None, arguments.device, arguments.keep)
+    rest = (arguments.bake or arguments.keep is not None, arguments.align, arguments.device, arguments.keep)
     runs = [
         Run(str(data), row, *(int(x) for x in run.split("/")), seed, arguments.photographs, *rest)
         for data, run, row, seed in itertools.product(arguments.data, arguments.runs, arguments.rows, arguments.seeds)
@@ -274,6 +284,7 @@ def read_arguments() -> Namespace:
     parser.add_argument("--photographs", type=int, default=0, help="train on so many photographs only; 0 = all")
     parser.add_argument("--bake", action="store_true", help="also bake: bytes, and quality of the bundle")
     parser.add_argument("--keep", type=Path, help="bake, and keep the bundles in this folder")
+    parser.add_argument("--align", action="store_true", help="align held-out poses of rows without refinement, too")
     parser.add_argument("--device", default="cpu", help="cpu or cuda (%(default)s)")
     parser.add_argument("--work", type=Path, default=Path("outputs/long"), help="folder of the finished runs")
     parser.add_argument("--output", type=Path, help="file for the tables")

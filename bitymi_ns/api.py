@@ -17,6 +17,7 @@ from bitymi_ns.ops import blended_image, can_rasterize, project, rasterize_image
 from bitymi_ns.ops.constants import COLOR_BIAS
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import NEAR, RenderOutput, Scene
+from bitymi_ns.train.config import RefinePoses
 from bitymi_ns.train.fit import TrainLog, fit
 from bitymi_ns.train.init import scene_for_views
 from bitymi_ns.train.preset import load_preset
@@ -37,7 +38,7 @@ def rasterize(
     near: float = NEAR,
     maps: bool = False,
 ) -> RenderOutput:
-    """Rasterize 2D Beta surfels with one color each; differentiable in everything but the camera.
+    """Rasterize 2D Beta surfels with one color each; differentiable in everything but the intrinsics.
 
     The blending weight of a surfel is w = sigma T with sigma = min(0.99, o (1 - (u^2 + v^2) / 9)^beta) at the
     intersection (u, v) of the pixel's ray with the surfel's plane, in units of its scales.
@@ -49,7 +50,7 @@ def rasterize(
         opacities: [N] from 0 to 1.
         betas: [N] from 0 to 4, exponent of the kernel: small = hard disc, 3.5 = nearly Gaussian.
         colors: [N, 3] in the images' own scale; below 0 they count as 0.
-        camera: the view; its axes are OpenCV's.
+        camera: the view; its axes are OpenCV's. The gradient of its `viewmat` is that along rigid motions.
         background: [3] color behind the surfels; None = black.
         near: surfels with a center nearer than this are not drawn (camera z, world units).
         maps: also depth and normals.
@@ -104,6 +105,7 @@ def train_scene(
     method: str = "bitymi",
     eval_views: Sequence[View] = (),
     seed: int = 0,
+    refine_poses: RefinePoses = "off",
     device: torch.device | str = "cpu",
     callback: Callable[[int, float], None] | None = None,
 ) -> tuple[Scene, TrainLog]:
@@ -118,11 +120,13 @@ def train_scene(
         method: preset, the name of a file in method_configs/.
         eval_views: held-out photographs; the log states their PSNR.
         seed: of everything random in the run.
+        refine_poses: on = move the cameras of the photographs beside the scene (`log.cameras`).
         device: where training runs.
         callback: called after every step with its number and the loss. Reading the loss waits for a CUDA device.
 
     Returns:
-        The scene on `device`, and the log with the PSNR of `eval_views` at the end.
+        The scene on `device`, and the log with the PSNR of `eval_views` at the end and the cameras of `views`. Where
+        poses were refined, give `bake_scene` the views with these cameras.
 
     Raises:
         ValueError: there are no views, points or colors are not [M, 3], or an option is out of range.
@@ -134,7 +138,7 @@ def train_scene(
         if values.ndim != 2 or values.shape[1] != 3 or len(values) != len(points):
             raise ValueError(f"{name} have to be [M, 3], as many as points, not {list(values.shape)}")
     preset = load_preset(method)
-    config = replace(copy.deepcopy(preset.train), seed=seed)
+    config = replace(copy.deepcopy(preset.train), seed=seed, refine_poses=refine_poses)
     scene = scene_for_views(views, points, colors, preset.scene, config, steps)
     scene, views = scene.to(device), [view.to(device) for view in views]
     step_done = None if callback is None else lambda trainer, *_: callback(trainer.step, trainer.loss)

@@ -113,10 +113,10 @@ GEOMETRY = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, camera, near, prefilter, photo_pixel, *geometry):
+    def forward(ctx, camera, near, prefilter, photo_pixel, viewmat, *geometry):
         means = geometry[0]
         inputs = {name: dense(t, means) for name, t in zip(GEOMETRY, geometry, strict=True)}
-        inputs |= {"viewmat": dense(camera.viewmat, means), "K": dense(camera.K, means)}
+        inputs |= {"viewmat": dense(viewmat, means), "K": dense(camera.K, means)}
         geom, frames, radii = (means.new_empty(len(means), k) for k in (GEOM, FRAME, 2))
         broken = torch.zeros(1, dtype=torch.int32, device=means.device)
         view = {"width": camera.width, "height": camera.height, "near": near, "prefilter": prefilter}
@@ -133,15 +133,54 @@ class _Project(torch.autograd.Function):
         *inputs, geom = ctx.saved_tensors
         dgeom = torch.zeros_like(geom) if dgeom is None else dense(dgeom, geom)
         dframes = None if dframes is None else dense(dframes, geom)
-        out = [torch.empty_like(t) for t in inputs[: len(GEOMETRY)]]
-        kernel("project_backward", geom)(
-            **dict(zip(ctx.names, inputs, strict=True)),
-            geom=geom,
-            dgeom=dgeom,
-            dframes=dframes,
-            **{f"d{name}": gradient for name, gradient in zip(GEOMETRY, out, strict=True)},
-        )
-        return None, None, None, None, *out
+
+        def gradients(dframes: Tensor | None) -> list[Tensor]:
+            out = [torch.empty_like(t) for t in inputs[: len(GEOMETRY)]]
+            kernel("project_backward", geom)(
+                **dict(zip(ctx.names, inputs, strict=True)),
+                geom=geom,
+                dgeom=dgeom,
+                dframes=dframes,
+                **{f"d{name}": gradient for name, gradient in zip(GEOMETRY, out, strict=True)},
+            )
+            return out
+
+        out, dviewmat = gradients(dframes), None
+        if ctx.needs_input_grad[4]:
+            named = dict(zip(ctx.names, inputs, strict=True))
+            dmeans, dquats = (out if dframes is None else gradients(None))[:2]  # frames are those of the world
+            dviewmat = rigid_gradient(named["means"], named["quats"], dmeans, dquats, named["viewmat"])
+        return None, None, None, None, dviewmat, *out
+
+
+def rigid_gradient(means: Tensor, quats: Tensor, dmeans: Tensor, dquats: Tensor, viewmat: Tensor) -> Tensor:
+    """Find the gradient with respect to a camera's pose by those of the surfels that it sees.
+
+    Where the camera moves, the surfels move rigidly the other way in its frame: the force on the surfels is the sum of
+    their gradients, the torque that of means x dmeans and of what turns the quaternions. Sums are in float64.
+
+    Args:
+        means: [N, 3] world positions.
+        quats: [N, 4] wxyz of any length.
+        dmeans: [N, 3] gradients of what is drawn, view colours left out.
+        dquats: [N, 4] likewise.
+        viewmat: [4, 4] world to camera.
+
+    Returns:
+        [4, 4] in the dtype of `viewmat`: the part of the gradient along rigid motions.
+    """
+    # surfels that are not finite are not drawn, and have gradients of 0
+    m, q = (t.double().nan_to_num(0.0, 0.0, 0.0) for t in (means, quats))
+    dm, dq = dmeans.double(), dquats.double()
+    turn = q[:, :1] * dq[:, 1:] - dq[:, :1] * q[:, 1:] + torch.linalg.cross(q[:, 1:], dq[:, 1:])
+    torque = (torch.linalg.cross(m, dm) + 0.5 * turn).sum(0)
+    rotation = viewmat[:3, :3].double()
+    # no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic algorithms
+    force, torque = (rotation * dm.sum(0)).sum(-1), (rotation * torque).sum(-1)
+    gradient = torch.zeros(4, 4, dtype=torch.float64, device=viewmat.device)
+    gradient[:3, :3] = 0.5 * torch.linalg.cross(torque[:, None], rotation, dim=0)
+    gradient[:3, 3] = force
+    return gradient.to(viewmat)
 
 
 def project(
@@ -164,7 +203,7 @@ def project(
         log_scales: [N, 2] natural logarithm of the tangent scales, world units; clamped to +-30.
         opacity_logits: [N], opacity = sigmoid.
         beta_raw: [N], beta = 4 sigmoid (eq. beta-kernel).
-        camera: OpenCV axes.
+        camera: OpenCV axes; its `viewmat` may ask for a gradient, which is that along rigid motions.
         near: surfels with a centre nearer than this (camera z) are not seen.
         prefilter: low_pass = the maximum of the kernel and a low pass; pixel = the kernel averaged over a pixel
             (csrc/core/prefilter.h), with n = fx fy s_u s_v / z^2 in the last column of geom.
@@ -187,5 +226,5 @@ def project(
     if camera.skewed:
         raise ValueError("cameras with skew (K[0, 1] != 0) are not supported: undistort the images first")
     geometry = (means, quats, log_scales, opacity_logits, beta_raw)
-    geom, frames, radii, broken = _Project.apply(camera, near, prefilter, photo_pixel, *geometry)
+    geom, frames, radii, broken = _Project.apply(camera, near, prefilter, photo_pixel, camera.viewmat, *geometry)
     return Projection(geom, frames, radii, camera, near, prefilter, broken, photo_pixel, alpha=alpha)

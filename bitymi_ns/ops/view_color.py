@@ -53,7 +53,8 @@ class _ViewColor(torch.autograd.Function):
         kernel("view_color_backward", means)(
             kind=ctx.kind, terms=ctx.terms, **parameters, **to, dout=dense(dout, means), dmeans=dmeans
         )
-        return None, None, None, None, dmeans, *grads
+        dcenter = -dmeans.sum(0, dtype=center.dtype) if ctx.needs_input_grad[3] else None
+        return None, None, None, dcenter, dmeans, *grads
 
 
 def check_view_color(kind: str, params: Mapping[str, Tensor], n: int) -> int:
@@ -104,7 +105,7 @@ def view_color(
             view_base [N, 3], view_span [N, 2] int32 (first term, how many), view_terms [terms, the kind's lean_width].
             More are ignored.
         means: [N, 3] world positions.
-        center: [3] camera centre, world; used in float64 (`Camera.exact_center`).
+        center: [3] camera centre, world; used in float64 (`Camera.exact_center`); may ask for a gradient.
         active: [N] bool; rows that are not active give 0 and get no gradient. None = all.
 
     Returns:

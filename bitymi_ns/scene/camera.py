@@ -66,6 +66,10 @@ class Camera:
             return self  # with what it has computed
         return self._with(viewmat=viewmat, K=K)
 
+    def posed(self, viewmat: Tensor) -> Camera:
+        """The same camera with another pose, world to camera [4, 4], in the dtype and on the device of its own."""
+        return self._with(viewmat=viewmat.to(self.viewmat))
+
     def local(self, points: Tensor) -> Tensor:
         """[M, 3] world points in the camera frame. `viewmat` and `points` lie on one device."""
         # no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic algorithms

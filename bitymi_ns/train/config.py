@@ -12,6 +12,7 @@ from bitymi_ns.ranges import MOST, Count, NonNegative, Positive, PositiveCount, 
 
 REFERENCE_STEPS = 30_000  # run length that every step count below is stated for
 ExposureKind = Literal["auto", "off", "gain", "affine"]  # colour corrections of the photographs
+RefinePoses = Literal["off", "on"]  # whether poses of the photographs are refined
 Background = Literal["auto", "black", "white", "random"]  # colours behind the scene
 
 
@@ -164,6 +165,17 @@ class GuardConfig:
 
 
 @dataclass
+class PoseConfig:
+    """Refinement of the photographs' poses, where it is on."""
+
+    start: Count = 3000  # First step in which poses move.
+    stop: Count = 27_000  # From this step on they stay, so that the texels settle.
+    pixels: Positive = 0.5
+    """How far the first step moves a picture where all of it agrees on the direction, in pixels of the resolution of
+    the moment; falls to 0 as a cosine."""
+
+
+@dataclass
 class TrainConfig:
     """Options of training."""
 
@@ -196,6 +208,9 @@ class TrainConfig:
     exposure: ExposureKind = "off"
     """Exposure and white balance of each photograph: gain = a learned factor per channel, affine = a learned 3 x 4
     matrix, off = all photographs are taken as they are, auto = gain where the photographs disagree by gains."""
+    refine_poses: RefinePoses = "off"
+    """Poses of the training photographs: on = refined beside the scene, off = as they are given."""
+    poses: PoseConfig = field(default_factory=PoseConfig)
     background: Background = "auto"
     """Colour behind the scene while training; images with alpha are composed over it. auto = another one in every step,
     as random does, for images with alpha, so that nothing is learned but what they show; alpha_color for others."""

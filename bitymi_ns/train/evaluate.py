@@ -10,6 +10,7 @@ import torch
 
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.losses import fitted_psnr, mean_psnr, psnr
+from bitymi_ns.train.poses import Poses, aligned, view_psnr
 from bitymi_ns.train.views import View, eval_background
 
 if TYPE_CHECKING:
@@ -22,6 +23,8 @@ class Quality(NamedTuple):
     psnr: float  # dB, over the views of which any pixel counts
     fragments: float  # blended fragments per view
     fitted_psnr: float  # dB after the affine fit of each view's colours (`losses.color_fitted`), over the same views
+    carried_psnr: float = math.nan  # dB from poses that were carried along with those of the photographs nearest
+    refined_psnr: float = math.nan  # dB from poses that were aligned with the scene
 
 
 def evenly_spaced(count: int, most: int) -> list[int]:
@@ -31,15 +34,17 @@ def evenly_spaced(count: int, most: int) -> list[int]:
 
 
 @torch.no_grad()
-def evaluate(scene: Scene, views: Sequence[View], config: TrainConfig) -> Quality:
+def evaluate(scene: Scene, views: Sequence[View], config: TrainConfig, poses: Poses | None = None) -> Quality:
     """Compare renders of a scene with photographs, over the background on which views are judged.
 
     Args:
         views: at full size; each is asked for once.
+        poses: of the run, where it refined them: views are also compared from poses that are carried along, and from
+            poses that are then aligned with the scene as it is.
     """
     device = scene.surfels["means"].device
     background = eval_background(config, device)
-    values, fitted, fragments = [], [], []
+    values, fitted, along, refined, fragments = [], [], [], [], []
     for view in (view.to(device) for view in views):
         output = scene.render(view.camera, background=background, field_mode="frozen")
         rgb, target = output.rgb.clamp(0.0, 1.0), view.target(background, device)
@@ -47,5 +52,10 @@ def evaluate(scene: Scene, views: Sequence[View], config: TrainConfig) -> Qualit
         fitted.append(fitted_psnr(rgb, target, view.mask))
         fragments.append(len(output.fragments))
         del output  # with its fragments, before the next view makes its own
+        if poses is not None:
+            view = view._replace(camera=poses.carried(view.camera))
+            along.append(view_psnr(scene, view, background))
+            view = view._replace(camera=aligned(scene, view, background, config.loss.ssim_weight))
+            refined.append(view_psnr(scene, view, background))
     mean_fragments = sum(fragments) / len(fragments) if fragments else math.nan
-    return Quality(mean_psnr(values), mean_fragments, mean_psnr(fitted))
+    return Quality(mean_psnr(values), mean_fragments, *(mean_psnr(each) for each in (fitted, along, refined)))

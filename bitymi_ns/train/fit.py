@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.init import scene_extent
@@ -34,6 +35,10 @@ class LogEntry:
     loss: float  # Objective of the last training step.
     psnr: float  # dB, mean over the evaluation views at full size; NaN without such views.
     fitted_psnr: float  # PSNR in dB after the affine fit of each view's colours (`losses.color_fitted`).
+    carried_psnr: float = math.nan
+    """PSNR in dB from poses that are carried along with the photographs' (`poses.carried`); NaN before the end and
+    where the run refines no poses."""
+    refined_psnr: float = math.nan  # PSNR in dB from poses that are aligned with the finished scene, likewise.
 
 
 @dataclass
@@ -42,6 +47,7 @@ class TrainLog:
 
     entries: list[LogEntry] = field(default_factory=list)
     events: list[dict[str, float]] = field(default_factory=list)  # Reports of the strategy, each with its `step`.
+    cameras: list[Camera] = field(default_factory=list)  # Of the training views, with refined poses where they are.
 
 
 class Trainer:
@@ -126,11 +132,12 @@ def fit(
             log.events.append({"step": trainer.step - 1, **report})
         if trainer.step in due:
             trainer.training.watch.finish(scene)
-            quality = evaluate(scene, eval_views, config)
+            poses = trainer.training.poses if trainer.step == max_steps else None
+            found = evaluate(scene, eval_views, config, poses if poses and poses.refined else None)
             times, loss = (clock.seconds, clock.cpu_seconds), trainer.loss
-            log.entries.append(
-                LogEntry(trainer.step, *times, len(scene), quality.fragments, loss, quality.psnr, quality.fitted_psnr)
-            )
+            figures = (found.psnr, found.fitted_psnr, found.carried_psnr, found.refined_psnr)
+            log.entries.append(LogEntry(trainer.step, *times, len(scene), found.fragments, loss, *figures))
         if callback is not None:
             callback(trainer, terms, output, report)
+    log.cameras = [trainer.training.poses.of(i, view.camera) for i, view in enumerate(views)]
     return log

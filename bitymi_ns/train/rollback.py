@@ -17,10 +17,10 @@ risen again (`Schedule.reset_opacity`). The last window ends with the run.
 What the schedule does is no divergence. When texels begin, windows start over: the first that is compared with those
 before ends more than a window later.
 
-Going back restores parameters, optimisers and the strategy's statistics as they were at the start of the last good
-window; the step count goes on. All learning rates are then multiplied by `guard.rates`, and by a higher power
-of it each time that the run goes back again without a good window between. After the first good window they return to
-normal; where the run then diverges again, it cannot bear them, and they stay lowered.
+Going back restores parameters, optimisers, exposures, poses and the strategy's statistics as they were at the start of
+the last good window; the step count goes on. All learning rates are then multiplied by `guard.rates`, and by a higher
+power of it each time that the run goes back again without a good window between. After the first good window they
+return to normal; where the run then diverges again, it cannot bear them, and they stay lowered.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ from bitymi_ns.train.views import DownscaledViews, spread, step_background
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
     from bitymi_ns.train.exposure import Exposure
+    from bitymi_ns.train.poses import Poses
 
 WORSE = 1.25
 """A window is bad when its mean loss is this many times that of the best window, or early on that of blank views."""
@@ -70,9 +71,11 @@ class RollbackGuard:
         optimizers: Mapping[str, Optimizer],
         strategy: Strategy,
         exposure: Exposure,
+        poses: Poses,
         announce: Callable[[str], None],
     ) -> None:
-        self.scene, self.optimizers, self.strategy, self.exposure = scene, optimizers, strategy, exposure
+        self.scene, self.optimizers, self.strategy = scene, optimizers, strategy
+        self.exposure, self.poses = exposure, poses
         self.schedule, self.config, self.processes = strategy.schedule, strategy.config, strategy.processes
         self.announce = announce
         self.window = max(self.config.guard.min_window, self.schedule.scaled(self.config.guard.window))
@@ -281,6 +284,7 @@ class RollbackGuard:
             "optimizers": {name: copy.deepcopy(o.state_dict()) for name, o in self.optimizers.items()},
             "strategy": self.strategy.state_dict(),
             "exposure": self.exposure.state_dict(),
+            "poses": self.poses.state_dict(),
         }
 
     def _restore(self, state: Mapping[str, Any]) -> None:
@@ -296,5 +300,6 @@ class RollbackGuard:
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(copy.deepcopy(state["optimizers"][name]))
         self.strategy.load_state_dict(state["strategy"])
+        self.poses.load_state_dict(state["poses"])
         if self._views is not None:
             self.exposure.load_state_dict(state["exposure"], len(self._views), surfels["means"].device)

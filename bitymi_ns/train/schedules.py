@@ -162,6 +162,14 @@ class Schedule:
         needed = 2.0 * texels.travel * views / self.texel_steps
         return max(texels.rate, min(needed, texels.travel)) * self._falling(step)
 
+    def pose_pixels(self, step: int) -> float:
+        """Length of a step of a photograph's pose, pixels; 0 where poses stay."""
+        poses = self.config.poses
+        first, last = self.scaled(poses.start), self.scaled(poses.stop)
+        if self.config.refine_poses == "off" or not first <= step < last:
+            return 0.0
+        return falling(poses.pixels, step - first, last - first)
+
     def _falling(self, step: int) -> float:
         return falling(1.0, step - self.texels_start, self.texel_steps)
 

@@ -19,6 +19,7 @@ from bitymi_ns.train.divergence import LossWatch, TrainingDiverged
 from bitymi_ns.train.exposure import Exposure
 from bitymi_ns.train.losses import objective
 from bitymi_ns.train.optimizers import ResizeHook, set_rate
+from bitymi_ns.train.poses import Poses
 from bitymi_ns.train.processes import ALONE, Processes
 from bitymi_ns.train.rollback import RollbackGuard
 from bitymi_ns.train.schedules import Schedule
@@ -78,6 +79,7 @@ class Training:
         step: index of the step that was begun last.
         schedule, strategy, guard, texels, watch, processes: of the run.
         exposure: how the training photographs differ in their colours; decided when the first step begins.
+        poses: where the cameras of the training photographs have moved.
         clock: time between `begin` and `finish`.
     """
 
@@ -109,10 +111,11 @@ class Training:
         self.schedule = Schedule(config, max_steps, data.extent, textured, pixels)
         self.strategy = Strategy(self.schedule, on_resize, data.image_pixels, data.first_surfels, processes)
         self.exposure = Exposure(config.exposure, data.exif_stops, data.photographs)
-        self.guard = RollbackGuard(scene, optimizers, self.strategy, self.exposure, announce)
+        cameras = [view.camera for view in data.views] if data.cameras is None else data.cameras
+        self.poses = Poses(self.schedule, cameras)
+        self.guard = RollbackGuard(scene, optimizers, self.strategy, self.exposure, self.poses, announce)
         self.texels = LearningTexels(scene, self.schedule, processes)
         self.watch = LossWatch()
-        cameras = [view.camera for view in data.views] if data.cameras is None else data.cameras
         self.step_sizes = StepSizes(self.schedule, cameras)
         self.clock = Stopwatch()
         self.step = 0
@@ -124,11 +127,12 @@ class Training:
     @functools.cached_property
     def views(self) -> DownscaledViews:
         """The training views. Made at first use: on a card it takes a share of the memory that is free then."""
-        return DownscaledViews(self._full_size, self.scene.surfels["means"].device, self.exposure.of)
+        return DownscaledViews(self._full_size, self.scene.surfels["means"].device, self.exposure.of, self.poses.of)
 
     def view(self, index: int) -> View:
         """Training view number `index`, as the step that was begun last wants it: on the device, reduced."""
-        return self.views.at(index, self.schedule.resolution_factor(self.step))
+        view = self.views.at(index, self.schedule.resolution_factor(self.step))
+        return view._replace(camera=self.poses.learning(index, view.camera, self.step))
 
     def begin(self, step: int) -> None:
         """Start the clock and set the learning rates of a step."""
@@ -136,6 +140,7 @@ class Training:
             self.processes.like_first(self.scene.state_dict().values())
         self.clock.start()
         self.step = step
+        self.poses.begin()
         if not self.exposure.decided:
             self.exposure.start(self.scene.surfels["means"], self._full_size, self.scene.near)
         if not self._alike:
@@ -211,6 +216,8 @@ class Training:
         assert outputs, "a step is finished after its losses"
         self._outputs, self._photometric = [], []
         self.exposure.step(self.guard.factor * self.schedule.lr("exposure", step))
+        pixels = self.guard.factor * self.schedule.pose_pixels(step)
+        self.poses.step([output.projection for output in outputs], pixels, self.processes)
         if not self.schedule.densification_over(step):
             self.strategy.accumulate(*outputs)
         loss, broken = self._together(photometric, [output.projection.broken for output in outputs])
@@ -247,6 +254,7 @@ class Training:
             "guard": self.guard.state_dict(),
             "exposure": self.exposure.state_dict(),
             "step_sizes": self.step_sizes.state_dict(),
+            "poses": self.poses.state_dict(),
             "seconds": self.clock.seconds,
             "cpu_seconds": self.clock.cpu_seconds,
         }
@@ -258,6 +266,7 @@ class Training:
             self.guard.load_state_dict(state["guard"])
         device = self.scene.surfels["means"].device  # a checkpoint is read on the CPU
         self.exposure.load_state_dict(state.get("exposure"), len(self._full_size), device)
+        self.poses.load_state_dict(state.get("poses"))
         if "step_sizes" in state:
             self.step_sizes.load_state_dict(state["step_sizes"], device)
         self.clock = Stopwatch(state["seconds"], state["cpu_seconds"])

@@ -231,6 +231,7 @@ class DownscaledViews:
         views: at full size.
         device: where the pictures are wanted.
         correction: gives the correction of a view by its number, as it is at the moment; None = there is none.
+        pose: moves the camera of a view, by its number, to where it is at the moment; None = it stays.
         resident_bytes: budget on a CUDA device; None = `photograph_budget`.
     """
 
@@ -239,10 +240,11 @@ class DownscaledViews:
         views: Sequence[View],
         device: torch.device | str = "cpu",
         correction: Callable[[int], Tensor | None] | None = None,
+        pose: Callable[[int, Camera], Camera] | None = None,
         resident_bytes: int | None = None,
     ) -> None:
         self._views = views
-        self._correction = correction
+        self._correction, self._pose = correction, pose
         self._device = torch.device(device)
         self._factor = 1.0
         self._kept: dict[int, View] = {}
@@ -260,6 +262,8 @@ class DownscaledViews:
     def at(self, index: int, factor: float) -> View:
         """View number `index`, its image resized by `factor`, with its correction."""
         view = self._at(index, factor)
+        if self._pose is not None:
+            view = view._replace(camera=self._pose(index, view.camera))
         return view if self._correction is None else view._replace(correction=self._correction(index))
 
     def _at(self, index: int, factor: float) -> View:

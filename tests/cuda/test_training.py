@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig
-from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.config import PoseConfig, TrainConfig
 from bitymi_ns.train.divergence import TrainingDiverged
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer
@@ -58,6 +58,24 @@ def test_training_steps_equal_those_of_the_cpu(background: str, exposure: str, d
         # Adam's first steps are as long as the rate whatever the gradient: where that is all but 0 its sign may differ
         close = torch.isclose(parameters[name], value, rtol=1e-3, atol=1e-4)
         assert close.float().mean() > 0.97, name
+
+
+def motions(device: torch.device) -> torch.Tensor:
+    """How the cameras of the photographs have moved after a few steps."""
+    scene, views = scene_and_views()
+    config = TrainConfig(resolution_schedule=0, refine_poses="on", poses=PoseConfig(start=0))
+    trainer = Trainer(scene.to(device), views, config, STEPS)
+    for _ in range(STEPS):
+        trainer.advance()
+    return trainer.training.poses.motions
+
+
+def test_poses_move_as_on_the_cpu(device: torch.device, cpu) -> None:
+    found = motions(device)
+    with cpu():
+        want = motions(torch.device("cpu"))
+    assert found.device.type == "cpu" and want.abs().max() > 1e-4
+    torch.testing.assert_close(found, want, rtol=0.02, atol=1e-5)
 
 
 def test_a_loss_that_is_not_finite_ends_the_run(device: torch.device) -> None:

@@ -14,7 +14,7 @@ import torch.distributed as dist
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.scene import Scene
-from bitymi_ns.train.config import DensifyConfig, ExposureKind, TexelConfig, TrainConfig
+from bitymi_ns.train.config import DensifyConfig, ExposureKind, RefinePoses, TexelConfig, TrainConfig
 from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.processes import Processes, ProcessLost
 
@@ -22,12 +22,14 @@ STEPS = 60
 LOST = 3
 
 
-def options(exposure: ExposureKind) -> TrainConfig:
+def options(exposure: ExposureKind, poses: RefinePoses) -> TrainConfig:
     """Densifications, a reset, final prunes, and texels from step 36 on."""
     densify = DensifyConfig(
         max_surfels=300, min_interval=1, min_reset_interval=1, pixels_per_surfel=0, views=5, reset_interval=9_000
     )
-    return TrainConfig(densify=densify, background="random", exposure=exposure, texels=TexelConfig(start=18_000))
+    return TrainConfig(
+        densify=densify, background="random", exposure=exposure, texels=TexelConfig(start=18_000), refine_poses=poses
+    )
 
 
 def state_of(trainer: Trainer) -> dict[str, Any]:
@@ -59,7 +61,11 @@ def train(inputs: dict[str, Any], processes: Processes) -> dict[str, Any]:
     if config.texture == "hash":
         field = HashField(config, (0.0, 0.0, 0.0), 1.5, False, 10, torch.Generator().manual_seed(processes.rank))
     trainer = Trainer(
-        Scene(config, inputs["surfels"], field), inputs["views"], options(inputs["exposure"]), STEPS, processes
+        Scene(config, inputs["surfels"], field),
+        inputs["views"],
+        options(inputs["exposure"], inputs["poses"]),
+        STEPS,
+        processes,
     )
     digests, reports = [], []
     while trainer.step < STEPS:

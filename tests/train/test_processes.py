@@ -26,7 +26,7 @@ def inputs(cameras, ball, views) -> dict[str, Any]:
     mask = torch.zeros(48, 48, 1, dtype=torch.bool)
     mask[10:] = True
     changed = [*views[:4], views[4]._replace(mask=mask), views[5]._replace(image=0.7 * views[5].image)]
-    return {"surfels": surfels, "views": changed, "texture": "texels", "exposure": "gain"}
+    return {"surfels": surfels, "views": changed, "texture": "texels", "exposure": "gain", "poses": "off"}
 
 
 def start(folder: Path, inputs: dict[str, Any]) -> list[subprocess.Popen[str]]:
@@ -59,9 +59,11 @@ def one_thread() -> Iterator[None]:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
-@pytest.mark.parametrize(("texture", "exposure"), [("texels", "gain"), ("hash", "affine")])
-def test_two_processes_are_one_that_looks_at_as_many_views(tmp_path, inputs, texture, exposure):
-    inputs |= {"texture": texture, "exposure": exposure}
+@pytest.mark.parametrize(
+    ("texture", "exposure", "poses"), [("texels", "gain", "off"), ("hash", "affine", "off"), ("texels", "off", "on")]
+)
+def test_two_processes_are_one_that_looks_at_as_many_views(tmp_path, inputs, texture, exposure, poses):
+    inputs |= {"texture": texture, "exposure": exposure, "poses": poses}
     for process in start(tmp_path, inputs):
         assert process.wait(timeout=120) == 0, process.stderr.read()
     first, second = (torch.load(tmp_path / f"end-{rank}.pt", weights_only=True) for rank in range(2))

@@ -16,11 +16,12 @@ from nerfstudio.configs.dataparser_configs import all_dataparsers
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from torch import Tensor
 
 from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.data import images
 from bitymi_ns.plugin.data.bundle_cameras import BundleCamerasConfig
-from bitymi_ns.plugin.data.cameras import check_cameras, to_camera
+from bitymi_ns.plugin.data.cameras import check_cameras, to_camera, to_cameras
 from bitymi_ns.plugin.data.capture_checks import check_capture, declares_box, reporting_input_errors
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.data.dataset import BitymiDataset, CachedImages, drop_blank_views, photograph_bytes
@@ -29,7 +30,9 @@ from bitymi_ns.plugin.data.find_files import check_photographs_exist
 from bitymi_ns.plugin.data.initial_points import reading_points
 from bitymi_ns.plugin.data.pose_checks import check_outliers, check_point_unit, warn_of_mirrored
 from bitymi_ns.plugin.data.views import LONGEST_SIDE, NO_PHOTOS, limit_size, with_lenses
+from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.background_points import background_points
+from bitymi_ns.train.poses import carried, cross_matrix
 from bitymi_ns.train.processes import Processes
 from bitymi_ns.train.views import MemoryBudget, OnDemand, View, spread, training_order
 
@@ -278,6 +281,25 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
     def eval_views(self) -> OnDemand[View]:
         """Held-out views likewise."""
         return OnDemand(len(self.eval_dataset), lambda i: self._view(self.eval_dataset, i, self.cached_eval[i]))
+
+    def move_cameras(self, motions: Tensor) -> Callable[[Camera], Camera] | None:
+        """Move the cameras of the training views to where a run has refined them.
+
+        Args:
+            motions: [V, 6] of `Poses`.
+
+        Returns:
+            What carries other cameras along; None, and nothing is moved, where the motions are of other photographs.
+        """
+        cameras = self.train_dataset.cameras
+        if len(motions) != len(cameras):
+            return None
+        given = torch.stack([camera.viewmat.double() for camera in to_cameras(cameras, "cpu")])
+        poses = cameras.camera_to_worlds.double().cpu()
+        turns = torch.linalg.matrix_exp(torch.stack([cross_matrix(motion[:3]) for motion in motions]))
+        poses = torch.cat([turns @ poses[..., :3], (poses[..., 3] + motions[:, 3:])[..., None]], -1)
+        cameras.camera_to_worlds = poses.to(cameras.camera_to_worlds)
+        return lambda camera: carried(camera, given, motions)
 
     def _view(self, dataset: BitymiDataset, index: int, batch: dict[str, Any]) -> View:
         camera = to_camera(dataset.cameras[index : index + 1], self.device)

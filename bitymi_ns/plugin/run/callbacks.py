@@ -174,7 +174,9 @@ class TrainingRun:
     def _add_point(self, step: int) -> None:
         views = self.datamanager.eval_views
         rows = evenly_spaced(len(views), 0 if step + 1 >= self.total else self._curve_views)
-        quality = evaluate(self.scene, OnDemand(len(rows), lambda i: views[rows[i]]), self.config)
+        refined = self.training.poses.refined and step + 1 >= self.total
+        poses = self.training.poses if refined else None
+        quality = evaluate(self.scene, OnDemand(len(rows), lambda i: views[rows[i]]), self.config, poses)
         point = {
             "step": step + 1,
             "seconds": round(self.training.clock.seconds, 4),
@@ -183,8 +185,11 @@ class TrainingRun:
         }
         shown = ""
         if not math.isnan(quality.psnr):
-            point |= {name: round(value, 4) for name, value in quality._asdict().items()}
+            point |= {k: round(value, 4) for k, value in quality._asdict().items() if not math.isnan(value)}
             shown = f"{quality.psnr:6.2f} dB held out, "
+            if refined:
+                shown += f"{quality.carried_psnr:.2f} dB with their poses carried along, "
+                shown += f"{quality.refined_psnr:.2f} dB with their poses refined, "
             writer.put_scalar("Held-out PSNR", torch.tensor(quality.psnr), step)
         self.curve.add({**point, **self.names})
         CONSOLE.print(

@@ -280,6 +280,9 @@ def _check_run(run: Entry, rows: int) -> None:
     if (capture := run.get("capture")) is not None:
         capture["views"].count()
         capture["names"].text(), capture["poses"].text()
+    if (poses := run.get("poses")) is not None and (motions := poses.get("motions")) is not None:
+        if not bool((motions.tensor(None, 6, dtype=torch.float64).abs() <= LARGEST).all()):
+            motions.refuse("finite")
     if (exposure := run.get("exposure")) is not None:
         exposure["kind"].text(), exposure["finding"].text()
         if not isinstance(exposure["decided"].value, bool):

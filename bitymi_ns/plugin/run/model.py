@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -28,6 +28,7 @@ from bitymi_ns.train import limits
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.init import build_scene, limit_first_surfels
 from bitymi_ns.train.losses import photometric
+from bitymi_ns.train.poses import aligned, view_psnr
 from bitymi_ns.train.views import View, eval_background
 
 PARAMETER_GROUPS = (*GEOMETRY, *VIEW_PARAMETERS, "field_table", "field_mlp")
@@ -91,6 +92,7 @@ class BitymiModel(SurfelModel):
         self.resume_state: dict[str, Any] = {}
         self.recorded_options: str | None = None  # of the run that is resumed
         self._run: TrainingRun | None = None
+        self.carry: Callable[[Camera], Camera] | None = None  # of a finished run that refined poses
 
     # rendering
 
@@ -114,6 +116,20 @@ class BitymiModel(SurfelModel):
                 raise RuntimeError("losses exist in training only")
             return {"losses": self._run.losses(ray_bundle)}
         return super().get_outputs(ray_bundle)
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Any]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Judge a held-out view as it is posed; after a run that refined poses also with its pose carried along with
+        those of the photographs, and from where it fits the scene."""
+        metrics, images = super().get_image_metrics_and_images(outputs, batch)
+        camera = getattr(self, "_last_camera", None)
+        if self.carry is not None and camera is not None:
+            view = View(self.carry(camera), *self.photograph(batch, outputs["rgb"]))
+            metrics["carried_psnr"] = view_psnr(self.scene, view, self.background)
+            view = view._replace(camera=aligned(self.scene, view, self.background, self.train_config.loss.ssim_weight))
+            metrics["refined_psnr"] = view_psnr(self.scene, view, self.background)
+        return metrics, images
 
     # training
 

@@ -228,6 +228,9 @@ class BitymiPipeline(VanillaPipeline):
             super().load_pipeline(loaded_state, step)
         except (RuntimeError, LookupError, TypeError, AttributeError) as error:  # torch's list of what does not fit
             fail(f"the checkpoint of step {step} does not fit this scene. {error}", error)
+        poses = self.model.resume_state.get("poses")
+        if self.test_mode != "val" and poses is not None and poses["motions"] is not None:  # a run moves them itself
+            self.model.carry = self.datamanager.move_cameras(poses["motions"])
 
     def get_average_image_metrics(self, data_loader: Any, *args: Any, **kwargs: Any) -> dict[str, float]:
         """Averages over images, without NaN, which JSON does not know.

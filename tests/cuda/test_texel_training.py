@@ -59,7 +59,12 @@ def scene_and_views() -> tuple[Scene, list[View]]:
 
 def config(alpha_rate: float = 0.0) -> TrainConfig:
     """Texels in the second half of the run, with the final prunes within it."""
-    prunes = {"min_surfels": 5, "final_prune_steps": (20_000, 22_500), "final_prune_opacity": 0.3}
+    prunes = {
+        "min_surfels": 5,
+        "final_prune_steps": (20_000, 22_500),
+        "final_prune_opacity": 0.6,
+        "final_prune_error": 0.2,
+    }
     densify = DensifyConfig(max_surfels=20, min_interval=1, min_reset_interval=1000, pixels_per_surfel=0, **prunes)
     texels = TexelConfig(start=30_000 * START // STEPS, pixels_per_texel=0.5, alpha_rate=alpha_rate)
     return TrainConfig(background="black", resolution_schedule=0, densify=densify, texels=texels)

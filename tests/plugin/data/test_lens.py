@@ -68,7 +68,7 @@ def test_windows_are_as_large_as_they_can_be(k: float, center: float, f: float) 
     rays = np.stack([(x - to.cx) / to.fx, (y - to.cy) / to.fy, np.ones_like(x)], -1)
     seen = camera.colmap.img_from_cam(rays)
     margin = min(seen.min(), (np.array(SIZE) - seen).min())
-    assert -0.01 < margin < 2.5 or max(to.view) > MAX_VIEW_ANGLE - 3.0
+    assert -0.3 < margin < 2.5 or max(to.view) > MAX_VIEW_ANGLE - 3.0
 
 
 def test_a_pinhole_is_left_as_it_is() -> None:

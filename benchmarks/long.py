@@ -41,7 +41,7 @@ from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.init import scene_for_views
 from bitymi_ns.train.losses import fitted_psnr, photometric, psnr
-from bitymi_ns.train.preset import Preset, load_preset
+from bitymi_ns.train.preset import Loader, Preset, load_preset
 from bitymi_ns.train.views import View, eval_background, spread
 
 RUNS = ("10000/4", "1500/2", "300/1")
@@ -112,7 +112,7 @@ def preset_of(row: str) -> Preset:
             owner = getattr(owner, parent)
         if leaf not in vars(owner):
             raise ValueError(f"row '{row}': there is no option {path}")
-        value = yaml.safe_load(text)
+        value = yaml.load(text, Loader)
         if isinstance(value, bool) and isinstance(getattr(owner, leaf), str):
             value = text  # YAML's on and off
         setattr(owner, leaf, tuple(value) if isinstance(value, list) else value)

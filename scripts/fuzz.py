@@ -48,7 +48,7 @@ ODD_BYTES = [
 
 
 def changed_json(data: bytes, dice: random.Random) -> bytes | None:
-    """The same JSON with a few entries removed, exchanged or replaced; None where it is none."""
+    """Remove, exchange or replace a few entries of JSON; None where it is none."""
     try:
         value = [json.loads(data)]
         for _ in range(dice.choice((1, 1, 1, 2, 4))):
@@ -67,7 +67,7 @@ def changed_json(data: bytes, dice: random.Random) -> bytes | None:
 
 
 def changed_numbers(data: bytes, dice: random.Random) -> bytes:
-    """The same bytes with an odd number in the place of others."""
+    """Put an odd number in the place of some bytes."""
     packed, at = dice.choice(ODD_BYTES), dice.randrange(len(data) + 1)
     return data[:at] + packed + data[at + len(packed) :]
 

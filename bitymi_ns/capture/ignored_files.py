@@ -40,7 +40,7 @@ FILES = {
     r"thumb(nail)?(_\d+)?": "a thumbnail", r"material_0|textured_output": "a texture", r"dynamic_mask_.*":
     "a mask of instant-ngp", r"depth_\d+|.*[._-]depth": "a depth map", r"conf_\d+": "a confidence map",
 }  # fmt: skip
-"""The same for files among photographs: patterns of their names in lower case, without their endings."""
+"""Names files among photographs that are none: patterns of their names in lower case, without their endings."""
 
 
 def poses_in(folder: Path) -> Iterator[tuple[Path, str]]:

@@ -67,7 +67,7 @@ class Camera:
         return self._with(viewmat=viewmat, K=K)
 
     def posed(self, viewmat: Tensor) -> Camera:
-        """The same camera with another pose, world to camera [4, 4], in the dtype and on the device of its own."""
+        """Move the camera to another pose, world to camera [4, 4], in the dtype and on the device of its own."""
         return self._with(viewmat=viewmat.to(self.viewmat))
 
     def local(self, points: Tensor) -> Tensor:

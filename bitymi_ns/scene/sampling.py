@@ -16,7 +16,7 @@ SMALLEST, LARGEST = 0.5, 2.0
 ONE_SAMPLE, TWO_SAMPLES = 0.6, 1 / 3
 """Views from these sizes on have one sample per pixel, and two along each axis."""
 SAMPLE = 0.58
-"""In smaller views a photograph's pixel is at least as many samples wide, as far as MOST_SAMPLES and MOST_PIXELS allow.
+"""Least samples across a pixel of a photograph in smaller views, as far as MOST_SAMPLES and MOST_PIXELS allow.
 Wider samples lose the edges that alpha texels of several surfels share: the mean transmittance of a stack is not the
 product of its means."""
 MOST_SAMPLES = 6  # samples per pixel, along each axis

@@ -152,7 +152,7 @@ class Poses:
         return camera.posed(moved(self._given[index], self.motions[index]))
 
     def learning(self, index: int, camera: Camera, step: int) -> Camera:
-        """The same for a training step: where the poses learn, its pose gets a gradient."""
+        """Do the same for a training step: where the poses learn, the pose gets a gradient."""
         if self.motions is None or self.schedule.pose_pixels(step) == 0.0:
             return self.of(index, camera)
         motion = torch.zeros(6, dtype=torch.float64, requires_grad=True)

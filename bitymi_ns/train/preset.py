@@ -22,11 +22,11 @@ class PresetError(ValueError):
     """A preset file that cannot be used; the message names the file and the key."""
 
 
-class _Loader(yaml.SafeLoader):
+class Loader(yaml.SafeLoader):
     """Reads 1e-3 as a number, which YAML 1.1 takes for text without a point."""
 
 
-_Loader.add_implicit_resolver(
+Loader.add_implicit_resolver(
     "tag:yaml.org,2002:float", re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789")
 )
 
@@ -71,7 +71,7 @@ def _read_with_base(path: Path, folder: Path, above: tuple[Path, ...]) -> dict[s
         there = ", ".join(sorted(file.stem for file in folder.glob("*.yaml"))) or "none; reinstall bitymi-ns"
         raise PresetError(f"there is no preset {path.stem!r}{where} in {folder}, which has {there}")
     try:
-        values = yaml.load(path.read_text("utf8"), _Loader)
+        values = yaml.load(path.read_text("utf8"), Loader)
     except yaml.YAMLError as error:
         raise PresetError(f"{path.name}: not valid YAML: {error}") from error
     if not isinstance(values, dict):

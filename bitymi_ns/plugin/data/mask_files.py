@@ -12,7 +12,7 @@ from bitymi_ns.plugin.data.images import image_size, in_threads, read_mask, wron
 from bitymi_ns.plugin.data.views import Photograph
 
 LEAVE_OUT = "`bitymi-data --use-masks False` leaves masks out"
-"""How to do without the masks of a capture."""
+"""Says in messages how to do without the masks of a capture."""
 
 
 def masks_named(masks: Path, names: Sequence[str], needed: bool = True) -> list[Path] | None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -56,19 +56,21 @@ def test_pixels_come_from_where_the_camera_saw_their_rays(model: str, f: float) 
         assert np.quantile(error, 0.99) < 2.0 and error.max() < 4.0
 
 
+@example(-0.09375, 0.5, 40.0)
 @given(st.floats(-0.1, 0.2), st.floats(0.35, 0.65), st.floats(40.0, 400.0))
 @settings(max_examples=25, deadline=None)
 def test_windows_are_as_large_as_they_can_be(k: float, center: float, f: float) -> None:
     """Their edge touches that of the photograph, within a few pixels, unless they are as wide as allowed."""
     camera = ColmapCamera("SIMPLE_RADIAL", *SIZE, (f, center * SIZE[0], 0.5 * SIZE[1], k))
-    (one, *_), _ = lenses_of(camera, SIZE, "camera 1")
-    to = one.pinhole
+    lenses, _ = lenses_of(camera, SIZE, "camera 1")
+    to = lenses[0].pinhole
     x, y = np.meshgrid([0.0, to.width], [0.0, to.height])
     x, y = np.append(x, [to.cx, to.cx, 0.0, to.width]), np.append(y, [0.0, to.height, to.cy, to.cy])
     rays = np.stack([(x - to.cx) / to.fx, (y - to.cy) / to.fy, np.ones_like(x)], -1)
     seen = camera.colmap.img_from_cam(rays)
     margin = min(seen.min(), (np.array(SIZE) - seen).min())
-    assert -0.3 < margin < 2.5 or max(to.view) > MAX_VIEW_ANGLE - 3.0
+    # a wider window gives way to faces of a cube, which are masked where the photograph ends
+    assert -0.01 < margin < 2.5 or max(to.view) > MAX_VIEW_ANGLE - 3.0 or len(lenses) > 1
 
 
 def test_a_pinhole_is_left_as_it_is() -> None:

@@ -1,4 +1,4 @@
-"""The README's table of options names options that exist, with their defaults."""
+"""The tables of options name options that exist, with their defaults."""
 
 import re
 from dataclasses import fields, is_dataclass
@@ -25,7 +25,7 @@ ELSEWHERE |= {
 
 
 def value_of(option: str) -> Any:
-    """Look up the default of an option as the README writes it."""
+    """Look up the default of an option as the tables write it."""
     prefix = max((root for root in ROOTS if option.startswith(root)), key=len)
     value = ROOTS[prefix]
     for name in option.removeprefix(prefix).replace("-", "_").split("."):
@@ -34,9 +34,12 @@ def value_of(option: str) -> Any:
     return value
 
 
-def test_options_have_the_defaults_that_the_readme_states() -> None:
-    table = (ROOT / "README.md").read_text("utf8").split("## Options that matter")[1].split("\n## ")[0]
-    rows = [line.strip("|").split("|") for line in table.splitlines() if line.startswith("| `")]
+def test_options_have_the_defaults_that_the_pages_state() -> None:
+    tables = [
+        (ROOT / "docs" / page).read_text("utf8").split("## Options\n")[1].split("\n## ")[0]
+        for page in ("training.md", "baking.md")
+    ]
+    rows = [line.strip("|").split("|") for table in tables for line in table.splitlines() if line.startswith("| `")]
     checked = 0
     for names, stated, _ in rows:
         option = re.findall(r"`([^`]+)`", names)[0]

@@ -174,7 +174,7 @@ def _page(backend: Backend, named: dict[str, list[Row]], swept: dict[str, list[R
         allowance=f"{ALLOWANCE:g}",
         picture=picture,
         sweeps=_sweeps(swept),
-        cases=_cases(named[PLAIN.name]),
+        cases=_inexact([row for row in named[PLAIN.name] if row.verdict != "nothing drawn"]),
         others={way.name: _inexact(named[way.name]) for way in WAYS},
         verdicts=_verdicts([row for rows in (*named.values(), *swept.values()) for row in rows]),
         nothing=", ".join(row.label for row in named[PLAIN.name] if row.verdict == "nothing drawn"),
@@ -186,14 +186,13 @@ SWEPT = ("kind", "values", "forward", "inputs", "gradient", "inputs", "float64",
 
 
 def _cases(rows: Sequence[Row]) -> str:
-    """One line for each scene of which something is drawn."""
+    """Format a table of one line per scene."""
     lines = []
     for row in rows:
         e = row.single
-        if e.drawn or row.verdict.startswith("**"):
-            flipped = f"{100 * e.flipped:.2g} %" if e.flipped else "0"
-            worst, exact = e.worst if e.gradient else "", [_short(row.exact), _short(row.trusted)]
-            lines.append([row.label, *map(_short, row.errors), worst, flipped, *exact, row.verdict])
+        flipped = f"{100 * e.flipped:.2g} %" if e.flipped else "0"
+        worst, exact = e.worst if e.gradient else "", [_short(row.exact), _short(row.trusted)]
+        lines.append([row.label, *map(_short, row.errors), worst, flipped, *exact, row.verdict])
     return markdown.table(CASES, lines, (0, 5, len(CASES) - 1))
 
 

@@ -240,11 +240,12 @@ class Unpack:
 
 @dataclass
 class Extras:
-    """Write a bundle for other programs into a folder beside it: as Gaussian splats, and as a textured mesh."""
+    """Write a bundle for other programs into a folder beside it: as Gaussians, surfels, OpenUSD, or a textured mesh."""
 
     bundle: tyro.conf.Positional[Path]  # Folder of the bundle, or its one file.
-    kinds: tuple[Literal["gaussians", "mesh"], ...] = ("gaussians", "mesh")
-    """gaussians: gaussians.ply, as 3DGS writes it; mesh: mesh.glb, a textured quad for each surfel."""
+    kinds: tuple[Literal["gaussians", "surfels", "usd", "mesh"], ...] = ("gaussians", "mesh")
+    """gaussians: gaussians.ply, as 3DGS writes it; surfels: surfels.ply, the same with two scales (2DGS, Brush); usd:
+    surfels.usdc, OpenUSD's surflets; mesh: mesh.glb, a textured quad for each surfel."""
     frame: Literal["scene", "capture"] = "scene"  # Frame of the files: the scene's, or the capture's own.
     output: Path | None = None  # Folder to write; not given: beside the bundle, with its name and .extras.
     overwrite: Flag = False  # Replace a folder of extras that is there already.

@@ -1,4 +1,4 @@
-"""Files for other programs, beside a bundle: a preview as Gaussian splats, and a textured mesh."""
+"""Files for other programs, beside a bundle: Gaussians, flat Gaussians, OpenUSD surflets, and a textured mesh."""
 
 import json
 import os
@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -23,6 +23,7 @@ from bitymi_ns.interchange.quads import quads_of
 from bitymi_ns.interchange.recolor import recolored
 from bitymi_ns.interchange.splat import draw_gaussians
 from bitymi_ns.interchange.surfel_colors import SurfelColors, fit_colors, weighted_residuals
+from bitymi_ns.interchange.usd import check_usd, write_usd
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
@@ -31,9 +32,15 @@ from bitymi_ns.train.losses import mean_psnr, psnr
 from bitymi_ns.train.views import View, at_size, spread
 from bitymi_ns.trust import Refused, keep
 
-Kind = Literal["gaussians", "mesh"]
+Kind = Literal["gaussians", "surfels", "usd", "mesh"]
 Frame = Literal["scene", "capture"]
-FILES: dict[str, str] = {"gaussians": "gaussians.ply", "mesh": "mesh.glb"}
+FILES: dict[str, str] = {
+    "gaussians": "gaussians.ply",
+    "surfels": "surfels.ply",
+    "usd": "surfels.usdc",
+    "mesh": "mesh.glb",
+}
+DEFAULT: tuple[Kind, ...] = ("gaussians", "mesh")
 SUMMARY = "extras.json"
 SUFFIX = ".extras"  # suffix of the folder beside a bundle
 LEVEL = 0.15  # opacity at which the quads of a mesh end
@@ -67,12 +74,15 @@ def check_extras(kinds: Sequence[str], folder: Path, overwrite: bool) -> None:
     """Check the kinds and the folder before the work.
 
     Raises:
-        BundleError: there is no such kind, or the folder is there and may not be replaced, or holds more.
+        BundleError: there is no such kind, OpenUSD is not installed, or the folder is there and may not be replaced, or
+            holds more.
     """
     unknown = [kind for kind in kinds if kind not in FILES]
     if unknown or not kinds:
         what = f"there is no extra {unknown[0]!r}" if unknown else "no extra is asked for"
         raise BundleError(f"{what}: choose among {', '.join(FILES)}")
+    if "usd" in kinds:
+        check_usd()
     if not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir())):
         return
     if not (folder / SUMMARY).is_file():
@@ -90,7 +100,7 @@ def check_extras(kinds: Sequence[str], folder: Path, overwrite: bool) -> None:
 def write_extras(
     bundle: Bundle,
     folder: str | Path,
-    kinds: Sequence[Kind] = get_args(Kind),
+    kinds: Sequence[Kind] = DEFAULT,
     *,
     frame: Frame = "scene",
     cameras: Sequence[Camera] = (),
@@ -128,25 +138,39 @@ def write_extras(
         return scene.render(camera, background).rgb
 
     base = _psnr(picture, views, background)
+    gaussians = gaussians_of(scene, colors.harmonics)
+    placed = gaussians if to is None else gaussians.moved(to)
+    place = upright(up_of(bundle.info.world, to), None if to is None else to.origin)
+    comments = [note] if note else []
+
+    def gaussians_psnr(discs: bool) -> float | None:
+        return _psnr(lambda camera: draw_gaussians(gaussians, camera, background, scene.near, discs), views, background)
+
+    def write(kind: Kind, path: Path) -> tuple[int, float | None]:
+        """Write a file; how many Gaussians or quads it has, and its PSNR."""
+        if kind == "mesh":
+            return write_mesh(path)
+        if kind == "usd":
+            write_usd(path, placed, place)
+        else:
+            write_gaussians(path, placed, comments, flat=kind == "surfels")
+        return len(gaussians), gaussians_psnr(discs=kind == "usd")
+
+    def write_mesh(path: Path) -> tuple[int, float | None]:
+        quads = quads_of(scene, colors.color, LEVEL)
+        if not len(quads):
+            raise BundleError(f"no surfel of the bundle has an opacity above {LEVEL}: there is no mesh")
+        chosen = [cameras[i].within(COLORED_SIDE) for i in spread(len(cameras), COLORED_VIEWS)]
+        quads, count = recolored(quads, picture, chosen, scene.near, progress), len(quads)
+        path.write_bytes(quads_glb(quads if to is None else quads.moved(to), place))
+        return count, _psnr(lambda camera: draw_quads(quads, camera, background, scene.near), views, background)
+
     written: dict[str, Written] = {}
     replaceable = partial(check_extras, kinds, folder, overwrite)
     with explained(folder, BundleError, ". Nothing was left behind"), complete_folder(folder, replaceable) as new:
         for kind in dict.fromkeys(kinds):
             path = new / FILES[kind]
-            if kind == "gaussians":
-                gaussians = gaussians_of(scene, colors.harmonics)
-                count = len(gaussians)
-                value = _psnr(lambda c, g=gaussians: draw_gaussians(g, c, background, scene.near), views, background)
-                write_gaussians(path, gaussians if to is None else gaussians.moved(to), note)
-            else:
-                quads = quads_of(scene, colors.color, LEVEL)
-                if not len(quads):
-                    raise BundleError(f"no surfel of the bundle has an opacity above {LEVEL}: there is no mesh")
-                chosen = [cameras[i].within(COLORED_SIDE) for i in spread(len(cameras), COLORED_VIEWS)]
-                quads, count = recolored(quads, picture, chosen, scene.near, progress), len(quads)
-                value = _psnr(lambda c, q=quads: draw_quads(q, c, background, scene.near), views, background)
-                place = upright(up_of(bundle.info.world, to), None if to is None else to.origin)
-                path.write_bytes(quads_glb(quads if to is None else quads.moved(to), place))
+            count, value = write(kind, path)
             written[kind] = Written(path.name, path.stat().st_size, count, value, base, len(views), note)
         summary = {"frame": frame, "training_views": len(cameras)}
         summary |= {kind: asdict(each) for kind, each in written.items()}

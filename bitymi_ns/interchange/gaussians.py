@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,6 +23,9 @@ FLAT_LOG_SCALE = -16.0
 """Third scale of the Gaussians in the scene's frame, whose cameras lie within a unit of the origin."""
 GRID = 24  # points along both axes of a kernel, of which the moments under alpha texels are summed
 LEAST_OPACITY = 1e-4  # of a surfel that alpha texels cut away
+HARD_BETA = 0.5658
+"""Exponent below which a disc of the same second moments is nearer to the kernel than a Gaussian, in squared error."""
+FLAT = "SplatRenderMode: 2dgs"  # comment of a PLY file whose Gaussians have two scales, as Brush writes it
 _NAMES = {
     "means": ("x", "y", "z"),
     "normals": ("nx", "ny", "nz"),
@@ -43,9 +47,13 @@ class Gaussians:
     log_scales: Tensor  # [N, 3] natural logarithms of the standard deviations along the axes
     opacity_logits: Tensor  # [N]
     harmonics: Tensor  # [N, 16, 3]; the colour is max(sum of harmonics Y(d) + 0.5, 0), d from the camera to the mean
+    hard: Tensor  # [N] bool: nearer to a disc of constant opacity, whose radius is two standard deviations
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def __getitem__(self, rows: Tensor) -> Gaussians:
+        return Gaussians(**{name: value[rows] for name, value in vars(self).items()})
 
     def moved(self, to: Similarity) -> Gaussians:
         """Transform to another frame."""
@@ -89,6 +97,7 @@ def gaussians_of(scene: BakedScene, coefficients: Tensor) -> Gaussians:
         torch.cat([tangent, flat], dim=1).float(),
         torch.logit(opacity).float(),
         coefficients.float(),
+        kernel_parameters(surfels)[1] < HARD_BETA,
     )
 
 
@@ -123,9 +132,13 @@ def _moments(scene: BakedScene, chunk: int = 1 << 20) -> tuple[Tensor, Tensor, T
     return strength, center, covariance
 
 
-def write_gaussians(path: str | Path, gaussians: Gaussians, note: str = "") -> None:
-    """Write the PLY file that 3DGS writes: f_rest has 15 coefficients of red, then of green, then of blue. A note
-    becomes a comment of its header."""
+def write_gaussians(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = (), flat: bool = False) -> None:
+    """Write the PLY file that 3DGS writes: f_rest has 15 coefficients of red, then of green, then of blue.
+
+    Args:
+        comments: lines of its header.
+        flat: leave out the third scales, and say so in a comment (`FLAT`).
+    """
     values = {
         "means": gaussians.means,
         "normals": torch.zeros_like(gaussians.means),
@@ -136,4 +149,6 @@ def write_gaussians(path: str | Path, gaussians: Gaussians, note: str = "") -> N
         "quats": gaussians.quats,
     }
     columns = {name: values[group][:, i].numpy() for group, names in _NAMES.items() for i, name in enumerate(names)}
-    ply.write_ply(path, columns, [note] if note else [])
+    if flat:
+        del columns["scale_2"]
+    ply.write_ply(path, columns, [*([FLAT] if flat else []), *comments])

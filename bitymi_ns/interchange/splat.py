@@ -21,7 +21,13 @@ _AT_ONCE = 512
 
 
 @torch.no_grad()
-def draw_gaussians(gaussians: Gaussians, camera: Camera, background: Tensor | None = None, near: float = 0.2) -> Tensor:
+def draw_gaussians(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Tensor | None = None,
+    near: float = 0.2,
+    discs: bool = False,
+) -> Tensor:
     """Draw a view.
 
     A Gaussian of covariance S has the footprint J W S W^T J^T + 0.3 I on the image, where W is the camera's rotation
@@ -33,6 +39,7 @@ def draw_gaussians(gaussians: Gaussians, camera: Camera, background: Tensor | No
         camera: of an H x W view.
         background: [3]; None = black.
         near: nearest depth that is drawn.
+        discs: draw `gaussians.hard` as discs of constant opacity: exp(-1/2 q) becomes 1 up to q = 4, and 0 beyond.
 
     Returns:
         [H, W, 3] float32.
@@ -43,6 +50,7 @@ def draw_gaussians(gaussians: Gaussians, camera: Camera, background: Tensor | No
     colors = (harmonics.basis(directions)[..., None] * gaussians.harmonics[rows]).sum(1)
     colors = (colors + COLOR_BIAS).clamp(min=0)
     opacity = torch.sigmoid(gaussians.opacity_logits[rows])
+    hard = gaussians.hard[rows] & discs
     behind = torch.zeros(3) if background is None else background
     image = torch.empty(camera.height, camera.width, 3)
     low, high = center - reach[:, None], center + reach[:, None]
@@ -57,7 +65,7 @@ def draw_gaussians(gaussians: Gaussians, camera: Camera, background: Tensor | No
             if not len(here):
                 image[top:bottom, left:right] = behind
                 continue
-            rgb, left_over = _blend(pixels, center[here], conic[here], opacity[here], colors[here])
+            rgb, left_over = _blend(pixels, center[here], conic[here], opacity[here], colors[here], hard[here])
             image[top:bottom, left:right] = (rgb + left_over[:, None] * behind).view(bottom - top, right - left, 3)
     return image
 
@@ -91,14 +99,17 @@ def _footprints(gaussians: Gaussians, camera: Camera, near: float) -> tuple[Tens
     return center[inside], conic[inside], reach[inside], z[inside], rows[inside]
 
 
-def _blend(pixels: Tensor, center: Tensor, conic: Tensor, opacity: Tensor, colors: Tensor) -> tuple[Tensor, Tensor]:
+def _blend(
+    pixels: Tensor, center: Tensor, conic: Tensor, opacity: Tensor, colors: Tensor, hard: Tensor
+) -> tuple[Tensor, Tensor]:
     """Colours [P, 3] of pixels [P, 2] and the transmittance [P] behind."""
     rgb, passed = pixels.new_zeros(len(pixels), 3), pixels.new_ones(len(pixels))
     ended = torch.zeros(len(pixels), dtype=torch.bool)
     for part in torch.arange(len(center)).split(_AT_ONCE):
         dx, dy = (pixels[:, None] - center[part]).unbind(2)  # [P, M]
         xx, xy, yy = conic[part].unbind(1)
-        alpha = opacity[part] * torch.exp(-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy)
+        exponent = -0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy
+        alpha = opacity[part] * torch.where(hard[part], (exponent >= -2.0).float(), exponent.exp())
         alpha = alpha.clamp(max=ALPHA_MAX)
         alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0.0)
         after = passed[:, None] * torch.cumprod(1 - alpha, dim=1)

@@ -183,7 +183,7 @@ def test_nothing_is_left_half_written(bundle: Bundle, tmp_path: Path, monkeypatc
     with pytest.raises(BundleError, match="there is no mesh"):
         write_extras(bundle, tmp_path / "out", overwrite=True)
 
-    def full(*args: object) -> None:
+    def full(*args: object, **more: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(extras, "write_gaussians", full)

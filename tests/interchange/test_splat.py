@@ -1,6 +1,7 @@
 """The renderer of Gaussians against the published formulas, pixel by pixel, in float64."""
 
 import numpy as np
+import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
@@ -16,11 +17,16 @@ def gaussians(count: int) -> Gaussians:
     scales = torch.cat([-2.0 + 0.7 * torch.randn(count, 2, generator=g), torch.full((count, 1), -16.0)], 1)
     opacity = 2 * torch.randn(count, generator=g)
     return Gaussians(
-        1.2 * torch.randn(count, 3, generator=g), quats, scales, opacity, 0.3 * torch.randn(count, 16, 3, generator=g)
+        1.2 * torch.randn(count, 3, generator=g),
+        quats,
+        scales,
+        opacity,
+        0.3 * torch.randn(count, 16, 3, generator=g),
+        torch.arange(count) % 2 == 0,
     )
 
 
-def expected(gs: Gaussians, camera, background: np.ndarray, near: float) -> np.ndarray:
+def expected(gs: Gaussians, camera, background: np.ndarray, near: float, discs: bool) -> np.ndarray:
     view, K = camera.viewmat.double().numpy(), camera.K.double().numpy()
     found = []
     for i in range(len(gs)):
@@ -39,14 +45,17 @@ def expected(gs: Gaussians, camera, background: np.ndarray, near: float) -> np.n
         center = np.array([K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]])
         d = torch.from_numpy(mean + view[:3, :3].T @ view[:3, 3])
         color = (sh_basis(3, d[None] / d.norm())[0] @ gs.harmonics[i].double() + 0.5).clamp(min=0).numpy()
-        found.append((z, center, np.linalg.inv(C), float(torch.sigmoid(gs.opacity_logits[i].double())), color))
+        found.append(
+            (z, center, np.linalg.inv(C), float(torch.sigmoid(gs.opacity_logits[i].double())), color, bool(gs.hard[i]))
+        )
     image = np.zeros((camera.height, camera.width, 3))
     for row in range(camera.height):
         for column in range(camera.width):
             left = 1.0
-            for _, center, inverse, opacity, color in sorted(found, key=lambda each: each[0]):
+            for _, center, inverse, opacity, color, hard in sorted(found, key=lambda each: each[0]):
                 d = np.array([column + 0.5, row + 0.5]) - center
-                alpha = min(0.99, opacity * np.exp(-0.5 * d @ inverse @ d))
+                q = d @ inverse @ d
+                alpha = min(0.99, opacity * (float(q <= 4) if hard and discs else np.exp(-0.5 * q)))
                 if alpha < 1 / 255:
                     continue
                 if left * (1 - alpha) < 1e-4:
@@ -57,11 +66,12 @@ def expected(gs: Gaussians, camera, background: np.ndarray, near: float) -> np.n
     return image
 
 
-def test_pictures_are_those_of_the_formulas(camera) -> None:
+@pytest.mark.parametrize("discs", [False, True])
+def test_pictures_are_those_of_the_formulas(camera, discs: bool) -> None:
     gs, view = gaussians(12), camera(4.0, 24, 20)
     background = torch.tensor([0.1, 0.5, 0.9])
-    found = draw_gaussians(gs, view, background).double().numpy()
-    difference = np.abs(found - expected(gs, view, background.double().numpy(), 0.2))
+    found = draw_gaussians(gs, view, background, discs=discs).double().numpy()
+    difference = np.abs(found - expected(gs, view, background.double().numpy(), 0.2, discs))
     # a footprint ends at three standard deviations of its longer axis, where alpha may be up to 0.011
     assert difference.max() < 0.03 and np.median(difference) < 1e-5
 

@@ -128,7 +128,8 @@ class ExportAtlas(BakeOptions, CompactOptions):
 
     extras: tuple[Kind, ...] = ()
     """Also write the scene for other programs, into a folder beside the bundle with its name and .extras: gaussians (a
-    preview as Gaussian splats), mesh (textured quads). `bitymi extras BUNDLE` does so later."""
+    preview as Gaussian splats), surfels (with two scales), usd (OpenUSD's surflets), mesh (textured quads). `bitymi
+    extras BUNDLE` does so later."""
     extras_frame: Frame = "scene"  # Frame of these files: the scene's, or the capture's own.
     check_room: bool = True
     """Stop before the work where the disk may have too little room, by an estimate that can be many times too high."""

@@ -1,0 +1,85 @@
+"""Flat Gaussians and discs as OpenUSD surflets (ParticleField, OpenUSD 26.03 and later)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from bitymi_ns.bundle.manifest import BundleError
+from bitymi_ns.interchange.gaussians import Gaussians
+
+
+def check_usd() -> None:
+    """Check that OpenUSD can be imported and has surflets.
+
+    Raises:
+        BundleError: it cannot.
+    """
+    try:
+        from pxr import UsdVol
+
+        UsdVol.ParticleFieldKernelConstantSurfletAPI  # noqa: B018
+    except (ImportError, AttributeError) as error:
+        raise BundleError('the kind usd needs OpenUSD 26.03 or later: pip install "usd-core>=26.3"') from error
+
+
+def write_usd(path: str | Path, gaussians: Gaussians, place: np.ndarray) -> None:
+    """Write a binary USD file with up to two ParticleField prims, one for each kernel.
+
+    A surflet is a disc in its xy plane: exp(-r^2 / 2) (GaussianSurfletAPI), or 1 up to r = 1 (ConstantSurfletAPI), with
+    scales, orientation, position and opacity of its own. Spherical harmonics have degree 3, the basis and offset of
+    3DGS, and give sRGB colors, which the attribute's color space says.
+
+    Args:
+        path: ends in .usdc.
+        gaussians: at least one; third scales are not written, discs get twice the scales (`Gaussians.hard`).
+        place: [4, 4] of the root, from the Gaussians' frame to one where +y is up; its unit counts as a metre.
+    """
+    from pxr import Gf, Sdf, Usd, UsdGeom, UsdVol, Vt
+
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    root = UsdGeom.Xform.Define(stage, "/scene")
+    root.AddTransformOp().Set(Gf.Matrix4d(place.T.tolist()))  # USD multiplies rows from the left
+    stage.SetDefaultPrim(root.GetPrim())
+    kernels = {
+        "gaussian_surflets": (UsdVol.ParticleFieldKernelGaussianSurfletAPI, ~gaussians.hard, 1.0),
+        "constant_surflets": (UsdVol.ParticleFieldKernelConstantSurfletAPI, gaussians.hard, 2.0),
+    }
+    for name, (kernel, chosen, radius) in kernels.items():
+        if not bool(chosen.any()):
+            continue
+        part = gaussians[chosen]
+        field = UsdVol.ParticleField.Define(stage, f"/scene/{name}")
+        prim = field.GetPrim()
+        kernel.Apply(prim)
+        scales = radius * part.log_scales.exp()
+        scales[:, 2] = 1.0  # the kernel has no depth
+        reach = scales[:, :2].amax(1, keepdim=True) * (3.0 if radius == 1.0 else 1.0)
+        position = UsdVol.ParticleFieldPositionAttributeAPI.Apply(prim)
+        position.CreatePositionsAttr(_vectors(Vt.Vec3fArray, part.means))
+        orientation = UsdVol.ParticleFieldOrientationAttributeAPI.Apply(prim)
+        orientation.CreateOrientationsAttr(Vt.QuatfArray([Gf.Quatf(*quat) for quat in part.quats.tolist()]))
+        scale = UsdVol.ParticleFieldScaleAttributeAPI.Apply(prim)
+        scale.CreateScalesAttr(_vectors(Vt.Vec3fArray, scales))
+        opacity = UsdVol.ParticleFieldOpacityAttributeAPI.Apply(prim)
+        opacity.CreateOpacitiesAttr(_vectors(Vt.FloatArray, part.opacity_logits.sigmoid()))
+        radiance = UsdVol.ParticleFieldSphericalHarmonicsAttributeAPI.Apply(prim)
+        radiance.CreateRadianceSphericalHarmonicsDegreeAttr(3)
+        coefficients = _vectors(Vt.Vec3fArray, part.harmonics.reshape(-1, 3))
+        radiance.CreateRadianceSphericalHarmonicsCoefficientsAttr(coefficients).SetColorSpace(
+            Gf.ColorSpaceNames.SRGBRec709
+        )
+        corners = (part.means - reach).amin(0), (part.means + reach).amax(0)
+        prim.CreateAttribute("extent", Sdf.ValueTypeNames.Float3Array, custom=False).Set(
+            Vt.Vec3fArray([Gf.Vec3f(*corner.tolist()) for corner in corners])
+        )
+    stage.Save()
+
+
+def _vectors(kind: type, values: Tensor) -> object:
+    """Convert float32 rows to a USD array."""
+    return kind.FromNumpy(np.ascontiguousarray(values.numpy()))  # type: ignore[attr-defined]

@@ -15,7 +15,7 @@ SOURCE = re.compile(r"(?<![\w./-])[\w/]+\.(?:py|h|cpp|cu|cmake)\b")
 DOTTED = re.compile(r"`([a-zA-Z_]\w*(?:\.\w+)+)`")
 FOREIGN = {"activations.py"}
 """Files of other projects that the pages mention."""
-DATA = set("json jsonl ply glb ktx2 webp png jpg yml yaml toml py h txt pth wgsl bin".split())
+DATA = set("json jsonl ply glb usdc ktx2 webp png jpg yml yaml toml py h txt pth wgsl bin".split())
 MENTION = re.compile(r"\b(?:docs|benchmarks)/[\w/]+\.md\b")
 
 

@@ -1,5 +1,5 @@
-"""Further first points, where the sparse points of a capture leave parts of its photographs empty: densification halves
-the few large surfels there too seldom in a short run (docs/benchmarks/training.md, Background points)."""
+"""Additional initial points in parts of the photographs without sparse points. In a short run, densification splits the
+few large surfels there too rarely (docs/benchmarks/training.md, Background points)."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from torch import Tensor
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import View, as_float, downscale_image, downscale_mask, spread
 
-CELLS = 24  # most cells along the longer side of a photograph
-POINTS_PER_CELL = 4  # fewest points for each cell of a photograph, on average: else empty cells say nothing
-MOST_VIEWS = 100  # photographs, spread over all, that are searched for empty cells
+CELLS = 24  # maximum number of cells along the longer side of a photograph
+POINTS_PER_CELL = 4  # minimum average of points per cell: with fewer, cells may be empty by chance
+MOST_VIEWS = 100  # maximum number of photographs searched for empty cells, evenly spaced
 NEAREST, FARTHEST = 1.2, 5.0
-"""Depths of the new points, in multiples of the median depth of the points that the photograph sees."""
-FEW = 10  # points in a photograph below which its median depth is that of the others
-RADIUS = 0.5  # largest first scale, in cells
-OPAQUE = 0.5  # share of a cell that must show something
-SUPPORT = 8  # fewest photographs that have a point in an empty cell: 17 photographs overfit points of fewer
-IN_FRONT = 0.2  # most photographs that have it in front of the points of a cell, as a share of those
+"""Depth range of the new points, in multiples of the median depth of the points visible in the photograph."""
+FEW = 10  # photographs with fewer points use the median depth of the others
+RADIUS = 0.5  # largest initial scale, in cells
+OPAQUE = 0.5  # minimum mean alpha of a cell
+SUPPORT = 8  # minimum number of photographs with the point in an empty cell: with fewer, a capture of 17 overfits
+IN_FRONT = 0.2  # maximum number of photographs with the point in front of a cell's points, relative to those
 
 
 class BackgroundPoints(NamedTuple):
@@ -30,25 +30,25 @@ class BackgroundPoints(NamedTuple):
 
     xyz: Tensor  # [B, 3] world positions
     rgb: Tensor  # [B, 3] mean colours of their cells, in [0, 1]
-    scales: Tensor  # [B] largest first scales of their surfels, world units
+    scales: Tensor  # [B] upper bounds of their surfels' initial scales, world units
 
 
 @torch.no_grad()
 def background_points(points: Tensor, views: Sequence[View], seed: int) -> BackgroundPoints:
-    """Place points behind the cells of the photographs that no sparse point projects to.
+    """Sample points behind the cells of the photographs that no sparse point projects to.
 
-    A cell's point lies on the ray of a random pixel of it, at a depth that is log-uniform between `NEAREST` and
-    `FARTHEST` times the median depth of the points that the photograph sees: between a wall and the sky. Masked and
-    transparent cells get none. A point stays if at least `SUPPORT` photographs have it in an empty cell, so that
-    training can find its depth, and few in front of the points of a cell.
+    A cell's point lies on the ray of a random pixel in it, at a depth that is log-uniform between `NEAREST` and
+    `FARTHEST` times the median depth of the points visible in the photograph: between a wall and the sky. Masked and
+    transparent cells get none. A point is kept if it projects into an empty cell of at least `SUPPORT` photographs, so
+    that training can determine its depth, and in front of a cell's points in few.
 
     Args:
-        points: [M, 3] world positions; those that are not finite do not count.
+        points: [M, 3] world positions; non-finite ones are ignored.
         views: training photographs at full size.
         seed: of the random pixels, depths and order.
 
     Returns:
-        float32 on the CPU; no point where no photograph sees a point.
+        float32 on the CPU; empty if no photograph shows a point.
     """
     generator = torch.Generator().manual_seed(seed)
     points = points.detach().reshape(-1, 3).float().cpu()
@@ -83,19 +83,20 @@ def background_points(points: Tensor, views: Sequence[View], seed: int) -> Backg
 
 
 class _Grid(NamedTuple):
-    """Cells of a view."""
+    """Grid of cells over a view."""
 
     nearest: Tensor  # [rows, columns] camera z of the nearest sparse point; infinite in empty cells
-    # width, height: of a cell, pixels
+    # size of a cell, pixels
     width: float
     height: float
 
     @classmethod
     def of(cls, camera: Camera, x: Tensor, y: Tensor, z: Tensor, count: float) -> _Grid:
-        """Sort the points of a view into cells of about equal sides.
+        """Bin the points of a view into nearly square cells.
 
         Args:
             x, y, z: [V] pixel coordinates and camera z.
+            count: number of points that decides the size of the cells.
         """
         longer, shorter = max(camera.width, camera.height), min(camera.width, camera.height)
         side = longer / min(CELLS, max(1.0, math.sqrt(count / POINTS_PER_CELL * longer / shorter)))
@@ -110,12 +111,12 @@ class _Grid(NamedTuple):
         return row * columns + column
 
     def at(self, x: Tensor, y: Tensor) -> Tensor:
-        """`nearest` at pixels [V] within the picture."""
+        """Return `nearest` at pixels [V] inside the image."""
         return self.nearest.view(-1)[self._index(x, y)]
 
 
 def _behind(view: View, camera: Camera, grid: _Grid, median: float, generator: torch.Generator) -> BackgroundPoints:
-    """Place a point behind each empty cell of a view whose points have the `median` depth, camera z."""
+    """Sample a point behind each empty cell of a view whose points have the given median depth, camera z."""
     rows, columns = grid.nearest.shape
     small = downscale_image(as_float(view.image.cpu()), columns, rows)  # [rows, columns, C]
     empty = grid.nearest.isinf()

@@ -1,4 +1,4 @@
-"""Training options. Every step count is stated for a run of 30,000 steps and scales with the length of the run."""
+"""Training options. Step counts are stated for a run of 30,000 steps and scale with the length of the run."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bitymi_ns.ranges import MOST, Count, NonNegative, Positive, PositiveCount, 
 
 REFERENCE_STEPS = 30_000  # run length that every step count below is stated for
 ExposureKind = Literal["auto", "off", "gain", "affine"]  # colour corrections of the photographs
-RefinePoses = Literal["off", "on"]  # whether poses of the photographs are refined
+RefinePoses = Literal["off", "on"]  # pose refinement of the photographs
 Background = Literal["auto", "black", "white", "random"]  # colours behind the scene
 
 
@@ -26,15 +26,15 @@ class LossConfig:
     falloff_gamma: NonNegative = 25.0
     """Decay of the falloff and overdraw losses with the photometric error e, L1 summed over rgb: exp(-gamma e)."""
     overdraw_weight: NonNegative = 0.0
-    """Weight of the loss on the number of fragments per pixel, which fades with the error as the falloff loss does."""
-    overdraw_start: int = 12_000  # First step with the overdraw loss: before, it costs quality.
-    overdraw_stop: int = 27_000  # Step from which the overdraw loss is off again, so that the picture settles.
+    """Weight of the loss on the number of fragments per pixel; it fades with the error like the falloff loss."""
+    overdraw_start: int = 12_000  # First step with the overdraw loss: earlier, it costs quality.
+    overdraw_stop: int = 27_000  # First step without the overdraw loss again, so that the image settles.
     overdraw_half: Positive = 0.005
     """Blending weight of a fragment that counts as half a fragment in the overdraw loss."""
     depth_weight: NonNegative = 0.01  # Weight of the depth loss, for captures with depth; 0 turns it off.
     normal_weight: NonNegative = 0.02  # Weight of the normal loss, for captures with normals; 0 turns it off.
     geometry_interval: PositiveCount = 4
-    """Steps between those with the depth and the normal loss, which weigh so many times as much there."""
+    """Interval N of the steps with the depth and normal losses, which are weighted x N on those steps."""
 
 
 @dataclass
@@ -45,7 +45,7 @@ class DensifyConfig:
     stop: int = 15_000  # Last step of densification (exclusive).
     interval: PositiveCount = 500  # Steps between densifications.
     views: PositiveCount = 10
-    """Training views rendered for the multi-view score; with fewer training views, all of them."""
+    """Training views rendered for the multi-view score, or all if there are fewer."""
     error_threshold: Share = 0.1  # A pixel counts as bad when its min-max normalised error is above this.
     importance: Annotated[int, Field(ge=-1, le=MOST)] = 5
     """Surfels are densified when their mean count of bad pixels per view is above this."""
@@ -57,30 +57,30 @@ class DensifyConfig:
     prune_world: Threshold = 0.1  # Surfels larger than this share of the scene extent are candidates for pruning.
     prune_screen: Threshold = 20.0
     """Surfels with a larger radius on screen, in pixels, are candidates for pruning after the first opacity reset."""
-    prune_budget: Share = 0.5  # Share of the candidates that is drawn for pruning at each densification.
+    prune_budget: Share = 0.5  # Share of the candidates sampled for pruning at each densification.
     opacity_clamp: PositiveShare = 0.8  # Opacities are clamped to this at each densification.
     reset_interval: PositiveCount = 3000  # Steps between opacity resets (until `stop`).
     min_reset_interval: Count = 1500  # Fewest steps between opacity resets, however short the run.
-    reset_opacity: PositiveShare = 0.01  # Opacity after a reset, at most. Very short runs reset to a higher one.
+    reset_opacity: PositiveShare = 0.01  # Largest opacity after a reset. Very short runs reset to a higher one.
     final_prune_steps: tuple[int, ...] = (18_000, 21_000, 24_000, 27_000)  # Steps of the final prunes.
-    final_prune_opacity: Share = 0.1  # Final prunes remove surfels below this opacity,
+    final_prune_opacity: Share = 0.1  # Opacity below which final prunes may remove a surfel.
     final_prune_error: Share = 0.02
-    """... those that change the training pictures least, together by at most this share of their squared error."""
+    """Squared error that a final prune may add to the training images, as a share of theirs; it removes the surfels
+    that add least."""
     prune_error: Share = 0.02
-    """After the last densification, surfels that hardly matter are removed: those whose removal changes the training
-    pictures least, together by at most this share of the pictures' squared error (or of that of pictures at 30 dB,
-    where it is larger); 0 = none."""
+    """Squared error that the prune after the last densification may add to the training images, as a share of theirs
+    (capped at that of images at 30 dB); it removes the surfels that add least. 0 = no such prune."""
     min_interval: Count = 100
-    """Fewest steps between densifications, however short the run: surfels need time to settle first."""
+    """Minimum number of steps between densifications, in runs of any length: surfels need time to settle."""
     pixels_per_surfel: NonNegative = 150.0
-    """Densification stops at one surfel for so many pixels of all training photographs together; 0 = no such bound."""
+    """Densification stops at one surfel per this many pixels of all training photographs together; 0 = no limit."""
     growth: NonNegative = 4.0
-    """... but not before there are so many times the surfels that training started with, however few the pixels: a
-    scene that cannot grow cannot put surfels where its errors are."""
+    """Growth to this many times the initial number of surfels is always allowed, despite `pixels_per_surfel`: a scene
+    that cannot grow cannot add surfels where its errors are."""
     max_surfels: Annotated[Count, tyro.conf.arg(aliases=("--max-surfels",))] = 0
-    """Surfels that densification grows to, and most at any time; 0 = as many as the thresholds ask for. Replaces
+    """Number of surfels that densification grows to, and the maximum at any time; 0 = the thresholds decide. Replaces
     `pixels_per_surfel`. Prunes may leave fewer."""
-    min_surfels: Count = 100  # No prune leaves fewer surfels than this.
+    min_surfels: Count = 100  # Minimum number of surfels that a prune leaves.
 
 
 @dataclass
@@ -89,11 +89,11 @@ class LearningRates:
 
     short_run_power: Annotated[float, Field(ge=0, le=10)] = 0.35
     """Runs of n < 30,000 steps multiply the rates of the surfels, not of the field, by (30,000 / n) to this power."""
-    short_run_max: Positive = 4.0  # The largest such factor: at 7 times the rates the held-out error grows again.
+    short_run_max: Positive = 4.0  # Largest such factor: at 7 times the rates the held-out error grows again.
     mean_pixels: tuple[Positive, Positive] = (0.07, 0.0007)
-    """Positions, in pixels of the photographs: the side of a pixel at the surfel, in the nearest view that holds it."""
+    """Positions, in pixels: a pixel's side at the surfel, in the nearest view that contains it."""
     means: tyro.conf.Suppress[tuple[Positive, Positive] | None] = None
-    """Positions, times the scene extent, as in runs recorded before steps were in pixels: replaces `mean_pixels`."""
+    """Positions, in scene extents, for runs recorded before steps were in pixels; replaces `mean_pixels`."""
     quats: NonNegative = 1e-3  # Rotations.
     log_scales: NonNegative = 5e-3  # Logarithms of the tangent scales.
     opacity_logits: NonNegative = 0.025  # Opacities, as logits.
@@ -105,10 +105,10 @@ class LearningRates:
     field_table: tuple[Positive, Positive] = (1e-2, 1e-3)  # Hash table of the texture field.
     field_mlp: tuple[Positive, Positive] = (1e-2, 1e-3)  # MLP of the texture field.
     exposure: tuple[Positive, Positive] = (5e-3, 5e-4)
-    """Colour corrections of the photographs: logarithms of gains, and what else they have."""
+    """Colour corrections of the photographs: log gains and the other matrix entries."""
 
     def times(self, factor: float) -> LearningRates:
-        """The rates times a factor; the rules for short runs stay as they are."""
+        """Multiply all rates by a factor; the short-run options do not change."""
         rates = {name: value for name, value in asdict(self).items() if value and not name.startswith("short_run")}
         scaled = {k: tuple(factor * x for x in v) if isinstance(v, tuple) else factor * v for k, v in rates.items()}
         return replace(self, **scaled)
@@ -126,30 +126,30 @@ class TexelSteps:
 
 @dataclass
 class TexelConfig(TexelSteps):
-    """Texels that learn in the last part of a run, where the texture of the scene is `texels`."""
+    """The texel stage, the last part of a run whose texture is `texels`."""
 
     start: Count = 18_000
-    """First step of that part. Nothing is densified any more, no opacity is reset, and every surfel has a tile as fine
-    as the training views see it; 30,000 or more = there is no such part."""
+    """First step of the texel stage. From here on there is no densification and no opacity reset, and every surfel has
+    a tile at the resolution of the training views; 30,000 or more = no texel stage."""
     travel: NonNegative = 0.3
-    """Largest distance that a texel can move in that part, colour units: where it passes over the views few times,
-    `rate` is raised so that texels get there, up to this."""
+    """Distance, in colour units, that texels should be able to move in the texel stage: `rate` is raised, up to this
+    value, if the stage has too few passes over the views for it."""
     alpha_rate: NonNegative = 30.0
-    """Rate of the texels' alphas, which cut silhouettes out of surfels, as a multiple of that of their colours; 0 =
+    """Rate of the texels' alphas, which cut silhouettes out of surfels, as a multiple of the rate of their colours; 0 =
     opaque texels."""
     surfel_rates: Positive = 0.4
-    """Rates of the surfels in that part, as a share of those of a run as long as it; they fall to 0 as a cosine."""
+    """Surfel rates in the texel stage, as a share of the rates of a run of the stage's length; cosine decay to 0."""
     mean_rates: Positive = 0.2
-    """Rates of the positions in that part, likewise: at `surfel_rates` what is drawn already would come apart."""
+    """Position rates in the texel stage, likewise: `surfel_rates` would destroy the existing image."""
     pixels_per_texel: Positive = 0.25
-    """A tile has at most one texel per this many pixels of its surfel (summed blending weight), in the view that shows
-    most of it."""
+    """A tile has at most one texel per this many pixels of its surfel (summed blending weight) in the view where the
+    surfel covers most."""
     rendered_pixels_per_texel: Positive = 32.0
-    """Limit on the texels of all tiles: one per this many pixels rendered in that part, but not below 8 million. Saves
-    memory."""
+    """Limit on the total number of texels: one per this many pixels rendered in the texel stage, but at least 8
+    million. Saves memory."""
     largest: Annotated[int, Field(ge=4, le=4096)] = 64  # Largest side of a tile, texels, a power of two.
     views: NonNegative = 0.25
-    """Views that tile sizes and coverage are measured on, as a share of the steps of that part; at least 32."""
+    """Views on which tile sizes and coverage are measured, as a share of the steps of the texel stage; at least 32."""
 
 
 @dataclass
@@ -158,21 +158,21 @@ class GuardConfig:
 
     rollbacks: Count = 5  # Most rollbacks to the last good state; 0 = a loss that is not finite ends the run.
     rates: PositiveShare = 0.3
-    """All learning rates are multiplied by this at a rollback; by its square, cube, ... at further ones without a good
-    window between."""
-    window: PositiveCount = 300  # Steps over which the loss is judged.
-    min_window: PositiveCount = 20  # Fewest steps of a window, however short the run.
+    """Factor of all learning rates after a rollback; its square, cube, ... if further rollbacks follow without a good
+    window between them."""
+    window: PositiveCount = 300  # Steps over which the loss is averaged.
+    min_window: PositiveCount = 20  # Minimum number of steps of a window, in runs of any length.
 
 
 @dataclass
 class PoseConfig:
-    """Refinement of the photographs' poses, where it is on."""
+    """Pose refinement of the photographs."""
 
     start: Count = 3000  # First step in which poses move.
-    stop: Count = 27_000  # From this step on they stay, so that the texels settle.
+    stop: Count = 27_000  # First step in which they are fixed again, so that the texels settle.
     pixels: Positive = 0.5
-    """How far the first step moves a picture where all of it agrees on the direction, in pixels of the resolution of
-    the moment; falls to 0 as a cosine."""
+    """Length of the first step, as the image motion it causes if all fragments agree on the direction, in pixels of
+    the current resolution; cosine decay to 0."""
 
 
 @dataclass
@@ -184,37 +184,37 @@ class TrainConfig:
     lr: LearningRates = field(default_factory=LearningRates)
     guard: GuardConfig = field(default_factory=GuardConfig)
     texels: TexelConfig = field(default_factory=TexelConfig)
-    freeze_after: Count = 5000  # From this step on the texture field learns on one step in `freeze_every` only.
+    freeze_after: Count = 5000  # From this step on, the texture field is trained in one step of `freeze_every` only.
     freeze_every: PositiveCount = 10
-    """Stride of the steps on which the texture field learns after `freeze_after`; 1 = every step."""
+    """Interval of the steps that train the texture field after `freeze_after`; 1 = every step."""
     freeze_min_updates: Count = 300
-    """Short runs freeze less, so that the field still learns on about this many steps after `freeze_after`."""
+    """Short runs use a smaller interval, so that about this many steps after `freeze_after` still train the field."""
     field_warmup: Count = 500  # Steps over which the learning rate of the texture field rises to its full value.
     resolution_schedule: Count = 3000
-    """Training starts at a lower image resolution and doubles it every this many steps; 0 = full size throughout. Where
-    texels learn in the last part, runs of fewer than 3,000 steps use a longer interval, but reach full size by then."""
+    """Training starts at a lower image resolution and doubles it every this many steps; 0 = full size throughout. Runs
+    of fewer than 3,000 steps with a texel stage use a longer interval, but reach full size before that stage."""
     small_photograph: PositiveCount = 10_000
-    """Photographs with at most this many pixels that show something do not stretch that interval; n times as many
+    """Number of opaque, unmasked pixels per photograph up to which that interval is not stretched; n times as many
     stretch it by at most sqrt(n)."""
     num_downscales: Annotated[int, Field(ge=0, le=16)] = 2  # Halvings of the image size at the start.
-    init_opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1  # Opacity of the first surfels.
+    init_opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1  # Initial opacity of the surfels.
     first_surfels: PositiveCount | None = None
-    """Most surfels that training starts with; excess points are dropped at random. Not given: in ns-train one for every
-    1,000 pixels that the run renders; else all points."""
+    """Maximum number of initial surfels; excess points are dropped at random. Not given: in ns-train one per 1,000
+    pixels that the run renders; else all points."""
     background_points: NonNegative = 0.15
-    """Most further first surfels where parts of the photographs show no point, as a share of the others; 0 = none."""
+    """Maximum number of initial surfels added where photographs show no point, as a share of the others; 0 = none."""
     random_points: PositiveCount = 20_000
-    """Surfels placed at random in the scene box when the capture has no sparse points."""
+    """Random surfels in the scene box if the capture has no sparse points."""
     exposure: ExposureKind = "off"
     """Exposure and white balance of each photograph: gain = a learned factor per channel, affine = a learned 3 x 4
-    matrix, off = all photographs are taken as they are, auto = gain where the photographs disagree by gains."""
+    matrix, off = no correction, auto = gain if the photographs' differences are explained by gains."""
     refine_poses: RefinePoses = "off"
-    """Poses of the training photographs: on = refined beside the scene, off = as they are given."""
+    """Poses of the training photographs: on = refined during training, off = fixed."""
     poses: PoseConfig = field(default_factory=PoseConfig)
     background: Background = "auto"
-    """Colour behind the scene while training; images with alpha are composed over it. auto = another one in every step,
-    as random does, for images with alpha, so that nothing is learned but what they show; alpha_color for others."""
+    """Background colour in training, also behind images with alpha. auto = for images with alpha a random colour in
+    each step, so that transparent regions stay transparent; for others `alpha_color`."""
     alpha_color: Literal["black", "white"] = "black"
-    """Colour behind images with alpha where views are judged and after training, with background auto and random. In
-    ns-train that of the capture, where it states one."""
+    """Background colour for evaluation and after training, with background auto and random. In ns-train the capture's,
+    if it states one."""
     seed: int = 0  # Seed of every random choice in training.

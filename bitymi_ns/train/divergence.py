@@ -1,4 +1,4 @@
-"""Notices a loss that is not finite, without making a step wait for its numbers."""
+"""Detection of losses that are not finite, without synchronising the GPU in every step."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ from torch import Tensor, nn
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
 
-TOGETHER = 4  # steps whose losses are sent to the host together
+TOGETHER = 4  # steps whose losses are copied to the host together
 
 
 class LossWatch:
-    """Notices a loss that is not finite.
+    """Detector of losses that are not finite.
 
-    On a CUDA device the host does not wait for the numbers: they are sent off together with those of other steps, and
-    looked at when they have arrived, a few steps later.
+    On a CUDA device losses of several steps are copied to the host asynchronously and checked a few steps later.
     """
 
     def __init__(self) -> None:
@@ -27,10 +26,10 @@ class LossWatch:
         self._underway: deque[tuple[list[tuple[int, tuple[str, ...]]], Tensor, torch.cuda.Event]] = deque()
 
     def note(self, scene: Scene, step: int, terms: dict[str, Tensor]) -> None:
-        """Take in the terms of a step's loss.
+        """Check the loss terms of a step, on a CUDA device later.
 
         Raises:
-            TrainingDiverged: a term of this step, or of an earlier one, is not finite.
+            TrainingDiverged: a term of this or an earlier step is not finite.
         """
         names, values = tuple(terms), [term.detach() for term in terms.values()]
         if values[0].device.type != "cuda":
@@ -54,14 +53,14 @@ class LossWatch:
         self._noted = []
 
     def finish(self, scene: Scene) -> None:
-        """Wait for all that is underway; raises what `note` raises."""
+        """Wait for pending losses and check them; raises what `note` raises."""
         self._send()
         while self._underway:
             self._underway[0][2].synchronize()
             self._check(scene, *self._underway.popleft()[:2])
 
     def forget(self) -> None:
-        """Look at nothing that is underway: the run has gone back to before it."""
+        """Discard pending losses after a rollback."""
         self._underway.clear()
         self._noted.clear()
 
@@ -79,7 +78,7 @@ class TrainingDiverged(ValueError):
 
 
 def describe_broken(module: nn.Module) -> str:
-    """Name the first parameter that is not finite, and its row; empty when all are finite."""
+    """Name the first parameter that is not finite, and its row; empty if all are finite."""
     for name, parameter in module.named_parameters():
         if len(parameter) == 0:
             continue

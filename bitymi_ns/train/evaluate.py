@@ -18,29 +18,29 @@ if TYPE_CHECKING:
 
 
 class Quality(NamedTuple):
-    """Means over views; NaN without views that count."""
+    """Means over views; NaN without views."""
 
-    psnr: float  # dB, over the views of which any pixel counts
+    psnr: float  # dB, over the views with unmasked pixels
     fragments: float  # blended fragments per view
-    fitted_psnr: float  # dB after the affine fit of each view's colours (`losses.color_fitted`), over the same views
-    carried_psnr: float = math.nan  # dB from poses that were carried along with those of the photographs nearest
-    refined_psnr: float = math.nan  # dB from poses that were aligned with the scene
+    fitted_psnr: float  # dB after an affine fit of each view's colours (`losses.color_fitted`), over the same views
+    carried_psnr: float = math.nan  # dB with poses corrected as those of the nearest photographs
+    refined_psnr: float = math.nan  # dB with poses aligned to the scene
 
 
 def evenly_spaced(count: int, most: int) -> list[int]:
-    """At most `most` (0 = all) of the numbers below `count`, evenly spaced, the first and the last among them."""
+    """List up to `most` (0: all) evenly spaced indices below `count`, including the first and the last."""
     used = count if most <= 0 else min(count, most)
     return sorted({round(i * (count - 1) / max(1, used - 1)) for i in range(used)})
 
 
 @torch.no_grad()
 def evaluate(scene: Scene, views: Sequence[View], config: TrainConfig, poses: Poses | None = None) -> Quality:
-    """Compare renders of a scene with photographs, over the background on which views are judged.
+    """Compare renders of a scene with photographs, over the evaluation background.
 
     Args:
-        views: at full size; each is asked for once.
-        poses: of the run, where it refined them: views are also compared from poses that are carried along, and from
-            poses that are then aligned with the scene as it is.
+        views: at full size; each is read once.
+        poses: of a run that refined them: views are also evaluated with the corrections of the nearest photographs,
+            and with poses then aligned to the scene.
     """
     device = scene.surfels["means"].device
     background = eval_background(config, device)
@@ -51,7 +51,7 @@ def evaluate(scene: Scene, views: Sequence[View], config: TrainConfig, poses: Po
         values.append(psnr(rgb, target, view.mask))
         fitted.append(fitted_psnr(rgb, target, view.mask))
         fragments.append(len(output.fragments))
-        del output  # with its fragments, before the next view makes its own
+        del output  # frees its fragments before the next view is rendered
         if poses is not None:
             view = view._replace(camera=poses.carried(view.camera))
             along.append(view_psnr(scene, view, background))

@@ -1,12 +1,12 @@
-"""Exposure and white balance of the training photographs: a colour correction per photograph, learned beside the scene.
+"""Exposure and white balance of the training photographs: a learned colour correction per photograph.
 
-A photograph shows the scene's colour c as gain c, with a gain per channel, or as matrix c + offset. The corrections are
-relative to the mean photograph: the logarithms of the gains, and what else there is, sum to zero over the photographs
-after every step, so that they tint nothing. They are no part of the scene: held-out views have none, bundles neither.
+A photograph maps the scene's colour c to gain c, with a gain per channel, or to matrix c + offset. Corrections are
+relative to the mean photograph: after every step log gains and other entries are shifted to sum to zero over the
+photographs, so that they do not tint the scene. They are not part of the scene: held-out views and bundles have none.
 
-Gains start from the colours of the sparse points. In logarithms, observation = point + photograph: two-way data, solved
-by medians in turn, which no highlight, nothing in front of a point and no wrong point can move by much. Points that
-others hide in a photograph do not count there.
+Gains are initialised from the colours of the sparse points. In logarithms, observation = point + photograph, solved by
+alternating medians (median polish), which are robust to highlights, occluders and wrong points. Points occluded by
+others in a photograph are ignored there.
 """
 
 import copy
@@ -26,34 +26,34 @@ from bitymi_ns.train.optimizers import set_rate
 from bitymi_ns.train.processes import Processes
 from bitymi_ns.train.views import OnDemand, View, as_float
 
-LIMIT = 2.0  # largest logarithm of a gain: 7.4 times as bright, in the encoded colours of photographs some 6 stops
+LIMIT = 2.0  # largest log gain: 7.4 times as bright, about 6 stops in gamma-encoded colours
 OTHER_LIMIT = 0.5  # largest other entry of an affine correction
 EXPLAINED = 0.1
-"""`auto` corrects photographs where gains explain more than this share of how far they disagree at the points."""
-EXIF_SPREAD = 0.03  # without enough points, `auto` corrects photographs whose EXIF gains deviate by this (0.1 stop)
-PRIOR_POINTS = 20  # weight of the EXIF prior (mean exposure where unknown), in points
-BETAS = (0.9, 0.99)  # Adam's decay: a photograph is shown once an epoch, so averages must be short
-ENCODING = 2.2  # encoded colours grow as this root of the light
+"""`auto` corrects photographs if gains explain more than this share of their disagreement at the points."""
+EXIF_SPREAD = 0.03  # without enough points, `auto` corrects photographs if their EXIF gains deviate by this (0.1 stop)
+PRIOR_POINTS = 20  # weight of the EXIF prior (mean exposure if unknown), in points
+BETAS = (0.9, 0.99)  # Adam's betas: a photograph is used once per epoch, so averages must be short
+ENCODING = 2.2  # gamma of encoded colours
 
-# of the comparison at the points
-POINTS = 6000  # most points compared
-HIDING = 100_000  # most points that may occlude them
-OBSERVATIONS = 1_200_000  # points times photographs, at most
-SWEEPS = 10  # passes over points and photographs
-DARKEST, BRIGHTEST = 0.03, 0.97  # channels beyond these are left out: noise, rounding and clipping decide them
-FEWEST_PHOTOGRAPHS = 3  # points that fewer photographs show are left out
-CELL = 2.0  # side of the cells of the occlusion test, in mean distances of the points in the picture
-HIDDEN = 1.05  # a point is hidden where one in its cell or a neighbouring one is nearer by this factor
-FEWEST_TESTED = 1000  # fewest observations for a test on the other half of the points
+# comparison at the points
+POINTS = 6000  # maximum number of points compared
+HIDING = 100_000  # maximum number of points that may occlude them
+OBSERVATIONS = 1_200_000  # maximum of points times photographs
+SWEEPS = 10  # passes of the median polish
+DARKEST, BRIGHTEST = 0.03, 0.97  # range of channels used: beyond it noise, rounding and clipping dominate
+FEWEST_PHOTOGRAPHS = 3  # minimum number of photographs that show a point
+CELL = 2.0  # side of the cells of the occlusion test, in mean distances of the points in the image
+HIDDEN = 1.05  # a point is occluded if another in its cell or a neighbouring cell is nearer by this factor
+FEWEST_TESTED = 1000  # minimum number of observations to test gains on the other half of the points
 
 
 class Exposure:
-    """The corrections of a run.
+    """Colour corrections of a run.
 
     Attributes:
-        table: [V, 3] logarithms of gains; of affine corrections [V, 12], the rows of [matrix | offset] one after the
-            other, with the logarithms of the gains on the diagonal. None = no photograph is corrected.
-        decided: whether `start` has been called, or a state loaded.
+        table: [V, 3] log gains; for affine corrections [V, 12], the rows of [matrix | offset] with log gains on the
+            diagonal. None: no corrections.
+        decided: True once `start` was called or a state loaded.
         reason: why photographs are corrected or not; empty until decided.
     """
 
@@ -62,9 +62,9 @@ class Exposure:
     ) -> None:
         """
         Args:
-            exif: log2 of the exposure of each training view (`exif_stops`), NaN = unknown; None = of all.
-            photographs: number of the photograph of each training view, from 0 on: views of one share its correction;
-                None = each is a photograph of its own.
+            exif: log2 exposure of each training view (`exif_stops`), NaN: unknown; None: unknown for every view.
+            photographs: index of each view's photograph; views of one photograph share its correction. None: one view
+                per photograph.
         """
         self.kind: ExposureKind = kind
         self.table: Parameter | None = None
@@ -75,12 +75,12 @@ class Exposure:
         self._optimizer: SparseAdam | None = None
 
     def start(self, points: Tensor, views: Sequence[View], near: float) -> None:
-        """Decide whether photographs are corrected, and where the corrections start from.
+        """Decide whether to correct photographs, and initialise the corrections.
 
         Args:
-            points: [M, 3] of the scene, at best those of the capture.
+            points: [M, 3] points of the scene, best those of the capture.
             views: training photographs at full size.
-            near: nearest drawn depth, camera z.
+            near: near plane, camera z.
         """
         self.decided = True
         agreement = estimate_gains(points, views, near)
@@ -110,26 +110,26 @@ class Exposure:
         return values.new_zeros(self.count(len(values)), values.shape[1]).index_add_(0, rows, values)
 
     def _pooled(self, values: Tensor, weights: Tensor) -> Tensor:
-        """Average values [V, C] of the views of each photograph by weights [V]; 0 where these are 0."""
+        """Average values [V, C] over the views of each photograph with weights [V]; 0 if all weights are 0."""
         if self._photographs is None:
             return values
         weights = weights[:, None]
         return self._summed(values * weights) / self._summed(weights).clamp(min=1e-6)
 
     def count(self, views: int) -> int:
-        """Photographs of so many views."""
+        """Count the photographs of `views` views."""
         return views if self._photographs is None else max(self._photographs, default=-1) + 1
 
     def _begin(self, log_gains: Tensor, affine: bool) -> None:
         first = log_gains.new_zeros(len(log_gains), 12 if affine else 3)
         first[:, _diagonal(first)] = log_gains
         self.table = Parameter(settled(first))
-        # sparse: a photograph that is not shown keeps its moments
+        # sparse: photographs that a step does not use keep their moments
         self._optimizer = SparseAdam([self.table], betas=BETAS)
 
     @property
     def sentence(self) -> str:
-        """The decision and its reason, for the console."""
+        """Message for the console: the decision and its reason."""
         gains = self.log_gains
         if gains is None:
             return f"Photographs are taken as they are exposed: {self.reason or 'as asked for'}."
@@ -138,11 +138,11 @@ class Exposure:
 
     @property
     def log_gains(self) -> Tensor | None:
-        """[V, 3] logarithms of the gains; None = no photograph is corrected."""
+        """Log gains [V, 3]; None: no corrections."""
         return None if self.table is None else self.table.detach()[:, _diagonal(self.table)]
 
     def of(self, number: int) -> Tensor | None:
-        """The correction of a training view: [3] gains, or [3, 4] matrix and offset; None = as it is."""
+        """Return the correction of a training view: [3] gains, or [3, 4] matrix and offset; None: no correction."""
         if self.table is None:
             return None
         number = number if self._photographs is None else self._photographs[number]
@@ -155,7 +155,7 @@ class Exposure:
 
     @torch.no_grad()
     def average(self, processes: Processes) -> None:
-        """Make the gradients of this process's photographs those of the mean loss of all photographs of the step."""
+        """Average the gradients over all views of the step."""
         if self.table is None:
             return
         rows = self.table.new_zeros(len(self.table), self.table.shape[1] + 1)
@@ -170,10 +170,10 @@ class Exposure:
             self.table.grad = torch.sparse_coo_tensor(shown[None], values, sizes, check_invariants=False)
 
     def step(self, rate: float) -> None:
-        """Update the corrections by the gradients of a step's loss, and clear these.
+        """Update the corrections by their gradients, and clear these.
 
         Args:
-            rate: learning rate, of logarithms and other entries alike.
+            rate: learning rate of log gains and other entries.
         """
         if self.table is None or self._optimizer is None or self.table.grad is None:
             return
@@ -186,7 +186,7 @@ class Exposure:
             self.table.copy_(settled(self.table))
 
     def state_dict(self) -> dict[str, Any]:
-        """Tensors, numbers and text only."""
+        """Return the state for a resumed run: tensors, numbers and strings only."""
         return {
             "kind": self.kind,
             "decided": self.decided,
@@ -198,12 +198,12 @@ class Exposure:
     def load_state_dict(
         self, state: Mapping[str, Any] | None, count: int, device: torch.device | str | None = None
     ) -> None:
-        """Continue where `state_dict` was taken; what belongs to another option or other photographs is left.
+        """Restore what `state_dict` returned. Ignores state saved with another option or number of photographs.
 
         Args:
-            state: None = of a run from before there were corrections: `auto` then leaves all as it is.
-            device: where the corrections are wanted, because a checkpoint may have been loaded elsewhere; None = where
-                those of `state` are.
+            state: None: a checkpoint from before there were corrections; `auto` then makes none.
+            count: number of training views.
+            device: of the corrections; None: that of `state`.
         """
         if state is None:
             self.decided = self.kind in ("off", "auto")
@@ -218,7 +218,7 @@ class Exposure:
         self._begin(table[:, _diagonal(table)].to(device or table.device), table.shape[1] > 3)
         assert self.table is not None and self._optimizer is not None
         self.table.data.copy_(table)
-        groups = self._optimizer.state_dict()["param_groups"]  # its options are those of this run
+        groups = self._optimizer.state_dict()["param_groups"]  # with this run's options
         moments = copy.deepcopy(state["optimizer"]["state"])
         self._optimizer.load_state_dict({"state": moments, "param_groups": groups})
 
@@ -226,14 +226,15 @@ class Exposure:
 def corrected(
     views: Sequence[View], state: Mapping[str, Any] | None, photographs: Sequence[int] | None = None
 ) -> Sequence[View]:
-    """The training views with the corrections that a run ended with.
+    """Add the final corrections of a run to its training views.
 
     Args:
         views: of the run, at full size.
-        state: of its `Exposure`; None = it had none.
+        state: of its `Exposure`; None: no corrections.
+        photographs: as in `Exposure`.
 
     Raises:
-        ValueError: there are more or fewer photographs than the run had.
+        ValueError: the number of photographs differs from the run's.
     """
     if state is None or state["table"] is None:
         return views
@@ -251,7 +252,7 @@ def corrected(
 
 
 def settled(table: Tensor) -> Tensor:
-    """The nearest admissible table [V, 3] or [V, 12]: finite, each column with mean 0 and within its limit."""
+    """Project a table [V, 3] or [V, 12] to an admissible one: finite, columns of mean 0 and within their limits."""
     limit = table.new_full(table.shape[1:], OTHER_LIMIT)
     limit[_diagonal(table)] = LIMIT
     table = torch.maximum(torch.minimum(table.detach().nan_to_num(0.0), limit), -limit)
@@ -260,20 +261,21 @@ def settled(table: Tensor) -> Tensor:
 
 
 def _diagonal(table: Tensor) -> slice:
-    """The columns of the gains' logarithms. A slice: a list would be copied to the card at every step."""
+    """Select the columns of the log gains. A slice, because an index list would be copied to the GPU in every step."""
     return slice(None) if table.shape[-1] == 3 else slice(0, None, 5)
 
 
 def exif_stops(seconds: float, f_number: float, iso: float) -> float:
-    """log2 of the light that a photograph's settings let count: shutter time times ISO over the f-number's square."""
+    """Compute the log2 exposure of a photograph: shutter time times ISO over f-number squared."""
     return math.log2(seconds * iso / (f_number * f_number))
 
 
 def seeds(stops: Sequence[float] | None, count: int) -> Tensor:
-    """[V, 3] logarithms of gains by EXIF: encoded colours grow as a root of the light. 0 where nothing is known.
+    """Compute initial log gains [V, 3] from EXIF exposures, for gamma-encoded colours; 0 if unknown.
 
     Args:
-        stops: by `exif_stops` for each photograph, NaN = unknown.
+        stops: `exif_stops` of each photograph, NaN: unknown; None: unknown for all.
+        count: number of photographs.
     """
     if stops is None:
         return torch.zeros(count, 3)
@@ -283,24 +285,23 @@ def seeds(stops: Sequence[float] | None, count: int) -> Tensor:
 
 
 class ExposureGains(NamedTuple):
-    """Gains of the photographs, and how well they explain the differences of colours."""
+    """Gains of the photographs, and how well they explain the colour differences."""
 
     log_gains: Tensor  # [V, 3] float32 natural logarithm of each photograph's gain per channel; each channel has mean 0
-    points: Tensor  # [V] int64, how many points each photograph was judged by
-    # share of the median distance of observations from their point's colour, in logarithms, that gains explain, on
-    # points that they were not found on; NaN = cannot be told, because there are too few or they agree
+    points: Tensor  # [V] int64, number of points used for each photograph
+    # share by which gains reduce the median deviation of log colours from their point's median, measured on points not
+    # used for the gains; NaN: too few points, or no deviation
     explained: float
 
 
 @torch.no_grad()
 def estimate_gains(points: Tensor, views: Sequence[View], near: float) -> ExposureGains:
-    """Compare the photographs at the points.
+    """Estimate the photographs' gains from their colours at the points.
 
     Args:
         points: [M, 3] world positions.
-        views: V photographs at full size; each is asked for once. Pixels that their masks exclude or that are
-            transparent do not count.
-        near: nearest drawn depth, camera z.
+        views: V photographs at full size, each read once; masked and transparent pixels are ignored.
+        near: near plane, camera z.
     """
     order = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:HIDING]
     points = points.detach()[order.to(points.device)]
@@ -318,8 +319,8 @@ def estimate_gains(points: Tensor, views: Sequence[View], near: float) -> Exposu
 
 
 def _log_colors(view: View, points: Tensor, count: int, near: float) -> Tensor:
-    """[C, 3] logarithm of the colour at the pixel of each of the first points; NaN where it is hidden or does not
-    count. All points may hide them."""
+    """Read the log colours [count, 3] of a view at the first `count` points; NaN if occluded by any of the points,
+    masked, transparent or out of range."""
     camera = view.camera.to(points.device)
     x, y, z, inside = camera.project(points, near)
     side = max(2.0, CELL * math.sqrt(camera.width * camera.height / max(1, int(inside.sum()))))
@@ -342,7 +343,8 @@ def _log_colors(view: View, points: Tensor, count: int, near: float) -> Tensor:
 
 
 def _pixels(image: Tensor, camera: Camera, x: Tensor, y: Tensor) -> Tensor:
-    """[C, ...] the pixels [H, W, ...] at image positions of the camera, whose size may be another; NaN gives any."""
+    """Read pixels [C, ...] of an image [H, W, ...] at image positions of a camera, which may have another size; NaN
+    positions give an arbitrary pixel."""
     at = (
         (along.nan_to_num(0.0) * size / full).long().clamp(0, size - 1).to(image.device)
         for along, size, full in zip((y, x), image.shape[:2], (camera.height, camera.width), strict=True)
@@ -351,7 +353,7 @@ def _pixels(image: Tensor, camera: Camera, x: Tensor, y: Tensor) -> Tensor:
 
 
 def _log_gains(logs: Tensor) -> Tensor:
-    """[V, 3] gains of the photographs, by medians in turn; 0 for one that shows no point. Mean 0 per channel."""
+    """Compute log gains [V, 3] by median polish, mean 0 per channel; 0 for photographs without points."""
     gains = torch.zeros(len(logs), 3)
     if logs.shape[1] == 0:
         return gains
@@ -363,15 +365,15 @@ def _log_gains(logs: Tensor) -> Tensor:
 
 
 def _disagreement(logs: Tensor) -> float:
-    """Median distance of the observations from the median of their point."""
+    """Compute the median deviation of the observations from their point's median."""
     apart = (logs - _median(logs, 0)).abs()
     return float(_median(apart[apart.isfinite()], 0))
 
 
 def _median(values: Tensor, dim: int) -> Tensor:
-    """Median along a dimension, NaN left out; the mean of the two in the middle where there are so many. NaN of none.
+    """Compute the median along a dimension without NaN, the mean of the middle two for even counts; NaN if empty.
 
-    The lower of the two, which torch takes, would find photographs in pairs to differ by more than they do."""
+    torch's lower median would overestimate the differences between photographs in pairs."""
     if values.shape[dim] == 0:
         return torch.full_like(values.sum(dim), math.nan)
     return 0.5 * (values.nanmedian(dim).values - (-values).nanmedian(dim).values)

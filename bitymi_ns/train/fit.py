@@ -1,4 +1,4 @@
-"""Training with torch alone, for benchmarks and tests; nerfstudio's loop makes the same steps."""
+"""Training loop without nerfstudio, for benchmarks and tests; both use the same `Training` steps."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ class LogEntry:
     surfels: int
     fragments: float  # Blended fragments per view, mean over the evaluation views.
     loss: float  # Objective of the last training step.
-    psnr: float  # dB, mean over the evaluation views at full size; NaN without such views.
-    fitted_psnr: float  # PSNR in dB after the affine fit of each view's colours (`losses.color_fitted`).
+    psnr: float  # dB, mean over the evaluation views at full size; NaN without evaluation views.
+    fitted_psnr: float  # PSNR in dB after an affine fit of each view's colours (`losses.color_fitted`).
     carried_psnr: float = math.nan
-    """PSNR in dB from poses that are carried along with the photographs' (`poses.carried`); NaN before the end and
-    where the run refines no poses."""
-    refined_psnr: float = math.nan  # PSNR in dB from poses that are aligned with the finished scene, likewise.
+    """PSNR in dB with poses moved along with the training poses (`poses.carried`); NaN before the last step and in
+    runs without pose refinement."""
+    refined_psnr: float = math.nan  # PSNR in dB with poses aligned to the finished scene; NaN likewise.
 
 
 @dataclass
@@ -47,7 +47,7 @@ class TrainLog:
 
     entries: list[LogEntry] = field(default_factory=list)
     events: list[dict[str, float]] = field(default_factory=list)  # Reports of the strategy, each with its `step`.
-    cameras: list[Camera] = field(default_factory=list)  # Of the training views, with refined poses where they are.
+    cameras: list[Camera] = field(default_factory=list)  # Of the training views, with refined poses if any.
 
 
 class Trainer:
@@ -56,7 +56,7 @@ class Trainer:
     Attributes:
         training: the run.
         step: number of steps done.
-        loss: objective of the last step; on a CUDA device, reading it waits for the step to end.
+        loss: objective of the last step; reading it synchronises a CUDA device.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Trainer:
             scene: changed in place.
             views: training views at full size.
             max_steps: length of the run; the schedules depend on it.
-            processes: of the run, and the views of each per step; all are given the same.
+            processes: the run's processes; each is given the same scene and views.
         """
         if not views:
             raise ValueError("there is nothing to train on: no views")
@@ -87,7 +87,7 @@ class Trainer:
         self._terms: list[Tensor] = []
 
     def advance(self) -> tuple[dict[str, Tensor], RenderOutput, dict[str, float]]:
-        """Do one step: the terms of the loss of its (last) view, that view, and what the strategy did after it."""
+        """Do one step; return the loss terms and render of its (last) view, and the strategy's report."""
         self.training.begin(self.step)
         forget_gradients(self.optimizers.values())
         for number in self.training.processes.numbers(self.step):
@@ -120,8 +120,8 @@ def fit(
 
     Args:
         views: training views at full size.
-        callback: called after each step with the trainer, the loss terms, the view and the strategy's report.
-        eval_steps: numbers of steps after which the log gets an entry; the end of the run always gets one.
+        callback: called after each step with the trainer, the loss terms, the render and the strategy's report.
+        eval_steps: numbers of steps after which an entry is logged; the last step always gets one.
     """
     trainer = Trainer(scene, views, config, max_steps)
     clock, log = trainer.training.clock, TrainLog()

@@ -1,4 +1,4 @@
-"""The scene that training starts from: surfels of the sparse points, and where in space the texture field lies."""
+"""Initial scene: surfels from the sparse points, and the domain of the texture field."""
 
 import math
 from collections.abc import Sequence
@@ -21,12 +21,12 @@ from bitymi_ns.train.views import View
 
 BETA_RAW = 2.0  # nearly Gaussian kernels at the start: beta = 4 sigmoid(2) = 3.52
 MAX_SCALE = 0.25
-"""Largest first scale, as a share of the scene extent or of the distance to the nearest camera, whichever is larger."""
-PIXELS_PER_FIRST_SURFEL = 1000  # fewest pixels rendered in a run per first surfel
-FEWEST_FIRST = 5000  # points that are always used, however short the run
-MIN_SCALE = 1e-6  # smallest first scale, as a share of the scene extent
-SAMPLE = 4096  # surfels that are tested first for whether a view sees them: nearly all views see one of them
-CHUNK = 1 << 20  # of the others that are tested together
+"""Largest initial scale, as a share of the larger of scene extent and distance to the nearest camera."""
+PIXELS_PER_FIRST_SURFEL = 1000  # minimum number of pixels rendered in a run per initial surfel
+FEWEST_FIRST = 5000  # points used in runs of any length
+MIN_SCALE = 1e-6  # smallest initial scale, as a share of the scene extent
+SAMPLE = 4096  # random surfels whose visibility is tested first: nearly all views see one of them
+CHUNK = 1 << 20  # surfels tested at a time after that
 
 
 @dataclass
@@ -37,15 +37,15 @@ class PointReport:
     not_finite: int = 0
     duplicates: int = 0
     over_cap: int = 0
-    random: int = 0  # Surfels placed at random because no point was usable.
-    background: int = 0  # Surfels placed where the photographs show no point (`background_points`).
+    random: int = 0  # Random surfels, because no point was usable.
+    background: int = 0  # Surfels added where the photographs show no point (`background_points`).
 
 
 def limit_first_surfels(config: TrainConfig, steps: int, pixels: int, views: int) -> TrainConfig:
-    """State the most surfels that a run starts with, where the options do not.
+    """Set `first_surfels` by the length of the run, unless the options set it.
 
     Args:
-        pixels: of all training views together, at full size.
+        pixels: total over all training views at full size.
     """
     if config.first_surfels is not None or not views:
         return config
@@ -53,12 +53,12 @@ def limit_first_surfels(config: TrainConfig, steps: int, pixels: int, views: int
 
 
 def scene_extent(camera_centers: Tensor, points: Tensor | None = None) -> float:
-    """1.1 times the largest distance of the training cameras from their mean, in world units.
+    """Compute 1.1 times the largest distance of the training cameras from their mean, in world units.
 
     Args:
         camera_centers: [C, 3].
-        points: [M, 3], used when the cameras do not span anything (one camera, or all at one place): then the extent
-            is the median distance of the finite points from the cameras. Without points: 1.
+        points: [M, 3]. If all cameras are at one position, the extent is the median distance of the finite points
+            from it, and 1 without points.
     """
     centers = camera_centers.detach().reshape(-1, 3).double().cpu()
     centers = centers[centers.isfinite().all(-1)]
@@ -85,26 +85,28 @@ def surfels_from_points(
     box: Tensor | None = None,
     background: BackgroundPoints | None = None,
 ) -> tuple[dict[str, Tensor], PointReport]:
-    """Surfel parameters from sparse points.
+    """Initialise surfel parameters from sparse points.
 
-    A point gives one surfel: scale = root mean square distance to its 3 nearest neighbours, the disc faces the nearest
-    camera with a random turn in its plane, the colour is the point's from every direction. Points that are not finite
-    and repeated positions are dropped and counted. With no usable point, `config.random_points` surfels are placed at
-    random in `box`. `config.densify.max_surfels` and `config.first_surfels` hold from the start: more points than that
-    are sampled at random. As many of the background points follow as `config.background_points` and
-    `config.densify.max_surfels` allow.
+    Each point becomes one surfel: scale = root mean square distance to its 3 nearest neighbours, normal towards the
+    nearest camera with a random in-plane rotation, the point's colour from every direction. Non-finite and duplicate
+    points are dropped and counted. Without a usable point, `config.random_points` surfels are sampled in `box`. If
+    there are more points than `config.densify.max_surfels` or `config.first_surfels`, a random subset is used.
+    Background points are appended as far as `config.background_points` and `config.densify.max_surfels` allow.
 
     Args:
         xyz: [M, 3] world positions; M may be 0.
-        rgb: [M, 3] colours in [0, 1]; values that are not finite become grey.
-        camera_centers: [C, 3] world positions of the training cameras; C may be 0: then the discs lie at random.
-        config: training options (opacity, seed, cap).
-        scene_config: decides the parameters of the view colour.
+        rgb: [M, 3] colours in [0, 1]; non-finite values become grey.
+        camera_centers: [C, 3] world positions of the training cameras; without cameras, orientations are random.
+        config: training options (opacity, seed, limits).
+        scene_config: kind of the view-dependent colour.
         box: [2, 3] lower and upper corner for random surfels; default: the cube of the scene extent about the cameras.
         background: points in parts of the photographs that no point of `xyz` projects to.
 
     Returns:
-        The parameters by name, float32, on the CPU (table in docs/overview.md), and what became of the points.
+        The parameters by name, float32, on the CPU (table in docs/overview.md), and the counts of points.
+
+    Raises:
+        ValueError: `xyz` and `rgb` differ in length.
     """
     generator = torch.Generator().manual_seed(config.seed)
     centers = camera_centers.detach().reshape(-1, 3).float().cpu()
@@ -149,11 +151,11 @@ def surfels_from_points(
 
 
 def neighbour_distance(xyz: Tensor, extent: float) -> Tensor:
-    """[M] root mean square distance of every point to its nearest neighbours (as many as there are, up to 3).
+    """Compute the root mean square distance [M] of each point to its 3 nearest neighbours, or fewer if there are fewer.
 
-    A point on its own gets a hundredth of the extent.
+    A single point gets a hundredth of the extent.
     """
-    from scipy.spatial import cKDTree  # slow to import and needed once per run
+    from scipy.spatial import cKDTree  # slow to import
 
     k = min(3, len(xyz) - 1)
     if k < 1:
@@ -170,7 +172,7 @@ def _usable(xyz: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor, PointReport]:
     xyz, rgb = xyz[finite], rgb[finite].nan_to_num(0.5, 0.5, 0.5).clamp(0.0, 1.0)
     if len(xyz) == 0:
         return xyz, rgb, report
-    _, first = np.unique(xyz.numpy() + 0.0, axis=0, return_index=True)  # + 0.0: -0 is the same place as 0
+    _, first = np.unique(xyz.numpy() + 0.0, axis=0, return_index=True)  # + 0.0 turns -0 into 0
     report.duplicates = len(xyz) - len(first)
     keep = torch.from_numpy(np.sort(first))
     return xyz[keep], rgb[keep], report
@@ -187,7 +189,7 @@ def _random_points(n: int, centers: Tensor, box: Tensor | None, generator: torch
 
 
 def _nearest_camera(xyz: Tensor, centers: Tensor) -> tuple[Tensor, Tensor]:
-    """[M, 3] vectors to the nearest camera centre and [M] their lengths; zeros without cameras."""
+    """Compute vectors [M, 3] to the nearest camera centre and their lengths [M]; zeros without cameras."""
     if len(centers) == 0:
         return torch.zeros_like(xyz), torch.zeros(len(xyz))
     nearest = torch.cat([torch.cdist(chunk, centers).argmin(-1) for chunk in xyz.split(65_536)])
@@ -196,7 +198,7 @@ def _nearest_camera(xyz: Tensor, centers: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _orientation(to_camera: Tensor, generator: torch.Generator) -> Tensor:
-    """[M, 4] discs facing along `to_camera` [M, 3]; at random where that vector vanishes."""
+    """Compute quaternions [M, 4] whose normals point along `to_camera` [M, 3], in a random direction if that is 0."""
     n = len(to_camera)
     angles = 2.0 * math.pi * torch.rand(n, generator=generator)
     fallback = torch.nn.functional.normalize(torch.randn(n, 3, generator=generator), dim=-1)
@@ -206,14 +208,11 @@ def _orientation(to_camera: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def facing(normals: Tensor, angles: Tensor) -> Tensor:
-    """Rotations that turn the z axis to a normal after turning the disc in its plane.
+    """Compute unit quaternions [N, 4] that rotate about z by an angle and then take the z axis to a normal.
 
     Args:
         normals: [N, 3] unit vectors.
-        angles: [N] in radians, rotation about z before the tilt.
-
-    Returns:
-        [N, 4] unit quaternions.
+        angles: [N] in radians.
     """
     x, y, z = normals.unbind(-1)
     zero = torch.zeros_like(x)
@@ -224,17 +223,17 @@ def facing(normals: Tensor, angles: Tensor) -> Tensor:
 
 
 def turned(quats: Tensor, angles: Tensor) -> Tensor:
-    """Rotations [N, 4] after turns [N] about their normals, from the first tangent to the second."""
+    """Rotate surfels in their planes: quaternions [N, 4] by angles [N] in radians, from first to second tangent."""
     w, x, y, z = quats.unbind(-1)
     cos, sin = torch.cos(angles / 2), torch.sin(angles / 2)
     return torch.stack([w * cos - z * sin, x * cos + y * sin, y * cos - x * sin, z * cos + w * sin], -1)
 
 
 def tangents(quats: Tensor) -> Tensor:
-    """The two tangent directions of surfels: the first two columns of their rotation matrices.
+    """Compute the tangents of surfels, the first two columns of their rotation matrices.
 
     Args:
-        quats: [N, 4], not normalised; a zero quaternion counts as no rotation.
+        quats: [N, 4], not normalised; zero means no rotation.
 
     Returns:
         [N, 3, 2] unit vectors; [..., 0] is the u axis, [..., 1] the v axis.
@@ -259,21 +258,21 @@ def build_scene(
     declared: Tensor | None = None,
     background: BackgroundPoints | None = None,
 ) -> tuple[Scene, PointReport]:
-    """Surfels at the points, or at random in the box, and an empty texture field around them.
+    """Build the initial scene: surfels at the points, or at random in the box, and an untrained texture field.
 
     Args:
         points: [M, 3] world positions; M may be 0.
         colours: [M, 3] in [0, 1].
         camera_centers: [C, 3] world positions of the training cameras.
-        bounded: there is nothing behind the scene (images with alpha): contraction "auto" is then off, as it is for
-            scenes with a small `declared` box.
-        image_pixels: of all training images together; decides the size of the hash table where none is given.
+        bounded: the scene has no background (images with alpha): contraction "auto" is then off, as with a small
+            `declared` box.
+        image_pixels: total over all training images; default for the size of the hash table.
         box: [2, 3] corners for random surfels; default: the cube of the scene extent about the cameras.
-        declared: [2, 3] corners of the box that the capture declares to hold its scene, if it does.
-        background: further points, in parts of the photographs that show none.
+        declared: [2, 3] corners of the scene box that the capture states, if any.
+        background: further points, in parts of the photographs without any.
 
     Returns:
-        The scene on the CPU, and what became of the points.
+        The scene on the CPU, and the counts of points.
 
     Raises:
         ValueError: an option is out of range.
@@ -281,12 +280,12 @@ def build_scene(
     check_ranges(scene_config)
     check_ranges(train_config)
     surfels, report = surfels_from_points(points, colours, camera_centers, train_config, scene_config, box, background)
-    means = surfels["means"][: len(surfels["means"]) - report.background]  # the others would make the field coarse
+    means = surfels["means"][: len(surfels["means"]) - report.background]  # background would make the field coarse
     near = NEAR * scene_extent(camera_centers, means)
     if scene_config.texture != "hash":  # texels are added once the geometry has settled
         return Scene(scene_config, surfels, None, near), report
-    if declared is not None:  # captures of open scenes may declare a large box: a grid over it would be coarser than
-        # one over contracted space, which is twice as wide as the cameras' ball
+    if declared is not None:  # over a large box (open scenes) a grid would be coarser than over contracted space,
+        # which is twice as wide as the cameras' ball
         bounded |= float((declared[1] - declared[0]).max()) <= 4 * scene_extent(camera_centers)
     contract = scene_config.contraction == "on" or (scene_config.contraction == "auto" and not bounded)
     mid, half = field_domain(means if declared is None else declared, camera_centers, contract)
@@ -306,13 +305,13 @@ def scene_for_views(
     train_config: TrainConfig,
     steps: int | None = None,
 ) -> Scene:
-    """Build the first scene of photographs that are in memory, see `build_scene`.
+    """Build the initial scene for photographs in memory, see `build_scene`.
 
     Args:
         views: training photographs at full size.
         points: [M, 3] world positions; M may be 0.
         colors: [M, 3] in [0, 1].
-        steps: length of the run, which limits the points that are used; None = all are.
+        steps: length of the run, which limits the number of points; None: no limit.
 
     Raises:
         ValueError: an option is out of range.
@@ -328,10 +327,10 @@ def scene_for_views(
 
 
 def field_domain(means: Tensor, camera_centers: Tensor, contract: bool) -> tuple[tuple[float, float, float], float]:
-    """Middle and half size of the field's domain, world units.
+    """Compute centre and half size of the field's domain, world units.
 
-    With contraction: the ball about the mean of the cameras that holds them all (`scene_extent`). Without: a cube
-    around `means` (the first surfels, or the corners of the capture's box), a tenth larger.
+    With contraction: the ball around all cameras (`scene_extent`). Without: a cube around `means` (the initial surfels,
+    or the corners of the capture's box), a tenth larger.
     """
     if contract and len(camera_centers):
         middle = camera_centers.detach().float().cpu().mean(0)
@@ -342,7 +341,7 @@ def field_domain(means: Tensor, camera_centers: Tensor, contract: bool) -> tuple
 
 
 def default_table_size(image_pixels: int) -> int:
-    """Entries per hash level, as a power of two: what the photographs can tell apart, and what a cache can hold.
+    """Choose log2 of the entries per hash level by the photographs, at most 17 so that the table fits into a cache.
 
     Four levels of 2^17 entries are 8 MB in float32.
     """
@@ -350,17 +349,16 @@ def default_table_size(image_pixels: int) -> int:
 
 
 def table_size_of(image_pixels: int) -> int:
-    """Entries per hash level, as a power of two, that the photographs can tell apart: one entry of 4 features for 32
+    """Compute log2 of the entries per hash level that the photographs can determine: one entry of 4 features for 32
     pixels of all photographs together."""
     return round(math.log2(max(1, image_pixels) / 32))
 
 
 @torch.no_grad()
 def views_without_surfels(scene: Scene, cameras: Sequence[Camera]) -> list[int]:
-    """Numbers of the views that no surfel can be seen in.
+    """List the indices of the views that no surfel is visible in.
 
-    A surfel counts as seen where the ball around it, as large as its disc, reaches beyond the near plane and into the
-    picture.
+    A surfel counts as visible if its bounding sphere extends beyond the near plane and into the image.
     """
     means = scene.surfels["means"].detach()
     radii = SUPPORT * scene.surfels["log_scales"].detach().exp().amax(-1)

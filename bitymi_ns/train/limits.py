@@ -1,4 +1,4 @@
-"""Messages for every limit that a run hits, and for what it does otherwise than it recorded."""
+"""Messages about the limits that a run hits, and about options that differ from the recorded ones."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from bitymi_ns.train.schedules import Schedule
 
 
 def short_run(schedule: Schedule, views: int, field: bool = True, at_once: int = 1) -> list[str]:
-    """The rules for short runs that are in force, and whether the run sees all of its photographs.
+    """Describe the short-run rules in force, and warn if the run ends before it has seen every photograph.
 
     Args:
-        at_once: views that a step looks at.
+        at_once: views rendered per step.
     """
     found = []
     if schedule.short_run_gain > 1.0:
@@ -39,11 +39,11 @@ def short_run(schedule: Schedule, views: int, field: bool = True, at_once: int =
 
 
 def start(points: PointReport, config: TrainConfig, image_pixels: int, scene: SceneConfig) -> list[str]:
-    """Bounds that the first scene meets.
+    """Describe the limits that the initial scene hits.
 
     Args:
-        points: what became of the sparse points.
-        image_pixels: of all training images together.
+        points: counts of the sparse points used and dropped.
+        image_pixels: total over all training images.
     """
     found = []
     if points.over_cap:
@@ -64,7 +64,7 @@ def start(points: PointReport, config: TrainConfig, image_pixels: int, scene: Sc
 
 
 def held_back(count: int, most: int, config: TrainConfig) -> str:
-    """Densification wanted `count` more surfels than the `most` there may be."""
+    """Report that densification wanted `count` surfels beyond the limit `most`."""
     densify = config.densify
     return (
         f"Densification stops at {most:,} surfels, one for {densify.pixels_per_surfel:g} pixels of all photographs or "
@@ -74,7 +74,7 @@ def held_back(count: int, most: int, config: TrainConfig) -> str:
 
 
 def recorded_rules(config: TrainConfig) -> list[str]:
-    """Name the rules of earlier versions that recorded options ask for."""
+    """Name the rules of earlier versions that the recorded options select."""
     if config.lr.means is None:
         return []
     return [
@@ -84,16 +84,16 @@ def recorded_rules(config: TrainConfig) -> list[str]:
 
 
 def recorded(config: TrainConfig) -> str:
-    """Write the training options as text for a checkpoint."""
+    """Serialise the training options as JSON for a checkpoint."""
     return json.dumps(asdict(config), sort_keys=True)
 
 
 def other_options(record: str | None, config: TrainConfig) -> list[str]:
-    """Name the options in which a resumed run differs from its record.
+    """List the options of a resumed run that differ from the recorded ones.
 
     Args:
-        record: of `recorded`; None = the checkpoint has none, as those of earlier versions.
-        config: the options of the resumed run.
+        record: result of `recorded`; None: a checkpoint of an earlier version, without a record.
+        config: options of the resumed run.
     """
     if record is None:
         return []

@@ -1,4 +1,4 @@
-"""The training objective: photometric loss, falloff and overdraw, and depth and normals where a capture has them."""
+"""Training objective: photometric, falloff, overdraw, depth and normal losses."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from bitymi_ns.scene.scene import RenderOutput
 
 DEPTH_EDGE = 0.1
-"""Relative difference of depth between neighbouring pixels that is an edge. Photographs blend both sides of it, depth
-maps do not, and those of sensors are least reliable there."""
-SAME_COLOR = 0.01  # standard deviation of colours along an axis from which a fit of colours changes their contrast
-FITTED = 0.01  # least share of a half's pixels that a fit of colours rests on
-SSIM_WINDOW = 11  # side of the SSIM window in pixels; images narrower than this have no valid window
+"""Relative depth difference between neighbouring pixels that counts as an edge. Photographs blend both sides of it,
+depth maps do not, and depth sensors are least reliable there."""
+SAME_COLOR = 0.01  # ridge of colour fits: keeps the contrast of colours with a smaller standard deviation
+FITTED = 0.01  # minimum share of a half's pixels for a colour fit
+SSIM_WINDOW = 11  # side of the SSIM window in pixels; narrower images have no valid window
 
 
 def objective(
@@ -33,17 +33,17 @@ def objective(
     depth: Tensor | None = None,
     normal: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """The terms of the objective, weighted: their sum is what training minimises.
+    """Compute the weighted terms of the objective, which is their sum.
 
     Args:
-        output: the rendered view, [H, W]; with `soft_overdraw` where the overdraw loss is on.
-        target: [H, W, 3] the photograph at the same size, over the same background.
-        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
-        depth, normal: of the view, see `View`; they count where the view was rendered with maps.
+        output: rendered view of H x W pixels; with `soft_overdraw` if the overdraw loss is on.
+        target: [H, W, 3] photograph at the same size, over the same background.
+        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None: everywhere.
+        depth, normal: of the view, see `View`; used if the view was rendered with maps.
 
     Returns:
-        `photometric`; `falloff` unless its weight is 0; `overdraw` where the view was rendered with `soft_overdraw`;
-        `depth` and `normal` where they count and their weights are not 0.
+        `photometric`; `falloff` unless its weight is 0; `overdraw` if the view was rendered with `soft_overdraw`;
+        `depth` and `normal` if used and their weights are not 0.
     """
     image = output.image
     if (
@@ -71,25 +71,25 @@ def objective(
 
 
 def numbers(image: Tensor, mask: Tensor | None, counted: int | None = None) -> int:
-    """Count of the values of a picture [H, W, C] that its mean loss is taken over; `counted` pixels of the mask count,
-    None = not known, to be read back."""
+    """Count the values that the mean loss of an image [H, W, C] averages; `counted` is the number of True pixels of the
+    mask, None: computed, which synchronises a GPU."""
     if mask is None:
         return 3 * image.shape[0] * image.shape[1]
     return 3 * (int(mask.sum()) if counted is None else counted)
 
 
 def photometric(rgb: Tensor, target: Tensor, ssim_weight: float, mask: Tensor | None = None) -> Tensor:
-    """(1 - w) L1 + w (1 - SSIM).
+    """Compute (1 - w) L1 + w (1 - SSIM).
 
     Args:
         rgb: [H, W, 3] rendered image.
         target: [H, W, 3] photograph in [0, 1].
-        ssim_weight: w. An image that holds no 11 x 11 window is judged by L1 alone.
-        mask: [H, W] or [H, W, 1] bool, True where the pixel counts. Other pixels are left out of L1 and made equal in
-            both images for SSIM, so that no gradient comes from them.
+        ssim_weight: w; 0 for images too small for an 11 x 11 window.
+        mask: [H, W] or [H, W, 1] bool, True where the pixel counts. Other pixels are excluded from L1 and made equal in
+            both images for SSIM, so that they have no gradient.
 
     Returns:
-        Scalar; 0 when no pixel counts.
+        Scalar; 0 if no pixel counts.
     """
     if mask is not None:
         mask = mask.reshape(*rgb.shape[:2], 1)
@@ -105,14 +105,14 @@ def photometric(rgb: Tensor, target: Tensor, ssim_weight: float, mask: Tensor | 
 
 
 def error_weight(rgb: Tensor, target: Tensor, gamma: float, mask: Tensor | None = None) -> Tensor:
-    """omega = exp(-gamma e) of the falloff loss, with the error e = L1 summed over rgb: 1 where the picture is right
-    already, near 0 where it is wrong.
+    """Compute omega = exp(-gamma e) of the falloff loss, with e = L1 summed over rgb: near 1 where the image is right,
+    near 0 where it is wrong.
 
-    Without gradient: else the loss could be lowered by making the error larger.
+    Without gradient: else a larger error would lower the loss.
 
     Args:
         rgb, target: [H, W, 3].
-        gamma: how fast omega fades with the error.
+        gamma: decay with the error.
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts; omega is 0 elsewhere.
 
     Returns:
@@ -124,7 +124,7 @@ def error_weight(rgb: Tensor, target: Tensor, gamma: float, mask: Tensor | None 
 
 
 def mean_where_right(omega: Tensor, values: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Mean over the pixels of omega * values: the falloff loss of a beta map, the overdraw loss of a soft count.
+    """Average omega * values over the pixels: the falloff loss of a beta map, or the overdraw loss of a soft count.
 
     Args:
         omega: [H, W, 1] from `error_weight`, with the same mask.
@@ -133,22 +133,22 @@ def mean_where_right(omega: Tensor, values: Tensor, mask: Tensor | None = None) 
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts.
 
     Returns:
-        Scalar; 0 when no pixel counts.
+        Scalar; 0 if no pixel counts.
     """
     return (omega * values).sum() / (omega.numel() if mask is None else mask.sum().clamp(min=1))
 
 
 def depth_error(rendered: Tensor, alpha: Tensor, depth: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Mean relative depth error |sum_i w_i (z_i - d)| / d over the pixels of known depth d that are not at its edges.
+    """Compute the mean relative depth error |sum_i w_i (z_i - d)| / d over pixels of known depth d, except at edges.
 
     Args:
         rendered: [H, W, 1] sum of w z, camera z.
         alpha: [H, W, 1] sum of w.
-        depth: [H, W] or [H, W, 1] d; any float dtype. Unknown where it is not finite or not above 0.
-        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
+        depth: [H, W] or [H, W, 1] d; any float dtype. Unknown where not finite or not above 0.
+        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None: everywhere.
 
     Returns:
-        Scalar; 0 when no depth is known.
+        Scalar; 0 if no depth is known.
     """
     depth = depth.reshape(rendered.shape).to(rendered)
     known = depth.isfinite() & (depth > 0.0)
@@ -158,7 +158,7 @@ def depth_error(rendered: Tensor, alpha: Tensor, depth: Tensor, mask: Tensor | N
 
 
 def _edges(depth: Tensor, known: Tensor) -> Tensor:
-    """[H, W, 1] bool, True where the 3 x 3 pixels around show surfaces of different depth."""
+    """Find depth edges, [H, W, 1] bool: True where depths differ within the surrounding 3 x 3 pixels."""
 
     def largest(values: Tensor) -> Tensor:
         return torch.nn.functional.max_pool2d(torch.where(known, values, 0.0)[None, ..., 0], 3, 1, 1)[0, ..., None]
@@ -167,16 +167,16 @@ def _edges(depth: Tensor, known: Tensor) -> Tensor:
 
 
 def normal_error(rendered: Tensor, alpha: Tensor, normal: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Mean of sum_i w_i (1 - n_i . n) over the pixels of known normal n.
+    """Compute the mean of sum_i w_i (1 - n_i . n) over the pixels of known normal n.
 
     Args:
         rendered: [H, W, 3] sum of w n, camera frame.
         alpha: [H, W, 1] sum of w.
-        normal: [H, W, 3] n in the same frame; any float dtype. Unknown where it is not finite or 0.
-        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
+        normal: [H, W, 3] n in the same frame; any float dtype. Unknown where not finite or 0.
+        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None: everywhere.
 
     Returns:
-        Scalar; 0 when no normal is known.
+        Scalar; 0 if no normal is known.
     """
     normal = normal.to(rendered)
     length = normal.norm(dim=-1, keepdim=True)
@@ -186,18 +186,18 @@ def normal_error(rendered: Tensor, alpha: Tensor, normal: Tensor, mask: Tensor |
 
 
 def _mean_of(values: Tensor, known: Tensor, mask: Tensor | None) -> Tensor:
-    """Mean over the known pixels that count; 0 when there is none."""
+    """Average over the known pixels that count; 0 if there is none."""
     if mask is not None:
         known = known & mask.reshape(known.shape)
     return torch.where(known, values, 0.0).sum() / known.sum().clamp(min=1)
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Peak signal to noise ratio in dB, at most 100 (equal images); NaN when no pixel counts.
+    """Compute the PSNR in dB, at most 100 (equal images); NaN if no pixel counts.
 
     Args:
         image, target: [H, W, 3] in [0, 1].
-        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
+        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None: everywhere.
     """
     error = (image - target).square()
     if mask is not None:
@@ -208,23 +208,22 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 
 
 def color_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """[H, W, 3] the image, each half's colours mapped by the affine fit of the other half, clamped to [0, 1].
+    """Map the colours of each half of an image by an affine fit on the other half, clamped to [0, 1]: [H, W, 3].
 
-    For held-out views whose photographs differ in exposure and white balance: matrix [3, 3] and offset [3] are those of
-    least squares over the pixels that count of the half that is not judged by them. A half is left as it is where the
-    other is not finite, or fewer than `FITTED` of its pixels count.
+    Compensates exposure and white balance of held-out photographs: matrix [3, 3] and offset [3] are the least squares
+    fit to `target` over the unmasked pixels of the other half. A half is returned unchanged if the other half is not
+    finite, or if fewer than `FITTED` of its pixels count.
 
     Args:
         image, target: [H, W, 3] in [0, 1].
-        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
+        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None: everywhere.
     """
     colors = torch.cat([image, torch.ones_like(image[..., :1])], -1).double()  # [H, W, 4]
     both = torch.cat([colors, target - image], -1)  # [H, W, 7] double
     if mask is not None:
         both = torch.where(mask.reshape(*image.shape[:2], 1).bool(), both, 0.0)
     left, right = slice(image.shape[1] // 2), slice(image.shape[1] // 2, None)
-    # normal equations; no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic
-    # algorithms
+    # normal equations; no matrix product: cuBLAS fails if torch is set to deterministic algorithms
     sums = [[(both[:, by, i : i + 1] * both[:, by]).sum((0, 1)) for i in range(4)] for by in (right, left)]
     sums = torch.stack([torch.stack(rows) for rows in sums]).cpu()  # [2, 4, 7]
     fitted = []
@@ -240,11 +239,11 @@ def color_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) -> T
 
 
 def fitted_psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """`psnr` of the `color_fitted` image; what is left when exposure and white balance do not count."""
+    """Compute the PSNR of the `color_fitted` image, which does not depend on exposure and white balance."""
     return psnr(color_fitted(image, target, mask), target, mask)
 
 
 def mean_psnr(values: Sequence[float]) -> float:
-    """Mean dB of the views of which any pixel counts; NaN when there is none."""
+    """Average PSNR values, dB, without NaN (views without unmasked pixels); NaN if empty."""
     counted = [value for value in values if not math.isnan(value)]
     return sum(counted) / len(counted) if counted else math.nan

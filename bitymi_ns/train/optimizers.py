@@ -1,4 +1,4 @@
-"""The optimisers of a scene's parameters."""
+"""Optimisers of a scene's parameters."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
 
 
-EPS = 1e-15  # added to the root of the second moment
-BETAS = (0.9, 0.999)  # decay of the running averages, of the surfels' parameters
-FIELD_BETAS = (0.9, 0.99)  # of the texture field's, whose gradients are sparse, and large early on
+EPS = 1e-15  # Adam's epsilon
+BETAS = (0.9, 0.999)  # Adam's betas of surfel parameters
+FIELD_BETAS = (0.9, 0.99)  # of the texture field, whose gradients are sparse, and large early on
 
 
 def adam(parameters: list[torch.nn.Parameter], betas: tuple[float, float] = BETAS) -> Adam:
-    """Fused Adam with the method's epsilon."""
+    """Create a fused Adam optimiser with the method's epsilon."""
     return Adam(parameters, lr=0.0, betas=betas, eps=EPS, fused=True)
 
 
 def surfel_optimizers(scene: Scene) -> dict[str, Adam]:
-    """One optimiser per surfel parameter, under its name."""
+    """Create one optimiser per surfel parameter, by its name."""
     return {name: adam([p]) for name, p in scene.surfels.items()}
 
 
 def make_optimizers(scene: Scene) -> dict[str, Adam]:
-    """Optimisers of the surfels, and `field_table` and `field_mlp`."""
+    """Create the optimisers of the surfel parameters, and `field_table` and `field_mlp` for a hash field."""
     optimizers = surfel_optimizers(scene)
     if isinstance(scene.field, HashField):
         table, *mlp = scene.field.weights
@@ -42,18 +42,18 @@ def make_optimizers(scene: Scene) -> dict[str, Adam]:
 
 
 PLAIN = {"fused": True, "weight_decay": 0.0, "amsgrad": False, "maximize": False, "differentiable": False}
-"""Options of Adam groups that `step` fuses."""
+"""Options of the Adam groups that `step` fuses."""
 
 
 def step(optimizers: Mapping[str, Optimizer], factors: Mapping[str, Tensor]) -> None:
-    """Do a step of every optimiser, as each would do it itself, to the last bit; then scale the steps of single rows.
+    """Step all optimisers, bit-identical to calling each `step`, and scale the updates of single rows.
 
-    Each Adam.step costs 100 to 200 us of Python, ten times the card's work. Those of fused Adam are therefore done
-    here: one addition for all their counters of steps, and one call per learning rate.
+    Each Adam.step costs 100-200 us of Python, ten times the GPU work. Fused Adam optimisers are therefore stepped here
+    together: one addition for all step counters, and one call per learning rate.
 
     Args:
         optimizers: by parameter group.
-        factors: [N] by which the step of each row of a group's parameters [N, ...] is multiplied, by group.
+        factors: row factors [N] of the updates of parameters [N, ...], by parameter group.
     """
     scaled = [
         (parameter, parameter.detach().clone(), factors[name].view(-1, *[1] * (parameter.ndim - 1)))
@@ -104,8 +104,8 @@ def _step_together(optimizers: Iterable[Optimizer]) -> None:
 
 
 def _ready(optimizer: Optimizer, group: dict[str, Any]) -> list[list[torch.Tensor]] | None:
-    """Parameter, gradient, both moments and the number of steps of each parameter with a gradient; None where the
-    optimiser has to do its step itself: it is another, or has not begun."""
+    """List parameter, gradient, both moments and step counter of each parameter with a gradient; None if the optimiser
+    must step itself, because it is no plain fused Adam or has no state yet."""
     if type(optimizer) is not Adam or any(group.get(name) != value for name, value in PLAIN.items()):
         return None
     if not isinstance(group["lr"], float):
@@ -129,14 +129,14 @@ def set_rate(optimizer: Optimizer, rate: float) -> None:
 
 
 def forget_gradients(optimizers: Iterable[Optimizer]) -> None:
-    """Set the gradients of all parameters to None, as `zero_grad` of each optimiser would."""
+    """Set the gradients of all parameters to None."""
     for optimizer in optimizers:
         for group in optimizer.param_groups:
             for parameter in group["params"]:
                 parameter.grad = None
 
 
-ResizeHook = Callable[[str, Parameter], None]  # called with the name and the new Parameter after each replacement
+ResizeHook = Callable[[str, Parameter], None]  # called with the name and the new Parameter when one is replaced
 
 
 @torch.no_grad()
@@ -149,16 +149,15 @@ def replace_rows(
 ) -> None:
     """Keep the rows `keep` of every surfel parameter, in that order, and append the rows `new`.
 
-    Every entry of `surfels` becomes a new Parameter, which replaces the old one in its optimiser. Rows that stay keep
-    their optimiser state. New rows start with zeros, as torch's Adam does for a new parameter.
+    Every entry of `surfels` becomes a new Parameter, also in its optimiser. Kept rows keep their optimiser state; that
+    of new rows is zero.
 
     Args:
         surfels: parameters by name, each [N, ...].
-        optimizers: by the same names; each holds one group with that one parameter. A parameter without optimiser is
-            resized all the same.
-        keep: [n] int64 row numbers.
+        optimizers: by the same names, each with one group of that one parameter; some may be missing.
+        keep: [n] int64 row indices.
         new: rows to append, by name, each [m, ...]; all names of `surfels`, or None for no new rows.
-        on_resize: told of every new Parameter.
+        on_resize: called for every new Parameter.
     """
     for name in list(surfels.keys()):
         old = surfels[name]
@@ -186,12 +185,12 @@ def replace_rows(
 def cap_opacity(
     surfels: Mapping[str, Parameter], optimizers: Mapping[str, Optimizer], highest: float, forget_all: bool = False
 ) -> int:
-    """Lower every opacity above `highest` to it, in place.
+    """Clamp opacities to at most `highest`, in place, and reset their optimiser state, or that of all rows.
 
-    The optimiser forgets the momentum of the rows it changed (which would lift them again at once), or of all rows.
+    The old momentum would raise the opacities again at once.
 
     Returns:
-        How many opacities were lowered.
+        The number of opacities lowered.
     """
     logits = surfels["opacity_logits"]
     limit = torch.logit(torch.tensor(highest, dtype=torch.float64)).item()

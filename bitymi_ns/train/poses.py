@@ -1,19 +1,18 @@
-"""Poses of the training photographs, refined beside the scene, and of other cameras that are carried along.
+"""Refinement of the training poses together with the scene.
 
-A photograph's pose moves by a Gauss-Newton step whenever it is shown. Its gradient is that of the loss along rigid
-motions (`ops.project`). Its curvature comes from the surfels: an L1 loss over a pixel's error rises with the absolute
-gradient a_i of each projected centre, and levels off within about a pixel. So with J_i [2, 6], how far the centre moves
-in pixels,
+A photograph's pose takes a Gauss-Newton step whenever it is rendered. The gradient is that of the loss with respect to
+rigid motions (`ops.project`). The curvature comes from the surfels: the L1 loss rises with the absolute gradient a_i of
+each projected centre and levels off within about a pixel. With the Jacobian J_i [2, 6] of the centre in pixels,
 
     step = -pixels (sum J_i^T a_i J_i)^-1 gradient
 
-moves the picture by `pixels` where all fragments agree on the direction, and less the less they agree.
+moves the image by `pixels` if all fragments agree on the direction, and by less if they do not.
 
-What moves all cameras together (a rotation, a shift, a scale of the world) changes no picture once the scene follows:
-it is taken out of every step, so that the scene stays where the capture has it.
+A common similarity of all cameras (rotation, translation, scale of the world) changes no image once the scene follows.
+It is projected out of every step, so that the scene stays in the capture's frame.
 
-Errors of poses from structure from motion are smooth: neighbours share them. A camera that no photograph belongs to
-is therefore carried along by the corrections of the photographs nearest to it.
+Pose errors from structure from motion are smooth: neighbouring photographs share them. Cameras without a training
+photograph therefore get the corrections of the nearest photographs.
 """
 
 from __future__ import annotations
@@ -36,10 +35,10 @@ if TYPE_CHECKING:
     from bitymi_ns.train.schedules import Schedule
     from bitymi_ns.train.views import View
 
-DAMPING = 0.01  # share of the curvature's diagonal that is added to it
-NEIGHBOURS = 4  # photographs whose corrections carry a camera along
-TRIES = 10  # most renders to align a view
-FIRST, SHORTEST = 0.7, 0.02  # pixels of the first step of an alignment, and of the step that ends it
+DAMPING = 0.01  # added to the curvature's diagonal, as a share of it
+NEIGHBOURS = 4  # photographs whose corrections are averaged for another camera
+TRIES = 10  # maximum number of renders to align a view
+FIRST, SHORTEST = 0.7, 0.02  # first step of an alignment and the step length that ends it, pixels
 
 
 def cross_matrix(vector: Tensor) -> Tensor:
@@ -50,11 +49,11 @@ def cross_matrix(vector: Tensor) -> Tensor:
 
 
 def moved(viewmat: Tensor, motion: Tensor) -> Tensor:
-    """Move a camera.
+    """Apply a rigid motion to a camera pose.
 
     Args:
         viewmat: [4, 4] float64, world to camera.
-        motion: [6] float64: rotation vector about its centre and shift of its centre, both in world axes.
+        motion: [6] float64: rotation vector about the camera centre and translation of it, both in world axes.
 
     Returns:
         [4, 4] float64, differentiable in the motion.
@@ -66,15 +65,15 @@ def moved(viewmat: Tensor, motion: Tensor) -> Tensor:
 
 
 def pose_step(gradient: Tensor, projection: Projection, pixels: float) -> Tensor:
-    """Find the step of a camera after the backward pass of a loss.
+    """Compute the Gauss-Newton step of a camera after the backward pass of a loss.
 
     Args:
         gradient: [6] float64 of the loss with respect to a motion as in `moved`.
         projection: of the view.
-        pixels: how far the picture moves where all fragments agree.
+        pixels: image motion if all fragments agree on the direction.
 
     Returns:
-        [6] float64 motion on the CPU; 0 where nothing was seen.
+        [6] float64 motion on the CPU; 0 if no surfel was visible.
     """
     weight = projection.mean2d_absgrad
     if weight is None or not bool(gradient.isfinite().all()):
@@ -85,12 +84,12 @@ def pose_step(gradient: Tensor, projection: Projection, pixels: float) -> Tensor
     x, y, z = camera.local(projection.frames.detach()[rows, :3]).detach().unbind(-1)
     x, y, zero = x / z, y / z, torch.zeros_like(z)
     fx, fy = camera.K[0, 0], camera.K[1, 1]
-    # a turn w and a shift s in the camera's axes move a point p by p x w - s
+    # a rotation w and a translation s in camera axes move a point p by p x w - s
     across = fx * torch.stack([x * y, -(1.0 + x * x), y, -1.0 / z, zero, x / z], -1)
     down = fy * torch.stack([1.0 + y * y, -x * y, -x, zero, -1.0 / z, y / z], -1)
     curvature = torch.zeros(6, 6, dtype=torch.float64, device=z.device)
     for rows_of, a in zip((across.double(), down.double()), weight[rows].double().unbind(1), strict=True):
-        # no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic algorithms
+        # no matrix product: cuBLAS fails if torch is set to deterministic algorithms
         curvature += (a[:, None, None] * rows_of[:, :, None] * rows_of[:, None, :]).sum(0)
     curvature = curvature.cpu()
     scale = curvature.diagonal().sqrt()
@@ -99,16 +98,16 @@ def pose_step(gradient: Tensor, projection: Projection, pixels: float) -> Tensor
     curvature = curvature / scale[:, None] / scale + DAMPING * torch.eye(6, dtype=torch.float64)
     local = torch.cat([rotation @ gradient[:3], rotation @ gradient[3:]])
     step = -torch.linalg.solve(curvature, local / scale)
-    square = float(step @ (curvature @ step) / weight[rows].double().sum())  # mean of the picture's motion, pixels
+    square = float(step @ (curvature @ step) / weight[rows].double().sum())  # mean squared image motion, pixels^2
     step = step / scale * (pixels / max(1.0, math.sqrt(square)))
     return torch.cat([rotation.T @ step[:3], rotation.T @ step[3:]])
 
 
 class Poses:
-    """Corrections of the poses of a run's photographs.
+    """Pose corrections of the training photographs.
 
     Attributes:
-        motions: [V, 6] float64 on the CPU: how the camera of each photograph is moved, see `moved`; None = none is.
+        motions: [V, 6] float64 on the CPU, motion of each camera, see `moved`; None: poses are not refined.
     """
 
     def __init__(self, schedule: Schedule, cameras: Sequence[Camera]) -> None:
@@ -125,7 +124,7 @@ class Poses:
 
     @cached_property
     def _given(self) -> Tensor:
-        """[V, 4, 4] float64 on the CPU: the poses of the capture."""
+        """Poses of the capture, [V, 4, 4] float64 on the CPU, world to camera."""
         return torch.stack([camera.viewmat.double().cpu() for camera in self._cameras])
 
     @cached_property
@@ -138,21 +137,21 @@ class Poses:
 
     @property
     def refined(self) -> bool:
-        """True where the poses of the photographs have moved, or will."""
+        """True if the poses are refined in this run or were before it was resumed."""
         return self.motions is not None
 
     def begin(self) -> None:
-        """Forget the cameras that a step was asked for and did not use."""
+        """Discard cameras that `learning` returned in an unfinished step."""
         self._learning = []
 
     def of(self, index: int, camera: Camera) -> Camera:
-        """The camera of a training view, at any size, where it is by now."""
+        """Return the camera of a training view, at any image size, with its corrected pose."""
         if self.motions is None:
             return camera
         return camera.posed(moved(self._given[index], self.motions[index]))
 
     def learning(self, index: int, camera: Camera, step: int) -> Camera:
-        """Do the same for a training step: where the poses learn, the pose gets a gradient."""
+        """Return the camera of a training view for a step; its pose gets a gradient in steps that refine poses."""
         if self.motions is None or self.schedule.pose_pixels(step) == 0.0:
             return self.of(index, camera)
         motion = torch.zeros(6, dtype=torch.float64, requires_grad=True)
@@ -161,12 +160,11 @@ class Poses:
 
     @torch.no_grad()
     def step(self, projections: Sequence[Projection], pixels: float, processes: Processes) -> None:
-        """Move the cameras of a step's views, after the backward passes.
+        """Update the poses of a step's views, after the backward passes.
 
         Args:
-            projections: of the views, in the order in which `learning` was asked for their cameras.
+            projections: of the views, in the order of the calls of `learning`.
             pixels: see `pose_step`.
-            processes: of the run.
         """
         learning, self._learning = self._learning, []
         if self.motions is None or pixels == 0.0:
@@ -179,11 +177,11 @@ class Poses:
         unit = steps.new_tensor([1.0] * 3 + [1.0 / self.schedule.extent] * 3)
         flat = (steps * unit).flatten()
         free = flat - self._gauge @ (self._gauge.T @ flat)
-        # turns are small: their vectors add up
+        # small rotations: their vectors add up
         self.motions = self.motions + free.view_as(steps) / unit
 
     def carried(self, camera: Camera) -> Camera:
-        """Carry a camera that belongs to no training photograph along, see `carried`."""
+        """Correct a camera that is not a training photograph's, see `carried`."""
         return camera if self.motions is None else carried(camera, self._given, self.motions)
 
     def state_dict(self) -> dict[str, Any]:
@@ -191,10 +189,10 @@ class Poses:
         return {"motions": self.motions}
 
     def load_state_dict(self, state: Mapping[str, Any] | None) -> None:
-        """Continue where `state_dict` was taken. Poses that were refined stay so where they are refined no further.
+        """Restore what `state_dict` returned, also if this run refines poses no further.
 
         Args:
-            state: None = of a run from before poses were refined; that of other photographs is left.
+            state: None: a checkpoint from before poses were refined. Ignored for another number of photographs.
         """
         motions = None if state is None else state["motions"]
         if motions is not None and len(motions) == len(self._cameras):
@@ -202,12 +200,12 @@ class Poses:
 
 
 def carried(camera: Camera, given: Tensor, motions: Tensor) -> Camera:
-    """Carry a camera along with the photographs nearest to it, by distance and direction.
+    """Correct a camera by the weighted mean motion of the nearest photographs, by distance and direction.
 
     Args:
         camera: in the frame of the capture.
         given: [V, 4, 4] float64 poses of the photographs in the capture, world to camera.
-        motions: [V, 6] float64 how they were moved.
+        motions: [V, 6] float64 corrections of these poses, see `moved`.
     """
     viewmat = camera.viewmat.double().cpu()
     centers = -(given[:, :3, :3] * given[:, :3, 3:]).sum(1)
@@ -220,11 +218,11 @@ def carried(camera: Camera, given: Tensor, motions: Tensor) -> Camera:
 
 
 def gauge(centers: Tensor, extent: float) -> Tensor:
-    """Find an orthonormal basis [V * 6, D] of the motions of all cameras together: rotations, shifts, scale.
+    """Compute an orthonormal basis [V * 6, D] of the similarities of all cameras: rotations, translations, scale.
 
     Args:
         centers: [V, 3] float64 world positions of the cameras.
-        extent: length that a shift is measured in.
+        extent: unit of length of translations.
     """
     arms = (centers - centers.mean(0)) / extent
     rows = torch.zeros(7, len(centers), 6, dtype=torch.float64)
@@ -241,7 +239,7 @@ def gauge(centers: Tensor, extent: float) -> Tensor:
 
 @torch.no_grad()
 def view_psnr(scene: Scene, view: View, background: Tensor | None) -> float:
-    """Compare a scene, over a background, with a photograph on its device: PSNR in dB."""
+    """Compute the PSNR, in dB, of a scene over a background against a photograph on the scene's device."""
     output = scene.render(view.camera, background, "frozen")
     rgb = view.shown(output.rgb, output.alpha, background).clamp(0.0, 1.0)
     return psnr(rgb, view.target(background, rgb.device), view.mask)
@@ -249,11 +247,11 @@ def view_psnr(scene: Scene, view: View, background: Tensor | None) -> float:
 
 @torch.enable_grad()
 def aligned(scene: Scene, view: View, background: Tensor | None, ssim_weight: float) -> Camera:
-    """Find the pose from which a scene, as it is, resembles a photograph most, near the one that is given.
+    """Align a camera to a fixed scene: minimise the photometric loss against its photograph from the given pose.
 
     Args:
         view: on the scene's device, at full size.
-        background: [3] colour behind the scene; None = black.
+        background: [3] colour behind the scene; None: black.
         ssim_weight: of the photometric loss.
     """
     target = view.target(background, scene.surfels["means"].device)

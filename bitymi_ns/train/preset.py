@@ -1,6 +1,6 @@
-"""Presets: the YAML files of method_configs/ as checked dataclasses.
+"""Presets: the YAML files of method_configs/ as validated dataclasses.
 
-A default is declared once, in the dataclass of the option; a file states what differs from it.
+Defaults are declared in the dataclasses; a file states only its differences.
 """
 
 import json
@@ -19,11 +19,11 @@ from bitymi_ns.train.config import TrainConfig
 
 
 class PresetError(ValueError):
-    """A preset file that cannot be used; the message names the file and the key."""
+    """Invalid preset file; the message names the file and the key."""
 
 
 class Loader(yaml.SafeLoader):
-    """Reads 1e-3 as a number, which YAML 1.1 takes for text without a point."""
+    """YAML loader that reads 1e-3 as a number; YAML 1.1 takes it for text, since it has no point."""
 
 
 Loader.add_implicit_resolver(
@@ -33,7 +33,7 @@ Loader.add_implicit_resolver(
 
 @dataclass
 class Preset:
-    """One method: the defaults that the dataclasses declare, changed by what its YAML file says."""
+    """A method: the dataclasses' defaults, overridden by its YAML file."""
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
@@ -53,7 +53,7 @@ def load_preset(name: str, folder: Path | None = None) -> Preset:
     path = folder / f"{name}.yaml"
     values = _read_with_base(path, folder, ())
     try:
-        # as JSON: lists become tuples, while true is no number and 3 no text
+        # strict validation as JSON accepts lists for tuples, but neither true for a number nor 3 for a string
         return TypeAdapter(Preset).validate_json(json.dumps({**values, "name": name}, default=str), strict=True)
     except ValidationError as error:
         first = error.errors()[0]
@@ -63,7 +63,7 @@ def load_preset(name: str, folder: Path | None = None) -> Preset:
 
 
 def _read_with_base(path: Path, folder: Path, above: tuple[Path, ...]) -> dict[str, Any]:
-    """The mapping of a preset file, laid over that of its `base`."""
+    """Read a preset file and merge it into its `base`."""
     if path in above:
         raise PresetError(f"{path.name}: base: presets refer to each other in a circle")
     if not path.is_file():

@@ -1,8 +1,8 @@
-"""Communication between the processes of a run, each of which renders views of its own.
+"""Communication between the processes of a run, each of which renders its own views.
 
-Every process holds the whole scene and makes every decision itself. What decisions rest on is made alike here: sums
-over all processes, or what the first one found. They speak through torch.distributed's default group, which needs gloo
-for tensors on the CPU, and nccl for those on cards.
+Every process holds the whole scene and makes all decisions itself, from inputs that are made equal here: sums over all
+processes, or values broadcast from the first. Uses torch.distributed's default group with gloo for CPU tensors and nccl
+for CUDA tensors.
 """
 
 from __future__ import annotations
@@ -28,42 +28,42 @@ class ProcessesApart(RuntimeError):
 
 @dataclass(frozen=True)
 class Processes:
-    """The processes of a run, seen from one of them. For a single process every method is a no-op."""
+    """Process group of a run. With a single process every method is a no-op."""
 
-    rank: int = 0  # number of this process; 0 is the first, which alone writes and prints
-    count: int = 1  # of processes
-    each: int = 1  # views that a process renders in a step, one after the other
+    rank: int = 0  # of this process; only rank 0 writes and prints
+    count: int = 1  # number of processes
+    each: int = 1  # views that a process renders per step, one after the other
 
     @classmethod
     def joined(cls, each: int = 1) -> Processes:
-        """Processes of torch.distributed's default group; a single one where there is none."""
+        """Wrap torch.distributed's default group, or a single process if there is none."""
         if not (dist.is_available() and dist.is_initialized()):
             return cls(each=each)
         return cls(dist.get_rank(), dist.get_world_size(), each)
 
     @property
     def first(self) -> bool:
-        """True for the process that writes and prints."""
+        """True for rank 0, which writes and prints."""
         return self.rank == 0
 
     @property
     def views(self) -> int:
-        """Views of a step over all processes."""
+        """Number of views per step over all processes."""
         return self.count * self.each
 
     def numbers(self, step: int) -> range:
-        """Positions in the training order of the views that this process renders in a step."""
+        """Compute the positions in the training order of this process's views in a step."""
         start = step * self.views + self.rank * self.each
         return range(start, start + self.each)
 
-    # what decisions rest on
+    # equal inputs of decisions
 
     def any(self, condition: bool) -> bool:
-        """True where the condition holds for any process."""
+        """Return True if the condition holds in any process."""
         return bool(self._largest([int(condition)])[0])
 
     def problem(self, own: str | None) -> str | None:
-        """The problem of the first process that has one; None where none has."""
+        """Return the first problem reported by any process, by rank; None if there is none."""
         if self.count == 1 or not self.any(own is not None):
             return own
         found: list[str | None] = [None] * self.count
@@ -72,13 +72,13 @@ class Processes:
         return next(text for text in found if text is not None)
 
     def mean(self, value: float) -> float:
-        """Mean over the processes of a number that all have, to within rounding."""
+        """Average a number that is equal in all processes up to rounding."""
         total = torch.tensor(value, dtype=torch.float64)
         self.sum(total)
         return float(total) / self.count
 
     def from_first(self, state: Any, device: torch.device | str) -> Any:
-        """Broadcast a state (tensors, numbers, text) of the first process to a device; the others may pass None."""
+        """Broadcast a state (tensors, numbers, strings) of rank 0 to a device; other ranks may pass None."""
         if self.count == 1:
             return state
         packed = io.BytesIO()
@@ -90,7 +90,7 @@ class Processes:
         return state if self.first else torch.load(io.BytesIO(box[0]), map_location=device, weights_only=True)
 
     def like_first(self, tensors: Iterable[Tensor]) -> None:
-        """Broadcast the values of tensors from the first process."""
+        """Broadcast tensors from rank 0, in place."""
         if self.count == 1:
             return
         with _answering(), torch.no_grad():
@@ -100,25 +100,25 @@ class Processes:
     # sums
 
     def sum(self, *tensors: Tensor) -> None:
-        """Replace tensors by their sums over the processes, the same bits in all, in one buffer of each dtype."""
+        """Replace tensors by their sums over the processes, bit-identical in all; one buffer per dtype."""
         self._reduce(tensors, dist.ReduceOp.SUM)
 
     def maximum(self, tensor: Tensor) -> None:
-        """Replace a tensor by its largest values over the processes."""
+        """Replace a tensor by its elementwise maximum over the processes."""
         self._reduce([tensor], dist.ReduceOp.MAX)
 
     @torch.no_grad()
     def average_gradients(self, parameters: Sequence[Tensor], surfels: int) -> None:
-        """Replace gradients that were summed over the views of this process by their means over all views of the step.
+        """Replace gradients, summed over this process's views, by their means over all views of the step.
 
-        A parameter that no view moves keeps having none.
+        The gradient of a parameter stays None if it is None in all processes.
 
         Args:
             parameters: the same in all processes, with dense gradients.
-            surfels: number of them in the scene, to be compared: the processes have to agree before they add.
+            surfels: number of surfels, compared between processes before gradients are added.
 
         Raises:
-            ProcessesApart: they do not.
+            ProcessesApart: the numbers of surfels differ.
             ProcessLost: another process has ended.
         """
         *moved, most, least = self._largest([*(int(p.grad is not None) for p in parameters), surfels, -surfels])

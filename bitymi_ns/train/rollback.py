@@ -1,26 +1,23 @@
-"""Keeps a run from ending in a broken scene: notices divergence, goes back to the last good state, lowers the rates.
+"""Rollback of diverged training: detects divergence, restores the last good state, and lowers the learning rates.
 
-What counts as divergence:
-- a loss that is not finite, where a parameter is to blame (broken images are not: nothing here could correct them);
-- surfels that are not finite, beyond a hundredth of them (fewer are dropped and counted);
-- views drawn worse than blank ones: over a window of steps the mean photometric loss exceeds two others. One is the
-  loss of views that show only their own mean colour, the other that of the scene as the run found it. In the first
-  tenth of the run, and in its first 100 steps, it has to exceed them by a quarter;
-- views drawn worse than before: the mean over a window exceeds that of the best window by a quarter, and by a tenth of
-  the loss of blank views. The best window is sought since the run began or last went back. Windows are whole epochs, so
-  that all are means over the same views. Where the resolution changes, earlier losses are converted by the loss of a
-  few views at both resolutions.
+Divergence is one of:
+- a loss that is not finite because of a parameter (not because of broken images, which a rollback cannot repair);
+- more than a hundredth of the surfels not finite (fewer are dropped and counted);
+- views rendered worse than blank ones: the mean photometric loss over a window of steps exceeds both the loss of images
+  of constant mean colour and that of the scene at the start of the run; by a quarter in the first tenth and in the
+  first 100 steps of the run;
+- views rendered worse than before: the mean over a window exceeds that of the best window since the start or the last
+  rollback, by a quarter and by a tenth of the blank loss. Windows are whole epochs, so that all are means over the same
+  views. When the resolution changes, earlier losses are converted by the loss of a few views at both resolutions.
 
-After an opacity reset nothing is judged until half of the time to the next reset has passed: by then opacities can have
-risen again (`Schedule.reset_opacity`). The last window ends with the run.
+Losses in the first half of the interval after an opacity reset are ignored: opacities recover in that time
+(`Schedule.reset_opacity`). The last window ends with the run. When the texel stage begins, windows start over, so that
+the rise of the loss caused by the schedule does not count as divergence.
 
-What the schedule does is no divergence. When texels begin, windows start over: the first that is compared with those
-before ends more than a window later.
-
-Going back restores parameters, optimisers, exposures, poses and the strategy's statistics as they were at the start of
-the last good window; the step count goes on. All learning rates are then multiplied by `guard.rates`, and by a higher
-power of it each time that the run goes back again without a good window between. After the first good window they
-return to normal; where the run then diverges again, it cannot bear them, and they stay lowered.
+A rollback restores parameters, optimisers, exposures, poses and the strategy's statistics from the start of the last
+good window; the step count continues. All learning rates are then multiplied by `guard.rates`, or by a higher power of
+it for each further rollback without a good window between. After the first good window they return to normal; if the
+run then diverges again, they stay lowered.
 """
 
 from __future__ import annotations
@@ -47,22 +44,22 @@ if TYPE_CHECKING:
     from bitymi_ns.train.poses import Poses
 
 WORSE = 1.25
-"""A window is bad when its mean loss is this many times that of the best window, or early on that of blank views."""
+"""A window is bad if its mean loss is this many times that of the best window, or early in the run of blank views."""
 RISE = 0.1
-"""Share of the loss of blank views by which a bad window must also exceed the best one: losses near 0 may double."""
-EARLY = 0.1  # share of the run in which views may still be drawn a little worse than blank ones
-EARLY_STEPS = 100  # fewest steps in which that is allowed: surfels have to settle, however short the run
-BROKEN_SHARE = 0.01  # surfels that are not finite are dropped up to this share of all; beyond, the run goes back
-COMPARED_VIEWS = 4  # views on which the blank picture, the first scene and a change of the resolution are judged
-SHARE_OF_RUN = 5  # a window is at most one part in so many of the run, also where that is less than an epoch
+"""Share of the blank loss by which a bad window must also exceed the best one: losses near 0 may double."""
+EARLY = 0.1  # share of the run in which views may be slightly worse than blank ones
+EARLY_STEPS = 100  # minimum number of such steps, in runs of any length: surfels need time to settle
+BROKEN_SHARE = 0.01  # surfels that are not finite are dropped up to this share of all; beyond, the run rolls back
+COMPARED_VIEWS = 4  # views for the loss of blank images, of the initial scene and at a change of resolution
+SHARE_OF_RUN = 5  # a window is at most 1 / SHARE_OF_RUN of the run, even if that is less than an epoch
 
 
 class RollbackGuard:
-    """Watches one run.
+    """Rollback guard of a run.
 
     Attributes:
-        factor: of all learning rates; 1 unless the run has gone back.
-        rollbacks: how often it has.
+        factor: of all learning rates; 1 before the first rollback.
+        rollbacks: number of rollbacks.
     """
 
     def __init__(
@@ -80,16 +77,16 @@ class RollbackGuard:
         self.announce = announce
         self.window = max(self.config.guard.min_window, self.schedule.scaled(self.config.guard.window))
         self.factor, self.rollbacks = 1.0, 0
-        self._returned = False  # lowered rates have been back to normal once
-        self._streak = 0  # times in a row, without a good window between
-        self._limit, self._best = math.nan, math.inf  # mean losses: of what is blank, of the best window
+        self._returned = False  # rates have returned to normal once
+        self._streak = 0  # rollbacks in a row without a good window
+        self._limit, self._best = math.nan, math.inf  # mean losses: blank or initial, and of the best window
         self._views: DownscaledViews | None = None
-        # on the scene's device, so that no step has to wait for numbers: of the losses, and the most surfels that broke
+        # on the scene's device, to avoid synchronisation: sum of losses, largest count of surfels that are not finite
         self._sum, self._broken, self._count = torch.zeros(()), torch.zeros(1, dtype=torch.int32), 0
-        self._states: list[tuple[int, dict[str, Any]]] = []  # the older one is known to be good
+        self._states: list[tuple[int, dict[str, Any]]] = []  # (step, state); the older one is known to be good
 
     def state_dict(self) -> dict[str, Any]:
-        """State for a resumed run; it can roll back no farther than to where it was resumed."""
+        """Return the state for a resumed run, without the states to restore: it rolls back to its resume at most."""
         return {
             "factor": self.factor,
             "rollbacks": self.rollbacks,
@@ -102,7 +99,7 @@ class RollbackGuard:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """The inverse of `state_dict`."""
+        """Restore what `state_dict` returned."""
         self.factor, self.rollbacks = float(state["factor"]), int(state["rollbacks"])
         self._returned, self._streak = bool(state.get("returned", False)), int(state["streak"])
         self._limit, self._best = float(state["limit"]), float(state.get("best", math.inf))
@@ -111,20 +108,19 @@ class RollbackGuard:
 
     @property
     def on(self) -> bool:
-        """True where rollbacks are enabled."""
+        """True if rollbacks are enabled."""
         return self.config.guard.rollbacks > 0
 
     def before(self, step: int, views: DownscaledViews) -> None:
-        """Call before each step: keeps the state that the run starts from, and measures the loss of its first scene.
+        """Capture the initial state and measure its loss; call it before each step.
 
         Args:
-            views: the training views. They are compared at full size: small pictures may hold no window of SSIM, and
-                then have smaller losses.
+            views: training views. Losses are compared at full size: images too small for SSIM have smaller losses.
         """
         if not self.on or self._states:
             return
         self._views = views
-        epoch = len(views) // math.gcd(len(views), self.processes.views)  # steps in which all are seen equally often
+        epoch = len(views) // math.gcd(len(views), self.processes.views)  # steps that use all views equally often
         epochs = -(-self.window // epoch) * epoch
         self.window = max(self.window, min(epochs, self.schedule.max_steps // SHARE_OF_RUN))
         if math.isnan(self._limit):
@@ -132,18 +128,18 @@ class RollbackGuard:
         self._states = [(step, self._capture())]
 
     def restart(self) -> None:
-        """Start windows over and forget the states to go back to: other parts make the scene from here on."""
+        """Discard captured states and start a new window: the scene has changed its kind of texture."""
         self._states = []
         self._sum, self._count = torch.zeros_like(self._sum), 0
 
     @torch.no_grad()
     def _loss_of(self, views: DownscaledViews, factor: float, blank: bool = False) -> float:
-        """Mean loss of a few views, resized by `factor`: of the scene as it is, or of pictures of their mean colour."""
+        """Compute the mean loss of a few views, resized by `factor`, of the scene or of images of their mean colour."""
         losses = []
         device = self.scene.surfels["means"].device
         for i in spread(len(views), COMPARED_VIEWS):
             view = views.at(i, factor)
-            # as in the steps with which this is compared; where their colours change, always the same ones
+            # as in training steps, but always the same colours if they are random
             background = step_background(self.config, view, i, device)
             target = view.target(background, device)
             if blank:
@@ -151,16 +147,16 @@ class RollbackGuard:
             else:
                 output = self.scene.render(view.camera.to(device), background=background, field_mode="frozen")
                 drawn = view.shown(output.rgb, output.alpha, background)
-                del output  # with its fragments, before the next view makes its own
+                del output  # frees its fragments before the next view is rendered
             losses.append(photometric(drawn, target, self.config.loss.ssim_weight, view.mask))
         return self.processes.mean(float(torch.stack(losses).mean()))
 
     def _convert(self, step: int) -> None:
-        """Express what was measured so far as losses at the resolution of the next step."""
+        """Convert the losses measured so far to the resolution of the next step."""
         before, now = (self.schedule.resolution_factor(s) for s in (step, step + 1))
         if before == now or self._views is None:
             return
-        if self.schedule.recovering(step + 1):  # a faded scene tells nothing
+        if self.schedule.recovering(step + 1):  # opacities are low: losses are not comparable
             self._best = math.inf
             return
         old, new = self._loss_of(self._views, before), self._loss_of(self._views, now)
@@ -168,14 +164,13 @@ class RollbackGuard:
             self._best, self._sum = self._best * new / old, self._sum * (new / old)
 
     def failed(self, step: int, error: TrainingDiverged) -> dict[str, float]:
-        """Call when a step could not be done because its loss is not finite, and then do it again; or when the scene
-        broke in it.
+        """Repair the scene after a loss that is not finite, before the step is repeated, or after the update broke it.
 
         Returns:
-            What was done, by name.
+            Counts of what was done, by name.
 
         Raises:
-            TrainingDiverged: nothing can be restored, or it has been tried too often.
+            TrainingDiverged: nothing can be restored, or the limit of rollbacks is reached.
         """
         cause = describe_broken(self.scene)
         if not self.on or not cause:
@@ -183,18 +178,18 @@ class RollbackGuard:
         return self._mend(step, cause)
 
     def after(self, step: int, loss: Tensor, broken: Tensor) -> dict[str, float]:
-        """Call after each step, when optimisers and strategy are done with it.
+        """Check for divergence and roll back if needed; call it after each step's optimisers and strategy.
 
         Args:
-            loss: scalar, photometric loss of the step, without graph. On a CUDA device it is read when a window
-                ends, and so is the next one; on the CPU at once.
-            broken: [1] int32, surfels that could not be drawn because they are not finite.
+            loss: scalar, photometric loss of the step, detached. Read at the end of a window only.
+            broken: [1] int32, number of surfels that are not finite; on a CUDA device read at the end of a window, on
+                the CPU in each step.
 
         Returns:
-            What was done, by name; empty when all is well.
+            Counts of what was done, by name; empty if nothing was.
 
         Raises:
-            TrainingDiverged: the run has gone back too often, or may not.
+            TrainingDiverged: the limit of rollbacks is reached, or rollbacks are disabled.
         """
         if not self.on:
             return {}
@@ -233,13 +228,13 @@ class RollbackGuard:
                 self.factor, self._returned = 1.0, True
                 self.announce(f"step {step}: learning rates return to normal")
         self._convert(step)
-        if not last and not (enough and mean > self._limit):  # a state that will be good enough later as well
-            self._states = self._states[-1:]  # before the next one is made: they are large
+        if not last and not (enough and mean > self._limit):  # a state that also passes the later, stricter test
+            self._states = self._states[-1:]  # frees the large old state before the next is captured
             self._states.append((step + 1, self._capture()))
         return {}
 
     def _mend(self, step: int, cause: str) -> dict[str, float]:
-        """Drop a few surfels that are not finite; go back where there are more, or the field is broken."""
+        """Drop surfels that are not finite; roll back if there are many, or if the field is broken."""
         broken = ~finite_rows(self.scene)
         dropped = float(broken.sum())
         field_broken = self.scene.field is not None and describe_broken(self.scene.field)
@@ -271,8 +266,8 @@ class RollbackGuard:
 
     def _capture(self) -> dict[str, Any]:
         scene = {name: value.detach() for name, value in self.scene.state_dict().items()}
-        # a long run has more texels than anything else. What never changes in place is kept once for all states, and
-        # the texels in half precision: going back is no resuming, and 2^-11 of a residual is nothing to see.
+        # texels dominate the memory of a state: buffers that never change in place are shared between states, and
+        # texels are kept in half precision, whose error of 2^-11 of a residual is invisible
         textured = isinstance(self.scene.field, TexelField)
         steady = {f"field.{name}" for name in TexelField.STEADY} if textured else set()
         texels = {"field.texels"} if textured else set()
@@ -288,7 +283,7 @@ class RollbackGuard:
         }
 
     def _restore(self, state: Mapping[str, Any]) -> None:
-        # new Parameters: autograd remembers the size of those that a living graph has used
+        # new Parameters: a live graph keeps the size of the old ones
         surfels = self.scene.surfels
         rows = {name: state["scene"][f"surfels.{name}"] for name in surfels.keys()}
         none = torch.zeros(0, dtype=torch.int64, device=surfels["means"].device)

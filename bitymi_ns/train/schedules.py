@@ -7,16 +7,15 @@ from bitymi_ns.ops.view_kinds import VIEW_PARAMETERS
 from bitymi_ns.ranges import check_ranges
 from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
 
-PATIENT_STEPS = 3000  # steps of a run from which it has time for full size as early as the options say
+PATIENT_STEPS = 3000  # runs of at least this many steps reach full size as early as the options say
 
 
 class Schedule:
-    """Events and rates of a run of `max_steps` steps.
+    """Events and learning rates of a run of `max_steps` steps.
 
-    The options give every step count for a run of 30,000 steps. A run of another length keeps the proportions: an
-    event that fires n times in 30,000 steps fires n times in any run with room for it, at the same share of the run.
-    Densifications and opacity resets keep a least distance in steps (`min_interval`, `min_reset_interval`) and so fire
-    less often in short runs.
+    The options state step counts for a run of 30,000 steps; runs of other lengths scale them in proportion.
+    Densifications and opacity resets keep a minimum interval (`min_interval`, `min_reset_interval`) and so are fewer in
+    short runs.
 
     `step` is the index of a training step, 0 to max_steps - 1. Events take place after that step's optimiser update.
     """
@@ -28,8 +27,11 @@ class Schedule:
         Args:
             max_steps: length of the run in steps.
             extent: scene extent in world units.
-            texels: whether texels learn in the last part of the run.
-            pixels: of a photograph that show something, on average.
+            texels: the run ends with a texel stage.
+            pixels: mean number of opaque, unmasked pixels per photograph.
+
+        Raises:
+            ValueError: an argument or option is out of range.
         """
         if max_steps < 1:
             raise ValueError(f"a run needs at least one step, not {max_steps}")
@@ -40,13 +42,12 @@ class Schedule:
         self.extent = float(extent)
         densify = config.densify
         check_ranges(config)
-        # short runs leave events out, so that about the least number of steps lies between two
+        # short runs skip events to keep the minimum interval
         reset = densify.reset_interval * self._stride(densify.reset_interval, densify.min_reset_interval)
         interval = densify.interval * self._stride(densify.interval, densify.min_interval)
         self.texels_start = min(max_steps, self.scaled(config.texels.start)) if texels else max_steps
         stop = min(densify.stop, config.texels.start) if texels else densify.stop
-        # after these steps surfels are cloned, split and pruned; opacities reset; surfels that hardly matter, and those
-        # that are transparent, pruned
+        # steps after which surfels are densified and pruned, opacities reset, and the error and final prunes run
         self.densify_steps = self._events(_multiples(interval, densify.start, stop))
         self.reset_steps = self._events(_multiples(reset, 0, stop))
         self.reset_every = self.scaled(reset)
@@ -62,26 +63,26 @@ class Schedule:
 
     @property
     def in_pixels(self) -> bool:
-        """True where the rate of the means is in pixels, see `step_sizes`; in world units otherwise."""
+        """True if the rate of the means is in pixels, see `step_sizes`; in world units otherwise."""
         return self.config.lr.means is None
 
     @property
     def texel_steps(self) -> int:
-        """Steps in which texels learn."""
+        """Number of steps of the texel stage."""
         return self.max_steps - self.texels_start
 
     @property
     def short_run_gain(self) -> float:
-        """Factor of the surfels' learning rates: more than 1 in runs of fewer than 30,000 steps.
+        """Factor of the surfels' learning rates, above 1 in runs of fewer than 30,000 steps.
 
-        Adam moves a parameter by about its rate per step, so a run of 600 steps at the published rates ends long before
-        the surfels have settled.
+        Adam moves a parameter by about its rate per step, so a run of 600 steps at the published rates would end long
+        before the surfels have converged.
         """
         shortness = max(1.0, REFERENCE_STEPS / self.max_steps)
         return min(self.config.lr.short_run_max, shortness**self.config.lr.short_run_power)
 
     def scaled(self, step_at_30k: float) -> int:
-        """The step count of this run that corresponds to one given for 30,000 steps: 0 stays 0, all else at least 1."""
+        """Scale a step count stated for 30,000 steps to this run: 0 stays 0, others become at least 1."""
         if step_at_30k <= 0:
             return 0
         return max(1, math.floor(step_at_30k * self.max_steps / REFERENCE_STEPS + 0.5))
@@ -93,77 +94,77 @@ class Schedule:
         return frozenset(min(self.scaled(s), self.max_steps - 1) for s in steps_at_30k)
 
     def reset_opacity(self) -> float:
-        """Opacity that a reset lowers to: `reset_opacity`, or more in a short run.
+        """Compute the opacity after a reset: `reset_opacity`, or more in short runs.
 
-        Adam moves a logit by no more than its learning rate per step. So a reset lowers opacities only as far as they
-        can rise again in half the time to the next reset. Otherwise a short run would never have an opaque surfel, and
-        its final prunes would remove nearly all. This matters where resets are less than about 370 steps apart (fewer
-        with the rates of a short run).
+        Adam moves a logit by at most its learning rate per step, so a reset lowers opacities only as far as they can
+        recover in half the time to the next reset. Otherwise a short run would have no opaque surfels, and its final
+        prunes would remove nearly all. This matters if resets are less than about 370 steps apart (fewer with the
+        higher rates of a short run).
         """
         densify = self.config.densify
         deepest = max(-500.0, -0.5 * self.reset_every * self.lr("opacity_logits", 0))  # exp() overflows beyond
         return max(densify.reset_opacity, 1.0 / (1.0 + math.exp(-deepest)))
 
     def recovering(self, step: int) -> bool:
-        """True where the last opacity reset may still show: half of the time to the next one is not over."""
+        """Return True in the first half of the interval after an opacity reset, when opacities may still be low."""
         return any(reset < step <= reset + max(1, self.reset_every // 2) for reset in self.reset_steps)
 
     def overdraw_counts(self, step: int) -> bool:
-        """True where the overdraw loss is part of this step's objective."""
+        """Return True if the overdraw loss is part of this step's objective."""
         loss = self.config.loss
         return loss.overdraw_weight > 0.0 and (
             self.scaled(loss.overdraw_start) <= step < self.scaled(loss.overdraw_stop)
         )
 
     def geometry_counts(self, step: int) -> bool:
-        """True where the depth and the normal loss are part of this step's objective, if the view has such maps."""
+        """Return True if the depth and normal losses are part of this step's objective, for views with such maps."""
         loss = self.config.loss
         return max(loss.depth_weight, loss.normal_weight) > 0.0 and step % loss.geometry_interval == 0
 
     def lists_fragments(self, maps: bool) -> bool:
-        """True where a step needs lists of fragments on a card, too: for the overdraw loss, or with depth or normals.
+        """Return True if some steps need fragment lists also on a GPU: for the overdraw, depth or normal loss.
 
         Args:
-            maps: there are views with depth or normals.
+            maps: some views have depth or normals.
         """
         loss = self.config.loss
         return loss.overdraw_weight > 0.0 or maps and max(loss.depth_weight, loss.normal_weight) > 0.0
 
     def densification_over(self, step: int) -> bool:
-        """True where no densification can follow this step, so that its statistics are needed no more."""
+        """Return True if no densification follows this step, so that its statistics are not needed."""
         return not self.densify_steps or step > max(self.densify_steps)
 
     def field_trains(self, step: int) -> bool:
-        """True where the texture learns in this step; on the other steps it is evaluated without gradient.
+        """Return True if the texture is trained in this step; in other steps it is evaluated without gradient.
 
-        From `freeze_after` on it learns in one step in `freeze_every` (section Training Time of the paper). A run of
-        few steps freezes less often: it could not learn a texture in a tenth of them. Texels learn in every step of
-        theirs.
+        From `freeze_after` on the field is trained in one step of `freeze_every` (section Training Time of the paper);
+        short runs freeze less, since a tenth of their steps is too few. Texels are trained in every step of their
+        stage.
         """
         return self.texels_learn(step) or step < self.scaled(self.config.freeze_after) or step % self.freeze_every == 0
 
     @property
     def freeze_every(self) -> int:
-        """After `freeze_after` the field learns in one step in so many."""
+        """Interval of the steps that train the field after `freeze_after`."""
         left = self.max_steps - self.scaled(self.config.freeze_after)
         return max(1, min(self.config.freeze_every, left // max(1, self.config.freeze_min_updates)))
 
     def texels_learn(self, step: int) -> bool:
-        """True where every surfel has its own texels in this step, and they learn."""
+        """Return True in the texel stage."""
         return step >= self.texels_start
 
     def texel_rate(self, step: int, views: int = 1) -> float:
-        """Rate of the texels in a step in which they learn.
+        """Compute the rate of the texels in a step of the texel stage, per pass over `views` views.
 
-        It falls to 0 as a cosine, so texels can move half as far as they would at its start. Few passes over the views
-        at `rate` would end before the texels are where the photographs want them.
+        The cosine decay to 0 halves the distance that texels can move. If the stage has too few passes over the views
+        to move them by `travel` at `rate`, the rate is raised.
         """
         texels = self.config.texels
         needed = 2.0 * texels.travel * views / self.texel_steps
         return max(texels.rate, min(needed, texels.travel)) * self._falling(step)
 
     def pose_pixels(self, step: int) -> float:
-        """Length of a step of a photograph's pose, pixels; 0 where poses stay."""
+        """Compute the length of a pose step, pixels; 0 if poses are fixed in this step."""
         poses = self.config.poses
         first, last = self.scaled(poses.start), self.scaled(poses.stop)
         if self.config.refine_poses == "off" or not first <= step < last:
@@ -174,17 +175,17 @@ class Schedule:
         return falling(1.0, step - self.texels_start, self.texel_steps)
 
     def resolution_factor(self, step: int) -> float:
-        """Factor of the image size, 2^-k; 1 from the last doubling on."""
+        """Compute the factor of the image size, 2^-k; 1 from the last doubling on."""
         return 2.0 ** -sum(step < at for at in self._doublings)
 
     def _image_doublings(self, pixels: float) -> list[int]:
-        """Steps from which the image size is doubled, `resolution_schedule` apart.
+        """List the steps from which the image size is doubled, `resolution_schedule` apart.
 
-        Short runs whose texels learn in a last part of their own wait longer, by `short_run_gain`, though full size
-        comes with the texels at the latest: what the surfels need to know before, smaller pictures show for less.
-        Photographs that are small themselves, or show something in few of their pixels, show too little then, and
-        their runs wait less: by the square root of these pixels over `small_photograph`. Longer runs learn more than
-        smaller pictures show: from about 1,850 steps on they wait less, from `PATIENT_STEPS` on not at all.
+        Short runs with a texel stage stretch that interval by `short_run_gain`, but reach full size before the texel
+        stage: until then smaller images teach the surfels as much at a lower cost. Three limits on the stretch:
+        images with few opaque, unmasked pixels would show too little (square root of these over `small_photograph`);
+        long runs learn more than small images show (less stretch from about 1,850 steps on, none from `PATIENT_STEPS`
+        on); and the texel stage needs full size.
         """
         apart, count = self.config.resolution_schedule, self.config.num_downscales
         if apart <= 0 or count <= 0:
@@ -196,7 +197,7 @@ class Schedule:
         return [self.scaled(apart * (i + 1)) for i in range(count)]
 
     def lr(self, name: str, step: int) -> float:
-        """Learning rate of a parameter in this step; of the means in pixels, if `in_pixels`.
+        """Compute the learning rate of a parameter in this step; that of the means in pixels if `in_pixels`.
 
         Args:
             name: a surfel parameter, field_table, field_mlp or exposure.
@@ -215,15 +216,15 @@ class Schedule:
         rate = getattr(rates, name)
         if not isinstance(rate, tuple):
             return factor * float(rate)
-        t = min(max(step / max(1, self.max_steps - 1), 0.0), 1.0)  # log-linear from the first rate to the second
+        t = min(max(step / max(1, self.max_steps - 1), 0.0), 1.0)  # log-linear decay
         return factor * math.exp((1.0 - t) * math.log(rate[0]) + t * math.log(rate[1]))
 
 
 def falling(rate: float, step: int, steps: int) -> float:
-    """A rate that falls to 0 as a cosine."""
+    """Compute the cosine decay of a rate from `rate` to 0 over `steps` steps."""
     return rate * 0.5 * (1.0 + math.cos(math.pi * step / steps))
 
 
 def _multiples(interval: int, start: int, stop: int) -> list[int]:
-    """Multiples of `interval` strictly between `start` and `stop`."""
+    """List the multiples of `interval` strictly between `start` and `stop`."""
     return [s for s in range(interval, stop, interval) if s > start]

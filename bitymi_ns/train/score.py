@@ -1,4 +1,4 @@
-"""Scores of surfels over many views: errors that they cover, after FastGS, and errors that their removal adds."""
+"""Multi-view scores of surfels: the errors they cover (FastGS), and the error that removing them adds."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ if TYPE_CHECKING:
 
 
 MOST_ERROR = 1e-3
-"""Mean square error (30 dB) above which a share of the error says nothing of what may be lost: errors of exposure or of
-what moved do not hide those of a missing surfel."""
+"""Upper bound (30 dB) on the mean squared error whose share limits a prune: errors from exposure or moving objects must
+not hide those of a missing surfel."""
 
 
 @dataclass(frozen=True)
 class Scores:
     """One row per surfel."""
 
-    importance: Tensor  # [N] int64, mean number of bad pixels, per view, that the surfel is blended into, rounded down
-    prune: Tensor  # [N] float32 in [0, 1]; high = covers many bad pixels of bad views
+    importance: Tensor  # [N] int64, mean number per view of bad pixels that the surfel is blended into, rounded down
+    prune: Tensor  # [N] float32 in [0, 1]; high: covers many bad pixels in views of high loss
 
 
 def normalise(values: Tensor) -> Tensor:
-    """`values` moved and scaled to [0, 1]; all zeros when they do not differ or are not finite."""
+    """Shift and scale values to [0, 1]; all zeros if they are equal or not finite."""
     if values.numel() == 0:
         return values
     low, high = values.min(), values.max()
@@ -43,7 +43,7 @@ def normalise(values: Tensor) -> Tensor:
 
 
 def bad_pixels(rgb: Tensor, target: Tensor, threshold: float, mask: Tensor | None = None) -> Tensor:
-    """[H, W] bool: the pixels whose error, normalised over the image, is above `threshold`.
+    """Find the pixels, [H, W] bool, whose error, normalised over the image, is above `threshold`.
 
     Args:
         rgb, target: [H, W, 3]; the error is the mean of |rgb - target| over the channels.
@@ -60,8 +60,10 @@ def bad_pixels(rgb: Tensor, target: Tensor, threshold: float, mask: Tensor | Non
 
 
 def _random_signs(like: Tensor, seed: int) -> Tensor:
-    """Draw +1 or -1 for every element of a tensor: the same on every device. A byte gives eight of them, since the CPU
-    draws numbers at 200 M a second: those of a photograph would take longer than its picture takes a card."""
+    """Draw +1 or -1 for every element of a tensor, the same on every device.
+
+    Each random byte gives eight signs: the CPU generates 200 M numbers a second, so that one number per sign would take
+    longer than a GPU takes to render the view."""
     count = like.numel()
     generator = torch.Generator().manual_seed(seed)
     drawn = torch.randint(0, 256, (-(-count // 8),), dtype=torch.int32, generator=generator).to(like.device)
@@ -76,7 +78,7 @@ def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig, 
     Every fragment that is blended at a bad pixel counts one for its surfel, whatever its weight.
 
     Args:
-        views: K views, at the size in which they are to be judged; none gives zero scores.
+        views: at the resolution to compare at; without views all scores are 0.
         processes: each renders its share of the views.
     """
     n = len(scene)
@@ -94,7 +96,7 @@ def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig, 
         loss = photometric(rgb, target, config.loss.ssim_weight, view.mask)
         total += counts
         weighted += loss.double() * counts
-        del output  # with its fragments, before the next view makes its own
+        del output  # frees its fragments before the next view is rendered
     processes.sum(total, weighted)
     importance = torch.div(total, max(1, len(views)), rounding_mode="floor")
     return Scores(importance, normalise(weighted).float())
@@ -103,26 +105,25 @@ def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig, 
 def removal_errors(
     scene: Scene, views: Sequence[View], config: TrainConfig, seed: int, processes: Processes = ALONE
 ) -> tuple[Tensor, Tensor]:
-    """Estimate the squared change of the views when a surfel is removed, and measure the squared error that they have.
+    """Estimate the squared change of the views when each surfel is removed, and measure their squared error.
 
-    A picture C is linear in the opacity o of each surfel, so removing it changes the picture by v = -o dC/do. Over
-    independent signs r, E[(r . v)^2] = |v|^2 (Hutchinson 1989), and one backward pass gives r . v of all surfels.
+    An image C is linear in the opacity o of each surfel, so removing it changes the image by v = -o dC/do. Over
+    independent signs r, E[(r . v)^2] = |v|^2 (Hutchinson 1989), and one backward pass gives r . v for all surfels.
 
     Args:
-        views: at the size in which they are to be judged.
-        seed: of the signs, and of random backgrounds.
+        views: at the resolution to compare at.
+        seed: of the signs and of random backgrounds.
         processes: each renders its share of the views.
 
     Returns:
-        [N] float64, summed over pixels that count, channels and views, 0 where no view shows the surfel; and the
-        squared error of the views against the photographs, summed alike, a float64 scalar, at most `MOST_ERROR` in the
-        mean.
+        Squared change [N] float64, summed over unmasked pixels, channels and views, 0 if no view shows the surfel; and
+        the squared error of the views, summed likewise, a float64 scalar, its mean clamped to `MOST_ERROR`.
     """
     logits = scene.surfels["opacity_logits"]
     device = logits.device
     by_logit = 1.0 + logits.detach().double().clamp(max=30.0).exp()  # o d/do = (1 + e^logit) d/dlogit
     added = torch.zeros_like(by_logit)
-    error, numbers = torch.zeros(2, dtype=torch.float64, device=device)  # squares, how many
+    error, numbers = torch.zeros(2, dtype=torch.float64, device=device)  # sum of squares, count of values
     for number in range(processes.rank, len(views), processes.count):
         view = views[number].to(device)
         background = step_background(config, view, seed + number, device)
@@ -137,6 +138,6 @@ def removal_errors(
         error += (signs * (rgb.detach() - target)).square().sum(dtype=torch.float64)
         numbers += signs.square().sum(dtype=torch.float64)
         added += (by_logit * gradient).square()
-        del output, rgb  # with their fragments, before the next view makes its own
+        del output, rgb  # frees their fragments before the next view is rendered
     processes.sum(added, error, numbers)
     return added, torch.minimum(error, MOST_ERROR * numbers)

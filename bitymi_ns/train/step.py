@@ -1,4 +1,4 @@
-"""One training step, whichever loop it stands in: `fit` here, or nerfstudio's."""
+"""The training step, shared by `fit` and nerfstudio's training loop."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ def view_losses(
     """Render a training view and compare it with its photograph.
 
     Args:
-        view: on the scene's device, its picture at the size of its camera.
-        schedule, step: which parts of the scene learn.
+        view: on the scene's device, with its image at its camera's size.
+        schedule, step: decide which parts of the scene are trained.
 
     Returns:
-        The weighted terms of the loss (their sum is the objective), and the rendered view.
+        The weighted loss terms (their sum is the objective) and the rendered view.
 
     Raises:
         TrainingDiverged: the loss is not finite.
@@ -68,19 +68,18 @@ def view_losses(
 
 
 class Training:
-    """A run of training steps. The order of a step:
+    """A training run. Each step calls, in this order:
 
     `begin` -> zero the gradients -> `losses` -> backward of their sum -> `combine` -> optimisers -> `finish`.
 
-    With more processes a step uses the mean loss of the views of all.
-    Every process calls everything here at the same steps. `losses` and backward are called for each of its views.
+    With several processes, a step minimises the mean loss over the views of all processes. Every process makes the
+    same calls at the same steps; it calls `losses` and backward once for each of its own views.
 
     Attributes:
-        step: index of the step that was begun last.
-        schedule, strategy, guard, texels, watch, processes: of the run.
-        exposure: how the training photographs differ in their colours; decided when the first step begins.
-        poses: where the cameras of the training photographs have moved.
-        clock: time between `begin` and `finish`.
+        step: index of the current step.
+        exposure: colour corrections of the training photographs; decided when the first step begins.
+        poses: pose corrections of the training photographs.
+        clock: time spent between `begin` and `finish`.
     """
 
     def __init__(
@@ -97,10 +96,10 @@ class Training:
         """
         Args:
             scene: changed in place.
-            optimizers: one per surfel parameter, under its name, and those of the field.
+            optimizers: by surfel parameter name, and those of the field.
             max_steps: length of the run; the schedules depend on it.
-            on_resize: told the name and the new Parameter after each replacement of a surfel parameter.
-            announce: told in a sentence whenever the run goes back, or surfels are dropped.
+            on_resize: called with the name and the new Parameter when a surfel parameter is replaced.
+            announce: called with a sentence on each rollback and whenever surfels are dropped.
 
         Raises:
             ValueError: a training option is out of its range.
@@ -126,17 +125,17 @@ class Training:
 
     @functools.cached_property
     def views(self) -> DownscaledViews:
-        """The training views. Made at first use: on a card it takes a share of the memory that is free then."""
+        """Training views. Created at first use, because their cache takes a share of the GPU memory free then."""
         return DownscaledViews(self._full_size, self.scene.surfels["means"].device, self.exposure.of, self.poses.of)
 
     def view(self, index: int) -> View:
-        """Training view number `index`, as the step that was begun last wants it: on the device, reduced."""
+        """Return training view `index` on the device, at the resolution and pose of the current step."""
         view = self.views.at(index, self.schedule.resolution_factor(self.step))
         return view._replace(camera=self.poses.learning(index, view.camera, self.step))
 
     def begin(self, step: int) -> None:
         """Start the clock and set the learning rates of a step."""
-        if not self._alike:  # waits for the others, which is no training time
+        if not self._alike:  # before the clock starts: waiting for other processes is no training time
             self.processes.like_first(self.scene.state_dict().values())
         self.clock.start()
         self.step = step
@@ -163,10 +162,10 @@ class Training:
             set_rate(optimizer, self.guard.factor * self.step_sizes.rate(name, self.step))
 
     def losses(self, view: View) -> tuple[dict[str, Tensor], RenderOutput]:
-        """`view_losses` of the step's view. Where they are not finite, the guard repairs the scene and draws it again.
+        """Compute `view_losses`. If a loss is not finite, the guard repairs the scene and the view is rendered again.
 
         Raises:
-            TrainingDiverged: nothing can be repaired, or it has been tried too often.
+            TrainingDiverged: the scene cannot be repaired, or the limit of rollbacks is reached.
         """
         while True:
             self.texels.prepare(self.step, view, self.guard.factor)
@@ -186,10 +185,10 @@ class Training:
             self._set_rates()
 
     def combine(self) -> dict[str, Tensor]:
-        """After the backward passes: the gradients become those of the mean loss of all views of the step.
+        """Average the gradients over all views of the step; call it after the backward passes.
 
         Returns:
-            Factors [N] of the surfels' rates, by parameter, for `optimizers.step`.
+            Rate factors [N] per surfel, by parameter name, for `optimizers.step`.
 
         Raises:
             ProcessesApart, ProcessLost: see `Processes.average_gradients`.
@@ -204,13 +203,13 @@ class Training:
         return self.step_sizes.factors()
 
     def finish(self) -> dict[str, float]:
-        """After the optimisers: densify, prune, look for divergence, stop the clock.
+        """Densify, prune, check for divergence and stop the clock; call it after the optimisers.
 
         Returns:
-            What was done, by name; empty when nothing was due.
+            Counts of what was done, by name; empty if nothing was due.
 
         Raises:
-            TrainingDiverged: the run has gone back too often, or may not.
+            TrainingDiverged: the limit of rollbacks is reached, or rollbacks are disabled.
         """
         step, outputs, photometric = self.step, self._outputs, self._photometric
         assert outputs, "a step is finished after its losses"
@@ -221,13 +220,13 @@ class Training:
         if not self.schedule.densification_over(step):
             self.strategy.accumulate(*outputs)
         loss, broken = self._together(photometric, [output.projection.broken for output in outputs])
-        del outputs  # with their fragments, before the strategy draws views of its own
+        del outputs  # frees their fragments before the strategy renders its own views
         factor = self.schedule.resolution_factor(step)
         try:
             report = self.strategy.step(
                 step, self.scene, self.optimizers, lambda k, generator: self.views.draw(k, generator, factor)
             )
-        except TrainingDiverged as error:  # the optimisers broke the field or all surfels; no loss has shown it yet
+        except TrainingDiverged as error:  # the optimisers broke the field or all surfels after the last loss
             report = self.guard.failed(step, error)
         else:
             report |= self.guard.after(step, loss, broken)
@@ -239,7 +238,7 @@ class Training:
         return report
 
     def _together(self, losses: list[Tensor], broken: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Mean loss of the views of the step, and most surfels that one of them could not draw."""
+        """Compute the mean loss over the step's views, and the largest count of non-finite surfels in one of them."""
         if self.processes.views == 1:
             return losses[0], broken[0]
         loss, most = torch.stack(losses).sum(), torch.stack(broken).amax(0)
@@ -248,7 +247,7 @@ class Training:
         return loss / self.processes.views, most
 
     def state_dict(self) -> dict[str, Any]:
-        """State of the run beside the scene and its optimisers."""
+        """Return the state of the run, without the scene and its optimisers."""
         return {
             "strategy": self.strategy.state_dict(),
             "guard": self.guard.state_dict(),
@@ -260,7 +259,7 @@ class Training:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """The inverse of `state_dict`."""
+        """Restore what `state_dict` returned."""
         self.strategy.load_state_dict(state["strategy"])
         if "guard" in state:  # checkpoints of earlier versions have none
             self.guard.load_state_dict(state["guard"])
@@ -273,7 +272,7 @@ class Training:
 
 
 class Stopwatch:
-    """Wall-clock and CPU seconds of the training steps alone: evaluation, saving and loading are not counted."""
+    """Wall-clock and CPU seconds of the training steps; evaluation, saving and loading are not counted."""
 
     def __init__(self, seconds: float = 0.0, cpu_seconds: float = 0.0) -> None:
         self.seconds = seconds

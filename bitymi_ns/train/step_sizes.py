@@ -1,4 +1,4 @@
-"""Steps of surfels in pixels of the photographs, whatever the scale of the capture."""
+"""Step sizes of surfel positions in pixels of the photographs, independent of the scale of the capture."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
     from bitymi_ns.train.schedules import Schedule
 
-MEASURED = 64  # most training views that footprints are measured in, evenly spread
+MEASURED = 64  # maximum number of training views to measure footprints in, evenly spaced
 
 
 @torch.no_grad()
 def pixel_footprints(means: Tensor, cameras: Sequence[Camera], near: float, extent: float) -> Tensor:
-    """Measure the side of a pixel at every surfel: depth over focal length in the nearest view that holds its centre.
+    """Measure the side of a pixel at each surfel: depth over focal length in the nearest view that contains its centre.
 
     Args:
         means: [N, 3] world positions.
         cameras: the training cameras at full size.
-        near: nearest drawn depth, camera z.
-        extent: scene extent in world units, the depth that counts where no view holds any surfel.
+        near: near plane, camera z.
+        extent: scene extent in world units, used as depth if no view contains any surfel.
 
     Returns:
-        [N] in the dtype of `means`, world units; a surfel that no view holds gets the median of the others.
+        [N] in the dtype of `means`, world units; a surfel outside all views gets the median of the others.
     """
     nearest = torch.full_like(means[:, 0], torch.inf)
     for camera in cameras:
@@ -47,16 +47,15 @@ def _focal(camera: Camera) -> Tensor:
 
 
 class StepSizes:
-    """Learning rates of single surfels.
+    """Learning rates per surfel.
 
     Attributes:
-        footprints: [N] side of a pixel at each surfel, world units; empty until they are measured.
+        footprints: [N] side of a pixel at each surfel, world units; empty until measured.
     """
 
     def __init__(self, schedule: Schedule, cameras: Sequence[Camera]) -> None:
         """
         Args:
-            schedule: of the run.
             cameras: the training cameras at full size.
         """
         self.schedule = schedule
@@ -64,10 +63,10 @@ class StepSizes:
         self._set(torch.zeros(0))
 
     def measure(self, scene: Scene, always: bool = True) -> None:
-        """Measure the footprints of the surfels that there are now.
+        """Measure the footprints of the current surfels.
 
         Args:
-            always: also where as many surfels have been measured already.
+            always: also if the number of surfels has not changed.
         """
         if self.schedule.in_pixels and (always or len(self.footprints) != len(scene)):
             means = scene.surfels["means"].detach()
@@ -79,12 +78,12 @@ class StepSizes:
         self._relative = footprints / self._typical
 
     def rate(self, name: str, step: int) -> float:
-        """Return the learning rate of a parameter's optimiser: of the typical surfel, where surfels differ."""
+        """Return the learning rate of a parameter's optimiser; if surfels differ, that of the median surfel."""
         rate = self.schedule.lr(name, step)
         return rate * self._typical if name == "means" and self.schedule.in_pixels else rate
 
     def factors(self) -> dict[str, Tensor]:
-        """Return the surfels' rates as multiples [N] of `rate`, by parameter; all others have one rate."""
+        """Return rate factors [N] relative to `rate`, by name, for the parameters with rates per surfel."""
         return {"means": self._relative} if self.schedule.in_pixels else {}
 
     def state_dict(self) -> dict[str, Any]:

@@ -1,15 +1,14 @@
-"""FastGS densification and pruning: multi-view scores decide which surfels multiply and which go. The
-thresholds are those of `config.DensifyConfig`.
+"""FastGS densification and pruning by multi-view scores, with the thresholds of `config.DensifyConfig`.
 
 At each densification, in this order:
-- surfels that can never be seen again are removed (a value that is not finite, or an opacity of 1/255 or less);
-- surfels with many bad pixels and a large gradient are cloned or split, the most important ones first where not all
-  fit. With `max_surfels` the number grows to it in equal parts instead: parents are drawn in proportion to their
-  gradient times their bad pixels, and faint surfels make room where more have both;
-- up to half of the candidates for pruning, drawn at random, are removed;
+- surfels that can never be visible again are removed (a non-finite parameter, or an opacity of 1/255 or less);
+- surfels with many bad pixels and a large gradient are cloned or split, the most important first if the limit does not
+  allow all. With `max_surfels` the number instead grows to that value in equal increments: parents are sampled in
+  proportion to gradient times bad pixels, and faint surfels are replaced if there are more parents than increments;
+- up to half of the candidates for pruning, sampled at random, are removed;
 - opacities are clamped.
-After the last one, surfels whose removal hardly changes the pictures go, and between 60 and 90 % of the run four final
-prunes remove what is nearly transparent and not missed. docs/training.md states the published rules.
+After the last densification, surfels whose removal hardly changes the images are pruned; between 60 and 90 % of the run
+four final prunes do the same among faint surfels. docs/training.md states the published rules.
 """
 
 from __future__ import annotations
@@ -40,27 +39,27 @@ if TYPE_CHECKING:
     from bitymi_ns.scene.scene import RenderOutput, Scene
 
 DrawViews = Callable[[int, torch.Generator], Sequence[View]]
-"""(k, CPU generator) -> k different training views, or all when there are fewer."""
+"""(k, CPU generator) -> k different training views, or all if there are fewer."""
 
 SPLIT_LONG, SPLIT_WIDE = 0.6, 0.7
-"""Scales of the halves of a split surfel, along its long axis and across it, as a share of the surfel's."""
+"""Scales of the halves of a split surfel, along its long axis and across it, relative to the surfel's."""
 SPLIT_APART = 0.7  # distance of the halves' centres from the surfel's, in scales of its long axis
-SPLIT_OPACITY = 0.9  # opacity of the halves as a share of the surfel's: they overlap where it is most opaque
+SPLIT_OPACITY = 0.9  # opacity of the halves relative to the surfel's: they overlap where it is most opaque
 ERROR_VIEWS, FEWEST_ERROR_VIEWS = 0.1, 64
-"""Most views that the errors of removals are measured on, as a share of the run's steps, and at least so many."""
-NO_BAD_PIXEL = 0.1  # what a mean of no bad pixel counts as where parents are drawn for a budget
+"""Views on which the error prune measures removals: a share of the run's steps, and the minimum."""
+NO_BAD_PIXEL = 0.1  # added to the mean count of bad pixels when parents are sampled: its weight is then never 0
 FINAL_VIEWS, FEWEST_FINAL_VIEWS = 0.025, 16  # the same for each of the four final prunes
 STATISTICS = ("grad_sum", "abs_grad_sum", "visible_count", "max_radius")
 
 
 class Strategy:
-    """Keeps the statistics of the projected centres and changes the number of surfels.
+    """Statistics of the projected centres, and the densification and pruning based on them.
 
     Attributes:
-        statistics: [4, N] since the last densification, named by `STATISTICS`: sum over the views of |gradient of the
-            projected centre|, normalised device coordinates; the same of the gradient whose absolute values were summed
-            over the pixels; number of views that saw the surfel; largest half extent on screen, pixels.
-        generator: source of every random choice, on the CPU.
+        statistics: [4, N] since the last densification, named by `STATISTICS`: sum over views of the gradient norm of
+            the projected centre, NDC; the same for the absolute gradient (AbsGS); number of views in which the surfel
+            was visible; largest half extent on screen, pixels.
+        generator: CPU generator of every random choice.
     """
 
     def __init__(
@@ -73,34 +72,33 @@ class Strategy:
     ) -> None:
         """
         Args:
-            schedule: of the run's events, with its options.
-            on_resize: told the name and the new Parameter after each replacement of a surfel parameter.
-            image_pixels: of all training images at full size, for `densify.pixels_per_surfel`; 0 = without that bound.
-            first_surfels: that training started with, for `densify.growth`.
+            schedule: events and options of the run.
+            on_resize: called with the name and the new Parameter when a surfel parameter is replaced.
+            image_pixels: total over all training images at full size, for `densify.pixels_per_surfel`; 0: no limit.
+            first_surfels: initial number of surfels, for `densify.growth`.
         """
         self.config = schedule.config
         self.processes = processes
         self.schedule = schedule
         self.on_resize = on_resize
         self.most = most_surfels(self.config, image_pixels, first_surfels)
-        # surfels that have become fainter than they began, and that a final prune would remove
+        # fainter than at the start, and faint enough for a final prune
         self._replaceable = min(self.config.densify.final_prune_opacity, 0.5 * self.config.init_opacity)
         self.generator = torch.Generator().manual_seed(self.config.seed)
         self.statistics = torch.zeros(len(STATISTICS), 0)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Everything an exact resume needs: statistics and the state of the generator."""
+        """Return the statistics and the state of the generator."""
         rows = zip(STATISTICS, self.statistics.clone(), strict=True)
         return {**dict(rows), "generator": self.generator.get_state()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """The inverse of `state_dict`."""
+        """Restore what `state_dict` returned."""
         self.statistics = torch.stack([state[name].detach().float() for name in STATISTICS])
         self.generator.set_state(state["generator"].cpu().to(torch.uint8))
 
     def accumulate(self, *outputs: RenderOutput) -> None:
-        """Note the statistics of the training views of a step, here and in all other processes; call it after the
-        backward pass."""
+        """Add the statistics of a step's training views, over all processes; call it after the backward passes."""
         if self.processes.views == 1:
             self._note(*outputs)
             return
@@ -132,7 +130,7 @@ class Strategy:
             return
         visible = projection.visible
         for total, gradient in ((grad_sum, projection.mean2d_grad), (abs_grad_sum, projection.mean2d_absgrad)):
-            if gradient is not None:  # no fragment at all, nothing to differentiate
+            if gradient is not None:  # None if there was no fragment
                 ndc = (0.5 * width * gradient[:, 0], 0.5 * height * gradient[:, 1])
                 size = torch.hypot(*ndc).nan_to_num(0.0, 0.0, 0.0)
                 total += torch.where(visible, size, 0.0)
@@ -141,18 +139,18 @@ class Strategy:
         torch.where(visible, torch.maximum(max_radius, radius), max_radius, out=max_radius)
 
     def step(self, step: int, scene: Scene, optimizers: Mapping[str, Optimizer], views: DrawViews) -> dict[str, float]:
-        """Do what the schedule asks for after the optimiser update of `step`.
+        """Densify, reset opacities and prune as scheduled after the optimiser update of `step`.
 
         Args:
             step: index of the step that just ended.
-            scene: its surfel parameters are replaced when their number changes.
-            views: draws the views for the score.
+            scene: its surfel parameters are replaced if their number changes.
+            views: samples the views for the scores.
 
         Returns:
-            What was done, by name; empty when nothing was due.
+            Counts of what was done, by name; empty if nothing was due.
         """
         report: dict[str, float] = {}
-        if 0 < self.config.densify.max_surfels < len(scene):  # it was loaded from elsewhere
+        if 0 < self.config.densify.max_surfels < len(scene):  # a loaded scene may exceed the limit
             report |= self._drop_dead(scene, optimizers)
         if step in self.schedule.densify_steps:
             report |= self._densify(step, scene, optimizers, views)
@@ -180,7 +178,7 @@ class Strategy:
         surfels = scene.surfels
         n, device = len(scene), surfels["means"].device
         statistics = self.statistics
-        if statistics.shape[1] != n:  # nothing was rendered since the last event
+        if statistics.shape[1] != n:  # no view since the last densification
             statistics = torch.zeros(len(STATISTICS), n, device=device)
         grad_sum, abs_grad_sum, visible_count, max_radius = statistics
         seen = visible_count.clamp(min=1)
@@ -195,7 +193,7 @@ class Strategy:
             gradient = abs_grad_sum / seen
             if config.max_surfels > 0:
                 room //= sum(step <= later for later in self.schedule.densify_steps)
-                # shortly after an opacity reset every opacity is low, whatever its surfel is worth
+                # shortly after an opacity reset all opacities are low
                 if not self.schedule.recovering(step):
                     faint = ~(clone | split) & (surfels["opacity_logits"].sigmoid() < self._replaceable)
                     replaced = _lowest(surfels["opacity_logits"], faint, count - room)
@@ -213,7 +211,7 @@ class Strategy:
         children = self._halves(surfels, splits)
         new = {name: torch.cat([p.detach()[clones], children[name]]) for name, p in surfels.items()}
 
-        # candidates for pruning are counted among all surfels there are now; only old ones can be drawn
+        # the budget counts candidates among old and new surfels; only old ones are sampled
         old_candidate, new_candidate = self._prunable(surfels), self._prunable(new)
         if step > self.schedule.reset_every:  # the first opacity reset is over
             old_candidate |= max_radius > config.prune_screen
@@ -232,8 +230,7 @@ class Strategy:
         return report | {"cloned": len(clones), "split": len(splits), "pruned": int(pruned.sum())}
 
     def _halves(self, surfels: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
-        """The two halves of each of `rows`, side by side along its long axis: together about the surfel that they were,
-        so that the picture stays."""
+        """Split each of `rows` into two halves along its long axis, which together look about like the surfel."""
         halves = {name: p.detach()[rows].repeat_interleave(2, dim=0) for name, p in surfels.items()}
         long = one_hot(halves["log_scales"].argmax(-1), 2).to(halves["log_scales"])  # [2S, 2]
         side = long.new_tensor([1.0, -1.0]).repeat(len(rows))[:, None]
@@ -261,7 +258,7 @@ class Strategy:
 
     @torch.no_grad()
     def _final_prune(self, scene: Scene, optimizers: Mapping[str, Optimizer], views: DrawViews) -> dict[str, float]:
-        """Remove faint surfels that the pictures do not miss: where opacities have been reset, many of them matter."""
+        """Remove the faint surfels that add little error; after an opacity reset many faint ones matter."""
         report, config = self._drop_dead(scene, optimizers), self.config.densify
         faint = scene.surfels["opacity_logits"].sigmoid() < config.final_prune_opacity
         drawn = self._error_views(views, FINAL_VIEWS, FEWEST_FINAL_VIEWS)
@@ -272,7 +269,7 @@ class Strategy:
         return views(max(fewest, round(share * self.schedule.max_steps)), self.generator)
 
     def _expendable(self, among: Tensor, share: float, scene: Scene, views: Sequence[View]) -> Tensor:
-        """[N] bool: those of the surfels `among` [N] bool that change the views least, together by at most a share of
+        """Select, [N] bool, the surfels `among` [N] bool that change the views least, together by at most a share of
         the views' squared error (`removal_errors`)."""
         seed = int(torch.randint(1 << 31, (), generator=self.generator))
         added, error = removal_errors(scene, views, self.config, seed, self.processes)
@@ -280,7 +277,7 @@ class Strategy:
         rows = rows[added[rows].argsort(stable=True)]
         chosen = torch.zeros_like(among)
         chosen[rows] = added[rows].cumsum(0) <= share * error
-        return chosen & (added > 0)  # views that were not drawn may show the others
+        return chosen & (added > 0)  # unsampled views may show the others
 
     def _prune(self, pruned: Tensor, scene: Scene, optimizers: Mapping[str, Optimizer]) -> dict[str, float]:
         """Remove as many of `pruned` [N] bool as `min_surfels` allows."""
@@ -289,7 +286,7 @@ class Strategy:
         return {"pruned": int(pruned.sum())}
 
     def _drop_dead(self, scene: Scene, optimizers: Mapping[str, Optimizer]) -> dict[str, float]:
-        """Remove surfels that are broken or can never be seen again, and those beyond the cap."""
+        """Remove surfels that are not finite or can never be visible again, and the faintest beyond `max_surfels`."""
         surfels = scene.surfels
         if scene.field is not None and not all(bool(p.isfinite().all()) for p in scene.field.parameters()):
             raise TrainingDiverged(f"the texture field is broken: {describe_broken(scene.field)}")
@@ -297,7 +294,7 @@ class Strategy:
         if not bool(finite.any()):
             raise TrainingDiverged(f"no surfel is left whose parameters are all finite: {describe_broken(scene)}")
         logits = surfels["opacity_logits"]
-        # no fragment anywhere, hence no gradient: they stay invisible for good
+        # no fragment, hence no gradient: they would stay invisible
         invisible = finite & (logits.sigmoid() <= ALPHA_MIN)
         if self.config.densify.max_surfels > 0:
             over = int(finite.sum() - invisible.sum()) - self.config.densify.max_surfels
@@ -307,8 +304,8 @@ class Strategy:
         return {"not_finite": int((~finite).sum()), "invisible": int((pruned & finite).sum())}
 
     def _keep_minimum(self, pruned: Tensor, opacity_logits: Tensor, count: int, among: Tensor | None = None) -> Tensor:
-        """Take back as much of `pruned` [N] bool, among the rows `among` [N] bool, as `min_surfels` asks for, the most
-        opaque first; `count` surfels there would be without this prune."""
+        """Clear the most opaque entries of `pruned` [N] bool, within `among` [N] bool, as far as needed to leave
+        `min_surfels`; `count` is the number of surfels without this prune."""
         if among is not None:
             pruned = pruned & among
         lowest = max(1, self.config.densify.min_surfels)
@@ -318,9 +315,9 @@ class Strategy:
         return pruned & ~_lowest(-opacity_logits, pruned, missing)
 
     def _draw(self, weights: Tensor, k: int) -> Tensor:
-        """[min(k, number of positive weights)] different rows, drawn one after the other in proportion to `weights`:
-        the k rows with the smallest Exp(1) / weight are such a sample (torch.multinomial takes no more than 2^24
-        rows)."""
+        """Sample k rows (at most the number of positive weights) without replacement, in proportion to `weights`.
+
+        The k rows with the smallest Exp(1) / weight are such a sample; torch.multinomial is limited to 2^24 rows."""
         k = min(k, int((weights > 0).sum()))
         race = torch.empty(len(weights), dtype=torch.float64).exponential_(generator=self.generator).to(weights.device)
         return (race / weights).topk(k, largest=False).indices
@@ -339,10 +336,11 @@ class Strategy:
 
 
 def most_surfels(config: TrainConfig, image_pixels: int, first_surfels: int = 0) -> int:
-    """The number of surfels that densification does not exceed; 0 = no bound.
+    """Compute the number of surfels at which densification stops; 0: no limit.
 
     Args:
-        image_pixels: of all training images at full size.
+        image_pixels: total over all training images at full size.
+        first_surfels: initial number of surfels.
     """
     densify = config.densify
     if densify.max_surfels > 0 or densify.pixels_per_surfel == 0 or image_pixels == 0:
@@ -351,7 +349,7 @@ def most_surfels(config: TrainConfig, image_pixels: int, first_surfels: int = 0)
 
 
 def finite_rows(scene: Scene) -> Tensor:
-    """[N] bool: every parameter of the surfel is finite."""
+    """Find the surfels, [N] bool, whose parameters are all finite."""
     finite = torch.ones(len(scene), dtype=torch.bool, device=scene.surfels["means"].device)
     for p in scene.surfels.values():
         finite &= p.detach().reshape(len(p), -1).isfinite().all(-1)
@@ -359,7 +357,7 @@ def finite_rows(scene: Scene) -> Tensor:
 
 
 def _lowest(values: Tensor, among: Tensor, k: int) -> Tensor:
-    """[N] bool: at most `k` of the rows `among` [N] bool, those with the lowest `values` [N]."""
+    """Select, [N] bool, the `k` rows with the lowest `values` [N] within `among` [N] bool."""
     rows = among.nonzero().flatten()
     chosen = torch.zeros_like(among)
     chosen[rows[values.detach()[rows].argsort(stable=True)[: max(0, k)]]] = True
@@ -367,7 +365,7 @@ def _lowest(values: Tensor, among: Tensor, k: int) -> Tensor:
 
 
 def _strongest(wanted: Tensor, importance: Tensor, gradient: Tensor, k: int) -> Tensor:
-    """[N] bool: at most `k` of the `wanted` rows, by importance first and gradient second."""
+    """Select, [N] bool, up to `k` of the `wanted` rows, by importance first and gradient second."""
     rows = wanted.nonzero().flatten()
     by_gradient = gradient[rows].argsort(descending=True, stable=True)
     rows = rows[by_gradient]

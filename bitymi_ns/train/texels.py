@@ -1,4 +1,4 @@
-"""Texels that learn in the last part of a run: every surfel gets a tile as fine as the training views see it."""
+"""The texel stage, the last part of a run: every surfel gets a tile at the resolution of the training views."""
 
 from __future__ import annotations
 
@@ -31,20 +31,19 @@ if TYPE_CHECKING:
     from bitymi_ns.train.schedules import Schedule
     from bitymi_ns.train.views import DownscaledViews, View
 
-FEWEST_VIEWS = 32  # fewest views that tiles are measured on, however short the run
+FEWEST_VIEWS = 32  # minimum number of views to measure tiles on, in runs of any length
 SMALLEST = 4  # side of the smallest tile, texels: a block of BC7
-FEW = 1 << 23  # texels that no run is too short for: 235 MB
-FEWER = 0.8  # factor by which tiles get fewer texels, as often as it takes until all are few enough
+FEW = 1 << 23  # total number of texels that runs of any length may have: 235 MB
+FEWER = 0.8  # factor on the texels per tile, repeated until the total is below the limit
 LEAST_SHARE = 0.25
-"""Lower bound of a texel's coverage where it is measured on a part of the views, as a share of what one view
-can show: no step is much longer than four times the rate. A whole view would slow down occluded texels."""
+"""Lower bound of a texel's coverage if only a sample of the views is measured, as a share of the coverage in one view.
+It limits a texel's step to about four times the rate. A full view as bound would slow down occluded texels."""
 SURVEY_PIXELS = 10_000
-"""Coverage is measured at half the size of the photographs where so many pixels remain: as accurate, in half
-the time."""
+"""Coverage is measured at half size if views have at least this many pixels then: as accurate, in half the time."""
 
 
 class LearningTexels:
-    """The part of a run in which texels learn."""
+    """Optimisation of the texels in the texel stage."""
 
     def __init__(self, scene: Scene, schedule: Schedule, processes: Processes) -> None:
         self.scene, self.schedule, self.options, self.processes = scene, schedule, schedule.config.texels, processes
@@ -52,7 +51,7 @@ class LearningTexels:
         self._views = 1
 
     def begin(self, step: int, views: DownscaledViews) -> bool:
-        """Create the tiles on the first step that needs them; True where this step is it."""
+        """Create the tiles on the first step of the texel stage; True on that step."""
         self._views = len(views)
         if not self.schedule.texels_learn(step) or isinstance(self.scene.field, TexelField):
             return False
@@ -70,7 +69,7 @@ class LearningTexels:
 
     @property
     def views_to_come(self) -> int:
-        """Views that the steps of this part render, counted with repetition."""
+        """Number of renders in the texel stage, over all processes."""
         return self.processes.views * self.schedule.texel_steps
 
     def prepare(self, step: int, view: View, factor: float) -> None:
@@ -78,13 +77,13 @@ class LearningTexels:
         field = self.scene.field
         if not isinstance(field, TexelField):
             return
-        # the loss is a mean, the step wants a sum
+        # the loss is a mean, but a texel's step is defined by the sum
         values = numbers(view.image, view.mask, view.counted)
         rate = factor * self.schedule.texel_rate(step, self._views) * values
         for handle in self._rates:
             handle.remove()
         self._rates = []
-        # one view moves the colours in its backward pass; several move them together, in `step`
+        # with one view per step, its backward pass updates the colours; with several, `step` does
         field.descent = TexelDescent(field.share, rate) if self.processes.views == 1 else None
         if field.descent is None:
             self._rates.append(field.texels.register_hook(lambda gradient: gradient * rate))
@@ -94,7 +93,7 @@ class LearningTexels:
 
     @property
     def _stepped(self) -> list[Parameter]:
-        """Colours and alphas of the texels that `step` moves."""
+        """Texel colours and alphas that `step` updates."""
         field = self.scene.field
         if not isinstance(field, TexelField):
             return []
@@ -103,8 +102,8 @@ class LearningTexels:
 
     @torch.no_grad()
     def average(self) -> None:
-        """Make the gradients those of the mean loss of all views of the step. Processes exchange those of the
-        texels alone that are not 0 in all of them."""
+        """Average the gradients over all views of the step. Processes exchange only rows with a nonzero gradient in at
+        least one process."""
         stepped = self._stepped
         for values in stepped:
             if values.grad is None:
@@ -123,7 +122,7 @@ class LearningTexels:
 
     @torch.no_grad()
     def step(self) -> None:
-        """Move colours and alphas by the mean of the steps of all views."""
+        """Update colours and alphas by their averaged gradients."""
         field = self.scene.field
         for values in self._stepped:
             if values.grad is not None:
@@ -138,14 +137,14 @@ class LearningTexels:
 def blank_texels(
     scene: Scene, views: Sequence[View], count: int, options: TexelConfig, to_come: float = math.inf
 ) -> TexelField:
-    """A tile for every surfel, with residuals of 0, and alphas of 1 where they learn.
+    """Create a tile for every surfel, with residuals of 0, and alphas of 1 if alphas are trained.
 
-    A surfel of which no view shows a residual has one texel.
+    A surfel without fragments that may have a residual gets one texel.
 
     Args:
-        views: sample to measure on, at full size; their pictures do not matter.
-        count: of all training views, which these stand for.
-        to_come: views that the texels learn from, counted with repetition.
+        views: sample of the training views at full size; only cameras and masks are used.
+        count: number of all training views.
+        to_come: number of renders in the texel stage.
     """
     surfels = {name: value.detach() for name, value in scene.surfels.items()}
     cameras = [view.camera for view in views]
@@ -168,36 +167,36 @@ def blank_texels(
 
 
 def most_texels(options: TexelConfig, rendered: float) -> float:
-    """Most texels of all tiles, for steps that render so many pixels."""
+    """Compute the maximum total number of texels for a texel stage that renders `rendered` pixels."""
     return max(FEW, rendered / options.rendered_pixels_per_texel)
 
 
 def mean_pixels(cameras: Sequence[Camera]) -> float:
-    """Mean pixels of a view; 0 without views."""
+    """Compute the mean number of pixels per view; 0 without views."""
     return sum(camera.width * camera.height for camera in cameras) / max(1, len(cameras))
 
 
 def single_view_coverage(
     surfels: Mapping[str, Tensor], cameras: Sequence[Camera], size: Tensor, extent: Tensor, near: float
 ) -> Tensor:
-    """About as much as a view can show of every texel, pixels [T]: its area in the view that is nearest to it, whether
-    or not that shows it, times the surfel's opacity.
+    """Estimate the coverage of each texel in one unoccluded view, pixels [T]: its area in the nearest view times the
+    surfel's opacity.
 
-    A view that is not measured may show what all others hide: by the measured coverage alone, its texels would take
-    steps a hundred times too long.
+    An unmeasured view may show texels that are occluded in all measured ones; by the measured coverage alone, their
+    steps would be a hundred times too long.
 
     Args:
-        cameras: the measured views; the others are about as near.
+        cameras: of the measured views; the others are assumed to be about as near.
         size: [N, 2] of the tiles.
         extent: [N] half sides of the tiles in scale units.
-        near: nearest drawn depth.
+        near: near plane.
     """
     area = tile_pixels(surfels, cameras, extent, near).prod(1) / size.prod(1)
     return (area * surfels["opacity_logits"].sigmoid()).repeat_interleave(size.long().prod(1))
 
 
 def tile_pixels(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], extent: Tensor, near: float) -> Tensor:
-    """Sides of the tiles of half sides `extent` in the view that shows them largest: pixels [N, 2]."""
+    """Compute the sides [N, 2], in pixels, of tiles of half sides `extent`, in the view where they are largest."""
     scales, axes = surfels["log_scales"].exp(), tangents(surfels["quats"])
     return max_projected_extent(surfels["means"], axes, scales, cameras, SUPPORT, near) * (extent / SUPPORT)[:, None]
 
@@ -211,16 +210,16 @@ def tiles_as_seen(
     options: TexelConfig,
     to_come: float = math.inf,
 ) -> tuple[Tensor, Tensor]:
-    """Tiles that reach as far as fragments reach the weight bound, with at most a texel for so many pixels of the view
-    that shows most of the surfel.
+    """Choose tile sizes. A tile covers the part of its surfel where fragments reach the weight bound, at the resolution
+    of the views and with at most one texel per `options.pixels_per_texel`.
 
     Args:
-        near: nearest drawn depth.
+        near: near plane.
         weight_bound: fragments of smaller weight get no residual.
-        to_come: views that the texels learn from, counted with repetition.
+        to_come: number of renders in the texel stage.
 
     Returns:
-        sizes [N, 2] int32 and half sides [N] in scale units; 1 x 1 where no fragment reaches the bound.
+        Sizes [N, 2] int32 and half sides [N] in scale units; 1 x 1 if no fragment reaches the bound.
     """
     extent = visible_extent(*kernel_parameters(surfels, seen.in_front), weight_bound)
     size = seen_sides(tile_pixels(surfels, cameras, extent, near), SMALLEST, options.largest)
@@ -236,8 +235,8 @@ def tiles_as_seen(
 
 @torch.no_grad()
 def coverage(scene: Scene, field: TexelField, views: Sequence[View]) -> Tensor:
-    """Coverage of every texel in pixels: [T] sum over views and fragments of the blending weight
-    times the bilinear weight, in pixels that count; 0 where no view sees it."""
+    """Compute the coverage [T] of each texel, in pixels: blending weight times bilinear weight, summed over unmasked
+    fragments and views."""
     total = torch.zeros_like(field.texels)
     for view in views:
         geometry = (scene.surfels[name].detach() for name in GEOMETRY)

@@ -1,4 +1,4 @@
-"""Training views: a camera, its photograph, which pixels of it count, and depth and normals where they are known."""
+"""Training views: camera and photograph, with optional mask, depth and normals."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from torch.nn.functional import interpolate
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.config import TrainConfig
 
-DOWNSCALED_BYTES = 1 << 28  # cache of downscaled pictures on the CPU; the others are downscaled at every use
-COVERED_VIEWS = 8  # views sampled for the share of pixels that show something
+DOWNSCALED_BYTES = 1 << 28  # cache of downscaled images on the CPU; others are downscaled at every use
+COVERED_VIEWS = 8  # views sampled by `covered_share`
 
 
 class View(NamedTuple):
     """One photograph.
 
     Attributes:
-        camera: the camera of the full-size image.
+        camera: of the full-size image.
         image: [H, W, 3] or, with straight (not premultiplied) alpha, [H, W, 4]; float in [0, 1] or uint8.
-        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
-        correction: how the photograph shows the scene's colours c: gains [3], gain c, or [3, 4], matrix c + offset;
-            None = as they are.
-        depth: [H, W] or [H, W, 1] float, camera z in world units, 0 or NaN where it is unknown; None = everywhere.
+        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None: everywhere.
+        correction: maps the scene's colour c to the photograph's: gains [3], gain c, or [3, 4], matrix c + offset;
+            None: no correction.
+        depth: [H, W] or [H, W, 1] float, camera z in world units, 0 or NaN where unknown; None: unknown everywhere.
         normal: [H, W, 3] float, surface normals in the camera frame (OpenCV axes, facing the camera), 0 or NaN where
-            they are unknown; None = everywhere.
-        counted: number of pixels that count, where that is known and `mask` is not None.
+            unknown; None: unknown everywhere.
+        counted: number of True pixels of `mask`; None: not known.
     """
 
     camera: Camera
@@ -43,20 +43,20 @@ class View(NamedTuple):
 
     @property
     def nbytes(self) -> int:
-        """Memory of the picture and of what belongs to its pixels."""
+        """Memory of image, mask, depth and normals, bytes."""
         return sum(map_.nbytes for map_ in (self.image, self.mask, self.depth, self.normal) if map_ is not None)
 
     def to(self, device: torch.device | str) -> View:
-        """The view on a device. Copies to a card go through pinned memory: the host does not wait."""
+        """Move the view to a device; copies to a GPU are asynchronous, from pinned memory."""
         maps = {name: _moved(value, device) for name, value in self._asdict().items() if isinstance(value, Tensor)}
         return self._replace(camera=self.camera.to(device), **maps)
 
     def shown(self, rgb: Tensor, alpha: Tensor, background: Tensor | None) -> Tensor:
-        """`shown` by this photograph's correction."""
+        """Apply this photograph's correction to a render, see `shown`."""
         return shown(rgb, self.correction, alpha, background)
 
     def target(self, background: Tensor | None, device: torch.device | str) -> Tensor:
-        """[H, W, 3] the photograph over a colour [3] (None = black), on a device."""
+        """Compose the photograph over a colour [3] (None: black) on a device: [H, W, 3]."""
         return over_background(as_float(self.image.to(device)), background)
 
 
@@ -67,12 +67,12 @@ class TrainingData:
     Attributes:
         views: training views at full size.
         extent: scene extent in world units (`init.scene_extent`).
-        image_pixels: of all training views together.
-        first_surfels: that training starts, or started, with.
-        covered: share of their pixels that show something (`covered_share`).
-        exif_stops: log2 of the exposure of each view (`exposure.exif_stops`), NaN = unknown; None = of all.
-        photographs: number of the photograph of each view; None = each is one.
-        cameras: of the views; None = they are asked of the views, which may read their photographs for it.
+        image_pixels: total over all training views.
+        first_surfels: initial number of surfels, also in a resumed run.
+        covered: share of opaque, unmasked pixels (`covered_share`).
+        exif_stops: log2 exposure of each view (`exposure.exif_stops`), NaN: unknown; None: unknown for every view.
+        photographs: index of each view's photograph; None: one view per photograph.
+        cameras: of the views; None: taken from the views, which may read the photographs for it.
     """
 
     views: Sequence[View]
@@ -92,13 +92,13 @@ def _moved(value: Tensor | None, device: torch.device | str) -> Tensor | None:
 
 
 def spread(count: int, most: int) -> list[int]:
-    """Numbers of at most `most` of `count` views, evenly spread; the first is one of them."""
+    """List up to `most` evenly spaced indices below `count`, including the first."""
     used = min(count, most)
     return [i * count // used for i in range(used)]
 
 
 def covered_share(views: Sequence[View]) -> float:
-    """Share of the pixels that count and are not transparent, in a few of the views."""
+    """Measure the share of pixels that are neither masked nor transparent, on a sample of the views."""
     shares = []
     for view in (views[i] for i in spread(len(views), COVERED_VIEWS)):
         shows = view.image[..., -1:] > 0 if view.image.shape[-1] == 4 else torch.ones((), dtype=torch.bool)
@@ -109,13 +109,13 @@ def covered_share(views: Sequence[View]) -> float:
 
 
 def shown(rgb: Tensor, correction: Tensor | None, alpha: Tensor, background: Tensor | None) -> Tensor:
-    """[H, W, 3] a rendered image as a photograph shows it. What is seen of the background stays as it is.
+    """Apply a photograph's correction to a rendered image [H, W, 3], except to the background's contribution.
 
     Args:
         rgb: [H, W, 3] over the background.
-        correction: of the photograph, see `View`; None = the image as it is.
+        correction: of the photograph, see `View`; None: returns `rgb`.
         alpha: [H, W, 1] coverage.
-        background: [3]; None = black.
+        background: [3]; None: black.
     """
     if correction is None:
         return rgb
@@ -123,26 +123,23 @@ def shown(rgb: Tensor, correction: Tensor | None, alpha: Tensor, background: Ten
     seen = rgb if behind is None else rgb - behind
     if correction.ndim == 1:
         seen = seen * correction
-    else:  # no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic algorithms
+    else:  # no matrix product: cuBLAS fails if torch is set to deterministic algorithms
         mixed = (seen[..., i : i + 1] * correction[:, i] for i in range(3))
         seen = sum(mixed, alpha * correction[:, 3])
     return seen if behind is None else seen + behind
 
 
 def as_float(image: Tensor) -> Tensor:
-    """The image as float32 in [0, 1]."""
+    """Convert an image to float32 in [0, 1]."""
     return image / 255.0 if image.dtype == torch.uint8 else image.float()
 
 
 def downscale_image(image: Tensor, width: int, height: int) -> Tensor:
-    """Area average of an image.
+    """Downscale an image by area averaging to [height, width, C].
 
     Args:
-        image: [H, W, C]; with C = 4 the colours are weighted by their alpha, so that what is hidden does not bleed in.
+        image: [H, W, C]; with C = 4 colours are weighted by alpha, so that hidden colours do not bleed in.
         width, height: new size in pixels.
-
-    Returns:
-        [height, width, C].
     """
     if image.shape[:2] == (height, width):
         return image
@@ -156,7 +153,7 @@ def downscale_image(image: Tensor, width: int, height: int) -> Tensor:
 
 
 def downscale_mask(mask: Tensor, width: int, height: int) -> Tensor:
-    """[height, width, 1] bool: True where every covered pixel of `mask` ([H, W] or [H, W, 1] bool) counts."""
+    """Downscale a mask ([H, W] or [H, W, 1] bool) to [height, width, 1]: True where all averaged pixels are True."""
     mask = mask.reshape(*mask.shape[:2], 1)
     if mask.shape[:2] == (height, width):
         return mask
@@ -164,7 +161,7 @@ def downscale_mask(mask: Tensor, width: int, height: int) -> Tensor:
 
 
 def nearest(values: Tensor, width: int, height: int) -> Tensor:
-    """[height, width, ...]: the nearest of the values [H, W, ...]; depths are not averaged across an edge."""
+    """Resample values [H, W, ...] to [height, width, ...] by nearest neighbour: depth must not average across edges."""
     rows, columns = (
         ((torch.arange(new, device=values.device) + 0.5) * (old / new)).long()
         for new, old in zip((height, width), values.shape[:2], strict=True)
@@ -173,13 +170,13 @@ def nearest(values: Tensor, width: int, height: int) -> Tensor:
 
 
 def background_changes(config: TrainConfig, view: View) -> bool:
-    """True where each step on a view has another colour behind the scene."""
+    """Return True if each step on a view uses another background colour."""
     return config.background == "random" or (config.background == "auto" and view.image.shape[-1] == 4)
 
 
 def step_background(config: TrainConfig, view: View, step: int, device: torch.device | str) -> Tensor | None:
-    """[3] the colour behind the scene in a step on a view, `config.background`; None = black. A random one depends on
-    seed and step alone."""
+    """Choose the background colour [3] of a training step, `config.background`; None: black. A random colour depends
+    only on seed and step."""
     if not background_changes(config, view):
         return eval_background(config, device)
     generator = torch.Generator().manual_seed((config.seed * 1_000_003 + step) & 0x7FFF_FFFF_FFFF_FFFF)
@@ -187,14 +184,14 @@ def step_background(config: TrainConfig, view: View, step: int, device: torch.de
 
 
 def eval_background(config: TrainConfig, device: torch.device | str) -> Tensor | None:
-    """[3] the colour behind the scene where views are judged, None = black: that of training, but `config.alpha_color`
-    where it changes, so that no figure depends on the draw."""
+    """Choose the background colour [3] for evaluation, None: black. It is that of training, or `config.alpha_color` if
+    training uses random colours, so that metrics are not random."""
     kind = config.background if config.background in ("black", "white") else config.alpha_color
     return torch.ones(3, device=device) if kind == "white" else None
 
 
 def over_background(image: Tensor, background: Tensor | None) -> Tensor:
-    """[H, W, 3]: an image with alpha composed over a colour [3] (None = black); one without is returned as it is."""
+    """Compose an image with alpha over a colour [3] (None: black): [H, W, 3]; returns one without alpha unchanged."""
     if image.shape[-1] == 3:
         return image
     color = image[..., :3] * image[..., 3:]
@@ -202,9 +199,12 @@ def over_background(image: Tensor, background: Tensor | None) -> Tensor:
 
 
 def at_size(view: View, camera: Camera, device: torch.device | str) -> View:
-    """The view on a device, its picture reduced to the size of `camera` (the view's own, scaled).
+    """Move a view to a device and downscale its image to the size of `camera`, the view's camera scaled.
 
-    The picture may be of that size already.
+    The image may have that size already.
+
+    Raises:
+        ValueError: image, mask, depth or normals have the size of neither camera.
     """
     image = as_float(view.image.to(device))
     for what in ("image", "mask", "depth", "normal"):
@@ -222,17 +222,17 @@ def at_size(view: View, camera: Camera, device: torch.device | str) -> View:
 
 
 class DownscaledViews:
-    """Training views at the resolution of the moment; downscaled pictures are kept until the resolution changes.
+    """Training views at the current resolution; downscaled images are cached until the resolution changes.
 
-    On the CPU `DOWNSCALED_BYTES` of them are kept. On a CUDA device full-size and reduced pictures share a budget, and
-    those that find no room in it are copied at every use.
+    On the CPU the cache holds `DOWNSCALED_BYTES`. On a CUDA device full-size and downscaled images share one budget;
+    images beyond it are copied at every use.
 
     Args:
         views: at full size.
-        device: where the pictures are wanted.
-        correction: gives the correction of a view by its number, as it is at the moment; None = there is none.
-        pose: moves the camera of a view, by its number, to where it is at the moment; None = it stays.
-        resident_bytes: budget on a CUDA device; None = `photograph_budget`.
+        device: of the images returned.
+        correction: returns the current correction of a view by its index; None: no corrections.
+        pose: returns a view's camera, by its index, with the current pose; None: poses are fixed.
+        resident_bytes: budget on a CUDA device; None: `photograph_budget`.
     """
 
     def __init__(
@@ -249,18 +249,18 @@ class DownscaledViews:
         self._factor = 1.0
         self._kept: dict[int, View] = {}
         self._resident: dict[int, View] = {}
-        self._counted: dict[int, int] = {}  # a step must not wait for the device to count
+        self._counted: dict[int, int] = {}  # avoids a synchronisation in every step
         if resident_bytes is None:
             resident_bytes = photograph_budget(self._device)
         self._budget = MemoryBudget(resident_bytes)
-        # a card has one budget for both: pictures of full size stay, reduced ones give theirs back
+        # on a GPU one budget for both: full-size images stay, downscaled ones free theirs when the resolution changes
         self._reduced_budget = self._budget if resident_bytes else MemoryBudget(DOWNSCALED_BYTES)
 
     def __len__(self) -> int:
         return len(self._views)
 
     def at(self, index: int, factor: float) -> View:
-        """View number `index`, its image resized by `factor`, with its correction."""
+        """Return view `index`, its image resized by `factor`, with its current correction and pose."""
         view = self._at(index, factor)
         if self._pose is not None:
             view = view._replace(camera=self._pose(index, view.camera))
@@ -292,21 +292,20 @@ class DownscaledViews:
         return moved
 
     def draw(self, k: int, generator: torch.Generator, factor: float) -> Sequence[View]:
-        """`k` different views, or all of them when there are fewer, downscaled when they are used; `generator` lives on
-        the CPU."""
+        """Sample `k` different views, or all if there are fewer, downscaled on access; `generator` is on the CPU."""
         order = torch.randperm(len(self), generator=generator).tolist()[:k]
         return OnDemand(len(order), lambda i: self.at(order[i], factor))
 
 
 def photograph_budget(device: torch.device) -> int:
-    """Bytes of photographs that stay on a CUDA device: a quarter of its free memory. 0 on the CPU, where they are."""
+    """Compute the bytes of photographs to cache on a CUDA device: a quarter of its free memory; 0 for the CPU."""
     return torch.cuda.mem_get_info(device)[0] // 4 if device.type == "cuda" else 0
 
 
 def training_order(n: int, seed: int, step: int) -> int:
-    """Index of the view of a training step: every view once an epoch, reshuffled each epoch.
+    """Compute the index of a training step's view: each view once per epoch, reshuffled each epoch.
 
-    Depends on the arguments alone, so that a resumed run sees the same views.
+    Depends only on the arguments, so that a resumed run uses the same views.
     """
     epoch, position = divmod(step, n)
     return _order(n, seed, epoch)[position]
@@ -322,18 +321,18 @@ T = TypeVar("T")
 
 
 class MemoryBudget:
-    """Byte budget shared by caches. What fits first stays: views are used in turn, so a cache that evicts the oldest
-    would drop each one just before its next use.
+    """Byte budget shared by caches, first come, first served: views are used cyclically, so evicting the oldest would
+    drop each view just before its next use.
 
     Attributes:
-        left: bytes that are not taken.
+        left: bytes not reserved.
     """
 
     def __init__(self, nbytes: int) -> None:
         self.left = nbytes
 
     def reserve(self, nbytes: int) -> bool:
-        """Take so many bytes if they are left; True where they were."""
+        """Reserve bytes; False if too few are left."""
         if nbytes > self.left:
             return False
         self.left -= nbytes
@@ -341,10 +340,10 @@ class MemoryBudget:
 
 
 class OnDemand(Sequence, Generic[T]):
-    """A sequence whose items are made whenever they are asked for.
+    """A sequence that creates its items at each access.
 
     Args:
-        make: gives the item of an index, 0 to count - 1.
+        make: creates the item of an index, 0 to count - 1.
     """
 
     def __init__(self, count: int, make: Callable[[int], T]) -> None:

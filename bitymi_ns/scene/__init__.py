@@ -1,4 +1,4 @@
-"""Trained scenes: surfels, their view colour, and the residual colour field."""
+"""Trained scenes: surfels with view-dependent and residual colours."""
 
 from .camera import Camera
 from .config import SceneConfig

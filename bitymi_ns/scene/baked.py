@@ -1,4 +1,4 @@
-"""A baked scene: surfels and an atlas, no network. Forward only, nothing here learns."""
+"""Baked scene: surfels and a texture atlas, no network; forward rendering only."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from bitymi_ns.ops.constants import TRANSMITTANCE_MIN
 from .camera import Camera
 from .sampling import Sampling, averaged, sampling_of, size_of
 
-FAST = 1 / 512  # transmittance at which a pixel ends that is drawn for speed: half of an 8-bit step of light is left
+FAST = 1 / 512  # transmittance at which fast rendering ends a pixel: at most half an 8-bit step is lost
 
 
 OUTPUTS = ("rgb", "alpha", "beta", "depth", "normal", "overdraw")  # fields of a `BakedOutput`
 
 
 def as_bytes(image: Tensor) -> Tensor:
-    """The image in [0, 1] as uint8 on the CPU; what is beyond is cut off."""
+    """Convert an image in [0, 1], clamped, to uint8 on the CPU."""
     return (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu()
 
 
 def image_names(maps: bool) -> tuple[str, ...]:
-    """Images to draw for a `BakedOutput`, names of `ops.baked.IMAGES`."""
+    """List the images, names of `ops.baked.IMAGES`, to render for a `BakedOutput`."""
     return OUTPUTS if maps else OUTPUTS[:2]
 
 
 @dataclass
 class BakedOutput:
-    """A view of a baked scene; the fields mean what they mean in `scene.RenderOutput`."""
+    """A rendered view of a baked scene; fields as in `scene.RenderOutput`."""
 
     rgb: Tensor
     alpha: Tensor
@@ -47,33 +47,31 @@ class BakedOutput:
 
 @dataclass
 class BakedScene:
-    """A baked scene and its renderer, on the CPU or, after `to`, on a CUDA device: what the bake makes, and what a
-    bundle holds.
+    """A baked scene and its renderer, on the CPU or a CUDA device; result of the bake and content of a bundle.
 
     Attributes:
         surfels: per-surfel parameters by name (docs/overview.md), float32.
         view_color: a name of `ops.VIEW_COLORS`.
         tiles: [N, 5] int32: x, y, layer, r_u, r_v in texels; r_u = 0: no tile.
-        atlas: [layers, height, width, 4] uint8 or float32 on the CPU, None = no residual. On a CUDA device float texels
-            become float16.
+        atlas: [layers, height, width, 4] uint8 or float32 on the CPU; None: no residual. Float texels are rendered as
+            float16 on a CUDA device.
         blocks: [layers, height / 4, width / 4, 16] uint8 on the CPU, the same atlas as BC7 blocks, which a CUDA device
-            reads as they are; None = not given. The CPU needs `atlas`.
+            reads directly; None: not given. The CPU needs `atlas`.
         offset, scale: residual = offset + scale * value, value = stored / 255 for uint8, stored for float32.
-        extent: [N] half side of the tile in scale units, None = 3, the kernel's support, everywhere.
-        mean_residual: [N, 3] float32 mean residual of every tile; a surfel without a tile has this residual. None = 0.
+        extent: [N] half side of the tile in scale units; None: 3 everywhere, the kernel's support.
+        mean_residual: [N, 3] float32 mean residual of each tile, and the residual of surfels without a tile. None: 0.
         alpha_scale: texels multiply their surfel's sigma by m = alpha_scale * value of their fourth channel, see
-            `ops.TexelAlpha`; 0 = they do not.
-        mean_alpha: [N] float32 mean m of every tile; that of a surfel without a tile. None = 1.
-        near: nearest depth that is drawn, camera z.
-        weight_bound: fragments of smaller blending weight keep the surfel's colour without the residual.
+            `ops.TexelAlpha`; 0: opaque texels.
+        mean_alpha: [N] float32 mean m of each tile, and m of surfels without a tile. None: 1.
+        near: near plane, camera z.
+        weight_bound: fragments of smaller blending weight have no residual.
         prefilter: low_pass or pixel, as in `SceneConfig`.
-        transmittance_min: a surfel that would leave a pixel less transmittance ends the pixel; 0 = every surfel is
-            blended. As in training 1e-4, where that surfel is not blended itself. `FAST` for speed: what is then left
-            out cannot change a pixel by more than half an 8-bit step. WebGPU always ends pixels at 1e-4.
-        photographed: [P, 4] float32 on the CPU, points of the scene, and with how many pixels per unit of length they
-            were photographed: by these a view is drawn for its size (`sampling.py`); None = every view is drawn as one
-            of the photographs' size.
-        through_webgpu: draw through WebGPU (`ops.webgpu`), wherever the surfels lie; images then lie on the CPU.
+        transmittance_min: a pixel ends at the surfel, not blended itself, that would leave less transmittance; 0: no
+            limit. Training uses 1e-4; `FAST` is faster and changes a pixel by at most half an 8-bit step. WebGPU always
+            uses 1e-4.
+        photographed: [P, 4] float32 on the CPU, points of the scene and the pixels per unit of length in their
+            photographs, to choose the sampling of a view (`sampling.py`); None: as for the photographs' scale.
+        through_webgpu: render through WebGPU (`ops.webgpu`) on any device; images are then on the CPU.
     """
 
     surfels: Mapping[str, Tensor]
@@ -96,7 +94,7 @@ class BakedScene:
     cache: DrawCache = field(default_factory=DrawCache, init=False, repr=False, compare=False)
 
     def residuals(self) -> Tensor:
-        """Residual colours of the atlas: [layers, height, width, 3] float32.
+        """Compute the residual colours of the atlas, [layers, height, width, 3] float32.
 
         Raises:
             ValueError: there is no atlas, or only its BC7 blocks.
@@ -104,8 +102,8 @@ class BakedScene:
         return self._values(slice(3)) * self.scale + self.offset
 
     def alphas(self) -> Tensor | None:
-        """Factors of sigma of the atlas: m [layers, height, width] float32; None without an atlas, or where its texels
-        have none.
+        """Compute the factors m of sigma of the atlas, [layers, height, width] float32; None if there is no atlas or
+        its texels are opaque.
 
         Raises:
             ValueError: there are only the atlas's BC7 blocks.
@@ -115,14 +113,14 @@ class BakedScene:
         return self._values(3) * self.alpha_scale
 
     def _values(self, channels: int | slice) -> Tensor:
-        """Values of the atlas as the renderers read them."""
+        """Read channels of the atlas as float32, uint8 scaled to [0, 1]."""
         if self.atlas is None:
             raise ValueError("the scene has no atlas" if self.blocks is None else "the atlas was not decoded")
         values = self.atlas[..., channels].float()
         return values / 255.0 if self.atlas.dtype == torch.uint8 else values
 
     def to(self, device: torch.device | str) -> BakedScene:
-        """The scene with its surfels on another device; texels go there, as textures, when it is first drawn."""
+        """Move the surfels to a device; texels are uploaded as textures at the first render."""
 
         def moved(t: Tensor | None) -> Tensor | None:
             return None if t is None else t.to(device)
@@ -136,18 +134,17 @@ class BakedScene:
 
     @torch.no_grad()
     def render(self, camera: Camera, background: Tensor | None = None, maps: bool = False) -> BakedOutput:
-        """Render a view: texels are fetched bilinearly, clamped to the tile's outer texel centres. A view that shows
-        the scene smaller or larger than the photographs do is drawn for its size (`sampling`); overdraw is then that of
-        all samples of a pixel.
+        """Render a view. Texels are fetched bilinearly, clamped to the tile's outer texel centres. Samples per pixel
+        follow the scale of the view (`sampling`); overdraw is the sum over the samples of a pixel.
 
-        On a CUDA device this allocates its images and waits for them; `baked_renderer` keeps memory and CUDA graphs.
+        On a CUDA device this allocates its images and synchronises; `baked_renderer` keeps memory and CUDA graphs.
 
         Args:
-            background: [3] colour behind the scene; None = black.
-            maps: also beta, depth, normals and overdraw.
+            background: [3] colour behind the scene; None: black.
+            maps: also render beta, depth, normals and overdraw.
 
         Raises:
-            ValueError: the scene is on the CPU, and its atlas only as BC7 blocks.
+            ValueError: the scene is on the CPU and has only the atlas's BC7 blocks.
         """
         images = {name: image[0] for name, image in self._draw([camera], background, image_names(maps)).items()}
         return BakedOutput(*map(images.get, OUTPUTS))
@@ -156,12 +153,12 @@ class BakedScene:
     def render_views(
         self, cameras: Sequence[Camera], background: Tensor | None = None, images: Sequence[str] = ("rgb", "alpha")
     ) -> dict[str, Tensor]:
-        """Render views of one size on a CUDA device, all in one go, with the same samples per pixel.
+        """Render a batch of views of one size on a CUDA device, with the same samples per pixel.
 
         Args:
             cameras: at least one.
-            background: [3] colour behind the scene; None = black.
-            images: what to draw, names of `ops.baked.IMAGES`.
+            background: [3] colour behind the scene; None: black.
+            images: names of `ops.baked.IMAGES`.
 
         Returns:
             name -> [views, height, width, channels].
@@ -177,14 +174,14 @@ class BakedScene:
         return self._draw(cameras, background, images)
 
     def sampling(self, cameras: Sequence[Camera]) -> Sampling:
-        """Sampling of views that are drawn together: by the geometric mean of their sizes."""
+        """Choose the sampling of a batch of views, by the geometric mean of their scales."""
         if self.photographed is None or not len(self.photographed):
             return Sampling()
         sizes = [size_of(self.photographed, camera) for camera in cameras]
         return sampling_of(math.exp(sum(map(math.log, sizes)) / len(sizes)), cameras[0].width * cameras[0].height)
 
     def _draw(self, cameras: Sequence[Camera], background: Tensor | None, images: Sequence[str]) -> dict[str, Tensor]:
-        """As `ops.baked.draw`, for the size of the views."""
+        """Render with `ops.baked.draw`, at the sampling of the views."""
         common_size(cameras)
         how = self.sampling(cameras)
         if how.samples == 1:

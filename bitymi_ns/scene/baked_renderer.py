@@ -1,4 +1,4 @@
-"""Rendering a baked scene frame after frame: working memory that is kept and, on a card, CUDA graphs."""
+"""Renderers of baked scenes that keep their working memory between frames and, on a GPU, use CUDA graphs."""
 
 import gc
 import threading
@@ -16,19 +16,19 @@ from .sampling import Sampling
 
 
 class BakedRenderer:
-    """Draws frames of one kind into images that are kept; each frame overwrites the one before.
+    """Renderer of frames of one size into the same images: each frame overwrites the one before.
 
     Args:
         scene: on a CUDA device.
         width, height: of the images, pixels.
-        views: drawn together in a frame.
-        images: what to draw, names of `ops.baked.IMAGES`: fewer images cost less.
-        background: [3] colour behind the scene; None = black.
-        graph: record the frame as a CUDA graph, which costs the host one call per frame. For a card only.
+        views: number of views per frame.
+        images: names of `ops.baked.IMAGES`: fewer images cost less.
+        background: [3] colour behind the scene; None: black.
+        graph: record the frame as a CUDA graph, which costs the host one call per frame. GPU only.
 
     Raises:
         RuntimeError: the scene is on the CPU, or the device has too little memory.
-        ValueError: an image that does not exist, or more surfels times views than 2^24.
+        ValueError: an image does not exist, `graph` without a GPU, or surfels times views is above 2^24.
     """
 
     def __init__(
@@ -59,16 +59,19 @@ class BakedRenderer:
     def draw(
         self, cameras: Sequence[Camera], check: bool = True, background: Tensor | None = None
     ) -> dict[str, Tensor]:
-        """Draw the views.
+        """Render the views.
 
         Args:
-            cameras: as many as the renderer has views, of its size.
-            check: wait for the frame and draw it again when the working memory was too small. Without, the frame is
-                only begun; ask `complete` later.
-            background: [3] another colour behind the scene, where the renderer has one; None = as before.
+            cameras: one per view, of the renderer's size.
+            check: wait for the frame and render it again if the working memory was too small. If False, the frame is
+                only started; call `complete` later.
+            background: [3] new background colour, if the renderer has one; None: as before.
 
         Returns:
             name -> [views, height, width, channels]; the same memory every time.
+
+        Raises:
+            ValueError: the cameras do not match the renderer.
         """
         viewmats, Ks, width, height = stack_cameras(cameras, self._viewmats.device)
         if (len(cameras), width, height) != self._size:
@@ -86,8 +89,8 @@ class BakedRenderer:
         return self.images
 
     def run(self, stages: Stage = Stage.ALL) -> None:
-        """Begin the frame of the latest cameras; single stages, for timing them, are never taken from the graph."""
-        with on_device(self._viewmats.device):  # a graph is recorded on a stream of the current one
+        """Start a frame with the latest cameras; single stages, for timing, never use the graph."""
+        with on_device(self._viewmats.device):  # a graph is recorded on a stream of the current device
             if not self._use_graph or stages != Stage.ALL:
                 self._draw(stages)
                 return
@@ -96,10 +99,10 @@ class BakedRenderer:
             self._graph.replay()
 
     def _record(self) -> None:
-        self._draw(Stage.ALL)  # before recording: first calls load kernels
+        self._draw(Stage.ALL)  # the first call loads kernels, which cannot be recorded
         torch.cuda.synchronize(self._viewmats.device)
         graph = torch.cuda.CUDAGraph()
-        # a texture that is freed waits for the device, which is an error while a graph is recorded.
+        # freeing a texture synchronises the device, which is an error during recording
         collects = gc.isenabled()
         gc.disable()
         try:
@@ -111,7 +114,7 @@ class BakedRenderer:
         self._graph = graph
 
     def complete(self) -> bool:
-        """True where the working memory was large enough for the latest frame; waits for it."""
+        """Wait for the latest frame; return True if the working memory was large enough for it."""
         return self._surfels == 0 or self.workspace.complete
 
     def _draw(self, stages: Stage) -> None:
@@ -124,12 +127,12 @@ class BakedRenderer:
 
 
 class SceneRenderer:
-    """Renders views of any camera, on any device. On a CUDA device a size that repeats is drawn by a `BakedRenderer` of
-    its own, on a card as a CUDA graph. Threads may share a renderer.
+    """Renderer for any camera and device. On a CUDA device each repeated image size gets its own `BakedRenderer`, on a
+    GPU with a CUDA graph. Thread-safe.
 
     Args:
-        scene: on the device where it is drawn.
-        kept: sizes that keep a `BakedRenderer`, each with its working memory; the oldest is dropped first.
+        scene: on the device to render on.
+        kept: maximum number of `BakedRenderer`, each with its own working memory; the oldest is dropped first.
     """
 
     def __init__(self, scene: BakedScene, kept: int = 4) -> None:
@@ -139,21 +142,21 @@ class SceneRenderer:
         self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple[type, tuple[BakedScene, int]]:
-        """Make a renderer of its own for a copy: working memory and graphs are of one process."""
+        """Pickle scene and settings only: working memory and graphs belong to one process."""
         return SceneRenderer, (self.scene, self._kept)
 
     @torch.no_grad()
     def render(self, camera: Camera, background: Tensor | None = None, maps: bool = False) -> BakedOutput:
-        """Render a view; arguments and images are those of `BakedScene.render`."""
+        """Render a view; arguments and images as in `BakedScene.render`."""
         scene, device = self.scene, self.scene.tiles.device
-        # a graph keeps the size of a photograph's pixel: views that show the scene smaller or larger go without one
+        # a graph fixes the sampling: views of another scale are rendered without one
         if scene.through_webgpu or not cuda_backend(device) or scene.sampling([camera]) != Sampling():
             return scene.render(camera, background, maps)
         key = (camera.width, camera.height, background is None, maps)
         with self._lock:
             repeats, self._latest = key == self._latest, key
             if key not in self._renderers:
-                if not repeats:  # the viewer changes its size while the camera moves: recording would not pay
+                if not repeats:  # a viewer changes its size while the camera moves: recording would not pay off
                     return scene.render(camera, background, maps)
                 while len(self._renderers) >= self._kept:
                     del self._renderers[next(iter(self._renderers))]

@@ -1,4 +1,4 @@
-"""A pinhole camera."""
+"""Pinhole camera."""
 
 from __future__ import annotations
 
@@ -36,21 +36,20 @@ class Camera:
 
     @cached_property
     def exact_center(self) -> Tensor:
-        """[3] float64, camera centre in the world frame: far from the origin float32 would not place it. Computed once:
-        a view is trained on many times."""
-        with torch.inference_mode(False):  # else it could not go into a graph later
+        """Camera centre in the world frame, [3] float64: float32 is too coarse far from the origin. Cached."""
+        with torch.inference_mode(False):  # an inference tensor could not enter an autograd graph later
             viewmat = self.viewmat.double()
-            # no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic algorithms
+            # no matrix product: cuBLAS fails if torch is set to deterministic algorithms
             return -(viewmat[:3, :3] * viewmat[:3, 3:]).sum(0)
 
     @property
     def center(self) -> Tensor:
-        """[3] camera centre in the world frame."""
+        """Camera centre in the world frame, [3], in the dtype of `viewmat`."""
         return self.exact_center.to(self.viewmat)
 
     @cached_property
     def skewed(self) -> bool:
-        """True if K has skew. Looked up before a camera goes to a device, so that nothing waits for that later."""
+        """True if K has skew. Read before the camera moves to a device, to avoid a synchronisation later."""
         return float(self.K[0, 1]) != 0.0
 
     def _with(self, **changes: Any) -> Camera:
@@ -59,28 +58,29 @@ class Camera:
         return other
 
     def to(self, device: torch.device | str) -> Camera:
-        """The same camera on another device; the host does not wait for a copy from its memory."""
+        """Move the camera to a device; copies from the CPU are asynchronous."""
         wait = self.K.device.type != "cpu"
         viewmat, K = (t.to(device, non_blocking=not wait) for t in (self.viewmat, self.K))
         if viewmat is self.viewmat and K is self.K:
-            return self  # with what it has computed
+            return self  # keeps cached properties
         return self._with(viewmat=viewmat, K=K)
 
     def posed(self, viewmat: Tensor) -> Camera:
-        """Move the camera to another pose, world to camera [4, 4], in the dtype and on the device of its own."""
+        """Replace the pose by another world-to-camera matrix [4, 4], converted to this camera's dtype and device."""
         return self._with(viewmat=viewmat.to(self.viewmat))
 
     def local(self, points: Tensor) -> Tensor:
-        """[M, 3] world points in the camera frame. `viewmat` and `points` lie on one device."""
-        # no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic algorithms
+        """Transform world points [M, 3], on the camera's device, to the camera frame."""
+        # no matrix product: cuBLAS fails if torch is set to deterministic algorithms
         viewmat = self.viewmat.to(points.dtype)
         return (points[:, None] * viewmat[:3, :3]).sum(-1) + viewmat[:3, 3]
 
     def project(self, points: Tensor, near: float = 0.0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Pixel coordinates x, y and camera z of world points [M, 3], each [M], and which lie in the picture, [M] bool.
+        """Project world points [M, 3] to pixel coordinates x, y and camera z, each [M], and test if they are inside the
+        image, [M] bool.
 
         Args:
-            near: points in the picture have a larger z; others are projected as if they had this one.
+            near: near plane; z is clamped to it for x and y, and points nearer than it are not inside.
         """
         x, y, z = self.local(points).unbind(-1)
         depth, K = z.clamp(min=near), self.K.to(points.dtype)
@@ -88,23 +88,23 @@ class Camera:
         return x, y, z, (z > near) & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
 
     def unproject(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-        """[M, 3] world points at pixel coordinates [M] with camera z [M], in the dtype of z."""
+        """Unproject pixel coordinates [M] with camera z [M] to world points [M, 3], in the dtype of z."""
         viewmat, K = self.viewmat.to(z.dtype), self.K.to(z.dtype)
         local = torch.stack([(x - K[0, 2]) / K[0, 0] * z, (y - K[1, 2]) / K[1, 1] * z, z], -1)
         return (local - viewmat[:3, 3]) @ viewmat[:3, :3]
 
     def rows(self, top: int, bottom: int) -> Camera:
-        """The camera of the image's rows from `top` to `bottom` (exclusive)."""
+        """Crop the image to rows `top` to `bottom` (exclusive)."""
         shift = torch.zeros_like(self.K)
         shift[1, 2] = top
         return self._with(K=self.K - shift, height=bottom - top)
 
     def within(self, side: int) -> Camera:
-        """The camera of the same view with its image scaled down to at most `side` pixels along its longer side."""
+        """Scale the image down to at most `side` pixels along its longer side."""
         return self.scaled(min(1.0, side / max(self.width, self.height)))
 
     def scaled(self, factor: float) -> Camera:
-        """The camera of the same view with its image resized by `factor` (size rounded to whole pixels)."""
+        """Scale the image by `factor` (size rounded to whole pixels)."""
         width = max(1, round(self.width * factor))
         height = max(1, round(self.height * factor))
         K = self.K.clone()

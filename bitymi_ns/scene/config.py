@@ -1,4 +1,4 @@
-"""Options that decide the parameters of a scene and how they are rendered."""
+"""Options of a scene's parameters and rendering."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -10,12 +10,12 @@ from bitymi_ns.ops.constants import MAX_LEVELS, MAX_TERMS
 from bitymi_ns.ops.view_kinds import Kind
 from bitymi_ns.ranges import Count, Share
 
-Texture = Literal["hash", "texels", "none"]  # what colours a surfel beside its view colour
+Texture = Literal["hash", "texels", "none"]  # residual colour, added to the view-dependent colour
 
 
 @dataclass
 class SceneConfig:
-    """Representation of the scene: surfels, view colour and residual colour field."""
+    """Representation of the scene: surfels, view-dependent colour and residual colour."""
 
     view_color: Kind = "sv"
     """View colour: sv = Spherical Voronoi, sh = spherical harmonics, sb = Spherical Beta, sg = spherical Gaussians."""
@@ -27,7 +27,7 @@ class SceneConfig:
     """Number of lobes per surfel of the Spherical Beta and spherical Gaussian colours, 1 to 32."""
     texture: Texture = "hash"
     """Residual colours: hash = a field in space, multiresolution hash grid and MLP; texels = texels on every surfel,
-    which learn in the last part of the run (train.texels); none = surfels alone."""
+    trained in the last part of the run (train.texels); none = no residual."""
     levels: Annotated[int, Field(ge=1, le=MAX_LEVELS)] = 4
     """Hash grid levels, 1 to 4, with resolutions min_resolution * 2^level; the paper's 4."""
     min_resolution: Annotated[int, Field(ge=2, le=1 << 20)] = 256
@@ -36,18 +36,19 @@ class SceneConfig:
     """Entries per hash level, as a power of two, 1 to 24; not given: chosen by the number of pixels in the photographs,
     so that the table fits the cache."""
     contraction: Literal["auto", "on", "off"] = "auto"
-    """Contraction of space beyond the cameras; auto: off for images with alpha, and where a small box is declared."""
+    """Contraction of space beyond the cameras; auto: off for images with alpha, and if the capture states a small
+    scene box."""
     near: Annotated[float, Field(ge=1e-6, le=1e6)] | None = None
-    """Nearest depth that is drawn, in scene units (camera z), above 0; not given: 0.02 of the extent of the cameras."""
+    """Near plane, in scene units (camera z), above 0; not given: 0.02 of the extent of the cameras."""
     weight_bound: Share = 0.02
-    """Fragments whose blending weight is below this keep the surfel's colour without the residual field; 0 to 1."""
+    """Blending weight below which fragments have no residual colour; 0 to 1."""
     texture_moves_surfels: bool = False
     """The gradient of the residual field with respect to position reaches the surfels; that of texels always does."""
     prefilter: Prefilter = "low_pass"
-    """How discs of a pixel or less are drawn: low_pass = never smaller than a fixed blob around their centre; pixel =
-    as what they cover of each pixel, with the right moments (docs/numerics.md)."""
+    """Antialiasing of small discs: low_pass = at least a fixed blob around the centre; pixel = integrated over the
+    pixel, with the right moments (docs/numerics.md)."""
     max_fragments: Count = 0
-    """Fragments that are kept at once. Views with more are drawn in bands, which the backward pass draws once more. 0:
-    on a GPU as many as its memory holds, on the CPU 2^25, which take 1.5 GB."""
+    """Maximum number of fragments in memory. Views with more are rendered in bands, which the backward pass renders
+    again. 0: on a GPU as many as its memory holds, on the CPU 2^25, which take 1.5 GB."""
     rim: Annotated[float, Field(ge=1e-8, le=1)] = 1e-3
     """Lower bound of 1 - x in the derivative of the Beta kernel, which diverges at the rim for beta < 1; 1e-8 to 1."""

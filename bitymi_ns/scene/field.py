@@ -1,4 +1,4 @@
-"""The residual colours of a scene as modules: a field in space, or texels on every surfel."""
+"""Residual colours of a scene as modules: a field in space, or texels on every surfel."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from .config import SceneConfig
 
 
 def _is_of(cached: tuple[Tensor, int, Any] | None, buffer: Tensor) -> bool:
-    """True where something was computed from a buffer that has neither been replaced nor written to since."""
+    """Test if a cached value belongs to a buffer in its current version."""
     return cached is not None and cached[0] is buffer and cached[1] == version_of(buffer)
 
 
 class ResidualField(nn.Module):
-    """Residual colours of fragments, beside the surfels' view colours."""
+    """Residual colours of fragments, added to the surfels' view-dependent colours."""
 
     def residual(
         self, fragments: Fragments, frames: Tensor, bound: float, learns: bool, read: Tensor | None = None
     ) -> dict[str, Any]:
-        """Arguments of `blended_image` for the residual of a view.
+        """Compute the residual of a view, as arguments of `blended_image`.
 
         Args:
-            frames: [N, 9] of its `Projection`.
-            bound: fragments of weight below this have no residual.
-            learns: whether it gets gradients.
-            read: what `snapshot` gave, for a view that is drawn in parts.
+            frames: [N, 9] of the view's `Projection`.
+            bound: fragments of smaller weight have no residual.
+            learns: compute gradients.
+            read: result of `snapshot`, for a view rendered in bands.
         """
         found = self.texture(bound, learns, read)
         if found is None:
@@ -41,31 +41,30 @@ class ResidualField(nn.Module):
         return found
 
     def texture(self, bound: float, learns: bool, read: Tensor | None = None) -> dict[str, Any] | None:
-        """Return texels [T, 3], tiles and the other arguments of `blended_image` by name, where the residual does not
-        depend on the fragments; None where it does. Arguments as in `residual`."""
+        """Return the arguments of `blended_image` if the residual is a texture (texels [T, 3], tiles), else None.
+        Arguments as in `residual`."""
         return None
 
     def opacity(self, bound: float, learns: bool) -> TexelAlpha | None:
-        """Opacities of texels, with gradients or without; None = all of a surfel is as opaque as it is. See
-        `ops.TexelAlpha` for the bound."""
+        """Return opacities of texels, with or without gradients, see `ops.TexelAlpha`; None: opaque texels."""
         return None
 
     def snapshot(self) -> Tensor | None:
-        """State that parts of a view read in place of the field itself, because the backward passes of other parts
-        change it before they have been drawn again; None: nothing changes."""
+        """Copy the state that bands of a view read, because the backward pass of one band may update the field before
+        another is rendered again; None: the backward pass changes nothing."""
         return None
 
 
 class HashField(ResidualField):
     """Multiresolution hash grid and MLP: view-independent residual colour rho(x), eq. (color).
 
-    The residual starts at zero: the last layer does. Table entries start at U(-1e-4, 1e-4).
+    The last layer is initialised with 0, and so the residual is 0; table entries with U(-1e-4, 1e-4).
 
     Args:
         mid: centre of the domain, world.
         half: radius of the uncontracted ball, or half edge of the box, world units.
-        contract: contraction of space outside.
-        log2_table_size: entries per level, as a power of two.
+        contract: contract space outside the ball.
+        log2_table_size: log2 of the entries per level.
     """
 
     def __init__(
@@ -90,17 +89,17 @@ class HashField(ResidualField):
         self.field_w1 = uniform((6 / inputs) ** 0.5, inputs, WIDTH)
         self.field_w2 = uniform((6 / WIDTH) ** 0.5, WIDTH, WIDTH)
         self.field_w3 = nn.Parameter(torch.zeros(WIDTH, 3))
-        # in the checkpoint: a loaded field lies where the trained one did
+        # a buffer, so that checkpoints contain it
         self.register_buffer("domain", torch.tensor([*mid, half, float(contract)], dtype=torch.float64))
         self._geometry: tuple[Tensor, int, FieldGeometry] | None = None
 
     @torch.no_grad()
     def only(self, first: int, count: int) -> HashField:
-        """A copy with the levels first ... first + count - 1 alone: the same residual, but that the features of the
-        other levels are 0, and the loads of these levels alone. Its voxels are those of its finest level.
+        """Copy the field with only the levels first ... first + count - 1, as if the features of all others were 0. Its
+        voxel size is that of its finest level.
 
         Raises:
-            ValueError: there are no such levels.
+            ValueError: the field has no such levels.
         """
         if not (0 <= first and 1 <= count and first + count <= self.levels):
             raise ValueError(f"a field of {self.levels} levels has none from {first} to {first + count - 1}")
@@ -117,7 +116,7 @@ class HashField(ResidualField):
 
     @property
     def geometry(self) -> FieldGeometry:
-        """Geometry of the grid. Read back once: a step must not wait for the device to tell."""
+        """Geometry of the grid. Cached, to avoid a synchronisation in every step."""
         if not _is_of(self._geometry, self.domain):
             *mid, half, contract = self.domain.tolist()
             geometry = FieldGeometry(self.min_resolution, bool(contract), tuple(mid), half)
@@ -126,7 +125,7 @@ class HashField(ResidualField):
 
     @property
     def weights(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Table and MLP weights, in the order the operations take them."""
+        """Table and MLP weights, in the order of the arguments of `ops.field`."""
         return self.field_table, self.field_w1, self.field_w2, self.field_w3
 
     def residual(
@@ -137,11 +136,11 @@ class HashField(ResidualField):
         return {"residual": fragment_residual(fragments, frames, self.geometry, weights, bound, moves)}
 
     def forward(self, x: Tensor) -> Tensor:
-        """Residual colour [M, 3] at world positions [M, 3]."""
+        """Compute the residual colour [M, 3] at world positions [M, 3]."""
         return field(x, self.geometry, *self.weights)
 
     def voxel_size(self, x: Tensor) -> Tensor:
-        """Edges of the finest voxel at world positions.
+        """Compute the edges of the finest voxel at world positions.
 
         Outside the unit ball the contraction stretches a voxel by r^2 radially and by r / (2 - 1/r) tangentially.
 
@@ -160,18 +159,18 @@ class HashField(ResidualField):
 
 
 class TexelField(ResidualField):
-    """Residual colours of N surfels in texels, as a bundle has them: each surfel carries its own, wherever it moves.
+    """Residual colours of N surfels in texels, one tile per surfel, as in a bundle.
 
     Args:
         size: [N, 2] int32 sides of the tiles along u and v, texels.
-        extent: [N] their half sides in scale units.
-        texels: [T, 3] residual colours to start from, tile after tile as in `TexelTiles.of_sizes`.
-        share: [T] how far a texel moves in a step, see `TexelDescent`; None = they are not stepped.
-        alpha: [T] factors of their surfel's opacity, from 0 to 2, see `ops.TexelAlpha`; None = opaque texels.
+        extent: [N] half sides of the tiles in scale units.
+        texels: [T, 3] initial residual colours, tile after tile as in `TexelTiles.of_sizes`.
+        share: [T] step size of each texel, see `TexelDescent`; None: texels are not optimised.
+        alpha: [T] factors of the surfel's opacity, from 0 to 2, see `ops.TexelAlpha`; None: opaque texels.
     """
 
     STEADY: ClassVar = ("size", "extent", "share")
-    """Buffers that training replaces and never writes into, so that copies of the scene may share them."""
+    """Buffers that training replaces but never modifies in place, so that copies of the scene may share them."""
 
     def __init__(
         self,
@@ -184,31 +183,31 @@ class TexelField(ResidualField):
         super().__init__()
         self.texels = nn.Parameter(texels.detach().clone())
         self.alpha = None if alpha is None else nn.Parameter(alpha.detach().clone())
-        # in the checkpoint, as the texels are
+        # buffers, so that checkpoints contain them
         self.register_buffer("size", size.to(torch.int32).clone())
         self.register_buffer("extent", extent.detach().to(texels).clone())
         self.register_buffer("share", texels.new_zeros(len(texels)) if share is None else share.detach().clone())
         self.descent: TexelDescent | None = None
-        """How a backward pass moves the texels; None = they get a gradient."""
+        """Update of the texels by a backward pass; None: they get a gradient."""
         self._tiles: tuple[Tensor, int, TexelTiles] | None = None
 
     @classmethod
     def blank(cls, surfels: int, texels: int, like: Tensor, alpha: bool = False) -> TexelField:
-        """One of so many surfels and texels, with alpha or without, for a state to be loaded into."""
+        """Create an empty field for `load_state_dict`."""
         size = torch.zeros(surfels, 2, dtype=torch.int32, device=like.device)
         factors = like.new_ones(texels) if alpha else None
         return cls(size, like.new_zeros(surfels), like.new_zeros(texels, 3), alpha=factors)
 
     @property
     def tiles(self) -> TexelTiles:
-        """Tiles of the surfels: sizes and offsets of their texels."""
+        """Sizes and texel offsets of the surfels' tiles."""
         if not _is_of(self._tiles, self.size):
             self._tiles = (self.size, version_of(self.size), TexelTiles.of_sizes(self.size, self.extent))
         return self._tiles[2]
 
     @torch.no_grad()
     def keep(self, rows: Tensor) -> None:
-        """Keep the surfels `rows` [n] int64 alone, in that order."""
+        """Keep only the surfels `rows` [n] int64, in that order."""
         old = self.tiles.rows_of(rows)
         self.texels = nn.Parameter(self.texels.detach()[old])
         self.alpha = None if self.alpha is None else nn.Parameter(self.alpha.detach()[old])
@@ -219,7 +218,7 @@ class TexelField(ResidualField):
         texels = self.texels if learns and descent is None else self.texels.detach()
         if descent is not None and read is not None:
             texels, descent = read, replace(descent, moved=texels)
-        # a surfel takes its own texels along, so that they tell it where to go
+        # texels move with their surfel, so that their gradient with respect to position is its gradient
         return {"texels": texels, "tiles": self.tiles, "bound": bound, "move_surfels": learns, "descent": descent}
 
     def opacity(self, bound: float, learns: bool) -> TexelAlpha | None:

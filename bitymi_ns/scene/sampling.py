@@ -1,4 +1,4 @@
-"""Sampling of views of another size than the photographs: resolution of the photographs, samples per pixel."""
+"""Supersampling and texture filtering of views that show the scene smaller or larger than the photographs."""
 
 import math
 from dataclasses import dataclass
@@ -9,19 +9,18 @@ from torch import Tensor
 from .camera import Camera
 
 AS_TRAINED = (0.75, 1.5)
-"""Views between these sizes are drawn as in training. The sizes of the photographs differ, too: they see a scene from
-near and from far."""
+"""Scales between which views are rendered as in training: photographs, too, show the scene from near and far."""
 SMALLEST, LARGEST = 0.5, 2.0
-"""Views beyond these sizes are drawn for what they are; in between it changes over, so that nothing jumps."""
+"""Scales beyond which the pixel footprint follows the view's scale; it is interpolated in between."""
 ONE_SAMPLE, TWO_SAMPLES = 0.6, 1 / 3
-"""Views from these sizes on have one sample per pixel, and two along each axis."""
+"""Smallest scales with one sample per pixel, and with two along each axis."""
 SAMPLE = 0.58
-"""Least samples across a pixel of a photograph in smaller views, as far as MOST_SAMPLES and MOST_PIXELS allow.
-Wider samples lose the edges that alpha texels of several surfels share: the mean transmittance of a stack is not the
-product of its means."""
-MOST_SAMPLES = 6  # samples per pixel, along each axis
-MOST_PIXELS = 1 << 24  # samples of a view: beyond, it has fewer samples per pixel
-FARTHEST = (1.0 / 64, 64.0)
+"""Minimum number of samples across a photograph's pixel at smaller scales, within MOST_SAMPLES and MOST_PIXELS. Coarser
+samples blur edges that the alpha texels of several surfels share: the mean transmittance of a stack is not the product
+of the means."""
+MOST_SAMPLES = 6  # maximum number of samples per pixel along each axis
+MOST_PIXELS = 1 << 24  # maximum number of samples of a view
+FARTHEST = (1.0 / 64, 64.0)  # range of scales
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,7 @@ class Sampling:
     """Samples per pixel of a view.
 
     Attributes:
-        samples: per pixel, along each axis.
+        samples: per pixel along each axis.
         photo_pixel: side of a photograph's pixel in samples (csrc/core/resize.h).
     """
 
@@ -38,15 +37,15 @@ class Sampling:
 
 
 def size_of(photographed: Tensor, camera: Camera) -> float:
-    """Scale at which a view shows the photographs: 1 = as large as the photographs, 0.5 = at half their size.
+    """Measure the scale of a view relative to the photographs: 1 = same size, 0.5 = half their size.
 
     Args:
-        photographed: [P, 4] points of the scene, and the pixels per unit of length with which they were photographed.
+        photographed: [P, 4] points of the scene with the pixels per unit of length of their photographs.
 
     Returns:
-        the median over the points in the picture; 1 where there is none.
+        Median over the points inside the image; 1 without such points.
     """
-    # NumPy: of a few thousand points, torch would take longer to start than to work, in every frame
+    # NumPy: for a few thousand points per frame, torch's overhead would dominate
     viewmat, K, points = (t.detach().cpu().double().numpy() for t in (camera.viewmat, camera.K, photographed))
     x, y, z = (points[:, :3] @ viewmat[:3, :3].T + viewmat[:3, 3]).T
     depth = np.maximum(z, 1e-12)
@@ -60,7 +59,7 @@ def size_of(photographed: Tensor, camera: Camera) -> float:
 
 
 def sampling_of(size: float, pixels: int) -> Sampling:
-    """Choose the samples per pixel of a view."""
+    """Choose the sampling of a view of some scale and number of pixels."""
     low, high = AS_TRAINED
     if low <= size <= high:
         return Sampling()
@@ -77,21 +76,21 @@ def sampling_of(size: float, pixels: int) -> Sampling:
 
 
 def averaged(images: dict[str, Tensor], samples: int) -> dict[str, Tensor]:
-    """Images of views from images of their samples.
+    """Downsample supersampled images.
 
     Args:
         images: name -> [views, samples * height, samples * width, channels].
-        samples: per pixel, along each axis.
+        samples: per pixel along each axis.
 
     Returns:
-        name -> [views, height, width, channels]: means, of integers (counts) sums.
+        name -> [views, height, width, channels]: means, but sums of integers (counts).
     """
     if samples == 1:
         return images
     out = {}
     for name, image in images.items():
         total = image
-        for axis in (1, 2):  # one after the other: torch would walk both in strides
+        for axis in (1, 2):  # one at a time: faster than one strided reduction over both
             total = total.unflatten(axis, (-1, samples)).sum(axis + 1, dtype=image.dtype)
         out[name] = total / samples**2 if image.is_floating_point() else total
     return out

@@ -1,4 +1,4 @@
-"""The scene: parameters and rendering."""
+"""Scene: parameters and rendering."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from .camera import Camera
 from .config import SceneConfig
 from .field import ResidualField, TexelField
 
-NEAR = 0.02  # nearest depth that is drawn, for cameras of extent 1
+NEAR = 0.02  # near plane for cameras of extent 1
 
 
 @dataclass
@@ -48,10 +48,10 @@ class RenderOutput:
         beta: [H, W, 1] sum of w beta, the paper's alpha-blended Beta value.
         depth: [H, W, 1] sum of w z, camera z, not divided by alpha; None without maps.
         normal: [H, W, 3] sum of w n, camera frame (OpenCV), facing the camera; None without maps.
-        soft_overdraw: [H, W, 1] fragments per pixel, those of small weight in part; None without `overdraw_half`.
-        fragments: the view's; `Bands` where they were too many for a list, `Marks` where it was drawn without one.
-        projection: the view's surfels.
-        image: [H, W, 5] rgb, alpha and beta in one tensor; None where there are maps or the overdraw.
+        soft_overdraw: [H, W, 1] differentiable count of fragments per pixel; None without `overdraw_half`.
+        fragments: blended fragments; `Bands` if they were too many for one list, `Marks` if rendered without a list.
+        projection: projected surfels.
+        image: [H, W, 5] rgb, alpha and beta in one tensor; None with maps or soft overdraw.
     """
 
     rgb: Tensor
@@ -74,13 +74,13 @@ class RenderOutput:
         maps: bool,
         soft_overdraw: bool = False,
     ) -> RenderOutput:
-        """Name the channels of a blended image, over a background.
+        """Compose a blended image over a background and split its channels.
 
         Args:
-            image: [H * W, C] of `ops.blended_image`, and the soft overdraw as last channel where there is one.
-            background: [3] colour behind the scene; None = black.
+            image: [H * W, C] of `ops.blended_image`, with the soft overdraw, if any, as last channel.
+            background: [3] colour behind the scene; None: black.
             maps: the image has depth and normals.
-            soft_overdraw: it has the soft overdraw.
+            soft_overdraw: the image has the soft overdraw.
         """
         image = image.view(projection.camera.height, projection.camera.width, -1)
         if background is not None:
@@ -100,20 +100,20 @@ class RenderOutput:
 
     @property
     def overdraw(self) -> Tensor:
-        """[H, W, 1] int32: blended surfels per pixel."""
+        """Number of blended surfels per pixel, [H, W, 1] int32."""
         return self.fragments.overdraw()
 
 
 class Scene(nn.Module):
-    """Beta surfels with a view-dependent colour each, and a residual colour field.
+    """Beta surfels with view-dependent colours, and residual colours.
 
     Args:
         surfels: initial per-surfel parameters by name (docs/overview.md), first dimension N each.
-        field: residual colours: `HashField`, or `TexelField`; None = surfels alone.
-        near: nearest drawn depth, camera z, where the configuration does not give it.
+        field: residual colours, `HashField` or `TexelField`; None: no residual.
+        near: near plane, camera z, if the configuration does not state it.
 
     Raises:
-        ValueError: a parameter is missing or does not belong to the chosen view colour.
+        ValueError: the parameters are not those of the chosen view colour.
     """
 
     def __init__(
@@ -132,11 +132,11 @@ class Scene(nn.Module):
         return self.surfels["means"].shape[0]
 
     def make_room(self, state: Mapping[str, Tensor], prefix: str = "") -> None:
-        """Give the surfels' parameters the rows, and the field the texels, of a state that is loaded next.
+        """Resize surfel parameters and texels for a state that is loaded next.
 
         Args:
             state: of a scene of the same configuration.
-            prefix: of its names there.
+            prefix: of the names in `state`.
         """
         n = len(state[f"{prefix}surfels.means"])
         for parameter in self.surfels.values():
@@ -149,7 +149,7 @@ class Scene(nn.Module):
             self.field = None
 
     def base_color(self, projection: Projection) -> Tensor:
-        """[N, 3] f_view(d) of the surfels that the camera sees, 0 elsewhere."""
+        """Compute the view-dependent colours f_view(d), [N, 3]; 0 for surfels that are not visible."""
         means = self.surfels["means"]
         center = projection.camera.exact_center
         return view_color(self.config.view_color, self.surfels, means, center, projection.visible)
@@ -164,18 +164,17 @@ class Scene(nn.Module):
     ) -> RenderOutput:
         """Render a view: visibility, then shading, then compositing.
 
-        On a card surfels and texels are drawn without a list of fragments, where neither maps nor the overdraw are
-        asked for. A view with more fragments than `config.max_fragments`, or than memory holds, is drawn in bands.
+        On a GPU scenes without a hash field are rasterized without fragment lists, unless maps or soft overdraw are
+        requested. A view with more fragments than `config.max_fragments`, or than memory holds, is rendered in bands.
 
         Args:
-            background: [3] colour behind the scene; None = black.
-            field_mode: train = the residual field gets gradients; frozen = it is evaluated without; off = its
-                colours are left out.
-            maps: also depth and normals.
-            overdraw_half: also the count of fragments with a gradient, see `ops.soft_overdraw`; None = without.
+            background: [3] colour behind the scene; None: black.
+            field_mode: train = residual with gradients; frozen = residual without gradients; off = no residual.
+            maps: also render depth and normals.
+            overdraw_half: also render the soft overdraw, see `ops.soft_overdraw`; None: no.
 
         Raises:
-            TooManyFragments: a single row of tiles has too many.
+            TooManyFragments: a single row of screen tiles has too many.
         """
         p = self.surfels
         projection = project(*(p[name] for name in GEOMETRY), camera, self.near, self.config.prefilter)
@@ -213,14 +212,14 @@ class Scene(nn.Module):
         draw: Callable[[Projection, int | None], tuple[Tensor, Fragments]],
         error: TooManyFragments,
     ) -> tuple[Tensor, Bands]:
-        """The image [H * W, C] of a view that was refused with `error`, and its fragments; see ops/bands.py."""
+        """Render the image [H * W, C] of a view that had too many fragments; see ops/bands.py."""
         most, height = self.config.max_fragments, projection.camera.height
 
         def draw_band(top: int, bottom: int) -> tuple[Tensor, int]:
             part, found = band(projection, top, bottom), []
 
             def draw_once(geom: Tensor) -> Tensor:
-                # what fitted once has to fit in the backward pass
+                # no limit in the backward pass: the band fitted in the forward pass
                 image, fragments = draw(replace(part, geom=geom), None if found else most)
                 found.append(len(fragments))
                 return image

@@ -1,4 +1,4 @@
-"""Extent of a surfel's tile, and number of its texels along each tangent axis."""
+"""Extents of surfel tiles, and their resolutions along each tangent axis."""
 
 from collections.abc import Mapping, Sequence
 
@@ -10,14 +10,13 @@ from bitymi_ns.ops.constants import ALPHA_MAX, BETA_MAX, SUPPORT
 from .camera import Camera
 
 MARGIN = 1.5
-"""Held-out views may see more of a surfel than the training views do: its transmittance is taken this much larger."""
+"""Factor of the transmittance in front of a surfel: held-out views may see more of it than training views."""
 
-# Forgives the rounding of a ratio that is meant to be a power of two, so that it does not double the tile.
-_ROUNDING = 1e-6
+_ROUNDING = 1e-6  # relative tolerance: a rounded power of two must not double the tile
 
 
 def next_power_of_two(x: Tensor) -> Tensor:
-    """The smallest power of two >= x, up to a relative rounding of 1e-6; float64, 0 where x <= 0."""
+    """Round up to a power of two, with a relative tolerance of 1e-6; float64, 0 where x <= 0."""
     x = x.double().clamp(min=0.0, max=2.0**62) * (1.0 - _ROUNDING)
     mantissa, exponent = torch.frexp(x)  # x = mantissa 2^exponent, mantissa in [0.5, 1)
     exponent = exponent - (mantissa == 0.5).to(exponent.dtype)
@@ -25,12 +24,12 @@ def next_power_of_two(x: Tensor) -> Tensor:
 
 
 def voxel_along_axes(voxel: Tensor, axes: Tensor, means: Tensor, center: Tensor | None = None) -> Tensor:
-    """Edge of the finest voxel along each tangent axis of a surfel: the local delta of the Nyquist rule.
+    """Compute the edge of the finest voxel along each tangent axis of a surfel, the local delta of the Nyquist rule.
 
     Outside the unit ball of a contracted scene a voxel is longer along the ray from the centre than across it.
     Let cos be the component of the axis t along that ray. A step of length 1 along t crosses cos / radial voxels along
     the ray and sin / tangential voxels across it. The edge along t is 1 over the root of the sum of their squares.
-    Without a centre the smaller of the two edges is taken for both axes, which never samples too coarsely.
+    Without a centre the smaller edge is used for both axes, which never samples too coarsely.
 
     Args:
         voxel: [N, 2] (radial, tangential) voxel edges at the surfels' centres, world units.
@@ -50,10 +49,10 @@ def voxel_along_axes(voxel: Tensor, axes: Tensor, means: Tensor, center: Tensor 
 
 
 def check_sides(r_min: int, r_max: int) -> None:
-    """Refuse smallest and largest sides of tiles that are not powers of two >= 4, or the wrong way round.
+    """Check the limits of tile sides.
 
     Raises:
-        ValueError: says which.
+        ValueError: a limit is no power of two >= 4, or `r_min` is larger than `r_max`.
     """
     for name, value in (("r_min", r_min), ("r_max", r_max)):
         if value < 4 or value & (value - 1):
@@ -70,7 +69,7 @@ def nyquist_resolution(
     r_max: int = 64,
     max_pixels: Tensor | None = None,
 ) -> Tensor:
-    """Tile resolutions at the Nyquist rate of the finest hash level, capped by what the training views resolve.
+    """Compute tile resolutions at the Nyquist rate of the finest hash level, capped by the training views' resolution.
 
     Paper, eq. (nyquist): r_a = clamp(2^ceil(log2(4 e s_a / delta)), r_min, r_max); then r_a is at most the next power
     of two of the largest projected extent in pixels.
@@ -78,7 +77,7 @@ def nyquist_resolution(
     Args:
         scales: [N, 2] tangent scales s, world units.
         delta: [N, 2] (or [N, 1]) finest voxel edge at the surfel along each axis, world units.
-        extent: e, half side of the tile in scale units. 3 covers the support exactly; the paper's 4 more than that.
+        extent: e, half side of the tile in scale units. 3 covers the support exactly; the paper uses 4.
         r_min, r_max: smallest and largest resolution, powers of two >= 4.
         max_pixels: [N, 2] largest projected extent of the tile over the training views, pixels.
 
@@ -93,7 +92,7 @@ def nyquist_resolution(
 
 
 def seen_sides(pixels: Tensor, r_min: int = 4, r_max: int = 64) -> Tensor:
-    """Tile resolutions by what the training views resolve alone.
+    """Compute tile resolutions by the training views' resolution alone.
 
     Args:
         pixels: [N, 2] largest projected extent of the tile over the training views.
@@ -107,11 +106,11 @@ def seen_sides(pixels: Tensor, r_min: int = 4, r_max: int = 64) -> Tensor:
 
 
 def coarsened(sides: Tensor, texels: Tensor, r_min: int = 4) -> Tensor:
-    """Tiles of at most so many texels each: the longer side is halved until it fits, or both are the smallest.
+    """Halve the longer side of tiles until they have at most `texels` texels, or both sides are `r_min`.
 
     Args:
         sides: [N, 2] int32 (r_u, r_v), powers of two of at least `r_min`.
-        texels: [N] how many each may have.
+        texels: [N] maximum number of texels of each tile.
 
     Returns:
         [N, 2] int32.
@@ -129,22 +128,22 @@ def coarsened(sides: Tensor, texels: Tensor, r_min: int = 4) -> Tensor:
 def max_projected_extent(
     means: Tensor, axes: Tensor, scales: Tensor, cameras: Sequence[Camera], extent: float = SUPPORT, near: float = 0.2
 ) -> Tensor:
-    """Largest projected size in pixels of every surfel's tile, per tangent axis, over the training views.
+    """Compute the largest projected size in pixels of each surfel's tile, per tangent axis, over the training views.
 
     The segment from -e s_a to +e s_a along axis a is projected with the Jacobian of the pinhole at the surfel's
-    centre. A view counts when the centre lies in front of the near plane and within the image enlarged by the
-    projected half extents.
+    centre. A view counts if the centre lies beyond the near plane and within the image enlarged by the projected half
+    extents.
 
     Args:
         means: [N, 3] world positions.
         axes: [N, 3, 2] unit tangent directions, world frame.
         scales: [N, 2] tangent scales, world units.
-        cameras: training views; with none, nothing is seen.
+        cameras: training views.
         extent: half side of the tile in scale units.
-        near: nearest drawn depth, camera z.
+        near: near plane, camera z.
 
     Returns:
-        [N, 2] float32 pixels, 0 where unseen.
+        [N, 2] float32 pixels, 0 if no view counts.
     """
     max_pixels = torch.zeros_like(scales)  # [N, 2]
     steps = axes * (2.0 * extent * scales)[:, None, :]  # [N, 3, 2] whole side of the tile
@@ -167,11 +166,11 @@ def max_projected_extent(
 
 
 def kernel_parameters(surfels: Mapping[str, Tensor], transmittance: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Largest blending weight at the centre, and exponent of the kernel, of every surfel: [N], [N].
+    """Compute each surfel's largest blending weight at its centre, [N], and its kernel exponent beta, [N].
 
     Args:
         surfels: opacity_logits [N], beta_raw [N].
-        transmittance: [N] of `Visibility`; None = nothing is in front of any surfel.
+        transmittance: [N] of `Visibility`; None: no occlusion.
     """
     opacity = surfels["opacity_logits"].sigmoid().clamp(max=ALPHA_MAX)
     if transmittance is not None:
@@ -180,9 +179,10 @@ def kernel_parameters(surfels: Mapping[str, Tensor], transmittance: Tensor | Non
 
 
 def visible_extent(opacity: Tensor, beta: Tensor, weight_bound: float) -> Tensor:
-    """Radius in scale units at which opacity * (1 - r^2 / 9)^beta falls to the weight bound: [N], 0 where all is below.
+    """Compute the radius [N], in scale units, at which opacity * (1 - r^2 / 9)^beta falls to the weight bound; 0 if all
+    is below.
 
-    What the low pass or the pixel spreads beyond it, about a pixel, reads the tile's edge.
+    The prefilter spreads a surfel about a pixel beyond it; there the tile's edge is read.
     """
     rest = (weight_bound / opacity.clamp(min=1e-12)).clamp(max=1.0) ** (1.0 / beta.clamp(min=1e-6))
     return SUPPORT * (1.0 - rest).clamp(min=0.0).sqrt()

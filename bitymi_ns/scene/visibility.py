@@ -1,4 +1,4 @@
-"""Visibility of every surfel in the training views: blended fragments, and the transmittance in front of them."""
+"""Visibility of surfels in the training views: views that blend them, and the transmittance in front of them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bitymi_ns.ops import Prefilter, TexelAlpha, fitting_lists, project
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 
-PART = 1 << 20  # fragments that are looked at together: what is computed of them then takes no memory from the system
+PART = 1 << 20  # fragments processed at a time: temporaries then fit in memory that the process already has
 
 
 @dataclass(frozen=True)
@@ -20,11 +20,11 @@ class Visibility:
     """Visibility of N surfels in the views.
 
     Attributes:
-        transmittance: [N] float32 in [0, 1], the largest one in front of a blended fragment of the surfel, over all
-            views: a fragment's weight is sigma T; the kernel gives sigma, this gives T. 0 for one that no view blends.
-        pixels: [N] float32, how many pixels of the view that shows most of the surfel it makes up: the sum of its
-            blending weights, of those that get a residual. A pixel is shared among its layers by weight.
-        seen: [V, N] bool, whether the view blends a fragment of the surfel.
+        transmittance: [N] float32 in [0, 1], maximum T over the surfel's blended fragments in all views (blending
+            weight = sigma T); 0 for a surfel that no view blends.
+        pixels: [N] float32, maximum over the views of the sum of the surfel's blending weights, without those that get
+            no residual.
+        seen: [V, N] bool, True if the view blends a fragment of the surfel.
     """
 
     transmittance: Tensor
@@ -33,11 +33,11 @@ class Visibility:
 
     @property
     def in_front(self) -> Tensor:
-        """[N] the transmittance to count with: 1 for surfels that no view blends, of which nothing is known."""
+        """Transmittance [N], but 1 for surfels that no view blends, for which it is unknown."""
         return torch.where(self.transmittance > 0, self.transmittance, 1.0)
 
     def of(self, rows: Tensor) -> Visibility:
-        """The same of some of the surfels."""
+        """Select surfels by row."""
         return Visibility(self.transmittance[rows], self.pixels[rows], self.seen[:, rows])
 
 
@@ -51,14 +51,14 @@ def visibility(
     progress: Progress = no_progress,
     alpha: TexelAlpha | None = None,
 ) -> Visibility:
-    """Find the views that see every surfel, and the transmittance in front of it.
+    """Find the views that show each surfel, and the transmittance in front of it.
 
     Args:
-        surfels: the per-surfel parameters of docs/overview.md, N rows, all of them finite and drawable.
-        near: nearest drawn depth.
+        surfels: the per-surfel parameters of docs/overview.md, N rows, all finite.
+        near: near plane.
         weight_bound: fragments of smaller weight get no residual.
         prefilter: as in `ops.project`.
-        alpha: opacities of the surfels' texels; None = opaque texels.
+        alpha: opacities of the surfels' texels; None: opaque texels.
     """
     means = surfels["means"]
     geometry = [surfels[name] for name in ("quats", "log_scales", "opacity_logits", "beta_raw")]
@@ -72,10 +72,10 @@ def visibility(
             lists = (fragments.surfel, fragments.weight, fragments.sigma)
             for surfel, weight, sigma in zip(*(values.split(PART) for values in lists), strict=True):
                 rows = surfel.long()
-                largest.scatter_reduce_(0, rows, weight / sigma.abs(), "amax")  # its sign tells the low-pass branch
+                largest.scatter_reduce_(0, rows, weight / sigma.abs(), "amax")  # sigma's sign is the low-pass branch
                 here.index_add_(0, rows, torch.where(weight >= weight_bound, weight, 0.0).to(here.dtype))
                 seen[done - 1, rows] = True
-            del fragments, lists, surfel, weight, sigma  # before the next list is made
+            del fragments, lists, surfel, weight, sigma  # frees memory before the next list
         pixels = torch.maximum(pixels, here)
         progress("looking through the training views", done, len(cameras))
     return Visibility(largest, pixels, seen)

@@ -22,7 +22,7 @@ FOCAL = 0.80  # focal length in image widths
 TARGET = np.array([0.0, 0.0, 0.72])
 BAND = 1 << 16  # rays traced at a time
 CAPTURE, CLOUD = "transforms.json", "sparse_pc.ply"
-MADE_BY = "bitymi sample"  # in transforms.json: only such a folder is overwritten
+MADE_BY = "bitymi sample"  # marks transforms.json: only folders with this mark are overwritten
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class View:
     height: int
 
     def rays(self, supersample: int = 1) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Origin [3] and unit directions [H s, W s, 3] through the centres of s by s parts of each pixel."""
+        """Compute the origin [3] and unit directions [H s, W s, 3] of rays through s by s subpixel centres."""
         h, w = self.height * supersample, self.width * supersample
         x = ((np.arange(w) + 0.5) / supersample - self.width / 2) / self.focal
         y = (self.height / 2 - (np.arange(h) + 0.5) / supersample) / self.focal
@@ -46,7 +46,7 @@ class View:
 
 
 def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Camera-to-world [4, 4], OpenGL axes, of a camera at `eye` that looks at `target` with z up."""
+    """Compute camera-to-world [4, 4], OpenGL axes, of a camera at `eye` facing `target`, with z up."""
     back = eye - target
     back /= np.linalg.norm(back)
     right = np.cross([0.0, 0.0, 1.0], back)
@@ -57,7 +57,7 @@ def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np
 
 
 def camera_path(views: int, width: int, height: int, seed: int) -> list[View]:
-    """Two turns around the objects, rising and falling, each camera looking in, a little off the middle."""
+    """Generate two orbits around the objects at varying heights, with random offsets of the cameras' targets."""
     rng = np.random.default_rng([seed, 1])
     path = []
     for k in range(views):
@@ -72,7 +72,7 @@ def camera_path(views: int, width: int, height: int, seed: int) -> list[View]:
 
 
 def render(room: Room, view: View, supersample: int = 3) -> NDArray[np.uint8]:
-    """The antialiased picture [H, W, 3] of one view."""
+    """Render a view with antialiasing: [H, W, 3]."""
     origin, directions = view.rays(supersample)
     o = tuple(np.float32(a) for a in origin)
     flat = directions.reshape(-1, 3)
@@ -85,7 +85,7 @@ def render(room: Room, view: View, supersample: int = 3) -> NDArray[np.uint8]:
 
 
 def first_hits(room: Room, view: View, pixels: NDArray[np.int64]) -> tuple[NDArray[np.float32], Hits]:
-    """World points [n, 3] seen through the centres of flat pixel indices [n], and the hits."""
+    """Trace the centres of pixels, flat indices [n]: world points [n, 3], and the hits."""
     origin, directions = view.rays()
     flat = directions.reshape(-1, 3)[pixels]
     o = tuple(np.float32(a) for a in origin)
@@ -96,7 +96,7 @@ def first_hits(room: Room, view: View, pixels: NDArray[np.int64]) -> tuple[NDArr
 def sparse_points(
     room: Room, views: list[View], images: list[NDArray[np.uint8]], count: int, seed: int
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """`count` exact surface points [count, 3] with their pixels' colors [count, 3], spread over all views."""
+    """Sample exact surface points [count, 3] and their pixels' colors [count, 3], evenly over all views."""
     rng = np.random.default_rng([seed, 2])
     points, colors = [], []
     shares = np.diff(np.linspace(0, count, len(views) + 1).astype(int))
@@ -108,7 +108,7 @@ def sparse_points(
 
 
 def write_ply(path: Path, points: NDArray[np.float32], colors: NDArray[np.uint8]) -> None:
-    """Binary little-endian PLY of points [n, 3] with colors [n, 3]."""
+    """Write points [n, 3] with colors [n, 3] as binary little-endian PLY."""
     rows = np.empty(len(points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
     rows["xyz"], rows["rgb"] = points, colors
     names = ["float x", "float y", "float z", "uchar red", "uchar green", "uchar blue"]
@@ -129,11 +129,14 @@ def generate(
 ) -> Path:
     """Write the sample capture to `output_dir` and return that folder.
 
-    Holds transforms.json (one shared pinhole camera, exact poses), images/frame_00001.png and on, and sparse_pc.ply.
-    Equal arguments give equal pictures. The folder is written aside and renamed, so it is there whole or not at all.
+    It contains transforms.json (one shared pinhole camera, exact poses), images/frame_00001.png etc., and
+    sparse_pc.ply. Equal arguments give equal images. The folder is written to a temporary name and renamed, so that it
+    is complete or absent.
 
-    Raises ValueError for sizes that make no picture, FileExistsError for a folder that already holds something,
-    and Refused for a sample beside which there is something else, that would be lost.
+    Raises:
+        ValueError: an argument is too small.
+        FileExistsError: the folder already holds files that are not a sample, or `overwrite` is False.
+        Refused: an earlier sample's folder also holds other files, which would be lost.
     """
     limits = {"views": (views, 1), "width": (width, 8), "height": (height, 8), "points": (points, 0), "seed": (seed, 0)}
     for name, (value, least) in limits.items():
@@ -158,7 +161,7 @@ def generate(
 
 
 def _is_sample(folder: Path) -> bool:
-    """Test if `generate` wrote the folder."""
+    """Return True if `generate` wrote the folder."""
     try:
         return read_json(folder / CAPTURE).get("made_by") == MADE_BY
     except (FileNotFoundError, ValueError, AttributeError):
@@ -166,13 +169,12 @@ def _is_sample(folder: Path) -> bool:
 
 
 def _files_of(folder: Path) -> list[str]:
-    """Names of the files that `generate` wrote into a folder."""
+    """List the files that `generate` wrote into a folder."""
     images = (folder / "images").glob("frame_[0-9][0-9][0-9][0-9][0-9].png")
     return [CAPTURE, CLOUD, *(f"images/{path.name}" for path in images)]
 
 
 def _write(folder: Path, views: int, width: int, height: int, seed: int, points: int, progress: bool) -> None:
-    """Render and write everything into an empty folder."""
     (folder / "images").mkdir()
     path = camera_path(views, width, height, seed)
     names = [f"images/frame_{k + 1:05d}.png" for k in range(views)]
@@ -186,10 +188,10 @@ def _write(folder: Path, views: int, width: int, height: int, seed: int, points:
             tell("Rendering the sample room", next(done), views)
             return image
 
-        with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:  # numpy works outside the interpreter lock
+        with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:  # numpy releases the GIL
             try:
                 images = list(pool.map(frame, range(views)))
-            except BaseException:  # Ctrl-C too: do not wait for what has not begun
+            except BaseException:  # also Ctrl-C: do not wait for pending frames
                 pool.shutdown(cancel_futures=True)
                 raise
     write_ply(folder / CLOUD, *sparse_points(room, path, images, points, seed))

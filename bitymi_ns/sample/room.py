@@ -1,8 +1,8 @@
 """The sample room and its ray tracer, in numpy.
 
 World frame: metres, x and y along the floor, z up. Rays are an origin and a direction of three float32 arrays [n] each
-(or scalars); their parameter t counts in direction lengths. The light on walls and floor is multiplied into their
-textures once; sphere and box are glossy. Colors are display values in [0, 1]."""
+(or scalars); t is in units of the direction's length. Lighting of walls and floor is baked into their textures; sphere
+and box are glossy. Colors are display values in [0, 1]."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ Vec = tuple[Image, Image, Image]
 LOW = np.float32([-3.0, -2.5, 0.0])
 HIGH = np.float32([3.0, 2.5, 2.6])
 WINDOW = (-1.3, 1.1, 0.75, 2.15)  # x0, x1, z0, z1 of the opening in the wall y = HIGH[1]
-OUTSIDE = (-40.0, 40.0, -5.0, 15.0)  # x0, x1, z0, z1 of the landscape picture
+OUTSIDE = (-40.0, 40.0, -5.0, 15.0)  # x0, x1, z0, z1 of the landscape image
 OUTSIDE_Y = 30.0
 LAMP = (-0.6, 0.9, -0.7, 0.1)  # x0, x1, y0, y1 of the light in the ceiling
 
@@ -35,7 +35,7 @@ NEAR = np.float32(1e-4)
 
 
 def _bars() -> tuple[np.ndarray, np.ndarray]:
-    """Corners (low, high), each [m, 3], of the thin bars: a free-standing lattice and the window's cross."""
+    """Build the corners (low, high), each [m, 3], of the bars: a free-standing lattice and the window's cross."""
     low, high = [], []
 
     def add(x0: float, x1: float, y0: float, y1: float, z0: float, z1: float) -> None:
@@ -60,16 +60,16 @@ class Hits:
     """First hits of n rays."""
 
     t: Image  # [n] distance in direction lengths
-    surface: np.ndarray  # [n] int8, which surface
-    part: np.ndarray  # [n] int8, which bar or pole
+    surface: np.ndarray  # [n] int8, index of the surface
+    part: np.ndarray  # [n] int8, index of the bar or pole
 
     def candidates(self, o: Vec, inverse: Vec, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Indices of the rays that pass through an axis-aligned box before their hits."""
+        """Find the rays, as indices, that enter an axis-aligned box before their hits."""
         near, far = _slab(o, inverse, low, high)
         return np.flatnonzero((near < far) & (far > NEAR) & (near < self.t))
 
     def shorten(self, index: np.ndarray, t: Image, meets: np.ndarray, surface: int, part: int = 0) -> None:
-        """Replace the hits of rays that meet a surface at a smaller t."""
+        """Update the hits of rays that meet a surface at a smaller t."""
         closer = meets & (t > NEAR) & (t < self.t[index])
         chosen = index[closer]
         self.t[chosen], self.surface[chosen], self.part[chosen] = t[closer], surface, part
@@ -80,7 +80,7 @@ def _dot(a: Vec, b: Vec) -> Image:
 
 
 def _slab(o: Vec, inverse: Vec, low: np.ndarray, high: np.ndarray) -> tuple[Image, Image]:
-    """Entry and exit t of rays through an axis-aligned box."""
+    """Compute entry and exit t of rays through an axis-aligned box."""
     near, far = None, None
     for a in range(3):
         t0, t1 = (low[a] - o[a]) * inverse[a], (high[a] - o[a]) * inverse[a]
@@ -91,7 +91,7 @@ def _slab(o: Vec, inverse: Vec, low: np.ndarray, high: np.ndarray) -> tuple[Imag
 
 
 def _entry(a: Image, b: Image, c: Image) -> tuple[Image, np.ndarray]:
-    """Smaller root t of a t^2 + 2 b t + c, and where there is one."""
+    """Compute the smaller root t of a t^2 + 2 b t + c, and whether it exists."""
     root = b * b - a * c
     return (-b - np.sqrt(np.maximum(root, 0))) / a, root > 0
 
@@ -101,7 +101,7 @@ def _take(v: Vec, index: np.ndarray) -> Vec:
 
 
 class Room:
-    """The scene: textures painted and lit from a seed, and functions that trace and color rays."""
+    """The room's textures, generated from a seed, and its ray tracer."""
 
     def __init__(self, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
@@ -135,7 +135,7 @@ class Room:
         self.plinth_texture = textures.poster(rng, 0.6, 0.44, "bars")
 
     def _light_map(self, side: int, rng: np.random.Generator, n: int = 96, samples: int = 48) -> Image:
-        """Light [n, n, 3] on one side of the room: an ambient part and the lamp with soft shadows."""
+        """Compute the light map [n, n, 3] of one side of the room: ambient light and the lamp with soft shadows."""
         v, u = np.meshgrid(*[(np.arange(n, dtype=np.float32) + 0.5) / n] * 2, indexing="ij")
         p, normal = _side_points(side, u.ravel(), v.ravel())
         ambient = np.ones(n * n, np.float32)
@@ -158,14 +158,14 @@ class Room:
         return (total[:, None] * warm).reshape(n, n, 3).astype(np.float32)
 
     def _blocked(self, o: Vec, d: Vec) -> np.ndarray:
-        """Test for an occluder (a big object or a pole) between o and o + d; [n] bool."""
+        """Test for an occluder between o and o + d; [n] bool."""
         t = np.full(d[0].shape, 1.0, np.float32)
         hits = Hits(t, np.zeros(t.shape, np.int8), np.zeros(t.shape, np.int8))
         self._objects(o, d, hits)
         return hits.t < np.float32(0.999)
 
     def _objects(self, o: Vec, d: Vec, hits: Hits) -> None:
-        """Shorten `hits` to what stands in the room."""
+        """Update `hits` with the objects in the room."""
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             inverse = tuple(np.float32(1) / a for a in d)
             self._hit_sphere(o, d, inverse, hits, SPHERE_CENTRE, SPHERE_RADIUS, SPHERE)
@@ -208,7 +208,7 @@ class Room:
     def _hit_boxes(
         self, o: Vec, inverse: Vec, hits: Hits, surface: int, lows: np.ndarray, highs: np.ndarray, first: int = 0
     ) -> None:
-        """Hit axis-aligned boxes, corners [m, 3], that are parts `first` and following of a surface."""
+        """Hit axis-aligned boxes, corners [m, 3], which are parts `first`, `first` + 1, ... of a surface."""
         index = hits.candidates(o, inverse, lows.min(axis=0), highs.max(axis=0))
         o, inverse = _take(o, index), _take(inverse, index)
         for k in range(len(lows)):
@@ -216,7 +216,7 @@ class Room:
             hits.shorten(index, near, near < far, surface, first + k)
 
     def hit(self, o: Vec, d: Vec) -> Hits:
-        """First hits of rays that start inside the room."""
+        """Compute the first hits of rays that start inside the room."""
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             exits = []
             for a in range(3):
@@ -241,7 +241,7 @@ class Room:
         return hits
 
     def color(self, o: Vec, d: Vec, hits: Hits, mirrors: bool = True) -> Image:
-        """Colors [n, 3] of rays with unit directions; `mirrors`: follow one reflection on glossy surfaces."""
+        """Compute colors [n, 3] of rays with unit directions; `mirrors`: trace one reflection on glossy surfaces."""
         result = np.zeros((hits.t.shape[0], 3), np.float32)
         for surface in np.unique(hits.surface):
             index = np.flatnonzero(hits.surface == surface)
@@ -259,7 +259,7 @@ class Room:
         return result
 
     def _object_color(self, surface: int, part: np.ndarray, p: Vec, d: Vec, mirrors: bool) -> Image:
-        """Colors [n, 3] of points p [n] on one object, seen along d [n]."""
+        """Compute colors [n, 3] of points p [n] on one object, viewed along d [n]."""
         n = p[0].shape[0]
         gloss = 0.0
         if surface in (SPHERE, KNOB):
@@ -288,7 +288,7 @@ class Room:
         light = tuple(lamp[a] - p[a] for a in range(3))
         distance = np.sqrt(_dot(light, light))
         lit = np.maximum(_dot(light, normal) / distance, 0) / (1 + 0.12 * distance * distance)
-        low = 1 - 0.35 * np.exp(-p[2] / np.float32(0.15))  # the floor's shade
+        low = 1 - 0.35 * np.exp(-p[2] / np.float32(0.15))  # ambient occlusion by the floor
         result = base * ((0.42 + 0.10 * normal[2]) * low + 0.95 * lit)[:, None]
         if gloss:
             facing = -_dot(d, normal)
@@ -305,14 +305,14 @@ class Room:
 
 
 def _to_box(v: Vec, point: bool) -> Vec:
-    """World to the yawed box's own axes."""
+    """Transform a point or direction from world axes to the box's."""
     c, s = np.cos(BOX_YAW), np.sin(BOX_YAW)
     x, y, z = (v[a] - BOX_CENTRE[a] for a in range(3)) if point else v
     return c * x + s * y, c * y - s * x, z
 
 
 def _aabb_face(p: Vec, low: np.ndarray, high: np.ndarray) -> tuple[Vec, Image, Image]:
-    """Outward normals and face coordinates u, v in [0, 1] of points on a box (corners [3] or [3, n])."""
+    """Compute outward normals and face coordinates u, v in [0, 1] of points on a box (corners [3] or [3, n])."""
     ratio = [(p[a] - (low[a] + high[a]) / 2) / ((high[a] - low[a]) / 2) for a in range(3)]
     axis = np.argmax(np.abs(np.stack(ratio)), axis=0)
     normal = tuple(np.where(axis == a, np.sign(ratio[a]), 0).astype(np.float32) for a in range(3))
@@ -322,19 +322,19 @@ def _aabb_face(p: Vec, low: np.ndarray, high: np.ndarray) -> tuple[Vec, Image, I
 
 
 def _box_face(p: Vec) -> tuple[Vec, Image, Image]:
-    """As `_aabb_face` for the yawed box; normals in world axes."""
+    """Compute `_aabb_face` of the rotated box; normals in world axes."""
     (nx, ny, nz), u, v = _aabb_face(_to_box(p, True), -BOX_HALF, BOX_HALF)
     c, s = np.cos(BOX_YAW), np.sin(BOX_YAW)
     return (c * nx - s * ny, s * nx + c * ny, nz), u, v
 
 
 def _side_axes(side: int) -> tuple[int, int, int]:
-    """World axes of the side's normal, its texture's u and its v."""
+    """Return the world axes of the side's normal, of its texture's u and of its v."""
     return ((0, 1, 2), (0, 1, 2), (1, 0, 2), (1, 0, 2), (2, 0, 1), (2, 0, 1))[side]
 
 
 def _side_uv(side: int, p: Vec) -> tuple[Image, Image]:
-    """Texture coordinates in [0, 1]; u runs to the right for who stands in the room facing a wall."""
+    """Compute texture coordinates in [0, 1]; u points right for a viewer inside the room."""
     _, ua, va = _side_axes(side)
     u = (p[ua] - LOW[ua]) / (HIGH[ua] - LOW[ua])
     if side in (1, 2):
@@ -343,7 +343,7 @@ def _side_uv(side: int, p: Vec) -> tuple[Image, Image]:
 
 
 def _side_points(side: int, u: Image, v: Image) -> tuple[Vec, np.ndarray]:
-    """World points [n] of texture coordinates and the side's inward normal [3]."""
+    """Compute world points [n] at texture coordinates, and the side's inward normal [3]."""
     na, ua, va = _side_axes(side)
     if side in (1, 2):
         u = 1 - u

@@ -1,4 +1,4 @@
-"""Procedural textures of the sample room: painted once as images, looked up bilinearly.
+"""Procedural textures of the sample room, generated once as images and sampled bilinearly.
 
 A texture is float32 [h, w, 3] in [0, 1]. Row 0 is v = 0 and column 0 is u = 0, both at the texel's centre.
 """
@@ -11,7 +11,7 @@ TEXELS_PER_METRE = 160.0
 
 
 def lookup(texture: Image, u: Image, v: Image) -> Image:
-    """Bilinear color [n, 3] at u, v [n] in [0, 1] (clamped), u along the columns."""
+    """Sample colors [n, 3] bilinearly at u, v [n] in [0, 1] (clamped), u along the columns."""
     h, w = texture.shape[:2]
     x = np.clip(u * np.float32(w) - np.float32(0.5), 0, w - 1)
     y = np.clip(v * np.float32(h) - np.float32(0.5), 0, h - 1)
@@ -27,7 +27,7 @@ def lookup(texture: Image, u: Image, v: Image) -> Image:
 
 
 def resize(image: Image, height: int, width: int) -> Image:
-    """Bilinear resampling of image [h, w] or [h, w, c] to [height, width] or [height, width, c], edges clamped."""
+    """Resample an image [h, w] or [h, w, c] bilinearly to [height, width] or [height, width, c], edges clamped."""
     for axis, size in ((0, height), (1, width)):
         n = image.shape[axis]
         x = np.clip((np.arange(size, dtype=np.float32) + 0.5) * np.float32(n / size) - np.float32(0.5), 0, n - 1)
@@ -38,7 +38,7 @@ def resize(image: Image, height: int, width: int) -> Image:
 
 
 def grid(width_m: float, height_m: float) -> tuple[Image, Image]:
-    """Metric coordinates (x, y), each [h, w], of the texel centres of a surface of the given size."""
+    """Compute metric coordinates (x, y), each [h, w], of the texel centres of a surface."""
     w = max(2, round(width_m * TEXELS_PER_METRE))
     h = max(2, round(height_m * TEXELS_PER_METRE))
     y, x = np.meshgrid(
@@ -50,7 +50,7 @@ def grid(width_m: float, height_m: float) -> tuple[Image, Image]:
 
 
 def noise(rng: np.random.Generator, shape: tuple[int, int], cells: tuple[int, int], octaves: int = 4) -> Image:
-    """Fractal value noise [h, w] with values about [0, 1]; `cells` (rows, columns) of its coarsest octave."""
+    """Generate fractal value noise [h, w] of about [0, 1]; `cells` are rows and columns of the coarsest octave."""
     total = np.zeros(shape, np.float32)
     weight = 0.0
     for octave in range(octaves):
@@ -61,13 +61,13 @@ def noise(rng: np.random.Generator, shape: tuple[int, int], cells: tuple[int, in
 
 
 def mix(a: Image | tuple[float, ...], b: Image | tuple[float, ...], t: Image) -> Image:
-    """a (1 - t) + b t for colors [3] or [h, w, 3] and t [h, w]."""
+    """Interpolate a (1 - t) + b t between colors [3] or [h, w, 3] by t [h, w]."""
     a, b = np.asarray(a, np.float32), np.asarray(b, np.float32)
     return a + (b - a) * t[..., None]
 
 
 def wood_tiles(rng: np.random.Generator, width_m: float, height_m: float, tile: float = 0.5) -> Image:
-    """Square tiles of wood, light and dark like a chessboard, the grain turning from tile to tile."""
+    """Paint square wooden tiles, light and dark like a chessboard, with alternating grain direction."""
     x, y = grid(width_m, height_m)
     i, j = (x / tile).astype(int), (y / tile).astype(int)
     odd = (i + j) % 2 == 1
@@ -84,7 +84,7 @@ def wood_tiles(rng: np.random.Generator, width_m: float, height_m: float, tile: 
 
 
 def bricks(rng: np.random.Generator, width_m: float, height_m: float) -> Image:
-    """Bricks of 25 by 9 cm in light mortar."""
+    """Paint bricks of 25 by 9 cm in light mortar."""
     x, y = grid(width_m, height_m)
     row = (y / 0.09).astype(int)
     shifted = x + 0.125 * (row % 2)
@@ -97,14 +97,14 @@ def bricks(rng: np.random.Generator, width_m: float, height_m: float) -> Image:
 
 
 def plaster(rng: np.random.Generator, width_m: float, height_m: float, color: tuple[float, float, float]) -> Image:
-    """Rough paint of one color."""
+    """Paint rough plaster of one color."""
     x, _ = grid(width_m, height_m)
     coarse, fine = noise(rng, x.shape, (6, 8)), noise(rng, x.shape, (80, 100), 3)
     return (np.asarray(color, np.float32) * (0.78 + 0.18 * coarse + 0.3 * (fine - 0.35))[..., None]).clip(0, 1)
 
 
 def wallpaper(rng: np.random.Generator, width_m: float, height_m: float) -> Image:
-    """Stripes with a small diamond pattern on every other one."""
+    """Paint stripes with small diamonds."""
     x, y = grid(width_m, height_m)
     stripe = (x / 0.16).astype(int) % 2 == 0
     diamond = np.abs((x % 0.16) - 0.08) + np.abs((y % 0.12) - 0.06) < 0.035
@@ -136,7 +136,7 @@ def print_text(rng: np.random.Generator, image: Image, glyph: float = 0.045, mar
 
 
 def poster(rng: np.random.Generator, width_m: float, height_m: float, kind: str) -> Image:
-    """A framed poster: `text`, `rings` (a zone-plate-like test pattern), `noise` (marble) or `bars` (color bars)."""
+    """Paint a framed poster: `text`, `rings` (zone plate), `noise` (marble) or `bars` (color bars)."""
     x, y = grid(width_m, height_m)
     if kind == "text":
         image = np.broadcast_to(np.float32([0.93, 0.91, 0.84]), (*x.shape, 3)).copy()
@@ -160,13 +160,13 @@ def poster(rng: np.random.Generator, width_m: float, height_m: float, kind: str)
 
 
 def hang(wall: Image, picture: Image, left_m: float, bottom_m: float) -> None:
-    """Put `picture` on `wall` in place, its lower left corner at the given metres from the wall's."""
+    """Draw `picture` onto `wall` in place, its lower left corner at the given metres from the wall's."""
     top, left = round(bottom_m * TEXELS_PER_METRE), round(left_m * TEXELS_PER_METRE)
     wall[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
 
 
 def landscape(rng: np.random.Generator) -> Image:
-    """Paint the view outside the window, [512, 2048, 3] over 80 by 20 metres: sky, clouds, hills, trees and houses."""
+    """Paint the landscape outside the window, [512, 2048, 3] over 80 by 20 metres."""
     h, w = 512, 2048
     v, u = np.meshgrid(np.linspace(0, 1, h, dtype=np.float32), np.linspace(0, 1, w, dtype=np.float32), indexing="ij")
     cloud = noise(rng, (h, w), (5, 14), 5)

@@ -1,4 +1,4 @@
-"""Baked scenes for other programs: as 3D Gaussians, and as a textured mesh; and how those would draw them."""
+"""Baked scenes for other programs, as 3D Gaussians and as textured meshes, with renderers to measure them."""
 
 from bitymi_ns.interchange.extras import Frame, Kind, check_extras, extras_folder, summary_line, write_extras
 from bitymi_ns.interchange.held_out import read_held_out, training_cameras

@@ -1,6 +1,6 @@
-"""Quads as other programs draw them: a depth buffer, an alpha mask, a bilinear fetch without mip levels.
+"""Renderer of quads with depth buffer, alpha mask and bilinear texture fetch without mip levels, to measure meshes.
 
-It is here to measure a mesh with, and small rather than fast: torch on the CPU.
+Simple rather than fast: torch on the CPU.
 """
 
 import math
@@ -14,23 +14,22 @@ from bitymi_ns.interchange.quads import MASK, Quads
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.sampling import averaged
 
-SAMPLES = 2  # samples per pixel along each axis, as a viewer's antialiasing takes four per pixel
-_AT_ONCE = 1 << 19  # pairs of quads and pixels
+SAMPLES = 2  # samples per pixel along each axis, like a viewer's 4x antialiasing
+_AT_ONCE = 1 << 19  # pairs of quads and pixels per batch
 
 
 @torch.no_grad()
 def draw_quads(quads: Quads, camera: Camera, background: Tensor | None = None, near: float = 0.2) -> Tensor:
-    """Draw a view.
+    """Render a view.
 
-    A ray r through a sample, with 1 as its z, meets the plane of a quad with the corner A and the sides E, F (in the
-    camera's frame) where z r = A + s E + t F: s = r . (F x A) / r . n, t = r . (A x E) / r . n, z = A . n / r . n with
-    n = E x F.
+    A ray r through a sample, with r_z = 1, meets the plane of a quad of corner A and sides E, F (camera frame) where
+    z r = A + s E + t F: s = r . (F x A) / r . n, t = r . (A x E) / r . n, z = A . n / r . n with n = E x F.
 
     Args:
         quads: in the camera's world frame.
         camera: of an H x W view.
-        background: [3]; None = black.
-        near: nearest depth that is drawn.
+        background: [3]; None: black.
+        near: near plane.
 
     Returns:
         [H, W, 3] float32.
@@ -46,17 +45,17 @@ def draw_quads(quads: Quads, camera: Camera, background: Tensor | None = None, n
 
 @dataclass(frozen=True)
 class Hits:
-    """Nearest quads at the centres of pixels; empty pixels are left out."""
+    """Nearest quads at pixel centres; empty pixels are omitted."""
 
     pixel: Tensor  # [F] y * width + x
-    quad: Tensor  # [F] rows of the quads
+    quad: Tensor  # [F] quad indices
     uv: Tensor  # [F, 2] float64 texture coordinates
     color: Tensor  # [F, 3] float32
 
 
 @torch.no_grad()
 def nearest(quads: Quads, camera: Camera, near: float) -> Hits:
-    """The nearest quad of every pixel; see `draw_quads`."""
+    """Find the nearest quad at each pixel; see `draw_quads`."""
     K, viewmat = camera.K.double(), camera.viewmat.double()
     corners = quads.corners.double() @ viewmat[:3, :3].T + viewmat[:3, 3]  # [Q, 4, 3]
     low, size, rows = _boxes(corners, K, near, camera.width, camera.height)
@@ -94,11 +93,11 @@ def nearest(quads: Quads, camera: Camera, near: float) -> Hits:
 
 
 def _boxes(corners: Tensor, K: Tensor, near: float, width: int, height: int) -> tuple[Tensor, Tensor, Tensor]:
-    """First pixels [M, 2] and sizes [M, 2] of the boxes around what is in the picture of the parts of quads beyond the
-    nearest depth, and the quads' rows [M]."""
+    """Compute the bounding boxes of quads in the image, clipped at the near plane: first pixels [M, 2], sizes [M, 2],
+    and quad indices [M]."""
     rows = torch.nonzero((corners[..., 2] > near).any(1)).squeeze(1)
     start, end = corners[rows], corners[rows].roll(-1, 1)
-    share = (near - start[..., 2:]) / (end[..., 2:] - start[..., 2:])  # of a side, where it meets that depth
+    share = (near - start[..., 2:]) / (end[..., 2:] - start[..., 2:])  # position along a side at the near plane
     meets = (share > 0) & (share < 1)
     points = torch.cat([start, start + torch.where(meets, share, 0.0) * (end - start)], dim=1)
     there = torch.cat([start[..., 2:] > near, meets], dim=1)
@@ -111,7 +110,7 @@ def _boxes(corners: Tensor, K: Tensor, near: float, width: int, height: int) -> 
 
 
 def _parts(counts: Tensor) -> Iterator[Tensor]:
-    """Rows in their order, in runs of about `_AT_ONCE` counts together."""
+    """Split row indices into consecutive batches of about `_AT_ONCE` total count."""
     run = (counts.cumsum(0) - counts) // _AT_ONCE
     start = 0
     for length in torch.unique_consecutive(run, return_counts=True)[1].tolist():
@@ -120,7 +119,7 @@ def _parts(counts: Tensor) -> Iterator[Tensor]:
 
 
 def _fetch(pages: Tensor, page: Tensor, uv: Tensor) -> Tensor:
-    """[F, 4] float32 in [0, 1], bilinear, of pages [P, height, width, 4] uint8 at uv [F, 2]."""
+    """Fetch texels [F, 4] float32 in [0, 1], bilinearly, from pages [P, height, width, 4] uint8 at uv [F, 2]."""
     size = torch.tensor([pages.shape[2], pages.shape[1]])
     at = uv * size - 0.5
     low = at.floor()

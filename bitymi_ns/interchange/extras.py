@@ -47,31 +47,30 @@ LEVEL = 0.15  # opacity at which the quads of a mesh end
 SEEN_SIDE, COLORED_SIDE, MEASURED_SIDE = 400, 800, 400
 """Longer side in pixels of the images for visibility, for the colours of a mesh, and for measuring the files."""
 COLORED_VIEWS, MEASURED_VIEWS = 64, 4
-"""Training views that colour a mesh, and held-out views in which the files are measured, at most."""
+"""Maximum number of training views that colour a mesh, and of held-out views to measure the files on."""
 
 
 @dataclass(frozen=True)
 class Written:
-    """Result of a written kind."""
+    """A written file and its quality."""
 
-    file: str  # its name
-    bytes: int  # of it
+    file: str  # name
+    bytes: int  # size
     count: int  # Gaussians or quads
-    # dB against the photographs of `views` held-out views, as other programs draw it; None = there were none
-    psnr: float | None
-    psnr_bundle: float | None  # dB of the bundle there
-    views: int  # in which this was measured, reduced to `MEASURED_SIDE` pixels
-    note: str = ""  # origin of its positions, where that is not 0
+    psnr: float | None  # dB on the held-out photographs, rendered as other programs do; None: without such
+    psnr_bundle: float | None  # dB of the bundle on the same views
+    views: int  # number of these views, scaled to `MEASURED_SIDE` pixels
+    note: str = ""  # origin of the positions, unless 0
 
 
 def extras_folder(bundle: Path) -> Path:
-    """The folder for the extras of a bundle: beside it, with its name and `SUFFIX`."""
+    """Return the default folder of a bundle's extras: beside the bundle, with its name and `SUFFIX`."""
     bundle = bundle.absolute()
     return bundle.with_name((bundle.stem if bundle.suffix == ".bitymi" else bundle.name) + SUFFIX)
 
 
 def check_extras(kinds: Sequence[str], folder: Path, overwrite: bool) -> None:
-    """Check the kinds and the folder before the work.
+    """Check the kinds and the output folder.
 
     Raises:
         BundleError: there is no such kind, OpenUSD is not installed, or the folder is there and may not be replaced, or
@@ -108,22 +107,23 @@ def write_extras(
     overwrite: bool = False,
     progress: Progress = no_progress,
 ) -> dict[str, Written]:
-    """Write a folder with a file for each kind and extras.json, which says how well they show held-out photographs;
-    whole or not at all.
+    """Write a folder with a file per kind and extras.json, which states their PSNR on held-out photographs. The folder
+    is complete or absent.
 
     Args:
         bundle: on the CPU, texels decoded.
-        frame: in which the files are: the scene's, or the capture's own, which bundle.json leads to.
-        cameras: of the training photographs: colours are fitted to what they see. Without any, harmonics are fitted
-            over the whole sphere, and a mesh keeps the surfels' own colours.
+        frame: of the files: the scene's or the capture's, by the transform of bundle.json.
+        cameras: of the training photographs, to fit colours to. Without cameras harmonics are fitted over the whole
+            sphere, and a mesh keeps the surfels' colours.
+        held_out: held-out photographs, to measure the files on.
         overwrite: replace a folder of extras.
 
     Returns:
-        what was written, by kind.
+        The written files, by kind.
 
     Raises:
-        BundleError: what `check_extras` raises; the bundle has nothing to write of a kind; the capture's frame cannot
-            be reached by a rotation; or the folder cannot be written.
+        BundleError: as `check_extras`; the bundle has no surfel for a mesh; the transform to the capture's frame is no
+            similarity; or the folder cannot be written.
     """
     folder = Path(folder)
     check_extras(kinds, folder, overwrite)
@@ -179,7 +179,7 @@ def write_extras(
 
 
 def summary_line(written: Written) -> str:
-    """One line about a written file."""
+    """Summarise a written file in one line."""
     line = f"{written.file}: {written.count:,}, {written.bytes / 1e6:.2f} MB" + (written.note and f"; {written.note}")
     if written.psnr is None or written.psnr_bundle is None:
         return line
@@ -187,7 +187,7 @@ def summary_line(written: Written) -> str:
 
 
 def _fitted_colors(scene: BakedScene, cameras: Sequence[Camera], progress: Progress) -> SurfelColors:
-    """Fitted to what the cameras see."""
+    """Fit the surfels' colours to the views of the cameras."""
     chosen = [camera.within(SEEN_SIDE) for camera in cameras]
     drawn = (scene.near, scene.weight_bound, scene.prefilter, progress, texel_alpha(scene))
     seen = visibility(scene.surfels, chosen, *drawn).seen
@@ -195,7 +195,7 @@ def _fitted_colors(scene: BakedScene, cameras: Sequence[Camera], progress: Progr
 
 
 def _psnr(draw: Callable[[Camera], Tensor], views: Sequence[View], background: Tensor) -> float | None:
-    """Mean dB over the views; None without any of which a pixel counts."""
+    """Compute the mean PSNR, dB, over the views; None without unmasked pixels."""
     values = [psnr(draw(view.camera).clamp(0.0, 1.0), view.target(background, "cpu"), view.mask) for view in views]
     mean = mean_psnr(values)
     return round(mean, 4) if mean == mean else None

@@ -1,4 +1,4 @@
-"""From the scene's frame to the capture's own."""
+"""Transforms from the scene's frame to the capture's."""
 
 import math
 from dataclasses import dataclass
@@ -11,34 +11,35 @@ from torch import Tensor
 from bitymi_ns.bundle.manifest import BundleError, WorldFrame
 
 FARTHEST = 1_000.0
-"""Units of the scene, whose cameras fit into a box from -1 to 1; so far from the origin float32 is off by 1/30,000."""
-_UP = (0.0, 0.0, 1.0)  # nerfstudio's, where the bundle does not know
-_SLACK = 1e-4  # of a rotation that was stored with rounding
+"""Distance from the origin, in scene units, beyond which positions get an origin: float32 is off by 1/30,000 there.
+Cameras fit into a box from -1 to 1."""
+_UP = (0.0, 0.0, 1.0)  # nerfstudio's, if the bundle states none
+_SLACK = 1e-4  # tolerance of a stored rotation's orthogonality
 
 
 @dataclass(frozen=True)
 class Similarity:
-    """x_new = scale * (turn @ x) + shift + origin. Positions are given relative to the origin."""
+    """Similarity x_new = scale * (turn @ x) + shift + origin. Positions are stored relative to the origin."""
 
-    turn: Tensor  # [3, 3] float64, orthogonal; it may mirror
-    scale: float  # of lengths
+    turn: Tensor  # [3, 3] float64, orthogonal; may be a reflection
+    scale: float
     shift: Tensor  # [3] float64
-    origin: Tensor  # [3] float64; 0 unless the scene lies so far out that float32 could not tell positions
+    origin: Tensor  # [3] float64; 0 unless float32 is too coarse at the scene's distance
 
     @property
     def note(self) -> str:
-        """States the origin; empty where it is 0."""
+        """Statement of the origin; empty if it is 0."""
         if not bool(self.origin.any()):
             return ""
         return "positions are relative to the origin " + " ".join(f"{value:.15g}" for value in self.origin.tolist())
 
     def points(self, points: Tensor) -> Tensor:
-        """[..., 3] points in the new frame, relative to the origin, of their type."""
+        """Transform points [..., 3] to the new frame, relative to the origin, in their dtype."""
         return (self.scale * (points.double() @ self.turn.T) + self.shift).to(points)
 
     def rotations(self, quats: Tensor) -> Tensor:
-        """[N, 4] float64 unit quaternions wxyz in the new frame. Where it is mirrored, the third axis is turned round:
-        a disc's or a Gaussian's own mirror image."""
+        """Transform rotations to the new frame, [N, 4] float64 unit quaternions wxyz. For a reflection the third axis
+        is inverted, which does not change a disc or a Gaussian."""
         old = Rotation.from_quat(quats.detach().double().numpy()[:, [1, 2, 3, 0]]).as_matrix()
         new = self.turn.numpy() @ old
         new[:, :, 2] *= np.linalg.det(self.turn.numpy())
@@ -46,10 +47,10 @@ class Similarity:
 
 
 def to_capture(place: WorldFrame) -> Similarity:
-    """Inverse of x_scene = scale * (transform @ [x_capture, 1]).
+    """Invert x_scene = scale * (transform @ [x_capture, 1]).
 
     Raises:
-        BundleError: the transform is no similarity, so that discs would not stay discs.
+        BundleError: the transform is no similarity, so that discs would not remain discs.
     """
     transform = torch.tensor(place.transform, dtype=torch.float64)
     matrix, offset = transform[:, :3], transform[:, 3]
@@ -61,7 +62,7 @@ def to_capture(place: WorldFrame) -> Similarity:
             "can be moved back there: choose the scene's frame (--frame scene)"
         )
     u, _, v = torch.linalg.svd(turn)
-    turn = u @ v  # the nearest orthogonal one
+    turn = u @ v  # nearest orthogonal matrix
     scale = 1 / (stretch * place.scale)
     shift = -torch.linalg.solve(matrix, offset)
     step = 10.0 ** math.floor(math.log10(FARTHEST * scale))
@@ -71,8 +72,8 @@ def to_capture(place: WorldFrame) -> Similarity:
 
 
 def up_of(place: WorldFrame, to: Similarity | None) -> Tensor:
-    """[3] up in the scene's frame; in another one the axis that is nearest to it, so that a turn to +y exchanges that
-    frame's coordinates and keeps their values."""
+    """Compute the up direction [3] in the scene's frame, or the nearest axis of another frame, so that a rotation to +y
+    only permutes the coordinates of that frame."""
     up = torch.tensor(place.up or _UP, dtype=torch.float64)
     if to is None:
         return up

@@ -1,4 +1,4 @@
-"""A baked scene as 3D Gaussians: a preview for the programs that draw Gaussian splats."""
+"""Baked scene as 3D Gaussians: a preview for Gaussian splatting programs."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from bitymi_ns.scene.tile_sizes import kernel_parameters
 from bitymi_ns.train.init import tangents, turned
 
 FLAT_LOG_SCALE = -16.0
-"""Third scale of the Gaussians in the scene's frame, whose cameras lie within a unit of the origin."""
-GRID = 24  # points along both axes of a kernel, of which the moments under alpha texels are summed
+"""Log of the Gaussians' third scale, in the scene's frame, whose cameras lie within a unit of the origin."""
+GRID = 24  # points along both axes of a kernel in the sums for the moments under alpha texels
 LEAST_OPACITY = 1e-4  # of a surfel that alpha texels cut away
 HARD_BETA = 0.5658
 """Exponent below which a disc of the same second moments is nearer to the kernel than a Gaussian, in squared error."""
@@ -35,7 +35,7 @@ _NAMES = {
     "log_scales": tuple(f"scale_{i}" for i in range(3)),
     "quats": tuple(f"rot_{i}" for i in range(4)),
 }
-"""Columns of the PLY file of 3DGS, in its order; f_rest has all of red, then green, then blue."""
+"""Columns of 3DGS's PLY file in order; f_rest has all of red, then green, then blue."""
 
 
 @dataclass(frozen=True)
@@ -69,12 +69,13 @@ class Gaussians:
 
 @torch.no_grad()
 def gaussians_of(scene: BakedScene, coefficients: Tensor) -> Gaussians:
-    """The Gaussians that stand for the surfels of a scene on the CPU, flat, with the colours [N, 16, 3] of
+    """Convert the surfels of a scene on the CPU to flat Gaussians with colours [N, 16, 3] of
     `surfel_colors.fit_colors`.
 
-    They have the surfels' opacities and the second moments of their kernels: of (1 - r^2 / R^2)^beta on the disc of
-    radius R the mean of u^2 is R^2 / (2 (beta + 2)). Alpha texels move and stretch them by the moments of
-    f = min(0.99, o k m), and multiply their opacities by the mean of f over itself, over that of o k.
+    Gaussians have the opacities and second moments of the surfels' kernels: under (1 - r^2 / R^2)^beta on the disc of
+    radius R the mean of u^2 is R^2 / (2 (beta + 2)). With alpha texels m they have centre and covariance of
+    f = min(0.99, o k m), and their opacity is multiplied by the f-weighted mean of f over the (o k)-weighted mean of
+    o k.
     """
     surfels = scene.surfels
     means, quats = surfels["means"].float(), torch.nn.functional.normalize(surfels["quats"].float(), dim=1)
@@ -102,8 +103,8 @@ def gaussians_of(scene: BakedScene, coefficients: Tensor) -> Gaussians:
 
 
 def _moments(scene: BakedScene, chunk: int = 1 << 20) -> tuple[Tensor, Tensor, Tensor]:
-    """Moments of f = min(0.99, o k m), float64: its mean weighted by itself [N], over that of o k; its centre [N, 2] in
-    scale units; and its covariance [N, 2, 2], over the variance of k."""
+    """Compute the moments of f = min(0.99, o k m), float64: its f-weighted mean [N], relative to the (o k)-weighted
+    mean of o k; its centre [N, 2] in scale units; and its covariance [N, 2, 2], relative to the variance of k."""
     n, step = len(scene), 2.0 * SUPPORT / GRID
     opacity, beta = kernel_parameters(scene.surfels)
     constant = torch.ones(n) if scene.mean_alpha is None else scene.mean_alpha
@@ -125,7 +126,7 @@ def _moments(scene: BakedScene, chunk: int = 1 << 20) -> tuple[Tensor, Tensor, T
         share, uncut = (f / f.sum(1, keepdim=True).clamp(min=1e-12) for f in (cut, kernel))
         strength[rows] = (share * cut).sum(1) / (uncut * kernel).sum(1).clamp(min=1e-12)
         center[rows] = share @ at
-        least = step**2 / 12.0 * torch.eye(2, dtype=torch.float64)  # of a point, which stands for a cell
+        least = step**2 / 12.0 * torch.eye(2, dtype=torch.float64)  # covariance within a grid cell
         second = torch.einsum("np,pi,pj->nij", share, at, at) - center[rows, :, None] * center[rows, None] + least
         whole = uncut @ at[:, 0].square() + step**2 / 12.0
         covariance[rows] = second / whole[:, None, None]

@@ -1,4 +1,4 @@
-"""Quads and surfaces as a binary glTF file, by trimesh."""
+"""Binary glTF files of quads and surfaces, with trimesh."""
 
 from typing import Any
 
@@ -13,12 +13,12 @@ from bitymi_ns.interchange.triangles import Triangles
 
 _LINEAR, _CLAMP = 9729, 33071
 _FACES = ((0, 1, 2), (0, 2, 3))
-_COLOR = "_COLOR_0"  # trimesh writes it as it is, and colors as bytes, which are too coarse for linear ones
+_COLOR = "_COLOR_0"  # float attribute: trimesh writes vertex colors as bytes, too coarse for linear colors
 
 
 def upright(up: Tensor, origin: Tensor | None = None) -> np.ndarray:
-    """[4, 4] placement of a file's node: from positions relative to an origin [3], with this direction [3] up, to
-    glTF's, where +y is up."""
+    """Compute the transform [4, 4] of a glTF node, from positions relative to an origin [3] with up direction [3] to
+    glTF's frame, where +y is up."""
     place = np.eye(4)
     place[:3, :3] = _to_y(up.double().numpy())
     if origin is not None:
@@ -27,12 +27,12 @@ def upright(up: Tensor, origin: Tensor | None = None) -> np.ndarray:
 
 
 def quads_glb(quads: Quads, place: np.ndarray) -> bytes:
-    """The file: a mesh for each page, four vertices and two triangles for each quad, seen from both sides and unlit
-    (KHR_materials_unlit), with its page as a PNG. Texels are read without mip levels, which would mix tiles.
+    """Encode quads as glTF: a mesh per page with the page as PNG, two triangles per quad, double-sided and unlit
+    (KHR_materials_unlit). The sampler has no mip levels, which would mix tiles.
 
     Args:
         quads: at least one.
-        place: of the node, as `upright` returns it.
+        place: transform of the node, of `upright`.
     """
     scene = trimesh.Scene()
     for page in torch.unique(quads.page).tolist():
@@ -52,11 +52,11 @@ def quads_glb(quads: Quads, place: np.ndarray) -> bytes:
 
 
 def surface_glb(mesh: Triangles, normals: np.ndarray, place: np.ndarray) -> bytes:
-    """The file: one mesh with linear vertex colors, lit, seen from both sides.
+    """Encode a surface as glTF: a mesh with linear vertex colors, lit and double-sided.
 
     Args:
-        normals: [V, 3] of the vertices, of length 1.
-        place: as in `quads_glb`.
+        normals: [V, 3] unit vertex normals.
+        place: transform of the node, of `upright`.
     """
     linear = np.where(mesh.colors <= 0.04045, mesh.colors / 12.92, ((mesh.colors + 0.055) / 1.055) ** 2.4)
     shape = trimesh.Trimesh(
@@ -73,19 +73,19 @@ def surface_glb(mesh: Triangles, normals: np.ndarray, place: np.ndarray) -> byte
 
 
 def _matte(**more: Any) -> trimesh.visual.material.PBRMaterial:
-    """A material that neither shines nor has a back."""
+    """Create a matte, double-sided material."""
     return trimesh.visual.material.PBRMaterial(metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True, **more)
 
 
 def _colored(tree: dict[str, Any]) -> None:
-    """Name the vertex colors as glTF does."""
+    """Rename the vertex color attribute to glTF's COLOR_0."""
     for mesh in tree["meshes"]:
         attributes = mesh["primitives"][0]["attributes"]
         attributes["COLOR_0"] = attributes.pop(_COLOR)
 
 
 def _unlit(tree: dict[str, Any]) -> None:
-    """Add the unlit extension and the sampler, which trimesh does not write, to the JSON."""
+    """Add the unlit extension and the sampler, which trimesh cannot write."""
     tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), "KHR_materials_unlit"})
     for material in tree["materials"]:
         material["extensions"] = {"KHR_materials_unlit": {}}
@@ -95,7 +95,7 @@ def _unlit(tree: dict[str, Any]) -> None:
 
 
 def _to_y(up: np.ndarray) -> np.ndarray:
-    """The smallest rotation that turns a direction to +y."""
+    """Compute the smallest rotation of a direction to +y."""
     up = up / np.linalg.norm(up)
     axis, cosine = np.cross(up, (0.0, 1.0, 0.0)), up[1]
     if cosine < -1 + 1e-9:

@@ -8,27 +8,27 @@ from torch import Tensor
 from bitymi_ns.ops import view_color
 from bitymi_ns.ops.view_kinds import entry_of, fibonacci_sphere
 
-TERMS = 16  # harmonics up to degree 3, that of degree 0 included
+TERMS = 16  # harmonics of degrees 0 to 3
 _POWERS = [(i, j, n - i - j) for n in (2, 3) for i in range(n + 1) for j in range(n + 1 - i)]  # 6 + 10 = TERMS
 
 
 def basis(directions: Tensor) -> Tensor:
-    """The harmonics in some directions.
+    """Evaluate the harmonics in some directions.
 
-    On the sphere they are polynomials of degree 2 and 3. The matrix that makes them of the monomials is solved from
-    values of the compiled kernel, in float64, where their formula stands.
+    On the sphere they are linear combinations of the monomials of degrees 2 and 3. The matrix is solved from values of
+    the compiled kernel, in float64, so that the formula exists once.
 
     Args:
         directions: [..., 3] unit vectors.
 
     Returns:
-        [..., 16] of the directions' type.
+        [..., 16] in the dtype of the directions.
     """
     return _monomials(directions) @ _from_monomials().to(directions)
 
 
 def turned(matrix: Tensor) -> Tensor:
-    """Matrix of the coefficients for directions of another frame.
+    """Compute the matrix that rotates coefficients to another frame.
 
     Args:
         matrix: [3, 3] float64, orthogonal: a direction d of the new frame is matrix @ d in the old one. Reflections
@@ -36,7 +36,7 @@ def turned(matrix: Tensor) -> Tensor:
 
     Returns:
         [16, 16] float64; a colour of coefficients c in the old frame has the coefficients turned @ c in the new one.
-        Every degree turns into itself, so this is exact.
+        Exact, because rotations do not mix degrees.
     """
     directions = fibonacci_sphere(_SAMPLES).double()
     old = basis(torch.nn.functional.normalize(directions @ matrix.T, dim=1))
@@ -56,7 +56,7 @@ def _from_monomials() -> Tensor:
 
 
 def _of_kernel(directions: Tensor) -> Tensor:
-    """[D, 16] float64: surfels whose coefficients are 0 but for one, seen in the directions."""
+    """Evaluate the compiled kernel for each harmonic in the directions, [D, 16] float64."""
     count = len(directions)
     columns = []
     for term in range(TERMS):

@@ -1,4 +1,4 @@
-"""Held-out photographs that a bundle holds."""
+"""Held-out photographs stored in a bundle."""
 
 import io
 from collections.abc import Sequence
@@ -16,22 +16,22 @@ from bitymi_ns.bundle.read import read_file
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import View
 
-PICTURES = ("JPEG", "PNG", "WEBP")  # formats of photographs, as Pillow names them
+PICTURES = ("JPEG", "PNG", "WEBP")  # Pillow's names of the photographs' formats
 
 
 def training_cameras(bundle: Bundle) -> Sequence[Camera]:
-    """The cameras whose photographs training saw; none where the bundle has no cameras.json."""
+    """List the cameras of the training photographs; empty if the bundle has no cameras.json."""
     return [row.camera for row in bundle.cameras if not row.held_out]
 
 
 def read_held_out(folder: str | Path, bundle: Bundle) -> list[View]:
-    """Read the held-out photographs of a bundle, with their cameras; none where it has none.
+    """Read the held-out photographs of a bundle with their cameras; empty if it has none.
 
     Args:
-        folder: the bundle's folder, or its one file.
+        folder: the bundle's folder, or its .bitymi file.
 
     Raises:
-        BundleError: a photograph is missing, altered or no picture.
+        BundleError: a photograph is missing, altered or no image.
     """
     with parts_of(folder) as parts:
         rows = [row for row in bundle.cameras if row.held_out and row.photograph is not None]
@@ -39,7 +39,7 @@ def read_held_out(folder: str | Path, bundle: Bundle) -> list[View]:
 
 
 def _view(parts: Parts, info: Manifest, row: CapturedCamera) -> View:
-    """A photograph, which may be smaller than its camera's image."""
+    """Read a photograph and scale its camera to it: photographs may be stored smaller."""
     name, camera = row.photograph or "", row.camera
     check_file_name(name, CAMERAS)
     if name not in info.files:

@@ -1,4 +1,4 @@
-"""A baked scene as a textured mesh: a quad for each surfel that hides what is behind it."""
+"""Baked scene as a textured mesh: an opaque quad per surfel."""
 
 from __future__ import annotations
 
@@ -15,22 +15,21 @@ from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.tile_sizes import kernel_parameters, next_power_of_two
 from bitymi_ns.train.init import tangents
 
-MASK = 0.5  # texels whose alpha is read as less are not drawn
+MASK = 0.5  # alpha cutoff
 _CORNERS = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
-_CHUNK = 1 << 20  # texels at once
+_CHUNK = 1 << 20  # texels per batch
 
 
 @dataclass(frozen=True)
 class Quads:
-    """Q parallelograms with a texture each."""
+    """Q textured parallelograms."""
 
     corners: Tensor  # [Q, 4, 3] float32 positions, in a ring
     # [Q, 4, 2] float32 texture coordinates of the corners: (0, 0) is the outer corner of the first texel of the page,
     # (1, 1) that of the last one, as in glTF
     uv: Tensor
-    page: Tensor  # [Q] int64, which page holds its texels
-    # [P, height, width, 4] uint8, red, green, blue and alpha; what is read of alpha below `MASK` is a hole
-    pages: Tensor
+    page: Tensor  # [Q] int64, page of the quad's texels
+    pages: Tensor  # [P, height, width, 4] uint8 RGBA, with alpha cutoff `MASK`
 
     def __len__(self) -> int:
         return len(self.corners)
@@ -42,18 +41,18 @@ class Quads:
 
 @torch.no_grad()
 def quads_of(scene: BakedScene, color: Tensor, level: float) -> Quads:
-    """The quads that stand for the surfels of a scene.
+    """Convert the surfels of a scene to quads.
 
-    A quad is the square around the disc in which the surfel's opacity o (1 - r^2 / R^2)^beta is at least `level`, and
-    its alpha is 1 - r^2 / (2 radius^2): half of it at the rim of the disc. Alpha texels m make the opacity o k m: the
-    disc is that of the largest m, and alpha at most o k m / (2 level). A surfel whose opacity nowhere reaches the level
-    has none. Its colours are max(color + residual, 0). Texels are read from the surfel's tile, on a grid about as fine
-    as that, whose outer texel centres are the corners.
+    A quad is the square around the disc in which the surfel's opacity o k = o (1 - r^2 / R^2)^beta is at least `level`.
+    Its alpha is 1 - r^2 / (2 radius^2), which is 0.5 at the rim of the disc. With alpha texels m the opacity is o k m:
+    the disc is that of the largest m, and alpha is at most o k m / (2 level). A surfel below the level everywhere has
+    no quad. Colours are max(color + residual, 0). Texels are resampled from the surfel's tile, at about its resolution,
+    with the outer texel centres at the corners.
 
     Args:
         scene: N surfels on the CPU, with its texels decoded.
         color: [N, 3] colour of each surfel without its residual.
-        level: of the opacity, in (0, 1).
+        level: opacity at which quads end, in (0, 1).
     """
     surfels = scene.surfels
     opacity = torch.sigmoid(surfels["opacity_logits"].double()) * _largest_alpha(scene)
@@ -79,15 +78,15 @@ def quads_of(scene: BakedScene, color: Tensor, level: float) -> Quads:
 
 
 def fetch_texels(scene: BakedScene, tiles: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Fetch texels: bilinear between texel centres, constant beyond the outer ones.
+    """Fetch texels bilinearly, clamped to the outer texel centres of each tile.
 
     Args:
         scene: on the CPU, with an atlas.
         tiles: [n, 5] int64, of the scene.
-        u, v: [n, r_u] and [n, r_v] coordinates in units of the half sides of the tiles, from -1 to 1 within them.
+        u, v: [n, r_u] and [n, r_v] coordinates in half sides of the tiles, from -1 to 1 inside.
 
     Returns:
-        [n, r_v, r_u, 4] residual colour and alpha; alpha is 0 where texels have none.
+        [n, r_v, r_u, 4] residual colour and alpha; alpha is 0 if the scene has no alpha texels.
     """
     assert scene.atlas is not None
     _, height, width, _ = scene.atlas.shape
@@ -109,7 +108,7 @@ def fetch_texels(scene: BakedScene, tiles: Tensor, u: Tensor, v: Tensor) -> Tens
 
 
 def _between(at: Tensor, count: Tensor, first: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The texels on both sides of positions [n, r] from -1 to 1 along an axis, and how far they are to the second."""
+    """Compute the texels on both sides of positions [n, r] in [-1, 1] along an axis, and the interpolation weights."""
     last = (count - 1)[:, None]
     x = ((0.5 * (at + 1.0)) * count[:, None] - 0.5).clamp(min=0.0)
     x = torch.minimum(x, last.to(x))
@@ -118,7 +117,8 @@ def _between(at: Tensor, count: Tensor, first: Tensor) -> tuple[Tensor, Tensor, 
 
 
 def _sizes(tiles: Tensor, share: Tensor) -> Tensor:
-    """[n, 2] sides for quads that show a share [n] of the sides of tiles [n, 2]: as fine as the tile, powers of two."""
+    """Choose texture sides [n, 2] of quads that cover a share [n] of tiles [n, 2]: the tile's resolution, rounded up to
+    powers of two."""
     return next_power_of_two((tiles * share[:, None]).ceil()).clamp(min=GRID).long()
 
 
@@ -131,9 +131,9 @@ def _texels(
     extent: Tensor,
     level: float,
 ) -> Tensor:
-    """[n, r_v, r_u, 4] uint8 of quads of one size."""
+    """Sample the textures [n, r_v, r_u, 4] uint8 of quads of one size."""
     across, down = (torch.linspace(-1.0, 1.0, count) for count in size)
-    r2 = across.square() + down[:, None].square()  # of the radius
+    r2 = across.square() + down[:, None].square()  # squared radius, relative to the disc's
     shown = color[rows, None, None].expand(-1, size[1], size[0], -1)
     if scene.mean_residual is not None:
         shown = shown + scene.mean_residual[rows, None, None]
@@ -146,14 +146,14 @@ def _texels(
         shown[tiled] = color[own, None, None] + texels[..., :3]
         if scene.alpha_scale:
             opacity, beta = (value[own, None, None] for value in kernel_parameters(scene.surfels))
-            # beyond the rim as at the rim, where the disc cuts
+            # clamped to the rim's value beyond the rim
             uncut = opacity * (1.0 - r2.clamp(max=1.0) * (radius[tiled, None, None] / SUPPORT).square()) ** beta
             alpha[tiled] = torch.minimum(alpha[tiled], 0.5 * uncut * texels[..., 3] / level)
     return (torch.cat([shown, alpha[..., None]], dim=3).clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
 
 
 def _largest_alpha(scene: BakedScene) -> Tensor:
-    """[N] the largest alpha of every surfel's texels; 1 where texels are opaque."""
+    """Compute the largest alpha [N] of each surfel's texels; 1 for opaque texels."""
     alpha = texel_alpha(scene)
     if alpha is None:
         return torch.ones(len(scene), dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""The colours of a mesh whose quads hide what is behind them, from pictures of the scene that it stands for."""
+"""Colours of an opaque mesh of quads, fitted to renders of the scene."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -12,7 +12,7 @@ from bitymi_ns.interchange.quads import Quads
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 
-PRIOR = 1.0  # a colour that was there before counts as much as so many pixels
+PRIOR = 1.0  # weight of the previous colour, in pixels
 
 
 @torch.no_grad()
@@ -23,15 +23,15 @@ def recolored(
     near: float,
     progress: Progress = no_progress,
 ) -> Quads:
-    """Quads whose texels show what pictures show where they are the nearest.
+    """Fit the texels of quads to renders of the scene, at the pixels where they are nearest.
 
-    A surfel is blended with what is behind it, a quad hides that. So every quad is shifted by the mean difference
-    between the pictures and its colours, over the pixels that show it; then every texel becomes the mean of the pixels
-    that show it. Both means count what was there before as PRIOR pixels.
+    A surfel is blended with what is behind it; an opaque quad is not. So the colours of each quad are first shifted by
+    their mean difference from the renders, over the quad's pixels; then each texel becomes the mean of its pixels. Both
+    means include the previous value with the weight of PRIOR pixels.
 
     Args:
-        picture: draws the scene for a camera, [H, W, 3].
-        near: nearest depth that is drawn.
+        picture: renders the scene for a camera, [H, W, 3].
+        near: near plane.
     """
     pages, height, width, _ = quads.pages.shape
     shift, shown = torch.zeros(len(quads), 3), torch.zeros(len(quads), 1)
@@ -57,7 +57,7 @@ def recolored(
 
 
 def _owners(quads: Quads) -> Tensor:
-    """Row of the quad of every texel of the pages, flat; -1 = none."""
+    """Find the quad of each texel of the pages: row indices, flat; -1: none."""
     pages, height, width, _ = quads.pages.shape
     corners = quads.uv.double() * torch.tensor([width, height])  # centres of texels
     first = corners[:, 0].floor().long()

@@ -1,6 +1,6 @@
-"""Gaussians as other programs draw them: elliptical weighted averages (Zwicker et al. 2001), as 3DGS has them.
+"""Renderer of 3D Gaussians as in 3DGS (elliptical weighted average, Zwicker et al. 2001), to measure previews.
 
-It is here to measure a preview with, and small rather than fast: torch on the CPU, a tile of the image at a time.
+Simple rather than fast: torch on the CPU, one tile of the image at a time.
 """
 
 import math
@@ -14,9 +14,9 @@ from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, TILE, TRAN
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.init import tangents
 
-DILATION = 0.3  # pixels squared that 3DGS adds to the variances of a footprint
-REACH = 3.0  # a footprint ends at so many standard deviations along its longer axis
-BEYOND = 1.3  # means farther out than this many half images are linearised as if they lay there
+DILATION = 0.3  # added to the variances of a footprint, pixels squared
+REACH = 3.0  # radius of a footprint, in standard deviations along its longer axis
+BEYOND = 1.3  # limit on the means' positions in the Jacobian, in half images from the centre
 _AT_ONCE = 512
 
 
@@ -31,8 +31,8 @@ def draw_gaussians(
     """Draw a view.
 
     A Gaussian of covariance S has the footprint J W S W^T J^T + 0.3 I on the image, where W is the camera's rotation
-    and J the derivative of the projection at its mean. From front to back by the depths of the means, a pixel takes
-    alpha = min(0.99, o exp(-1/2 q)) of each, unless alpha < 1/255, until less than 1e-4 would be left.
+    and J the Jacobian of the projection at its mean. A pixel blends alpha = min(0.99, o exp(-1/2 q)), front to back by
+    the depths of the means, skips alpha < 1/255, and ends before the transmittance would fall below 1e-4.
 
     Args:
         gaussians: on the CPU, in the camera's world frame.
@@ -71,8 +71,8 @@ def draw_gaussians(
 
 
 def _footprints(gaussians: Gaussians, camera: Camera, near: float) -> tuple[Tensor, ...]:
-    """Footprints that may be in the image, from front to back: centres [M, 2] in pixels, inverse covariances [M, 3]
-    (xx, xy, yy), reaches [M], depths [M], rows [M]."""
+    """Project the Gaussians, sorted front to back: centres [M, 2] in pixels, inverse covariances [M, 3] (xx, xy, yy),
+    radii [M], depths [M], rows [M]; without those outside the image."""
     rotation, K = camera.viewmat[:3, :3], camera.K
     seen = gaussians.means @ rotation.T + camera.viewmat[:3, 3]
     rows = torch.nonzero(seen[:, 2] > near).squeeze(1)

@@ -1,7 +1,4 @@
-"""The surface of a scene as a triangle mesh: TSDF fusion of median depths (as in 2DGS, Huang et al. 2024).
-
-open3d, which nerfstudio depends on, does the fusion, the extraction and the simplification.
-"""
+"""Surface extraction from a scene: TSDF fusion of median depths (as in 2DGS, Huang et al. 2024), with open3d."""
 
 from __future__ import annotations
 
@@ -29,35 +26,35 @@ if TYPE_CHECKING:
 
 HALF = 0.5  # accumulated weight at which the median depth is reached
 TRUNCATION = 8.0  # truncation distance of the TSDF in voxels; with 4, walls with noisy depth get more holes
-SMOOTHING = 10  # iterations of Taubin smoothing, which takes the noise of depths and keeps volumes
-QUANTILE = 0.01  # share of the observed points that the box leaves out at each of its sides
+SMOOTHING = 10  # iterations of Taubin smoothing, which removes the noise of depths and preserves volumes
+QUANTILE = 0.01  # share of the observed points outside each side of the box
 REACH = 3.0
-"""Half the side of the largest box, in units of the greatest distance of a camera from their mean or, where that is
-more, of the median depth of all views."""
-SMALLEST = 0.005  # connected parts with less than this share of the triangles of the largest part are dropped
-BOX_SIDE = 160  # longer side in pixels of the depth maps that the box is found from
+"""Half side of the largest box, in units of the larger of the cameras' greatest distance from their mean and the median
+depth of all views."""
+SMALLEST = 0.005  # components with less than this share of the triangles of the largest one are dropped
+BOX_SIDE = 160  # longer side in pixels of the depth maps that determine the box
 PIXELS_PER_VOXEL = 2.0
-"""Pixels along a voxel where a view is far: a finer depth map tells the volume nothing."""
-FAR = 0.9  # quantile of a view's depths in the box that counts as far
+"""Pixels per voxel at far depths: finer depth maps do not improve the volume."""
+FAR = 0.9  # quantile of a view's depths in the box used as far depth
 POISSON_DEPTH = 9  # depth of the octree of the watertight reconstruction
 
 
 class NoSurface(ValueError):
-    """The cameras see no surface that could be fused; the message says why."""
+    """No surface can be extracted; the message says why."""
 
 
 @dataclass(kw_only=True)
 class SurfaceOptions:
-    """Options of the extraction of a surface."""
+    """Options of surface extraction."""
 
     resolution: Annotated[int, Field(ge=16, le=4096)] = 256
-    """Voxels along the longest side of the box that holds what the cameras see, 16 to 4096. Time and memory grow with
-    its square."""
+    """Voxels along the longest side of the box around the observed surface, 16 to 4096. Time and memory grow with its
+    square."""
     triangles: Annotated[int, Field(ge=0, le=10**8)] = 500_000
-    """Budget of triangles, met by simplification (quadric error metrics); 0 = no limit."""
+    """Maximum number of triangles, reached by simplification (quadric error metrics); 0 = no limit."""
     watertight: bool = False
-    """Close the mesh, for printing: a Poisson reconstruction, of which what is open or touches itself is cut away and
-    filled. Invents surface where nothing was seen."""
+    """Close the mesh, for 3D printing, by Poisson reconstruction; open or self-touching parts are cut and filled.
+    Invents surface in unobserved regions."""
 
 
 @torch.no_grad()
@@ -68,17 +65,16 @@ def median_depth(
     prefilter: Prefilter = "low_pass",
     alpha: TexelAlpha | None = None,
 ) -> Tensor:
-    """Depth at which half of the light of each pixel is blocked.
+    """Compute the median depth of each pixel, at which the accumulated blending weight reaches 0.5.
 
     Args:
         surfels: geometry by name (`GEOMETRY`), of N surfels.
-        near: nearest depth that is drawn, camera z.
+        near: near plane, camera z.
         prefilter: as in `ops.project`.
-        alpha: opacities of the surfels' texels; None = opaque texels.
+        alpha: opacities of the surfels' texels; None: opaque texels.
 
     Returns:
-        [H, W] camera z of the first fragment with which the blending weights of its pixel reach 0.5; 0 where they do
-        not.
+        [H, W] camera z of the fragment that reaches it; 0 if none does.
 
     Raises:
         TooManyFragments: a single row of screen tiles has more fragments than memory holds.
@@ -86,12 +82,12 @@ def median_depth(
     projection = project(*(surfels[name] for name in GEOMETRY), camera, near, prefilter, alpha=alpha)
     rows = []
     for fragments in fitting_lists(projection):
-        order = fragments.pixel.argsort(stable=True)  # front to back within each pixel, as the fragments of a tile are
+        order = fragments.pixel.argsort(stable=True)  # keeps the front-to-back order within each pixel
         weight = fragments.weight[order].double()
         total = weight.cumsum(0)
         part = fragments.weight.new_zeros(fragments.height * fragments.width)
         count = torch.bincount(fragments.pixel, minlength=len(part))
-        before = torch.cat([total.new_zeros(1), total])[count.cumsum(0) - count]  # of the pixels in front
+        before = torch.cat([total.new_zeros(1), total])[count.cumsum(0) - count]  # total of all previous pixels
         reached = total - before.repeat_interleave(count)
         crossing = order[(reached >= HALF) & (reached - weight < HALF)]
         part[fragments.pixel[crossing].long()] = fragments.depth[crossing]
@@ -100,11 +96,11 @@ def median_depth(
 
 
 def observed_box(depths: Sequence[Tensor], cameras: Sequence[Camera]) -> Tensor:
-    """[2, 3] corners of the box that holds what the cameras see, without the outermost `QUANTILE` of it, cut to `REACH`
-    times the extent of the cameras or their median depth.
+    """Compute the box [2, 3] around the points of depth maps, without the outermost `QUANTILE` at each side, limited to
+    `REACH` times the extent of the cameras or their median depth.
 
     Raises:
-        NoSurface: no depth is known.
+        NoSurface: there are no cameras, or no pixel has a depth.
     """
     if not cameras:
         raise NoSurface("there are no cameras that see the surface")
@@ -122,7 +118,7 @@ def observed_box(depths: Sequence[Tensor], cameras: Sequence[Camera]) -> Tensor:
 
 
 def _points(depth: Tensor, camera: Camera) -> Tensor:
-    """[M, 3] world points of the pixels [H, W] whose depth is known."""
+    """Unproject the pixels of known depth [H, W] to world points [M, 3]."""
     y, x = (depth > 0).nonzero(as_tuple=True)
     return camera.to("cpu").unproject(x.cpu() + 0.5, y.cpu() + 0.5, depth[y, x].cpu().double())
 
@@ -142,11 +138,11 @@ def extract_surface(
 
     Args:
         surfels: geometry by name (`GEOMETRY`).
-        render: [H, W, 3] colors of a view, for the vertices.
-        near: nearest depth that is drawn, camera z.
+        render: renders the colors [H, W, 3] of a view, for the vertices.
+        near: near plane, camera z.
         prefilter: as in `ops.project`.
         alpha: as in `median_depth`.
-        to: the frame of the mesh; None = the scene's.
+        to: transform to the mesh's frame; None: the scene's frame.
 
     Raises:
         NoSurface: there is nothing to fuse.
@@ -156,7 +152,7 @@ def extract_surface(
 
     options = options or SurfaceOptions()
     check_ranges(options)
-    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):  # it warns of what is raised here
+    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):  # errors are raised here instead
         small = [camera.within(BOX_SIDE) for camera in cameras]
         depths = []
         for i, camera in enumerate(small):
@@ -181,7 +177,7 @@ def extract_surface(
                 convert_rgb_to_intensity=False,
             )
             K = camera.K.cpu().double()
-            # open3d samples a pixel at its integer coordinates, this package half a pixel further
+            # open3d samples pixels at integer coordinates, this package at + 0.5
             pinhole = (K[0, 0].item(), K[1, 1].item(), K[0, 2].item() - 0.5, K[1, 2].item() - 0.5)
             intrinsic = open3d.camera.PinholeCameraIntrinsic(camera.width, camera.height, *pinhole)
             volume.integrate(picture, intrinsic, camera.viewmat.cpu().double().numpy())
@@ -193,13 +189,13 @@ def extract_surface(
 
 
 def _coarsened(camera: Camera, focal: float) -> Camera:
-    """The camera with pictures reduced to a focal length in pixels, but not below `BOX_SIDE`."""
+    """Scale a camera's image down to a focal length in pixels, but not below `BOX_SIDE`."""
     side = max(camera.width, camera.height)
     return camera.within(max(BOX_SIDE, math.ceil(side * focal / float(camera.K[:2, :2].diagonal().max()))))
 
 
 def _cut(depth: Tensor, camera: Camera, box: Tensor) -> Tensor:
-    """The depths [H, W] of points within the box [2, 3], 0 elsewhere."""
+    """Set depths [H, W] of points outside the box [2, 3] to 0."""
     known = depth > 0
     points = _points(depth, camera)
     inside = ((points >= box[0]) & (points <= box[1])).all(1)
@@ -211,7 +207,7 @@ def _cut(depth: Tensor, camera: Camera, box: Tensor) -> Tensor:
 def _finished(
     mesh: open3d.geometry.TriangleMesh, options: SurfaceOptions, progress: Progress, to: Similarity | None
 ) -> Triangles:
-    """The mesh in its frame without specks, closed where asked for, within the budget of triangles."""
+    """Remove specks, simplify, smooth, transform and, if requested, close the mesh."""
     import open3d
 
     labels, counts, _ = (np.asarray(part) for part in mesh.cluster_connected_triangles())
@@ -237,15 +233,15 @@ def _finished(
             raise NoSurface("nothing is left of the mesh: try more --triangles")
         if not options.triangles or len(result) <= options.triangles:
             return result
-        budget -= len(result) - options.triangles  # triangles that close holes
+        budget -= len(result) - options.triangles  # triangles added to close holes
 
 
 def _as_written(mesh: open3d.geometry.TriangleMesh, to: Similarity | None) -> Triangles:
-    """The mesh in another frame."""
+    """Convert a mesh from open3d and transform it to another frame."""
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles).astype(np.int64)
     if to is not None:
         vertices = to.points(torch.from_numpy(vertices)).numpy()
-        if float(torch.linalg.det(to.turn)) < 0:  # a mirror image turns triangles inside out
+        if float(torch.linalg.det(to.turn)) < 0:  # a reflection turns triangles inside out
             faces = faces[:, ::-1]
     colors = np.asarray(mesh.vertex_colors).clip(0.0, 1.0)
     return cleaned(Triangles(vertices.astype(np.float32), faces, colors.astype(np.float32)))

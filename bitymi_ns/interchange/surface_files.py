@@ -1,4 +1,4 @@
-"""Surface meshes as files: PLY, glTF and OBJ."""
+"""Surface mesh files: PLY, glTF and OBJ."""
 
 import io
 from typing import Literal
@@ -14,13 +14,13 @@ MeshFormat = Literal["ply", "glb", "obj"]
 
 
 def mesh_bytes(mesh: Triangles, form: MeshFormat, up: Tensor, origin: Tensor, note: str = "") -> bytes:
-    """The file, with vertex colors and normals. PLY and OBJ have the mesh's own axes, and the note as a comment; glTF
-    has +y up, and the origin in its node.
+    """Encode a mesh file with vertex colors and normals. PLY and OBJ keep the mesh's axes and have the note as a
+    comment; glTF has +y up and the origin in its node.
 
     Args:
-        up: [3] direction of the mesh that is up.
-        origin: [3] point that positions are relative to.
-        note: one line that states it; empty = none.
+        up: [3] up direction of the mesh.
+        origin: [3] origin of the positions.
+        note: one line that states the origin; empty: none.
     """
     normals = _normals(mesh)
     if form == "glb":
@@ -34,7 +34,7 @@ def mesh_bytes(mesh: Triangles, form: MeshFormat, up: Tensor, origin: Tensor, no
 
 
 def _normals(mesh: Triangles) -> np.ndarray:
-    """[V, 3] float32 means of the triangles' normals, weighted by their areas, of length 1."""
+    """Compute unit vertex normals [V, 3] float32, area-weighted means of the triangles' normals."""
     a, b, c = (mesh.vertices.astype(np.float64)[corner] for corner in mesh.faces.T)
     total = np.zeros(mesh.vertices.shape)
     for corner in mesh.faces.T:
@@ -44,9 +44,9 @@ def _normals(mesh: Triangles) -> np.ndarray:
 
 
 def _obj(mesh: Triangles, normals: np.ndarray, note: str) -> bytes:
-    """Nine digits, which float32 needs."""
     buffer = io.StringIO()
     buffer.write("# bitymi-ns: position and color of vertices, normals, triangles\n" + (f"# {note}\n" if note else ""))
+    # nine digits, which float32 needs
     np.savetxt(buffer, np.concatenate([mesh.vertices, mesh.colors], 1), "v %.9g %.9g %.9g %.4f %.4f %.4f")
     np.savetxt(buffer, normals, "vn %.5f %.5f %.5f")
     np.savetxt(buffer, (mesh.faces + 1).repeat(2, axis=1), "f %d//%d %d//%d %d//%d")

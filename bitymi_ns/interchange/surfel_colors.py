@@ -17,7 +17,7 @@ from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.tile_sizes import kernel_parameters
 
 OUTSIDE, OUTSIDE_WEIGHT = 32, 0.1
-"""So many directions over the whole sphere count so much together, where the others count 1."""
+"""Number of directions over the whole sphere, and their total weight relative to the viewing directions'."""
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,11 @@ class SurfelColors:
 
     # [N, 16, 3] float32; the colour in the direction d from the camera is max(sum of harmonics Y(d) + 0.5, 0)
     harmonics: Tensor
-    color: Tensor  # [N, 3] float32, the mean colour without the residual, over the same directions
+    color: Tensor  # [N, 3] float32, mean colour without the residual, over the same directions
 
 
 def rows_of(surfels: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
-    """The parameters of some surfels; lean view colours keep all terms, to which their spans point."""
+    """Select surfels by row; reduced view colours keep all terms, which they index."""
     return {name: value if name == "view_terms" else value[rows] for name, value in surfels.items()}
 
 
@@ -38,15 +38,15 @@ def rows_of(surfels: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
 def fit_colors(scene: BakedScene, residual: Tensor | None, seen: Tensor, centers: Tensor) -> SurfelColors:
     """Fit spherical harmonics to the colours of surfels, by least squares over directions.
 
-    The colour is max(max(f_view(d) + 0.5, 0) + residual, 0). Directions are those of `bake.directions`: of all
-    training views that see the surfel and 32 between and around these, which count 1 together; and OUTSIDE over the
-    whole sphere, which count OUTSIDE_WEIGHT together and hold the harmonics where nobody looks from. A surfel that no
-    view sees has directions over the sphere alone.
+    The colour is max(max(f_view(d) + 0.5, 0) + residual, 0). Directions are those of `bake.directions` (of all training
+    views that show the surfel, and 32 between and around them), with a total weight of 1, and OUTSIDE directions over
+    the whole sphere with a total weight of OUTSIDE_WEIGHT, which regularise the fit elsewhere. A surfel that no view
+    shows has directions over the sphere only.
 
     Args:
         scene: N surfels on the CPU.
-        residual: [N, 3] residual colour of each surfel; None = none.
-        seen: [V, N] bool, the views that see each surfel; V may be 0.
+        residual: [N, 3] residual colour of each surfel; None: no residual.
+        seen: [V, N] bool, the views that show each surfel; V may be 0.
         centers: [V, 3] float64 camera centres, the scene's frame.
     """
     surfels = scene.surfels
@@ -70,7 +70,7 @@ def fit_colors(scene: BakedScene, residual: Tensor | None, seen: Tensor, centers
 
 
 def weighted_fit(directions: Tensor, values: Tensor, weight: Tensor) -> Tensor:
-    """Coefficients [n, 16, C] of harmonics nearest to values [n, D, C] in directions [n, D, 3] with weights [n, D]."""
+    """Fit coefficients [n, 16, C] of harmonics to values [n, D, C] in directions [n, D, 3] with weights [n, D]."""
     columns = harmonics.basis(directions)
     weighted = (columns * weight[..., None]).transpose(1, 2)
     return torch.linalg.solve(weighted @ columns, weighted @ values)
@@ -78,8 +78,8 @@ def weighted_fit(directions: Tensor, values: Tensor, weight: Tensor) -> Tensor:
 
 @torch.no_grad()
 def weighted_residuals(scene: BakedScene, chunk: int = 1 << 20) -> Tensor | None:
-    """[N, 3] mean residual of each surfel, over its texels with the weight of the kernel there, times their alpha; of a
-    surfel without a tile its constant. None = the scene has no residual."""
+    """Average the residual of each surfel over its texels, [N, 3], weighted by kernel times alpha; the constant of a
+    surfel without a tile. None: the scene has no residual."""
     if scene.mean_residual is None and scene.atlas is None:
         return None
     means = scene.surfels["means"]

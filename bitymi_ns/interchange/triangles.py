@@ -1,4 +1,4 @@
-"""Triangle meshes as they are written: float32 positions, no faces without area, closed where they have to be."""
+"""Triangle meshes in float32: removal of degenerate triangles, and closing of holes."""
 
 from __future__ import annotations
 
@@ -9,46 +9,46 @@ import numpy.typing as npt
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-FLAT = 1e-6  # height of a triangle over its longest side, below which it is a line: float32 tells no more
-_ROUNDS = 20  # in which triangles without area are collapsed, each of which may make others
-_ATTEMPTS = 4  # at closing a mesh so that no triangle without area is left; closed it is after the first
+FLAT = 1e-6  # height over longest side below which a triangle is degenerate, the precision of float32
+_ROUNDS = 20  # of collapsing degenerate triangles: each may create others
+_ATTEMPTS = 4  # at a closed mesh without degenerate triangles; it is closed after the first
 
 
 @dataclass(frozen=True)
 class Triangles:
-    """V vertices with colours, and F triangles."""
+    """Mesh of V vertices with colours, and F triangles."""
 
     vertices: npt.NDArray[np.float32]  # [V, 3]
-    faces: npt.NDArray[np.int64]  # [F, 3] vertices, counterclockwise as seen from outside
+    faces: npt.NDArray[np.int64]  # [F, 3] vertex indices, counterclockwise seen from outside
     colors: npt.NDArray[np.float32]  # [V, 3] sRGB from 0 to 1
 
     def __len__(self) -> int:
         return len(self.faces)
 
     def open_edges(self) -> int:
-        """Count the edges that are not shared by exactly two triangles, of opposite directions."""
+        """Count the edges that are not shared by exactly two triangles in opposite directions."""
         forth, back = _keys(self.faces)
         return int((~np.isin(forth, back)).sum() + len(forth) - len(np.unique(forth)))
 
     def parts(self) -> npt.NDArray[np.int64]:
-        """[F] the connected part of each triangle, from 0; triangles that share a vertex are connected."""
+        """Label the connected components, [F] from 0; triangles that share a vertex are connected."""
         start, end = self.faces[:, [0, 1]].ravel(), self.faces[:, [1, 2]].ravel()
         links = coo_matrix((np.ones(len(start), bool), (start, end)), shape=(len(self.vertices),) * 2)
         labels = connected_components(links, directed=False)[1]
         return np.unique(labels[self.faces[:, 0]], return_inverse=True)[1]
 
     def volume(self) -> float:
-        """Volume within a closed mesh; negative where its triangles are seen from inside."""
+        """Compute the volume of a closed mesh; negative if its triangles face inwards."""
         a, b, c = (self.vertices - self.vertices.mean(0, dtype=np.float64))[self.faces.T]
         return float((a * np.cross(b, c)).sum() / 6.0)
 
     def kept(self, keep: npt.NDArray[np.bool_]) -> Triangles:
-        """The triangles [F] alone, and the vertices that they have."""
+        """Keep the triangles where `keep` [F] is True, and their vertices."""
         used, faces = np.unique(self.faces[keep], return_inverse=True)
         return Triangles(self.vertices[used], faces.reshape(-1, 3), self.colors[used])
 
     def without_specks(self, share: float) -> Triangles:
-        """The parts that have at least a share of the triangles of the largest one."""
+        """Keep the components with at least a share of the triangles of the largest one."""
         if not len(self):
             return self
         part = self.parts()
@@ -57,7 +57,7 @@ class Triangles:
 
 
 def cleaned(mesh: Triangles) -> Triangles:
-    """Join vertices of one position, and collapse triangles without area along their shortest sides."""
+    """Merge vertices of equal position, and collapse degenerate triangles along their shortest sides."""
     _, first, into = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
     mesh = _joined(mesh, first[into.ravel()])
     for _ in range(_ROUNDS):
@@ -78,9 +78,8 @@ def cleaned(mesh: Triangles) -> Triangles:
 
 
 def closed(mesh: Triangles) -> Triangles:
-    """Close a mesh: remove triangles at edges of more than two, and at vertices in which several fans of triangles meet
-    all but the largest fan; then fill each hole, which is a ring that does not touch itself, with a fan around its
-    centre."""
+    """Close a mesh. Removes the triangles at edges of more than two triangles, and all but the largest fan at vertices
+    of several fans; the remaining holes are simple rings, and each is filled with a fan around its centre."""
     while len(mesh):
         _, index, count = np.unique(_keys(mesh.faces)[0], return_inverse=True, return_counts=True)
         keep = (count[index] == 1).reshape(3, -1).all(0)
@@ -111,29 +110,29 @@ def closed(mesh: Triangles) -> Triangles:
 
 
 def solid(mesh: Triangles, smallest: float) -> Triangles:
-    """Clean and close a mesh, with its triangles seen from outside, without parts of less than a share of the triangles
-    of the largest part. `open_edges` counts what could not be closed."""
+    """Clean and close a mesh, orient its triangles outwards, and remove components of less than a share `smallest` of
+    the triangles of the largest one. `open_edges` counts the edges that could not be closed."""
     for _ in range(_ATTEMPTS):
-        mesh = closed(cleaned(mesh).without_specks(smallest)).without_specks(smallest)  # what the cuts cut off
+        mesh = closed(cleaned(mesh).without_specks(smallest)).without_specks(smallest)  # also specks cut off by closing
         if len(cleaned(mesh)) == len(mesh):
             break
     return replace(mesh, faces=mesh.faces[:, ::-1]) if len(mesh) and mesh.volume() < 0 else mesh
 
 
 def _directed(faces: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Start and end [3F] of the edges: the first of every triangle, then the second, then the third."""
+    """List start and end vertices [3F] of the edges: the first edges of all triangles, then the second, the third."""
     return faces.T.ravel(), np.roll(faces, -1, axis=1).T.ravel()
 
 
 def _keys(faces: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """[3F] a number for each edge, in the order of `_directed`, and that of the same edge the other way round."""
+    """Compute a key [3F] of each edge, in the order of `_directed`, and the key of the reversed edge."""
     start, end = _directed(faces)
     return start << 32 | end, end << 32 | start
 
 
 def _joined(mesh: Triangles, to: npt.NDArray[np.int64]) -> Triangles:
-    """The mesh with each vertex replaced by another [V], without triangles that became lines, lie on their own
-    back, or are there twice."""
+    """Replace each vertex by another [V], and remove degenerate triangles, duplicates, and pairs of opposite
+    orientation."""
     faces = to[mesh.faces]
     a, b, c = faces.T
     full = np.flatnonzero((a != b) & (b != c) & (c != a))
@@ -147,11 +146,11 @@ def _joined(mesh: Triangles, to: npt.NDArray[np.int64]) -> Triangles:
 
 
 def _in_largest_fans(faces: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-    """[F] whether all corners of a triangle are in the largest fan around their vertex. A fan is triangles that follow
-    one another around the vertex; directed edges must be there once at most."""
+    """Find the triangles, [F] bool, whose corners are all in the largest fan around their vertex. A fan is a sequence
+    of adjacent triangles around a vertex; directed edges must be unique."""
     count = len(faces)
     corner = np.arange(3 * count).reshape(3, count)  # of the first vertices, the second, the third
-    first, second = corner.ravel(), np.roll(corner, -1, axis=0).ravel()  # the corners at both ends of `_directed`
+    first, second = corner.ravel(), np.roll(corner, -1, axis=0).ravel()  # corners at both ends of `_directed` edges
     forth, back = _keys(faces)
     order = forth.argsort()
     twin = order[np.searchsorted(forth[order], back).clip(max=len(order) - 1)]
@@ -159,7 +158,7 @@ def _in_largest_fans(faces: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
     links = coo_matrix((np.ones(both.sum(), bool), (first[both], second[twin[both]])), shape=(3 * count,) * 2)
     fan = connected_components(links, directed=False)[1]
     size = np.bincount(fan)
-    by_vertex = np.lexsort((-size[fan], faces.T.ravel()))  # corners, those of the largest fan first
+    by_vertex = np.lexsort((-size[fan], faces.T.ravel()))  # corners by vertex, largest fan first
     _, start = np.unique(faces.T.ravel()[by_vertex], return_index=True)
     largest = np.zeros(len(size), bool)
     largest[fan[by_vertex[start]]] = True

@@ -1,1 +1,1 @@
-"""Measuring: benchmarks and reports, stability, pictures of a run. Nothing of the method needs it."""
+"""Benchmarks, reports, numerical stability, and images of a run; the method does not depend on this package."""

@@ -1,4 +1,4 @@
-"""Describe what a figure was measured with: machine, versions, commit."""
+"""Provenance of measured figures: machine, versions, commit."""
 
 import functools
 import importlib.metadata
@@ -10,7 +10,7 @@ from pathlib import Path
 
 
 def _output(command: list[str], where: Path | None = None) -> str:
-    """Standard output of a command; empty when it fails."""
+    """Run a command and return its standard output; empty if it fails."""
     try:
         result = subprocess.run(command, cwd=where, capture_output=True, text=True, check=False, timeout=30)
     except (OSError, subprocess.TimeoutExpired):
@@ -20,7 +20,7 @@ def _output(command: list[str], where: Path | None = None) -> str:
 
 @functools.cache
 def commit() -> str:
-    """The checkout's commit, with `+` when the tree differs from it; empty outside a checkout of this project."""
+    """Return the checkout's commit, with `+` if the tree is dirty; empty outside a checkout of this project."""
     where = Path(__file__).resolve().parents[2]
     if not (where / ".git").exists():
         return ""
@@ -28,19 +28,19 @@ def commit() -> str:
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Count the cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def gpus() -> list[str]:
-    """Names of the NVIDIA GPUs that the driver lists."""
+    """List the names of the NVIDIA GPUs, as the driver reports them."""
     if shutil.which("nvidia-smi") is None:
         return []
     return _output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]).splitlines()
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that decide a figure."""
+    """Return the versions of Python and of the packages that affect results."""
     found = {"python": platform.python_version()}
     for name in ("bitymi-ns", "torch", "nerfstudio"):
         try:
@@ -52,7 +52,7 @@ def versions() -> dict[str, str]:
 
 @functools.cache
 def processor() -> str:
-    """Model of the processor."""
+    """Return the processor's model name."""
     model = platform.processor() or platform.machine()
     try:
         lines = Path("/proc/cpuinfo").read_text("utf8").splitlines()
@@ -63,7 +63,7 @@ def processor() -> str:
 
 @functools.cache
 def machine() -> str:
-    """One line about the machine: processor, cores, memory, GPUs, and a limit on threads."""
+    """Describe the machine in one line: processor, cores, memory, GPUs, and the limit on threads."""
     memory = ""
     try:
         memory = f", {os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB"
@@ -77,5 +77,5 @@ def machine() -> str:
 
 
 def software() -> str:
-    """One line of versions."""
+    """Format the versions in one line."""
     return ", ".join(f"{name} {version}" for name, version in versions().items())

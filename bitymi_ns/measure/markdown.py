@@ -1,4 +1,4 @@
-"""Write Markdown tables and sections, and render the Jinja templates of the folder beside this module."""
+"""Markdown tables and sections, and rendering of the Jinja templates in templates/."""
 
 import base64
 import datetime
@@ -15,7 +15,7 @@ from bitymi_ns.measure.machine import commit, machine, software
 
 
 def escaped(text: str) -> str:
-    """Escape the text of a table cell: one line, with bars and backslashes kept literal."""
+    """Escape the text of a table cell: one line, with literal bars and backslashes."""
     return text.replace("\\", "\\\\").replace("|", "\\|").replace("\n", " ")
 
 
@@ -23,8 +23,8 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], text_columns: Se
     """Format a table, without a trailing newline.
 
     Args:
-        rows: their cells; markup in them is kept.
-        text_columns: indices of left-aligned columns; the others hold numbers.
+        rows: cells, which may contain markup.
+        text_columns: indices of left-aligned columns; the others are right-aligned.
     """
     rule = "".join("---|" if i in text_columns else "---:|" for i in range(len(header)))
     lines = ["| " + " | ".join(row) + " |" for row in (header, *rows)]
@@ -43,10 +43,10 @@ def _command_line() -> str:
 
 
 def page(title: str, body: str, notes: Sequence[str] = (), commits: Sequence[str] = ()) -> str:
-    """Write a section: title, command line, machine and commit, body, notes.
+    """Format a section: title, command line, machine and commit, body, notes.
 
     Args:
-        commits: that measured the figures; empty = this checkout.
+        commits: at which the figures were measured; empty: that of this checkout.
     """
     measured = sorted(set(commits)) or [commit()]
     lines = [f"## {title}", "", f"`{_command_line()}`  ", f"{machine()}; {software()}  "]
@@ -71,5 +71,5 @@ def _environment() -> Environment:
 
 
 def rendered(template: str, **values: Any) -> str:
-    """Render a template. In .html.j2 every value is escaped; an undefined name is an error."""
+    """Render a template. Values are escaped in .html.j2; an undefined name is an error."""
     return _environment().get_template(template).render(**values)

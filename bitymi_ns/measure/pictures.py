@@ -1,4 +1,4 @@
-"""Draw the worst held-out views: errors, and the contribution of each part of the scene."""
+"""Images of the worst held-out views: errors, and the contribution of each part of the scene."""
 
 import io
 import json
@@ -24,8 +24,8 @@ from bitymi_ns.scene import RenderOutput, Scene
 from bitymi_ns.scene.baked import as_bytes
 from bitymi_ns.scene.field import TexelField
 
-FILE = re.compile(r"view\d{4,}-\w+\.png")  # name of a picture
-RESIDUAL_GAIN = 4.0  # residuals are small; the pictures of them are brightened by this factor
+FILE = re.compile(r"view\d{4,}-\w+\.png")  # name of an image
+RESIDUAL_GAIN = 4.0  # residuals are small; their images are scaled by this factor
 
 KINDS = {
     "photo": "photograph",
@@ -36,11 +36,11 @@ KINDS = {
     "residual_negative": f"negative residual, x{RESIDUAL_GAIN:g}",
     "overdraw": f"overdraw: surfels blended at a pixel, 0 (black) to {OVERDRAW_SCALE:g} (yellow)",
 }
-"""Pictures of a view in order, with their captions."""
+"""Images of a view in order, with their captions."""
 
 
 def heat_map(values: Tensor, scale: float) -> Tensor:
-    """Colours [H, W, 3] of values [H, W] or [H, W, 1]: black at 0, yellow at `scale` and above."""
+    """Map values [H, W] or [H, W, 1] to colours [H, W, 3]: black at 0, yellow at `scale` and above."""
     return torch.from_numpy(heat(values.reshape(*values.shape[:2]).float().cpu().numpy(), scale))
 
 
@@ -48,11 +48,11 @@ def heat_map(values: Tensor, scale: float) -> Tensor:
 def residual_parts(scene: Scene, output: RenderOutput) -> tuple[Tensor, Tensor]:
     """Blend the positive and the negative part of the residual: sum of w max(rho, 0) and of w max(-rho, 0), [H, W, 3].
 
-    As in rendering, fragments below the weight bound have none. The sum of the view colour alone and the difference
-    of the two is the render wherever no colour had to be cut off at 0. The scene has a texture.
+    As in rendering, fragments below the weight bound have no residual. View colour + positive - negative is the render
+    wherever no colour was clamped at 0. The scene must have a texture.
     """
     field, bound = scene.field, scene.config.weight_bound
-    # over view colours of 0 a colour is the positive part of its residual
+    # with view colours of 0 a fragment's colour is the positive part of its residual
     dark = torch.full_like(scene.surfels["means"], -COLOR_BIAS)
     bands = []
     for fragments in output.fragments.lists():
@@ -69,7 +69,8 @@ def residual_parts(scene: Scene, output: RenderOutput) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def decompose(scene: Scene, camera: Any, background: Tensor, photo: Tensor) -> dict[str, Tensor]:
-    """Draw the pictures of one view, [H, W, 3] each; without a texture there are none of the residual."""
+    """Render the images of one view, [H, W, 3] each, by their names in `KINDS`; without a texture none of the
+    residual."""
     output = scene.render(camera, background, "frozen")
     final = output.rgb.clamp(0.0, 1.0)
     pictures = {"photo": photo, "final": final, "error": heat_map((final - photo).abs().mean(-1), ERROR_SCALE)}
@@ -89,18 +90,19 @@ def png(image: Tensor) -> bytes:
 
 
 def _check_output(folder: Path) -> None:
-    """Stop where a folder holds anything but earlier pictures, which would be lost."""
+    """Fail if a folder holds other files than earlier images, which would be lost."""
     if folder.is_dir() and not all(FILE.fullmatch(path.name) or path.name == PICTURES for path in folder.iterdir()):
         fail(f"the folder {folder} holds other files than pictures of a run and is not replaced: choose another one.")
 
 
 @torch.no_grad()
 def draw_worst(load_config: Path, output_dir: Path, views: int) -> None:
-    """Write the pictures of the held-out views with the lowest PSNR, and pictures.json, which describes them.
+    """Write images of the held-out views with the lowest PSNR, and pictures.json, which describes them.
 
     Args:
         load_config: config.yml of a trained run.
-        output_dir: folder for the files, which replaces an earlier one; it may hold nothing else.
+        output_dir: folder of the files; replaces an earlier one, and must hold nothing else.
+        views: number of views.
     """
     if views < 1:
         fail(f"--views must be at least 1, not {views}")

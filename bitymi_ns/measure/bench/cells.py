@@ -1,4 +1,4 @@
-"""Store finished cells: JSON lines of `key` (every setting that decides the result), `value` (the figures; paths are
+"""Store of finished cells: JSON lines of `key` (all settings that affect the result), `value` (the figures; paths are
 relative to the work folder) and `made` (time, machine, versions, command)."""
 
 import datetime
@@ -17,16 +17,16 @@ from bitymi_ns.reading import read_bytes
 from bitymi_ns.trust import json_of, no_links
 
 FILE = "cells.jsonl"
-NAMES = ("suite", "row")  # entries of a key that are labels and do not tell cells apart
+NAMES = ("suite", "row")  # entries of a key that are labels, not part of its identity
 
 
 def identity(key: dict[str, Any], *without: str) -> str:
-    """Text that is equal for equal cells; for those that differ in these entries alone, too."""
+    """Serialise the identity of a cell, ignoring the entries `without`."""
     return json.dumps({name: value for name, value in key.items() if name not in (*NAMES, *without)}, sort_keys=True)
 
 
 def provenance(command: list[str], seconds: float) -> dict[str, Any]:
-    """Entry `made` of a cell."""
+    """Build the entry `made` of a cell."""
     return {
         "at": f"{datetime.datetime.now(datetime.timezone.utc):%Y-%m-%dT%H:%M:%SZ}",
         "seconds": round(seconds, 2),
@@ -40,7 +40,7 @@ def provenance(command: list[str], seconds: float) -> dict[str, Any]:
 
 
 class Cells:
-    """The finished cells of a work folder; processes may append to the file at the same time."""
+    """Finished cells of a work folder; several processes may append to the file."""
 
     def __init__(self, path: Path) -> None:
         """
@@ -57,7 +57,7 @@ class Cells:
         return iter(self._known.values())
 
     def refresh(self) -> None:
-        """Read the file again. An unfinished last line (of a killed writer) is skipped."""
+        """Read the file again. A truncated last line (of a killed writer) is skipped."""
         self._known: dict[str, dict[str, Any]] = {}
         text = read_bytes(self.path) if self.path.is_file() else b""
         for number, line in enumerate(text[: text.rfind(b"\n") + 1].splitlines(), 1):
@@ -73,11 +73,11 @@ class Cells:
                 ) from error
 
     def get(self, key: dict[str, Any]) -> dict[str, Any] | None:
-        """The line of a finished cell."""
+        """Return a finished cell, or None."""
         return self._known.get(identity(key))
 
     def add(self, key: dict[str, Any], value: dict[str, Any], origin: dict[str, Any]) -> None:
-        """Append a cell as a whole line; an unfinished line of a killed writer is cut off first.
+        """Append a cell, after removing a truncated last line.
 
         Raises:
             BenchError: the file cannot be written.
@@ -97,5 +97,5 @@ class Cells:
 
 
 def without_nan(value: dict[str, Any]) -> dict[str, Any]:
-    """Replace numbers that JSON cannot hold by None."""
+    """Replace NaN and infinite numbers, which JSON cannot hold, by None."""
     return json.loads(json.dumps(value), parse_constant=lambda constant: None)

@@ -1,4 +1,4 @@
-"""Command line of a matrix: `bitymi bench local`, `bitymi bench mipnerf360`, ..."""
+"""Command line of benchmark matrices: `bitymi bench local`, `bitymi bench mipnerf360`, ..."""
 
 import os
 import shlex
@@ -30,30 +30,27 @@ from bitymi_ns.measure.report.records import Records
 from bitymi_ns.measure.report.tables import NOTES, markdown_tables, quality_tables
 from bitymi_ns.trust import printable
 
-FAILED, INTERRUPTED = 1, 130  # exit statuses when a cell failed, and after Ctrl-C
+FAILED, INTERRUPTED = 1, 130  # exit statuses after a failed cell and after Ctrl-C
 
 
 @dataclass
 class BenchRun:
     """Train, bake and evaluate a matrix of scenes, methods and seeds."""
 
-    data: tuple[Path, ...]  # local: folders of captures. A standard data set: the folder that holds its scenes.
+    data: tuple[Path, ...]  # local: folders of captures. A standard data set: the folder of its scenes.
     scenes: tuple[str, ...] = ()  # Only these scenes of a standard data set.
     methods: tuple[str, ...] = ("bitymi",)  # Methods of ns-train.
     plan: str | None = None
-    """Rows to train instead of --methods: ablation, atlas, overdraw, rate, resolution, or
-    a YAML file of that form."""
+    """Rows to train instead of --methods: ablation, atlas, overdraw, rate, resolution, or a YAML file of plans."""
     extra: str = ""
     """Further options of ns-train for every run, as one word: --extra="--pipeline.model.scene.weight-bound 0"."""
-    seeds: tuple[int, ...] = ()  # Train once for each of these seeds; none = once, with the method's own.
-    steps: int | None = None  # Steps of a training; the schedules follow. None = the method's own for this machine.
-    formats: tuple[Format, ...] = get_args(
-        Format
-    )  # Formats of bundles that each trained scene is baked into; none = no baking.
+    seeds: tuple[int, ...] = ()  # Train once per seed; none = once, with the method's own.
+    steps: int | None = None  # Steps of a training; schedules scale with it. None = the method's own.
+    formats: tuple[Format, ...] = get_args(Format)  # Bundle formats to bake each trained scene to; none = no baking.
     pictures: int = 2  # Number of worst held-out views of each run to draw with errors and decomposition.
     work: Path = Path("outputs/bench")
-    """Folder of runs, bundles, logs and finished cells, which are not done again. The command may run several times at
-    once on one folder, with other GPUs or on other machines: each takes runs that no other is working on."""
+    """Folder of runs, bundles, logs and finished cells, which are not run again. Several processes may share the
+    folder, on different GPUs or machines: each takes runs that no other is working on."""
     output: Path | None = None  # Also write the table to this Markdown file.
     suite: tyro.conf.Suppress[str] = "local"
 
@@ -67,10 +64,10 @@ class BenchRun:
         return standard_scenes(self.suite, self.data[0], self.scenes)
 
     def matrix(self) -> Matrix:
-        """The matrix of these options.
+        """Build the matrix of these options.
 
         Raises:
-            BenchError: an option makes no sense; the message says which.
+            BenchError: an option is invalid; the message says which.
         """
         if self.steps is not None and self.steps < 1:
             raise BenchError(f"--steps must be at least 1, not {self.steps}")
@@ -89,7 +86,7 @@ class BenchRun:
         return Matrix(self._scenes(), rows, self.seeds, self.steps, bundles, self.pictures)
 
     def run(self) -> int:
-        """Run the missing cells, then print the table; returns the exit status."""
+        """Run the missing cells, print the table, and return the exit status."""
         matrix, work = self.matrix(), Path(os.path.expanduser(self.work)).resolve()
         cells = Cells(work / FILE)
         if self.output is not None:
@@ -118,7 +115,7 @@ class BenchRun:
 
 
 def results_page(title: str, matrix: Matrix, cells: Cells, failures: Sequence[str] = ()) -> str:
-    """Markdown of the quality tables of a matrix, as far as its cells are finished."""
+    """Format the quality tables of a matrix's finished cells as Markdown."""
     stages = [stage for chain in matrix.chains() for stage in chain if stage.kind in ("train", "eval", "export")]
     found = [cell for stage in stages if (cell := cells.get(stage.key)) is not None]
     records = Records()

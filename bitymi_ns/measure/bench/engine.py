@@ -1,5 +1,5 @@
-"""Run the cells of a matrix that are not finished. Processes may share a folder, each on another GPU or machine: a run
-that another process holds is left to it."""
+"""Execution of a matrix's missing cells. Several processes, on different GPUs or machines, may share a folder: runs
+locked by another process are skipped."""
 
 import shutil
 import statistics
@@ -17,16 +17,16 @@ from bitymi_ns.measure.report.read import PICTURES, read_jsonl
 from bitymi_ns.trust import json_of
 
 CURVE = "training_curve.jsonl"
-Chain = Sequence[Stage]  # the cells of one run; each may need those before it
+Chain = Sequence[Stage]  # the cells of one run; each may depend on those before it
 
 
 def config_of(work: Path, run: Run) -> Path:
-    """config.yml of a trained run."""
+    """Return the path of a run's config.yml."""
     return work / "runs" / run.folder / "config.yml"
 
 
 def output_of(work: Path, stage: Stage) -> Path:
-    """The folder that a cell leaves; of an evaluation its file."""
+    """Return the output path of a cell: a folder, or the file of an evaluation."""
     run = stage.run.folder
     return {
         "train": work / "runs" / run,
@@ -37,7 +37,7 @@ def output_of(work: Path, stage: Stage) -> Path:
 
 
 def train_command(work: Path, run: Run) -> list[str]:
-    """Command line of ns-train without viewer; a seed is set wherever one is read."""
+    """Build the command line of ns-train, without viewer, with the run's seed for all generators."""
     command = [tool("ns-train"), run.row.method, "--output-dir", str(work / "runs")]
     command += ["--experiment-name", run.scene.name, "--timestamp", run.name, "--vis", "none"]
     if run.steps is not None:
@@ -53,7 +53,7 @@ def train_command(work: Path, run: Run) -> list[str]:
 
 
 def stage_command(work: Path, stage: Stage) -> list[str]:
-    """Command line of a cell."""
+    """Build the command line of a cell."""
     if stage.kind == "train":
         return train_command(work, stage.run)
     config, output = config_of(work, stage.run), str(output_of(work, stage))
@@ -70,14 +70,14 @@ def stage_command(work: Path, stage: Stage) -> list[str]:
 
 
 def read_result(work: Path, stage: Stage) -> dict[str, Any]:
-    """Read the figures that a finished command left.
+    """Read the figures of a finished command.
 
-    train: `steps`, `seconds` and `cpu_seconds` of the training steps alone (no loading, evaluation or saving),
-    `surfels`, `fragments`, `curve`. export: `bytes` and `files` of the bundle, its `statistics`. eval: nerfstudio's
-    `results`, means over the held-out views. pictures: what that command wrote.
+    train: `steps`, `seconds` and `cpu_seconds` of the training steps only (no loading, evaluation or saving),
+    `surfels`, `fragments`, `curve`. export: `bytes`, `files`, `format` and `statistics` of the bundle. eval:
+    nerfstudio's `results`, means over the held-out views. pictures: the number of `views`. All but eval: the `folder`.
 
     Raises:
-        CommandFailed: there are none.
+        CommandFailed: there are no readable figures.
     """
     readers = {"train": _train, "export": _export, "eval": _evaluation, "pictures": _pictures}
     try:
@@ -98,7 +98,7 @@ def _train(folder: Path, stage: Stage) -> dict[str, Any]:
 
 
 def _export(folder: Path, stage: Stage) -> dict[str, Any]:
-    from bitymi_ns.bundle.read import download_bytes, read_manifest  # imports torch, which other methods do without
+    from bitymi_ns.bundle.read import download_bytes, read_manifest  # imports torch, not needed for other methods
 
     info = read_manifest(folder)
     compact = info.surfels.columns is not None
@@ -122,17 +122,14 @@ def _pictures(folder: Path, stage: Stage) -> dict[str, Any]:
 
 
 def _needs(stage: Stage, other: Stage) -> bool:
-    """True if `stage` cannot be done without `other`, of the same run."""
+    """Return True if `stage` depends on `other`, of the same run."""
     if other.kind == "train":
         return stage.kind != "train"
     return other.kind == "export" and stage.kind == "eval" and stage.bundle == other.bundle
 
 
 def missing(chain: Chain, cells: Cells) -> list[Stage]:
-    """The cells of a run that are to be done: those without a line, and those that need one of these.
-
-    A training that is done again makes the evaluations of the earlier one obsolete.
-    """
+    """List the cells of a run to execute: those not finished, and those that depend on these."""
     pending: list[Stage] = []
     for stage in chain:
         if cells.get(stage.key) is None or any(_needs(stage, other) for other in pending):
@@ -142,10 +139,10 @@ def missing(chain: Chain, cells: Cells) -> list[Stage]:
 
 @contextmanager
 def locked(work: Path, run: Run) -> Iterator[Lock]:
-    """Hold a run, so that no other process works in its folders.
+    """Lock a run against other processes.
 
     Raises:
-        CommandFailed: another process holds it.
+        CommandFailed: another process holds the lock.
     """
     path = work / "locks" / f"{run.folder.replace('/', '--')}.lock"
     with explained(work, BenchError, ", with --work"):
@@ -160,10 +157,10 @@ def locked(work: Path, run: Run) -> Iterator[Lock]:
 
 def _run_stage(work: Path, stage: Stage, cells: Cells, lock: Lock) -> None:
     command, output = stage_command(work, stage), output_of(work, stage)
-    if stage.kind == "eval":  # its folder holds the results of other evaluations
+    if stage.kind == "eval":  # the folder also holds other evaluations
         output.parent.mkdir(parents=True, exist_ok=True)
     else:
-        shutil.rmtree(output, ignore_errors=True)  # of an earlier attempt
+        shutil.rmtree(output, ignore_errors=True)  # output of an earlier attempt
     start = time.perf_counter()
     cost = run_measured(command, work / "logs" / stage.run.folder / f"{stage.kind}-{stage.form}.log", lock)
     value = {**read_result(work, stage), **cost}
@@ -171,7 +168,8 @@ def _run_stage(work: Path, stage: Stage, cells: Cells, lock: Lock) -> None:
 
 
 def _run_chain(work: Path, chain: Chain, cells: Cells, told: Callable[[Stage], None]) -> list[str]:
-    """Do the missing cells of a run in order, but none that needs a cell that failed; returns a message per failure."""
+    """Execute the missing cells of a run in order, except those that depend on a failed one; return a message per
+    failure."""
     failures: list[str] = []
     broken: list[Stage] = []
     with locked(work, chain[0].run) as lock:
@@ -190,13 +188,13 @@ def _run_chain(work: Path, chain: Chain, cells: Cells, told: Callable[[Stage], N
 
 
 def run_chains(work: Path, chains: Sequence[Chain]) -> list[str]:
-    """Do the missing cells of run after run.
+    """Execute the missing cells of all runs.
 
     Args:
         chains: the cells of each run.
 
     Returns:
-        One message for every cell that failed and every run that another process holds.
+        A message for each failed cell and each run locked by another process.
 
     Raises:
         BenchError: there is nothing to run.
@@ -225,8 +223,8 @@ def run_chains(work: Path, chains: Sequence[Chain]) -> list[str]:
 
 
 def time_left(stages: Iterable[Stage], cells: Cells) -> str:
-    """Estimate the time that cells take from the mean of finished ones of the same kind, scene and number of steps,
-    else of the same kind; empty while a kind has none."""
+    """Estimate the remaining time from the mean of finished cells of the same kind, scene and number of steps, or else
+    of the same kind; empty if a kind has none."""
     known: dict[tuple, list[float]] = {}
     for cell in cells:
         key, seconds = cell["key"], cell.get("made", {}).get("seconds")

@@ -1,4 +1,4 @@
-"""Describe what is measured: scenes x rows x seeds, the cells of each run; standard data sets and plans by name."""
+"""Benchmark matrix: scenes x rows x seeds, the cells of each run; standard data sets and plans by name."""
 
 import hashlib
 import json
@@ -21,13 +21,12 @@ Kind = Literal["train", "eval", "export", "pictures"]
 
 @dataclass(frozen=True)
 class SceneSpec:
-    """A capture and how it is read."""
+    """A capture and its dataparser."""
 
     name: str  # label in tables, and nerfstudio's experiment name
-    data: Path  # its folder, absolute
+    data: Path  # absolute folder
     suite: str = "local"  # name of the data set, or `local`
-    # nerfstudio's dataparser with its options, the end of ns-train's command line; empty = the method's own
-    parser: tuple[str, ...] = ()
+    parser: tuple[str, ...] = ()  # nerfstudio's dataparser and its options; empty: the method's own
 
 
 @dataclass(frozen=True)
@@ -40,13 +39,13 @@ class Row:
 
     @property
     def ours(self) -> bool:
-        """True for a method of this package: only these are baked and have a training curve."""
+        """True for a method of this package; only these are baked and have a training curve."""
         return self.method in preset_names()
 
 
 @dataclass(frozen=True)
 class Bundle:
-    """A way to bake: options of `ns-export bitymi-atlas`."""
+    """Named options of `ns-export bitymi-atlas`."""
 
     name: str
     options: tuple[str, ...]
@@ -54,7 +53,7 @@ class Bundle:
 
 @dataclass(frozen=True)
 class Run:
-    """One training: a scene, a row, a seed (None = the method's own) and a length (None = the method's own)."""
+    """A training run: scene, row, seed (None: the method's own) and number of steps (None: the method's own)."""
 
     scene: SceneSpec
     row: Row
@@ -63,7 +62,7 @@ class Run:
 
     @property
     def key(self) -> dict[str, Any]:
-        """Every setting."""
+        """All settings of the run."""
         return {
             "suite": self.scene.suite,
             "row": self.row.name,
@@ -78,7 +77,7 @@ class Run:
 
     @property
     def name(self) -> str:
-        """Name of the run's folder, unique among the runs of a method on a capture."""
+        """Folder name, unique among the runs of a method on a capture."""
         settings = {k: v for k, v in self.key.items() if k not in ("suite", "row")}
         digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
         length = "own-length" if self.steps is None else f"{self.steps}-steps"
@@ -87,7 +86,7 @@ class Run:
 
     @property
     def folder(self) -> str:
-        """Its path below runs/, bundles/, evals/, pictures/ and logs/ of the work folder."""
+        """Path below runs/, bundles/, evals/, pictures/ and logs/ of the work folder."""
         return f"{self.scene.name}/{self.row.method}/{self.name}"
 
     def __str__(self) -> str:
@@ -97,7 +96,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Stage:
-    """One cell of the matrix."""
+    """A cell of the matrix."""
 
     run: Run
     kind: Kind
@@ -106,7 +105,7 @@ class Stage:
 
     @property
     def key(self) -> dict[str, Any]:
-        """Settings that decide the result of the cell."""
+        """All settings that affect the result of the cell."""
         key: dict[str, Any] = {"cell": self.kind, **self.run.key}
         if self.bundle is not None:
             key |= {"bundle": self.bundle.name, "export": list(self.bundle.options)}
@@ -116,7 +115,7 @@ class Stage:
 
     @property
     def form(self) -> str:
-        """The bundle's name, or `trained` for the trained scene."""
+        """Name of the bundle, or `trained`."""
         return self.bundle.name if self.bundle else "trained"
 
     def __str__(self) -> str:
@@ -126,22 +125,22 @@ class Stage:
 
 @dataclass(frozen=True)
 class Matrix:
-    """Every row is trained on every scene with every seed, then baked into every bundle."""
+    """Matrix of runs: each row is trained on each scene with each seed, then baked to each bundle."""
 
     scenes: Sequence[SceneSpec]
     rows: Sequence[Row]
-    seeds: Sequence[int] = ()  # empty = once, with the method's own seed
-    steps: int | None = None  # length of a run; None = the method's own for this machine
+    seeds: Sequence[int] = ()  # empty: once, with the method's own seed
+    steps: int | None = None  # length of a run; None: the method's own for this machine
     bundles: Sequence[Bundle] = field(default_factory=tuple)
-    pictures: int = 0  # number of worst held-out views that are drawn with their decomposition
+    pictures: int = 0  # number of worst held-out views to draw with their decomposition
 
     def runs(self) -> list[Run]:
-        """All trainings, the seeds of a row one after another."""
+        """List all runs."""
         seeds = list(self.seeds) or [None]
         return [Run(s, r, seed, self.steps) for s in self.scenes for r in self.rows for seed in seeds]
 
     def stages(self, run: Run) -> list[Stage]:
-        """The cells of a run in the order in which they need each other."""
+        """List the cells of a run in the order of their dependencies."""
         stages = [Stage(run, "train"), Stage(run, "eval")]
         if not run.row.ours:
             return stages
@@ -152,7 +151,7 @@ class Matrix:
         return stages
 
     def chains(self) -> list[list[Stage]]:
-        """The cells of every run."""
+        """List the cells of each run."""
         return [self.stages(run) for run in self.runs()]
 
 
@@ -161,11 +160,11 @@ Format = Literal["fp16", "uint8", "bc7", "compact"]  # of `ns-export bitymi-atla
 
 @dataclass(frozen=True)
 class Suite:
-    """A standard data set: an entry of suites.yaml."""
+    """A standard data set, an entry of suites.yaml."""
 
     title: str
-    scenes: dict[str, int]  # with the factor by which their images are smaller than those that COLMAP saw
-    needed: list[str]  # files and folders of a scene
+    scenes: dict[str, int]  # name -> downscale factor of the images relative to COLMAP's
+    needed: list[str]  # required files and folders of a scene
     parser: str  # dataparser with its options
 
 
@@ -181,17 +180,17 @@ def _read(path: Path) -> Any:
 
 
 def suites() -> dict[str, Suite]:
-    """The standard data sets by name."""
+    """Read the standard data sets, by name."""
     entries = _read(Path(__file__).with_name("suites.yaml"))
     return {name: Suite(**entry) for name, entry in entries.items()}
 
 
 def local_scenes(folders: Sequence[Path]) -> list[SceneSpec]:
-    """Own captures in any form that `ns-train bitymi --data` takes. A Blender data set starts from the points of its
-    `hull_pc.ply` if there is one.
+    """List captures in any format that `ns-train bitymi --data` accepts. A Blender data set uses the points of its
+    `hull_pc.ply`, if any.
 
     Raises:
-        BenchError: a folder holds nothing to train on, or two have the same name.
+        BenchError: a folder is no capture, two have the same name, or there is none.
     """
     if not folders:
         raise BenchError('no capture: give --data with one or more folders, as in --data "captures/fox"')
@@ -214,10 +213,10 @@ def local_scenes(folders: Sequence[Path]) -> list[SceneSpec]:
 
 
 def standard_scenes(name: str, root: Path, only: Sequence[str] = ()) -> list[SceneSpec]:
-    """Scenes of a standard data set below its folder.
+    """List the scenes of a standard data set.
 
     Raises:
-        BenchError: the folder, or a scene of it, does not have the layout.
+        BenchError: a scene does not exist, or its folder lacks required files.
     """
     suite, scenes = suites()[name], []
     unknown = sorted(set(only) - set(suite.scenes))
@@ -256,10 +255,10 @@ def read_plan(name: str) -> tuple[list[Row], list[Bundle] | None]:
     """Read a plan by name, or from a YAML file.
 
     Returns:
-        rows, and the bundles; None when the plan names none.
+        Rows, and bundles or None if the plan states none.
 
     Raises:
-        BenchError: there is no such plan, or it is malformed; the message says where.
+        BenchError: the plan does not exist or is malformed; the message says where.
     """
     if name.endswith((".yaml", ".yml")):
         entry = _read(Path(os.path.expanduser(name)))

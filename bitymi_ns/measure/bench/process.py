@@ -1,4 +1,4 @@
-"""Run commands as measured subprocesses."""
+"""Subprocesses with measured time and memory."""
 
 import datetime
 import os
@@ -13,16 +13,16 @@ from pathlib import Path
 from bitymi_ns.files import Lock
 from bitymi_ns.trust import no_links, printable
 
-TAIL = 25  # lines of a failed command's log that are shown
-GRACE = 20.0  # seconds from an interrupt until a command that has not ended is killed
+TAIL = 25  # lines of a failed command's log to show
+GRACE = 20.0  # seconds between terminating and killing a command
 
 
 class BenchError(ValueError):
-    """A benchmark cannot be run as asked; the message says what to change."""
+    """The benchmark cannot be run; the message says what to change."""
 
 
 class CommandFailed(BenchError):
-    """A command ended with a non-zero status; the message has the end of its log."""
+    """A command failed; the message has the end of its log."""
 
 
 def run_measured(
@@ -32,13 +32,13 @@ def run_measured(
     cwd: Path | None = None,
     env: Mapping[str, str] = os.environ,
 ) -> dict[str, float]:
-    """Run a command with its output in a file; an interrupt ends the command first, then this call.
+    """Run a command with its output in a file; an interrupt terminates the command first.
 
-    OpenMP threads wait without spinning, so that CPU seconds count work.
+    OpenMP threads wait without spinning, so that CPU seconds measure work.
 
     Args:
-        lock: inherited by the command and naming it: when this process is killed while the command goes on, the lock
-            outlives it.
+        lock: inherited by the command and labelled with its process, so that it stays locked if only this process is
+            killed.
         cwd, env: working folder and environment of the command; default: those of this process.
 
     Returns:
@@ -89,10 +89,10 @@ def run_measured(
 
 
 def tool(name: str) -> str:
-    """Find a console script of this Python's environment, else on PATH.
+    """Find a console script in this Python's environment or on PATH.
 
     Raises:
-        BenchError: there is none.
+        BenchError: it is missing.
     """
     beside = Path(sys.executable).with_name(name)
     found = str(beside) if beside.is_file() else shutil.which(name)

@@ -1,4 +1,4 @@
-"""Put a report together and write it as one self-contained HTML page."""
+"""Composition of a report as one self-contained HTML page."""
 
 import json
 import os
@@ -18,7 +18,7 @@ from bitymi_ns.measure.report.tables import NOTES, poses_tables, quality_tables,
 from bitymi_ns.reading import open_regular
 
 PAGE = "index.html"
-GENERATOR = '<meta name="generator" content="bitymi report">'  # marks a page as ours, so that it may be replaced
+GENERATOR = '<meta name="generator" content="bitymi report">'  # marks pages that may be replaced
 VIEWS_NOTE = f"The worst, the median and the best view by the PSNR of these pictures, with their {ERROR_CAPTION}."
 TRADE_OFF = "The dashed line is the Pareto front: of all points of a scene those that no other beats in both."
 
@@ -28,14 +28,14 @@ def _counted(number: int, noun: str) -> str:
 
 
 def compose(records: Records, title: str) -> dict[str, Any]:
-    """Build everything that a page shows of these records, by its names in the template."""
+    """Build the variables of the page's template from records."""
     notes = list(records.notes)
     found = {json.dumps(values, sort_keys=True): (path, values) for path, values in records.poses.items()}
     counts = {
         "evaluation": len(records.evaluations),
         "training run": len(records.curves),
         "scene": len({row.scene for row in records.evaluations}),
-        "capture with found poses": len(found),  # of several runs of one capture once
+        "capture with found poses": len(found),  # runs with the same poses count once
     }
     counted = ", ".join(_counted(number, noun) for noun, number in counts.items() if number)
     measured = f" Measured on: {'; '.join(records.machines)}." if records.machines else ""
@@ -61,13 +61,13 @@ def compose(records: Records, title: str) -> dict[str, Any]:
 
 
 def to_page(content: dict[str, Any]) -> str:
-    """Write the report as a single HTML document that needs no other file."""
+    """Render the report as a self-contained HTML document."""
     texts = {"views": VIEWS_NOTE, "tables": NOTES, "trade_off": TRADE_OFF}
     return rendered("report.html.j2", content=content, generator=GENERATOR, texts=texts)
 
 
 def _check_output(output_dir: Path) -> None:
-    """Refuse a destination that is a file, or holds a page that is no report."""
+    """Refuse an output folder that is a file, or that holds a page other than a report."""
     if output_dir.exists() and not output_dir.is_dir():
         raise ReportError(f"{output_dir} is a file; give a folder for the report.")
     page = output_dir / PAGE
@@ -81,16 +81,13 @@ def _beginning(page: Path) -> str:
 
 
 def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report") -> Path:
-    """Write a report: index.html, which needs no other file.
+    """Write a report as a self-contained index.html and return its path.
 
     Args:
         inputs: ns-eval JSON files, training curves (JSONL with `step` and any of `seconds`, `cpu_seconds`, `surfels`,
-            `fragments`, `psnr`), cells and pictures of `bitymi bench`, report.json of camera poses, PNG images
-            of ns-eval, and folders that are searched for all of these.
-        output_dir: folder of the report; created if needed. A report of an earlier call is replaced.
-
-    Returns:
-        The path of index.html.
+            `fragments`, `psnr`), cells and images of `bitymi bench`, report.json of camera poses, PNG images of
+            ns-eval, and folders to search for these.
+        output_dir: folder of the report, created if needed; an earlier report is replaced.
 
     Raises:
         ReportError: an input is missing or broken, nothing usable was found, or the report cannot be written.

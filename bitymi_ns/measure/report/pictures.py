@@ -1,5 +1,5 @@
-"""Embed pictures in a report: the best, median and worst held-out views that `ns-eval --render-output-path` wrote
-(photograph, render, error; side by side where folders show the same photographs), and cameras of found poses."""
+"""Images embedded in a report: the best, median and worst held-out views that `ns-eval --render-output-path` wrote
+(photograph, render, error; side by side if folders show the same photographs), and plots of estimated poses."""
 
 import hashlib
 import io
@@ -18,12 +18,12 @@ from bitymi_ns.measure.report.read import SIDE_BY_SIDE
 from bitymi_ns.measure.report.records import is_bundle_name
 from bitymi_ns.reading import open_regular
 
-ERROR_SCALE = 0.25  # error at which an error map ends: mean absolute difference of the three colours
+ERROR_SCALE = 0.25  # error shown as yellow: mean absolute difference over the channels
 ERROR_CAPTION = f"error: mean of |difference| over the colours, 0 (black) to {ERROR_SCALE:g} (yellow)"
-MAX_SETS = 4  # sets of photographs that a page shows views of
-MAX_WORST = 16  # worst views that a page shows
-MAX_WIDTH = 1200  # width in pixels to which wider images are scaled down
-MAX_PNG_BYTES = 400_000  # images that are larger as PNG are embedded as JPEG of quality 92
+MAX_SETS = 4  # sets of photographs per page
+MAX_WORST = 16  # worst views per page
+MAX_WIDTH = 1200  # of embedded images, pixels
+MAX_PNG_BYTES = 400_000  # larger images are embedded as JPEG of quality 92
 _RANKS = (("Worst view", 0.0), ("Median view", 0.5), ("Best view", 1.0))
 
 Pixels = npt.NDArray[np.float32]
@@ -42,7 +42,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Group:
-    """Columns of pictures under one heading."""
+    """Columns of images under one heading."""
 
     title: str
     columns: tuple[tuple[Picture, ...], ...]
@@ -56,10 +56,10 @@ class _Render:
 
 
 def open_image(path: Path) -> Image.Image:
-    """Read an image as RGB, or as RGBA where it has transparency.
+    """Read an image as RGB, or as RGBA if it has transparency.
 
     Raises:
-        OSError: the file is not an image that can be read.
+        OSError: the file is no readable image.
     """
     open_regular(path).close()
     try:
@@ -83,7 +83,7 @@ def encode(image: Image.Image, caption: str) -> Picture:
 
 
 def encode_files(files: Sequence[tuple[str, Path]], notes: list[str]) -> tuple[Picture, ...]:
-    """Encode captioned files; those that cannot be read are noted."""
+    """Encode captioned files; appends a note for each that cannot be read."""
     pictures = []
     for caption, path in files:
         try:
@@ -94,7 +94,7 @@ def encode_files(files: Sequence[tuple[str, Path]], notes: list[str]) -> tuple[P
 
 
 def worst_views(views: Mapping[str, Sequence[tuple[str, Path]]], notes: list[str]) -> list[Group]:
-    """Encode the pictures of the worst views, one group per view."""
+    """Encode the images of the worst views, one group per view."""
     if len(views) > MAX_WORST:
         notes.append(f"{len(views) - MAX_WORST} more worst views are not shown; the page holds {MAX_WORST}.")
     read = {title: encode_files(files, notes) for title, files in list(views.items())[:MAX_WORST]}
@@ -107,11 +107,10 @@ def heat(values: Pixels, scale: float) -> Pixels:
 
 
 def compare_views(images: Sequence[Path], notes: list[str]) -> list[Group]:
-    """Choose and encode views among images of photographs beside renders; what cannot be read is noted.
+    """Choose and encode views among images of photographs beside renders; appends a note for unreadable images.
 
-    The columns of a view are the photograph, then for every folder the render above its error; with one folder the
-    error stands beside the render. Views are ranked by the PSNR of their pictures, averaged over the folders; masks are
-    not known here.
+    The columns of a view are the photograph and, for each folder, the render above its error map; with one folder the
+    error map is beside the render. Views are ranked by PSNR without masks, averaged over the folders.
     """
     folders: dict[Path, dict[int, _Render]] = {}
     for path in sorted(p.resolve() for p in images):
@@ -136,7 +135,7 @@ def compare_views(images: Sequence[Path], notes: list[str]) -> list[Group]:
 
 
 def _titles(folders: list[Path]) -> dict[Path, str]:
-    """Folder paths without the components that all share."""
+    """Strip the common path of folders."""
     if len(folders) < 2:
         return {folder: folder.name for folder in folders}
     shared = os.path.commonpath(folders)
@@ -144,7 +143,7 @@ def _titles(folders: list[Path]) -> dict[Path, str]:
 
 
 def _halves(path: Path) -> tuple[Pixels, Pixels]:
-    """Photograph and render, [H, W, 3] in [0, 1]."""
+    """Read photograph and render, [H, W, 3] in [0, 1], from an image of both."""
     pixels = np.asarray(open_image(path).convert("RGB"), np.float32) / 255.0
     width = pixels.shape[1] // 2
     if pixels.shape[1] != 2 * width or width == 0:

@@ -1,4 +1,4 @@
-"""Draw the plots of a report: training curves, and quality against cost with Pareto fronts; one panel per scene."""
+"""Plots of a report: training curves, and quality against cost with Pareto fronts; one panel per scene."""
 
 import io
 import math
@@ -17,15 +17,15 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from bitymi_ns.measure.report.records import Curve, Evaluation
 
 PLAIN = ("default", {"text.parse_math": False})
-"""Style of all plots, whatever a matplotlibrc in the current folder says: it may ask for LaTeX. Names may hold a $."""
+"""Style of all plots: overrides a matplotlibrc in the current folder, which may enable LaTeX. Names may contain a $."""
 INK, GRID = "#26292e", "#e3e5e8"
 COLORS = (
     "#0b62b8", "#d1540b", "#1a8a5a", "#a8358f", "#8a6d00", "#128a9e", "#c22f3d", "#5b4bc4", "#6b6f76", "#4f7a14",
 )  # fmt: skip
 MARKERS = ("s", "^", "D", "v", "P", "X", "*", "p", "<", ">", "h", "d", "8", "H")
-"""Marks of baked evaluations, one per format."""
+"""Markers of bundles, one per format."""
 TRAINING, RENDERING, SIZE = "Error against training time", "Error against rendering time", "Error against size"
-"""Headings of the page's sections of plots."""
+"""Headings of the sections of plots."""
 CURVES = (
     ("PSNR in the course of training", "training seconds", "PSNR (dB)", ("seconds", "psnr")),
     ("PSNR by CPU seconds of training", "CPU seconds", "PSNR (dB)", ("cpu_seconds", "psnr")),
@@ -39,13 +39,13 @@ METRICS = {
     "lpips": ("LPIPS", False, 0.01),
     "lpips_vgg": ("LPIPS (VGG)", False, 0.01),
 }
-"""Measure of quality -> title, True if more is better, least span of its axis."""
-MIN_POINTS = 3  # plots of fewer points are left out: the tables say the same
+"""Metric -> title, True if higher is better, minimum span of its axis."""
+MIN_POINTS = 3  # minimum number of points of a plot: the tables show the same
 
 
 @dataclass(frozen=True)
 class Plot:
-    """A plot: title, section of the page, number of panels, PNG bytes; `front`: it has a Pareto front."""
+    """A plot: title, section of the page, number of panels, PNG bytes; `front`: has a Pareto front."""
 
     title: str
     section: str
@@ -56,7 +56,7 @@ class Plot:
 
 @dataclass(frozen=True)
 class Cost:
-    """A cost axis: in titles, on the axis, section of the page, value."""
+    """A cost axis: name in titles, axis label, section of the page, value."""
 
     title: str
     label: str
@@ -65,7 +65,7 @@ class Cost:
 
 
 def costs(rows: list[Evaluation]) -> tuple[Cost, ...]:
-    """The x axes. Sizes are of whole bundles (the download) where all bundles state them; else of their atlases."""
+    """List the cost axes. Sizes are those of whole bundles (downloads) if all bundles state them, else of atlases."""
 
     def positive(key: str, scale: float = 1.0) -> Callable[[Evaluation], float | None]:
         return lambda e: (e.get(key) or 0.0) * scale or None
@@ -81,14 +81,11 @@ def costs(rows: list[Evaluation]) -> tuple[Cost, ...]:
 
 
 def front(points: Sequence[tuple[float, float]], up: bool) -> list[tuple[float, float]]:
-    """The Pareto front of (cost, quality) points, cheapest first.
+    """Compute the Pareto front of (cost, quality) points, cheapest first, without duplicates.
 
     Args:
-        points: costs, of which less is better, and qualities.
-        up: more quality is better (PSNR), else less (FLIP).
-
-    Returns:
-        The points of which none other is at least as good in both and better in one; equal points once.
+        points: costs (lower is better) and qualities.
+        up: higher quality is better (PSNR), else lower (FLIP).
     """
     best: list[tuple[float, float]] = []
     for cost, quality in sorted(set(points), key=lambda p: (p[0], -p[1] if up else p[1])):
@@ -98,7 +95,7 @@ def front(points: Sequence[tuple[float, float]], up: bool) -> list[tuple[float, 
 
 
 def draw_plots(evaluations: list[Evaluation], curves: list[Curve]) -> list[Plot]:
-    """Every plot for which there are at least MIN_POINTS points in a panel."""
+    """Draw all plots that have a panel with at least MIN_POINTS points."""
     names = dict.fromkeys([*sorted({e.method for e in evaluations}), *sorted({c.label for c in curves})])
     colors = {name: COLORS[i % len(COLORS)] for i, name in enumerate(names)}
     plots = [_curve_plot(*axes, curves, colors) for axes in CURVES]
@@ -130,8 +127,8 @@ def _curve_plot(
 def pareto_panel(
     axes: Axes, rows: list[Evaluation], key: str, cost: Cost, colors: dict[str, str], markers: dict[str, str]
 ) -> None:
-    """Draw quality against cost of one scene: hollow circles before baking, filled marks after, a thin line through the
-    points of a method, and the Pareto front of all points."""
+    """Draw quality against cost of one scene: hollow circles for trained scenes, filled markers for bundles, a thin
+    line through the points of a method, and the Pareto front of all points."""
     _, up, span = METRICS[key]
     points = {id(e): (cost.value(e), e.get(key)) for e in rows}
     best = front(list(points.values()), up)
@@ -150,7 +147,7 @@ def pareto_panel(
             axes.plot([x], [y], marker="o", ms=7, markerfacecolor="white", markeredgewidth=1.8, **mark)
     axes.margins(0.12)
     low, high = (f(y for _, y in points.values()) for f in (min, max))
-    if high - low < span:  # differences in the third decimal shall not look like cliffs
+    if high - low < span:  # do not exaggerate differences in the third decimal
         axes.set_ylim((low + high) / 2 - 0.6 * span, (low + high) / 2 + 0.6 * span)
     _log_when_wide(axes, [x for x, _ in points.values()])
 
@@ -182,12 +179,12 @@ def _pareto_plot(key: str, cost: Cost, evaluations: list[Evaluation], colors: di
 
 
 def _variant(row: Evaluation) -> str:
-    """The part of a label beyond the method: the atlas format, or what tells it from its namesakes."""
+    """Strip the method from a label: the atlas format, or another distinguishing suffix."""
     return (row.group or row.label).removeprefix(row.method).strip(", ()")
 
 
 def _log_when_wide(axes: Axes, values: list[float]) -> None:
-    """A logarithmic x axis for positive values that span more than a factor of eight."""
+    """Set a logarithmic x axis for positive values that span more than a factor of eight."""
     if min(values) > 0 and max(values) / min(values) > 8:
         axes.set_xscale("log")
         narrow = math.log10(max(values) / min(values)) < 2

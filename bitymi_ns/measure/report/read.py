@@ -1,5 +1,5 @@
-"""Read the inputs of a report: ns-eval files, training curves, cells, pictures and found poses, and folders that
-are searched for these."""
+"""Readers of a report's inputs: ns-eval files, training curves, benchmark cells, images, estimated poses, and folders
+of these."""
 
 import os
 import re
@@ -29,9 +29,9 @@ from bitymi_ns.trust import json_of
 
 PICTURES = "pictures.json"
 MAX_BYTES = 64 << 20  # larger files are no evaluation
-MAX_DEPTH = 8  # folders are searched this many levels down
+MAX_DEPTH = 8  # levels of folders that are searched
 SIDE_BY_SIDE = re.compile(r"^eval_img_(?P<index>\d{4,})$", re.IGNORECASE)
-"""Stem of a photograph beside its render, as `ns-eval --render-output-path` writes it."""
+"""Stem of an image of photograph and render, as `ns-eval --render-output-path` writes it."""
 
 _SKIPPED = {"__pycache__", "node_modules", "wandb", "nerfstudio_models"}
 _NOT_OF_A_RUN = ("cell", "bundle", "export", "views")
@@ -45,7 +45,7 @@ def parse_json(text: str, where: str) -> Any:
     """Parse JSON (NaN and Infinity tokens allowed).
 
     Raises:
-        ReportError: with the file and reason.
+        ReportError: it is no valid JSON; the message names the file.
     """
     try:
         return json_of(text)
@@ -54,7 +54,7 @@ def parse_json(text: str, where: str) -> Any:
 
 
 def read_text(path: Path) -> str:
-    """Read a file.
+    """Read a text file.
 
     Raises:
         ReportError: it is too large, no text, or cannot be read.
@@ -68,12 +68,12 @@ def _refuse(message: str, cause: BaseException) -> NoReturn:
 
 
 def read_lines(path: Path) -> tuple[list[Any], list[str]]:
-    """Read the values of a JSONL file, and notes.
+    """Read the values of a JSONL file; also returns notes.
 
-    A truncated last line (of a run that was killed while it wrote) is left out with a note.
+    A truncated last line (of a killed run) is skipped with a note.
 
     Raises:
-        ReportError: an earlier line is broken.
+        ReportError: another line is broken.
     """
     numbered = [(i, s) for i, s in enumerate(read_text(path).splitlines(), 1) if s.strip()]
     values, notes = [], []
@@ -91,12 +91,12 @@ def read_lines(path: Path) -> tuple[list[Any], list[str]]:
 
 
 def is_evaluation(data: Any) -> bool:
-    """True for ns-eval's JSON."""
+    """Return True for ns-eval's JSON."""
     return isinstance(data, dict) and isinstance(data.get("results"), dict)
 
 
 def read_jsonl(path: Path) -> tuple[list[Evaluation], list[Curve], list[str]]:
-    """Read the evaluations, the curve and notes of a JSONL file; all empty when it holds something else."""
+    """Read evaluations, curve and notes of a JSONL file; empty if it holds something else."""
     values, notes = read_lines(path)
     evaluations = [evaluation_from(value, path) for value in values if is_evaluation(value)]
     points = [v for v in values if isinstance(v, dict) and "step" in finite_numbers(v) and not is_evaluation(v)]
@@ -104,10 +104,10 @@ def read_jsonl(path: Path) -> tuple[list[Evaluation], list[Curve], list[str]]:
 
 
 def picture_files(path: Path, run: str = "") -> dict[str, list[tuple[str, Path]]]:
-    """Read the worst views that a pictures.json lists, as in `Records`; empty when the file is something else.
+    """Read the worst views listed in a pictures.json, as in `Records`; empty if the file is something else.
 
     Raises:
-        ReportError: it is no valid JSON, or lists its views in another form.
+        ReportError: it is no valid JSON, or its views are malformed.
     """
     data = parse_json(read_text(path), str(path))
     if not isinstance(data, dict) or "bitymi_pictures" not in data:
@@ -131,16 +131,16 @@ def picture_files(path: Path, run: str = "") -> dict[str, list[tuple[str, Path]]
 
 
 def add_cells(cells: Iterable[dict[str, Any]], path: Path, records: Records) -> None:
-    """Add the cells of a benchmark, and the curves and pictures that they name, where these are there.
+    """Add the cells of a benchmark, and the curves and images that they name, if these exist.
 
     Args:
         cells: of the file `path`.
 
     Raises:
-        ReportError: one lacks what its kind must have.
+        ReportError: a cell lacks an entry that its kind requires.
     """
-    keys: dict[str, dict[str, Any]] = {}  # of the trainings
-    runs: dict[str, dict[tuple[str, str], dict[str, Any]]] = {}  # their cells: (kind, bundle) -> value
+    keys: dict[str, dict[str, Any]] = {}  # identity of a run -> a cell's key
+    runs: dict[str, dict[tuple[str, str], dict[str, Any]]] = {}  # identity of a run -> (kind, bundle) -> value
     for cell in cells:
         key, run = cell["key"], identity(cell["key"], *_NOT_OF_A_RUN)
         keys.setdefault(run, key)
@@ -155,7 +155,7 @@ def add_cells(cells: Iterable[dict[str, Any]], path: Path, records: Records) -> 
     seeds = Counter(series[run] for run in keys)
     for run, key in keys.items():
         name, seed, steps = names[run], key.get("seed"), key.get("steps")
-        if namesakes[str(key.get("scene")), name, str(seed)] > 1:  # say what else tells them apart
+        if namesakes[str(key.get("scene")), name, str(seed)] > 1:  # runs that differ in their length
             name += f", {steps:,} steps" if isinstance(steps, int) else ", own length"
         suffix = f", seed {seed}" if seeds[series[run]] > 1 and seed is not None else ""
         scene = str(key.get("scene") or "unnamed scene")
@@ -164,7 +164,7 @@ def add_cells(cells: Iterable[dict[str, Any]], path: Path, records: Records) -> 
 
 
 def _add_run(trained: Evaluation, suffix: str, cells: dict[tuple[str, str], dict[str, Any]], records: Records) -> None:
-    """Add the cells of a training, given what the evaluations of its trained scene have beside their results."""
+    """Add the cells of a run; `trained` is the evaluation of its trained scene without results."""
     folder, train = trained.source.parent, cells.get(("train", ""), {})
     figures = finite_numbers(train)
     times = {f"train_{k}": figures[k] for k in ("seconds", "cpu_seconds", "peak_bytes") if k in figures}
@@ -193,8 +193,8 @@ def _add_run(trained: Evaluation, suffix: str, cells: dict[tuple[str, str], dict
 
 
 def _walk(folder: Path, skip: Path) -> Iterator[Path]:
-    """Files below `folder`, sorted, without hidden folders, links to folders, and `skip` when it lies below; of a
-    benchmark's work folder only its cells, which name everything else that counts."""
+    """List the files below `folder`, sorted, without hidden folders, links to folders, and `skip`; of a benchmark's
+    work folder only its cells, which name all other files."""
     for root, folders, files in os.walk(folder):
         here = Path(root)
         if CELLS in files:
@@ -211,7 +211,7 @@ def _walk(folder: Path, skip: Path) -> Iterator[Path]:
 
 
 def _read(path: Path, records: Records) -> bool:
-    """Add the records of one file; False if it has none."""
+    """Add the records of a file; return False if it has none."""
     before = sum(map(len, vars(records).values())) - len(records.notes)
     if path.suffix.lower() == ".png":
         records.images.append(path)
@@ -242,14 +242,14 @@ def collect(inputs: list[Path], output_dir: Path) -> Records:
 
     Args:
         inputs: files, and folders to search for files.
-        output_dir: where the report goes; not searched when it lies inside one of the folders.
+        output_dir: folder of the report, which is not searched.
 
     Raises:
-        ReportError: a named file is missing, broken, or of no kind that is known; or nothing usable was found.
+        ReportError: a named file is missing, broken, or of an unknown kind; or nothing usable was found.
     """
     records = Records()
     seen: set[Path] = set()
-    # Named files first: their errors are fatal, also when a folder holds the same file.
+    # named files first: their errors are fatal, also if a folder contains the same file
     paths = [Path(os.path.expanduser(p)) for p in inputs]
     for path in sorted(paths, key=lambda p: p.is_dir()):
         if not path.exists():

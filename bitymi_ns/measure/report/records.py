@@ -1,4 +1,4 @@
-"""Records of a report and how they relate: evaluations, training curves, worst views, found poses."""
+"""Records of a report and the links between them: evaluations, training curves, worst views, estimated poses."""
 
 import math
 import re
@@ -14,33 +14,33 @@ _FORMAT = re.compile(r"(?<![a-z0-9])(fp16|uint8|bc7|compact)(?![a-z0-9])")
 
 
 class ReportError(ValueError):
-    """A report cannot be made; the message names the input at fault and what to do."""
+    """The report cannot be made; the message names the input at fault and what to do."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """One evaluation of a model on the held-out views."""
+    """Evaluation of a model on the held-out views."""
 
-    scene: str  # the experiment's name; evaluations are compared within one scene
-    method: str  # method name without any mark of baking, so that a bundle shares it with its trained parent
-    baked: bool  # True for the images of a bundle
-    label: str  # shown in tables, unique within its scene and stage after `disambiguate`
+    scene: str  # experiment name; evaluations are compared within one scene
+    method: str  # method name without a suffix for baking, so that a bundle shares it with its trained scene
+    baked: bool  # True for a bundle
+    label: str  # for tables, unique within its scene and stage after `disambiguate`
     results: dict[str, float]  # finite numbers by name (psnr, ssim, render_ms, atlas_bytes, ...)
-    checkpoint: str  # path of the checkpoint as recorded, possibly empty
-    source: Path  # the file that it was read from
-    run: str = ""  # identifies its training run, empty when unknown (a bare ns-eval file)
-    group: str = ""  # its label without the seed; empty = it has none
-    series: str = ""  # its run without the seed
-    seed: int | None = None  # of its training, None when not stated
+    checkpoint: str  # recorded path of the checkpoint, may be empty
+    source: Path  # file it was read from
+    run: str = ""  # identity of the training run, empty if unknown (a bare ns-eval file)
+    group: str = ""  # label without the seed; empty: not grouped over seeds
+    series: str = ""  # run without the seed
+    seed: int | None = None  # of the training, None if not stated
 
     def get(self, key: str) -> float | None:
-        """A result; None when it is missing or was not finite."""
+        """Return a result; None if it is missing or was not finite."""
         return self.results.get(key)
 
 
 @dataclass(frozen=True)
 class Curve:
-    """A training run: points by step, each a dict of finite numbers with at least `step`."""
+    """Training curve: points by step, each a dict of finite numbers with at least `step`."""
 
     scene: str
     label: str
@@ -49,32 +49,31 @@ class Curve:
     run: str = ""
 
     def series(self, x: str, y: str) -> tuple[list[float], list[float]]:
-        """Columns x and y of the points that have both."""
+        """Return the columns x and y of the points that have both."""
         pairs = [(p[x], p[y]) for p in self.points if x in p and y in p]
         return [a for a, _ in pairs], [b for _, b in pairs]
 
     def last(self, key: str) -> float | None:
-        """The last recorded value of `key`."""
+        """Return the last recorded value of `key`, or None."""
         return next((p[key] for p in reversed(self.points) if key in p), None)
 
 
 @dataclass
 class Records:
-    """Everything that was read, with notes on what was skipped and why."""
+    """All records read, with notes on skipped inputs."""
 
     evaluations: list[Evaluation] = field(default_factory=list)
     curves: list[Curve] = field(default_factory=list)
     images: list[Path] = field(default_factory=list)  # photographs beside renders, as ns-eval writes them
-    # title of a view -> its pictures, (caption, file)
-    worst: dict[str, list[tuple[str, Path]]] = field(default_factory=dict)
-    # report.json of found poses -> its content; a picture of the cameras lies beside it
+    worst: dict[str, list[tuple[str, Path]]] = field(default_factory=dict)  # title of a view -> (caption, file)
+    # path of a report.json of estimated poses -> content; an image of the cameras is beside it
     poses: dict[Path, dict[str, Any]] = field(default_factory=dict)
     machines: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
 def finite_numbers(values: Mapping[str, Any]) -> dict[str, float]:
-    """The entries of a JSON object that are finite numbers."""
+    """Select the finite numbers of a JSON object, as floats."""
     numbers = {}
     for key, value in values.items():
         if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -89,7 +88,7 @@ def finite_numbers(values: Mapping[str, Any]) -> dict[str, float]:
 
 
 def is_bundle_name(name: str) -> bool:
-    """True if a method, folder or path is called after a bundle."""
+    """Return True if the name of a method, folder or path contains "bundle" or "baked"."""
     return _BUNDLE.search(name.lower()) is not None
 
 
@@ -98,7 +97,7 @@ def evaluation_from(data: dict[str, Any], source: Path) -> Evaluation:
     results = finite_numbers(data["results"])
     checkpoint = str(data.get("checkpoint") or "")
     name = str(data.get("method_name") or "unnamed method")
-    # Of the checkpoint only .../<folder>/<folder>/nerfstudio_models/step-*.ckpt counts: not the name of some data set.
+    # only the tail .../<folder>/<folder>/nerfstudio_models/step-*.ckpt: a data set's name must not match
     tail = "/".join(Path(checkpoint.replace("\\", "/")).parts[-4:]).lower()
     baked = results.get("atlas_bytes", 0.0) > 0 or is_bundle_name(name) or is_bundle_name(tail)
     method = (_BUNDLE_SUFFIX.sub("", name) or name) if baked else name
@@ -111,8 +110,8 @@ def evaluation_from(data: dict[str, Any], source: Path) -> Evaluation:
 def curve_from(lines: list[dict[str, Any]], source: Path) -> Curve:
     """Build a curve from the objects of a JSONL file.
 
-    A step that occurs twice (a resumed run) keeps its last line. Scene and label come from the lines themselves
-    (`experiment_name`, `method_name`) or from nerfstudio's folders <experiment>/<method>/<time>, else from the file.
+    If a step occurs twice (a resumed run), its last line is used. Scene and label come from the lines
+    (`experiment_name`, `method_name`), nerfstudio's folders <experiment>/<method>/<time>, or the file's name.
     """
     points: dict[float, dict[str, float]] = {}
     for line in lines:
@@ -127,8 +126,8 @@ def curve_from(lines: list[dict[str, Any]], source: Path) -> Curve:
 
 
 def link(records: Records) -> None:
-    """Name curves after the evaluation whose checkpoint lies in their folder, make labels unique, and give evaluations
-    without it the training time of the one curve of their scene and method."""
+    """Link records: name curves after the evaluation whose checkpoint is in their folder, make labels unique, and add
+    missing training times to evaluations from the only curve of their scene and method."""
     for i, curve in enumerate(records.curves):
         folder = str(curve.source.resolve().parent)
         parents = (e for e in records.evaluations if not curve.run and not e.baked and e.checkpoint)
@@ -147,9 +146,9 @@ def link(records: Records) -> None:
 
 
 def over_seeds(evaluations: list[Evaluation]) -> list[Evaluation]:
-    """Average runs that differ in their seed alone; `psnr_seeds` is the standard deviation of their PSNR.
+    """Average runs that differ only in their seed; `psnr_seeds` is the standard deviation of their PSNR.
 
-    Baked ones have `psnr_delta`, their PSNR minus that of the trained scene: of the same run each, before the mean.
+    `psnr_delta` of bundles, their PSNR minus that of the trained scene, is computed per run before averaging.
     """
     deltas = [psnr_delta(row, evaluations) for row in evaluations]
     evaluations = [
@@ -176,7 +175,7 @@ def over_seeds(evaluations: list[Evaluation]) -> list[Evaluation]:
 
 
 def psnr_delta(row: Evaluation, evaluations: list[Evaluation]) -> float | None:
-    """PSNR of a baked evaluation minus that of its trained parent."""
+    """Compute the PSNR of a bundle minus that of its trained scene; None if unknown."""
     known = row.get("psnr_delta")
     if known is not None:
         return known
@@ -186,11 +185,8 @@ def psnr_delta(row: Evaluation, evaluations: list[Evaluation]) -> float | None:
 
 
 def trained_parent(row: Evaluation, evaluations: list[Evaluation]) -> Evaluation | None:
-    """The trained evaluation that a baked one is compared with.
-
-    That of the same run where that is known; else of the same scene and method, and of several the one whose file lies
-    in the same folder. None when that is ambiguous.
-    """
+    """Find the evaluation of a bundle's trained scene: of the same scene, method and run; if there are several, the one
+    whose file is in the same folder. None if ambiguous."""
     same = [e for e in evaluations if not e.baked and (e.scene, e.method, e.run) == (row.scene, row.method, row.run)]
     if len(same) > 1:
         same = [e for e in same if e.source.parent == row.source.parent]
@@ -198,7 +194,7 @@ def trained_parent(row: Evaluation, evaluations: list[Evaluation]) -> Evaluation
 
 
 def _suffixes(sources: list[Path]) -> list[str]:
-    """The last component of each path, or the nearest to it, in which all differ."""
+    """Return the last component of each path in which all paths differ."""
     parts = [[*path.resolve().parts[:-1], path.stem] for path in sources]
     for depth in range(1, max(map(len, parts)) + 1):
         pieces = [p[-depth] if len(p) >= depth else "" for p in parts]

@@ -1,4 +1,4 @@
-"""Build the tables of a report; their HTML is in templates/report.html.j2."""
+"""Tables of a report; their HTML is in templates/report.html.j2."""
 
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ MISSING = "–"
 
 @dataclass(frozen=True)
 class Row:
-    """A row of texts; `best` holds the columns whose value is the best of its table. A section row has one cell."""
+    """A row of strings; `best` are the columns in which it has the table's best value. A section row has one cell."""
 
     cells: tuple[str, ...]
     best: frozenset[int] = frozenset()
@@ -26,7 +26,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """A titled table; the first column is a name, the others are numbers."""
+    """A titled table of names (first column) and numbers."""
 
     title: str
     header: tuple[str, ...]
@@ -36,7 +36,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of numbers: its title, the key of `shown_results`, how a value is written, which direction is better."""
+    """A column of numbers: title, key of `shown_results`, format, and which direction is better."""
 
     title: str
     key: str
@@ -45,12 +45,12 @@ class Column:
 
     @property
     def heading(self) -> str:
-        """The title with the paper's arrow."""
+        """Title with an arrow for the better direction, as in the paper."""
         return self.title + {"up": " ↑", "down": " ↓", None: ""}[self.better]
 
 
 def significant(value: float) -> str:
-    """About three significant digits, without an exponent for the sizes that occur here."""
+    """Format about three significant digits, without an exponent for usual sizes."""
     magnitude = abs(value)
     if magnitude < 0.01:
         return f"{value:.2g}"
@@ -59,17 +59,17 @@ def significant(value: float) -> str:
 
 
 def signed(value: float) -> str:
-    """A difference with its sign and three decimals."""
+    """Format a difference with its sign and three decimals."""
     return f"{value:+.3f}".replace("-", "−")
 
 
 def count(value: float) -> str:
-    """A whole number with separators."""
+    """Format a whole number with separators."""
     return f"{value:,.0f}"
 
 
 def megabytes(value: float) -> str:
-    """Bytes in units of 10^6."""
+    """Format bytes as MB of 10^6."""
     return significant(value / 1e6)
 
 
@@ -95,7 +95,7 @@ TRAINING = (
     Column("Training CPU s", "train_cpu_seconds", count),
     Column("Training peak MB", "train_peak_bytes", lambda value: count(value / 1e6)),
 )
-"""Of the training steps alone; the peak is that of ns-train as a whole."""
+"""Columns of training costs: times of the training steps only; peak memory of the whole ns-train process."""
 
 CURVE_COLUMNS = (
     Column("Steps", "step", count),
@@ -117,9 +117,9 @@ NOTES = (
 
 
 def shown_results(row: Evaluation, evaluations: list[Evaluation]) -> dict[str, float]:
-    """The results of an evaluation, with those that follow from them."""
+    """Add derived values to the results of an evaluation, and drop those that do not apply to it."""
     results = {k: v for k, v in row.results.items() if not (row.baked and k.startswith("train_"))}
-    if not results.get("atlas_bytes"):  # a trained row has no atlas, not one of 0 MB
+    if not results.get("atlas_bytes"):  # a trained scene has no atlas, not one of 0 MB
         results.pop("atlas_bytes", None)
     if milliseconds := results.get("render_ms"):
         results["frames_per_second"] = 1000.0 / milliseconds
@@ -128,7 +128,7 @@ def shown_results(row: Evaluation, evaluations: list[Evaluation]) -> dict[str, f
 
 
 def _rows(evaluations: list[Evaluation], columns: list[Column]) -> list[Row]:
-    """One row per evaluation, the best value of each column marked when the rows differ in it."""
+    """Build one row per evaluation, with the best value of each column marked unless all are equal."""
     texts = []
     best: list[set[int]] = [set() for _ in evaluations]
     for j, column in enumerate(columns, 1):
@@ -139,13 +139,13 @@ def _rows(evaluations: list[Evaluation], columns: list[Column]) -> list[Row]:
         if column.better and len({t for t in written if t != MISSING}) > 1:
             top = column.text(max(known) if column.better == "up" else min(known))
             for i, text in enumerate(written):
-                if text == top:  # equal as printed: no row is bold for digits that nobody sees
+                if text == top:  # compared as printed, so that equal figures are marked alike
                     best[i].add(j)
     return [Row((row.label, *(column[i] for column in texts)), frozenset(best[i])) for i, row in enumerate(evaluations)]
 
 
 def _grouped(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
-    """Items by key, in the order of their first."""
+    """Group items by key, in the order of first occurrence."""
     groups: dict[K, list[T]] = {}
     for item in items:
         groups.setdefault(key(item), []).append(item)
@@ -153,7 +153,7 @@ def _grouped(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
 
 
 def _by_stage(title: str, columns: list[Column], rows: list[tuple[bool, Row]], note: str = "") -> Table:
-    """A table with a section for trained scenes and one for bundles."""
+    """Build a table with a section for trained scenes and one for bundles."""
     sections = []
     for baked in (False, True):
         of_stage = [row for stage, row in rows if stage is baked]
@@ -162,15 +162,15 @@ def _by_stage(title: str, columns: list[Column], rows: list[tuple[bool, Row]], n
 
 
 def scene_table(scene: str, evaluations: list[Evaluation], columns: list[Column]) -> Table:
-    """The evaluations of one scene: those before baking, then those after."""
+    """Build the table of one scene: trained scenes, then bundles."""
     ordered = sorted(evaluations, key=lambda e: e.label)
     return _by_stage(scene, columns, [(e.baked, row) for e, row in zip(ordered, _rows(ordered, columns), strict=True)])
 
 
 def mean_table(evaluations: list[Evaluation], columns: list[Column]) -> Table | None:
-    """Means over scenes, for what was evaluated in the largest number of scenes; None for a single scene.
+    """Average over scenes; None for a single scene.
 
-    Only labels that cover the same scenes are put side by side: a mean over other scenes is not comparable.
+    Only labels evaluated on the largest set of scenes are included: means over different scenes are not comparable.
     """
     groups = _grouped(evaluations, lambda e: (e.baked, e.label))
     covers = {key: frozenset(e.scene for e in rows) for key, rows in groups.items()}
@@ -188,7 +188,7 @@ def mean_table(evaluations: list[Evaluation], columns: list[Column]) -> Table | 
 
 
 def training_table(curves: list[Curve]) -> Table | None:
-    """One row per training run: how long, and where it ended."""
+    """Build the table of training runs: duration and final values."""
     if not curves:
         return None
     columns = [c for c in CURVE_COLUMNS if any(curve.last(c.key) is not None for curve in curves)]
@@ -203,7 +203,7 @@ def training_table(curves: list[Curve]) -> Table | None:
 
 
 def quality_tables(evaluations: list[Evaluation], training: bool = False) -> list[Table]:
-    """One table per scene, and their means when there are several scenes; with the cost of training if `training`."""
+    """Build one table per scene and one of means over scenes; with the costs of training if `training`."""
     evaluations = [replace(row, results=shown_results(row, evaluations)) for row in evaluations]
     wanted = (*COLUMNS, *(TRAINING if training else ()), Column("ΔPSNR", "psnr_delta", signed))
     columns = [c for c in wanted if any(c.key in row.results for row in evaluations)]
@@ -213,11 +213,11 @@ def quality_tables(evaluations: list[Evaluation], training: bool = False) -> lis
     return [*tables, mean] if mean else tables
 
 
-MOST_NAMED = 60  # photographs that a table names; report.json has them all
+MOST_NAMED = 60  # maximum number of photographs in a table; report.json lists all
 
 
 def poses_tables(values: Mapping[str, Any]) -> list[Table]:
-    """Statistics of the camera poses of a capture, and photographs with a reason or remark."""
+    """Build the tables of a capture's camera poses: statistics, photographs left out, and notes."""
     tables = [Table("Poses", ("", str(values["source"])), tuple(map(Row, overview(values).items())))]
     for key, title, header in (("left_out", "Left out", "Why"), ("notes", "Notes", "")):
         named = values.get(key)
@@ -230,7 +230,7 @@ def poses_tables(values: Mapping[str, Any]) -> list[Table]:
 
 
 def to_markdown(table: Table) -> str:
-    """A table as Markdown, without its title."""
+    """Format a table as Markdown, without its title."""
     width, rows = len(table.header), []
     for row in table.rows:
         cells = [escaped(text) for text in row.cells] + [""] * (width - len(row.cells))
@@ -241,7 +241,7 @@ def to_markdown(table: Table) -> str:
 
 
 def markdown_tables(tables: Sequence[Table]) -> list[str]:
-    """Tables as Markdown paragraphs, each with its title and note."""
+    """Format tables as Markdown paragraphs, each with its title and note."""
     parts = []
     for table in tables:
         parts += [f"### {table.title}", to_markdown(table), *filter(None, [table.note])]

@@ -1,4 +1,4 @@
-"""Measure errors of a backend against the float64 reference, and the share that the rounding of the inputs explains."""
+"""Errors of a backend against the float64 reference, and errors caused by rounding the inputs."""
 
 from __future__ import annotations
 
@@ -33,12 +33,11 @@ from bitymi_ns.scene.camera import Camera
 
 @dataclass(frozen=True)
 class Backend:
-    """A set of compiled kernels behind `bitymi_ns.ops`."""
+    """A set of compiled kernels of `bitymi_ns.ops`."""
 
     name: str  # for tables and tests
-    device: str  # of the tensors that it takes
-    # context in which `bitymi_ns.ops` uses it, where the device alone does not choose it
-    use: Callable[[], AbstractContextManager[object]] = nullcontext
+    device: str  # of its tensors
+    use: Callable[[], AbstractContextManager[object]] = nullcontext  # context that selects it in `bitymi_ns.ops`
 
 
 BACKENDS: dict[str, Backend] = {
@@ -46,11 +45,11 @@ BACKENDS: dict[str, Backend] = {
     "cuda": Backend("cuda", "cuda"),
     "emulated": Backend("emulated", "cpu", emulated_cuda),
 }
-"""Backends by name; tests/stress runs every case on those that are there. `emulated`: CUDA kernels, run on the host."""
+"""Backends by name; tests/stress runs every case on the available ones. `emulated`: CUDA kernels run on the host."""
 
 
 def missing(backend: Backend) -> str:
-    """The reason why a backend cannot be used here; empty when it can."""
+    """Return the reason why a backend cannot be used here; empty if it can."""
     device = torch.device(backend.device)
     if device.type == "cuda" and not torch.cuda.is_available():
         return "no CUDA device (or torch without CUDA)"
@@ -73,42 +72,41 @@ CHANNELS = {
 """Channels of the image of `ops.blended_image`."""
 ROUNDING = {torch.float32: 2.0**-24, torch.float64: 2.0**-53}
 NOTHING = 1e-15
-"""Images and gradients that are smaller than this everywhere are compared absolutely: beside the others of their scene
-they are rounding, of the reference too."""
-PROBES = 3  # random roundings of the inputs from which `Errors.input_*` is taken
+"""Images and gradients below this everywhere are compared absolutely: they are rounding errors of both sides."""
+PROBES = 3  # random perturbations of the inputs for `Errors.input_*`
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of one case, each the largest over all pixels or numbers, relative to the largest value of its kind.
+    """Errors of one case, each the maximum over all elements, relative to the largest value of the image or parameter.
 
-    A pixel is compared only if both sides blend the same surfels there, in the same branch of the kernel, and fetch
-    between the same texels. The gradients are those of a loss over these pixels. In the other pixels rounding moved a
-    value across a threshold (1/255, the transmittance, which branch is the larger, a texel's centre), so the two sides
-    add up different terms. `flipped` is the share of these pixels.
+    A pixel is compared only if both renderers blend the same surfels there, in the same branch of the kernel, and fetch
+    between the same texels. The gradients are those of a loss over these pixels. In the other, flipped pixels rounding
+    moved a value across a threshold (1/255, the transmittance, the larger branch, a texel's centre), so that the
+    renderers sum different terms.
     """
 
     forward: float  # largest error of rgb, alpha, depth, normal and Beta map
     gradient: float  # largest error of the gradients of a random linear loss of these images
-    worst: str  # the parameter with that error
-    flipped: float  # share of the pixels that are not compared
+    worst: str  # parameter with that error
+    flipped: float  # share of flipped pixels
     input_forward: float
-    """Change of the reference's images when each input is moved by up to half a unit in its last place."""
-    input_gradient: float  # the same of its gradients
+    """Change of the reference's images if each input is perturbed by up to half a unit in its last place."""
+    input_gradient: float  # the same for its gradients
     drawn: int  # blended fragments of the reference
-    finite: bool  # True if every image and gradient of the backend is finite, over all pixels
+    finite: bool  # True if all images and gradients of the backend are finite, over all pixels
 
 
 @dataclass
 class _Result:
-    images: dict[str, Tensor]  # [P, C] each, with their graph
+    images: dict[str, Tensor]  # [P, C] each, with autograd graph
     blended: Tensor  # [P, N] bool
     low_pass: Tensor  # [P, N] bool
     leaves: dict[str, Tensor]
     cells: Tensor | None = None  # [P, N] int64, of textured surfels
 
     def same(self, other: _Result) -> Tensor:
-        """[P] bool, pixels in which both add up the same terms."""
+        """Find the pixels, [P] bool, in which both sum the same terms."""
         alike = self.low_pass == other.low_pass
         if self.cells is not None and other.cells is not None:
             alike &= (self.cells == other.cells) & (self.cells >= 0)
@@ -118,14 +116,12 @@ class _Result:
 def measure(
     case: SceneCase, backend: Backend, dtype: torch.dtype = torch.float32, near: float = 0.2, way: Way = PLAIN
 ) -> Errors:
-    """Draw a case with a backend and with the reference, and differentiate both.
-
-    The reference gets the numbers that the backend gets: rounded to `dtype` first.
+    """Render and differentiate a case with a backend and with the reference, from inputs rounded to `dtype`.
 
     Args:
         case: scene and camera, float64.
-        near: nearest depth that is drawn, camera z.
-        way: what is drawn of it, and how.
+        near: near plane, camera z.
+        way: rendering mode.
     """
     rounded = _map(way.of(case), lambda t: t.to(dtype).double())
     with backend.use():
@@ -207,7 +203,7 @@ def _by_reference(case: SceneCase, near: float, way: Way) -> _Result:
 
 
 def _loss_weights(images: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Random weights per pixel and channel; each image counts by its own size."""
+    """Draw random loss weights per pixel and channel, normalised by each image's largest value."""
     generator = torch.Generator().manual_seed(1)
     weights = {}
     for key, image in images.items():
@@ -218,7 +214,7 @@ def _loss_weights(images: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _gradients(result: _Result, weights: dict[str, Tensor], pixels: Tensor, keep: bool = True) -> dict[str, Tensor]:
-    """d sum(weights * images over `pixels`) / d leaves, float64 on the CPU."""
+    """Compute d sum(weights * images over `pixels`) / d leaves, float64 on the CPU."""
     leaves = result.leaves
     loss = 0.0
     for key, image in result.images.items():
@@ -250,28 +246,28 @@ def _relative(got: Tensor, want: Tensor) -> float:
 
 
 def _order(error: float) -> float:
-    """For comparisons: what is not a number is the largest error."""
+    """Sort key of errors: NaN is the largest."""
     return math.inf if math.isnan(error) else error
 
 
 @dataclass(frozen=True)
 class ExtendedErrors:
-    """Errors against extended precision (`ops.reference.extended`), where even float64 may lose figures."""
+    """Errors against extended precision (`ops.reference.extended`), for scenes where even float64 may be inaccurate."""
 
     forward: float
     """Largest error of alpha, depth, normal and Beta map over the pixels where both blend the same surfels."""
     gradient: float
-    """Largest error of a directional derivative of the loss, one random direction a geometry parameter, relative to
-    the root of the sum of squares of the products that it sums."""
+    """Largest error of a directional derivative of the loss, in one random direction per geometry parameter, relative
+    to the root of the sum of squares of its terms."""
 
 
 def against_extended(case: SceneCase, backend: Backend | None = None, near: float = 0.2) -> ExtendedErrors:
-    """The float64 reference, or a backend in float64, against extended precision.
+    """Measure the float64 reference, or a backend in float64, against extended precision.
 
     Args:
         case: scene and camera; rounded to float32 as for `measure`.
-        backend: what to measure; None = the reference.
-        near: nearest depth that is drawn, camera z.
+        backend: to measure; None: the reference.
+        near: near plane, camera z.
     """
     rounded = _map(case, lambda t: t.float().double())
     if backend is None:

@@ -1,4 +1,4 @@
-"""Write the page of docs/stability.md: errors of float32, case by case and along each kind of stiffness."""
+"""The page docs/stability.md: errors of float32 in each case and along each kind of stiffness."""
 
 import io
 from collections import Counter
@@ -28,9 +28,9 @@ from bitymi_ns.measure.stability.scenes import PLAIN, RIM, SWEEPS, WAYS, SceneCa
 
 ACCURATE = 1e-4  # largest error that counts as accurate
 STEPS = round(1 / (255 * ACCURATE))  # an 8-bit step in units of ACCURATE
-ALLOWANCE = 4.0  # a case whose inputs, rounded, already do this share of the error is as good as float32 inputs allow
+ALLOWANCE = 4.0  # an error of at most this many times the effect of rounding the inputs is `LIMITED`
 LIMITED = "as the inputs allow"
-EXTENDED_SIZE = 20_000  # largest number of pixels times surfels for which extended precision is evaluated
+EXTENDED_SIZE = 20_000  # maximum of pixels times surfels for extended precision
 
 
 @dataclass(frozen=True)
@@ -75,12 +75,12 @@ ALLOWED: dict[str, tuple[tuple[float, float, float] | None, ...]] = {
     "image_8192x1": ((3e-06, 2e-05, 0), (5e-06, 2e-05, 0.00018), (5e-06, 1e-05, 0.00037), (3e-06, 2e-05, 0)),
     "image_1x8192": ((0.0007, 0.0003, 0), (0.0007, 0.0003, 0), (0.0004, 0.0003, 0), (4e-05, 3e-06, 0)),
 }  # fmt: skip
-"""Case -> errors of the images, of the gradients, and share of pixels that may flip, for plain, texels, alpha and
-pixel: three times what the CPU kernels have, rounded up. Other cases, and None, draw nothing."""
+"""Case -> allowed errors of images and gradients, and allowed share of flipped pixels, for plain, texels, alpha and
+pixel: three times the CPU kernels' values, rounded up. Other cases, and None, draw nothing."""
 
 
 def cases(way: Way = PLAIN) -> list[Case]:
-    """All cases in a rendering mode, in the order of the page."""
+    """List all cases in a rendering mode, in the order of the page."""
     column = (PLAIN, *WAYS).index(way)
     nothing = (0.0, 0.0, 0.0)
     return [Case(scene, *(ALLOWED.get(scene.name, (None,) * 4)[column] or nothing), way) for scene in extreme_scenes()]
@@ -97,23 +97,23 @@ class Row:
 
     @property
     def exact(self) -> float:
-        """Largest error of the kernels in double, of images and gradients."""
+        """Largest error of images and gradients of the kernels in float64."""
         return max(self.double.forward, self.double.gradient)
 
     @property
     def trusted(self) -> float | None:
-        """Largest error of the float64 reference against extended precision; None where that was too large to run."""
+        """Largest error of the float64 reference against extended precision; None if the scene is too large for it."""
         return max(self.trust.forward, self.trust.gradient) if self.trust else None
 
     @property
     def errors(self) -> tuple[float, float, float, float]:
-        """Errors of the images and of rounded inputs, errors of the gradients and of rounded inputs."""
+        """Errors of the images, their errors from rounded inputs, and the same of the gradients."""
         e = self.single
         return e.forward, e.input_forward, e.gradient, e.input_gradient
 
     @property
     def verdict(self) -> str:
-        """One of the verdicts that the page explains."""
+        """Verdict, as explained on the page."""
         both = (self.single, self.double)
         if not all(e.finite for e in both):
             return "**not finite**"
@@ -128,7 +128,7 @@ class Row:
 
 
 def measure_row(label: str, scene: SceneCase, backend: Backend, near: float = 0.2, way: Way = PLAIN) -> Row:
-    """Measure one scene: float32, float64, and extended precision where it is small enough."""
+    """Measure one scene in float32, float64 and, if it is small enough, extended precision."""
     size = scene.width * scene.height * len(scene.params["means"])
     trust = against_extended(scene, near=near) if way is PLAIN and size <= EXTENDED_SIZE else None
     double = measure(scene, backend, torch.float64, near, way)
@@ -136,11 +136,7 @@ def measure_row(label: str, scene: SceneCase, backend: Backend, near: float = 0.
 
 
 def write(path: Path, backend: Backend = BACKENDS["cpu"], progress: Callable[[str], None] | None = None) -> list[Row]:
-    """Measure all cases and sweeps and write the page and, beside it, the plot `<stem>.png`.
-
-    Returns:
-        The rows of the cases and the sweeps.
-    """
+    """Measure all cases and sweeps, write the page and its plot `<stem>.png`, and return the rows."""
     tell = progress or (lambda text: None)
     check_writable(path)
     named: dict[str, list[Row]] = {}
@@ -197,7 +193,7 @@ def _cases(rows: Sequence[Row]) -> str:
 
 
 def _inexact(rows: Sequence[Row]) -> str:
-    """Count of the accurate cases with their largest errors, then one line for each of the others."""
+    """Summarise the accurate cases with their largest errors, then format a line for each other case."""
     accurate = [row for row in rows if row.verdict == "accurate"]
     images, gradients = (max((row.errors[i] for row in accurate), default=0.0) for i in (0, 2))
     count = f"{len(accurate)} of {len(rows)} cases are accurate: images within {_short(images)}, gradients within"
@@ -206,7 +202,7 @@ def _inexact(rows: Sequence[Row]) -> str:
 
 
 def _verdicts(rows: Sequence[Row]) -> str:
-    """Number of rows by verdict, without those that draw nothing; "loses figures" even if there is none."""
+    """Count rows by verdict, without those that draw nothing; "loses figures" is listed even if 0."""
     counts = Counter(row.verdict.strip("*") for row in rows if row.single.drawn)
     return ", ".join(
         f"{counts[name]} {name}" for name in dict.fromkeys(["accurate", LIMITED, "loses figures", *counts])
@@ -214,7 +210,7 @@ def _verdicts(rows: Sequence[Row]) -> str:
 
 
 def _sweeps(swept: Mapping[str, Sequence[Row]]) -> str:
-    """One line for each sweep: the largest errors, and where the verdict is not "accurate"."""
+    """Format a line for each sweep: the largest errors, and the values whose verdict is not "accurate"."""
     lines = []
     for sweep in SWEEPS:
         rows = swept[sweep.name]
@@ -242,7 +238,7 @@ LINES = (
 LOWEST = 1e-17
 
 
-@matplotlib.style.context("default")  # and not as a matplotlibrc in the current folder says
+@matplotlib.style.context("default")  # overrides a matplotlibrc in the current folder
 def _plot(swept: dict[str, list[Row]]) -> bytes:
     figure = Figure(figsize=(13, 6.4), layout="constrained")
     FigureCanvasAgg(figure)

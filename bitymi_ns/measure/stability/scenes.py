@@ -1,5 +1,5 @@
-"""Build small float64 scenes for tests and measurements: random ones, numerically extreme ones, and sweeps along one
-kind of stiffness."""
+"""Small float64 scenes for tests and measurements: random ones, numerically extreme ones, and sweeps along one kind of
+stiffness."""
 
 import math
 from collections.abc import Callable
@@ -27,14 +27,14 @@ class SceneCase:
     width: int
     height: int
     background: Tensor  # [3]
-    tiles: list[Tensor] | None = None  # one [r_v, r_u, 3] a surfel
-    single: bool = True  # float32 is expected to agree with float64; if not, only to stay finite
+    tiles: list[Tensor] | None = None  # one [r_v, r_u, 3] per surfel
+    single: bool = True  # True: float32 must agree with float64; False: it must only be finite
 
 
 def random_scene(
     n: int, seed: int, width: int = 48, height: int = 36, scale: float = 0.25, name: str = "random"
 ) -> SceneCase:
-    """n surfels of about `scale` units at depths 2 to 6 in front of a camera with an oblique pose and fx != fy."""
+    """Generate n surfels of about `scale` units at depths 2 to 6 before a camera with an oblique pose and fx != fy."""
     g = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -64,7 +64,7 @@ def random_scene(
 
 
 def front_scene(n: int, seed: int, width: int = 24, height: int = 16, **kwargs: float) -> SceneCase:
-    """A random scene seen by a camera at the origin without rotation, so that camera coordinates are world ones."""
+    """Generate a random scene in front of a camera at the origin, whose frame is the world frame."""
     case = random_scene(n, seed, width, height, **kwargs)
     case.params["means"] = case.params["means"] @ case.viewmat[:3, :3].T + case.viewmat[:3, 3]
     case.viewmat = torch.eye(4, dtype=torch.float64)
@@ -72,7 +72,7 @@ def front_scene(n: int, seed: int, width: int = 24, height: int = 16, **kwargs: 
 
 
 def with_params(case: SceneCase, name: str, single: bool = True, **params: Tensor | float) -> SceneCase:
-    """The case renamed, with some parameters replaced (a number fills the whole parameter)."""
+    """Copy and rename a case with some parameters replaced; a number fills the whole parameter."""
     new = {key: value.clone() for key, value in case.params.items()}
     for key, value in params.items():
         new[key] = torch.full_like(new[key], value) if isinstance(value, int | float) else value
@@ -80,7 +80,7 @@ def with_params(case: SceneCase, name: str, single: bool = True, **params: Tenso
 
 
 def extreme_scenes() -> list[SceneCase]:
-    """Finite inputs that break renderers: whatever is drawn must be finite, gradients too."""
+    """Build scenes of finite inputs that break renderers: images and gradients must be finite."""
     base = front_scene(12, 0)
     means, zero = base.params["means"], torch.zeros(12, dtype=torch.float64)
     cases = []
@@ -150,7 +150,7 @@ def extreme_scenes() -> list[SceneCase]:
 
 
 def quaternions(R: Tensor) -> Tensor:
-    """Quaternions wxyz [N, 4] of rotation matrices [N, 3, 3]: the eigenvector of the largest eigenvalue of a 4 x 4."""
+    """Convert rotation matrices [N, 3, 3] to quaternions wxyz [N, 4], by the dominant eigenvector of a 4 x 4 matrix."""
     xx, xy, xz, yx, yy, yz, zx, zy, zz = R.flatten(1).unbind(-1)
     rows = [
         torch.stack([xx + yy + zz, zy - yz, xz - zx, yx - xy], -1),
@@ -163,18 +163,17 @@ def quaternions(R: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Sweep:
-    """One kind of stiffness."""
+    """Sweep along one kind of stiffness."""
 
     name: str  # short, for tables
-    axis: str  # what the number is, with its unit
+    axis: str  # quantity with its unit
     values: tuple[float, ...]  # from easy to hard
-    # the scene of a value; all scenes of a sweep differ in what the number says only
-    make: Callable[[float], SceneCase]
-    near: Callable[[float], float] = lambda value: 0.2  # nearest depth that is drawn, of a value
+    make: Callable[[float], SceneCase]  # builds the scene of a value; scenes differ in that quantity only
+    near: Callable[[float], float] = lambda value: 0.2  # near plane for a value
 
 
 def decades(first: int, last: int) -> tuple[float, ...]:
-    """Powers of ten."""
+    """List the powers of ten from 10^first to 10^last."""
     step = 1 if last > first else -1
     return tuple(10.0**k for k in range(first, last + step, step))
 
@@ -183,7 +182,7 @@ N, WIDTH, HEIGHT = 16, 24, 16
 
 
 def _edge_on(angle: float) -> SceneCase:
-    """Every disc's plane makes this angle with the ray through its centre."""
+    """Build discs whose planes make this angle with the ray through their centres."""
     base = front_scene(N, 0, WIDTH, HEIGHT, scale=0.5)
     ray = torch.nn.functional.normalize(base.params["means"], dim=-1)
     helper = torch.tensor([[0.3, 1.0, 0.2]], dtype=torch.float64).expand(N, 3)
@@ -195,7 +194,7 @@ def _edge_on(angle: float) -> SceneCase:
 
 
 def _near_plane(depth: float) -> SceneCase:
-    """Discs of scale 0.5 whose centres lie about this deep, half to one and a half times."""
+    """Build discs of scale 0.5 with centres at 0.5 to 1.5 times this depth."""
     base = front_scene(N, 1, WIDTH, HEIGHT, scale=0.5)
     means = base.params["means"]
     return with_params(base, f"near_{depth:g}", means=means * (depth / 4.0))
@@ -218,7 +217,7 @@ def _axis_ratio(ratio: float) -> SceneCase:
 
 
 def _world(size: float) -> SceneCase:
-    """The scene and its camera, oblique, moved away from the origin; positions are rounded to float32 there."""
+    """Build a scene and an oblique camera moved away from the origin, where float32 positions are coarse."""
     base = random_scene(N, 5, WIDTH, HEIGHT)
     shift = size * torch.tensor([0.6, -0.7, 0.39], dtype=torch.float64)
     viewmat = base.viewmat.clone()
@@ -234,7 +233,7 @@ def _opacity(transparency: float) -> SceneCase:
 
 
 def _layers(count: float) -> SceneCase:
-    """Large discs, all over one another, so faint that all of them are seen."""
+    """Build large overlapping discs, so faint that all of them are blended."""
     n = int(count)
     base = front_scene(n, 7, 8, 6, scale=2.0)
     opacity = min(0.5, max(0.006, 6.0 / n))
@@ -259,28 +258,27 @@ SWEEPS: tuple[Sweep, ...] = (
 )
 
 
-RIM = 1e-3  # bound of the kernel's derivative at the rim, the default of a scene, for the gradients on both sides
-TEXELS, ALPHAS = "texels", "texel_alpha"  # names of the texels and their alphas among the parameters of a case
+RIM = 1e-3  # bound of the kernel's derivative at the rim, `SceneConfig.rim`'s default, in backend and reference
+TEXELS, ALPHAS = "texels", "texel_alpha"  # names of texels and their alphas among the parameters of a case
 TILE = (8, 4)  # sides of a tile of a case, texels along u and v
 ON_A_TEXEL = 1e-6
-"""Coordinates that are nearer than this to a texel's centre, as a share of the tile, may lie on either side of it."""
+"""Distance from a texel's centre, as a share of the tile, below which rounding decides the side of it."""
 
 
 @dataclass(frozen=True)
 class Way:
-    """A rendering mode that is measured on the same scenes."""
+    """A rendering mode, measured on the same scenes."""
 
     name: str  # short, for tables and tests
-    # every surfel has a tile of random texels; the gradient reaches them and, through the fetch, u and v
-    texels: bool = False
+    texels: bool = False  # each surfel has a tile of random texels; gradients reach them and, by the fetch, u and v
     alpha: bool = False  # the texels have random alphas from 0 to 2, without a weight bound
     prefilter: Prefilter = "low_pass"  # as in `ops.project`
-    # bound of the derivative at the rim on both sides, `Scene.rim`. Through a pixel the bound is another one, that of
-    # the kernel averaged over the pixel, which the reference does not have: 0 turns it off
+    # bound of the derivative at the rim, as in `ops.trace`. With prefilter pixel the kernels bound the derivative of
+    # the averaged kernel, the reference does not: 0 disables the bound
     rim: float = RIM
 
     def of(self, case: SceneCase) -> SceneCase:
-        """The case, with texels if this mode has them."""
+        """Add random texels to a case if this mode has texels."""
         if not self.texels:
             return case
         n = len(case.params["means"])
@@ -296,24 +294,24 @@ WAYS = (
     Way(TEXELS, texels=True),
     Way("alpha", texels=True, alpha=True),
     Way("pixel", prefilter="pixel", rim=0.0),
-)  # the modes beside the plain one
+)  # rendering modes besides PLAIN
 
 
 def tiles_of(texels: Tensor) -> TexelTiles:
-    """Tiles of the texels [T, 3] of the surfels."""
+    """Build the tiles of texels [T, 3]."""
     n = len(texels) // (TILE[0] * TILE[1])
     size = torch.tensor(TILE, dtype=torch.int32, device=texels.device).expand(n, 2)
     return TexelTiles.of_sizes(size, texels.new_full((n,), float(SUPPORT)))
 
 
 def tile_images(texels: Tensor) -> list[Tensor]:
-    """Texels [T, C] as one image [r_v, r_u, C] per surfel."""
-    return list(texels.view(-1, TILE[1], TILE[0], texels.shape[1]).unbind())  # one backward pass for all of them
+    """Split texels [T, C] into one image [r_v, r_u, C] per surfel."""
+    return list(texels.view(-1, TILE[1], TILE[0], texels.shape[1]).unbind())
 
 
 def cells(uv: Tensor) -> Tensor:
-    """Between which texels' centres coordinates [..., 2] lie, which decides the slope of the fetch: [...] int64, -1
-    where rounding does."""
+    """Index the cell between texel centres, [...] int64, that coordinates [..., 2] lie in, which decides the slope of
+    the fetch; -1 if rounding decides the cell."""
     size = torch.tensor(TILE, dtype=torch.float64, device=uv.device)
     at = (uv.detach().double().clamp(-SUPPORT, SUPPORT) + SUPPORT) / (2 * SUPPORT) * size - 0.5  # -0.5 to size - 0.5
     column, row = (at.floor().long() + 1).unbind(-1)

@@ -1,4 +1,4 @@
-"""Bundles in a browser: a service on this machine, and a folder for any web server. The page is built from `web/`."""
+"""Bundles in a browser: a local server, and export to a folder for any web server. The page is built from `web/`."""
 
 from .page import PageError, Site, single_site, site_of, write_static
 from .serve import address_of, is_loopback, serve

@@ -1,4 +1,4 @@
-"""Files that the viewer serves: the built page and the files of a bundle; and their export as a folder."""
+"""Files served by the viewer (the built page and a bundle), and their export to a folder."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ TYPES = {
     ".webp": "image/webp",
 }
 _POLICY = re.compile(rb'http-equiv="Content-Security-Policy"\s+content="([^"]+)"')
-NOTHING = "default-src 'none'"  # policy of a site without a page
+NOTHING = "default-src 'none'"  # Content-Security-Policy of a site without a page
 BUNDLE = "bundle/"
 _NOTES = f"{BUNDLE}{NOTES}"
-SINGLE = "scene.bitymi"  # name of the one file beside an exported page
+SINGLE = "scene.bitymi"  # name of a single-file bundle beside an exported page
 _ASKS = '<meta name="bundle" content="{}" />'
-"""Tag that names the bundle file of the page; empty = the folder beside it."""
+"""Tag that names the page's single-file bundle; empty: the bundle folder beside the page."""
 
 
 class PageError(ValueError):
@@ -48,18 +48,17 @@ class PageError(ValueError):
 class Site:
     """Files served."""
 
-    # path on the server, without the first slash, to what gives the contents
-    files: Mapping[str, Callable[[], bytes | bytearray]]
-    left_out: Sequence[str] = ()  # files that the bundle lists, and that are not served
-    notes: Callable[[], bytes | None] = lambda: None  # the bundle's notes.json, which comes and goes; None without
-    bundle: Shown | None = None  # whose files are served, as it is then
+    files: Mapping[str, Callable[[], bytes | bytearray]]  # path without leading slash -> reader of the contents
+    left_out: Sequence[str] = ()  # files listed in the bundle but not served
+    notes: Callable[[], bytes | None] = lambda: None  # reads the bundle's current notes.json; None: there is none
+    bundle: Shown | None = None  # bundle to serve, in its current state
 
     def __contains__(self, path: str) -> bool:
         return path in self.files or path == _NOTES or path in self._parts
 
     @property
     def _parts(self) -> list[str]:
-        """Paths of the files of the bundle."""
+        """Paths of the bundle's files."""
         return [] if self.bundle is None else [f"{BUNDLE}{name}" for name in self.bundle.names]
 
     @property
@@ -68,20 +67,20 @@ class Site:
 
     @cached_property
     def policy(self) -> str:
-        """Content-Security-Policy of what is served: that of the page, and no frames. Nothing of a bundle runs: scripts
-        come from the page alone, and a bundle's files are never sent as such."""
+        """Content-Security-Policy of all responses: that of the page, without frames. Nothing in a bundle can run:
+        scripts come only from the page, and a bundle's files are never sent as scripts."""
         found = _POLICY.search(self.files["index.html"]()) if "index.html" in self.files else None
         return f"{found[1].decode() if found else NOTHING}; frame-ancestors 'none'"
 
     def stamp(self, path: str) -> object:
-        """A value that changes when what is served changes; that of notes is always another one."""
+        """Return a value that changes when the contents of a path change; always a new one for notes."""
         return object() if path == _NOTES else None if self.bundle is None else self.bundle.stamp()
 
     def read(self, path: str) -> bytes | bytearray:
-        """The contents of one of `paths`.
+        """Read one of `paths`.
 
         Raises:
-            BundleError: a file of the bundle is missing, altered, or a link that leads out of it.
+            BundleError: a file of the bundle is missing, altered, or a link out of the bundle.
             OSError: a file of the page cannot be read.
         """
         if path == _NOTES:
@@ -95,15 +94,15 @@ class Site:
 
 
 def media_type(path: str) -> str:
-    """Media type by the extension of a name; unknown ones are bytes."""
+    """Return the media type for a name's extension; application/octet-stream if unknown."""
     return TYPES.get(Path(path).suffix.lower(), "application/octet-stream")
 
 
 def page_files() -> dict[str, Callable[[], bytes | bytearray]]:
-    """Readers of the files of the built page, by name.
+    """Return readers of the built page's files, by name.
 
     Raises:
-        PageError: it was not built.
+        PageError: the page was not built.
     """
     folder = Path(str(resources.files("bitymi_ns.view"))) / "page"
     files = {path.name: path.read_bytes for path in sorted(folder.glob("*")) if path.is_file()}
@@ -113,7 +112,7 @@ def page_files() -> dict[str, Callable[[], bytes | bytearray]]:
 
 
 def site_of(bundle: Path) -> Site:
-    """The page with a bundle, a folder or one file; of the latter the parts are sent as files are.
+    """Build a site of the page and a bundle; parts of a single-file bundle are served as separate files.
 
     Raises:
         PageError: the page was not built.
@@ -126,7 +125,8 @@ def site_of(bundle: Path) -> Site:
 
 
 def single_site(bundle: Path) -> Site:
-    """The page with a bundle as one file, of which it asks for ranges; of a server that knows none for the whole.
+    """Build a site of the page and a single-file bundle, which the page reads by range requests, or as a whole if the
+    server does not support them.
 
     Raises:
         PageError: the page was not built.
@@ -143,10 +143,10 @@ def single_site(bundle: Path) -> Site:
 
 
 def _about(bundle: Path) -> bytes:
-    """Contents of view.json: the title of a bundle, and whether it has notes."""
+    """Encode view.json: title of a bundle, and whether it has notes."""
     try:
         notes = notes_of(bundle) is not None
-    except BundleError:  # damaged since: the page asks for it, and states that it cannot be read
+    except BundleError:  # damaged in the meantime: the page requests the notes and shows the error
         notes = True
     path = Path(os.path.realpath(bundle))
     title = path.stem if os.path.isfile(path) else path.parent.name if path.name == "bundle" else path.name
@@ -154,8 +154,8 @@ def _about(bundle: Path) -> bytes:
 
 
 class Shown:
-    """A bundle that is being served. Its files have the sizes and hashes of its bundle.json whenever they are read; a
-    bundle that is exported again meanwhile is served as it is then."""
+    """A bundle being served. Each read checks size and hash of the file against bundle.json; if the bundle is exported
+    again, the new one is served."""
 
     def __init__(self, bundle: Path) -> None:
         self._bundle = bundle
@@ -170,7 +170,7 @@ class Shown:
 
     @property
     def names(self) -> list[str]:
-        """Names of the files that are passed on now; those of before where bundle.json cannot be read."""
+        """Names of the served files; the previous ones if bundle.json cannot be read."""
         with suppress(BundleError):
             self._refresh()
         return [MANIFEST, *(name for name in self.info.files if is_known(name))]
@@ -180,7 +180,7 @@ class Shown:
             self._read_manifest()
 
     def stamp(self) -> tuple[int, ...]:
-        """A value that changes when bundle.json, or the one file, is written."""
+        """Return a value that changes when bundle.json, or the single file, is written."""
         path = self._bundle if os.path.isfile(self._bundle) else self._bundle / MANIFEST
         try:
             found = os.stat(path)
@@ -189,10 +189,10 @@ class Shown:
         return found.st_ino, found.st_size, found.st_mtime_ns
 
     def read(self, name: str) -> bytes | bytearray:
-        """A file as it is passed on.
+        """Read a file to serve.
 
         Raises:
-            BundleError: it is missing, altered, or a link that leads out of the bundle.
+            BundleError: it is missing, altered, or a link out of the bundle.
         """
         self._refresh()
         if name == MANIFEST:
@@ -204,17 +204,14 @@ class Shown:
 
 
 def write_static(site: Site, folder: Path, overwrite: bool = False) -> int:
-    """Write the files that are served to a folder, which appears complete or not at all.
+    """Write the files of a site to a folder, which is complete or absent; return the bytes written.
 
     Args:
-        overwrite: replace a page that was written there before.
-
-    Returns:
-        bytes written.
+        overwrite: replace an exported page.
 
     Raises:
-        PageError: something else is there, or beside an earlier page.
-        BundleError: a file of the bundle is missing, altered, or a link that leads out of it.
+        PageError: the folder holds other files, or an exported page without `overwrite`.
+        BundleError: a file of the bundle is missing, altered, or a link out of the bundle.
         OSError: the folder cannot be written.
     """
 

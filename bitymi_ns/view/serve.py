@@ -1,4 +1,4 @@
-"""A small web server for one page and one bundle."""
+"""Web server for one page and one bundle."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from .page import PageError, Site, media_type
 
 LOOPBACK = "127.0.0.1"
 LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
-REQUEST_SECONDS, SEND_SECONDS = 20.0, 60.0  # timeouts of receiving a request and of sending a piece of an answer
-MOST_CLIENTS = 64  # connections at a time; a browser opens six
+REQUEST_SECONDS, SEND_SECONDS = 20.0, 60.0  # timeouts of receiving a request and of sending a piece of a response
+MOST_CLIENTS = 64  # maximum number of connections; a browser opens six
 _BUSY = b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 _PIECE = 1 << 20
 _HEADERS = {
@@ -34,7 +34,7 @@ _HEADERS = {
 
 
 class _Timed(io.RawIOBase):
-    """Reads a connection until the deadline `until`."""
+    """Raw reader of a connection with the deadline `until`."""
 
     def __init__(self, connection: socket.socket) -> None:
         self._connection, self.until = connection, 0.0
@@ -51,7 +51,7 @@ class _Timed(io.RawIOBase):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Answers GET and HEAD for what the server's site has."""
+    """Handler of GET and HEAD for the files of the server's site."""
 
     server: _Server
     server_version, sys_version = "bitymi", ""
@@ -96,14 +96,14 @@ class _Handler(BaseHTTPRequestHandler):
     do_HEAD = do_GET
 
     def _is_whole(self) -> bool:
-        """True for a request without a body and with an unambiguous header."""
+        """Return True for a request without body and with unambiguous headers."""
         bodies = self.headers.get_all("Content-Length", ["0"]) + self.headers.get_all("Transfer-Encoding", [])
         return set(bodies) == {"0"} and len(self.headers.get_all("Host", [])) < 2 and not self.headers.defects
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Refuse a request that is not supported, and end the connection."""
+        """Send an error and close the connection."""
         self.close_connection = True
-        self.request_version = self.protocol_version  # else one that is not understood is answered without a header
+        self.request_version = self.protocol_version  # else malformed requests get a response without headers
         status = HTTPStatus(code)
         self._send(status, f"{status.phrase}\n".encode())
 
@@ -128,7 +128,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 @dataclass(eq=False)
 class _Held:
-    """A file that is being sent: one copy for all who read it, however slowly."""
+    """Contents of a file being sent, shared by all connections that read it."""
 
     key: tuple[str, object]
     reading: threading.Lock = field(default_factory=threading.Lock)
@@ -149,12 +149,12 @@ class _Server(ThreadingHTTPServer):
         self._names = {*LOCAL_NAMES, host.lower(), _shown(self)}
 
     def is_named(self, host: str) -> bool:
-        """True where the Host header is allowed; any is when the server is open to the network."""
+        """Return True if a Host header is allowed; any is if the server does not listen on a loopback address."""
         host = host.lower()
         return not is_loopback(self) or host in self._names or host.rpartition(":")[0] in self._names
 
     def hold(self, name: str) -> _Held:
-        """The contents of a file, kept until as many calls of `release`; raises as `Site.read` does."""
+        """Read a file, shared until `release` was called once per `hold`; raises what `Site.read` raises."""
         key = (name, self.site.stamp(name))
         with self._counting:
             held = self._held.setdefault(key, _Held(key))
@@ -169,14 +169,14 @@ class _Server(ThreadingHTTPServer):
         return held
 
     def release(self, held: _Held) -> None:
-        """Forget a file that nobody is sent any more."""
+        """Drop a file once it has no readers."""
         with self._counting:
             held.readers -= 1
             if not held.readers:
                 del self._held[held.key]
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer in a thread of its own, as long as there are few."""
+        """Handle a request in a new thread, or respond 503 beyond `MOST_CLIENTS`."""
         if not self._room.acquire(blocking=False):
             with suppress(OSError):
                 request.settimeout(0.0)
@@ -196,20 +196,20 @@ class _Server(ThreadingHTTPServer):
             self._room.release()
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """A browser that goes away in the middle of an answer is no error."""
+        """Ignore errors: a browser may close the connection during a response."""
 
 
 def serve(
     site: Site, host: str = LOOPBACK, port: int = 0, request_seconds: float = REQUEST_SECONDS
 ) -> ThreadingHTTPServer:
-    """A server that listens and waits for `serve_forever`; `address_of` says where.
+    """Create a listening server; call its `serve_forever`, and `address_of` for the URL.
 
     Args:
-        site: what is served; any other path is not found.
-        host: address to listen at. On a loopback address, requests that name another host are refused: a page of the
-            web could otherwise have its own name point here.
-        port: 0 = any that is free.
-        request_seconds: after which a request that has not come to its end is left.
+        site: files to serve; other paths are not found.
+        host: address to listen at. On a loopback address, requests for another host name are refused, against DNS
+            rebinding by web pages.
+        port: 0: any free port.
+        request_seconds: timeout of receiving a request.
 
     Raises:
         PageError: the address cannot be used.
@@ -218,18 +218,18 @@ def serve(
         raise PageError(f"the port must be from 0 to 65535, not {port}")
     try:
         return _Server(site, host, port, request_seconds)
-    except (OSError, ValueError) as error:  # ValueError: a name that none can be
+    except (OSError, ValueError) as error:  # ValueError: an invalid host name
         why = getattr(error, "strerror", None) or error
         raise PageError(f"cannot listen at {host} port {port}: {why}") from error
 
 
 def is_loopback(server: ThreadingHTTPServer) -> bool:
-    """True where the server listens on a loopback address."""
+    """Return True if the server listens on a loopback address."""
     return ipaddress.ip_address(str(server.server_address[0]).partition("%")[0]).is_loopback
 
 
 def address_of(server: ThreadingHTTPServer) -> str:
-    """URL of the page for a browser on this machine."""
+    """Return the URL of the page for a browser on this machine."""
     return f"http://{_shown(server)}:{server.server_address[1]}/"
 
 

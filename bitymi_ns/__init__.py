@@ -13,12 +13,12 @@ __all__ = ["Bundle", "Camera", "View", "bake_scene", "rasterize", "read_bundle",
 
 
 class KernelsUnavailable(RuntimeError):
-    """The compiled kernels are missing, or not for this machine; the message says what to do."""
+    """The compiled kernels are missing or do not run on this machine; the message says what to do."""
 
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'bitymi_ns' has no attribute '{name}'")
-    from bitymi_ns import api  # not before it is asked for: nerfstudio imports this package to list its methods
+    from bitymi_ns import api  # lazily: nerfstudio imports this package to list its methods
 
     return getattr(api, name)

@@ -1,17 +1,17 @@
-"""The console script `bitymi`. What it takes a second to import is imported where Ctrl-C is already met."""
+"""The console script `bitymi`. Slow imports happen where Ctrl-C is already handled."""
 
 import sys
 import warnings
 
 
 def main() -> int:
-    """Run one command; returns its exit status."""
+    """Run one command and return its exit status."""
     try:
         from bitymi_ns import endings
     except KeyboardInterrupt:
         return 130
 
-    # of nerfstudio's use of torch, about which no user can do anything
+    # from nerfstudio's use of torch
     warnings.filterwarnings("ignore", category=FutureWarning, module="nerfstudio")
 
     def command() -> int:

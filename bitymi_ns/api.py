@@ -1,4 +1,4 @@
-"""The public functions: rasterize surfels, train a scene, bake it, read a bundle. None of them needs nerfstudio."""
+"""Public functions: rasterize surfels, train a scene, bake it, read a bundle. None of them needs nerfstudio."""
 
 import copy
 from collections.abc import Callable, Sequence
@@ -45,15 +45,15 @@ def rasterize(
 
     Args:
         means: [N, 3] centers, world frame.
-        quats: [N, 4] rotations, wxyz, of any length but 0; the surfel spans the first two columns of the matrix.
+        quats: [N, 4] rotations, wxyz, not necessarily normalised; the first two columns of the matrix are the tangents.
         scales: [N, 2] > 0, lengths of the two tangents, world units; the disc ends at three times its scales.
         opacities: [N] from 0 to 1.
         betas: [N] from 0 to 4, exponent of the kernel: small = hard disc, 3.5 = nearly Gaussian.
-        colors: [N, 3] in the images' own scale; below 0 they count as 0.
-        camera: the view; its axes are OpenCV's. The gradient of its `viewmat` is that along rigid motions.
-        background: [3] color behind the surfels; None = black.
-        near: surfels with a center nearer than this are not drawn (camera z, world units).
-        maps: also depth and normals.
+        colors: [N, 3] in the images' own scale, clamped at 0.
+        camera: in OpenCV axes. The gradient of its `viewmat` is projected onto rigid motions.
+        background: [3] color behind the surfels; None: black.
+        near: surfels with a nearer center are not drawn (camera z, world units).
+        maps: also render depth and normals.
         All tensors are float32 or float64, of one dtype, on the CPU or on one CUDA device.
 
     Returns:
@@ -80,7 +80,7 @@ def rasterize(
 
 
 def _check_range(name: str, values: Tensor, low: float, high: float) -> None:
-    """Raise a ValueError for numbers out of a range, NaN included."""
+    """Raise a ValueError for values out of a range, including NaN."""
     wrong = ~((values >= low) & (values <= high))
     if bool(wrong.any()):
         row = tuple(wrong.nonzero()[0].tolist())
@@ -90,8 +90,8 @@ def _check_range(name: str, values: Tensor, low: float, high: float) -> None:
 
 
 def _logit(share: Tensor) -> Tensor:
-    """The logit of a share from 0 to 1, as the operations take it, which undo it: of 0 and 1 that of the nearest share
-    with a finite one, whose gradient is that of the share as well."""
+    """Compute the logit of values in [0, 1], which the operations invert. 0 and 1 are replaced by the nearest values of
+    finite logit, with a straight-through gradient."""
     nearest = share.clamp(1e-12, 1.0 - 8 * torch.finfo(share.dtype).eps)
     return torch.logit(share + (nearest - share).detach())
 
@@ -109,24 +109,24 @@ def train_scene(
     device: torch.device | str = "cpu",
     callback: Callable[[int, float], None] | None = None,
 ) -> tuple[Scene, TrainLog]:
-    """Train a scene on photographs with poses: the steps of `ns-train`, without nerfstudio.
+    """Train a scene on photographs with known poses, with the training steps of `ns-train`, without nerfstudio.
 
     Args:
         views: photographs with their cameras, at full size.
-        points: [M, 3] world positions of the first surfels, such as a sparse point cloud; M may be 0. A short run
-            starts from some of them, chosen at random (`TrainConfig.first_surfels`).
+        points: [M, 3] world positions of the initial surfels, e.g. a sparse point cloud; M may be 0. A short run uses a
+            random subset (`TrainConfig.first_surfels`).
         colors: [M, 3] in [0, 1], of the points.
         steps: length of the run; all schedules scale with it.
         method: preset, the name of a file in method_configs/.
-        eval_views: held-out photographs; the log states their PSNR.
-        seed: of everything random in the run.
-        refine_poses: on = move the cameras of the photographs beside the scene (`log.cameras`).
-        device: where training runs.
-        callback: called after every step with its number and the loss. Reading the loss waits for a CUDA device.
+        eval_views: held-out photographs, whose PSNR is logged.
+        seed: of all random numbers.
+        refine_poses: on = optimise the cameras of the photographs together with the scene (`log.cameras`).
+        device: to train on.
+        callback: called after each step with the number of steps and the loss, which synchronises a CUDA device.
 
     Returns:
-        The scene on `device`, and the log with the PSNR of `eval_views` at the end and the cameras of `views`. Where
-        poses were refined, give `bake_scene` the views with these cameras.
+        The scene on `device`, and the log with the final PSNR of `eval_views` and the cameras of `views`. If poses were
+        refined, give `bake_scene` the views with these cameras.
 
     Raises:
         ValueError: there are no views, points or colors are not [M, 3], or an option is out of range.
@@ -154,16 +154,16 @@ def bake_scene(
     overwrite: bool = False,
     options: BakeOptions | None = None,
 ) -> Bundle:
-    """Bake a trained scene into a bundle and read it back: what `ns-export bitymi-atlas` does.
+    """Bake a trained scene to a bundle, as `ns-export bitymi-atlas` does, and read it back.
 
     Args:
-        scene: of `train_scene`, with its texture as texels, as a field, or without texture.
+        scene: of `train_scene`, with any texture.
         views: the training photographs, on which texels are fine-tuned.
-        folder: of the bundle; appears complete or not at all.
-        background: [3] color behind the scene; None = black.
-        overwrite: replace a bundle that is there.
+        folder: of the bundle, complete or absent.
+        background: [3] color behind the scene; None: black.
+        overwrite: replace an existing bundle.
         options: format of the bundle (compact, bc7, uint8 or fp16), tolerance, tiles and others, see `BakeOptions`;
-            None = its defaults, a compact bundle.
+            None: its defaults, a compact bundle.
 
     Returns:
         The bundle as read from the folder, with the cameras of the views.

@@ -1,5 +1,5 @@
-"""The `bitymi` console script: tyro subcommands, each a thin call into the package (training, baking and evaluation
-are nerfstudio's own commands: ns-train, ns-export, ns-eval)."""
+"""Subcommands of the `bitymi` console script. Training, baking and evaluation are nerfstudio's commands: ns-train,
+ns-export, ns-eval."""
 
 import os
 import sys
@@ -19,11 +19,11 @@ from bitymi_ns.trust import listed, printable
 
 
 def say(text: object, to: TextIO | None = None) -> None:
-    """Print a line at once; what in it would control the terminal, as the name of a file may, stands as an escape."""
+    """Print a line and flush, with control characters, e.g. of file names, escaped."""
     print(printable(str(text)), file=to or sys.stdout, flush=True)
 
 
-# A switch without its --no- twin, where this tyro knows how.
+# a flag without its --no- form, if this version of tyro supports it
 Flag = tyro.conf.FlagCreatePairsOff[bool] if hasattr(tyro.conf, "FlagCreatePairsOff") else bool
 
 
@@ -54,7 +54,7 @@ class Sfm:
 
     source: tyro.conf.Positional[Path]  # Folder of photographs (or with `images`, and `masks`, in it), or a video.
     output: Path | None = None
-    """Folder to write the capture to; none = the poses are kept beside the photographs, and their folder is printed."""
+    """Folder to write the capture to; none = keep the poses beside the photographs, and print their folder."""
     options: tyro.conf.OmitArgPrefixes[SfmOptions] = SfmOptions()
 
     def run(self) -> None:
@@ -86,8 +86,7 @@ class Report:
     """Turn ns-eval results and training logs into one page: tables and plots of error against time."""
 
     inputs: tyro.conf.Positional[tuple[Path, ...]]
-    """JSON files that ns-eval wrote, cells of `bitymi bench`, training curves, images, and folders to search
-    for these."""
+    """JSON files of ns-eval, cells of `bitymi bench`, training curves, images, and folders to search for these."""
     output_dir: Path = Path("report")  # Folder to write the page to.
     title: str = "bitymi report"  # Heading of the page.
 
@@ -99,7 +98,7 @@ class Report:
 
 @dataclass
 class Stability:
-    """Measure what float32 costs on extreme scenes and write the page of it, with a plot beside it."""
+    """Measure float32 errors on extreme scenes and write a page with a plot beside it."""
 
     output: Path = Path("stability.md")  # Markdown file to write; the plot gets its name with .png.
     backend: Literal["cpu", "cuda", "emulated"] = "cpu"  # Kernels to measure.
@@ -155,11 +154,11 @@ class Bench:
 
 @dataclass
 class Verify:
-    """Check a bundle: files, hashes, formats, tiles; and optionally against the run it was baked from."""
+    """Check a bundle: files, hashes, formats, tiles; optionally also against the run it was baked from."""
 
     bundle: tyro.conf.Positional[Path]  # Folder of the bundle, or its one file (bitymi pack).
     run_config: Annotated[Path | None, tyro.conf.arg(name="run")] = None
-    """config.yml, folder or checkpoint of the run: also checks the error against its field, and renders of both."""
+    """config.yml, folder or checkpoint of the run: also compare residuals and renders of the bundle with the run's."""
     views: int = 4  # Held-out views to render.
 
     def run(self) -> int:
@@ -190,18 +189,18 @@ class Verify:
 
 
 def _say_left_out(names: Sequence[str]) -> None:
-    """List the files of a bundle that are not written."""
+    """Report the files of a bundle that are not written."""
     if names:
         say(f"Left out, because no file of a bundle has such a name: {listed(names, most=5)}.", sys.stderr)
 
 
 @dataclass
 class Pack:
-    """Write a bundle as one file, its parts in the order of their use; everything reads it like the folder."""
+    """Write a bundle as one file, its parts in the order of their use; all commands read it like the folder."""
 
     bundle: tyro.conf.Positional[Path]  # Folder of the bundle, or its one file.
     output: Path | None = None  # File to write; not given: beside the folder, with its name and .bitymi.
-    overwrite: Flag = False  # Replace a bundle in one file that is there already.
+    overwrite: Flag = False  # Replace an existing single-file bundle.
 
     def run(self) -> None:
         from bitymi_ns.bundle.single import SUFFIX, is_single, write_single
@@ -221,7 +220,7 @@ class Pack:
 
 @dataclass
 class Unpack:
-    """Write a bundle in one file as a folder again, with a config.yml for nerfstudio's commands."""
+    """Write a single-file bundle as a folder, with a config.yml for nerfstudio's commands."""
 
     bundle: tyro.conf.Positional[Path]  # The one file, or the folder of a bundle that has no config.yml.
     output: Path | None = None  # Folder to write; not given: beside the file, with its name without .bitymi.
@@ -248,7 +247,7 @@ class Extras:
     surfels.usdc, OpenUSD's surflets; mesh: mesh.glb, a textured quad for each surfel."""
     frame: Literal["scene", "capture"] = "scene"  # Frame of the files: the scene's, or the capture's own.
     output: Path | None = None  # Folder to write; not given: beside the bundle, with its name and .extras.
-    overwrite: Flag = False  # Replace a folder of extras that is there already.
+    overwrite: Flag = False  # Replace an existing folder of extras.
 
     def run(self) -> None:
         from bitymi_ns import interchange
@@ -279,15 +278,15 @@ class Extras:
 
 @dataclass
 class View:
-    """Show a bundle in the browser; or write it with its page as a folder, which any web server can send."""
+    """Show a bundle in the browser, or export it with its page to a folder for any web server."""
 
     bundle: tyro.conf.Positional[Path]  # Folder of the bundle, or its one file.
     export: Path | None = None  # Folder to write the page and the bundle to; none = show it now.
-    one_file: Flag = False  # With --export: write the bundle as one file, which the page reads in ranges.
-    overwrite: Flag = False  # Replace a page that was exported there before.
+    one_file: Flag = False  # With --export: write the bundle as one file, which the page reads by range requests.
+    overwrite: Flag = False  # Replace an exported page.
     host: str = "127.0.0.1"
-    """Address to listen at. Others than loopback addresses show the bundle to all who can reach this machine."""
-    port: int = 0  # Port to listen at; 0 = any that is free.
+    """Address to listen at. On an address other than loopback, everyone who can reach this machine sees the bundle."""
+    port: int = 0  # Port to listen at; 0 = any free port.
     open_browser: bool = True  # Open the page in the browser.
 
     def run(self) -> None:
@@ -335,7 +334,7 @@ Command = (
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run one command; returns its exit status. What the user can put right is one line on stderr, not a traceback."""
+    """Run one command and return its exit status. Errors that the user can correct print one line, no traceback."""
     return endings.run(lambda: _run(args))
 
 
@@ -348,7 +347,7 @@ def _run(args: Sequence[str] | None) -> int:
     )
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # a terminal that lacks a letter gets its number
+            stream.reconfigure(errors="backslashreplace")  # for terminals whose encoding lacks a character
     try:
         return command.run() or 0
     except BrokenPipeError:

@@ -1,4 +1,4 @@
-"""End commands that cannot go on, interrupted or without a reader, space or memory, with one line and no traceback."""
+"""Termination of commands with one line and no traceback: on interrupts, closed pipes, and lack of space or memory."""
 
 import errno
 import os
@@ -11,14 +11,14 @@ from types import TracebackType
 from bitymi_ns.files import reason
 from bitymi_ns.trust import printable
 
-INTERRUPTED = 130  # exit statuses by the convention of shells: 128 and the number of the signal
+INTERRUPTED = 130  # exit statuses by shell convention: 128 + signal number
 NO_READER = 141
 _OF_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 _OF_ANY = (errno.EIO, errno.EMFILE, errno.ENFILE)
 
 
 def line_of(error: BaseException) -> str | None:
-    """Say what to tell the user of an exception that no command expects; None = it is a fault of the program."""
+    """Describe an exception for the user; None: it is a bug, and deserves its traceback."""
     if isinstance(error, KeyboardInterrupt):
         return "interrupted; nothing was left half-written"
     if isinstance(error, MemoryError):
@@ -30,17 +30,17 @@ def line_of(error: BaseException) -> str | None:
 
 
 def run(command: Callable[[], int]) -> int:
-    """Run a command to its end, whatever that is; returns its exit status.
+    """Run a command and return its exit status, also after exceptions that `line_of` describes.
 
-    Where nobody reads its output any more, as behind `| head`, it ends silently."""
+    Ends silently if its output is a closed pipe, as with `| head`."""
     try:
         try:
             return command()
         finally:
             sys.stdout.flush()
     except BrokenPipeError:
-        with suppress(OSError, ValueError):  # of a stream that is no file
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more as it ends
+        with suppress(OSError, ValueError):  # stdout may be no file
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes again at exit
         return NO_READER
     except (KeyboardInterrupt, MemoryError, OSError) as error:
         line = line_of(error)
@@ -51,7 +51,7 @@ def run(command: Callable[[], int]) -> int:
 
 
 def install() -> None:
-    """Have this process, which runs somebody else's command, end on what nobody caught as `run` does."""
+    """Handle uncaught exceptions of this process as `run` does, in commands of other packages."""
     before = sys.excepthook
 
     def told(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:

@@ -1,8 +1,8 @@
-"""Files and folders that appear whole or not at all, one writer at a time, and why something cannot be written.
+"""Atomic writes of files and folders with locks, and explanations of failed writes.
 
-Files are written as `.NAME.unfinished`, folders as `.NAME.new`, flushed, then renamed; a folder that is replaced is
-`.NAME.old` meanwhile. Writers hold a lock, which the kernel releases however they end. The names are fixed, so that the
-next writer finds what a killed process left, and puts it back or removes it."""
+Files are written as `.NAME.unfinished`, folders as `.NAME.new`, flushed, then renamed; a replaced folder is `.NAME.old`
+in between. Writers hold a lock, which the kernel releases when they end. The names are fixed, so that the next writer
+finds the remains of a killed process, and restores or removes them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Tell = Callable[[str], None]  # receives a warning for the user
 
 
 class Busy(BlockingIOError):
-    """Another process writes the same file or folder; `who` names it, as far as it is known, and says what to do."""
+    """Another process writes the same file or folder; `who` names it, if known, and says what to do."""
 
     def __init__(self, who: str) -> None:
         super().__init__(errno.EAGAIN, who)
@@ -55,7 +55,7 @@ _REASONS = {
 
 
 def reason(error: OSError, path: Path) -> str:
-    """Explain why `path` could not be written, and what to do; without a full stop."""
+    """Explain why `path` could not be written and what to do, without a full stop."""
     if isinstance(error, (Busy, Refused)):
         return str(error)
     if error.errno in (errno.ENOTDIR, errno.EEXIST, errno.ENOENT):
@@ -68,34 +68,34 @@ def reason(error: OSError, path: Path) -> str:
 
 @contextmanager
 def explained(path: Path, kind: type[BaseException], then: str = "") -> Iterator[None]:
-    """Turn OSErrors in the block into exceptions of this kind that explain why `path` cannot be written; `then` ends
-    their message."""
+    """Convert OSErrors in the block to exceptions of type `kind` that explain why `path` cannot be written; `then` is
+    appended to the message."""
     try:
         yield
     except OSError as error:
-        if error.errno is None:  # raised by this package, with a message of its own
+        if error.errno is None:  # raised by this package, with its own message
             raise
         raise kind(f"{path} cannot be written: {reason(error, path)}{then}") from error
 
 
 def free_bytes(path: Path) -> int:
-    """Free space for a file or folder that may not be there yet, nor its parents."""
+    """Return the free space for a file or folder, which need not exist, nor its parents."""
     return shutil.disk_usage(_nearest(path.absolute())).free
 
 
 def size_text(size: int) -> str:
-    """A number of bytes for people, in decimal units."""
+    """Format a number of bytes in decimal units."""
     return decimal(size)
 
 
 def _nearest(path: Path) -> Path:
-    """The path, or the nearest of its parents that exists."""
+    """Return the path or its nearest existing parent."""
     return next((p for p in (path, *path.parents) if os.path.lexists(p)), Path("/"))
 
 
 @contextmanager
 def parents_of(path: Path) -> Iterator[None]:
-    """Make the missing parents of a path for the block, and remove those that are empty at its end."""
+    """Create the missing parents of a path for the block, and remove those that are empty at its end."""
     made = [parent for parent in path.parents if not os.path.lexists(parent)]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -107,12 +107,12 @@ def parents_of(path: Path) -> Iterator[None]:
 
 
 def _open_locked(path: Path) -> tuple[BinaryIO, bool]:
-    """Open a file for writing, made where it is missing, and lock it until it is closed in all processes that have it.
-    Returns the file, and whether it is locked: some network file systems know no locks.
+    """Open or create a file for writing, and lock it until all processes that have it open close it. Returns the file,
+    and False if the file system does not support locks.
 
     Raises:
         BlockingIOError: another process has the lock.
-        OSError: it cannot be opened, or is not what it should be; see `no_links`."""
+        OSError: it cannot be opened, or is refused by `no_links`."""
     while True:
         file = open(path, "r+b", opener=no_links)
         try:
@@ -125,22 +125,22 @@ def _open_locked(path: Path) -> tuple[BinaryIO, bool]:
         with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(file.fileno()), os.lstat(path)):
                 return file, True
-        file.close()  # its last holder has removed or renamed it in the meantime
+        file.close()  # the previous holder has removed or renamed it in the meantime
 
 
 class Lock:
-    """A file that one process at a time holds. It has the number of that process, for the message to the others; it is
-    removed when the lock is released, and a file that a killed process left is no hindrance."""
+    """Lock file held by one process at a time. It contains the process's number, for the message to others, and is
+    removed on release; the file of a killed process does not block."""
 
     def __init__(self, path: Path, tell: Tell = warnings.warn) -> None:
         """
         Args:
-            path: the file; its folder must exist.
-            tell: told where the file system has no locks; the lock then keeps nobody out.
+            path: of the file; its folder must exist.
+            tell: called if the file system has no locks; the lock is then ineffective.
 
         Raises:
             Busy: another process holds it.
-            OSError: the file cannot be made.
+            OSError: the file cannot be created.
         """
         self.path, self._owner = path, os.getpid()
         try:
@@ -152,7 +152,7 @@ class Lock:
         self.name(self._owner)
 
     def name(self, process: int) -> None:
-        """State that this process does the work, for the message to others; a full disk costs only that."""
+        """Write the working process's number to the file, for the message to others; write errors are ignored."""
         with suppress(OSError):
             self._file.seek(0)
             self._file.truncate()
@@ -160,11 +160,11 @@ class Lock:
             self._file.flush()
 
     def fileno(self) -> int:
-        """The descriptor that holds the lock: a child that inherits it holds it, too."""
+        """Return the descriptor that holds the lock; a child that inherits it also holds the lock."""
         return self._file.fileno()
 
     def release(self) -> None:
-        """Let others have it; a second call, or one in a forked child, changes nothing."""
+        """Release the lock; a second call, or one in a forked child, does nothing."""
         if not self._file.closed and self._owner == os.getpid():
             with suppress(OSError):
                 self.path.unlink()
@@ -182,24 +182,24 @@ def _holder(path: Path) -> str:
     """Describe the holder of a lock, and what to do."""
     try:
         process, host = path.read_text("utf8").split()
-    except (OSError, ValueError):  # it has been released just now, or has not been named yet
+    except (OSError, ValueError):  # just released, or not yet named
         return "another process is writing there: wait for it, or end it"
     where = "" if host == socket.gethostname() else f" on {host}"
     return f"process {process}{where} is writing there: wait for it, or end it (kill {process})"
 
 
-_held: dict[tuple[str, int], Lock] = {}  # locks by file and thread: who has one may take it again
+_held: dict[tuple[str, int], Lock] = {}  # locks by file and thread, to make them reentrant
 
 
 def hold(path: Path, tell: Tell = warnings.warn) -> None:
-    """Take the lock on this file, unless this thread has it already; see `Lock`."""
+    """Acquire the lock on a file, unless this thread has it already; see `Lock`."""
     key = (os.path.realpath(path), threading.get_ident())
     if key not in _held:
         _held[key] = Lock(path, tell)
 
 
 def release(path: Path) -> None:
-    """Release the lock that `hold` took, if there is one."""
+    """Release the lock of `hold`, if any."""
     lock = _held.pop((os.path.realpath(path), threading.get_ident()), None)
     if lock is not None:
         lock.release()
@@ -207,17 +207,17 @@ def release(path: Path) -> None:
 
 @contextmanager
 def reserved(target: str | Path, tell: Tell = warnings.warn) -> Iterator[Path]:
-    """Lock the path of a file or folder, and repair what a killed process left of a folder there.
+    """Lock the path of a file or folder, and repair the remains of a killed process there.
 
-    Makes missing parents, and removes them again where they stay empty. As this writes beside the target, it also fails
-    early where nothing can be written.
+    Creates missing parents, and removes those that remain empty. Since this writes beside the target, it fails early if
+    nothing can be written there.
 
     Args:
-        target: what is to be written in the block; reservations of one thread may be nested.
-        tell: called where the file system has no locks.
+        target: to be written in the block; reservations of one thread may be nested.
+        tell: called if the file system has no locks.
 
     Yields:
-        the target with links resolved.
+        The target with links resolved.
 
     Raises:
         Busy: another process is writing it.
@@ -239,14 +239,14 @@ def reserved(target: str | Path, tell: Tell = warnings.warn) -> Iterator[Path]:
 
 
 def check_writable(target: Path) -> None:
-    """Check that a file or folder can be written, before the work of making it; raises as `reserved` does."""
+    """Check in advance that a file or folder can be written; raises what `reserved` raises."""
     if not _is_device(target):
         with reserved(target):
             pass
 
 
 def _is_device(path: Path) -> bool:
-    """Test for a device or a pipe, such as /dev/stdout."""
+    """Return True for a device or a pipe, such as /dev/stdout."""
     return path.exists() and not path.is_file() and not path.is_dir()
 
 
@@ -255,13 +255,13 @@ def _beside(place: Path) -> tuple[Path, Path]:
 
 
 def _settle(place: Path) -> None:
-    """Complete or undo an interrupted replacement: the new folder if it was complete, else the old one. The caller
-    holds the lock."""
+    """Complete or undo an interrupted replacement: keep the new folder if complete, else restore the old one. The
+    caller holds the lock."""
     new, old = _beside(place)
     _remove(new)
     if is_left(old):
         if place.exists():
-            old.rename(new)  # so that an .old is always whole, should this be the moment of a kill
+            old.rename(new)  # so that an .old is always complete, even if killed during removal
             _remove(new)
         else:
             old.rename(place)
@@ -276,18 +276,18 @@ def _remove(folder: Path) -> None:
 def complete_folder(
     target: str | Path, check: Callable[[], None] = lambda: None, tell: Tell = warnings.warn
 ) -> Iterator[Path]:
-    """Make a temporary folder that replaces the target when the block ends without an exception.
+    """Create a temporary folder that replaces the target if the block ends without an exception.
 
-    On any exception, KeyboardInterrupt included, the target is as it was. After a kill it is the earlier folder or the
-    later one, or both are beside it, and the next writer puts that right.
+    After any exception, including KeyboardInterrupt, the target is unchanged. After a kill it is the old or the new
+    folder, or both are beside it until the next writer repairs that.
 
     Args:
-        target: the folder; missing parents are made.
-        check: raises if what is in the place may not be replaced; called before the block and after it.
-        tell: called where the file system has no locks.
+        target: the folder; missing parents are created.
+        check: raises if the existing target may not be replaced; called before and after the block.
+        tell: called if the file system has no locks.
 
     Yields:
-        the temporary folder.
+        The temporary folder.
 
     Raises:
         Busy: another process is writing it.
@@ -314,11 +314,11 @@ def complete_folder(
 
 @contextmanager
 def complete_file(path: Path, scratch: Path | None = None) -> Iterator[BinaryIO]:
-    """Open a temporary file that replaces `path` when the block ends without an exception.
+    """Open a temporary file that replaces `path` if the block ends without an exception.
 
     Args:
-        path: the file; missing parents are made.
-        scratch: a folder of the same file system for the unfinished file; None = that of `path`.
+        path: the file; missing parents are created.
+        scratch: folder on the same file system for the unfinished file; None: that of `path`.
 
     Raises:
         Busy: another process is writing it.
@@ -341,13 +341,13 @@ def complete_file(path: Path, scratch: Path | None = None) -> Iterator[BinaryIO]
                 unfinished.unlink()
             raise
         finally:
-            with suppress(OSError):  # what it still has in its buffer is of a write that failed
+            with suppress(OSError):  # the buffer may hold the rest of a failed write
                 file.close()
         flush(path.parent)
 
 
 def copy_files(folder: Path, to: Path) -> None:
-    """Copy the files of a folder to a new one; unlike `shutil.copytree`, this ends at the first error, and with it."""
+    """Copy the files of a folder to a new one; unlike `shutil.copytree`, raises the first error at once."""
     to.mkdir(parents=True)
     for path in sorted(folder.iterdir()):
         if path.is_file():
@@ -355,7 +355,7 @@ def copy_files(folder: Path, to: Path) -> None:
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all; see `complete_file`. Devices and pipes are written to as they are."""
+    """Write a file atomically, see `complete_file`; devices and pipes are written directly."""
     if _is_device(path):
         path.write_bytes(data)
         return
@@ -364,7 +364,7 @@ def write_file(path: Path, data: bytes) -> None:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove the unfinished files of processes that have ended; what cannot be removed stays."""
+    """Remove unfinished files of ended processes; errors are ignored."""
     for path in folder.glob(f".*{UNFINISHED}"):
         with suppress(OSError):
             file, locked = _open_locked(path)
@@ -374,12 +374,12 @@ def remove_unfinished(folder: Path) -> None:
 
 
 def flush(path: Path) -> None:
-    """Flush a file's bytes, or a folder's names, to disk; a full disk is reported here at the latest."""
+    """Flush a file or a folder's entries to disk; a full disk is reported here at the latest."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     except OSError:
-        if not path.is_dir():  # not every file system can flush a folder
+        if not path.is_dir():  # some file systems cannot flush folders
             raise
     finally:
         os.close(descriptor)

@@ -1,5 +1,5 @@
-"""Reader of PLY files: header, and the rows of an element, binary or text. plyfile, the library for such files, is not
-used: it is under the GPL, and takes memory for as many rows of text as a header claims."""
+"""Reader of PLY files, binary or text: header, and the rows of an element. plyfile is not used: it is under the GPL,
+and allocates memory for as many rows of text as a header claims."""
 
 import re
 import warnings
@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from bitymi_ns.reading import open_regular
 
-HEADER_LIMIT = 1 << 16  # no header is longer, in bytes
+HEADER_LIMIT = 1 << 16  # maximum length of a header, bytes
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
@@ -31,30 +31,30 @@ _END = re.compile(rb"\nend_header[ \t]*\r?\n")
 
 
 class PlyError(ValueError):
-    """The bytes are not a PLY file, or not one of the kind that is wanted; the message says what is wrong."""
+    """The data is no PLY file, or not of the required kind; the message says what is wrong."""
 
 
 @dataclass(frozen=True)
 class Element:
     """Element of a PLY file."""
 
-    count: int  # of its rows
-    names: tuple[str, ...]  # of its properties
-    row: np.dtype | None  # type of a row, a field per property; None where a property is a list
+    count: int  # of rows
+    names: tuple[str, ...]  # of properties
+    row: np.dtype | None  # dtype of a row, a field per property; None if a property is a list
 
 
 @dataclass(frozen=True)
 class Header:
     """Header of a PLY file."""
 
-    order: str  # of the bytes, < or >; "" in a text file
+    order: str  # byte order, < or >; "" in a text file
     elements: dict[str, Element]  # by name, in the file's order
-    start: int  # where the rows begin, bytes
-    lines: int  # of the header
+    start: int  # offset of the rows, bytes
+    lines: int  # number of lines of the header
 
     def ahead(self, name: str) -> int | None:
-        """Count lines of a text file, else bytes, between the header and an element's rows; None where lists hide
-        it."""
+        """Count the lines (of a text file) or bytes between the header and an element's rows; None if unknown because
+        of lists."""
         total = 0
         for other, element in self.elements.items():
             if other == name:
@@ -66,16 +66,16 @@ class Header:
 
 
 def read_header(path: Path) -> Header:
-    """The header of a file; PlyError where it is none."""
+    """Read the header of a file; raises what `parse_header` raises."""
     with open_regular(path) as file:
         return parse_header(file.read(HEADER_LIMIT))
 
 
 def parse_header(data: bytes | bytearray) -> Header:
-    """The header of a file that begins with `data`, which is all of it or its first `HEADER_LIMIT` bytes.
+    """Parse the header from a file's contents, or its first `HEADER_LIMIT` bytes.
 
     Raises:
-        PlyError: there is no header, or it has a line that is not understood.
+        PlyError: there is no header, or it is malformed.
     """
     end = _END.search(data, 0, HEADER_LIMIT)
     if not _MAGIC.match(data) or end is None:
@@ -125,7 +125,7 @@ def _row(properties: dict[str, str | None], order: str) -> np.dtype | None:
 
 
 def rows_there(path: Path, header: Header, name: str) -> int | None:
-    """Count the rows of an element that the file has room for; None where the header does not determine it."""
+    """Count the rows of an element that the file's size allows; None if the header does not determine it."""
     element, ahead = header.elements[name], header.ahead(name)
     if ahead is None:
         return None
@@ -137,10 +137,10 @@ def rows_there(path: Path, header: Header, name: str) -> int | None:
 
 
 def read_rows(path: Path, header: Header, name: str) -> npt.NDArray[np.void]:
-    """The rows of an element, [count], a field per property.
+    """Read the rows of an element, [count], a field per property.
 
     Raises:
-        PlyError: the rows have lists or follow some, there are fewer than stated, or a line of text is no row.
+        PlyError: the element or a binary element before it has lists, rows are missing, or a line of text is malformed.
     """
     element, ahead = header.elements[name], header.ahead(name)
     if element.row is None or ahead is None:
@@ -148,14 +148,14 @@ def read_rows(path: Path, header: Header, name: str) -> npt.NDArray[np.void]:
     if not header.order:
         text = (line for _, line in islice(text_lines(path, header, name), element.count))
         with warnings.catch_warnings(), np.errstate(over="ignore"):
-            warnings.simplefilter("error", DeprecationWarning)  # a fraction for a whole number
-            warnings.filterwarnings("ignore", "loadtxt", UserWarning)  # no line at all
+            warnings.simplefilter("error", DeprecationWarning)  # a fraction for an integer
+            warnings.filterwarnings("ignore", "loadtxt", UserWarning)  # no lines
             try:
                 rows = np.loadtxt(text, element.row, comments=None, ndmin=1)
             except (ValueError, DeprecationWarning) as error:
                 raise PlyError(f"a line is no row of the element {name}: {error}") from error
     else:
-        there = rows_there(path, header, name) or 0  # fromfile takes the memory first
+        there = rows_there(path, header, name) or 0  # fromfile allocates before it reads
         rows = np.fromfile(path, element.row, min(there, element.count), offset=header.start + ahead)
     if len(rows) < element.count:
         raise PlyError(f"it is cut off: it has {len(rows)} of {element.count} rows of the element {name}")
@@ -163,7 +163,7 @@ def read_rows(path: Path, header: Header, name: str) -> npt.NDArray[np.void]:
 
 
 def text_lines(path: Path, header: Header, name: str) -> Iterator[tuple[int, str]]:
-    """Number, from 1 in the file, and text of each line from an element's first row on; empty ones do not count."""
+    """Iterate over the nonempty lines from an element's first row on: line number in the file, from 1, and text."""
     with TextIOWrapper(open_regular(path), encoding="latin-1", newline="\n") as file:
         filled = ((number, line) for number, line in enumerate(file, 1) if number > header.lines and line.strip())
         yield from islice(filled, header.ahead(name), None)

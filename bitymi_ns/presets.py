@@ -4,7 +4,11 @@ from pathlib import Path
 
 
 def preset_dir() -> Path:
-    """The folder of the presets: inside the installed package, or beside it in a source checkout."""
+    """Find the folder of the presets: inside the installed package, or beside it in a source checkout.
+
+    Raises:
+        FileNotFoundError: it is missing.
+    """
     package = Path(__file__).resolve().parent
     for folder in (package / "method_configs", package.parent / "method_configs"):
         if folder.is_dir():
@@ -15,5 +19,5 @@ def preset_dir() -> Path:
 
 
 def preset_names() -> list[str]:
-    """Names of all presets, sorted."""
+    """List the names of all presets, sorted."""
     return sorted(path.stem for path in preset_dir().glob("*.yaml"))

@@ -1,4 +1,4 @@
-"""Progress of the slow steps, as a callback that anything can implement."""
+"""Progress callbacks of slow steps."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -6,7 +6,7 @@ from typing import Protocol
 
 
 class Progress(Protocol):
-    """Called after every chunk of work with the step's name and how much of it is done."""
+    """Callback after each chunk of work, with the step's name, the amount done and the total."""
 
     def __call__(self, step: str, done: int, total: int) -> None: ...
 
@@ -17,8 +17,8 @@ def no_progress(step: str, done: int, total: int) -> None:
 
 @contextmanager
 def rich_progress() -> Iterator[Progress]:
-    """A callback that draws one bar per step; `with rich_progress() as progress: bake(..., progress)`."""
-    from rich.progress import Progress as Bars  # kept out of the import of the package: only the terminal needs it
+    """Create a callback that draws one bar per step; `with rich_progress() as progress: bake(..., progress)`."""
+    from rich.progress import Progress as Bars  # lazily: only needed in a terminal
 
     with Bars() as bars:
         tasks: dict[str, int] = {}

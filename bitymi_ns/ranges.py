@@ -1,11 +1,11 @@
-"""Ranges of options, stated in the types of their fields, and what is wrong with data of such types."""
+"""Ranges of options as types of their fields, and validation errors of such data."""
 
 from dataclasses import asdict
 from typing import Annotated, Any
 
 from pydantic import Field, TypeAdapter, ValidationError
 
-MOST = 10**9  # largest value of a count, and of a weight
+MOST = 10**9  # largest value of a count or a weight
 Share = Annotated[float, Field(ge=0, le=1)]
 PositiveShare = Annotated[float, Field(gt=0, le=1)]
 NonNegative = Annotated[float, Field(ge=0, le=MOST)]
@@ -16,16 +16,16 @@ PositiveCount = Annotated[int, Field(ge=1, le=MOST)]
 
 
 def first_problem(error: ValidationError) -> tuple[str, str]:
-    """The entry of the first fault of some data, its names and numbers joined by dots, and what is wrong with it."""
+    """Return the location of the first validation error, joined by dots, and its message."""
     first = error.errors(include_url=False, include_input=False)[0]
     return ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
 
 
 def check_ranges(options: Any) -> None:
-    """Refuse options out of their range, NaN included.
+    """Check that options are within their ranges.
 
     Raises:
-        ValueError: names the option, its range and the value.
+        ValueError: one is not, or is NaN; the message has the option, its range and the value.
     """
     try:
         TypeAdapter(type(options)).validate_python(asdict(options))

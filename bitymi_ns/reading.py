@@ -1,5 +1,5 @@
-"""Files that somebody else wrote: opened only where they are files, of a size that is known before they are read, and
-whatever is wrong with them said with the file and the entry."""
+"""Reading of untrusted files: only regular files are opened, sizes are checked before reading, and errors name the file
+and the entry."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from rich.filesize import decimal
 
 from bitymi_ns.trust import json_of
 
-MOST_TEXT = 1 << 30  # bytes of JSON or text; that of 100,000 photographs takes a tenth of it
+MOST_TEXT = 1 << 30  # maximum size of JSON or text, bytes; 100,000 photographs need a tenth of it
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a file for reading. A folder, a pipe or a device is refused before it is opened, also where a link leads to
-    it: opening a pipe waits for its other end.
+    """Open a regular file for reading, also through a link. A folder, pipe or device is refused before it is opened:
+    opening a pipe blocks.
 
     Raises:
-        OSError: there is no such file, it is something else, or the system refuses it; `strerror` says which.
+        OSError: the file does not exist, is not regular, or cannot be opened; `strerror` says which.
     """
     try:
         found = os.stat(path)
     except ValueError:  # a null character
         raise OSError(errno.EINVAL, "no file can have this name", str(path)) from None
     if stat.S_ISREG(found.st_mode):
-        # should it have become a pipe by now, opening it does not wait for its other end
+        # O_NONBLOCK: opening does not block even if it has become a pipe in the meantime
         file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
         if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             return file
@@ -41,10 +41,10 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def read_bytes(path: Path, most: int = MOST_TEXT) -> bytes:
-    """Read a file of at most so many bytes.
+    """Read a file of at most `most` bytes.
 
     Raises:
-        OSError: it is no file, larger, or cannot be read.
+        OSError: it is no regular file, larger, or cannot be read.
     """
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
@@ -53,18 +53,18 @@ def read_bytes(path: Path, most: int = MOST_TEXT) -> bytes:
 
 
 def open_text(path: Path, errors: str = "strict") -> TextIO:
-    """Open a text file, in the encoding of its byte order mark, which editors and shells of Windows write, or else in
-    UTF-8. Raises as `open_regular` does."""
+    """Open a text file in the encoding of its byte order mark (written by Windows programs), or else in UTF-8; raises
+    what `open_regular` raises."""
     file = open_regular(path)
     wide = file.peek(2)[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)  # type: ignore[attr-defined]
     return TextIOWrapper(file, encoding="utf-16" if wide else "utf-8-sig", errors=errors)
 
 
 def read_text(path: Path, most: int = MOST_TEXT) -> str:
-    """Read a text file, see `open_text`, of at most so many bytes.
+    """Read a text file of at most `most` bytes, see `open_text`.
 
     Raises:
-        OSError: it is no file, larger, or cannot be read.
+        OSError: it is no regular file, larger, or cannot be read.
         UnicodeDecodeError: it is no text.
     """
     with open_text(path) as file:
@@ -78,17 +78,17 @@ def _check_size(path: Path, size: int, most: int) -> None:
 
 
 def read_json(path: Path, most: int = MOST_TEXT) -> Any:
-    """Read a file of JSON.
+    """Read a JSON file.
 
     Raises:
         OSError: see `read_bytes`.
-        ValueError: it is no JSON, or is nested too deeply to process.
+        ValueError: it is no JSON, or is nested too deeply.
     """
     return json_of(read_bytes(path, most))
 
 
 def why(error: BaseException) -> str:
-    """Say in one line what is wrong with what was read; without a full stop."""
+    """Describe a reading error in one line, without a full stop."""
     if isinstance(error, FileNotFoundError):
         return "it is a link to nothing" if os.path.islink(error.filename or "") else "it does not exist"
     if isinstance(error, OSError) and error.strerror:
@@ -113,15 +113,15 @@ def reading(
     advice: str = "",
     passing: tuple[type[BaseException], ...] = (),
 ) -> Iterator[None]:
-    """Turn whatever goes wrong in the block, which reads data of others, into one line that says where and what.
+    """Convert any exception in the block, which reads untrusted data, to a one-line message of place and cause.
 
-    Libraries raise what they like on such data, so no list of exceptions is complete; the cause is kept for debuggers.
+    All exceptions are caught, because libraries raise many kinds on such data.
 
     Args:
-        what: the file, and the entry of it that is read, as in "a.json: frame 3".
+        what: file and entry being read, as in "a.json: frame 3".
         refuse: raises the exception for a message and its cause.
-        advice: ends the message: what to do.
-        passing: exceptions that say all of that already.
+        advice: end of the message: what to do.
+        passing: exceptions with such a message, which are passed on.
     """
     try:
         yield

@@ -1,5 +1,5 @@
-"""Protection against files of others: links are not followed, folders that others can write to are not used, names stay
-inside a folder, JSON within a nesting depth, text is printable, and Python runs no module of the current folder."""
+"""Protection against untrusted files: links are not followed, folders writable by others are not used, names cannot
+leave their folder, JSON depth is limited, text is escaped, and Python runs no module from the current folder."""
 
 import errno
 import json
@@ -12,15 +12,15 @@ from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-UNFINISHED = ".unfinished"  # ends the name of a file on its way, which begins with a dot: a killed process leaves it
-LONGEST = 1000  # letters of a name that are shown
-DEEPEST = 100  # levels of JSON that are read
+UNFINISHED = ".unfinished"  # suffix of files being written, whose names begin with a dot; a killed process leaves them
+LONGEST = 1000  # maximum number of characters of a name in messages
+DEEPEST = 100  # maximum nesting depth of JSON
 _CALL = "import sys; sys.path[:] = [folder for folder in sys.path if folder]; from {0} import {1}; sys.exit({1}())"
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
 class Refused(PermissionError):
-    """A file or folder may have been put there by somebody else; the message says what to do."""
+    """A file or folder may belong to somebody else; the message says what to do."""
 
     def __init__(self, message: str, path: Path) -> None:
         super().__init__(errno.EPERM, message, str(path))
@@ -30,11 +30,11 @@ class Refused(PermissionError):
 
 
 def no_links(name: str | os.PathLike[str], flags: int) -> int:
-    """Open a file for writing, made where it is missing; to be given to `open` as its opener.
+    """Open or create a file for writing without following links; an opener for `open`.
 
     Raises:
-        Refused: it is a link, or has another name elsewhere, or is no file; or it is of somebody to whom the folder
-            does not belong either.
+        Refused: it is a symbolic or hard link, is no regular file, or belongs neither to the user nor to the folder's
+            owner.
         OSError: it cannot be opened.
     """
     path = Path(name)
@@ -46,9 +46,9 @@ def no_links(name: str | os.PathLike[str], flags: int) -> int:
         except FileExistsError:
             pass
         try:
-            file = os.open(path, flags | os.O_NONBLOCK)  # which does not wait for the other end of a pipe
+            file = os.open(path, flags | os.O_NONBLOCK)  # does not block on a pipe
             break
-        except FileNotFoundError:  # it has been removed in the meantime
+        except FileNotFoundError:  # removed in the meantime
             continue
         except OSError as error:
             if path.is_symlink():
@@ -74,16 +74,16 @@ def _check(path: Path, found: os.stat_result) -> None:
 
 
 def _check_owner(path: Path, found: os.stat_result) -> None:
-    """Refuse files of anybody but the user and the owner of the folder, who could replace them at any time."""
+    """Refuse files of users other than this one and the folder's owner, who could replace them anyway."""
     if found.st_uid not in (os.geteuid(), os.stat(path.parent).st_uid):
         raise Refused(f"{path} belongs to another user: have it removed, or choose another path", path)
 
 
 def is_left(folder: Path) -> bool:
-    """Test for a folder that a killed process may have left.
+    """Return True if a folder left by a killed process exists.
 
     Raises:
-        Refused: something else is there, or somebody else's.
+        Refused: it is no folder, or belongs to somebody else.
     """
     try:
         found = os.lstat(folder)
@@ -96,19 +96,19 @@ def is_left(folder: Path) -> bool:
 
 
 def own_folder(folder: Path, close: bool = False) -> None:
-    """Make a folder that only the user can write to, where it is missing.
+    """Create a folder, if missing, that only the user can write to.
 
     Args:
         folder: its parent is not checked.
-        close: remove write permission of others from an existing folder, whose content does not matter.
+        close: remove the write permission of others from an existing folder, whose contents do not matter.
 
     Raises:
-        Refused: what is there belongs to another user, can be written by others, or is a link.
-        OSError: it cannot be made.
+        Refused: it belongs to another user, is writable by others, or is a link.
+        OSError: it cannot be created.
     """
     with suppress(FileExistsError):
         folder.mkdir(mode=0o755)
-        close = True  # an access list of the parent may have given more rights
+        close = True  # an ACL of the parent may have granted more rights
     with suppress(OSError):
         found = os.lstat(folder)
         if close and stat.S_ISDIR(found.st_mode) and found.st_mode & 0o022 and found.st_uid == os.geteuid():
@@ -118,7 +118,7 @@ def own_folder(folder: Path, close: bool = False) -> None:
 
 
 def is_own(folder: Path) -> bool:
-    """Test for a folder, not a link to one, that belongs to the user and that nobody else can write to."""
+    """Return True for a folder, not a link, that belongs to the user and only the user can write to."""
     try:
         found = os.lstat(folder)
     except OSError:
@@ -127,10 +127,10 @@ def is_own(folder: Path) -> bool:
 
 
 def check_no_links(paths: Iterable[Path]) -> None:
-    """Check that none of these paths, which may be missing, is a symbolic or hard link; archives can contain both.
+    """Check that no path, if it exists, is a symbolic or hard link; archives can contain both.
 
     Raises:
-        Refused: one is.
+        Refused: a path is a link.
     """
     for path in paths:
         try:
@@ -142,10 +142,10 @@ def check_no_links(paths: Iterable[Path]) -> None:
 
 
 def strangers(folder: Path, made: Iterable[str]) -> list[str]:
-    """List files and folders in a folder that are not among those made by its writer, relative to it.
+    """List files and folders in a folder, relative to it, that its writer did not create.
 
     Args:
-        made: names of all files that were made, relative to it.
+        made: names of all files that the writer created, relative to the folder.
     """
     named = [PurePosixPath(name) for name in made]
     files = {str(path) for name in named for path in (name, name.with_name(f".{name.name}{UNFINISHED}"))}
@@ -163,10 +163,10 @@ def strangers(folder: Path, made: Iterable[str]) -> list[str]:
 
 
 def keep(folder: Path, made: Iterable[str]) -> None:
-    """Check that a folder holds nothing that would be lost if it was replaced.
+    """Check that a folder holds only the files `made`, so that it can be replaced without loss.
 
     Raises:
-        Refused: it does.
+        Refused: it holds other files.
     """
     others = strangers(folder, made)
     if others:
@@ -178,7 +178,7 @@ def inside(folder: Path, name: str) -> Path:
     """Join a folder and a relative name.
 
     Raises:
-        ValueError: the name leads out of the folder, or is empty.
+        ValueError: the name is empty or leaves the folder.
     """
     if not leads_inside(name):
         raise ValueError(f"the name {name!r} leads elsewhere than to a file in the folder: correct it")
@@ -186,7 +186,7 @@ def inside(folder: Path, name: str) -> Path:
 
 
 def leads_inside(name: str) -> bool:
-    """Test that a relative name stays inside the folder that it is relative to."""
+    """Return True if a relative name stays inside its folder."""
     path = PurePosixPath(name)
     return bool(path.parts) and not path.is_absolute() and ".." not in path.parts and "\0" not in name
 
@@ -195,7 +195,7 @@ def json_of(data: str | bytes) -> Any:
     """Parse untrusted JSON.
 
     Raises:
-        ValueError: it is no JSON, or is nested too deeply to process.
+        ValueError: it is no JSON, or is nested too deeply.
     """
     try:
         value = json.loads(data)
@@ -215,19 +215,18 @@ def json_of(data: str | bytes) -> Any:
 
 
 def printable(text: str) -> str:
-    """Escape control characters, changes of writing direction and surrogates for a terminal; file names may hold
-    them."""
+    """Escape control characters, bidirectional controls and surrogates for a terminal; file names may contain them."""
     return _CONTROLS.sub(lambda found: found.group().encode("unicode_escape").decode(), text)
 
 
 def listed(names: Sequence[object], most: int = 3) -> str:
-    """The first few names, at most LONGEST letters of each, and how many more there are."""
+    """Join the first few names, truncated to LONGEST characters, and the number of further ones."""
     shown = ", ".join(str(name)[:LONGEST] for name in names[:most])
     return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
 
 
 def is_text(name: str | os.PathLike[str]) -> bool:
-    """Test if a file's name is UTF-8, as most files that name it need."""
+    """Return True if a file's name can be encoded as UTF-8."""
     try:
         os.fspath(name).encode()
     except UnicodeEncodeError:
@@ -236,11 +235,11 @@ def is_text(name: str | os.PathLike[str]) -> bool:
 
 
 def python_command(module: str, function: str) -> list[str]:
-    """The command that calls a function of a module in a new process of this Python, without arguments; the function
-    returns the exit code, as that of a console script does. Further words of the command are in `sys.argv`.
+    """Build a command that calls a function without arguments in a new process of this Python; the function returns the
+    exit status, and further words of the command are in `sys.argv`.
 
-    The current folder is not on its search path, as it would be with `-m` or `-c` alone: it may be a capture of
-    somebody else, and a `json.py` in it would be run. `-P` does the same, but Python 3.10 does not know it; `-I` does
-    more, so that the user's own packages would not be found.
+    The current folder, which may be an untrusted capture, is removed from the search path: with `-m` or `-c` alone a
+    `json.py` in it would be run. `-P` does the same, but is missing in Python 3.10; `-I` would also hide the user's own
+    packages.
     """
     return [sys.executable, "-c", _CALL.format(module, function)]

@@ -1,13 +1,12 @@
 #!/usr/bin/env bash
 # Train, bake, evaluate and report: the sample room, or your own capture.
 #
-#   scripts/demo.sh [DATA]     DATA: whatever `ns-train bitymi --data` takes: photographs, a video, a COLMAP project,
-#                              a capture with transforms.json
+#   scripts/demo.sh [DATA]     DATA: as for `ns-train bitymi --data`: photographs, a video, a COLMAP project, or a
+#                              capture with transforms.json
 #
-# The commands are on PATH after `make setup` when called by `make demo`, or in an environment with this package
-# installed. Each step is skipped when its result is there; remove the result to do it again. A training that was
-# interrupted goes on from its last checkpoint.
-# METHOD (default bitymi) and STEPS (default: the method's own) choose what is trained.
+# Needs the commands on PATH: run by `make demo` after `make setup`, or in an environment with this package installed.
+# Steps whose results exist are skipped; remove a result to compute it again. An interrupted training resumes from its
+# last checkpoint. METHOD (default bitymi) and STEPS (default: the method's own) select the method and length.
 set -euo pipefail
 [ $# -eq 0 ] || data=$(realpath -- "$1" 2>/dev/null) || data=
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -29,9 +28,9 @@ fi
 run=$out/outputs/$name/$method/run
 options=()
 [ -z "${STEPS:-}" ] || options=(--max-num-iterations "$STEPS")
-asked="$data ${STEPS:-}" # what the results in $out belong to
+asked="$data ${STEPS:-}" # identifies the results in $out
 
-# nerfstudio 1.1.5 imports names that newer versions of torch warn about, before any method can have a say in it
+# nerfstudio 1.1.5 imports deprecated names of torch before the plugin is loaded
 export PYTHONWARNINGS=${PYTHONWARNINGS:-ignore::FutureWarning:nerfstudio.field_components.activations}
 
 say() { printf '\n== %s (%d s so far)\n' "$*" "$SECONDS"; }

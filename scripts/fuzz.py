@@ -1,13 +1,12 @@
-"""Feed the readers of other people's files with damaged ones, guided by the lines that these reach.
+"""Fuzz the readers of untrusted files, guided by coverage.
 
-    python -m scripts.fuzz TARGET --seconds 600     a target, or `all`, one after the other
-    python -m scripts.fuzz TARGET --input FILE      such an input again, with its traceback
+    python -m scripts.fuzz TARGET --seconds 600     a target, or `all` in turn
+    python -m scripts.fuzz TARGET --input FILE      reproduce a finding, with its traceback
 
-Needs atheris, which is no dependency of anything else: `pip install atheris`, on Linux with Python 3.11 or later.
+Needs atheris, which is no dependency of the package: `pip install atheris`, on Linux with Python 3.11 or later.
 
-How a reader refuses a file is documented. Whatever else it raises is a finding: the input is kept in --findings, one
-for each line of the package that it comes from, and the exit status is 1. A crash or a hang of compiled code ends the
-target.
+Any exception other than the reader's documented ones is a finding: the input is saved in --findings, one per line of
+the package that raised, and the exit status is 1. A crash or a hang of compiled code ends the target.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ ODD_BYTES = [
 
 
 def changed_json(data: bytes, dice: random.Random) -> bytes | None:
-    """Remove, exchange or replace a few entries of JSON; None where it is none."""
+    """Remove, exchange or replace a few entries of JSON; None if the data is no JSON."""
     try:
         value = [json.loads(data)]
         for _ in range(dice.choice((1, 1, 1, 2, 4))):
@@ -67,13 +66,13 @@ def changed_json(data: bytes, dice: random.Random) -> bytes | None:
 
 
 def changed_numbers(data: bytes, dice: random.Random) -> bytes:
-    """Put an odd number in the place of some bytes."""
+    """Overwrite some bytes with an odd number."""
     packed, at = dice.choice(ODD_BYTES), dice.randrange(len(data) + 1)
     return data[:at] + packed + data[at + len(packed) :]
 
 
 def mutator(target: Target) -> Callable[[bytes, int, int], bytes]:
-    """Half of the changes are those of libFuzzer, which knows bytes alone."""
+    """Create a mutator of JSON and numbers, mixed with libFuzzer's own mutations of bytes."""
 
     def mutate(data: bytes, most: int, seed: int) -> bytes:
         dice = random.Random(seed)
@@ -93,18 +92,17 @@ def mutator(target: Target) -> Callable[[bytes, int, int], bytes]:
 
 
 def place_of(error: BaseException) -> str:
-    """Name the last line of the package in a traceback, and what was raised there."""
+    """Name the package's last line in a traceback, and the exception's type."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if "bitymi_ns" in f.filename]
     where = f"{Path(frames[-1].filename).name}-{frames[-1].lineno}" if frames else "elsewhere"
     return f"{where}-{type(error).__name__}"
 
 
 def follow() -> None:
-    """Have atheris see which lines of the package an input reaches. Its own hook of imports does not meet packages that
-    are installed for editing."""
+    """Instrument the package for atheris, whose import hook does not see editable installs."""
     for each in gc.get_objects():
         if isinstance(each, types.FunctionType) and str(each.__module__).startswith("bitymi_ns."):
-            with contextlib.suppress(Exception):  # of code that it cannot rewrite
+            with contextlib.suppress(Exception):  # some code cannot be rewritten
                 atheris.instrument_func(each)
 
 

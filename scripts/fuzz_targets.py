@@ -1,4 +1,4 @@
-"""Readers of other people's files as scripts/fuzz.py runs them, with inputs to begin with."""
+"""Fuzz targets of scripts/fuzz.py: readers of untrusted files, with seed inputs."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from bitymi_ns.scene.config import SceneConfig
 from tests.plugin.data.captures import as_binary, colmap_model
 from tests.plugin.run.test_checkpoints import moved, state
 
-CUT = b"\n--8<--\n"  # between the files of an input that has several
+CUT = b"\n--8<--\n"  # separates the files of an input
 ODD_NUMBERS = (0, -1, 1, 255, 1e-300, -1e308, float("nan"), float("inf"), 2**31, 2**62, 10**400, 0.1, True)
 ODD_TEXTS = ("", "32", "\0", "../../x", "images", "/", "\ud800", "x" * 5000, "OPENCV", "é/..", "SIMPLE_RADIAL_FISHEYE")
 ODD_VALUES = (*ODD_NUMBERS, *ODD_TEXTS, None, [], {}, [[]], [1.0, 2.0, 3.0], [[0.0] * 4] * 4, {"a": None})
@@ -45,16 +45,16 @@ ODD_VALUES = (*ODD_NUMBERS, *ODD_TEXTS, None, [], {}, [[]], [1.0, 2.0, 3.0], [[0
 
 @dataclass
 class Target:
-    """A reader with inputs to begin with."""
+    """A reader with seed inputs."""
 
     run: Callable[[bytes], object]  # reads an input
     seeds: list[bytes]
-    refusals: tuple[type[BaseException], ...] = ()  # what it documents to raise
-    json: bool = False  # the last file of an input is of JSON, or of lines of it
+    refusals: tuple[type[BaseException], ...] = ()  # documented exceptions
+    json: bool = False  # the last file of an input is JSON or JSONL
 
 
 def nodes(value: Any) -> list[tuple[Any, Any]]:
-    """All entries of a tree of tables and lists, as container and key."""
+    """List all entries of nested dicts and lists, as container and key."""
     found = []
     for key in list(value) if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ():
         found += [(value, key), *nodes(value[key])]
@@ -62,7 +62,7 @@ def nodes(value: Any) -> list[tuple[Any, Any]]:
 
 
 def no_colmap(*_: Any, **__: Any) -> Any:
-    """Stand for structure from motion, which takes seconds."""
+    """Replace structure from motion, which takes seconds."""
     raise CaptureError("not here")
 
 
@@ -71,7 +71,7 @@ def _capture(work: Path) -> Path:
 
 
 def transforms(work: Path) -> Target:
-    """Read transforms.json, up to the views."""
+    """Parse transforms.json, up to the views."""
     room = _capture(work)
     (room / "masks").mkdir()
     for path in sorted((room / "images").iterdir())[:2]:
@@ -149,7 +149,7 @@ def exif_data(work: Path) -> Target:
 
 
 def maps(work: Path) -> Target:
-    """Read maps of depth and of normals. The first byte says which format."""
+    """Read depth and normal maps. The first byte selects the format."""
     (lens,), _ = lenses_of(ColmapCamera("PINHOLE", 8, 6, (8.0, 8.0, 4.0, 3.0)), (8, 6), "a")
     endings, seeds = (".npy", ".npz", ".png", ".tiff", ".exr"), []
     for k, values in enumerate((np.ones((6, 8), np.float32), np.ones((6, 8), np.uint16), np.ones((6, 8, 3), "f4"))):
@@ -194,7 +194,7 @@ def ply(work: Path) -> Target:
 
 
 def camera_path(work: Path) -> Target:
-    """Read camera paths, as far as nerfstudio's reader of them."""
+    """Read camera paths, including nerfstudio's reader."""
     from nerfstudio.cameras.camera_paths import get_path_from_json
 
     frame = {"camera_to_world": np.eye(4).flatten().tolist(), "fov": 50.0, "aspect": 1.5, "principal_point": [0.5, 0.5]}
@@ -210,7 +210,7 @@ def camera_path(work: Path) -> Target:
 
 
 def report(work: Path) -> Target:
-    """Read what `bitymi report` does. The first file of an input is the name of the second."""
+    """Read inputs of `bitymi report`. The first file of an input selects the name of the second."""
     results = {"psnr": 20.0, "ssim": 0.9, "lpips": 0.1, "psnr_std": 1.0, "num_rays_per_sec": 1e6, "fps": 3.0}
     evaluation = {"experiment_name": "a", "method_name": "bitymi", "checkpoint": "a/b/c.ckpt", "results": results}
     point = {"step": 10, "seconds": 1.0, "cpu_seconds": 2.0, "surfels": 10, "fragments": 5, "psnr": 20.0}
@@ -242,8 +242,8 @@ def report(work: Path) -> Target:
 
 
 def checkpoint(work: Path) -> Target:
-    """Read checkpoints, as far as the optimisers. An input is a seed for changes of a whole one: bytes are under a
-    checksum."""
+    """Read checkpoints, including the optimisers. An input is a seed for mutations of a valid checkpoint, because its
+    bytes have a checksum."""
     path = checkpoints.path_of(work, 7)
     tensors = [torch.zeros(3), torch.zeros(0), torch.zeros(5, 3, dtype=torch.int32), torch.zeros(1, 1, 1)]
     tensors += [torch.full((5, 3), 1e30), torch.zeros(5, 3).expand(5, 3).T, torch.zeros(5, 3).to_sparse()]
@@ -267,7 +267,7 @@ def checkpoint(work: Path) -> Target:
                 holder[key] = odd[found.ConsumeIntInRange(0, len(odd) - 1)]
         try:
             torch.save(value[0], path)
-        except Exception:  # it cannot be stored: nobody will read it
+        except Exception:  # cannot be stored, hence not read
             return
         loaded = checkpoints.load(path, SceneConfig())
         for name, saved in loaded["optimizers"].items():

@@ -6,7 +6,7 @@ from pathlib import Path
 
 try:
     import tomllib
-except ModuleNotFoundError:  # Python 3.10: the one that comes inside pip
+except ModuleNotFoundError:  # Python 3.10: use pip's
     from pip._vendor import tomli as tomllib
 
 

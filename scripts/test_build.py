@@ -1,8 +1,8 @@
 #!/usr/bin/env python
-"""Run tests with a build of the CPU kernels other than the installed one: scripts/test_build.py BUILD_FOLDER TEST...
+"""Run tests with another build of the CPU kernels than the installed one: scripts/test_build.py BUILD_FOLDER TEST...
 
-The build may be by another compiler, for another CPU, or with the sanitizers (`--sanitizers`), whose libraries have to
-be in the process before Python is: then this starts itself again with them.
+The build may be by another compiler, for another CPU, or with sanitizers (`--sanitizers`), whose libraries must be
+preloaded: the script then restarts itself with them.
 """
 
 import argparse
@@ -16,7 +16,7 @@ LIBRARIES = ("libasan.so", "libubsan.so")
 
 
 def preload() -> str:
-    """Paths of the sanitizers' libraries of the compiler that is used."""
+    """Return LD_PRELOAD for the compiler's sanitizer libraries."""
     compiler = os.environ.get("CXX", "c++")
     paths = []
     for name in LIBRARIES:
@@ -25,7 +25,7 @@ def preload() -> str:
         if not path.is_absolute():
             sys.exit(f"{compiler} has no {name}: install the sanitizers of the compiler (gcc brings them)")
         paths.append(str(path.resolve()))
-    # the sanitizer catches C++ exceptions of libraries that are loaded later only if this is there first
+    # preloaded, so that the sanitizer intercepts C++ exceptions of libraries loaded later
     stdcpp = subprocess.run([compiler, "-print-file-name=libstdc++.so"], capture_output=True, text=True, check=True)
     return ":".join([*paths, str(Path(stdcpp.stdout.strip()).resolve())])
 
@@ -42,7 +42,7 @@ def main() -> int:
             **os.environ,
             "BITYMI_SANITIZED": "1",
             "LD_PRELOAD": preload(),
-            # Python itself frees little at its end
+            # Python does not free all memory at exit
             "ASAN_OPTIONS": "detect_leaks=0:abort_on_error=0:exitcode=99",
             "UBSAN_OPTIONS": "print_stacktrace=1",
         }
@@ -53,7 +53,7 @@ def main() -> int:
     compiled = importlib.util.module_from_spec(spec)
     sys.modules["bitymi_ns._cpu"] = compiled
     spec.loader.exec_module(compiled)
-    # The CUDA kernels on the host belong to the installed build, and their fibers confuse the sanitizers: left out.
+    # the emulated CUDA kernels belong to the installed build, and their fibers confuse the sanitizers
     for name in ("bitymi_ns._emulated", "bitymi_ns._cuda"):
         sys.modules[name] = None  # type: ignore[assignment]
 
@@ -63,7 +63,7 @@ def main() -> int:
 
     assert Path(_cpu.__file__) == module, f"{_cpu.__file__} is used instead of {module}"
     print(f"{module}: {_cpu.CPU_FEATURES or 'no extensions of the instruction set'}", flush=True)
-    # uncaptured: a finding of the sanitizers ends the process and would take its report along
+    # without capturing, because a sanitizer's finding ends the process before captured output is printed
     uncaptured = ["-x", "-s"] if options.sanitizers else []
     return pytest.main(["-q", *uncaptured, "-p", "no:cacheprovider", *options.tests])
 

@@ -1,10 +1,9 @@
 #!/usr/bin/env python
-"""Build the wheel as `pip install .` does, check its contents, install it on its own and run tests against it.
+"""Build the wheel as `pip install .` does, check its contents, install it in isolation and run tests against it.
 
-The build starts from an empty folder and sees none of the environment's variables but PATH and HOME; only the CUDA
-kernels are left out, which take minutes. The wheel goes into a new virtual environment that finds the dependencies
-of this one, but not the checkout: the tests run on a copy of their folder, those of the kernels with each module that
-this CPU can run.
+The build starts from an empty folder with only PATH, HOME and TMPDIR of the environment, and without the CUDA kernels,
+which take minutes. The wheel is installed to a new virtual environment that finds the dependencies of this one, but not
+the checkout: the tests run on a copy of their folder, those of the kernels with each module that this CPU can run.
 """
 
 import os
@@ -50,7 +49,7 @@ sys.exit(pytest.main(sys.argv[1:]))
 
 
 def run(*command: str | Path, cwd: Path = ROOT) -> None:
-    """Run a command without the environment's variables; exit if it fails."""
+    """Run a command with a minimal environment; exit if it fails."""
     variables = {name: os.environ[name] for name in ("HOME", "TMPDIR") if name in os.environ}
     variables["PATH"] = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     if code := subprocess.run([str(word) for word in command], cwd=cwd, env=variables, check=False).returncode:
@@ -58,7 +57,7 @@ def run(*command: str | Path, cwd: Path = ROOT) -> None:
 
 
 def build(folder: Path) -> Path:
-    """The wheel, built in `folder`."""
+    """Build the wheel in `folder` and return its path."""
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check")
     options = (
         "-q",
@@ -73,7 +72,7 @@ def build(folder: Path) -> Path:
 
 
 def expected() -> set[str]:
-    """The files a wheel has, beside its metadata: those of the package, the presets, and what is compiled."""
+    """List the expected files of the wheel, without metadata: package, presets, and compiled modules."""
     command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "bitymi_ns", "method_configs"]
     listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     files = {line.replace("method_configs/", "bitymi_ns/method_configs/") for line in listed.stdout.splitlines()}
@@ -83,7 +82,7 @@ def expected() -> set[str]:
 
 
 def check_contents(wheel: Path) -> None:
-    """End this script where a file is missing from the wheel or superfluous in it."""
+    """Exit if the wheel lacks a file or has a superfluous one."""
     with zipfile.ZipFile(wheel) as archive:
         files = {name for name in archive.namelist() if ".dist-info/" not in name}
     if files != expected():
@@ -95,12 +94,12 @@ def check_contents(wheel: Path) -> None:
 
 
 def install(wheel: Path, folder: Path) -> Path:
-    """A virtual environment with the wheel in it, and behind it what is installed here; its interpreter."""
+    """Create a virtual environment with the wheel and access to this one's packages; return its interpreter."""
     run(sys.executable, "-m", "venv", "--without-pip", folder)
     python = folder / "bin" / "python"
     site = folder / SITE_PACKAGES.relative_to(sys.prefix)
-    # A folder that a .pth file names is searched, but its own .pth files, the editable installation's among them, are
-    # not read. The remedy for torchvision (scripts/torchvision_remedy.py) has to be.
+    # a folder named in a .pth file is searched, but its own .pth files (of the editable install) are not read; that of
+    # scripts/torchvision_remedy.py must be
     lines = [str(SITE_PACKAGES)] + [f"import {path.stem}" for path in SITE_PACKAGES.glob("_torchvision*.pth")]
     (site / "dependencies.pth").write_text("\n".join(lines) + "\n", encoding="utf8")
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", python)
@@ -121,7 +120,7 @@ def main() -> None:
         run(python, "-c", WHERE, cwd=away)
         options = ("-q", "-p", "no:cacheprovider", "--disable-warnings")
         run(python, "-m", "pytest", *options, *TESTS, cwd=away)
-        # the module for CPUs without AVX-512, which is taken where nothing is known about the CPU
+        # the module for CPUs without AVX-512, used if the CPU is unknown
         run(python, "-c", FIRST, *options, KERNELS, cwd=away)
 
 

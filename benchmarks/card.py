@@ -1,10 +1,10 @@
 #!/usr/bin/env python
-"""Bring the package to a bare machine with a card, and run tests and benchmarks there.
+"""Transfer the package to a bare machine with a GPU, and run tests and benchmarks there.
 
-`card.py stage FOLDER --python python3.12` compiles the wheel for that Python and card here, and fetches what it and
-nerfstudio need beside torch and numpy, in parts FOLDER/0 and on, for machines that take so much at a time. `card.py run
-ORDER... --stage PART... --output RESULTS` unpacks them there and runs the orders; each step has a limit of its own.
-Orders joined by a plus sign run at the same time: for what is not timed."""
+`card.py stage FOLDER --python python3.12` compiles the wheel for that Python and GPU, and downloads the dependencies of
+it and nerfstudio except torch and numpy, in parts FOLDER/0, FOLDER/1, ... of limited size. `card.py run ORDER...
+--stage PART... --output RESULTS` unpacks them on the machine and runs the orders; each step has its own time limit.
+Orders joined by a plus sign run concurrently, for steps that are not timed."""
 
 import argparse
 import os
@@ -23,40 +23,40 @@ NEEDED = ("ispc_texcomp", "pydantic", "flip-evaluator", "torchmetrics", "lightni
 NEEDED += ("zstandard", "wgpu", "cffi", "pycparser", "rendercanvas")
 NEEDED += ("nerfstudio", "viser", "websockets", "msgspec", "trimesh", "tyro", "docstring-parser", "typeguard")
 NEEDED += ("appdirs", "mediapy", "pyquaternion", "pytorch-msssim", "splines", "pycolmap", "nerfacc")
-"""Wheels that machines with torch and the usual scientific packages lack, in the versions of constraints.txt. What else
-nerfstudio imports has stand-ins (card_nerfstudio.py)."""
+"""Wheels missing on machines with torch and the usual scientific packages, in the versions of constraints.txt.
+nerfstudio's other imports have stand-ins (card_nerfstudio.py)."""
 TOOLS = ("scikit-build-core", "nanobind", "cmake", "ninja", "numpy")
 
 
 @dataclass(frozen=True)
 class Step:
-    """A process."""
+    """One or several concurrent commands with a time limit."""
 
     name: str  # in the summary
-    commands: Sequence[Sequence[str]]  # one, or several that run at the same time
+    commands: Sequence[Sequence[str]]
     limit: float  # seconds
 
 
 def python(script: str, *words: str) -> list[str]:
-    """A command that runs a script of this folder."""
+    """Build a command that runs a script of this folder."""
     return [sys.executable, f"benchmarks/{script}", *words]
 
 
 def sanitizer(tool: str, *sections: str) -> list[str]:
-    """A command that runs kernels under a tool of compute-sanitizer."""
+    """Build a command that runs kernels under a tool of compute-sanitizer."""
     command = ["compute-sanitizer", "--tool", tool, "--error-exitcode", "9", "--print-limit", "20"]
     return [*command, *python("gpu_kernels.py", "--sections", *sections)]
 
 
 def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | None = None) -> dict[str, list[Step]]:
-    """Steps of every order, by name. `frames`, `peers` and `kernels` draw the bundles that `train` left, `peers` the
-    Gaussians of `gaussians`, too.
+    """Build the steps of every order, by name. `frames`, `peers` and `kernels` render the bundles of `train`, `peers`
+    also the Gaussians of `gaussians`.
 
     Args:
         results: folder of the tables.
         data: folder of captures.
-        surfels: sizes of the scenes in the tables.
-        steps: of the runs of `train` and `nerfstudio`; None = the script's default.
+        surfels: numbers of surfels of the synthetic scenes.
+        steps: of the runs of `train` and `nerfstudio`; None: the script's default.
     """
     length = [] if steps is None else ["--steps", str(steps)]
     on_card = ("--runs", f"{steps or REFERENCE_STEPS}/1", "--device", "cuda", "--work", results / "runs")
@@ -67,11 +67,11 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
     bundled = ["--bundles", *kept] if kept else []
 
     def page(name: str, script: str, *words: object) -> list[str]:
-        """A command that also writes its Markdown to a file of the results."""
+        """Build a command that also writes its Markdown to a file of the results."""
         return python(script, *map(str, words), "--output", str(results / f"{name}.md"))
 
     def of_each(what: str, limit: float, commands: Callable[[str], list[list[str]]]) -> list[Step]:
-        """A step for every capture."""
+        """Build a step for each capture."""
         names = sorted(file.parent.name for file in data.glob("*/transforms.json"))
         return [Step(f"{what}{name}", commands(name), limit) for name in names]
 
@@ -123,11 +123,11 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
 
 
 REFERENCE_STEPS = 30_000  # of a run of `train`
-GAUSSIANS = (300_000, 1_000_000)  # numbers that are trained to compare with
+GAUSSIANS = (300_000, 1_000_000)  # numbers of Gaussians trained for comparison
 
 
 def together(steps: Sequence[Step]) -> Step:
-    """The commands of several steps at the same time."""
+    """Merge steps into one of concurrent commands."""
     commands = [command for step in steps for command in step.commands]
     return Step(" + ".join(step.name for step in steps), commands, max(step.limit for step in steps))
 
@@ -138,7 +138,7 @@ SANITIZERS = ("memcheck", "racecheck", "initcheck", "synccheck")
 
 
 def stage(arguments: argparse.Namespace) -> int:
-    """Make the folder of wheels, and of the weights of LPIPS."""
+    """Collect the wheels and LPIPS's weights."""
     folder = arguments.folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
     for file in folder.glob("*/*"):
@@ -161,7 +161,7 @@ def stage(arguments: argparse.Namespace) -> int:
         if not list(folder.glob(f"{name.replace('-', '_')}-*.whl")):
             with_needs = [] if name == "pydantic" else ["--no-deps"]
             subprocess.run([*fetched, *with_needs, name], check=True)
-    from bitymi_ns.plugin.run import lpips  # where `run` begins there is no such package yet
+    from bitymi_ns.plugin.run import lpips  # lazily: `run` starts without this package
 
     lpips.load("alex")
     shutil.copy(lpips.weights_path("alex"), folder)
@@ -174,7 +174,7 @@ def stage(arguments: argparse.Namespace) -> int:
 
 
 def parts(folder: Path, most: float) -> list[list[Path]]:
-    """The files of a folder, the largest first, in as many lists as need at most so many bytes each."""
+    """Split the files of a folder, largest first, into lists of at most `most` bytes each."""
     lists: list[list[Path]] = []
     for file in sorted(filter(Path.is_file, folder.iterdir()), key=lambda file: -file.stat().st_size):
         sizes = [sum(other.stat().st_size for other in files) for files in lists]
@@ -187,7 +187,7 @@ def parts(folder: Path, most: float) -> list[list[Path]]:
 
 
 def unpack(staged: Sequence[Path], work: Path) -> dict[str, str]:
-    """Install the wheels into a folder, copy the checkout with their compiled modules; returns the environment."""
+    """Install the wheels to a folder, copy the checkout with their compiled modules, and return the environment."""
     site = work / "site"
     command = [sys.executable, "-m", "pip", "install", "-q", "--no-index", "--no-deps", "--no-compile", "--target"]
     wheels = [str(file) for folder in staged for file in folder.glob("**/*.whl")]
@@ -207,19 +207,19 @@ def unpack(staged: Sequence[Path], work: Path) -> dict[str, str]:
     path = os.pathsep.join([str(tree), str(site), *filter(None, [os.environ.get("PYTHONPATH")])])
     programs = os.pathsep.join([str(site / "bin"), os.environ["PATH"]])
     changed = {"PATH": programs, "PYTHONPATH": path, "XDG_CACHE_HOME": str(cache.parent)}
-    changed["BITYMI_TESTS_REQUIRE"] = "card"  # else tests/cuda end well where there is none
+    changed["BITYMI_TESTS_REQUIRE"] = "card"  # else tests/cuda would be skipped without a GPU
     return {**os.environ, **changed}
 
 
 def run_step(step: Step, tree: Path, environment: dict[str, str], logs: Path, deadline: float) -> str:
-    """Run a step, with a log for every command; returns its line of the summary."""
+    """Run a step with a log per command, and return its line of the summary."""
     start = time.perf_counter()
     limit = min(step.limit, deadline - time.monotonic())
     if limit < 5:
         return f"| {step.name} | not begun: no time left | |"
     running, ends = [], []
     with tempfile.TemporaryDirectory() as folder:
-        # unbuffered, so that the last line of a log is what was printed last
+        # unbuffered, so that logs are complete
         environment = {**environment, "TMPDIR": folder, "PYTHONUNBUFFERED": "1"}
         if len(step.commands) > 1:
             environment["OMP_NUM_THREADS"] = str(max(1, (os.cpu_count() or 1) // len(step.commands)))

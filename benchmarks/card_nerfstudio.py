@@ -1,9 +1,9 @@
 #!/usr/bin/env python
-"""Run nerfstudio's own commands on a capture, as they are typed, and table what each took: train, resume, evaluate,
-export, evaluate and render the bundle.
+"""Run nerfstudio's commands on a capture and tabulate time and memory: train, resume, evaluate, export, evaluate and
+render the bundle.
 
-A bare machine lacks much that nerfstudio imports and this plugin never uses there: `STAND_INS` are modules whose every
-use is an error, here too where the real ones are installed, so that a run on any machine shows that none is needed.
+A bare machine lacks packages that nerfstudio imports but this plugin does not use. `STAND_INS` are replaced by modules
+whose use is an error, also on machines that have the packages, so that a run shows that none is needed.
 """
 
 import contextlib
@@ -30,7 +30,7 @@ IGNORED = (
     "IPython.get_ipython",
     "pillow_heif.register_heif_opener",
     "tensorly.set_backend",
-)  # called where modules are imported
+)  # called at import time
 
 SITE = '''"""Stand-ins, not the packages of these names: an attribute is a class, and to make one of it an error."""
 
@@ -78,7 +78,7 @@ sys.meta_path.insert(0, Finder())
 
 
 def stand_in(folder: Path) -> dict[str, str]:
-    """Write the stand-ins to a folder; returns an environment in which every Python has them."""
+    """Write the stand-ins to a folder and return environment variables that make every Python use them."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "sitecustomize.py").write_text(SITE.replace("NAMES", repr(STAND_INS)).replace("IGNORED", repr(IGNORED)))
     path = os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])])
@@ -87,7 +87,7 @@ def stand_in(folder: Path) -> dict[str, str]:
 
 
 def card_memory() -> float | None:
-    """Memory in use on the first card, MB."""
+    """Read the memory in use on the first GPU, MB; None without a GPU."""
     command = ["nvidia-smi", "--query-gpu=memory.used", "--format=csv,noheader,nounits", "--id=0"]
     with contextlib.suppress(OSError, ValueError):
         return float(subprocess.run(command, capture_output=True, text=True, check=False).stdout)
@@ -96,7 +96,7 @@ def card_memory() -> float | None:
 
 @contextlib.contextmanager
 def watched() -> Iterator[list[float]]:
-    """Gather the card's memory in use, every fifth of a second."""
+    """Sample the GPU memory in use five times a second."""
     seen: list[float] = []
     over = threading.Event()
 
@@ -114,20 +114,20 @@ def watched() -> Iterator[list[float]]:
 
 
 class Commands:
-    """Runs commands one after the other, in a folder and with an environment; `rows` has what each took.
+    """Sequential commands in a folder, with their costs in `rows`.
 
     Args:
-        after: called after each, so that a run that is stopped leaves what it had.
+        after: called after each command, so that an interrupted run leaves its results.
     """
 
     def __init__(self, folder: Path, environment: dict[str, str], after: Callable[[], None] = lambda: None) -> None:
         self.rows: list[tuple[str, dict[str, float] | None, float | None]] = []
-        """Command, cost as in `run_measured` or None where it failed, and largest memory in use on the card, MB, that
-        of other programs included; None = no card."""
+        """Command, cost of `run_measured` (None: failed), and peak memory in use on the GPU by all programs, MB (None:
+        no GPU)."""
         self._folder, self._environment, self._after = folder, environment, after
 
     def run(self, *words: object) -> bool:
-        """Run a command; True where it ended well."""
+        """Run a command and return True on success."""
         typed, log = [str(word) for word in words], self._folder / f"{len(self.rows)}.log"
         cost = None
         with watched() as used:
@@ -141,11 +141,11 @@ class Commands:
         return cost is not None
 
 
-WAITS_STEPS = 60  # of the run in which waits are counted
+WAITS_STEPS = 60  # length of the run in which synchronisations are counted
 
 
 def waits(words: Sequence[str]) -> None:
-    """Train in this process and print the waits of the host for the card, per step of the run's second half."""
+    """Train in this process and print the GPU synchronisations per step in the second half of the run."""
     import torch
 
     from bitymi_ns.train.step import Training
@@ -168,7 +168,7 @@ def waits(words: Sequence[str]) -> None:
 
 
 def all_commands(capture: Path, folder: Path, steps: int, options: Sequence[str], commands: Commands) -> None:
-    """Run them: each needs what those before it left in `folder`."""
+    """Run all commands; each uses the results of those before it in `folder`."""
     train = ["ns-train", "bitymi", "--data", capture, "--output-dir", "outputs", "--experiment-name", "capture"]
     train += ["--max-num-iterations", steps, "--vis", "tensorboard"]
     runs, bundle = folder / "outputs/capture/bitymi", folder / "bundle/config.yml"
@@ -190,7 +190,7 @@ def all_commands(capture: Path, folder: Path, steps: int, options: Sequence[str]
 
 
 def tables(folder: Path, commands: Commands) -> str:
-    """Tabulate what the commands took and found, as Markdown."""
+    """Tabulate costs and quality as Markdown."""
     cells = []
     for command, cost, card in commands.rows:
         took = (number(cost["process_seconds"], 1), number(cost["peak_bytes"] / 1e6, 0)) if cost else ("failed", "")

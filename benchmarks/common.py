@@ -1,4 +1,4 @@
-"""Shared by the scripts of this folder: arguments, Markdown pages and progress as `bitymi bench` writes them."""
+"""Helpers of the scripts in this folder: arguments, Markdown pages and progress as in `bitymi bench`."""
 
 import argparse
 from pathlib import Path
@@ -10,13 +10,13 @@ __all__ = ["arguments_of", "number", "page", "publish", "say", "table"]
 
 
 def arguments_of(script: str | None) -> argparse.ArgumentParser:
-    """Make the parser of a script's arguments, with its docstring for a help text."""
+    """Create an argument parser with the script's docstring as help text."""
     formatter = argparse.RawDescriptionHelpFormatter
     return argparse.ArgumentParser(description=script, formatter_class=formatter, allow_abbrev=False)
 
 
 def publish(text: str, output: Path | None) -> None:
-    """Print a page, and write it to `output` if that is a path."""
+    """Print a page, and write it to `output` if given."""
     print(text)
     if output is not None:
         output.parent.mkdir(parents=True, exist_ok=True)

@@ -1,9 +1,9 @@
 #!/usr/bin/env python
-"""Compare a fixed small job with the committed baseline: quality, bytes, memory and time.
+"""Compare quality, bytes, memory and time of a fixed small job with the committed baseline.
 
-Training is chaotic: a change of rounding alone moves one seed's PSNR by up to 0.13 dB, so the mean over seeds and all
-photographs is compared. CPU seconds are divided by those of a calibration between the parts, so that a busy machine, or
-a slower one of the same kind, gives the same figures. `--accept` makes them the new baseline, benchmarks/gate.json."""
+Training is chaotic: rounding alone moves one seed's PSNR by up to 0.13 dB, so the mean over seeds and all photographs
+is compared. CPU seconds are divided by those of a calibration run in between, so that a busy or slower machine gives
+the same figures. `--accept` writes the figures to the baseline, benchmarks/gate.json."""
 
 import argparse
 import itertools
@@ -30,7 +30,7 @@ THREADS = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
 
 
 SETTINGS = {"steps": 320, "tuning": 20, "seeds": 4}
-"""The job: steps of training and of the texel tuning, and how many seeds."""
+"""The job: steps of training and of texel tuning, and number of seeds."""
 
 
 @dataclass(frozen=True)
@@ -38,14 +38,14 @@ class Limit:
     """Tolerance of a figure against the baseline."""
 
     title: str
-    better: str  # whether "more" or "less" of it is better
-    by: float  # the largest step in the wrong direction
-    relative: bool = True  # `by` is a share of the baseline and not a difference
-    digits: int = 0  # that are shown
-    timed: bool = False  # depends on the kind of processor; judged only where it is that of the baseline
+    better: str  # direction, "more" or "less"
+    by: float  # largest allowed change for the worse
+    relative: bool = True  # `by` is a share of the baseline, not a difference
+    digits: int = 0  # decimals to print
+    timed: bool = False  # depends on the processor; compared only on the baseline's model
 
     def worse(self, value: float, baseline: float, slack: float = 1.0) -> bool:
-        """True if the figure is worse than the baseline by more than `slack` times its limit."""
+        """Return True if the figure is worse than the baseline by more than `slack` times its limit."""
         loss = baseline - value if self.better == "more" else value - baseline
         return loss > slack * (self.by * abs(baseline) if self.relative else self.by)
 
@@ -62,13 +62,13 @@ LIMITS = {
     "bake": Limit("bake and tuning, calibrations", "less", 0.15, digits=2, timed=True),
     "frame": Limit("a baked frame, calibrations", "less", 0.15, digits=4, timed=True),
 }
-ELSEWHERE = 2.0  # factor of the limits on another kind of processor than the baseline's
+ELSEWHERE = 2.0  # factor of the limits on another processor model than the baseline's
 Scenes = dict[str, dict[str, float]]  # scene -> figure -> value
 
 
 class Calibration:
-    """A fixed piece of work in torch alone, done now and then while a part is timed: a matrix product, a sort, and a
-    gather from 32 MB. What slows the machine then slows both."""
+    """A fixed workload in torch (matrix product, sort, gather from 32 MB), run repeatedly while a part is timed, so
+    that a slow machine slows both."""
 
     def __init__(self) -> None:
         import torch
@@ -80,10 +80,10 @@ class Calibration:
         self._rows = torch.randint(1 << 21, (1_000_000,), generator=generator)
         self.seconds: list[float] = []
         self.run()
-        self.seconds.clear()  # the first one warms up
+        self.seconds.clear()  # warm-up
 
     def run(self, *_: Any) -> None:
-        """Do the work once."""
+        """Run the workload once."""
         start = time.process_time()
         x = self._matrix
         for _ in range(4):
@@ -93,12 +93,13 @@ class Calibration:
         self.seconds.append(time.process_time() - start)
 
     def every(self, n: int) -> Callable[..., None]:
-        """A callback that does the work at every n-th call."""
+        """Create a callback that runs the workload at every n-th call."""
         calls = itertools.count(1)
         return lambda *_: self.run() if next(calls) % n == 0 else None
 
     def timed(self, work: Callable[[], Any]) -> tuple[Any, float]:
-        """Run `work`; returns its result, and its CPU seconds over those of the calibrations in it, or of one after."""
+        """Run `work` and return its result, and its CPU seconds in units of the calibrations within it, or of one
+        after it."""
         self.seconds.clear()
         start = time.process_time()
         result = work()
@@ -109,7 +110,7 @@ class Calibration:
 
 
 def run_seed(capture: "Capture", seed: int, calibration: Calibration) -> dict[str, float]:
-    """The figures of one scene and seed."""
+    """Measure the figures of one scene and seed."""
     import torch
 
     from bitymi_ns.bake import BakeOptions, Learning, TuneOptions, bake_and_learn, export
@@ -148,7 +149,7 @@ def run_seed(capture: "Capture", seed: int, calibration: Calibration) -> dict[st
         quality.append(psnr(*pair))
         try:
             distances.append(lpips(*pair, "alex"))
-        except LpipsUnavailable:  # `main` says why
+        except LpipsUnavailable:  # reported by `main`
             distances.append(math.nan)
     return {
         "psnr_trained": trained,
@@ -164,7 +165,7 @@ def run_seed(capture: "Capture", seed: int, calibration: Calibration) -> dict[st
 
 
 def run_job(data: Path, downscale: int) -> dict[str, float]:
-    """The figures of one scene, in this process: their means over the seeds, but for the peak memory."""
+    """Measure the figures of one scene in this process: means over the seeds, and peak memory."""
     import torch
     from plain_capture import load_capture
 
@@ -180,7 +181,7 @@ def run_job(data: Path, downscale: int) -> dict[str, float]:
 
 
 def in_a_process(data: Path, downscale: int) -> dict[str, float]:
-    """`run_job` in a process of its own, whose peak memory is that of the job."""
+    """Run `run_job` in a new process, so that peak memory is the job's."""
     os.environ |= THREADS  # read when torch loads OpenMP
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
         return process.submit(run_job, data, downscale).result()
@@ -190,8 +191,8 @@ Line = tuple[str, str, list[str]]  # figure, verdict, cells of the table
 
 
 def judge(found: Scenes, baseline: Scenes, same_cpu: bool) -> list[Line]:
-    """Every figure against its baseline. Verdicts: "ok", "WORSE", "new" (no baseline) or "not judged" (a time on
-    another kind of processor, or LPIPS without its weights)."""
+    """Compare each figure with its baseline. Verdicts: "ok", "WORSE", "new" (no baseline) or "not judged" (a time on
+    another processor model, or LPIPS without its weights)."""
     lines = []
     for scene, figures in found.items():
         for key, limit in LIMITS.items():
@@ -212,13 +213,13 @@ def judge(found: Scenes, baseline: Scenes, same_cpu: bool) -> list[Line]:
 
 
 def quicker(found: Scenes, again: Scenes) -> Scenes:
-    """The figures of the first run, but the smaller times of two."""
+    """Take the figures of the first run, but the smaller times of both."""
     timed = [key for key, limit in LIMITS.items() if limit.timed]
     return {scene: {**f, **{key: min(f[key], again[scene][key]) for key in timed}} for scene, f in found.items()}
 
 
 def measure(capture: Path | None) -> Scenes:
-    """The figures of the room at 160 x 120, and of a capture at half its size."""
+    """Measure the room at 160 x 120, and a capture at half its size."""
     from common import say
 
     from bitymi_ns.sample import generate
@@ -251,7 +252,7 @@ def main() -> None:
         lpips.load("alex")
     except lpips.LpipsUnavailable as error:
         say(f"gate: LPIPS is not judged: {error}")
-        os.environ["BITYMI_NO_DOWNLOAD"] = "1"  # not tried again for every view
+        os.environ["BITYMI_NO_DOWNLOAD"] = "1"  # do not try again for every view
     empty = {"settings": SETTINGS, "processor": processor(), "scenes": {}}
     baseline = json.loads(options.baseline.read_text("utf8")) if options.baseline.is_file() else empty
     if not options.accept and baseline["settings"] != SETTINGS:
@@ -276,7 +277,7 @@ def main() -> None:
         rounded = {
             name: {k: round(v, 5) for k, v in figures.items() if not math.isnan(v)} for name, figures in found.items()
         }
-        # those of other captures stay, as far as they are of the same job on the same kind of machine
+        # keep other captures' figures of the same job and processor model
         kept = baseline["scenes"] if {**baseline, "scenes": {}} == {**empty, "scenes": {}} else {}
         text = json.dumps({**empty, "scenes": {**kept, **rounded}}, indent=2, sort_keys=True)
         write_file(options.baseline, (text + "\n").encode())

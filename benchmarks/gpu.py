@@ -1,13 +1,13 @@
 #!/usr/bin/env python
-"""Time frames of baked scenes on a card (medians after a warm-up) and print a table.
+"""Time frames of baked scenes on a GPU (medians after a warm-up) and print a table.
 
-The scenes of `harness.textured`, and bundles (--bundles) seen by three cameras around their middle. "list" and "draw"
-are the two stages of a frame, "frame" both launched by the host, "graph" the same as a CUDA graph, "packed" that with 8
-bits per channel instead of floats, "waited for" the time of a program that waits for each frame. "ends at 1/512" is the
-packed graph where a pixel takes no more light at that transmittance instead of 1e-4.
+Scenes: those of `harness.textured`, and bundles (--bundles) with three cameras around their centre. "list" and "draw"
+are the two stages of a frame, "frame" is both launched by the host, "graph" the same as a CUDA graph, "packed" that
+with 8 bits per channel instead of floats, "waited for" includes synchronising after each frame. "ends at 1/512" is the
+packed graph with pixels that end at that transmittance instead of 1e-4.
 
-Needs the core packages alone (torch, numpy). `--emulated` runs the host's emulation of the kernels on tiny scenes, to
-try the script without a card; its times mean nothing.
+Needs only the core packages (torch, numpy). `--emulated` runs the kernels' host emulation on tiny scenes, to try the
+script without a GPU; its times are meaningless.
 """
 
 import subprocess
@@ -38,7 +38,7 @@ HEADER = (
 
 
 def measured(scene: BakedScene, cameras: Sequence[Camera], options: Options) -> dict[str, float]:
-    """Means over cameras of one size: pairs of surfel and tile, fragments, and the milliseconds of TIMED."""
+    """Average over cameras of one size: pairs of surfel and tile, fragments, and the milliseconds of TIMED."""
     size, graph = (cameras[0].width, cameras[0].height), options.device.type == "cuda"
     sums = dict.fromkeys(("pairs", "fragments", *TIMED), 0.0)
     for camera in cameras:
@@ -61,7 +61,7 @@ def measured(scene: BakedScene, cameras: Sequence[Camera], options: Options) -> 
 
 
 def synthetic(n: int, width: int, height: int, options: Options) -> list[str]:
-    """Row of a scene of n surfels."""
+    """Measure the row of a synthetic scene of n surfels."""
     scene, camera = textured(n, width, height, options.device)
     return row(f"synthetic, {n:,}", scene, [camera], options)
 
@@ -89,7 +89,7 @@ def row(name: str, scene: BakedScene, cameras: Sequence[Camera], options: Option
 
 
 def card(device: torch.device) -> list[str]:
-    """The card, its clocks and its driver."""
+    """Describe the GPU, its clocks and its driver."""
     if device.type != "cuda":
         return ["No card: kernels emulated on the host, times mean nothing."]
     properties = torch.cuda.get_device_properties(device)

@@ -1,7 +1,7 @@
 #!/usr/bin/env python
-"""Run each CUDA kernel once on a scene of a size of choice, for sanitizers.
+"""Run each CUDA kernel once on a small scene, for sanitizers.
 
-`--sections baked training` chooses; `--times` prints the device's time by kernel over a number of runs.
+`--sections baked training` selects kernels; `--times RUNS` prints the device time by kernel.
 """
 
 import sys
@@ -19,7 +19,7 @@ from bitymi_ns.scene.baked_renderer import BakedRenderer
 
 
 def baked(n: int, width: int, height: int, device: torch.device) -> Callable[[], object]:
-    """A frame with a BC7 atlas."""
+    """Prepare a frame with a BC7 atlas."""
     scene, camera = textured(n, width, height, device)
     renderer = BakedRenderer(scene, width, height)
     renderer.draw([camera])
@@ -27,7 +27,7 @@ def baked(n: int, width: int, height: int, device: torch.device) -> Callable[[],
 
 
 def bundled(folder: Path, width: int, height: int, device: torch.device) -> Callable[[], object]:
-    """A frame of a bundle."""
+    """Prepare a frame of a bundle."""
     bundle = read_bundle(folder, decode=False)
     renderer = BakedRenderer(bundle.scene.to(device), width, height, images=("packed",))
     renderer.draw([around(bundle, width, height)[0]])
@@ -35,20 +35,20 @@ def bundled(folder: Path, width: int, height: int, device: torch.device) -> Call
 
 
 def images(n: int, width: int, height: int, device: torch.device) -> Callable[[], object]:
-    """The same with every image."""
+    """Prepare a frame with a BC7 atlas and every image."""
     scene, camera = textured(n, width, height, device)
     return lambda: scene.render_views([camera], None, ops.baked.IMAGES)
 
 
 def training(n: int, width: int, height: int, device: torch.device) -> Callable[[], object]:
-    """A training step: field, SSIM, Adam."""
+    """Prepare a training step: field, SSIM, Adam."""
     scene, camera = trained_like(n, width, height, device)
     loss = photo_loss(torch.rand(height, width, 3, device=device))
     return training_step(lambda: scene.render(camera, field_mode="train").rgb, loss, list(scene.parameters()))
 
 
 def texels(n: int, width: int, height: int, device: torch.device, most: int = 0) -> Callable[[], object]:
-    """A training step in which texels learn: SSIM, Adam of the surfels. most: bound of a list, 0 = there is none."""
+    """Prepare a training step with texels: SSIM, Adam of the surfels. `most`: limit of a fragment list, 0 = none."""
     scene, camera = with_texels(n, width, height, device)
     scene.config.max_fragments = most
     loss = photo_loss(torch.rand(height, width, 3, device=device))
@@ -56,11 +56,11 @@ def texels(n: int, width: int, height: int, device: torch.device, most: int = 0)
 
 
 def exact(n: int, width: int, height: int, device: torch.device) -> Callable[[], object]:
-    """A training step of either texture with sums that do not depend on the order."""
+    """Prepare a training step of either texture with deterministic sums."""
     steps = [training(n, width, height, device), texels(n, width, height, device)]
 
     def run() -> None:
-        torch.use_deterministic_algorithms(True, warn_only=True)  # torch's own operations have none such everywhere
+        torch.use_deterministic_algorithms(True, warn_only=True)  # some of torch's own operations have none
         for step in steps:
             step()
         torch.use_deterministic_algorithms(False)
@@ -101,7 +101,7 @@ def main() -> int:
 
 
 def print_times(name: str, run: Callable[[], object], runs: int) -> None:
-    """Device time of every kernel after a warm-up, of the longest first, per run."""
+    """Print the device time per run of each kernel after a warm-up, longest first."""
     for _ in range(5):
         run()
     torch.cuda.synchronize()

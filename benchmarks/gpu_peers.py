@@ -1,9 +1,9 @@
 #!/usr/bin/env python
-"""Compare with gsplat at equal quality on a card: train its Gaussians on the photographs of our bundles by its MCMC
-strategy, with several numbers of Gaussians, and draw both at the held-out cameras: PSNR beside ms per frame.
+"""Compare bundles with gsplat at equal quality on a GPU: train Gaussians, in several numbers, on the same photographs
+with gsplat's MCMC strategy, and render both at the held-out cameras: PSNR and ms per frame.
 
-Our bundles are those that `long.py --keep` left; `--train` trains the Gaussians first, from the same points, with
-the rates of gsplat's own example and the regularisation that the strategy asks for."""
+Bundles are those of `long.py --keep`. `--train` trains the Gaussians first, from the same points, with the learning
+rates of gsplat's example and the strategy's regularisation."""
 
 import sys
 import time
@@ -31,14 +31,14 @@ from bitymi_ns.train.views import training_order
 
 RATES = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}
 
-CAMERAS = 6  # held-out cameras that are timed
+CAMERAS = 6  # held-out cameras to time
 RUNS = 50  # frames per camera
 Frames = Callable[[Camera], Callable[[], Tensor]]
-"""Makes for a camera a function that draws its view: [H, W, 3], or [H, W, 1] int32 with 8 bits per channel."""
+"""Camera -> function that renders its view: [H, W, 3], or [H, W, 1] int32 with 8 bits per channel."""
 
 
 def packed(scene: BakedScene) -> Frames:
-    """Frames of a bundle as a CUDA graph, with 8 bits per channel."""
+    """Render a bundle as a CUDA graph, with 8 bits per channel."""
 
     def make(camera: Camera) -> Callable[[], Tensor]:
         renderer = BakedRenderer(scene, camera.width, camera.height, images=("packed",), graph=True)
@@ -54,7 +54,7 @@ def packed(scene: BakedScene) -> Frames:
 
 
 def rasterized(gsplat: Any, g: dict[str, Tensor]) -> Frames:
-    """Frames by gsplat's rasterization, of Gaussians as in `activated`."""
+    """Render Gaussians as in `activated` with gsplat's rasterization."""
 
     def make(camera: Camera) -> Callable[[], Tensor]:
         view = (camera.viewmat[None], camera.K[None], camera.width, camera.height)
@@ -64,7 +64,7 @@ def rasterized(gsplat: Any, g: dict[str, Tensor]) -> Frames:
 
 
 def inferred(g: dict[str, Tensor]) -> Frames:
-    """Frames by its inference renderer, of a scene that is packed to half precision beforehand."""
+    """Render Gaussians with gsplat's inference renderer, converted to half precision beforehand."""
     from gsplat.experimental import GaussianInferenceRenderer, GaussianInferenceScene
 
     scene = GaussianInferenceScene.from_gaussian_tensors(
@@ -80,17 +80,17 @@ def inferred(g: dict[str, Tensor]) -> Frames:
 
 
 def load() -> tuple[Any, str]:
-    """Import gsplat: the module and, where it is missing, the reason."""
+    """Import gsplat; return the module, or None and the reason."""
     try:
         import gsplat
-        import gsplat.cuda._backend  # compiles the kernels where that was not done
+        import gsplat.cuda._backend  # compiles the kernels if needed
     except (ImportError, RuntimeError, OSError) as error:
         return None, f"gsplat cannot be timed here: {error}"
     return gsplat, ""
 
 
 def first_gaussians(capture: Capture, most: int, extent: float) -> dict[str, Tensor]:
-    """means, scales (logarithms), quats, opacities (logits), sh0 [N, 1, 3], shN [N, 15, 3], from the points."""
+    """Initialise means, scales (logarithms), quats, opacities (logits), sh0 [N, 1, 3], shN [N, 15, 3] from points."""
     chosen = torch.randperm(len(capture.points), generator=torch.Generator().manual_seed(0))[:most]
     points, colours = capture.points[chosen], capture.colours[chosen]
     size = neighbour_distance(points, extent).clamp_min(1e-6)
@@ -106,7 +106,7 @@ def first_gaussians(capture: Capture, most: int, extent: float) -> dict[str, Ten
 
 
 def activated(p: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """means, quats (unit), scales, opacities, sh [N, 16, 3] of parameters as in `first_gaussians`."""
+    """Compute means, quats (unit), scales, opacities, sh [N, 16, 3] from parameters as in `first_gaussians`."""
     return {
         "means": p["means"],
         "quats": normalize(p["quats"], dim=-1),
@@ -119,13 +119,13 @@ def activated(p: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def train(
     gsplat: Any, capture: Capture, most: int, steps: int, device: torch.device
 ) -> tuple[dict[str, Tensor], float]:
-    """Train Gaussians on a capture, by gsplat's MCMC strategy, which refines in the first 25 of 30 parts of the steps.
+    """Train Gaussians on a capture with gsplat's MCMC strategy, which refines in the first 25/30 of the steps.
 
     Args:
-        most: Gaussians.
+        most: maximum number of Gaussians.
 
     Returns:
-        the Gaussians, as in `activated`, and seconds of training.
+        The Gaussians, as in `activated`, and seconds of training.
     """
     extent = scene_extent(torch.stack([view.camera.center for view in capture.train]), capture.points)
     parameters = torch.nn.ParameterDict(
@@ -165,15 +165,15 @@ def train(
 
 
 def picture(image: Tensor) -> Tensor:
-    """[H, W, 3] of a frame."""
+    """Convert a frame to [H, W, 3]."""
     return image if image.is_floating_point() else image.view(torch.uint8)[..., :3] / 255
 
 
 def row(
     name: str, count: int, seconds: float | None, make: Frames, capture: Capture, times: dict[int, list[Camera]]
 ) -> list[str]:
-    """Cells of a renderer: primitives, seconds of training (None = not trained here), means over the held-out views,
-    and mean over cameras of the median milliseconds of a frame, by factor of the size."""
+    """Measure the row of a renderer: primitives, seconds of training (None: not trained here), quality on the held-out
+    views, and median milliseconds of a frame, averaged over cameras, by image size."""
     device = torch.device("cuda")
     good = quality(lambda camera: picture(make(camera)()), capture.held_out, device)
     options = Options(device, 5, RUNS)

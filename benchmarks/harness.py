@@ -1,4 +1,4 @@
-"""Shared by the kernel benchmarks: timing on the device, scenes like trained ones."""
+"""Helpers of the kernel benchmarks: timing on the device, scenes like trained ones."""
 
 import math
 import statistics
@@ -30,22 +30,21 @@ LOG2_TABLE = 17
 FAILURES: list[str] = []
 T = TypeVar("T")
 CROSSING = 0.016  # share of the surfels that cross the camera's plane out of view
-PIXEL_SCALE = 0.9  # median scale of a surfel over the side of its share of the image
-CLOCK = 2.0e9  # cycles per second, at most about what cards run at: how long `torch.cuda._sleep` spins
+PIXEL_SCALE = 0.9  # median scale of a surfel, relative to the side of its share of the image
+CLOCK = 2.0e9  # upper bound of GPU clocks, Hz, to convert seconds to cycles of `torch.cuda._sleep`
 
 
 @dataclass(frozen=True)
 class Options:
     """Settings of a benchmark."""
 
-    device: torch.device  # of the kernels; the CPU = their emulation, to try a script without a card
-    # warm_up, runs: of every timing
-    warm_up: int
-    runs: int
+    device: torch.device  # of the kernels; CPU: their emulation, to try a script without a GPU
+    warm_up: int  # untimed runs of each timing
+    runs: int  # timed runs
 
 
 def attempt(what: str, run: Callable[[], T]) -> T | None:
-    """Run a part of a section; None where it failed, which is noted in FAILURES."""
+    """Run a part of a section; on failure append to FAILURES and return None."""
     try:
         return run()
     except (RuntimeError, ValueError, TypeError, AttributeError, OSError) as error:
@@ -56,13 +55,13 @@ def attempt(what: str, run: Callable[[], T]) -> T | None:
 
 
 def failures() -> str:
-    """The parts that failed so far, as a list in Markdown."""
+    """List the failed parts in Markdown."""
     return "".join(f"\n\n- Failed: {text}" for text in FAILURES)
 
 
 def milliseconds(run: Callable[[], object], options: Options) -> float:
-    """Median device time of a call: calls are queued behind a spin of the device that lasts longer than the host needs
-    to queue them, so that launches are not measured. A call that waits for the device is timed with its waits."""
+    """Measure the median device time of a call. Calls are queued behind a spin of the device that outlasts the
+    queueing, so that launches are not measured. Synchronisations within a call are included."""
     for _ in range(options.warm_up):
         run()
     if options.device.type != "cuda":
@@ -87,7 +86,7 @@ def milliseconds(run: Callable[[], object], options: Options) -> float:
 
 
 def with_launches(run: Callable[[], object], options: Options) -> float:
-    """Median milliseconds of a call for a program that waits for each."""
+    """Measure the median milliseconds of a call followed by a synchronisation."""
     for _ in range(options.warm_up):
         run()
 
@@ -108,11 +107,11 @@ def _seconds(run: Callable[[], object]) -> float:
 def quality(
     draw: Callable[[Camera], Tensor], views: Sequence[View], device: torch.device, background: Tensor | None = None
 ) -> tuple[float, ...]:
-    """Means over held-out views: PSNR, PSNR after the affine fit of colours, SSIM.
+    """Average PSNR, PSNR after an affine fit of colours, and SSIM over held-out views.
 
     Args:
-        draw: makes the picture [H, W, 3] of a camera.
-        background: [3] colour behind photographs with alpha; None = black.
+        draw: renders the image [H, W, 3] of a camera.
+        background: [3] colour behind photographs with alpha; None: black.
     """
     values = []
     for view in (view.to(device) for view in views):
@@ -122,14 +121,14 @@ def quality(
 
 
 def backward(outputs: Tensor | Sequence[Tensor], inputs: Sequence[Tensor]) -> Callable[[], object]:
-    """A backward pass on a graph that is kept, with fixed random gradients."""
+    """Prepare a backward pass on a retained graph, with fixed random gradients."""
     outputs = [outputs] if isinstance(outputs, Tensor) else list(outputs)
     gradients = [torch.randn_like(output) for output in outputs]
     return lambda: torch.autograd.grad(outputs, inputs, gradients, retain_graph=True)
 
 
 def without_graph(run: Callable[[], object]) -> Callable[[], object]:
-    """A call that records nothing for a backward pass."""
+    """Wrap a call in `torch.no_grad`."""
 
     def call() -> object:
         with torch.no_grad():
@@ -139,15 +138,15 @@ def without_graph(run: Callable[[], object]) -> Callable[[], object]:
 
 
 def photo_loss(photo: Tensor) -> Callable[[Tensor], Tensor]:
-    """0.8 L1 + 0.2 (1 - SSIM) of an image [height, width, 3]."""
+    """Create the loss 0.8 L1 + 0.2 (1 - SSIM) against an image [height, width, 3]."""
     return lambda rgb: 0.8 * l1_loss(rgb, photo) + 0.2 * (1 - ops.ssim(rgb, photo))
 
 
 def training_step(
     render: Callable[[], Tensor], loss: Callable[[Tensor], Tensor], parameters: list[Tensor]
 ) -> Callable[[], object]:
-    """Render, loss, backward and Adam, of the parameters."""
-    # a rate of zero: the work of a step, but the scene stays what it is
+    """Prepare a training step: render, loss, backward and Adam on the parameters."""
+    # learning rate 0: the work of a step without changing the scene
     optimizer = torch.optim.Adam(parameters, lr=0.0, fused=True)
 
     def run() -> None:
@@ -159,12 +158,12 @@ def training_step(
 
 
 def trained_like(n: int, width: int, height: int, device: torch.device, texture: bool = True) -> tuple[Scene, Camera]:
-    """A scene with the statistics of trained ones and its camera; the same every time.
+    """Generate a scene with the statistics of trained ones, and its camera, deterministically.
 
     Fitted to scenes of 17,000 to 22,000 surfels after 1,200 steps on three captures: ln(s_u / s_v) is normal with
-    deviation 0.85, the mean log scale in pixels 0.7, opacity and kernel exponent are logistic-normal (medians 0.45 and
-    2.4); about 23 fragments per pixel are blended, whatever n. A fifth of the surfels lies outside the view; as many as
-    in trained scenes (`CROSSING`) are discs beside the camera that cross its plane.
+    standard deviation 0.85, the mean log scale in pixels has 0.7, opacity and kernel exponent are logistic-normal
+    (medians 0.45 and 2.4); about 23 fragments are blended per pixel for any n. A fifth of the surfels lies outside the
+    view; a share `CROSSING` are discs beside the camera that cross its plane.
     """
     g = torch.Generator().manual_seed(0)
 
@@ -207,8 +206,8 @@ def trained_like(n: int, width: int, height: int, device: torch.device, texture:
 def _move_beside_the_camera(surfels: dict[str, Tensor], g: torch.Generator) -> None:
     """Move surfels in place so that they cross the camera's plane out of view.
 
-    As in a room of 12,900 surfels: median depth 0.09 where surfels have 1.0 (here 4), 12 depths off the axis, the
-    larger scale 0.9 depths, three times the smaller.
+    Statistics of a trained room of 12,900 surfels: median depth 0.09 times that of the others, 12 depths off the axis,
+    larger scale 0.9 depths and three times the smaller.
     """
     n = len(surfels["means"])
     z = 0.35 * torch.exp(0.3 * torch.randn(n, generator=g)).clamp(min=0.75)  # behind `near`
@@ -222,8 +221,8 @@ def _move_beside_the_camera(surfels: dict[str, Tensor], g: torch.Generator) -> N
 
 
 def with_texels(n: int, width: int, height: int, device: torch.device) -> tuple[Scene, Camera]:
-    """The same with a tile for every surfel, as fine as that camera sees it, and random texels, which backward passes
-    move by a rate of zero: the work of a step, but they stay what they are."""
+    """Generate `trained_like` with a tile per surfel at the camera's resolution, and random texels that backward passes
+    update at rate 0: the work of a step without changing them."""
     scene, camera = trained_like(n, width, height, device, texture=False)
     scene.config.texture = "texels"
     field = blank_texels(scene, [View(camera, torch.zeros(height, width, 3, device=device))], 1, TexelConfig())
@@ -236,7 +235,7 @@ def with_texels(n: int, width: int, height: int, device: torch.device) -> tuple[
 
 
 def textured(n: int, width: int, height: int, device: torch.device) -> tuple[BakedScene, Camera]:
-    """`trained_like` with an atlas of random texels, as large as surfels are on screen: BC7 on a card, else bytes."""
+    """Generate `trained_like` with an atlas of random texels, one per pixel: BC7 on a GPU, else uint8."""
     scene, camera = trained_like(n, width, height, torch.device("cpu"), texture=False)
     surfels = {name: value.detach().contiguous() for name, value in scene.surfels.items()}
     pixels = 6 * surfels["log_scales"].exp() * camera.K[0, 0] / surfels["means"][:, 2:]
@@ -265,7 +264,7 @@ def textured(n: int, width: int, height: int, device: torch.device) -> tuple[Bak
 
 
 def around(bundle: Bundle, width: int, height: int) -> list[Camera]:
-    """Three cameras around the middle of a bundle; training scales the cameras of a capture to the unit ball."""
+    """Build three cameras around the centre of a bundle, at the scale of training (cameras in the unit ball)."""
     middle = bundle.scene.surfels["means"].median(dim=0).values
     K = torch.tensor([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]])
     cameras = []

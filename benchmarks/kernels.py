@@ -1,20 +1,20 @@
 #!/usr/bin/env python
 """Compare each CPU kernel with the machine's ceilings, on a scene like a trained one (`harness.trained_like`).
 
-For the baked render every surfel has a tile of a uint8 atlas with one texel per pixel of its size on screen. Each
-kernel is called through `bitymi_ns.ops`, as training and rendering call it; median of --runs after two to warm up.
+The baked scene has a uint8 atlas with a tile per surfel, at one texel per pixel. Kernels are called through
+`bitymi_ns.ops`, as in training and rendering; median of --runs after two warm-up runs.
 
-Operations: additions, multiplications, comparisons, minima, roots and divisions count 1, exp and log 10, integers
-nothing. Only what the formulas need is counted: pixels that a SIMD block computes in vain are the kernel's own loss.
-Bytes: arrays that are streamed count once; rows, table entries and texels that are gathered count every time, in cache
-or not; what a tile keeps counts once per pixel. Loads: gathered table entries (16 bytes) and texels (4 bytes).
+Operations: additions, multiplications, comparisons, minima, roots and divisions count 1, exp and log 10, integers 0.
+Only operations that the formulas need are counted, not unused lanes of SIMD blocks. Bytes: streamed arrays count once;
+gathered rows, table entries and texels count every time, cached or not; per-tile buffers count once per pixel. Loads:
+gathered table entries (16 bytes) and texels (4 bytes).
 
-The formulas are in `cases`, with n surfels of which v are visible, p pixels, f fragments of which t are textured
-(weight at least the scene's bound), b pairs of surfel and tile, r of them with a fragment, K sites, L levels:
+The formulas are in `cases`, with n surfels (v visible), p pixels, f fragments (t textured, with at least the scene's
+weight bound), b pairs of surfel and tile (r with a fragment), K sites, L levels:
 
-- trace: fragments are written, then put in order; its backward reads a row of geom and 14 sums per pair.
-- field: 88 L for cell, weights and interpolation, then an MLP of 4 L x 16 x 16 x 3; its backward looks up again, and
-  half of its loads are read-modify-write; 128 L are indices and weights written and read again; 64 MB of gradient.
+- trace: fragments are written, then sorted; the backward pass reads a row of geom and 14 sums per pair.
+- field: 88 L for cell, weights and interpolation, then an MLP of 4 L x 16 x 16 x 3; the backward pass looks up again,
+  and half of its loads are read-modify-write; 128 L are indices and weights, written and read; 64 MB of gradient.
 - blend, texels: neighbouring texels are gathered from the cache, so their loads are not counted.
 """
 
@@ -49,7 +49,7 @@ Case = tuple[str, Callable[[], object], float, float, float]  # kernel, call, op
 
 
 def timed(run: Callable[[], object], runs: int) -> tuple[float, float]:
-    """Median wall-clock and CPU seconds."""
+    """Measure the median wall-clock and CPU seconds."""
     for _ in range(WARM_UP):
         run()
     times = []
@@ -62,7 +62,7 @@ def timed(run: Callable[[], object], runs: int) -> tuple[float, float]:
 
 
 def pairs(projection: ops.Projection) -> int:
-    """Pairs of surfel and tile that the tracer visits."""
+    """Count the pairs of surfel and tile that the tracer visits."""
     geom = projection.geom.detach()
     with tracers(geom).borrow() as tracer:
         tracer.run(**projection.view(geom), most=1)
@@ -70,7 +70,7 @@ def pairs(projection: ops.Projection) -> int:
 
 
 def cases(n: int, width: int, height: int) -> tuple[str, list[Case]]:
-    """Counts of a scene, and its kernels with the work they do; backward passes run on a graph that is kept."""
+    """Describe a scene's counts, and list its kernels with their work; backward passes run on a retained graph."""
     scene, camera = trained_like(n, width, height, torch.device("cpu"))
     baked, _ = textured(n, width, height, torch.device("cpu"))
     q, field, bound = scene.surfels, scene.field, scene.config.weight_bound
@@ -83,7 +83,7 @@ def cases(n: int, width: int, height: int) -> tuple[str, list[Case]]:
     projection = project()
     fragments = ops.trace(projection, scene.config.rim)
     base = scene.base_color(projection)
-    leaf = base.detach().requires_grad_()  # leaves, so that each backward pass is one kernel's
+    leaf = base.detach().requires_grad_()  # leaves, so that each backward pass runs one kernel
     frames = projection.frames.detach()
 
     def residual(weights: tuple[torch.Tensor, ...]) -> torch.Tensor:

@@ -1,11 +1,11 @@
 #!/usr/bin/env python
-"""Compare rules of training in long runs and in short ones, with the core packages alone (nerfstudio is not used): no
-default is chosen from short runs alone.
+"""Compare training options in long and short runs, with the core packages only (without nerfstudio): no default is
+chosen from short runs alone.
 
     python benchmarks/long.py DATA... --rows bitymi "bitymi train.texels.mean_rates=0.2" --runs 10000/4 1500/2 300/1
 
-A run is STEPS/REDUCTION: so many steps on photographs reduced by a whole factor. On a CPU a long one takes 25 to 60
-minutes of one core, on a card (--device cuda) one or two. Start several commands with the same --work, they share the
+A run is STEPS/REDUCTION: number of steps, and integer factor by which photographs are downscaled. A long one takes 25
+to 60 minutes on one CPU core, or one to two on a GPU (--device cuda). Several commands with the same --work share the
 runs. Rounding alone moves PSNR by 0.1 dB: give --seeds."""
 
 import contextlib
@@ -46,7 +46,7 @@ from bitymi_ns.train.views import View, eval_background, spread
 
 RUNS = ("10000/4", "1500/2", "300/1")
 WATCHED, EVERY, WATCH = 8, 30, 300
-"""Training views whose loss is watched when texels begin, the steps between, and for how many steps."""
+"""Number of training views whose loss is monitored when the texel stage begins, interval in steps, and duration."""
 COLUMNS = {
     "PSNR": ("psnr", 2),
     "fitted": ("fitted_psnr", 2),
@@ -82,7 +82,7 @@ class Run:
     bake: bool
     align: bool
     device: str
-    keep: Path | None = None  # folder in which the bundle stays
+    keep: Path | None = None  # folder to keep the bundle in
 
     @property
     def key(self) -> dict[str, Any]:
@@ -92,15 +92,15 @@ class Run:
 
 
 def device_name(device: str) -> str:
-    """Name the processor: the card's model, or cpu."""
+    """Return the GPU's model, or cpu."""
     return torch.cuda.get_device_name(device) if torch.device(device).type == "cuda" else "cpu"
 
 
 def preset_of(row: str) -> Preset:
-    """Load the preset that a row names, with its settings.
+    """Load the preset of a row and apply its settings.
 
     Raises:
-        ValueError: there is no such option.
+        ValueError: an option does not exist.
     """
     name, *settings = shlex.split(row)
     preset = load_preset(name)
@@ -114,7 +114,7 @@ def preset_of(row: str) -> Preset:
             raise ValueError(f"row '{row}': there is no option {path}")
         value = yaml.load(text, Loader)
         if isinstance(value, bool) and isinstance(getattr(owner, leaf), str):
-            value = text  # YAML's on and off
+            value = text  # YAML reads on and off as booleans
         setattr(owner, leaf, tuple(value) if isinstance(value, list) else value)
     return preset
 
@@ -132,7 +132,7 @@ def means(rows: Sequence[dict[str, float]]) -> dict[str, float]:
 
 
 class TexelWatch:
-    """Watches the loss of a few training views from the step before texels begin on."""
+    """Monitor of the loss of a few training views from the step before the texel stage on."""
 
     def __init__(self, trainer: Trainer, views: Sequence[View]) -> None:
         self.trainer, self.views = trainer, [views[i] for i in spread(len(views), WATCHED)]
@@ -154,7 +154,7 @@ class TexelWatch:
         self.losses.append(float(torch.stack(losses).mean()))
 
     def figures(self) -> dict[str, Any]:
-        """Return the largest loss as a multiple of that before, and after how many steps it is below it again."""
+        """Return the peak loss relative to the loss before, and the number of steps until it is below that again."""
         if len(self.losses) < 2:
             return {}
         before, *after = self.losses
@@ -167,13 +167,13 @@ load = functools.lru_cache(maxsize=1)(load_capture)
 
 
 def cut(capture: Capture, photographs: int) -> Capture:
-    """Keep so many training photographs at most (0 = all), evenly spread; as many are held out as in the whole."""
+    """Keep at most `photographs` training photographs (0 = all), evenly spaced; held-out ones do not change."""
     kept = spread(len(capture.train), photographs or len(capture.train))
     return replace(capture, train=[capture.train[i] for i in kept])
 
 
 def measure(run: Run) -> dict[str, Any]:
-    """Train, and bake if that is asked for."""
+    """Train, evaluate and, if requested, bake a run."""
     preset = preset_of(run.row)
     preset.train.seed = run.seed
     capture, device = cut(load(Path(run.data), run.reduction), run.photographs), torch.device(run.device)
@@ -228,7 +228,7 @@ def measure(run: Run) -> dict[str, Any]:
 
 
 def tables(runs: Sequence[Run], cells: Cells) -> str:
-    """Write a table per capture and kind of run: a line per row, the mean over seeds with the PSNR's deviation."""
+    """Format a table per capture and kind of run: a line per row, means over seeds, standard deviation of the PSNR."""
     parts = []
     for group, members in itertools.groupby(runs, lambda run: (run.data, run.steps, run.reduction)):
         lines, size = [], ""

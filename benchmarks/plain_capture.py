@@ -1,4 +1,4 @@
-"""Read an undistorted capture without nerfstudio, from its transforms.json or Blender's files: photographs, poses and
+"""Reader of undistorted captures without nerfstudio, from transforms.json or Blender's files: photographs, poses and
 points."""
 
 import json
@@ -23,27 +23,26 @@ HELD_OUT = 8
 class Capture:
     """A capture for training."""
 
-    # train, held_out: views; every `HELD_OUT`-th photograph is held out, the first one too
     train: list[View]
-    held_out: list[View]
+    held_out: list[View]  # every `HELD_OUT`-th photograph, including the first
     points: Tensor  # [M, 3] sparse points
     colours: Tensor  # [M, 3] in [0, 1]
-    white: bool = False  # what is transparent is judged over white, as Blender's captures are
+    white: bool = False  # evaluate images with alpha over white, as for Blender's captures
 
     @property
     def views(self) -> list[View]:
-        """All of them."""
+        """All views."""
         return [*self.train, *self.held_out]
 
 
 def load_capture(path: Path, downscale: int = 1) -> Capture:
-    """Read an undistorted capture, moved and scaled as nerfstudio does it: the mean of the cameras is the origin and
-    their largest coordinate 1. The orientation stays.
+    """Read an undistorted capture, translated and scaled as in nerfstudio: the mean of the cameras is the origin, and
+    their largest coordinate is 1. The orientation is kept.
 
     Args:
         path: a folder with transforms.json, or such a file; or a folder with Blender's transforms_train.json,
             transforms_test.json (held out) and *_pc.ply.
-        downscale: whole factor by which photographs are reduced.
+        downscale: integer factor by which photographs are downscaled.
 
     Raises:
         ValueError: the images have lens distortion, or the point cloud is damaged.
@@ -101,7 +100,7 @@ def _camera(values: dict[str, Any], pose: Tensor, middle: Tensor, scale: float, 
 
 
 def _points(path: Path) -> tuple[Tensor, Tensor]:
-    """Positions and colours of a PLY file with the colours as bytes."""
+    """Read positions and colours of a PLY file with uint8 colours."""
     rows = read_rows(path, read_header(path), "vertex")
     xyz, rgb = (
         np.stack([rows[name] for name in group], axis=1).astype(np.float64)

@@ -122,8 +122,7 @@ class Commands:
 
     def __init__(self, folder: Path, environment: dict[str, str], after: Callable[[], None] = lambda: None) -> None:
         self.rows: list[tuple[str, dict[str, float] | None, float | None]] = []
-        """Command, cost of `run_measured` (None: failed), and peak memory in use on the GPU by all programs, MB (None:
-        no GPU)."""
+        """Command, cost of `run_measured` (None: failed), peak GPU memory of all programs, MB (None: no GPU)."""
         self._folder, self._environment, self._after = folder, environment, after
 
     def run(self, *words: object) -> bool:

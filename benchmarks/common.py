@@ -16,7 +16,6 @@ def arguments_of(script: str | None) -> argparse.ArgumentParser:
 
 
 def publish(text: str, output: Path | None) -> None:
-    """Print a page, and write it to `output` if given."""
     print(text)
     if output is not None:
         output.parent.mkdir(parents=True, exist_ok=True)

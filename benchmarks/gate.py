@@ -83,7 +83,6 @@ class Calibration:
         self.seconds.clear()  # warm-up
 
     def run(self, *_: Any) -> None:
-        """Run the workload once."""
         start = time.process_time()
         x = self._matrix
         for _ in range(4):
@@ -98,8 +97,7 @@ class Calibration:
         return lambda *_: self.run() if next(calls) % n == 0 else None
 
     def timed(self, work: Callable[[], Any]) -> tuple[Any, float]:
-        """Run `work` and return its result, and its CPU seconds in units of the calibrations within it, or of one
-        after it."""
+        """Run `work`; return its result and its CPU seconds in calibrations within it (or after it)."""
         self.seconds.clear()
         start = time.process_time()
         result = work()

@@ -80,7 +80,6 @@ def rasterize(
 
 
 def _check_range(name: str, values: Tensor, low: float, high: float) -> None:
-    """Raise a ValueError for values out of a range, including NaN."""
     wrong = ~((values >= low) & (values <= high))
     if bool(wrong.any()):
         row = tuple(wrong.nonzero()[0].tolist())
@@ -90,8 +89,7 @@ def _check_range(name: str, values: Tensor, low: float, high: float) -> None:
 
 
 def _logit(share: Tensor) -> Tensor:
-    """Compute the logit of values in [0, 1], which the operations invert. 0 and 1 are replaced by the nearest values of
-    finite logit, with a straight-through gradient."""
+    """Compute logits, which the operations invert, clamped to finite values with a straight-through gradient."""
     nearest = share.clamp(1e-12, 1.0 - 8 * torch.finfo(share.dtype).eps)
     return torch.logit(share + (nearest - share).detach())
 

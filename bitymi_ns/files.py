@@ -129,8 +129,8 @@ def _open_locked(path: Path) -> tuple[BinaryIO, bool]:
 
 
 class Lock:
-    """Lock file held by one process at a time. It contains the process's number, for the message to others, and is
-    removed on release; the file of a killed process does not block."""
+    """Lock file of one process. It contains the process's number, for the message to others, and is removed on release;
+    the file of a killed process does not block."""
 
     def __init__(self, path: Path, tell: Tell = warnings.warn) -> None:
         """

@@ -66,7 +66,6 @@ def changed_json(data: bytes, dice: random.Random) -> bytes | None:
 
 
 def changed_numbers(data: bytes, dice: random.Random) -> bytes:
-    """Overwrite some bytes with an odd number."""
     packed, at = dice.choice(ODD_BYTES), dice.randrange(len(data) + 1)
     return data[:at] + packed + data[at + len(packed) :]
 

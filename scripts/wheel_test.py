@@ -82,7 +82,6 @@ def expected() -> set[str]:
 
 
 def check_contents(wheel: Path) -> None:
-    """Exit if the wheel lacks a file or has a superfluous one."""
     with zipfile.ZipFile(wheel) as archive:
         files = {name for name in archive.namelist() if ".dist-info/" not in name}
     if files != expected():

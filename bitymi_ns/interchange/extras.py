@@ -187,7 +187,6 @@ def summary_line(written: Written) -> str:
 
 
 def _fitted_colors(scene: BakedScene, cameras: Sequence[Camera], progress: Progress) -> SurfelColors:
-    """Fit the surfels' colours to the views of the cameras."""
     chosen = [camera.within(SEEN_SIDE) for camera in cameras]
     drawn = (scene.near, scene.weight_bound, scene.prefilter, progress, texel_alpha(scene))
     seen = visibility(scene.surfels, chosen, *drawn).seen

@@ -11,8 +11,7 @@ from torch import Tensor
 from bitymi_ns.bundle.manifest import BundleError, WorldFrame
 
 FARTHEST = 1_000.0
-"""Distance from the origin, in scene units, beyond which positions get an origin: float32 is off by 1/30,000 there.
-Cameras fit into a box from -1 to 1."""
+"""Distance, in scene units (cameras in [-1, 1]), beyond which positions get an origin: float32 is off by 1/30,000."""
 _UP = (0.0, 0.0, 1.0)  # nerfstudio's, if the bundle states none
 _SLACK = 1e-4  # tolerance of a stored rotation's orthogonality
 

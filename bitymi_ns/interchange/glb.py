@@ -73,7 +73,6 @@ def surface_glb(mesh: Triangles, normals: np.ndarray, place: np.ndarray) -> byte
 
 
 def _matte(**more: Any) -> trimesh.visual.material.PBRMaterial:
-    """Create a matte, double-sided material."""
     return trimesh.visual.material.PBRMaterial(metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True, **more)
 
 

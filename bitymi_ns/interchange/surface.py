@@ -29,8 +29,7 @@ TRUNCATION = 8.0  # truncation distance of the TSDF in voxels; with 4, walls wit
 SMOOTHING = 10  # iterations of Taubin smoothing, which removes the noise of depths and preserves volumes
 QUANTILE = 0.01  # share of the observed points outside each side of the box
 REACH = 3.0
-"""Half side of the largest box, in units of the larger of the cameras' greatest distance from their mean and the median
-depth of all views."""
+"""Maximum half side of the box, relative to the larger of the cameras' extent and the median depth of all views."""
 SMALLEST = 0.005  # components with less than this share of the triangles of the largest one are dropped
 BOX_SIDE = 160  # longer side in pixels of the depth maps that determine the box
 PIXELS_PER_VOXEL = 2.0
@@ -48,8 +47,7 @@ class SurfaceOptions:
     """Options of surface extraction."""
 
     resolution: Annotated[int, Field(ge=16, le=4096)] = 256
-    """Voxels along the longest side of the box around the observed surface, 16 to 4096. Time and memory grow with its
-    square."""
+    """Voxels along the longest side of the observed box, 16 to 4096. Time and memory grow with its square."""
     triangles: Annotated[int, Field(ge=0, le=10**8)] = 500_000
     """Maximum number of triangles, reached by simplification (quadric error metrics); 0 = no limit."""
     watertight: bool = False
@@ -207,7 +205,6 @@ def _cut(depth: Tensor, camera: Camera, box: Tensor) -> Tensor:
 def _finished(
     mesh: open3d.geometry.TriangleMesh, options: SurfaceOptions, progress: Progress, to: Similarity | None
 ) -> Triangles:
-    """Remove specks, simplify, smooth, transform and, if requested, close the mesh."""
     import open3d
 
     labels, counts, _ = (np.asarray(part) for part in mesh.cluster_connected_triangles())
@@ -237,7 +234,6 @@ def _finished(
 
 
 def _as_written(mesh: open3d.geometry.TriangleMesh, to: Similarity | None) -> Triangles:
-    """Convert a mesh from open3d and transform it to another frame."""
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles).astype(np.int64)
     if to is not None:
         vertices = to.points(torch.from_numpy(vertices)).numpy()

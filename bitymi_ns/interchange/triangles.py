@@ -131,8 +131,7 @@ def _keys(faces: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.NDAr
 
 
 def _joined(mesh: Triangles, to: npt.NDArray[np.int64]) -> Triangles:
-    """Replace each vertex by another [V], and remove degenerate triangles, duplicates, and pairs of opposite
-    orientation."""
+    """Replace each vertex by another [V]; remove degenerate and duplicate triangles, and pairs facing opposite ways."""
     faces = to[mesh.faces]
     a, b, c = faces.T
     full = np.flatnonzero((a != b) & (b != c) & (c != a))

@@ -52,7 +52,6 @@ def versions() -> dict[str, str]:
 
 @functools.cache
 def processor() -> str:
-    """Return the processor's model name."""
     model = platform.processor() or platform.machine()
     try:
         lines = Path("/proc/cpuinfo").read_text("utf8").splitlines()
@@ -77,5 +76,4 @@ def machine() -> str:
 
 
 def software() -> str:
-    """Format the versions in one line."""
     return ", ".join(f"{name} {version}" for name, version in versions().items())

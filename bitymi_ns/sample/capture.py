@@ -161,7 +161,6 @@ def generate(
 
 
 def _is_sample(folder: Path) -> bool:
-    """Return True if `generate` wrote the folder."""
     try:
         return read_json(folder / CAPTURE).get("made_by") == MADE_BY
     except (FileNotFoundError, ValueError, AttributeError):
@@ -169,7 +168,6 @@ def _is_sample(folder: Path) -> bool:
 
 
 def _files_of(folder: Path) -> list[str]:
-    """List the files that `generate` wrote into a folder."""
     images = (folder / "images").glob("frame_[0-9][0-9][0-9][0-9][0-9].png")
     return [CAPTURE, CLOUD, *(f"images/{path.name}" for path in images)]
 

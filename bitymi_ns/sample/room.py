@@ -165,7 +165,6 @@ class Room:
         return hits.t < np.float32(0.999)
 
     def _objects(self, o: Vec, d: Vec, hits: Hits) -> None:
-        """Update `hits` with the objects in the room."""
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             inverse = tuple(np.float32(1) / a for a in d)
             self._hit_sphere(o, d, inverse, hits, SPHERE_CENTRE, SPHERE_RADIUS, SPHERE)

@@ -97,7 +97,6 @@ def bricks(rng: np.random.Generator, width_m: float, height_m: float) -> Image:
 
 
 def plaster(rng: np.random.Generator, width_m: float, height_m: float, color: tuple[float, float, float]) -> Image:
-    """Paint rough plaster of one color."""
     x, _ = grid(width_m, height_m)
     coarse, fine = noise(rng, x.shape, (6, 8)), noise(rng, x.shape, (80, 100), 3)
     return (np.asarray(color, np.float32) * (0.78 + 0.18 * coarse + 0.3 * (fine - 0.35))[..., None]).clip(0, 1)

@@ -26,8 +26,8 @@ class SceneConfig:
     lobes: Annotated[int, Field(ge=1, le=MAX_TERMS)] = 2
     """Number of lobes per surfel of the Spherical Beta and spherical Gaussian colours, 1 to 32."""
     texture: Texture = "hash"
-    """Residual colours: hash = a field in space, multiresolution hash grid and MLP; texels = texels on every surfel,
-    trained in the last part of the run (train.texels); none = no residual."""
+    """Residual colours: hash = a field in space (hash grid and MLP); texels = texels on every surfel, trained in the
+    last part of the run (train.texels); none = no residual."""
     levels: Annotated[int, Field(ge=1, le=MAX_LEVELS)] = 4
     """Hash grid levels, 1 to 4, with resolutions min_resolution * 2^level; the paper's 4."""
     min_resolution: Annotated[int, Field(ge=2, le=1 << 20)] = 256
@@ -36,8 +36,7 @@ class SceneConfig:
     """Entries per hash level, as a power of two, 1 to 24; not given: chosen by the number of pixels in the photographs,
     so that the table fits the cache."""
     contraction: Literal["auto", "on", "off"] = "auto"
-    """Contraction of space beyond the cameras; auto: off for images with alpha, and if the capture states a small
-    scene box."""
+    """Contraction of space beyond the cameras; auto: off for images with alpha and captures with a small scene box."""
     near: Annotated[float, Field(ge=1e-6, le=1e6)] | None = None
     """Near plane, in scene units (camera z), above 0; not given: 0.02 of the extent of the cameras."""
     weight_bound: Share = 0.02

@@ -26,10 +26,10 @@ def next_power_of_two(x: Tensor) -> Tensor:
 def voxel_along_axes(voxel: Tensor, axes: Tensor, means: Tensor, center: Tensor | None = None) -> Tensor:
     """Compute the edge of the finest voxel along each tangent axis of a surfel, the local delta of the Nyquist rule.
 
-    Outside the unit ball of a contracted scene a voxel is longer along the ray from the centre than across it.
-    Let cos be the component of the axis t along that ray. A step of length 1 along t crosses cos / radial voxels along
-    the ray and sin / tangential voxels across it. The edge along t is 1 over the root of the sum of their squares.
-    Without a centre the smaller edge is used for both axes, which never samples too coarsely.
+    Outside the unit ball of a contracted scene, voxels are elongated along the ray from the centre. Let cos be the
+    component of the axis t along that ray: a unit step along t crosses cos / radial voxels along the ray and
+    sin / tangential voxels across it, and the edge along t is 1 over the root of the sum of their squares. Without a
+    centre both axes use the smaller edge, which never samples too coarsely.
 
     Args:
         voxel: [N, 2] (radial, tangential) voxel edges at the surfels' centres, world units.

@@ -83,8 +83,6 @@ def background_points(points: Tensor, views: Sequence[View], seed: int) -> Backg
 
 
 class _Grid(NamedTuple):
-    """Grid of cells over a view."""
-
     nearest: Tensor  # [rows, columns] camera z of the nearest sparse point; infinite in empty cells
     # size of a cell, pixels
     width: float

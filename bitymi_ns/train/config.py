@@ -65,8 +65,7 @@ class DensifyConfig:
     final_prune_steps: tuple[int, ...] = (18_000, 21_000, 24_000, 27_000)  # Steps of the final prunes.
     final_prune_opacity: Share = 0.1  # Opacity below which final prunes may remove a surfel.
     final_prune_error: Share = 0.02
-    """Squared error that a final prune may add to the training images, as a share of theirs; it removes the surfels
-    that add least."""
+    """Squared error that a final prune may add to the training images, as a share of theirs; least harmful first."""
     prune_error: Share = 0.02
     """Squared error that the prune after the last densification may add to the training images, as a share of theirs
     (capped at that of images at 30 dB); it removes the surfels that add least. 0 = no such prune."""
@@ -135,18 +134,15 @@ class TexelConfig(TexelSteps):
     """Distance, in colour units, that texels should be able to move in the texel stage: `rate` is raised, up to this
     value, if the stage has too few passes over the views for it."""
     alpha_rate: NonNegative = 30.0
-    """Rate of the texels' alphas, which cut silhouettes out of surfels, as a multiple of the rate of their colours; 0 =
-    opaque texels."""
+    """Rate of the texels' alphas, which cut out silhouettes, relative to that of their colours; 0 = opaque texels."""
     surfel_rates: Positive = 0.4
     """Surfel rates in the texel stage, as a share of the rates of a run of the stage's length; cosine decay to 0."""
     mean_rates: Positive = 0.2
     """Position rates in the texel stage, likewise: `surfel_rates` would destroy the existing image."""
     pixels_per_texel: Positive = 0.25
-    """A tile has at most one texel per this many pixels of its surfel (summed blending weight) in the view where the
-    surfel covers most."""
+    """Pixels of a surfel (summed blending weight, in the view where it covers most) per texel of its tile, at least."""
     rendered_pixels_per_texel: Positive = 32.0
-    """Limit on the total number of texels: one per this many pixels rendered in the texel stage, but at least 8
-    million. Saves memory."""
+    """Pixels rendered in the texel stage per texel, at least; 8 million texels are always allowed. Saves memory."""
     largest: Annotated[int, Field(ge=4, le=4096)] = 64  # Largest side of a tile, texels, a power of two.
     views: NonNegative = 0.25
     """Views on which tile sizes and coverage are measured, as a share of the steps of the texel stage; at least 32."""

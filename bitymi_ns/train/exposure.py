@@ -343,8 +343,7 @@ def _log_colors(view: View, points: Tensor, count: int, near: float) -> Tensor:
 
 
 def _pixels(image: Tensor, camera: Camera, x: Tensor, y: Tensor) -> Tensor:
-    """Read pixels [C, ...] of an image [H, W, ...] at image positions of a camera, which may have another size; NaN
-    positions give an arbitrary pixel."""
+    """Read pixels [C, ...] of an image [H, W, ...] at positions in a camera's image, whose size may differ."""
     at = (
         (along.nan_to_num(0.0) * size / full).long().clamp(0, size - 1).to(image.device)
         for along, size, full in zip((y, x), image.shape[:2], (camera.height, camera.width), strict=True)

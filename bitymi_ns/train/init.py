@@ -349,8 +349,7 @@ def default_table_size(image_pixels: int) -> int:
 
 
 def table_size_of(image_pixels: int) -> int:
-    """Compute log2 of the entries per hash level that the photographs can determine: one entry of 4 features for 32
-    pixels of all photographs together."""
+    """Compute log2 of the entries per hash level that the photographs support: one (4 features) per 32 pixels."""
     return round(math.log2(max(1, image_pixels) / 32))
 
 

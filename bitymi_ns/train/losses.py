@@ -71,8 +71,7 @@ def objective(
 
 
 def numbers(image: Tensor, mask: Tensor | None, counted: int | None = None) -> int:
-    """Count the values that the mean loss of an image [H, W, C] averages; `counted` is the number of True pixels of the
-    mask, None: computed, which synchronises a GPU."""
+    """Count the unmasked colour values of an image [H, W, C]; `counted`: number of unmasked pixels, if known."""
     if mask is None:
         return 3 * image.shape[0] * image.shape[1]
     return 3 * (int(mask.sum()) if counted is None else counted)

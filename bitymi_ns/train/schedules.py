@@ -226,5 +226,4 @@ def falling(rate: float, step: int, steps: int) -> float:
 
 
 def _multiples(interval: int, start: int, stop: int) -> list[int]:
-    """List the multiples of `interval` strictly between `start` and `stop`."""
     return [s for s in range(interval, stop, interval) if s > start]

@@ -59,7 +59,7 @@ class Strategy:
         statistics: [4, N] since the last densification, named by `STATISTICS`: sum over views of the gradient norm of
             the projected centre, NDC; the same for the absolute gradient (AbsGS); number of views in which the surfel
             was visible; largest half extent on screen, pixels.
-        generator: CPU generator of every random choice.
+        generator: CPU generator of all random choices.
     """
 
     def __init__(
@@ -114,8 +114,7 @@ class Strategy:
 
     @torch.no_grad()
     def _note(self, output: RenderOutput) -> None:
-        """Add the statistics of one training view: `projection.mean2d_grad` and `mean2d_absgrad` ([N, 2], pixels),
-        `visible` [N] and `radii` [N, 2]."""
+        """Add the statistics of one training view."""
         projection = output.projection
         n, device = len(projection.radii), projection.radii.device
         if self.statistics.shape[1] == 0:

@@ -102,8 +102,7 @@ class LearningTexels:
 
     @torch.no_grad()
     def average(self) -> None:
-        """Average the gradients over all views of the step. Processes exchange only rows with a nonzero gradient in at
-        least one process."""
+        """Average the gradients over all views of the step; processes exchange only rows with a nonzero gradient."""
         stepped = self._stepped
         for values in stepped:
             if values.grad is None:
@@ -235,8 +234,7 @@ def tiles_as_seen(
 
 @torch.no_grad()
 def coverage(scene: Scene, field: TexelField, views: Sequence[View]) -> Tensor:
-    """Compute the coverage [T] of each texel, in pixels: blending weight times bilinear weight, summed over unmasked
-    fragments and views."""
+    """Sum blending weight times bilinear weight of each texel, [T] pixels, over unmasked fragments and views."""
     total = torch.zeros_like(field.texels)
     for view in views:
         geometry = (scene.surfels[name].detach() for name in GEOMETRY)

@@ -58,7 +58,6 @@ class Site:
 
     @property
     def _parts(self) -> list[str]:
-        """Paths of the bundle's files."""
         return [] if self.bundle is None else [f"{BUNDLE}{name}" for name in self.bundle.names]
 
     @property

@@ -168,8 +168,7 @@ def _run_stage(work: Path, stage: Stage, cells: Cells, lock: Lock) -> None:
 
 
 def _run_chain(work: Path, chain: Chain, cells: Cells, told: Callable[[Stage], None]) -> list[str]:
-    """Execute the missing cells of a run in order, except those that depend on a failed one; return a message per
-    failure."""
+    """Execute the missing cells of a run, except those that depend on a failed one; return a message per failure."""
     failures: list[str] = []
     broken: list[Stage] = []
     with locked(work, chain[0].run) as lock:

@@ -62,7 +62,6 @@ class Run:
 
     @property
     def key(self) -> dict[str, Any]:
-        """All settings of the run."""
         return {
             "suite": self.scene.suite,
             "row": self.row.name,
@@ -135,7 +134,6 @@ class Matrix:
     pictures: int = 0  # number of worst held-out views to draw with their decomposition
 
     def runs(self) -> list[Run]:
-        """List all runs."""
         seeds = list(self.seeds) or [None]
         return [Run(s, r, seed, self.steps) for s in self.scenes for r in self.rows for seed in seeds]
 
@@ -151,7 +149,6 @@ class Matrix:
         return stages
 
     def chains(self) -> list[list[Stage]]:
-        """List the cells of each run."""
         return [self.stages(run) for run in self.runs()]
 
 

@@ -135,7 +135,6 @@ def compare_views(images: Sequence[Path], notes: list[str]) -> list[Group]:
 
 
 def _titles(folders: list[Path]) -> dict[Path, str]:
-    """Strip the common path of folders."""
     if len(folders) < 2:
         return {folder: folder.name for folder in folders}
     shared = os.path.commonpath(folders)

@@ -25,7 +25,6 @@ COLORS = (
 MARKERS = ("s", "^", "D", "v", "P", "X", "*", "p", "<", ">", "h", "d", "8", "H")
 """Markers of bundles, one per format."""
 TRAINING, RENDERING, SIZE = "Error against training time", "Error against rendering time", "Error against size"
-"""Headings of the sections of plots."""
 CURVES = (
     ("PSNR in the course of training", "training seconds", "PSNR (dB)", ("seconds", "psnr")),
     ("PSNR by CPU seconds of training", "CPU seconds", "PSNR (dB)", ("cpu_seconds", "psnr")),
@@ -127,8 +126,8 @@ def _curve_plot(
 def pareto_panel(
     axes: Axes, rows: list[Evaluation], key: str, cost: Cost, colors: dict[str, str], markers: dict[str, str]
 ) -> None:
-    """Draw quality against cost of one scene: hollow circles for trained scenes, filled markers for bundles, a thin
-    line through the points of a method, and the Pareto front of all points."""
+    """Draw quality against cost of one scene: hollow circles for trained scenes, filled markers for bundles, a line per
+    method, and the Pareto front of all points."""
     _, up, span = METRICS[key]
     points = {id(e): (cost.value(e), e.get(key)) for e in rows}
     best = front(list(points.values()), up)
@@ -184,7 +183,6 @@ def _variant(row: Evaluation) -> str:
 
 
 def _log_when_wide(axes: Axes, values: list[float]) -> None:
-    """Set a logarithmic x axis for positive values that span more than a factor of eight."""
     if min(values) > 0 and max(values) / min(values) > 8:
         axes.set_xscale("log")
         narrow = math.log10(max(values) / min(values)) < 2

@@ -64,7 +64,6 @@ def signed(value: float) -> str:
 
 
 def count(value: float) -> str:
-    """Format a whole number with separators."""
     return f"{value:,.0f}"
 
 
@@ -145,7 +144,6 @@ def _rows(evaluations: list[Evaluation], columns: list[Column]) -> list[Row]:
 
 
 def _grouped(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
-    """Group items by key, in the order of first occurrence."""
     groups: dict[K, list[T]] = {}
     for item in items:
         groups.setdefault(key(item), []).append(item)

@@ -178,11 +178,11 @@ def parts(folder: Path, most: float) -> list[list[Path]]:
     lists: list[list[Path]] = []
     for file in sorted(filter(Path.is_file, folder.iterdir()), key=lambda file: -file.stat().st_size):
         sizes = [sum(other.stat().st_size for other in files) for files in lists]
-        roomy = [files for files, size in zip(lists, sizes, strict=True) if size + file.stat().st_size <= most]
-        if not roomy:
-            lists.append(roomy_one := [])
-            roomy = [roomy_one]
-        roomy[0].append(file)
+        fitting = [files for files, size in zip(lists, sizes, strict=True) if size + file.stat().st_size <= most]
+        if not fitting:
+            lists.append(new := [])
+            fitting = [new]
+        fitting[0].append(file)
     return lists
 
 
@@ -217,7 +217,7 @@ def run_step(step: Step, tree: Path, environment: dict[str, str], logs: Path, de
     limit = min(step.limit, deadline - time.monotonic())
     if limit < 5:
         return f"| {step.name} | not begun: no time left | |"
-    running, ends = [], []
+    running, statuses = [], []
     with tempfile.TemporaryDirectory() as folder:
         # unbuffered, so that logs are complete
         environment = {**environment, "TMPDIR": folder, "PYTHONUNBUFFERED": "1"}
@@ -236,12 +236,12 @@ def run_step(step: Step, tree: Path, environment: dict[str, str], logs: Path, de
             try:
                 status = process.wait(max(1.0, limit - (time.perf_counter() - start)))
                 last = text.read_text(errors="replace").strip().splitlines()[-1].replace("|", "/")
-                ends.append(f"{status}: {last}" if status else "0")
+                statuses.append(f"{status}: {last}" if status else "0")
             except subprocess.TimeoutExpired:
                 os.killpg(process.pid, 9)
                 process.wait()
-                ends.append("stopped")
-    return f"| {step.name} | {', '.join(ends)} | {time.perf_counter() - start:.0f} |"
+                statuses.append("stopped")
+    return f"| {step.name} | {', '.join(statuses)} | {time.perf_counter() - start:.0f} |"
 
 
 def main() -> int:

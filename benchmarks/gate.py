@@ -124,14 +124,14 @@ def run_seed(capture: "Capture", seed: int, calibration: Calibration) -> dict[st
     config, background = TrainConfig(seed=seed), torch.zeros(3)
     cameras = [view.camera for view in capture.train]
     scene = scene_for_views(capture.train, capture.points, capture.colours, SceneConfig(texture="texels"), config)
-    aside = calibration.every(10)
-    _, train = calibration.timed(lambda: fit(scene, capture.train, [], config, SETTINGS["steps"], callback=aside))
+    calibrate = calibration.every(10)
+    _, train = calibration.timed(lambda: fit(scene, capture.train, [], config, SETTINGS["steps"], callback=calibrate))
     trained, fragments, *_ = evaluate(scene, capture.views, config)
 
     def make() -> Any:
         learning = Learning(tune=TuneOptions.of_learned(SETTINGS["tuning"]), train=config)
-        aside = calibration.every(10)
-        return bake_and_learn(scene, cameras, capture.train, background, BakeOptions(format="bc7"), learning, aside)
+        calibrate = calibration.every(10)
+        return bake_and_learn(scene, cameras, capture.train, background, BakeOptions(format="bc7"), learning, calibrate)
 
     baked, baking = calibration.timed(make)
     with tempfile.TemporaryDirectory() as folder:

@@ -95,14 +95,14 @@ def card(device: torch.device) -> list[str]:
     properties = torch.cuda.get_device_properties(device)
     query = ["nvidia-smi", "--query-gpu=driver_version,clocks.sm,clocks.mem,clocks.max.sm,power.limit,temperature.gpu"]
     try:
-        asked = subprocess.run([*query, "--format=csv,noheader"], capture_output=True, text=True, check=False).stdout
+        status = subprocess.run([*query, "--format=csv,noheader"], capture_output=True, text=True, check=False).stdout
     except OSError:
-        asked = ""
+        status = ""
     return [
         f"{properties.name}, {properties.multi_processor_count} multiprocessors, "
         f"{properties.total_memory / 2**30:.0f} GiB, compute capability {properties.major}.{properties.minor}; "
         f"torch {torch.__version__}, CUDA {torch.version.cuda}.",
-        f"Driver, clocks now (SM, memory), highest, power limit, temperature: {asked.strip() or 'not known'}.",
+        f"Driver, clocks now (SM, memory), highest, power limit, temperature: {status.strip() or 'not known'}.",
     ]
 
 

@@ -13,8 +13,8 @@ from bitymi_ns.trust import printable
 
 INTERRUPTED = 130  # exit statuses by shell convention: 128 + signal number
 NO_READER = 141
-_OF_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
-_OF_ANY = (errno.EIO, errno.EMFILE, errno.ENFILE)
+_WRITE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+_IO_ERRORS = (errno.EIO, errno.EMFILE, errno.ENFILE)
 
 
 def line_of(error: BaseException) -> str | None:
@@ -23,8 +23,8 @@ def line_of(error: BaseException) -> str | None:
         return "interrupted; nothing was left half-written"
     if isinstance(error, MemoryError):
         return "there is not enough memory for this; nothing was left half-written"
-    if isinstance(error, OSError) and error.errno in (*_OF_WRITING, *_OF_ANY):
-        what = "cannot be written" if error.errno in _OF_WRITING else "cannot be read or written"
+    if isinstance(error, OSError) and error.errno in (*_WRITE_ERRORS, *_IO_ERRORS):
+        what = "cannot be written" if error.errno in _WRITE_ERRORS else "cannot be read or written"
         return f"{error.filename or 'a result'} {what}: {reason(error, Path(str(error.filename)))}"
     return None
 
@@ -46,7 +46,7 @@ def run(command: Callable[[], int]) -> int:
         line = line_of(error)
         if line is None:
             raise
-        _tell(line)
+        _print_error(line)
         return INTERRUPTED if isinstance(error, KeyboardInterrupt) else 1
 
 
@@ -54,17 +54,17 @@ def install() -> None:
     """Handle uncaught exceptions of this process as `run` does, in commands of other packages."""
     before = sys.excepthook
 
-    def told(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    def handle(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
         line = line_of(error)
         if line is None:
             before(kind, error, trace)
         else:
-            _tell(line)
+            _print_error(line)
 
     if getattr(before, "__module__", "") != __name__:
-        sys.excepthook = told
+        sys.excepthook = handle
 
 
-def _tell(line: str) -> None:
+def _print_error(line: str) -> None:
     with suppress(OSError):
         print(printable(f"bitymi: {line}"), file=sys.stderr, flush=True)

@@ -231,7 +231,7 @@ def reserved(target: str | Path, tell: Tell = warnings.warn) -> Iterator[Path]:
     with parents_of(place):
         hold(lock, tell)
         try:
-            _settle(place)
+            _recover(place)
             yield place
         finally:
             if outermost:
@@ -250,14 +250,14 @@ def _is_device(path: Path) -> bool:
     return path.exists() and not path.is_file() and not path.is_dir()
 
 
-def _beside(place: Path) -> tuple[Path, Path]:
+def _temporary_paths(place: Path) -> tuple[Path, Path]:
     return place.with_name(f".{place.name}.new"), place.with_name(f".{place.name}.old")
 
 
-def _settle(place: Path) -> None:
+def _recover(place: Path) -> None:
     """Complete or undo an interrupted replacement: keep the new folder if complete, else restore the old one. The
     caller holds the lock."""
-    new, old = _beside(place)
+    new, old = _temporary_paths(place)
     _remove(new)
     if is_left(old):
         if place.exists():
@@ -295,7 +295,7 @@ def complete_folder(
     """
     with reserved(target, tell) as place:
         check()
-        new, old = _beside(place)
+        new, old = _temporary_paths(place)
         try:
             new.mkdir()
             yield new
@@ -309,7 +309,7 @@ def complete_folder(
             flush(place.parent)
         finally:
             with suppress(OSError):  # the next writer tries again
-                _settle(place)
+                _recover(place)
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from bitymi_ns.bundle.manifest import BundleError, WorldFrame
 FARTHEST = 1_000.0
 """Distance, in scene units (cameras in [-1, 1]), beyond which positions get an origin: float32 is off by 1/30,000."""
 _UP = (0.0, 0.0, 1.0)  # nerfstudio's, if the bundle states none
-_SLACK = 1e-4  # tolerance of a stored rotation's orthogonality
+_TOLERANCE = 1e-4  # tolerance of a stored rotation's orthogonality
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def to_capture(place: WorldFrame) -> Similarity:
     matrix, offset = transform[:, :3], transform[:, 3]
     stretch = float(torch.linalg.det(matrix).abs()) ** (1 / 3)
     turn = matrix / stretch if stretch > 0 else matrix
-    if not bool(((turn @ turn.T - torch.eye(3, dtype=torch.float64)).abs() <= _SLACK).all()):
+    if not bool(((turn @ turn.T - torch.eye(3, dtype=torch.float64)).abs() <= _TOLERANCE).all()):
         raise BundleError(
             "the transform from the capture's own frame to the scene's is no rotation with one scale, so that nothing "
             "can be moved back there: choose the scene's frame (--frame scene)"

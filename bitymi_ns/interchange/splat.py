@@ -65,8 +65,8 @@ def draw_gaussians(
             if not len(here):
                 image[top:bottom, left:right] = behind
                 continue
-            rgb, left_over = _blend(pixels, center[here], conic[here], opacity[here], colors[here], hard[here])
-            image[top:bottom, left:right] = (rgb + left_over[:, None] * behind).view(bottom - top, right - left, 3)
+            rgb, transmittance = _blend(pixels, center[here], conic[here], opacity[here], colors[here], hard[here])
+            image[top:bottom, left:right] = (rgb + transmittance[:, None] * behind).view(bottom - top, right - left, 3)
     return image
 
 
@@ -103,7 +103,7 @@ def _blend(
     pixels: Tensor, center: Tensor, conic: Tensor, opacity: Tensor, colors: Tensor, hard: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Colours [P, 3] of pixels [P, 2] and the transmittance [P] behind."""
-    rgb, passed = pixels.new_zeros(len(pixels), 3), pixels.new_ones(len(pixels))
+    rgb, transmittance = pixels.new_zeros(len(pixels), 3), pixels.new_ones(len(pixels))
     ended = torch.zeros(len(pixels), dtype=torch.bool)
     for part in torch.arange(len(center)).split(_AT_ONCE):
         dx, dy = (pixels[:, None] - center[part]).unbind(2)  # [P, M]
@@ -112,12 +112,12 @@ def _blend(
         alpha = opacity[part] * torch.where(hard[part], (exponent >= -2.0).float(), exponent.exp())
         alpha = alpha.clamp(max=ALPHA_MAX)
         alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0.0)
-        after = passed[:, None] * torch.cumprod(1 - alpha, dim=1)
-        takes = (after >= TRANSMITTANCE_MIN) & ~ended[:, None]
-        before = torch.cat([passed[:, None], after[:, :-1]], dim=1)
-        rgb += torch.where(takes, alpha * before, 0.0) @ colors[part]
-        passed = torch.where(takes, after, math.inf).amin(1).minimum(passed)
-        ended |= ~takes[:, -1]
+        after = transmittance[:, None] * torch.cumprod(1 - alpha, dim=1)
+        blended = (after >= TRANSMITTANCE_MIN) & ~ended[:, None]
+        before = torch.cat([transmittance[:, None], after[:, :-1]], dim=1)
+        rgb += torch.where(blended, alpha * before, 0.0) @ colors[part]
+        transmittance = torch.where(blended, after, math.inf).amin(1).minimum(transmittance)
+        ended |= ~blended[:, -1]
         if bool(ended.all()):
             break
-    return rgb, passed
+    return rgb, transmittance

@@ -183,7 +183,7 @@ def extract_surface(
         mesh = volume.extract_triangle_mesh()
         if not len(mesh.triangles):
             raise NoSurface("the depth maps fuse to no surface: try a smaller --resolution")
-        return _finished(mesh, options, progress, to)
+        return _postprocess(mesh, options, progress, to)
 
 
 def _coarsened(camera: Camera, focal: float) -> Camera:
@@ -202,7 +202,7 @@ def _cut(depth: Tensor, camera: Camera, box: Tensor) -> Tensor:
     return cut
 
 
-def _finished(
+def _postprocess(
     mesh: open3d.geometry.TriangleMesh, options: SurfaceOptions, progress: Progress, to: Similarity | None
 ) -> Triangles:
     import open3d
@@ -217,12 +217,12 @@ def _finished(
         cloud.normals, cloud.colors = mesh.vertex_normals, mesh.vertex_colors
         mesh, _ = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=POISSON_DEPTH)
     budget = options.triangles or len(mesh.triangles)
-    few = mesh
+    simplified = mesh
     while True:
-        if len(few.triangles) > budget:
-            few = mesh.simplify_quadric_decimation(budget)
+        if len(simplified.triangles) > budget:
+            simplified = mesh.simplify_quadric_decimation(budget)
             progress("simplifying", 1, 1)
-        result = _as_written(few.filter_smooth_taubin(SMOOTHING), to)
+        result = _from_open3d(simplified.filter_smooth_taubin(SMOOTHING), to)
         if options.watertight:
             result = solid(result, SMALLEST)
             progress("closing the mesh", 1, 1)
@@ -233,7 +233,7 @@ def _finished(
         budget -= len(result) - options.triangles  # triangles added to close holes
 
 
-def _as_written(mesh: open3d.geometry.TriangleMesh, to: Similarity | None) -> Triangles:
+def _from_open3d(mesh: open3d.geometry.TriangleMesh, to: Similarity | None) -> Triangles:
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles).astype(np.int64)
     if to is not None:
         vertices = to.points(torch.from_numpy(vertices)).numpy()

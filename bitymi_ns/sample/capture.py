@@ -177,13 +177,13 @@ def _write(folder: Path, views: int, width: int, height: int, seed: int, points:
     path = camera_path(views, width, height, seed)
     names = [f"images/frame_{k + 1:05d}.png" for k in range(views)]
 
-    with rich_progress() if progress else nullcontext(no_progress) as tell:
+    with rich_progress() if progress else nullcontext(no_progress) as report_progress:
         room, done = Room(seed), count(1)
 
         def frame(k: int) -> NDArray[np.uint8]:
             image = render(room, path[k])
             PILImage.fromarray(image).save(folder / names[k])
-            tell("Rendering the sample room", next(done), views)
+            report_progress("Rendering the sample room", next(done), views)
             return image
 
         with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:  # numpy releases the GIL

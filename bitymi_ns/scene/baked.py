@@ -183,14 +183,14 @@ class BakedScene:
     def _draw(self, cameras: Sequence[Camera], background: Tensor | None, images: Sequence[str]) -> dict[str, Tensor]:
         """Render with `ops.baked.draw`, at the sampling of the views."""
         common_size(cameras)
-        how = self.sampling(cameras)
-        if how.samples == 1:
-            return draw(self, cameras, background, images, how.photo_pixel)
+        sampling = self.sampling(cameras)
+        if sampling.samples == 1:
+            return draw(self, cameras, background, images, sampling.photo_pixel)
         names = [name for name in images if name != "packed"]
         if "packed" in images:  # bytes cannot be averaged
             names += [name for name in ("rgb", "alpha") if name not in names]
-        views = [camera.scaled(how.samples) for camera in cameras]
-        drawn = averaged(draw(self, views, background, names, how.photo_pixel), how.samples)
+        views = [camera.scaled(sampling.samples) for camera in cameras]
+        drawn = averaged(draw(self, views, background, names, sampling.photo_pixel), sampling.samples)
         if "packed" in images:
             drawn["packed"] = packed(drawn["rgb"], drawn["alpha"])
         return {name: drawn[name] for name in images}

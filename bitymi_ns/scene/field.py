@@ -16,7 +16,7 @@ from bitymi_ns.ops.field import FieldGeometry, field
 from .config import SceneConfig
 
 
-def _is_of(cached: tuple[Tensor, int, Any] | None, buffer: Tensor) -> bool:
+def _is_current(cached: tuple[Tensor, int, Any] | None, buffer: Tensor) -> bool:
     """Test if a cached value belongs to a buffer in its current version."""
     return cached is not None and cached[0] is buffer and cached[1] == version_of(buffer)
 
@@ -117,7 +117,7 @@ class HashField(ResidualField):
     @property
     def geometry(self) -> FieldGeometry:
         """Geometry of the grid. Cached, to avoid a synchronisation in every step."""
-        if not _is_of(self._geometry, self.domain):
+        if not _is_current(self._geometry, self.domain):
             *mid, half, contract = self.domain.tolist()
             geometry = FieldGeometry(self.min_resolution, bool(contract), tuple(mid), half)
             self._geometry = (self.domain, version_of(self.domain), geometry)
@@ -201,7 +201,7 @@ class TexelField(ResidualField):
     @property
     def tiles(self) -> TexelTiles:
         """Sizes and texel offsets of the surfels' tiles."""
-        if not _is_of(self._tiles, self.size):
+        if not _is_current(self._tiles, self.size):
             self._tiles = (self.size, version_of(self.size), TexelTiles.of_sizes(self.size, self.extent))
         return self._tiles[2]
 

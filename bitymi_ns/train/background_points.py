@@ -64,10 +64,10 @@ def background_points(points: Tensor, views: Sequence[View], seed: int) -> Backg
     if len(counts) == 0:
         return BackgroundPoints(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
     medians = medians.nan_to_num(float(medians.nanmedian()))
-    usual = float(counts.median())
-    grids = [_Grid.of(camera, *each, usual) for camera, each in zip(cameras, seen, strict=True)]
+    typical_count = float(counts.median())
+    grids = [_Grid.of(camera, *each, typical_count) for camera, each in zip(cameras, seen, strict=True)]
     found = [
-        _behind(view, camera, grid, float(median), generator)
+        _points_behind(view, camera, grid, float(median), generator)
         for view, camera, grid, median in zip(chosen, cameras, grids, medians, strict=True)
     ]
     joined = BackgroundPoints(*map(torch.cat, zip(*found, strict=True)))
@@ -113,7 +113,9 @@ class _Grid(NamedTuple):
         return self.nearest.view(-1)[self._index(x, y)]
 
 
-def _behind(view: View, camera: Camera, grid: _Grid, median: float, generator: torch.Generator) -> BackgroundPoints:
+def _points_behind(
+    view: View, camera: Camera, grid: _Grid, median: float, generator: torch.Generator
+) -> BackgroundPoints:
     """Sample a point behind each empty cell of a view whose points have the given median depth, camera z."""
     rows, columns = grid.nearest.shape
     small = downscale_image(as_float(view.image.cpu()), columns, rows)  # [rows, columns, C]

@@ -68,23 +68,23 @@ def step(optimizers: Mapping[str, Optimizer], factors: Mapping[str, Tensor]) -> 
 
 
 def _step_together(optimizers: Iterable[Optimizer]) -> None:
-    together: dict[tuple[Any, ...], list[list[torch.Tensor]]] = {}
+    batches: dict[tuple[Any, ...], list[list[torch.Tensor]]] = {}
     counters: list[torch.Tensor] = []
     for optimizer in optimizers:
-        found = [_ready(optimizer, group) for group in optimizer.param_groups]
+        found = [_fusable(optimizer, group) for group in optimizer.param_groups]
         if any(rows is None for rows in found):
             optimizer.step()
             continue
         for group, rows in zip(optimizer.param_groups, found, strict=True):
             for row in rows or ():
                 key = (row[0].device, row[0].dtype, group["lr"], *group["betas"], group["eps"])
-                together.setdefault(key, []).append(row)
+                batches.setdefault(key, []).append(row)
                 counters.append(row[-1])
     if not counters:
         return
     with torch.no_grad():
         torch._foreach_add_(counters, 1.0)
-        for (_, _, rate, first, second, eps), rows in together.items():
+        for (_, _, rate, first, second, eps), rows in batches.items():
             parameters, gradients, means, squares, steps = (list(column) for column in zip(*rows, strict=True))
             torch._fused_adam_(
                 parameters,
@@ -103,7 +103,7 @@ def _step_together(optimizers: Iterable[Optimizer]) -> None:
             )
 
 
-def _ready(optimizer: Optimizer, group: dict[str, Any]) -> list[list[torch.Tensor]] | None:
+def _fusable(optimizer: Optimizer, group: dict[str, Any]) -> list[list[torch.Tensor]] | None:
     """List parameter, gradient, both moments and step counter of each parameter with a gradient; None if the optimiser
     must step itself, because it is no plain fused Adam or has no state yet."""
     if type(optimizer) is not Adam or any(group.get(name) != value for name, value in PLAIN.items()):

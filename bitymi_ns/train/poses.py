@@ -210,9 +210,9 @@ def carried(camera: Camera, given: Tensor, motions: Tensor) -> Camera:
     viewmat = camera.viewmat.double().cpu()
     centers = -(given[:, :3, :3] * given[:, :3, 3:]).sum(1)
     reach = (centers - centers.mean(0)).square().sum(1).amax().clamp(min=1e-30)
-    apart = (centers - camera.exact_center.cpu()).square().sum(1) / reach
-    turned = 0.5 * (given[:, :3, :3] - viewmat[:3, :3]).square().sum((1, 2))
-    distance, rows = (apart + turned).topk(min(NEIGHBOURS, len(given)), largest=False)
+    translation = (centers - camera.exact_center.cpu()).square().sum(1) / reach
+    rotation = 0.5 * (given[:, :3, :3] - viewmat[:3, :3]).square().sum((1, 2))
+    distance, rows = (translation + rotation).topk(min(NEIGHBOURS, len(given)), largest=False)
     weight = 1.0 / (distance + 1e-8)
     return camera.posed(moved(viewmat, (weight[:, None] * motions[rows]).sum(0) / weight.sum()))
 

@@ -67,7 +67,7 @@ class Processes:
         if self.count == 1 or not self.any(own is not None):
             return own
         found: list[str | None] = [None] * self.count
-        with _answering():
+        with _raise_process_lost():
             dist.all_gather_object(found, own)
         return next(text for text in found if text is not None)
 
@@ -85,7 +85,7 @@ class Processes:
         if self.first:
             torch.save(state, packed)
         box = [packed.getvalue()]
-        with _answering():
+        with _raise_process_lost():
             dist.broadcast_object_list(box, src=0, device=torch.device("cpu"))
         return state if self.first else torch.load(io.BytesIO(box[0]), map_location=device, weights_only=True)
 
@@ -93,7 +93,7 @@ class Processes:
         """Broadcast tensors from rank 0, in place."""
         if self.count == 1:
             return
-        with _answering(), torch.no_grad():
+        with _raise_process_lost(), torch.no_grad():
             for tensor in tensors:
                 dist.broadcast(tensor, src=0)
 
@@ -143,16 +143,16 @@ class Processes:
         return found.tolist()
 
     @torch.no_grad()
-    def _reduce(self, tensors: Sequence[Tensor], how: Any) -> None:
+    def _reduce(self, tensors: Sequence[Tensor], op: Any) -> None:
         if self.count == 1:
             return
         for dtype in dict.fromkeys(tensor.dtype for tensor in tensors):
-            some = [tensor for tensor in tensors if tensor.dtype == dtype]
-            flat = torch.cat([tensor.reshape(-1) for tensor in some])
-            with _answering():
-                dist.all_reduce(flat, how)
-            parts = flat.split([tensor.numel() for tensor in some])
-            for tensor, part in zip(some, parts, strict=True):
+            same_dtype = [tensor for tensor in tensors if tensor.dtype == dtype]
+            flat = torch.cat([tensor.reshape(-1) for tensor in same_dtype])
+            with _raise_process_lost():
+                dist.all_reduce(flat, op)
+            parts = flat.split([tensor.numel() for tensor in same_dtype])
+            for tensor, part in zip(same_dtype, parts, strict=True):
                 tensor.copy_(part.view_as(tensor))
 
 
@@ -160,7 +160,7 @@ ALONE = Processes()
 
 
 @contextmanager
-def _answering() -> Iterator[None]:
+def _raise_process_lost() -> Iterator[None]:
     """Turn torch's connection errors into ProcessLost."""
     try:
         yield

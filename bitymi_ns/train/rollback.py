@@ -77,7 +77,7 @@ class RollbackGuard:
         self.announce = announce
         self.window = max(self.config.guard.min_window, self.schedule.scaled(self.config.guard.window))
         self.factor, self.rollbacks = 1.0, 0
-        self._returned = False  # rates have returned to normal once
+        self._rates_restored = False  # rates have returned to normal once
         self._streak = 0  # rollbacks in a row without a good window
         self._limit, self._best = math.nan, math.inf  # mean losses: blank or initial, and of the best window
         self._views: DownscaledViews | None = None
@@ -90,7 +90,7 @@ class RollbackGuard:
         return {
             "factor": self.factor,
             "rollbacks": self.rollbacks,
-            "returned": self._returned,
+            "returned": self._rates_restored,
             "streak": self._streak,
             "limit": self._limit,
             "best": self._best,
@@ -101,7 +101,7 @@ class RollbackGuard:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned."""
         self.factor, self.rollbacks = float(state["factor"]), int(state["rollbacks"])
-        self._returned, self._streak = bool(state.get("returned", False)), int(state["streak"])
+        self._rates_restored, self._streak = bool(state.get("returned", False)), int(state["streak"])
         self._limit, self._best = float(state["limit"]), float(state.get("best", math.inf))
         self._sum, self._count = torch.tensor(state["sum"]), int(state["count"])
         self._states = []
@@ -175,7 +175,7 @@ class RollbackGuard:
         cause = describe_broken(self.scene)
         if not self.on or not cause:
             raise error
-        return self._mend(step, cause)
+        return self._repair(step, cause)
 
     def after(self, step: int, loss: Tensor, broken: Tensor) -> dict[str, float]:
         """Check for divergence and roll back if needed; call it after each step's optimisers and strategy.
@@ -220,12 +220,12 @@ class RollbackGuard:
             )
         cause = describe_broken(self.scene)
         if cause:
-            return self._mend(step, cause)
+            return self._repair(step, cause)
         self._streak = 0
         if whole:
             self._best = min(self._best, mean)
-            if self.factor < 1.0 and not self._returned:
-                self.factor, self._returned = 1.0, True
+            if self.factor < 1.0 and not self._rates_restored:
+                self.factor, self._rates_restored = 1.0, True
                 self.announce(f"step {step}: learning rates return to normal")
         self._convert(step)
         if not last and not (enough and mean > self._limit):  # a state that also passes the later, stricter test
@@ -233,7 +233,7 @@ class RollbackGuard:
             self._states.append((step + 1, self._capture()))
         return {}
 
-    def _mend(self, step: int, cause: str) -> dict[str, float]:
+    def _repair(self, step: int, cause: str) -> dict[str, float]:
         """Drop surfels that are not finite; roll back if there are many, or if the field is broken."""
         broken = ~finite_rows(self.scene)
         dropped = float(broken.sum())

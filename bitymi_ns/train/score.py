@@ -123,7 +123,7 @@ def removal_errors(
     device = logits.device
     by_logit = 1.0 + logits.detach().double().clamp(max=30.0).exp()  # o d/do = (1 + e^logit) d/dlogit
     added = torch.zeros_like(by_logit)
-    error, numbers = torch.zeros(2, dtype=torch.float64, device=device)  # sum of squares, count of values
+    error, value_count = torch.zeros(2, dtype=torch.float64, device=device)  # sum of squares, count of values
     for number in range(processes.rank, len(views), processes.count):
         view = views[number].to(device)
         background = step_background(config, view, seed + number, device)
@@ -136,8 +136,8 @@ def removal_errors(
             rgb = view.shown(output.rgb, output.alpha, background)
             (gradient,) = torch.autograd.grad((rgb * signs).sum(), logits)
         error += (signs * (rgb.detach() - target)).square().sum(dtype=torch.float64)
-        numbers += signs.square().sum(dtype=torch.float64)
+        value_count += signs.square().sum(dtype=torch.float64)
         added += (by_logit * gradient).square()
         del output, rgb  # frees their fragments before the next view is rendered
-    processes.sum(added, error, numbers)
-    return added, torch.minimum(error, MOST_ERROR * numbers)
+    processes.sum(added, error, value_count)
+    return added, torch.minimum(error, MOST_ERROR * value_count)

@@ -121,7 +121,7 @@ class Training:
         self._full_size = data.views
         self._outputs: list[RenderOutput] = []
         self._photometric: list[Tensor] = []
-        self._alike = processes.count == 1
+        self._synchronised = processes.count == 1
 
     @functools.cached_property
     def views(self) -> DownscaledViews:
@@ -135,15 +135,15 @@ class Training:
 
     def begin(self, step: int) -> None:
         """Start the clock and set the learning rates of a step."""
-        if not self._alike:  # before the clock starts: waiting for other processes is no training time
+        if not self._synchronised:  # before the clock starts: waiting for other processes is no training time
             self.processes.like_first(self.scene.state_dict().values())
         self.clock.start()
         self.step = step
         self.poses.begin()
         if not self.exposure.decided:
             self.exposure.start(self.scene.surfels["means"], self._full_size, self.scene.near)
-        if not self._alike:
-            self._alike = True
+        if not self._synchronised:
+            self._synchronised = True
             device = self.scene.surfels["means"].device
             found = self.processes.from_first(self.exposure.state_dict(), device)
             self.exposure.load_state_dict(found, len(self._full_size), device)
@@ -219,7 +219,7 @@ class Training:
         self.poses.step([output.projection for output in outputs], pixels, self.processes)
         if not self.schedule.densification_over(step):
             self.strategy.accumulate(*outputs)
-        loss, broken = self._together(photometric, [output.projection.broken for output in outputs])
+        loss, broken = self._reduce_over_views(photometric, [output.projection.broken for output in outputs])
         del outputs  # frees their fragments before the strategy renders its own views
         factor = self.schedule.resolution_factor(step)
         try:
@@ -237,7 +237,7 @@ class Training:
         self.clock.stop()
         return report
 
-    def _together(self, losses: list[Tensor], broken: list[Tensor]) -> tuple[Tensor, Tensor]:
+    def _reduce_over_views(self, losses: list[Tensor], broken: list[Tensor]) -> tuple[Tensor, Tensor]:
         """Compute the mean loss over the step's views, and the largest count of non-finite surfels in one of them."""
         if self.processes.views == 1:
             return losses[0], broken[0]

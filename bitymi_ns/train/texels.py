@@ -56,10 +56,10 @@ class LearningTexels:
         if not self.schedule.texels_learn(step) or isinstance(self.scene.field, TexelField):
             return False
         sample = spread(len(views), max(FEWEST_VIEWS, round(self.options.views * self.schedule.texel_steps)))
-        some = OnDemand(len(sample), lambda i: views.at(sample[i], 1.0))
+        sampled = OnDemand(len(sample), lambda i: views.at(sample[i], 1.0))
         field = None
         if self.processes.first:
-            field = blank_texels(self.scene, some, len(views), self.options, self.views_to_come)
+            field = blank_texels(self.scene, sampled, len(views), self.options, self.views_to_come)
         if self.processes.count > 1:
             device = self.scene.surfels["means"].device
             found = self.processes.from_first(None if field is None else field.state_dict(), device)
@@ -92,7 +92,7 @@ class LearningTexels:
             self._rates.append(field.alpha.register_hook(lambda gradient: gradient * alpha_rate))
 
     @property
-    def _stepped(self) -> list[Parameter]:
+    def _parameters(self) -> list[Parameter]:
         """Texel colours and alphas that `step` updates."""
         field = self.scene.field
         if not isinstance(field, TexelField):
@@ -103,12 +103,12 @@ class LearningTexels:
     @torch.no_grad()
     def average(self) -> None:
         """Average the gradients over all views of the step; processes exchange only rows with a nonzero gradient."""
-        stepped = self._stepped
-        for values in stepped:
+        parameters = self._parameters
+        for values in parameters:
             if values.grad is None:
                 values.grad = torch.zeros_like(values)
-        gradients = [values.grad.view(len(values), -1) for values in stepped]
-        if self.processes.count > 1 and stepped:
+        gradients = [values.grad.view(len(values), -1) for values in parameters]
+        if self.processes.count > 1 and parameters:
             moved = sum(gradient.any(1).to(torch.uint8) for gradient in gradients)
             self.processes.maximum(moved)
             rows = moved.nonzero().flatten()
@@ -123,7 +123,7 @@ class LearningTexels:
     def step(self) -> None:
         """Update colours and alphas by their averaged gradients."""
         field = self.scene.field
-        for values in self._stepped:
+        for values in self._parameters:
             if values.grad is not None:
                 share = field.share if values is field.alpha else field.share[:, None]
                 values.addcmul_(share, values.grad, value=-1.0)

@@ -36,7 +36,7 @@ NOTHING = "default-src 'none'"  # Content-Security-Policy of a site without a pa
 BUNDLE = "bundle/"
 _NOTES = f"{BUNDLE}{NOTES}"
 SINGLE = "scene.bitymi"  # name of a single-file bundle beside an exported page
-_ASKS = '<meta name="bundle" content="{}" />'
+_BUNDLE_TAG = '<meta name="bundle" content="{}" />'
 """Tag that names the page's single-file bundle; empty: the bundle folder beside the page."""
 
 
@@ -119,7 +119,7 @@ def site_of(bundle: Path) -> Site:
     """
     notes_of(bundle)
     shown = Shown(Path(os.path.realpath(bundle)))
-    files = {**page_files(), "view.json": partial(_about, bundle)}
+    files = {**page_files(), "view.json": partial(_view_json, bundle)}
     return Site(files, left_out(shown.info), partial(notes_of, bundle), shown)
 
 
@@ -132,16 +132,16 @@ def single_site(bundle: Path) -> Site:
         BundleError: there is no bundle, or it is damaged.
     """
     info, files = read_manifest(bundle), page_files()
-    empty, named = (_ASKS.format(name).encode() for name in ("", SINGLE))
+    empty, named = (_BUNDLE_TAG.format(name).encode() for name in ("", SINGLE))
     index = files["index.html"]()
     if empty not in index:
         raise PageError("the viewer's page is of another version: in a checkout, build it with `make web`")
     files["index.html"] = lambda: index.replace(empty, named)
-    files |= {SINGLE: lambda: joined(bundle)[0], "view.json": partial(_about, bundle)}
+    files |= {SINGLE: lambda: joined(bundle)[0], "view.json": partial(_view_json, bundle)}
     return Site(files, left_out(info))
 
 
-def _about(bundle: Path) -> bytes:
+def _view_json(bundle: Path) -> bytes:
     """Encode view.json: title of a bundle, and whether it has notes."""
     try:
         notes = notes_of(bundle) is not None

@@ -127,7 +127,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 @dataclass(eq=False)
-class _Held:
+class _SharedFile:
     """Contents of a file being sent, shared by all connections that read it."""
 
     key: tuple[str, object]
@@ -143,8 +143,8 @@ class _Server(ThreadingHTTPServer):
     def __init__(self, site: Site, host: str, port: int, request_seconds: float) -> None:
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         self.site, self.request_seconds = site, request_seconds
-        self._held: dict[tuple[str, object], _Held] = {}
-        self._counting, self._room = threading.Lock(), threading.BoundedSemaphore(MOST_CLIENTS)
+        self._held: dict[tuple[str, object], _SharedFile] = {}
+        self._count_lock, self._connections = threading.Lock(), threading.BoundedSemaphore(MOST_CLIENTS)
         super().__init__((host, port), _Handler)
         self._names = {*LOCAL_NAMES, host.lower(), _shown(self)}
 
@@ -153,11 +153,11 @@ class _Server(ThreadingHTTPServer):
         host = host.lower()
         return not is_loopback(self) or host in self._names or host.rpartition(":")[0] in self._names
 
-    def hold(self, name: str) -> _Held:
+    def hold(self, name: str) -> _SharedFile:
         """Read a file, shared until `release` was called once per `hold`; raises what `Site.read` raises."""
         key = (name, self.site.stamp(name))
-        with self._counting:
-            held = self._held.setdefault(key, _Held(key))
+        with self._count_lock:
+            held = self._held.setdefault(key, _SharedFile(key))
             held.readers += 1
         try:
             with held.reading:
@@ -168,16 +168,16 @@ class _Server(ThreadingHTTPServer):
             raise
         return held
 
-    def release(self, held: _Held) -> None:
+    def release(self, held: _SharedFile) -> None:
         """Drop a file once it has no readers."""
-        with self._counting:
+        with self._count_lock:
             held.readers -= 1
             if not held.readers:
                 del self._held[held.key]
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Handle a request in a new thread, or respond 503 beyond `MOST_CLIENTS`."""
-        if not self._room.acquire(blocking=False):
+        if not self._connections.acquire(blocking=False):
             with suppress(OSError):
                 request.settimeout(0.0)
                 request.send(_BUSY)
@@ -186,14 +186,14 @@ class _Server(ThreadingHTTPServer):
         try:
             super().process_request(request, client_address)
         except BaseException:
-            self._room.release()
+            self._connections.release()
             raise
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._room.release()
+            self._connections.release()
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Ignore errors: a browser may close the connection during a response."""

@@ -167,7 +167,7 @@ def _run_stage(work: Path, stage: Stage, cells: Cells, lock: Lock) -> None:
     cells.add(stage.key, value, provenance(command, time.perf_counter() - start))
 
 
-def _run_chain(work: Path, chain: Chain, cells: Cells, told: Callable[[Stage], None]) -> list[str]:
+def _run_chain(work: Path, chain: Chain, cells: Cells, announce: Callable[[Stage], None]) -> list[str]:
     """Execute the missing cells of a run, except those that depend on a failed one; return a message per failure."""
     failures: list[str] = []
     broken: list[Stage] = []
@@ -177,7 +177,7 @@ def _run_chain(work: Path, chain: Chain, cells: Cells, told: Callable[[Stage], N
             if any(_needs(stage, other) for other in broken):
                 broken.append(stage)
                 continue
-            told(stage)
+            announce(stage)
             try:
                 _run_stage(work, stage, cells, lock)
             except CommandFailed as error:
@@ -206,7 +206,7 @@ def run_chains(work: Path, chains: Sequence[Chain]) -> list[str]:
     if done:
         say(f"{done} of {total} cells are finished already")
 
-    def told(stage: Stage) -> None:
+    def announce(stage: Stage) -> None:
         left = [other for chain in chains for other in missing(chain, cells)]
         say(f"{stage} ({total - len(left) + 1} of {total}{time_left(left, cells)})")
 
@@ -215,7 +215,7 @@ def run_chains(work: Path, chains: Sequence[Chain]) -> list[str]:
         if not missing(chain, cells):
             continue
         try:
-            failures += _run_chain(work, chain, cells, told)
+            failures += _run_chain(work, chain, cells, announce)
         except CommandFailed as error:
             failures.append(str(error))
     return failures

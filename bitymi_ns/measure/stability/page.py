@@ -137,19 +137,19 @@ def measure_row(label: str, scene: SceneCase, backend: Backend, near: float = 0.
 
 def write(path: Path, backend: Backend = BACKENDS["cpu"], progress: Callable[[str], None] | None = None) -> list[Row]:
     """Measure all cases and sweeps, write the page and its plot `<stem>.png`, and return the rows."""
-    tell = progress or (lambda text: None)
+    report_progress = progress or (lambda text: None)
     check_writable(path)
     named: dict[str, list[Row]] = {}
     for way in (PLAIN, *WAYS):
         named[way.name] = []
         for case in cases(way):
-            tell(f"case {case.name}, {way.name}")
+            report_progress(f"case {case.name}, {way.name}")
             row = measure_row(case.name.replace("_", " "), case.scene, backend, way=way)
             if way is PLAIN or row.single.drawn:
                 named[way.name].append(row)
     swept: dict[str, list[Row]] = {}
     for sweep in SWEEPS:
-        tell(f"sweep {sweep.name}")
+        report_progress(f"sweep {sweep.name}")
         swept[sweep.name] = [
             measure_row(f"{value:g}", sweep.make(value), backend, sweep.near(value)) for value in sweep.values
         ]

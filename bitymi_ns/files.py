@@ -108,7 +108,7 @@ def parents_of(path: Path) -> Iterator[None]:
 
 def _open_locked(path: Path) -> tuple[BinaryIO, bool]:
     """Open or create a file for writing, and lock it until all processes that have it open close it. Returns the file,
-    and False if the file system does not support locks.
+    and True if it is locked; False if the file system does not support locks.
 
     Raises:
         BlockingIOError: another process has the lock.

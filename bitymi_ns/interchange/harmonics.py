@@ -15,8 +15,8 @@ _POWERS = [(i, j, n - i - j) for n in (2, 3) for i in range(n + 1) for j in rang
 def basis(directions: Tensor) -> Tensor:
     """Evaluate the harmonics in some directions.
 
-    On the sphere they are linear combinations of the monomials of degrees 2 and 3. The matrix is solved from values of
-    the compiled kernel, in float64, so that the formula exists once.
+    On the sphere they are linear combinations of the monomials of degrees 2 and 3. Their coefficients are solved for
+    from values of the compiled kernel, in float64, so that the formula exists once.
 
     Args:
         directions: [..., 3] unit vectors.

@@ -218,7 +218,7 @@ class TexelField(ResidualField):
         texels = self.texels if learns and descent is None else self.texels.detach()
         if descent is not None and read is not None:
             texels, descent = read, replace(descent, moved=texels)
-        # texels move with their surfel, so that their gradient with respect to position is its gradient
+        # tiles move with their surfels, so gradients of texels with respect to position belong to the surfels
         return {"texels": texels, "tiles": self.tiles, "bound": bound, "move_surfels": learns, "descent": descent}
 
     def opacity(self, bound: float, learns: bool) -> TexelAlpha | None:

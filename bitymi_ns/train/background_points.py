@@ -21,8 +21,8 @@ NEAREST, FARTHEST = 1.2, 5.0
 FEW = 10  # photographs with fewer points use the median depth of the others
 RADIUS = 0.5  # largest initial scale, in cells
 OPAQUE = 0.5  # minimum mean alpha of a cell
-SUPPORT = 8  # minimum number of photographs with the point in an empty cell: with fewer, a capture of 17 overfits
-IN_FRONT = 0.2  # maximum number of photographs with the point in front of a cell's points, relative to those
+SUPPORT = 8  # minimum number of photographs with the point in an empty cell: with fewer, 17 photographs overfit
+IN_FRONT = 0.2  # maximum ratio of photographs with the point in front of a cell's points to photographs as above
 
 
 class BackgroundPoints(NamedTuple):

@@ -26,7 +26,7 @@ class LossWatch:
         self._in_flight: deque[tuple[list[tuple[int, tuple[str, ...]]], Tensor, torch.cuda.Event]] = deque()
 
     def note(self, scene: Scene, step: int, terms: dict[str, Tensor]) -> None:
-        """Check the loss terms of a step, on a CUDA device later.
+        """Check the loss terms of a step; on a CUDA device, a few steps later.
 
         Raises:
             TrainingDiverged: a term of this or an earlier step is not finite.
@@ -74,7 +74,7 @@ class LossWatch:
 
 
 class TrainingDiverged(ValueError):
-    """The loss or every surfel is no longer finite."""
+    """Training has diverged: loss, field or surfels are not finite, or no rollback is left."""
 
 
 def describe_broken(module: nn.Module) -> str:

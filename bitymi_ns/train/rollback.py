@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from bitymi_ns.train.poses import Poses
 
 WORSE = 1.25
-"""A window is bad if its mean loss is this many times that of the best window, or early in the run of blank views."""
+"""A window is bad if its mean loss is this many times the best window's, or early in the run the blank loss."""
 RISE = 0.1
 """Share of the blank loss by which a bad window must also exceed the best one: losses near 0 may double."""
 EARLY = 0.1  # share of the run in which views may be slightly worse than blank ones
@@ -112,7 +112,7 @@ class RollbackGuard:
         return self.config.guard.rollbacks > 0
 
     def before(self, step: int, views: DownscaledViews) -> None:
-        """Capture the initial state and measure its loss; call it before each step.
+        """Capture a state if there is none, and measure the initial loss once; call it before each step.
 
         Args:
             views: training views. Losses are compared at full size: images too small for SSIM have smaller losses.
@@ -128,7 +128,7 @@ class RollbackGuard:
         self._states = [(step, self._capture())]
 
     def restart(self) -> None:
-        """Discard captured states and start a new window: the scene has changed its kind of texture."""
+        """Discard captured states and start a new window, when the scene's texture becomes texels."""
         self._states = []
         self._sum, self._count = torch.zeros_like(self._sum), 0
 
@@ -164,7 +164,7 @@ class RollbackGuard:
             self._best, self._sum = self._best * new / old, self._sum * (new / old)
 
     def failed(self, step: int, error: TrainingDiverged) -> dict[str, float]:
-        """Repair the scene after a loss that is not finite, before the step is repeated, or after the update broke it.
+        """Repair the scene after a loss that is not finite (the step is then repeated), or after an update broke it.
 
         Returns:
             Counts of what was done, by name.

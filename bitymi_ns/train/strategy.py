@@ -4,7 +4,7 @@ At each densification, in this order:
 - surfels that can never be visible again are removed (a non-finite parameter, or an opacity of 1/255 or less);
 - surfels with many bad pixels and a large gradient are cloned or split, the most important first if the limit does not
   allow all. With `max_surfels` the number instead grows to that value in equal increments: parents are sampled in
-  proportion to gradient times bad pixels, and faint surfels are replaced if there are more parents than increments;
+  proportion to gradient times bad pixels, and faint surfels are replaced if there are more parents than the increment;
 - up to half of the candidates for pruning, sampled at random, are removed;
 - opacities are clamped.
 After the last densification, surfels whose removal hardly changes the images are pruned; between 60 and 90 % of the run
@@ -46,8 +46,8 @@ SPLIT_LONG, SPLIT_WIDE = 0.6, 0.7
 SPLIT_APART = 0.7  # distance of the halves' centres from the surfel's, in scales of its long axis
 SPLIT_OPACITY = 0.9  # opacity of the halves relative to the surfel's: they overlap where it is most opaque
 ERROR_VIEWS, FEWEST_ERROR_VIEWS = 0.1, 64
-"""Views on which the error prune measures removals: a share of the run's steps, and the minimum."""
-NO_BAD_PIXEL = 0.1  # added to the mean count of bad pixels when parents are sampled: its weight is then never 0
+"""Number of views on which the error prune measures removals, as a share of the run's steps, and its minimum."""
+NO_BAD_PIXEL = 0.1  # added to counts of bad pixels when parents are sampled, so that surfels without any have a chance
 FINAL_VIEWS, FEWEST_FINAL_VIEWS = 0.025, 16  # the same for each of the four final prunes
 STATISTICS = ("grad_sum", "abs_grad_sum", "visible_count", "max_radius")
 
@@ -229,7 +229,7 @@ class Strategy:
         return report | {"cloned": len(clones), "split": len(splits), "pruned": int(pruned.sum())}
 
     def _halves(self, surfels: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
-        """Split each of `rows` into two halves along its long axis, which together look about like the surfel."""
+        """Split surfels into two halves along their long axes, which together look about like the surfel."""
         halves = {name: p.detach()[rows].repeat_interleave(2, dim=0) for name, p in surfels.items()}
         long = one_hot(halves["log_scales"].argmax(-1), 2).to(halves["log_scales"])  # [2S, 2]
         side = long.new_tensor([1.0, -1.0]).repeat(len(rows))[:, None]
@@ -257,7 +257,7 @@ class Strategy:
 
     @torch.no_grad()
     def _final_prune(self, scene: Scene, optimizers: Mapping[str, Optimizer], views: DrawViews) -> dict[str, float]:
-        """Remove the faint surfels that add little error; after an opacity reset many faint ones matter."""
+        """Remove the faint surfels that matter little; after an opacity reset many faint ones do matter."""
         report, config = self._drop_dead(scene, optimizers), self.config.densify
         faint = scene.surfels["opacity_logits"].sigmoid() < config.final_prune_opacity
         drawn = self._error_views(views, FINAL_VIEWS, FEWEST_FINAL_VIEWS)

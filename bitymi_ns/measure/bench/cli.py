@@ -41,7 +41,7 @@ class BenchRun:
     scenes: tuple[str, ...] = ()  # Only these scenes of a standard data set.
     methods: tuple[str, ...] = ("bitymi",)  # Methods of ns-train.
     plan: str | None = None
-    """Rows to train instead of --methods: ablation, atlas, overdraw, rate, resolution, or a YAML file of plans."""
+    """Rows to train instead of --methods: ablation, atlas, overdraw, rate, resolution, or a plan's YAML file."""
     extra: str = ""
     """Further options of ns-train for every run, as one word: --extra="--pipeline.model.scene.weight-bound 0"."""
     seeds: tuple[int, ...] = ()  # Train once per seed; none = once, with the method's own.

@@ -31,7 +31,7 @@ PICTURES = "pictures.json"
 MAX_BYTES = 64 << 20  # larger files are no evaluation
 MAX_DEPTH = 8  # levels of folders that are searched
 SIDE_BY_SIDE = re.compile(r"^eval_img_(?P<index>\d{4,})$", re.IGNORECASE)
-"""Stem of an image of photograph and render, as `ns-eval --render-output-path` writes it."""
+"""File name stem of a photograph beside its render, as `ns-eval --render-output-path` writes it."""
 
 _SKIPPED = {"__pycache__", "node_modules", "wandb", "nerfstudio_models"}
 _NOT_OF_A_RUN = ("cell", "bundle", "export", "views")

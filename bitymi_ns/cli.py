@@ -239,13 +239,13 @@ class Unpack:
 
 @dataclass
 class Extras:
-    """Write a bundle for other programs into a folder beside it: as Gaussians, surfels, OpenUSD, or a textured mesh."""
+    """Convert a bundle for other programs, to a folder beside it: Gaussians, surfels, OpenUSD, or a textured mesh."""
 
     bundle: tyro.conf.Positional[Path]  # Folder of the bundle, or its one file.
     kinds: tuple[Literal["gaussians", "surfels", "usd", "mesh"], ...] = ("gaussians", "mesh")
-    """gaussians: gaussians.ply, as 3DGS writes it; surfels: surfels.ply, the same with two scales (2DGS, Brush); usd:
-    surfels.usdc, OpenUSD's surflets; mesh: mesh.glb, a textured quad for each surfel."""
-    frame: Literal["scene", "capture"] = "scene"  # Frame of the files: the scene's, or the capture's own.
+    """gaussians: gaussians.ply, in 3DGS's format; surfels: surfels.ply, the same with two scales (2DGS, Brush); usd:
+    surfels.usdc, OpenUSD's surflets; mesh: mesh.glb, a textured quad per surfel."""
+    frame: Literal["scene", "capture"] = "scene"  # Frame of the files: the scene's, or the capture's.
     output: Path | None = None  # Folder to write; not given: beside the bundle, with its name and .extras.
     overwrite: Flag = False  # Replace an existing folder of extras.
 

@@ -1,4 +1,4 @@
-"""Files for other programs, beside a bundle: Gaussians, flat Gaussians, OpenUSD surflets, and a textured mesh."""
+"""Extras of a bundle, for other programs: Gaussians, flat Gaussians, OpenUSD surflets, and a textured mesh."""
 
 import json
 import os
@@ -73,8 +73,8 @@ def check_extras(kinds: Sequence[str], folder: Path, overwrite: bool) -> None:
     """Check the kinds and the output folder.
 
     Raises:
-        BundleError: there is no such kind, OpenUSD is not installed, or the folder is there and may not be replaced, or
-            holds more.
+        BundleError: a kind does not exist, or needs OpenUSD, which is not installed; or the folder exists and
+            `overwrite` is False, or it holds other files.
     """
     unknown = [kind for kind in kinds if kind not in FILES]
     if unknown or not kinds:

@@ -24,7 +24,7 @@ FLAT_LOG_SCALE = -16.0
 GRID = 24  # points along both axes of a kernel in the sums for the moments under alpha texels
 LEAST_OPACITY = 1e-4  # of a surfel that alpha texels cut away
 HARD_BETA = 0.5658
-"""Exponent below which a disc of the same second moments is nearer to the kernel than a Gaussian, in squared error."""
+"""Exponent below which a disc approximates the kernel better than a Gaussian of equal moments, in squared error."""
 FLAT = "SplatRenderMode: 2dgs"  # comment of a PLY file whose Gaussians have two scales, as Brush writes it
 _NAMES = {
     "means": ("x", "y", "z"),
@@ -47,7 +47,7 @@ class Gaussians:
     log_scales: Tensor  # [N, 3] natural logarithms of the standard deviations along the axes
     opacity_logits: Tensor  # [N]
     harmonics: Tensor  # [N, 16, 3]; the colour is max(sum of harmonics Y(d) + 0.5, 0), d from the camera to the mean
-    hard: Tensor  # [N] bool: nearer to a disc of constant opacity, whose radius is two standard deviations
+    hard: Tensor  # [N] bool, better approximated by a disc of constant opacity with a radius of two standard deviations
 
     def __len__(self) -> int:
         return len(self.means)
@@ -134,11 +134,11 @@ def _moments(scene: BakedScene, chunk: int = 1 << 20) -> tuple[Tensor, Tensor, T
 
 
 def write_gaussians(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = (), flat: bool = False) -> None:
-    """Write the PLY file that 3DGS writes: f_rest has 15 coefficients of red, then of green, then of blue.
+    """Write Gaussians as a 3DGS PLY file.
 
     Args:
-        comments: lines of its header.
-        flat: leave out the third scales, and say so in a comment (`FLAT`).
+        comments: lines of the header.
+        flat: omit the third scales, and state so in a comment (`FLAT`).
     """
     values = {
         "means": gaussians.means,

@@ -28,7 +28,7 @@ def draw_gaussians(
     near: float = 0.2,
     discs: bool = False,
 ) -> Tensor:
-    """Draw a view.
+    """Render a view.
 
     A Gaussian of covariance S has the footprint J W S W^T J^T + 0.3 I on the image, where W is the camera's rotation
     and J the Jacobian of the projection at its mean. A pixel blends alpha = min(0.99, o exp(-1/2 q)), front to back by
@@ -37,9 +37,9 @@ def draw_gaussians(
     Args:
         gaussians: on the CPU, in the camera's world frame.
         camera: of an H x W view.
-        background: [3]; None = black.
-        near: nearest depth that is drawn.
-        discs: draw `gaussians.hard` as discs of constant opacity: exp(-1/2 q) becomes 1 up to q = 4, and 0 beyond.
+        background: [3]; None: black.
+        near: near plane.
+        discs: render `gaussians.hard` as discs of constant opacity: 1 instead of exp(-1/2 q) up to q = 4, 0 beyond.
 
     Returns:
         [H, W, 3] float32.
@@ -102,7 +102,7 @@ def _footprints(gaussians: Gaussians, camera: Camera, near: float) -> tuple[Tens
 def _blend(
     pixels: Tensor, center: Tensor, conic: Tensor, opacity: Tensor, colors: Tensor, hard: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Colours [P, 3] of pixels [P, 2] and the transmittance [P] behind."""
+    """Blend pixels [P, 2]: colours [P, 3] and final transmittance [P]."""
     rgb, transmittance = pixels.new_zeros(len(pixels), 3), pixels.new_ones(len(pixels))
     ended = torch.zeros(len(pixels), dtype=torch.bool)
     for part in torch.arange(len(center)).split(_AT_ONCE):

@@ -15,7 +15,7 @@ def check_usd() -> None:
     """Check that OpenUSD can be imported and has surflets.
 
     Raises:
-        BundleError: it cannot.
+        BundleError: it cannot, or is too old.
     """
     try:
         from pxr import UsdVol
@@ -26,16 +26,16 @@ def check_usd() -> None:
 
 
 def write_usd(path: str | Path, gaussians: Gaussians, place: np.ndarray) -> None:
-    """Write a binary USD file with up to two ParticleField prims, one for each kernel.
+    """Write a binary USD file with a ParticleField prim per kernel.
 
-    A surflet is a disc in its xy plane: exp(-r^2 / 2) (GaussianSurfletAPI), or 1 up to r = 1 (ConstantSurfletAPI), with
-    scales, orientation, position and opacity of its own. Spherical harmonics have degree 3, the basis and offset of
-    3DGS, and give sRGB colors, which the attribute's color space says.
+    A surflet is a disc in its xy plane with kernel exp(-r^2 / 2) (GaussianSurfletAPI), or 1 up to r = 1
+    (ConstantSurfletAPI), and its own scales, orientation, position and opacity. Spherical harmonics have degree 3, the
+    basis and offset of 3DGS, and give sRGB colors, as the attribute's color space states.
 
     Args:
         path: ends in .usdc.
-        gaussians: at least one; third scales are not written, discs get twice the scales (`Gaussians.hard`).
-        place: [4, 4] of the root, from the Gaussians' frame to one where +y is up; its unit counts as a metre.
+        gaussians: at least one; third scales are omitted, discs (`Gaussians.hard`) get twice the scales.
+        place: transform [4, 4] of the root, from the Gaussians' frame to one with +y up; its unit is taken as a metre.
     """
     from pxr import Gf, Sdf, Usd, UsdGeom, UsdVol, Vt
 
@@ -43,7 +43,7 @@ def write_usd(path: str | Path, gaussians: Gaussians, place: np.ndarray) -> None
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     root = UsdGeom.Xform.Define(stage, "/scene")
-    root.AddTransformOp().Set(Gf.Matrix4d(place.T.tolist()))  # USD multiplies rows from the left
+    root.AddTransformOp().Set(Gf.Matrix4d(place.T.tolist()))  # USD multiplies row vectors
     stage.SetDefaultPrim(root.GetPrim())
     kernels = {
         "gaussian_surflets": (UsdVol.ParticleFieldKernelGaussianSurfletAPI, ~gaussians.hard, 1.0),

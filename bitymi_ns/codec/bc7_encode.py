@@ -1,4 +1,4 @@
-"""The BC7 encoder of atlas pages (ispc_texcomp); `ops.baked_scene.decode_bc7` reads its blocks."""
+"""BC7 encoding of atlas pages (ispc_texcomp); `ops.baked_scene.decode_bc7` decodes the blocks."""
 
 import os
 from collections.abc import Callable
@@ -10,16 +10,16 @@ import numpy.typing as npt
 
 Profile = Literal["slow", "basic", "fast", "veryfast", "ultrafast"]
 
-STRIP = 64  # rows encoded at once: small enough to share among threads and to report progress
+STRIP = 64  # rows per encoder call: enough calls for all threads and for progress
 
 
 def bc7_encoder(profile: Profile, alpha: bool = False) -> Callable[[npt.NDArray[np.uint8]], bytes]:
-    """A function from RGBA texels [h, w, 4] (sides multiples of 4) to BC7 blocks, rows of blocks from the top. Without
-    `alpha` all alphas are 255.
+    """Return a function that encodes RGBA texels [h, w, 4] (sides multiples of 4) to BC7 blocks in row-major order.
+    Without `alpha`, every alpha byte is 255.
 
     Raises:
         RuntimeError: the encoder is not installed.
-        ValueError: there is no such profile.
+        ValueError: unknown profile.
     """
     try:
         import ispc_texcomp
@@ -41,10 +41,10 @@ def bc7_encoder(profile: Profile, alpha: bool = False) -> Callable[[npt.NDArray[
 
 
 def bc7_blocks(pages: npt.NDArray[np.uint8], profile: Profile, alpha: bool = False) -> npt.NDArray[np.uint8]:
-    """The BC7 blocks of texels [layers, height, width, 4], sides multiples of 4: [layers, height / 4, width / 4, 16].
+    """Encode texels [layers, height, width, 4], sides multiples of 4: [layers, height / 4, width / 4, 16] blocks.
 
     Args:
-        alpha: alphas are encoded; without, all of them are 255.
+        alpha: encode alphas; otherwise all of them are 255.
 
     Raises:
         RuntimeError: the encoder is not installed.

@@ -1,7 +1,7 @@
 """Limits of the values in the files of a bundle.
 
-Far beyond what training reaches (an optimiser moves a parameter by at most its learning rate per step), and close
-enough that every number a renderer computes is finite and no channel of a picture exceeds `BRIGHTEST`.
+They lie far beyond what training reaches (an optimiser moves a parameter by at most its learning rate per step) and
+keep every number of a renderer finite and every channel of a picture at most `BRIGHTEST`.
 """
 
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ RESIDUAL_LIMIT = 256.0  # largest absolute value of a residual colour
 ALPHA_ONE = 128  # byte of an alpha of 1
 ALPHA_SCALE = 255 / ALPHA_ONE  # alpha of a texel whose byte is 255
 ALPHA_LIMIT = 2.0  # largest alpha
-BRIGHTEST = 1e4  # no channel of a rendered picture exceeds this: a base colour, 32 lobes and a residual
+BRIGHTEST = 1e4  # bound of a rendered channel: a base colour, 32 lobes and a residual
 EXTENTS = (1e-6, 16.0)  # half sides of tiles in scale units
 UNIT_SLACK = 0.01  # tolerance of the length of a stored rotation
 
@@ -28,21 +28,21 @@ LIMITS: dict[str, Limit] = {
     "view_base": (COLOR_LIMIT,),
     "mean_residual": (RESIDUAL_LIMIT,),
 }
-"""Largest absolute value of a parameter, one for all its numbers or one for each along its last axis."""
+"""Largest absolute value of a parameter: one number, or one for each entry of its last axis."""
 
 
 def limit_of(name: str, kind: str) -> Limit:
-    """Largest absolute values of a parameter, as in `LIMITS`; infinite for one without a limit.
+    """Return the largest absolute values of a parameter, as in `LIMITS`; infinite if it has no limit.
 
     Args:
-        name: a parameter of the surfels, view_terms of lean view colours, or mean_residual.
+        name: a surfel parameter, view_terms of lean view colours, or mean_residual.
         kind: a name of `ops.VIEW_COLORS`.
     """
     return VIEW_COLORS[kind].lean_limit if name == "view_terms" else LIMITS.get(name, (float("inf"),))
 
 
 def beyond(name: str, kind: str, values: Tensor) -> Tensor:
-    """Mask of the numbers of a parameter beyond its limit: bool of the shape of `values`.
+    """Compute the mask of values beyond the limit of their parameter: bool, of the shape of `values`.
 
     Args:
         name, kind: as in `limit_of`.
@@ -53,6 +53,6 @@ def beyond(name: str, kind: str, values: Tensor) -> Tensor:
 
 
 def within(surfels: Mapping[str, Tensor], kind: str) -> Tensor:
-    """[N] bool, True for surfels whose parameters, each with a row per surfel, keep the limits."""
+    """Compute the mask [N] of surfels whose parameters ([N, ...] each) all keep their limits."""
     bad = [beyond(name, kind, value.detach()) for name, value in surfels.items()]
     return ~torch.stack([each.flatten(1).any(1) if each.dim() > 1 else each for each in bad]).any(0)

@@ -5,16 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-GRID = 4  # tiles sit on the grid of BC7 blocks, so that no block belongs to two surfels
-ROWS = 64  # page heights are multiples of this, once an atlas has so many rows
+GRID = 4  # tiles are aligned to BC7 blocks, so that no block is shared by two surfels
+ROWS = 64  # page heights of larger atlases are multiples of this
 
 
 @dataclass(frozen=True)
 class Packing:
     """Layout of the tiles in pages."""
 
-    # [N, 5] int32 (x, y, layer, r_u, r_v): texel origin, page, and size, with u along x. A surfel without a tile has a
-    # row of zeros
+    # [N, 5] int32 (x, y, layer, r_u, r_v): texel origin, page, and size, with u along x; zeros without a tile
     tiles: npt.NDArray[np.int32]
     # width, height: size of every page in texels
     width: int
@@ -31,14 +30,13 @@ class Packing:
 def pack(resolution: npt.ArrayLike, page_width: int = 4096, max_rows: int = 8192, max_layers: int = 2048) -> Packing:
     """Pack tiles by Shelf-First-Fit-Decreasing (paper, section Texture Baking).
 
-    Tiles are taken by r_v descending, then r_u descending, then index; each goes to the first shelf with room, or
-    opens a new shelf of its own height. Sides are powers of two, so all tiles of one size are placed by arithmetic,
-    shelf starts are multiples of their height, and cutting the column of shelves into pages of equal height never
-    cuts a shelf. The result depends on the input alone.
+    Tiles are sorted by r_v descending, then r_u descending, then index; each goes to the first shelf with room, or
+    opens a new shelf of its own height. Sides are powers of two, so the tiles of one size are placed by arithmetic,
+    shelf starts are multiples of their height, and page boundaries never cut a shelf. The result is deterministic.
 
     Args:
         resolution: [N, 2] integers (r_u, r_v), powers of two >= 4; (0, 0) for a surfel without a tile.
-        page_width: largest page width in texels, a power of two (smaller atlases get a narrower page).
+        page_width: largest page width in texels, a power of two; smaller atlases get narrower pages.
         max_rows: largest page height; 8192 is the limit of WebGPU and phones.
 
     Raises:
@@ -52,7 +50,7 @@ def pack(resolution: npt.ArrayLike, page_width: int = 4096, max_rows: int = 8192
         return Packing(tiles, GRID, GRID, 1, 0.0)
     tallest = int(sizes[:, 1].max())
     width = max(GRID, int(sizes[:, 0].max()))
-    while width < page_width and width * width < area:  # narrower where a square of that side holds everything
+    while width < page_width and width * width < area:  # a square of this side is too small
         width *= 2
 
     placed = np.flatnonzero(sizes[:, 0])
@@ -97,10 +95,10 @@ def pack(resolution: npt.ArrayLike, page_width: int = 4096, max_rows: int = 8192
 
 
 def check_page(page_width: int, max_rows: int) -> None:
-    """Refuse sizes that no page can have.
+    """Check the page size.
 
     Raises:
-        ValueError: says which.
+        ValueError: the width or the height is not allowed.
     """
     if page_width < GRID or page_width & (page_width - 1):
         raise ValueError(f"the page width must be a power of two of at least {GRID}, not {page_width}")

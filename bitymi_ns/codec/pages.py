@@ -1,4 +1,4 @@
-"""Texels as a list, tile after tile as in `ops.TexelTiles`, and as pages of an atlas.
+"""Texels as a list, tile after tile as in `ops.TexelTiles`, and as atlas pages.
 
 In the list a surfel without a tile has one texel, its constant.
 """
@@ -17,12 +17,12 @@ from bitymi_ns.scene.baked import BakedScene
 
 
 def size_classes(sizes: Tensor) -> list[tuple[int, int, Tensor]]:
-    """Surfels grouped by the sizes [N, 2] (r_u, r_v) of their tiles.
+    """Group surfels by tile size (r_u, r_v), given as [N, 2].
 
     Returns:
-        a list of (r_u, r_v, rows [M] int64), sizes ascending; surfels without a tile are left out.
+        list of (r_u, r_v, rows [M] int64), sizes ascending, without surfels that have no tile.
     """
-    # as one number each: torch.unique of rows sorts them many times as slowly
+    # packed into one integer: torch.unique over rows is many times slower
     keys, inverse = torch.unique((sizes[:, 0].long() << 32) + sizes[:, 1].long(), return_inverse=True)
     found = torch.stack([keys >> 32, keys & 0xFFFFFFFF], dim=1)
     return [
@@ -33,14 +33,14 @@ def size_classes(sizes: Tensor) -> list[tuple[int, int, Tensor]]:
 
 
 def listed_tiles(sizes: Tensor, chunk: int = 1 << 20) -> Iterator[tuple[tuple[int, int], Tensor, Tensor]]:
-    """Tiles of a texel list, in chunks of one size; surfels without a tile, which have one texel, are left out.
+    """Yield the tiles of a texel list in chunks of one size, without surfels that have no tile.
 
     Args:
         sizes: [N, 2] (r_u, r_v) of the tiles.
-        chunk: texels at once (a tile is never split).
+        chunk: texels per chunk; tiles are never split.
 
     Yields:
-        (r_u, r_v), rows [n] int64 of the surfels, rows [n, r_v, r_u] int64 of their texels.
+        (r_u, r_v), rows [n] int64 of the surfels, texel rows [n, r_v, r_u] int64.
     """
     first = first_texels(sizes)
     for r_u, r_v, members in size_classes(sizes):
@@ -50,13 +50,13 @@ def listed_tiles(sizes: Tensor, chunk: int = 1 << 20) -> Iterator[tuple[tuple[in
 
 
 def first_texels(sizes: Tensor) -> Tensor:
-    """[N] int64 row of the first texel of every surfel in the list, of the sizes [N, 2] of the tiles."""
+    """Compute the row [N] int64 of each surfel's first texel in the list, from tile sizes [N, 2]."""
     area = sizes.long().clamp(min=1).prod(dim=1)
     return area.cumsum(0) - area
 
 
 def texel_index(tiles: Tensor, size: tuple[int, int], width: int, height: int) -> Tensor:
-    """Flat index, (layer * height + y) * width + x, of every texel of tiles that share one size.
+    """Compute the flat index (layer * height + y) * width + x of each texel of equally sized tiles.
 
     Args:
         tiles: [N, 5] int32 (x, y, layer, r_u, r_v).
@@ -73,8 +73,8 @@ def texel_index(tiles: Tensor, size: tuple[int, int], width: int, height: int) -
 
 
 def tile_means(texels: Tensor, sizes: Tensor) -> Tensor:
-    """[N, C] mean of every tile of a texel list [T, C], of sizes [N, 2]; of a surfel without a tile its texel. Colours
-    are weighted by alpha, where there is a fourth channel and not all of it is 0."""
+    """Compute the mean [N, C] of each tile of a texel list [T, C], given tile sizes [N, 2]. With a fourth channel
+    (alpha), colours are weighted by alpha unless all of a tile's alphas are 0."""
     means = texels[first_texels(sizes)]
     for _, rows, index in listed_tiles(sizes):
         values = texels[index]
@@ -83,7 +83,7 @@ def tile_means(texels: Tensor, sizes: Tensor) -> Tensor:
 
 
 def _texel_rows(packing: Packing) -> Iterator[tuple[Tensor, Tensor]]:
-    """Rows of the texel list and of the flattened pages of the same texels, a pair for each chunk of tiles."""
+    """Yield matching rows of the texel list and of the flattened pages, one pair per chunk of tiles."""
     tiles = torch.from_numpy(packing.tiles)
     for size, rows, listed in listed_tiles(tiles[:, 3:]):
         paged = texel_index(tiles[rows], size, packing.width, packing.height)
@@ -91,7 +91,8 @@ def _texel_rows(packing: Packing) -> Iterator[tuple[Tensor, Tensor]]:
 
 
 def listed_texels(pages: Tensor, packing: Packing, constants: Tensor) -> Tensor:
-    """Texel list [T, C] of pages [layers, height, width, C]; a surfel without a tile has its constant of [N, C]."""
+    """Gather pages [layers, height, width, C] into a texel list [T, C]; surfels without a tile get their row of
+    `constants` [N, C]."""
     area = torch.from_numpy(packing.tiles[:, 3:]).long().clamp(min=1).prod(dim=1)
     texels = constants.repeat_interleave(area, dim=0)
     for listed, paged in _texel_rows(packing):
@@ -100,7 +101,7 @@ def listed_texels(pages: Tensor, packing: Packing, constants: Tensor) -> Tensor:
 
 
 def paged_texels(texels: Tensor, packing: Packing, elsewhere: float = 0.0) -> Tensor:
-    """Pages [layers, height, width, ...] of a texel list [T, ...], with a number outside of tiles."""
+    """Scatter a texel list [T, ...] into pages [layers, height, width, ...], filled with `elsewhere` between tiles."""
     rest = texels.shape[1:]
     pages = texels.new_full((packing.layers, packing.height, packing.width, *rest), elsewhere)
     for listed, paged in _texel_rows(packing):
@@ -109,7 +110,7 @@ def paged_texels(texels: Tensor, packing: Packing, elsewhere: float = 0.0) -> Te
 
 
 def scene_texels(scene: BakedScene) -> Tensor:
-    """[T, 3] residual colours of a scene on the CPU; a surfel without a tile has one, its mean residual."""
+    """Return the residual colours [T, 3] of a scene on the CPU, the mean residual for a surfel without a tile."""
     assert scene.mean_residual is not None
     if scene.atlas is None and scene.blocks is None:
         return scene.mean_residual
@@ -117,18 +118,18 @@ def scene_texels(scene: BakedScene) -> Tensor:
 
 
 def texel_alpha(scene: BakedScene) -> TexelAlpha | None:
-    """Alpha texels of a scene for its projections, on its device; a surfel without a tile has one, its mean alpha.
-    None = the scene has no alpha.
+    """Return the alpha texels of a scene on its device, the mean alpha for a surfel without a tile; None if the scene
+    has no alpha.
 
     Raises:
-        ValueError: the atlas is only there as BC7 blocks.
+        ValueError: the atlas exists only as BC7 blocks.
     """
     alphas, device = scene.alphas(), scene.tiles.device
     if alphas is None and scene.mean_alpha is None:
         return None
     means = torch.ones(len(scene)) if scene.mean_alpha is None else scene.mean_alpha.cpu()
     extent = torch.full_like(means, SUPPORT, device=device) if scene.extent is None else scene.extent.float()
-    if alphas is None:  # without an atlas every surfel has its constant
+    if alphas is None:  # no atlas: constants only
         sizes, values = torch.ones_like(scene.tiles[:, 3:]), means
     else:
         sizes, values = scene.tiles[:, 3:].clamp(min=1), _listed(scene, alphas[..., None], means[:, None])[:, 0]
@@ -141,7 +142,7 @@ def _listed(scene: BakedScene, pages: Tensor, constants: Tensor) -> Tensor:
 
 
 def covered_blocks(tiles: np.ndarray, width: int, height: int, layers: int) -> np.ndarray:
-    """[layers, height / 4, width / 4] bool, True for 4 x 4 blocks that belong to a tile."""
+    """Compute the mask [layers, height / 4, width / 4] of 4 x 4 blocks that belong to a tile."""
     blocks = torch.from_numpy(np.ascontiguousarray(tiles)).clone()
     blocks[:, [0, 1, 3, 4]] //= 4
     mask = torch.zeros(layers * (height // 4) * (width // 4), dtype=torch.bool)

@@ -1,4 +1,4 @@
-"""Quantisation of the atlas: one global range, and the three texel formats."""
+"""Quantisation of the atlas: global range and texel formats."""
 
 import os
 from collections.abc import Sequence
@@ -19,32 +19,32 @@ from bitymi_ns.progress import Progress, no_progress
 Format = Literal["bc7", "uint8", "fp16"]
 RangeRule = Literal["sigma6", "minmax", "auto"]
 
-STEPS = 255.0  # 8-bit steps in a colour of 1: the unit of errors and of the tolerance
+STEPS = 255.0  # 8-bit steps per colour unit: the unit of errors and of the tolerance
 BYTES_PER_TEXEL: dict[str, int] = {"bc7": 1, "uint8": 4, "fp16": 8}
 _SMALLEST_SPAN = 1e-6
 
 
 @dataclass(frozen=True)
 class Range:
-    """The global quantisation range: value = offset + scale * unorm with unorm in [0, 1]."""
+    """Global quantisation range: value = offset + scale * unorm with unorm in [0, 1]."""
 
     offset: float
     scale: float
     rule: str
 
     def to_unorm8(self, values: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
-        """Nearest 8-bit codes of `values`, clipped to the range."""
+        """Quantise `values` to the nearest 8-bit codes, clipped to the range."""
         unorm = (values - np.float32(self.offset)) * np.float32(1.0 / self.scale)
         return np.rint(np.clip(unorm, 0.0, 1.0) * 255.0).astype(np.uint8)
 
     def from_unorm8(self, codes: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
-        """Values of 8-bit codes."""
+        """Dequantise 8-bit codes."""
         return codes.astype(np.float32) * np.float32(self.scale / 255.0) + np.float32(self.offset)
 
 
 @dataclass(frozen=True)
 class EncodedAtlas:
-    """An atlas in the format it is stored in."""
+    """An atlas in its stored format."""
 
     payload: list[bytes]  # one bytes object per page: BC7 blocks, RGBA8 texels, or RGBA half floats, rows from the top
     format: Format  # one of bc7, uint8, fp16
@@ -59,7 +59,7 @@ class EncodedAtlas:
 
     @property
     def psnr(self) -> float | None:
-        """PSNR in dB of the decoded tiles' colours against the atlas, for a peak of 1; None when they are equal."""
+        """PSNR in dB of the decoded tiles' colours against the atlas, peak 1; None if they are equal."""
         return None if self.mse == 0 else float(-10.0 * np.log10(self.mse))
 
     @property
@@ -68,7 +68,7 @@ class EncodedAtlas:
         return sum(len(page) for page in self.payload)
 
     def decoded(self) -> npt.NDArray[np.float32]:
-        """Residual colours and, where there are such, alphas as a renderer reads them: [layers, height, width, C]."""
+        """Decode to [layers, height, width, C]: residual colours and, if stored, alphas."""
         return decode(
             self.payload, self.format, self.width, self.height, self.range.offset, self.range.scale, self.alpha_scale
         )
@@ -77,13 +77,13 @@ class EncodedAtlas:
 def choose_range(
     texels: npt.NDArray[np.float32], rule: RangeRule = "sigma6", samples: int = 1 << 18, seed: int = 0
 ) -> Range:
-    """The quantisation range of an atlas, one (offset, scale) for the three channels of its colours.
+    """Choose the quantisation range of an atlas, shared by its three colour channels.
 
     sigma6: mean +- 6 standard deviations of a bootstrap sample (paper, Quantization). minmax: smallest to largest
-    value, nothing clipped. auto: whichever of the two has the smaller mean squared 8-bit error on the sample.
+    value, nothing clipped. auto: the one with the smaller mean squared 8-bit error on the sample.
 
     Args:
-        texels: [T, C] float32 of the tiles.
+        texels: [T, C] float32 texels of the tiles.
         samples: size of the bootstrap sample, uniform over the texels, with replacement.
     """
     if len(texels) == 0:
@@ -120,11 +120,11 @@ def encode(
 
     Args:
         texels: [layers, height, width, C] float32 residual colours and, where C = 4, alphas.
-        packing: where the tiles lie: errors are measured there only.
+        packing: layout of the tiles; errors are measured inside them only.
         format: bc7 (1 byte per texel), uint8 (RGBA, 4) or fp16 (RGBA half floats, 8).
-        value_range: quantisation range; not given: `choose_range` with its defaults. Not used by fp16.
+        value_range: quantisation range, not used by fp16; None: `choose_range` with its defaults.
         profile: effort of the BC7 encoder, from ultrafast to slow.
-        threads: encoder threads; not given: one per processor. The result does not depend on it.
+        threads: encoder threads, without effect on the result; None: one per processor.
     """
     if format not in BYTES_PER_TEXEL:
         raise ValueError(f"the atlas format must be bc7, uint8 or fp16, not {format!r}")
@@ -148,7 +148,7 @@ def encode(
             low, high = -RESIDUAL_LIMIT, RESIDUAL_LIMIT
         else:
             low, high = value_range.offset, value_range.offset + value_range.scale
-        slack = 1e-6 * (high - low)  # the extremes themselves, rounded to float32, are not clipped
+        slack = 1e-6 * (high - low)  # the extremes may round to float32 just outside
         clipped = int(((inside < low - slack) | (inside > high + slack)).sum())
         return data, clipped, float(np.square(decoded[mask].astype(np.float64) - inside).sum())
 
@@ -176,7 +176,7 @@ def encode(
 
 
 def decode_pages(payload: Sequence[bytes], format: Format, width: int, height: int) -> np.ndarray:
-    """Stored texels of an encoded atlas: [layers, height, width, 4], uint8 for bc7 and uint8, float16 for fp16.
+    """Unpack an encoded atlas to stored texels [layers, height, width, 4]: uint8 for bc7 and uint8, float16 for fp16.
 
     Raises:
         ValueError: a page has the wrong number of bytes.
@@ -203,8 +203,8 @@ def decode(
     scale: float,
     alpha_scale: float = 0.0,
 ) -> npt.NDArray[np.float32]:
-    """Texels of an encoded atlas: [layers, height, width, C] float32, colours offset + scale * stored value and, where
-    `alpha_scale` is not 0, alphas."""
+    """Decode an atlas to texels [layers, height, width, C] float32: colours offset + scale * stored value, and alphas
+    if `alpha_scale` is not 0."""
     stored = decode_pages(payload, format, width, height)[..., : 4 if alpha_scale else 3]
     if format == "fp16":
         return stored.astype(np.float32)
@@ -215,12 +215,12 @@ def decode(
 
 
 def alpha_bytes(alpha: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
-    """Nearest bytes of alphas, 128 for 1, clipped to 0 to 255."""
+    """Quantise alphas to the nearest byte, 128 = 1, clipped to 0 to 255."""
     return np.rint(np.clip(alpha * np.float32(ALPHA_ONE), 0.0, 255.0)).astype(np.uint8)
 
 
 def _quantised(values: npt.NDArray[np.float32], format: Format, value_range: Range) -> np.ndarray:
-    """RGBA texels, of full alpha where they are opaque: [h, w, 4] uint8, or little-endian float16."""
+    """Quantise to RGBA texels [h, w, 4], uint8 or little-endian float16; opaque texels get full alpha."""
     alpha = values[..., 3] if values.shape[2] == 4 else None
     if format == "fp16":
         rgba = np.ones((*values.shape[:2], 4), dtype="<f2")

@@ -1,4 +1,4 @@
-"""Columns of integers as Zstandard frames, one for each byte plane of each number, of known sizes."""
+"""Integer columns as Zstandard frames: one frame per byte plane, of known size."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,26 +8,25 @@ import numpy.typing as npt
 import zstandard
 
 LEVEL = 19
-MOST_PLANES = 7  # bytes of a number: what a float64 holds exactly
+MOST_PLANES = 7  # bytes of an integer that a float64 holds exactly
 _WINDOW = 1 << 23
 
 
 class StreamError(ValueError):
-    """The bytes are not what their description says."""
+    """Bytes that do not match their description."""
 
 
 @dataclass(frozen=True)
 class Compressed:
-    """A compressed column of integers."""
+    """A compressed integer column of n numbers per row."""
 
-    low: list[int]  # of each of its numbers, the smallest value, which was subtracted
-    # of each of its numbers, the sizes in bytes of its frames, the lowest byte first; none where all are 0
-    planes: list[list[int]]
-    data: bytes  # the frames, one after the other
+    low: list[int]  # [n] smallest value of each number, subtracted before packing
+    planes: list[list[int]]  # [n] byte sizes of the frames, lowest byte first; empty if all values are equal
+    data: bytes  # concatenated frames
 
 
 def compress(codes: npt.NDArray[np.int64], level: int = LEVEL) -> Compressed:
-    """Compress int64 [rows, numbers] below 2^53 in size at a Zstandard level of 1 to 22."""
+    """Compress int64 [rows, n] of magnitude below 2^53; `level` is Zstandard's, 1 to 22."""
     compressor = zstandard.ZstdCompressor(level=level, write_content_size=True)
     low = [int(column.min()) if len(column) else 0 for column in codes.T]
     frames: list[list[bytes]] = []
@@ -44,10 +43,10 @@ def compress(codes: npt.NDArray[np.int64], level: int = LEVEL) -> Compressed:
 def decompress(
     view: memoryview, rows: int, low: Sequence[int], planes: Sequence[Sequence[int]], dtype: type[np.integer] = np.int64
 ) -> npt.NDArray:
-    """Decompress integers [rows, numbers] of `compress`, in memory for `rows` of them and no more.
+    """Decompress the integers [rows, n] of `compress`, in memory bounded by `rows`.
 
     Raises:
-        StreamError: a frame is damaged, or holds another number of bytes than there are rows.
+        StreamError: a frame is damaged or its size does not match `rows`.
     """
     codes = np.empty((rows, len(low)), dtype=dtype)
     at = 0
@@ -63,10 +62,10 @@ def decompress(
 
 
 def plane_bytes(frame: memoryview, size: int) -> npt.NDArray[np.uint8]:
-    """Bytes of a frame that must hold `size` of them; its header is checked before anything is allocated.
+    """Decompress a frame of exactly `size` bytes; its header is checked before allocating.
 
     Raises:
-        StreamError: it is damaged or holds another number.
+        StreamError: the frame is damaged or has another size.
     """
     try:
         header = zstandard.get_frame_parameters(bytes(frame[:32]))

@@ -1,4 +1,4 @@
-"""Integer codes of surfels, and the parameters that they decode to."""
+"""Integer codes of surfels and their decoding."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ from bitymi_ns.ops.view_kinds import COLOR_LIMIT, VIEW_COLORS
 
 Codes = npt.NDArray[np.int64]
 
-POSITION_BITS = 17  # bits per axis of a position: three times as many are exact in a float64
-SMALLEST_SHARE = 1.0 / 1024  # opacities and betas keep this distance from their ends, where a logit would be infinite
+POSITION_BITS = 17  # bits per axis of a position: three axes fit exactly into a float64
+SMALLEST_SHARE = 1.0 / 1024  # margin of opacities and betas to 0 and 1, where the logit is infinite
 REFERENCE: dict[str, float] = {
     "place": 1.0 / 512,
     "rotation": 1.0 / 128,
@@ -29,18 +29,18 @@ REFERENCE: dict[str, float] = {
     "term_shape": 1.0 / 12,
     "term_color": 1.0 / 64,
 }
-"""Columns whose precision is chosen, with steps to which the error is about proportional: of place (positions) in
-`PositionGrid` units, of opacity and beta as shares of their ranges, of term_shape in units of asinh."""
+"""Reference steps of the columns whose precision is chosen; near them an error is about proportional to its step.
+Units: place (positions) as in `PositionGrid`, opacity and beta shares of their ranges, term_shape asinh."""
 PARAMETERS = {"place": "means", "rotation": "quats", "opacity": "opacity_logits", "beta": "beta_raw"}
-"""Parameters of the surfels by column, where the names differ."""
+"""Surfel parameter of each column whose name differs."""
 
 
 @dataclass(frozen=True)
 class PositionGrid:
-    """Grid of positions: x = center + scale sinh(low + step k), per axis, with integers k from 0. It is about uniform
-    within `scale` of the centre, and beyond its cells grow with the distance."""
+    """Grid of positions: x = center + scale sinh(low + step k), per axis, with integers k >= 0. Cells are about uniform
+    within `scale` of the centre and grow with the distance beyond."""
 
-    # center, low: one number per axis
+    # center, low: per axis
     center: tuple[float, float, float]
     scale: float  # world units
     low: tuple[float, float, float]
@@ -48,17 +48,16 @@ class PositionGrid:
 
 @dataclass(frozen=True)
 class SurfelCodes:
-    """N surfels along a Morton curve, as integers."""
+    """N surfels as integers, in Morton order."""
 
-    kind: str  # of the view colours, a name of `ops.VIEW_COLORS`
-    frame: PositionGrid  # the grid of positions
-    steps: Mapping[str, float]  # the distance of neighbouring values by column, as in `REFERENCE`
-    # column to [rows, numbers] int64. place [N, 1]: Morton codes of the positions, ascending: bit 3 i + a is bit i of
-    # the cell along axis a. largest [N, 1], rotation [N, 3]: which of w, x, y, z has the largest size and is positive;
+    kind: str  # view-colour kind, a name of `ops.VIEW_COLORS`
+    frame: PositionGrid
+    steps: Mapping[str, float]  # quantisation step by column, as in `REFERENCE`
+    # column to [rows, numbers] int64. place [N, 1]: ascending Morton codes of the cells: bit 3 i + a is bit i along
+    # axis a. largest [N, 1]: index of the quaternion component (wxyz) of largest size, made positive; rotation [N, 3]:
     # the others. log_scales [N, 2], opacity [N, 1], beta [N, 1]. size [N, 1]: 16 log2(r_u) + log2(r_v); 0 = no tile.
-    # extent [tiles, 1]: half sides of the tiles that there are. view_base [N, 3], view_count [N, 1]: base colours and
-    # numbers of terms. term_shape, term_color [T, ...]: the terms, those numbers that are no colours and those that
-    # are. Colours are green, red - green, blue - green
+    # extent [tiles, 1]: half sides of the tiles. view_base [N, 3], view_count [N, 1]: base colour and number of terms.
+    # term_shape, term_color [T, ...]: numbers of the terms, colours apart. Colours are green, red - green, blue - green
     codes: Mapping[str, Codes]
 
     def __len__(self) -> int:
@@ -66,27 +65,27 @@ class SurfelCodes:
 
     @property
     def columns(self) -> dict[str, Codes]:
-        """The columns of surfels.bin, of which residuals are another: name to [rows, numbers]."""
+        """The columns of surfels.bin except residuals: name to [rows, numbers]."""
         return {**self.codes, "place": np.diff(self.codes["place"], axis=0, prepend=0)}
 
     def nbytes(self) -> int:
-        """Bytes of surfels.bin without residuals."""
+        """Count the bytes of surfels.bin without residuals."""
         return sum(len(streams.compress(column).data) for column in self.columns.values())
 
     @property
     def sizes(self) -> npt.NDArray[np.int64]:
-        """[N, 2] sides of the tiles, texels; (0, 0) where there is none."""
+        """[N, 2] tile sides, texels; (0, 0) without a tile."""
         size = self.codes["size"][:, 0]
         return np.where(size[:, None] > 0, 1 << np.stack([size >> 4, size & 15], axis=1), 0)
 
     def extent(self, default: float) -> Tensor:
-        """[N] half sides of the tiles in scale units, `default` where there is none."""
+        """Decode the tiles' half sides [N] in scale units; `default` without a tile."""
         tiled, extent = self.codes["size"][:, 0] > 0, np.full(len(self), default)
         extent[tiled] = np.clip(self._linear("extent")[:, 0], *EXTENTS)
         return torch.from_numpy(extent.astype(np.float32)).clamp(*EXTENTS)
 
     def surfels(self) -> dict[str, Tensor]:
-        """Decoded parameters, float32, with lean view colours."""
+        """Decode the parameters, float32, with lean view colours."""
         entry, (colors, shapes) = VIEW_COLORS[self.kind], term_numbers(self.kind)
         terms = np.zeros((len(self.codes["term_color"]), entry.lean_width))
         count = self.codes["view_count"][:, 0]
@@ -125,17 +124,17 @@ class SurfelCodes:
 def code_surfels(
     surfels: Mapping[str, Tensor], kind: str, sizes: npt.ArrayLike, extent: Tensor, steps: Mapping[str, float]
 ) -> tuple[SurfelCodes, Tensor]:
-    """Round surfels to the given steps, in Morton order of their positions.
+    """Quantise surfels and sort them in Morton order.
 
     Args:
         surfels: parameters by name, on the CPU, with lean view colours.
         kind: a name of `ops.VIEW_COLORS`.
         sizes: [N, 2] sides of the tiles, texels; (0, 0) = none.
         extent: [N] half sides of the tiles, scale units.
-        steps: by column, as in `REFERENCE`; that of place grows where its cells would exceed `POSITION_BITS`.
+        steps: by column, as in `REFERENCE`; the step of place grows if its cells would exceed `POSITION_BITS`.
 
     Returns:
-        the codes, and [N] int64: the row that each of them was.
+        the codes, and their order: [N] int64 rows of `surfels`.
     """
     values = {name: value.detach().double().numpy() for name, value in surfels.items()}
     frame, step, cell = _grid_cells(values["means"], steps["place"])
@@ -171,7 +170,7 @@ def code_surfels(
 
 
 def reordered(surfels: Mapping[str, Tensor], order: Tensor) -> dict[str, Tensor]:
-    """Surfels with lean view colours in another order [N], their terms in the order of the surfels."""
+    """Reorder surfels with lean view colours by rows [N]; terms follow their surfels."""
     span = surfels["view_span"].long()[order]
     moved = {name: value[order].contiguous() for name, value in surfels.items() if name not in LEAN}
     moved["view_base"] = surfels["view_base"][order].contiguous()
@@ -181,7 +180,7 @@ def reordered(surfels: Mapping[str, Tensor], order: Tensor) -> dict[str, Tensor]
 
 
 def term_numbers(kind: str) -> tuple[list[int], list[int]]:
-    """Indices of the numbers of a lean term that are colours, in threes, and of the others."""
+    """Split the indices of a lean term's numbers into colours (in threes) and others."""
     limit = limit_of("view_terms", kind)
     every = limit * (VIEW_COLORS[kind].lean_width if len(limit) == 1 else 1)
     colors = [i for i, each in enumerate(every) if each == COLOR_LIMIT]
@@ -189,18 +188,18 @@ def term_numbers(kind: str) -> tuple[list[int], list[int]]:
 
 
 def morton_codes(cell: Codes) -> Codes:
-    """[N] Morton codes of cells [N, 3] of at most 2^17 per axis."""
+    """Interleave cells [N, 3], below 2^17 per axis, to Morton codes [N]."""
     return sum(((cell[:, a] >> i) & 1) << (3 * i + a) for i in range(POSITION_BITS) for a in range(3))
 
 
 def morton_cells(codes: Codes) -> Codes:
-    """[N, 3] cells of Morton codes [N, 1]."""
+    """Deinterleave Morton codes [N, 1] to cells [N, 3]."""
     axes = [sum(((codes[:, 0] >> (3 * i + a)) & 1) << i for i in range(POSITION_BITS)) for a in range(3)]
     return np.stack(axes, axis=1)
 
 
 def _grid_cells(means: npt.NDArray[np.float64], step: float) -> tuple[PositionGrid, float, Codes]:
-    """Grid of the positions [N, 3], its step, and the cells [N, 3]."""
+    """Fit the grid to positions [N, 3]: the grid, its step, and the cells [N, 3]."""
     center = np.median(means, axis=0)
     scale = float(np.median(np.abs(means - center))) or 1.0
     bent = np.arcsinh((means - center) / scale)
@@ -211,7 +210,7 @@ def _grid_cells(means: npt.NDArray[np.float64], step: float) -> tuple[PositionGr
 
 
 def _term_rows(span: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Rows of the terms, surfel after surfel, of spans [N, 2]."""
+    """List the rows of the terms of spans [N, 2], surfel after surfel."""
     first, count = span[:, 0], span[:, 1]
     start = np.cumsum(count) - count
     return np.repeat(first - start, count) + np.arange(int(count.sum()))
@@ -222,7 +221,7 @@ def _codes(values: npt.NDArray[np.float64], step: float) -> Codes:
 
 
 def _differences(rgb: Codes) -> Codes:
-    """Green, red - green, blue - green of channels (..., 3 each)."""
+    """Convert channels (r, g, b repeated) to green, red - green, blue - green."""
     r, g, b = (rgb[:, i::3] for i in range(3))
     return np.stack([g, r - g, b - g], axis=2).reshape(rgb.shape)
 
@@ -233,7 +232,7 @@ def _rgb(differences: Codes) -> Codes:
 
 
 def _sinh(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    return np.sinh(np.clip(x, -50.0, 50.0))  # beyond all limits already, and finite
+    return np.sinh(np.clip(x, -50.0, 50.0))  # beyond all limits, and finite
 
 
 def _sigmoid(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -246,6 +245,6 @@ def _logit(share: npt.NDArray[np.float64], least: float) -> npt.NDArray[np.float
 
 
 def _within(name: str, kind: str, values: npt.NDArray[np.float64]) -> Tensor:
-    """float32 values clipped to the limits of a bundle, which rounding may exceed."""
+    """Clip to the limits of a bundle, which rounding may exceed, as float32."""
     limit = np.array(limit_of(name, kind) if name == "view_terms" else LIMITS.get(name, (np.inf,)))
     return torch.from_numpy(np.clip(values, -limit, limit).astype(np.float32))

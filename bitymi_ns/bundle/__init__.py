@@ -1,4 +1,4 @@
-"""Bundles: the folder a baked scene is written to, with its surfels, atlas and description; reading and checking it."""
+"""Bundles, the folders of baked scenes (surfels, atlas, description): writing, reading, checking."""
 
 from bitymi_ns.bundle.manifest import BundleError
 from bitymi_ns.bundle.parts import check_target

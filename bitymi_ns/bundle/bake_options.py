@@ -1,4 +1,4 @@
-"""Options of the bake, which bundle.json states."""
+"""Options of the bake, recorded in bundle.json."""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -15,12 +15,12 @@ BundleFormat = Literal["compact", Format]
 
 @dataclass
 class BakeOptions:
-    """Options of the bake: format of the bundle, tolerance, tiles."""
+    """Options of the bake: bundle format, tolerance, tiles."""
 
     format: BundleFormat | None = None
-    """compact: surfels and view colours as far as the pictures need them, texels by cosine transform; a sixth to a
-    half of the bytes of bc7, which is surfels.ply and texels of 1 byte each. uint8, fp16: the same with texels of 4
-    and 8 bytes. Not given: compact, or bc7 where everything is kept (a tolerance of 0)."""
+    """compact: surfels and view colours quantised as far as the pictures allow, texels by cosine transform; a sixth to
+    a half of the bytes of bc7, which is surfels.ply and texels of 1 byte each. uint8, fp16: as bc7, with texels of 4
+    and 8 bytes. None: compact, or bc7 for a tolerance of 0, which keeps everything."""
     bc7_profile: Profile = "veryfast"
     """Effort of the BC7 encoder; basic and slow gain about 0.3 dB at a quarter and a twelfth of the speed."""
     r_min: int = 4
@@ -28,29 +28,29 @@ class BakeOptions:
     r_max: int = 64
     """Largest tile side in texels, a power of two."""
     extent: float = SUPPORT
-    """Largest half side of a tile in scale units (the paper's e); 3 covers exactly the kernel's support, the paper uses
-    4. With a tolerance a tile covers no more than where fragments reach the weight bound."""
+    """Largest half side of a tile in scale units (the paper's e, 4 there); 3 covers exactly the kernel's support. With
+    a tolerance a tile covers only fragments above the weight bound."""
     tolerance: float = 0.75
-    """Largest error of the reduction, in 8-bit steps, weighted by what a fragment can contribute to a pixel. A tile
+    """Largest error of the reduction, in 8-bit steps, weighted by a fragment's largest contribution to a pixel. A tile
     takes the smallest grid, or none, whose root mean square error over its visible part is within it. A view colour
-    keeps the fewest Spherical Voronoi sites, or one colour, whose largest error is within it, at the directions of the
-    training views that see the surfel and at others between and around them. (Other view colours keep all or one
-    colour.) 0: tile sizes by the Nyquist rule, and all of the view colours."""
+    keeps the fewest Spherical Voronoi sites, or one colour, whose largest error is within it, over the directions of
+    the training views that see the surfel and others between and around them. (Other view colours keep everything or
+    one colour.) 0: tile sizes by the Nyquist rule, view colours unchanged."""
     local_voxel: bool = True
-    """Choose the size of a tile by the field's voxels where the surfel is; False: by the smallest voxel of the scene,
-    as in the paper (which also has an extent of 4)."""
+    """Choose the size of a tile by the field's voxels at the surfel; False: by the smallest voxel of the scene, as in
+    the paper."""
     cap_by_views: bool = True
-    """Give no tile more texels than pixels it covers in the training view that sees it largest."""
+    """Limit the texels of a tile to the pixels it covers in the training view that sees it largest."""
     drop_unseen: bool = True
-    """Leave out surfels of which no training view blends a fragment (where views are given)."""
+    """Drop surfels that no training view blends (if views are given)."""
     range: RangeRule = "sigma6"
     """Quantisation range: sigma6 = mean +- 6 standard deviations, minmax = no clipping, auto = the smaller error."""
     range_samples: int = 1 << 18
-    """Texels in the bootstrap sample that the range is chosen from."""
+    """Texels in the bootstrap sample for the range."""
     seed: int = 0
     """Seed of that sample."""
     page_width: int = 4096
-    """Width of an atlas page in texels, a power of two; small atlases get a narrower page."""
+    """Width of an atlas page in texels, a power of two; small atlases get narrower pages."""
     page_rows: int = 8192
     """Largest height of an atlas page; phones and WebGPU stop at 8192."""
     chunk: int = 1 << 18
@@ -58,20 +58,20 @@ class BakeOptions:
 
     @property
     def bundle_format(self) -> BundleFormat:
-        """Format of the bundle, chosen where it is not given."""
+        """Format of the bundle, with the default resolved."""
         return self.format or ("compact" if self.tolerance > 0 else "bc7")
 
     @property
     def texel_format(self) -> Format:
-        """Format of the atlas in memory; the texels of a compact bundle are decoded to 8 bits, without an encoder."""
+        """Format of the atlas in memory: compact texels are decoded to 8 bits, without an encoder."""
         return "uint8" if self.bundle_format == "compact" else self.bundle_format
 
     def check(self) -> None:
-        """Refuse values out of range.
+        """Check the values.
 
         Raises:
             ValueError: an option is out of its range.
-            RuntimeError: the encoder of BC7 is not installed.
+            RuntimeError: the BC7 encoder is not installed.
         """
         if not EXTENTS[0] <= self.extent <= EXTENTS[1]:
             raise ValueError(f"the extent must be from {EXTENTS[0]:g} to {EXTENTS[1]:g}, not {self.extent}")

@@ -1,4 +1,4 @@
-"""cameras.json of a bundle: the cameras of the capture that it was made of."""
+"""cameras.json of a bundle: the cameras of the capture."""
 
 import json
 from collections.abc import Iterable
@@ -24,10 +24,10 @@ class CapturedCamera(BaseModel):
 
     Attributes:
         name: name of its photograph.
-        held_out: whether training did not see that.
+        held_out: whether training left the photograph out.
         width, height, fx, fy, cx, cy: of the photograph, in pixels.
         viewmat: [16] world to camera by rows, OpenCV axes.
-        photograph: file of the bundle with the photograph, which may be smaller; None = the bundle has none.
+        photograph: file of the bundle with the photograph, possibly reduced; None if it has none.
     """
 
     name: str
@@ -52,25 +52,25 @@ class CapturedCamera(BaseModel):
 
     @property
     def camera(self) -> Camera:
-        """The camera, on the CPU."""
+        """Convert to a camera on the CPU."""
         K = torch.tensor([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
         return Camera(torch.tensor(self.viewmat).view(4, 4), K, self.width, self.height)
 
 
 def cameras_data(cameras: Iterable[CapturedCamera]) -> bytes:
-    """Write the bytes of cameras.json."""
+    """Serialise cameras.json."""
     rows = [camera.model_dump(exclude_none=True) for camera in cameras]
     return (json.dumps({"cameras": rows}) + "\n").encode()
 
 
 def parse_cameras(data: bytes | bytearray, path: Path) -> list[CapturedCamera]:
-    """Read the bytes of cameras.json.
+    """Parse cameras.json.
 
     Args:
-        path: of the file, for messages.
+        path: path for messages.
 
     Raises:
-        BundleError: it is malformed; names the first entry that is.
+        BundleError: malformed; names the first bad entry.
     """
     try:
         value = strict_json.loads(data)

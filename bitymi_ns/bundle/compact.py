@@ -1,4 +1,4 @@
-"""The two files of a compact bundle: surfels.bin and texels.bin, columns of integers that bundle.json describes."""
+"""surfels.bin and texels.bin of a compact bundle: integer columns described by bundle.json."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -16,23 +16,23 @@ from bitymi_ns.codec.texel_codes import GRADES, AlphaCodes, TexelCodes, blocks_o
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 
 SURFELS_PER_BYTE, TEXELS_PER_BYTE = 1, 64
-"""Files that claim more than these, plus `SPARE_*`, are refused: constant columns take no bytes, but memory.
-Trained scenes have a surfel per 12 bytes or more and at most 5 texels per byte. Flat tiles take bytes of their surfel
-alone, so both files count for texels."""
+"""Upper bounds, plus `SPARE_*`, on what a file may claim: constant columns take no bytes on disk, but memory. Trained
+scenes have a surfel per 12 bytes or more and at most 5 texels per byte. Flat tiles take bytes in surfels.bin only, so
+the sum of both files counts for texels."""
 SPARE_SURFELS, SPARE_TEXELS = 1 << 12, 1 << 20
-MOST_EXPONENT = 12  # of two, in the side of a tile
+MOST_EXPONENT = 12  # largest log2 of a tile side
 _COEFFICIENT_PLANES = 3
 
 
 def encode_surfels(
     codes: SurfelCodes, residual: Codes, residual_step: float, alpha: Codes | None = None
 ) -> tuple[dict[str, Any], bytes]:
-    """Entries of bundle.json for surfels.bin, and the file.
+    """Encode surfels.bin; returns its entries in bundle.json and its bytes.
 
     Args:
-        residual: [N, 3] mean residuals: green, red less green, blue less green.
-        residual_step: of these.
-        alpha: [N] mean alphas, 128 for 1; None = opaque texels.
+        residual: [N, 3] mean residuals: green, red - green, blue - green.
+        residual_step: their step.
+        alpha: [N] mean alphas, 128 = 1; None if opaque.
     """
     columns = {**codes.columns, "residual": residual}
     if alpha is not None:
@@ -47,10 +47,10 @@ def encode_surfels(
 def decode_surfels(
     info: Surfels, data: memoryview, has_alpha: bool = False
 ) -> tuple[SurfelCodes, Codes, float, Codes | None]:
-    """Decode surfels.bin: the codes, the residuals [N, 3] and their step, and mean alphas [N] where it has them.
+    """Decode surfels.bin: the codes, the residuals [N, 3] and their step, and mean alphas [N] if it has them.
 
     Raises:
-        StreamError: the file is damaged, contradicts bundle.json, or holds a number that no surfel can have.
+        StreamError: the file is damaged, contradicts bundle.json, or holds a number out of range.
     """
     assert info.columns is not None and info.frame is not None
     names, numbers = _surfel_columns(info.view_color, has_alpha)
@@ -71,7 +71,7 @@ def decode_surfels(
 
 
 def encode_texels(codes: TexelCodes) -> tuple[dict[str, Any], bytes]:
-    """Entries of bundle.json for texels.bin, and the file."""
+    """Encode texels.bin; returns its entries in bundle.json and its bytes."""
     columns, alpha = codes.columns, codes.alpha
     steps = {} if alpha is None else {name: alpha.step for name in columns if name.startswith("alpha_")}
     described, data = _compressed(columns, steps)
@@ -80,7 +80,7 @@ def encode_texels(codes: TexelCodes) -> tuple[dict[str, Any], bytes]:
 
 
 def _compressed(columns: Mapping[str, Codes], steps: Mapping[str, float]) -> tuple[list[dict[str, Any]], bytes]:
-    """Entries of columns in bundle.json, and their bytes."""
+    """Compress columns; returns their entries in bundle.json and the bytes."""
     found = {name: streams.compress(values) for name, values in columns.items()}
     entries = [{"name": name, "step": steps.get(name), "low": c.low, "planes": c.planes} for name, c in found.items()]
     return entries, b"".join(c.data for c in found.values())
@@ -92,12 +92,12 @@ def decode_texels(
     """Decode texels.bin.
 
     Args:
-        sizes: [N, 2] sides of the tiles.
-        residual, residual_step: of surfels.bin.
-        alpha: of surfels.bin, None = opaque texels.
+        sizes: [N, 2] tile sides.
+        residual, residual_step: from surfels.bin.
+        alpha: from surfels.bin; None if opaque.
 
     Raises:
-        StreamError: the file is damaged, contradicts bundle.json or the sizes of the tiles.
+        StreamError: the file is damaged or contradicts bundle.json or the tile sizes.
     """
     assert info.columns is not None and info.step is not None and info.texels is not None
     count = int(sizes.prod(dim=1).sum())
@@ -127,10 +127,10 @@ def decode_texels(
 
 
 def packing_of(info: Atlas, sizes: Tensor) -> Packing:
-    """Packing of the tiles, which follows from their sizes.
+    """Pack the tiles; the packing follows from their sizes.
 
     Raises:
-        StreamError: they do not lie in pages of the size that bundle.json states.
+        StreamError: the pages differ from those in bundle.json.
     """
     try:
         packing = pack(sizes.numpy(), info.page_width, info.page_rows)
@@ -143,10 +143,10 @@ def packing_of(info: Atlas, sizes: Tensor) -> Packing:
 
 
 def check_surfels_size(info: Surfels, size: int) -> None:
-    """Refuse a surfels.bin whose size contradicts bundle.json, before it is read.
+    """Check the size of surfels.bin against bundle.json before reading.
 
     Raises:
-        StreamError: says why.
+        StreamError: they differ.
     """
     _check_size(info.columns or [], size)
     if max(info.count, info.terms or 0) > SURFELS_PER_BYTE * size + SPARE_SURFELS:
@@ -154,10 +154,10 @@ def check_surfels_size(info: Surfels, size: int) -> None:
 
 
 def check_texels_size(info: Atlas, size: int, surfels: int) -> None:
-    """Refuse a texels.bin whose size contradicts bundle.json, beside a surfels.bin of `surfels` bytes.
+    """Check the size of texels.bin against bundle.json before reading; surfels.bin has `surfels` bytes.
 
     Raises:
-        StreamError: says why.
+        StreamError: they differ.
     """
     _check_size(info.columns or [], size)
     if (
@@ -168,7 +168,7 @@ def check_texels_size(info: Atlas, size: int, surfels: int) -> None:
 
 
 def _surfel_columns(kind: str, has_alpha: bool) -> tuple[list[str], dict[str, int]]:
-    """Columns of surfels.bin in their order, and how many numbers each has."""
+    """List the columns of surfels.bin in order, and the numbers per row of each."""
     colors, shapes = term_numbers(kind)
     numbers = {"place": 1, "largest": 1, "rotation": 3, "log_scales": 2, "opacity": 1, "beta": 1, "size": 1}
     numbers |= {"residual": 3, **({"alpha": 1} if has_alpha else {}), "view_base": 3, "extent": 1, "view_count": 1}
@@ -194,7 +194,7 @@ def _check_columns(
 
 
 def _check_codes(name: str, codes: Codes, info: Surfels) -> None:
-    """Refuse numbers that no surfel can have; those that are only too large are clipped by the decoder."""
+    """Check codes for impossible values; the decoder clips those that are only too large."""
     if codes.size == 0:
         return
     low, high = int(codes.min()), int(codes.max())

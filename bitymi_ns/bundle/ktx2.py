@@ -1,4 +1,4 @@
-"""KTX2 files: 2D array textures of one level, in the three texel formats of an atlas.
+"""KTX2 files: 2D array textures with one level, in the texel formats of an atlas.
 
 Written from the Khronos KTX File Format Specification 2.0 and the Khronos Data Format Specification 1.3.
 """
@@ -12,14 +12,14 @@ from bitymi_ns.codec.quantise import Format
 
 IDENTIFIER = b"\xabKTX 20\xbb\r\n\x1a\n"
 
-_HEADER = struct.Struct("<12s9I4I2Q3Q")  # identifier, header, index, and the one level
+_HEADER = struct.Struct("<12s9I4I2Q3Q")  # identifier, header, index, the level
 _KEY_LIMIT = 1 << 20
-HEADER_LIMIT = 1 << 10  # header, index, level and data format descriptor are shorter, in bytes
+HEADER_LIMIT = 1 << 10  # bound in bytes of header, index, level and data format descriptor
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """Fields of the file that depend on the texel format."""
+    """Fields that depend on the texel format."""
 
     vk_format: int
     type_size: int  # bytes of one component, 1 for compressed formats
@@ -41,7 +41,7 @@ _LAYOUTS: dict[str, _Layout] = {
 
 
 class Ktx2Error(ValueError):
-    """The bytes are not a KTX2 file of the kind this module writes; the message says what is wrong."""
+    """Bytes that are no KTX2 file of the supported kind; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -49,22 +49,22 @@ class Ktx2Image:
     """A 2D array texture."""
 
     format: Format  # one of bc7, uint8, fp16
-    # width, height: size in texels
+    # width, height: in texels
     width: int
     height: int
-    layers: int  # number of layers
-    data_at: int  # where the texels begin, bytes; they end with the file
-    payload: Sequence[memoryview] = ()  # one bytes-like object a layer, where more than the header was read
+    layers: int
+    data_at: int  # byte offset of the texels, which end with the file
+    payload: Sequence[memoryview] = ()  # one buffer per layer; empty if only the header was read
 
 
 def layer_bytes(format: Format, width: int, height: int) -> int:
-    """Bytes of one layer of `width` x `height` texels."""
+    """Compute the bytes of a layer of `width` x `height` texels."""
     layout = _LAYOUTS[format]
     return -(-width // layout.block) * -(-height // layout.block) * layout.block_bytes
 
 
 def descriptor(format: Format) -> bytes:
-    """The Data Format Descriptor: a basic descriptor block with linear transfer and BT.709 primaries."""
+    """Build the Data Format Descriptor: a basic descriptor block with linear transfer and BT.709 primaries."""
     layout = _LAYOUTS[format]
     size = 24 + 16 * len(layout.samples)
     block = struct.pack("<IHH", 0, 2, size)  # Khronos, basic format, version 1.3
@@ -79,12 +79,12 @@ def descriptor(format: Format) -> bytes:
 def write_ktx2(
     path: str | Path, payload: Sequence[bytes], format: Format, width: int, height: int, writer: str
 ) -> None:
-    """Write a 2D array texture with one level, not supercompressed.
+    """Write a 2D array texture with one level, without supercompression.
 
     Args:
-        payload: one bytes object a layer, rows from the top.
+        payload: one bytes object per layer, rows from the top.
         format: bc7, uint8 (RGBA) or fp16 (RGBA).
-        width, height: size in texels; multiples of 4 for bc7.
+        width, height: in texels; multiples of 4 for bc7.
         writer: name and version of the program (KTXwriter).
     """
     layout = _LAYOUTS[format]
@@ -111,14 +111,14 @@ def write_ktx2(
 
 
 def read_header(data: bytes | bytearray | memoryview, size: int) -> Ktx2Image:
-    """The header of a file, from its first `HEADER_LIMIT` bytes or more.
+    """Parse the header.
 
     Args:
-        data: how the file begins.
+        data: the first `HEADER_LIMIT` bytes of the file, or more.
         size: bytes of the whole file.
 
     Raises:
-        Ktx2Error: the file is something else, has another size than its header says, or contradicts itself.
+        Ktx2Error: another kind of file, another size than the header states, or contradictory fields.
     """
     view = memoryview(data)
     if len(view) < _HEADER.size or bytes(view[:12]) != IDENTIFIER:
@@ -151,10 +151,10 @@ def read_header(data: bytes | bytearray | memoryview, size: int) -> Ktx2Image:
 
 
 def parse_ktx2(data: bytes | bytearray | memoryview) -> Ktx2Image:
-    """Read and checks a file written by `write_ktx2`, without copying the texels.
+    """Parse and check a file written by `write_ktx2`, without copying the texels.
 
     Raises:
-        Ktx2Error: the file is something else, is truncated, or contradicts itself.
+        Ktx2Error: another kind of file, truncated, or contradictory.
     """
     view = memoryview(data)
     header = read_header(view, len(view))

@@ -1,4 +1,4 @@
-"""bundle.json: its only description, for writing and reading, and the digest that protects it."""
+"""bundle.json: its schema, for writing and reading, and the digest that protects it."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, SUPPORT, T
 from bitymi_ns.ops.view_kinds import Kind
 
 FORMAT = "bitymi-bundle"
-VERSION = (4, 0)  # the newest version that is read: texels with alphas, which readers of version 3 would draw opaque
-COMPACT_VERSION = (3, 0)  # surfels and texels as columns of integers
-LEAN_VERSION = (2, 3)  # version of a bundle with lean view colours in a PLY file, which readers of version 1 refuse
-FULL_VERSION = (1, 4)  # version of a bundle whose surfels have all parameters
-_DIGEST_SINCE = {1: 2, 2: 1, 3: 0}  # major version to the minor one from which on bundle.json has a digest
+VERSION = (4, 0)  # newest version that is read: alphas of texels, which readers of version 3 would draw opaque
+COMPACT_VERSION = (3, 0)  # integer columns
+LEAN_VERSION = (2, 3)  # lean view colours in a PLY file, refused by readers of version 1
+FULL_VERSION = (1, 4)  # surfels with all parameters
+_DIGEST_SINCE = {1: 2, 2: 1, 3: 0}  # major version: first minor version with a digest
 SURFELS, ATLAS, MANIFEST = "surfels.ply", "atlas.ktx2", "bundle.json"
 COMPACT_SURFELS, TEXELS = "surfels.bin", "texels.bin"
-POSTER = "poster.webp"  # a picture of what a viewer shows first, which a bundle may have: `bundle.poster`
+POSTER = "poster.webp"  # optional picture of a viewer's first view: `bundle.poster`
 ACTIVATIONS = {"opacity": "sigmoid", "scale": "exp", "beta": "4 * sigmoid", "rotation": "wxyz, unit"}
-UNIT_LENGTH = 1e-3  # by how much the length of a direction may differ from 1
-_MOST_PROBLEMS = 3  # in one message
+UNIT_LENGTH = 1e-3  # tolerance of a unit vector's length
+_MOST_PROBLEMS = 3  # per message
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
 class BundleError(ValueError):
-    """A bundle cannot be written or read; the message says what is wrong and what to do."""
+    """A bundle that cannot be written or read; the message says why and what to do."""
 
 
 def check_file_name(name: str, source: str) -> None:
-    """Refuse names that are not a plain file name: a bundle never reaches out of its folder.
+    """Check that a name is a plain file name, so that no bundle reaches out of its folder.
 
     Raises:
-        BundleError: naming `source`.
+        BundleError: it is not; names `source`.
     """
     if not _is_file_name(name):
         raise BundleError(f"{source}: {_short(name)} cannot be the name of a file of the bundle")
@@ -56,7 +56,7 @@ def _is_file_name(name: str) -> bool:
 
 
 def _only(value: float) -> Any:
-    """Type of a constant of the renderers: stated for other programs, and any other value is refused."""
+    """Return the type of a renderer constant: written for other programs, every other value refused."""
 
     def check(found: float) -> float:
         if found != value:
@@ -67,15 +67,15 @@ def _only(value: float) -> Any:
 
 
 def points_text(points: Tensor) -> str:
-    """Points with a rate, [P, 4], as bundle.json holds them: base64 of little-endian float32 rows x, y, z, rate."""
+    """Encode points with a rate, [P, 4], for bundle.json: base64 of little-endian float32 rows x, y, z, rate."""
     return base64.b64encode(points.detach().float().cpu().numpy().astype("<f4").tobytes()).decode()
 
 
 def points_of(text: str) -> Tensor:
-    """The points [P, 4] float32 of `points_text`.
+    """Decode the points [P, 4] float32 of `points_text`.
 
     Raises:
-        PydanticCustomError: it is no such text, or a number is out of range.
+        PydanticCustomError: malformed, or a number is out of range.
     """
     try:
         data = base64.b64decode(text, validate=True)
@@ -111,7 +111,7 @@ Row = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 
 
 class Column(Part):
-    """A column of integers, as `streams.compress` writes it."""
+    """An integer column, as written by `streams.compress`."""
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9_]{1,20}$")]
     step: Annotated[float, Field(ge=1e-12, le=1e6)] | None = None
@@ -123,7 +123,7 @@ class Column(Part):
 
 
 class PositionFrame(Part):
-    """Grid of the positions: x = center + scale sinh(low + step k), `codec.surfel_codes.PositionGrid`."""
+    """Grid of positions: x = center + scale sinh(low + step k), `codec.surfel_codes.PositionGrid`."""
 
     center: tuple[Coordinate, Coordinate, Coordinate]
     scale: Annotated[float, Field(gt=0, le=LIMITS["means"][0])]
@@ -136,41 +136,41 @@ class Surfels(Part):
     file: Literal["surfels.ply", "surfels.bin"] = SURFELS
     count: Whole
     frame: PositionFrame | None = None
-    columns: Annotated[list[Column], Field(max_length=64)] | None = None  # columns of surfels.bin, in their order
+    columns: Annotated[list[Column], Field(max_length=64)] | None = None  # of surfels.bin, in order
     view_color: Kind
     kernel: str = "min(alpha_max, opacity * max((1 - (u^2 + v^2) / support^2)+ ^ beta, exp(-low_pass * d^2)))"
     support: _only(SUPPORT) = SUPPORT  # type: ignore[valid-type]
     residual: str = "of a surfel without a tile: residual_0..2, at weights of at least render.weight_bound"
     activations: dict[str, str] = ACTIVATIONS
-    sites: Whole | None = None  # Spherical Voronoi sites per surfel, where all are kept
-    terms: Whole | None = None  # terms of all lean view colours together; None = view colours are complete
+    sites: Whole | None = None  # Spherical Voronoi sites per surfel, if all are kept
+    terms: Whole | None = None  # terms of all lean view colours; None: view colours are complete
     view_terms: str | None = None  # formula of a lean view colour
 
 
 class Atlas(Part):
     """Contents of atlas.ktx2: residual = offset + scale * value, value = stored / 255 for bc7 and uint8; or of
-    texels.bin, of the format dct: texels that are rounded to 8 bits of that range."""
+    texels.bin (format dct), whose texels are rounded to 8 bits of that range."""
 
     file: Literal["atlas.ktx2", "texels.bin"] = ATLAS
     format: Literal["bc7", "uint8", "fp16", "dct"]
-    texels: Whole | None = None  # texels of all tiles, in texels.bin
-    step: Annotated[float, Field(ge=1e-6, le=100)] | None = None  # step of coefficients of grade 0, in texels.bin
+    texels: Whole | None = None  # texels of all tiles in texels.bin
+    step: Annotated[float, Field(ge=1e-6, le=100)] | None = None  # step of coefficients of grade 0 in texels.bin
     page_width: Side | None = None
     page_rows: Side | None = None
-    """Arguments of `codec.packing.pack`, by which the packing follows from the sizes of the tiles."""
-    columns: Annotated[list[Column], Field(max_length=64)] | None = None  # columns of texels.bin, in their order
+    """Arguments of `codec.packing.pack`, which gives the packing from the tile sizes."""
+    columns: Annotated[list[Column], Field(max_length=64)] | None = None  # of texels.bin, in order
     width: Side
     height: Side
     layers: Side
     extent: Annotated[float, Field(ge=EXTENTS[0], le=EXTENTS[1])] = SUPPORT
-    """Half side of the tiles of a surfels.ply without the extents' column."""
+    """Half side of the tiles if surfels.ply has no column of extents."""
     extent_column: str | None = None
     offset: Annotated[float, Field(ge=-RESIDUAL_LIMIT, le=RESIDUAL_LIMIT)]
     scale: Annotated[float, Field(gt=0, le=2 * RESIDUAL_LIMIT)]
     range: str | None = None
     alpha_scale: Annotated[float, Field(gt=0, le=2)] | None = None
-    """Scale of the fourth channel: alpha = alpha_scale * value multiplies the surfel's opacity, and the texels of a
-    surfel without a tile have the alpha of its column; None = opaque texels. Since version 4."""
+    """Scale of the fourth channel: alpha = alpha_scale * value multiplies the surfel's opacity; a surfel without a tile
+    has the alpha of its column. None: opaque texels. Since version 4."""
     clipped_fraction: Share | None = None
     encoder: str | None = None
     psnr: Decibels = None
@@ -212,18 +212,18 @@ class Render(Part):
     low_pass: _only(1.0) = 1.0  # type: ignore[valid-type]
     prefilter: Literal["low_pass", "pixel"] = "low_pass"
     photographed: Annotated[str, AfterValidator(_points)] | None = None
-    """Points of the scene, and with how many pixels per unit of length they were photographed (`points_text`): since
-    versions 1.4 and 2.3."""
+    """Points of the scene with the pixels per unit of length of their photographs (`points_text`): since versions 1.4
+    and 2.3."""
     background: tuple[Share, Share, Share]
 
 
 class WorldFrame(Part):
-    """Transform from the capture's frame, x_scene = scale * (transform @ [x_capture, 1]), and the scene's up and scale
-    in the real world, where known: since versions 1.3 and 2.2."""
+    """Transform from the capture's frame, x_scene = scale * (transform @ [x_capture, 1]), and the scene's up vector and
+    metric scale if known: since versions 1.3 and 2.2."""
 
     transform: tuple[Row, Row, Row]
     scale: Positive
-    up: tuple[Cosine, Cosine, Cosine] | None = None  # unit vector of the scene that points away from the ground
+    up: tuple[Cosine, Cosine, Cosine] | None = None  # unit vector away from the ground, scene frame
     up_from: Annotated[str, Field(pattern=r"^[a-z][a-z_-]{0,39}$")] | None = None
     """Source of `up`: gps, gravity, or cameras (upright as a rule)."""
     metres_per_unit: Positive | None = None  # length of a unit of the scene
@@ -238,14 +238,14 @@ class WorldFrame(Part):
 
 
 class Bounds(Part):
-    """Corners of the box around the surfels' means."""
+    """Axis-aligned bounding box of the surfels' means."""
 
     min: Point
     max: Point
 
 
 class FileEntry(Part):
-    """Size and hash of a file of the bundle."""
+    """Size and hash of a file."""
 
     bytes: Annotated[int, Field(ge=0, le=1 << 36)]
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -296,15 +296,15 @@ class Manifest(Part):
 
     @property
     def has_alpha(self) -> bool:
-        """Texels multiply their surfels' opacities."""
+        """Whether texels multiply their surfels' opacities."""
         return self.atlas is not None and self.atlas.alpha_scale is not None
 
 
 def describe(info: Mapping[str, Any]) -> Manifest:
-    """The manifest of `info`, whose arrays become lists and numbers that are not finite null.
+    """Build the manifest of `info`; arrays become lists, non-finite numbers null.
 
     Raises:
-        BundleError: a value is missing or out of range: what would be refused when read is not written.
+        BundleError: a value that readers would refuse is missing or out of range.
     """
     try:
         return Manifest.model_validate_json(strict_json.canonical(strict_json.plain(info)))
@@ -313,10 +313,10 @@ def describe(info: Mapping[str, Any]) -> Manifest:
 
 
 def dump(manifest: Manifest) -> bytes:
-    """bundle.json of a manifest, with the digest of its contents.
+    """Serialise a manifest to bundle.json, with the digest of its contents.
 
     Raises:
-        BundleError: a value was set that `parse` would refuse.
+        BundleError: `parse` would refuse a value.
     """
     info = describe(manifest.model_dump(mode="json", exclude={"digest"})).model_dump(mode="json")
     info["digest"] = strict_json.digest(info)
@@ -324,11 +324,11 @@ def dump(manifest: Manifest) -> bytes:
 
 
 def parse(data: bytes, source: str = MANIFEST) -> Manifest:
-    """Read bundle.json and check everything a reader relies on; unknown keys are kept and ignored.
+    """Parse bundle.json and check everything that readers rely on; unknown keys are kept and ignored.
 
     Raises:
-        BundleError: not a bundle, a newer major version, a value that is missing or out of range, or a digest that is
-            not that of the contents.
+        BundleError: not a bundle, a newer major version, a value missing or out of range, or a digest that does not
+            match the contents.
     """
     try:
         info = strict_json.loads(data)
@@ -369,7 +369,7 @@ def _version(version: Any, source: str) -> tuple[int, int]:
 
 
 def _problems(error: ValidationError) -> str:
-    """One line: where in the JSON, what must be there, and what is there, of the first three values."""
+    """Describe the first three errors in one line: path in the JSON, expected, found."""
     found = error.errors(include_url=False, include_context=False)
     more = len(found) - _MOST_PROBLEMS
     return "; ".join(map(_problem, found[:_MOST_PROBLEMS])) + (f" (and {more} more)" if more > 0 else "")
@@ -386,6 +386,6 @@ def _problem(detail: Any) -> str:
 def _short(value: Any) -> str:
     try:
         text = repr(value)
-    except (ValueError, RecursionError):  # an integer of too many digits
+    except (ValueError, RecursionError):  # an integer with too many digits
         text = f"a {type(value).__name__}"
     return text if len(text) <= 60 else text[:57] + "..."

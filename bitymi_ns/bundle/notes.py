@@ -1,4 +1,4 @@
-"""Saved views and notes beside a bundle: notes.json, which bundle.json does not list because readers write it later."""
+"""Saved views and notes of a bundle: notes.json, not listed in bundle.json because viewers write it later."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,7 +13,7 @@ from bitymi_ns.ranges import first_problem
 
 MOST_VIEWS, MOST_NOTES = 200, 500
 LONGEST_NAME, LONGEST_TEXT = 80, 1000
-"""Characters of the name of a view and of a note."""
+"""Largest number of characters in the name of a view and in a note."""
 FARTHEST = 1e9
 
 
@@ -39,7 +39,7 @@ class _Strict(BaseModel):
 
 
 class SavedView(_Strict):
-    """A camera with a name, in the scene's frame; right and forward are unit vectors at right angles."""
+    """A named camera in the scene frame; right and forward are orthogonal unit vectors."""
 
     name: Annotated[str, Field(min_length=1, max_length=LONGEST_NAME), AfterValidator(_printable)]
     position: _Vector
@@ -50,7 +50,7 @@ class SavedView(_Strict):
 
 
 class Note(_Strict):
-    """Plain text at a position of the scene's frame."""
+    """Plain text at a position in the scene frame."""
 
     text: Annotated[str, Field(min_length=1, max_length=LONGEST_TEXT), AfterValidator(_printable)]
     position: _Vector
@@ -66,10 +66,10 @@ class Notes(_Strict):
 
 
 def parse_notes(data: bytes, source: str = NOTES) -> Notes:
-    """Read notes.json.
+    """Parse notes.json.
 
     Raises:
-        BundleError: naming the source, the entry and what is wrong with it.
+        BundleError: names the source, the entry and the fault.
     """
     try:
         found = Notes.model_validate(strict_json.loads(data))
@@ -94,17 +94,17 @@ def _refusal(source: str, what: str) -> BundleError:
 
 
 def read_notes(parts: Parts) -> tuple[bytes, Notes] | None:
-    """Contents of a bundle's notes.json, as bytes and checked; None where there is none.
+    """Read and check a bundle's notes.json: bytes and contents; None if it has none.
 
     Raises:
-        BundleError: it cannot be read, is too large, or an entry is refused.
+        BundleError: unreadable, too large, or an entry is refused.
     """
     data = notes_data(parts)
     return None if data is None else (data, parse_notes(data, str(parts.bundle / NOTES)))
 
 
 def notes_of(bundle: str | Path) -> bytes | None:
-    """Contents of a bundle's notes.json, to be passed on with it: a link that leads out of the folder is refused.
+    """Read a bundle's notes.json for copying; links out of the folder are refused.
 
     Raises:
         BundleError: as `read_notes`.

@@ -1,4 +1,4 @@
-"""Files of a bundle, a folder or one file: opening them, their names, and the folder to write."""
+"""Files of a bundle, a folder or one file: opening, names, target folder."""
 
 import os
 import re
@@ -23,43 +23,43 @@ from bitymi_ns.bundle.manifest import (
 )
 from bitymi_ns.trust import Refused, json_of, keep
 
-MANIFEST_LIMIT = 4 << 20  # bytes that a bundle.json may have
-DIRECTORY_LIMIT = 4 << 20  # bytes that the directory of a bundle in one file may have
-NOTES, NOTES_LIMIT = "notes.json", 256 << 10  # saved views and notes: `bundle.notes`; its bytes at most
-CONFIG = "config.yml"  # configuration for nerfstudio's tools, for which bundle.json does not vouch
+MANIFEST_LIMIT = 4 << 20  # largest bundle.json, bytes
+DIRECTORY_LIMIT = 4 << 20  # largest ZIP directory of a bundle in one file, bytes
+NOTES, NOTES_LIMIT = "notes.json", 256 << 10  # saved views and notes (`bundle.notes`), and their largest size in bytes
+CONFIG = "config.yml"  # configuration for nerfstudio's tools, not covered by the digest
 CAMERAS, PREVIEWS = "cameras.json", ("preview.jpg", "preview.png")
 _PHOTOGRAPH = re.compile(r"photograph-[0-9]{4,6}\.jpg")
-# The last records of a ZIP: where that of large files is, that of large files itself, and the end.
+# Last records of a ZIP: ZIP64 end of directory, its locator, end of directory.
 _LARGE, _LARGE_AT, _END = struct.Struct("<4s36xQQ"), struct.Struct("<4s4xQ4x"), struct.Struct("<4s8xLLH")
 
 
 class MissingPart(BundleError):
-    """A bundle has no file of a name."""
+    """A file that the bundle lacks."""
 
 
 def is_known(name: str) -> bool:
-    """True for the names of the format. Other files may lie in a bundle; they are not passed on."""
+    """Return True for file names of the format; a bundle may hold other files, which are not copied with it."""
     known = (MANIFEST, SURFELS, ATLAS, COMPACT_SURFELS, TEXELS, POSTER, CAMERAS, *PREVIEWS)
     return name in known or _PHOTOGRAPH.fullmatch(name) is not None
 
 
 def left_out(info: Manifest) -> list[str]:
-    """The files that a bundle lists and that are not passed on with it."""
+    """List the files in bundle.json that are not copied with the bundle."""
     return [name for name in info.files if not is_known(name)]
 
 
 def passed_on(info: Manifest, data: bytes) -> bytes:
-    """The bundle.json that is passed on: `data`, if all files that it lists are; else one that lists those alone."""
+    """Return bundle.json for a copy: `data`, or a version without the files that are left out."""
     if not left_out(info):
         return data
     return dump(info.model_copy(update={"files": {name: e for name, e in info.files.items() if is_known(name)}}))
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a file of a bundle for reading, see `reading.open_regular`.
+    """Open a file of a bundle for reading with `reading.open_regular`.
 
     Raises:
-        BundleError: there is no such file, it is something else, or the system refuses it.
+        BundleError: missing, not a regular file, or the system refuses it.
     """
     try:
         return reading.open_regular(path)
@@ -70,25 +70,25 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 class Parts:
-    """The files of a bundle, by name."""
+    """Files of a bundle by name."""
 
     def __init__(self, bundle: Path, archive: zipfile.ZipFile | None, size: int, inside: bool) -> None:
-        """See `parts_of`.
+        """Prefer `parts_of`.
 
         Args:
-            bundle: the folder or the file, also for messages.
+            bundle: folder or file, also for messages.
             archive: None for a folder.
-            size: bytes of the one file.
-            inside: refuse links that lead out of the folder.
+            size: bytes of the single file.
+            inside: refuse links out of the folder.
         """
         self.bundle, self._archive, self._size, self._inside = bundle, archive, size, inside
 
     @contextmanager
     def opened(self, name: str) -> Iterator[tuple[IO[bytes], int]]:
-        """A file, and how many bytes it has; nothing has been read of it.
+        """Open a file unread; yields it and its size in bytes.
 
         Raises:
-            BundleError: there is no such file, or it is none that can be read.
+            BundleError: missing or unreadable.
         """
         path = self.bundle / name
         if self._archive is None:
@@ -125,10 +125,10 @@ class Parts:
         return entry
 
     def read(self, name: str, most: int) -> bytes:
-        """All bytes of a file that may have at most so many, which is seen before it is read.
+        """Read a file of at most `most` bytes; the size is checked first.
 
         Raises:
-            BundleError: there is no such file, it is larger, or it cannot be read.
+            BundleError: missing, larger, or unreadable.
         """
         with self.opened(name) as (file, size):
             if size > most:
@@ -137,7 +137,7 @@ class Parts:
 
 
 _DAMAGE = (zipfile.BadZipFile, OSError, EOFError, RuntimeError, struct.error)
-"""Errors of `zipfile` for other or damaged files."""
+"""Errors of `zipfile` on foreign or damaged files."""
 
 
 @contextmanager
@@ -145,11 +145,11 @@ def parts_of(bundle: str | Path, inside: bool = False) -> Iterator[Parts]:
     """Open the files of a bundle.
 
     Args:
-        bundle: its folder, or its one file.
-        inside: refuse links that lead out of the folder, because what is read is passed on.
+        bundle: folder or single file.
+        inside: refuse links out of the folder, because its contents are copied on.
 
     Raises:
-        BundleError: the one file is damaged.
+        BundleError: the single file is damaged.
     """
     path = Path(bundle)
     if not os.path.isfile(path):
@@ -169,8 +169,9 @@ def parts_of(bundle: str | Path, inside: bool = False) -> Iterator[Parts]:
 
 
 def _check_directory(file: BinaryIO) -> int:
-    """Size of a file. Raises a ValueError for one whose directory exceeds `DIRECTORY_LIMIT`, which takes `zipfile` long
-    to read, or that begins with something else, which may then be of another type, too."""
+    """Return the size of a file after checking its ZIP directory. Raises a ValueError if the directory exceeds
+    `DIRECTORY_LIMIT` (`zipfile` would take long), or if the file starts with anything else: it could then also be of
+    another type."""
     size = file.seek(0, os.SEEK_END)
     records = _LARGE.size + _LARGE_AT.size + _END.size
     file.seek(max(0, size - records))
@@ -192,10 +193,10 @@ def _check_directory(file: BinaryIO) -> int:
 
 
 def notes_data(parts: Parts) -> bytes | None:
-    """Bytes of notes.json, unchecked; None where a bundle has none.
+    """Read notes.json, unchecked; None if there is none.
 
     Raises:
-        BundleError: it cannot be read, or has more than `NOTES_LIMIT` bytes.
+        BundleError: unreadable, or more than `NOTES_LIMIT` bytes.
     """
     try:
         return parts.read(NOTES, NOTES_LIMIT)
@@ -204,13 +205,12 @@ def notes_data(parts: Parts) -> bytes | None:
 
 
 def bundle_at(path: Path) -> Path | None:
-    """Find the bundle that a path names: itself, a folder or one file, or what it lies in, as config.yml does; None
-    where it names something else."""
+    """Find the bundle of a path: the path itself, or its parent (as for config.yml); None if there is none."""
     return next((place for place in (path, path.parent) if (place / MANIFEST).is_file() or _is_archive(place)), None)
 
 
 def instead_of(path: Path) -> str | None:
-    """Say what a path that is no bundle is, and what to give in its place; None where that is not known."""
+    """Explain a path that is not a bundle and suggest another; None if nothing is known."""
     if not os.path.lexists(path):
         return "it does not exist"
     bundle = next((place for place in (path.parent, path / "bundle") if (place / MANIFEST).is_file()), None)
@@ -224,7 +224,7 @@ def instead_of(path: Path) -> str | None:
 
 
 def _is_archive(path: Path) -> bool:
-    """True for a file that begins as a bundle in one file does."""
+    """Return True for a file with the signature of a bundle in one file."""
     try:
         with reading.open_regular(path) as file:
             return file.read(4) == b"PK\3\4"
@@ -233,11 +233,11 @@ def _is_archive(path: Path) -> bool:
 
 
 def check_target(folder: str | Path, overwrite: bool = False) -> None:
-    """Check that a bundle may be written to a folder, before the work of making one.
+    """Check that a bundle may be written to a folder, before the work of baking it.
 
     Raises:
-        BundleError: it exists and `overwrite` is off; or it is something other than a bundle, or holds something else,
-            or a notes.json that cannot be carried over.
+        BundleError: it exists and `overwrite` is off; or it is not a bundle, or holds foreign files, or a notes.json
+            that cannot be carried over.
     """
     folder = Path(folder)
     if not os.path.lexists(folder):
@@ -262,11 +262,11 @@ def check_target(folder: str | Path, overwrite: bool = False) -> None:
 
 
 def files_of(folder: Path) -> list[str]:
-    """Names of the files of a bundle of any version: bundle.json, those that it lists, the configuration for
-    nerfstudio's tools, and cameras.json, which the first versions of `bake_scene` wrote without listing it.
+    """List the files of a bundle of any version: bundle.json, the files it lists, config.yml, and cameras.json, which
+    the first versions of `bake_scene` did not list.
 
     Raises:
-        BundleError: bundle.json cannot be read.
+        BundleError: bundle.json is unreadable.
     """
     try:
         with parts_of(folder) as parts:

@@ -1,4 +1,4 @@
-"""The PLY file of a bundle: binary, little-endian, of float and int properties; `vertex`, and perhaps more after it."""
+"""PLY file of a bundle: binary little-endian, float and int properties, element `vertex` first."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,12 +17,12 @@ def write_ply(
     comments: Sequence[str] = (),
     more: Mapping[str, Mapping[str, npt.NDArray]] | None = None,
 ) -> None:
-    """Write the columns as properties of `vertex`, in their order.
+    """Write columns as properties of `vertex`, in order.
 
     Args:
         columns: name to [N] array; integer columns become `int`, the others `float`.
         comments: header comments, one line each.
-        more: columns of further elements by their name, in the order in which they follow.
+        more: columns of further elements by name, in order.
     """
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
     body = []
@@ -44,10 +44,10 @@ def write_ply(
 
 
 def read_header(data: bytes | bytearray, size: int) -> Header:
-    """The header of a file, from its first `HEADER_LIMIT` bytes or more.
+    """Parse the header.
 
     Args:
-        data: how the file begins.
+        data: the first `HEADER_LIMIT` bytes of the file, or more.
         size: bytes of the whole file.
 
     Raises:
@@ -71,7 +71,7 @@ def read_header(data: bytes | bytearray, size: int) -> Header:
 
 
 def parse_ply(data: bytes | bytearray) -> dict[str, dict[str, npt.NDArray]]:
-    """Read a file written by `write_ply`.
+    """Parse a file written by `write_ply`.
 
     Args:
         data: the whole file.
@@ -80,8 +80,7 @@ def parse_ply(data: bytes | bytearray) -> dict[str, dict[str, npt.NDArray]]:
         element to name to [N] float32 or int32 array, in the file's order; the first element is `vertex`.
 
     Raises:
-        PlyError: another kind of PLY, a length that does not match the header, or a value that is not finite where it
-            has to be.
+        PlyError: another kind of PLY, a length that does not match the header, or a value that is not finite.
     """
     header = read_header(data, len(data))
     elements, at = {}, header.start

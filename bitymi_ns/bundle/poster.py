@@ -1,4 +1,4 @@
-"""The poster of a bundle: a small picture of what a viewer shows first, there before the surfels are."""
+"""Poster of a bundle: a small picture of the viewer's first view, shown before the surfels are loaded."""
 
 import io
 from collections.abc import Sequence
@@ -13,29 +13,29 @@ from bitymi_ns.scene.camera import Camera
 
 Pixels = npt.NDArray[np.uint8]
 
-SIDE = 480  # pixels of its longer side, at most
-SHARE = 0.02  # largest share of the bytes of surfels and texels
-LEAST = 2048  # bytes that it may take however small these are
+SIDE = 480  # largest side, pixels
+SHARE = 0.02  # largest size relative to surfels and texels
+LEAST = 2048  # bytes that are always allowed
 _QUALITIES = (80, 70, 60, 50, 40)
 _SMALLER = 0.75
 _SMALLEST = 16
 
 
 def draw_poster(scene: BakedScene, camera: Camera, background: Sequence[float]) -> Pixels:
-    """[H, W, 3] the scene, on the CPU, as the camera sees it, at most `SIDE` pixels along a side."""
+    """Render the scene on the CPU from a camera, reduced to at most `SIDE` pixels along a side: [H, W, 3]."""
     view = camera.to("cpu").within(SIDE)
     return as_bytes(scene.render(view, torch.tensor(background, dtype=torch.float32)).rgb).numpy()
 
 
 def most_bytes(scene: int) -> int:
-    """Bytes that a poster may take beside so many of surfels and texels."""
+    """Compute the allowed bytes of a poster for a scene of `scene` bytes of surfels and texels."""
     return max(LEAST, int(SHARE * scene))
 
 
 def encode_poster(pixels: Pixels, most: int) -> bytes | None:
-    """A picture [H, W, 3] as lossy WebP of at most `most` bytes: the best quality that fits, or else fewer pixels.
+    """Encode a picture [H, W, 3] as lossy WebP of at most `most` bytes: best quality that fits, else fewer pixels.
 
-    None where nothing fits, or where this machine's Pillow writes no WebP: a bundle can do without.
+    Returns None if nothing fits or this Pillow cannot write WebP: posters are optional.
     """
     if not features.check("webp"):
         return None

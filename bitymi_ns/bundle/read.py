@@ -1,4 +1,4 @@
-"""Reading of bundles: sizes are checked by headers before more is read, and every file is read once."""
+"""Reading of bundles: headers and sizes are checked first, and each file is read once."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ from bitymi_ns.scene.baked import BakedOutput, BakedScene
 from bitymi_ns.scene.camera import Camera
 
 REMEDY = "Copy the bundle again from where it is whole, or export the scene again with ns-export bitymi-atlas."
-"""Advice for a damaged bundle."""
+"""Advice on a damaged bundle."""
 BESIDE_LIMIT = 64 << 20
-"""Bytes that a file beside surfels and texels may have, such as a photograph, to be kept in memory."""
+"""Largest file other than surfels and texels, such as a photograph, that is kept in memory, bytes."""
 LARGE_ATLAS = 64 << 20
-"""Bytes of decoded texels of a compact bundle from which on a card gets BC7 blocks of them, a quarter of that. Fewer
-are no burden to any card, and blocks cost time, and some of the quality of texels that were not tuned to them."""
-LOAD_PROFILE: Profile = "veryfast"  # encoder profile of these blocks: the next faster one loses more than twice as much
-CONTENTS = SCENE_FILES | {CAMERAS}  # the files of a bundle that `assemble` takes
+"""Bytes of a decoded compact atlas from which a CUDA device gets BC7 blocks, a quarter of the memory. Smaller
+atlases fit any device, and encoding costs time and some quality of texels that were not tuned for BC7."""
+LOAD_PROFILE: Profile = "veryfast"  # of this encoding: the next faster profile loses more than twice as much
+CONTENTS = SCENE_FILES | {CAMERAS}  # files used by `assemble`
 _CHUNK = 1 << 22
 
 
@@ -57,10 +57,9 @@ class Bundle:
     """A loaded bundle.
 
     Attributes:
-        scene: what it holds, on the CPU; the view colours may be lean (`ops.view_color.LEAN`).
+        scene: the baked scene on the CPU; view colours may be lean (`ops.view_color.LEAN`).
         info: bundle.json.
-        cameras: of the capture, training cameras and held-out ones (`CapturedCamera.camera`); none where the bundle has
-            no cameras.json.
+        cameras: cameras of the capture, training and held out (`CapturedCamera.camera`); empty without cameras.json.
     """
 
     scene: BakedScene
@@ -71,7 +70,7 @@ class Bundle:
         return len(self.scene)
 
     def to(self, device: torch.device | str) -> Bundle:
-        """The bundle with its scene on a device."""
+        """Move the scene to a device."""
         return replace(self, scene=self.scene.to(device))
 
     def render(self, camera: Camera, background: Tensor | None = None, maps: bool = False) -> BakedOutput:
@@ -79,7 +78,7 @@ class Bundle:
 
         Args:
             camera: the view, on the scene's device.
-            background: [3] color behind the scene; None = the bundle's own.
+            background: [3] colour behind the scene; None: the bundle's own.
             maps: also beta, depth, normals and overdraw.
         """
         if background is None:
@@ -91,14 +90,14 @@ def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True) ->
     """Load a bundle.
 
     Args:
-        folder: the bundle's folder, or its one file (`single.write_single`).
-        verify: compare every file with its sha256 (sizes are always compared).
-        decode: also decode a BC7 atlas, four bytes per texel; a CUDA device draws from the blocks alone. False also
-            encodes the texels of a compact bundle where they are many (`LARGE_ATLAS`), because they have no blocks.
+        folder: the bundle's folder, or its single file (`single.write_single`).
+        verify: compare every file with its SHA-256 (sizes are always compared).
+        decode: decode a BC7 atlas to four bytes per texel; a CUDA device draws from the blocks alone. False also
+            encodes large compact atlases (`LARGE_ATLAS`) to BC7, because they have no blocks.
 
     Raises:
         BundleError: a file is missing, truncated, altered or malformed, a value is out of range, the version is too
-            new, or there is too little memory.
+            new, or memory is insufficient.
     """
     with parts_of(folder) as parts:
         info = manifest_of(parts)
@@ -108,17 +107,17 @@ def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True) ->
 
 
 def read_manifest(folder: str | Path) -> Manifest:
-    """Read bundle.json of a folder or one file, checked as far as possible without the other files.
+    """Read bundle.json of a folder or single file, checked as far as possible without the other files.
 
     Raises:
-        BundleError: it is missing, malformed or altered, or a value is out of range.
+        BundleError: missing, malformed or altered, or a value is out of range.
     """
     with parts_of(folder) as parts:
         return manifest_of(parts)
 
 
 def read_cameras(folder: str | Path) -> list[CapturedCamera]:
-    """Read cameras.json of a bundle alone; none where it has no such file. Raises as `read_bundle` does."""
+    """Read only cameras.json of a bundle; empty without one. Raises as `read_bundle`."""
     with parts_of(folder) as parts:
         info = manifest_of(parts)
         return parse_cameras(read_file(parts, info, CAMERAS), parts.bundle / CAMERAS) if CAMERAS in info.files else []
@@ -135,23 +134,23 @@ def manifest_of(parts: Parts) -> Manifest:
 
 
 def download_bytes(folder: Path, info: Manifest) -> int:
-    """Bytes of bundle.json and of the files that it lists, or of the one file that a bundle is."""
+    """Count the bytes to download: bundle.json and the files it lists, or the single file."""
     if folder.is_file():
         return folder.stat().st_size
     return (folder / MANIFEST).stat().st_size + sum(entry.bytes for entry in info.files.values())
 
 
 def read_file(parts: Parts, info: Manifest, name: str, verify: bool = True, keep: bool = True) -> bytearray:
-    """The bytes of a file that bundle.json lists.
+    """Read a file listed in bundle.json.
 
     Args:
         name: one of `info.files`.
-        verify: compare the file with its sha256, while it is read.
-        keep: False only checks it, and returns nothing of it.
+        verify: compare it with its SHA-256 while reading.
+        keep: False: only check it and return no bytes.
 
     Raises:
-        BundleError: the file is missing, its size or hash is not the one stated, its header contradicts its size or
-            bundle.json, or its contents need more memory than this machine has. The hash alone is found by reading it.
+        BundleError: the file is missing, its size or hash differs, its header contradicts its size or bundle.json, or
+            its contents exceed this machine's memory. All but the hash is checked before the file is read.
     """
     path, entry = parts.bundle / name, info.files[name]
     with parts.opened(name) as (file, size):
@@ -175,7 +174,7 @@ def read_file(parts: Parts, info: Manifest, name: str, verify: bool = True, keep
 
 
 def _whole(file: IO[bytes], head: bytes, size: int, keep: bool, path: Path, sha256: Any) -> bytearray:
-    """The `size` bytes of a file of which `head` has been read, none where they are not kept; `sha256` gets them."""
+    """Read the `size` bytes of a file after `head`, feeding `sha256`; returns nothing of it unless `keep`."""
     data, at = bytearray(size if keep else min(size, max(_CHUNK, len(head)))), len(head)
     view = memoryview(data)
     view[:at] = head
@@ -193,13 +192,13 @@ def _whole(file: IO[bytes], head: bytes, size: int, keep: bool, path: Path, sha2
 
 
 def assemble(folder: Path, info: Manifest, files: dict[str, bytearray], decode: bool = True) -> Bundle:
-    """The bundle of what `read_file` read.
+    """Assemble a bundle from the results of `read_file`.
 
     Args:
-        files: contents of the files with surfels, texels and cameras, by name.
+        files: contents of the files of surfels, texels and cameras, by name.
 
     Raises:
-        BundleError: a file is malformed, or a value is out of range.
+        BundleError: malformed, or a value is out of range.
     """
     render, atlas, points = info.render, info.atlas, info.render.photographed
     contents = _compact_contents if info.surfels.file == COMPACT_SURFELS else _ply_contents
@@ -218,7 +217,7 @@ def assemble(folder: Path, info: Manifest, files: dict[str, bytearray], decode: 
 
 
 def _ply_contents(folder: Path, info: Manifest, files: Mapping[str, bytearray], decode: bool) -> dict[str, Any]:
-    """Surfels, tiles and texels of surfels.ply and atlas.ktx2, by the names of `BakedScene`."""
+    """Decode surfels.ply and atlas.ktx2 to fields of `BakedScene`."""
     path = folder / SURFELS
     try:
         elements = ply.parse_ply(files[SURFELS])
@@ -239,7 +238,7 @@ def _ply_contents(folder: Path, info: Manifest, files: Mapping[str, bytearray], 
 
 
 def _compact_contents(folder: Path, info: Manifest, files: Mapping[str, bytearray], decode: bool) -> dict[str, Any]:
-    """The same of surfels.bin and texels.bin."""
+    """Decode surfels.bin and texels.bin to fields of `BakedScene`."""
     atlas, where = info.atlas, folder / COMPACT_SURFELS
     try:
         data = memoryview(files[COMPACT_SURFELS])
@@ -270,7 +269,7 @@ def _compact_contents(folder: Path, info: Manifest, files: Mapping[str, bytearra
 
 
 def _rounded(codes: TexelCodes, packing: Packing, value_range: Range) -> Tensor:
-    """[layers, height, width, 4] uint8 of coded texels: rounded, then moved, a texel at once."""
+    """Round coded texels to pages [layers, height, width, 4] uint8; rounding first moves one int32 per texel."""
 
     def whole(colors: np.ndarray, alphas: np.ndarray | None) -> np.ndarray:
         rgba = np.full((len(colors), 4), 255, dtype=np.uint8)
@@ -286,7 +285,7 @@ def _rounded(codes: TexelCodes, packing: Packing, value_range: Range) -> Tensor:
 
 
 def _blocks(texels: Tensor, alpha: bool) -> Tensor | None:
-    """BC7 blocks of decoded texels; None, with a warning, where the encoder is not installed."""
+    """Encode decoded texels to BC7 blocks; None, with a warning, without the encoder."""
     try:
         return torch.from_numpy(bc7_blocks(texels.numpy(), LOAD_PROFILE, alpha))
     except RuntimeError:
@@ -299,7 +298,7 @@ def _blocks(texels: Tensor, alpha: bool) -> Tensor | None:
 
 
 def _check_tiles(tiles: Tensor, info: Manifest, source: Path) -> None:
-    """Refuse tiles that reach out of the atlas."""
+    """Check that tiles lie inside the atlas."""
     layers, height, width = (info.atlas.layers, info.atlas.height, info.atlas.width) if info.atlas else (1, 0, 0)
     x, y, layer, r_u, r_v = tiles.long().unbind(1)
     good = (tiles >= 0).all(1) & (x + r_u <= width) & (y + r_v <= height) & (layer < layers)
@@ -309,7 +308,7 @@ def _check_tiles(tiles: Tensor, info: Manifest, source: Path) -> None:
 
 
 def _texels(image: ktx2.Ktx2Image, decode: bool, has_alpha: bool, source: Path) -> tuple[Tensor | None, Tensor | None]:
-    """The texels, and the BC7 blocks where the atlas has such."""
+    """Return the texels and, for bc7, the blocks."""
     blocks = None
     if image.format == "bc7":
         pages = [np.frombuffer(page, np.uint8) for page in image.payload]

@@ -1,5 +1,5 @@
-"""A bundle in one file: an uncompressed ZIP whose parts lie in the order in which a viewer needs them; and such a file
-as a folder again."""
+"""Bundle in one file: an uncompressed ZIP with its parts in the order a viewer needs them; conversion to and from a
+folder."""
 
 import io
 import os
@@ -17,31 +17,30 @@ from bitymi_ns.bundle.sizes import enough_memory, machine_memory
 from bitymi_ns.files import complete_folder, size_text, write_file
 
 _ORDER = (POSTER, COMPACT_SURFELS, TEXELS, SURFELS, ATLAS)
-SUFFIX = ".bitymi"  # suffix of such a file
+SUFFIX = ".bitymi"
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
 @dataclass(frozen=True)
 class Written:
-    """Sizes of a written file."""
+    """Sizes of a written file, in bytes."""
 
-    first: int  # bytes from the start to the end of the surfels
-    bytes: int  # of the file
-    left_out: list[str]  # files that the bundle lists and the format does not name, which the file does not have
+    first: int  # from the start to the end of the surfels
+    bytes: int
+    left_out: list[str]  # files listed in bundle.json that are not of the format and were not written
 
 
 def write_single(bundle: str | Path, path: str | Path) -> Written:
-    """Write the files of a bundle that bundle.json lists and the format names into one, whole or not at all; and its
-    notes.json.
+    """Write a bundle to one file, atomically: the files of the format that bundle.json lists, and notes.json.
 
-    Nothing is deflated, sizes stand before the parts, and bundle.json comes first: a reader of the beginning knows
-    where everything lies, and any part is one range of the file.
+    Nothing is deflated, sizes precede the parts, and bundle.json comes first: the beginning of the file tells where
+    everything lies, and each part is one byte range.
 
     Args:
-        bundle: its folder, or such a file.
+        bundle: folder, or such a file.
 
     Raises:
-        BundleError: there is no bundle, a file is missing or altered, or there is too little memory.
+        BundleError: no bundle, a file is missing or altered, or memory is insufficient.
     """
     data, written = joined(bundle)
     write_file(Path(path), data)
@@ -49,10 +48,10 @@ def write_single(bundle: str | Path, path: str | Path) -> Written:
 
 
 def is_single(path: Path) -> bool:
-    """True where a file is a bundle, which another one may replace.
+    """Return True if a file is a bundle and may be replaced by one.
 
     Raises:
-        BundleError: the system cannot read it now.
+        BundleError: the system cannot read it.
     """
     try:
         read_manifest(path)
@@ -64,7 +63,7 @@ def is_single(path: Path) -> bool:
 
 
 def joined(bundle: str | Path) -> tuple[bytes, Written]:
-    """Contents of `write_single`'s file, and what it returns; raises as it does."""
+    """Build the contents of `write_single`'s file; returns and raises as it does."""
     first, buffer = 0, io.BytesIO()
     with parts_of(bundle, inside=True) as parts:
         info = manifest_of(parts)
@@ -83,19 +82,18 @@ def joined(bundle: str | Path) -> tuple[bytes, Written]:
 
 
 def write_folder(bundle: str | Path, folder: Path, beside: Mapping[str, bytes]) -> list[str]:
-    """Write the files of a bundle to a folder, whole or not at all.
+    """Write the files of a bundle to a folder, atomically.
 
     Args:
-        bundle: its one file, or its folder.
-        folder: that is not there yet, or empty.
-        beside: further files by name, for which bundle.json does not vouch.
+        bundle: single file or folder.
+        folder: missing or empty.
+        beside: further files by name, not covered by bundle.json.
 
     Returns:
-        files that the bundle lists and the format does not name, which were not written.
+        files listed in bundle.json that are not of the format and were not written.
 
     Raises:
-        BundleError: there is no bundle, a file is missing or altered, there is too little memory, or something is in
-            the place of the folder.
+        BundleError: no bundle, a file is missing or altered, memory is insufficient, or the folder is occupied.
         OSError: it cannot be written.
     """
 
@@ -112,13 +110,13 @@ def write_folder(bundle: str | Path, folder: Path, beside: Mapping[str, bytes]) 
 
 
 def _names(info: Manifest) -> list[str]:
-    """The files that are passed on, in the order in which a viewer needs them."""
+    """List the files to copy, in the order a viewer needs them."""
     known = filter(is_known, info.files)
     return sorted(known, key=lambda name: (_ORDER.index(name) if name in _ORDER else len(_ORDER), name))
 
 
 def _contents(parts: Parts, info: Manifest) -> Iterator[tuple[str, bytes | bytearray]]:
-    """Name and bytes of all files that are passed on, bundle.json first, each compared with its hash."""
+    """Yield name and bytes of each file to copy, bundle.json first, each compared with its hash."""
     yield MANIFEST, passed_on(info, parts.read(MANIFEST, MANIFEST_LIMIT))
     for name in _names(info):
         yield name, read_file(parts, info, name)

@@ -1,4 +1,4 @@
-"""Checks of a bundle's files before they are read: headers, bundle.json, memory."""
+"""Checks of a bundle's files before reading: headers, bundle.json, memory."""
 
 import math
 from collections.abc import Iterator
@@ -12,18 +12,18 @@ from bitymi_ns.bundle.manifest import ATLAS, COMPACT_SURFELS, MANIFEST, SURFELS,
 from bitymi_ns.bundle.surfel_table import TERMS
 from bitymi_ns.files import size_text
 
-SCENE_FILES = frozenset((SURFELS, ATLAS, COMPACT_SURFELS, TEXELS))  # the files of which a scene is made
-HEAD = max(ply.HEADER_LIMIT, ktx2.HEADER_LIMIT)  # bytes from the start of a file that `check_head` reads
+SCENE_FILES = frozenset((SURFELS, ATLAS, COMPACT_SURFELS, TEXELS))  # surfels and texels
+HEAD = max(ply.HEADER_LIMIT, ktx2.HEADER_LIMIT)  # leading bytes that `check_head` reads
 _SURFEL_BYTES, _TERM_BYTES, _TEXEL_BYTES = 340, 150, 60
-"""Bytes of a compact bundle while it is decoded: 2 million surfels took 370 each, 4 million terms 165, 17 million
-texels 67 with their pages."""
+"""Bytes of memory for decoding a compact bundle; measured: 370 per surfel (2 million), 165 per term (4 million), 67 per
+texel with its pages (17 million)."""
 
 
 def check_head(info: Manifest, name: str, head: bytes, size: int) -> None:
-    """Refuse a file of surfels or texels whose beginning contradicts its size or bundle.json; other files pass.
+    """Check the beginning of a file of surfels or texels against its size and bundle.json; other files pass.
 
     Raises:
-        PlyError, Ktx2Error, StreamError: say why.
+        PlyError, Ktx2Error, StreamError: they differ.
     """
     surfels, atlas = info.surfels, info.atlas
     if name == SURFELS:
@@ -46,7 +46,7 @@ def check_head(info: Manifest, name: str, head: bytes, size: int) -> None:
 
 @contextmanager
 def enough_memory(bundle: Path, info: Manifest) -> Iterator[None]:
-    """Report a lack of memory for a bundle's contents as a BundleError with the size of the files."""
+    """Convert a lack of memory into a BundleError that states the size of the files."""
     try:
         yield
     except MemoryError as error:
@@ -55,10 +55,10 @@ def enough_memory(bundle: Path, info: Manifest) -> Iterator[None]:
 
 
 def check_memory(bundle: Path, info: Manifest, name: str) -> None:
-    """Refuse a file of surfels or texels whose contents cannot be held on this machine, before they are read.
+    """Check that a file of surfels or texels fits into this machine's memory, before reading it.
 
     Raises:
-        BundleError: says what they take at least.
+        BundleError: states the memory needed.
     """
     least, there = least_memory(info, name), machine_memory()
     if least > there:
@@ -67,7 +67,7 @@ def check_memory(bundle: Path, info: Manifest, name: str) -> None:
 
 
 def least_memory(info: Manifest, name: str) -> int:
-    """Bytes that reading such a file takes at least: itself, what it is decoded to on the way, pages."""
+    """Estimate the least memory for reading a file of surfels or texels, bytes: file, intermediate data, pages."""
     surfels, atlas, total = info.surfels, info.atlas, info.files[name].bytes
     if name == COMPACT_SURFELS:
         total += _SURFEL_BYTES * surfels.count + _TERM_BYTES * (surfels.terms or 0)
@@ -77,14 +77,14 @@ def least_memory(info: Manifest, name: str) -> int:
 
 
 def machine_memory() -> int:
-    """Bytes of memory that this machine has, or that this process may use of it."""
+    """Return the memory of this machine, or of this process's limit, in bytes."""
     return int(min(psutil.virtual_memory().total, memory_limit()))
 
 
 def memory_limit(mount: Path = Path("/sys/fs/cgroup"), cgroups: Path = Path("/proc/self/cgroup")) -> float:
-    """Bytes that the control groups (v2 and v1) of this process may take; infinite where none has a limit."""
+    """Return the memory limit of this process's control groups (v2 and v1), bytes; infinite if none has one."""
     found = [math.inf]
-    with suppress(OSError):  # no Linux
+    with suppress(OSError):  # not Linux
         for line in cgroups.read_text().splitlines():
             _, controllers, path = line.split(":", 2)
             if controllers and "memory" not in controllers.split(","):
@@ -92,7 +92,7 @@ def memory_limit(mount: Path = Path("/sys/fs/cgroup"), cgroups: Path = Path("/pr
             base, name = (mount / "memory", "memory.limit_in_bytes") if controllers else (mount, "memory.max")
             folder = base / path.lstrip("/")
             for each in (folder, *folder.parents):
-                with suppress(OSError, ValueError):  # of another namespace; "max"
+                with suppress(OSError, ValueError):  # another namespace; "max"
                     found.append(float((each / name).read_text()))
                 if each == base:
                     break

@@ -1,7 +1,7 @@
-"""Count sketches of lists of texels: the distance between two lists is estimated from their sketches alone.
+"""Count sketches of texel lists, from which the distance of two lists is estimated.
 
-The sketch of numbers x_i is M sums, S_g = sum over i in group g of s_i x_i, where a hash of i gives the group and the
-sign s_i. sum_g (S_g(x) - S_g(y))^2 has the mean |x - y|^2 and a relative standard deviation of at most sqrt(2 / M)."""
+The sketch of numbers x_i is M sums S_g = sum over i in group g of s_i x_i, where a hash of i gives its group and sign
+s_i. sum_g (S_g(x) - S_g(y))^2 has the mean |x - y|^2 and a relative standard deviation of at most sqrt(2 / M)."""
 
 import base64
 
@@ -11,12 +11,12 @@ from torch import Tensor
 
 from bitymi_ns.codec.quantise import STEPS
 
-SIZE = 128  # M, the sums of a sketch
+SIZE = 128  # M
 _CHUNK = 1 << 20
 
 
 def sketch(texels: Tensor) -> npt.NDArray[np.float64]:
-    """[SIZE] count sketch of texels [T, 3]."""
+    """Compute the count sketch [SIZE] of texels [T, 3]."""
     values, sums = texels.double().numpy().reshape(-1), np.zeros(SIZE)
     for start in range(0, len(values), _CHUNK):
         part = values[start : start + _CHUNK]
@@ -27,23 +27,23 @@ def sketch(texels: Tensor) -> npt.NDArray[np.float64]:
 
 
 def sketches_text(before: Tensor, stored: Tensor) -> str:
-    """Sketches of texels [T, 3] before quantisation and as stored, as bundle.json holds them: base64 of little-endian
+    """Encode the sketches of texels [T, 3] before quantisation and as stored for bundle.json: base64 of little-endian
     float32."""
     return base64.b64encode(np.stack([sketch(before), sketch(stored)]).astype("<f4").tobytes()).decode()
 
 
 def sketches_of(text: str) -> npt.NDArray[np.float64]:
-    """[2, SIZE] sketches of `sketches_text`."""
+    """Decode the sketches [2, SIZE] of `sketches_text`."""
     return np.frombuffer(base64.b64decode(text), "<f4").reshape(2, SIZE).astype(np.float64)
 
 
 def estimated_rms(texels: Tensor, before: npt.NDArray[np.float64]) -> float:
-    """Estimate of the root mean square difference of texels [T, 3] from those of a sketch [SIZE], 8-bit steps."""
+    """Estimate the root mean square difference between texels [T, 3] and a sketched list [SIZE], 8-bit steps."""
     return STEPS * float(np.sqrt(np.square(sketch(texels) - before).sum() / max(1, texels.numel())))
 
 
 def _splitmix64(x: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
-    """64-bit hashes: the finaliser of SplitMix64."""
+    """Hash 64-bit integers with the finaliser of SplitMix64."""
     x = x + np.uint64(0x9E3779B97F4A7C15)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

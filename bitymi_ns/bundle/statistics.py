@@ -1,6 +1,6 @@
-"""Statistics of the bake in bundle.json: what was left out, its error, sizes.
+"""Statistics of the bake in bundle.json: surfels left out, errors, sizes.
 
-Every part may lack what an earlier version did not state, and keeps keys that it does not know.
+Every part may lack fields that earlier versions did not write, and keeps unknown keys.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ _P = TypeVar("_P", bound="Part")
 
 
 class Part(BaseModel):
-    """An object of bundle.json. Keys that it does not know are kept and ignored; numbers are finite, and no bool or
-    text is taken for one. What was not given is not written."""
+    """An object of bundle.json. Unknown keys are kept and ignored; numbers are finite and never bools or text. Only
+    fields that were set are written."""
 
     model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False)
 
@@ -29,7 +29,7 @@ class Part(BaseModel):
         return {key: value for key, value in serialize(self).items() if value is not None or key in given}
 
     def but(self: _P, **changes: Any) -> _P:
-        """Copy with other values; None removes one."""
+        """Copy with other values; None removes a field."""
         return type(self)(**{name: value for name, value in {**dict(self), **changes}.items() if value is not None})
 
 
@@ -40,14 +40,14 @@ def _number(value: Any) -> Any:
 Whole = Annotated[int, Field(ge=0, le=2**31 - 1)]
 Count = Annotated[int, Field(ge=0, le=2**60)]
 NotNegative = Annotated[float, Field(ge=0, le=_LARGEST)]
-Measured = Annotated[NotNegative | None, BeforeValidator(_number)]  # None = not a number
+Measured = Annotated[NotNegative | None, BeforeValidator(_number)]  # None: not a number
 Share = Annotated[float, Field(ge=0, le=1)]
 Decibels = Annotated[Annotated[float, Field(ge=-1e3, le=1e3)] | None, BeforeValidator(_number)]
-"""None = not a number: the pictures are equal, or no pixel counts."""
+"""None: not a number, as the pictures are equal or no pixel counts."""
 
 
 class Percentiles(Part):
-    """Percentiles of an error over the surfels; p100 is the largest. None = not a number."""
+    """Percentiles of an error over the surfels; p100 is the largest. None: not a number."""
 
     p50: NotNegative | None = None
     p90: NotNegative | None = None
@@ -56,7 +56,7 @@ class Percentiles(Part):
 
     @classmethod
     def of(cls, values: Tensor) -> Percentiles:
-        """Percentiles of [n] values, n at least 1, to four digits."""
+        """Compute the percentiles of [n] values, n >= 1, to four digits."""
         ordered = values.double().sort().values
         found = {p: round(float(ordered[round((len(ordered) - 1) * p / 100)]), 4) for p in (50, 90, 99, 100)}
         return cls(**{f"p{p}": value if value <= _LARGEST else None for p, value in found.items()})
@@ -72,8 +72,8 @@ class TileError(Part):
 
 
 class Certificate(Part):
-    """Counts of surfels whose stored residual is within the tolerance, as the closest training view shows it: weighted
-    by the blending weight, averaged over a pixel, root mean square over the tile. Alphas do not count."""
+    """Numbers of surfels whose stored residual is within the tolerance as seen by the closest training view: weighted
+    by blending weight, averaged per pixel, root mean square over the tile; alphas are ignored."""
 
     against: Literal["field", "texels"]  # reference: the field, or the trained texels before quantisation
     tolerance: NotNegative
@@ -81,20 +81,20 @@ class Certificate(Part):
     beyond: Whole
     worst: Measured = None  # 8-bit steps
     texel_rms: Measured = None
-    """Root mean square of the texels themselves, wherever they are seen, 8-bit steps."""
+    """Root mean square over all texels without weights, 8-bit steps."""
     marks: Annotated[str, Field(min_length=1368, max_length=1368, pattern=r"^[A-Za-z0-9+/]{1366}==$")] | None = None
-    """Count sketches, 2 x 128 sums, before quantisation and as stored (`sketch.sketches_text`)."""
+    """Count sketches of 2 x 128 sums, before quantisation and as stored (`sketch.sketches_text`)."""
 
     @classmethod
     def of(cls, errors: Tensor, tolerance: float, against: Literal["field", "texels"]) -> Certificate:
-        """Certificate of errors [n], 8-bit steps."""
+        """Certify errors [n], 8-bit steps."""
         within = int((errors <= tolerance).sum())
         worst = float(errors.amax()) if len(errors) else 0.0
         return cls(against=against, tolerance=tolerance, within=within, beyond=len(errors) - within, worst=worst)
 
 
 class LeftOut(Part):
-    """Numbers of surfels left out, by reason; `unseen` where visibility was computed."""
+    """Numbers of surfels left out, by reason; `unseen` if visibility was computed."""
 
     not_finite: Whole | None = None
     beyond_limits: Whole | None = None
@@ -103,7 +103,7 @@ class LeftOut(Part):
 
 
 class KeptSurfels(Part):
-    """Numbers of surfels; `without_tile` of a scene with a field."""
+    """Numbers of surfels; `without_tile` for a scene with a field."""
 
     trained: Whole | None = None
     kept: Whole | None = None
@@ -112,31 +112,31 @@ class KeptSurfels(Part):
 
 
 class KeptTexels(Part):
-    """Numbers of texels: by the paper's rule, by every rule that takes some away, and what is stored."""
+    """Numbers of texels: by the paper's rule, after each reduction, and as stored."""
 
     paper: Count | None = None
     nyquist: Count | None = None
     after_cap_by_views: Count | None = None
     within_visible_part: Count | None = None
-    polished: Count | None = None  # texels of the tiles that a polish started from
-    learned: Count | None = None  # texels of the tiles that were trained
+    polished: Count | None = None  # texels before the polish
+    learned: Count | None = None  # texels that were trained
     kept: Count | None = None
-    not_finite: Count | None = None  # points at which the field was not finite
+    not_finite: Count | None = None  # points where the field was not finite
 
 
 class FieldLevels(Part):
-    """Levels of the field that were evaluated, and the change of a residual without each, 8-bit steps."""
+    """Evaluated levels of the field, and the change of a residual without each, 8-bit steps."""
 
     unit: str | None = None
     levels: Whole | None = None
-    kept: tuple[Whole, Annotated[int, Field(ge=1, le=64)]]  # the first one and how many
+    kept: tuple[Whole, Annotated[int, Field(ge=1, le=64)]]  # first level and number of levels
     change_of_each: Annotated[list[Measured], Field(max_length=64)] | None = None
-    change: Measured = None  # change without all that are left out
+    change: Measured = None  # change without all dropped levels
     tolerance: NotNegative | None = None
 
 
 class AtlasCost(Part):
-    """Bytes of the atlas and error of the quantisation."""
+    """Bytes of the atlas and quantisation error."""
 
     bytes: Count | None = None
     pages: tuple[Whole, Whole, Whole] | None = None  # layers, height, width in texels
@@ -146,14 +146,14 @@ class AtlasCost(Part):
 
 
 class Kept(Part):
-    """Numbers of sites, coefficients or lobes, or bytes."""
+    """Numbers of sites, coefficients or lobes, or bytes, before and after."""
 
     before: Count | None = None
     after: Count
 
 
 class ViewColorError(Part):
-    """Terms of the view colours that are kept, and their error in 8-bit steps."""
+    """Terms of the reduced view colours, and their error in 8-bit steps."""
 
     kind: str | None = None
     tolerance: NotNegative
@@ -165,22 +165,22 @@ class ViewColorError(Part):
 
 
 class Gain(Part):
-    """PSNR over some views, dB, with the texels as baked and as tuned."""
+    """PSNR over some views, dB, with texels as baked and as tuned."""
 
     before: Decibels = None
     after: Decibels = None
 
 
 class Rounding(Part):
-    """Rounding of the surfels of a compact bundle."""
+    """Quantisation of the surfels of a compact bundle."""
 
     mse: Measured = None
-    """Mean square error that it made in the training views before the texels were tuned, colours from 0 to 1."""
+    """Mean squared error in the training views before texels were tuned, colours in [0, 1]."""
     steps: dict[str, NotNegative] = {}  # by column, as in `surfel_codes.REFERENCE`
 
 
 class FineTuning(Part):
-    """Fine-tuning or polish; no steps where there were too few views."""
+    """Fine-tuning or polish; no steps with too few views."""
 
     views: Whole | None = None
     held_in_views: Whole | None = None  # validation views
@@ -190,38 +190,38 @@ class FineTuning(Part):
     psnr_held_in: Gain | None = None
     psnr_held_out: Gain | None = None
     curve: Annotated[list[tuple[Whole, Decibels]], Field(max_length=1 << 16)] | None = None
-    """Steps and dB over the validation views."""
+    """Step and PSNR over the validation views, dB."""
     seconds: NotNegative | None = None
     cpu_seconds: NotNegative | None = None
     error_before: TileError | None = None  # error of the texels as baked from the field
 
 
 class HeldOut(Part):
-    """PSNR over the held-out views, dB: means, and the view in which the bundle is farthest from the trained scene."""
+    """PSNR over the held-out views, dB: means, and the view where the bundle differs most from the trained scene."""
 
     views: Whole | None = None
     psnr_baked_against_neural: Decibels = None
     psnr_neural_against_photos: Decibels = None
     psnr_baked_against_photos: Decibels = None
-    fitted_psnr_neural_against_photos: Decibels = None  # after the affine fit of each view's colours to its photograph
+    fitted_psnr_neural_against_photos: Decibels = None  # after an affine fit of each view's colours to its photograph
     fitted_psnr_baked_against_photos: Decibels = None
     psnr_baked_against_neural_worst: Decibels = None
 
 
 class Statistics(Part):
-    """For people and reports, and for `bitymi verify` to measure again."""
+    """Statistics for readers and reports; `bitymi verify` measures them again."""
 
     surfels: KeptSurfels | None = None
     texels: KeptTexels | None = None
-    error: TileError | None = None  # None: nothing was textured, or the texels were changed after the bake
-    certificate: Certificate | None = None  # None: nothing was textured, or there is no tolerance
-    view_color: ViewColorError | None = None  # None: all of the view colours is kept
+    error: TileError | None = None  # None: no texture, or texels changed after the bake
+    certificate: Certificate | None = None  # None: no texture, or no tolerance
+    view_color: ViewColorError | None = None  # None: view colours unchanged
     field: FieldLevels | None = None
     atlas: AtlasCost | None = None
     polish: FineTuning | None = None
     rounding: Rounding | None = None
     finetune: FineTuning | None = None
-    seconds: NotNegative | None = None  # seconds of the bake, without the fine-tuning
+    seconds: NotNegative | None = None  # of the bake, without fine-tuning
     options: BakeOptions | None = None
     method: str | None = None
     held_out: HeldOut | None = None

@@ -1,4 +1,4 @@
-"""JSON without its traps: one value for a key, finite numbers alone, and one way to write a value for a digest."""
+"""Strict JSON: unique keys, finite numbers, and a canonical form for digests."""
 
 import hashlib
 import json
@@ -11,10 +11,10 @@ from torch import Tensor
 
 
 def loads(data: bytes | bytearray) -> Any:
-    """The value of UTF-8 JSON text.
+    """Parse UTF-8 JSON.
 
     Raises:
-        ValueError: not JSON, a key that occurs twice, NaN or infinity (also as 1e999), or nested too deeply.
+        ValueError: not JSON, a duplicate key, NaN or infinity (also as 1e999), or nested too deeply.
     """
     try:
         return json.loads(
@@ -25,7 +25,7 @@ def loads(data: bytes | bytearray) -> Any:
 
 
 def canonical(value: Any) -> bytes:
-    """The one text of a value of JSON: keys sorted, no white space, ASCII.
+    """Serialise a JSON value canonically: sorted keys, no white space, ASCII.
 
     Raises:
         ValueError: a number is not finite, or the value is nested too deeply.
@@ -37,17 +37,17 @@ def canonical(value: Any) -> bytes:
 
 
 def digest(value: Any) -> str:
-    """SHA-256 of `canonical(value)`, 64 hexadecimal digits."""
+    """Compute the SHA-256 of `canonical(value)`, 64 hexadecimal digits."""
     return digest_of(canonical(value))
 
 
 def digest_of(text: bytes) -> str:
-    """The digest of a value of which this is the canonical text."""
+    """Compute the digest of a value from its canonical text."""
     return hashlib.sha256(text).hexdigest()
 
 
 def plain(value: Any) -> Any:
-    """`value` as JSON holds it: arrays as lists, numbers that are not finite as None, anything unknown as text."""
+    """Convert to JSON types: arrays to lists, non-finite numbers to None, anything unknown to text."""
     if isinstance(value, Mapping):
         return {str(key): plain(each) for key, each in value.items()}
     if isinstance(value, (list, tuple)):

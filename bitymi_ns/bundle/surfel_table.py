@@ -1,13 +1,13 @@
-"""Surfels as the columns of a PLY file, and back.
+"""Conversion between surfels and the columns of a PLY file.
 
 The names of 3D Gaussian splatting come first, so that its viewers show a sensible colour: x y z, f_dc_0..2, opacity
-(logit), scale_0..2 (log; scale_2 = -31, a flat disc), rot_0..3 (wxyz, unit). Then beta (raw), the view colour by
-name, `<parameter>_<i>` in C order, the tile rectangle tile_x, tile_y, tile_layer, tile_ru, tile_rv, the half side of
-the tile in scale units, tile_extent, and the mean residual residual_0..2, which is that of a surfel without a tile.
-Where texels have alphas, alpha is their mean, or that of a surfel without a tile.
+(logit), scale_0..2 (log; scale_2 = -31, a flat disc), rot_0..3 (wxyz, unit). Then beta (raw), the view colour as
+`<parameter>_<i>` in C order, the tile rectangle tile_x, tile_y, tile_layer, tile_ru, tile_rv, its half side in scale
+units, tile_extent, and the mean residual residual_0..2. Texels with alphas add alpha, their mean. A surfel without a
+tile is drawn with its mean residual and alpha.
 
-Lean view colours (`ops.view_color.LEAN`) have view_base_0..2 and view_terms, the number of the surfel's terms, instead;
-the terms themselves, surfel after surfel, are rows of a second element, `view_term`: term_0, term_1, ...
+Lean view colours (`ops.view_color.LEAN`) have view_base_0..2 and view_terms (number of terms) instead; the terms,
+surfel after surfel, are rows of a second element, `view_term`: term_0, term_1, ...
 """
 
 from collections.abc import Mapping
@@ -34,7 +34,7 @@ ALPHA_COLUMN = "alpha"
 COUNT_COLUMN = "view_terms"
 TERMS = "view_term"
 
-# Columns of the parameters whose columns are not `<parameter>_<i>`.
+# Columns of the parameters that are not named `<parameter>_<i>`.
 COLUMNS: dict[str, tuple[str, ...]] = {
     "means": ("x", "y", "z"),
     "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
@@ -47,10 +47,10 @@ COLUMNS: dict[str, tuple[str, ...]] = {
 
 
 def mean_view_color(surfels: Mapping[str, Tensor], kind: str | None = None) -> Tensor:
-    """Mean of f_view over all directions, without the bias 0.5: [N, 3].
+    """Average f_view over all directions, without the bias 0.5: [N, 3].
 
-    Exact where the kind has a closed form (`ViewColor.mean`); else, and for lean colours, whose kind must be given, a
-    mean over 32 directions. For display only.
+    Uses the closed form of the kind (`ViewColor.mean`) if there is one; else, and for lean colours (which need `kind`),
+    a mean over 32 directions. For display only.
     """
     kind = kind or kind_of(surfels)
     entry = VIEW_COLORS[kind]
@@ -62,12 +62,12 @@ def mean_view_color(surfels: Mapping[str, Tensor], kind: str | None = None) -> T
 
 
 def to_columns(scene: BakedScene, has_alpha: bool = False) -> dict[str, npt.NDArray]:
-    """The columns of surfels.ply; those of the terms of lean view colours are `term_columns`.
+    """Convert a scene to the columns of surfels.ply, without the terms of lean view colours (`term_columns`).
 
     Args:
-        scene: of N surfels. Its mean residuals are added to the colour shown by other viewers; they and the extents get
-            columns where they are stated.
-        has_alpha: mean alphas get a column.
+        scene: N surfels. Mean residuals are included in the colour that other viewers show; residuals and extents get
+            columns if present.
+        has_alpha: write mean alphas.
     """
     kind, surfels, tiles = scene.view_color, scene.surfels, scene.tiles.numpy()
     lean = "view_terms" in surfels
@@ -104,10 +104,10 @@ def to_columns(scene: BakedScene, has_alpha: bool = False) -> dict[str, npt.NDAr
 
 
 def term_columns(surfels: Mapping[str, Tensor]) -> dict[str, npt.NDArray]:
-    """The columns of the terms of lean view colours, surfel after surfel: term_0, term_1, ...; [T] float32."""
+    """Convert the terms of lean view colours to columns, surfel after surfel: term_0, term_1, ...; [T] float32."""
     first, count = surfels["view_span"].long().cpu().unbind(1)
     terms = surfels["view_terms"].detach().float().cpu()
-    start = count.cumsum(0) - count  # a span may lie anywhere, the file has them in order
+    start = count.cumsum(0) - count  # spans may lie anywhere, the file has them in order
     inside = torch.arange(int(count.sum())) - start.repeat_interleave(count)
     ordered = terms[first.repeat_interleave(count) + inside]
     return {name: ordered[:, i].numpy() for i, name in enumerate(_numbered("term", terms.shape[1]))}
@@ -123,10 +123,10 @@ def _bounded(columns: Mapping[str, npt.NDArray], name: str, low: float, high: fl
 
 
 def first_problem(surfels: Mapping[str, Tensor], kind: str) -> str | None:
-    """The first number beyond its limit (`limits.LIMITS`), by column and row of surfels.ply; None where there is none.
+    """Describe the first number beyond its limit (`limits.LIMITS`), by column and row of surfels.ply; None if none.
 
     Args:
-        surfels: parameters by name, mean_residual too.
+        surfels: parameters by name, including mean_residual.
         kind: a name of `ops.VIEW_COLORS`.
     """
     for name, values in surfels.items():
@@ -155,21 +155,21 @@ def from_columns(
     extent: float = SUPPORT,
     has_alpha: bool = False,
 ) -> dict[str, Any]:
-    """Surfels and tiles from the columns of surfels.ply.
+    """Convert the columns of surfels.ply to surfels and tiles.
 
     Args:
-        columns: of the element `vertex`.
+        columns: of element `vertex`.
         kind: a name of `ops.VIEW_COLORS`.
-        terms: columns of the element `view_term`, for lean view colours; None = the file has none.
-        extent: half side of the tiles in scale units where the file has no column of it.
-        has_alpha: mean alphas are needed.
+        terms: columns of element `view_term`, for lean view colours; None if absent.
+        extent: half side of the tiles in scale units if there is no column.
+        has_alpha: require mean alphas.
 
     Returns:
-        by the names of `BakedScene`: surfels, the per-surfel parameters, float32 (quaternions have length 1); tiles
-        [N, 5] int32; extent [N]; mean_residual [N, 3], 0 where the file has no such columns; mean_alpha [N] or None.
+        fields of `BakedScene`: surfels, float32 per-surfel parameters (unit quaternions); tiles [N, 5] int32; extent
+        [N]; mean_residual [N, 3], 0 without its columns; mean_alpha [N] or None.
 
     Raises:
-        PlyError: a column is missing or has the wrong type, the view colour has the wrong number of columns, or a value
+        PlyError: a column is missing or of the wrong type, the view colour has the wrong number of columns, or a value
             is beyond its limit.
     """
     if kind not in VIEW_COLORS:
@@ -237,7 +237,7 @@ def _plain(value: Tensor) -> Tensor:
 
 
 def _stack(columns: Mapping[str, npt.NDArray], names: tuple[str, ...], dtype: type = np.float32) -> Tensor:
-    """[N, len(names)] of the columns; PlyError where one is missing or of another type."""
+    """Stack columns to [N, len(names)]; raises a PlyError if one is missing or of another type."""
     for name in names:
         if name not in columns:
             raise PlyError(f"the column {name} is missing")

@@ -1,4 +1,4 @@
-"""Checks of a bundle by itself: files, numbers, tiles, and what bundle.json states of them."""
+"""Checks of a bundle on its own: files, numbers, tiles, statements of bundle.json."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,13 +19,13 @@ from bitymi_ns.codec.quantise import STEPS
 
 SLACK_STEPS = 0.02  # 8-bit steps by which a measured error may exceed the stated one
 _SLACK_CODES = 4.0
-"""8-bit codes by which a sum of a sketch may differ: processors round values between two codes either way."""
-_SLACK_SKETCH = 1.4  # the square that sketches estimate is within 1.96 times the true one: 7 standard deviations
+"""8-bit codes by which a sum of a sketch may differ: processors round ties either way."""
+_SLACK_SKETCH = 1.4  # 1.4^2 = 1.96, 7 standard deviations above the true mean square
 
 
 @dataclass(frozen=True)
 class Check:
-    """Result of a check: its name, whether it holds, and the numbers."""
+    """Result of a check: name, outcome, numbers."""
 
     name: str
     ok: bool
@@ -33,15 +33,15 @@ class Check:
 
 
 def check_files(folder: str | Path) -> tuple[Bundle | None, list[Check]]:
-    """Check a bundle by itself: sizes and hashes of its files, their formats, its numbers, its tiles.
+    """Check a bundle on its own: sizes and hashes of its files, formats, numbers, tiles.
 
     Returns:
-        the bundle, None when it cannot be read, and the checks in the order they were made.
+        the bundle, None if unreadable, and the checks in order.
     """
     try:
         with parts_of(folder) as parts:
             return _check_parts(parts)
-    except BundleError as error:  # of one file, which cannot be opened
+    except BundleError as error:  # a single file that cannot be opened
         return None, [Check(MANIFEST, False, str(error))]
 
 
@@ -71,7 +71,7 @@ def _check_parts(parts: Parts) -> tuple[Bundle | None, list[Check]]:
 
 
 def _check_notes(parts: Parts) -> list[Check]:
-    """Check notes.json, where there is one."""
+    """Check notes.json if present."""
     try:
         found = read_notes(parts)
     except BundleError as error:
@@ -80,16 +80,16 @@ def _check_notes(parts: Parts) -> list[Check]:
 
 
 def _real_world(place: WorldFrame) -> str:
-    """Text of up and metres per unit, where stated."""
+    """Format up vector and metres per unit, if stated."""
     text = "" if place.up is None else f", up ({', '.join(f'{x:.3f}' for x in place.up)}) by {place.up_from}"
     return text + ("" if place.metres_per_unit is None else f", {place.metres_per_unit:.4g} m per unit")
 
 
 def check_world(stated: WorldFrame, world: World) -> Check:
-    """Compare the frame that a bundle states with that of its run.
+    """Compare the frame in bundle.json with that of the training run.
 
     Args:
-        stated: of bundle.json; an earlier version states neither up nor lengths.
+        stated: from bundle.json; earlier versions lack up and lengths.
     """
     wrong = []
     for key, found in world.described().items():
@@ -102,8 +102,8 @@ def check_world(stated: WorldFrame, world: World) -> Check:
 
 
 def check_certificate(bundle: Bundle) -> list[Check]:
-    """Check the texels' colours by the sketches of the certificate: that they are those measured, and as near to those
-    before quantisation as stated; nothing to check without a certificate."""
+    """Check the texels' colours by the sketches of the certificate: equal to those measured, and as close to the
+    unquantised ones as stated. Returns no checks without a certificate."""
     stated, atlas = bundle.info.statistics.certificate, bundle.info.atlas
     if stated is None:
         return []
@@ -132,7 +132,7 @@ def steps_text(error: float | None) -> str:
 
 
 def _tiles(bundle: Bundle) -> Check:
-    """Sides are powers of two on the grid of 4 x 4 blocks, and no texel belongs to two tiles."""
+    """Check that sides are powers of two on the grid of 4 x 4 blocks and that tiles do not overlap."""
     tiled = bundle.scene.tiles[bundle.scene.tiles[:, 3] > 0].long()
     if len(tiled) == 0:
         return Check("tiles", True, "none")
@@ -147,7 +147,7 @@ def _tiles(bundle: Bundle) -> Check:
 
 
 def _blocks(tiles: Tensor, atlas: Tensor | None) -> Tensor:
-    """[layers, height / 4, width / 4] number of tiles over every 4 x 4 block, from differences at the corners."""
+    """Count the tiles over each 4 x 4 block, [layers, height / 4, width / 4], by 2D prefix sums of corner marks."""
     layers, height, width = (1, 4, 4) if atlas is None else atlas.shape[:3]
     counts = torch.zeros(layers, height // 4 + 1, width // 4 + 1, dtype=torch.int32)
     x, y, layer, r_u, r_v = tiles.unbind(1)
@@ -158,7 +158,7 @@ def _blocks(tiles: Tensor, atlas: Tensor | None) -> Tensor:
 
 
 def _statements(bundle: Bundle) -> Check:
-    """Check the counts of bundle.json against the files."""
+    """Compare the counts in bundle.json with the files."""
     statistics = bundle.info.statistics
     surfels, texels, lean = statistics.surfels, statistics.texels, statistics.view_color
     found = {"surfels kept": len(bundle), "texels kept": int(bundle.scene.tiles[:, 3:].long().prod(1).sum())}

@@ -1,4 +1,4 @@
-"""Writing of bundles: compact columns, or surfels.ply and atlas.ktx2; and bundle.json."""
+"""Writing of bundles: compact columns, or surfels.ply and atlas.ktx2, with bundle.json."""
 
 from __future__ import annotations
 
@@ -50,17 +50,16 @@ _CHUNK = 1 << 22
 
 @dataclass(frozen=True)
 class World:
-    """Frame of the scene in the capture's, x_scene = scale * (transform @ [x_capture, 1]), and in the real world."""
+    """Frame of the scene: transform from the capture, x_scene = scale * (transform @ [x_capture, 1]), up, metres."""
 
-    transform: npt.ArrayLike = field(default_factory=lambda: np.eye(4)[:3])  # [3, 4] (the dataparser's transform)
-    scale: float = 1.0  # the dataparser's scale
-    # [3] direction of the capture's own frame that points away from the ground; None = it is not known
-    up: npt.ArrayLike | None = None
-    up_from: str = ""  # where `up` comes from, a word
-    metres_per_unit: float | None = None  # length of a unit of the capture's own frame; None = it is not known
+    transform: npt.ArrayLike = field(default_factory=lambda: np.eye(4)[:3])  # [3, 4] (the dataparser's)
+    scale: float = 1.0  # the dataparser's
+    up: npt.ArrayLike | None = None  # [3] direction away from the ground, capture frame; None: unknown
+    up_from: str = ""  # source of `up`, one word
+    metres_per_unit: float | None = None  # length of a unit of the capture frame; None: unknown
 
     def described(self) -> dict[str, Any]:
-        """`manifest.WorldFrame`: up and length in the scene's own frame."""
+        """Convert to `manifest.WorldFrame`, with up and length in the scene frame."""
         transform = np.asarray(self.transform, dtype=np.float64)[:3]
         place: dict[str, Any] = {"transform": transform, "scale": float(self.scale)}
         if self.up is not None:
@@ -90,26 +89,25 @@ def write_bundle(
     """Write a bundle; the folder appears complete or not at all.
 
     Args:
-        scene: on the CPU, all numbers finite, the view colours all or lean. Its own atlas is not looked at. The mean
-            residuals are also a part of the colour that other viewers show. Its mean alphas are written beside an
-            atlas with alphas, which needs them.
-        atlas: the encoded atlas, None for a scene without texture.
-        codes: what surfels and texels stand for, for a compact bundle; the scene and the atlas are decoded from them.
+        scene: on the CPU, all numbers finite; its own atlas is ignored. Mean residuals are also added to the colour
+            that other viewers show. Mean alphas are required by, and written with, an atlas with alphas.
+        atlas: encoded atlas; None for a scene without texture.
+        codes: codes of surfels and texels, for a compact bundle; scene and atlas must be decoded from them.
         background: colour behind the surfels.
-        world: place in the capture's own frame.
-        statistics: anything worth knowing about the bake, for people and reports.
+        world: frame of the scene.
+        statistics: statistics of the bake (`statistics.Statistics`).
         extra_files: further files by name, such as preview.png.
-        loose_files: files that bundle.json does not vouch for, because they may be edited later.
-        overwrite: replace an existing bundle; its notes.json is carried over.
-        interchange: write surfels.ply into a compact bundle, too, for other programs.
-        poster: [H, W, 3] picture of what a viewer shows first.
+        loose_files: files that may be edited later, not covered by bundle.json.
+        overwrite: replace an existing bundle, carrying over its notes.json.
+        interchange: also write surfels.ply into a compact bundle, for other programs.
+        poster: [H, W, 3] picture of the viewer's first view.
 
     Returns:
         the folder.
 
     Raises:
-        BundleError: the target exists or cannot be written, or the parameters are not finite or beyond the limits of
-            what is read (`limits.py`, `manifest.py`).
+        BundleError: the target exists or cannot be written, or a parameter is not finite or beyond its limit
+            (`limits.py`, `manifest.py`).
     """
     folder = Path(folder)
     surfels = scene.surfels
@@ -152,7 +150,7 @@ def write_bundle(
 
 
 def _compact_parts(codes: SceneCodes, info: dict[str, Any]) -> dict[str, bytes]:
-    """The two files of a compact bundle; their description goes into `info`."""
+    """Encode the two files of a compact bundle, adding their description to `info`."""
     of_surfels, surfels = compact.encode_surfels(codes.surfels, codes.residual, codes.residual_step, codes.alpha)
     info["surfels"] |= {"file": COMPACT_SURFELS, **of_surfels}
     if codes.alpha is None:
@@ -176,7 +174,7 @@ def _describe(
     world: World,
     statistics: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
-    """Arguments of `manifest.describe` without the list of files."""
+    """Build the arguments of `manifest.describe`, without the list of files."""
     surfels, kind = scene.surfels, scene.view_color
     entry = VIEW_COLORS[kind]
     means, lean = surfels["means"].detach(), "view_terms" in surfels
@@ -230,7 +228,7 @@ def _has_alpha(atlas: EncodedAtlas | None) -> bool:
 
 
 def _check_alpha(scene: BakedScene, atlas: EncodedAtlas | None, codes: SceneCodes | None) -> None:
-    """Refuse mean alphas, pages and codes of which some have alpha and some have none."""
+    """Check that mean alphas, pages and codes agree on having alpha."""
     if codes is not None and codes.texels is not None and (codes.alpha is not None) != _has_alpha(atlas):
         raise BundleError("the atlas and the codes of the texels disagree whether there are alphas")
     if not _has_alpha(atlas):

@@ -1,6 +1,6 @@
-// The rectangle on the screen that holds what a surfel can touch: the level set sigma = 1/255 of the kernel and that of
-// the low pass. As core/plane_bounds.h, but along the axes of the surfel's own image, because a rasterizer draws any
-// rectangle: a needle across the screen then costs what it covers.
+// Screen rectangles that bound a surfel: the level set sigma = 1/255 of the kernel and of the low pass. As
+// core/plane_bounds.h, but along the axes of the surfel's image, as a rasterizer draws any rectangle: a long thin
+// surfel then costs only its own area.
 
 struct Rectangle {
   visible: bool,
@@ -10,21 +10,21 @@ struct Rectangle {
 }
 
 const BOUND_PAD: f32 = 0.02;  // pixels
-const WIDEST: f32 = 1e5;  // pixels, beyond which the whole screen is drawn
-const LEAST_ANGLE: f32 = 1e-6;  // between the lines U = 0 and V = 0, below which floats do not tell where a disc is
+const WIDEST: f32 = 1e5;  // pixels; larger surfels cover the whole screen
+const LEAST_ANGLE: f32 = 1e-6;  // between the lines U = 0 and V = 0; below, the disc's image is lost to rounding
 
-// Squared radius in scale units at which the kernel is exp(-level) of its centre, a little wide.
+// Computes the squared radius in scale units where the kernel is exp(-level) of its maximum, slightly enlarged.
 fn level_radius2(level: f32, beta: f32) -> f32 {
   return SUPPORT2 * min(1.0, (1.0 - exp(-level / max(beta, 1e-6))) * 1.0002 + 4e-6);
 }
 
-// The larger principal axis of the ellipse that is the image of the unit circle under [p q].
+// Computes the major principal axis of the ellipse [p q] (unit circle).
 fn major_axis(p: vec2f, q: vec2f) -> vec2f {
   let angle = 0.5 * atan2(2.0 * (p.x * p.y + q.x * q.y), p.x * p.x + q.x * q.x - p.y * p.y - q.y * q.y);
   return vec2f(cos(angle), sin(angle));
 }
 
-// How far the image of the disc reaches along `e`: x = P.q / (1 + C.q) on the unit disc, `rest` = 1 - |C|^2.
+// Computes the extent of the disc's image along `e`: x = P.q / (1 + C.q) on the unit disc, `rest` = 1 - |C|^2.
 fn reach(e: vec2f, p: vec2f, q: vec2f, c: vec2f, rest: f32) -> vec2f {
   let along = vec2f(dot(e, p), dot(e, q));
   let pc = dot(along, c);
@@ -39,7 +39,7 @@ fn screen() -> Rectangle {
   return Rectangle(true, vec2f(1.0, 0.0), 0.5 * frame.size, 0.5 * frame.size);
 }
 
-// From `low` to `high` along an axis and across it, offsets from the projected centre.
+// Builds the rectangle from `low` to `high` along an axis and across it, offsets from the projected centre.
 fn finish(center: vec2f, axis: vec2f, low: vec2f, high: vec2f) -> Rectangle {
   let half_size = 0.5 * (high - low) * 1.0002 + BOUND_PAD;
   if !(max(half_size.x, half_size.y) < WIDEST) { return screen(); }
@@ -47,7 +47,7 @@ fn finish(center: vec2f, axis: vec2f, low: vec2f, high: vec2f) -> Rectangle {
   return Rectangle(true, axis, center + axis * middle.x + vec2f(-axis.y, axis.x) * middle.y, half_size);
 }
 
-// Whether all of a disc that lies in front of the camera lies beyond a border of the image; core/outline.h.
+// Returns true if the visible part of a disc lies beyond a border of the image; core/outline.h.
 fn beyond_border(along: vec2f, c: vec2f, border: f32) -> bool {
   let off = along - border * c;
   let far = abs(border);
@@ -58,8 +58,8 @@ fn beyond_border(along: vec2f, c: vec2f, border: f32) -> bool {
 const CORNERS: u32 = 8;  // of a polygon about the disc
 const MOST_CORNERS: u32 = CORNERS + 5;  // each plane adds one
 
-// What is left of a polygon about a disc behind `near` and within the image, and the low pass: for discs that cross the
-// camera's plane, whose image is no ellipse, and those whose ellipse is larger than the screen.
+// Clips a polygon around the disc to `near` and the image, and adds the low pass: for discs that cross the camera's
+// plane, whose image is no ellipse, and for ellipses larger than the screen.
 fn clipped(s: Seen, p: vec2f, q: vec2f, c: vec2f, blur: f32) -> Rectangle {
   let border = select(-s.center, min(frame.size - s.center, vec2f(0.0)), s.center >= vec2f(0.0));
   var low = vec2f(-blur);
@@ -98,14 +98,14 @@ fn clipped(s: Seen, p: vec2f, q: vec2f, c: vec2f, blur: f32) -> Rectangle {
       }
     }
   }
-  if count > 0 && blur == 0.0 {  // nothing of the centre
+  if count > 0 && blur == 0.0 {  // the centre does not count
     low = vec2f(1e9);
     high = -low;
   }
   for (var k = 0u; k < count; k++) {
     let depth = corners[k].z;
     let at = corners[k].xy / depth;
-    // a corner is what is left of differences of the disc's axes, divided by a depth that may be small
+    // rounding error: differences of the disc's axes, divided by a possibly small depth
     let lost = 5e-7 * (abs(p) + abs(q) + abs(at) * (abs(c.x) + abs(c.y) + 1.0)) / depth;
     low = min(low, at - 0.5 - lost);
     high = max(high, at + 0.5 + lost);
@@ -117,11 +117,11 @@ fn clipped(s: Seen, p: vec2f, q: vec2f, c: vec2f, blur: f32) -> Rectangle {
 
 fn rectangle(s: Seen) -> Rectangle {
   let ratio = s.opacity / ALPHA_MIN;
-  let blurred = -s.area * ratio;  // of the low pass
+  let blurred = -s.area * ratio;  // maximum of the low pass over ALPHA_MIN
   let almost = 1.0 - 1e-6;
   if max(ratio, blurred) < almost { return hidden(); }
   let r2 = level_radius2(log(max(ratio, 1.0)) + 1e-5, s.beta);
-  // where the kernel is larger than the low pass everywhere, the low pass needs no room
+  // if the kernel exceeds the low pass everywhere, the latter needs no extra pixels
   let blur2 = 1.0 / low_pass_sharp();
   let change = LOW_PASS_REACH * sqrt(blur2) * (abs(s.w.x) + abs(s.w.y));
   let least = s.w0 - change;
@@ -162,7 +162,7 @@ fn filter_variance(beta: f32) -> f32 {
   return PIXEL_VARIANCE * 2.0 / SUPPORT2 * (beta + 2.0);
 }
 
-// Seen through a pixel: the ellipse of the largest blur and magnification that any pixel can have (core/bounds.h).
+// Bounds the prefiltered kernel: the ellipse of the largest blur and magnification at any pixel (core/bounds.h).
 fn filtered_rectangle(s: Seen) -> Rectangle {
   let ratio = s.opacity / ALPHA_MIN;
   if !(s.w0 > 0.0) || !(ratio > 1.0) { return hidden(); }
@@ -185,7 +185,7 @@ fn filtered_rectangle(s: Seen) -> Rectangle {
   return finish(s.center, axis, -vec2f(along, across), vec2f(along, across));
 }
 
-// Whether the rectangle meets the image.
+// Returns true if the rectangle meets the image.
 fn on_screen(r: Rectangle) -> bool {
   let box = abs(r.axis) * r.half_size.x + abs(r.axis.yx) * r.half_size.y;
   return r.visible && all(r.middle + box >= vec2f(0.0)) && all(r.middle - box <= frame.size);

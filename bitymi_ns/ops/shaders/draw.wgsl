@@ -1,10 +1,9 @@
-// Draws a batch of surfels, nearest first, each as a rectangle, into a target that holds the sums of a pixel and, in
-// alpha, the transmittance that is left. The blending unit does the rest of core/blend.h:
+// Draws a batch of surfels, nearest first, as rectangles into a target with the sums of a pixel and, in alpha, the
+// remaining transmittance. Blending does the rest of core/blend.h:
 //   sums += transmittance * (sigma * color),   transmittance *= 1 - sigma.
 //
-// What a fragment's weight is, the blending unit does not tell. Where the weight decides (the bound of residual and
-// alpha, the end of a pixel), it is judged by the transmittance that was left before the batch: from above. The more
-// batches, the closer; what it costs in the picture is in docs/viewer.md.
+// Blending does not expose a fragment's weight. Tests of the weight (bound of residual and alpha, end of a pixel) use
+// the transmittance before the batch, an upper bound; more batches tighten it. docs/viewer.md has the image error.
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> surfels: array<Surfel>;
@@ -13,8 +12,8 @@
 @group(0) @binding(4) var<storage, read> visible: u32;
 @group(1) @binding(0) var atlas: texture_2d_array<f32>;
 @group(1) @binding(1) var bilinear: sampler;
-@group(1) @binding(2) var coarser: texture_2d_array<f32>;  // the levels 1 and 2 of the tiles, as its levels 0 and 1
-@group(2) @binding(0) var<uniform> layer: vec4u;  // which batch
+@group(1) @binding(2) var coarser: texture_2d_array<f32>;  // levels 1 and 2 of the tiles, as its levels 0 and 1
+@group(2) @binding(0) var<uniform> layer: vec4u;  // x: batch
 @group(2) @binding(1) var before: texture_2d<f32>;  // the target before this batch
 
 struct Corner {
@@ -106,7 +105,7 @@ fn filtered_fragment(c: Corner, d: vec2f) -> Fragment {
   return f;
 }
 
-// The residual, and what sigma is multiplied by.
+// Fetches the residual and the factor of sigma.
 fn texels(c: Corner, at: vec2f) -> vec4f {
   if c.texel.x < 0.0 { return c.tile; }
   let span = c.tile.zw;

@@ -1,5 +1,5 @@
-// A page of an atlas at half its size: means of 2 x 2 texels, as `ops.tile_levels` takes them. With alpha colours are
-// weighted by it, where it is not 0 in all four: what is cut away does not tint its neighbours.
+// Halves a page of an atlas: means of 2 x 2 texels, as `ops.tile_levels`. With alpha, colours are weighted by it unless
+// all four are 0: transparent texels do not tint their neighbours.
 
 @group(0) @binding(0) var finer: texture_2d<f32>;
 
@@ -22,7 +22,7 @@ fn weighted(t: array<vec4f, 4>) -> vec3f {
   return t[0].a * t[0].rgb + t[1].a * t[1].rgb + t[2].a * t[2].rgb + t[3].a * t[3].rgb;
 }
 
-// Bytes, rounded.
+// Averages bytes, rounded.
 fn bytes(t: array<vec4f, 4>) -> vec4f {
   return floor((round(sum(t) * 255.0) + 2.0) / 4.0) / 255.0;
 }

@@ -1,4 +1,4 @@
-// One thread per surfel: its projection, view colour, rectangle, and the key by which it is sorted.
+// Computes projection, view colour, bounding rectangle and sort key, one thread per surfel.
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> surfels: array<Surfel>;
@@ -65,6 +65,6 @@ fn prepare(@builtin(global_invocation_id) id: vec3u) {
   s.level = tile_level(s, surfel);
   s.color = max(view_color(frame.kind, surfel, direction) + COLOR_BIAS, vec3f(0.0));
   seen[i] = s;
-  keys[i] = bitcast<u32>(p.z);  // positive floats are ordered as their bits are
+  keys[i] = bitcast<u32>(p.z);  // positive floats sort like their bits
   atomicAdd(&visible, 1u);
 }

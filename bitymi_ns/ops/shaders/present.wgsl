@@ -1,11 +1,11 @@
-// Shows what was drawn (draw.wgsl) on the screen: over the background, or as a map in colours.
+// Presents the sums of draw.wgsl on the screen: over the background, or as a colour map.
 
 struct Screen {
   background: vec4f,
-  size: vec2f,  // of the screen's part, pixels
+  size: vec2f,  // viewport, pixels
   show: u32,  // SHOW_*
-  most: f32,  // of a map: the value of the last colour
-  samples: u32,  // of a pixel, along each axis
+  most: f32,  // upper end of a map's range
+  samples: u32,  // per pixel and axis
 }
 
 @group(0) @binding(0) var<uniform> screen: Screen;
@@ -17,7 +17,7 @@ fn whole(@builtin(vertex_index) vertex: u32) -> @builtin(position) vec4f {
   return vec4f(f32(vertex & 1) * 4.0 - 1.0, f32(vertex >> 1) * 4.0 - 1.0, 0.0, 1.0);
 }
 
-// From dark blue over green and yellow to red.
+// Maps 0 to 1 to dark blue, green, yellow, red.
 fn ramp(x: f32) -> vec3f {
   let t = clamp(x, 0.0, 1.0);
   let stops = array<vec3f, 5>(
@@ -29,7 +29,7 @@ fn ramp(x: f32) -> vec3f {
   return mix(stops[k], stops[k + 1], at - f32(k));
 }
 
-// What was drawn of a pixel: between the pixels that there are, or the mean of its samples.
+// Resamples the sums at a pixel: interpolated, or the mean of its samples.
 fn drawn(position: vec2f) -> vec4f {
   if screen.samples <= 1 { return textureSampleLevel(sums, smooth_sampler, position / screen.size, 0.0); }
   let pixels = vec2f(textureDimensions(sums) / screen.samples);

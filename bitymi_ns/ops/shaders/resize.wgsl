@@ -1,22 +1,22 @@
-// A surfel in a view of another size than the photographs that it was trained on: as core/resize.h and core/texel.h.
+// Adaptation of surfels to views of another size than the training photographs, as core/resize.h and core/texel.h.
 
-// Side of a photograph's pixel, for the kernels. One that is seen through a pixel is so through any.
+// Returns the side of a photograph's pixel for the kernels; 1 with the pixel prefilter, which adapts itself.
 fn kernel_pixel() -> f32 {
   return select(frame.photo_pixel, 1.0, frame.prefilter != 0);
 }
-// Variance that a pixel adds along each axis, pixels^2.
+// Computes the variance that a pixel adds along each axis, pixels^2.
 fn pixel_variance() -> f32 {
   let p = kernel_pixel();
   return max(0.0, (1.0 - p * p) / 12.0);
 }
-// 1 / squared radius of the low pass.
+// Computes 1 / squared radius of the low pass.
 fn low_pass_sharp() -> f32 {
   let p = kernel_pixel();
   return 1.0 / (p * p + 2.0 * pixel_variance());
 }
 
-// The surfel widened by the pixel, its low pass by the view's size; `area` then holds by how much that is higher than
-// the kernel.
+// Widens the surfel by the pixel and its low pass by the view's size; `area` then holds the height of the low pass over
+// that of the kernel, negated.
 fn resized(seen: Seen) -> Seen {
   var s = seen;
   let variance = pixel_variance();
@@ -24,7 +24,7 @@ fn resized(seen: Seen) -> Seen {
   let share = p * p * low_pass_sharp();
   s.area = -share;
   if variance == 0.0 || !(s.w0 > 0.0) { return s; }
-  // M' = (1 + c M M^T)^(-1/2) M: sums of positive terms
+  // M' = (1 + c M M^T)^(-1/2) M, from positive terms only
   let c = variance * 2.0 / SUPPORT2 * (s.beta + 2.0);
   let u = s.u / s.w0;
   let v = s.v / s.w0;
@@ -42,7 +42,7 @@ fn resized(seen: Seen) -> Seen {
   return s;
 }
 
-// The level of a tile whose texels are about as large as a pixel, as far as the tile has it.
+// Selects the level of a tile with about one texel per pixel, limited to the tile's levels.
 fn tile_level(s: Seen, surfel: Surfel) -> u32 {
   if surfel.sides == 0 || frame.detail == DETAIL_MEANS { return TILE_LEVELS; }
   let p = frame.photo_pixel;

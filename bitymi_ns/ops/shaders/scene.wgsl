@@ -1,7 +1,7 @@
-// What the shaders of a baked scene share: its numbers, its surfels, and what a frame is drawn with.
+// Declarations shared by the shaders of a baked scene: constants, surfels, frame uniforms.
 //
-// These files are the renderer for every screen: the browser's viewer and the package's `webgpu` renderer put them
-// together and run them. The formulas are those of csrc/core; its files say why they are as they are.
+// These shaders are the renderer of both the browser viewer and the package's `webgpu` backend. csrc/core explains
+// their formulas.
 
 const SUPPORT: f32 = 3.0;
 const SUPPORT2: f32 = 9.0;
@@ -14,7 +14,7 @@ const LOG_SCALE_MAX: f32 = 30.0;
 const COLOR_BIAS: f32 = 0.5;
 const PIXEL_VARIANCE: f32 = 0.25;
 
-// A surfel as it is stored, 96 bytes. Means are relative to the scene's origin.
+// A stored surfel, 96 bytes; means are relative to the scene's origin.
 struct Surfel {
   mean: vec3f,
   opacity_logit: f32,
@@ -22,16 +22,16 @@ struct Surfel {
   log_scale: vec2f,
   beta_raw: f32,
   extent: f32,  // half side of the tile, scale units
-  residual: vec3f,  // of a surfel without a tile
-  layer: u32,  // of the tile, 24 bits; above them 128 times the alpha of a surfel without a tile
-  base: vec3f,  // view colour: base, and its terms
+  residual: vec3f,  // without a tile
+  layer: u32,  // of the tile, 24 bits; above, 128 times the alpha without a tile
+  base: vec3f,  // base of the view colour
   first_term: u32,
   tile: vec2u,  // first texel
   sides: u32,  // texels along u, and along v in the upper half; 0: no tile
   terms: u32,
 }
 
-// A surfel as a camera sees it, 96 bytes; core/surfel.h has the planes U, V and W.
+// A projected surfel, 96 bytes; core/surfel.h defines the planes U, V and W.
 struct Seen {
   center: vec2f,  // pixels
   u: vec2f,
@@ -42,19 +42,19 @@ struct Seen {
   opacity: f32,
   beta: f32,
   color: vec3f,  // relu(f_view + 0.5)
-  area: f32,  // > 0 where the surfel is seen through a pixel; else by how much the low pass is higher, negative
-  axis: vec2f,  // of the rectangle that holds it on the screen, a unit vector
+  area: f32,  // > 0 with the pixel prefilter; else minus the height of the low pass over that of the kernel
+  axis: vec2f,  // unit vector along the bounding rectangle
   middle: vec2f,  // of the rectangle, pixels
   half_size: vec2f,  // along the axis and across
   normal_z: f32,
-  level: u32,  // of its tile; TILE_LEVELS: the mean residual alone
+  level: u32,  // of its tile; TILE_LEVELS: mean residual only
 }
 
 struct Frame {
   rotation: array<vec4f, 3>,  // rows, world to camera
-  center: vec3f,  // where the camera stands, relative to the scene's origin
-  alpha_scale: f32,  // m = alpha_scale * a texel's alpha multiplies sigma; 0: the scene is opaque
-  color_center: vec4f,  // from where view colours are seen; `center`, unless they are held
+  center: vec3f,  // camera centre relative to the scene's origin
+  alpha_scale: f32,  // m = alpha_scale * a texel's alpha multiplies sigma; 0: opaque scene
+  color_center: vec4f,  // viewpoint for view colours; `center` unless frozen
   lens: vec4f,  // fx, fy, cx, cy
   size: vec2f,  // pixels
   near: f32,
@@ -65,21 +65,21 @@ struct Frame {
   surfels: u32,
   kind: u32,  // of the view colours, VIEW_*
   prefilter: u32,
-  layers: u32,  // batches of surfels that are drawn one after the other
+  layers: u32,  // batches of surfels, drawn in sequence
   show: u32,  // SHOW_*
-  residuals: u32,  // whether they are added
+  residuals: u32,  // 1: add residuals
   photo_pixel: f32,  // side of a photograph's pixel in pixels of the view: resize.wgsl
   detail: u32,  // DETAIL_*
 }
 
-// What of the residuals is there.
-const DETAIL_MEANS: u32 = 0;  // their means alone: the texels are still to come
+// Available residuals.
+const DETAIL_MEANS: u32 = 0;  // means only, texels are still loading
 const DETAIL_TEXELS: u32 = 1;
 const DETAIL_ALL: u32 = 2;
 
-const TILE_LEVELS: u32 = 3;  // of a tile: its texels, means of 2 x 2 of them, and of 4 x 4
+const TILE_LEVELS: u32 = 3;  // of a tile: texels, and means of 2 x 2 and 4 x 4
 
-// What is blended: see draw.wgsl.
+// Blended quantity, see draw.wgsl.
 const SHOW_COLOR: u32 = 0;
 const SHOW_DEPTH: u32 = 1;
 const SHOW_NORMAL: u32 = 2;

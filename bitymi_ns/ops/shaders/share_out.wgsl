@@ -1,4 +1,4 @@
-// The visible surfels, front to back, are drawn in batches of equal size; this fills in how many each has.
+// Divides the visible surfels, front to back, into batches of equal size and writes their draw arguments.
 
 struct Draw {
   vertices: u32,

@@ -1,10 +1,10 @@
-// Sorts (key, value) pairs by 4 bits of the key, lowest first; eight rounds sort them all. It is stable, so surfels of
-// equal depth keep their order. Three kernels per round; none waits for another group of its own launch, because
-// devices differ in whether that ever ends.
+// Sorts (key, value) pairs by 4 bits of the key, lowest first; eight rounds sort completely. The sort is stable, so
+// surfels of equal depth keep their order. Each round has three kernels, as workgroups of one dispatch must not wait
+// for each other: forward progress is not guaranteed.
 //
-//   count    how often every digit occurs in every block of 1,024 keys
-//   scan     where the pairs of every digit and block begin
-//   scatter  moves them there
+//   count    histogram of digits per block of 1,024 keys
+//   scan     first output position per digit and block
+//   scatter  moves the pairs
 
 const THREADS: u32 = 256;
 const PER_THREAD: u32 = 4;
@@ -41,7 +41,7 @@ fn count(@builtin(local_invocation_index) thread: u32, @builtin(workgroup_id) gr
 
 var<workgroup> sums: array<u32, THREADS>;
 
-// One group; every thread takes a run of the table.
+// Scans the table in one workgroup; each thread takes a run.
 @compute @workgroup_size(THREADS)
 fn scan(@builtin(local_invocation_index) thread: u32) {
   let size = DIGITS * round.blocks;
@@ -66,7 +66,7 @@ fn scan(@builtin(local_invocation_index) thread: u32) {
   }
 }
 
-// Counts of 16 digits, 16 bits each: digit d in half d % 2 of word d / 2.
+// Counters of 16 digits, 16 bits each: digit d in half d % 2 of word d / 2.
 struct Counts {
   low: vec4u,
   high: vec4u,

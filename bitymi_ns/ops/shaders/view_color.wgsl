@@ -1,4 +1,4 @@
-// View colours f_view(d), without the offset 0.5, as core/view_kinds.h has them: a base, and terms.
+// View colours f_view(d), without the offset 0.5, from a base and terms, as core/view_kinds.h.
 
 const VIEW_SV: u32 = 0;  // lean: b, rgb
 const VIEW_SV_SITES: u32 = 1;  // all sites: site, log temperature, rgb

@@ -1,10 +1,10 @@
-function e(e,t,n){let r=e.getContext(`webgpu`);if(!r)throw Error(`The canvas gives no WebGPU context.`);return r.configure({device:n,format:navigator.gpu.getPreferredCanvasFormat(),alphaMode:`opaque`}),(n,i,a)=>{let{width:o,height:s}=n;return(e.width!==o||e.height!==s)&&Object.assign(e,{width:o,height:s}),t.draw(n,r.getCurrentTexture(),i,a)}}function t(e,t){let n=e.getContext(`2d`,{alpha:!1});if(!n)throw Error(`The canvas gives no 2D context.`);return async(r,i,a)=>{let[o,s]=[r.width,r.height].map(e=>Math.max(1,Math.round(e*i))),c=await t.read(r.scaledTo(o,s),a);Object.assign(e,{width:o,height:s}),n.putImageData(c,0,0)}}var n=(n,r,i)=>i.software?t(n,r):e(n,r,i.device),r=class{scale=1;milliseconds=0;took(e){this.milliseconds=this.milliseconds?.7*this.milliseconds+.3*e:e;let t=this.scale*Math.sqrt(14.166666666666668/Math.max(this.milliseconds,.5)),n=Math.min(1,Math.max(.2,t));if(Math.abs(n-this.scale)>.08*this.scale){let e=.5*(n-this.scale);this.scale+=Math.sign(e)*Math.max(Math.abs(e),Math.min(.05,Math.abs(2*e))),this.milliseconds=0}}};function i(e){let t=document.getElementById(e);if(!t)throw Error(`index.html has no element ${e}`);return t}var a=(e,t)=>e.setAttribute(`aria-pressed`,String(t)),o=e=>e.getAttribute(`aria-pressed`)===`true`;function s(e,t,...n){let r=Object.assign(document.createElement(e),t);return r.append(...n),r}var c=(e,t)=>i(e).addEventListener(`click`,t),l=(e,{run:t,...n})=>s(`button`,{type:`button`,onclick:t,...n},e),u=e=>[HTMLSelectElement,HTMLInputElement,HTMLTextAreaElement].some(t=>e instanceof t);function d(e,t){let n=s(`a`,{href:URL.createObjectURL(t),download:e});n.click(),setTimeout(()=>URL.revokeObjectURL(n.href),6e4)}var f=`// Where batch k of \`layers\` begins in the sorted list of \`count\` visible surfels.
+function e(e,t,n){let r=e.getContext(`webgpu`);if(!r)throw Error(`The canvas gives no WebGPU context.`);return r.configure({device:n,format:navigator.gpu.getPreferredCanvasFormat(),alphaMode:`opaque`}),(n,i,a)=>{let{width:o,height:s}=n;return(e.width!==o||e.height!==s)&&Object.assign(e,{width:o,height:s}),t.draw(n,r.getCurrentTexture(),i,a)}}function t(e,t){let n=e.getContext(`2d`,{alpha:!1});if(!n)throw Error(`The canvas gives no 2D context.`);return async(r,i,a)=>{let[o,s]=[r.width,r.height].map(e=>Math.max(1,Math.round(e*i))),c=await t.read(r.scaledTo(o,s),a);Object.assign(e,{width:o,height:s}),n.putImageData(c,0,0)}}var n=(n,r,i)=>i.software?t(n,r):e(n,r,i.device),r=class{scale=1;milliseconds=0;took(e){this.milliseconds=this.milliseconds?.7*this.milliseconds+.3*e:e;let t=this.scale*Math.sqrt(14.166666666666668/Math.max(this.milliseconds,.5)),n=Math.min(1,Math.max(.2,t));if(Math.abs(n-this.scale)>.08*this.scale){let e=.5*(n-this.scale);this.scale+=Math.sign(e)*Math.max(Math.abs(e),Math.min(.05,Math.abs(2*e))),this.milliseconds=0}}};function i(e){let t=document.getElementById(e);if(!t)throw Error(`index.html has no element ${e}`);return t}var a=(e,t)=>e.setAttribute(`aria-pressed`,String(t)),o=e=>e.getAttribute(`aria-pressed`)===`true`;function s(e,t,...n){let r=Object.assign(document.createElement(e),t);return r.append(...n),r}var c=(e,t)=>i(e).addEventListener(`click`,t),l=(e,{run:t,...n})=>s(`button`,{type:`button`,onclick:t,...n},e),u=e=>[HTMLSelectElement,HTMLInputElement,HTMLTextAreaElement].some(t=>e instanceof t);function d(e,t){let n=s(`a`,{href:URL.createObjectURL(t),download:e});n.click(),setTimeout(()=>URL.revokeObjectURL(n.href),6e4)}var f=`// Returns the start of batch k of \`layers\` in the sorted list of \`count\` visible surfels.
 fn layer_begin(count: u32, k: u32, layers: u32) -> u32 {
   return count / layers * k + min(k, count % layers);
 }
-`,p=`// The rectangle on the screen that holds what a surfel can touch: the level set sigma = 1/255 of the kernel and that of
-// the low pass. As core/plane_bounds.h, but along the axes of the surfel's own image, because a rasterizer draws any
-// rectangle: a needle across the screen then costs what it covers.
+`,p=`// Screen rectangles that bound a surfel: the level set sigma = 1/255 of the kernel and of the low pass. As
+// core/plane_bounds.h, but along the axes of the surfel's image, as a rasterizer draws any rectangle: a long thin
+// surfel then costs only its own area.
 
 struct Rectangle {
   visible: bool,
@@ -14,21 +14,21 @@ struct Rectangle {
 }
 
 const BOUND_PAD: f32 = 0.02;  // pixels
-const WIDEST: f32 = 1e5;  // pixels, beyond which the whole screen is drawn
-const LEAST_ANGLE: f32 = 1e-6;  // between the lines U = 0 and V = 0, below which floats do not tell where a disc is
+const WIDEST: f32 = 1e5;  // pixels; larger surfels cover the whole screen
+const LEAST_ANGLE: f32 = 1e-6;  // between the lines U = 0 and V = 0; below, the disc's image is lost to rounding
 
-// Squared radius in scale units at which the kernel is exp(-level) of its centre, a little wide.
+// Computes the squared radius in scale units where the kernel is exp(-level) of its maximum, slightly enlarged.
 fn level_radius2(level: f32, beta: f32) -> f32 {
   return SUPPORT2 * min(1.0, (1.0 - exp(-level / max(beta, 1e-6))) * 1.0002 + 4e-6);
 }
 
-// The larger principal axis of the ellipse that is the image of the unit circle under [p q].
+// Computes the major principal axis of the ellipse [p q] (unit circle).
 fn major_axis(p: vec2f, q: vec2f) -> vec2f {
   let angle = 0.5 * atan2(2.0 * (p.x * p.y + q.x * q.y), p.x * p.x + q.x * q.x - p.y * p.y - q.y * q.y);
   return vec2f(cos(angle), sin(angle));
 }
 
-// How far the image of the disc reaches along \`e\`: x = P.q / (1 + C.q) on the unit disc, \`rest\` = 1 - |C|^2.
+// Computes the extent of the disc's image along \`e\`: x = P.q / (1 + C.q) on the unit disc, \`rest\` = 1 - |C|^2.
 fn reach(e: vec2f, p: vec2f, q: vec2f, c: vec2f, rest: f32) -> vec2f {
   let along = vec2f(dot(e, p), dot(e, q));
   let pc = dot(along, c);
@@ -43,7 +43,7 @@ fn screen() -> Rectangle {
   return Rectangle(true, vec2f(1.0, 0.0), 0.5 * frame.size, 0.5 * frame.size);
 }
 
-// From \`low\` to \`high\` along an axis and across it, offsets from the projected centre.
+// Builds the rectangle from \`low\` to \`high\` along an axis and across it, offsets from the projected centre.
 fn finish(center: vec2f, axis: vec2f, low: vec2f, high: vec2f) -> Rectangle {
   let half_size = 0.5 * (high - low) * 1.0002 + BOUND_PAD;
   if !(max(half_size.x, half_size.y) < WIDEST) { return screen(); }
@@ -51,7 +51,7 @@ fn finish(center: vec2f, axis: vec2f, low: vec2f, high: vec2f) -> Rectangle {
   return Rectangle(true, axis, center + axis * middle.x + vec2f(-axis.y, axis.x) * middle.y, half_size);
 }
 
-// Whether all of a disc that lies in front of the camera lies beyond a border of the image; core/outline.h.
+// Returns true if the visible part of a disc lies beyond a border of the image; core/outline.h.
 fn beyond_border(along: vec2f, c: vec2f, border: f32) -> bool {
   let off = along - border * c;
   let far = abs(border);
@@ -62,8 +62,8 @@ fn beyond_border(along: vec2f, c: vec2f, border: f32) -> bool {
 const CORNERS: u32 = 8;  // of a polygon about the disc
 const MOST_CORNERS: u32 = CORNERS + 5;  // each plane adds one
 
-// What is left of a polygon about a disc behind \`near\` and within the image, and the low pass: for discs that cross the
-// camera's plane, whose image is no ellipse, and those whose ellipse is larger than the screen.
+// Clips a polygon around the disc to \`near\` and the image, and adds the low pass: for discs that cross the camera's
+// plane, whose image is no ellipse, and for ellipses larger than the screen.
 fn clipped(s: Seen, p: vec2f, q: vec2f, c: vec2f, blur: f32) -> Rectangle {
   let border = select(-s.center, min(frame.size - s.center, vec2f(0.0)), s.center >= vec2f(0.0));
   var low = vec2f(-blur);
@@ -102,14 +102,14 @@ fn clipped(s: Seen, p: vec2f, q: vec2f, c: vec2f, blur: f32) -> Rectangle {
       }
     }
   }
-  if count > 0 && blur == 0.0 {  // nothing of the centre
+  if count > 0 && blur == 0.0 {  // the centre does not count
     low = vec2f(1e9);
     high = -low;
   }
   for (var k = 0u; k < count; k++) {
     let depth = corners[k].z;
     let at = corners[k].xy / depth;
-    // a corner is what is left of differences of the disc's axes, divided by a depth that may be small
+    // rounding error: differences of the disc's axes, divided by a possibly small depth
     let lost = 5e-7 * (abs(p) + abs(q) + abs(at) * (abs(c.x) + abs(c.y) + 1.0)) / depth;
     low = min(low, at - 0.5 - lost);
     high = max(high, at + 0.5 + lost);
@@ -121,11 +121,11 @@ fn clipped(s: Seen, p: vec2f, q: vec2f, c: vec2f, blur: f32) -> Rectangle {
 
 fn rectangle(s: Seen) -> Rectangle {
   let ratio = s.opacity / ALPHA_MIN;
-  let blurred = -s.area * ratio;  // of the low pass
+  let blurred = -s.area * ratio;  // maximum of the low pass over ALPHA_MIN
   let almost = 1.0 - 1e-6;
   if max(ratio, blurred) < almost { return hidden(); }
   let r2 = level_radius2(log(max(ratio, 1.0)) + 1e-5, s.beta);
-  // where the kernel is larger than the low pass everywhere, the low pass needs no room
+  // if the kernel exceeds the low pass everywhere, the latter needs no extra pixels
   let blur2 = 1.0 / low_pass_sharp();
   let change = LOW_PASS_REACH * sqrt(blur2) * (abs(s.w.x) + abs(s.w.y));
   let least = s.w0 - change;
@@ -166,7 +166,7 @@ fn filter_variance(beta: f32) -> f32 {
   return PIXEL_VARIANCE * 2.0 / SUPPORT2 * (beta + 2.0);
 }
 
-// Seen through a pixel: the ellipse of the largest blur and magnification that any pixel can have (core/bounds.h).
+// Bounds the prefiltered kernel: the ellipse of the largest blur and magnification at any pixel (core/bounds.h).
 fn filtered_rectangle(s: Seen) -> Rectangle {
   let ratio = s.opacity / ALPHA_MIN;
   if !(s.w0 > 0.0) || !(ratio > 1.0) { return hidden(); }
@@ -189,18 +189,17 @@ fn filtered_rectangle(s: Seen) -> Rectangle {
   return finish(s.center, axis, -vec2f(along, across), vec2f(along, across));
 }
 
-// Whether the rectangle meets the image.
+// Returns true if the rectangle meets the image.
 fn on_screen(r: Rectangle) -> bool {
   let box = abs(r.axis) * r.half_size.x + abs(r.axis.yx) * r.half_size.y;
   return r.visible && all(r.middle + box >= vec2f(0.0)) && all(r.middle - box <= frame.size);
 }
-`,m=`// Draws a batch of surfels, nearest first, each as a rectangle, into a target that holds the sums of a pixel and, in
-// alpha, the transmittance that is left. The blending unit does the rest of core/blend.h:
+`,m=`// Draws a batch of surfels, nearest first, as rectangles into a target with the sums of a pixel and, in alpha, the
+// remaining transmittance. Blending does the rest of core/blend.h:
 //   sums += transmittance * (sigma * color),   transmittance *= 1 - sigma.
 //
-// What a fragment's weight is, the blending unit does not tell. Where the weight decides (the bound of residual and
-// alpha, the end of a pixel), it is judged by the transmittance that was left before the batch: from above. The more
-// batches, the closer; what it costs in the picture is in docs/viewer.md.
+// Blending does not expose a fragment's weight. Tests of the weight (bound of residual and alpha, end of a pixel) use
+// the transmittance before the batch, an upper bound; more batches tighten it. docs/viewer.md has the image error.
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> surfels: array<Surfel>;
@@ -209,8 +208,8 @@ fn on_screen(r: Rectangle) -> bool {
 @group(0) @binding(4) var<storage, read> visible: u32;
 @group(1) @binding(0) var atlas: texture_2d_array<f32>;
 @group(1) @binding(1) var bilinear: sampler;
-@group(1) @binding(2) var coarser: texture_2d_array<f32>;  // the levels 1 and 2 of the tiles, as its levels 0 and 1
-@group(2) @binding(0) var<uniform> layer: vec4u;  // which batch
+@group(1) @binding(2) var coarser: texture_2d_array<f32>;  // levels 1 and 2 of the tiles, as its levels 0 and 1
+@group(2) @binding(0) var<uniform> layer: vec4u;  // x: batch
 @group(2) @binding(1) var before: texture_2d<f32>;  // the target before this batch
 
 struct Corner {
@@ -302,7 +301,7 @@ fn filtered_fragment(c: Corner, d: vec2f) -> Fragment {
   return f;
 }
 
-// The residual, and what sigma is multiplied by.
+// Fetches the residual and the factor of sigma.
 fn texels(c: Corner, at: vec2f) -> vec4f {
   if c.texel.x < 0.0 { return c.tile; }
   let span = c.tile.zw;
@@ -355,8 +354,8 @@ fn surfel(c: Corner) -> @location(0) vec4f {
     }
   }
 }
-`,h=`// A page of an atlas at half its size: means of 2 x 2 texels, as \`ops.tile_levels\` takes them. With alpha colours are
-// weighted by it, where it is not 0 in all four: what is cut away does not tint its neighbours.
+`,h=`// Halves a page of an atlas: means of 2 x 2 texels, as \`ops.tile_levels\`. With alpha, colours are weighted by it unless
+// all four are 0: transparent texels do not tint their neighbours.
 
 @group(0) @binding(0) var finer: texture_2d<f32>;
 
@@ -379,7 +378,7 @@ fn weighted(t: array<vec4f, 4>) -> vec3f {
   return t[0].a * t[0].rgb + t[1].a * t[1].rgb + t[2].a * t[2].rgb + t[3].a * t[3].rgb;
 }
 
-// Bytes, rounded.
+// Averages bytes, rounded.
 fn bytes(t: array<vec4f, 4>) -> vec4f {
   return floor((round(sum(t) * 255.0) + 2.0) / 4.0) / 255.0;
 }
@@ -408,7 +407,7 @@ fn halve_alpha_floats(@builtin(position) position: vec4f) -> @location(0) vec4f 
   if mean.a == 0.0 { return mean; }
   return vec4f(weighted(t) / (4.0 * mean.a), mean.a);
 }
-`,g=`// One thread per surfel: its projection, view colour, rectangle, and the key by which it is sorted.
+`,g=`// Computes projection, view colour, bounding rectangle and sort key, one thread per surfel.
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> surfels: array<Surfel>;
@@ -475,17 +474,17 @@ fn prepare(@builtin(global_invocation_id) id: vec3u) {
   s.level = tile_level(s, surfel);
   s.color = max(view_color(frame.kind, surfel, direction) + COLOR_BIAS, vec3f(0.0));
   seen[i] = s;
-  keys[i] = bitcast<u32>(p.z);  // positive floats are ordered as their bits are
+  keys[i] = bitcast<u32>(p.z);  // positive floats sort like their bits
   atomicAdd(&visible, 1u);
 }
-`,_=`// Shows what was drawn (draw.wgsl) on the screen: over the background, or as a map in colours.
+`,_=`// Presents the sums of draw.wgsl on the screen: over the background, or as a colour map.
 
 struct Screen {
   background: vec4f,
-  size: vec2f,  // of the screen's part, pixels
+  size: vec2f,  // viewport, pixels
   show: u32,  // SHOW_*
-  most: f32,  // of a map: the value of the last colour
-  samples: u32,  // of a pixel, along each axis
+  most: f32,  // upper end of a map's range
+  samples: u32,  // per pixel and axis
 }
 
 @group(0) @binding(0) var<uniform> screen: Screen;
@@ -497,7 +496,7 @@ fn whole(@builtin(vertex_index) vertex: u32) -> @builtin(position) vec4f {
   return vec4f(f32(vertex & 1) * 4.0 - 1.0, f32(vertex >> 1) * 4.0 - 1.0, 0.0, 1.0);
 }
 
-// From dark blue over green and yellow to red.
+// Maps 0 to 1 to dark blue, green, yellow, red.
 fn ramp(x: f32) -> vec3f {
   let t = clamp(x, 0.0, 1.0);
   let stops = array<vec3f, 5>(
@@ -509,7 +508,7 @@ fn ramp(x: f32) -> vec3f {
   return mix(stops[k], stops[k + 1], at - f32(k));
 }
 
-// What was drawn of a pixel: between the pixels that there are, or the mean of its samples.
+// Resamples the sums at a pixel: interpolated, or the mean of its samples.
 fn drawn(position: vec2f) -> vec4f {
   if screen.samples <= 1 { return textureSampleLevel(sums, smooth_sampler, position / screen.size, 0.0); }
   let pixels = vec2f(textureDimensions(sums) / screen.samples);
@@ -538,25 +537,25 @@ fn present(@builtin(position) position: vec4f) -> @location(0) vec4f {
     default: { return vec4f(s.rgb + s.a * screen.background.rgb, 1.0); }
   }
 }
-`,v=`// A surfel in a view of another size than the photographs that it was trained on: as core/resize.h and core/texel.h.
+`,v=`// Adaptation of surfels to views of another size than the training photographs, as core/resize.h and core/texel.h.
 
-// Side of a photograph's pixel, for the kernels. One that is seen through a pixel is so through any.
+// Returns the side of a photograph's pixel for the kernels; 1 with the pixel prefilter, which adapts itself.
 fn kernel_pixel() -> f32 {
   return select(frame.photo_pixel, 1.0, frame.prefilter != 0);
 }
-// Variance that a pixel adds along each axis, pixels^2.
+// Computes the variance that a pixel adds along each axis, pixels^2.
 fn pixel_variance() -> f32 {
   let p = kernel_pixel();
   return max(0.0, (1.0 - p * p) / 12.0);
 }
-// 1 / squared radius of the low pass.
+// Computes 1 / squared radius of the low pass.
 fn low_pass_sharp() -> f32 {
   let p = kernel_pixel();
   return 1.0 / (p * p + 2.0 * pixel_variance());
 }
 
-// The surfel widened by the pixel, its low pass by the view's size; \`area\` then holds by how much that is higher than
-// the kernel.
+// Widens the surfel by the pixel and its low pass by the view's size; \`area\` then holds the height of the low pass over
+// that of the kernel, negated.
 fn resized(seen: Seen) -> Seen {
   var s = seen;
   let variance = pixel_variance();
@@ -564,7 +563,7 @@ fn resized(seen: Seen) -> Seen {
   let share = p * p * low_pass_sharp();
   s.area = -share;
   if variance == 0.0 || !(s.w0 > 0.0) { return s; }
-  // M' = (1 + c M M^T)^(-1/2) M: sums of positive terms
+  // M' = (1 + c M M^T)^(-1/2) M, from positive terms only
   let c = variance * 2.0 / SUPPORT2 * (s.beta + 2.0);
   let u = s.u / s.w0;
   let v = s.v / s.w0;
@@ -582,7 +581,7 @@ fn resized(seen: Seen) -> Seen {
   return s;
 }
 
-// The level of a tile whose texels are about as large as a pixel, as far as the tile has it.
+// Selects the level of a tile with about one texel per pixel, limited to the tile's levels.
 fn tile_level(s: Seen, surfel: Surfel) -> u32 {
   if surfel.sides == 0 || frame.detail == DETAIL_MEANS { return TILE_LEVELS; }
   let p = frame.photo_pixel;
@@ -602,10 +601,10 @@ fn tile_level(s: Seen, surfel: Surfel) -> u32 {
   while level > 0 && (grid & ((1u << level) - 1)) != 0 { level--; }
   return level;
 }
-`,y=`// What the shaders of a baked scene share: its numbers, its surfels, and what a frame is drawn with.
+`,y=`// Declarations shared by the shaders of a baked scene: constants, surfels, frame uniforms.
 //
-// These files are the renderer for every screen: the browser's viewer and the package's \`webgpu\` renderer put them
-// together and run them. The formulas are those of csrc/core; its files say why they are as they are.
+// These shaders are the renderer of both the browser viewer and the package's \`webgpu\` backend. csrc/core explains
+// their formulas.
 
 const SUPPORT: f32 = 3.0;
 const SUPPORT2: f32 = 9.0;
@@ -618,7 +617,7 @@ const LOG_SCALE_MAX: f32 = 30.0;
 const COLOR_BIAS: f32 = 0.5;
 const PIXEL_VARIANCE: f32 = 0.25;
 
-// A surfel as it is stored, 96 bytes. Means are relative to the scene's origin.
+// A stored surfel, 96 bytes; means are relative to the scene's origin.
 struct Surfel {
   mean: vec3f,
   opacity_logit: f32,
@@ -626,16 +625,16 @@ struct Surfel {
   log_scale: vec2f,
   beta_raw: f32,
   extent: f32,  // half side of the tile, scale units
-  residual: vec3f,  // of a surfel without a tile
-  layer: u32,  // of the tile, 24 bits; above them 128 times the alpha of a surfel without a tile
-  base: vec3f,  // view colour: base, and its terms
+  residual: vec3f,  // without a tile
+  layer: u32,  // of the tile, 24 bits; above, 128 times the alpha without a tile
+  base: vec3f,  // base of the view colour
   first_term: u32,
   tile: vec2u,  // first texel
   sides: u32,  // texels along u, and along v in the upper half; 0: no tile
   terms: u32,
 }
 
-// A surfel as a camera sees it, 96 bytes; core/surfel.h has the planes U, V and W.
+// A projected surfel, 96 bytes; core/surfel.h defines the planes U, V and W.
 struct Seen {
   center: vec2f,  // pixels
   u: vec2f,
@@ -646,19 +645,19 @@ struct Seen {
   opacity: f32,
   beta: f32,
   color: vec3f,  // relu(f_view + 0.5)
-  area: f32,  // > 0 where the surfel is seen through a pixel; else by how much the low pass is higher, negative
-  axis: vec2f,  // of the rectangle that holds it on the screen, a unit vector
+  area: f32,  // > 0 with the pixel prefilter; else minus the height of the low pass over that of the kernel
+  axis: vec2f,  // unit vector along the bounding rectangle
   middle: vec2f,  // of the rectangle, pixels
   half_size: vec2f,  // along the axis and across
   normal_z: f32,
-  level: u32,  // of its tile; TILE_LEVELS: the mean residual alone
+  level: u32,  // of its tile; TILE_LEVELS: mean residual only
 }
 
 struct Frame {
   rotation: array<vec4f, 3>,  // rows, world to camera
-  center: vec3f,  // where the camera stands, relative to the scene's origin
-  alpha_scale: f32,  // m = alpha_scale * a texel's alpha multiplies sigma; 0: the scene is opaque
-  color_center: vec4f,  // from where view colours are seen; \`center\`, unless they are held
+  center: vec3f,  // camera centre relative to the scene's origin
+  alpha_scale: f32,  // m = alpha_scale * a texel's alpha multiplies sigma; 0: opaque scene
+  color_center: vec4f,  // viewpoint for view colours; \`center\` unless frozen
   lens: vec4f,  // fx, fy, cx, cy
   size: vec2f,  // pixels
   near: f32,
@@ -669,21 +668,21 @@ struct Frame {
   surfels: u32,
   kind: u32,  // of the view colours, VIEW_*
   prefilter: u32,
-  layers: u32,  // batches of surfels that are drawn one after the other
+  layers: u32,  // batches of surfels, drawn in sequence
   show: u32,  // SHOW_*
-  residuals: u32,  // whether they are added
+  residuals: u32,  // 1: add residuals
   photo_pixel: f32,  // side of a photograph's pixel in pixels of the view: resize.wgsl
   detail: u32,  // DETAIL_*
 }
 
-// What of the residuals is there.
-const DETAIL_MEANS: u32 = 0;  // their means alone: the texels are still to come
+// Available residuals.
+const DETAIL_MEANS: u32 = 0;  // means only, texels are still loading
 const DETAIL_TEXELS: u32 = 1;
 const DETAIL_ALL: u32 = 2;
 
-const TILE_LEVELS: u32 = 3;  // of a tile: its texels, means of 2 x 2 of them, and of 4 x 4
+const TILE_LEVELS: u32 = 3;  // of a tile: texels, and means of 2 x 2 and 4 x 4
 
-// What is blended: see draw.wgsl.
+// Blended quantity, see draw.wgsl.
 const SHOW_COLOR: u32 = 0;
 const SHOW_DEPTH: u32 = 1;
 const SHOW_NORMAL: u32 = 2;
@@ -694,7 +693,7 @@ fn sigmoid(x: f32) -> f32 {
   let e = exp(-abs(x));
   return select(1.0, e, x < 0.0) / (1.0 + e);
 }
-`,ee=`// The visible surfels, front to back, are drawn in batches of equal size; this fills in how many each has.
+`,ee=`// Divides the visible surfels, front to back, into batches of equal size and writes their draw arguments.
 
 struct Draw {
   vertices: u32,
@@ -713,13 +712,13 @@ fn share_out(@builtin(global_invocation_id) id: vec3u) {
   if k >= frame.layers { return; }
   draws[k] = Draw(4, layer_begin(visible, k + 1, frame.layers) - layer_begin(visible, k, frame.layers), 0, 0);
 }
-`,te=`// Sorts (key, value) pairs by 4 bits of the key, lowest first; eight rounds sort them all. It is stable, so surfels of
-// equal depth keep their order. Three kernels per round; none waits for another group of its own launch, because
-// devices differ in whether that ever ends.
+`,te=`// Sorts (key, value) pairs by 4 bits of the key, lowest first; eight rounds sort completely. The sort is stable, so
+// surfels of equal depth keep their order. Each round has three kernels, as workgroups of one dispatch must not wait
+// for each other: forward progress is not guaranteed.
 //
-//   count    how often every digit occurs in every block of 1,024 keys
-//   scan     where the pairs of every digit and block begin
-//   scatter  moves them there
+//   count    histogram of digits per block of 1,024 keys
+//   scan     first output position per digit and block
+//   scatter  moves the pairs
 
 const THREADS: u32 = 256;
 const PER_THREAD: u32 = 4;
@@ -756,7 +755,7 @@ fn count(@builtin(local_invocation_index) thread: u32, @builtin(workgroup_id) gr
 
 var<workgroup> sums: array<u32, THREADS>;
 
-// One group; every thread takes a run of the table.
+// Scans the table in one workgroup; each thread takes a run.
 @compute @workgroup_size(THREADS)
 fn scan(@builtin(local_invocation_index) thread: u32) {
   let size = DIGITS * round.blocks;
@@ -781,7 +780,7 @@ fn scan(@builtin(local_invocation_index) thread: u32) {
   }
 }
 
-// Counts of 16 digits, 16 bits each: digit d in half d % 2 of word d / 2.
+// Counters of 16 digits, 16 bits each: digit d in half d % 2 of word d / 2.
 struct Counts {
   low: vec4u,
   high: vec4u,
@@ -829,7 +828,7 @@ fn scatter(@builtin(local_invocation_index) thread: u32, @builtin(workgroup_id) 
     before = Counts(before.low + c.low, before.high + c.high);
   }
 }
-`,ne=`// View colours f_view(d), without the offset 0.5, as core/view_kinds.h has them: a base, and terms.
+`,ne=`// View colours f_view(d), without the offset 0.5, from a base and terms, as core/view_kinds.h.
 
 const VIEW_SV: u32 = 0;  // lean: b, rgb
 const VIEW_SV_SITES: u32 = 1;  // all sites: site, log temperature, rgb

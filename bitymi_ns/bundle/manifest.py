@@ -296,7 +296,7 @@ class Manifest(Part):
 
     @property
     def has_alpha(self) -> bool:
-        """Whether texels multiply their surfels' opacities."""
+        """True if texels multiply their surfels' opacities."""
         return self.atlas is not None and self.atlas.alpha_scale is not None
 
 

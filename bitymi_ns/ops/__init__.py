@@ -1,7 +1,7 @@
 """Differentiable torch operations over the compiled kernels; float64 twins are in `ops.reference`.
 
-Every function takes float32 or float64 tensors and dispatches on their device and dtype. `baked.draw` draws a baked
-scene on both, by `baked_cpu` or `baked_cuda`.
+Functions take float32 or float64 tensors and dispatch on device and dtype. `baked.draw` draws a baked scene on the CPU
+(`baked_cpu`) or a CUDA device (`baked_cuda`).
 """
 
 from .bands import Bands, band, by_bands, fitting_lists, refused

@@ -1,4 +1,4 @@
-"""The compiled kernel for a tensor, by its device and dtype, and objects of kernels that keep their memory."""
+"""Dispatch to compiled kernels by device and dtype; pools of kernel objects that keep their memory."""
 
 import functools
 import importlib
@@ -26,13 +26,13 @@ _emulated = False
 
 @contextmanager
 def emulated_cuda(seed: int = 0) -> Iterator[None]:
-    """Send tensors on the CPU to the CUDA kernels, which run thread by thread on the host. For tests.
+    """Send CPU tensors to the CUDA kernels, run thread by thread on the host. For tests.
 
     Args:
-        seed: of the order in which the threads of a block take turns.
+        seed: of the order in which the threads of a block run.
 
     Raises:
-        RuntimeError: the package was built without them (CMake option BITYMI_EMULATED_CUDA).
+        RuntimeError: the package was built without BITYMI_EMULATED_CUDA (a CMake option).
     """
     global _emulated
     before = _emulated
@@ -46,13 +46,13 @@ def emulated_cuda(seed: int = 0) -> Iterator[None]:
 
 @functools.cache
 def cpu_module() -> str:
-    """Name of the module of CPU kernels: of those that were built, the last for which this CPU has all that it needs.
+    """Return the name of the best module of CPU kernels that this CPU can run.
 
-    Asked before it is loaded: a CPU ends a process at an instruction that it does not have. Only Linux lists a CPU's
-    features; elsewhere the first module is taken to run.
+    Checked before loading, as an unsupported instruction ends the process. Only Linux lists CPU features; elsewhere the
+    first module is used.
 
     Raises:
-        KernelsUnavailable: this CPU lacks a feature that each of them needs.
+        KernelsUnavailable: this CPU lacks a feature that all modules need.
     """
     try:
         needs = importlib.import_module("bitymi_ns._cpu_features").FEATURES
@@ -75,10 +75,10 @@ def cpu_module() -> str:
 
 @functools.cache
 def load(name: str) -> ModuleType:
-    """The compiled module of that name: _cpu, _cuda or _emulated. Starts no thread and changes no setting.
+    """Load a compiled module: _cpu, _cuda or _emulated. Starts no thread and changes no setting.
 
     Raises:
-        KernelsUnavailable: it is missing, or not for this CPU.
+        KernelsUnavailable: missing, or not for this CPU.
     """
     try:
         return importlib.import_module(f"bitymi_ns.{cpu_module() if name == '_cpu' else name}")
@@ -99,21 +99,21 @@ def _set_up_process() -> None:
 
 
 def give_back_memory() -> None:
-    """Return freed memory that the process keeps for the next views to the system, before views of other sizes."""
+    """Release memory that is kept for later views to the system, before views of other sizes."""
     if _set_up_process.cache_info().currsize:  # the CPU kernels have been asked for
         load("_cpu").give_back_memory()
 
 
 def cuda_backend(device: torch.device) -> bool:
-    """Return True if tensors on that device go to the CUDA kernels or to their emulation."""
+    """Return True if tensors on that device go to the CUDA kernels or their emulation."""
     return device.type == "cuda" or _emulated
 
 
 def module(device: torch.device) -> ModuleType:
-    """The kernel module for a device.
+    """Return the kernel module for a device.
 
     Raises:
-        RuntimeError: the kernels for that device are not built, or not for this CPU.
+        RuntimeError: its kernels are not built, or not for this CPU.
     """
     if device.type not in ("cpu", "cuda"):
         raise RuntimeError(f"no kernels for device '{device}': move the tensors to the CPU or a CUDA device")
@@ -124,14 +124,14 @@ def module(device: torch.device) -> ModuleType:
 
 
 def require(operation: str, kind: str, device: torch.device, instead: str) -> None:
-    """Refuse a device on which an operation has no kernel.
+    """Check that an operation has kernels for a device.
 
     Args:
-        kind: cpu or cuda, where it has one.
-        instead: what to do, the end of the message.
+        kind: cpu or cuda, the one with kernels.
+        instead: advice, the end of the message.
 
     Raises:
-        RuntimeError: the device is not of that kind.
+        RuntimeError: the device is of the other kind.
     """
     if cuda_backend(device) != (kind == "cuda") or device.type not in ("cpu", "cuda"):
         where = {"cpu": "on the CPU", "cuda": "on a CUDA device"}
@@ -139,11 +139,11 @@ def require(operation: str, kind: str, device: torch.device, instead: str) -> No
 
 
 def function(name: str, device: torch.device) -> Callable[..., Any]:
-    """The kernel function of that name, which takes its arguments by keyword (csrc/ops); on a CUDA device it runs on
-    torch's current stream of that device.
+    """Return a kernel function by name. It takes keyword arguments (csrc/ops) and, on a CUDA device, runs on torch's
+    current stream of that device.
 
     Raises:
-        RuntimeError: the kernels for that device are not built, or it has none of that name.
+        RuntimeError: the kernels for that device are not built, or lack the function.
     """
     compiled = getattr(module(device), name, None)
     if compiled is None:
@@ -159,8 +159,8 @@ def function(name: str, device: torch.device) -> Callable[..., Any]:
 
 
 def _stream(device: torch.device) -> int:
-    """torch's current stream of a CUDA device, as the number that CUDA knows it by."""
-    raw = getattr(torch._C, "_cuda_getCurrentRawStream", None)  # in half a microsecond, where a Stream takes ten
+    """Return torch's current stream of a CUDA device as a raw handle."""
+    raw = getattr(torch._C, "_cuda_getCurrentRawStream", None)  # 0.5 us; constructing a Stream takes ten
     if raw is None or device.index is None:
         return torch.cuda.current_stream(device).cuda_stream
     return raw(device.index)
@@ -173,7 +173,7 @@ def _name(name: str, like: Tensor) -> str:
 
 
 def kernel(name: str, like: Tensor) -> Callable[..., Any]:
-    """The kernel function `name` for tensors like `like`.
+    """Return the kernel function `name` for tensors like `like`.
 
     Raises:
         TypeError: the dtype is neither float32 nor float64.
@@ -183,12 +183,12 @@ def kernel(name: str, like: Tensor) -> Callable[..., Any]:
 
 
 def kernel_class(name: str, like: Tensor) -> type:
-    """The class `name` of the kernel module for tensors like `like`; raises what `kernel` raises."""
+    """Return the class `name` of the kernel module for tensors like `like`; raises as `kernel`."""
     return getattr(module(like.device), _name(name, like))
 
 
 def workspace(name: str, like: Tensor, **sizes: int) -> Tensor:
-    """Working memory for the CUDA kernel `name`: [bytes] uint8, as many as its function `name`_workspace asks for."""
+    """Allocate working memory for the CUDA kernel `name`: [bytes] uint8, sized by its function `name`_workspace."""
     ask = getattr(module(like.device), _name(f"{name}_workspace", like))
     with on_device(like.device):
         size = ask(**sizes)
@@ -196,17 +196,17 @@ def workspace(name: str, like: Tensor, **sizes: int) -> Tensor:
 
 
 def on_device(device: torch.device) -> AbstractContextManager[Any]:
-    """A context in which that CUDA device is the current one, for calls that take no stream."""
+    """Return a context that makes a CUDA device current, for calls that take no stream."""
     if device.type != "cuda" or device.index == torch.cuda.current_device():
         return _AS_IT_IS
     return torch.cuda.device(device)
 
 
 def on_same_device(like: Tensor, **tensors: Tensor) -> None:
-    """Check that tensors lie where `like` does.
+    """Check that tensors are on the device of `like`.
 
     Raises:
-        ValueError: one does not; names it.
+        ValueError: names one that is not.
     """
     for name, tensor in tensors.items():
         if tensor.device != like.device:
@@ -214,10 +214,10 @@ def on_same_device(like: Tensor, **tensors: Tensor) -> None:
 
 
 def check_shapes(**shapes: tuple[Tensor, Sequence[int]]) -> None:
-    """Check tensors against their shapes, by name.
+    """Check the shapes of tensors, by name.
 
     Raises:
-        ValueError: one has another shape; names it.
+        ValueError: names one with another shape.
     """
     for name, (tensor, shape) in shapes.items():
         if tuple(tensor.shape) != tuple(shape):
@@ -225,19 +225,19 @@ def check_shapes(**shapes: tuple[Tensor, Sequence[int]]) -> None:
 
 
 def dense(tensor: Tensor, like: Tensor) -> Tensor:
-    """`tensor` without its graph, contiguous, with the dtype and device of `like`."""
+    """Return `tensor` detached and contiguous, with the dtype and device of `like`."""
     if tensor.dtype != like.dtype or tensor.device != like.device:
         tensor = tensor.to(like)
     return (tensor.detach() if tensor.requires_grad else tensor).contiguous()
 
 
 def version_of(tensor: Tensor) -> int:
-    """Count how often a tensor was written to; -1 for one of inference mode, which does not count."""
+    """Return the number of writes to a tensor; -1 for inference tensors, which do not count them."""
     return -1 if tensor.is_inference() else tensor._version
 
 
 class Pool(Generic[T]):
-    """Objects of one kind, made where none is idle; one is used by one thread at a time."""
+    """Reusable objects, each used by one thread at a time."""
 
     def __init__(self, make: Callable[[], T]) -> None:
         self._make = make
@@ -246,7 +246,7 @@ class Pool(Generic[T]):
 
     @contextmanager
     def borrow(self) -> Iterator[T]:
-        """An idle object, or a new one. It is idle again where the block ends without an error."""
+        """Yield an idle object, or a new one; it returns to the pool unless the block raises."""
         with self._lock:
             borrowed = self._idle.pop() if self._idle else None
         if borrowed is None:

@@ -1,4 +1,4 @@
-"""Drawing a baked scene: forward only, texels in place of the field."""
+"""Rendering of baked scenes: forward only, with texels instead of the field."""
 
 from collections.abc import Sequence
 
@@ -21,22 +21,22 @@ def draw(
     images: Sequence[str],
     photo_pixel: float = 1.0,
 ) -> dict[str, Tensor]:
-    """Draw views of one size. On a CUDA device all in one go; on the CPU and through WebGPU one after the other.
+    """Draw views of one size: in one batch on a CUDA device, one by one on the CPU and with WebGPU.
 
     Args:
-        scene: on the device that draws; anywhere, if it asks for WebGPU.
+        scene: on the rendering device; on any device for WebGPU.
         cameras: at least one.
-        background: [3] colour behind the scene; None = black.
-        images: what to draw, names of `IMAGES`.
+        background: [3] colour behind the scene; None: black.
+        images: names of `IMAGES` to draw.
         photo_pixel: side of a photograph's pixel in pixels of the views (csrc/core/resize.h).
 
     Returns:
         name -> [views, height, width, channels].
 
     Raises:
-        ValueError: the cameras differ in size or have skew; there is no such image, or this device cannot draw it; on
-            the CPU, the atlas was not decoded from BC7 blocks; on a CUDA device, views times surfels is above 2^24.
-        RuntimeError: the device has too little memory; or it is WebGPU that is asked for, and it is not there.
+        ValueError: the cameras differ in size or have skew; an image is unknown or not available on this device; on the
+            CPU, the atlas was not decoded from BC7 blocks; on a CUDA device, views times surfels exceed 2^24.
+        RuntimeError: not enough memory on the device, or WebGPU is requested but not available.
     """
     if scene.through_webgpu:
         return webgpu.draw(scene, cameras, background, images, photo_pixel)

@@ -1,4 +1,4 @@
-"""Drawing a baked scene with the CPU kernels: no fragment list."""
+"""Rendering of baked scenes with the CPU kernels, without a fragment list."""
 
 import functools
 from collections.abc import Sequence
@@ -15,24 +15,24 @@ from .view_color import view_color
 
 ON_CUDA = "move the scene to the CPU, or draw with `baked.draw`"
 CHANNELS = {"rgb": slice(0, 3), "alpha": slice(3, 4), "beta": slice(4, 5), "depth": slice(5, 6), "normal": slice(6, 9)}
-"""Of an image; it has the first two alone where no maps are drawn."""
+"""Channels of a frame by image; without maps only the first two."""
 
 
 @functools.cache
 def _bins() -> Pool[Any]:
-    """Memory for the tile lists of frames, which stays."""
+    """Return reusable memory for the tile lists of frames."""
     return Pool(module(torch.device("cpu")).Bins)
 
 
 def gather(atlas: Tensor | None, tiles: Tensor) -> Any:
-    """The atlas as the kernel reads it, every surfel's tile in one run of memory.
+    """Gather each surfel's tile into contiguous memory, as the kernel reads it.
 
     Args:
-        atlas: [layers, height, width, 4] uint8 or float32 on the CPU; None = no tiles.
+        atlas: [layers, height, width, 4] uint8 or float32 on the CPU; None: no tiles.
         tiles: [N, 5] int32: x, y, layer, r_u, r_v in texels; r_u = 0: no tile.
 
     Raises:
-        ValueError: a tile does not lie on a page; names its surfel.
+        ValueError: names a surfel whose tile lies outside its page.
         RuntimeError: the tiles are not on the CPU.
     """
     require("baked_cpu.gather", "cpu", tiles.device, ON_CUDA)
@@ -42,7 +42,7 @@ def gather(atlas: Tensor | None, tiles: Tensor) -> Any:
 
 
 def coarser(atlas: Tensor, tiles: Tensor, alpha: bool) -> dict[str, Any]:
-    """The levels of an atlas, with alpha texels or without, as the kernel reads them, by name."""
+    """Compute the coarser levels of an atlas, with or without alpha, gathered for the kernel, by name."""
     return {name: gather(pages, of) for name, pages, of in tile_levels(atlas, tiles, alpha)}
 
 
@@ -50,17 +50,17 @@ def frame(scene: BakedScene, camera: Camera, maps: bool, photo_pixel: float = 1.
     """Draw a view.
 
     Args:
-        scene: of N surfels, on the CPU.
+        scene: N surfels, on the CPU.
         camera: of an H x W view.
-        maps: also beta, depth, normal and overdraw.
+        maps: also draw beta, depth, normal and overdraw.
         photo_pixel: side of a photograph's pixel in pixels of the view.
 
     Returns:
-        [H, W, 4] rgb and alpha, with maps [H, W, 9]: also the sums of w beta, w z and w n. And with maps the blended
-        surfels per pixel, [H, W, 1] int32. The background is not included.
+        [H, W, 4] rgb and alpha, or [H, W, 9] with maps, adding the sums of w beta, w z and w n; and with maps the
+        number of blended surfels per pixel, [H, W, 1] int32. The background is not included.
 
     Raises:
-        ValueError: the atlas is only there as BC7 blocks.
+        ValueError: the atlas exists only as BC7 blocks.
         RuntimeError: the scene is not on the CPU.
     """
     require("baked_cpu.frame", "cpu", scene.tiles.device, ON_CUDA)
@@ -100,7 +100,7 @@ def draw(
     images: Sequence[str],
     photo_pixel: float = 1.0,
 ) -> dict[str, Tensor]:
-    """As `baked.draw`, one view after the other."""
+    """Draw views one by one; see `baked.draw`."""
     require("baked_cpu.draw", "cpu", scene.tiles.device, ON_CUDA)
     check_images(images, on_cuda=False)
     common_size(cameras)

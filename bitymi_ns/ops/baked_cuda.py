@@ -1,4 +1,4 @@
-"""Drawing a baked scene with the CUDA kernels: textures, working memory and the call itself."""
+"""Rendering of baked scenes with the CUDA kernels: textures, working memory, kernel calls."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ON_CPU = "move the scene there, or draw with `baked.draw`"
 
 
 class Stage(IntFlag):
-    """Stages of a frame, for timing them apart; each needs what the ones before it left in the working memory."""
+    """Stages of a frame, for timing; each needs the results of the previous ones in the working memory."""
 
     LIST = 1
     DRAW = 2
@@ -30,35 +30,36 @@ class Stage(IntFlag):
 
 
 def draws_blocks(device: torch.device) -> bool:
-    """Return True if the texture unit of a CUDA device decodes BC7 blocks; tested by drawing some."""
+    """Return True if the texture unit of a CUDA device decodes BC7 blocks, tested by drawing some."""
     with on_device(device):
         return module(device).draws_bc7()
 
 
 def decoded(blocks: Tensor) -> Tensor:
-    """BC7 blocks [layers, height / 4, width / 4, 16] uint8 as texels [layers, height, width, 4] uint8, on the CPU."""
+    """Decode BC7 blocks [layers, height / 4, width / 4, 16] uint8 to texels [layers, height, width, 4] uint8 on the
+    CPU."""
     height, width = 4 * blocks.shape[1], 4 * blocks.shape[2]
     pages = [decode_bc7(bytes(page.contiguous().numpy()), width, height) for page in blocks.cpu()]
     return torch.from_numpy(np.stack(pages))
 
 
 class Sheet(NamedTuple):
-    """Arrangement of the pages of an atlas in one texture: below each other, then beside."""
+    """Layout of the pages of an atlas in one texture: columns of pages."""
 
-    down: int  # pages below each other
-    # width, height: from the corner of a page to that of the next, in texels of the atlas
+    down: int  # pages per column
+    # width, height: pitch of the pages, in texels of the atlas
     width: int
     height: int
 
     @classmethod
     def of(cls, pages: int, height: int, width: int) -> Sheet:
-        """Of so many pages of so many texels: up to 2^14 rows, which textures of any kind have, and where coordinates
-        keep the texture unit's fractions of a texel."""
+        """Lay out pages of equal size in columns of up to 2^14 rows: every texture format allows that many, and
+        coordinates keep the texture unit's fractional bits."""
         height, width = -(-height // 4) * 4, -(-width // 4) * 4  # corners on the grid of the coarsest level
         return cls(max(1, min(pages, 2**14 // height)), width, height)
 
     def joined(self, pages: Tensor, side: int) -> Tensor:
-        """Pages [pages, rows, columns, channels] of texels, or of blocks with `side` texels along a side, as one
+        """Join pages [pages, rows, columns, channels] of texels, or of blocks with `side` texels along a side, to one
         [rows, columns, channels]."""
         height, width = self.height // side, self.width // side
         count, rows, columns, channels = pages.shape
@@ -71,16 +72,16 @@ class Sheet(NamedTuple):
 
 
 class AtlasTexture:
-    """A sheet of texels in the memory of a device, as its texture unit reads them.
+    """A texture with the texels of a sheet.
 
     Args:
         texels: [height, width, 4] uint8, or float16 or float32 (stored as float16); or BC7 blocks
             [height / 4, width / 4, 16] uint8. On the CPU.
-        blocks: `texels` are BC7 blocks.
+        blocks: whether `texels` are BC7 blocks.
 
     Raises:
-        ValueError: there are more texels than a texture has.
-        RuntimeError: the device has too little memory or draws no such blocks, or is no CUDA device.
+        ValueError: more texels than a texture can have.
+        RuntimeError: not enough memory, BC7 is not supported, or not a CUDA device.
     """
 
     def __init__(self, texels: Tensor, blocks: bool, device: torch.device) -> None:
@@ -97,8 +98,8 @@ class AtlasTexture:
             )
 
     def halved(self, alpha: bool) -> AtlasTexture:
-        """Return the texture of half the sides, means of 2 x 2 texels as `baked_scene.halved` takes them: made on the
-        device, which need not decode blocks for it."""
+        """Return a texture of half the sides, averaging 2 x 2 texels like `baked_scene.halved`; computed on the device,
+        which decodes BC7 while sampling."""
         height, width = (side // 2 for side in self.size)
         dtype = torch.uint8 if self._bytes else torch.float32
         texels = torch.empty(height, width, 4, dtype=dtype, device=self._device)
@@ -108,7 +109,7 @@ class AtlasTexture:
 
 
 class Atlas(NamedTuple):
-    """The pages of an atlas on a device."""
+    """Pages of an atlas on a device."""
 
     sheet: Sheet  # arrangement of the pages
     texture: AtlasTexture
@@ -120,7 +121,7 @@ class Atlas(NamedTuple):
         Args:
             pages: [pages, height, width, 4] texels, or BC7 blocks [pages, height / 4, width / 4, 16], as `AtlasTexture`
                 takes them.
-            blocks: they are BC7 blocks; decoded, with a warning, where the device draws none.
+            blocks: whether they are BC7 blocks; decoded, with a warning, if the device does not support them.
         """
         pages = pages.detach().cpu()
         if blocks and not draws_blocks(device):
@@ -135,18 +136,18 @@ class Atlas(NamedTuple):
         return cls(sheet, AtlasTexture(sheet.joined(pages, side), blocks, device))
 
     def levels(self, alpha: bool) -> dict[str, AtlasTexture]:
-        """The coarser levels of the tiles, with alpha texels or without, by name (`tile_levels`)."""
+        """Compute the coarser levels of the tiles, with or without alpha, by name (`tile_levels`)."""
         half = self.texture.halved(alpha)
         return dict(zip(LEVELS, (half, half.halved(alpha)), strict=True))
 
 
 def compiled(scene: BakedScene, photo_pixel: float = 1.0) -> Any:
-    """The scene as the kernels read it (`BakedScene` of csrc/cuda/baked.h), its atlas as textures on the device of the
-    surfels. It keeps all that it points to, so that a recorded CUDA graph never points at memory that is gone.
+    """Prepare the scene for the kernels (`BakedScene` of csrc/cuda/baked.h), with its atlas as textures. The result
+    keeps all memory it refers to alive, so that recorded CUDA graphs stay valid.
 
     Args:
         scene: on a CUDA device.
-        photo_pixel: as in `frame`; for one below 1 the scene has the levels of its tiles.
+        photo_pixel: as in `frame`; below 1 the levels of the tiles are added.
 
     Raises:
         TypeError: the surfels are not float32.
@@ -191,26 +192,26 @@ def compiled(scene: BakedScene, photo_pixel: float = 1.0) -> Any:
 
 
 def tiles_of(views: int, width: int, height: int) -> int:
-    """Screen tiles of all views."""
+    """Count the screen tiles of all views."""
     return -(-width // TILE) * -(-height // TILE) * views
 
 
 def slots_per_tile(capacity: int, tiles: int) -> int:
-    """Slots for the pairs of each screen tile: twice the mean of `capacity` pairs, or more while 32 MB hold all, but no
-    more than a block of the device sorts at once. Pairs beyond them are in one list of all tiles."""
+    """Choose the slots for the pairs of each screen tile: twice the mean of `capacity` pairs, more if all fit in 32 MB,
+    at most what a block of threads sorts at once. Further pairs share one list of all tiles."""
     return max(32, min(1024, max(2 * capacity, 1 << 23) // tiles) // 32 * 32)
 
 
 class Workspace:
-    """Working memory of frames on a device; it grows when a frame is prepared that needs more, and stays.
+    """Working memory of frames on a device; it grows as needed and is kept.
 
     Attributes:
-        capacity: pairs of surfel and screen tile that fit, however they are distributed over the tiles.
-        slots: of a tile; 0 before the first frame.
-        memory: [bytes] uint8, None before the first frame.
+        capacity: pairs of surfel and screen tile that fit, for any distribution over the tiles.
+        slots: per tile; 0 before the first frame.
+        memory: [bytes] uint8; None before the first frame.
 
     Raises:
-        RuntimeError: it is no CUDA device.
+        RuntimeError: not a CUDA device.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -220,10 +221,10 @@ class Workspace:
         self.memory: Tensor | None = None
 
     def resize(self, surfels: int, views: int, width: int, height: int, normals: bool, capacity: int = 0) -> None:
-        """Make room for frames of this kind with at least `capacity` pairs, or as many as `frame_fitted` found.
+        """Allocate for such frames with at least `capacity` pairs, or the number that `frame_fitted` found.
 
         Raises:
-            ValueError: more surfels, views or pairs than a frame can have; the message gives the numbers.
+            ValueError: more surfels, views or pairs than a frame can have; states the numbers.
         """
         kernels, device = module(self._device), self._device
         most = kernels.MOST_PAIRS
@@ -235,27 +236,27 @@ class Workspace:
         with on_device(device):
             needed = kernels.baked_memory(**size, slots=self.slots, capacity=self.capacity)
         if self.memory is None or self.memory.numel() < needed:
-            self.memory = None  # frees the old before the new is taken
+            self.memory = None  # frees the old memory first
             self.memory = torch.empty(needed, dtype=torch.uint8, device=device)
 
     def counts(self) -> tuple[int, int]:
-        """Pairs of the latest frame, which had surfels, and how many of them found no slot; waits for the device."""
+        """Return the pairs of the latest non-empty frame, and those without a slot; waits for the device."""
         assert self.memory is not None
         pairs, spilled = self.memory[:16].view(torch.int64).tolist()
         return pairs, spilled
 
     @property
     def pairs(self) -> int:
-        """Pairs of surfel and tile in the latest frame, which had surfels; waits for the device."""
+        """Return the pairs of surfel and tile in the latest non-empty frame; waits for the device."""
         return self.counts()[0]
 
     @property
     def complete(self) -> bool:
-        """True if all pairs of the latest frame, which had surfels, had room; waits for the device."""
+        """True if all pairs of the latest non-empty frame fitted; waits for the device."""
         return self.counts()[1] <= self.capacity
 
     def frame_fitted(self) -> bool:
-        """Return True if the latest frame fitted; waits for the device. The next `resize` makes room for as many pairs
+        """Return True if the latest frame fitted; waits for the device. The next `resize` allocates for its pairs
         and a quarter more."""
         pairs, spilled = self.counts()
         fitted = spilled <= self.capacity
@@ -264,17 +265,17 @@ class Workspace:
 
 
 def empty_images(names: Sequence[str], views: int, width: int, height: int, device: torch.device) -> dict[str, Tensor]:
-    """Memory for images: name -> [views, height, width, channels] (IMAGES)."""
+    """Allocate images: name -> [views, height, width, channels] (IMAGES)."""
     check_images(names, on_cuda=True)
     shape = (views, height, width)
     return {name: torch.empty(*shape, IMAGES[name][0], dtype=IMAGES[name][1], device=device) for name in names}
 
 
 def stack_cameras(cameras: Sequence[Camera], device: torch.device) -> tuple[Tensor, Tensor, int, int]:
-    """Cameras of one size as viewmats [V, 4, 4] and Ks [V, 3, 3], float32 on `device`, with width and height.
+    """Stack cameras of one size: viewmats [V, 4, 4] and Ks [V, 3, 3], float32 on `device`, width and height.
 
     Raises:
-        ValueError: there is none, they differ in size, or one has skew.
+        ValueError: no cameras, different sizes, or skew.
     """
     size = common_size(cameras)
     viewmats = torch.stack([camera.viewmat for camera in cameras]).to(device, torch.float32)
@@ -292,21 +293,21 @@ def frame(
     stages: Stage = Stage.ALL,
     photo_pixel: float = 1.0,
 ) -> None:
-    """Draw views into `images`. Allocates nothing and does not wait: it can be recorded in a CUDA graph.
+    """Draw views into `images` without allocating or waiting, so that it can be recorded in a CUDA graph.
 
-    When more pairs were needed than the workspace has room for, surfels are missing: ask `workspace.complete`, `resize`
-    and draw again.
+    If the workspace is too small for the pairs, surfels are missing: check `workspace.complete`, `resize` and draw
+    again.
 
     Args:
         viewmats: [V, 4, 4] float32, world to camera, on the scene's device.
         Ks: [V, 3, 3] float32, likewise.
-        background: [3] float32, likewise; None = black.
-        images: what to draw, as `empty_images` makes them.
-        workspace: fitted to such a frame.
+        background: [3] float32, likewise; None: black.
+        images: images to draw, from `empty_images`.
+        workspace: resized for such a frame.
         photo_pixel: side of a photograph's pixel in pixels of the views.
 
     Raises:
-        ValueError: a shape is wrong, or the workspace is too small.
+        ValueError: wrong shape, or the workspace is too small.
         RuntimeError: the views are not on a CUDA device.
     """
     require("baked_cuda.frame", "cuda", viewmats.device, ON_CPU)
@@ -334,7 +335,7 @@ def draw(
     images: Sequence[str],
     photo_pixel: float = 1.0,
 ) -> dict[str, Tensor]:
-    """As `baked.draw`, all in one go. Waits for the images, to see whether the working memory was large enough."""
+    """Draw views in one batch; see `baked.draw`. Waits for the images, to check that the working memory sufficed."""
     device, n = scene.tiles.device, len(scene.tiles)
     require("baked_cuda.draw", "cuda", device, ON_CPU)
     viewmats, Ks, width, height = stack_cameras(cameras, device)

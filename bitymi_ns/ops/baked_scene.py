@@ -1,4 +1,4 @@
-"""Images of a baked scene, and the parts of its renderers that all devices share."""
+"""Images of a baked scene, and what its renderers share."""
 
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,14 +22,13 @@ IMAGES: dict[str, tuple[int, torch.dtype]] = {
     "normal": (3, torch.float32),
     "overdraw": (1, torch.int32),
 }
-"""Channels and dtype of what can be drawn. packed, on a CUDA device only: red, green, blue and alpha as bytes, red the
-lowest."""
+"""Channels and dtype of each image. packed (CUDA only): red, green, blue and alpha as bytes, red lowest."""
 
 
 class DrawCache:
-    """Memory of a scene from frame to frame: the atlas as its device reads it, and working memory.
+    """Data of a scene kept between frames: the atlas in device form, and working memory.
 
-    Several threads may draw a scene, as those of nerfstudio's viewer do: the others wait for the one that fills it."""
+    Thread-safe, as nerfstudio's viewer renders from several threads."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -39,11 +38,11 @@ class DrawCache:
         self._workspaces: Pool[Any] | None = None
 
     def __reduce__(self) -> tuple[type, tuple[()]]:
-        """Copies and files of a scene have an empty one: what it holds is made again, and is of one process."""
+        """Pickle and copy as an empty cache: its contents belong to one process."""
         return DrawCache, ()
 
     def atlas(self, make: Callable[[], Any], *sources: Tensor | str | None) -> Any:
-        """Return the atlas, made for the first frame and again when a source is another one or was written to."""
+        """Return the atlas, made for the first frame and whenever a source was replaced or written to."""
         now = [(t, version_of(t) if isinstance(t, Tensor) else 0) for t in sources]
         with self._lock:
             if len(now) != len(self._sources) or any(
@@ -54,7 +53,7 @@ class DrawCache:
             return self._atlas
 
     def coarser(self, make: Callable[[], Any]) -> Any:
-        """The levels of the atlas that `atlas` gave last: made for the first frame that is smaller than the
+        """Return the coarser levels of the latest `atlas`, made for the first frame that is smaller than the
         photographs."""
         with self._lock:
             if self._coarser is None:
@@ -62,7 +61,7 @@ class DrawCache:
             return self._coarser
 
     def workspaces(self, make: Callable[[], Any]) -> Pool[Any]:
-        """Working memory of frames, by what makes it."""
+        """Return the pool of working memory that `make` constructs."""
         with self._lock:
             if self._workspaces is None:
                 self._workspaces = Pool(make)
@@ -92,7 +91,7 @@ class BakedScene(Protocol):
 
 
 def residual(scene: BakedScene) -> dict[str, Any]:
-    """Arguments of the kernels for texels (`BakedResidual` of csrc/ops/texel.h)."""
+    """Build the kernels' arguments for texels (`BakedResidual` of csrc/ops/texel.h)."""
     numbers = ("offset", "scale", "alpha_scale", "weight_bound", "transmittance_min")
     arrays = {name: getattr(scene, name) for name in ("extent", "mean_residual", "mean_alpha")}
     dense = {name: None if t is None else t.detach().float().contiguous() for name, t in arrays.items()}
@@ -100,7 +99,7 @@ def residual(scene: BakedScene) -> dict[str, Any]:
 
 
 def check_images(names: Sequence[str], on_cuda: bool) -> None:
-    """Raise ValueError for an image that does not exist, or that is drawn on CUDA devices alone."""
+    """Raise ValueError for an image that does not exist or needs a CUDA device."""
     unknown = [name for name in names if name not in IMAGES]
     if unknown:
         raise ValueError(f"there is no image '{unknown[0]}': choose among {', '.join(IMAGES)}")
@@ -109,16 +108,16 @@ def check_images(names: Sequence[str], on_cuda: bool) -> None:
 
 
 def packed(rgb: Tensor, alpha: Tensor) -> Tensor:
-    """The image `packed` [..., 1] int32 of colours [..., 3] over the background and coverage [..., 1]."""
+    """Pack colours over the background [..., 3] and coverage [..., 1] to the image `packed` [..., 1] int32."""
     byte = (torch.cat([rgb, alpha], -1).clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.int32)
     return byte[..., :1] | byte[..., 1:2] << 8 | byte[..., 2:3] << 16 | byte[..., 3:] << 24
 
 
 def common_size(cameras: Sequence[Camera]) -> tuple[int, int]:
-    """Width and height of views that are drawn together.
+    """Return the common width and height of views.
 
     Raises:
-        ValueError: there is none, they differ in size, or one has skew.
+        ValueError: no views, different sizes, or skew.
     """
     sizes = {(camera.width, camera.height) for camera in cameras}
     if len(sizes) != 1:
@@ -128,13 +127,13 @@ def common_size(cameras: Sequence[Camera]) -> tuple[int, int]:
     return sizes.pop()
 
 
-LEVELS = ("half", "quarter")  # names of the levels: what is left of a side
+LEVELS = ("half", "quarter")  # names of the levels, by their side relative to the atlas
 
 
 def halved(atlas: Tensor, alpha: bool = False) -> Tensor:
-    """Means of 2 x 2 texels, those of bytes rounded: [layers, height / 2, width / 2, 4] of [layers, height, width, 4];
-    an odd row or column is left out. With `alpha` colours are weighted by the fourth channel where any of the four is
-    not 0: what is cut away does not tint its neighbours."""
+    """Average 2 x 2 texels: [layers, height, width, 4] to [layers, height / 2, width / 2, 4], bytes rounded, an odd row
+    or column dropped. With `alpha`, colours are weighted by the fourth channel unless all four are 0: transparent
+    texels do not tint their neighbours."""
     layers, height, width, channels = atlas.shape
     cut = atlas[:, : height // 2 * 2, : width // 2 * 2].reshape(layers, height // 2, 2, width // 2, 2, channels)
     if atlas.dtype == torch.uint8:
@@ -150,7 +149,7 @@ def halved(atlas: Tensor, alpha: bool = False) -> Tensor:
 
 
 def alpha_means(texels: Tensor, dims: tuple[int, ...]) -> Tensor:
-    """Means over dimensions of texels [..., 4]: colours weighted by alpha, the fourth channel, where any is not 0."""
+    """Average texels [..., 4] over dimensions; colours are weighted by alpha (fourth channel) unless it is all 0."""
     means, alpha = texels.mean(dims), texels[..., 3:]
     total = alpha.sum(dims)
     colors = (alpha * texels[..., :3]).sum(dims) / total.clamp(min=1e-6)
@@ -159,7 +158,7 @@ def alpha_means(texels: Tensor, dims: tuple[int, ...]) -> Tensor:
 
 
 def tile_levels(atlas: Tensor, tiles: Tensor, alpha: bool = False) -> Iterator[tuple[str, Tensor, Tensor]]:
-    """The levels of an atlas, finest first, without that of the atlas itself.
+    """Yield the coarser levels of an atlas, finest first.
 
     Args:
         atlas: [layers, height, width, 4] uint8 or float.
@@ -167,8 +166,8 @@ def tile_levels(atlas: Tensor, tiles: Tensor, alpha: bool = False) -> Iterator[t
         alpha: as in `halved`.
 
     Yields:
-        name, pages, and the tiles on them: r_u = 0 where a tile has no such level, because its corner or its sides do
-        not lie on the grid of the level. A bundle's tiles lie on a grid of four texels, so each has both levels.
+        name, pages, and the tiles on them; r_u = 0 for a tile without such a level, because its corner or sides are off
+        the grid of the level. Tiles of bundles lie on a grid of four texels, so they have both levels.
     """
     scaled = tiles.new_tensor([1, 1, 0, 1, 1])
     for level, name in enumerate(LEVELS, start=1):
@@ -180,6 +179,5 @@ def tile_levels(atlas: Tensor, tiles: Tensor, alpha: bool = False) -> Iterator[t
 
 
 def decode_bc7(blocks: bytes, width: int, height: int) -> npt.NDArray[np.uint8]:
-    """Texels [height, width, 4] of rows of BC7 blocks from the top, where no texture unit decodes them; the sides are
-    multiples of 4."""
+    """Decode row-major BC7 blocks to texels [height, width, 4] on the CPU; sides are multiples of 4."""
     return np.array(Image.frombytes("RGBA", (width, height), blocks, "bcn", (7, "BC7")))

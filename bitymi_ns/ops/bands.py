@@ -1,5 +1,5 @@
-"""Views with more fragments than memory, drawn a few rows of tiles at a time. A band is the same projection with the
-image's rows above it cut off; its fragments are made when it is drawn, and once more in its backward pass."""
+"""Views whose fragments exceed memory, drawn in bands of rows of tiles. A band is the same projection with the rows
+above it cut off; its fragments are computed when it is drawn and again in its backward pass."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -17,16 +17,16 @@ from .trace import Fragments, masked_counts, trace
 T = TypeVar("T")
 
 PASSING = 1 << 18
-"""Pixels of a list of the CPU that is read and dropped. Its memory then stays with the program; that of a whole
-view the system takes back and clears for the next, which takes longer than finding the fragments."""
+"""Pixels of a temporary CPU list. Its memory is kept and reused; memory for a whole view would go back to the system
+and be cleared for the next, which takes longer than finding the fragments."""
 
 
 @dataclass(frozen=True)
 class Bands:
-    """The fragments of a view that was drawn in bands: found again for every question."""
+    """Fragments of a view drawn in bands; recomputed per query."""
 
     projection: Projection  # of the whole view
-    rows: tuple[tuple[int, int], ...]  # first and last pixel row (exclusive) of every band, from top to bottom
+    rows: tuple[tuple[int, int], ...]  # first and last pixel row (exclusive) of each band, top to bottom
     rim: float  # as in `trace`
     count: int  # number of fragments F
 
@@ -34,7 +34,7 @@ class Bands:
         return self.count
 
     def lists(self) -> Iterator[Fragments]:
-        """The fragments of one band after the other, without gradient."""
+        """Yield the fragments band by band, without gradient."""
         for top, bottom in self.rows:
             with torch.no_grad():
                 fragments = trace(band(self.projection, top, bottom), self.rim)
@@ -42,11 +42,11 @@ class Bands:
             del fragments  # before the next list is made
 
     def overdraw(self) -> Tensor:
-        """[H, W, 1] int32: blended surfels per pixel."""
+        """Count the blended surfels per pixel: [H, W, 1] int32."""
         return torch.cat([fragments.overdraw() for fragments in self.lists()])
 
     def masked_counts(self, mask: Tensor, n: int) -> Tensor:
-        """As `masked_counts` of a list."""
+        """Count fragments on masked pixels; see `trace.masked_counts`."""
         camera = self.projection.camera
         if mask.numel() != camera.width * camera.height:
             raise ValueError(f"the mask has {mask.numel()} pixels, the view {camera.width * camera.height}")
@@ -58,11 +58,11 @@ class Bands:
 
 
 def fitting_lists(projection: Projection, most: int = 0, rim: float = 1e-3) -> Iterator[Fragments]:
-    """The fragments of a view, to be read and dropped: as one list on a CUDA device, on the CPU as lists of some
-    rows of tiles each; smaller ones where one has too many.
+    """Yield the fragments of a view for a single read: one list on a CUDA device, lists of some rows of tiles on the
+    CPU; smaller ones if a list has too many fragments.
 
     Args:
-        most: fragments of a list, as in `trace`.
+        most: largest number of fragments of a list, as in `trace`.
 
     Raises:
         TooManyFragments: a single row of tiles has too many.
@@ -70,7 +70,7 @@ def fitting_lists(projection: Projection, most: int = 0, rim: float = 1e-3) -> I
     width, height = projection.camera.width, projection.camera.height
     parts = 1 if cuda_backend(projection.geom.device) else -(-width * height // PASSING)
 
-    @torch.no_grad()  # of the generator, it would hold on to what it has yielded
+    @torch.no_grad()  # on the generator, it would keep the yielded lists alive
     def find(top: int, bottom: int) -> Fragments:
         return trace(projection if bottom - top == height else band(projection, top, bottom), rim, most)
 
@@ -80,14 +80,14 @@ def fitting_lists(projection: Projection, most: int = 0, rim: float = 1e-3) -> I
 
 
 def by_bands(waiting: list[tuple[int, int]], draw: Callable[[int, int], T]) -> Iterator[tuple[int, int, T]]:
-    """Draw bands from top to bottom, in smaller ones where that raises `TooManyFragments`.
+    """Draw bands from top to bottom, splitting those that raise `TooManyFragments`.
 
     Args:
-        waiting: first and last pixel row (exclusive) of every band.
-        draw: what is done with the rows of a band.
+        waiting: first and last pixel row (exclusive) of each band.
+        draw: draws the rows of a band.
 
     Yields:
-        first and last row of every band as it was drawn, and what `draw` gave.
+        first and last row of each band as drawn, and the result of `draw`.
 
     Raises:
         TooManyFragments: a single row of tiles has too many.
@@ -103,17 +103,17 @@ def by_bands(waiting: list[tuple[int, int]], draw: Callable[[int, int], T]) -> I
             waiting = parts + rest
             continue
         yield top, bottom, drawn
-        del drawn  # a list of fragments, say: before the next one is made
+        del drawn  # may hold a list of fragments: free it before the next
         waiting = rest
 
 
 def refused(top: int, bottom: int, error: TooManyFragments) -> list[tuple[int, int]]:
-    """Bands of rows that were refused as one: as many as their number of fragments asks for, two at least."""
+    """Split refused rows into bands by their number of fragments, at least two."""
     return split(top, bottom, max(2, -(-error.count // max(1, error.most))))
 
 
 def band(projection: Projection, top: int, bottom: int) -> Projection:
-    """The pixel rows from `top`, a multiple of TILE, to `bottom` (exclusive) of a view, as a view of their own.
+    """Crop a projection to the pixel rows from `top`, a multiple of TILE, to `bottom` (exclusive).
 
     Its backward pass adds to `mean2d_grad` and `mean2d_absgrad` of `projection`.
     """
@@ -124,7 +124,7 @@ def band(projection: Projection, top: int, bottom: int) -> Projection:
 
 
 def split(top: int, bottom: int, parts: int) -> list[tuple[int, int]]:
-    """Pixel rows cut into at most `parts` bands of whole tiles; a single row of tiles stays as it is."""
+    """Split pixel rows into at most `parts` bands of whole tiles, at least one row of tiles each."""
     tiles = -(-(bottom - top) // TILE)
     parts = min(parts, tiles)
     edges = [top + TILE * (tiles * i // parts) for i in range(parts)]

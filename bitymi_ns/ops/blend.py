@@ -1,4 +1,4 @@
-"""Shading and compositing in one: the image of surfels with their view colours and a residual."""
+"""Shading and compositing in one pass, from surfels with view colours and residuals."""
 
 import functools
 
@@ -14,22 +14,22 @@ from .trace import Fragments
 
 @functools.lru_cache(maxsize=4)
 def _no_tiles(surfels: int, dtype: torch.dtype, device: torch.device) -> TexelTiles:
-    """Tiles of surfels without texels. Kept: a step on a card should not clear them again."""
+    """Return tiles of surfels without texels; cached, so that a training step on a GPU does not clear them again."""
     size = torch.zeros(surfels, 2, dtype=torch.int32, device=device)
     return TexelTiles.of_sizes(size, torch.zeros(surfels, dtype=dtype, device=device))
 
 
 def backward_memory(fragments: Fragments, maps: bool, texels: int) -> dict[str, Tensor]:
-    """Working memory of the backward kernel by name: none on the CPU.
+    """Allocate working memory of the backward kernel by name; none on the CPU.
 
     Args:
-        texels: T of which gradients are added up. On CUDA a row of four numbers each; where torch is asked for
-            deterministic algorithms, int64 sums in its place: a sum of integers does not depend on the order.
+        texels: number T of texels with a gradient. On CUDA a row of four numbers each; with deterministic algorithms
+            int64 sums instead, which do not depend on the order.
     """
     like = fragments.weight
     if not cuda_backend(like.device):
         return {}
-    work = {"partial": like.new_empty(fragments.layout.handle.pairs, 8 if maps else 4)}  # of surfels, by pair
+    work = {"partial": like.new_empty(fragments.layout.handle.pairs, 8 if maps else 4)}  # gradients of surfels by pair
     if texels and torch.are_deterministic_algorithms_enabled():
         numbers = module(like.device).exact_size(4 * texels)
         work["exact_work"] = torch.empty(numbers, dtype=torch.int64, device=like.device)
@@ -77,16 +77,16 @@ def checked_texels(
     move_surfels: bool,
     descent: TexelDescent | None,
 ) -> tuple[Tensor, TexelTiles, bool, TexelDescent | None]:
-    """Return texels [T, 3], tiles, move_surfels and descent of `blended_image`, filled in where there are none.
+    """Check and complete the texel arguments of `blended_image`: texels [T, 3], tiles, move_surfels, descent.
 
     Args:
-        like: of the device that all have to lie on.
+        like: on the device of all tensors.
         surfels: N.
         base: [N, 3] view colours.
         texels, tiles, move_surfels, descent: as in `blended_image`.
 
     Raises:
-        ValueError: as of `blended_image`.
+        ValueError: as `blended_image`.
     """
     if texels is None or tiles is None:
         tiles = _no_tiles(surfels, base.dtype, base.device)
@@ -116,39 +116,38 @@ def blended_image(
     descent: TexelDescent | None = None,
     residual: Tensor | None = None,
 ) -> Tensor:
-    """Shade and composite: sums of w times colour, 1 and beta, and with maps also depth and normal, per pixel.
+    """Shade and composite per pixel: sums of w times colour, 1 and beta; with maps also depth and normal.
 
-    A fragment's colour is ReLU(ReLU(f_view(d) + 0.5) + r), eq. (color), with the residual r of texels at (u, v),
-    bilinear between the four nearest texel centres, constant beyond the outer ones; or a residual of each fragment, as
-    `fragment_residual` has it of a field; or none. Differentiable in the fragments' weights, depths and coordinates,
-    `projection.geom`, `base`, `texels` and `residual`. Along u and v the slope is that of the bilinear fetch, and 0
-    beyond the outer texel centres.
+    A fragment's colour is ReLU(ReLU(f_view(d) + 0.5) + r), eq. (color). The residual r is that of texels at (u, v),
+    bilinear between the four nearest texel centres and constant beyond the outer ones; or of each fragment, as from
+    `fragment_residual`; or 0. Differentiable in the fragments' weights, depths and coordinates, `projection.geom`,
+    `base`, `texels` and `residual`. Along u and v the slope is that of the bilinear fetch, and 0 beyond the outer texel
+    centres.
 
-    It is one pass over the fragments, and one backward, which list neither colours nor their gradients: of 64 bytes per
-    fragment 40 are left on a card, 32 on the CPU. On the CPU the sums of the backward pass depend neither on the number
-    of threads nor on what learns: each surfel's are added by one thread. On a card only the gradients of texels depend
-    on the order of sums, and not even they after torch.use_deterministic_algorithms(True).
+    Forward and backward are one pass over the fragments each and store neither colours nor their gradients, which saves
+    24 of 64 bytes per fragment on CUDA and 32 on the CPU. CPU gradients do not depend on the number of threads or on
+    what requires gradients: one thread adds up each surfel. On CUDA only gradients of texels depend on the order of
+    sums, unless torch.use_deterministic_algorithms(True) is set.
 
     Args:
         fragments: F fragments of an H x W view.
-        projection: the view's, of N surfels.
-        base: [N, 3] f_view of every surfel.
-        texels: [T, 3] residual colours, of the fragments' dtype; None = none.
-        bound: fragments of weight below this, and those of surfels without a tile, keep ReLU(f_view + 0.5).
+        projection: of the view and N surfels.
+        base: [N, 3] f_view of each surfel.
+        texels: [T, 3] residual colours, of the fragments' dtype; None: none.
+        bound: fragments of weight below this, or without a tile, have the colour ReLU(f_view + 0.5).
         maps: add depth and normal.
-        move_surfels: the gradient of r with respect to u and v reaches the fragments.
-        descent: the backward pass moves the texels that the view shows, in place, and keeps no gradient of them. So a
-            whole atlas need not be cleared and read for every view.
-        residual: [F, 3] residual colour of each fragment, in place of texels.
+        move_surfels: propagate the gradient of r with respect to u and v to the fragments.
+        descent: step on the texels of the view, taken in place in the backward pass without storing their gradient,
+            which saves clearing and reading a whole atlas per view.
+        residual: [F, 3] residual colour of each fragment, instead of texels.
 
     Returns:
         [H * W, 5] rgb, alpha, sum w beta; with maps [H * W, 9]: also sum w z (camera z) and sum w n (unit normals in
         the camera frame, OpenCV axes, facing the camera). Nothing is divided by alpha; the background is not included.
 
     Raises:
-        ValueError: the tiles are not those of these texels or surfels, or the fragments those of others; or texels
-            that ask for a gradient are to be moved; or there are texels and a residual; or tensors lie on several
-            devices.
+        ValueError: tiles do not match texels or surfels, or fragments do not match the projection; texels that require
+            a gradient have a descent; texels and a residual are both given; or tensors are on different devices.
     """
     on_same_device(fragments.weight, geom=projection.geom)
     if len(projection.geom) != fragments.surfels:
@@ -163,20 +162,20 @@ def blended_image(
     )
     uv = fragments.uv if move_surfels else fragments.uv.detach()
     if descent is not None and not base.requires_grad:
-        base = base.detach().requires_grad_()  # so that there is a backward pass, whatever else learns
+        base = base.detach().requires_grad_()  # so that there is a backward pass, even if nothing else learns
     rest = (projection.geom, base, texels, residual, fragments, tiles, bound, maps, descent)
     return _BlendedImage.apply(fragments.weight, fragments.depth, uv, *rest)
 
 
 def soft_overdraw(fragments: Fragments, half: float) -> Tensor:
-    """A count of a pixel's fragments with a gradient: sum of w / (w + half), [H * W].
+    """Count the fragments of a pixel differentiably: sum of w / (w + half), [H * W].
 
     Args:
         fragments: of an H x W view.
-        half: the weight that counts one half, above 0. A fragment far heavier counts 1, one far lighter w / half.
+        half: the weight that counts one half, > 0. Far larger weights count 1, far smaller ones w / half.
 
     Raises:
-        ValueError: half is not above 0.
+        ValueError: half is not positive.
     """
     if not half > 0.0:
         raise ValueError(f"the weight that counts one half must be above 0, not {half}")
@@ -185,7 +184,7 @@ def soft_overdraw(fragments: Fragments, half: float) -> Tensor:
 
 
 def composite(fragments: Fragments, values: Tensor) -> Tensor:
-    """Sums of w times any values [F, C] per pixel: [H * W, C]."""
+    """Composite values [F, C]: sums of w times value per pixel, [H * W, C]."""
     if values.dim() != 2 or len(values) != len(fragments):
         raise ValueError(f"values must have a row for each of the {len(fragments)} fragments, not {list(values.shape)}")
     on_same_device(fragments.weight, values=values)

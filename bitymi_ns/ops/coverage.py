@@ -1,4 +1,4 @@
-"""Coverage: pixels of a view that every texel makes up, the weights of its step."""
+"""Coverage of texels: the pixels of a view that each texel accounts for, which weight its step."""
 
 from collections.abc import Iterable
 
@@ -20,16 +20,15 @@ def add_texel_coverage(
     total: Tensor | None,
     squares: Tensor | None = None,
 ) -> None:
-    """Add the coverage of every texel in a view, in pixels: the sum over the fragments of blending weight times
-    bilinear weight.
+    """Add the coverage of each texel in a view, in pixels: sum over fragments of blending weight times bilinear weight.
 
     Args:
-        lists: the fragments of an H x W view, from top to bottom, as of `fitting_lists`.
+        lists: fragments of an H x W view from top to bottom, as from `fitting_lists`.
         tiles: of the T texels.
-        mask: [H, W] or [H, W, 1] bool, True for the pixels that count; None = all.
-        bound: fragments of weight below this count as nothing.
-        total: [T, 3] of the tiles' dtype, dense, added to, alike in all columns; None = not wanted.
-        squares: [T, 3], added to: the same of the blending weights' squares. None = not wanted.
+        mask: [H, W] or [H, W, 1] bool, True for pixels that count; None: all.
+        bound: fragments of smaller weight are ignored.
+        total: [T, 3] of the tiles' dtype, dense, equal columns, added to; None: skip.
+        squares: [T, 3], added to: the same sum with squared blending weights; None: skip.
     """
     like, top = tiles.extent, 0
     share = like.new_ones(tiles.count)
@@ -49,8 +48,8 @@ def add_texel_coverage(
 def _add(
     fragments: Fragments, weight: Tensor, tiles: TexelTiles, counts: Tensor, bound: float, total: Tensor, share: Tensor
 ) -> None:
-    """The same of one list with these weights, and for every pixel what it counts [H * W]: the gradient of colours of
-    which no channel is cut off, as a step of length -1 by a share [T] of 1."""
+    """Accumulate one list with these weights and counts per pixel [H * W], as a texel step of length -1 with `share`
+    [T] of 1 for colours with no clamped channel."""
     surfels = fragments.surfels
     base, geom = total.new_zeros(surfels, 3), total.new_zeros(surfels, GEOM)
     dimage = torch.nn.functional.pad(counts[:, None].expand(-1, 3), (0, IMAGE_CHANNELS - 3))

@@ -1,4 +1,4 @@
-"""The residual colour field rho(x) = f_phi(E_theta(x)): contraction, hash grid, MLP."""
+"""Residual colour field rho(x) = f_phi(E_theta(x)): contraction, hash grid, MLP."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,26 +10,26 @@ from .backend import check_shapes, cuda_backend, dense, kernel, kernel_class, mo
 from .constants import FEATURES, FRAME, WIDTH
 from .trace import Fragments
 
-WEIGHTS = ("table", "w1", "w2", "w3")  # the kernels' names of the field's parameters
+WEIGHTS = ("table", "w1", "w2", "w3")  # the kernels' parameter names
 
 
 @dataclass(frozen=True)
 class FieldGeometry:
-    """Position of the hash grid in the world."""
+    """Placement of the hash grid in the world."""
 
     min_resolution: int  # cells along an edge of the coarsest level; each level doubles it
-    # mip-NeRF 360 contraction: the unit ball around `mid` of radius `half` is kept, all space outside maps into the
-    # shell up to radius 2. Without it, the cube of half edge `half` is the domain; positions are clamped
+    # mip-NeRF 360 contraction: the unit ball around `mid` of radius `half` is kept, the space outside maps into the
+    # shell up to radius 2. Without it, positions are clamped to the cube of half edge `half`
     contract: bool
     mid: tuple[float, float, float]  # centre, world units
     half: float  # radius or half edge, world units
 
 
 def kernel_field(geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Tensor, w3: Tensor):
-    """The kernels' view of the field's parameters.
+    """Wrap the field's parameters for the kernels.
 
     Raises:
-        ValueError: shapes do not agree.
+        ValueError: shapes do not match.
     """
     levels, size, features = table.shape
     log2_size = size.bit_length() - 1
@@ -71,7 +71,7 @@ class _Field(torch.autograd.Function):
 
 
 def field(x: Tensor, geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Tensor, w3: Tensor) -> Tensor:
-    """Residual colour at world positions, eq. (color): four levels are interpolated trilinearly, concatenated and
+    """Evaluate the residual colour at world positions, eq. (color): levels interpolated trilinearly, concatenated and
     decoded by an MLP with two hidden layers of 16 ReLU units, no biases, linear output.
 
     Args:
@@ -94,20 +94,20 @@ def fragment_residual(
     bound: float = 0.0,
     move_surfels: bool = False,
 ) -> Tensor:
-    """rho(x) of fragments, x = mean + u s_u t_u + v s_v t_v.
+    """Evaluate rho(x) at fragments, x = mean + u s_u t_u + v s_v t_v.
 
     Args:
         fragments: F fragments.
         frames: [N, 9] of the projection.
         geometry, weights: the field (table, w1, w2, w3), as in `field`.
-        bound: fragments of weight below this have none.
-        move_surfels: the gradient of rho with respect to x reaches uv and frames.
+        bound: fragments of smaller weight get 0.
+        move_surfels: propagate the gradient of rho with respect to x to uv and frames.
 
     Returns:
         [F, 3], 0 below the bound.
 
     Raises:
-        ValueError: shapes or devices do not agree.
+        ValueError: shapes or devices do not match.
     """
     check_shapes(frames=(frames, (fragments.surfels, FRAME)))
     on_same_device(fragments.weight, frames=frames)

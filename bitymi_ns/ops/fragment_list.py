@@ -1,4 +1,4 @@
-"""Parts of a fragment list that the CPU and a CUDA device have in common."""
+"""Parts of a fragment list shared by the CPU and CUDA."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,11 +10,11 @@ from .project import Projection
 
 
 class TooManyFragments(RuntimeError):
-    """A view has more fragments than it may have.
+    """A view with more fragments than allowed.
 
     Args:
-        count, most: fragments that there are, and that there may be; also attributes.
-        ids: surfel and pixel are listed, too: 8 bytes beside 5 numbers like those of `geom`.
+        count, most: number of fragments, and its limit; also attributes.
+        ids: whether surfel and pixel are stored too: 8 bytes beside 5 numbers of geom's dtype.
     """
 
     def __init__(self, geom: Tensor, projection: Projection, count: int, most: int, ids: bool) -> None:
@@ -28,31 +28,31 @@ class TooManyFragments(RuntimeError):
 
 
 def empty_list(geom: Tensor, count: int) -> dict[str, Tensor]:
-    """The numbers of `count` fragments by name, for the kernels to fill."""
+    """Allocate the numbers of `count` fragments by name."""
     return {name: geom.new_empty(count) for name in ("weight", "depth", "sigma")} | {"uv": geom.new_empty(2, count)}
 
 
 def empty_ids(like: Tensor, count: int) -> dict[str, Tensor]:
-    """Surfel and pixel of `count` fragments by name, [count] int32, likewise."""
+    """Allocate surfel and pixel of `count` fragments by name, [count] int32."""
     return {name: like.new_empty(count, dtype=torch.int32) for name in ("surfel", "pixel")}
 
 
 class Layout:
-    """Index of a fragment list: its runs by tile, and the surfel and pixel of every fragment.
+    """Index of a fragment list: its runs by tile, and surfel and pixel of each fragment.
 
-    On the CPU the runs imply surfels and pixels, which is enough for most operations: the arrays of these are made at
-    their first use.
+    On the CPU the runs imply surfels and pixels, which suffices for most operations; these arrays are made at first
+    use.
 
     Attributes:
         handle: the kernels' object: `TileBlocks` (csrc/cpu/blocks.h) or `Pairs` (csrc/cuda/fragment_list.h).
-        arrays: the arrays that it refers to, by name.
+        arrays: arrays it refers to, by name.
     """
 
     def __init__(self, handle: Any, arrays: dict[str, Tensor], find_ids: Callable[[], dict[str, Tensor]]) -> None:
         """
         Args:
             handle, arrays: see above.
-            find_ids: makes surfel, pixel [F] int32 by name.
+            find_ids: computes surfel, pixel [F] int32 by name.
         """
         self.handle, self.arrays = handle, arrays
         self._find_ids = find_ids
@@ -61,7 +61,7 @@ class Layout:
     def ids(self) -> dict[str, Tensor]:
         """surfel, pixel [F] int32."""
         if self._ids is None:
-            with torch.inference_mode(False):  # kept, so that a graph may need them later
+            with torch.inference_mode(False):  # cached, and may be used in a graph later
                 self._ids = self._find_ids()
         return self._ids
 

@@ -1,6 +1,6 @@
-"""Losses of an image and statistics of projected centres in a training step, by the CUDA kernels.
+"""Image losses and densification statistics of a training step, by CUDA kernels.
 
-torch would do it in some fifty small operations, whose launches take the host longer than all of them take the card.
+In torch they are about fifty small operations, whose launches take the host longer than the GPU takes to run them.
 """
 
 import torch
@@ -16,7 +16,7 @@ class _PictureLosses(torch.autograd.Function):
     @staticmethod
     def forward(ctx, image, target, mask, share, weight, gamma):
         pixels, wanted, rgb, flat = dense(image, image), dense(target, image), image[..., :3].detach(), None
-        if mask is not None:  # pixels that do not count are equal in both pictures
+        if mask is not None:  # masked-out pixels are made equal in both pictures
             flat, counts = mask.reshape(-1).contiguous().view(torch.uint8), mask.reshape(*image.shape[:2], 1)
             rgb, wanted = torch.where(counts, rgb, 0.0), torch.where(counts, wanted, 0.0)
         alike, dalike = similarity(rgb, wanted, ctx.needs_input_grad[0])
@@ -64,15 +64,15 @@ def picture_losses(
     gamma: float,
     mask: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """The photometric and the weighted falloff loss of a picture (`train.losses.objective`), two scalars.
+    """Compute the photometric and the weighted falloff loss of a picture (`train.losses.objective`), two scalars.
 
     Args:
-        image: [H, W, 5] rgb, alpha and beta on a CUDA device, the picture at least as large as a window of SSIM.
+        image: [H, W, 5] rgb, alpha and beta on a CUDA device, at least as large as a window of SSIM.
         target: [H, W, 3] photograph.
         ssim_weight: w of (1 - w) L1 + w (1 - SSIM).
-        falloff_weight: of the mean of omega beta, omega = exp(-gamma e).
-        gamma: how fast omega fades with the error e, the sum of the absolute differences over rgb.
-        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None = everywhere.
+        falloff_weight: weight of the mean of omega beta, omega = exp(-gamma e).
+        gamma: decay of omega with the error e, the sum of absolute differences over rgb.
+        mask: [H, W] or [H, W, 1] bool, True for pixels that count; None: all.
 
     Raises:
         ValueError: shapes or devices do not agree.
@@ -99,7 +99,7 @@ def note_centers(
     visible_count: Tensor,
     max_radius: Tensor,
 ) -> None:
-    """Add a view to the statistics of densification, in place: what `train.strategy.Strategy.accumulate` says.
+    """Add a view to the statistics of densification in place; see `train.strategy.Strategy.accumulate`.
 
     Args:
         projection: of the view, after its backward pass.

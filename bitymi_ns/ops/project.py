@@ -13,7 +13,7 @@ from .backend import check_shapes, cuda_backend, dense, kernel, on_same_device
 from .constants import FRAME, GEOM
 from .texel import TexelAlpha
 
-Prefilter = Literal["low_pass", "pixel"]  # how surfels smaller than a pixel are drawn, see `project`
+Prefilter = Literal["low_pass", "pixel"]  # treatment of surfels smaller than a pixel, see `project`
 
 
 class Camera(Protocol):
@@ -23,7 +23,7 @@ class Camera(Protocol):
         viewmat: [4, 4] world to camera, OpenCV axes.
         K: [3, 3] intrinsics in pixels.
         width, height: of the image in pixels.
-        skewed: whether K[0, 1] is not 0, which the kernels do not take.
+        skewed: whether K[0, 1] is not 0, which the kernels do not support.
     """
 
     viewmat: Tensor
@@ -37,7 +37,7 @@ class Camera(Protocol):
 
 @dataclass
 class Projection:
-    """Surfels as a camera sees them. Rows of surfels that it cannot see are zero.
+    """Surfels projected into a camera; rows of invisible surfels are zero.
 
     With (dx, dy) the offset in pixels from the projected centre (cx, cy), a pixel's ray meets the surfel at
     u = (u1 dx + u2 dy) / W, v = (v1 dx + v2 dy) / W, W = w0 + w1 dx + w2 dy, at depth z w0 / W (csrc/core/surfel.h).
@@ -45,17 +45,16 @@ class Projection:
     Attributes:
         geom: [N, 16], differentiable.
         frames: [N, 9] mean, s_u t_u, s_v t_v in the world frame, differentiable.
-        radii: [N, 2] half extents in pixels of the box in which a surfel can reach alpha 1/255; 0 = not visible.
+        radii: [N, 2] half extents in pixels of the box in which a surfel can reach alpha 1/255; 0: not visible.
         camera: the camera.
         near: nearest depth that is drawn, camera z.
-        prefilter: as in `project`; every kernel that reads the rows takes it.
-        photo_pixel: side of a photograph's pixel in pixels of the view; rows of another one than 1 are for the baked
-            renderer alone.
-        broken: [1] int32, how many surfels were left out because a parameter is NaN or infinite.
+        prefilter: as in `project`; every kernel that reads the rows needs it.
+        photo_pixel: side of a photograph's pixel in pixels of the view; if not 1, only the baked renderer can use it.
+        broken: [1] int32, number of surfels dropped because a parameter is NaN or infinite.
         mean2d_grad: [N, 2] after backward: gradient with respect to the projected centre, in pixels.
-        mean2d_absgrad: [N, 2] after backward: the same with the absolute value taken per fragment before the sum.
-        whole: the view that this is a band of (ops/bands.py).
-        alpha: what texels make of the surfels' opacity; None = opaque texels.
+        mean2d_absgrad: [N, 2] after backward: the same, with absolute values per fragment before the sum.
+        whole: the view of which this is a band (ops/bands.py).
+        alpha: alpha texels; None: opaque.
     """
 
     geom: Tensor
@@ -72,7 +71,7 @@ class Projection:
     alpha: TexelAlpha | None = None
 
     def take_mean2d(self, grad: Tensor, absgrad: Tensor) -> None:
-        """Note the gradients of the projected centres; those of bands are added up in the whole view."""
+        """Store the gradients of the projected centres; those of bands are added up in the whole view."""
         if self.whole is None:
             self.mean2d_grad, self.mean2d_absgrad = grad, absgrad
         elif self.whole.mean2d_grad is None:
@@ -82,10 +81,10 @@ class Projection:
             self.whole.mean2d_absgrad += absgrad
 
     def view(self, geom: Tensor) -> dict[str, Any]:
-        """Arguments of the kernels for a view (`View` of csrc/ops/visibility.h).
+        """Build the kernels' arguments for a view (`View` of csrc/ops/visibility.h).
 
         Args:
-            geom: `self.geom` without its graph.
+            geom: `self.geom`, detached.
         """
         size = {"width": self.camera.width, "height": self.camera.height}
         drawn = {"near": self.near, "prefilter": self.prefilter, "photo_pixel": self.photo_pixel}
@@ -93,22 +92,22 @@ class Projection:
 
     @property
     def alpha_arrays(self) -> dict[str, Any]:
-        """Arguments of the kernels for alpha texels (`AlphaTiles` of csrc/ops/visibility.h); none where opaque."""
+        """The kernels' arguments for alpha texels (`AlphaTiles` of csrc/ops/visibility.h); empty if opaque."""
         return {} if self.alpha is None else self.alpha.arrays
 
     @property
     def not_finite(self) -> int:
-        """`broken` as a number; waits for the device."""
+        """`broken` as an int; waits for the device."""
         return int(self.broken)
 
     @cached_property
     def visible(self) -> Tensor:
-        """[N] bool: the surfel can reach some pixel."""
+        """[N] bool, True if the surfel can reach a pixel."""
         return self.radii[:, 0] > 0
 
 
 GEOMETRY = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
-"""Names of the parameters that say where surfels are."""
+"""Names of the surfels' geometry parameters."""
 
 
 class _Project(torch.autograd.Function):
@@ -154,28 +153,28 @@ class _Project(torch.autograd.Function):
 
 
 def rigid_gradient(means: Tensor, quats: Tensor, dmeans: Tensor, dquats: Tensor, viewmat: Tensor) -> Tensor:
-    """Find the gradient with respect to a camera's pose by those of the surfels that it sees.
+    """Compute the gradient of a camera's pose from the gradients of the surfels.
 
-    Where the camera moves, the surfels move rigidly the other way in its frame: the force on the surfels is the sum of
-    their gradients, the torque that of means x dmeans and of what turns the quaternions. Sums are in float64.
+    Moving the camera moves the surfels rigidly the other way in its frame: the force on the surfels is the sum of their
+    gradients, the torque that of means x dmeans and of the quaternions' rotational part. Sums are in float64.
 
     Args:
         means: [N, 3] world positions.
         quats: [N, 4] wxyz of any length.
-        dmeans: [N, 3] gradients of what is drawn, view colours left out.
+        dmeans: [N, 3] gradients of the image, without the view colours' part.
         dquats: [N, 4] likewise.
         viewmat: [4, 4] world to camera.
 
     Returns:
-        [4, 4] in the dtype of `viewmat`: the part of the gradient along rigid motions.
+        [4, 4] in the dtype of `viewmat`: the gradient restricted to rigid motions.
     """
-    # surfels that are not finite are not drawn, and have gradients of 0
+    # surfels that are not finite are not drawn and have gradients of 0
     m, q = (t.double().nan_to_num(0.0, 0.0, 0.0) for t in (means, quats))
     dm, dq = dmeans.double(), dquats.double()
     turn = q[:, :1] * dq[:, 1:] - dq[:, :1] * q[:, 1:] + torch.linalg.cross(q[:, 1:], dq[:, 1:])
     torque = (torch.linalg.cross(m, dm) + 0.5 * turn).sum(0)
     rotation = viewmat[:3, :3].double()
-    # no product of matrices: on a card cuBLAS would refuse where torch is asked for deterministic algorithms
+    # elementwise: cuBLAS products raise under torch.use_deterministic_algorithms
     force, torque = (rotation * dm.sum(0)).sum(-1), (rotation * torque).sum(-1)
     gradient = torch.zeros(4, 4, dtype=torch.float64, device=viewmat.device)
     gradient[:3, :3] = 0.5 * torch.linalg.cross(torque[:, None], rotation, dim=0)
@@ -203,18 +202,18 @@ def project(
         log_scales: [N, 2] natural logarithm of the tangent scales, world units; clamped to +-30.
         opacity_logits: [N], opacity = sigmoid.
         beta_raw: [N], beta = 4 sigmoid (eq. beta-kernel).
-        camera: OpenCV axes; its `viewmat` may ask for a gradient, which is that along rigid motions.
-        near: surfels with a centre nearer than this (camera z) are not seen.
+        camera: OpenCV axes; its `viewmat` may require a gradient (along rigid motions).
+        near: surfels with a centre nearer than this (camera z) are dropped.
         prefilter: low_pass = the maximum of the kernel and a low pass; pixel = the kernel averaged over a pixel
             (csrc/core/prefilter.h), with n = fx fy s_u s_v / z^2 in the last column of geom.
-        photo_pixel: side of a photograph's pixel in pixels of the view (csrc/core/resize.h); another one than 1 is for
-            the baked renderer on the CPU, without gradients, and does nothing with the prefilter `pixel`. The last
-            column of geom is then the height of the low pass over that of the kernel.
-        alpha: opacities of the surfels' texels; None = opaque texels.
+        photo_pixel: side of a photograph's pixel in pixels of the view (csrc/core/resize.h); if not 1, for the baked
+            renderer on the CPU only, without gradients, and without effect on the prefilter `pixel`. The last column of
+            geom is then the height of the low pass over that of the kernel.
+        alpha: alpha texels; None: opaque.
 
     Raises:
-        ValueError: shapes or devices do not agree, the camera has skew, or a gradient or a CUDA device is asked for
-            with another photo_pixel than 1.
+        ValueError: shapes or devices do not match, the camera has skew, or a photo_pixel other than 1 is combined with
+            gradients or a CUDA device.
     """
     if photo_pixel != 1.0 and (cuda_backend(means.device) or (torch.is_grad_enabled() and means.requires_grad)):
         raise ValueError("surfels are resized on the CPU and without gradients alone")

@@ -1,7 +1,7 @@
-"""Pictures of views by the CUDA kernels without lists of fragments (csrc/cuda/rasterize.cu).
+"""Images by CUDA kernels without fragment lists (csrc/cuda/rasterize.cu).
 
-Of every fragment two bits are kept, in masks of the pairs of surfel and tile; the backward pass finds the rest again,
-tile by tile. So a view of any number of fragments is drawn at once, and the host waits once, for the number of pairs.
+Two bits per fragment are kept, in masks of the pairs of surfel and tile; the backward pass recomputes the rest tile by
+tile. So a view with any number of fragments is drawn at once, and the host waits once, for the number of pairs.
 """
 
 from collections.abc import Iterator
@@ -22,16 +22,16 @@ from .trace_cuda import layout_of, tile_lists
 
 
 def can_rasterize(device: torch.device) -> bool:
-    """Return True where `rasterize_image` runs: on CUDA devices, unless torch is asked for deterministic algorithms.
-    Gradients of alpha texels have no bound before they are known, so that sums in integers take a list."""
+    """Return True if `rasterize_image` can run: on CUDA devices without deterministic algorithms. These need a list,
+    because integer sums need a bound of the gradients of alpha texels."""
     return cuda_backend(device) and not torch.are_deterministic_algorithms_enabled()
 
 
 @dataclass(frozen=True)
 class Marks:
-    """The fragments of a view of which masks were kept. Their numbers are found again for every question."""
+    """Fragments of a view, kept as masks; recomputed per query."""
 
-    projection: Projection  # of the view
+    projection: Projection
     rim: float  # as in `trace`
     layout: Layout  # pairs and masks
 
@@ -41,15 +41,15 @@ class Marks:
         return int(self.masked_counts(every, len(self.projection.geom)).sum())
 
     def lists(self) -> Iterator[Fragments]:
-        """The fragments without gradient, from top to bottom: as one list, or in bands where memory asks for it."""
+        """Yield the fragments without gradient, top to bottom: one list, or bands if memory requires it."""
         return fitting_lists(self.projection, rim=self.rim)
 
     def overdraw(self) -> Tensor:
-        """[H, W, 1] int32: blended surfels per pixel."""
+        """Count the blended surfels per pixel: [H, W, 1] int32."""
         return torch.cat([fragments.overdraw() for fragments in self.lists()])
 
     def masked_counts(self, mask: Tensor, n: int) -> Tensor:
-        """[n] int32 of a mask [H * W] bool, as the function `masked_counts`."""
+        """Count fragments on the pixels of a mask [H * W] bool: [n] int32; see `trace.masked_counts`."""
         camera = self.projection.camera
         return counted({"layout": self.layout.handle, "width": camera.width, "height": camera.height}, mask, n)
 
@@ -123,29 +123,29 @@ def rasterize_image(
     descent: TexelDescent | None = None,
     rim: float = 1e-3,
 ) -> tuple[Tensor, Marks]:
-    """Draw a view: `trace` and `blended_image` without maps, in one kernel, and in one more backwards.
+    """Draw a view: `trace` and `blended_image` without maps, in one kernel each forward and backward.
 
     Differentiable in `projection.geom`, its alpha texels, `base` and `texels`. The backward pass fills
-    `projection.mean2d_grad` and `projection.mean2d_absgrad`. Only sums of texels depend on the order of threads.
+    `projection.mean2d_grad` and `projection.mean2d_absgrad`. Only sums over texels depend on the thread order.
 
     Args:
-        projection: of `project`, on a device where `can_rasterize`; geom [N, 16].
+        projection: from `project`, on a device where `can_rasterize`; geom [N, 16].
         base, texels, tiles, bound, move_surfels, descent: as in `blended_image`.
         rim: as in `trace`.
 
     Returns:
-        [H * W, 5] rgb, alpha, sum w beta, as of `blended_image`; and the view's fragments.
+        [H * W, 5] rgb, alpha, sum w beta, as from `blended_image`; and the view's fragments.
 
     Raises:
-        RuntimeError: 2^31 pairs of surfel and tile or more, or the device is not a CUDA device.
-        ValueError: the tiles are not those of these texels, surfels and alpha texels; or texels that ask for a gradient
-            are to be moved; or tensors lie on several devices.
+        RuntimeError: 2^31 pairs of surfel and tile or more, or not a CUDA device.
+        ValueError: tiles do not match texels, surfels or alpha texels; texels that require a gradient have a descent;
+            or tensors are on different devices.
     """
     geom = projection.geom
     require("rasterize_image", "cuda", geom.device, "call `trace` and `blended_image`")
     texels, tiles, move_surfels, descent = checked_texels(geom, len(geom), base, texels, tiles, move_surfels, descent)
     if descent is not None and not base.requires_grad:
-        base = base.detach().requires_grad_()  # so that there is a backward pass, whatever else learns
+        base = base.detach().requires_grad_()  # so that there is a backward pass, even if nothing else learns
     alpha = None if projection.alpha is None else projection.alpha.values
     if projection.alpha is not None and projection.alpha.tiles.first is not tiles.first:
         raise ValueError("the alphas of texels lie in other tiles than their colours")

@@ -7,7 +7,7 @@ from .backend import cuda_backend, dense, kernel, workspace
 
 
 def similarity(a: Tensor, b: Tensor, gradient: bool) -> tuple[Tensor, Tensor | None]:
-    """`ssim` without a graph, and where it is asked for its gradient with respect to a, [H, W, C]."""
+    """Compute `ssim` without a graph and, if asked for, its gradient with respect to a, [H, W, C]."""
     height, width, channels = a.shape
     x, y = dense(a, a), dense(b, a)
     grad = torch.empty_like(x) if gradient else None
@@ -32,9 +32,9 @@ class _Ssim(torch.autograd.Function):
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:
-    """Mean SSIM over the valid 11 x 11 Gaussian windows (sigma 1.5), K1 = 0.01, K2 = 0.03, data range 1.
+    """Compute the mean SSIM over the valid 11 x 11 Gaussian windows (sigma 1.5), K1 = 0.01, K2 = 0.03, data range 1.
 
-    Differentiable in a. Images smaller than a window have nothing to compare: 1.
+    Differentiable in a. Images smaller than a window give 1.
 
     Args:
         a, b: [H, W, C] in [0, 1].

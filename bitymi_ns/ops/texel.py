@@ -1,4 +1,4 @@
-"""Texels of surfels in one list, and the step that a backward pass takes."""
+"""Texels of surfels in one list, and their step in a backward pass."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class TexelTiles:
-    """Offsets, sizes and extents of the surfels' tiles in one list of texels, [T, 3].
+    """Offsets, sizes and extents of the surfels' tiles in a texel list [T, 3].
 
     Texel (i, j) of surfel s, i along u and j along v, is row first[s] + j r_u + i; its centre lies at
     u = (i + 0.5) / r_u * 2e - e, v likewise. A tile of 1 x 1 texel is a constant.
 
     Attributes:
         first: [N] int64.
-        size: [N, 2] int32 (r_u, r_v); (0, 0) = no tile.
+        size: [N, 2] int32 (r_u, r_v); (0, 0): no tile.
         extent: [N] half side e of the tile in scale units, of the texels' dtype.
     """
 
@@ -29,36 +29,36 @@ class TexelTiles:
 
     @classmethod
     def of_sizes(cls, size: Tensor, extent: Tensor) -> TexelTiles:
-        """Tiles of the sizes [N, 2] and extents [N], one after the other."""
+        """Lay out tiles of sizes [N, 2] and extents [N] consecutively."""
         area = size.long().prod(dim=1)
         return cls(area.cumsum(0) - area, size.to(torch.int32).contiguous(), extent.contiguous())
 
     def rows_of(self, surfels: Tensor) -> Tensor:
-        """[t] int64 rows of the texels of some surfels [n] int64, tile after tile in their order."""
+        """List the texel rows [t] int64 of surfels [n] int64, tile after tile."""
         area = self.size[surfels].long().prod(dim=1)
         shift = self.first[surfels] - (area.cumsum(0) - area)
         return shift.repeat_interleave(area) + torch.arange(int(area.sum()), device=area.device)
 
     @property
     def arrays(self) -> dict[str, Tensor]:
-        """Arguments of the kernels, by name."""
+        """Build the kernels' arguments, by name."""
         return {"first": self.first, "size": self.size, "extent": self.extent}
 
     @functools.cached_property
     def count(self) -> int:
-        """T: texels of all tiles. Read back once: a step must not wait for the device."""
+        """T: texels of all tiles; read from the device once."""
         return int(self.size.long().prod(dim=1).sum())
 
 
 @dataclass(frozen=True)
 class TexelAlpha:
-    """Factors of opacity by texel: sigma = min(0.99, sigma0 m) of a fragment whose weight sigma0 T would be at least
-    `bound`, with m the bilinear fetch at its u and v. sigma0 < 1/255 is no fragment, whatever m.
+    """Opacity factors by texel: sigma = min(0.99, sigma0 m) for fragments whose weight sigma0 T would be at least
+    `bound`, with m the bilinear fetch at (u, v). Fragments with sigma0 < 1/255 are skipped for any m.
 
     Attributes:
         tiles: of the texels.
         values: [T] m, from 0 to 2.
-        bound: fragments whose weight would be less keep their sigma.
+        bound: fragments of smaller weight keep their sigma.
     """
 
     tiles: TexelTiles
@@ -66,29 +66,29 @@ class TexelAlpha:
     bound: float
 
     def of(self, surfels: Tensor) -> TexelAlpha:
-        """The same of some of the surfels [n] int64."""
+        """Select the texels of surfels [n] int64."""
         tiles = TexelTiles.of_sizes(self.tiles.size[surfels], self.tiles.extent[surfels])
         return TexelAlpha(tiles, self.values[self.tiles.rows_of(surfels)], self.bound)
 
     def to(self, device: torch.device | str) -> TexelAlpha:
-        """The same on another device."""
+        """Move to a device."""
         tiles = TexelTiles(*(t.to(device) for t in (self.tiles.first, self.tiles.size, self.tiles.extent)))
         return TexelAlpha(tiles, self.values.to(device), self.bound)
 
     @property
     def arrays(self) -> dict[str, Any]:
-        """Arguments of the kernels, by name."""
+        """The kernels' arguments, by name."""
         return {**self.tiles.arrays, "texel_alpha": self.values.detach(), "alpha_bound": self.bound}
 
 
 @dataclass(frozen=True)
 class TexelDescent:
-    """Step of a backward pass for texels: texel t moves by -rate share[t] times its gradient.
+    """Step on texels within a backward pass: texel t moves by -rate share[t] times its gradient.
 
     Attributes:
         share: [T] of the texels' dtype.
-        rate: of all texels.
-        moved: [T, 3] the texels that are moved; None = those that are read.
+        rate: common step length.
+        moved: [T, 3] texels to update; None: those that are read.
     """
 
     share: Tensor
@@ -96,15 +96,15 @@ class TexelDescent:
     moved: Tensor | None = None
 
     def arguments(self, read: Tensor) -> dict[str, Any]:
-        """The kernels' keywords, for a backward pass that reads the texels `read`."""
+        """Build the kernels' keywords for a backward pass that reads texels `read`."""
         return {"moved": read if self.moved is None else self.moved, "share": self.share, "rate": self.rate}
 
 
 def gradient_or_step(
     texels: Tensor, learns: bool, descent: TexelDescent | None
 ) -> tuple[Tensor | None, dict[str, Any]]:
-    """Return what a backward pass does with texels [T, 3]: their gradient [T, 3], to be filled, None where they do not
-    learn; and the kernels' keywords, with `moved` where there is a gradient or a descent."""
+    """Prepare the backward pass of texels [T, 3]: a zero gradient [T, 3] to fill, None unless they learn; and the
+    kernels' keywords, with `moved` if there is a gradient or a descent."""
     if not learns:
         return None, {"rate": 0.0} if descent is None else descent.arguments(texels)
     dtexels = torch.zeros_like(texels)

@@ -1,4 +1,4 @@
-"""Visibility: the fragments of a view with their blending weights."""
+"""Visibility: fragments of a view and their blending weights."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["Fragments", "TooManyFragments", "masked_counts", "select", "trace"]
 
 @dataclass
 class Fragments:
-    """The blended (pixel, surfel) pairs of a view: by tile of 16 x 16 pixels, in a tile front to back.
+    """Blended (pixel, surfel) pairs of a view: by tile of 16 x 16 pixels, front to back within a tile.
 
     Attributes:
         weight: [F] blending weight w = sigma T, differentiable.
@@ -29,7 +29,7 @@ class Fragments:
         sigma: [F] effective opacity, negative in the low-pass branch.
         width, height: of the image, pixels.
         layout: index of the list.
-        surfels: number N of rows of the projection that they belong to.
+        surfels: number N of rows of the projection.
     """
 
     weight: Tensor
@@ -56,13 +56,13 @@ class Fragments:
 
     @property
     def arrays(self) -> dict[str, Tensor]:
-        """The list without the graph, by the names of `FragmentArrays` (csrc/ops/arguments.h); the kernels of the CPU
-        know surfels and pixels from the layout."""
+        """The list without graph, by the names of `FragmentArrays` (csrc/ops/arguments.h); CPU kernels get surfels and
+        pixels from the layout."""
         return _for_layout(self._numbers, self.layout)
 
     @property
     def view(self) -> dict[str, Any]:
-        """Layout and size of the image, by the names of the kernels' arguments."""
+        """Layout and image size, as keyword arguments of the kernels."""
         return {"layout": self.layout.handle, "width": self.width, "height": self.height}
 
     @property
@@ -76,16 +76,16 @@ class Fragments:
         return {"weight": w, "uv": uv, "depth": depth, "sigma": self.sigma}
 
     def lists(self) -> Iterator[Fragments]:
-        """The view's lists one after the other, from top to bottom: this one."""
+        """Yield the view's lists from top to bottom: this one."""
         yield self
 
     def overdraw(self) -> Tensor:
-        """[H, W, 1] int32: blended surfels per pixel."""
+        """Count the blended surfels per pixel: [H, W, 1] int32."""
         count = torch.bincount(self.pixel, minlength=self.width * self.height)
         return count.to(torch.int32).view(self.height, self.width, 1)
 
     def masked_counts(self, mask: Tensor, n: int) -> Tensor:
-        """As the function `masked_counts`."""
+        """Count fragments on masked pixels; see `masked_counts`."""
         return masked_counts(self, mask, n)
 
 
@@ -134,24 +134,24 @@ class _Trace(torch.autograd.Function):
 
 
 def trace(projection: Projection, rim: float = 1e-3, most: int | None = None) -> Fragments:
-    """Find the fragments of a view: for each pixel the surfels that are blended there, front to back by centre depth.
+    """Find the fragments of a view: for each pixel the blended surfels, front to back by centre depth.
 
-    They have sigma = min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))) >= 1/255. A pixel ends before the surfel
-    that would take its transmittance below 1e-4. Where the projection has alpha texels, these multiply sigma
-    (`TexelAlpha`); the last bit of v then says of which fragments.
+    sigma = min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))) >= 1/255. A pixel ends before the surfel that would
+    reduce its transmittance below 1e-4. Alpha texels of the projection multiply sigma (`TexelAlpha`); the last bit of v
+    marks these fragments.
 
     The backward pass fills `projection.mean2d_grad` and `projection.mean2d_absgrad`.
 
     Args:
-        projection: of `project`; geom [N, 16].
+        projection: from `project`; geom [N, 16].
         rim: lower bound of 1 - x in the derivative of the Beta kernel, which diverges at the rim for beta < 1.
-        most: largest number of fragments; None = no limit; 0 = on the CPU `trace_cpu.MOST`, on a CUDA device as many as
-            its free memory holds together with what shading, blending and their backward pass need.
+        most: largest number of fragments; None: no limit; 0: `trace_cpu.MOST` on the CPU, on a CUDA device the number
+            whose list, shading, blending and backward pass fit into free memory.
 
     Raises:
-        ValueError: the rows are not of `project`, not for a view of the photographs' size, or the tiles of alpha texels
-            are of other surfels.
-        TooManyFragments: there are more, or their list does not fit the memory of the CUDA device.
+        ValueError: the projection has wrong rows or a photo_pixel other than 1, or its alpha tiles are of other
+            surfels.
+        TooManyFragments: there are more, or their list does not fit into the memory of the CUDA device.
     """
     if projection.photo_pixel != 1.0:
         raise ValueError("surfels in a view of another size than the photographs are drawn by the baked renderer alone")
@@ -164,7 +164,7 @@ def trace(projection: Projection, rim: float = 1e-3, most: int | None = None) ->
 
 
 def select(fragments: Fragments, keep: Tensor) -> Fragments:
-    """The fragments of a view that are kept, as a list of their own, without the graph.
+    """Select fragments of a view as a new list, without the graph.
 
     Args:
         fragments: F fragments.
@@ -188,7 +188,7 @@ def masked_counts(fragments: Fragments, mask: Tensor, n: int) -> Tensor:
     """Count the blended fragments of each surfel on masked pixels (FastGS's per-view importance).
 
     Args:
-        fragments: of a view of H x W pixels.
+        fragments: of an H x W view.
         mask: [H * W] bool.
 
     Returns:
@@ -206,8 +206,8 @@ def masked_counts(fragments: Fragments, mask: Tensor, n: int) -> Tensor:
 
 
 def counted(view: dict[str, Any], mask: Tensor, n: int) -> Tensor:
-    """Count as `masked_counts` does, for a mask [H * W] bool of a list with the arguments `view`, as of
-    `Fragments.view`. Returns [n] int32."""
+    """Count as `masked_counts`, for a mask [H * W] bool and the list with the arguments `view` (`Fragments.view`):
+    [n] int32."""
     counts = torch.zeros(n, dtype=torch.int32, device=mask.device)
     flat = mask.reshape(-1).to(torch.uint8).contiguous()
     function("masked_counts", counts.device)(**view, mask=flat, counts=counts)

@@ -1,4 +1,4 @@
-"""The fragment list by the CPU kernels."""
+"""Fragment lists by the CPU kernels."""
 
 import functools
 from typing import Any
@@ -11,23 +11,23 @@ from .fragment_list import Layout, TooManyFragments, empty_ids, empty_list
 from .project import Projection
 
 MOST = 1 << 25
-"""Fragments of a list whose length memory decides: 1.2 GB with what blending and its backward pass add, 36 bytes per
-fragment; 96 where a field shades them. Fixed, so that what is computed does not depend on the machine."""
+"""Default limit of a list's fragments: 1.2 GB with blending and its backward pass, 36 bytes per fragment (96 with a
+field). Fixed, so that results do not depend on the machine."""
 
 _pool = functools.cache(Pool)
 
 
 def tracers(like: Tensor) -> Pool[Any]:
-    """Tracers for tensors like `like`, which keep their memory from view to view."""
+    """Return reusable tracers for tensors like `like`, which keep their memory between views."""
     return _pool(kernel_class("Trace", like))
 
 
 def find_fragments(geom: Tensor, projection: Projection, most: int | None = None) -> tuple[Layout, dict[str, Tensor]]:
-    """The fragments of a view.
+    """Find the fragments of a view.
 
     Args:
-        geom: [N, 16] without graph.
-        most: fragments that there may be; 0 = `MOST`, None = any number.
+        geom: [N, 16], detached.
+        most: largest number of fragments; 0: `MOST`; None: no limit.
 
     Returns:
         layout, and the numbers of `Fragments` by name.
@@ -49,7 +49,7 @@ def find_fragments(geom: Tensor, projection: Projection, most: int | None = None
 
 
 def select(layout: Layout, keep: Tensor, width: int, height: int) -> Layout:
-    """The layout of the fragments that are kept.
+    """Build the layout of the selected fragments.
 
     Args:
         layout: of a list of F fragments.
@@ -80,7 +80,7 @@ def _layout(arrays: dict[str, Tensor], width: int, height: int) -> Layout:
 
 
 def count(projection: Projection) -> int:
-    """Number of fragments of a view on the CPU; their list is not made.
+    """Count the fragments of a view on the CPU without making their list.
 
     Raises:
         RuntimeError: the projection is not on the CPU.

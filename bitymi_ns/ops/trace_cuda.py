@@ -1,7 +1,7 @@
-"""The fragment list by the CUDA kernels (csrc/cuda/fragment_list.h describes it).
+"""Fragment lists by the CUDA kernels; described in csrc/cuda/fragment_list.h.
 
-Two numbers decide how much memory is needed, so the host waits for the device twice per view: for the number of pairs
-of surfel and tile, and for the number of fragments. Pictures need the first alone (rasterize_cuda.py).
+Memory depends on two counts, so the host waits for the device twice per view: for the pairs of surfel and tile, and for
+the fragments. Images without lists need the first only (rasterize_cuda.py).
 """
 
 from dataclasses import dataclass
@@ -15,19 +15,19 @@ from .fragment_list import Layout, TooManyFragments, empty_ids, empty_list
 from .project import Projection
 
 NUMBERS = 24
-"""That a fragment takes in a training step: 7 in the list, 3 of its residual, 8 of gradients; the rest is slack."""
-FEW = 1 << 23  # fragments for which there is always room, so that nobody asks the device for its free memory
+"""Numbers per fragment in a training step: 7 in the list, 3 of its residual, 8 of gradients; the rest is slack."""
+FEW = 1 << 23  # up to this many fragments free memory is not queried
 LISTS_PER_CHECK = 100
-"""Lists after which the device is asked again. Asking takes as long as a tenth of a training step, and between steps
-only other programs change the answer: torch keeps the memory of a list for the next one."""
+"""Lists between queries of free memory. A query takes a tenth of a training step, and between steps only other programs
+change the answer, as torch keeps a list's memory for the next one."""
 
 
 @dataclass
 class _Room:
-    """Fragments that the free memory of a device holds, as last measured."""
+    """Fragments that fit into a device's free memory, as last measured."""
 
     capacity: int  # fragments
-    largest: int  # list that was compared with it
+    largest: int  # longest list checked against it
     lists: int = 0  # since then
 
 
@@ -36,15 +36,14 @@ _rooms: dict[torch.device, _Room] = {}
 
 @dataclass(frozen=True)
 class Bins:
-    """Pairs of surfel and tile that may touch; P of them."""
+    """P potentially touching pairs of surfel and tile."""
 
     order: Tensor  # [N] int32 surfels front to back
-    slot_start: Tensor  # [N + 1] int64 by rank in that order: the surfel's first slot
+    slot_start: Tensor  # [N + 1] int64 first slot of the surfel at each rank of that order
     slot: Tensor  # [P] int32, by tile, then front to back: the pair's slot
     surfel: Tensor  # [P] int32, likewise: the pair's surfel
-    tile_pairs: Tensor  # [tiles + 1] int64, where each tile's pairs begin
-    # [1] int32, by how many pairs the lists differ from what was counted; not 0: the kernels were compiled wrongly
-    differing: Tensor
+    tile_pairs: Tensor  # [tiles + 1] int64, first pair of each tile
+    differing: Tensor  # [1] int32, difference between listed and counted pairs; not 0: the kernels are miscompiled
 
     @property
     def layout(self) -> dict[str, Tensor]:
@@ -61,7 +60,7 @@ def _longs(like: Tensor, count: int) -> Tensor:
 
 
 def tile_lists(geom: Tensor, projection: Projection) -> Bins:
-    """Pairs of surfel and tile of a view; waits once for their number.
+    """List the pairs of surfel and tile of a view; waits once for their number.
 
     Raises:
         RuntimeError: 2^31 pairs or more.
@@ -85,8 +84,8 @@ def tile_lists(geom: Tensor, projection: Projection) -> Bins:
 
 
 def blended(geom: Tensor, projection: Projection, bins: Bins) -> Layout:
-    """Mark the pixels that blend each pair: the layout of the fragment list, with surfels and pixels unwritten;
-    waits once for the number of fragments."""
+    """Mark the pixels where each pair blends: returns the layout of the fragment list, surfels and pixels unwritten.
+    Waits once for the number of fragments."""
     require("trace_cuda.blended", "cuda", geom.device, "call `trace`")
     camera, pairs = projection.camera, bins.surfel.shape[0]
     marks = {"masks": _ints(geom, module(geom.device).TILE_WARPS, pairs), "offsets": _longs(geom, pairs + 1)}
@@ -102,12 +101,12 @@ def blended(geom: Tensor, projection: Projection, bins: Bins) -> Layout:
 
 
 def layout_of(arrays: dict[str, Tensor], width: int, height: int, ids: dict[str, Tensor] | None = None) -> Layout:
-    """Return the layout of P pairs of surfel and tile. Waits for the number of fragments where there are offsets.
+    """Build the layout of P pairs of surfel and tile. Waits for the number of fragments if there are offsets.
 
     Args:
-        arrays: of `Bins.layout`, masks [TILE_WARPS, P] int32 and offsets [P + 1] int64; without offsets no list.
+        arrays: from `Bins.layout`, masks [TILE_WARPS, P] int32 and offsets [P + 1] int64 (none without a list).
         width, height: of the image, pixels.
-        ids: surfel and pixel [F] int32 of its fragments; None = still to be written.
+        ids: surfel and pixel [F] int32 of the fragments; None: not written yet.
     """
     masks = arrays["masks"]
     count = int(arrays["offsets"][-1]) if "offsets" in arrays else -1
@@ -117,20 +116,20 @@ def layout_of(arrays: dict[str, Tensor], width: int, height: int, ids: dict[str,
 
 
 def free_memory(device: torch.device) -> int:
-    """Bytes of a CUDA device that are free, with what torch keeps unused."""
+    """Return the free bytes of a CUDA device, including what torch holds unused."""
     kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     return torch.cuda.mem_get_info(device)[0] + kept
 
 
 def fragment_capacity(geom: Tensor) -> int:
-    """Fragments that the free memory of a CUDA device holds with all that a training step makes of them."""
+    """Compute the number of fragments whose training step fits into the free memory of a CUDA device."""
     return free_memory(geom.device) // (NUMBERS * geom.element_size())
 
 
 def check_capacity(geom: Tensor, projection: Projection, count: int, most: int | None) -> None:
-    """Raise TooManyFragments for a list that is longer than allowed or, with most = 0, than there is memory for.
+    """Raise TooManyFragments if a list is longer than allowed or, with most = 0, than memory permits.
 
-    The memory is looked up for a list that is longer than all before, and every `LISTS_PER_CHECK` lists."""
+    Free memory is queried for a list longer than all before, and every `LISTS_PER_CHECK` lists."""
     if most == 0 and geom.device.type == "cuda" and count > FEW:
         room = _rooms.get(geom.device)
         if room is None or count > room.largest or room.lists >= LISTS_PER_CHECK:
@@ -142,7 +141,7 @@ def check_capacity(geom: Tensor, projection: Projection, count: int, most: int |
 
 
 def fill(geom: Tensor, projection: Projection, layout: Layout) -> dict[str, Tensor]:
-    """The numbers of `Fragments` by name; raises TooManyFragments where they find no room."""
+    """Compute the numbers of `Fragments` by name; raises TooManyFragments if memory is insufficient."""
     count = layout.handle.fragments
     try:
         found, ids = empty_list(geom, count), layout.ids()
@@ -154,18 +153,18 @@ def fill(geom: Tensor, projection: Projection, layout: Layout) -> dict[str, Tens
 
 
 def find_fragments(geom: Tensor, projection: Projection, most: int | None = None) -> tuple[Layout, dict[str, Tensor]]:
-    """The fragments of a view.
+    """Find the fragments of a view.
 
     Args:
-        geom: [N, 16] without graph.
-        most: fragments that there may be; 0 = as many as a training step has memory for; None = any number.
+        geom: [N, 16], detached.
+        most: largest number of fragments; 0: as many as a training step has memory for; None: no limit.
 
     Returns:
         layout, and the numbers of `Fragments` by name.
 
     Raises:
         RuntimeError: 2^31 pairs of surfel and tile or more.
-        TooManyFragments: there are more than that, or the device has no memory for their list.
+        TooManyFragments: there are more, or their list does not fit into the device's memory.
     """
     layout = blended(geom, projection, tile_lists(geom, projection))
     check_capacity(geom, projection, layout.handle.fragments, most)
@@ -173,7 +172,7 @@ def find_fragments(geom: Tensor, projection: Projection, most: int | None = None
 
 
 def select(layout: Layout, keep: Tensor, width: int, height: int) -> Layout:
-    """The layout of the fragments that are kept.
+    """Build the layout of the selected fragments.
 
     Args:
         layout: of a list of F fragments.
@@ -188,12 +187,11 @@ def select(layout: Layout, keep: Tensor, width: int, height: int) -> Layout:
 
 
 def backward_memory(geom: Tensor, layout: Layout, texel_alpha: Tensor | None) -> dict[str, Tensor]:
-    """Working memory of the backward kernel, by name.
+    """Allocate working memory of the backward kernel, by name.
 
     Args:
-        geom: [N, 16] without graph.
-        texel_alpha: [T] gradients that are added up, None = none; in int64 where torch is asked for deterministic
-            algorithms.
+        geom: [N, 16], detached.
+        texel_alpha: [T] texels with a gradient, summed in int64 with deterministic algorithms; None: none.
     """
     kernels = module(geom.device)
     work = {"dsigma": geom.new_empty(layout.handle.fragments)}

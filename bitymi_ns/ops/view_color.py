@@ -1,4 +1,4 @@
-"""View-dependent surfel colour f_view(d), of the kinds that `view_kinds` lists."""
+"""View-dependent surfel colour f_view(d), of the kinds in `view_kinds`."""
 
 from collections.abc import Mapping, Sequence
 
@@ -10,11 +10,11 @@ from .constants import COLOR_BIAS, MAX_TERMS
 from .view_kinds import entry_of
 
 LEAN = ("view_base", "view_span", "view_terms")
-"""Names of the parameters of lean view colours, of which every surfel has as many terms as it needs."""
+"""Parameter names of lean view colours, which have a varying number of terms per surfel."""
 
 
 def view_base(f_view: Tensor) -> Tensor:
-    """ReLU(f_view + 0.5): a fragment's colour without residual."""
+    """Compute ReLU(f_view + 0.5), a fragment's colour without residual."""
     return torch.relu(f_view + COLOR_BIAS)
 
 
@@ -24,12 +24,12 @@ def _directions(means: Tensor, center: Tensor, active: Tensor) -> dict[str, Tens
 
 
 def _flags(active: Tensor) -> Tensor:
-    """The same as uint8, without a copy where it is bool and dense."""
+    """Convert to uint8, without a copy of dense bools."""
     return active.view(torch.uint8).contiguous() if active.dtype == torch.bool else active.to(torch.uint8)
 
 
 def lettered(parameters: Sequence[Tensor], prefix: str = "") -> dict[str, Tensor]:
-    """Parameters by the kernels' names: a, b and, where there is a third, c."""
+    """Name parameters as the kernels do: a, b and, if there is a third, c."""
     return {prefix + letter: p for letter, p in zip("abc", parameters, strict=False)}
 
 
@@ -58,7 +58,7 @@ class _ViewColor(torch.autograd.Function):
 
 
 def check_view_color(kind: str, params: Mapping[str, Tensor], n: int) -> int:
-    """The number of terms (sites, coefficients with dc, or lobes) of n surfels' view colours.
+    """Check the view colours of n surfels; returns the number of terms (sites, coefficients with dc, or lobes).
 
     Raises:
         ValueError: unknown kind, or a parameter has the wrong shape.
@@ -77,7 +77,7 @@ def check_lean(kind: str, params: Mapping[str, Tensor], n: int) -> None:
     """Check the lean view colours of n surfels; waits for a device.
 
     Raises:
-        ValueError: a shape or dtype is wrong, a span lies outside the terms, or harmonics end within a degree.
+        ValueError: wrong shape or dtype, a span outside the terms, or harmonics that end within a degree.
     """
     entry = entry_of(kind)
     base, span, terms = (params[name] for name in LEAN)
@@ -97,22 +97,22 @@ def check_lean(kind: str, params: Mapping[str, Tensor], n: int) -> None:
 def view_color(
     kind: str, params: Mapping[str, Tensor], means: Tensor, center: Tensor, active: Tensor | None = None
 ) -> Tensor:
-    """f_view(d) without the offset 0.5, d = (mean - centre) / |mean - centre| in the world frame.
+    """Compute f_view(d) without the offset 0.5, d = (mean - centre) / |mean - centre| in the world frame.
 
     Args:
-        kind: a name of `VIEW_COLORS`: sv is the paper's.
-        params: the parameters that its entry names; or those of lean colours (`LEAN`), which have no gradient:
-            view_base [N, 3], view_span [N, 2] int32 (first term, how many), view_terms [terms, the kind's lean_width].
-            More are ignored.
+        kind: a name of `VIEW_COLORS`; sv is the paper's.
+        params: the parameters of its entry; or those of lean colours (`LEAN`), without gradient: view_base [N, 3],
+            view_span [N, 2] int32 (first term, number of terms), view_terms [terms, the kind's lean_width]. Others are
+            ignored.
         means: [N, 3] world positions.
-        center: [3] camera centre, world; used in float64 (`Camera.exact_center`); may ask for a gradient.
-        active: [N] bool; rows that are not active give 0 and get no gradient. None = all.
+        center: [3] camera centre, world; used in float64 (`Camera.exact_center`); may require a gradient.
+        active: [N] bool; inactive rows give 0 and get no gradient; None: all active.
 
     Returns:
         [N, 3].
 
     Raises:
-        ValueError: unknown kind, or a parameter has the wrong shape or lies on another device.
+        ValueError: unknown kind, or a parameter has the wrong shape or device.
     """
     n = means.shape[0]
     flags = means.new_ones(n, dtype=torch.uint8) if active is None else _flags(active.to(means.device))

@@ -1,5 +1,5 @@
-"""The kinds of view colour: one entry of `VIEW_COLORS` each holds all that depends on the kind, but for the colour in a
-direction: csrc/core/view_kinds.h, and in float64 `ops.reference.view_color`."""
+"""Kinds of view colour: an entry of `VIEW_COLORS` holds all that depends on the kind, except the evaluation
+(csrc/core/view_kinds.h, and in float64 `ops.reference.view_color`)."""
 
 import math
 from collections.abc import Callable, Collection, Mapping
@@ -14,27 +14,27 @@ from torch.nn import functional as F
 from .constants import LOG_TAU_MAX, MAX_TERMS, SH_C0
 
 Limit = tuple[float, ...]
-"""Largest absolute value of a parameter, one for all its numbers or one for each along its last axis."""
-COLOR_LIMIT = 256.0  # largest absolute value of a colour, a coefficient or the colour of a lobe, 1 = white
-SHAPE_LIMIT = 1e4  # of logits, angles and logarithms of sharpness: sigmoid and exp have long reached their ends
-DIRECTION_LIMIT = 1e6  # of directions of any length: the renderers normalise
-VECTOR_LIMIT = 2e7  # of differences of two temperatures of at most exp(16) times a direction
+"""Largest absolute value of a parameter: one number, or one for each entry of its last axis."""
+COLOR_LIMIT = 256.0  # of colours and of coefficients and lobes' colours, 1 = white
+SHAPE_LIMIT = 1e4  # of logits, angles and log sharpnesses: sigmoid and exp saturate far below
+DIRECTION_LIMIT = 1e6  # of unnormalised directions
+VECTOR_LIMIT = 2e7  # of differences of two temperatures, at most exp(16), times a direction
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of a view colour, of which every surfel has one row."""
+    """A view-colour parameter with one row per surfel."""
 
     name: str  # as in checkpoints, optimiser groups and columns of surfels.ply
-    shape: tuple[int, ...]  # of a row; -1 = one for each term, or for each but the one that the first parameter holds
-    limit: Limit  # what a bundle may hold
-    rate: Literal["view_color", "view_shape"]  # the learning rate in `train.config.LearningRates` that it has,
-    share: float = 1.0  # and how much of it
-    activation: str | None = None  # what is done to it before use, as bundle.json says it; None = it says nothing
+    shape: tuple[int, ...]  # of a row; -1 = number of terms, less the one that the first parameter may hold
+    limit: Limit  # allowed in a bundle
+    rate: Literal["view_color", "view_shape"]  # learning rate in `train.config.LearningRates`,
+    share: float = 1.0  # and its factor
+    activation: str | None = None  # activation as stated in bundle.json; None: not stated
 
     @property
     def width(self) -> int:
-        """Numbers of a row, or of a term of it."""
+        """Numbers per row, or per term of it."""
         return math.prod(size for size in self.shape if size > 0)
 
 
@@ -42,35 +42,34 @@ class Parameter:
 class ViewColor:
     """A kind of view colour.
 
-    A term is a site, a coefficient or a lobe. Lean colours (`ops.view_color.LEAN`) have a base colour and as many terms
-    as each surfel needs.
+    A term is a site, a coefficient or a lobe. Lean colours (`ops.view_color.LEAN`) have a base colour and a varying
+    number of terms per surfel.
     """
 
-    title: str  # what people call it
-    # term, kept: a term, and the heading under which people read how many a bundle keeps, base colours included
+    title: str  # display name
+    # term, kept: name of a term, and heading of the number of terms in a bundle, base colours included
     term: str
     kept: str
-    parameters: tuple[Parameter, ...]  # as the kernels take them, two or three; the second has one row per term
-    counts: Collection[int]  # numbers of terms that there may be
-    rule: str  # the same in words, of the rows that there are
-    base_terms: int  # terms that the base of a lean colour stands for: 1, or 0 where it stands beside the terms
-    option: str  # the option of `SceneConfig` that decides how many terms there are,
-    terms_of: Callable[[int], int]  # and the number of terms for a value
-    # the first parameters from colours [N, 3] less `COLOR_BIAS`, the number of terms and a random generator: they show
-    # the colours from every direction, or on average over them
+    parameters: tuple[Parameter, ...]  # two or three, in the kernels' order; the second has one row per term
+    counts: Collection[int]  # allowed numbers of terms
+    rule: str  # the same in words, for rows
+    base_terms: int  # terms that the base of a lean colour replaces: 1, or 0 if it is additional
+    option: str  # option of `SceneConfig` for the number of terms,
+    terms_of: Callable[[int], int]  # and the number of terms for its value
+    # initial first parameters from colours [N, 3] less `COLOR_BIAS`, the number of terms and a random generator; they
+    # show the colours from every direction, or on average
     start: Callable[[Tensor, int, torch.Generator], tuple[Tensor, ...]]
     lean_width: int  # numbers of a lean term
-    lean_limit: Limit  # what a bundle may hold of them
-    lean_formula: str  # how a lean colour is evaluated, for bundle.json
-    lean_counts: Collection[int] = range(MAX_TERMS + 1)  # numbers of lean terms that a surfel may have
-    base_unit: float = 1.0  # the colour that a base of 1 shows
-    # f_view's mean over all directions [N, 3] from the parameters, for display; None = no closed form is known
+    lean_limit: Limit  # of a lean term, allowed in a bundle
+    lean_formula: str  # evaluation of a lean colour, for bundle.json
+    lean_counts: Collection[int] = range(MAX_TERMS + 1)  # allowed numbers of lean terms of a surfel
+    base_unit: float = 1.0  # colour for a base of 1
+    # mean of f_view over all directions [N, 3] from the parameters, for display; None: no closed form
     mean: Callable[..., Tensor] | None = None
-    # the colour as softmax_k(v_k . d) rgb_k, from its parameters: v and rgb [N, K, 3] each. The bake then fits fewer
-    # terms. None = it is nothing of the kind: a surfel keeps all terms, or one colour
+    # v and rgb [N, K, 3] of the form softmax_k(v_k . d) rgb_k, from the parameters; the bake can then fit fewer terms.
+    # None: no such form; a surfel keeps all terms, or one colour
     sites: Callable[..., tuple[Tensor, Tensor]] | None = None
-    # the key of bundle.json's surfels under which the number of terms stands; None = it does not
-    stated: str | None = None
+    stated: str | None = None  # key for the number of terms in bundle.json's surfels; None: not stated
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -79,28 +78,28 @@ class ViewColor:
 
     @property
     def _in_first(self) -> int:
-        """Terms that the first parameter holds alone: 1 for sh, whose dc is the coefficient of degree 0."""
+        """Terms in the first parameter: 1 for sh, whose dc is the coefficient of degree 0."""
         return 0 if -1 in self.parameters[0].shape else self.base_terms
 
     def of(self, params: Mapping[str, Tensor]) -> list[Tensor]:
-        """The parameters, out of all of the surfels."""
+        """Select the parameters from all of the surfels'."""
         return [params[name] for name in self.names]
 
     def terms(self, params: Mapping[str, Tensor]) -> int:
-        """Return the number of terms."""
+        """Count the terms."""
         return params[self.names[1]].shape[1] + self._in_first
 
     def shapes(self, terms: int) -> list[tuple[int, ...]]:
-        """Shapes of a row of each parameter."""
+        """List the row shapes of the parameters."""
         rows = terms - self._in_first
         return [tuple(rows if size < 0 else size for size in p.shape) for p in self.parameters]
 
     def problem(self, terms: int) -> str | None:
-        """Return what is wrong with a number of terms, None if nothing."""
+        """Explain why a number of terms is not allowed; None if it is."""
         return None if terms in self.counts else f"{self.rule}, not {terms - self._in_first}"
 
     def first_values(self, color: Tensor, config: Any, generator: torch.Generator) -> dict[str, Tensor]:
-        """The parameters that training starts from: see `start`; `config` is a `SceneConfig`."""
+        """Initialise the parameters (`start`); `config` is a `SceneConfig`."""
         values = self.start(color, self.terms_of(getattr(config, self.option)), generator)
         return dict(zip(self.names, values, strict=True))
 
@@ -115,7 +114,7 @@ def _sv_start(color: Tensor, sites: int, generator: torch.Generator) -> tuple[Te
 
 
 def _sv_sites(sites: Tensor, log_tau: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor]:
-    """tau_k s_k, the gradients of the logits, and the colours."""
+    """Compute tau_k s_k, the gradients of the logits, and the colours."""
     return F.normalize(sites, dim=2) * log_tau.clamp(max=LOG_TAU_MAX).exp()[..., None], rgb
 
 
@@ -124,7 +123,7 @@ def _sh_start(color: Tensor, terms: int, generator: torch.Generator) -> tuple[Te
 
 
 def _sb_start(color: Tensor, lobes: int, generator: torch.Generator) -> tuple[Tensor, ...]:
-    # raw colour 0 passes softplus as 0.1, which keeps the gradient alive; the base makes up for it
+    # softplus maps raw colour 0 to 0.1, which keeps the gradient alive; the base compensates
     shape = torch.zeros(len(color), lobes, 6)
     shape[..., 3] = math.pi * torch.rand(len(color), lobes, generator=generator)
     shape[..., 4] = 2.0 * math.pi * torch.rand(len(color), lobes, generator=generator)
@@ -137,7 +136,7 @@ sphere, 0.1."""
 
 
 def _sb_mean(base: Tensor, lobes: Tensor) -> Tensor:
-    """The mean over the sphere of max(0, d.mu)^p is 1 / (2 (p + 1))."""
+    """Average over the sphere: max(0, d.mu)^p has the mean 1 / (2 (p + 1))."""
     power = 4.0 * lobes[..., 5].exp()
     rgb = F.softplus(lobes[..., :3], beta=10.0 * math.log(2.0))
     return base + (rgb / (2.0 * (power + 1.0))[..., None]).sum(1)
@@ -146,12 +145,12 @@ def _sb_mean(base: Tensor, lobes: Tensor) -> Tensor:
 def _sg_start(color: Tensor, lobes: int, generator: torch.Generator) -> tuple[Tensor, ...]:
     n = len(color)
     axes = F.normalize(torch.randn(n, lobes, 3, generator=generator), dim=-1)
-    # log sharpness 1, and no colour of its own yet
+    # log sharpness 1, colour 0
     return color.clone(), torch.cat([axes, torch.ones(n, lobes, 1), torch.zeros(n, lobes, 3)], -1)
 
 
 def _sg_mean(base: Tensor, lobes: Tensor) -> Tensor:
-    """The mean over the sphere of exp(l (d.mu - 1)) is (1 - exp(-2l)) / 2l."""
+    """Average over the sphere: exp(l (d.mu - 1)) has the mean (1 - exp(-2l)) / 2l."""
     sharpness = lobes[..., 3].exp().clamp(1e-6, 1e6)
     share = -torch.expm1(-2.0 * sharpness) / (2.0 * sharpness)
     return base + (lobes[..., 4:] * share[..., None]).sum(1)
@@ -169,7 +168,7 @@ def _with_lobes(
     start: Callable[[Tensor, int, torch.Generator], tuple[Tensor, ...]],
     mean: Callable[[Tensor, Tensor], Tensor],
 ) -> ViewColor:
-    """A kind of a base colour and lobes."""
+    """Build a kind with a base colour and lobes."""
     return ViewColor(
         title=title,
         term="lobe",
@@ -238,18 +237,18 @@ VIEW_COLORS: dict[str, ViewColor] = {
     "sb": _with_lobes("Spherical Beta", "sb", _BETA_LOBE, _sb_start, _sb_mean),
     "sg": _with_lobes("Spherical Gaussian", "sg", _GAUSSIAN_LOBE, _sg_start, _sg_mean),
 }
-"""The kinds, by name."""
+"""Kinds by name."""
 VIEW_PARAMETERS: dict[str, Parameter] = {p.name: p for kind in VIEW_COLORS.values() for p in kind.parameters}
-"""The parameters of all kinds, by name."""
+"""Parameters of all kinds by name."""
 Kind = Literal[tuple(VIEW_COLORS)]  # type: ignore[valid-type]
-"""A name of `VIEW_COLORS`, for options and files that are checked by their types."""
+"""Names of `VIEW_COLORS`, for options and files checked by type."""
 
 
 def entry_of(kind: str) -> ViewColor:
     """Return the entry of a kind.
 
     Raises:
-        ValueError: there is none of this name.
+        ValueError: unknown kind.
     """
     if kind not in VIEW_COLORS:
         raise ValueError(f"unknown view colour '{kind}': choose one of {', '.join(VIEW_COLORS)}")
@@ -257,10 +256,10 @@ def entry_of(kind: str) -> ViewColor:
 
 
 def kind_of(params: Mapping[str, Tensor]) -> str:
-    """Return the name of the view colour whose parameters are complete.
+    """Return the kind whose parameters are complete.
 
     Raises:
-        ValueError: the parameters of none are there.
+        ValueError: no kind is.
     """
     for kind, entry in VIEW_COLORS.items():
         if all(name in params for name in entry.names):
@@ -269,7 +268,7 @@ def kind_of(params: Mapping[str, Tensor]) -> str:
 
 
 def fibonacci_sphere(n: int) -> Tensor:
-    """[n, 3] float32 unit vectors spread evenly over the sphere along a Fibonacci spiral."""
+    """Return [n, 3] float32 unit vectors, evenly distributed over the sphere along a Fibonacci spiral."""
     i = torch.arange(n, dtype=torch.float64)
     z = 1.0 - (2.0 * i + 1.0) / n
     phi = i * math.pi * (3.0 - math.sqrt(5.0))

@@ -1,7 +1,7 @@
-"""The image formation in extended precision (numpy long double, 64 bits of mantissa on x86-64), to check the float64
-references where these may lose figures themselves. Written apart from them: planes through the camera centre instead
-of the adjugate. Complex inputs of tiny imaginary part give a directional derivative without differences (Squire and
-Trapp 1998): the imaginary part of the result over that of the input is exact to rounding.
+"""Image formation in extended precision (numpy long double, 64-bit mantissa on x86-64), to check the float64 references
+where these may lose digits. Written independently: planes through the camera centre instead of the adjugate. Inputs
+with a tiny imaginary part give a directional derivative without differences (complex step, Squire and Trapp 1998): the
+imaginary part of the result over that of the input is exact to rounding.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ Array = npt.NDArray[np.clongdouble]
 
 @dataclass
 class Extended:
-    """Sums over the blended fragments per pixel; P = H W pixels, row major."""
+    """Sums over the blended fragments of each pixel; P = H W pixels, row-major."""
 
     weight: Array  # [P, N]
     alpha: Array  # [P]
@@ -31,7 +31,7 @@ class Extended:
 
 
 def render(geometry: Sequence[npt.ArrayLike], camera: Camera, near: float = 0.2) -> Extended:
-    """Every pixel against every surfel, as `reference.render`; arguments as there, real or complex, no colours."""
+    """Render every pixel against every surfel; arguments as `reference.render`, real or complex, without colours."""
     mean, q, logs, logit, raw, view, k = (
         np.asarray(a, dtype=np.clongdouble) for a in (*geometry, camera.viewmat, camera.K)
     )
@@ -49,7 +49,7 @@ def render(geometry: Sequence[npt.ArrayLike], camera: Camera, near: float = 0.2)
     ).transpose(2, 0, 1)  # [N, 3, 3]
     axes = view[:3, :3] @ rotation  # camera frame
     a, b, normal = axes[:, :, 0], axes[:, :, 1], axes[:, :, 2]
-    # a rotation that was rounded to float32 is not quite one: coordinates along a and b by their dual vectors
+    # a rotation rounded to float32 is not orthonormal: use dual vectors for coordinates along a and b
     n = np.cross(a, b)
     dual_a, dual_b = np.cross(b, n), np.cross(n, a)
     dual_a, dual_b = dual_a / (dual_a * a).sum(-1, keepdims=True), dual_b / (dual_b * b).sum(-1, keepdims=True)

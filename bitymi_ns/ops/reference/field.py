@@ -1,4 +1,4 @@
-"""Residual colour field, in float64: contraction of space, multiresolution hash encoding, small MLP."""
+"""Residual colour field in float64: contraction of space, multiresolution hash encoding, small MLP."""
 
 import itertools
 
@@ -9,7 +9,7 @@ PRIMES = (1, 2654435761, 805459861)
 
 
 def contract(x: Tensor, mid: Tensor, half: Tensor | float, contraction: bool = True) -> Tensor:
-    """Grid coordinates [M, 3] in [0, 1] of world positions x [M, 3].
+    """Map world positions x [M, 3] to grid coordinates [M, 3] in [0, 1].
 
     p = (x - mid) / half. With contraction (mip-NeRF 360, Barron et al. 2022, eq. 10): p stays where |p| <= 1, else
     becomes (2 - 1/|p|) p/|p|, and (p + 2) / 4 is the grid coordinate. Without: (p + 1) / 2, clamped to [0, 1].
@@ -24,7 +24,7 @@ def contract(x: Tensor, mid: Tensor, half: Tensor | float, contraction: bool = T
 
 
 def hash_index(corner: Tensor, table_size: int) -> Tensor:
-    """Table row [M] of integer grid corners [M, 3] int64: XOR of coordinate times prime in uint32, modulo a power of 2.
+    """Hash integer grid corners [M, 3] int64 to table rows [M]: XOR of coordinate times prime (uint32), mod table_size.
 
     (Mueller et al. 2022, eq. 4.)
     """
@@ -33,10 +33,10 @@ def hash_index(corner: Tensor, table_size: int) -> Tensor:
 
 
 def encode(c: Tensor, table: Tensor, min_resolution: int = 256) -> Tensor:
-    """Trilinear features [M, L F] (level-major) at grid coordinates c [M, 3] in [0, 1].
+    """Interpolate trilinear features [M, L F] (level-major) at grid coordinates c [M, 3] in [0, 1].
 
-    Level l has resolution R_l = min_resolution 2^l; the position is c R_l, its cell the floor of that. Every level is
-    hashed, however small.
+    Level l has resolution R_l = min_resolution 2^l; the position is c R_l, its cell the floor of that. All levels are
+    hashed.
 
     Args:
         c: [M, 3].
@@ -58,7 +58,7 @@ def encode(c: Tensor, table: Tensor, min_resolution: int = 256) -> Tensor:
 
 
 def mlp(features: Tensor, w1: Tensor, w2: Tensor, w3: Tensor) -> Tensor:
-    """relu(relu(features @ w1) @ w2) @ w3: [M, L F] to [M, 3], no biases, linear output."""
+    """Evaluate relu(relu(features @ w1) @ w2) @ w3: [M, L F] to [M, 3], no biases, linear output."""
     return torch.relu(torch.relu(features @ w1) @ w2) @ w3
 
 
@@ -73,5 +73,5 @@ def field(
     min_resolution: int = 256,
     contraction: bool = True,
 ) -> Tensor:
-    """Residual colour rho(x) [M, 3] at world positions x [M, 3]; see `contract`, `encode` and `mlp`."""
+    """Evaluate the residual colour rho(x) [M, 3] at world positions x [M, 3]; see `contract`, `encode` and `mlp`."""
     return mlp(encode(contract(x, mid, half, contraction), table, min_resolution), w1, w2, w3)

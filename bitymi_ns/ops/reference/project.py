@@ -1,4 +1,4 @@
-"""Surfels seen by a camera, in float64 and without tricks."""
+"""Projection of surfels in float64, without optimisations."""
 
 from dataclasses import dataclass
 
@@ -11,13 +11,13 @@ NORM_FLOOR = 1e-12
 
 
 def unit(x: Tensor) -> Tensor:
-    """`x` [..., C] divided by its length, or by 1e-12 where that is longer: a vector of length 0 stays 0."""
+    """Normalise `x` [..., C]; lengths below 1e-12 are divided by 1e-12."""
     return torch.nn.functional.normalize(x, dim=-1, eps=NORM_FLOOR)
 
 
 def rotation(quats: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of quaternions wxyz [N, 4] of any length."""
-    largest = quats.detach().abs().amax(-1, keepdim=True)  # first to about 1, so that no length is too short
+    """Convert quaternions wxyz [N, 4] of any length to rotation matrices [N, 3, 3]."""
+    largest = quats.detach().abs().amax(-1, keepdim=True)  # scaled to about 1 first, so that no length underflows
     w, x, y, z = unit(quats / torch.where(largest > 0, largest, torch.ones_like(largest))).unbind(-1)
     rows = [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
@@ -29,10 +29,10 @@ def rotation(quats: Tensor) -> Tensor:
 
 @dataclass
 class Projection:
-    """Surfels seen by a camera; row i belongs to surfel i."""
+    """N surfels projected into a camera."""
 
     M: Tensor  # [N, 3, 3], takes (u, v, 1) to (x z, y z, z): x, y in pixels, z the camera's depth
-    mean2d: Tensor  # [N, 2] projected centre, pixels; 0 where not valid
+    mean2d: Tensor  # [N, 2] projected centre, pixels; 0 if not valid
     depth: Tensor  # [N] camera z of the centre
     opacity: Tensor  # [N] in (0, 1)
     beta: Tensor  # [N] in (0, 4)
@@ -51,7 +51,7 @@ def project(
     K: Tensor,
     near: float = 0.2,
 ) -> Projection:
-    """Homography, centre and kernel parameters of every surfel (2DGS: Huang et al. 2024, eq. 5 to 9).
+    """Compute homography, centre and kernel parameters of each surfel (2DGS: Huang et al. 2024, eq. 5 to 9).
 
     A surfel's point is mean + u s_u t_u + v s_v t_v, with t_u, t_v the first two columns of its rotation. M's columns
     are K times the camera-frame s_u t_u, s_v t_v and mean.

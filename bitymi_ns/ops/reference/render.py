@@ -1,4 +1,4 @@
-"""The whole image formation, in float64: brute-force visibility, texels, colours, weighted sums."""
+"""Image formation in float64: brute-force visibility, texels, colours, weighted sums."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from bitymi_ns.ops.reference.trace import SUPPORT, Trace, trace
 
 
 class Camera(Protocol):
-    """A pinhole camera: viewmat [4, 4] world to camera with OpenCV axes, K [3, 3] in pixels, and the image's size."""
+    """A pinhole camera: viewmat [4, 4] world to camera with OpenCV axes, K [3, 3] in pixels, image size."""
 
     viewmat: Tensor
     K: Tensor
@@ -22,7 +22,7 @@ class Camera(Protocol):
 
 @dataclass
 class Render:
-    """Images of a render; all sums run over the blended fragments and are not divided by alpha."""
+    """Rendered images; sums run over the blended fragments and are not divided by alpha."""
 
     rgb: Tensor  # [H, W, 3] sum of w c, plus the background times the remaining transmittance
     alpha: Tensor  # [H, W] sum of w
@@ -34,17 +34,17 @@ class Render:
 
 
 def texel_centers(resolution: int) -> Tensor:
-    """Surfel coordinates [resolution] float64 of the texel centres along one axis: (i + 0.5) / r * 6 - 3."""
+    """Compute the texel centres along an axis in surfel coordinates: (i + 0.5) / r * 6 - 3, [resolution] float64."""
     return (torch.arange(resolution, dtype=torch.float64) + 0.5) / resolution * (2 * SUPPORT) - SUPPORT
 
 
 def texel(tile: Tensor, uv: Tensor, of: Tensor | None = None) -> Tensor:
-    """Colour of a tile at surfel coordinates: bilinear between texel centres, constant beyond the outer ones.
+    """Fetch the colour of a tile at surfel coordinates: bilinear between texel centres, constant beyond the outer ones.
 
     Args:
         tile: [r_v, r_u, C], or K of them; a tile covers the support square [-3, 3]^2.
         uv: [M, 2] in scale units.
-        of: [M] which of K tiles.
+        of: [M] index of the tile, for K tiles.
 
     Returns:
         [M, C].
@@ -63,12 +63,12 @@ def texel(tile: Tensor, uv: Tensor, of: Tensor | None = None) -> Tensor:
 
 
 def view_directions(means: Tensor, viewmat: Tensor) -> Tensor:
-    """World-frame unit vectors [N, 3] from the camera centre to the surfels' centres (differentiable in `means`)."""
+    """Compute unit vectors [N, 3] from the camera to the surfels' centres, world frame; differentiable in `means`."""
     return unit(means + viewmat[:3, :3].T @ viewmat[:3, 3])
 
 
 def fetched(tiles: Sequence[Tensor], uv: Tensor, where: Tensor) -> Tensor:
-    """Texels [P, N, C] of the tiles [r_v, r_u, C] of N surfels at coordinates [P, N, 2]; 0 but `where` [P, N]."""
+    """Fetch texels [P, N, C] of N tiles [r_v, r_u, C] at coordinates [P, N, 2]; 0 outside the mask `where` [P, N]."""
     values = uv.new_zeros(*where.shape, tiles[0].shape[-1] if tiles else 3)
     for size in {tile.shape for tile in tiles}:  # tiles of one size at once
         of = torch.tensor([i for i, tile in enumerate(tiles) if tile.shape == size])
@@ -89,14 +89,14 @@ def render(
     rim: float = 0.0,
     prefilter: str = "low_pass",
 ) -> Render:
-    """Render surfels; colour of a fragment: ReLU(f_view + 0.5), then ReLU(that + texture) where there is a texture.
+    """Render surfels. Colour of a fragment: ReLU(f_view + 0.5), with texture ReLU(that + texture).
 
     Args:
         geometry: means, quats, log_scales, opacity_logits, beta_raw, see `project`.
         colors: [N, 3] view-dependent colour f_view(d) of each surfel, without the 0.5.
-        camera: viewmat, K, see `project`, and the size of the image in pixels.
-        background: [3], None = black.
-        tiles: one texture tile [r_v, r_u, 3] per surfel; [r_v, r_u, 4] with factors of sigma.
+        camera: viewmat, K, see `project`, and the image size in pixels.
+        background: [3]; None: black.
+        tiles: a texture tile [r_v, r_u, 3] per surfel, or [r_v, r_u, 4] with factors of sigma.
         residual: residual colour field, world positions [M, 3] to colours [M, 3]; instead of `tiles`.
         near: see `project`.
         rim, prefilter: see `trace`.

@@ -1,4 +1,4 @@
-"""Weights of surfels at pixels: every pixel against every surfel, in float64."""
+"""Brute-force visibility in float64: blending weights of every surfel at every pixel."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,19 +16,19 @@ TRANSMITTANCE_MIN = 1e-4
 
 @dataclass
 class Trace:
-    """Dense blending weights: P pixels (row major, y * width + x) against N surfels in their own order."""
+    """Dense blending weights: P pixels (row-major, y * width + x) against N surfels in input order."""
 
     weight: Tensor  # [P, N] w = sigma T, 0 where not blended
     uv: Tensor  # [P, N, 2] scale units; clamped to the support in the low-pass branch, 0 without a hit
     depth: Tensor  # [P, N] camera z of the hit; of the surfel's centre in the low-pass branch
-    low_pass: Tensor  # [P, N] bool: the screen-space term of the kernel is the larger one
+    low_pass: Tensor  # [P, N] bool: the low pass exceeds the Beta kernel
     blended: Tensor  # [P, N] bool
     order: Tensor  # [N] surfels front to back
-    transmittance: Tensor  # [P] what is left for the background
+    transmittance: Tensor  # [P] remaining for the background
 
 
 def pixel_centers(width: int, height: int) -> Tensor:
-    """Sample positions [H W, 2] float64 in pixels, (i + 0.5, j + 0.5), row major."""
+    """Return the sample positions [H W, 2] float64 in pixels, (i + 0.5, j + 0.5), row-major."""
     y, x = torch.meshgrid(
         torch.arange(height, dtype=torch.float64), torch.arange(width, dtype=torch.float64), indexing="ij"
     )
@@ -36,7 +36,7 @@ def pixel_centers(width: int, height: int) -> Tensor:
 
 
 def _power(base: Tensor, exponent: Tensor, floor: float) -> Tensor:
-    """base ** exponent; its derivative with respect to the base has max(base, floor) in the denominator."""
+    """Compute base ** exponent; the derivative with respect to the base is divided by max(base, floor)."""
     if floor <= 0:
         return base**exponent
     fixed = base.detach()
@@ -47,13 +47,13 @@ PIXEL_VARIANCE = 0.25  # pixels^2, along each axis
 
 
 def _jacobian(projection: Projection) -> tuple[Tensor, Tensor]:
-    """J = d pixel / d (u, v) at the centre [N, 2, 2], and its depth [N], 1 where the surfel is not valid."""
+    """Compute J = d pixel / d (u, v) at the centre [N, 2, 2], and its depth [N], 1 if the surfel is not valid."""
     M, z = projection.M, torch.where(projection.valid, projection.depth, 1.0)
     return (M[:, :2, :2] - projection.mean2d[:, :, None] * M[:, 2:, :2]) / z[:, None, None], z
 
 
 def _filtered(projection: Projection, pixels: Tensor, near: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Kernel times area share [P, N], uv [P, N, 2] and depth [P, N] with the prefilter (docs/numerics.md).
+    """Compute kernel times area share [P, N], uv [P, N, 2] and depth [P, N] with the prefilter (docs/numerics.md).
 
     J = d pixel / d (u, v) at the centre; at a pixel with offset d the affine coordinate is a = J^-1 d, and the disc's
     perspective there is omega = z / depth = 1 - e.a, with the disc's depth z (1 + e.(u, v)). Outside of the disc's
@@ -88,8 +88,8 @@ def _filtered(projection: Projection, pixels: Tensor, near: float) -> tuple[Tens
 def _resized(projection: Projection, photo_pixel: float) -> tuple[Tensor, Tensor, float, float]:
     """Resize surfels for a view in which a photograph's pixel has the side `photo_pixel` (docs/numerics.md).
 
-    With J = d pixel / d (u, v) at the centre, what (u, v) is multiplied by [N, 2, 2], (1 + c' J^-1 J^-T)^(-1/2), and
-    the share of the kernel's height that is left [N]; the low pass's squared radius, and its share.
+    Returns, with J = d pixel / d (u, v) at the centre: the factor of (u, v) [N, 2, 2], (1 + c' J^-1 J^-T)^(-1/2), and
+    of the kernel's height [N]; the low pass's squared radius, and the factor of its height.
     """
     variance = max(0.0, (1 - photo_pixel**2) / 12)
     radius2 = photo_pixel**2 + 2 * variance
@@ -114,18 +114,18 @@ def trace(
     photo_pixel: float = 1.0,
     factor: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> Trace:
-    """Intersections, effective opacities and front-to-back weights of all surfels in all pixels.
+    """Compute intersections, effective opacities and front-to-back weights of all surfels at all pixels.
 
     With k = x M2 - M0, l = y M2 - M1 and c = k x l, the ray of pixel (x, y) meets the surfel at (u, v) = (c.x, c.y) /
     c.z, at camera depth M2 . (u, v, 1). Then sigma = min(0.99, o G) with the kernel
     G = max((1 - (u^2 + v^2) / 9)+^beta, exp(-d^2)), d the distance in pixels to the projected centre. A ray parallel to
     the surfel, or meeting it at a depth <= near, has no hit: the first term is 0 there and u = v = 0.
-    A fragment is skipped when sigma < 1/255 or its surfel is not valid. Surfels are blended in the order of their
-    centres' depths (equal depths: by index); the one that would take the transmittance below 1e-4 is not blended, and
-    ends the pixel. `rim` bounds 1 - x from below in the kernel's derivative, as the kernels do; values do not change.
-    With the prefilter `pixel`, G is the kernel averaged over a pixel instead (`_filtered`), without a bound at the rim.
+    A fragment is skipped if sigma < 1/255 or its surfel is not valid. Surfels are blended in the order of their
+    centres' depths (equal depths: by index); the one that would reduce the transmittance below 1e-4 is not blended and
+    ends the pixel. `rim` bounds 1 - x from below in the kernel's derivative only, as in the compiled kernels.
+    With the prefilter `pixel`, G is the kernel averaged over a pixel instead (`_filtered`), without `rim`.
     Without it, `photo_pixel` is the side of a photograph's pixel in pixels of the view (`_resized`). Sigma is
-    multiplied by `factor`, up to 0.99: [P, N] of uv [P, N, 2] and where it is asked for, [P, N] bool.
+    multiplied by `factor`, up to 0.99: [P, N] from uv [P, N, 2] and a mask of needed entries [P, N].
     """
     pixels = pixel_centers(width, height)  # [P, 2]
     M = projection.M

@@ -1,4 +1,4 @@
-"""View-dependent colour of surfels, in float64: Spherical Voronoi, spherical harmonics, Spherical Beta, Gaussians."""
+"""View-dependent surfel colour in float64: Spherical Voronoi, spherical harmonics, Spherical Beta, Gaussians."""
 
 import math
 
@@ -12,10 +12,10 @@ SOFTPLUS_BETA = 10 * math.log(2)
 
 
 def sv(sites: Tensor, log_tau: Tensor, rgb: Tensor, dirs: Tensor) -> Tensor:
-    """Spherical Voronoi colour: sum_k softmax_k(tau_k s_k . d) rgb_k, with tau = exp(log_tau) (Di Sario et al. 2025).
+    """Evaluate Spherical Voronoi: sum_k softmax_k(tau_k s_k . d) rgb_k, with tau = exp(log_tau) (Di Sario et al. 2025).
 
     Args:
-        sites: [N, K, 3] site vectors; their directions s_k count, a site of length 0 has logit 0.
+        sites: [N, K, 3] site vectors, normalised to s_k; a site of length 0 has logit 0.
         log_tau: [N, K] natural logarithm of the temperatures.
         rgb: [N, K, 3].
         dirs: [N, 3] unit view directions, world frame, from the camera to the surfel.
@@ -28,7 +28,7 @@ def sv(sites: Tensor, log_tau: Tensor, rgb: Tensor, dirs: Tensor) -> Tensor:
 
 
 def sh_basis(degree: int, dirs: Tensor) -> Tensor:
-    """Real spherical harmonics [N, (degree + 1)^2] at unit vectors [N, 3], degree 0 to 3.
+    """Evaluate real spherical harmonics at unit vectors [N, 3], degree 0 to 3: [N, (degree + 1)^2].
 
     Order l, m = -l .. l, with the Condon-Shortley sign (-1)^m, as in 3DGS: Y_1 = sqrt(3 / 4 pi) (-y, z, -x).
     """
@@ -62,8 +62,8 @@ def sh_basis(degree: int, dirs: Tensor) -> Tensor:
 
 
 def sh(dc: Tensor, rest: Tensor, dirs: Tensor, degree: int | None = None) -> Tensor:
-    """Spherical harmonics colour [N, 3] from dc [N, 3] and rest [N, >= (degree + 1)^2 - 1, 3] at unit dirs [N, 3]; the
-    degree is that of all coefficients, without it."""
+    """Evaluate spherical harmonics from dc [N, 3] and rest [N, >= (degree + 1)^2 - 1, 3] at unit dirs [N, 3]: [N, 3].
+    Without `degree`, all coefficients are used."""
     if degree is None:
         degree = round((rest.shape[1] + 1) ** 0.5) - 1
     coefficients = torch.cat([dc[:, None], rest[:, : (degree + 1) ** 2 - 1]], dim=1)
@@ -71,7 +71,7 @@ def sh(dc: Tensor, rest: Tensor, dirs: Tensor, degree: int | None = None) -> Ten
 
 
 def sb(base: Tensor, lobes: Tensor, dirs: Tensor) -> Tensor:
-    """Spherical Beta colour: base + sum_k softplus(rgb_k) max(0, d . mu_k)^(4 exp(b_k)) (DBS: Liu et al. 2025).
+    """Evaluate Spherical Beta: base + sum_k softplus(rgb_k) max(0, d . mu_k)^(4 exp(b_k)) (DBS: Liu et al. 2025).
 
     mu = (sin t cos p, sin t sin p, cos t); softplus(x) = log(1 + exp(a x)) / a with a = 10 ln 2, so softplus(0) = 0.1.
 
@@ -92,7 +92,7 @@ def sb(base: Tensor, lobes: Tensor, dirs: Tensor) -> Tensor:
 
 
 def sg(base: Tensor, lobes: Tensor, dirs: Tensor) -> Tensor:
-    """Spherical Gaussian colour: base + sum_k rgb_k exp(exp(l_k) (d . mu_k - 1)), mu_k a unit vector.
+    """Evaluate Spherical Gaussians: base + sum_k rgb_k exp(exp(l_k) (d . mu_k - 1)), mu_k a unit vector.
 
     Args:
         base: [N, 3].
@@ -108,7 +108,7 @@ def sg(base: Tensor, lobes: Tensor, dirs: Tensor) -> Tensor:
 
 
 def lean(kind: str, base: Tensor, span: Tensor, terms: Tensor, dirs: Tensor) -> Tensor:
-    """View colours of which every surfel has as many terms as it needs; without any, its base colour.
+    """Evaluate lean view colours, with a varying number of terms per surfel; without terms the base colour.
 
     sv: (base + sum_k exp(b_k . d) rgb_k) / (1 + sum_k exp(b_k . d)), a term is b, rgb: Spherical Voronoi relative to
     its first site. sh: base is dc, terms are the coefficients from degree 1 on. sb, sg: base plus lobes.

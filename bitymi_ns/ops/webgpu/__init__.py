@@ -1,6 +1,6 @@
-"""Drawing a baked scene through WebGPU: on graphics of any maker, by the shaders that the browser's viewer runs.
+"""Rendering of baked scenes through WebGPU, on any vendor's GPU, with the shaders of the browser viewer.
 
-Needs the package `wgpu`, which is optional (`pip install 'bitymi-ns[webgpu]'`).
+Requires the optional package `wgpu` (`pip install 'bitymi-ns[webgpu]'`).
 """
 
 from .device import WebGpuUnavailable

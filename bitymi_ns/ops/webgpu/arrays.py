@@ -1,4 +1,4 @@
-"""A baked scene as the arrays that the shaders read (shaders/scene.wgsl)."""
+"""Conversion of a baked scene to the shaders' arrays (shaders/scene.wgsl)."""
 
 from dataclasses import dataclass
 
@@ -12,10 +12,10 @@ from ..constants import SUPPORT
 from ..view_color import LEAN, check_lean, check_view_color
 from ..view_kinds import VIEW_COLORS
 
-WHOLE = " sites"  # what a form is called, behind its kind, that holds sites and no base
+WHOLE = " sites"  # suffix of a kind's form with all sites and no base
 FORMS = [kind + end for kind, entry in VIEW_COLORS.items() for end in (("", WHOLE) if entry.sites else ("",))]
 KINDS = {name: number for number, name in enumerate(FORMS)}
-"""Forms of view colours, by their numbers in view_color.wgsl."""
+"""Numbers of the view-colour forms in view_color.wgsl."""
 SURFEL = np.dtype(
     [
         *(("mean", "<f4", 3), ("opacity_logit", "<f4"), ("quat", "<f4", 4), ("log_scale", "<f4", 2)),
@@ -23,26 +23,25 @@ SURFEL = np.dtype(
         *(("first_term", "<u4"), ("tile", "<u4", 2), ("sides", "<u4"), ("terms", "<u4")),
     ]
 )
-"""A surfel, as the struct of scene.wgsl."""
+"""Struct `Surfel` of scene.wgsl."""
 
 
 @dataclass
 class Arrays:
-    """Arrays of a scene that the shaders read."""
+    """Arrays that the shaders read."""
 
     surfels: npt.NDArray  # [N] of `SURFEL`
-    terms: npt.NDArray[np.float32]  # of the view colours, [.] float32
+    terms: npt.NDArray[np.float32]  # [.] terms of the view colours
     kind: int  # a number of `KINDS`
-    # [3] float64, which is taken off positions: far from the world's origin float32 would not resolve them
-    origin: npt.NDArray[np.float64]
+    origin: npt.NDArray[np.float64]  # [3] subtracted from positions, for float32 resolution far from the world's origin
 
 
 def arrays(scene: BakedScene) -> Arrays:
-    """The arrays of a scene.
+    """Convert a scene.
 
     Raises:
         TypeError: the surfels are not float32.
-        ValueError: a parameter of the view colour has a wrong shape, or a tile does not lie on a page.
+        ValueError: a view-colour parameter has a wrong shape, or a tile lies outside its page.
     """
     p = {name: value.detach().cpu() for name, value in scene.surfels.items()}
     for name, value in p.items():
@@ -90,7 +89,7 @@ def _set_tiles(surfels: npt.NDArray, scene: BakedScene) -> None:
 
 
 def _view_colors(kind: str, p: dict[str, Tensor], n: int) -> tuple[str, Tensor, Tensor, Tensor]:
-    """Form, base [N, 3], first number and count of terms [N, 2], terms."""
+    """Return the form, base [N, 3], first term and number of terms [N, 2], and terms."""
     if "view_terms" in p:
         check_lean(kind, p, n)
         base, span, terms = (p[name] for name in LEAN)
@@ -109,7 +108,7 @@ def _view_colors(kind: str, p: dict[str, Tensor], n: int) -> tuple[str, Tensor, 
 
 
 def _hide_broken(surfels: npt.NDArray, p: dict[str, Tensor]) -> None:
-    """Surfels of which a number is not finite, or a rotation 0, are never drawn: shaders need not tell NaN."""
+    """Hide surfels with non-finite numbers or a zero rotation, so that shaders need not test for NaN."""
     geometry = [p[name].flatten(1) for name in ("means", "quats", "log_scales")]
     rest = torch.stack([p["opacity_logits"], p["beta_raw"]], dim=1)
     good = torch.cat([*geometry, rest], dim=1).isfinite().all(1) & (p["quats"].abs().amax(1) > 0)

@@ -1,4 +1,4 @@
-"""The graphics device that draws, and what it can do."""
+"""The WebGPU device and its capabilities."""
 
 import functools
 import importlib
@@ -7,7 +7,7 @@ from typing import Any
 
 INSTALL = "pip install 'bitymi-ns[webgpu]'"
 OPTIONAL = ("texture-compression-bc", "float32-blendable", "float32-filterable")
-"""Features that are used where the device has them."""
+"""Features that are used if available."""
 _LIMITS = (
     *("max-texture-dimension-2d", "max-texture-array-layers", "max-storage-buffer-binding-size", "max-buffer-size"),
     "max-compute-workgroups-per-dimension",
@@ -15,19 +15,19 @@ _LIMITS = (
 
 
 class WebGpuUnavailable(RuntimeError):
-    """Nothing here can be drawn through WebGPU; the message says why and what to do."""
+    """WebGPU is not available; the message says why and what to do."""
 
 
 @functools.cache
 def library() -> ModuleType:
-    """The module wgpu.
+    """Import wgpu.
 
     Raises:
-        WebGpuUnavailable: it is not installed, or cannot be loaded.
+        WebGpuUnavailable: not installed, or not loadable.
     """
     try:
         return importlib.import_module("wgpu")
-    except Exception as error:  # its library may be for another system: what it then raises is not written down
+    except Exception as error:  # the library may be for another system; what it raises is undocumented
         raise WebGpuUnavailable(
             f"drawing through WebGPU needs Python 3.11 and the package wgpu ({INSTALL}): {error}"
         ) from error
@@ -35,10 +35,10 @@ def library() -> ModuleType:
 
 @functools.cache
 def device() -> Any:
-    """The device that draws, one per process, with as much of `OPTIONAL` as it has: a real card before one in software.
+    """Return the device of this process, a GPU if possible, else a software adapter, with the available `OPTIONAL`.
 
     Raises:
-        WebGpuUnavailable: there is none; says what to do.
+        WebGpuUnavailable: none found; says what to do.
     """
     rank = {"DiscreteGPU": 0, "IntegratedGPU": 1, "VirtualGPU": 2, "Unknown": 3, "CPU": 4}
     found = [a for a in library().gpu.enumerate_adapters_sync() if a.info["backend_type"] != "OpenGL"]
@@ -58,15 +58,15 @@ def device() -> Any:
 
 
 def check_room(array_bytes: int, groups: int, size: tuple[int, int], layers: int = 1) -> None:
-    """Sees that the device takes something of this size, before it is asked to.
+    """Check resources against the device's limits before creating them.
 
     Args:
         array_bytes: of the largest buffer.
-        groups: largest number of groups of threads that are started at once.
+        groups: largest number of workgroups in a dispatch.
         size: width and height of a texture.
 
     Raises:
-        WebGpuUnavailable: it does not; says what is too large.
+        WebGpuUnavailable: a limit is exceeded; says which.
     """
     found = device().limits
     wanted = {
@@ -83,5 +83,5 @@ def check_room(array_bytes: int, groups: int, size: tuple[int, int], layers: int
 
 
 def in_software() -> bool:
-    """True where the processor draws, which decodes a block of texels for each that it fetches."""
+    """Return True for a software adapter, which decodes a BC7 block for each texel fetch."""
     return device().adapter.info["adapter_type"] == "CPU"

@@ -1,4 +1,4 @@
-"""Drawing a baked scene through WebGPU, as the kernels draw it: the scene in the memory of a graphics device."""
+"""Rendering of baked scenes through WebGPU, equal to the kernels': buffers, textures and passes."""
 
 import functools
 import struct
@@ -19,10 +19,10 @@ from .arrays import arrays
 from .device import check_room, device, in_software, library
 from .programs import Programs
 
-SHOW = {"color": 0, "depth": 1, "normal": 2, "overdraw": 3}  # what is blended, by its number in scene.wgsl
+SHOW = {"color": 0, "depth": 1, "normal": 2, "overdraw": 3}  # blended quantity, by its number in scene.wgsl
 BLOCK, DIGITS, ROUNDS = 1024, 16, 8  # of sort.wgsl: keys per block, digits, rounds of 4 bits
 MOST_LAYERS = 64
-LAYERS = 16  # batches in which surfels are drawn: docs/viewer.md has what fewer cost in the picture
+LAYERS = 16  # batches of surfels; docs/viewer.md has the image error of fewer
 _FROM = {
     "rgb": ("color", slice(0, 3)),
     "alpha": ("color", slice(3, 4)),
@@ -31,12 +31,12 @@ _FROM = {
     "normal": ("normal", slice(0, 3)),
     "overdraw": ("overdraw", slice(0, 1)),
 }
-_STRIDE = 256  # between the uniforms of batches and of rounds, which devices want so
+_STRIDE = 256  # offset alignment of the uniforms of batches and rounds
 
 
 @functools.cache
 def programs() -> Programs:
-    """Compiled for the device of this process."""
+    """Compile the programs for the device of this process."""
     found = device()
     return Programs(found, "rgba32float" if "float32-blendable" in found.features else "rgba16float")
 
@@ -53,13 +53,13 @@ class _Target:
 
 
 class SceneOnDevice:
-    """A scene as textures and buffers of the graphics device.
+    """A scene as textures and buffers of the WebGPU device.
 
     Args:
-        scene: what to draw. Its numbers are copied.
+        scene: the scene, copied.
 
     Raises:
-        WebGpuUnavailable: there is no such device, or it has too little room for the scene.
+        WebGpuUnavailable: no device, or the scene exceeds its limits.
         TypeError, ValueError: as `arrays`.
     """
 
@@ -121,7 +121,7 @@ class SceneOnDevice:
         return self._pages("rgba16float", texels.detach().half().cpu().numpy(), 1)
 
     def _pages(self, format: str, pages: npt.NDArray, block: int) -> tuple[Any, tuple[int, int]]:
-        """An array texture of pages [layers, rows of blocks, blocks, ...]."""
+        """Create an array texture from pages [layers, rows of blocks, blocks, ...]."""
         layers, rows, columns = pages.shape[:3]
         size = (columns * block, rows * block, layers)
         check_room(0, 0, size[:2], layers)
@@ -176,13 +176,13 @@ class SceneOnDevice:
         self._bind_pages(self._atlas)
 
     def _bind_pages(self, coarser: Any) -> None:
-        """Binds the atlas and its coarser levels; any texture stands for those that are not looked at."""
+        """Bind the atlas and its coarser levels; levels that are not sampled may be any texture."""
         sampler = self._device.create_sampler(mag_filter="linear", min_filter="linear")
         views = [texture.create_view(dimension="2d-array") for texture in (self._atlas, coarser)]
         self._pages_bound = self._group(self._programs.layout[1], views[0], sampler, views[1])
 
     def _make_coarser(self) -> None:
-        """The levels 1 and 2 of the tiles, of all pages: for the first view that is smaller than the photographs."""
+        """Make the levels 1 and 2 of all pages, for the first view smaller than the photographs."""
         formats = {"rgba16float": "rgba16float", "rgba32float": "rgba32float"}
         format = formats.get(self._atlas.format, "rgba8unorm")
         width, height, layers = self._atlas.size
@@ -254,12 +254,12 @@ class SceneOnDevice:
         """Draw a view.
 
         Args:
-            show: of `SHOW`.
+            show: a name of `SHOW`.
             layers: batches, at most `MOST_LAYERS`.
             photo_pixel: side of a photograph's pixel in pixels of the view.
 
         Returns:
-            [H, W, 4]: the sums, and what is left of the transmittance.
+            [H, W, 4]: sums, and remaining transmittance.
         """
         target = self._target_of(camera.width, camera.height)
         if photo_pixel < 1.0 and self._coarser is None:
@@ -335,7 +335,7 @@ def draw(
     photo_pixel: float = 1.0,
     layers: int = LAYERS,
 ) -> dict[str, Tensor]:
-    """As `baked.draw`, one view after the other; the images lie on the CPU.
+    """Draw views one by one to the CPU; see `baked.draw`.
 
     Raises:
         WebGpuUnavailable: the package wgpu or a graphics device is missing.

@@ -1,4 +1,4 @@
-"""The shaders, put together and compiled for a device."""
+"""Shader programs: assembled and compiled for a device."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,21 +14,21 @@ PARTS = {
     "draw": ("scene", "batches", "resize", "draw"),
     "halve": ("halve",),
 }
-"""Files of every program, in the order in which they are put together."""
+"""Files of each program, in order."""
 
 
 def source(program: str) -> str:
-    """The text of a program of `PARTS`."""
+    """Assemble the source of a program of `PARTS`."""
     folder = resources.files("bitymi_ns.ops") / "shaders"
     return "\n".join((folder / f"{part}.wgsl").read_text("utf8") for part in PARTS[program])
 
 
 @dataclass
 class Programs:
-    """Pipelines of a device."""
+    """Pipelines for a device."""
 
     device: Any  # of `device.device`
-    format: str  # of the target that is drawn to
+    format: str  # of the render target
 
     def _module(self, name: str) -> Any:
         return self.device.create_shader_module(label=name, code=source(name))
@@ -57,11 +57,11 @@ class Programs:
 
     @cached_property
     def layout(self) -> list[Any]:
-        """Bind group layouts of `draw`: the scene and the frame, the atlas, the batch."""
+        """Bind group layouts of `draw`: scene and frame, atlas, batch."""
         wgpu = library()
         vertex, fragment = wgpu.ShaderStage.VERTEX, wgpu.ShaderStage.FRAGMENT
         make = self.device.create_bind_group_layout
-        # which the binding of the target's format declares
+        # part of the texture's binding declaration
         filters = self.format != "rgba32float" or "float32-filterable" in self.device.features
         read = {"type": "read-only-storage"}
         atlas = {"sample_type": "float", "view_dimension": "2d-array"}
@@ -111,12 +111,12 @@ class Programs:
 
     @cached_property
     def blend(self) -> Any:
-        """Add a fragment times the transmittance in front of it."""
+        """Pipeline that adds a fragment times the transmittance in front of it."""
         return self._draw({"operation": "add", "src_factor": "dst-alpha", "dst_factor": "one"})
 
     @cached_property
     def count_fragments(self) -> Any:
-        """Add fragments as they are."""
+        """Pipeline that adds fragments unweighted."""
         return self._draw({"operation": "add", "src_factor": "one", "dst_factor": "one"})
 
     @cached_property
@@ -124,7 +124,7 @@ class Programs:
         return self._module("halve")
 
     def halve(self, format: str, alpha: bool) -> Any:
-        """Render a page at half its size to a target of this format; `alpha`: with colours weighted by alpha."""
+        """Build the pipeline that halves a page into a target of this format, with `alpha` weighting colours by it."""
         entry = f"halve{'_alpha' if alpha else ''}_{'bytes' if format == 'rgba8unorm' else 'floats'}"
         module = self._halve_module
         wgpu = library()

@@ -1,5 +1,5 @@
-// bitymi_ns._cpu, or a module of another name for another CPU. Every operation takes its struct's arguments by keyword
-// (csrc/ops); the caller allocates; shapes and dtypes are checked on the way (reader.h), values in Python.
+// bitymi_ns._cpu, or a module of another name for another CPU. Operations take the arguments of their struct (csrc/ops)
+// by keyword; the caller allocates; shapes and dtypes are checked here (reader.h), values in Python.
 #include <nanobind/stl/optional.h>
 
 #include "bindings/reader.h"
@@ -16,7 +16,7 @@ namespace bt {
 namespace {
 using namespace nb::literals;
 
-// Blocks of this size come from the system, whatever is set (glibc), and go back to it.
+// Blocks of this size are always mapped from the system and unmapped when freed (glibc).
 constexpr size_t kFromSystem = size_t(32) << 20;
 
 void prepare(void* at, size_t bytes) {
@@ -25,12 +25,12 @@ void prepare(void* at, size_t bytes) {
 
 const Device kHost = {nb::device::cpu::value, "the CPU", false, prepare};
 
-// Settings of the whole process that the kernels are fast with. Not made on import: who only reads a constant keeps his
-// threads and his memory as they are.
+// Process-wide settings for fast kernels. Not made on import, so that reading a constant does not change threads and
+// memory.
 void set_up_process() {
 #if defined(__GLIBC__)
-  // Every view allocates and frees the same tens of megabytes. Given back to the system in between, they cost more in
-  // page faults than what is computed in them.
+  // Every view allocates and frees tens of megabytes; unmapping them each time costs more in page faults than computing
+  // in them.
   mallopt(M_MMAP_THRESHOLD, kFromSystem);
   mallopt(M_TRIM_THRESHOLD, 1 << 30);
   mallopt(M_TOP_PAD, 64 << 20);
@@ -38,7 +38,7 @@ void set_up_process() {
   wait_without_spinning();
 }
 
-// Gives memory that was freed, but kept for the next views, back to the system.
+// Returns freed memory that is kept for later views to the system.
 void give_back_memory() {
 #if defined(__GLIBC__)
   malloc_trim(0);
@@ -54,7 +54,7 @@ template <class Arguments> void bind_operation(nb::module_& m, const std::string
   });
 }
 
-// The pages of an atlas, until gathered.
+// Pages of an atlas before gathering.
 struct Pages {
   const uint8_t* bytes;
   const float* floats;
@@ -110,9 +110,9 @@ template <class S> void bind_operations(nb::module_& m) {
 
 NB_MODULE(BITYMI_MODULE, m) {
   using namespace bt;
-  nb::set_leak_warnings(false);  // tracers keep their memory until the process ends
+  nb::set_leak_warnings(false);  // tracers live until the process ends
   m.doc() = "CPU kernels: see bitymi_ns.ops for their meaning.";
-  m.attr("CPU_FEATURES") = BITYMI_CPU_FEATURES;  // the features of a CPU that this needs, as in bitymi_ns._cpu_features
+  m.attr("CPU_FEATURES") = BITYMI_CPU_FEATURES;  // required CPU features, as named by bitymi_ns._cpu_features
   nb::class_<Bins>(m, "Bins", "Memory for a view's tile lists, kept from frame to frame.").def(nb::init<>());
   nb::class_<Patches>(m, "Patches", "An atlas, every surfel's tile in one run.")
       .def("__init__", [](Patches* self, const nb::kwargs& kwargs) {

@@ -1,5 +1,5 @@
-// bitymi_ns._cuda: the operations of bitymi_ns._cpu for arrays on a CUDA device, each with the stream that it runs on.
-// The same file with BITYMI_EMULATED is bitymi_ns._emulated, which runs the CUDA kernels on the host, for tests.
+// bitymi_ns._cuda: the operations of bitymi_ns._cpu for arrays on a CUDA device, each with a stream.
+// Compiled with BITYMI_EMULATED it is bitymi_ns._emulated, which runs the CUDA kernels on the host, for tests.
 #include <nanobind/stl/vector.h>
 
 #include "bindings/reader.h"
@@ -18,7 +18,7 @@ const Device kCard = {nb::device::cpu::value, "the CPU", true};
 const Device kCard = {nb::device::cuda::value, "a CUDA device", true};
 #endif
 
-// Its arguments and the stream, which torch gives as a number.
+// Arguments and stream; torch passes streams as integers.
 template <class Arguments> struct OnStream {
   Arguments arguments;
   uint64_t stream;

@@ -1,4 +1,4 @@
-// The arguments of one call, by keyword: fills the struct of an operation (ops/arguments.h), names what is wrong.
+// Reads the keyword arguments of a call into the struct of an operation (ops/arguments.h), with errors by name.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -21,25 +21,25 @@ namespace bt {
 
 namespace nb = nanobind;
 
-// The device of a module's kernels.
+// Device of a module's kernels.
 struct Device {
   int32_t type;                                       // of DLPack
-  const char* name;                                   // in messages
-  bool cuda;                                          // they take working memory, and read rows 16 bytes at a time
-  void (*prepare)(void* at, size_t bytes) = nullptr;  // memory that is going to be written, if there is anything to do
+  const char* name;                                   // for messages
+  bool cuda;                                          // takes working memory, and reads rows 16 bytes at a time
+  void (*prepare)(void* at, size_t bytes) = nullptr;  // prepares memory that will be written, or null
 };
 
-// References to the arrays and objects that a Python object points into.
+// References to the arrays and objects that a Python object points to.
 struct References {
   std::vector<nb::ndarray<nb::ro>> read;
   std::vector<nb::ndarray<>> written;
   std::vector<nb::object> objects;
 };
 
-// Reads torch's tensors without DLPack, whose capsule takes torch about 10 us of Python per tensor.
+// Reads torch tensors without DLPack, whose capsule costs about 10 us of Python per tensor.
 class Torch {
  public:
-  // Null while nobody has imported torch.
+  // Null until torch is imported.
   static const Torch* get() {
     static const Torch* torch = nullptr;
     if (!torch && nb::borrow<nb::dict>(nb::module_::import_("sys").attr("modules")).contains("torch"))
@@ -50,7 +50,7 @@ class Torch {
     const PyObject* type = reinterpret_cast<const PyObject*>(Py_TYPE(object.ptr()));
     return type == tensor_ || type == parameter_;
   }
-  // Reads address and size of a dense tensor; false for any other.
+  // Reads address and size of a dense tensor; returns false for any other.
   bool read(nb::handle tensor, nb::dlpack::dtype dtype, int32_t device, void*& at, int64_t& size) const {
     const PyObject* wanted = dtype_of(dtype);
     if (!wanted || nb::steal(PyObject_GetAttr(tensor.ptr(), dtype_)).ptr() != wanted) return false;
@@ -66,7 +66,7 @@ class Torch {
   }
 
  private:
-  // For as long as the process: at its end there may be no Python to give them back to.
+  // Kept until the process ends, when Python may be gone.
   Torch() {
     const nb::object torch = nb::module_::import_("torch");
     tensor_ = torch.attr("Tensor").inc_ref().ptr();
@@ -83,7 +83,7 @@ class Torch {
   }
   static nb::object call(nb::handle tensor, PyObject* method) {
     nb::object answer = nb::steal(PyObject_CallMethodNoArgs(tensor.ptr(), method));
-    if (!answer.is_valid()) PyErr_Clear();  // it has no memory
+    if (!answer.is_valid()) PyErr_Clear();  // a tensor without memory
     return answer;
   }
   static constexpr int kTypes = 5;
@@ -99,7 +99,7 @@ template <class T, class = void> struct IsDescribed : std::false_type {};
 template <class T>
 struct IsDescribed<T, std::void_t<decltype(std::declval<T&>().fields(std::declval<Reader&>()))>> : std::true_type {};
 
-// nanobind knows a type by its name, in all modules of a process: each has names of its own.
+// nanobind identifies a type by its name across the process: each module has its own namespace.
 #if defined(BITYMI_MODULE)
 inline namespace of_cpu {
 #elif defined(BITYMI_EMULATED)
@@ -107,7 +107,7 @@ inline namespace of_emulated {
 #else
 inline namespace of_cuda {
 #endif
-// Arguments that are an object of Python, with what they point to.
+// Arguments that are a Python object, with what they point to.
 template <class Arguments> struct Held : Arguments {
   References kept;
 };
@@ -137,7 +137,7 @@ class Reader {
     to = take<T>(name, size, device_.cuda ? 16 : alignof(T));
     expect(name, size, count);
   }
-  // An empty array has no address, but it is there.
+  // An empty array is present but has no address.
   template <class T> void maybe(const char* name, T*& to, int64_t count) {
     static std::remove_const_t<T> nothing;
     to = nullptr;
@@ -170,7 +170,7 @@ class Reader {
     if (!nb::try_cast(find(name), value)) wrong(name, "three numbers");
     to[0] = S(std::get<0>(value)), to[1] = S(std::get<1>(value)), to[2] = S(std::get<2>(value));
   }
-  // More of one kind: name, target, name, target.
+  // Reads more of one kind: name, target, name, target.
   template <class... More> void numbers(const char* name, More&... more) {
     each([this](const char* n, auto& to) { number(n, to); }, name, more...);
   }
@@ -215,7 +215,7 @@ class Reader {
     if constexpr (sizeof...(More) > 0) each(fn, more...);
   }
 
-  // The names as Python keeps them: the dictionary would make a string of each first.
+  // Names as Python stores them; a dictionary would create strings first.
   struct Argument {
     const char* name;
     PyObject* value;
@@ -238,7 +238,7 @@ class Reader {
   }
   [[noreturn]] void wrong(const char* name, const std::string& wanted) const;
 
-  // torch has no unsigned numbers of 32 and 64 bits
+  // torch lacks unsigned integers of 32 and 64 bits
   template <class T>
   using Stored = std::conditional_t<std::is_same_v<T, uint32_t>, int32_t,
                                     std::conditional_t<std::is_same_v<T, uint64_t>, int64_t, T>>;
@@ -281,9 +281,9 @@ class Reader {
   }
   [[noreturn]] void not_an_array(const char* name, nb::dlpack::dtype dtype) const;
 
-  const std::string function_;  // its own: callers pass literals, too
+  const std::string function_;  // a copy: callers also pass literals
   Device device_;
-  std::vector<Argument> arguments_;  // all of them; the call keeps the objects
+  std::vector<Argument> arguments_;  // the call keeps the objects alive
   References kept_;
 };
 
@@ -314,7 +314,7 @@ template <class Arguments> Arguments read(Reader& r) {
   return a;
 }
 
-// A class whose objects are arguments that several calls share; its constructor takes them by keyword.
+// Binds a class of arguments shared by several calls; its constructor takes them by keyword.
 template <class Arguments>
 nb::class_<Held<Arguments>> bind_class(nb::module_& m, const std::string& name, const Device& device, const char* doc) {
   return nb::class_<Held<Arguments>>(m, name.c_str(), doc)
@@ -329,7 +329,7 @@ template <class S> constexpr const char* kSuffix = sizeof(S) == 4 ? "_f32" : "_f
 
 }  // namespace bt
 
-// The operations of both devices: functions of bt and of bt::cuda, templates of the type of number.
+// Operations of both devices: templates over the number type in bt and bt::cuda.
 // clang-format off
 #define BT_OPERATIONS(each)   \
   each(project_forward)       \

@@ -1,14 +1,14 @@
-// Front-to-back blending of a pixel's fragments, its end, and its vector-Jacobian product.
+// Front-to-back blending of a pixel's fragments, its end, and their vector-Jacobian product.
 #pragma once
 
 #include "core/surfel.h"
 
 namespace bt {
 
-// Sums over a pixel's fragments, each times its weight: rgb, 1 and beta; with maps also depth and normal.
+// Sums over a pixel's fragments, weighted: rgb, 1 and beta; with maps also depth and normal.
 constexpr int kImageChannels = 5, kMapChannels = 9;
 
-// The weight of a fragment at a transmittance, and the transmittance behind it.
+// The weight of a fragment, and the transmittance behind it.
 template <class T> struct Blend {
   T weight, behind;
 };
@@ -17,11 +17,11 @@ template <class T> BT_HD Blend<T> blend(T sigma, T transmittance) {
   return {weight, transmittance - weight};
 }
 
-// Sigma under a texel of alpha m, see AlphaTiles.
+// Multiplies sigma by a texel's alpha m and clamps it, see AlphaTiles.
 template <class T> BT_HD T alpha_cut(T sigma, T m) { return min_(T(kAlphaMax), sigma * m); }
 
-// The open pixels that take the fragment, and those that it ends, as it would leave them less than `stop`. One that
-// would leave less than kTransmittanceMin is not blended itself, unless `stop` is below that.
+// The open pixels that take the fragment, and those it ends, because it would leave less transmittance than `stop`. A
+// fragment that would leave less than kTransmittanceMin is not blended, unless `stop` is smaller.
 template <class T> struct BlendTest {
   MaskOf<T> takes, ends;
 };
@@ -33,15 +33,15 @@ template <class T> BT_HD BlendTest<T> blend_test(MaskOf<T> open, T sigma, T behi
   return v;
 }
 
-// dL/dsigma of a fragment, back to front: `later` is the sum of w dL/dw over the fragments behind it, which it joins.
+// Computes dL/dsigma of a fragment, back to front; `later`, the sum of w dL/dw behind it, is updated.
 template <class S> BT_HD S blend_vjp(S weight, S sigma, S dweight, S& later) {
   const S dsigma = weight / sigma * dweight - later / (S(1) - sigma);
   later += weight * dweight;
   return dsigma;
 }
 
-// Adds a fragment to the sums of its pixel; depth and normal with maps alone. By reference: each number is read where
-// it is needed.
+// Adds a fragment to the sums of its pixel; depth and normal only with maps. By reference, so that numbers are loaded
+// where they are used.
 template <bool kMaps, class S>
 BT_HD void add_blended(S weight, const S* color, const S& beta, const S& depth, const S* normal, S* sums) {
   sums[0] += weight * color[0], sums[1] += weight * color[1], sums[2] += weight * color[2];
@@ -52,7 +52,7 @@ BT_HD void add_blended(S weight, const S* color, const S& beta, const S& depth, 
     sums[6] += weight * normal[0], sums[7] += weight * normal[1], sums[8] += weight * normal[2];
   }
 }
-// dL/dweight from the gradient of the sums.
+// Computes dL/dweight from the gradient of the sums.
 template <bool kMaps, class S>
 BT_HD S weight_gradient(const S* d, const S* color, const S& beta, const S& depth, const S* normal) {
   S gradient = d[0] * color[0] + d[1] * color[1] + d[2] * color[2] + d[3] + d[4] * beta;

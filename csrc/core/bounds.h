@@ -2,9 +2,9 @@
 // Hanson et al. 2025) for the level set of the Beta kernel, united with the low pass. In the offset (dx, dy) from the
 // projected centre the level set u^2 + v^2 <= r_c^2 is the conic U^2 + V^2 <= r_c^2 W^2.
 //
-// Always evaluated in double, from the same (rounded) coefficients that the fragments use: the conic of a needle with
-// axis ratio k loses k^2 in its determinant, and a bound that misses a pixel is a hole in the picture. This is what
-// the CPU uses; plane_bounds.h is for cards, on which doubles are slow. core/outline.h has what both share.
+// Always evaluated in double, from the (rounded) coefficients of the fragments: the determinant of a conic with axis
+// ratio k loses a factor k^2, and a bound that misses a pixel leaves a hole. Used on the CPU; plane_bounds.h serves
+// GPUs, where doubles are slow, and core/outline.h has the shared part.
 #pragma once
 
 #include "core/outline.h"
@@ -19,19 +19,19 @@ template <class T> struct ExtentOf : Outline<T> {
   // qa x^2 + 2 qb x y + qc y^2 + 2 qd x + 2 qe y + qf <= 0
 };
 using Extent = ExtentOf<double>;
-// fn(number of a, the same of b) for all numbers of two extents.
+// Calls fn(number of a, number of b) for all numbers of two extents.
 template <class A, class B, class F> BT_HD void each_number(A& a, B& b, F&& fn) {
   fn(a.x0, b.x0), fn(a.x1, b.x1), fn(a.y0, b.y0), fn(a.y1, b.y1);
   fn(a.y_left, b.y_left), fn(a.y_right, b.y_right), fn(a.blur, b.blur);
   fn(a.qa, b.qa), fn(a.qb, b.qb), fn(a.qc, b.qc), fn(a.qd, b.qd), fn(a.qe, b.qe), fn(a.qf, b.qf);
 }
-// The outermost points of a conic with a box.
+// Finds the leftmost and rightmost points of a conic with a box.
 template <class T> BT_HD void find_outermost(ExtentOf<T>& e) {
   e.y_left = -(e.qb * e.x0 + e.qe) / e.qc, e.y_right = -(e.qb * e.x1 + e.qe) / e.qc;
 }
 
-// Seen through a pixel the level set lies in the ellipse q <= r_c^2 of the largest blur and magnification that any
-// pixel can have: omega <= 1 / (1 - eta), eta = the relative reach of the support in depth.
+// Bounds the prefiltered level set by the ellipse q <= r_c^2 of the largest blur and magnification at any pixel:
+// omega <= 1 / (1 - eta), eta = the relative reach of the support in depth.
 BT_HD Extent filtered_extent(const double* g) {
   using S = double;
   Extent e;
@@ -45,7 +45,7 @@ BT_HD Extent filtered_extent(const double* g) {
   const S w = S(1) / (S(1) - eta), w2 = w * w * n * n;
   const S xx = w2 * (g[kU2] * g[kU2] + g[kV2] * g[kV2]) + c, yy = w2 * (g[kU1] * g[kU1] + g[kV1] * g[kV1]) + c;
   const S xy = -w2 * (g[kU1] * g[kU2] + g[kV1] * g[kV2]), area = w * w * n * w0;
-  // the determinant without cancellation, and not below what rounding the coefficients leaves of it
+  // the determinant without cancellation, at least the rounding error of its coefficients
   const S det = max_(area * area + c * (xx + yy - c), S(1e-12) * xx * yy);
   const S level = log_(times_drawn(g[kOpacity]) * area / sqrt_(det)) + S(1e-4);
   e.visible = level >= S(0);
@@ -60,7 +60,7 @@ BT_HD Extent filtered_extent(const double* g) {
   return e;
 }
 
-// The level set of a row that is not seen through a pixel. `room`: by how much its logarithm is larger; 0 for doubles.
+// Level set of a row without prefilter. `room`: margin of its logarithm, 0 for doubles.
 constexpr double kFloatRoom = 1e-5;
 template <class T> struct Level {
   MaskOf<T> visible;
@@ -78,7 +78,7 @@ template <class Kernel, class T> BT_HD Level<T> level_of(const T* g, double shar
     l.blur = select(blurred >= almost, low_pass_radius(log_(max_(blurred, one)) + T(room)) / T(sqrt_(sharp)), T(0.0f));
   return l;
 }
-// Its conic and the box of that, in doubles; of an image of that size.
+// Computes its conic and bounding box, in doubles, for an image of that size.
 template <class T> BT_HD ExtentOf<T> conic_extent(const T* g, T rc2, T blur, int width, int height) {
   const T zero = T(0.0f);
   const T u1 = g[kU1], u2 = g[kU2], v1 = g[kV1], v2 = g[kV2], w0 = g[kW0], w1 = g[kW1], w2 = g[kW2];
@@ -97,10 +97,10 @@ template <class T> BT_HD ExtentOf<T> conic_extent(const T* g, T rc2, T blur, int
   const T hx = sqrt_(max_(mx * mx - c11 / c33, zero)), hy = sqrt_(max_(my * my - c22 / c33, zero));
   const T pad = T(kBoundPad) + T(1e-4) * max_(hx, hy);
   e.x0 = mx - hx - pad, e.x1 = mx + hx + pad, e.y0 = my - hy - pad, e.y1 = my + hy + pad;
-  // an ellipse exactly when the whole disc lies in front of the camera plane
+  // an ellipse if and only if the whole disc lies in front of the camera plane
   const MaskOf<T> before = (c33 > T(1e-13) * scale) & (e.qa > zero) & (e.qc > zero);
   const MaskOf<T> boxed = before & finite_(e.x0) & finite_(e.x1) & finite_(e.y0) & finite_(e.y1);
-  const MaskOf<T> hit = w0 > zero;  // seen exactly edge-on no ray hits it, the low pass alone is drawn
+  const MaskOf<T> hit = w0 > zero;  // edge-on: no ray hits, only the low pass is drawn
   e.ellipse = hit & before;
   e.whole = hit & (select(boxed, zero, T(1.0f)) > zero);
   e.thin = select(c33 > T(1e-10) * scale, zero, T(1.0f)) > zero;
@@ -108,7 +108,7 @@ template <class T> BT_HD ExtentOf<T> conic_extent(const T* g, T rc2, T blur, int
   return e;
 }
 
-// Level set and conic of rows that are not seen through a pixel; the conic, in doubles, without its outermost points.
+// Level set and conic (in doubles) of rows without prefilter, without the outermost points.
 template <class T> struct LevelExtent {
   Level<T> level;
   ExtentOf<Widened<T>> conic;
@@ -121,7 +121,7 @@ BT_HD LevelExtent<T> level_extent(const T* g, int width, int height, double shar
   return {level, conic_extent(wide, widened(level.r2), widened(level.blur), width, height)};
 }
 
-// In an image of that size.
+// Bounds a row of geom in an image of that size.
 template <class Kernel, class F> BT_HD Extent extent(const F* geom, int width, int height, double sharp = 1) {
   double g[kGeom];
   for (int i = 0; i < kGeom; ++i) g[i] = double(geom[i]);
@@ -134,7 +134,7 @@ template <class Kernel, class F> BT_HD Extent extent(const F* geom, int width, i
   return e;
 }
 
-// The x offsets that the surfel can touch between the lines y = lo and y = hi.
+// Returns the x offsets that the surfel can touch between the lines y = lo and y = hi.
 template <class T> BT_HD Interval<T> row_interval(const ExtentOf<T>& e, T lo, T hi) {
   const T zero = T(0.0f);
   const MaskOf<T> boxed = e.whole | (e.thin & e.ellipse);
@@ -151,7 +151,7 @@ template <class T> BT_HD Interval<T> row_interval(const ExtentOf<T>& e, T lo, T 
       const T pad = T(2 * kBoundPad) + T(kBoundSlack) * root;
       r.add_where(crossed & (disc >= zero), mid - root - pad, mid + root + pad);
     }
-    // no crossing of either: the ellipse lies wholly between them
+    // no crossings: the ellipse lies between the lines
     r.add_where(crossed & r.empty(), e.x0, e.x1);
     add_outermost(crossed, e, lo, hi, T(2 * kBoundPad) + T(kBoundSlack) * (e.y1 - e.y0), r);
     const Interval<T> none;
@@ -171,11 +171,11 @@ template <class T> BT_HD Interval<T> row_interval(const ExtentOf<T>& e, T lo, T 
 constexpr int kTile = 16;  // pixels along a side
 BT_HD int tiles_across(int pixels) { return (pixels + kTile - 1) / kTile; }
 
-// Whole numbers; none when first > last.
+// Integer interval, empty when first > last.
 template <class T> struct TileSpan {
   T first, last;
 };
-// Those along an axis of `pixels` pixels that the offsets meet from c, the position of a centre; that of pixel i is i.
+// Returns the tiles along an axis of `pixels` pixels that offsets from the centre c meet; pixel i is at i.
 template <class T> BT_HD TileSpan<T> tile_span(const Interval<T>& x, T c, int pixels) {
   const T zero = T(0.0f), one = T(1.0f), size = T(double(pixels));
   const MaskOf<T> none = x.empty() | (zero > c + x.x1) | (c + x.x0 > size - one);
@@ -183,11 +183,11 @@ template <class T> BT_HD TileSpan<T> tile_span(const Interval<T>& x, T c, int pi
   const T last = floor_(-floor_(-min_(size, c + x.x1)) * T(1.0 / kTile));  // of the next whole number
   return {select(none, zero, first), select(none, -one, min_(last, T(double(tiles_across(pixels) - 1))))};
 }
-// The surfel has radii above 0: its box meets the image.
+// Returns the rows of tiles of a surfel with radii above 0, i.e. whose box meets the image.
 template <class F> BT_HD TileSpan<double> tile_rows(const Extent& e, const F* geom, int height) {
   return tile_span(rows_of(e), double(geom[kCy]) - 0.5, height);
 }
-// cx, cy: of the projected centre.
+// Returns the tiles that a surfel meets in a row of tiles; cx, cy: projected centre.
 template <class T> BT_HD TileSpan<T> tile_columns(const ExtentOf<T>& e, T cx, T cy, T row, int width) {
   const T top = row * T(double(kTile)) - (cy - T(0.5));  // pixel centre i + 0.5 has the offset i + 0.5 - c
   return tile_span(row_interval(e, top, top + T(double(kTile - 1))), cx - T(0.5), width);

@@ -1,4 +1,4 @@
-// Scalars, small vectors and the few functions that every formula needs, for host and device.
+// Scalars, small vectors and elementary functions, for host and device.
 // A "real" T is float, double, or Lanes (cpu/simd.h), which overload the same functions.
 #pragma once
 
@@ -11,7 +11,7 @@
 #else
 #define BT_HD inline __attribute__((always_inline))
 #endif
-// Before a loop whose indices nvcc must know: arrays live in registers only then.
+// Before loops whose indices nvcc must know, so that arrays stay in registers.
 #if defined(__CUDA_ARCH__)
 #define BT_UNROLL _Pragma("unroll")
 #else
@@ -35,7 +35,7 @@ BT_HD double floor_(double x) { return floor(x); }
 BT_HD bool finite_(float x) { return fabsf(x) <= 3.402823466e38f; }  // false for NaN as well
 BT_HD bool finite_(double x) { return fabs(x) <= 1.7976931348623157e308; }
 
-// The result of comparing two reals: a bool, or one for each lane.
+// Type of a comparison of two reals: bool, or a mask with one per lane.
 template <class T> using MaskOf = decltype(std::declval<T>() < std::declval<T>());
 BT_HD bool not_(bool m) { return !m; }
 BT_HD bool any_(bool m) { return m; }
@@ -44,11 +44,11 @@ template <class T> BT_HD T select(bool condition, T yes, T no) { return conditio
 template <class T> BT_HD T max_(T a, T b) { return select(a > b, a, b); }
 template <class T> BT_HD T min_(T a, T b) { return select(a < b, a, b); }
 template <class T> BT_HD T abs_(T x) { return select(x < T(0.0f), -x, x); }
-// NaN stays NaN: a broken parameter must show, not turn black
+// Keeps NaN, so that a broken parameter shows.
 template <class T> BT_HD T relu(T x) { return select(x < T(0.0f), T(0.0f), x); }
 template <class T> BT_HD T clamp_(T x, T low, T high) { return min_(max_(x, low), high); }
 
-// A real in double, or lanes of doubles, and back.
+// Converts to double (or lanes of doubles), and back.
 BT_HD double widened(float x) { return x; }
 BT_HD double widened(double x) { return x; }
 template <class T> using Widened = decltype(widened(std::declval<T>()));
@@ -76,8 +76,7 @@ template <class S> BT_HD Vec3<S> cross(Vec3<S> a, Vec3<S> b) {
 template <class S> BT_HD Vec3<S> load3(const S* p) { return {p[0], p[1], p[2]}; }
 template <class S> BT_HD void store3(S* p, Vec3<S> a) { p[0] = a.x, p[1] = a.y, p[2] = a.z; }
 
-// Unit vector of a; a vector shorter than the floor keeps its direction at reduced length, so that nothing divides by
-// 0.
+// Normalises a; vectors shorter than the floor are divided by it.
 template <class S> struct Unit {
   Vec3<S> n;
   S inv;           // 1 / max(|a|, floor)
@@ -92,7 +91,7 @@ template <class S> BT_HD Unit<S> normalize(Vec3<S> a) {
   const S inv = one / sqrt_(dot(b, b));
   return {select(full, inv * b, floor_inv * a), select(full, inv / big, floor_inv), full};
 }
-// d loss / d a from d loss / d n
+// Computes d loss / d a from d loss / d n.
 template <class S> BT_HD Vec3<S> normalize_vjp(const Unit<S>& u, Vec3<S> dn) {
   return u.inv * select(u.full, dn - dot(dn, u.n) * u.n, dn);
 }

@@ -1,5 +1,5 @@
-// The residual colour field rho(x): contraction of space, multiresolution hash encoding (Instant NGP,
-// Müller et al. 2022) and a small MLP, eq. (color).
+// Residual colour field rho(x): contraction of space, multiresolution hash encoding (Instant NGP, Müller et al. 2022)
+// and a small MLP, eq. (color).
 #pragma once
 
 #include "core/common.h"
@@ -17,7 +17,7 @@ template <class S> struct FieldArrays {
   S mid[3], half;
   const S *table, *w1, *w2, *w3;  // [levels, 2^log2_size, 4], [4 levels, 16], [16, 16], [16, 3]
 
-  // Entries before those of a level; and numbers of all.
+  // First entry of a level; and numbers in all levels.
   BT_HD int64_t first_entry(int level) const { return int64_t(level) << log2_size; }
   BT_HD int64_t table_size() const { return first_entry(levels) * kFeatures; }
   BT_HD uint32_t hash_mask() const { return (1u << log2_size) - 1u; }
@@ -45,23 +45,23 @@ template <class S> struct FieldGradients {
   }
 };
 
-// Unsigned integers as wide as a real; hashing needs their low 32 bits only.
+// Unsigned integer as wide as a real; hashing uses its low 32 bits.
 template <class T> struct IndexOf {
   using type = uint32_t;
 };
 BT_HD uint32_t to_index(float x) { return uint32_t(int32_t(x)); }
 BT_HD uint32_t to_index(double x) { return uint32_t(int32_t(x)); }
 
-// Grid coordinate in [0, 1]^3 of a world position. With contraction p -> (2 - 1/|p|) p/|p| outside the unit ball
-// (mip-NeRF 360, Barron et al. 2022) and the ball of radius 2 fills the cube; without it the cube of half edge `half`
-// does, clamped.
+// Maps a world position to grid coordinates in [0, 1]^3. With contraction p -> (2 - 1/|p|) p/|p| outside the unit ball
+// (mip-NeRF 360, Barron et al. 2022) the ball of radius 2 fills the cube; without it the cube of half edge `half` does,
+// clamped.
 template <class S, class T> BT_HD Vec3<T> grid_coordinate(Vec3<T> x, Vec3<S> mid, S half, bool contract) {
   const T k = T(S(1) / half), one = T(S(1)), zero = T(S(0));
   const Vec3<T> p = {k * (x.x - T(mid.x)), k * (x.y - T(mid.y)), k * (x.z - T(mid.z))};
   const T h = T(S(0.5));
   if (!contract)
     return {clamp_(h * (p.x + one), zero, one), clamp_(h * (p.y + one), zero, one), clamp_(h * (p.z + one), zero, one)};
-  const T ir = one / sqrt_(max_(dot(p, p), one));  // 1 inside the ball, where the factor below is then 1
+  const T ir = one / sqrt_(max_(dot(p, p), one));  // 1 inside the ball, which makes the factor below 1
   const T q = T(S(0.25)) * (T(S(2)) - ir) * ir;
   return {q * p.x + h, q * p.y + h, q * p.z + h};
 }
@@ -81,8 +81,8 @@ template <class S> BT_HD Vec3<S> grid_coordinate_vjp(Vec3<S> x, Vec3<S> mid, S h
   return k * (tangential * (dc - along * n) + (radial * along) * n);
 }
 
-// Eight corners of a level's cell: entries of the hash table and trilinear weights. Corner c has bit 0 for x, 1 for y,
-// 2 for z. XOR of coordinate times prime with the standard primes.
+// Corners of a level's cell: entries of the hash table and trilinear weights. Bits of the corner's index: x, y, z. The
+// hash is XOR of coordinate times prime, with the standard primes.
 template <class T> struct Corners {
   typename IndexOf<T>::type index[8];
   T weight[8];
@@ -106,7 +106,7 @@ template <class T> BT_HD void corners(Vec3<T> c, T resolution, uint32_t mask, Co
   }
 }
 
-// d loss / d grid coordinate from d loss / d interpolated value of each corner.
+// Computes d loss / d grid coordinate from d loss / d interpolated value of each corner.
 template <class S> BT_HD Vec3<S> cell_gradient(S fx, S fy, S fz, S resolution, const S* d) {
   const S gx = S(1) - fx, gy = S(1) - fy, gz = S(1) - fz;
   return {resolution *
@@ -117,9 +117,8 @@ template <class S> BT_HD Vec3<S> cell_gradient(S fx, S fy, S fz, S resolution, c
               (gx * gy * (d[4] - d[0]) + fx * gy * (d[5] - d[1]) + gx * fy * (d[6] - d[2]) + fx * fy * (d[7] - d[3]))};
 }
 
-// The MLP on rows of kWidth values. `Row` is kWidth lanes; weights are stored input-major, w3 output-major
-// (three rows), and the transposes serve the backward pass. With fewer levels than kMaxLevels the rows of w1 that have
-// no input are 0, and so are those inputs.
+// MLP on rows of kWidth values. `Row` is kWidth lanes; weights are stored input-major, w3 output-major (three rows),
+// and transposed for the backward pass. With fewer levels than kMaxLevels the unused inputs and rows of w1 are 0.
 constexpr int kInputs = kMaxLevels * kFeatures;
 static_assert(kInputs == kWidth, "features and hidden layers share one type of row");
 template <class S, class Row> struct Mlp {
@@ -128,13 +127,13 @@ template <class S, class Row> struct Mlp {
 template <class S, class Row> struct MlpState {
   Row h1, h2;
 };
-// Gradients before the two ReLUs.
+// Gradients at the inputs of the two ReLUs.
 template <class Row> struct MlpGradient {
   Row g1, g2;
 };
 // sum_i w_i in_i
 template <class S, class Row> BT_HD Row product(const Row* w, const S* in) {
-  Row a = Row(S(0)), b = Row(S(0));  // two chains hide the latency of the multiply-add
+  Row a = Row(S(0)), b = Row(S(0));  // two chains hide the latency of multiply-adds
   for (int i = 0; i < kWidth; i += 2) {
     a += w[i] * Row(in[i]);
     b += w[i + 1] * Row(in[i + 1]);
@@ -160,8 +159,7 @@ BT_HD Row mlp_vjp(const Mlp<S, Row>& m, const MlpState<S, Row>& state, Vec3<S> d
   store(h, g.g1);
   return product(m.w1t, h);
 }
-// Adds the weights' gradients to w1, w2 and w3 of `sums`: outer products of a layer's input and the gradient of its
-// output.
+// Adds the weights' gradients to w1, w2 and w3 of `sums`: outer products of a layer's input and its output's gradient.
 template <class S, class Row>
 BT_HD void add_weight_gradient(const S* features, const MlpState<S, Row>& state, const MlpGradient<Row>& g, Vec3<S> d,
                                Mlp<S, Row>& sums) {

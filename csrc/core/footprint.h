@@ -1,4 +1,4 @@
-// The tiles that a surfel can touch, and their parts of 8 x 4 pixels, by the bounds of plane_bounds.h.
+// Tiles that a surfel can touch, and their parts of 8 x 4 pixels, by the bounds of plane_bounds.h.
 #pragma once
 
 #include "core/kernel.h"
@@ -11,11 +11,11 @@ constexpr int kBands = 4, kBandRows = kTile / kBands;  // of a tile
 // A row of geom up to kBeta with its level set.
 enum LevelColumn {
   kR2 = kBeta + 1,  // u^2 + v^2 <= r2
-  kBlur2,  // and d^2 <= blur2; 0: the low pass does not show; -kArea where PixelKernel filters the surfel. With
-           // ResizedKernel it also says how high the low pass is: 1/255 is left of it there
+  kBlur2,  // and d^2 <= blur2; 0: no visible low pass; -kArea if PixelKernel filters the surfel. With ResizedKernel
+           // also the height of the low pass, which falls to 1/255 there
   kLevelRow
 };
-// Fills it; false where nothing of the surfel is visible.
+// Fills the row; false if nothing of the surfel is visible.
 template <class Kernel, class S> BT_HD bool level_row(const S* geom, S near, S sharp, S* row) {
   for (int k = 0; k <= kBeta; ++k) row[k] = geom[k];
   if (filtered<Kernel>(geom)) {
@@ -27,7 +27,7 @@ template <class Kernel, class S> BT_HD bool level_row(const S* geom, S near, S s
   return level.visible;
 }
 template <class Kernel, class S> BT_HD bool filtered_row(const S* row) { return Kernel::kPixel && row[kBlur2] < S(0); }
-// Of the pixels that it can touch; `pad` is by what an ellipse may be rounded.
+// Bounds of the pixels that it can touch; `pad`: rounding margin of an ellipse.
 template <class S> struct RowBounds {
   PlaneBounds<S> bounds;
   S pad;
@@ -73,15 +73,14 @@ template <class Kernel, class S> BT_HD Footprint<S> footprint(const S* row, int 
   return f;
 }
 
-// Interval of the pixels that it can touch; of a footprint that is not everywhere.
+// Returns the columns that it can touch, for a footprint that does not cover everything.
 template <class S> BT_HD Interval<S> columns_of(const Footprint<S>& f) {
   const Interval<S> x = columns_of(f.bounds);
   const S pad = f.bounds.ellipse ? f.pad : S(0);
   return {f.cx + x.x0 - pad, f.cx + x.x1 + pad};
 }
 
-// A row of tiles: the pixels that can be touched in each of its bands of four rows, and the tiles of these; of a
-// footprint with a box.
+// A row of tiles of a footprint with a box: the pixels that can be touched in each band of four rows, and their tiles.
 struct TileRow {
   int from[kBands], to[kBands];  // pixels, none when from > to
   int left, right;               // tiles, none when left > right
@@ -90,7 +89,7 @@ template <class S> BT_HD TileRow tile_row(const Footprint<S>& f, int ty, int wid
   TileRow r;
   const PlaneBounds<S>& e = f.bounds;
   int from = width, to = -1;
-  Interval<S> upper;  // crossings with the line above a band; below it those of the next
+  Interval<S> upper;  // crossings with the line above a band
   if (e.ellipse) add_crossings(e, ty * kTile - f.cy, upper);
   for (int band = 0; band < kBands; ++band) {
     const S lo = ty * kTile + band * kBandRows - f.cy, hi = lo + kBandRows;
@@ -112,7 +111,7 @@ template <class S> BT_HD TileRow tile_row(const Footprint<S>& f, int ty, int wid
   if (from > to) r.left = 0, r.right = -1;
   return r;
 }
-// Bit 2 band + half is set when the surfel reaches these 8 x 4 pixels of tile tx.
+// Sets bit 2 band + half if the surfel reaches these 8 x 4 pixels of tile tx.
 BT_HD uint32_t part_mask(const TileRow& r, int tx) {
   uint32_t mask = 0;
   const int x = tx * kTile, half = kTile / 2;
@@ -122,8 +121,8 @@ BT_HD uint32_t part_mask(const TileRow& r, int tx) {
   }
   return mask;
 }
-// The same for a disc without a box that crosses the camera's plane: the parts that its level set or its low pass
-// reaches. All of those of a disc seen through a pixel.
+// Computes the part mask of a disc without a box that crosses the camera's plane: parts that its level set or low pass
+// reaches, or all parts with the prefilter.
 template <class Kernel, class S> BT_HD uint32_t reached_parts(const S* row, int tx, int ty) {
   if (filtered_row<Kernel>(row)) return (1u << 2 * kBands) - 1;
   constexpr S kPartWidth = kTile / 2;

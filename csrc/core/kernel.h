@@ -1,6 +1,6 @@
-// Intersection of a pixel's ray with a surfel, and its coverage: the Beta kernel of eq. (beta-kernel)
-// (Deformable Beta Splatting, Liu et al. 2025) with a screen-space low pass, as 2D Gaussian Splatting has one, sigma =
-// min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))); or PixelKernel, of which core/prefilter.h has the formulas.
+// Intersection of a pixel's ray with a surfel, and its coverage: the Beta kernel of eq. (beta-kernel) (Deformable Beta
+// Splatting, Liu et al. 2025) with the screen-space low pass of 2D Gaussian Splatting,
+// sigma = min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))); or PixelKernel (core/prefilter.h).
 #pragma once
 
 #include "core/blend.h"
@@ -9,37 +9,37 @@
 
 namespace bt {
 
-// True where the low pass may be drawn.
+// Returns true where the low pass may be drawn.
 template <class T> BT_HD MaskOf<T> near_centre(T dx, T dy) {
   return dx * dx + dy * dy < T(kLowPassReach * kLowPassReach);
 }
 
-// The planes U, V and W at a pixel. S: the surfel's scalars, T: a real for the pixels. dx, dy: pixels from the
-// projected centre.
+// The planes U, V and W at a pixel. S: the surfel's scalars, T: a real for the pixels. dx, dy: offset in pixels from
+// the projected centre.
 template <class T> struct Planes {
   T U, V, W;
 };
 template <class S, class T> BT_HD Planes<T> planes(const S* g, T dx, T dy) {
-  // the sum from left to right, as a chain of multiply-adds
+  // left to right, as a chain of multiply-adds
   return {slope(g, kU1, dx, dy), slope(g, kV1, dx, dy), T(g[kW0]) + T(g[kW1]) * dx + T(g[kW2]) * dy};
 }
-// u^2 + v^2 < r2 without a division, on either side of the camera.
+// Tests u^2 + v^2 < r2 without a division, on either side of the camera.
 template <class T> BT_HD MaskOf<T> within(const Planes<T>& p, T r2) { return p.U * p.U + p.V * p.V < r2 * p.W * p.W; }
 
-// The same, and in front of the camera.
+// Tests the same, and in front of the camera.
 template <class T> BT_HD MaskOf<T> within_in_front(const Planes<T>& p, T r2) {
   return p.U * p.U + p.V * p.V < r2 * p.W * abs_(p.W);
 }
 
-// True where the kernel is above 0, in front of the camera or behind it.
+// Returns true where the kernel is above 0, in front of the camera or behind it.
 template <class T> BT_HD MaskOf<T> in_support(const Planes<T>& p) { return within(p, T(kSupport2)); }
 
-// Distance of pixels from the middle of their cell, with the error of rounding; offsets of pixels are up to
+// Returns the largest distance of a pixel from the middle of its cell, with the rounding error for offsets up to
 // `largest`.
 template <class S> BT_HD S cell_half(S half, S centre, S largest) { return half + S(1e-6) * (largest + abs_(centre)); }
-// True where a cell of an image has a pixel in the kernel's level set u^2 + v^2 < r2, and in that of the low pass, d^2
-// < blur2. x, y: offset of its middle from the surfel's projected centre. Never one cell too few, few too many: within
-// a cell a plane differs from its value in the middle by no more than `spread`, and by what rounding may add.
+// Masks of cells with a pixel in the kernel's level set u^2 + v^2 < r2, and in that of the low pass, d^2 < blur2. x, y:
+// offset of the cell's middle from the projected centre. Conservative, with few false positives: within a cell a plane
+// differs from its value in the middle by at most `spread` and the rounding error.
 template <class T> struct Reached {
   MaskOf<T> support, centre;
 };
@@ -53,7 +53,7 @@ template <class S, class T> BT_HD Reached<T> reached(const S* g, T x, T y, S hal
   return {within_in_front(nearest, T(r2 * S(1 + 1e-5))), dx * dx + dy * dy < T(blur2)};
 }
 
-// True where the plane lies behind `near`; for points in front of the camera.
+// Returns true where the plane lies beyond the near depth; for points in front of the camera.
 template <class S, class T> BT_HD MaskOf<T> behind_near(const S* g, S near, T W) {
   return T(g[kW0] * g[kZ]) > T(near) * W;
 }
@@ -62,12 +62,12 @@ template <class T> BT_HD T inverse_(T x) { return T(1.0f) / x; }
 
 // Intersection of a ray with a surfel's plane.
 template <class T> struct Hit {
-  MaskOf<T> ok;  // in front of the camera, behind `near`
+  MaskOf<T> ok;  // in front of the camera, beyond `near`
   T inv;         // 1 / W; 1 without a hit
   T u, v;        // 0 without a hit
   T rest;        // 1 - (u^2 + v^2) / 9
 };
-// Without kMisses all but `ok` is anything where there is no hit, NaN too.
+// Without kMisses, everything but `ok` is undefined (possibly NaN) where there is no hit.
 template <bool kMisses = true, class S, class T> BT_HD Hit<T> hit(const S* g, S near, T dx, T dy) {
   const T zero = T(S(0)), one = T(S(1));
   const Planes<T> p = planes(g, dx, dy);
@@ -80,8 +80,8 @@ template <bool kMisses = true, class S, class T> BT_HD Hit<T> hit(const S* g, S 
   return h;
 }
 
-// Without kBlur the low pass is left out, for pixels that are not near the centre; where sigma is 0 the rest is then
-// anything. `sharp` here and below: 1 / squared radius of the low pass, which ResizedKernel alone uses.
+// Evaluates a surfel at a pixel. Without kBlur the low pass is left out, for pixels not near the centre; where sigma is
+// 0 the rest is then undefined. `sharp` here and below: 1 / squared radius of the low pass, used by ResizedKernel only.
 template <class Kernel, bool kBlur = true, class S, class T>
 BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy, S sharp = S(1)) {
   const T zero = T(S(0)), one = T(S(1));
@@ -108,7 +108,7 @@ BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy, S sharp = S(1)) {
   return f;
 }
 
-// `fragment` without the low pass, where it is known that the pixel lies within_in_front and behind_near.
+// Evaluates without low pass where within_in_front and behind_near are known to hold.
 template <class S, class T> BT_HD Fragment<T> fragment_within(const S* g, const Planes<T>& p) {
   const T inv = inverse_(p.W);
   const T rest = T(S(1)) - (p.U * p.U + p.V * p.V) * (inv * inv) * T(S(1.0 / kSupport2));
@@ -118,18 +118,18 @@ template <class S, class T> BT_HD Fragment<T> fragment_within(const S* g, const 
   return f;
 }
 
-// `blur`: one of the pixels drawn together is near the centre.
+// `blur`: whether any of the pixels drawn together is near the centre.
 template <class Kernel, class S, class T>
 BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy, bool blur, S sharp = S(1)) {
   return blur ? fragment<Kernel, true>(g, near, dx, dy, sharp) : fragment<Kernel, false>(g, near, dx, dy, sharp);
 }
 
-// Sigma as a list of fragments holds it: negative in the low-pass branch.
+// Encodes sigma for a fragment list: negative in the low-pass branch.
 template <class T> BT_HD T listed_sigma(const Fragment<T>& f) {
   return select(f.low_pass > T(0.0f), -f.sigma, f.sigma);
 }
 
-// Gradients towards a row of geom, added to d[kGeom], from those of a fragment with sigma `listed`; ddx, ddy is the
+// Adds the gradients of a row of geom to d[kGeom], from those of a fragment with sigma `listed`; ddx, ddy is the
 // gradient with respect to the pixel's offset. `rim` bounds 1 - x from below in the kernel's derivative, which diverges
 // at the rim for beta < 1.
 template <class Kernel, class S, class T>

@@ -1,6 +1,6 @@
-// A surfel's pixels are bounded in two ways: in double (core/bounds.h), and in the reals of the fragments
-// (core/plane_bounds.h). This is what both share: the level set, the padding, which discs lie out of view, and which x
-// offsets a box, an ellipse and the low pass have between two lines.
+// Shared part of the bounds of a surfel's pixels in double (core/bounds.h) and in the reals of the fragments
+// (core/plane_bounds.h): level set, padding, culling of discs out of view, and x offsets of box, ellipse and low pass
+// between two lines.
 #pragma once
 
 #include "core/surfel.h"
@@ -8,21 +8,21 @@
 namespace bt {
 
 // sigma >= 1/255  <=>  u^2 + v^2 <= r_c^2 with r_c^2 = 9 (1 - (255 o)^(-1/beta)), or d^2 <= ln(255 o).
-// An opacity over the smallest drawn sigma.
+// Returns an opacity relative to the smallest drawn sigma.
 template <class S> BT_HD S times_drawn(S opacity) { return S(1 / kAlphaMin) * opacity; }
-// Squared radius r_c^2 = 9 (1 - exp(-level / beta)) at which the kernel is exp(-level) of its centre; a part in 5,000
-// and `slack` wider: a bound must hold in spite of rounding.
+// Computes the squared radius r_c^2 = 9 (1 - exp(-level / beta)) where the kernel is exp(-level) of its maximum;
+// enlarged by a part in 5,000 and `slack`, so that the bound holds despite rounding.
 template <class S> BT_HD S level_radius2(S level, S beta, S slack) {
   const S x = S(1) - exp_(-level / max_(beta, S(1e-6)));
   return S(kSupport2) * min_(S(1), x * S(1.0002) + slack);
 }
-// Radius in pixels of the disc in which the low pass is exp(-level).
+// Computes the radius in pixels where the low pass is exp(-level).
 template <class S> BT_HD S low_pass_radius(S level) { return sqrt_(level) + S(0.01); }
 
-// True where the kernel of a row is nowhere below the low pass of the squared radius `wide` and no more than its
-// height. With x = rho / 9 <= d^2 / k near the centre, k = 9 W^2 / |UV|^2 at its smallest, and log(1 - x) >= -x / (1 -
-// x), the kernel (1 - x)^beta is at least exp(-d^2 / wide) out to d^2 / wide = ln 255 where k >= (beta + ln 255) wide.
-// As far the plane has to lie behind `near`, which cuts the kernel alone.
+// Returns true where the kernel of a row is nowhere below the low pass of squared radius `wide` and at most its height.
+// With x = rho / 9 <= d^2 / k near the centre, k = 9 W^2 / |UV|^2 at its smallest, and log(1 - x) >= -x / (1 - x), the
+// kernel (1 - x)^beta is at least exp(-d^2 / wide) out to d^2 / wide = ln 255 where k >= (beta + ln 255) wide. Up to
+// there the plane must lie beyond `near`, which clips the kernel only.
 template <class T> BT_HD MaskOf<T> covers_low_pass(const T* g, T near, T wide) {
   const T reach = T(kLowPassReach), change = reach * sqrt_(wide) * (abs_(g[kW1]) + abs_(g[kW2]));
   const T least = g[kW0] - change, most = g[kW0] + change, k = T(kSupport2) * least * least;
@@ -31,8 +31,8 @@ template <class T> BT_HD MaskOf<T> covers_low_pass(const T* g, T near, T wide) {
          (k >= (g[kBeta] + reach * reach) * wide * T(1.001) * slope);
 }
 
-constexpr double kBoundPad = 0.01;    // pixels, by which a box is wider
-constexpr double kBoundSlack = 1e-3;  // share of an ellipse by which its points count as between two lines
+constexpr double kBoundPad = 0.01;    // pixels added to a box
+constexpr double kBoundSlack = 1e-3;  // tolerance of "between two lines", relative to an ellipse's height
 
 template <class T> struct Interval {
   T x0 = T(1e30), x1 = T(-1e30);  // nothing
@@ -43,20 +43,20 @@ template <class T> struct Interval {
   }
 };
 
-// The image of a level set: the ellipse's box and outermost points, and the low pass's disc. Offsets from the projected
+// Image of a level set: the ellipse's box and outermost points, and the low pass's disc. Offsets from the projected
 // centre in pixels.
 template <class T> struct Outline {
-  MaskOf<T> whole = T(0.0f) < T(0.0f);             // the disc comes near the camera plane: anything on the screen
-  MaskOf<T> ellipse = T(0.0f) < T(0.0f);           // false: the low pass alone
+  MaskOf<T> whole = T(0.0f) < T(0.0f);             // the disc comes near the camera plane: covers the screen
+  MaskOf<T> ellipse = T(0.0f) < T(0.0f);           // false: low pass only
   T x0 = T(1), x1 = T(-1), y0 = T(1), y1 = T(-1);  // box of the ellipse
-  T y_left = T(0), y_right = T(0);                 // where its leftmost and its rightmost point lie
+  T y_left = T(0), y_right = T(0);                 // y of its leftmost and rightmost points
   T blur = T(0);                                   // radius of the low pass; 0: none
 };
 
-// The image of the disc u^2 + v^2 <= r^2 of a row: the three planes of surfel.h solved for the pixel,
+// Image of the disc u^2 + v^2 <= r^2 of a row: the three planes of surfel.h solved for the pixel,
 //   dx = X.q / (1 + C.q),  dy = Y.q / (1 + C.q)   with q = (u, v) / r on the unit disc,
-// where a point lies in front of the camera if 1 + C.q > 0. What costs digits is a small angle between the lines U = 0
-// and V = 0 on the screen; r is widened by as much.
+// in front of the camera where 1 + C.q > 0. Precision is lost if the angle between the lines U = 0 and V = 0 on the
+// screen is small; r is widened accordingly.
 template <class T> struct DiscImage {
   T xu, xv, yu, yv, cu, cv;  // X, Y, C
   T angle;                   // sine of the angle between the two lines, up to a factor of 2
@@ -77,13 +77,13 @@ template <class T> BT_HD DiscImage<T> disc_image(const T* g, T r2) {
           angle};
 }
 
-// True where all of a disc in front of the camera lies beyond a border of the image: the disc against the plane
-// through the camera and the border. `border`: offset from the projected centre of the border's line, which lies
-// between the centre and the image; 0: the centre is not beyond it. With X.q < border (1 + C.q) on the whole disc, or
-// >, no ray of the image meets it, also where it crosses the camera's plane and has no box. False for NaN.
+// Returns true where the part of a disc in front of the camera lies beyond a border of the image: the disc against the
+// plane through the camera and the border. `border`: offset of the border's line from the projected centre, between the
+// centre and the image; 0: the centre is not beyond it. If X.q < border (1 + C.q) on the whole disc, or >, no ray of
+// the image meets it, even where it crosses the camera's plane and has no box. False for NaN.
 template <class T> BT_HD MaskOf<T> beyond_border(T xu, T xv, T cu, T cv, T border) {
   const T u = xu - border * cu, v = xv - border * cv, far = abs_(border);
-  const T room = far - T(1e-5) * (abs_(xu) + abs_(xv) + far * (abs_(cu) + abs_(cv)));  // less what rounding may add
+  const T room = far - T(1e-5) * (abs_(xu) + abs_(xv) + far * (abs_(cu) + abs_(cv)));  // less the rounding error
   return (room > T(0.0f)) & (u * u + v * v < room * room);
 }
 template <class T> BT_HD MaskOf<T> out_of_view(const DiscImage<T>& d, T cx, T cy, int width, int height) {
@@ -91,7 +91,7 @@ template <class T> BT_HD MaskOf<T> out_of_view(const DiscImage<T>& d, T cx, T cy
   return (d.angle > T(1e-6)) & (beyond_border(d.xu, d.xv, d.cu, d.cv, border(cx, width)) |
                                 beyond_border(d.yu, d.yv, d.cu, d.cv, border(cy, height)));
 }
-// Leaves the low pass alone of the discs without a box, `d`, that are out of view.
+// Reduces discs without a box, `d`, that are out of view to their low pass.
 template <class T> BT_HD void cut_to_view(const DiscImage<T>& d, T cx, T cy, int width, int height, Outline<T>& e) {
   const MaskOf<T> in_view = not_(e.whole & out_of_view(d, cx, cy, width, height));
   e.whole = e.whole & in_view, e.ellipse = e.ellipse & in_view;
@@ -106,8 +106,8 @@ template <class T> BT_HD Interval<T> range_of(const Outline<T>& e, T low, T high
 }
 template <class T> BT_HD Interval<T> columns_of(const Outline<T>& e) { return range_of(e, e.x0, e.x1); }
 template <class T> BT_HD Interval<T> rows_of(const Outline<T>& e) { return range_of(e, e.y0, e.y1); }
-// AccuTile: between the lines y = lo and y = hi an ellipse reaches as far as on the lines themselves (the caller's
-// part), or as far as its leftmost and rightmost points where they lie between, which is judged generously.
+// AccuTile: between the lines y = lo and y = hi an ellipse reaches as far as on the lines (added by the caller), or as
+// its leftmost and rightmost points if they lie between, tested with slack.
 template <class T> BT_HD void add_outermost(MaskOf<T> where, const Outline<T>& e, T lo, T hi, T slack, Interval<T>& r) {
   r.add_where(where & (e.y_left >= lo - slack) & (hi + slack >= e.y_left), e.x0, e.x0);
   r.add_where(where & (e.y_right >= lo - slack) & (hi + slack >= e.y_right), e.x1, e.x1);

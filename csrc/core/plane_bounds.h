@@ -1,21 +1,20 @@
-// Bounds of the pixels that a surfel can touch, like bounds.h, but in the reals of the fragments: for devices on which
-// doubles are slow. It takes the image of the level set's disc (outline.h) instead of
-// forming a conic. A box and the crossings with a line then follow from sums of squares; no determinant of squared
-// coefficients is taken, so that a needle costs no digits.
+// Bounds of the pixels that a surfel can touch, like bounds.h, but in the reals of the fragments, for devices with slow
+// doubles. It uses the image of the level set's disc (outline.h) instead of a conic: the box and crossings with a line
+// follow from sums of squares, without a determinant of squared coefficients, so that thin surfels lose no precision.
 #pragma once
 
 #include "core/bounds.h"
 
 namespace bt {
 
-// The level set sigma = 1/255: u^2 + v^2 <= r2, or d^2 <= blur2; both a little wide.
+// Level set sigma = 1/255: u^2 + v^2 <= r2, or d^2 <= blur2; both slightly enlarged.
 template <class S> struct LevelSet {
   bool visible;
   S r2;
-  S blur2;  // 0: the low pass cannot exceed the kernel anywhere
+  S blur2;  // 0: the low pass nowhere exceeds the kernel
 };
 
-// Of a row; with ResizedKernel the low pass has the squared radius 1 / sharp and the height kLowPassHeight.
+// Computes that of a row; with ResizedKernel the low pass has the squared radius 1 / sharp and height kLowPassHeight.
 template <class Kernel, class S> BT_HD LevelSet<S> level_set(const S* g, S near, S sharp) {
   LevelSet<S> l = {false, S(0), S(0)};
   const S ratio = times_drawn(g[kOpacity]), almost = S(1) - S(1e-6);
@@ -30,7 +29,7 @@ template <class Kernel, class S> BT_HD LevelSet<S> level_set(const S* g, S near,
 
 template <class S> struct PlaneBounds : Outline<S>, DiscImage<S> {};
 
-// Box and outermost points from X, Y and C.
+// Computes box and outermost points from X, Y and C.
 template <class S> BT_HD void bounding_box(PlaneBounds<S>& e) {
   const S cc = e.cu * e.cu + e.cv * e.cv, rest = S(1) - cc;
   const S xx = e.xu * e.xu + e.xv * e.xv, yy = e.yu * e.yu + e.yv * e.yv;
@@ -51,11 +50,11 @@ template <class S> BT_HD void bounding_box(PlaneBounds<S>& e) {
   }
 }
 
-// r2 and blur2 are those of level_set; of an image of that size.
+// Bounds a row with r2 and blur2 of level_set, for an image of that size.
 template <class S> BT_HD PlaneBounds<S> plane_bounds(const S* g, S r2, S blur2, int width, int height) {
   PlaneBounds<S> e = {};
   if (blur2 > S(0)) e.blur = low_pass_radius(blur2);
-  if (!(g[kW0] > S(0))) return e;  // seen exactly edge-on: no ray hits it
+  if (!(g[kW0] > S(0))) return e;  // edge-on: no ray hits
   e.ellipse = true;
   static_cast<DiscImage<S>&>(e) = disc_image(g, r2);
   bounding_box(e);
@@ -64,7 +63,7 @@ template <class S> BT_HD PlaneBounds<S> plane_bounds(const S* g, S r2, S blur2, 
   return e;
 }
 
-// Seen through a pixel: the ellipse of bounds.h, which has no perspective. It is rare, and evaluated in double.
+// Prefiltered bounds: the ellipse of bounds.h, without perspective. Rare, so evaluated in double.
 template <class S> struct FilteredBounds {
   bool visible;
   PlaneBounds<S> bounds;
@@ -85,7 +84,7 @@ template <class S> BT_HD FilteredBounds<S> filtered_bounds(const S* geom) {
   return f;
 }
 
-// Adds where the line y crosses the ellipse.
+// Adds the crossings of the line y with the ellipse.
 template <class S> BT_HD void add_crossings(const PlaneBounds<S>& e, S y, Interval<S>& r) {
   const S mu = e.yu - y * e.cu, mv = e.yv - y * e.cv, mm = mu * mu + mv * mv;
   if (!(mm > S(0)) || !(y * y <= mm)) return;

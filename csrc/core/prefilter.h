@@ -1,6 +1,5 @@
-// The Beta kernel seen through a pixel: a prefilter that keeps the total, the centre and the second moments of what a
-// surfel covers, however small or thin it is, in the manner of EWA splatting (Zwicker et al. 2002; docs/numerics.md
-// derives it).
+// Beta kernel averaged over a pixel: a prefilter that keeps the total, centre and second moments of a surfel's
+// coverage, however small or thin it is, as EWA splatting does (Zwicker et al. 2002; derivation in docs/numerics.md).
 //
 // Sigma = n^2 [[u2^2 + v2^2, -(u1 u2 + v1 v2)], [., u1^2 + v1^2]] is the projected scale ellipse in pixels^2, omega =
 // W / w0 the perspective at the pixel, c = kPixelVariance 2 (beta + 2) / 9 the blur. Then
@@ -30,10 +29,10 @@ template <class S> BT_HD S filter_spread(const S* g) {
   return a * a + b * b + c * c + d * d;
 }
 
-// The filtered disc at a pixel (dx, dy) from the projected centre.
+// The filtered disc at offset (dx, dy) from the projected centre, pixels.
 template <class T> struct FilteredHit {
   T U, V, r;       // r = sqrt(U^2 + V^2)
-  T omega;         // W / w0; outside the disc's image that of the rim in the pixel's direction, so that it is bounded
+  T omega;         // W / w0; outside the disc's image that of the rim in the pixel's direction, which bounds it
   T beyond;        // r - 3 (W - w0) outside, 0 inside
   T Un, Vn, D, q;  // n U, n V
 };
@@ -53,7 +52,7 @@ template <class S, class T> BT_HD FilteredHit<T> filtered_hit(const S* g, T dx, 
   f.q = (w2 * (f.Un * f.Un + f.Vn * f.Vn) + T(c) * (dx * dx + dy * dy)) / f.D;
   return f;
 }
-// True where the kernel is above 0.
+// Returns true where the kernel is above 0.
 template <class T> BT_HD MaskOf<T> in_support(const FilteredHit<T>& at) { return at.q < T(kSupport2); }
 template <class S, class T> BT_HD Fragment<T> filtered_fragment(const S* g, S near, const FilteredHit<T>& at) {
   const T zero = T(S(0)), one = T(S(1)), r = T(S(kSupport));
@@ -70,9 +69,8 @@ template <class S, class T> BT_HD Fragment<T> filtered_fragment(const S* g, S ne
   return f;
 }
 
-// As fragment_vjp (core/kernel.h). 1 - x is bounded from below by what x changes over a pixel: the derivative is
-// then no larger than that of the kernel averaged over the pixel, also at the rim for beta < 1. rim = 0: no bound, the
-// exact derivative.
+// As fragment_vjp (core/kernel.h). 1 - x is bounded from below by the change of x over a pixel: the derivative then
+// does not exceed that of the kernel averaged over the pixel, even at the rim for beta < 1. rim = 0: exact derivative.
 template <class S, class T>
 BT_HD void filtered_vjp(const S* g, S near, S rim, T dx, T dy, T dsigma, T du, T dv, T ddepth, T* d, T& ddx, T& ddy) {
   const T zero = T(S(0)), one = T(S(1)), two = T(S(2)), reach = T(S(kSupport));
@@ -88,16 +86,16 @@ BT_HD void filtered_vjp(const S* g, S near, S rim, T dx, T dy, T dsigma, T du, T
   d[kOpacity] += gs * kernel;
   const T gl = gs * T(g[kOpacity]) * kernel;  // d sigma / d log(rho kernel)
   const S bounded = rim > S(0) ? S(2) : S(0);
-  const T across = T(bounded) * ninth * sqrt_(at.q * (w2 * T(spread) + T(S(2) * c)) * inv_d);  // of x, over a pixel
+  const T across = T(bounded) * ninth * sqrt_(at.q * (w2 * T(spread) + T(S(2) * c)) * inv_d);  // change of x per pixel
   const T gq = -gl * T(g[kBeta]) * ninth / max_(rest, max_(across, T(rim)));
   const T gnum = gq * inv_d, gd = -(gq * at.q + T(S(0.5)) * gl) * inv_d;
   const T ga = gl / a + two * gd * a;
   const T gc = gnum * (dx * dx + dy * dy) + gd * (w2 * T(spread) + T(S(2) * c));
   d[kBeta] += gl * log_rest + gc * T(S(kPixelVariance * 2 / kSupport2));
-  // towards omega, U, V, n, w0 and the coefficients in tr Sigma
+  // with respect to omega, U, V, n, w0 and the coefficients in tr Sigma
   const T inv = one / (w0 * w), u = at.U * inv, v = at.V * inv;
   const T gu = select(u * u < reach * reach, du, zero), gv = select(v * v < reach * reach, dv, zero);
-  const T pull = -(gu * u + gv * v) * inv;  // towards w0 omega
+  const T pull = -(gu * u + gv * v) * inv;  // with respect to w0 omega
   const T square = at.Un * at.Un + at.Vn * at.Vn;
   const T gspread = gd * T(c) * w2;
   const T gw =

@@ -1,24 +1,24 @@
-// A surfel in a view of another size than the photographs that it was trained on.
+// Adaptation of surfels to views of another size than the training photographs.
 //
-// Let p be the side of a photograph's pixel in pixels of the view. What is to be seen is what the trained picture
-// shows, averaged over the view's pixels. Where p < 1 a pixel averages 1 / p^2 samples of it, which lie evenly in it:
-// of their positions the variance along each axis is c = (1 - p^2) / 12 pixels^2. So (docs/numerics.md)
+// Let p be the side of a photograph's pixel in pixels of the view. The goal is the trained picture averaged over the
+// view's pixels. For p < 1 a pixel averages 1 / p^2 samples, evenly distributed in it, whose positions have the
+// variance c = (1 - p^2) / 12 pixels^2 along each axis. So (docs/numerics.md)
 //   the scale ellipse Sigma = M^-1 M^-T, with (u, v) = M (dx, dy) at the centre, becomes Sigma + c' with
-//   c' = c 2 (beta + 2) / 9, in the unit in which the kernel has the variance 1; its opacity times sqrt(det Sigma /
-//   det(Sigma + c')), which keeps the total;
-//   the low pass exp(-d^2 / p^2) becomes that of the squared radius p^2 + 2 c, times p^2 / (p^2 + 2 c), likewise.
-// Where p > 1 the low pass is p pixels wide, as it is in an enlarged picture. At p = 1 nothing changes.
+//   c' = c 2 (beta + 2) / 9, in units where the kernel has the variance 1; its opacity is multiplied by
+//   sqrt(det Sigma / det(Sigma + c')), which keeps the total;
+//   the low pass exp(-d^2 / p^2) gets the squared radius p^2 + 2 c and the factor p^2 / (p^2 + 2 c), likewise.
+// For p > 1 the low pass is p pixels wide, as in an enlarged picture. At p = 1 nothing changes.
 #pragma once
 
 #include "core/surfel.h"
 
 namespace bt {
 
-// Parameters of a view.
+// Resampling parameters of a view.
 template <class S> struct Resize {
   S variance;  // c, pixels^2
   S sharp;     // 1 / squared radius of the low pass
-  S share;     // of its height that is left
+  S share;     // factor of its height
 
   BT_HD explicit Resize(S photo_pixel)
       : variance(max_(S(0), (S(1) - photo_pixel * photo_pixel) / S(12))),
@@ -26,19 +26,19 @@ template <class S> struct Resize {
         share(photo_pixel * photo_pixel * sharp) {}
 };
 
-// Changes a row of geom; kLowPassHeight then holds by how much the low pass is higher than the kernel at the centre.
-// False where the row is no longer finite.
+// Resizes a row of geom; kLowPassHeight becomes the height of the low pass over that of the kernel at the centre. False
+// where the row is no longer finite.
 template <class S, class T> BT_HD MaskOf<T> resize(const Resize<S>& to, T* g) {
   const T zero = T(0.0f), one = T(1.0f), two = T(2.0f);
   g[kLowPassHeight] = T(to.share);
   const MaskOf<T> seen = g[kW0] > zero;
   if (to.variance == S(0)) return finite_(one);
-  // M' = (1 + c' M M^T)^(-1/2) M: sums of positive terms
+  // M' = (1 + c' M M^T)^(-1/2) M, from positive terms only
   const T c = T(to.variance * S(2 / kSupport2)) * (g[kBeta] + two), inv = one / select(seen, g[kW0], one);
   const T u1 = g[kU1] * inv, u2 = g[kU2] * inv, v1 = g[kV1] * inv, v2 = g[kV2] * inv;
   const T uu = c * (u1 * u1 + u2 * u2), uv = c * (u1 * v1 + u2 * v2), vv = c * (v1 * v1 + v2 * v2);
   const T cross = c * (u1 * v2 - u2 * v1), root = sqrt_(one + uu + vv + cross * cross);  // of the determinant
-  // of A = 1 + c' M M^T the square root is (A + root) / t, its inverse the adjugate of A + root over root t
+  // A = 1 + c' M M^T has the square root (A + root) / t, whose inverse is the adjugate of A + root over root t
   const T t = sqrt_(two + uu + vv + two * root), k = one / (root * t);
   const T a = (one + vv + root) * k, b = -uv * k, d = (one + uu + root) * k;
   for (int j = 0; j < 2; ++j) {

@@ -1,4 +1,4 @@
-// The colour of a fragment, eq. (color): relu(relu(f_view + 0.5) + rho), rho the residual of the field or of a texel.
+// Colour of a fragment, eq. (color): relu(relu(f_view + 0.5) + rho), rho the residual of the field or of a texel.
 #pragma once
 
 #include "core/common.h"
@@ -7,7 +7,7 @@ namespace bt {
 
 constexpr double kColorBias = 0.5;
 
-// relu(f_view + 0.5): all of the colour where there is no residual.
+// Computes relu(f_view + 0.5), the colour without residual.
 template <class S> BT_HD S view_base(S f_view) { return relu(f_view + S(kColorBias)); }
 template <class S> BT_HD Vec3<S> view_base(Vec3<S> f_view) {
   return {view_base(f_view.x), view_base(f_view.y), view_base(f_view.z)};
@@ -17,7 +17,8 @@ template <class S> BT_HD Vec3<S> shaded(Vec3<S> base, Vec3<S> residual) {
   return {shaded(base.x, residual.x), shaded(base.y, residual.y), shaded(base.z, residual.z)};
 }
 
-// The residual passes gradient where the outer ReLU is open, the view colour where both are.
+// Computes the gradient of the residual: it passes where the outer ReLU is open; that of the view colour where both
+// are.
 template <class T> BT_HD T residual_gradient(T color, T dcolor) { return select(color > T(0.0f), dcolor, T(0.0f)); }
 template <class S> BT_HD Vec3<S> residual_gradient(Vec3<S> color, Vec3<S> dcolor) {
   return {residual_gradient(color.x, dcolor.x), residual_gradient(color.y, dcolor.y),

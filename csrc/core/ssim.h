@@ -1,5 +1,5 @@
-// Structural similarity (Wang et al. 2004) of one window from its moments, and the part of its gradient that all its
-// pixels share.
+// Structural similarity (Wang et al. 2004) of a window from its moments, and the part of its gradient shared by its
+// pixels.
 #pragma once
 
 #include "core/common.h"
@@ -9,7 +9,7 @@ namespace bt {
 constexpr int kSsimTaps = 11;
 constexpr double kSsimC1 = 0.01 * 0.01, kSsimC2 = 0.03 * 0.03;
 
-// The Gaussian window of standard deviation 1.5, normalised.
+// Gaussian window of standard deviation 1.5, normalised.
 template <class S> struct SsimWindow {
   S k[kSsimTaps];
   SsimWindow() {
@@ -22,14 +22,14 @@ template <class S> struct SsimWindow {
   }
 };
 
-// Adds a pixel's share to a window's five means, which are of a, b, a^2, b^2 and a b; k is its weight.
+// Adds a pixel of weight k to a window's means of a, b, a^2, b^2 and a b.
 template <class S> BT_HD void add_moments(S k, S a, S b, S* means) {
   const S ka = k * a, kb = k * b;
   means[0] += ka, means[1] += kb, means[2] += ka * a, means[3] += kb * b, means[4] += ka * b;
 }
 
-// Weighted means over a window: of a, b, a^2, b^2 and a b. The derivatives are those towards the means of a, a^2 and
-// a b; a pixel p of weight k gets k (d[0] + 2 a_p d[1] + b_p d[2]).
+// Computes SSIM from weighted means over a window of a, b, a^2, b^2 and a b. d: derivatives with respect to the means
+// of a, a^2 and a b; a pixel p of weight k gets k (d[0] + 2 a_p d[1] + b_p d[2]).
 template <class S> BT_HD S ssim_window(S a, S b, S aa, S bb, S ab, S* d) {
   const S c1 = S(kSsimC1), c2 = S(kSsimC2), one = S(1.0f), two = S(2.0f);
   const S p = two * a * b + c1, q = two * (ab - a * b) + c2;
@@ -40,7 +40,7 @@ template <class S> BT_HD S ssim_window(S a, S b, S aa, S bb, S ab, S* d) {
   d[2] = two * p * i;
   return value;
 }
-// The gradient of pixel a from the sums over its windows of k d[0], k d[1] and k d[2].
+// Computes the gradient of pixel a from the sums over its windows of k d[0], k d[1] and k d[2].
 template <class S> BT_HD S ssim_pixel_gradient(S a, S b, S d0, S d1, S d2) { return d0 + S(2.0f) * a * d1 + b * d2; }
 
 }  // namespace bt

@@ -1,4 +1,4 @@
-// A surfel seen by a camera: everything that its fragments need, and the vector-Jacobian product of that.
+// A projected surfel, with everything its fragments need, and the vector-Jacobian product.
 //
 // Let a, b be the unit tangents, n = a x b the normal and p the centre, all in the camera frame, and r the ray
 // r = (x, y, 1) of a pixel at (dx, dy) pixels from the projected centre. The ray meets the disc's plane at depth
@@ -6,38 +6,37 @@
 //   u = U / W,  v = V / W,  W = n.r = n.p/z + n.x dx/fx + n.y dy/fy,
 //   U = -((p x b).x dx/fx + (p x b).y dy/fy) / s_u,   V = ((p x a).x dx/fx + (p x a).y dy/fy) / s_v.
 // This is the solution of the homography of 2D Gaussian Splatting (Huang et al. 2024) divided by fx fy s_u s_v. No
-// coefficient is a difference of large numbers: the principal point has cancelled, and n comes from the rotation and
-// not from a determinant; float32 suffices. All are multiplied by the sign of n.p, so that W > 0 means "in front".
+// coefficient is a difference of large numbers, as the principal point cancels and n comes from the rotation instead of
+// a determinant; float32 suffices. All are multiplied by the sign of n.p, so that W > 0 means "in front".
 #pragma once
 
 #include "core/camera.h"
 
 namespace bt {
 
-constexpr double kSupport = 3.0;  // R: the kernel ends at 3 scale units
+constexpr double kSupport = 3.0;  // R: radius of the kernel in scale units
 constexpr double kSupport2 = kSupport * kSupport;
-constexpr double kAlphaMax = 0.99;          // sigma is clamped to this
-constexpr double kAlphaMin = 1.0 / 255;     // fragments below this are skipped
-constexpr double kTransmittanceMin = 1e-4;  // a pixel takes no fragment that would leave it less
-constexpr double kLowPassReach = 2.36;      // pixels, > sqrt(ln(1 / kAlphaMin)): where the low pass falls below that
+constexpr double kAlphaMax = 0.99;          // upper bound of sigma
+constexpr double kAlphaMin = 1.0 / 255;     // fragments of smaller sigma are skipped
+constexpr double kTransmittanceMin = 1e-4;  // a pixel ends before the fragment that would leave less
+constexpr double kLowPassReach = 2.36;      // pixels, > sqrt(ln(1 / kAlphaMin)): the low pass is below kAlphaMin beyond
 constexpr double kBetaMax = 4.0;
 constexpr double kLogScaleMax = 30.0;  // log scales are clamped to +-30: their squares stay finite in float32
 
 // Columns of a row of `geom` [N, kGeom].
 enum GeomColumn { kCx, kCy, kU1, kU2, kV1, kV2, kW0, kW1, kW2, kZ, kOpacity, kBeta, kNx, kNy, kNz, kGeom = 16 };
-// The last column by kernel. PixelKernel: n = fx fy s_u s_v / z^2, for which n w0 is the area of the projected scale
-// ellipse over pi; 0 where it does not filter the surfel. ResizedKernel: height of the low pass over that of the kernel
+// Last column by kernel. PixelKernel: n = fx fy s_u s_v / z^2, so that n w0 is the area of the projected scale ellipse
+// over pi; 0 if the surfel is not filtered. ResizedKernel: height of the low pass over that of the kernel
 // (core/resize.h). LowPassKernel: 0.
 constexpr GeomColumn kArea = GeomColumn(kGeom - 1), kLowPassHeight = kArea;
 // Columns of a row of `frames` [N, kFrame]: mean, s_u t_u, s_v t_v, all in the world frame.
 constexpr int kFrame = 9;
 
-// The option `prefilter`, a number in this list.
+// Values of the option `prefilter`, by index.
 constexpr const char* kPrefilters[] = {"low_pass", "pixel"};
-// The kernels that surfels are drawn with, chosen at compile time. LowPassKernel: the maximum of the kernel and the low
-// pass (core/kernel.h). PixelKernel: the prefilter of core/prefilter.h; rows with kArea 0 are drawn as with
-// LowPassKernel. ResizedKernel: LowPassKernel in a view of another size than the photographs, for the baked renderers
-// alone. Only with_kernel chooses.
+// Kernels, chosen at compile time by with_kernel. LowPassKernel: the maximum of the Beta kernel and the low pass
+// (core/kernel.h). PixelKernel: the prefilter of core/prefilter.h; rows with kArea 0 are drawn as by LowPassKernel.
+// ResizedKernel: LowPassKernel in a view of another size than the photographs, for the baked renderers.
 struct LowPassKernel {
   static constexpr bool kPixel = false, kResized = false;
 };
@@ -61,13 +60,13 @@ template <class Kernel, class S> BT_HD bool filtered(const S* g) {
     return false;
 }
 
-// The slope of a plane at (dx, dy) pixels from the projected centre: U is slope(g, kU1, ...), W is g[kW0] and that of
-// kW1.
+// Evaluates a plane without its constant at (dx, dy) pixels from the projected centre: U is slope(g, kU1, ...), W is
+// g[kW0] + slope(g, kW1, ...).
 template <class S, class T> BT_HD T slope(const S* g, GeomColumn first, T dx, T dy) {
   return T(g[first]) * dx + T(g[first + 1]) * dy;
 }
 
-// The geometry of n surfels: [n, 3], [n, 4] wxyz, [n, 2], [n], [n].
+// Geometry of n surfels: [n, 3], [n, 4] wxyz, [n, 2], [n], [n].
 template <class S> struct Surfels {
   int64_t n;
   const S *means, *quats, *log_scales, *opacity_logits, *beta_raw;
@@ -92,7 +91,7 @@ template <class S> struct SurfelGradients {
   }
 };
 
-// One of them; with Lanes, one in each lane.
+// One surfel, or one per lane.
 template <class T> struct SurfelRow {
   Vec3<T> mean;
   T quat[4], log_scale[2], opacity_logit, beta_raw;
@@ -140,12 +139,12 @@ template <class S> BT_HD void rotation_vjp(const Rotation<S>& r, Vec3<S> du, Vec
       two * (-two * y * du.x + x * du.y - w * du.z + x * dv.x + z * dv.z + w * dn.x + z * dn.y - two * y * dn.z);
   const S gz =
       two * (-two * z * du.x + w * du.y + x * du.z - w * dv.x - two * z * dv.y + y * dv.z + x * dn.x + y * dn.y);
-  const S along = gw * w + gx * x + gy * y + gz * z;  // the length of q has no effect
+  const S along = gw * w + gx * x + gy * y + gz * z;  // the length of q does not matter
   dq[0] = (gw - along * w) * r.inv, dq[1] = (gx - along * x) * r.inv;
   dq[2] = (gy - along * y) * r.inv, dq[3] = (gz - along * z) * r.inv;
 }
 
-// s = exp of the clamped log scale; ds/dlog is s inside the range and 0 beyond.
+// Computes s = exp of the clamped log scale; ds/dlog is s inside the range and 0 outside.
 template <class T> BT_HD T surfel_scale(T log_scale) {
   return exp_(clamp_(log_scale, T(-kLogScaleMax), T(kLogScaleMax)));
 }
@@ -153,7 +152,7 @@ template <class S> BT_HD bool scale_moves(S log_scale) {
   return log_scale > S(-kLogScaleMax) && log_scale < S(kLogScaleMax);
 }
 
-// A surfel in the world, its centre in the camera's frame.
+// A surfel in the world, with its centre in the camera frame.
 template <class T> struct WorldSurfel {
   Rotation<T> rot;
   T su, sv;  // scales
@@ -162,8 +161,7 @@ template <class T> struct WorldSurfel {
 template <class S, class T> BT_HD WorldSurfel<T> world_surfel(const Pinhole<S>& cam, const SurfelRow<T>& in) {
   return {rotation(in.quat), surfel_scale(in.log_scale[0]), surfel_scale(in.log_scale[1]), to_camera(cam, in.mean)};
 }
-// And what else a camera sees of it: tangents, normal, n.p with its sign, and the reciprocals of p.z, fx, fy and
-// scales.
+// A surfel in the camera frame: tangents, normal, n.p with its sign, and the reciprocals of p.z, fx, fy and scales.
 template <class S, class T> struct CameraSurfel {
   Vec3<T> a, b, n;
   T np, sign, iz, isu, isv;
@@ -180,8 +178,8 @@ template <class S, class T> BT_HD CameraSurfel<S, T> camera_surfel(const Pinhole
   return s;
 }
 
-// Fills a row of geom and of frames; false where the surfel is not finite or its centre is nearer than `near` (camera
-// z): the rows are then anything.
+// Fills a row of geom and of frames; false, with undefined rows, if the surfel is not finite or its centre is nearer
+// than `near` (camera z).
 template <class Kernel, class S, class T>
 BT_HD MaskOf<T> project(const Pinhole<S>& cam, const SurfelRow<T>& in, S near, T* g, T* frame) {
   const WorldSurfel<T> at = world_surfel(cam, in);
@@ -199,7 +197,7 @@ BT_HD MaskOf<T> project(const Pinhole<S>& cam, const SurfelRow<T>& in, S near, T
   g[kNx] = -sign * n.x, g[kNy] = -sign * n.y, g[kNz] = -sign * n.z;
   g[kArea] = T(0.0f);
   if constexpr (Kernel::kPixel) {
-    // discs of a million pixels need no filter, and their squared areas would overflow
+    // discs of a million pixels need no filter, and their squared areas could overflow
     const T area = T(cam.fx) * T(cam.fy) * su * sv * iz * iz;
     g[kArea] = select(area < T(1e12), area, T(0.0f));
   }
@@ -212,9 +210,8 @@ BT_HD MaskOf<T> project(const Pinhole<S>& cam, const SurfelRow<T>& in, S near, T
   return ok;
 }
 
-// Gradients of the parameters of surfel i from those of its rows; they are written, not added, and 0 where the camera
-// does not see the surfel. dframe may be null (zero). The slope of a sigmoid is taken from its argument, sigmoid(x)
-// sigmoid(-x): at o -> 1 nothing is left of 1 - o in float32.
+// Writes the gradients of the parameters of surfel i from those of its rows; 0 if the surfel is not visible. dframe may
+// be null (zero). The slope of a sigmoid is sigmoid(x) sigmoid(-x), as 1 - o vanishes in float32 for o -> 1.
 template <class S>
 BT_HD void project_vjp(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, const S* geom, const S* dgeom,
                        const S* dframe, const SurfelGradients<S>& out) {
@@ -245,7 +242,7 @@ BT_HD void project_vjp(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, c
   dp.y += cam.fy * iz * dgeom[kCy];
   dp.z += dgeom[kZ] - iz * (dgeom[kW0] * geom[kW0] + iz * (cam.fx * p.x * dgeom[kCx] + cam.fy * p.y * dgeom[kCy]));
 
-  const S darea = dgeom[kArea] * geom[kArea];  // towards log n
+  const S darea = dgeom[kArea] * geom[kArea];  // with respect to log n
   dp.z -= S(2) * iz * darea;
 
   const Vec3<S> dmean = rotate_transposed(cam.R, dp) + load3(dframe);

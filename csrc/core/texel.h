@@ -1,5 +1,5 @@
-// Positions of surfel coordinates in an atlas tile: texel i of r has its centre at u = (i + 0.5) / r * 2 e - e,
-// with e the half side of the surfel's tile in scale units (eq. texel centres).
+// Positions of surfel coordinates in an atlas tile: texel i of r has its centre at u = (i + 0.5) / r * 2 e - e, with e
+// the half side of the surfel's tile in scale units (eq. texel centres).
 #pragma once
 
 #include <cstdint>
@@ -8,40 +8,40 @@
 
 namespace bt {
 
-// Position along one axis of a tile of r texels, clamped to the outer texel centres: texel floor(x), its neighbour
-// min(floor(x) + 1, r - 1), and the fraction is the neighbour's weight.
+// Computes the position along one axis of a tile of r texels, clamped to the outer texel centres: texel floor(x), its
+// neighbour min(floor(x) + 1, r - 1), and the fraction is the neighbour's weight.
 template <class S, class T> BT_HD T texel_position(T u, int r, S extent) {
   const T x = (u + T(extent)) * T(S(r) / (S(2) * extent)) - T(S(0.5));
   return clamp_(x, T(S(0)), T(S(r - 1)));
 }
 
-// The same for a tile of span + 1 texels, with k = 1 / (2 extent) at hand.
+// Computes the same for a tile of span + 1 texels, given k = 1 / (2 extent).
 template <class S, class T> BT_HD T texel_position_scaled(T u, S span, S k) {
   return clamp_(u * T((span + S(1)) * k) + T(S(0.5) * span), T(S(0)), T(span));
 }
 
-// Levels of a tile: 2 x 2 texels of a level are one of the next, as long as all of that lies on the grid of the page.
+// Levels of a tile: 2 x 2 texels of a level form one of the next, if they lie on the grid of the page.
 constexpr int kTileLevels = 3;
 BT_HD bool has_level(const int32_t* tile, int level) {  // x, y, page, r_u, r_v
   return ((tile[0] | tile[1] | tile[3] | tile[4]) & ((1 << level) - 1)) == 0;
 }
-// The level of which a texel is about as large as a pixel, by a row of geom of core/surfel.h: the geometric mean along
-// the axes. Not coarser than a pixel of the view is than one of a photograph: nearer to its size the texels were
-// trained as they are. kTileLevels where nothing is left but a constant.
+// Selects the level with about one texel per pixel from a row of geom (core/surfel.h): the geometric mean over the
+// axes. Not coarser than the view relative to the photographs: near their size the texels were trained as they are.
+// kTileLevels if only a constant is left.
 template <class S> BT_HD int tile_level(const S* g, int r_u, int r_v, S extent, S photo_pixel) {
   const S k = S(0.5) / (extent * g[kW0]);  // texels per pixel along the gradient of u and v, squared
   const S u = g[kU1] * g[kU1] + g[kU2] * g[kU2], v = g[kV1] * g[kV1] + g[kV2] * g[kV2];
   const S area = sqrt_(u * v) * k * k * S(r_u) * S(r_v);  // texels per pixel, by area
   const S most = S(1) / (photo_pixel * photo_pixel);
   int level = 0, side = max_(r_u, r_v);
-  // half way between two levels, 4^l sqrt(4) / 2
+  // midway between two levels, 4^l sqrt(4) / 2
   for (S size = S(2); level < kTileLevels && area > size && most >= size; size *= S(4)) ++level, side /= 2;
   return level && side <= 2 ? kTileLevels : min_(level, kTileLevels - 1);
 }
 
-// The texels on both sides of a position along one axis: `first`, a whole number, and the next, which weighs
-// `fraction`. A tile of one texel has no next: `first` stands for it. Beyond the outer texel centres, not `inside`, the
-// position stands still.
+// Texels on both sides of a position along one axis: `first`, a whole number, and the next, with weight `fraction`. A
+// tile of one texel has no next: `first` replaces it. Not `inside`: beyond the outer texel centres, where the position
+// is clamped.
 template <class T> struct TexelAxis {
   T first, fraction;
   MaskOf<T> inside;
@@ -51,14 +51,14 @@ template <class S, class T> BT_HD TexelAxis<T> texel_axis(T u, int r, S extent) 
   const MaskOf<T> inside = (x > T(S(0))) & (x < T(S(r - 1)));
   return {first, x - first, inside};
 }
-// From a texel to the next ones along u and v, in texels (rows lie along v).
+// Index steps to the next texels along u and v (rows lie along v).
 struct TexelSteps {
   int right, down;
   BT_HD explicit TexelSteps(const int32_t* size) : right(size[0] > 1 ? 1 : 0), down(size[1] > 1 ? size[0] : 0) {}
 };
 
-// The bilinear fetch from four texels t (three channels or a vector of the processor), rows along v, and the gradient
-// of it along each axis, per texel: it is linear between texel centres.
+// Weights of the bilinear fetch from four texels t (three channels or a SIMD vector), rows along v, and its gradient
+// along each axis, per texel: it is linear between texel centres.
 template <class S> BT_HD void texel_weights(S fx, S fy, S* weight) {
   weight[0] = (S(1) - fx) * (S(1) - fy), weight[1] = fx * (S(1) - fy), weight[2] = (S(1) - fx) * fy;
   weight[3] = fx * fy;
@@ -66,7 +66,7 @@ template <class S> BT_HD void texel_weights(S fx, S fy, S* weight) {
 template <class V, class S> BT_HD V texel_mix(const V* t, const S* weight) {
   return (weight[0] * t[0] + weight[1] * t[1]) + (weight[2] * t[2] + weight[3] * t[3]);
 }
-// The same along u, then along v: exactly the texels' value where they are equal, as those of an alpha of 1.
+// Interpolates along u, then along v: exact for equal texels, such as alphas of 1.
 template <class S> BT_HD S texel_lerp(const S* t, S fx, S fy) {
   const S above = t[0] + fx * (t[1] - t[0]), below = t[2] + fx * (t[3] - t[2]);
   return above + fy * (below - above);
@@ -77,10 +77,10 @@ template <class V, class S> BT_HD V texel_slope_u(const V* t, S fy) {
 template <class V, class S> BT_HD V texel_slope_v(const V* t, S fx) {
   return (S(1) - fx) * (t[2] - t[0]) + fx * (t[3] - t[1]);
 }
-// Texels per unit of u.
+// Returns the texels per unit of u.
 template <class S> BT_HD S texel_density(int r, S extent) { return S(r) / (S(2) * extent); }
 
-// The texels of one fetch, as offsets from the tile's first, and their weights.
+// Texels of one fetch, as offsets from the tile's first, and their weights.
 template <class S> struct TexelCorners {
   int32_t at[4];
   S weight[4];
@@ -98,12 +98,12 @@ template <class S> BT_HD TexelCorners<S> texel_corners(S u, S v, const int32_t* 
   return c;
 }
 
-// The texels there.
+// Loads these texels.
 template <class S> BT_HD void load_corners(const S* tile, const TexelCorners<S>& c, Vec3<S>* t) {
   for (int k = 0; k < 4; ++k) t[k] = load3(tile + 3 * c.at[k]);
 }
-// Gradient of the fetch along u and v from its four texels: 0 from the outer texel centres on; at a centre between
-// them, where the slope jumps, that of the side of larger coordinates.
+// Gradient of the fetch along u and v from its four texels: 0 beyond the outer texel centres; at a centre between them,
+// where the slope jumps, that on the side of larger coordinates.
 template <class S> struct TexelSlopes {
   Vec3<S> u, v;
 };
@@ -115,7 +115,7 @@ BT_HD TexelSlopes<S> texel_slopes(const Vec3<S>* t, const TexelCorners<S>& c, co
   return s;
 }
 
-// A texel after a step along its gradient g.
+// Returns a texel after a step along its gradient g.
 template <class V, class S> BT_HD V texel_step(V texel, V g, S rate, S share) { return texel + -rate * share * g; }
 
 }  // namespace bt

@@ -1,13 +1,13 @@
-// The view-dependent colours f_view(d) of all surfels: the parameters as arrays, and for_view_color, which finds the
-// struct of a kind (core/view_kinds.h).
+// View-dependent colours f_view(d) of all surfels: parameter arrays, and dispatch to the struct of a kind
+// (core/view_kinds.h).
 #pragma once
 
 #include "core/view_kinds.h"
 
 namespace bt {
 
-// Direction from the camera's centre, in double: far from the origin its rounding to float32 would turn the
-// direction, while the difference is as exact as the surfel's own position.
+// Computes the vector from the camera's centre in double: far from the origin, rounding the centre to float32 would
+// turn the direction.
 template <class S> BT_HD Vec3<S> from_center(const S* mean, const double* center) {
   return {S(double(mean[0]) - center[0]), S(double(mean[1]) - center[1]), S(double(mean[2]) - center[2])};
 }
@@ -17,9 +17,9 @@ template <class S> BT_HD Unit<S> view_direction(const S* mean, const double* cen
 
 constexpr const char* kViewColorNames[] = {SphericalVoronoi::kName, SphericalHarmonics::kName, SphericalBeta::kName,
                                            SphericalGaussians::kName};
-// Calls f with the struct of a kind, a number in that list.
+// Calls f with the struct of a kind, an index into that list.
 #if defined(__CUDACC__)
-#pragma nv_exec_check_disable  // f may be for one of host and device alone
+#pragma nv_exec_check_disable  // f may be for host or device only
 #endif
 template <class F> BT_HD auto for_view_color(int kind, F&& f) {
   switch (kind) {
@@ -37,7 +37,7 @@ BT_HD ViewColorWidths view_color_widths(int kind, int K) {
   return for_view_color(kind, [=](auto view_color) { return view_color.widths(K); });
 }
 
-// The parameters of all surfels. `terms` = sites, coefficients (with dc) or lobes.
+// Parameters of all surfels. `terms` = sites, coefficients (with dc) or lobes.
 template <class S> struct ViewColorArrays {
   int kind, terms;
   S *a, *b, *c;
@@ -56,10 +56,10 @@ template <class S> struct ViewColorArrays {
     r.array(name_b, b, w.b * n);
     if (w.c) r.array(name_c, c, w.c * n);
   }
-  // Of surfel i.
+  // Returns the row of surfel i.
   BT_HD ViewColorRow<S> row(ViewColorWidths w, int64_t i) const { return {a + w.a * i, b + w.b * i, c + w.c * i}; }
 };
-// Colour of surfel i. K is p.terms; a kernel that knows it when it is compiled unrolls its loops.
+// Evaluates the colour of surfel i. K is p.terms; kernels that know it at compile time unroll their loops.
 template <class ViewColor, class S>
 BT_HD Vec3<S> view_color(int K, const ViewColorArrays<const S>& p, int64_t i, Vec3<S> d) {
   return ViewColor::color(K, p.row(ViewColor::widths(K), i), d);
@@ -76,11 +76,11 @@ BT_HD Vec3<S> view_color_vjp(int K, const ViewColorArrays<const S>& p, int64_t i
 BT_HD int lean_width(int kind) {
   return for_view_color(kind, [](auto view_color) { return view_color.kLeanWidth; });
 }
-// View colours of which only what a surfel needs is left: a base colour, and as many terms as its span says.
+// Lean view colours: a base colour and a varying number of terms per surfel.
 template <class S> struct LeanColors {
   int kind;
   const S *base, *terms;  // [n, 3], [all terms, lean_width(kind)]
-  const int32_t* span;    // [n, 2]: first term, how many
+  const int32_t* span;    // [n, 2]: first term, number of terms
 
   template <class R> void fields(R& r, int64_t n, int64_t& count) {
     r.choice("kind", kind, kViewColorNames);
@@ -95,7 +95,7 @@ template <class S> BT_HD Vec3<S> view_color(const LeanColors<S>& p, int64_t i, V
     return view_color.lean_color(p.span[2 * i + 1], p.base + 3 * i, p.terms + int64_t(p.span[2 * i]) * kWidth, d);
   });
 }
-// View colours of n surfels: whole, or lean where lean.base is not null.
+// View colours of n surfels: whole, or lean if lean.base is not null.
 template <class S> struct ViewColors {
   ViewColorArrays<const S> whole;
   LeanColors<S> lean;

@@ -1,7 +1,7 @@
 // View-dependent surfel colour f_view(d), without the offset 0.5: Spherical Voronoi (sv, Di Sario et al. 2025),
 // spherical harmonics (sh, as in 3D Gaussian Splatting, Kerbl et al. 2023), Spherical Beta (sb, Deformable Beta
-// Splatting, Liu et al. 2025) and spherical Gaussians (sg), each with its vector-Jacobian product. d is the unit vector
-// from the camera centre to the surfel, world frame. A kind is one struct.
+// Splatting, Liu et al. 2025) and spherical Gaussians (sg), each a struct with its vector-Jacobian product. d is the
+// unit vector from the camera centre to the surfel, world frame.
 #pragma once
 
 #include "core/common.h"
@@ -9,30 +9,30 @@
 namespace bt {
 
 constexpr int kMaxTerms = 32;                  // sites or lobes
-constexpr double kShC0 = 0.28209479177387814;  // the harmonic of degree 0, 1 / (2 sqrt(pi)); and those of 1 to 3
+constexpr double kShC0 = 0.28209479177387814;  // harmonic of degree 0, 1 / (2 sqrt(pi)); below, degrees 1 to 3
 constexpr double kShC1 = 0.4886025119029199;
 constexpr double kShC2a = 1.0925484305920792, kShC2b = 0.31539156525252005, kShC2c = 0.5462742152960396;
 constexpr double kShC3a = 0.5900435899266435, kShC3b = 2.890611442640554, kShC3c = 0.4570457994644658;
 constexpr double kShC3e = 0.3731763325901154, kShC3f = 1.445305721320277;
-constexpr double kLogTauMax = 16;    // temperatures end at 9e6: finite in, finite out
-constexpr double kLogPowerMax = 10;  // and the powers of Spherical Beta lobes at 9e4
+constexpr double kLogTauMax = 16;    // temperatures up to 9e6, so that results are finite
+constexpr double kLogPowerMax = 10;  // powers of Spherical Beta lobes up to 9e4
 
-// The temperature of a site or the sharpness of a Gaussian lobe.
+// Computes the temperature of a site or the sharpness of a Gaussian lobe.
 template <class S> BT_HD S temperature(S log_tau) { return exp_(min_(log_tau, S(kLogTauMax))); }
 
 // Numbers per surfel of the parameters a, b and c.
 struct ViewColorWidths {
   int64_t a, b, c;
 };
-// Those of one surfel.
+// Parameters of one surfel.
 template <class S> struct ViewColorRow {
   S *a, *b, *c;
 };
 
-// Members of a kind's struct: its name, the fewest terms, and those of its preset, for which kernels that unroll their
-// loops are compiled; the widths of its parameters; the colour, and its vector-Jacobian product, which writes the
-// gradients of the parameters and adds to that of d; and its lean form: terms of kLeanWidth numbers, and the colour of
-// a base and K of them.
+// Members of a kind's struct: name, fewest terms, and the preset's number of terms, for which kernels with unrolled
+// loops are compiled; parameter widths; the colour, and its vector-Jacobian product, which writes the gradients of the
+// parameters and adds to that of d; and the lean form: terms of kLeanWidth numbers, and the colour of a base and K
+// terms.
 
 // Spherical Voronoi. a = sites [K, 3], b = log tau [K], c = rgb [K, 3].
 struct SphericalVoronoi {
@@ -57,8 +57,8 @@ struct SphericalVoronoi {
     }
     return (S(1) / total) * c;
   }
-  // The same relative to site 0, which then needs no direction: term k is b_k = tau_k s_k - tau_0 s_0 and rgb_k,
-  // c = (base + sum_k exp(b_k . d) rgb_k) / (1 + sum_k exp(b_k . d)). Without terms this is one colour.
+  // Relative to site 0, which then needs no direction: term k is b_k = tau_k s_k - tau_0 s_0 and rgb_k,
+  // c = (base + sum_k exp(b_k . d) rgb_k) / (1 + sum_k exp(b_k . d)); the base alone without terms.
   template <class S> BT_HD static Vec3<S> lean_color(int K, const S* base, const S* terms, Vec3<S> d) {
     Vec3<S> c = load3(base);
     if (K == 0) return c;
@@ -73,9 +73,9 @@ struct SphericalVoronoi {
     }
     return (S(1) / total) * c;
   }
-  // dlogit_k = w_k dc . (rgb_k - c) is taken with all colours relative to that of the heaviest site: where one site
-  // takes nearly all, its own rgb_k - c is then a sum of the others' small shares and not the difference of two equal
-  // colours, whose rounding a temperature of 1e4 would multiply.
+  // dlogit_k = w_k dc . (rgb_k - c) is computed with all colours relative to that of the heaviest site: if one site has
+  // nearly all weight, its rgb_k - c is then a sum of small terms, not a difference of equal colours, whose rounding a
+  // temperature of 1e4 would amplify.
   template <class S>
   BT_HD static void color_vjp(int K, ViewColorRow<const S> p, Vec3<S> d, Vec3<S> dc, ViewColorRow<S> dp, Vec3<S>& dd) {
     const S *sites = p.a, *log_tau = p.b, *rgb = p.c;
@@ -109,16 +109,15 @@ struct SphericalVoronoi {
   }
 };
 
-// The lean form of a kind whose terms are kept as they are. kInBase: how many of them the base is, as the coefficient
-// of degree 0 is of the spherical harmonics.
+// Lean form of a kind with unchanged terms. kInBase: number of terms in the base, 1 for spherical harmonics (degree 0).
 template <class Kind, int kInBase = 0> struct StoredWhole {
   template <class S> BT_HD static Vec3<S> lean_color(int K, const S* base, const S* terms, Vec3<S> d) {
     return Kind::color(K + kInBase, ViewColorRow<const S>{base, terms, nullptr}, d);
   }
 };
 
-// Real spherical harmonics up to degree 3 in the order and sign convention of 3DGS; out has 16 entries, `terms` are
-// set.
+// Computes real spherical harmonics up to degree 3 in the order and sign convention of 3DGS: the first `terms` of out
+// [16].
 template <class S> BT_HD void sh_basis(int terms, Vec3<S> d, S* out) {
   const S x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
   out[0] = S(kShC0);
@@ -139,7 +138,7 @@ template <class S> BT_HD void sh_basis(int terms, Vec3<S> d, S* out) {
     out[14] = f * z * (xx - yy), out[15] = -a * x * (xx - S(3) * yy);
   }
 }
-// sum_k g_k d basis_k / d direction
+// Computes sum_k g_k d basis_k / d direction.
 template <class S> BT_HD Vec3<S> sh_basis_vjp(int terms, Vec3<S> d, const S* g) {
   const S x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z, two = S(2), six = S(6);
   Vec3<S> r = {S(0), S(0), S(0)};
@@ -165,7 +164,7 @@ template <class S> BT_HD Vec3<S> sh_basis_vjp(int terms, Vec3<S> d, const S* g) 
   }
   return r;
 }
-// Spherical harmonics of `terms` coefficients. a = dc [3], b = rest [terms - 1, 3].
+// Spherical harmonics with `terms` coefficients. a = dc [3], b = rest [terms - 1, 3].
 struct SphericalHarmonics : StoredWhole<SphericalHarmonics, 1> {
   static constexpr const char* kName = "sh";
   static constexpr int kLeastTerms = 1, kPresetTerms = 16, kLeanWidth = 3;
@@ -196,7 +195,7 @@ struct SphericalHarmonics : StoredWhole<SphericalHarmonics, 1> {
   }
 };
 
-// softplus with slope 10 ln 2, which is 0.1 at 0 (Deformable Beta Splatting's lobe colours)
+// Softplus with slope 10 ln 2, which is 0.1 at 0 (lobe colours of Deformable Beta Splatting).
 constexpr double kLobeSlope = 6.931471805599453;
 template <class S> BT_HD S lobe_softplus(S x) {
   const S a = S(kLobeSlope) * x;
@@ -219,7 +218,7 @@ template <class S> BT_HD BetaLobe<S> beta_lobe(const S* lobe, Vec3<S> d) {
   l.value = l.cosine > S(0) ? exp_(l.power * log_(l.cosine)) : S(0);
   return l;
 }
-// Spherical Beta: c = base + the sum of the lobes. a = base [3], b = lobes [K, 6].
+// Spherical Beta: c = base + sum of lobes. a = base [3], b = lobes [K, 6].
 struct SphericalBeta : StoredWhole<SphericalBeta> {
   static constexpr const char* kName = "sb";
   static constexpr int kLeastTerms = 0, kPresetTerms = 2, kLeanWidth = 6;
@@ -248,7 +247,7 @@ struct SphericalBeta : StoredWhole<SphericalBeta> {
       g[2] = l.value * dc.z * sigmoid(S(kLobeSlope) * lobe[2]);
       const S dvalue = dot(dc, l.color);
       const bool lit = l.cosine > S(0);
-      // value / cosine stays finite: the power is above 0 and a tiny cosine gives value 0 first
+      // value / cosine stays finite: the power is positive, so value vanishes with the cosine
       const S dcos = lit ? dvalue * l.power * l.value / max_(l.cosine, S(1e-6)) : S(0);
       g[5] = lit && lobe[5] < S(kLogPowerMax) ? dvalue * l.value * log_(l.cosine) * l.power : S(0);
       const Vec3<S> dmu = dcos * d;

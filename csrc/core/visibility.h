@@ -1,4 +1,4 @@
-// Visibility of surfels: projected, and with a box that meets the image.
+// Visibility of surfels: projected, with a box that meets the image.
 #pragma once
 
 #include "core/bounds.h"
@@ -14,16 +14,16 @@ template <class S> BT_HD bool surfel_finite(const Surfels<S>& in, int64_t i) {
   return finite;
 }
 
-// Half extents of what has no box, in pixels, and the most that those of a box are.
+// Half extents of surfels without a box, in pixels, and the upper bound of others.
 constexpr double kBoxless = 1e6;
 
-// A surfel as a camera sees it, or one in each lane: rows of geom and frames, and half extents of the level set's
-// box in pixels. `projected`: it is finite and in front of the camera; `seen`: and its box meets the image.
+// A projected surfel, or one per lane: rows of geom and frames, and half extents of the level set's box in pixels.
+// `projected`: finite and in front of the camera; `seen`: and its box meets the image.
 template <class T> struct Sight {
   T geom[kGeom], frame[kFrame], radii[2];
   MaskOf<T> projected, seen;
 };
-// Marks those whose box meets the image, of the ones that are visible at all.
+// Marks the visible surfels whose box meets the image.
 template <class T, class E>
 BT_HD void find_seen(MaskOf<T> visible, const E& extent, int width, int height, Sight<T>& s) {
   const auto columns = columns_of(extent), rows = rows_of(extent);
@@ -35,8 +35,8 @@ BT_HD void find_seen(MaskOf<T> visible, const E& extent, int width, int height, 
   s.radii[0] = min_(most, max_(x1, -x0)), s.radii[1] = min_(most, max_(y1, -y0));
 }
 
-// Writes the rows of surfel i; all 0 where the camera does not see it. False when that is because a parameter is not
-// finite. mark(sight): calls find_seen.
+// Writes the rows of surfel i, 0 if it is not visible. Returns false if a parameter is not finite. mark(sight): calls
+// find_seen.
 template <class Kernel, class S, class Mark>
 BT_HD bool project_visible(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, S near, const Resize<S>& to, S* geom,
                            S* frames, S* radii, Mark&& mark) {

@@ -6,7 +6,7 @@
 
 namespace bt {
 
-// Directions from center [3], the camera's, to means [n, 3]. Rows where active [n] is 0 give 0 and get gradient 0.
+// Directions from the camera centre [3] to means [n, 3]. Rows with active [n] = 0 give 0 and get gradient 0.
 template <class S> struct Directions {
   int64_t n;
   const S* means;
@@ -49,7 +49,7 @@ template <class S> struct ViewColorBackward {
   }
 };
 
-// Images [height, width, channels]; value [1] and, when not null, da are written.
+// Images [height, width, channels]; writes value [1] and, unless null, da.
 template <class S> struct Ssim {
   int height, width, channels;
   const S *a, *b;

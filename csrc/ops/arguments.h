@@ -1,17 +1,17 @@
-// The arguments of an operation are one struct, the same for its kernels on the CPU and on CUDA. The struct's `fields`
-// names each argument once, with its size, to a reader that fills it (bindings/reader.h): it knows nothing of Python.
+// Each operation has one struct of arguments, shared by its CPU and CUDA kernels. The struct's `fields` names each
+// argument once, with its size, to a reader that fills it (bindings/reader.h), independently of Python.
 //
 //   r.array(name, pointer, count)      `count` numbers; input where the pointer is to const
 //   r.wide(name, pointer, count)       likewise; CUDA kernels read it 16 bytes at a time
-//   r.maybe(name, pointer, count)      likewise; null where it is absent
-//   r.rows(name, pointer, n, width)    any number n of rows of `width` numbers: n is written
+//   r.maybe(name, pointer, count)      likewise; null if absent
+//   r.rows(name, pointer, n, width)    any number n of rows of `width` numbers; n is set
 //   r.work(name, pointer, count)       working memory of CUDA kernels; null on the CPU
-//   r.memory(name, workspace)          the same as bytes, of which the kernel says how many it needs
+//   r.memory(name, workspace)          working memory in bytes, as many as the kernel needs
 //   r.number(name, x), r.choice(name, index, names)
 //   r.numbers(name, x, ...), r.arrays(count, name, pointer, ...), r.maybes(count, name, pointer, ...)
-//   r.object(name, pointer), r.maybe_object(name, pointer)    a class of its own in Python
-//   r.has(name)                        true where the caller passed it
-//   r.refuse(why)                      ends the call
+//   r.object(name, pointer), r.maybe_object(name, pointer)    a Python class of its own
+//   r.has(name)                        true if passed
+//   r.refuse(why)                      raises
 #pragma once
 
 #include <cstdint>
@@ -31,13 +31,13 @@ struct Workspace {
   }
 };
 
-// The fragments of a view, ordered by tile, then front to back by surfel, then as the layout says.
+// Fragments of a view, ordered by tile, then front to back by surfel, then by the layout.
 template <class S> struct FragmentArrays {
   int64_t total;
   int32_t *surfel, *pixel;
   S *weight, *uv, *depth, *sigma;  // uv [2, total]; sigma is negative in the low-pass branch
 
-  // Without `ids` surfel and pixel are null: the layout has them.
+  // Without `ids`, surfel and pixel are null and come from the layout.
   template <class R> void fields(R& r, bool ids = true) {
     r.rows("weight", weight, total, 1);
     r.array("uv", uv, 2 * total);
@@ -61,16 +61,15 @@ template <class R> void take(R& r, const char* name, TileStarts& to) {
   to.fragments = to.start[to.tiles];
 }
 
-// Index of a fragment list on the CPU: the fragments of a surfel in a tile are ordered by blocks of 4 x 4 pixels
-// (cpu/blocks.h). Made by trace alone: that blocks and fragments belong together is not checked. CUDA's kernels have
-// `Pairs`.
+// Index of a fragment list on the CPU: within a tile and surfel, fragments are ordered by blocks of 4 x 4 pixels
+// (cpu/blocks.h). Made by trace only: blocks and fragments are not checked against each other. CUDA has `Pairs`.
 struct TileBlocks {
-  const int64_t* start;        // [tiles + 1] where each tile's fragments begin
-  const int64_t* block_start;  // [tiles + 1] and where its blocks do
-  const int32_t* blocks;       // [count, 2] the pixels of a surfel in a block, see BlockPart
+  const int64_t* start;        // [tiles + 1] first fragment of each tile
+  const int64_t* block_start;  // [tiles + 1] first block of each tile
+  const int32_t* blocks;       // [count, 2] pixels of a surfel in a block, see BlockPart
   int64_t tiles, count, fragments;
-  static constexpr int64_t pairs = 0;    // of surfel and tile: not kept
-  static constexpr bool kHasIds = true;  // has surfel and pixel of all fragments
+  static constexpr int64_t pairs = 0;    // pairs of surfel and tile are not kept
+  static constexpr bool kHasIds = true;  // surfel and pixel of all fragments are known
   bool fits(int64_t, int width, int height) const { return tiles == tiles_of(width, height); }
 
   template <class R> void fields(R& r) {
@@ -82,7 +81,7 @@ struct TileBlocks {
     if (block_start[0] != 0 || block_start[tiles] != count) r.refuse("the blocks do not belong to these tiles");
   }
 };
-// A layout that is an object of Python.
+// Reads a layout that is a Python object.
 template <class R, class Layout> void take(R& r, const char* name, Layout& to) {
   const Layout* layout = nullptr;
   r.object(name, layout);

@@ -6,7 +6,7 @@
 
 namespace bt {
 
-// Surfels as a view shows them, with texels, or without any (sizes 0, 0).
+// Surfels of a view, with texels or without (sizes 0, 0).
 template <class S, class Layout> struct BlendedSurfels {
   bool maps;
   const S* geom;  // [n, kGeom]
@@ -14,7 +14,7 @@ template <class S, class Layout> struct BlendedSurfels {
   Fragments<S, Layout> fragments;
   S bound;
   TexelTiles<S> table;
-  const S* residual;  // [F, 3] that of each fragment, in place of texels; null: there is none
+  const S* residual;  // [F, 3] residual of each fragment, instead of texels; or null
 
   int64_t numbers() const { return int64_t(width) * height * (maps ? kMapChannels : kImageChannels); }
   template <class R> void fields(R& r) {
@@ -27,9 +27,9 @@ template <class S, class Layout> struct BlendedSurfels {
   }
 };
 
-// image [height, width, channels]: the sums of core/blend.h, kMapChannels with maps, else kImageChannels, of the
-// colours relu(relu(base + 0.5) + residual). That of texels is texel(u, v), below `bound` and without a tile 0.
-// Written.
+// Writes image [height, width, channels]: the sums of core/blend.h, kMapChannels with maps, else kImageChannels, of the
+// colours relu(relu(base + 0.5) + residual). The residual of texels is texel(u, v), and 0 below `bound` or without a
+// tile.
 template <class S, class Layout> struct BlendForward {
   BlendedSurfels<S, Layout> of;
   S* image;
@@ -40,12 +40,12 @@ template <class S, class Layout> struct BlendForward {
   }
 };
 
-// Sums of a pair of surfel and tile for its surfel: beta and the colour, with maps also the normal and one unused.
+// Gradient sums of a pair of surfel and tile: beta and the colour, with maps also the normal and one unused.
 constexpr int blend_sums(bool maps) { return maps ? 8 : 4; }
 
-// ddepth [F] (maps only), dgeom [n, kGeom] (beta and normal columns) and dbase [n, 3] are written, and, where not null,
-// dweight [F], duv [2, F] and dresidual [F, 3]. The gradient g of texels moves those of `moved` [texels, 3], which may
-// be those that are read: texel t by -rate share[t] g. partial [pairs, blend_sums] and work are working memory.
+// Writes ddepth [F] (maps only), dgeom [n, kGeom] (beta and normal columns), dbase [n, 3] and, unless null, dweight
+// [F], duv [2, F] and dresidual [F, 3]. Texel t of `moved` [texels, 3], which may be the texels that are read, moves by
+// -rate share[t] times its gradient. partial [pairs, blend_sums] and work are working memory.
 template <class S, class Layout> struct BlendBackward {
   BlendedSurfels<S, Layout> of;
   const S *dimage, *share;

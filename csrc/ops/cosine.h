@@ -1,4 +1,4 @@
-// Sparse cosine coefficients of blocks of texels as an operation takes them.
+// Arguments of sparse cosine coefficients of texel blocks.
 #pragma once
 
 #include <algorithm>
@@ -9,19 +9,19 @@ namespace bt {
 
 constexpr int kCosines = 8;  // texels along a side of the largest block
 
-// Coefficients c of every block and channel that nearly minimise sum of weight (t - t(c))^2 + an L1 penalty, as whole
-// numbers of steps: `rounds` iterations of ISTA from the plain transform.
+// Coefficients c of every block and channel that nearly minimise sum of weight (t - t(c))^2 + an L1 penalty, as integer
+// multiples of steps: `rounds` iterations of ISTA from the plain transform.
 template <class S> struct SparseCosines {
   int64_t texels, tiles, blocks;
   int height, width, channels, rounds;  // of a block, at most kCosines each
-  S shrink;                             // the soft threshold as a share of the step, where all weights are alike
+  S shrink;                             // soft threshold relative to the step, for equal weights
   const S* values;                      // [texels, channels]
-  const S* weights;                     // [texels], above 0
+  const S* weights;                     // [texels], positive
   const S* mean;                        // [tiles, channels], subtracted
   const S* step;                        // [tiles]
-  const S* mix;                         // [channels, channels] from channels to those that are coded, orthonormal
-  const S *down, *across;               // [height, height], [width, width] the transform: row k is frequency k
-  const int64_t* order;                 // [height * width] coefficients as they are kept, k_v width + k_u
+  const S* mix;                         // [channels, channels] orthonormal transform of the channels
+  const S *down, *across;               // [height, height], [width, width] cosine transforms: row k is frequency k
+  const int64_t* order;                 // [height * width] stored order of coefficients, k_v width + k_u
   const int64_t* tile;                  // [blocks]
   const int64_t* rows;                  // [blocks, height, width] of `values`
   int32_t* codes;                       // [height * width, blocks, channels]

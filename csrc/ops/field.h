@@ -7,11 +7,11 @@
 namespace bt {
 
 constexpr int kMlpWeights = kInputs * kWidth + kWidth * kWidth + kWidth * 3;  // w1, w2, w3, each input-major
-// Blocks of a backward pass on CUDA: fixed, so that sums do not depend on the card. One round of four blocks on each of
-// the 132 multiprocessors of an H100.
+// Blocks of a backward pass on CUDA; fixed, so that sums do not depend on the GPU. Four per multiprocessor of an H100
+// (132).
 constexpr int kMostBlocks = 528;
 
-// Numbers of ExactRange (cuda/exact_sums.h), and of all that exact sums of so many entries take.
+// Size of ExactRange (cuda/exact_sums.h), and of exact sums over a number of entries.
 constexpr int64_t kExactRange = 2;
 constexpr int64_t exact_size(int64_t entries) { return entries + kExactRange; }
 
@@ -28,7 +28,7 @@ template <class S> struct FieldForward {
   }
 };
 
-// dx may be null. Gradients are written. mlp and exact are working memory on CUDA.
+// dx may be null. Writes the gradients. mlp and exact are working memory on CUDA.
 template <class S> struct FieldBackward {
   const FieldArrays<S>* field;
   int64_t n;
@@ -36,7 +36,7 @@ template <class S> struct FieldBackward {
   FieldGradients<S> dfield;
   S* dx;
   S* mlp;          // [kMostBlocks, kMlpWeights]
-  int64_t* exact;  // null, or for sums that do not depend on the order: [exact_size(entries of the table)]
+  int64_t* exact;  // null, or order-independent sums: [exact_size(entries of the table)]
 
   template <class R> void fields(R& r) {
     r.object("field", field);

@@ -1,4 +1,4 @@
-// Texels of surfels as operations take them, and the working memory of their gradients.
+// Arguments of texels, and the working memory of their gradients.
 #pragma once
 
 #include "core/shading.h"
@@ -8,7 +8,7 @@
 
 namespace bt {
 
-// Texels of all tiles in one list, rows along v: tile i of r_u x r_v texels begins at first[i]; 0, 0 = no tile.
+// Texels of all tiles in one list, rows along v: tile i of r_u x r_v texels starts at first[i]; 0, 0 = no tile.
 template <class S> struct TexelTiles {
   int64_t n, texels;
   const int64_t* first;  // [n], in texels
@@ -25,7 +25,7 @@ template <class S> struct TexelTiles {
     r.rows("texels", values, texels, 3);
   }
 };
-// The texels of one surfel.
+// Texels of one surfel.
 template <class S> struct TexelPatch {
   const int32_t* size;  // r_u, r_v; 0, 0 = no tile
   const S* tile;        // its texels
@@ -41,7 +41,7 @@ template <class S> struct TexelPatch {
         view(view_base(load3(tiles.base + 3 * id))) {}
   BT_HD bool textured() const { return size[0] > 0; }
   BT_HD TexelCorners<S> corners(S u, S v) const { return texel_corners(u, v, size, extent); }
-  // Of a fragment of that weight: texels show from the bound on.
+  // Computes the colour of a fragment; texels count from the weight `bound` on.
   BT_HD Vec3<S> color(S weight, S bound, S u, S v) const {
     TexelSlopes<S> none;
     return weight >= bound && textured() ? color(corners(u, v), false, none) : view;
@@ -53,10 +53,10 @@ template <class S> struct TexelPatch {
     return shaded(view, texel_mix(t, at.weight));
   }
 };
-// Working memory of the backward pass on CUDA: where the texels' gradients are added up, rows of four, the last 0.
+// Working memory of the backward pass on CUDA: gradient sums of texels, rows of four, the last 0.
 template <class S> struct TexelWork {
   S* sums;         // [texels, 4]
-  int64_t* exact;  // null, or instead of `sums` for sums that do not depend on the order: [exact_size(...)]
+  int64_t* exact;  // null, or order-independent sums instead of `sums`: [exact_size(...)]
 
   template <class R> void fields(R& r, int64_t texels) {
     sums = nullptr, exact = nullptr;
@@ -67,18 +67,18 @@ template <class S> struct TexelWork {
   }
 };
 
-// Channels of a baked image of the CPU: rgb, alpha; with maps those of BlendForward.
+// Channels of a baked image on the CPU: rgb, alpha; with maps those of BlendForward.
 constexpr int kBakedChannels = 4;
 
 // Texels of n surfels.
 struct BakedResidual {
   float offset, scale;         // residual = offset + scale * stored
   const float* extent;         // [n] half side of the tile, scale units; null: kSupport everywhere
-  const float* mean_residual;  // [n, 3], the residual of a surfel without a tile; null: 0
-  float alpha_scale;           // m = alpha_scale * stored multiplies sigma, as AlphaTiles say; 0: opaque
+  const float* mean_residual;  // [n, 3], residual of a surfel without a tile; null: 0
+  float alpha_scale;           // m = alpha_scale * stored multiplies sigma, see AlphaTiles; 0: opaque
   const float* mean_alpha;     // [n], m of a surfel without a tile; null: 1
   float weight_bound;          // fragments of smaller weight get neither
-  float transmittance_min;     // a surfel that would leave a pixel less ends it, see blend_test; 0: none does
+  float transmittance_min;     // a surfel that would leave a pixel less ends it, see blend_test; 0: never
 
   template <class R> void fields(R& r, int64_t n) {
     r.numbers("offset", offset, "scale", scale);

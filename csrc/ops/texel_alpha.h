@@ -1,4 +1,4 @@
-// Alpha texels as operations take them, the alpha of a fragment, and the vector-Jacobian product of that.
+// Arguments of alpha texels, the alpha of a fragment, and its vector-Jacobian product.
 #pragma once
 
 #include "core/blend.h"
@@ -8,14 +8,14 @@
 namespace bt {
 
 // Alpha texels: the sigma of a fragment whose weight would be at least `bound` is multiplied by the bilinear fetch at
-// its u and v, and clamped again; the last bit of its listed v is then 1, else 0. Absent: `values` is null.
+// (u, v) and clamped again; the last bit of its listed v is then 1, else 0. Null `values`: none.
 template <class S> struct AlphaTiles {
   int64_t texels;
   const int64_t* first;  // [n], as in TexelTiles
   const int32_t* size;   // [n, 2]
   const S* extent;       // [n]
   const S* values;       // [texels], from 0 to 2
-  S bound;               // fragments whose weight would be less keep their sigma
+  S bound;               // fragments of smaller weight keep their sigma
 
   template <class R> void fields(R& r, int64_t n) {
     values = nullptr, bound = 0;
@@ -28,7 +28,7 @@ template <class S> struct AlphaTiles {
   }
 };
 
-// The alpha texels of one surfel.
+// Alpha texels of one surfel.
 template <class S> struct AlphaPatch {
   const int32_t* size;  // r_u, r_v; 0, 0 = no tile
   const S* tile;
@@ -42,7 +42,7 @@ template <class S> struct AlphaPatch {
         extent(tiles.extent[id]) {}
   BT_HD bool textured() const { return size[0] > 0; }
   BT_HD TexelCorners<S> corners(S u, S v) const { return texel_corners(u, v, size, extent); }
-  // m, exactly 1 between texels of 1, and the four texels.
+  // Fetches m, exactly 1 between texels of 1, and the four texels.
   BT_HD S fetch(const TexelCorners<S>& at, S (&t)[4]) const {
     BT_UNROLL
     for (int k = 0; k < 4; ++k) t[k] = tile[at.at[k]];
@@ -50,14 +50,13 @@ template <class S> struct AlphaPatch {
   }
 };
 
-// Gradients of alpha's share of a fragment's sigma: from gs, that of the listed sigma, to that of the kernel's sigma,
-// which takes the place of the listed one; more of gu and gv; and the return value, that of m. t: the four texels.
+// Computes the gradients of a fragment's alpha factor: replaces gs, the gradient of the listed sigma, and the listed
+// sigma by those of the kernel's, adds to gu and gv, and returns the gradient of m. t: the four texels.
 template <class S, class T>
 BT_HD T alpha_vjp(const AlphaPatch<S>& patch, const T (&t)[4], const TexelAxis<T>& x, const TexelAxis<T>& y, T& listed,
                   T& gs, T& gu, T& gv) {
   const T m = texel_lerp(t, x.fraction, y.fraction), sigma = abs_(listed), zero = T(S(0));
-  // neither clamp passes a gradient, that of the product and the kernel's own; m may be rounded otherwise than when the
-  // fragment was written
+  // clamped values pass no gradient; m may round differently than when the fragment was written
   const MaskOf<T> moves = sigma < T(S(kAlphaMax)), uncut_moves = moves & (sigma < m * T(S(kAlphaMax * (1 - 1e-6))));
   const T dm = select(moves, gs * sigma / m, zero);
   gu += select(x.inside, dm * T(texel_density(patch.size[0], patch.extent)) * texel_slope_u(t, y.fraction), zero);

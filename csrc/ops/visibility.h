@@ -9,11 +9,10 @@
 
 namespace bt {
 
-// viewmat [4, 4] and K [3, 3] lie where the surfels do. Written: geom [n, kGeom], frames [n, kFrame] and radii [n, 2]
-// (half extents of the level-set box in pixels, 0 where not visible); rows of surfels that are not visible are zero.
-// broken [1] is raised by the number of rows that are not finite. `prefilter` and `photo_pixel` choose between the
-// kernels of core/surfel.h, and have to be the same wherever a view's rows go; with another photo_pixel than 1 that is
-// the baked renderer alone.
+// viewmat [4, 4] and K [3, 3] are on the surfels' device. Writes geom [n, kGeom], frames [n, kFrame] and radii [n, 2]
+// (half extents of the level-set box in pixels); rows of invisible surfels are zero. Adds the number of rows that are
+// not finite to broken [1]. `prefilter` and `photo_pixel` select a kernel of core/surfel.h and must be the same
+// wherever the rows are used; a photo_pixel other than 1 is for the baked renderer only.
 template <class S> struct ProjectForward {
   Surfels<S> surfels;
   const S *viewmat, *K;
@@ -38,7 +37,7 @@ template <class S> struct ProjectForward {
   }
 };
 
-// dframes may be null (zero). The surfels' gradients are written.
+// dframes may be null (zero). Writes the surfels' gradients.
 template <class S> struct ProjectBackward {
   Surfels<S> surfels;
   const S *viewmat, *K;
@@ -55,7 +54,7 @@ template <class S> struct ProjectBackward {
   }
 };
 
-// The rows of a projection.
+// Rows of a projection.
 template <class S> struct View {
   int64_t n;
   const S *geom, *radii;
@@ -73,8 +72,8 @@ template <class S> struct View {
   }
 };
 
-// dgeom [n, kGeom] and absgrad [n, 2] are written. dweight, duv, ddepth may be null (zero). dsigma and partial are
-// working memory; the sums of a pair: columns 0 to kBeta of geom, two absolute gradients, one unused, kArea.
+// Writes dgeom [n, kGeom] and absgrad [n, 2]. dweight, duv, ddepth may be null (zero). dsigma and partial are working
+// memory; the sums of a pair: columns 0 to kBeta of geom, two absolute gradients, one unused, kArea.
 constexpr int kTraceSums = 16;
 template <class S, class Layout> struct TraceBackward {
   View<S> view;
@@ -84,8 +83,8 @@ template <class S, class Layout> struct TraceBackward {
   S *dsigma, *partial;
   S *dgeom, *absgrad;
   AlphaTiles<S> alpha;
-  S* dtexel_alpha;       // [texels] is written; may be null
-  int64_t* exact_alpha;  // working memory of CUDA for sums of it that do not depend on the order, or null
+  S* dtexel_alpha;       // [texels] written, unless null
+  int64_t* exact_alpha;  // order-independent sums of it on CUDA, working memory; or null
 
   template <class R> void fields(R& r) {
     view.fields(r);
@@ -106,7 +105,7 @@ template <class S, class Layout> struct TraceBackward {
   }
 };
 
-// counts [n] is raised by the fragments of each surfel on pixels where mask [height, width] is not 0.
+// Adds to counts [n] the fragments of each surfel on pixels with mask [height, width] not 0.
 template <class Layout> struct MaskedCounts {
   Layout layout;
   int width, height;

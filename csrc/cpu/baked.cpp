@@ -1,4 +1,4 @@
-// The baked renderer: forward only, no fragment list, texels instead of the field.
+// Baked renderer: forward only, without fragment list, texels instead of the field.
 #include <memory>
 #include <stdexcept>
 #include <string>
@@ -12,11 +12,11 @@
 namespace bt {
 
 namespace {
-// Red, green and blue of a texel for each lane, and its alpha where there are four channels.
+// Red, green and blue of a texel per lane, and alpha with four channels.
 template <class S, int channels> struct Texels {
   Lanes<S> of[channels];
 };
-// The texels at the lanes' offsets in a tile's texels, and their right neighbours.
+// Texels at the lanes' offsets in a tile, and their right neighbours.
 template <class S, int channels> struct TexelPairs {
   Texels<S, channels> left, right;
 };
@@ -26,7 +26,7 @@ template <class S, int channels> inline Texels<S, channels> texels_of(const Wide
   for (int c = 0; c < channels; ++c) t.of[c] = from_integers<S>(rgba >> 8 * c & 255u);
   return t;
 }
-// The texels at 16 offsets and their right neighbours, from 8 bytes for each, which hold both.
+// Loads the texels at 16 offsets and their right neighbours, 8 bytes per pair.
 inline void pairs_of(const uint8_t* patch, const int32_t* at, Wide<uint32_t>* left, Wide<uint32_t>* right) {
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
   const auto eight = [&](const int32_t* offsets) {
@@ -73,8 +73,8 @@ template <class S, int channels> inline TexelPairs<S, channels> texel_pairs(cons
   return t;
 }
 
-// Stored values at the lanes' positions in a tile, bilinear. A position is clamped to the outer texel centres, so at a
-// tile's last column and row the neighbour has weight 0 and may be any texel.
+// Interpolates stored values bilinearly at the lanes' positions in a tile. Positions are clamped to the outer texel
+// centres; in a tile's last column and row the neighbour has weight 0 and may be any texel.
 template <class S, int channels, class T>
 inline Texels<S, channels> bilinear(const T* patch, int columns, Lanes<S> x, Lanes<S> y) {
   using P = Lanes<S>;
@@ -108,7 +108,7 @@ void gather_patches(int layers, int height, int width, const uint8_t* bytes, con
     texels += int64_t(columns) * rows;
     widest = std::max(widest, columns);
   }
-  const int64_t size = 4 * (texels + widest + 2);  // a fetch at the last texel reads its neighbours, with weight 0
+  const int64_t size = 4 * (texels + widest + 2);  // a fetch at the last texel also reads neighbours, with weight 0
   out.bytes.assign(bytes ? size : 0, 0), out.floats.assign(floats ? size : 0, 0.0f);
   parallel_parts(n, 64, [&](int, int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
@@ -125,19 +125,19 @@ void gather_patches(int layers, int height, int width, const uint8_t* bytes, con
 }
 
 namespace {
-// Parameters of a surfel besides its row of geom, next to each other: they are read in every tile that it touches.
+// Parameters of a surfel besides its row of geom, contiguous, as every tile it touches reads them.
 template <class S> struct DrawnSurfel {
-  S view[3];             // its colour without a residual
-  S bound;               // fragments of smaller weight have none
-  S flat[4];             // the residual and alpha where there are no texels
-  bool cut;              // whether alpha is another than 1 anywhere
-  S k;                   // texels per scale unit are k times the texels along a side
+  S view[3];             // colour without residual
+  S bound;               // fragments of smaller weight get no residual
+  S flat[4];             // residual and alpha without texels
+  bool cut;              // whether any alpha differs from 1
+  S k;                   // texels per scale unit, over the texels along a side
   const Patches* level;  // null: no texels
   int64_t first;
   int32_t sides[2];
 };
 
-// The level of a surfel's tile that a view shows; null: its mean alone.
+// Returns the level of a surfel's tile for a view; null: the mean only.
 template <class S> const Patches* level_of(const BakedForward<S>& a, int64_t id, S extent) {
   const int32_t* sides = a.patches->sides.data() + 2 * id;
   if (!sides[0]) return nullptr;
@@ -165,7 +165,7 @@ template <class S> DrawnSurfel<S> drawn_surfel(const BakedForward<S>& a, int64_t
   return d;
 }
 
-// Residuals of a surfel at surfel coordinates, and alpha where there are four channels.
+// Fetches a surfel's residuals at surfel coordinates, and alpha with four channels.
 template <int channels, class S>
 inline Texels<S, channels> texels_at(const DrawnSurfel<S>& d, Lanes<S> u, Lanes<S> v, const BakedResidual& atlas) {
   using P = Lanes<S>;
@@ -198,7 +198,7 @@ template <class Kernel, bool kMaps, class S> void baked_forward(const BakedForwa
   int32_t* overdraw = a.overdraw;
   constexpr int channels = kMaps ? kMapChannels : kBakedChannels;
   const S photo_pixel = a.view.photo_pixel, sharp = Resize<S>(photo_pixel).sharp;
-  const std::unique_ptr<DrawnSurfel<S>[]> drawn(new DrawnSurfel<S>[a.view.n]);  // of the visible ones
+  const std::unique_ptr<DrawnSurfel<S>[]> drawn(new DrawnSurfel<S>[a.view.n]);  // visible surfels only
   const auto draw = [&](int64_t tile) {
     const int tx = int(tile % bins.tiles_x), ty = int(tile / bins.tiles_x);
     TileState<S> state(tx, ty, width, height, S(atlas.transmittance_min));
@@ -237,7 +237,7 @@ template <class Kernel, bool kMaps, class S> void baked_forward(const BakedForwa
             sharp);
         continue;
       }
-      Texels<S, 4> fetched;  // of a block: what has the weight for a residual had it for alpha
+      Texels<S, 4> fetched;  // of a block: a weight that suffices for a residual did so for alpha
       const auto cut = [&](Fragment<P>& f, const typename P::M& covered, const P& transmittance) {
         const typename P::M reaches = covered & (bt::blend(f.sigma, transmittance).weight >= P(d.bound));
         if (!bits(reaches)) return;

@@ -1,4 +1,4 @@
-// Tile lists: of every tile the surfels that may touch it, front to back.
+// Tile lists: the surfels that may touch each tile, front to back.
 #include <cstring>
 #include <numeric>
 
@@ -10,7 +10,8 @@
 namespace bt {
 
 namespace {
-// The tile that holds the box of a surfel, as most of small ones: none of its rows is intersected. -1: there are more.
+// Returns the tile that contains the box of a surfel, the common case of small ones, whose rows are not intersected.
+// -1: several tiles.
 template <class S> int only_tile(const S* g, const S* radii, const Bins& bins) {
   const S x = g[kCx] - S(0.5), y = g[kCy] - S(0.5), side = S(kTile);
   const S column = floor_((x - radii[0]) / side), row = floor_((y - radii[1]) / side);
@@ -19,8 +20,8 @@ template <class S> int only_tile(const S* g, const S* radii, const Bins& bins) {
   return int(row) * bins.tiles_x + int(column);
 }
 
-// Arguments of core/kernel.h's `reached` for such a row: r_c^2, and the squared radius of the low pass, 0 where
-// the kernel covers it.
+// Arguments of `reached` (core/kernel.h) for a row without prefilter: r_c^2, and the squared radius of the low pass, 0
+// if the kernel covers it.
 struct ReachLevels {
   float r2, blur2;
 };
@@ -32,11 +33,11 @@ template <class Kernel, class S> BT_HD ReachLevels reach_levels(const S* geom, S
   return {float(l.r2), blur * blur};
 }
 
-// Sorted by depth; those of the same depth keep their order.
+// Sorts by depth, stably.
 template <class S> void sort_by_depth(std::vector<std::pair<S, int32_t>>& order) {
   std::sort(order.begin(), order.end());
 }
-// Depths in front of the camera are ordered as their bits are: a radix sort in three rounds of eleven bits.
+// Radix-sorts depths in front of the camera by their bits, in three rounds of eleven.
 void sort_by_depth(std::vector<std::pair<float, int32_t>>& order) {
   constexpr int kBits = 11, kBuckets = 1 << kBits, kRounds = 3;
   const auto digit = [](float depth, int round) {
@@ -57,7 +58,7 @@ void sort_by_depth(std::vector<std::pair<float, int32_t>>& order) {
 
 template <class S> using Order = std::pair<S, int32_t>;  // depth, surfel
 
-// The extents and level sets of surfels in an order, computed sixteen at a time.
+// Extents and level sets of surfels in an order, sixteen at a time.
 template <class Kernel, class S> class Extents {
  public:
   Extents(const View<S>& view, const Order<S>* order, int64_t begin, int64_t end, float* level)
@@ -91,7 +92,7 @@ template <class Kernel, class S> class Extents {
       for (int lane = 0; lane < next_ - first_; ++lane) {
         const S* g = row(lane);
         found_[lane] = extent<Kernel>(g, width_, height_, sharp_);
-        if (filtered<Kernel>(g)) continue;  // has no level set of its own
+        if (filtered<Kernel>(g)) continue;  // has no level set
         store_levels(lane, reach_levels<Kernel>(g, near_, sharp_));
       }
   }
@@ -130,11 +131,11 @@ template <class Kernel, class S> class Extents {
   Extent found_[kLanes];
 };
 
-// The tiles of surfels row by row, sixteen rows at a time, of one surfel or more.
+// Tile spans of surfels row by row, sixteen rows at a time across surfels.
 class TileRows {
  public:
   explicit TileRows(int width) : width_(width) {}
-  // The rows of a surfel; put(k, row, first, last) for all of those that fill the lanes, in the order of the surfels.
+  // Adds the rows of a surfel; calls put(k, row, first, last) when the lanes are full, in surfel order.
   template <class S, class Put> void add(int64_t k, const Extent& e, const S* g, int height, Put&& put) {
     const TileSpan<double> rows = tile_rows(e, g, height);
     for (int row = int(rows.first); row <= int(rows.last); ++row) {
@@ -145,7 +146,7 @@ class TileRows {
       if (++count_ == kLanes) finish(put);
     }
   }
-  // The rest.
+  // Puts the remaining rows.
   template <class Put> void finish(Put&& put) {
     extents_.whole = mask_of<double>(whole_), extents_.ellipse = mask_of<double>(ellipse_);
     extents_.thin = mask_of<double>(thin_);
@@ -158,13 +159,13 @@ class TileRows {
  private:
   using P = Lanes<double>;
   ExtentOf<P> extents_;
-  uint32_t whole_ = 0, ellipse_ = 0, thin_ = 0;  // of the extents, by lane
+  uint32_t whole_ = 0, ellipse_ = 0, thin_ = 0;  // flags of the extents, by lane
   P cx_ = P(0.0), cy_ = P(0.0), row_ = P(0.0);
   int64_t k_[kLanes];
   int width_, count_ = 0;
 };
 
-// fn(tile) for every tile that a disc may touch which comes near the camera's plane and has no box.
+// Calls fn(tile) for every tile that may be touched by a disc near the camera's plane without a box.
 template <class S, class F> void for_reached_tiles(const S* g, const float* level, const Bins& bins, F&& fn) {
   using P = Lanes<S>;
   constexpr S kHalf = S(0.5 * (kTile - 1));
@@ -182,7 +183,7 @@ template <class S, class F> void for_reached_tiles(const S* g, const float* leve
     }
 }
 
-// In phases. Each thread counts and later fills its own run of the order: the lists come out sorted.
+// Bins in phases. Each thread counts and later fills its own run of the order, so lists come out sorted.
 template <class Kernel, class S> class KernelBinner final : public Binner<S> {
  public:
   KernelBinner(const View<S>& view, Bins& bins) : view_(view), bins_(bins) {
@@ -207,12 +208,12 @@ template <class Kernel, class S> class KernelBinner final : public Binner<S> {
 
  private:
   static constexpr int64_t kChunk = 1024;
-  // Neighbouring tiles that surfel k of the order may touch.
+  // Adjacent tiles in a row that surfel k of the order may touch.
   struct Span {
     int32_t k, tile, count;
   };
   struct Touched {
-    std::vector<Span> alone, others;  // of surfels of one tile, and of the others, each in order
+    std::vector<Span> alone, others;  // of surfels with one tile, and of others, in order
   };
 
   void gather(int64_t begin, int64_t end) {
@@ -222,7 +223,7 @@ template <class Kernel, class S> class KernelBinner final : public Binner<S> {
     visible_[begin / kChunk] = to - (order_.data() + begin);
   }
 
-  // Front to back once for all tiles; equal depths keep their order.
+  // Sorts front to back once for all tiles, stably.
   void sort(int parts) {
     auto end = order_.begin();
     for (size_t c = 0; c < visible_.size(); ++c) {
@@ -260,7 +261,7 @@ template <class Kernel, class S> class KernelBinner final : public Binner<S> {
       if (const int only = only_tile(g, view_.radii + 2 * id, bins_); only >= 0) {
         add(to.alone, k, only, 1);
       } else if (e.whole && !filtered<Kernel>(g)) {
-        rows.finish(add_row);  // those before it
+        rows.finish(add_row);  // earlier surfels first
         for_reached_tiles(g, bins_.level.data() + 2 * id, bins_, [&](int tile) { add(to.others, k, tile, 1); });
       } else {
         rows.add(k, e, g, view_.height, add_row);
@@ -269,7 +270,7 @@ template <class Kernel, class S> class KernelBinner final : public Binner<S> {
     rows.finish(add_row);
   }
 
-  // From the numbers of a tile's surfels in each run to their offsets.
+  // Converts counts per tile and run to offsets.
   void scan() {
     bins_.start.assign(tiles() + 1, 0);
     for (int64_t tile = 0; tile < tiles(); ++tile) {
@@ -300,10 +301,10 @@ template <class Kernel, class S> class KernelBinner final : public Binner<S> {
 
   const View<S> view_;
   Bins& bins_;
-  std::vector<Order<S>> order_;           // of the visible ones, once sorted
-  std::vector<int64_t> visible_;          // in each chunk
-  std::vector<Touched> touched_;          // of each run
-  std::vector<std::vector<int64_t>> at_;  // of each run: for each tile how many, then where the next one goes
+  std::vector<Order<S>> order_;           // visible surfels, once sorted
+  std::vector<int64_t> visible_;          // per chunk
+  std::vector<Touched> touched_;          // per run
+  std::vector<std::vector<int64_t>> at_;  // per run and tile: count, then next offset
 };
 }  // namespace
 

@@ -1,5 +1,5 @@
-// Shading and blending in one pass over the fragments, and its backward pass: colours and their gradients are never
-// listed. A block at a time; texels fragment by fragment.
+// Shading and blending in one pass over the fragments, and the backward pass, without storing colours or their
+// gradients. Vectorised by block; texels fragment by fragment.
 #include "ops/blend.h"
 
 #include <numeric>
@@ -13,14 +13,14 @@
 namespace bt {
 
 namespace {
-// Arguments with the layout of the CPU.
+// Arguments with the CPU layout.
 template <class S> using Blended = BlendedSurfels<S, TileBlocks>;
 template <class S> using Forward = BlendForward<S, TileBlocks>;
 template <class S> using Backward = BlendBackward<S, TileBlocks>;
 
 template <bool kMaps> constexpr int kChannels = kMaps ? kMapChannels : kImageChannels;
 
-// The fragments of a surfel in a tile, ready to be blended.
+// Fragments of a surfel in a tile, ready for blending.
 template <class S> class SurfelRun {
  public:
   using P = Lanes<S>;
@@ -28,19 +28,19 @@ template <class S> class SurfelRun {
   const TexelPatch<S> patch;
   const P beta, normal[3];
 
-  // `prefetch`: its texels, some time before they are used.
+  // `prefetch`: prefetch its texels.
   SurfelRun(const Blended<S>& of, const BlockRun& run, bool prefetch)
       : SurfelRun(of, run, prefetch, of.geom + int64_t(run.surfel) * kGeom) {}
   SurfelRun(const SurfelRun&) = delete;
 
   const PatchFragments<S>& few() const { return few_; }
-  // Those of block k's fragments that show texels, by lane.
+  // Returns the lanes of block k's fragments with texels.
   BT_HD uint32_t textured(int64_t k) const { return patch.textured() ? textured_[k - run.first] : 0; }
   bool any_textured() const { return any_textured_; }
-  // Of block k's first fragment among `few`.
+  // Returns the index of block k's first fragment among `few`.
   BT_HD int number(int64_t k) const { return int(k - run.first) * kLanes; }
-  // The colours of block k's fragments, 0 in other lanes: what is not finite shows where it is and nowhere else.
-  // `residual`: of the block's first fragment, null: of texels. `under`: written where some are textured.
+  // Computes the colours of block k's fragments, 0 in other lanes, so that non-finite values stay in their own pixel.
+  // `residual`: of the block's first fragment; null: from texels. `under`: written if any are textured.
   BT_HD void colors(const BlockPart& part, int64_t k, const S* residual, BlockTexels<S>& under, P* to) const {
     P rgb[3] = {P(patch.view.x), P(patch.view.y), P(patch.view.z)};
     if (const uint32_t lanes = textured(k)) {
@@ -74,19 +74,18 @@ template <class S> class SurfelRun {
     });
   }
 
-  uint32_t textured_[kBlocks];  // of each block of the run; not written where the surfel has no texels
+  uint32_t textured_[kBlocks];  // per block of the run; unset if the surfel has no texels
   bool any_textured_ = false;
   PatchFragments<S> few_;
 };
-// Prefetches what a SurfelRun reads of its surfel.
+// Prefetches a surfel's data for SurfelRun.
 template <class S> BT_HD void prefetch_surfel(const Blended<S>& of, int64_t id) {
   const TexelTiles<S>& t = of.table;
   __builtin_prefetch(of.geom + id * kGeom), __builtin_prefetch(t.base + 3 * id), __builtin_prefetch(t.first + id);
   __builtin_prefetch(t.size + 2 * id), __builtin_prefetch(t.extent + id);
 }
 
-// fn(SurfelRun) for runs one after the other; each is looked up before the one in front of it is through, so that its
-// texels are on their way.
+// Calls fn(SurfelRun) for runs in order; each is set up one run ahead, to prefetch its texels.
 template <class S, class F>
 BT_HD void each_surfel_run(const Blended<S>& of, const std::vector<BlockRun>& runs, F&& fn) {
   const int64_t n = int64_t(runs.size());
@@ -127,14 +126,13 @@ template <bool kMaps, class S> void forward(const Forward<S>& a) {
   });
 }
 
-// Sums over fragments of a surfel for its gradients: view colour and beta, and the normal with maps.
+// A surfel's sums over fragments for its gradients: view colour and beta, and the normal with maps.
 template <class T> struct Sums {
   T view[3], beta, normal[3];
   Sums() : beta(T(0.0f)) { std::fill(view, view + 3, beta), std::fill(normal, normal + 3, beta); }
 };
 
-// The gradients of the fragments of a run. `rows`: gradients of the surfel's texels, rows of four; null: there are
-// none.
+// Computes the gradients of the fragments of a run. `rows`: gradients of the surfel's texels, rows of four, or null.
 template <bool kMaps, class S>
 void run_backward(const Backward<S>& a, const BlockPicture<S, kChannels<kMaps>>& dimage, const SurfelRun<S>& surfel,
                   S* rows, Sums<Lanes<S>>& sums) {
@@ -188,7 +186,7 @@ void run_backward(const Backward<S>& a, const BlockPicture<S, kChannels<kMaps>>&
   });
 }
 
-// The lanes added up.
+// Sums the lanes.
 template <bool kMaps, class S> Sums<S> total(const Sums<Lanes<S>>& of) {
   Sums<S> all;
   for (int k = 0; k < 3; ++k) {
@@ -210,11 +208,11 @@ template <class S> void surfel_backward(const Backward<S>& a, int64_t id, const 
   for (int k = 0; k < 3; ++k) dgeom[kNx + k] = sums.normal[k];
 }
 
-// All runs of a list, in its order.
+// All runs of a list, in order.
 class ListedRuns {
  public:
   explicit ListedRuns(const TileBlocks& layout) {
-    std::vector<int64_t> before(layout.tiles + 1, 0);  // runs of earlier tiles
+    std::vector<int64_t> before(layout.tiles + 1, 0);  // runs in earlier tiles
     const auto each_tile = [&](auto&& fn) {
       parallel_tiles(layout.block_start, layout.tiles, 1 << 20, [&](int, int64_t first, int64_t last) {
         for (int64_t tile = first; tile < last; ++tile) fn(tile);
@@ -246,9 +244,8 @@ class ListedRuns {
   std::vector<Start> starts_;  // [runs + 1]
 };
 
-// Prefetches what the runs after run k of `order` read: they lie all over the list, and waiting for them would take
-// most of the time. First for what they are, then for their fragments and pixels. Always inlined: GCC drops calls of a
-// function that does nothing else.
+// Prefetches data of the runs after run k of `order`, which are scattered over the list; stalls would dominate. First
+// their descriptions, then fragments and pixels. Always inlined: GCC drops calls of a function without other effects.
 template <int channels, class S>
 BT_HD void prefetch_next(const Backward<S>& a, const BlockPicture<S, channels>& dimage, const ListedRuns& listed,
                          const std::vector<int64_t>& order, int64_t k) {
@@ -271,8 +268,8 @@ BT_HD void prefetch_next(const Backward<S>& a, const BlockPicture<S, channels>& 
   }
 }
 
-// Moves texels by their gradients, rows of four of which the last is 0. The store of one also writes a number of the
-// next as it was; loads of what was just stored in part would wait.
+// Moves texels by their gradients, rows of four with the last 0. Each store also rewrites a number of the next texel,
+// so several are loaded together: loads of partly stored data would stall.
 template <class S> void move_texels(const S* rows, int64_t count, S rate, const S* share, S* texels) {
   constexpr int kTogether = 8;
   int64_t t = 0;
@@ -284,15 +281,15 @@ template <class S> void move_texels(const S* rows, int64_t count, S rate, const 
   }
   for (; t < count; ++t) store3(texels + 3 * t, texel_step(load3(texels + 3 * t), load3(rows + 4 * t), rate, share[t]));
 }
-// Surfel after surfel: a thread adds to the texels of its own. Also where they do not learn, so that the gradients of
-// the surfels are the same.
+// Surfel by surfel: each thread adds to its own surfels' texels. Also used without learning texels, so that gradients
+// of surfels stay the same.
 template <bool kMaps, class S>
 void backward_by_surfel(const Backward<S>& a, const BlockPicture<S, kChannels<kMaps>>& dimage, const ListedRuns& listed,
                         const std::vector<int64_t>& order) {
   for_surfels(listed, order.data(), [&](int64_t first, int64_t last) {
     const int64_t id = listed.surfel(order[first]);
     const TexelPatch<S> patch(a.of.table, id);
-    thread_local std::vector<S> own;  // gradients of the texels, rows of four
+    thread_local std::vector<S> own;  // texel gradients, rows of four
     const int64_t area = a.moved ? int64_t(patch.size[0]) * patch.size[1] : 0;
     bool moves = false;
     Sums<Lanes<S>> sums;
@@ -306,7 +303,7 @@ void backward_by_surfel(const Backward<S>& a, const BlockPicture<S, kChannels<kM
     if (moves) move_texels(own.data(), area, a.rate, a.share + patch.first, a.moved + 3 * patch.first);
   });
 }
-// Run after run, which is faster where there are no texels: what a pass reads follows each other.
+// Run by run, faster without texels as it reads sequentially.
 template <bool kMaps, class S>
 void backward_by_run(const Backward<S>& a, const BlockPicture<S, kChannels<kMaps>>& dimage, const ListedRuns& listed,
                      const std::vector<int64_t>& order) {

@@ -1,4 +1,4 @@
-// A tile is 16 blocks of 4 x 4 pixels, each a vector: the fragments of blocks in a list, and pictures by block.
+// A tile is 16 blocks of 4 x 4 pixels, one vector each: fragments of blocks in a list, and images by block.
 #pragma once
 
 #include "cpu/memory.h"
@@ -11,20 +11,20 @@ namespace bt {
 constexpr int kBlockSide = 4, kBlocksAcross = kTile / kBlockSide, kBlocks = kBlocksAcross * kBlocksAcross;
 static_assert(kBlocks == kLanes && kBlocksAcross == 4, "a bit and a lane for each block of a tile");
 
-// A block's first pixel in its tile.
+// Returns a block's first pixel within its tile.
 constexpr int block_column(int block) { return block % kBlocksAcross * kBlockSide; }
 constexpr int block_row(int block) { return block / kBlocksAcross * kBlockSide; }
-// A pixel's position in its block.
+// Returns a pixel's position within its block.
 constexpr int lane_column(int lane) { return lane % kBlockSide; }
 constexpr int lane_row(int lane) { return lane / kBlockSide; }
-// The centres of a block's pixels, from its corner on.
+// Pixel centres of a block, from its corner.
 template <class S> struct BlockCentres {
   Lanes<S> x, y;
   BlockCentres() {
     for (int i = 0; i < kLanes; ++i) x.set(i, pixel_centre<S>(lane_column(i))), y.set(i, pixel_centre<S>(lane_row(i)));
   }
 };
-// A block's first pixel as reals, which would else be converted for every block that is drawn.
+// First pixels of the blocks as reals, converted once.
 template <class S> struct BlockOffsets {
   S column[kBlocks] = {}, row[kBlocks] = {};
   constexpr BlockOffsets() {
@@ -33,7 +33,7 @@ template <class S> struct BlockOffsets {
 };
 template <class S> inline constexpr BlockOffsets<S> kBlockOffsets;
 
-// The pixels of a surfel in a block; their fragments follow each other by lane.
+// Pixels of a surfel in a block; their fragments are consecutive by lane.
 struct BlockPart {
   uint32_t lanes;
   int block;
@@ -46,12 +46,12 @@ struct BlockPart {
   int count() const { return __builtin_popcount(lanes); }
 };
 
-// The fragments of a surfel in a tile: `begin` to `end` - 1 of the list, in the blocks `first` to `last` - 1.
+// Fragments of a surfel in a tile: `begin` to `end` - 1 of the list, in the blocks `first` to `last` - 1.
 struct BlockRun {
   int32_t tile, surfel;
   int64_t begin, end, first, last;
 };
-// fn(k, at, part) for its blocks k; a block's fragments begin at `at`.
+// Calls fn(k, at, part) for its blocks k; a block's fragments begin at `at`.
 template <class F> BT_HD void each_block(const TileBlocks& of, const BlockRun& run, F&& fn) {
   int64_t at = run.begin;
   for (int64_t k = run.first; k < run.last; ++k) {
@@ -60,7 +60,7 @@ template <class F> BT_HD void each_block(const TileBlocks& of, const BlockRun& r
     at += part.count();
   }
 }
-// fn(run) for the surfels of a tile, front to back.
+// Calls fn(run) for the surfels of a tile, front to back.
 template <class F> BT_HD void each_run(const TileBlocks& of, int64_t tile, F&& fn) {
   const int64_t last = of.block_start[tile + 1];
   BlockRun run = {int32_t(tile), 0, 0, of.start[tile], 0, of.block_start[tile]};
@@ -71,7 +71,7 @@ template <class F> BT_HD void each_run(const TileBlocks& of, int64_t tile, F&& f
     fn(run);
   }
 }
-// The same, back to front.
+// Calls fn(run) for the surfels of a tile, back to front.
 template <class F> BT_HD void each_run_back(const TileBlocks& of, int64_t tile, F&& fn) {
   const int64_t first = of.block_start[tile];
   BlockRun run = {int32_t(tile), 0, of.start[tile + 1], 0, of.block_start[tile + 1], 0};
@@ -83,13 +83,13 @@ template <class F> BT_HD void each_run_back(const TileBlocks& of, int64_t tile, 
   }
 }
 
-// The first pixel of a tile's block in an image, and another lane's from it on.
+// Returns the first pixel of a tile's block in an image; pixels_on: a lane's offset from it.
 inline int64_t first_pixel(int64_t tile, int block, int width) {
   const int64_t corner = (tile / tiles_across(width) * width + tile % tiles_across(width)) * kTile;
   return corner + block_row(block) * width + block_column(block);
 }
 constexpr int pixels_on(int lane, int width) { return lane_row(lane) * width + lane_column(lane); }
-// fn(run, i, pixel) for the fragments i of a tile, in the list's order.
+// Calls fn(run, i, pixel) for the fragments i of a tile, in the list's order.
 template <class F> BT_HD void each_fragment(const TileBlocks& of, int64_t tile, int width, F&& fn) {
   each_run(of, tile, [&](const BlockRun& run) {
     each_block(of, run, [&](int64_t, int64_t at, const BlockPart& part) {
@@ -100,7 +100,7 @@ template <class F> BT_HD void each_fragment(const TileBlocks& of, int64_t tile, 
   });
 }
 
-// fn(pixel, block, lane) for the pixels of a tile that lie in an image.
+// Calls fn(pixel, block, lane) for the pixels of a tile inside an image.
 template <class F> BT_HD void each_pixel(int64_t tile, int width, int height, F&& fn) {
   const int x0 = int(tile % tiles_across(width)) * kTile, y0 = int(tile / tiles_across(width)) * kTile;
   for (int block = 0; block < kBlocks; ++block)
@@ -110,7 +110,7 @@ template <class F> BT_HD void each_pixel(int64_t tile, int width, int height, F&
     }
 }
 
-// The rows of an image by blocks: its channels lie 16 pixels at a time. Outside of it they are 0.
+// A row of tiles of an image by blocks, 16 pixels of a channel contiguous; 0 outside the image.
 template <class S, int channels> class BlockPicture {
  public:
   BlockPicture(const S* rows, int width, int height)

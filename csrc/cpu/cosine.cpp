@@ -1,4 +1,4 @@
-// Sparse cosine coefficients of blocks of texels: a lane for every block and channel.
+// Sparse cosine coefficients of texel blocks: a lane per block and channel.
 #include "ops/cosine.h"
 
 #include "cpu/kernels.h"
@@ -15,7 +15,7 @@ template <class S> class BlockLanes {
  public:
   explicit BlockLanes(const SparseCosines<S>& a) : a_(a), area_(a.height * a.width) {}
 
-  // Blocks and channels from `first` on, counted through: as many as there are lanes, or fewer at the end.
+  // Solves for consecutive (block, channel) pairs from `first` on, up to the number of lanes.
   void run(int64_t first) {
     const int count = int(std::min<int64_t>(kLanes, a_.blocks * a_.channels - first));
     gather(first, count);
@@ -60,7 +60,7 @@ template <class S> class BlockLanes {
     const P rest = max_(max_(x, -x) - threshold_, P(S(0)));
     return select(x < P(S(0)), -rest, rest);
   }
-  // Along u, then along v; `back`: by the transposed matrices.
+  // Transforms along u, then along v; `back`: with the transposed matrices.
   void transform(const P* from, P* to, bool back) {
     const int h = a_.height, w = a_.width;
     for (int v = 0; v < h; ++v) product(a_.across, w, back, from + v * w, half_ + v * w, 1);

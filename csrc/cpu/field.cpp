@@ -1,10 +1,10 @@
-// The residual field at points.
+// Residual field at points.
 #include "cpu/field.h"
 
 namespace bt {
 
 namespace {
-constexpr int64_t kChunk = 1 << 15;  // points whose table gradients are collected before they are added
+constexpr int64_t kChunk = 1 << 15;  // points between additions of table gradients
 }
 
 template <class S> void field_forward(const FieldForward<S>& a) {

@@ -1,4 +1,4 @@
-// The residual field on the CPU: batches of points, SIMD across the features and the hidden units.
+// Residual field on the CPU: batches of points, SIMD across features and hidden units.
 #pragma once
 
 #include "core/field.h"
@@ -8,9 +8,9 @@
 
 namespace bt {
 
-constexpr int kBatch = 16;  // points whose table entries are looked up together
+constexpr int kBatch = 16;  // points per batch of table lookups
 
-// The weights in lanes, with the transposes of the backward pass.
+// Loads the weights into lanes, with their transposes for the backward pass.
 template <class S> Mlp<S, Lanes<S>> load_mlp(const FieldArrays<S>& field) {
   Mlp<S, Lanes<S>> m;
   const int inputs = field.levels * kFeatures;
@@ -31,8 +31,8 @@ template <class S> void clear(Mlp<S, Lanes<S>>& m) {
   std::fill(std::begin(m.w3), std::end(m.w3), Lanes<S>(S(0)));
 }
 
-// Encodes a batch of kBatch points; the indices and weights stay for the backward pass. Points beyond the count repeat
-// whatever lies in x and are not looked up.
+// Encodes a batch of kBatch points; indices and weights are kept for the backward pass. Points beyond the count are not
+// looked up.
 template <class S> struct Encoder {
   using P = Lanes<S>;
   Corners<P> at[kMaxLevels];
@@ -47,7 +47,7 @@ template <class S> struct Encoder {
     const uint32_t mask = f.hash_mask();
     const Vec3<P> c = grid_coordinate(Vec3<P>{load(x[0]), load(x[1]), load(x[2])}, load3(f.mid), f.half, f.contract);
     for (int l = 0; l < f.levels; ++l) corners(c, P(f.resolution(l)), mask, at[l]);
-    // all lines are on their way before the first is needed
+    // prefetch all lines before the first is needed
     for (int l = 0; l < f.levels; ++l)
       for (int k = 0; k < 8; ++k)
         for (int p = 0; p < count; ++p) __builtin_prefetch(level(f, l) + int64_t(at[l].index[k][p]) * kFeatures);
@@ -64,7 +64,7 @@ template <class S> struct Encoder {
       }
     }
   }
-  // d loss / d x of point p from that of its features
+  // Computes d loss / d x of point p from that of its features.
   Vec3<S> position_gradient(const FieldArrays<S>& f, int p, const S* dfeatures) const {
     Vec3<S> dc = {S(0), S(0), S(0)};
     for (int l = 0; l < f.levels; ++l) {
@@ -81,8 +81,8 @@ template <class S> struct Encoder {
   }
 };
 
-// Collects what batches of points give to the table and adds it, level by level: no two threads write one level, and
-// every entry sums its points in their order.
+// Collects gradients of the table from batches of points and adds them level by level: no level is written by two
+// threads, and every entry sums its points in order.
 template <class S> struct TableScatter {
   struct Batch {
     int count = 0;
@@ -91,7 +91,7 @@ template <class S> struct TableScatter {
     Lanes<S> dfeatures[kBatch];
   };
   std::vector<Batch> batches;
-  // room for n points in `parts` parts; part p, which begins at point b, uses batches from slot(p, b) on
+  // Reserves n points in `parts` parts; part p, which begins at point b, uses batches from slot(p, b) on.
   void resize(int64_t n, int parts) {
     batches.resize(n / kBatch + 2 * parts + 1);
     for (Batch& b : batches) b.count = 0;

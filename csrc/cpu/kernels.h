@@ -1,5 +1,5 @@
-// The CPU kernels: loops over core/ with threads and SIMD. Arrays are dense and row major; nothing here knows Python.
-// Every kernel gives the same result however the threads run; the order of summation depends on their number alone.
+// CPU kernels: loops over core/ with threads and SIMD, independent of Python. Arrays are dense and row major. Results
+// do not depend on thread scheduling; the order of summation depends on the number of threads only.
 #pragma once
 
 #include <cstdint>
@@ -27,37 +27,37 @@ template <class S> void project_forward(const ProjectForward<S>& a);
 template <class S> void project_backward(const ProjectBackward<S>& a);
 template <class S> void sparse_cosines(const SparseCosines<S>& a);
 
-// Per tile, the visible surfels front to back, and of each the squared radius of its kernel's
-// level set, in scale units, and that of the low pass's in pixels, 0 where that is nowhere above the kernel.
+// Visible surfels per tile, front to back, and the squared radii of each surfel's level set in scale units, and of its
+// low pass in pixels, 0 where the kernel covers that.
 struct Bins {
   Bins() = default;
-  Bins(const Bins&) = delete;  // nanobind would else offer copies
+  Bins(const Bins&) = delete;  // or nanobind would offer copies
   int tiles_x = 0, tiles_y = 0;
   std::vector<int64_t> start;    // [tiles + 1]
   std::vector<int32_t> surfels;  // [start.back()]
-  std::vector<float> level;      // [n, 2], of the visible ones
+  std::vector<float> level;      // [n, 2], of visible surfels
 };
-// Fills them, by the threads of a team.
+// Fills the bins with the threads of a team.
 template <class S> class Binner {
  public:
   using Aside = std::function<void(int64_t begin, int64_t end)>;
   virtual ~Binner() = default;
-  // All of them call it; the lists are there when it returns. aside(begin, end), if any, for all surfels: work of the
-  // threads while one of them sorts.
+  // Called by all threads; the lists are complete when it returns. aside(begin, end), if given, is work for all surfels
+  // that the threads do while one of them sorts.
   virtual void run(const Member& m, const Aside& aside) = 0;
 };
 template <class S> std::unique_ptr<Binner<S>> binner(const View<S>& view, Bins& bins);
 
-// Fragments as they are found, ordered like FragmentArrays; their blocks have surfels and pixels.
+// Fragments as found, ordered like FragmentArrays; blocks hold surfels and pixels.
 template <class S> struct FoundFragments {
   std::vector<int64_t> tile_start, block_start;  // [tiles + 1]
   int64_t total = 0, blocks = 0;
-  // Filled by trace, read out by copy. Chunks are large, so that what is not written to takes no memory and what is
-  // freed goes back to the operating system. A tile's fragments lie in one chunk.
+  // Filled by trace, read by copy. Chunks are large, so that unwritten memory costs nothing and freed memory returns to
+  // the system. A tile's fragments lie in one chunk.
   struct Chunk {
     static constexpr int64_t kSize = int64_t(1) << 21;
     explicit Chunk(bool first) : memory(allocate(kSize * (2 * sizeof(int32_t) + 5 * sizeof(S)), !first)) {}
-    Memory memory;  // small views, which use a part of the first chunk, do without large pages
+    Memory memory;  // the first chunk has no large pages, as small views use little of it
     int32_t* blocks = reinterpret_cast<int32_t*>(memory.get());
     S *weight = reinterpret_cast<S*>(blocks + 2 * kSize), *u = weight + kSize, *v = u + kSize, *depth = v + kSize,
       *sigma = depth + kSize;
@@ -70,14 +70,14 @@ template <class S> struct FoundFragments {
   };
   std::vector<Piece> pieces;  // [tiles]
 };
-// Memory of a tracer: tile lists and, until copied, the fragments.
+// Memory of a tracer: tile lists and, until copied, fragments.
 template <class S> struct Trace {
   Trace() = default;
   Trace(const Trace&) = delete;
   Bins bins;
   FoundFragments<S> list;
 };
-// More fragments than `most` (0 = any number) are only counted.
+// More fragments than `most` (0 = no limit) are only counted.
 template <class S> struct TraceForward {
   View<S> view;
   int64_t most;
@@ -90,7 +90,7 @@ template <class S> struct TraceForward {
   }
 };
 template <class S> void trace_forward(const TraceForward<S>& a, Trace<S>& to);
-// Written: the list, and the arrays of its TileBlocks.
+// Writes the list, and the arrays of its TileBlocks.
 template <class S> struct TraceCopy {
   int64_t starts, blocks_listed;
   int64_t *tile_start, *block_start;
@@ -104,10 +104,10 @@ template <class S> struct TraceCopy {
     out.fields(r, false);
   }
 };
-// Large lists give their memory back, a chunk of every thread at a time.
+// Large lists free their memory, a chunk of every thread at a time.
 template <class S> void trace_copy(const TraceCopy<S>& a, Trace<S>& from);
 
-// Written: surfel and pixel [F] of the fragments of a list.
+// Writes surfel and pixel [F] of the fragments of a list.
 struct ListedIds {
   TileBlocks layout;
   int width, height;
@@ -124,8 +124,8 @@ struct ListedIds {
 };
 void list_ids(const ListedIds& a);
 
-// The layout of the fragments whose keep [F] is not 0. Written: tile_start, block_start, and as many rows of blocks as
-// the last block_start says.
+// Selects the fragments with keep [F] not 0. Writes tile_start, block_start, and as many rows of blocks as the last
+// block_start.
 struct SelectBlocks {
   TileBlocks layout;
   const uint8_t* keep;
@@ -144,7 +144,7 @@ void select_fragments(const SelectBlocks& a);
 template <class S> void trace_backward(const TraceBackward<S, TileBlocks>& a);
 void masked_counts(const MaskedCounts<TileBlocks>& a);
 
-// Throws std::invalid_argument for a surfel whose lean terms are not there.
+// Throws std::invalid_argument for a surfel with a span outside the terms.
 template <class S> void view_color_forward(const ViewColorForward<S>& a);
 template <class S> void view_color_backward(const ViewColorBackward<S>& a);
 
@@ -155,26 +155,26 @@ template <class S> void blend_forward(const BlendForward<S, TileBlocks>& a);
 template <class S> void blend_backward(const BlendBackward<S, TileBlocks>& a);
 template <class S> void ssim(const Ssim<S>& a);
 
-// An atlas as the renderer reads it: every surfel's tile in one run, row by row. In pages the rows of a tile lie far
-// apart, and each costs a line of the cache and an entry of the page table's.
+// An atlas in the renderer's form: every surfel's tile contiguous, row by row. On pages each row of a tile would cost a
+// cache line and a TLB entry.
 struct Patches {
   std::vector<uint8_t> bytes;  // RGBA, or empty
   std::vector<float> floats;   // RGBA, or empty
-  std::vector<int64_t> first;  // [n] a patch's first texel
+  std::vector<int64_t> first;  // [n] first texel of a patch
   std::vector<int32_t> sides;  // [n, 2] r_u, r_v; 0: no tile
 };
-// Pages RGBA [layers, height, width, 4] as bytes or floats, the other null; tiles [n, 5]: x, y, layer, r_u, r_v.
-// Throws std::invalid_argument for a tile that does not lie on its page.
+// Gathers pages RGBA [layers, height, width, 4], bytes or floats, the other null; tiles [n, 5]: x, y, layer, r_u, r_v.
+// Throws std::invalid_argument for a tile outside its page.
 void gather_patches(int layers, int height, int width, const uint8_t* bytes, const float* floats, int64_t n,
                     const int32_t* tiles, Patches& out);
-// The forward-only renderer of a baked scene: image [height, width, channels] is written, overdraw [height, width]
-// int32 or null. `bins` is its working memory.
+// Forward-only renderer of a baked scene: writes image [height, width, channels] and, unless null, overdraw [height,
+// width] int32. `bins` is working memory.
 template <class S> struct BakedForward {
   View<S> view;
   const S* base;  // [n, 3] f_view
   BakedResidual residual;
   const Patches* patches;
-  const Patches* coarser[kTileLevels - 1];  // the levels of the tiles; null: none, as in views of the photographs' size
+  const Patches* coarser[kTileLevels - 1];  // levels of the tiles; null in views of the photographs' size
   Bins* bins;
   bool maps;
   S* image;

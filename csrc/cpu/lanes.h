@@ -1,4 +1,4 @@
-// Some lanes of a vector of 16: as a mask, and to and from memory, where they lie next to each other.
+// Subsets of 16 lanes: masks, and loads and stores to contiguous memory.
 #pragma once
 
 #include <array>
@@ -7,11 +7,11 @@
 
 namespace bt {
 
-// fn(lane) for a set of lanes.
+// Calls fn(lane) for a set of lanes.
 template <class F> BT_HD void each_lane(uint32_t lanes, F&& fn) {
   for (; lanes; lanes &= lanes - 1) fn(__builtin_ctz(lanes));
 }
-// The mask of the lanes that have a bit in `lanes`.
+// Builds the mask of the lanes with a bit in `lanes`.
 template <class M> BT_HD M mask_of_lanes(uint32_t lanes) {
   if constexpr (is_two<M>) {
     constexpr int n = sizeof(M::low) / sizeof(typename M::Lane);
@@ -27,21 +27,21 @@ template <class M> BT_HD M mask_of_lanes(uint32_t lanes) {
 template <> BT_HD MaskOfFloats mask_of_lanes(uint32_t lanes) { return {__mmask16(lanes)}; }
 BT_HD __mmask16 first_lanes(uint32_t lanes) { return __mmask16((1u << __builtin_popcount(lanes)) - 1u); }
 
-// The lanes named by `lanes`, next to each other; `to` has room for all lanes of `a`.
+// Stores the selected lanes contiguously; `to` has room for all lanes of `a`.
 BT_HD void compress_lanes(float* to, const Vector<float>& a, uint32_t lanes) {
   _mm512_storeu_ps(to, _mm512_maskz_compress_ps(__mmask16(lanes), (__m512)a));
 }
 BT_HD void compress_lanes(int32_t* to, const Vector<int32_t>& a, uint32_t lanes) {
   _mm512_storeu_si512(to, _mm512_maskz_compress_epi32(__mmask16(lanes), (__m512i)a));
 }
-// The same; what lies behind them in memory stays.
+// Stores the selected lanes without writing beyond them.
 BT_HD void compress_lanes_only(float* to, const Vector<float>& a, uint32_t lanes) {
   _mm512_mask_storeu_ps(to, first_lanes(lanes), _mm512_maskz_compress_ps(__mmask16(lanes), (__m512)a));
 }
 BT_HD void compress_lanes_only(int32_t* to, const Vector<int32_t>& a, uint32_t lanes) {
   _mm512_mask_storeu_epi32(to, first_lanes(lanes), _mm512_maskz_compress_epi32(__mmask16(lanes), (__m512i)a));
 }
-// And back; the other lanes are 0. What lies behind them in memory is not read.
+// Loads contiguous memory into the selected lanes, others 0, without reading beyond.
 BT_HD void expand_lanes(const float* from, Vector<float>& to, uint32_t lanes) {
   to = (Vector<float>)_mm512_maskz_expand_ps(__mmask16(lanes), _mm512_maskz_loadu_ps(first_lanes(lanes), from));
 }
@@ -53,8 +53,8 @@ BT_HD __m256i mask_of_eight(uint32_t lanes) {
 template <> BT_HD MaskOfFloats mask_of_lanes(uint32_t lanes) { return (MaskOfFloats)mask_of_eight(lanes); }
 BT_HD __m256i first_lanes(uint32_t lanes) { return mask_of_eight((1u << __builtin_popcount(lanes)) - 1u); }
 
-// For every set of eight lanes a byte for each lane: the numbers of those in the set, in order, and back: how many come
-// before a lane.
+// Permutations per set of eight lanes, a byte per lane: the selected lanes in order, and its inverse, the rank of each
+// lane.
 struct LaneOrder {
   std::array<uint64_t, 256> number{}, rank{};
   constexpr LaneOrder() {
@@ -87,7 +87,7 @@ BT_HD void expand_lanes(const float* from, Vector<float>& to, uint32_t lanes) {
 }
 #endif
 
-// fn(lanes of the lower half, of the upper half, how many the lower half has)
+// Calls fn(lanes of the lower half, of the upper half, number in the lower half).
 template <class V, class F> BT_HD void by_halves(uint32_t lanes, F&& fn) {
   constexpr int n = sizeof(V::low) / sizeof(typename V::Lane);
   const uint32_t low = lanes & ((1u << n) - 1u);

@@ -1,4 +1,4 @@
-// Memory for large blocks.
+// Allocation of large blocks.
 #pragma once
 
 #include <cstddef>
@@ -20,8 +20,7 @@ using Memory = std::unique_ptr<unsigned char, FreeMemory>;
 
 constexpr size_t kLargePage = size_t(1) << 21;
 
-// Asks for large pages (2 MB, where the system has them) for what lies between: writing there for the first time then
-// costs a sixth of the time.
+// Requests large pages (2 MB, if the system has them) for this range: first writes then take a sixth of the time.
 inline void use_large_pages(void* at, size_t bytes) {
 #if defined(__linux__) && defined(MADV_HUGEPAGE)
   const uintptr_t from = (reinterpret_cast<uintptr_t>(at) + kLargePage - 1) / kLargePage * kLargePage;
@@ -32,7 +31,7 @@ inline void use_large_pages(void* at, size_t bytes) {
 #endif
 }
 
-// Memory that is not cleared. What is not written to takes none.
+// Allocates uncleared memory; unwritten pages cost nothing.
 inline Memory allocate(size_t bytes, bool large_pages) {
   bytes = (bytes + kLargePage - 1) / kLargePage * kLargePage;
   Memory memory(static_cast<unsigned char*>(std::aligned_alloc(kLargePage, bytes)));

@@ -1,4 +1,4 @@
-// Projection of all surfels; the number of threads.
+// Projection of surfels; number of threads.
 #include <numeric>
 
 #include "core/visibility.h"
@@ -26,7 +26,7 @@ namespace {
 using P = Lanes<float>;
 constexpr int kSurfelColumns = 11;
 
-// Surfels begin to begin + n, n <= kLanes; the last one stands for those that are missing.
+// Loads surfels begin to begin + n, n <= kLanes, repeating the last one.
 SurfelRow<P> surfel_lanes(const Surfels<float>& in, int64_t begin, int n) {
   float columns[kSurfelColumns][kLanes];
   for (int lane = 0; lane < kLanes; ++lane) {
@@ -40,7 +40,7 @@ SurfelRow<P> surfel_lanes(const Surfels<float>& in, int64_t begin, int n) {
   return {{at(0), at(1), at(2)}, {at(3), at(4), at(5), at(6)}, {at(7), at(8)}, at(9), at(10)};
 }
 
-// As project_visible (core/visibility.h) has it for one surfel.
+// Computes project_visible (core/visibility.h) for lanes of surfels.
 template <class Kernel>
 Sight<P> sight(const Pinhole<float>& cam, int width, int height, const SurfelRow<P>& in, float near,
                const Resize<float>& to) {
@@ -52,7 +52,7 @@ Sight<P> sight(const Pinhole<float>& cam, int width, int height, const SurfelRow
   return s;
 }
 
-// Rows of lanes from columns of lanes, 0 where they are not seen.
+// Transposes columns of lanes to rows, 0 where not seen.
 template <int columns> void store_rows(const P* from, uint32_t seen, int n, float* to) {
   float all[columns][kLanes];
   for (int k = 0; k < columns; ++k) store(all[k], from[k]);
@@ -60,7 +60,7 @@ template <int columns> void store_rows(const P* from, uint32_t seen, int n, floa
     for (int k = 0; k < columns; ++k) to[lane * columns + k] = seen >> lane & 1 ? all[k][lane] : 0.0f;
 }
 
-// Returns the number of surfels that are not finite.
+// Returns the number of non-finite surfels.
 template <class Kernel>
 int64_t project_lanes(const Pinhole<float>& cam, const ProjectForward<float>& a, const Resize<float>& to, int64_t begin,
                       int64_t end) {

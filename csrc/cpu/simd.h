@@ -1,4 +1,4 @@
-// 16 lanes on the compiler's vector extensions, with the functions that core/ expects of a real.
+// 16 lanes on the compiler's vector extensions, with the functions that core/ needs of a real.
 #pragma once
 
 #include <cstring>
@@ -14,7 +14,7 @@ namespace bt {
 
 template <class S> struct Lanes;
 
-// Spelt out for each scalar: the compiler drops the vector attribute of a dependent type.
+// Spelt out per scalar: the compiler drops the vector attribute of dependent types.
 template <class S> struct LaneTypes;
 template <> struct LaneTypes<float> {
   using M = decltype(above(Wide<float>{}, Wide<float>{}));
@@ -30,8 +30,8 @@ template <> struct LaneTypes<double> {
   typedef double O __attribute__((vector_size(64)));
   typedef double Q __attribute__((vector_size(32)));
 };
-template <class S> using Quad = typename LaneTypes<S>::Q;  // four lanes: a table entry
-template <class S> using Oct = typename LaneTypes<S>::O;   // eight
+template <class S> using Quad = typename LaneTypes<S>::Q;  // 4 lanes: a table entry
+template <class S> using Oct = typename LaneTypes<S>::O;   // 8 lanes
 
 template <class S> struct IndexOf<Lanes<S>> {
   using type = typename LaneTypes<S>::U;
@@ -40,7 +40,7 @@ template <class S> struct IndexOf<Lanes<S>> {
 template <class S> struct Lanes {
   using V = Wide<S>;
   using M = typename LaneTypes<S>::M;  // a mask
-  using I = typename LaneTypes<S>::I;  // whole numbers
+  using I = typename LaneTypes<S>::I;  // integers
   V v;
   Lanes() = default;
   BT_HD Lanes(const V& value) : v(value) {}
@@ -64,7 +64,7 @@ template <class S> BT_HD Lanes<S>& operator-=(Lanes<S>& a, Lanes<S> b) {
   a.v = a.v - b.v;
   return a;
 }
-// Comparisons give masks, which combine with & | ~.
+// Comparisons return masks, which combine with & | ~.
 template <class S> BT_HD typename Lanes<S>::M operator>(Lanes<S> a, Lanes<S> b) { return above(a.v, b.v); }
 template <class S> BT_HD typename Lanes<S>::M operator<(Lanes<S> a, Lanes<S> b) { return above(b.v, a.v); }
 template <class S> BT_HD typename Lanes<S>::M operator>=(Lanes<S> a, Lanes<S> b) { return at_least(a.v, b.v); }
@@ -82,11 +82,11 @@ template <class S> BT_HD Lanes<S> max_(Lanes<S> a, Lanes<S> b) { return larger(a
 template <class S> BT_HD Lanes<S> min_(Lanes<S> a, Lanes<S> b) { return smaller(a.v, b.v); }
 
 template <class S> BT_HD Lanes<S> relu(Lanes<S> a) {
-  return larger(Lanes<S>(S(0)).v, a.v);  // NaN stays NaN
+  return larger(Lanes<S>(S(0)).v, a.v);  // keeps NaN
 }
 
-// exp and log of floats, below 2 ulp over the normal range: Cody-Waite reduction and a minimax polynomial in pairs, so
-// that few operations wait for one another.
+// exp and log of floats, below 2 ulp over the normal range: Cody-Waite reduction and a minimax polynomial in pairs, for
+// short dependency chains.
 BT_HD Lanes<float> exp_(Lanes<float> x) {
   using V = Lanes<float>::V;
   using I = Lanes<float>::I;
@@ -104,7 +104,7 @@ BT_HD Lanes<float> log_(Lanes<float> x) {
   using V = Lanes<float>::V;
   using I = Lanes<float>::I;
   const I bits = same_bits<I>(x.v);
-  // mantissa in [sqrt(1/2), sqrt(2)), so that the logarithm keeps its relative accuracy near 1
+  // mantissa in [sqrt(1/2), sqrt(2)), for relative accuracy near 1
   const I shifted = bits - 0x3f3504f3;
   const I e = shifted >> 23;
   const V m = same_bits<V>((shifted & 0x007fffff) + 0x3f3504f3);
@@ -116,11 +116,10 @@ BT_HD Lanes<float> log_(Lanes<float> x) {
   const V n = convert<V>(e);
   return (r + n * 1.42860677e-6f) + n * 0.693145752f;
 }
-// x^y for x in (0, 1] and y >= 0, below 1e-6 of it where it is above 1e-3: as exp_ of y log_(x), which is as accurate
-// wherever x is, in half of the operations; at least 2^-126, as smaller numbers are slow. Logarithm and power are those
-// of 2.
+// x^y for x in (0, 1] and y >= 0, with a relative error below 1e-6 where the result exceeds 1e-3: as accurate as exp_
+// of y log_(x) in half the operations; at least 2^-126, as denormals are slow. Logarithm and power are to base 2.
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
-// 1 / m and its logarithm's opposite in the middles of 16 parts of [1, 2)
+// 1 / m and -log2 of it, at the middles of 16 parts of [1, 2)
 alignas(64) inline constexpr float kInverse[16] = {
     0.969696999f, 0.914285719f, 0.864864886f, 0.820512831f, 0.780487776f, 0.744186044f, 0.711111128f, 0.680851042f,
     0.653061211f, 0.627451003f, 0.603773594f, 0.581818163f, 0.561403513f, 0.542372882f, 0.524590135f, 0.507936537f};
@@ -131,7 +130,7 @@ BT_HD Lanes<float> power_(Lanes<float> x, Lanes<float> y) {
   constexpr __mmask16 kAll = 0xffff;
   using V = Lanes<float>::V;
   const __m512 m = _mm512_maskz_getmant_ps(kAll, (__m512)x.v, _MM_MANT_NORM_1_2, _MM_MANT_SIGN_src);
-  const __m512i part = _mm512_maskz_srli_epi32(kAll, (__m512i)m, 19);  // of which four bits count below
+  const __m512i part = _mm512_maskz_srli_epi32(kAll, (__m512i)m, 19);  // the permutation uses its low four bits
   const V c = (V)_mm512_maskz_permutexvar_ps(kAll, part, _mm512_load_ps(kInverse));
   const V l = (V)_mm512_maskz_permutexvar_ps(kAll, part, _mm512_load_ps(kLogarithm));
   const V r = (V)m * c - 1.0f;
@@ -143,14 +142,14 @@ BT_HD Lanes<float> power_(Lanes<float> x, Lanes<float> y) {
   return (V)_mm512_maskz_scalef_ps(kAll, (__m512)(f * p + 1.0f), (__m512)n);
 }
 #else
-// Half by half: both at once would not fit the registers.
+// In halves: a whole vector would exceed the registers.
 template <class V> BT_HD V power_of(const V& x, const V& y) {
   if constexpr (is_two<V>) {
     return {power_of(x.low, y.low), power_of(x.high, y.high)};
   } else {
     using I = Vector<int32_t>;
     const I shifted = same_bits<I>(x) - 0x3f3504f3;
-    // the mantissa less one, in [sqrt(1/2), sqrt(2)) before
+    // mantissa - 1, for mantissas in [sqrt(1/2), sqrt(2))
     const V r = same_bits<V>((shifted & 0x007fffff) + 0x3f3504f3) - 1.0f, r2 = r * r;
     const V low = (1.44269478f - 0.721357167f * r) + r2 * (0.480939448f - 0.360087216f * r);
     const V high = (0.286707461f - 0.250069052f * r) + r2 * (0.23689033f - 0.145744368f * r);
@@ -183,10 +182,10 @@ template <class T> BT_HD T narrowed(Lanes<double> a) {
     return a;
 }
 template <class S> BT_HD typename Lanes<S>::M finite_(Lanes<S> a) {
-  return abs_(a) < Lanes<S>(std::numeric_limits<S>::infinity());  // not for NaN
+  return abs_(a) < Lanes<S>(std::numeric_limits<S>::infinity());  // false for NaN
 }
 
-// Some lanes: their mask, and to and from memory, next to each other (cpu/lanes.h).
+// Subsets of lanes: mask, contiguous loads and stores (cpu/lanes.h).
 template <class S> BT_HD typename Lanes<S>::M mask_of(uint32_t lanes) {
   return mask_of_lanes<typename Lanes<S>::M>(lanes);
 }
@@ -194,7 +193,7 @@ template <class S> BT_HD void compress(S* to, Lanes<S> a, uint32_t lanes) { comp
 BT_HD void compress(int32_t* to, const Wide<int32_t>& a, uint32_t lanes) { compress_lanes(to, a, lanes); }
 template <class S> BT_HD void compress_only(S* to, Lanes<S> a, uint32_t lanes) { compress_lanes_only(to, a.v, lanes); }
 BT_HD void compress_only(int32_t* to, const Wide<int32_t>& a, uint32_t lanes) { compress_lanes_only(to, a, lanes); }
-// The same where what lies up to `end` is written later: a masked store costs AMD's processors dozens of operations.
+// Stores them where memory up to `end` is written later anyway: masked stores cost dozens of operations on AMD.
 template <class T, class V> BT_HD void compress_until(T* end, T* to, const V& a, uint32_t lanes) {
   end - to >= kLanes ? compress(to, a, lanes) : compress_only(to, a, lanes);
 }
@@ -211,7 +210,7 @@ template <class S> BT_HD Lanes<S> floor_(Lanes<S> a) { return round_down(a.v); }
 template <class S> BT_HD typename IndexOf<Lanes<S>>::type to_index(Lanes<S> a) {
   return same_bits<typename IndexOf<Lanes<S>>::type>(convert<typename Lanes<S>::I>(a.v));
 }
-// Lanes of integers below 2^24, and such lanes as integers.
+// Converts integers below 2^24 to lanes, and back.
 template <class S> BT_HD Lanes<S> from_integers(const Wide<uint32_t>& a) {
   if constexpr (std::is_same_v<S, float>) return convert<Wide<float>>(same_bits<Wide<int32_t>>(a));
   Lanes<S> r;
@@ -225,7 +224,7 @@ template <class S> BT_HD void store_integers(int32_t* to, Lanes<S> a) {
   else
     for (int i = 0; i < kLanes; ++i) to[i] = int32_t(whole[i]);
 }
-// Half of a vector: the lower one (0) or the upper one (1). GCC has the shuffle from version 12 on.
+// Returns half of a vector: lower (0) or upper (1). GCC has the shuffle since version 12.
 template <int which, class Half, class V> BT_HD Half half(V v) {
   static_assert(sizeof(V) == 2 * sizeof(Half));
 #if __has_builtin(__builtin_shufflevector)
@@ -240,7 +239,7 @@ template <int which, class Half, class V> BT_HD Half half(V v) {
   return r;
 #endif
 }
-// The lanes added to four: halves to halves.
+// Folds the lanes to four by adding halves.
 template <class S, class V> BT_HD Quad<S> folded(const V& v) {
   if constexpr (std::is_same_v<V, Quad<S>>)
     return v;

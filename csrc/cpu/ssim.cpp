@@ -1,4 +1,4 @@
-// Structural similarity over the valid 11 x 11 Gaussian windows, with its gradient, separable.
+// Structural similarity over the valid 11 x 11 Gaussian windows, separable, with its gradient.
 #include "core/ssim.h"
 
 #include "cpu/kernels.h"
@@ -9,11 +9,11 @@ namespace bt {
 
 namespace {
 constexpr int kTaps = kSsimTaps;
-constexpr int kMoments = 5, kSlopes = 3;  // means of a window, and derivatives towards three of them
+constexpr int kMoments = 5, kSlopes = 3;  // means of a window, derivatives with respect to three of them
 
 inline int whole_vectors(int n) { return (n + kLanes - 1) / kLanes * kLanes; }
 
-// Rows of numbers, the last kTaps of them, each of some columns; rows that were never written are 0.
+// Ring buffer of the last kTaps rows, each with several columns; unwritten rows are 0.
 template <class S> class LastRows {
  public:
   LastRows(int columns, int length)
@@ -28,7 +28,7 @@ template <class S> class LastRows {
   std::vector<S> numbers_;
 };
 
-// Working memory of a thread: of rows `from` to `to` the windows that begin there, and the gradient.
+// Working memory of a thread: the windows that begin in rows `from` to `to`, and the gradient.
 template <class S> class Band {
   using P = Lanes<S>;
 
@@ -52,9 +52,9 @@ template <class S> class Band {
     for (int t = 0; t < kTaps; ++t) k_[t] = P(window.k[t]);
   }
 
-  // row_sum [rows]: of the windows' values.
+  // row_sum [rows]: sums of the windows' values.
   void run(int64_t from, int64_t to, double* row_sum) {
-    // a pixel's gradient needs the windows that begin up to kTaps - 1 rows above, a window as many rows below
+    // a pixel's gradient needs windows from up to kTaps - 1 rows above, a window needs as many rows below
     const int64_t first = da_ ? std::max<int64_t>(0, from - kTaps + 1) : from, last = std::min<int64_t>(to, rows_);
     for (int64_t y = first; y < std::min<int64_t>(first + kTaps - 1, last + kTaps - 1); ++y) filter_row(y);
     for (int64_t y = first; y < to; ++y) {
@@ -70,7 +70,7 @@ template <class S> class Band {
   }
 
  private:
-  // The five moments of row y, filtered along the row.
+  // Filters the five moments of row y along the row.
   void filter_row(int64_t y) {
     const S *a = a_ + y * line_, *b = b_ + y * line_;
     S* p[kMoments];
@@ -89,7 +89,7 @@ template <class S> class Band {
     }
   }
 
-  // The windows that begin in row y: the sum of their values; their slopes are kept.
+  // Sums the values of the windows that begin in row y, keeping their slopes.
   double windows(int64_t y) {
     P lane, sum = P(S(0));
     for (int i = 0; i < kLanes; ++i) lane.set(i, S(i));
@@ -109,7 +109,7 @@ template <class S> class Band {
     return total;
   }
 
-  // The transpose of the filter: first down the columns, then along the row.
+  // Applies the transposed filter: columns first, then the row.
   void gradient_row(int64_t y) {
     const int stride = whole_vectors(line_) + pad_;
     for (int j = 0; j < kSlopes; ++j)

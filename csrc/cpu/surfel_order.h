@@ -1,4 +1,4 @@
-// Whole surfels of a fragment list, one after the other: the order of backward passes that add to what a surfel owns.
+// Grouping of a fragment list by surfel, for backward passes that add to per-surfel data.
 #pragma once
 
 #include <cstdint>
@@ -10,14 +10,13 @@
 
 namespace bt {
 
-// Runs are fragments of one surfel that follow each other in the list. `runs` has their surfels and lengths:
-// runs.count(), runs.surfel(r), runs.length(r).
+// Runs are consecutive fragments of one surfel in the list: runs.count(), runs.surfel(r), runs.length(r).
 
-// The runs surfel by surfel, these in the order in which the list first has them, n at most. So they are neighbours on
-// the screen that follow each other, whose runs lie near each other in the list, as their pixels do in the picture.
+// Returns the runs grouped by surfel, surfels (at most n) in order of first appearance. Consecutive surfels are then
+// neighbours on the screen, so their runs lie close together in the list, as do their pixels.
 template <class R> std::vector<int64_t> by_surfel(const R& runs, int64_t n) {
   std::vector<int32_t> rank(n, -1);
-  std::vector<int64_t> next{0};  // first the number of runs of each rank, then the offset of its next one
+  std::vector<int64_t> next{0};  // number of runs of each rank, then the offset of its next one
   for (int64_t r = 0; r < runs.count(); ++r) {
     int32_t& its = rank[runs.surfel(r)];
     if (its < 0) its = int32_t(next.size()) - 1, next.push_back(0);
@@ -29,8 +28,8 @@ template <class R> std::vector<int64_t> by_surfel(const R& runs, int64_t n) {
   return order;
 }
 
-// fn(k, last) for the runs order[k] to order[last - 1] of every surfel. A thread takes whole surfels: what is added to
-// their tiles is added by it alone, and in the order of the list.
+// Calls fn(k, last) for the runs order[k] to order[last - 1] of every surfel. One thread handles all runs of a surfel
+// in list order, so no other thread adds to its texels.
 template <class R, class F> void for_surfels(const R& runs, const int64_t* order, F&& fn) {
   const int64_t count = runs.count();
   std::vector<int64_t> cost(count + 1, 0);

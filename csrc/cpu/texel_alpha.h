@@ -1,4 +1,4 @@
-// Alpha texels under the fragments of a block: the cut of their sigma, and the mark in their v.
+// Alpha texels of a block's fragments: multiplication of sigma, and the mark in v.
 #pragma once
 
 #include <algorithm>
@@ -9,7 +9,7 @@
 
 namespace bt {
 
-// Fragments whose sigma was multiplied, as the last bit of their v.
+// Marks fragments whose sigma was multiplied by the last bit of v.
 template <class S> Lanes<S> marked(Lanes<S> v, uint32_t lanes) {
   using V = typename Lanes<S>::V;
   using I = typename Lanes<S>::I;
@@ -22,8 +22,8 @@ template <class S> uint32_t marks(Lanes<S> v) {
   return bits(Lanes<S>(convert<V>(same_bits<I>(v.v) & 1)) > Lanes<S>(S(0.5)));
 }
 
-// Prefetches where the tile of a surfel lies that comes later, and what most tiles have of one that comes soon; also of
-// the gradients `of_texels`, null: there are none.
+// Prefetches the tile entry of a surfel a few steps ahead, and the texels of one that comes next; also the gradients
+// `of_texels`, unless null.
 template <class S> BT_HD void prefetch_tile(const AlphaTiles<S>& tiles, int64_t id) {
   __builtin_prefetch(tiles.first + id), __builtin_prefetch(tiles.size + 2 * id), __builtin_prefetch(tiles.extent + id);
 }
@@ -35,7 +35,7 @@ template <class S> BT_HD void prefetch_texels(const AlphaTiles<S>& tiles, int64_
     if (of_texels) __builtin_prefetch(of_texels + t, 1);
   }
 }
-// Two texels side by side by lane, the left one at first[lane] of a tile; where there are not both, the left one twice.
+// Loads two adjacent texels per lane, the left one at first[lane] of a tile; the left one twice unless `both`.
 template <class S>
 BT_HD void load_sides(const S* tile, const int32_t* first, bool both, Lanes<S>& left, Lanes<S>& right) {
 #if defined(__AVX2__)
@@ -58,7 +58,7 @@ BT_HD void load_sides(const S* tile, const int32_t* first, bool both, Lanes<S>& 
   for (int lane = 0; lane < kLanes; ++lane)
     left.set(lane, tile[first[lane]]), right.set(lane, tile[first[lane] + int(both)]);
 }
-// The alpha texels under some of a block's fragments; those under others are not told.
+// Alpha texels of a subset of a block's fragments; undefined for others.
 template <class S> class AlphaLanes {
  public:
   using P = Lanes<S>;
@@ -76,7 +76,7 @@ template <class S> class AlphaLanes {
   P sigma(P uncut) const {
     return select(mask_of<S>(lanes_), alpha_cut(uncut, texel_lerp(t_, x_.fraction, y_.fraction)), uncut);
   }
-  // See alpha_vjp. Adds the gradients of the texels to those of their tile, null: there are none.
+  // Computes alpha_vjp, and adds the texels' gradients to those of their tile, unless null.
   void gradient(P& listed, P& gs, P& gu, P& gv, S* to) const {
     P of[] = {listed, gs, gu, gv};
     const P dm = alpha_vjp(patch_, t_, x_, y_, of[0], of[1], of[2], of[3]);
@@ -102,7 +102,7 @@ template <class S> class AlphaLanes {
   int32_t first_[kLanes];
   P t_[4];
 };
-// The sigma of a block's fragments, multiplied by alpha where the weight reaches the bound, and the mark.
+// Multiplies the sigma of a block's fragments by alpha where the weight reaches the bound, and marks them.
 template <class S>
 void cut(const AlphaTiles<S>& tiles, int64_t id, const typename Lanes<S>::M& covered, Lanes<S> transmittance,
          Fragment<Lanes<S>>& f) {

@@ -1,13 +1,11 @@
-// The texels under fragments of one surfel: positions and values of a block's fragments at a time, gradients as vectors
-// of four.
-#pragma once
+// Texels of one surfel's fragments: positions and values per block, gradients as vectors of four.
 
 #include "cpu/blocks.h"
 #include "ops/texel.h"
 
 namespace bt {
 
-// A colour and a fourth number, with the functions that core/ expects of a real.
+// A colour and a fourth number, with the functions that core/ needs of a real.
 template <class S> struct Four {
   Quad<S> v;
   Four() = default;
@@ -27,11 +25,10 @@ template <class S> BT_HD Four<S> operator+(Four<S> a, Four<S> b) { return a.v + 
 template <class S> BT_HD Four<S> operator-(Four<S> a, Four<S> b) { return a.v - b.v; }
 template <class S> BT_HD Four<S> operator*(S k, Four<S> a) { return k * a.v; }
 
-// Up to so many fragments: those of a surfel in the blocks of a tile.
+// Most fragments of a surfel in a tile.
 constexpr int kFew = kBlocks * kLanes;
 
-// The numbers of two texels side by side by lane, which lie at 3 first[lane] of a tile; of the left one twice where
-// there are not both.
+// Loads the numbers of two adjacent texels per lane, at 3 first[lane] of a tile; the left one twice unless `both`.
 template <class S> BT_HD void load_pairs(const S* tile, const int32_t* first, bool both, Lanes<S>* to) {
   const auto pair = [&](int lane) { return tile + 3 * int64_t(first[lane]); };
 #if defined(__AVX2__)
@@ -39,7 +36,7 @@ template <class S> BT_HD void load_pairs(const S* tile, const int32_t* first, bo
     if (both) {
       __m256 numbers[6][2];
       for (int half = 0; half < 2; ++half) {
-        // four numbers of two lanes, which are four apart
+        // four numbers of two lanes, four lanes apart
         const auto rows = [&](int lane, int number) {
           const __m128 low = _mm_loadu_ps(pair(8 * half + lane) + number);
           return _mm256_insertf128_ps(_mm256_castps128_ps256(low), _mm_loadu_ps(pair(8 * half + lane + 4) + number), 1);
@@ -62,19 +59,19 @@ template <class S> BT_HD void load_pairs(const S* tile, const int32_t* first, bo
     for (int k = 0; k < 6; ++k) to[k].set(lane, pair(lane)[k < 3 || both ? k : k - 3]);
 }
 
-// The four texels around the fragments of a block by lane, mixed along v, and the steps along v between them.
+// The four texels around each fragment of a block, interpolated along v, and the differences along v.
 template <class S> struct BlockTexels {
   using P = Lanes<S>;
-  P mixed[6], step[6];  // r, g, b of the left ones, of the right ones
+  P mixed[6], step[6];  // r, g, b on the left, then on the right
   P fx;
 
   BT_HD P residual(int c) const { return mixed[c] + fx * slope_u(c); }
-  // The bilinear fetch's slopes, per texel.
+  // Slopes of the bilinear fetch, per texel.
   BT_HD P slope_u(int c) const { return mixed[3 + c] - mixed[c]; }
   BT_HD P slope_v(int c) const { return step[c] + fx * (step[3 + c] - step[c]); }
 };
 
-// Up to kFew fragments of a surfel that has texels.
+// Up to kFew fragments of a surfel with texels.
 template <class S> class PatchFragments {
  public:
   BT_HD explicit PatchFragments(const TexelPatch<S>& of)
@@ -83,7 +80,7 @@ template <class S> class PatchFragments {
         per_u_(texel_density(of.size[0], of.extent)),
         per_v_(texel_density(of.size[1], of.extent)) {}
 
-  // Computes the texel positions of a block's fragments, numbered from j on by lane.
+  // Computes the texel positions of a block's fragments, numbered from j by lane.
   BT_HD void locate(int j, Lanes<S> u, Lanes<S> v) {
     const TexelAxis<Lanes<S>> x = texel_axis(u, of_.size[0], of_.extent), y = texel_axis(v, of_.size[1], of_.extent);
     store_integers(first_ + j, y.first * Lanes<S>(S(of_.size[0])) + x.first);
@@ -96,7 +93,7 @@ template <class S> class PatchFragments {
     __builtin_prefetch(t), __builtin_prefetch(t + 3 * next_.down);
   }
 
-  // The texels around the fragments of a block, numbered from j on.
+  // Loads the texels around the fragments of a block, numbered from j.
   BT_HD BlockTexels<S> texels(int j) const {
     BlockTexels<S> r;
     Lanes<S> below[6];
@@ -107,8 +104,8 @@ template <class S> class PatchFragments {
     r.fx = load(fx_ + j);
     return r;
   }
-  // Adds the gradients of fragment j's texels to rows of four, g that of its colour. Four at a time: a load of eight
-  // would wait for the stores of the fragment before, of which it has a part.
+  // Adds the gradients of fragment j's texels to rows of four; g: gradient of its colour. Four at a time, as loads of
+  // eight would wait for the partial stores of the previous fragment.
   BT_HD void add_gradient(int j, Four<S> g, S* rows) const {
     const Four<S> below = fy_[j] * g, above = g - below, below_right = fx_[j] * below, right = fx_[j] * above;
     S* at = rows + 4 * int64_t(first_[j]);
@@ -116,8 +113,8 @@ template <class S> class PatchFragments {
     add(above - right, at), add(right, at + across);
     add(below - below_right, at + down), add(below_right, at + down + across);
   }
-  // The gradients of the coordinates of a block's fragments, g those of its colours, where they lie within the outer
-  // texel centres; 0 beyond.
+  // Computes the coordinates' gradients of a block's fragments from those of their colours, g; 0 beyond the outer texel
+  // centres.
   BT_HD Lanes<S> gradient_u(int j, const BlockTexels<S>& at, const Lanes<S>* g) const {
     const Lanes<S> slope = g[0] * at.slope_u(0) + g[1] * at.slope_u(1) + g[2] * at.slope_u(2);
     return select(mask_of<S>(inside_u_[j / kLanes]), Lanes<S>(per_u_) * slope, Lanes<S>(S(0)));

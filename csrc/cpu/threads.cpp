@@ -1,4 +1,4 @@
-// Waiting of OpenMP's threads.
+// Waiting of OpenMP threads.
 #include "cpu/threads.h"
 
 #if defined(_OPENMP)
@@ -13,11 +13,11 @@
 
 namespace bt {
 
-// libgomp's threads spin for milliseconds after every parallel region, torch's regions and ours alike, unless
-// OMP_WAIT_POLICY or GOMP_SPINCOUNT say otherwise. It reads these once, when torch loads it: too late for a plugin. But
-// it spins a thousandth of that as long as a process has more OpenMP threads than processors, by its manual. A second
-// team that sleeps for good brings that about, of as many threads as are missing. A process with one thread has none
-// that spin, and one with few of the processors' threads leaves the other processors alone: there is no team for these.
+// libgomp's threads spin for milliseconds after every parallel region, torch's and ours, unless OMP_WAIT_POLICY or
+// GOMP_SPINCOUNT are set. It reads these once, when torch loads it: too late for a plugin. But according to its manual
+// it spins a thousandth of that while a process has more OpenMP threads than processors. A second team of the missing
+// threads, which sleeps for good, achieves this. A process with one thread has none that spin, and one that uses few of
+// the processors leaves the others alone: these get no team.
 void wait_without_spinning() {
 #if defined(_OPENMP)
   const int processors = omp_get_num_procs(), threads = omp_get_max_threads();
@@ -34,10 +34,10 @@ void wait_without_spinning() {
 #pragma omp parallel num_threads(more)
       std::this_thread::yield();
       promise.set_value();
-      for (;;) std::this_thread::sleep_for(std::chrono::hours(24));  // a team lives as long as the thread that made it
+      for (;;) std::this_thread::sleep_for(std::chrono::hours(24));  // a team lives as long as its first thread
     }).detach();
     started.wait();
-  } catch (const std::system_error&) {  // no more threads to be had: the others spin, and nothing else is lost
+  } catch (const std::system_error&) {  // no threads left: the others keep spinning, which is harmless
   }
 #endif
 }

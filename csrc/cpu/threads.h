@@ -1,4 +1,4 @@
-// Threads: OpenMP where there is one.
+// Threads: OpenMP if available.
 #pragma once
 
 #include <algorithm>
@@ -16,18 +16,18 @@ namespace bt {
 
 int num_threads();
 
-// From now on idle threads sleep instead of spinning, unless OMP_WAIT_POLICY or GOMP_SPINCOUNT decide; once a process.
+// Lets idle threads sleep instead of spin, unless OMP_WAIT_POLICY or GOMP_SPINCOUNT are set; once per process.
 void wait_without_spinning();
 
-// fn(thread, begin, end) over n items in equal, fixed parts.
+// Calls fn(thread, begin, end) over n items in equal, fixed parts.
 template <class F> void parallel_parts(int64_t n, int64_t least, F&& fn) {
   const int parts = int(std::max<int64_t>(1, std::min<int64_t>(num_threads(), n / std::max<int64_t>(least, 1))));
 #pragma omp parallel for num_threads(parts) schedule(static, 1)
   for (int t = 0; t < parts; ++t) fn(t, n * t / parts, n * (t + 1) / parts);
 }
 
-// Boundaries that cut items of running cost (start[i+1] - start[i]) into `parts` of about equal cost. They depend
-// on the input alone, so that sums over the parts come out the same however the threads are scheduled.
+// Splits items of cumulative cost `start` into `parts` of about equal cost, depending on the input alone, so that sums
+// over the parts do not depend on scheduling.
 inline std::vector<int64_t> balanced_parts(const int64_t* start, int64_t items, int parts) {
   std::vector<int64_t> cut(parts + 1, items);
   cut[0] = 0;
@@ -39,7 +39,7 @@ inline std::vector<int64_t> balanced_parts(const int64_t* start, int64_t items, 
   return cut;
 }
 
-// fn(thread, begin, end) over tiles, balanced by their fragments.
+// Calls fn(thread, begin, end) over tiles, balanced by fragments.
 template <class F> int parallel_tiles(const int64_t* tile_start, int64_t tiles, int most, F&& fn) {
   const int parts = int(std::max<int64_t>(1, std::min<int64_t>(std::min(num_threads(), most), tiles)));
   const std::vector<int64_t> cut = balanced_parts(tile_start, tiles, parts);
@@ -48,12 +48,11 @@ template <class F> int parallel_tiles(const int64_t* tile_start, int64_t tiles, 
   return parts;
 }
 
-// Threads that go through the phases of one piece of work together. OpenMP's threads sleep between its regions
-// (threads.cpp), and to wake them takes a tenth of a millisecond, as long as a small phase: in a team they wait awake.
+// Threads that run the phases of one task together. OpenMP's threads sleep between parallel regions (threads.cpp), and
+// waking them takes 0.1 ms, as long as a small phase; a team waits awake.
 class Team {
  public:
-  // Waits until all `size` of them are here: awake, then giving its processor to others, after some milliseconds
-  // asleep.
+  // Waits for all `size` threads: spinning, then yielding, after some milliseconds asleep.
   void meet(int size) {
     const uint32_t turn = turn_.load(std::memory_order_acquire);
     if (arrived_.fetch_add(1, std::memory_order_acq_rel) == size - 1) {
@@ -69,7 +68,7 @@ class Team {
       else
         std::this_thread::sleep_for(std::chrono::microseconds(20));
   }
-  // Takes the next `count` of the phase's items; returns the first.
+  // Takes the next `count` items of the phase; returns the first.
   int64_t take(int64_t count) { return taken_.fetch_add(count, std::memory_order_relaxed); }
 
  private:
@@ -79,23 +78,23 @@ class Team {
     __builtin_ia32_pause();
 #endif
   }
-  std::atomic<uint32_t> turn_{0};  // how often all have met
+  std::atomic<uint32_t> turn_{0};  // number of meetings
   std::atomic<int> arrived_{0};
   std::atomic<int64_t> taken_{0};
 };
-// One thread of a team.
+// A thread of a team.
 struct Member {
   Team& team;
   int index, size;
 
-  // The end of a phase: what the others wrote in it is there.
+  // Ends a phase: writes of all threads become visible.
   void meet() const { team.meet(size); }
-  // fn(begin, end) over n items, `step` at a time, by whoever comes first. Once in a phase.
+  // Calls fn(begin, end) over n items, `step` at a time, dynamically; once per phase.
   template <class F> void each(int64_t n, int64_t step, F&& fn) const {
     for (int64_t begin; (begin = team.take(step)) < n;) fn(begin, std::min(begin + step, n));
   }
 };
-// fn(member) by every thread.
+// Runs fn(member) on every thread.
 template <class F> void run_together(F&& fn) {
   Team team;
 #if defined(_OPENMP)

@@ -1,4 +1,4 @@
-// Walking a tile's surfels.
+// Traversal of a tile's surfels.
 #pragma once
 
 #include "core/kernel.h"
@@ -8,7 +8,7 @@
 
 namespace bt {
 
-// Prefetches the row of a surfel that comes soon: a tile's list names surfels from all over the memory.
+// Prefetches the row of a surfel a few steps ahead, as a tile's surfels are scattered in memory.
 constexpr int kAhead = 3;
 template <class S> BT_HD void prefetch(const View<S>& view, const Bins& bins, int64_t id) {
   __builtin_prefetch(view.geom + id * kGeom);
@@ -16,7 +16,7 @@ template <class S> BT_HD void prefetch(const View<S>& view, const Bins& bins, in
   __builtin_prefetch(bins.level.data() + 2 * id);
 }
 
-// Of 16 cells of an image those with a pixel in the kernel's level set, and in the low pass's.
+// Cells of 16 with a pixel in the kernel's level set, and in that of the low pass.
 struct ReachedCells {
   uint32_t support, centre;
 };
@@ -26,15 +26,15 @@ BT_HD ReachedCells reached_cells(const S* g, Lanes<S> x, Lanes<S> y, S half_x, S
   return {bits(r.support), bits(r.centre)};
 }
 
-// A tile's transmittance while its surfels are drawn front to back.
+// Transmittance of a tile while its surfels are drawn front to back.
 template <class S> struct TileState {
   using P = Lanes<S>;
   using M = typename P::M;
   P transmittance[kBlocks];
-  M open[kBlocks];           // pixels inside the image that still take light
-  uint32_t open_blocks = 0;  // a bit for each block that has such pixels
+  M open[kBlocks];           // pixels inside the image that are not ended
+  uint32_t open_blocks = 0;  // bit per block with such pixels
   S x0, y0;                  // the tile's first pixel
-  S stop;                    // transmittance at which a pixel takes no more light
+  S stop;                    // transmittance at which a pixel ends
   P lane_x, lane_y;          // pixel centres of a block
   P middle_x, middle_y;      // middles of the blocks, from the tile's corner
 
@@ -52,15 +52,14 @@ template <class S> struct TileState {
     }
   }
 
-  // Blends surfel `id`: fn(block, mask of its pixels, fragment, weight) for every block in which some pixel takes it.
-  // Without kAll the fragment has no depth and does not tell whether the low pass is drawn.
-  // cut(fragment, mask, transmittance): multiplies the sigma of pixels by that of texels.
+  // Blends surfel `id`: fn(block, mask, fragment, weight) for every block with a pixel that takes it. Without kAll the
+  // fragment lacks depth and low_pass. cut(fragment, mask, transmittance): applies alpha texels to sigma.
   template <class Kernel, bool kAll, class F, class C>
   void blend(const View<S>& view, const Bins& bins, int64_t id, F&& fn, S sharp, C&& cut) {
     const S *g = view.geom + id * kGeom, cx = g[kCx] - x0, cy = g[kCy] - y0;
     const ReachedCells r = reached_in_tile<Kernel>(g, cx, cy, view.radii + 2 * id, bins.level.data() + 2 * id);
     uint32_t blocks = open_blocks & (r.support | r.centre);
-    // all fragments first: what a branch on one of them waits for is then known
+    // all fragments before any branch on them, to overlap their latencies
     Fragment<P> found[kBlocks];
     int at[kBlocks], n = 0;
     for (; blocks; blocks &= blocks - 1) {
@@ -104,7 +103,7 @@ template <class S> struct TileState {
     constexpr S kHalf = S(0.5 * (kBlockSide - 1));
     const P x = middle_x - P(cx), y = middle_y - P(cy);
     const S half_x = cell_half(kHalf, cx, S(kTile)), half_y = cell_half(kHalf, cy, S(kTile));
-    // the centre of a disc without a box may lie further away than its radii say
+    // the centre of a disc without a box may lie beyond its radii
     const bool boxless = max_(radius[0], radius[1]) >= S(kBoxless);
     const uint32_t box =
         boxless ? ~uint32_t(0) : bits((abs_(x) < P(radius[0] + half_x)) & (abs_(y) < P(radius[1] + half_y)));

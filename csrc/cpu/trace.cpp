@@ -1,4 +1,4 @@
-// Fragments of a view and their backward pass; per-surfel counts.
+// Fragments of a view, their backward pass, and per-surfel counts.
 #include <atomic>
 #include <stdexcept>
 #include <string>
@@ -13,10 +13,10 @@
 namespace bt {
 
 namespace {
-// A tile cannot have more: every blended fragment takes at least 1/255 of a transmittance that stays above 1e-4, which
-// makes 2344 of them per pixel. Vectors may be written past the last one.
+// Bound on a tile's fragments: each takes at least 1/255 of a transmittance that stays above 1e-4, i.e. at most 2344
+// per pixel. Vector stores may go past the last one.
 constexpr int64_t kTileMost = 2400 * kTile * kTile + kLanes;
-constexpr int64_t kKept = int64_t(1) << 22;  // lists up to this length keep their memory for the next view
+constexpr int64_t kKept = int64_t(1) << 22;  // longest list that keeps its memory for the next view
 }  // namespace
 
 namespace {
@@ -92,7 +92,7 @@ void trace_forward(const View<S>& view, const AlphaTiles<S>& alpha, int64_t most
     list.block_start[t + 1] = list.block_start[t] + list.pieces[t].blocks;
   }
   list.total = list.tile_start[tiles], list.blocks = list.block_start[tiles];
-  if (most && list.total > most) list.chunks.clear(), list.blocks = 0;  // nothing will be copied
+  if (most && list.total > most) list.chunks.clear(), list.blocks = 0;  // will not be copied
 }
 }  // namespace
 
@@ -112,7 +112,7 @@ template <class S> void trace_copy(const TraceCopy<S>& a, Trace<S>& from) {
                                 std::to_string(list.tile_start.size() - 1) + " tiles");
   std::copy(list.tile_start.begin(), list.tile_start.end(), a.tile_start);
   std::copy(list.block_start.begin(), list.block_start.end(), a.block_start);
-  std::vector<std::vector<int64_t>> tiles;  // of the k-th chunks of all threads
+  std::vector<std::vector<int64_t>> tiles;  // with the k-th chunks of all threads
   for (size_t t = 0; t < list.pieces.size(); ++t) {
     const auto& p = list.pieces[t];
     if (!p.count) continue;
@@ -135,7 +135,7 @@ template <class S> void trace_copy(const TraceCopy<S>& a, Trace<S>& from) {
     }
     if (!large) continue;
     for (auto& own : list.chunks)
-      if (k < own.size()) own[k].memory.reset();  // at once, so that the list is not there twice
+      if (k < own.size()) own[k].memory.reset();  // at once, to avoid two copies of the list
   }
   if (large) list.chunks.clear();
 }
@@ -160,8 +160,8 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
   std::fill(absgrad, absgrad + 2 * n, S(0));
   const BlockCentres<S> centres;
   const P zero = P(S(0));
-  // Arrays to read, and how far ahead they are prefetched: runs are read from the list's end, each from its start,
-  // which the processor does not foresee.
+  // Arrays to read and their prefetch distances: runs are read from the list's end, each from its start, which hardware
+  // prefetchers do not predict.
   const S* columns[] = {f.sigma,
                         f.weight,
                         dweight,
@@ -171,12 +171,12 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
                         a.alpha.values ? f.uv : nullptr,
                         a.alpha.values ? f.uv + total : nullptr};
   constexpr int64_t kSoon = 256, kBlocksSoon = 6;
-  // a part's own sums: 15 numbers per surfel (12 columns of geom, the area, and the two absolute gradients)
+  // sums of a part: 15 numbers per surfel (12 columns of geom, the area, two absolute gradients)
   constexpr int kColumns = kBeta + 1, kSums = kColumns + 3;
   const int parts = parallel_tiles(layout.start, layout.tiles, most, [&](int part, int64_t first, int64_t last) {
     std::vector<S>& sums = partial[part];
     sums.assign(n * kSums, S(0));
-    of_texels[part].assign(part ? texels : 0, S(0));  // the first part adds to the result itself
+    of_texels[part].assign(part ? texels : 0, S(0));  // the first part adds directly to the result
     S* const dtexels = !texels ? nullptr : part ? of_texels[part].data() : a.dtexel_alpha;
     for (int64_t tile = first; tile < last; ++tile) {
       const S x0 = S(tile % tiles_x * kTile), y0 = S(tile / tiles_x * kTile);
@@ -249,10 +249,10 @@ template <class S> void trace_backward(const TraceBackward<S, TileBlocks>& a) {
 
 void list_ids(const ListedIds& a) {
   using Whole = Wide<int32_t>;
-  Whole in_block;  // the pixels, from the first one on
+  Whole in_block;  // offsets of the pixels from the first one
   for (int lane = 0; lane < kLanes; ++lane) set_lane(in_block, lane, pixels_on(lane, a.width));
   parallel_tiles(a.layout.start, a.layout.tiles, 1 << 20, [&](int, int64_t first, int64_t last) {
-    // what lies behind belongs to another thread
+    // memory behind belongs to another thread
     int32_t *const surfels = a.surfel + a.layout.start[last], *const pixels = a.pixel + a.layout.start[last];
     for (int64_t tile = first; tile < last; ++tile)
       each_run(a.layout, tile, [&](const BlockRun& run) {

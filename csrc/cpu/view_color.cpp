@@ -1,4 +1,4 @@
-// View colours of all surfels.
+// View colours of surfels.
 #include "core/view_color.h"
 
 #include <stdexcept>
@@ -19,17 +19,17 @@ template <class S> void check_terms(const ViewColors<S>& colors, int64_t n) {
   }
 }
 
-// Kinds of which the colours of 16 surfels are computed together.
+// Kinds evaluated for 16 surfels at a time.
 template <class Kind, class S>
 constexpr bool kTogether = std::is_same_v<Kind, SphericalVoronoi> && std::is_same_v<S, float>;
 
 using P = Lanes<float>;
-// Up to 16 of the surfels that have a colour; the last one stands for those that are missing.
+// Up to 16 active surfels; the last one is repeated.
 struct Together {
   int64_t ids[kLanes];
   int count = 0;
 
-  // Numbers of theirs as lanes, and back.
+  // Loads rows of numbers as lanes, and stores them.
   void load_rows(const float* from, int64_t width, P* to) const {
     for (int lane = 0; lane < kLanes; ++lane)
       for (int64_t k = 0; k < width; ++k) to[k].set(lane, from[ids[lane] * width + k]);
@@ -47,7 +47,7 @@ struct Together {
     return normalize(load3(along));
   }
 };
-// fn(Together) for the surfels begin to end - 1 that have a colour.
+// Calls fn(Together) for the active surfels of begin to end - 1.
 template <class F> void each_together(const uint8_t* active, int64_t begin, int64_t end, F&& fn) {
   Together some;
   for (int64_t i = begin; i < end; ++i) {
@@ -58,7 +58,7 @@ template <class F> void each_together(const uint8_t* active, int64_t begin, int6
     some.count = 0;
   }
 }
-// Parameters of some surfels or their gradients.
+// Parameters of several surfels, or their gradients.
 struct TogetherRow {
   P a[3 * kMaxTerms], b[kMaxTerms], c[3 * kMaxTerms];
 };

@@ -1,5 +1,5 @@
-// Vectors of 16 lanes: as many of the processor's own vectors as that takes, side by side, with the operators of one.
-// The compiler takes a vector that is wider than a register apart lane by lane where it compares and selects.
+// Vectors of 16 lanes, composed of native vectors, with the same operators. The compiler splits vectors wider than a
+// register lane by lane in comparisons and selections.
 #pragma once
 
 #include <cstdint>
@@ -22,7 +22,7 @@ constexpr int kVectorBytes = 64;
 constexpr int kVectorBytes = 32;
 #endif
 
-// Spelt out for each scalar: the compiler drops the vector attribute of a dependent type.
+// Spelt out per scalar: the compiler drops the vector attribute of dependent types.
 template <class T> struct VectorOf;
 #define BT_VECTOR(T)                                           \
   template <> struct VectorOf<T> {                             \
@@ -37,9 +37,8 @@ BT_VECTOR(uint64_t)
 #undef BT_VECTOR
 template <class T> using Vector = typename VectorOf<T>::type;
 
-// Masks are lanes of 0 or -1, as the compiler makes them: which of its 64-bit integers they are differs. AVX-512 has
-// registers with a bit for each lane, between which and such lanes the compiler goes to and fro: there the mask of
-// floats is what lies in one of these.
+// Masks are lanes of 0 or -1, as the compiler makes them (its choice of 64-bit integer type varies). With AVX-512 the
+// mask of floats is a mask register, as conversions between these and lanes would be frequent.
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
 struct MaskOfFloats {
   __mmask16 m;
@@ -52,13 +51,13 @@ using MaskOfFloats = decltype(Vector<float>{} > Vector<float>{});
 #endif
 using MaskOfDoubles = decltype(Vector<double>{} > Vector<double>{});
 
-// Two of them, or two pairs; lanes lie in memory as in one vector.
+// Two vectors, or two pairs; in memory like one vector.
 template <class H> struct Two {
   H low, high;
   Two() = default;
   BT_HD Two(const H& low, const H& high) : low(low), high(high) {}
-  // Written out, so that copies are of whole vectors: the compiler's own go by smaller parts, for which loads of whole
-  // ones then wait.
+  // Explicit, so that copies are of whole vectors: the compiler's copies are smaller, and stall later loads of whole
+  // vectors.
   BT_HD Two(const Two& o) : low(o.low), high(o.high) {}
   BT_HD Two& operator=(const Two& o) {
     low = o.low, high = o.high;
@@ -111,14 +110,14 @@ BT_BINARY(!=)
 template <class H> BT_HD Two<H> operator-(const Two<H>& a) { return {-a.low, -a.high}; }
 template <class H> BT_HD Two<H> operator~(const Two<H>& a) { return {~a.low, ~a.high}; }
 
-// Lane by lane: yes where the mask is set, else no.
+// Selects per lane: yes where the mask is set, else no.
 template <class M, class V> BT_HD V choose(const M& m, const V& yes, const V& no) {
   if constexpr (is_two<V>)
     return {choose(m.low, yes.low, no.low), choose(m.high, yes.high, no.high)};
   else
     return m ? yes : no;
 }
-// Masks of comparisons.
+// Compares to masks.
 template <class V> BT_HD auto above(const V& a, const V& b) { return a > b; }
 template <class V> BT_HD auto at_least(const V& a, const V& b) { return a >= b; }
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
@@ -132,7 +131,7 @@ BT_HD Vector<float> choose(MaskOfFloats m, const Vector<float>& yes, const Vecto
   return (Vector<float>)_mm512_mask_blend_ps(m.m, (__m512)no, (__m512)yes);
 }
 #endif
-// a > b ? a : b and a < b ? a : b, for which processors have one instruction that the compiler does not find.
+// Computes a > b ? a : b and a < b ? a : b, single instructions that the compiler does not find.
 template <class V> BT_HD V larger(const V& a, const V& b) {
   if constexpr (is_two<V>)
     return {larger(a.low, b.low), larger(a.high, b.high)};
@@ -160,7 +159,7 @@ template <> BT_HD Vector<float> smaller(const Vector<float>& a, const Vector<flo
   return (Vector<float>)_mm256_min_ps((__m256)a, (__m256)b);
 }
 #endif
-// Numbers to numbers of another type, as wide.
+// Converts to another type of the same width.
 template <class To, class V> BT_HD To convert(const V& v) {
   if constexpr (is_two<V>)
     return {convert<decltype(To::low)>(v.low), convert<decltype(To::high)>(v.high)};
@@ -185,7 +184,7 @@ template <class V, class T> BT_HD V all_lanes(T value) {
     return value - V{};
   }
 }
-// From and to memory; the halves one by one, which the compiler would else copy through the stack.
+// Loads and stores, in halves, which the compiler would otherwise copy through the stack.
 template <class V, class T> BT_HD V load_vector(const T* p) {
   if constexpr (is_two<V>) {
     using Half = decltype(V::low);
@@ -209,7 +208,7 @@ template <class V, class T> BT_HD void set_lane(V& v, int i, T value) {
     v[i] = value;
 }
 
-// Floats as doubles, which are twice as wide, and back.
+// Converts floats to doubles, and back.
 BT_HD Two<Vector<double>> widened_vector(const Vector<float>& a) {
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
   const auto eight = [](__m256d half) { return _mm512_maskz_cvtps_pd(__mmask8(0xff), (__m256)half); };
@@ -262,7 +261,7 @@ BT_HD Wide<float> joined(__m256 low, __m256 high) {
 }
 #endif
 
-// One bit per lane of a mask.
+// Returns a mask's bits, one per lane.
 BT_HD uint32_t bits(const MaskOfFloats& m) {
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
   return m.m;
@@ -283,7 +282,7 @@ template <class H> BT_HD uint32_t bits(const Two<H>& m) {
   return bits(m.low) | bits(m.high) << (sizeof(H) / sizeof(m[0]));
 }
 
-// The largest whole numbers that are no larger.
+// Rounds down to integers.
 template <class V> BT_HD V round_down(const V& a) {
   if constexpr (is_two<V>) {
     return {round_down(a.low), round_down(a.high)};

@@ -1,5 +1,5 @@
-// bitymi_ns._cuda: the operations of bitymi_ns._cpu for arrays on a CUDA device, each with a stream.
-// Compiled with BITYMI_EMULATED it is bitymi_ns._emulated, which runs the CUDA kernels on the host, for tests.
+// bitymi_ns._cuda: the operations of bitymi_ns._cpu for arrays on a CUDA device, each with a stream. Compiled with
+// BITYMI_EMULATED it is bitymi_ns._emulated, which runs the CUDA kernels on the host, for tests.
 #include <nanobind/stl/vector.h>
 
 #include "bindings/reader.h"

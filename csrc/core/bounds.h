@@ -30,8 +30,8 @@ template <class T> BT_HD void find_outermost(ExtentOf<T>& e) {
   e.y_left = -(e.qb * e.x0 + e.qe) / e.qc, e.y_right = -(e.qb * e.x1 + e.qe) / e.qc;
 }
 
-// Bounds the prefiltered level set by the ellipse q <= r_c^2 of the largest blur and magnification at any pixel:
-// omega <= 1 / (1 - eta), eta = the relative reach of the support in depth.
+// Bounds the prefiltered level set by the ellipse q <= r_c^2 of the largest blur and magnification at any pixel: omega
+// <= 1 / (1 - eta), eta = the relative reach of the support in depth.
 BT_HD Extent filtered_extent(const double* g) {
   using S = double;
   Extent e;

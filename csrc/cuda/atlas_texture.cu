@@ -1,4 +1,4 @@
-// An atlas on the device; on the host a stand-in with the texture unit's rounding.
+// An atlas on the device; on the host an emulation with the texture unit's rounding.
 #include <cstring>
 #include <map>
 #include <stdexcept>
@@ -29,7 +29,7 @@ BT_HD void put_mean(const float (&texels)[4], uint8_t& to) {
   to = uint8_t(sum / 4);
 }
 BT_HD void put_mean(const float (&texels)[4], float& to) { to = (texels[0] + texels[1] + texels[2] + texels[3]) / 4; }
-// Weighted by alpha, of which some is not 0.
+// Averages with alpha as weight, not all 0.
 BT_HD void put_mean(const float (&texels)[4], const float (&alpha)[4], uint8_t& to) {
   int sum = 0, total = 0;
   for (int k = 0; k < 4; ++k) {
@@ -77,7 +77,7 @@ template void halve_texels(const HalvedTexels<float>&, Stream);
 #if defined(__CUDACC__)
 
 namespace {
-// The array and its texture; `array` is set as soon as there is something to free.
+// Creates the array and its texture; `array` is set as soon as it must be freed.
 cudaTextureObject_t make_texture(TexelFormat format, int height, int width, const void* texels, cudaArray_t& array) {
   const bool blocks = format == TexelFormat::kBc7, half = format == TexelFormat::kHalf;
   const cudaChannelFormatDesc channels = blocks
@@ -90,7 +90,7 @@ cudaTextureObject_t make_texture(TexelFormat format, int height, int width, cons
   cudaMemcpy3DParms copy = {};
   copy.srcPtr = make_cudaPitchedPtr(const_cast<void*>(texels), row, width, rows);
   copy.dstArray = array;
-  copy.extent = make_cudaExtent(width, height, 1);  // of an array of blocks: in texels (measured; not written down)
+  copy.extent = make_cudaExtent(width, height, 1);  // in texels even for blocks (measured; undocumented)
   copy.kind = cudaMemcpyHostToDevice;
   check(cudaMemcpy3D(&copy), "copy of the atlas");
   cudaResourceDesc resource = {};
@@ -106,10 +106,10 @@ cudaTextureObject_t make_texture(TexelFormat format, int height, int width, cons
   return texture;
 }
 
-// Blocks of one colour each, and what lies between its texels.
+// Probe: blocks of one colour each, and interpolated texels between them.
 constexpr int kProbeWidth = 32, kProbeHeight = 16, kProbeAcross = kProbeWidth / 4;
 constexpr int kProbeX = kProbeWidth / 2 - 1, kProbeY = kProbeHeight / 2 - 1;
-int probe_red(int block) { return 6 * block + 11; }  // odd, as the last bit of every colour below
+int probe_red(int block) { return 6 * block + 11; }  // odd, as the last bit of every colour below is 1
 // Mode 6: six zeros and a one, red, green, blue and alpha twice with 7 bits, their two last bits, and weights of 0.
 void probe_block(int block, unsigned char* to) {
   const uint64_t red = probe_red(block) >> 1, green = 127 - red, full = 127;
@@ -123,7 +123,7 @@ __global__ void probe_kernel(uint64_t texture, float4* to) {
 }
 constexpr float kStep = 1.0f / 0xff;  // of 8 bits
 void probe() {                        // throws when it does not work
-  // more than is read, should a driver take the copy's rows for rows of blocks
+  // more than is read, in case a driver takes the copy's rows for rows of blocks
   std::vector<unsigned char> blocks(4 * kProbeWidth * kProbeHeight);
   for (int i = 0; i < kProbeAcross * kProbeHeight / 4; ++i) probe_block(i, blocks.data() + 16 * i);
   struct Owned {
@@ -143,7 +143,7 @@ void probe() {                        // throws when it does not work
   check(cudaMemcpy(found, owned.found, sizeof found, cudaMemcpyDeviceToHost), "probe");
   for (int j = 0; j < kProbeY; ++j)
     for (int i = 0; i < kProbeX; ++i) {
-      const int x = 2 * i + 2, y = 2 * j + 2;  // the middle of four texels
+      const int x = 2 * i + 2, y = 2 * j + 2;  // corner between four texels
       float red = 0;
       for (int k = 0; k < 4; ++k) red += probe_red((y - k / 2) / 4 * kProbeAcross + (x - k % 2) / 4) * kStep / 4;
       const float4 c = found[j][i];
@@ -164,7 +164,7 @@ bool draws_bc7() {
     probe();
     return known[device] = true;
   } catch (const std::runtime_error&) {
-    cudaGetLastError();  // what was found here is no error of a later call
+    cudaGetLastError();  // not to be reported by a later call
     return known[device] = false;
   }
 }
@@ -178,7 +178,7 @@ AtlasTexture::AtlasTexture(TexelFormat format, int height, int width, const void
   try {
     handle_ = make_texture(format, height, width, texels, array);
     texels_ = array;
-    // a copy from pageable memory may still be under way, and streams other than the default one do not wait for it
+    // a copy from pageable memory may be pending, and only the default stream waits for it
     check(cudaStreamSynchronize(nullptr), "copy of the atlas");
   } catch (...) {
     texels_ = array;
@@ -191,7 +191,7 @@ void AtlasTexture::release() {
   int current = device_;
   cudaGetDevice(&current);
   cudaSetDevice(device_);
-  cudaDeviceSynchronize();  // frames under way still read the texels
+  cudaDeviceSynchronize();  // pending frames may still read the texels
   if (handle_) cudaDestroyTextureObject(handle_);
   if (texels_) cudaFreeArray(static_cast<cudaArray_t>(texels_));
   cudaSetDevice(current);
@@ -232,7 +232,7 @@ void AtlasTexture::release() { delete static_cast<HostTexture*>(texels_); }
 
 float4 fetch_texel(uint64_t handle, float x, float y) {
   const HostTexture& texture = *reinterpret_cast<const HostTexture*>(handle);
-  // weights are fixed point with 8 bits of fraction
+  // weights are fixed point with 8 fractional bits
   const float bx = std::floor(x - 0.5f), by = std::floor(y - 0.5f);
   const float fx = std::floor((x - 0.5f - bx) * 256 + 0.5f) / 256, fy = std::floor((y - 0.5f - by) * 256 + 0.5f) / 256;
   const auto at = [&](float column, float row) {

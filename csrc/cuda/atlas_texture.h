@@ -11,16 +11,15 @@ namespace bt::cuda {
 enum class TexelFormat { kBc7, kUint8, kHalf };
 constexpr const char* kTexelFormats[] = {"bc7", "uint8", "half"};
 
-// True where the current device draws BC7 blocks; tested by drawing some. The first call waits for the device.
+// Returns true if the current device draws BC7 blocks; tested by drawing some. The first call waits for the device.
 bool draws_bc7();
 
-// Of a texture, on every card that the kernels are built for.
+// Largest texture on any GPU that the kernels are built for.
 constexpr int kMostTextureWidth = 131072, kMostTextureHeight = 65536;
 
-// One texture of all pages, which the caller has put together, so that its handle is an argument of the drawing kernel:
-// a handle per surfel is the same in a whole warp, but the compiler cannot know that, and takes sixteen instructions to
-// find out. Memory is allocated here, once, and freed by the destructor. Throws std::runtime_error when the device
-// refuses, std::invalid_argument when the texture is too large for any.
+// One texture with all pages, so that its handle is a kernel argument: a handle per surfel would be uniform in a warp,
+// but the compiler cannot know and takes sixteen instructions to establish it. Allocates in the constructor. Throws
+// std::runtime_error if the device refuses, std::invalid_argument if the texture is too large for any device.
 class AtlasTexture {
  public:
   // texels: on the host, [height, width, 4] bytes or halves, or BC7 blocks [height / 4, width / 4, 16].
@@ -37,8 +36,8 @@ class AtlasTexture {
   int device_ = 0;
 };
 
-// Means of 2 x 2 texels of a texture: texels [height, width, 4], half its sides. Those of bytes are bytes, and rounded
-// as `ops.tile_levels` rounds them; of halves they are floats. alpha: as there.
+// Halves a texture: means of 2 x 2 texels [height, width, 4]. Bytes give bytes, rounded as `ops.tile_levels` does;
+// halves give floats. alpha: as there.
 template <class T> struct HalvedTexels {
   const AtlasTexture* texture;
   int height, width;

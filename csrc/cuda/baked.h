@@ -1,15 +1,15 @@
-// The forward-only renderer of a baked scene on the device.
+// Forward-only renderer of a baked scene on the device.
 //
-//   list      one thread per surfel: projection, level set, bounds; then, for the visible ones alone, the view colour
-//             and the tile of the atlas. Leaves a row of 24 floats, which is all that is read later. Pairs of surfel
-//             and tile are numbered within their tile as they are found, and written to the tile's slot of this number,
-//             or to a list of all tiles where it has no slot.
-//   draw      a block per tile of 16 x 16 pixels sorts the tile's list front to back (ties by the surfel's number);
-//             then one warp per 8 x 8 pixels, two per thread. A pair carries the mask of the 8 x 4 parts of the tile
-//             that its surfel reaches, so a warp reads those alone.
+//   list      one thread per surfel: projection, level set, bounds; for visible ones also the view colour and the tile
+//             of the atlas. Writes a row of 24 floats, all that later stages read. Pairs of surfel and tile are
+//             numbered within their tile as they are found, and written to the tile's slot of this number, or without a
+//             slot to a list shared by all tiles.
+//   draw      a block per tile of 16 x 16 pixels sorts the tile's list front to back (ties by the surfel's index);
+//             then one warp per 8 x 8 pixels, two per thread. A pair has the mask of the 8 x 4 parts of the tile that
+//             its surfel reaches, so a warp reads only its own pairs.
 //
-// Nothing is allocated and nothing waits: counts stay on the device. Pairs without room are counted; the image then
-// lacks surfels and the frame is to be drawn again with more capacity.
+// Nothing is allocated and nothing waits: counts stay on the device. Pairs that do not fit are counted; their surfels
+// are missing, and the frame must be drawn again with more capacity.
 #pragma once
 
 #include <cstddef>
@@ -25,17 +25,17 @@ namespace bt::cuda {
 
 class AtlasTexture;
 
-// A baked scene as the kernels read it.
+// A baked scene in the kernels' form.
 struct BakedScene : BakedResidual {
   Surfels<float> geometry;
   ViewColors<float> colors;
   const int32_t* tiles;  // [n, 5]: x, y, page, r_u, r_v; r_u = 0: no tile
-  // The atlas, and the levels of its tiles (core/texel.h) for views smaller than the photographs; null: none. On the
-  // host; Python keeps them.
+  // The atlas, and the levels of its tiles (core/texel.h) for views smaller than the photographs; null: none. Host
+  // objects, kept by Python.
   const AtlasTexture* levels[kTileLevels];
-  int pages_down, page_width, page_height;  // pages lie below each other, so many of them, then beside
+  int pages_down, page_width, page_height;  // pages per column, and their pitch
   float near;
-  int prefilter;  // chooses between the kernels of core/surfel.h
+  int prefilter;  // selects a kernel of core/surfel.h
 
   template <class R>  // as in ops/arguments.h
   void fields(R& r) {
@@ -78,14 +78,14 @@ struct BakedImages {
 
 enum BakedStage { kList = 1, kDraw = 2 };
 
-constexpr int64_t kMostRows = int64_t(1) << 24;  // surfels times views: a pair holds 24 bits of row and 8 of mask
+constexpr int64_t kMostRows = int64_t(1) << 24;  // surfels times views: a pair has 24 bits of row and 8 of mask
 constexpr int64_t kMostPairs = (int64_t(1) << 31) - 1024;
 
-// Bytes of working memory. After a frame its first 16 hold the number of pairs and how many of them found no slot,
+// Returns the bytes of working memory. After a frame its first 16 hold the number of pairs and of those without a slot,
 // which must be at most `capacity` (int64).
 size_t baked_memory(int64_t surfels, const BakedViews& views, int slots, int64_t capacity, bool normals);
 
-// A frame of all views: the stages (a sum of BakedStage); one needs what those before it left in `memory`.
+// A frame of all views. stages: a sum of BakedStage; each needs the results of earlier ones in `memory`.
 struct BakedDraw {
   const BakedScene* scene;
   BakedViews views;
@@ -93,8 +93,8 @@ struct BakedDraw {
   int stages;
   float photo_pixel;  // side of a photograph's pixel in pixels of the views
   Workspace memory;
-  int slots;         // of a screen tile, for pairs; a multiple of 32
-  int64_t capacity;  // pairs that find no slot and fit
+  int slots;         // per screen tile, for pairs; a multiple of 32
+  int64_t capacity;  // pairs without a slot that fit
 
   template <class R> void fields(R& r) {
     r.object("scene", scene);

@@ -1,4 +1,4 @@
-// The host's side of a frame: its working memory and its stages.
+// Host side of a frame: working memory and stages.
 #include <stdexcept>
 #include <string>
 
@@ -7,10 +7,10 @@
 namespace bt::cuda {
 
 namespace {
-constexpr int kLong = 2;         // times the mean for which there is room: a list that is long,
-constexpr int kLeastLong = 128;  // but not with fewer pairs than this
+constexpr int kLong = 2;         // a long list has more than this times the mean capacity,
+constexpr int kLeastLong = 128;  // and at least this many pairs
 
-// Cuts the working memory into its arrays; the bytes needed. With a null base only the bytes count.
+// Divides the working memory into arrays; returns the bytes needed. With a null base it only counts.
 int64_t lay_out(BakedFrame& f, void* base, bool normals) {
   Arena arena(base);
   BakedMemory& m = f.memory;
@@ -41,7 +41,7 @@ BakedFrame frame_of(int64_t surfels, const BakedViews& v, int slots, int64_t cap
   if (f.rows > kMostRows)
     throw std::invalid_argument("surfels times views is " + std::to_string(f.rows) + ", at most " +
                                 std::to_string(kMostRows) + " are drawn in one call: draw fewer views at once");
-  // indices of pairs have 32 bits
+  // pair indices have 32 bits
   if (f.capacity > kMostPairs || f.tiles > kMostPairs / slots || v.count > 65535)
     throw std::invalid_argument(
         "too many views, pixels or pairs of surfel and tile for one call: draw fewer views at "

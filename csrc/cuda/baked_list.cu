@@ -1,10 +1,8 @@
-// First stage of the baked renderer: the surfels that a view sees, each as the row that drawing reads, and in which
-// screen tiles.
+// First stage of the baked renderer: the visible surfels, as rows for drawing, and their screen tiles.
 //
-// One thread per surfel, 44 bytes in and 100 out where it is visible. A block then lists the pairs of its surfels from
-// their footprints in shared memory. View colours (196 bytes of parameters per surfel
-// with seven sites, 20 + 24 per term of lean ones) are computed for the visible ones alone, by threads that stand next
-// to each other: a block compacts them.
+// One thread per surfel, 44 bytes in and, if visible, 100 out. A block then lists the pairs of its surfels from their
+// footprints in shared memory. View colours (196 bytes of parameters per surfel with seven sites, 20 + 24 per term of
+// lean ones) are computed for visible surfels only, by adjacent threads: a block compacts them.
 #include "core/shading.h"
 #include "core/view_color.h"
 #include "cuda/baked_pairs.h"
@@ -13,12 +11,12 @@
 namespace bt::cuda {
 
 namespace {
-constexpr int64_t kMostBlocks = 1024;  // up to which a block takes fewer surfels, all at once on a large card,
-constexpr int kLeastOwned = 4;         // but as many as this
-constexpr int kLargeParts = 16;        // in which the rows of tiles of a surfel of many are shared out
-constexpr int kLargeBlocks = 528;      // four for each multiprocessor of a large card
+constexpr int64_t kMostBlocks = 1024;  // up to this many, blocks take fewer surfels, to fill a large GPU,
+constexpr int kLeastOwned = 4;         // but at least this many
+constexpr int kLargeParts = 16;        // shares of the tile rows of a surfel with many tiles
+constexpr int kLargeBlocks = 528;      // four per multiprocessor of a large GPU
 
-// The presets' numbers of terms as constants, so that the loops unroll and nothing goes to local memory.
+// The presets' numbers of terms are constants, so that loops unroll and local memory is not used.
 __device__ Vec3<float> view_color_of(const BakedScene& s, int64_t i, Vec3<float> d) {
   if (s.colors.lean.base) return view_color(s.colors.lean, i, d);
   const ViewColorArrays<const float>& p = s.colors.whole;
@@ -57,8 +55,8 @@ __device__ void write_texture(const BakedScene& s, int64_t i, Vec3<float> color,
   for (int k = 0; k < 4; ++k) row[kTileX + k] = texture[k];
 }
 
-// A block takes `owned` surfels. Those of many tiles, or without a box, are only noted: the block with most of them
-// would be what a frame waits for.
+// A block takes `owned` surfels. Those with many tiles or without a box are deferred, as the block with most of them
+// would dominate frame time.
 template <class Kernel>
 __global__ void __launch_bounds__(kListThreads, Kernel::kPixel ? 1 : bounded_blocks(9, kListThreads))
     list_kernel(BakedScene s, BakedViews v, BakedFrame f, int owned) {
@@ -68,13 +66,13 @@ __global__ void __launch_bounds__(kListThreads, Kernel::kPixel ? 1 : bounded_blo
   const int64_t block = int64_t(blockIdx.x) * owned, i = block + threadIdx.x;
   const int view = blockIdx.y;
   const bool owns = int(threadIdx.x) < owned && i < f.n;
-  const int64_t first = f.n * view, at = first + i;  // rows of the view; of the surfel
+  const int64_t first = f.n * view, at = first + i;  // row of the view's first surfel; of this one
   if (threadIdx.x == 0) seen_count = 0;
   __syncthreads();
 
   float row[kGeom];
   bool seen = false;
-  int rows = 0;  // of tiles
+  int rows = 0;  // rows of tiles
   float z = 0;
   if (owns) {
     const Surfels<float>& in = s.geometry;
@@ -93,7 +91,7 @@ __global__ void __launch_bounds__(kListThreads, Kernel::kPixel ? 1 : bounded_blo
         f.memory.large[atomicAdd(f.memory.large_count, 1)] = uint32_t(at);
       else if (seen)
         footprint_in(area[threadIdx.x]) = of, rows = of.bottom - of.top + 1;
-      // where the nearest point of the disc lies behind `near`, so do all pixels of it
+      // if the nearest point of the disc lies beyond `near`, all of it does
       const PlaneBounds<float>& disc = of.bounds;
       const float nearest = z * (1 - sqrt_(disc.cu * disc.cu + disc.cv * disc.cv));
       if (!Kernel::kPixel && row[kBlur2] == 0 && (disc.whole || !(nearest > s.near * 1.0001f))) row[kBlur2] = kNearCuts;
@@ -122,7 +120,7 @@ __global__ void __launch_bounds__(kListThreads, Kernel::kPixel ? 1 : bounded_blo
   list_pairs(f, area, owned, first + block, rows);
 }
 
-// Lists a row of tiles of a surfel without a box, of which lanes take a tile each. Returns how many.
+// Lists a row of tiles of a surfel without a box, one tile per lane. Returns their number.
 template <class Kernel> __device__ int list_reached(const BakedFrame& f, uint32_t r, int ty, int lane) {
   const float* row = f.memory.rows + int64_t(r) * kRow;
   const uint32_t tile = first_tile(f, r, ty);
@@ -136,7 +134,7 @@ template <class Kernel> __device__ int list_reached(const BakedFrame& f, uint32_
   return listed;
 }
 
-// The surfels of many tiles and those without a box, a warp to a share of the rows of tiles of one.
+// Lists the deferred surfels, a warp per share of the tile rows of one.
 template <class Kernel> __global__ void __launch_bounds__(kListThreads, 4) large_pairs_kernel(BakedFrame f) {
   const BakedMemory& m = f.memory;
   const int lane = threadIdx.x % kWarp, warps = int(gridDim.x) * kListWarps;

@@ -1,9 +1,8 @@
-// The pairs of surfel and screen tile of the baked renderer: how they are found and where they are written.
+// Pairs of surfel and screen tile of the baked renderer: how they are found and stored.
 //
-// No sort runs over all surfels or all pairs, and tiles are found once. A pair draws its number within its tile from
-// the tile's counter, and is written to the tile's slot of this number. Pairs that find no slot go to one list of all
-// tiles. Each tile's list is sorted where the tile is drawn (baked_sort.h). In which order pairs came has no influence
-// on the image.
+// There is no sort over all surfels or pairs, and tiles are found once. A pair takes its number within its tile from
+// the tile's counter and goes to the tile's slot of this number, or without a slot to one list of all tiles. Each
+// tile's list is sorted when the tile is drawn (baked_sort.h), so the image does not depend on the order of insertion.
 #pragma once
 
 #include "cuda/baked_stages.h"
@@ -12,11 +11,10 @@
 namespace bt::cuda {
 
 constexpr int kListThreads = 128, kListWarps = kListThreads / kWarp;
-constexpr int kLarge = 128;  // tiles from which on a surfel is left to `large_pairs_kernel`
+constexpr int kLarge = 128;  // tiles from which a surfel is handled by `large_pairs_kernel`
 
 namespace {
-// The sum of the values of the threads before mine. `sums`: kListWarps numbers in shared memory. All threads of the
-// block take part; it ends with a barrier.
+// Exclusive prefix sum over the block's threads, with barriers. `sums`: kListWarps numbers in shared memory.
 __device__ int block_sum_before(int value, int* sums, int& total) {
   const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
   int before = sum_below(value, lane);
@@ -30,7 +28,7 @@ __device__ int block_sum_before(int value, int* sums, int& total) {
   __syncthreads();
   return before;
 }
-// The last of `count` > 0 ascending numbers, of which the first is 0, that is at most i.
+// Finds the last of `count` > 0 ascending numbers, the first of which is 0, that is at most i.
 __device__ int last_at_most(const int* numbers, int count, int i) {
   int low = 0;
   for (int high = count; high - low > 1;) {
@@ -40,20 +38,20 @@ __device__ int last_at_most(const int* numbers, int count, int i) {
   return low;
 }
 
-// Room for a footprint in shared memory, where nothing may have a constructor.
+// Storage of a footprint in shared memory, where constructors are not allowed.
 struct alignas(Footprint<float>) FootprintRoom {
   unsigned char bytes[sizeof(Footprint<float>)];
 };
 __device__ Footprint<float>& footprint_in(FootprintRoom& room) { return *reinterpret_cast<Footprint<float>*>(&room); }
 
-// At most so many tiles are listed for a surfel that has a box.
+// Bounds the number of tiles listed for a surfel with a box.
 __device__ int most_tiles(const Footprint<float>& of, const BakedFrame& f) {
   const Interval<float> x = columns_of(of);
   const int left = pixel_from(x.x0, f.width) / kTile, right = pixel_to(x.x1, f.width) / kTile;
   return (of.bottom - of.top + 1) * max_(right - left + 1, 1);
 }
 
-// The first tile of row `ty` of the view that row `r` of the surfels belongs to.
+// Returns the first tile of row `ty` in the view of row `r` of the surfels.
 __device__ uint32_t first_tile(const BakedFrame& f, uint32_t r, int ty) {
   return r / uint32_t(f.n) * uint32_t(f.tiles_x * f.tiles_y) + uint32_t(ty * f.tiles_x);
 }
@@ -75,14 +73,13 @@ __device__ void list_pair(const BakedFrame& f, uint32_t r, uint32_t tile, uint32
   if (at < f.capacity) m.spilled[at] = {pair, atomicExch(&list.chains[number % kChains], uint32_t(at + 1))};
 }
 
-// Lists the pairs of the block's surfels: `area` has the footprints of `owned` of them, the first of which has row
-// `first` of all; `mine` is in how many rows of tiles the thread's is listed. Threads take a row of tiles each, then a
-// pair each, so that all are busy and neighbours list neighbours however many rows a surfel has and however wide they
-// are.
+// Lists the pairs of the block's surfels: `area` has the footprints of `owned` of them, starting at row `first`; `mine`
+// is the number of tile rows of the thread's surfel. Threads first take a row of tiles each, then a pair each, so that
+// the load is balanced for surfels of any height and width.
 __device__ void list_pairs(const BakedFrame& f, FootprintRoom* area, int owned, int64_t first, int mine) {
   __shared__ int first_row[kListThreads];  // rows of tiles before a surfel's
   __shared__ TileRow row[kListThreads];
-  __shared__ uint32_t row_id[kListThreads], row_tile[kListThreads];  // a row's surfel and the tile at its left end
+  __shared__ uint32_t row_id[kListThreads], row_tile[kListThreads];  // a row's surfel and its leftmost tile
   __shared__ int first_pair[kListThreads];                           // pairs before a row's
   __shared__ int sums[kListWarps];
   const int me = threadIdx.x;

@@ -1,15 +1,14 @@
-// Second stage of the baked renderer: the images.
+// Second stage of the baked renderer: images.
 //
-// The block of a tile sorts the tile's list. From there on a warp draws 8 x 8 pixels, two per thread (four rows apart),
-// and works for itself: no barrier of the block, no waiting for pixels elsewhere in the tile. It takes the tile's list
-// 32 pairs at a time and keeps those whose mask names one of its two parts. When it has 32 it loads their rows side by
-// side into shared memory. Then every thread reads the same row (a broadcast, four loads of 16 bytes), and works on
-// both its pixels together.
+// The block of a tile sorts its list. Then each warp draws 8 x 8 pixels, two per thread (four rows apart),
+// independently of the others. It takes the tile's list 32 pairs at a time and keeps those whose mask has one of its
+// two parts. When it has 32, it loads their rows into shared memory. Every thread then reads the same row (a broadcast,
+// four loads of 16 bytes) and evaluates both its pixels together.
 //
-// On scenes like trained ones 2.5 of a tile's four warps examine a pair, in 4.3 of its 8 parts, and 6 of 10 pixels that
-// are examined blend it. So the masks leave little to reject. A hit costs one reciprocal, one logarithm, one
-// exponential and, where the weight is above the bound, one texture fetch. The kernel is bound by issue of arithmetic,
-// then by the texture unit. Memory traffic is 96 bytes per row and warp, mostly from L2.
+// On scenes like trained ones 2.5 of a tile's four warps examine a pair, in 4.3 of its 8 parts, and 6 of 10 examined
+// pixels blend it, so the masks leave little to reject. A hit costs one reciprocal, one logarithm, one exponential and,
+// above the weight bound, one texture fetch. The kernel is bound by arithmetic issue, then by the texture unit. Memory
+// traffic is 96 bytes per row and warp, mostly from L2.
 #include <type_traits>
 
 #include "core/kernel.h"
@@ -22,11 +21,11 @@
 namespace bt::cuda {
 
 namespace {
-constexpr int kPixels = 2;  // per thread; with one, frames of bundles take 6 to 33 % longer on an H100
+constexpr int kPixels = 2;  // per thread; with one, frames take 6 to 33 % longer on an H100
 constexpr int kWarps = 2 * kBands / kPixels, kThreads = kWarps * kWarp;
 static_assert(kThreads == kDrawThreads);
 constexpr int kRowQuads = kRow / 4;  // float4s of a row
-constexpr int kCheckEvery = 8;       // rows after which finished pixels are checked
+constexpr int kCheckEvery = 8;       // rows between checks for ended pixels
 
 struct DrawArgs {
   BakedFrame frame;
@@ -37,12 +36,12 @@ struct DrawArgs {
 };
 
 struct Pixel {
-  float transmittance;  // negative once the pixel takes no more light
+  float transmittance;  // negative once the pixel has ended
   float red, green, blue, beta, depth, nx, ny, nz;
   int count;
 };
 
-// A surfel as all threads of a warp read it from shared memory.
+// A surfel's row in shared memory, read by all threads of a warp.
 struct Row {
   float g[kGeom];
   float r2, blur2, red, green;
@@ -50,7 +49,7 @@ struct Row {
   uint32_t id;
 };
 
-// The texels under the pixels that want them, all on their way before one is used. c, t: the row's `rest`.
+// Fetches the texels of the pixels that need them, all before one is used. c, t: the row's `rest`.
 template <bool kLevels>
 __device__ __forceinline__ void fetch_texels(const DrawArgs& a, const float4& c, const float4& t,
                                              const bool (&wanted)[kPixels], const Fragment<FastFloat> (&f)[kPixels],
@@ -62,7 +61,7 @@ __device__ __forceinline__ void fetch_texels(const DrawArgs& a, const float4& c,
         texel[j] = fetch_texel(atlas, t.x + texel_position_scaled(f[j].u, t.z, c.y).v,
                                t.y + texel_position_scaled(f[j].v, t.w, c.y).v);
   };
-  // by name, not by index: see AtlasTexture
+  // by name, not index: see AtlasTexture
   if (!kLevels || c.z == 0)
     fetch(a.atlas[0]);
   else if (c.z == 1)
@@ -71,8 +70,8 @@ __device__ __forceinline__ void fetch_texels(const DrawArgs& a, const float4& c,
     fetch(a.atlas[2]);
 }
 
-// Multiplies sigma by alpha where the weight reaches the bound, as AlphaTiles say, and leaves the texels there: what
-// has the weight for a residual afterwards is among them.
+// Multiplies sigma by alpha where the weight reaches the bound (AlphaTiles), and keeps the texels: fragments whose
+// weight later suffices for a residual are among them.
 template <bool kLevels>
 __device__ __forceinline__ void cut(const DrawArgs& a, const Row& s, const bool (&covers)[kPixels],
                                     const Pixel (&p)[kPixels], Fragment<FastFloat> (&f)[kPixels],
@@ -94,8 +93,7 @@ __device__ __forceinline__ void cut(const DrawArgs& a, const Row& s, const bool 
       f[j].sigma = FastFloat(alpha_cut(f[j].sigma.v, c.y > 0 ? a.alpha_offset + a.alpha_scale * texel[j].w : t.w));
 }
 
-// Adds a row's fragments to the thread's pixels, with weight 0 to those that do not take it. texel: with kAlpha what
-// `cut` left.
+// Adds a row's fragments to the thread's pixels, with weight 0 unless taken. texel: with kAlpha the result of `cut`.
 template <bool kMaps, bool kLevels, bool kAlpha>
 __device__ __forceinline__ void add(const DrawArgs& a, const Row& s, const bool (&taken)[kPixels],
                                     const float (&weight)[kPixels], const Fragment<FastFloat> (&f)[kPixels],
@@ -137,9 +135,9 @@ __device__ __forceinline__ void add(const DrawArgs& a, const Row& s, const bool 
   }
 }
 
-// A row under the thread's pixels, of which the first is dx, dy from the projected centre. Both are worked on together,
-// so that one does not wait for the other's steps. Unless kAll the low pass does not show, and no pixel of the disc
-// lies before the near plane; PixelKernel is for the rows that it filters alone.
+// Evaluates and blends a row at the thread's pixels, the first at offset (dx, dy) from the projected centre, both at
+// once for instruction-level parallelism. Without kAll there is no visible low pass and no part of the disc before the
+// near plane; PixelKernel is only for rows that it filters.
 template <bool kMaps, bool kLevels, bool kAlpha, class Kernel, bool kAll>
 __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx, float dy, Pixel (&p)[kPixels]) {
   Planes<FastFloat> at[kPixels];
@@ -149,7 +147,7 @@ __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx,
   for (int j = 0; j < kPixels; ++j) {
     y[j] = FastFloat(j ? dy + kBandRows * j : dy);
     taken[j] = p[j].transmittance > 0;
-    if (!Kernel::kPixel) {  // the planes alone say for most pixels that the surfel is not there
+    if (!Kernel::kPixel) {  // the planes alone reject most pixels
       at[j] = planes(s.g, FastFloat(dx), y[j]);
       bool inside = within_in_front(at[j], FastFloat(s.r2));
       if (kAll) inside = (inside & behind_near(s.g, a.near, at[j].W)) | (dx * dx + y[j].v * y[j].v < s.blur2);
@@ -184,7 +182,7 @@ __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx,
   if (any) add<kMaps, kLevels, kAlpha>(a, s, taken, weight, f, texel, p);
 }
 
-// Rounded as the image of floats would be: the product for itself.
+// Rounds like the float image's conversion; the product must not be fused.
 __device__ uint32_t to_byte(float x) {
 #if defined(__CUDA_ARCH__)
   return uint32_t(__fmul_rn(clamp_(x, 0.0f, 1.0f), 255.0f) + 0.5f);
@@ -209,11 +207,10 @@ template <bool kMaps> __device__ void write(const DrawArgs& a, const Pixel& p, i
   }
 }
 
-// The kernel for the rows that a kernel does not filter.
+// Kernel for rows that `Kernel` does not filter.
 template <class Kernel> using Unfiltered = std::conditional_t<Kernel::kResized, ResizedKernel, LowPassKernel>;
 
-// Tiles of long lists are drawn first, so that none of them is left when all others are done. The block of such a tile
-// draws the tile of a block that draws one of them.
+// Tiles with long lists are drawn first, so that none is left at the end: blocks swap tiles with those of long lists.
 __device__ unsigned tile_of_block(const BakedMemory& m, unsigned block) {
   if (block < unsigned(*m.long_count)) return m.long_tiles[block];
   unsigned tile = block;
@@ -221,7 +218,7 @@ __device__ unsigned tile_of_block(const BakedMemory& m, unsigned block) {
   return tile;
 }
 
-// Blocks per multiprocessor: as many as registers allow that the loop over pairs needs without the sort.
+// Blocks per multiprocessor: as many as the registers of the pair loop (without the sort) allow.
 template <bool kMaps, class Kernel, bool kAlpha>
 constexpr int kBlocks = bounded_blocks(
     (kMaps ? (Kernel::kPixel ? 6 : 7) : (Kernel::kPixel || Kernel::kResized ? 8 : 9)) - int(kAlpha), kThreads);
@@ -230,7 +227,7 @@ template <bool kMaps, class Kernel, bool kAlpha>
 __global__ void __launch_bounds__(kThreads, kBlocks<kMaps, Kernel, kAlpha>) draw_kernel(DrawArgs a) {
   __shared__ float4 staged[kWarps][kWarp * kRowQuads];
   __shared__ uint32_t queues[kWarps][2 * kWarp];
-  constexpr bool kLevels = Kernel::kPixel || Kernel::kResized;  // those of smaller views are among these
+  constexpr bool kLevels = Kernel::kPixel || Kernel::kResized;  // only these kernels draw smaller views
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
   const BakedFrame& f = a.frame;
   const unsigned tile = f.rows ? tile_of_block(f.memory, blockIdx.x) : blockIdx.x;
@@ -243,12 +240,12 @@ __global__ void __launch_bounds__(kThreads, kBlocks<kMaps, Kernel, kAlpha>) draw
   float4* stage = staged[warp];
   uint32_t* queue = queues[warp];
   Pixel p[kPixels];
-  uint32_t part[kPixels];  // bit of the part of the tile that holds the thread's pixel
+  uint32_t part[kPixels];  // bit of the part of the tile with the thread's pixel
   for (int j = 0; j < kPixels; ++j) {
     p[j] = {x < f.width && y + kBandRows * j < f.height ? 1.0f : -1.0f, 0, 0, 0, 0, 0, 0, 0, 0, 0};
     part[j] = 1u << (2 * ((warp >> 1) * kPixels + j) + (warp & 1));
   }
-  uint32_t wanted = 0;  // parts that still take light
+  uint32_t wanted = 0;  // parts with pixels that are not ended
   for (int j = 0; j < kPixels; ++j) wanted |= __any_sync(kFullMask, p[j].transmittance > 0) ? part[j] : 0;
 
   int next = 0;
@@ -265,7 +262,7 @@ __global__ void __launch_bounds__(kThreads, kBlocks<kMaps, Kernel, kAlpha>) draw
     __syncwarp();
     const int in_hand = min_(waiting, kWarp);
     if (in_hand == 0) break;
-    // three loads in flight: six at once would not fit the registers
+    // three loads in flight: six would exceed the registers
     BT_UNROLL_BY(3)
     for (int k = 0; k < kRowQuads; ++k) {
       const int quad = k * kWarp + lane, r = quad / kRowQuads;
@@ -309,7 +306,7 @@ __global__ void __launch_bounds__(kThreads, kBlocks<kMaps, Kernel, kAlpha>) draw
   }
   const int64_t view = tile / tiles_of_view;
   for (int j = 0; j < kPixels; ++j) {
-    const int column = int(px), row = int(py) + kBandRows * j;  // not x and y, which would be kept for this alone
+    const int column = int(px), row = int(py) + kBandRows * j;  // recomputed: keeping x and y costs registers
     if (column < f.width && row < f.height) write<kMaps>(a, p[j], (view * f.height + row) * f.width + column);
   }
 }
@@ -326,7 +323,7 @@ void baked_draw(const BakedScene& s, const BakedImages& images, const BakedFrame
                       s.scale,
                       s.alpha_scale != 0 ? 0.0f : 1.0f,  // opaque texels have m = 1
                       s.alpha_scale,
-                      max_(s.weight_bound, 1e-30f),  // above the weight of a pixel without a fragment
+                      max_(s.weight_bound, 1e-30f),  // above the weight of pixels without a fragment
                       s.transmittance_min,
                       Resize<float>(f.photo_pixel).sharp,
                       images};

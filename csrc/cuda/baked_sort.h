@@ -1,10 +1,9 @@
-// A screen tile's list front to back: sorted by the block that draws it.
+// Sorting of a screen tile's list front to back, by the block that draws it.
 //
-// A warp collects what the tile's slots had no room for. Then each warp sorts a part of the list in registers (a
-// bitonic network), the parts meet in shared memory, and the position of a key is its number in its own part
-// and the number of smaller keys in the others. Lists longer than that room are sorted in runs, which are then merged
-// two by two where they stand. Keys hold the depth and the surfel's row, so no two are alike and the order does not
-// depend on who wrote first.
+// A warp collects the pairs that had no slot. Then each warp sorts a part of the list in registers (bitonic network),
+// the parts go to shared memory, and a key's position is its index in its own part plus the number of smaller keys in
+// the others. Longer lists are sorted in runs, which are merged in pairs in place. Keys hold the depth and the surfel's
+// row, so they are unique and the order is deterministic.
 #pragma once
 
 #include "cuda/baked_stages.h"
@@ -12,19 +11,19 @@
 
 namespace bt::cuda {
 
-constexpr int kDrawThreads = 4 * kWarp;  // of the block
+constexpr int kDrawThreads = 4 * kWarp;  // per block
 
 namespace {
 constexpr int kMostPerLane = 8;
 constexpr int kRun = kDrawThreads * kMostPerLane;  // keys that a block sorts at once
-constexpr int kHalf = kRun / 2;                    // of two runs that it merges at once
+constexpr int kHalf = kRun / 2;                    // keys of each run in a merge step
 
 using Key = uint64_t;  // depth << 32 | pair
 constexpr Key kNone = ~Key(0);
 
 // Sorts the warp's keys: the one numbered lane * K + k is in key[k].
 template <int K> __device__ void sort_warp(Key (&key)[K], int lane) {
-  for (int size = 2; size <= kWarp * K; size *= 2) {  // parts of so many keys, rising and falling in turn, are merged
+  for (int size = 2; size <= kWarp * K; size *= 2) {  // merges parts of this size, alternately rising and falling
     for (int by = size / 2; by >= K; by /= 2) {
       const bool rising = !(lane * K & size), keep_low = !(lane * K & by) == rising;
       BT_UNROLL
@@ -48,7 +47,7 @@ template <int K> __device__ void sort_warp(Key (&key)[K], int lane) {
   }
 }
 
-// Number of `count` ascending keys that are below `key`.
+// Counts the keys below `key` among `count` ascending ones.
 __device__ int below(const Key* keys, int count, Key key) {
   int low = 0;
   for (int high = count; low < high;) {
@@ -61,8 +60,8 @@ __device__ int below(const Key* keys, int count, Key key) {
   return low;
 }
 
-// Sorts n <= kDrawThreads * K keys through `shared`, which has room for so many: get(i) gives one, put(i, key) takes it
-// at its position. All threads of the block take part.
+// Sorts n <= kDrawThreads * K keys through `shared`, which has room for as many: get(i) reads a key, put(i, key) writes
+// position i. All threads of the block take part.
 template <int K, class Get, class Put> __device__ void sort_run(int n, Key* shared, Get get, Put put) {
   constexpr int kPart = kWarp * K;
   const int lane = threadIdx.x % kWarp, from = int(threadIdx.x) / kWarp * kPart;
@@ -99,14 +98,14 @@ template <class Get, class Put> __device__ void sort_run(int n, Key* shared, Get
 
 __device__ Key key_of(const BakedMemory& m, uint32_t pair) { return Key(m.depth[pair >> 8]) << 32 | pair; }
 
-// A tile's pairs, in its slots and behind those of all tiles.
+// A tile's pairs, in its slots and after those of all tiles.
 struct PairsOfTile {
   uint32_t *slots, *rest;
   int slot_count;
   __device__ uint32_t& operator[](int i) const { return (i < slot_count ? slots : rest)[i]; }
 };
 
-// Writes the pairs of a tile's chains one after the other. Of a frame that does not fit some are missing.
+// Writes the pairs of a tile's chains contiguously. Some are missing in a frame that does not fit.
 __device__ void collect_spilled(const BakedFrame& f, int64_t tile, int lane) {
   const BakedMemory& m = f.memory;
   TileList& list = m.lists[tile];
@@ -129,7 +128,7 @@ __device__ void collect_spilled(const BakedFrame& f, int64_t tile, int lane) {
   if (lane == 0) list.rest = uint32_t((f.tiles - 1) * f.slots + begin), list.listed = f.slots + min_(found, room);
 }
 
-// Of two sorted runs, of kHalf pairs and of n, the lower ones go to the first. All threads of the block take part.
+// Merges two sorted runs of kHalf and n pairs, lower keys to the first. All threads of the block take part.
 __device__ void merge(const BakedMemory& m, const PairsOfTile& pairs, int first, int second, int n, Key* shared) {
   const auto index = [&](int i) { return i < kHalf ? first + i : second + i - kHalf; };
   for (int i = threadIdx.x; i < kHalf + n; i += kDrawThreads) shared[i] = key_of(m, pairs[index(i)]);
@@ -142,8 +141,8 @@ __device__ void merge(const BakedMemory& m, const PairsOfTile& pairs, int first,
   __syncthreads();
 }
 
-// Sorts n pairs. Runs are merged as Batcher's network compares numbers: in an order that does not depend
-// on them and where they stand, with no more memory than `shared`.
+// Sorts n pairs. Runs are merged in place in the order of Batcher's network, which does not depend on the keys, using
+// only `shared`.
 __device__ void sort_pairs(const BakedMemory& m, const PairsOfTile& pairs, int n, Key* shared) {
   for (int run = 0; run < n; run += kRun) {
     sort_run(
@@ -152,14 +151,15 @@ __device__ void sort_pairs(const BakedMemory& m, const PairsOfTile& pairs, int n
     __syncthreads();
   }
   const int runs = int(ceil_div(n, kHalf));
-  for (int sorted = 2; sorted < runs; sorted *= 2)  // so many runs stand in order
+  for (int sorted = 2; sorted < runs; sorted *= 2)  // length of the sorted sequences, in runs
     for (int apart = sorted; apart > 0; apart /= 2)
       for (int run = apart % sorted; run + apart < runs; ++run)
         if ((run - apart % sorted) / apart % 2 == 0 && run / (2 * sorted) == (run + apart) / (2 * sorted))
           merge(m, pairs, run * kHalf, (run + apart) * kHalf, min_(n - (run + apart) * kHalf, kHalf), shared);
 }
 
-// Sorts a tile's list; how many pairs are listed. `shared` has room for kRun keys. All threads of the block take part.
+// Sorts a tile's list; returns its number of pairs. `shared` has room for kRun keys. All threads of the block take
+// part.
 __device__ int sort_list(const BakedFrame& f, int64_t tile, Key* shared) {
   const TileList& list = f.memory.lists[tile];
   int n = list.count;

@@ -1,9 +1,9 @@
-// Tile lists: of every tile the surfels that may touch it, front to back.
+// Tile lists: the surfels that may touch each tile, front to back.
 //
-// Two sorts instead of one by a joint key of tile and depth: the n surfels by depth, then, written out in that order,
-// the pairs by tile alone. Both are stable, so a tile's pairs end front to back and equal depths keep the surfels'
-// order. There are about six pairs per surfel: the large sort moves 8 bytes per pair through two passes (13 bits for
-// 4,000 tiles) instead of 12 bytes through six (45 bits), and the depth enters with all its bits, in double as well.
+// Two sorts instead of one by a joint key of tile and depth: the n surfels by depth, then, written in that order, the
+// pairs by tile alone. Both are stable, so a tile's pairs end up front to back, with ties in surfel order. With about
+// six pairs per surfel, the large sort moves 8 bytes per pair through two passes (13 bits for 4,000 tiles) instead of
+// 12 through six (45 bits), and depth keeps all its bits, in double as well.
 #include "core/footprint.h"
 #include "cuda/kernels.h"
 #include "cuda/sort_scan.h"
@@ -13,7 +13,7 @@ namespace bt::cuda {
 
 namespace {
 constexpr int kThreads = 128;
-constexpr int kAlone = 64;  // tiles that a thread lists by itself; beyond that its warp helps
+constexpr int kAlone = 64;  // tiles that a thread lists alone; beyond, its warp helps
 
 template <class S> struct CountSpace {
   using Key = typename SortKey<S>::type;
@@ -34,7 +34,7 @@ template <class S> struct CountSpace {
   }
 };
 
-// Bits that tell the tiles apart, and the number behind the last.
+// Returns the bits that distinguish the tiles and the number after the last.
 int tile_bits(int64_t tiles) {
   int bits = 1;
   while ((int64_t(1) << bits) <= tiles) ++bits;
@@ -54,7 +54,7 @@ struct FillSpace {
         temp(arena.take<char>(temp_size)) {}
 };
 
-// The tiles that a surfel can touch.
+// Tiles that a surfel can touch.
 template <class Kernel, class S> struct TouchedTiles {
   S row[kLevelRow];
   Footprint<S> of;
@@ -64,17 +64,17 @@ template <class Kernel, class S> struct TouchedTiles {
     level_row<Kernel>(v.geom + id * kGeom, v.near, S(1), row);
     of = footprint<Kernel>(row, width, height);
   }
-  // True for a disc that crosses the camera's plane, which has no box whose tiles could be listed.
+  // True for a disc that crosses the camera's plane and has no box.
   __device__ bool boxless() const { return of.bounds.whole; }
-  // fn(row, first, last) for the rows of tiles of one with a box.
+  // Calls fn(row, first, last) for the rows of tiles of a surfel with a box.
   template <class F> __device__ void each_row(F&& fn) const {
     for (int ty = of.top; ty <= of.bottom; ++ty) {
       const TileRow tiles = tile_row(of, ty, width);
       if (tiles.left <= tiles.right) fn(ty, tiles.left, tiles.right);
     }
   }
-  // fn(votes, tile) by all lanes of a warp for the tiles that one without reaches: lanes take a tile each, those with a
-  // vote have one that is reached.
+  // Calls fn(votes, tile) by all lanes of a warp for the tiles reached by a surfel without a box: a tile per lane,
+  // `votes` has the lanes whose tile is reached.
   template <class F> __device__ void each_reached(int lane, F&& fn) const {
     const int across = tiles_across(width), tiles = across * tiles_across(height);
     for (int first = 0; first < tiles; first += kWarp) {
@@ -109,17 +109,17 @@ template <class Kernel, class S> __global__ void __launch_bounds__(kThreads) cou
   w.counts[i] = int32_t(count);  // at most the tiles of an image
 }
 
-// counts by rank; one more entry for the total
+// Gathers counts by rank, with one more entry for the total.
 __global__ void __launch_bounds__(kThreads)
     rank_kernel(int64_t n, const int32_t* order, const int32_t* counts, int32_t* ranked) {
   const int64_t r = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (r <= n) ranked[r] = r < n ? counts[order[r]] : 0;
 }
 
-// One thread per surfel, by rank; a warp lists its large surfels together, so that one disc before the camera does not
-// keep a thread busy with the whole screen. The count comes from another kernel, and one formula may be rounded in two
-// ways (cmake/cuda.cmake keeps nvcc from it). Whatever was counted: nobody writes beyond the slots of his surfel, a
-// slot without a tile is a pair behind those of all tiles, and the difference is noted.
+// Lists the pairs, one thread per surfel by rank; a warp lists large surfels together, so that a disc in front of the
+// camera does not leave the whole screen to one thread. Counts come from another kernel, which may round differently
+// (cmake/cuda.cmake prevents that for nvcc). In any case no thread writes past its slots, slots without a tile become
+// pairs after those of all tiles, and the difference is recorded.
 template <class Kernel, class S>
 __global__ void __launch_bounds__(kThreads)
     list_kernel(View<S> v, const int32_t* order, const int64_t* slot_start, FillSpace w, int32_t* differing) {
@@ -132,7 +132,7 @@ __global__ void __launch_bounds__(kThreads)
     w.slots[slot] = int32_t(slot);
     w.owner[slot] = whose;
   };
-  // the tiles of a box by `step` threads, of which this is number `mine`; where the next slot is
+  // lists the tiles of a box, this being thread `mine` of `step`; returns the next slot
   using Touched = TouchedTiles<Kernel, S>;
   const auto list_box = [&](const Touched& touched, int32_t whose, int64_t at, int64_t end, int mine, int step) {
     touched.each_row([&](int row, int first, int last) {
@@ -179,7 +179,7 @@ __global__ void __launch_bounds__(kThreads)
   if (k < pairs) surfel[k] = owner[slot[k]];
 }
 
-// The first pair of every tile, by bisection: a tile without pairs costs no more than others.
+// Finds the first pair of every tile by bisection, at the same cost for tiles without pairs.
 __global__ void __launch_bounds__(kThreads)
     range_kernel(int64_t pairs, const uint32_t* tile, int64_t tiles, int64_t* tile_pairs) {
   const int64_t t = int64_t(blockIdx.x) * kThreads + threadIdx.x;

@@ -1,13 +1,13 @@
-// Shading and blending, and its backward pass: colours and their gradients never leave the multiprocessor.
+// Shading and blending, and the backward pass; colours and their gradients stay on the multiprocessor.
 //
-// Forward a block takes its tile's list stretch by stretch through shared memory: first every thread works out colours,
-// one fragment after the other, then every lane adds up those of its pixel. So all lanes are busy with the look-ups,
-// and the sums need no atomics.
+// Forward, a block takes its tile's list chunk by chunk through shared memory: threads first compute colours, a
+// fragment each, then each lane adds up those of its pixel. So all lanes are busy with texel fetches, and sums need no
+// atomics.
 //
-// Backward kRunLanes lanes take a pair's fragments in turns, with the tile's part of dimage in shared memory. What a
-// pair adds to its surfel goes to its slot, so that only the sums of texels are added in any order.
+// Backward, kRunLanes lanes take a pair's fragments in turn, with the tile's part of dimage in shared memory. A pair's
+// contribution to its surfel goes to its slot, so only sums of texels depend on the order.
 //
-// Bytes per fragment of surfels alone; with texels, which are 4 of 12 bytes more; and with a residual of each fragment:
+// Bytes per fragment of surfels alone; with texels on 4 of 12 bytes more; and with a residual per fragment:
 //             alone   with texels   with residuals
 //   forward     8         16              20
 //   backward   12         24              36
@@ -37,12 +37,12 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
     Stretch<kHeld> part(p, s, first, end, bits);
     taken_pairs = part.pairs;
     if (!taken_pairs) break;
-    // beta and the normal, one lane per pair
+    // beta and normal, one lane per pair
     const bool some = s.lane < taken_pairs;
     const S* g = of.geom + (some ? int64_t(p.surfel[first + s.lane]) * kGeom : 0);
     const S beta = some ? g[kBeta] : S(0), nx = kMaps && some ? g[kNx] : S(0), ny = kMaps && some ? g[kNy] : S(0),
             nz = kMaps && some ? g[kNz] : S(0);
-    __syncthreads();  // what was held is added up
+    __syncthreads();  // the previous chunk has been summed
     part.find_own(s);
     part.each_fragment([&](int i, int64_t at) {
       const bool textured = of.table.texels > 0;
@@ -75,21 +75,20 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
 // Outputs of the backward kernel; null: not requested.
 template <class S> struct Gradients {
   S *weight, *uv, *depth, *residual, *partial;
-  S* texels;  // sums, where they are not exact
+  S* texels;  // sums, unless exact
   bool sums_texels;
 };
 
-// The residual colours of fragments: none, those of texels, or one listed for each.
+// Source of residual colours: none, texels, or one listed per fragment.
 enum class Residual { kNone, kTexels, kListed };
-// Blocks at a time on a multiprocessor, as many as there are registers for: the look-up of texels and the sums of its
-// gradients take 80 in single precision.
+// Resident blocks per multiprocessor, as registers allow: texel fetches and the sums of their gradients take 80 in
+// single precision.
 template <class S, bool kMaps, Residual kResidual> constexpr int resident() {
   if (sizeof(S) == 8) return 1;
   return kResidual == Residual::kTexels ? (kMaps ? 2 : 3) : (kMaps ? 4 : 5);
 }
 
-// A run is read and written from a multiple of 8 fragments on: memory takes whole sectors of 32 bytes faster than
-// parts.
+// Runs are read and written from a multiple of 8 fragments, as whole sectors of 32 bytes are faster than parts.
 template <class S, bool kMaps, Residual kResidual, bool kExact>
 __global__ void __launch_bounds__(kTileThreads, resident<S, kMaps, kResidual>())
     backward_kernel(BlendedSurfels<S, Pairs> of, const S* __restrict__ dimage, Gradients<S> out, ExactSums exact) {
@@ -107,7 +106,7 @@ __global__ void __launch_bounds__(kTileThreads, resident<S, kMaps, kResidual>())
   Adder<S, kExact> texel_sums = {};
   if constexpr (kTexels) texel_sums = adder<kExact>(out.texels, exact);
   const int lane = int(threadIdx.x) % kRunLanes, worker = int(threadIdx.x) / kRunLanes;
-  // The runs of a warp take their turns together.
+  // Runs of a warp take turns together.
   for (int64_t k = first + worker; k - worker % 2 < end; k += kWorkers) {
     const bool some = k < end;
     const int64_t begin = some ? p.offsets[k] : 0;
@@ -121,7 +120,7 @@ __global__ void __launch_bounds__(kTileThreads, resident<S, kMaps, kResidual>())
     for (int c = 0; c < kSums; ++c) sums[c] = S(0);
     const int own = count ? skipped + count : 0, stop = max_(own, __shfl_xor_sync(kFullMask, own, kRunLanes));
     for (int turn = 0; turn < stop; turn += kRunLanes) {
-      const int at = turn - skipped + lane;  // in the run
+      const int at = turn - skipped + lane;  // index in the run
       const int64_t i = begin + at;
       const bool mine = at >= 0 && at < count;
       S w = S(0), u = S(0), v = S(0), depth = S(0);
@@ -133,7 +132,7 @@ __global__ void __launch_bounds__(kTileThreads, resident<S, kMaps, kResidual>())
         if constexpr (kMaps) depth = f.depth[i];
         if constexpr (kListed) residual = load3(of.residual + 3 * i);
       }
-      __syncwarp();  // no load is put off until its number is used: one wait is for all
+      __syncwarp();  // all loads are issued before any is used: one wait for all
       const bool textured = kTexels && mine && w >= of.bound && patch.textured();
       TexelCorners<S> corners = {};
       TexelSlopes<S> slopes = {};

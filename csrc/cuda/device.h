@@ -1,5 +1,5 @@
-// The language of kernels. Compiled by nvcc a source is CUDA; compiled by a C++ compiler the same source runs on the
-// host, thread by thread (emulator.h), so that indexing, barriers and warp steps are tested on machines without a card.
+// The language of kernels. nvcc compiles a source as CUDA; a C++ compiler makes the same source run on the host, thread
+// by thread (emulator.h), so that indexing, barriers and warp operations are tested without a GPU.
 #pragma once
 
 #include <cstddef>
@@ -22,7 +22,7 @@ inline void check(cudaError_t error, const char* what) {
 
 }  // namespace bt::cuda
 
-// Launches kernel<<<grid, block, shared bytes, stream>>>(...). A kernel with template commas goes in parentheses.
+// Launches kernel<<<grid, block, shared bytes, stream>>>(...). A kernel name with commas goes in parentheses.
 #define BT_LAUNCH(kernel, grid, block, shared, stream, ...)                                \
   do {                                                                                     \
     kernel<<<(grid), (block), (shared), static_cast<cudaStream_t>(stream)>>>(__VA_ARGS__); \
@@ -37,7 +37,7 @@ inline void check(cudaError_t error, const char* what) {
 #define BT_UNROLL_BY(n)
 #endif
 
-// More than 48 KB of shared memory per block has to be asked for.
+// Requests more than 48 KB of shared memory per block.
 #define BT_ALLOW_SHARED(kernel, bytes) \
   ::bt::cuda::check(                   \
       cudaFuncSetAttribute((kernel), cudaFuncAttributeMaxDynamicSharedMemorySize, static_cast<int>(bytes)), #kernel)
@@ -63,13 +63,13 @@ inline void check(cudaError_t error, const char* what) {
 
 namespace bt::cuda {
 
-// A CUDA stream (cudaStream_t) without CUDA's headers; the emulator ignores it.
+// CUDA stream (cudaStream_t) without CUDA's headers; the emulator ignores it.
 using Stream = void*;
 
 constexpr int kWarp = 32;
 constexpr unsigned kFullMask = 0xffffffffu;
 
-// Threads of a multiprocessor; launch bounds must not ask for more.
+// Threads per multiprocessor, an upper limit for launch bounds.
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ < 800
 constexpr int kMostThreads = 1024;
 #else
@@ -79,7 +79,7 @@ constexpr int bounded_blocks(int blocks, int threads) {
   return blocks * threads > kMostThreads ? kMostThreads / threads : blocks;
 }
 
-// Sets memory to zero bytes, which are zeros of every number type.
+// Zeroes memory of any number type.
 template <class T> void fill_zero(T* to, int64_t count, Stream stream) {
   if (count <= 0) return;
 #if defined(__CUDACC__)
@@ -92,8 +92,8 @@ template <class T> void fill_zero(T* to, int64_t count, Stream stream) {
 
 constexpr int64_t ceil_div(int64_t a, int64_t b) { return (a + b - 1) / b; }
 
-// Working memory, one block from which a kernel's function cuts arrays. Run with a null block it counts the bytes, with
-// a block it hands out addresses: one description serves both.
+// Working memory, one block from which arrays are cut. With a null block it counts the bytes, else it returns
+// addresses: one description serves both.
 class Arena {
  public:
   explicit Arena(void* block) : base_(reinterpret_cast<uintptr_t>(block)) {}
@@ -105,7 +105,7 @@ class Arena {
   int64_t used() const { return used_; }
 
  private:
-  static constexpr int64_t kAlign = 256;  // what cudaMalloc gives
+  static constexpr int64_t kAlign = 256;  // alignment of cudaMalloc
   uintptr_t base_;
   int64_t used_ = 0;
 };

@@ -1,4 +1,4 @@
-// The check of a device, by a kernel without work.
+// Check of a device by an empty kernel.
 #include "cuda/kernels.h"
 
 namespace bt::cuda {
@@ -36,7 +36,7 @@ std::string device_problem(int device) {
   } else if (error != cudaSuccess) {
     problem = std::string("the CUDA device cannot be used: ") + cudaGetErrorString(error);
   }
-  cudaGetLastError();  // what was found here is no error of a later call
+  cudaGetLastError();  // not to be reported by a later call
   cudaSetDevice(before);
   return problem;
 }

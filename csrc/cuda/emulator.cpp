@@ -1,6 +1,6 @@
-// Fibers that stand in for the threads of a block. A fiber gets its stack by makecontext and is then entered and left
-// by _setjmp and _longjmp, which, unlike swapcontext, ask the kernel for nothing: a switch takes tens of nanoseconds.
-#undef _FORTIFY_SOURCE  // its longjmp takes a jump to another stack for an error
+// Fibers in place of a block's threads. A fiber gets its stack by makecontext and is then switched by _setjmp and
+// _longjmp, which, unlike swapcontext, make no system call: a switch takes tens of nanoseconds.
+#undef _FORTIFY_SOURCE  // its longjmp rejects jumps to another stack
 #include "cuda/emulator.h"
 
 #include <link.h>
@@ -26,15 +26,15 @@ constexpr unsigned kLanesOfWarp = 32;
 enum class State { kReady, kAtBlock, kAtWarp, kDone };
 
 struct Fiber {
-  ucontext_t context;  // where it begins
-  jmp_buf resume;      // where it left
+  ucontext_t context;  // start
+  jmp_buf resume;      // where it was left
   bool begun = false;
-  std::unique_ptr<char[]> stack{new char[kStack]};  // pages are touched only as deep as a kernel goes
+  std::unique_ptr<char[]> stack{new char[kStack]};  // pages are allocated as used
   State state;
   Index index;
-  unsigned mask;                    // of the warp step it waits at
-  uint64_t posted;                  // what it gave
-  uint64_t received[kLanesOfWarp];  // what the warp gave
+  unsigned mask;                    // of the warp operation it waits at
+  uint64_t posted;                  // its value
+  uint64_t received[kLanesOfWarp];  // values of the warp
 };
 
 std::vector<std::unique_ptr<Fiber>> fibers;
@@ -43,10 +43,10 @@ std::mt19937 shuffle;
 jmp_buf scheduler;
 size_t current;
 const std::function<void()>* body;
-bool inside = false;  // of a kernel's thread
-std::string fault;    // of a thread that had to stop
+bool inside = false;  // inside a kernel's thread
+std::string fault;    // of a thread that was stopped
 
-// A switch returns a second time when its side is entered again: no variable of a caller may be at stake.
+// _setjmp returns again when this side is resumed: no variable of the caller may be live across it.
 __attribute__((noinline)) void enter(Fiber& f) {
   if (_setjmp(scheduler)) return;
   inside = true;
@@ -60,7 +60,7 @@ __attribute__((noinline)) void leave(Fiber& f, State state) {
   if (!_setjmp(f.resume)) _longjmp(scheduler, 1);
 }
 
-void run_threads() {  // of block after block
+void run_threads() {  // for block after block
   for (;;) {
     (*body)();
     leave(*fibers[current], State::kDone);
@@ -74,12 +74,12 @@ __attribute__((noinline)) void make(Fiber& f) {
   makecontext(&f.context, run_threads, 0);
 }
 
-// The shared memory of all kernels: this library's storage of the thread, in which they alone keep anything.
+// Shared memory of all kernels: this library's thread-local storage, used for nothing else.
 struct Range {
   char* begin = nullptr;
   size_t bytes = 0;
 };
-thread_local int mine = 0;  // so that there is such storage
+thread_local int mine = 0;  // ensures that the storage exists
 int visit(dl_phdr_info* library, size_t, void* found) {
   const auto* at = reinterpret_cast<const char*>(&mine);
   for (int i = 0; i < library->dlpi_phnum; ++i) {
@@ -101,7 +101,7 @@ Range shared_of_kernels() {
 
 void wait(State at) { leave(*fibers[current], at); }
 
-// Opens the barriers whose threads have all come. False when none did.
+// Opens the barriers that all threads have reached; returns false if there are none.
 bool open_barriers(size_t threads) {
   bool opened = false;
   size_t at_block = 0, done = 0;
@@ -141,7 +141,7 @@ bool open_barriers(size_t threads) {
 }
 
 [[noreturn]] void give_up(const std::string& why) {
-  fibers.clear();  // they would go on in the middle of this kernel
+  fibers.clear();  // they would resume in the middle of this kernel
   fault.clear();
   throw std::runtime_error(why);
 }
@@ -185,7 +185,7 @@ void launch(const char* kernel, dim3 grid, dim3 block, size_t shared, const std:
   const Range kept = shared_of_kernels();
   for (size_t b : blocks) {
     block_index = {unsigned(b % grid.x), unsigned(b / grid.x % grid.y), unsigned(b / grid.x / grid.y)};
-    std::memset(kept.begin, 0xff, kept.bytes);  // NaN: nobody may count on zeros, or on what a block before left
+    std::memset(kept.begin, 0xff, kept.bytes);  // NaN: reveals reads of unwritten memory
     shared_memory.assign(shared / 8 + 1, 0xffffffffffffffffull);
     for (size_t i = 0; i < threads; ++i) {
       fibers[i]->state = State::kReady;
@@ -213,7 +213,7 @@ void launch(const char* kernel, dim3 grid, dim3 block, size_t shared, const std:
 
 }  // namespace bt::emulator
 
-// Called by code that is compiled with -fsanitize=alignment, before an access that a card would refuse.
+// Called by code compiled with -fsanitize=alignment before an access that a GPU would refuse.
 struct Access {
   const char* file;
   unsigned line, column;

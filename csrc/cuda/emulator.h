@@ -1,7 +1,7 @@
-// The part of CUDA that our kernels use, on the host: every CUDA thread is a fiber, a block's threads take turns in a
-// shuffled order and switch at barriers and warp steps. A missing barrier shows as a wrong result for some seed, a
-// barrier that not all threads reach as an error. Blocks run one after another, in a shuffled order too, and each
-// begins with shared memory in which every number is NaN and every index is far off. For tests: correct, not fast.
+// The part of CUDA that the kernels use, on the host: each CUDA thread is a fiber; a block's threads run in shuffled
+// order and switch at barriers and warp operations. A missing barrier shows as a wrong result for some seed, a barrier
+// that not all threads reach as an error. Blocks run one after another in shuffled order, each with shared memory set
+// to NaN (or, as indices, far out of range). For tests: correct, not fast.
 #pragma once
 
 #include <cmath>
@@ -27,22 +27,22 @@ struct Index {
 extern Index thread_index, block_index;
 extern dim3 grid_size;
 
-// Runs every thread of every block; `seed` of the order in which threads take turns is set by set_seed.
-// Throws std::runtime_error when threads wait at barriers that can never open.
+// Runs every thread of every block, in an order seeded by set_seed. Throws std::runtime_error when threads wait at
+// barriers that can never open.
 void launch(const char* kernel, dim3 grid, dim3 block, size_t shared, const std::function<void()>& thread);
 void set_seed(unsigned seed);
 
-// Kernels with a fault that the emulator must find (emulator_probe.cpp).
-int stale_numbers();            // number of threads that read what a block before theirs left in shared memory
-void open_barrier();            // threads wait for one that does not come
-float read_float4(int offset);  // the second of four floats that begin so many floats behind a multiple of 16 bytes
+// Faulty kernels that the emulator must detect (emulator_probe.cpp).
+int stale_numbers();            // counts threads that read what an earlier block left in shared memory
+void open_barrier();            // threads wait for one that never comes
+float read_float4(int offset);  // reads the second of four floats, `offset` floats after a multiple of 16 bytes
 void* dynamic_shared();
 
 void block_barrier();
-// Posts a value to the calling warp and returns those of all 32 lanes (lanes outside the mask: 0).
+// Posts a value to the calling warp and returns those of all 32 lanes (0 for lanes outside the mask).
 const uint64_t* warp_exchange(unsigned mask, uint64_t value);
 int lane();
-void misaligned(const char* file, unsigned line);  // ends the thread, and the kernel with an error
+void misaligned(const char* file, unsigned line);  // ends the thread and fails the kernel
 
 template <class T> uint64_t to_bits(T value) {
   static_assert(sizeof(T) <= 8);
@@ -61,7 +61,7 @@ template <class T> T from_bits(uint64_t bits) {
 #define __global__
 #define __device__
 #define __forceinline__ inline
-#define __shared__ static thread_local  // `launch` finds all of them in the thread's storage
+#define __shared__ static thread_local  // found by `launch` in the thread's storage
 #define __launch_bounds__(...)
 #define __restrict__
 
@@ -98,7 +98,7 @@ inline long long __double2ll_rn(double x) { return std::fabs(x) < 9e18 ? std::ll
 inline int __clz(int x) { return x ? __builtin_clz(unsigned(x)) : 32; }
 template <class T> T __ldg(const T* p) { return *p; }
 
-// blocks and threads take turns: plain read-modify-write is atomic
+// blocks and threads run one at a time, so read-modify-write is atomic
 template <class T> T atomicAdd(T* to, T value) {
   const T old = *to;
   *to = old + value;

@@ -1,4 +1,4 @@
-// Kernels with a fault that the emulator must find: a test that finds nothing has to be one that can.
+// Faulty kernels that the emulator must detect, so that tests prove its checks work.
 #include "cuda/device.h"
 
 namespace bt::emulator {
@@ -8,11 +8,11 @@ constexpr int kThreads = 64, kWarp = 32;
 
 __global__ void stale_kernel(int* found) {
   __shared__ int left[kThreads];
-  found[blockIdx.x * kThreads + threadIdx.x] = left[threadIdx.x];  // nobody has written it
+  found[blockIdx.x * kThreads + threadIdx.x] = left[threadIdx.x];  // unwritten
   left[threadIdx.x] = 7;
 }
 __global__ void barrier_kernel() {
-  if (threadIdx.x % kWarp) __syncwarp();  // the first lane does not come, and waits elsewhere
+  if (threadIdx.x % kWarp) __syncwarp();  // the first lane is missing, and waits elsewhere
   __syncthreads();
 }
 __global__ void aligned_kernel(const float* from, float* to) { to[0] = reinterpret_cast<const float4*>(from)->y; }

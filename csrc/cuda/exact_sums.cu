@@ -1,4 +1,4 @@
-// Units of exact sums, and what becomes of these.
+// Units of exact sums, and their conversion.
 #include <cmath>
 
 #include "cuda/exact_sums.h"
@@ -8,7 +8,7 @@ namespace bt::cuda {
 namespace {
 constexpr int kThreads = 256;
 
-// The largest |value|, as the bits of a double: they are ordered like the numbers, and NaN is above all.
+// Finds the largest |value| as the bits of a double, which are ordered like the numbers, with NaN above all.
 template <class S>
 __global__ void __launch_bounds__(kThreads) largest_kernel(int64_t n, const S* values, unsigned long long* bits) {
   unsigned long long most = 0;
@@ -25,7 +25,7 @@ __global__ void __launch_bounds__(kThreads) largest_kernel(int64_t n, const S* v
   if (threadIdx.x % kWarp == 0 && most) atomicMax(bits, most);
 }
 
-// 1 / unit for sums of `count` numbers of size up to `most`; NaN when they are not finite.
+// Returns 1 / unit for sums of `count` numbers of size up to `most`; NaN if not finite.
 __device__ double scale_for(double most, int64_t count) {
   const double total = most * double(count > 0 ? count : 1);
   if (!finite_(total)) return NAN;
@@ -35,8 +35,8 @@ __device__ double scale_for(double most, int64_t count) {
   return ldexp(1.0, exponent < -900 ? 961 : 61 - exponent);
 }
 
-// Bounds the entries' gradients by the largest gradient of the field's output and the weights; without levels entries
-// get shares of the gradients.
+// Bounds the entries' gradients by the largest gradient of the field's output and the weights; without levels the
+// entries get shares of the gradients.
 template <class S> __global__ void range_kernel(FieldArrays<S> f, int64_t count, ExactRange* range) {
   double most;
   memcpy(&most, &range->gradient, sizeof most);

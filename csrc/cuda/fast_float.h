@@ -1,5 +1,5 @@
-// A real for pixels with the device's own approximations: exp2, log2, root and reciprocal of the special function unit,
-// about 2 ulp each. The formulas in core/ take it as they take a float.
+// A real with the GPU's approximations: exp2, log2, square root and reciprocal of the special function unit, about 2
+// ulp each, usable in the formulas of core/.
 #pragma once
 
 #include <type_traits>
@@ -14,13 +14,12 @@ struct FastFloat {
   FastFloat() = default;
   BT_HD explicit FastFloat(float value) : v(value) {}
 #if defined(__CUDACC__)
-  // In place of those of core/common.h, of which these take one instruction, or none. Here, so that floats do not see
-  // them.
+  // Replace those of core/common.h by one instruction or none; friends, so that floats do not use them.
   friend __device__ __forceinline__ FastFloat clamp_(FastFloat x, FastFloat low, FastFloat high) {
     return FastFloat(fminf(fmaxf(x.v, low.v), high.v));
   }
   friend __device__ __forceinline__ FastFloat abs_(FastFloat x) { return FastFloat(fabsf(x.v)); }
-  friend __device__ __forceinline__ FastFloat relu(FastFloat x) {  // NaN stays NaN
+  friend __device__ __forceinline__ FastFloat relu(FastFloat x) {  // keeps NaN
 #if __CUDA_ARCH__ >= 800
     float y;
     asm("max.NaN.f32 %0, %1, 0f00000000;" : "=f"(y) : "f"(x.v));
@@ -52,7 +51,7 @@ __device__ __forceinline__ float log2_approx(float x) {
   return y;
 }
 __device__ __forceinline__ FastFloat operator/(FastFloat a, FastFloat b) { return FastFloat(__fdividef(a.v, b.v)); }
-// 1 / x; infinite below 1.2e-38
+// Computes 1 / x; infinite below 1.2e-38.
 __device__ __forceinline__ FastFloat inverse_(FastFloat x) {
   float y;
   asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x.v));
@@ -76,7 +75,7 @@ inline FastFloat sqrt_(FastFloat x) { return FastFloat(sqrtf(x.v)); }
 inline FastFloat power_(FastFloat x, FastFloat y) { return FastFloat(exp2f(y.v * log2f(x.v))); }
 #endif
 
-// The real of a training kernel's pixels: doubles stay exact.
+// The real for pixels in training kernels; doubles stay exact.
 template <class S> using FastFloatOr = std::conditional_t<std::is_same_v<S, float>, FastFloat, S>;
 BT_HD float plain(FastFloat x) { return x.v; }
 BT_HD double plain(double x) { return x; }

@@ -1,4 +1,4 @@
-// The residual field at points.
+// Residual field at points.
 #include "cuda/field_device.h"
 
 namespace bt::cuda {
@@ -44,8 +44,8 @@ __global__ void __launch_bounds__(kBackwardWarps<S>* kWarp, kBackwardResident<S>
   store_weight_sums(*shared, weights, warp, lane, partial);
 }
 
-// Adds up the blocks' sums of the weights' gradients. 32 columns per block: 8 groups of threads walk down the rows,
-// then the groups are added in order.
+// Adds up the blocks' weight gradients. 32 columns per block: 8 groups of threads sum rows, then the groups are added
+// in order.
 constexpr int kSumThreads = 256, kSumRows = kSumThreads / kWarp;
 template <class S>
 __global__ void __launch_bounds__(kSumThreads)

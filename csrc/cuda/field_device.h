@@ -1,12 +1,12 @@
-// The residual field on CUDA, at points.
+// Residual field on CUDA, at points.
 //
-// Work of one look-up with L = 4 levels: 32 entries of 16 bytes gathered from the table (1 KB of 32-byte sectors at
-// worst; the table of at most 8 MB stays in the L2, and neighbouring points that share cells find them in the L1),
-// and an MLP of 560 multiply-adds, 1,680 with its gradients. What limits the kernels is the number of instructions that
-// they issue, and how many warps there are to wait for memory. So a warp takes 32 look-ups, gathers with a lane per
-// look-up, hands the features over in shared memory, and does the MLP on tensor cores (warp_mlp.h): 24 steps for what
-// are 256 multiply-adds and 64 loads per lane. The backward pass repeats the look-up and adds 32 times 16 bytes to the
-// table's gradient, one vector reduction each, after sums over neighbouring points in one cell.
+// A look-up with L = 4 levels gathers 32 entries of 16 bytes (1 KB of 32-byte sectors at worst; the table of at most 8
+// MB stays in L2, and neighbouring points share cells in L1) and runs an MLP of 560 multiply-adds, 1,680 with
+// gradients. The kernels are bound by instruction issue and by warps available to hide latency. So a warp takes 32
+// look-ups, gathers with a lane per look-up, passes the features through shared memory, and runs the MLP on tensor
+// cores (warp_mlp.h): 24 steps instead of 256 multiply-adds and 64 loads per lane. The backward pass repeats the
+// look-up and adds 32 times 16 bytes to the table's gradient, one vector reduction each, after summing over
+// neighbouring points in a cell.
 #pragma once
 
 #include "cuda/exact_sums.h"
@@ -26,9 +26,8 @@ template <class S> __device__ Vec3<S> grid_position(const FieldArrays<S>& f, Vec
   return grid_coordinate(x, load3(f.mid), f.half, f.contract);
 }
 
-// Interpolated features at a grid position, to memory; those of missing levels and of look-ups that are not active are
-// 0. All entries of a level are asked for before the first is waited for, and a level's features leave the registers at
-// once.
+// Writes the interpolated features at a grid position; 0 for missing levels and inactive look-ups. All entries of a
+// level are requested before the first is used, and its features are stored at once to free registers.
 template <class S> __device__ void encode(const FieldArrays<S>& f, Vec3<S> c, bool active, S* to) {
   const uint32_t mask = f.hash_mask();
   BT_UNROLL
@@ -50,13 +49,13 @@ template <class S> __device__ void encode(const FieldArrays<S>& f, Vec3<S> c, bo
   }
 }
 
-// Memory of a warp for 32 values of the field. With rows 24 numbers apart the pairs that lanes read as a first factor
-// lie in different banks.
+// Memory of a warp for 32 values of the field. The row stride of 24 avoids bank conflicts between lanes that read pairs
+// of a first factor.
 template <class S> struct ForwardStage {
   enum { kX = 0, kOut = 16, kColumns = 24 };
   alignas(16) S number[kWarp * kColumns];
 };
-// The residual at a point per lane. All 32 lanes take part; those that are not active get the value at features of 0.
+// Evaluates the residual at a point per lane. All 32 lanes take part; inactive ones get the value at features of 0.
 template <class S>
 __device__ Vec3<S> evaluate(const FieldArrays<S>& f, const ForwardMlp<S>& m, Vec3<S> x, bool active, int lane,
                             ForwardStage<S>& stage) {
@@ -69,7 +68,7 @@ __device__ Vec3<S> evaluate(const FieldArrays<S>& f, const ForwardMlp<S>& m, Vec
   const Rows<S> h2 = rectified(layer(h1, m.w2, lane));
   S rho[2][1][4];
   product(h2, m.w3, lane, rho);
-  if (lane % 4 < 2) {  // the other lanes hold columns 4 to 7
+  if (lane % 4 < 2) {  // other lanes hold columns 4 to 7
     BT_UNROLL
     for (int i = 0; i < 4; ++i)
       *reinterpret_cast<Pair<S>*>(row(8 * i + lane / 4) + Stage::kOut +
@@ -79,12 +78,12 @@ __device__ Vec3<S> evaluate(const FieldArrays<S>& f, const ForwardMlp<S>& m, Vec
   return load3(mine + Stage::kOut);
 }
 
-// ---- backward, by warps
+// ---- backward pass, by warps
 
-// Memory of a warp for 32 look-ups: first what layers were given and their gradients and the point, a row per look-up
-// and rows 72 apart, so that a factor's numbers lie in different banks along rows and along columns. Later, in the same
-// place, the gradients of the features, and weights and entries of the corners of a level (two levels take turns).
-// There look-ups 0, 8, 16 and 24 are read together, and every eight of them begin at another bank.
+// Memory of a warp for 32 look-ups. First the layers' inputs and gradients and the point, a row per look-up; the stride
+// of 72 avoids bank conflicts along rows and columns. Later, in the same memory, the gradients of the features, and
+// weights and entries of a level's corners (two levels alternate). Look-ups 0, 8, 16 and 24 are then read together, so
+// each group of eight starts at another bank.
 template <class S> struct Stage {
   enum { kX = 0, kH1 = 16, kG1 = 32, kG2 = 48, kD = 64, kPoint = 68, kColumns = 72 };
   enum { kFeatureRows = 648, kCornerRows = 280 };
@@ -102,9 +101,9 @@ template <class S> struct Stage {
   }
 };
 
-// Adds the table's gradient of 32 look-ups at a level: four groups of eight lanes, a lane per corner, walk along eight
-// look-ups each and add up those in one cell before they go to memory. `ends`: the look-ups whose successor lies in
-// another cell; none where all lie in one.
+// Adds the table's gradient of 32 look-ups at a level: four groups of eight lanes, a lane per corner, go through eight
+// look-ups each and sum those in one cell before writing. `ends`: look-ups whose successor is in another cell; none if
+// all are in one.
 template <class S, bool kExact>
 __device__ void scatter(Stage<S>& stage, int turn, int level, int64_t first_entry, unsigned actives, unsigned ends,
                         int lane, const Adder<S, kExact>& table) {
@@ -127,7 +126,7 @@ __device__ void scatter(Stage<S>& stage, int turn, int level, int64_t first_entr
     if (group == 0 && actives) add(0);
     return;
   }
-  ends |= actives & (0x80808080u | ~(actives >> 1));  // and the last of each group and of all
+  ends |= actives & (0x80808080u | ~(actives >> 1));  // and the last of each group, and of all
   BT_UNROLL
   for (int i = 0; i < 8; ++i) {
     take(group + i);
@@ -137,8 +136,8 @@ __device__ void scatter(Stage<S>& stage, int turn, int level, int64_t first_entr
   }
 }
 
-// The table's gradient, and d loss / d grid position if asked for, of 32 look-ups whose gradients of the features stand
-// in the stage. Lanes that are not active come after the others; their gradients are 0.
+// Adds the table's gradient, and returns d loss / d grid position if requested, for 32 look-ups whose feature gradients
+// are in the stage. Inactive lanes come last; their gradients are 0.
 template <class S, bool kExact>
 __device__ Vec3<S> encode_vjp(const FieldArrays<S>& f, Vec3<S> c, bool active, int lane, Stage<S>& stage,
                               const Adder<S, kExact>& table, bool positions) {
@@ -176,8 +175,8 @@ __device__ Vec3<S> encode_vjp(const FieldArrays<S>& f, Vec3<S> c, bool active, i
   return dc;
 }
 
-// One backward look-up per lane; all 32 lanes take part. Those that are not active come after the others and add
-// nothing. Returns d loss / d x if asked for.
+// Runs one backward look-up per lane; all 32 lanes take part. Inactive lanes come last and add nothing. Returns d loss
+// / d x if requested.
 template <class S, bool kExact>
 __device__ Vec3<S> field_vjp(const FieldArrays<S>& f, const WarpMlp<S>& m, Vec3<S> x, Vec3<S> drho, bool active,
                              int lane, Stage<S>& stage, WeightSums<S>& weights, const Adder<S, kExact>& table,
@@ -185,7 +184,7 @@ __device__ Vec3<S> field_vjp(const FieldArrays<S>& f, const WarpMlp<S>& m, Vec3<
   using At = Stage<S>;
   encode(f, grid_position(f, x), active, stage.row(lane) + At::kX);
   *reinterpret_cast<Entry<S>*>(stage.row(lane) + At::kD) = {{drho.x, drho.y, drho.z, S(0)}};
-  *reinterpret_cast<Entry<S>*>(stage.row(lane) + At::kPoint) = {{x.x, x.y, x.z, S(0)}};  // registers are scarce
+  *reinterpret_cast<Entry<S>*>(stage.row(lane) + At::kPoint) = {{x.x, x.y, x.z, S(0)}};  // saves registers
   __syncwarp();
   const auto column = [&](int first) { return [&stage, first](int p) { return stage.row(p) + first; }; };
   Rows<S> g;
@@ -217,7 +216,7 @@ __device__ Vec3<S> field_vjp(const FieldArrays<S>& f, const WarpMlp<S>& m, Vec3<
   __syncwarp();
   store_rows(g, lane, [&](int p) { return stage.feature_gradients(p); });
   const Vec3<S> dc = encode_vjp(f, grid_position(f, x), active, lane, stage, table, positions);
-  __syncwarp();  // the next look-ups write where these are read
+  __syncwarp();  // before the next look-ups overwrite what is read here
   if (!positions || !active) return {S(0), S(0), S(0)};
   return grid_coordinate_vjp(x, load3(f.mid), f.half, f.contract, dc);
 }
@@ -225,7 +224,7 @@ __device__ Vec3<S> field_vjp(const FieldArrays<S>& f, const WarpMlp<S>& m, Vec3<
 // ---- blocks of a backward pass
 
 template <class S> constexpr int kBackwardWarps = sizeof(S) == 4 ? 4 : 2;  // a warp's stage is 9 KB, or 18 KB in double
-template <class S> constexpr int kBackwardResident = sizeof(S) == 4 ? 4 : 2;  // blocks at a time on a multiprocessor
+template <class S> constexpr int kBackwardResident = sizeof(S) == 4 ? 4 : 2;  // resident blocks per multiprocessor
 
 constexpr int kChunk = 8 * kWarp;  // consecutive points that a warp takes at a time
 
@@ -234,7 +233,7 @@ template <class S> struct BackwardShared {
   Stage<S> stage[kBackwardWarps<S>];
 };
 
-// Sums of the block's warps, in their order, to the block's row of `out`.
+// Adds up the block's warps in order into its row of `out`.
 template <class S>
 __device__ void store_weight_sums(BackwardShared<S>& shared, WeightSums<S>& weights, int warp, int lane, S* out) {
   constexpr int kThreads = kBackwardWarps<S> * kWarp;
@@ -250,7 +249,7 @@ __device__ void store_weight_sums(BackwardShared<S>& shared, WeightSums<S>& weig
   for (int k = threadIdx.x; k < kMlpWeights; k += kThreads) out[int64_t(blockIdx.x) * kMlpWeights + k] = sums[k];
 }
 
-// Blocks of a backward pass over n points. A function of n alone: with it the order of all sums is fixed.
+// Returns the blocks of a backward pass over n points, a function of n alone, which fixes the order of all sums.
 template <class S> int backward_blocks(int64_t n) {
   const int64_t blocks = ceil_div(n, int64_t(kChunk) * kBackwardWarps<S>);
   return int(blocks < 1 ? 1 : blocks > kMostBlocks ? kMostBlocks : blocks);

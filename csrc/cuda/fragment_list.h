@@ -1,16 +1,15 @@
-// The fragment list of a view, and how kernels find their way in it.
+// The fragment list of a view, and access to it.
 //
 // A pair is a surfel and a tile that it may touch. Pairs have two orders:
-//   list order  by tile, then front to back: the order of the fragments. A pair's fragments are one run of the list,
-//               offsets[k] to offsets[k + 1] - 1, its tile's pairs are tile_pairs[tile] to tile_pairs[tile + 1] - 1.
-//   slots       by surfel, front to back, then by tile. slot[k] is the slot of pair k; the surfel order[r] has the
-//   slots
-//               slot_start[r] to slot_start[r + 1] - 1. A kernel writes what a pair adds to its surfel into the pair's
-//               slot, and sum_slots adds a surfel's slots in order: no atomics, and the same bits every time.
+//   list order  by tile, then front to back, as the fragments. A pair's fragments are offsets[k] to offsets[k + 1] - 1,
+//               a tile's pairs tile_pairs[tile] to tile_pairs[tile + 1] - 1.
+//   slots       by surfel, front to back, then by tile. slot[k] is the slot of pair k; surfel order[r] has the slots
+//               slot_start[r] to slot_start[r + 1] - 1. A kernel writes a pair's contribution to its surfel into the
+//               pair's slot, and sum_slots adds a surfel's slots in order: no atomics, bitwise reproducible.
 //
-// A tile is a block of 8 warps, one warp per 8 x 4 pixels, one lane per pixel. masks[warp][k] has a bit for every pixel
-// of the warp that blends pair k; a run has the fragments of warp 0 first, in a warp by lane. So a fragment's offset is
-// offsets[k] + the bits of lower warps + the bits of lower lanes, and no kernel has to search.
+// A tile is a block of 8 warps, one warp per 8 x 4 pixels, one lane per pixel. masks[warp][k] has a bit for each pixel
+// of the warp that blends pair k; a pair's fragments are ordered by warp, then by lane. So a fragment's offset is
+// offsets[k] + the bits of lower warps + the bits of lower lanes, without a search.
 #pragma once
 
 #include "core/bounds.h"
@@ -22,7 +21,7 @@ namespace bt::cuda {
 constexpr int kTileThreads = kTile * kTile, kTileWarps = kTileThreads / kWarp;
 constexpr int kWarpWidth = 8, kWarpHeight = 4;
 
-// Pairs are counted in 32 bits.
+// Checks that pairs can be counted in 32 bits.
 template <class R> void check_pairs(R& r, int64_t pairs) {
   if (pairs > INT32_MAX) r.refuse("more than 2^31 pairs of surfel and tile");
 }
@@ -33,11 +32,11 @@ struct Pairs {
   const int32_t* surfel;                  // [pairs] list order
   const int32_t* slot;                    // [pairs] list order
   const uint32_t* masks;                  // [kTileWarps, pairs] list order
-  const int64_t* offsets;                 // [pairs + 1] list order; null: the fragments are not listed
+  const int64_t* offsets;                 // [pairs + 1] list order; null: fragments are not listed
   const int64_t* tile_pairs;              // [tiles + 1]
   const int32_t* order;                   // [surfels] front to back
   const int64_t* slot_start;              // [surfels + 1]
-  int64_t fragments;                      // -1: not listed, so that no list belongs to it
+  int64_t fragments;                      // -1: not listed
   static constexpr bool kHasIds = false;  // kernels read them from the list
   int64_t tiles() const { return tiles_of(width, height); }
   bool fits(int64_t n, int wide, int high) const { return n == surfels && wide == width && high == height; }
@@ -57,7 +56,7 @@ struct Pairs {
   }
 };
 
-// Position of a thread of a tile's block.
+// Position of a thread in a tile's block.
 struct TileThread {
   int warp, lane;
   int left, top;  // first pixel of the warp
@@ -73,7 +72,7 @@ __device__ inline TileThread tile_thread(int width) {
   return s;
 }
 
-// The first 12 columns of a row of geom, by the widest loads: all lanes of a warp read the same row.
+// Loads the first 12 columns of a row of geom with the widest loads, as all lanes of a warp read the same row.
 constexpr int kShape = kBeta + 1;
 template <class S> __device__ inline void load_shape(const S* row, S* g) {
 #if defined(__CUDACC__)
@@ -93,7 +92,7 @@ template <class S> __device__ inline void load_shape(const S* row, S* g) {
   g[kArea] = row[kArea];
 }
 
-// Rows of geom of up to 32 pairs' surfels, in shared memory.
+// Rows of geom for up to 32 pairs, in shared memory.
 template <class S> struct SurfelRows {
   struct alignas(16) Row {
     S g[kGeom];
@@ -101,7 +100,7 @@ template <class S> struct SurfelRows {
   Row rows[kWarp];
   int32_t ids[kWarp];
 
-  // Those of surfel[begin] to surfel[end - 1], by all threads of a tile's block; a barrier has to follow.
+  // Loads the rows of surfel[begin] to surfel[end - 1], by all threads of a tile's block; a barrier must follow.
   __device__ void load(const S* geom, const int32_t* surfel, int begin, int end) {
     constexpr int kLoaders = kTileThreads / kWarp;  // threads per row
     static_assert(kGeom % kLoaders == 0);
@@ -114,7 +113,7 @@ template <class S> struct SurfelRows {
   }
 };
 
-// Puts the sums of a surfel's pairs: columns of geom, those of the absolute gradients between.
+// Writes the sums of a surfel's pairs: columns of geom, and in between the absolute gradients.
 template <class S> struct StoreGeomGradient {
   S *dgeom, *absgrad;
   __device__ void operator()(int64_t surfel, int column, S sum) const {
@@ -123,17 +122,16 @@ template <class S> struct StoreGeomGradient {
   }
 };
 
-// Visits the pairs of a tile that have a fragment in the calling warp, back to front. Every lane calls
-// load(k, surfel, mine, i) and later use(what load gave): `mine` says whether the lane's pixel has a fragment of pair
-// k, i is its offset in the list. kAhead loads are under way before the first is used: a warp has about ten fragments
-// of a pair, far too few bytes to keep the memory busy one at a time. Warps go their own way: nothing waits for the
-// block.
+// Visits the pairs of a tile that have a fragment in the calling warp, back to front. Every lane calls load(k, surfel,
+// mine, i) and later use(result of load): `mine` is true if the lane's pixel has a fragment of pair k, i is its index
+// in the list. kAhead loads are in flight before the first is used, as a warp has only about ten fragments of a pair.
+// Warps do not wait for the block.
 template <int kAhead, class Load, class Use>
 __device__ inline void each_fragment_back(const Pairs& p, const TileThread& s, Load&& load, Use&& use) {
   const int64_t begin = p.tile_pairs[blockIdx.x], end = p.tile_pairs[blockIdx.x + 1];
   const int64_t batches = ceil_div(end - begin, kWarp);
   for (int64_t b = 0; b < batches; ++b) {
-    // one lane per pair: marks, and where the warp's fragments begin
+    // one lane per pair: masks, and first fragments of the warp
     const int64_t first = begin + kWarp * (batches - 1 - b), own = first + s.lane;
     uint32_t mark = 0;
     int32_t id = 0;
@@ -159,18 +157,18 @@ __device__ inline void each_fragment_back(const Pairs& p, const TileThread& s, L
   }
 }
 
-// A stretch of the list that a tile's block takes through shared memory: the next pairs, 32 at most, whose fragments
-// are no more than kHeld. A warp has about ten fragments of a pair, the block some hundreds of a stretch: all of its
-// threads read, work out or write them one after the other, and lanes find those of their pixels by the masks.
+// A chunk of the list that a tile's block processes in shared memory: the next pairs, at most 32, with at most kHeld
+// fragments. A warp has about ten fragments of a pair, the block some hundreds of a chunk: all its threads read,
+// compute or write them in sequence, and lanes find those of their pixels by the masks.
 template <int kHeld> class Stretch {
   static_assert(kHeld >= kTileThreads, "no pair has more than a tile's pixels");
 
  public:
-  int pairs, count;  // from `first` on; of their fragments
-  int64_t base;      // the first of these in the list
+  int pairs, count;  // pairs from `first` on, and their fragments
+  int64_t base;      // index of the first fragment
 
-  // All threads of the block. Then a barrier, `find_own`, and another barrier before the next stretch: its warps write
-  // to `bits` at once.
+  // By all threads of the block. A barrier, `find_own` and another barrier must come before the next chunk, whose warps
+  // write to `bits` immediately.
   __device__ Stretch(const Pairs& p, const TileThread& s, int64_t first, int64_t end, int (&bits)[kTileWarps][kWarp])
       : base(p.offsets[first]), bits_(bits) {
     const int64_t own = first + s.lane;  // one lane per pair
@@ -183,13 +181,13 @@ template <int kHeld> class Stretch {
     if (s.lane >= pairs) mark_ = 0;
     bits[s.warp][s.lane] = __popc(mark_);
   }
-  // Offsets of the warp's own fragments of each pair.
+  // Computes the offsets of the warp's fragments of each pair.
   __device__ void find_own(const TileThread& s) {
     BT_UNROLL
     for (int w = 0; w < kTileWarps - 1; ++w) from_ += w < s.warp ? bits_[w][s.lane] : 0;
   }
-  // After it: use(j, i, mine) for the pairs first + j that have a fragment in the calling warp, front to back: fragment
-  // base + i is that of the lane's pixel, if it is `mine`.
+  // Then calls use(j, i, mine) for the pairs first + j with a fragment in the calling warp, front to back: fragment
+  // base + i is that of the lane's pixel, if `mine`.
   template <class Use> __device__ void each_pair(const TileThread& s, Use&& use) const {
     for (unsigned todo = __ballot_sync(kFullMask, mark_ != 0); todo;) {
       const int j = take_first(todo);
@@ -197,8 +195,7 @@ template <int kHeld> class Stretch {
       use(j, __shfl_sync(kFullMask, from_, j) + count_below(taken, s.lane), bool(taken >> s.lane & 1u));
     }
   }
-  // each(i, base + i) by all threads; a warp begins at a multiple of 32 of the list, so that it reads and writes whole
-  // sectors.
+  // Calls each(i, base + i) by all threads; a warp begins at a multiple of 32 of the list, to access whole sectors.
   template <class Each> __device__ void each_fragment(Each&& each) const {
     BT_UNROLL_BY(1)
     for (int i = int(threadIdx.x) - int(base % kWarp); i < count; i += kTileThreads)
@@ -207,12 +204,12 @@ template <int kHeld> class Stretch {
 
  private:
   int (&bits_)[kTileWarps][kWarp];  // fragments of a warp and a pair
-  uint32_t mark_;                   // of the lane's pair: the warp's pixels that blend it
-  int from_;                        // where the pair begins, then the warp's fragments of it
+  uint32_t mark_;                   // the warp's pixels that blend the lane's pair
+  int from_;                        // start of the pair, then of the warp's fragments of it
 };
 
-// The row of a pixel of an image. A division of integers takes 25 instructions; the product with the reciprocal is off
-// by one at most, below 2^21 rows.
+// Computes the row of an image's pixel. Integer division takes 25 instructions; the product with the reciprocal is off
+// by at most one, below 2^21 rows.
 class RowOf {
  public:
   __device__ explicit RowOf(int width) : width_(width), inverse_(1.0f / float(width)) {}
@@ -226,8 +223,7 @@ class RowOf {
   float inverse_;
 };
 
-// The pairs that a tile's block goes through. Those behind all tiles' have no fragments, but slots: they are left to
-// the last block.
+// Pairs of a tile's block. Those behind all tiles' have no fragments, only slots, and go to the last block.
 struct PairRange {
   int64_t first, end;
 };
@@ -235,7 +231,7 @@ __device__ inline PairRange block_pairs(const Pairs& p) {
   return {p.tile_pairs[blockIdx.x], blockIdx.x + 1 < gridDim.x ? p.tile_pairs[blockIdx.x + 1] : p.pairs};
 }
 
-// A tile's part of an image, in shared memory. Counts of channels are odd, so that lanes hit different banks.
+// A tile's part of an image, in shared memory. Odd channel counts avoid bank conflicts.
 class TilePart {
  public:
   __device__ explicit TilePart(const Pairs& p)
@@ -245,7 +241,7 @@ class TilePart {
         columns_(min_(kTile, p.width - left_)),
         rows_(min_(kTile, p.height - top_)),
         row_of_(p.width) {}
-  // By all threads of the block; a barrier has to follow.
+  // Loads by all threads of the block; a barrier must follow.
   template <int kChannels, class S> __device__ void load(const S* image, S* to) const {
     for (int j = int(threadIdx.x); j < kTileThreads * kChannels; j += kTileThreads) {
       const int row = j / (kTile * kChannels), column = j - row * (kTile * kChannels);
@@ -253,7 +249,7 @@ class TilePart {
         to[j] = image[(int64_t(top_ + row) * width_ + left_) * kChannels + column];
     }
   }
-  // Offset of a pixel of the image in it.
+  // Returns the index of an image's pixel in it.
   __device__ int at(int32_t pixel) const {
     const int row = row_of_(pixel);
     return (row - top_) * kTile + (pixel - row * width_ - left_);
@@ -264,11 +260,11 @@ class TilePart {
   RowOf row_of_;
 };
 
-// The other way through the list: kRunLanes lanes per pair, which take the fragments of its run in turns. Fragments of
-// a pair are about thirty on average: 16 lanes are busier than 32, and share a row of geom and one sum.
+// Traversal by pair: kRunLanes lanes per pair take the fragments of its run in turn. A pair has about thirty fragments
+// on average: 16 lanes are better utilised than 32, and share a row of geom and one sum.
 constexpr int kRunLanes = 16, kRunThreads = 128;
 struct Run {
-  bool some;  // false behind the last pair: the lane has nothing to do but takes part in warp steps
+  bool some;  // false after the last pair: the lane is idle but takes part in warp operations
   int lane;   // of kRunLanes
   int64_t k, begin, end;
 };
@@ -282,9 +278,9 @@ __device__ inline Run run(const Pairs& p) {
 }
 inline dim3 run_blocks(const Pairs& p) { return dim3(unsigned(ceil_div(p.pairs, kRunThreads / kRunLanes))); }
 
-// Sums of kColumns values each over the lanes of a run: lane c % kColumns gets that of column c. Each step halves both
-// the lanes that differ and the columns that a lane still keeps: 15 shuffles for 16 columns instead of 64. By
-// recursion: nvcc does not unroll a loop whose bounds halve, and indexes its registers.
+// Sums kColumns values over the lanes of a run: lane c % kColumns gets column c. Each step halves both the lanes that
+// differ and the columns a lane keeps: 15 shuffles for 16 columns instead of 64. Recursive, as nvcc does not unroll a
+// loop whose bounds halve, and would index registers.
 template <int kStep, class S, int kColumns> __device__ __forceinline__ void fold_columns(S (&v)[kColumns], int lane) {
   const bool upper = lane & kStep;
   BT_UNROLL
@@ -305,9 +301,9 @@ template <int kColumns, class S> __device__ __forceinline__ S sum_over_run(S (&v
   return v[0];
 }
 
-// put(surfel, column, sum) for every surfel and column of partial [pairs, kColumns], by slot. One warp per surfel:
-// lanes are columns, and groups of lanes take slots in turns. A surfel with more than kLong slots, a disc before the
-// camera, say, would keep its warp long after all others: it is left to the whole block.
+// Calls put(surfel, column, sum) for every surfel and column of partial [pairs, kColumns], summed by slot. One warp per
+// surfel: lanes are columns, groups of lanes take slots in turn. Surfels with more than kLong slots, such as a disc in
+// front of the camera, are summed by the whole block, or their warps would finish last.
 constexpr int kSlotThreads = 256, kSlotWarps = kSlotThreads / kWarp, kLong = 64;
 template <int kColumns, class S>
 __device__ inline S sum_slots_of(const S* partial, int64_t begin, int64_t end, int worker, int workers) {
@@ -343,7 +339,7 @@ __global__ void __launch_bounds__(kSlotThreads) sum_slots_kernel(Pairs p, const 
       for (int w = 0; w < kSlotWarps; ++w) sum += shares[w][lane];
       put(p.order[r], lane, sum);
     }
-    __syncthreads();  // before the next surfel's shares
+    __syncthreads();  // before the next surfel's sums
   }
 }
 template <int kColumns, class S, class Put> void sum_slots(const Pairs& p, const S* partial, Put put, Stream stream) {

@@ -1,5 +1,5 @@
-// The CUDA kernels as functions of an operation's arguments (csrc/ops), all on the device, and a stream. Nothing here
-// allocates, waits for the device or knows Python; the caller gives all memory, also the working memory.
+// The CUDA kernels as functions of an operation's arguments (csrc/ops), all on the device, and a stream. They do not
+// allocate, wait for the device or depend on Python; the caller provides all memory.
 #pragma once
 
 #include <string>
@@ -12,17 +12,17 @@
 
 namespace bt::cuda {
 
-// Reason why the kernels cannot run on CUDA device number `device`, and the remedy; empty when they can. Runs nothing.
+// Explains why the kernels cannot run on CUDA device number `device`, with the remedy; empty if they can. Runs nothing.
 std::string device_problem(int device);
 
 template <class S> void project_forward(const ProjectForward<S>& a, Stream stream);
 template <class S> void project_backward(const ProjectBackward<S>& a, Stream stream);
 
-// Visibility: nothing waits. Where a count decides an allocation, the caller reads the last entry of slot_start or
+// Visibility without waiting. If a count decides an allocation, the caller reads the last entry of slot_start or
 // offsets, allocates, and calls the next function.
 
-// Orders the surfels front to back and counts their tiles: order [n] and slot_start [n + 1] are written; the number of
-// pairs is slot_start[n].
+// Sorts the surfels front to back and counts their tiles: writes order [n] and slot_start [n + 1]; slot_start[n] is the
+// number of pairs.
 template <class S> struct BinCount {
   View<S> view;
   int32_t* order;
@@ -39,9 +39,9 @@ template <class S> struct BinCount {
 template <class S> int64_t bin_count_workspace(int64_t n);
 template <class S> void bin_count(const BinCount<S>& a, Stream stream);
 
-// Lists the pairs (below 2^31): slot [pairs], surfel [pairs] and tile_pairs [tiles + 1] are written, and differing [1]:
-// by how many pairs the lists differ from the counts, 0 unless a compiler rounds one formula in two ways. A pair that
-// was counted and is not there stands behind those of the tiles.
+// Lists the pairs (below 2^31): writes slot [pairs], surfel [pairs], tile_pairs [tiles + 1], and differing [1], the
+// difference between listed and counted pairs, 0 unless a compiler rounds a formula in two ways. Counted pairs that are
+// not found come after those of the tiles.
 template <class S> struct BinFill {
   View<S> view;
   const int32_t* order;
@@ -67,8 +67,8 @@ template <class S> struct BinFill {
 int64_t bin_fill_workspace(int64_t pairs, int width, int height);
 template <class S> void bin_fill(const BinFill<S>& a, Stream stream);
 
-// Finds which pixels blend which pairs: masks [kTileWarps, pairs] and offsets [pairs + 1] are written; the number
-// of fragments is offsets[pairs].
+// Finds which pixels blend which pairs: writes masks [kTileWarps, pairs] and offsets [pairs + 1]; offsets[pairs] is the
+// number of fragments.
 template <class S> struct TraceMark {
   View<S> view;
   AlphaTiles<S> alpha;
@@ -112,7 +112,7 @@ template <class S> void trace_backward(const TraceBackward<S, Pairs>& a, Stream 
 template <class S> void blend_forward(const BlendForward<S, Pairs>& a, Stream stream);
 template <class S> void blend_backward(const BlendBackward<S, Pairs>& a, Stream stream);
 void masked_counts(const MaskedCounts<Pairs>& a, Stream stream);
-// The layout of the fragments whose keep [F] is not 0. Written: masks, and how many fragments each pair then has.
+// Selects the fragments with keep [F] not 0. Writes masks, and the number of fragments of each pair.
 struct SelectPairs {
   Pairs layout;
   const uint8_t* keep;
@@ -128,9 +128,9 @@ struct SelectPairs {
 };
 void select_fragments(const SelectPairs& a, Stream stream);
 
-// The picture of a view without a list of fragments: `trace` and `blend` in one, opaque or with alpha texels, without
-// maps. Written: image [height, width, kImageChannels], as of BlendForward, and what the backward pass takes: masks and
-// cuts [kTileWarps, pairs] and each pixel's transmittance [height, width]. cuts may be null.
+// Draws a view without a fragment list: `trace` and `blend` in one, opaque or with alpha texels, without maps. Writes
+// image [height, width, kImageChannels] as BlendForward, and for the backward pass masks and cuts [kTileWarps, pairs]
+// and each pixel's transmittance [height, width]. cuts may be null.
 template <class S> struct RasterizeForward {
   View<S> view;
   AlphaTiles<S> alpha;
@@ -161,8 +161,8 @@ template <class S> struct RasterizeForward {
 };
 template <class S> void rasterize_forward(const RasterizeForward<S>& a, Stream stream);
 
-// Gradients as of TraceBackward and BlendBackward, without those of fragments. moves: coordinates on texels move
-// surfels. texel_sums [texels, 4]: working memory where texels move or their alphas have gradients.
+// Gradients as of TraceBackward and BlendBackward, except those of fragments. moves: texel coordinates pass gradients
+// to surfels. texel_sums [texels, 4]: working memory if texels move or their alphas have gradients.
 template <class S> struct RasterizeBackward {
   View<S> view;
   S rim;

@@ -1,4 +1,4 @@
-// The walk of a tile's block through the pairs of its tile, front to back, which finds the pixels that blend each.
+// Front-to-back pass of a tile's block over its pairs, which finds the pixels that blend each.
 #pragma once
 
 #include "core/kernel.h"
@@ -9,7 +9,7 @@
 
 namespace bt::cuda {
 
-// True where the support or the low pass of a surfel without a box may reach the warp's pixels.
+// Returns true if the support or low pass of a surfel without a box may reach the warp's pixels.
 template <class Kernel, class S> __device__ bool reached_by_warp(const S* g, const TileThread& s) {
   if (filtered<Kernel>(g)) return true;
   const S x = S(s.left) + S(0.5 * kWarpWidth) - g[kCx], y = S(s.top) + S(0.5 * kWarpHeight) - g[kCy];
@@ -19,9 +19,9 @@ template <class Kernel, class S> __device__ bool reached_by_warp(const S* g, con
   return r.support || r.centre;
 }
 
-// Writes the masks of a tile's pairs and, with kAlpha and where not null, `cuts`: those of the fragments whose sigma
-// alpha texels have multiplied. blended(surfel, g, fragment, weight) for every fragment, by the lane of its pixel.
-// Returns the transmittance behind all of them.
+// Writes the masks of a tile's pairs and, with kAlpha and unless null, `cuts`: the fragments whose sigma alpha texels
+// multiplied. Calls blended(surfel, g, fragment, weight) for every fragment, in the lane of its pixel. Returns the
+// remaining transmittance.
 template <class Kernel, bool kAlpha, class S, class Blended>
 __device__ __forceinline__ S mark_pairs(const View<S>& view, const AlphaTiles<S>& alpha, int64_t pairs,
                                         const int32_t* surfel, const int64_t* tile_pairs, uint32_t* masks,
@@ -31,10 +31,10 @@ __device__ __forceinline__ S mark_pairs(const View<S>& view, const AlphaTiles<S>
   int64_t first = tile_pairs[blockIdx.x];
   uint32_t* row = masks + s.warp * pairs;
   const S x = pixel_centre<S>(s.x), y = pixel_centre<S>(s.y);
-  bool open = s.x < view.width && s.y < view.height;  // the pixel still takes light
+  bool open = s.x < view.width && s.y < view.height;  // the pixel is not ended
   S transmittance = S(1);
   for (; first < end && __any_sync(kFullMask, open); first += kWarp) {
-    // one lane per pair: does its box meet the warp's pixels, or do these reach it where it has none?
+    // one lane per pair: does its box meet the warp's pixels, or without a box, does it reach them?
     const int64_t own = first + s.lane;
     int32_t id = 0;
     bool meets = false;
@@ -42,7 +42,7 @@ __device__ __forceinline__ S mark_pairs(const View<S>& view, const AlphaTiles<S>
       id = surfel[own];
       const S* g = view.geom + int64_t(id) * kGeom;
       const S rx = view.radii[2 * int64_t(id)], ry = view.radii[2 * int64_t(id) + 1];
-      // the centre of a disc without a box may lie further away than its radii say
+      // the centre of a disc without a box may lie beyond its radii
       if (max_(rx, ry) >= S(kBoxless))
         meets = reached_by_warp<Kernel>(g, s);
       else
@@ -57,7 +57,7 @@ __device__ __forceinline__ S mark_pairs(const View<S>& view, const AlphaTiles<S>
       const int64_t drawn = __shfl_sync(kFullMask, id, j);
       load_shape(view.geom + drawn * kGeom, g);
       const T dx = T(x - g[kCx]), dy = T(y - g[kCy]);
-      // a cheap test first: an open pixel in the support or near the centre
+      // a cheap test first: any open pixel in the support or near the centre
       const bool close = near_centre(dx, dy);
       const bool reached = filtered<Kernel>(g) ? in_support(filtered_hit<S, T>(g, dx, dy))
                                                : close || in_support(planes<S, T>(g, dx, dy));

@@ -1,4 +1,4 @@
-// Projection of all surfels: one thread per surfel.
+// Projection of surfels, one thread each.
 #include "core/footprint.h"
 #include "core/visibility.h"
 #include "cuda/kernels.h"

@@ -1,14 +1,13 @@
-// The picture of a view in one kernel, and its backward pass in one more: no fragment is written to memory.
+// Images of views in one kernel, and the backward pass in another, without writing fragments to memory.
 //
-// Forward is the walk of trace_mark with shading and blending in it; what it leaves for the backward pass is a mask per
-// warp and pair, and each pixel's transmittance. Backward a block goes back through its tile's pairs, as many at a time
-// as have room for their fragments in shared memory, in four steps:
-//   - a walk, one lane per pixel, evaluates the fragments again and lists them;
-//   - kRunLanes lanes a turn, most of them busy, shade them, for the gradients of weights and coordinates;
-//   - a walk turns gradients of weights into those of sigma, with the light from behind in a register;
+// Forward is the pass of trace_mark with shading and blending; it leaves for the backward pass a mask per warp and
+// pair, and each pixel's transmittance. Backward, a block goes back through its tile's pairs, as many at a time as
+// their fragments fit into shared memory, in four steps:
+//   - a pass with one lane per pixel recomputes the fragments and lists them;
+//   - kRunLanes lanes per turn, most of them busy, shade them, for the gradients of weights and coordinates;
+//   - a pass turns gradients of weights into those of sigma, with the sum over fragments behind in a register;
 //   - turns again add up the gradients of surfels, colours and texels.
-// A pair of many fragments takes many turns, of which every run of lanes takes its share; their sums are added in
-// order.
+// A pair with many fragments takes many turns, shared among runs of lanes; their sums are added in order.
 #include "cuda/kernels.h"
 #include "cuda/mark.h"
 #include "cuda/texel_sums.h"
@@ -37,14 +36,14 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 4) forward_
   a.transmittance[pixel] = behind;
 }
 
-// The last pairs before `end`, 32 at most, whose fragments are no more than kHeld: a lane has each, the last lane the
-// last. All warps of the block come to the same.
+// The last pairs before `end`, at most 32, with at most kHeld fragments: one per lane, the last lane has the last. All
+// warps of the block get the same.
 template <int kHeld> struct LastPairs {
   static_assert(kHeld >= kTileThreads, "no pair has more than a tile's pixels");
-  int first_lane;       // that has a pair
-  int own, begin;       // of the lane's pair: how many, and where they begin among these
-  uint32_t mark, cuts;  // of the lane's pair: the warp's pixels that blend it, and those of which alpha texels cut it
-  int from;             // where the warp's fragments of the lane's pair begin
+  int first_lane;       // first lane with a pair
+  int own, begin;       // fragments of the lane's pair, and their start among these
+  uint32_t mark, cuts;  // the warp's pixels that blend the lane's pair, and those where alpha texels multiplied sigma
+  int from;             // start of the warp's fragments of the lane's pair
 
   // Pairs from `listed` on have no masks.
   __device__ LastPairs(const Pairs& p, const uint32_t* cut_masks, const TileThread& s, int64_t begin_pair,
@@ -65,8 +64,8 @@ template <int kHeld> struct LastPairs {
     begin = before - __shfl_sync(kFullMask, before, first_lane), from += begin;
     if (s.lane < first_lane) mark = 0, own = 0;
   }
-  // use(j, i, mine, cut) for the pairs that have a fragment in the calling warp, back to front: lane j has the pair, i
-  // is the fragment of the lane's pixel, if it is `mine`.
+  // Calls use(j, i, mine, cut) for the pairs with a fragment in the calling warp, back to front: lane j has the pair, i
+  // is the fragment of the lane's pixel, if `mine`.
   template <class Use> __device__ void each_pair_back(const TileThread& s, Use&& use) const {
     for (unsigned todo = __ballot_sync(kFullMask, mark != 0); todo;) {
       const int j = take_last(todo);
@@ -77,22 +76,22 @@ template <int kHeld> struct LastPairs {
   }
 };
 
-// A fragment's pixel in the tile, and whether channels of its colour are above 0, alpha has cut it, it shows texels.
+// A fragment's pixel in the tile, and flags: colour channels above 0, multiplied by alpha, textured.
 enum FragmentBits { kPixel = kTileThreads - 1, kOpenRed = kTileThreads, kCut = 8 * kOpenRed, kTextured = 2 * kCut };
 
-// The fragments of LastPairs, and whose turn it is: kRunLanes of a pair each.
+// The fragments of LastPairs, and turns of kRunLanes of a pair each.
 template <class S> struct Held : SurfelRows<S> {
   static constexpr int kFragments = sizeof(S) == 8 ? 320 : 1024, kTurns = kFragments / kRunLanes + kWarp;
   static constexpr int kColors = 4;  // sums of a pair for the view colour, the last unused
   S gradient[kTileThreads * kImageChannels];
-  S weight[kFragments], u[kFragments], v[kFragments], sigma[kFragments];  // sigma as it is listed
-  S dsigma[kFragments], du[kFragments], dv[kFragments];                   // first dL/dweight
+  S weight[kFragments], u[kFragments], v[kFragments], sigma[kFragments];  // sigma as listed
+  S dsigma[kFragments], du[kFragments], dv[kFragments];                   // dsigma holds dL/dweight first
   S sums[kTurns * kTraceSums], color_sums[kTurns * kColors];
   int32_t bits[kFragments], begin[kWarp], count[kWarp], first_turn[kWarp];
   uint8_t pair[kTurns];
   int turns;
 
-  // By one warp.
+  // Assigns turns, by one warp.
   __device__ void make_turns(const LastPairs<kFragments>& part, int lane) {
     const int own = (part.own + kRunLanes - 1) / kRunLanes;
     const int first = sum_below(own, lane);
@@ -100,8 +99,7 @@ template <class S> struct Held : SurfelRows<S> {
     for (int t = first; t < first + own; ++t) pair[t] = uint8_t(lane);
     if (lane == kWarp - 1) turns = first + own;
   }
-  // By all threads: take(turn, j, i, mine), the same number of times in all lanes of a warp; `turn` may be behind the
-  // last.
+  // Calls take(turn, j, i, mine) by all threads, equally often in all lanes of a warp; `turn` may be past the last.
   template <class Take> __device__ void each_turn(Take&& take) const {
     constexpr int kWorkers = kTileThreads / kRunLanes;
     const int lane = int(threadIdx.x) % kRunLanes, worker = int(threadIdx.x) / kRunLanes;
@@ -112,7 +110,7 @@ template <class S> struct Held : SurfelRows<S> {
       take(turn, j, begin[j] + at, at < count[j]);
     }
   }
-  // Writes the sums of the turns of each pair, kColumns of them, to its slot.
+  // Writes the sums of each pair's turns, kColumns numbers, to its slot.
   template <int kColumns>
   __device__ void put(const S* of_turns, const int32_t* slots, int first_lane, S* partial) const {
     for (int c = int(threadIdx.x); c < kWarp * kColumns; c += kTileThreads) {
@@ -145,7 +143,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 3) backward
   int64_t end = last;
   while (end > first) {
     const LastPairs<Held<S>::kFragments> part(p, kAlpha ? a.cuts : nullptr, s, first, listed, end);
-    const int64_t lanes = end - kWarp;  // the pair of lane 0
+    const int64_t lanes = end - kWarp;  // pair of lane 0
     end -= kWarp - part.first_lane;
     if (s.warp == 0) held.make_turns(part, s.lane);
     held.load(a.view.geom, p.surfel + lanes, part.first_lane, kWarp);
@@ -157,7 +155,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 3) backward
       const Fragment<T> f =
           fragment<Kernel>(g, a.view.near, dx, dy, __any_sync(kFullMask, mine && near_centre(dx, dy)));
       if (!mine) return;
-      // the mark found at least that much, perhaps rounded otherwise
+      // the forward pass found at least that much, perhaps rounded differently
       S sigma = max_(plain(f.sigma), S(kAlphaMin));
       if (kAlpha && is_cut) {
         const AlphaPatch<S> patch(a.alpha, held.ids[j]);
@@ -250,7 +248,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 3) backward
     __syncthreads();
     held.template put<kTraceSums>(held.sums, p.slot + lanes, part.first_lane, a.partial);
     held.template put<kColors>(held.color_sums, p.slot + lanes, part.first_lane, a.color_partial);
-    __syncthreads();  // before the next ones are held
+    __syncthreads();  // before the next chunk
   }
 }
 
@@ -264,7 +262,7 @@ template <class S> struct StoreColorGradient {
   }
 };
 
-// A step of the texel's colour, and the gradient of its alpha.
+// Steps on the texel's colour, and writes the gradient of its alpha.
 template <class S> struct PutTexel {
   MoveTexel<S, false> color;
   S* dalpha;

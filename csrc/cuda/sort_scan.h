@@ -1,4 +1,4 @@
-// Sorting and scanning by CUB; on the host plain loops with the same contract.
+// Sorting and scanning by CUB, or on the host by plain loops with the same contract.
 #pragma once
 
 #include <cstdint>
@@ -9,7 +9,7 @@
 
 namespace bt::cuda {
 
-// Unsigned integers in the order of the reals; the largest is no real's.
+// Unsigned integers ordered like the reals; the largest is no real's key.
 template <class S> struct SortKey;
 template <> struct SortKey<float> {
   using type = uint32_t;

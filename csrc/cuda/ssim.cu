@@ -1,7 +1,7 @@
-// SSIM and its gradient, separable, one channel at a time. A block takes a tile of windows: the pixels under it go to
-// shared memory once, are filtered along the rows, then down the columns, each thread keeping its part of a column in
-// registers. At 88 bytes and some 400 operations per value for both passes, memory and arithmetic are about even on an
-// H200; what is read twice, at the rims of tiles, comes from the L2.
+// SSIM and its gradient, separable, one channel at a time. A block takes a tile of windows: its pixels are loaded into
+// shared memory once, filtered along rows, then along columns, each thread keeping its part of a column in registers.
+// At 88 bytes and about 400 operations per value for both passes, memory and arithmetic are about balanced on an H200;
+// pixels read twice, at tile rims, come from L2.
 #include "core/ssim.h"
 #include "cuda/kernels.h"
 #include "cuda/warp.h"
@@ -11,7 +11,7 @@ namespace bt::cuda {
 namespace {
 constexpr int kTaps = kSsimTaps, kRim = kTaps - 1;
 constexpr int kWide = 32, kRows = 4;  // a tile is 32 columns; a thread takes 4 rows of one
-template <class S> constexpr int kThreads = sizeof(S) == 4 ? 128 : 64;  // as many as the shared memory of 48 KB allows
+template <class S> constexpr int kThreads = sizeof(S) == 4 ? 128 : 64;  // as 48 KB of shared memory allow
 template <class S> constexpr int kHigh = kThreads<S> / kWide * kRows;
 
 template <class S> struct Moments {
@@ -73,7 +73,7 @@ __global__ void __launch_bounds__(kThreads<S>)
   if (thread == 0) sums[(int64_t(channel) * gridDim.y + blockIdx.y) * gridDim.x + blockIdx.x] = sum;
 }
 
-// Adds up the blocks in an order that depends on their number alone.
+// Adds up the blocks in a fixed order.
 constexpr int kSumThreads = 256;
 template <class S>
 __global__ void __launch_bounds__(kSumThreads) mean_kernel(int64_t n, const double* sums, double count, S* value) {
@@ -89,7 +89,7 @@ template <class S> struct Parts {
   S row[3][kHigh<S> + kRim][kWide];
 };
 
-// The transposed filter: a pixel gets from the windows up to 10 pixels above and left of it.
+// Applies the transposed filter: a pixel receives from the windows up to 10 pixels above and left of it.
 template <class S>
 __global__ void __launch_bounds__(kThreads<S>)
     gradient_kernel(int height, int width, int channels, SsimWindow<S> window, const S* __restrict__ a,

@@ -1,4 +1,4 @@
-// Alpha texels on the device: the cut of a fragment's sigma, and the mark in its v.
+// Alpha texels on the device: multiplication of a fragment's sigma, and the mark in v.
 #pragma once
 
 #include <cstring>
@@ -8,7 +8,7 @@
 
 namespace bt::cuda {
 
-// v with the last bit of its mantissa set or cleared: whether the fragment's sigma was multiplied.
+// v with the last mantissa bit set or cleared, which marks a multiplied sigma.
 template <class S> using BitsOf = std::conditional_t<sizeof(S) == 4, uint32_t, uint64_t>;
 template <class S> __device__ BitsOf<S> bits_of(S v) {
   BitsOf<S> bits;
@@ -22,8 +22,8 @@ template <class S> __device__ S with_mark(S v, bool mark) {
   return v;
 }
 
-// Multiplies the sigma of a surfel's fragment, at least 1/255, where its weight would be at least the bound, and marks
-// v; true where it did. Both passes over a view call it, so that they agree.
+// Multiplies the sigma (>= 1/255) of a surfel's fragment if its weight would be at least the bound, and marks v;
+// returns whether it did. Shared by both passes over a view, so that they agree.
 template <class S> __device__ bool cut(const AlphaTiles<S>& tiles, int64_t id, S transmittance, S u, S& v, S& sigma) {
   const AlphaPatch<S> patch(tiles, id);
   if (!patch.textured()) return false;

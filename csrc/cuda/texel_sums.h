@@ -1,6 +1,5 @@
-// Sums of the texels' gradients over fragments, and what becomes of them. Rows of four numbers per texel, the last that
-// of alpha or 0, so that a texel takes one vector reduction (warp.h); or integers, for sums that do not depend on the
-// order.
+// Gradient sums of texels over fragments, and their use. Four numbers per texel, the last that of alpha or 0, for one
+// vector reduction per texel (warp.h); or integers, for order-independent sums.
 #pragma once
 
 #include "cuda/exact_sums.h"
@@ -9,9 +8,9 @@
 
 namespace bt::cuda {
 
-// Adds the gradients of every lane's four corners, g being that of the fetch of M channels; one addition per run of
-// lanes between the same texels. row: that of the first corner in the list of texels, -1 where there is none. Sums of
-// three channels have rows of four.
+// Adds the gradients of each lane's four corners; g: gradient of the fetch of M channels; one addition per run of lanes
+// with the same texels. row: row of the first corner in the texel list, -1: none. Sums of three channels have rows of
+// four.
 template <int M, class S, bool kExact>
 __device__ void add_to_corners(int64_t row, const TexelCorners<S>& at, const S (&g)[M], int lane,
                                const Adder<S, kExact>& to) {
@@ -36,7 +35,7 @@ __device__ void add_to_corners(int64_t row, const TexelCorners<S>& at, const S (
 }
 
 constexpr int kTexelThreads = 256;
-// fn(texel) for the texels of the surfels that have a pair, which are all that a view can show: a warp per surfel.
+// Calls fn(texel) for the texels of surfels with a pair, i.e. all that a view can show: a warp per surfel.
 template <class S, class F>
 __global__ void __launch_bounds__(kTexelThreads) shown_texels_kernel(Pairs p, TexelTiles<S> tiles, F fn) {
   const int64_t r = (int64_t(blockIdx.x) * kTexelThreads + threadIdx.x) / kWarp;
@@ -59,7 +58,7 @@ template <class S> struct ClearTexel {
   S* sums;
   __device__ void operator()(int64_t t) const { reinterpret_cast<Row*>(sums)[t] = {}; }
 };
-// A step of the texel by its sums.
+// Steps on a texel by its sums.
 template <class S, bool kExact> struct MoveTexel {
   S* sums;
   ExactSums exact;

@@ -1,10 +1,9 @@
-// Fragments of a view. One block per tile, one warp per 8 x 4 pixels, one lane per pixel; warps do not wait for each
-// other.
+// Fragments of a view. One block per tile, one warp per 8 x 4 pixels, one lane per pixel; warps are independent.
 //
 // The weights decide which pairs are blended, so the list's length is known only after all sigma are: trace_mark finds
-// the masks, a scan gives every fragment its offset, trace_fill writes the fragments there. The second pass evaluates
-// marked pairs alone. trace_mark is bound by arithmetic (about 100 operations per lane and pair, a third of the lanes
-// with a fragment), trace_fill also by the 28 bytes per fragment that it writes.
+// the masks, a scan gives every fragment its offset, trace_fill writes the fragments, evaluating marked pairs only.
+// trace_mark is bound by arithmetic (about 100 operations per lane and pair, a third of the lanes with a fragment),
+// trace_fill also by the 28 bytes it writes per fragment.
 #include "cuda/kernels.h"
 #include "cuda/mark.h"
 #include "cuda/sort_scan.h"
@@ -32,7 +31,7 @@ __global__ void __launch_bounds__(kTileThreads)
                              tile_thread(view.width), [](int64_t, const S*, const Fragment<FastFloatOr<S>>&, S) {});
 }
 
-// Pairs behind those of the tiles have no masks.
+// Pairs after those of the tiles have no masks.
 __global__ void __launch_bounds__(kThreads)
     size_kernel(int64_t pairs, const int64_t* listed, const uint32_t* masks, int32_t* counts) {
   const int64_t k = int64_t(blockIdx.x) * kThreads + threadIdx.x;
@@ -43,9 +42,9 @@ __global__ void __launch_bounds__(kThreads)
   counts[k] = count;
 }
 
-// A warp has about ten fragments of a pair, which rarely fill a sector of 32 bytes. If each warp wrote its own, most
-// sectors would be written in parts, by several warps, and memory takes longer for a part than for a whole sector. So a
-// block collects the fragments of up to 32 pairs, in the list's order, and writes them as one contiguous stretch.
+// A warp has about ten fragments of a pair, which rarely fill a sector of 32 bytes, and partial sectors are slower to
+// write than whole ones. So a block collects the fragments of up to 32 pairs, in list order, and writes them
+// contiguously.
 template <class Kernel, class S, bool kAlpha>
 __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
                                                 : kAlpha       ? 5
@@ -68,7 +67,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
     taken_pairs = part.pairs;
     if (!taken_pairs) return;
     held.load(geom, p.surfel + first, 0, taken_pairs);
-    __syncthreads();  // the rows are there, and what was held is written
+    __syncthreads();  // rows are loaded, and the previous chunk is written
     part.find_own(s);
     part.each_pair(s, [&](int j, int i, bool mine) {
       S g[kGeom];
@@ -76,13 +75,13 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
       const T dx = T(x - g[kCx]), dy = T(y - g[kCy]);
       const Fragment<T> f = fragment<Kernel>(g, near, dx, dy, __any_sync(kFullMask, mine && near_centre(dx, dy)));
       if (!mine) return;
-      // The mark found at least that much. Where the kernel ends abruptly the same formula, rounded otherwise here,
-      // may find nothing, and the gradient would divide by it.
+      // trace_mark found at least that much. Where the kernel is discontinuous, different rounding may give 0 here, and
+      // the gradient would divide by it.
       S sigma = max_(plain(f.sigma), S(kAlphaMin)), v = plain(f.v);
       if constexpr (kAlpha) {
         const S uncut = sigma;
         cut(alpha, held.ids[j], transmittance, plain(f.u), v, sigma);
-        // far less is that of a weight at the bound, which the mark found to be below it
+        // far less means a weight at the bound, which trace_mark found to be below it
         if (sigma < S(0.5 * kAlphaMin)) sigma = uncut, v = with_mark(v, false);
         sigma = max_(sigma, S(kAlphaMin));
       }
@@ -105,7 +104,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
   }
 }
 
-// The marks tell which of a surfel's fragments lie on masked pixels: the list itself is not read.
+// Counts by the masks a surfel's fragments on masked pixels, without reading the list.
 __global__ void __launch_bounds__(kTileThreads) counts_kernel(Pairs p, const uint8_t* mask, int32_t* counts) {
   const TileThread s = tile_thread(p.width);
   const bool on = s.x < p.width && s.y < p.height && mask[int64_t(s.y) * p.width + s.x];
@@ -113,11 +112,11 @@ __global__ void __launch_bounds__(kTileThreads) counts_kernel(Pairs p, const uin
   if (!pixels) return;
   for (int64_t k = p.tile_pairs[blockIdx.x] + s.lane; k < p.tile_pairs[blockIdx.x + 1]; k += kWarp) {
     const int count = __popc(p.masks[s.warp * p.pairs + k] & pixels);
-    if (count) atomicAdd(counts + p.surfel[k], count);  // of integers: the order does not show
+    if (count) atomicAdd(counts + p.surfel[k], count);  // integers: order-independent
   }
 }
 
-// Pairs without fragments, such as those behind the tiles', may have no masks.
+// Pairs without fragments, such as those after the tiles', may have no masks.
 __global__ void __launch_bounds__(kThreads)
     select_kernel(Pairs p, const uint8_t* keep, uint32_t* masks, int64_t* counts) {
   const int64_t k = int64_t(blockIdx.x) * kThreads + threadIdx.x;

@@ -1,9 +1,9 @@
-// From gradients of the fragments to gradients of the surfels, in three kernels.
+// Gradients of the surfels from gradients of the fragments, in three kernels.
 //
-// dL/dsigma of a fragment needs the sum of w dL/dw over the fragments behind it in its pixel: a walk back to front with
-// that sum in a register, 16 bytes per fragment. The long formulas then need no order any more, so they run through the
-// list one pair at a time with all lanes busy (in the walk two thirds would idle) and reduce once per pair. Gradients
-// of alpha texels are summed over neighbouring fragments between the same texels, then added in memory.
+// dL/dsigma of a fragment needs the sum of w dL/dw over the fragments behind it in its pixel: a pass back to front with
+// that sum in a register, 16 bytes per fragment. The long formulas need no order, so they run through the list one pair
+// at a time with all lanes busy (in the first pass two thirds would idle) and reduce once per pair. Gradients of alpha
+// texels are summed over neighbouring fragments with the same texels, then added in memory.
 #include "core/kernel.h"
 #include "cuda/fast_float.h"
 #include "cuda/kernels.h"
@@ -38,7 +38,7 @@ __global__ void __launch_bounds__(kTileThreads)
   each_fragment_back<4>(p, s, load, use);
 }
 
-// Alpha texels, and where their gradients are added up; `texels` null: nowhere.
+// Alpha texels, and where their gradients are added up; `texels` null: not at all.
 template <class S> struct AlphaGradient {
   AlphaTiles<S> tiles;
   S* texels;
@@ -70,7 +70,7 @@ __global__ void __launch_bounds__(kRunThreads)
       if (duv) gu = duv[i], gv = duv[f.total + i];
       if (ddepth) gz = ddepth[i];
     }
-    __syncwarp();  // no load is put off until its number is used: one wait is for all
+    __syncwarp();  // all loads are issued before any is used: one wait for all
     if constexpr (kAlpha) {
       const AlphaPatch<S> patch(alpha.tiles, id);
       TexelCorners<S> corners = {};

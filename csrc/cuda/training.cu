@@ -1,4 +1,4 @@
-// Losses of a picture and statistics of densification; see training.h.
+// Losses and densification statistics of a training step; see training.h.
 #include <cmath>
 
 #include "core/common.h"
@@ -11,7 +11,7 @@ namespace {
 constexpr int kThreads = 256;
 
 template <class S> BT_HD S sign_(S x) {
-  return x > S(0) ? S(1) : x < S(0) ? S(-1) : x;  // 0 and NaN stay
+  return x > S(0) ? S(1) : x < S(0) ? S(-1) : x;  // keeps 0 and NaN
 }
 
 template <class S> struct Error {
@@ -28,7 +28,7 @@ template <class S> BT_HD Error<S> error_at(const Picture<S>& p, int64_t i) {
   return e;
 }
 
-// Thread 0 gets the sums of the block.
+// Sums over the block, to thread 0.
 __device__ void add_up(double (&own)[kLossSums], double (*total)[kThreads]) {
   for (int k = 0; k < kLossSums; ++k) own[k] = block_sum<kThreads>(own[k], total[k]);
 }

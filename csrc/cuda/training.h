@@ -1,5 +1,5 @@
-// Losses and statistics of a training step, for all surfels and pixels at once: by torch they are some fifty small
-// operations, whose launches take the host longer than all of them take the card.
+// Losses and statistics of a training step, for all surfels and pixels at once; torch would need about fifty small
+// operations, whose launches take longer than the operations.
 #pragma once
 
 #include "core/blend.h"
@@ -8,9 +8,9 @@
 
 namespace bt::cuda {
 
-// image [pixels, kImageChannels]: rgb, alpha and beta; target [pixels, 3]; mask [pixels], not 0 where the pixel counts,
-// null: all count. The losses that `train.losses.objective` describes: l1 is the mean of |rgb - target|, right that of
-// omega beta, omega = exp(-gamma e), e = |rgb - target| summed over rgb.
+// image [pixels, kImageChannels]: rgb, alpha and beta; target [pixels, 3]; mask [pixels], 0 for pixels that do not
+// count, null: all count. The losses of `train.losses.objective`: l1 is the mean of |rgb - target|, right that of omega
+// beta, omega = exp(-gamma e), e = |rgb - target| summed over rgb.
 template <class S> struct Picture {
   int64_t pixels;
   const S *image, *target;
@@ -45,8 +45,8 @@ template <class S> struct PictureLoss {
 };
 template <class S> void picture_loss(const PictureLoss<S>& a, Stream stream);
 
-// Writes dimage from the gradients of both losses [1] and that of the similarity with respect to rgb [pixels, 3].
-// omega has no gradient.
+// Writes dimage from the gradients of both losses [1] and that of the similarity with respect to rgb [pixels, 3]; omega
+// is a constant.
 template <class S> struct PictureLossBackward {
   Picture<S> picture;
   S share, weight;
@@ -63,8 +63,8 @@ template <class S> struct PictureLossBackward {
 };
 template <class S> void picture_loss_backward(const PictureLossBackward<S>& a, Stream stream);
 
-// Statistics of a view for densification, `train.strategy.Strategy.accumulate`: the four statistics [n] are changed.
-// grad and absgrad [n, 2] are null where nothing was seen.
+// Updates the densification statistics [n] with a view, see `train.strategy.Strategy.accumulate`. grad and absgrad [n,
+// 2] are null if nothing was visible.
 template <class S> struct NoteCenters {
   int64_t n;
   const S *radii, *grad, *absgrad;

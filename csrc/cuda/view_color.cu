@@ -1,6 +1,6 @@
-// View colours of all surfels: one thread per surfel. Spherical Voronoi with 7 sites reads 196 bytes per visible surfel
-// and does 330 operations, backward 392 bytes and 550: bound by memory. A thread's numbers lie together, so a warp
-// reads whole lines, a few numbers of each at a time, and finds the rest of them in the L1.
+// View colours of surfels, one thread each. Spherical Voronoi with 7 sites reads 196 bytes per visible surfel for 330
+// operations, backward 392 bytes for 550: memory-bound. A thread's numbers are contiguous, so a warp reads whole lines,
+// a few numbers of each at a time, and finds the rest in L1.
 #include <type_traits>
 
 #include "cuda/kernels.h"
@@ -16,7 +16,7 @@ template <class S, class ViewColor, int kTerms> struct WholeColor {
     return view_color<ViewColor>(kTerms ? kTerms : p.terms, p, i, d);
   }
 };
-// A surfel of one colour reads 20 bytes; each further term is 24 (sv).
+// A single-colour surfel reads 20 bytes; each term 24 more (sv).
 template <class S> struct LeanColor {
   LeanColors<S> p;
   __device__ Vec3<S> operator()(int64_t i, Vec3<S> d) const { return view_color(p, i, d); }
@@ -54,8 +54,7 @@ __global__ void __launch_bounds__(kThreads)
   store3(dmeans + 3 * i, normalize_vjp(d, dd));
 }
 
-// Calls f with the kind's struct, and with its preset's number of terms, for which the compiler unrolls, or 0 for any
-// other.
+// Calls f with the kind's struct, and its preset's number of terms, for unrolled loops, or 0 for any other.
 template <class F> void dispatch(int kind, int terms, F&& f) {
   for_view_color(kind, [&](auto view_color) {
     constexpr int kPreset = decltype(view_color)::kPresetTerms;

@@ -1,4 +1,4 @@
-// Steps of a warp: runs of lanes with equal keys, sums over them, and adding to memory.
+// Warp operations: runs of lanes with equal keys, sums over them, additions to memory.
 #pragma once
 
 #include "core/common.h"
@@ -6,9 +6,9 @@
 
 namespace bt::cuda {
 
-// `in` of the lanes below mine.
+// Counts the lanes of `in` below this one.
 __device__ inline int count_below(unsigned in, int lane) { return __popc(in & ((1u << lane) - 1u)); }
-// The sum of the values of the lanes below mine. All 32 lanes take part.
+// Sums the values of the lanes below this one. All 32 lanes take part.
 __device__ inline int sum_below(int value, int lane) {
   int sum = value;
   BT_UNROLL
@@ -18,7 +18,7 @@ __device__ inline int sum_below(int value, int lane) {
   }
   return sum - value;
 }
-// Take the first or the last lane from a mask that has some.
+// Removes and returns the first or last lane of a non-empty mask.
 __device__ inline int take_first(unsigned& lanes) {
   const int lane = __ffs(int(lanes)) - 1;
   lanes &= lanes - 1;
@@ -30,7 +30,7 @@ __device__ inline int take_last(unsigned& lanes) {
   return lane;
 }
 
-// The lanes of my run: neighbours with my key. All 32 lanes take part.
+// Returns the lanes of this lane's run: neighbours with the same key. All 32 lanes take part.
 template <class Key> __device__ unsigned run_of(Key key, int lane) {
   const Key before = __shfl_up_sync(kFullMask, key, 1);
   const unsigned heads = __ballot_sync(kFullMask, lane == 0 || key != before);
@@ -41,10 +41,10 @@ template <class Key> __device__ unsigned run_of(Key key, int lane) {
   return from_head & to_end;
 }
 
-// Sums M values over the lanes of each run; the first lane of a run gets the sum, always in the same order. Takes
-// log2(longest run) steps of M shuffles.
+// Sums M values over the lanes of each run, in fixed order; the run's first lane gets the sum. Takes log2(longest run)
+// steps of M shuffles.
 template <int M, class S> __device__ void sum_over_run(unsigned run, int lane, S (&value)[M]) {
-  const int above = kWarp - 1 - __clz(int(run)) - lane;  // lanes of my run after me
+  const int above = kWarp - 1 - __clz(int(run)) - lane;  // lanes of the run after this one
   for (int step = 1; __any_sync(kFullMask, above >= step); step *= 2) {
     BT_UNROLL
     for (int m = 0; m < M; ++m) {
@@ -54,8 +54,8 @@ template <int M, class S> __device__ void sum_over_run(unsigned run, int lane, S
   }
 }
 
-// The sum of the values of a block of kThreads, a power of two, to thread 0, always in the same order. `shared` has
-// room for all of them.
+// Sums the values of a block of kThreads (a power of two) in fixed order; thread 0 gets the sum. `shared` has room for
+// all values.
 template <int kThreads> __device__ double block_sum(double own, double* shared) {
   const int thread = int(threadIdx.x);
   shared[thread] = own;
@@ -66,13 +66,13 @@ template <int kThreads> __device__ double block_sum(double own, double* shared) 
   return shared[thread];
 }
 
-// The sum of integers in units of 1 / scale as a number.
+// Converts an integer sum in units of 1 / scale to a number.
 template <class S> __device__ S exact_value(unsigned long long sum, double scale) {
   return S(double(static_cast<long long>(sum)) / scale);
 }
 
-// Adds to memory that all blocks share. Sums of floating-point numbers depend on the order in which the blocks come;
-// for a result that does not, values are added as integers in units of 1 / scale.
+// Adds to memory shared by all blocks. Floating-point sums depend on the order of blocks; for reproducible results,
+// values are added as integers in units of 1 / scale.
 template <class S, bool kExact> struct Adder;
 template <class S> struct Adder<S, false> {
   S* to;
@@ -81,12 +81,12 @@ template <class S> struct Adder<S, false> {
   __device__ void add4(int64_t at, const S* v) const {
     for (int j = 0; j < 4; ++j) atomicAdd(to + at + j, v[j]);
   }
-  // once all have been added
+  // Returns the sum, after all additions.
   __device__ S sum(int64_t at) const { return to[at]; }
 };
 template <> __device__ inline void Adder<float, false>::add4(int64_t at, const float* v) const {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900 && (__CUDACC_VER_MAJOR__ > 12 || __CUDACC_VER_MINOR__ >= 1)
-  // one request of 16 bytes to the L2 instead of four of 4
+  // one request of 16 bytes to L2 instead of four of 4
   asm volatile("red.global.add.v4.f32 [%0], {%1, %2, %3, %4};" ::"l"(__cvta_generic_to_global(to + at)), "f"(v[0]),
                "f"(v[1]), "f"(v[2]), "f"(v[3])
                : "memory");

@@ -1,13 +1,12 @@
-// The field's MLP by warps: the layers of 32 look-ups are products of a 32 x 16 and a 16 x 16 matrix, made of products
-// of 16 x 8 and 8 x 8, each of which is one step of the tensor cores (mma.m16n8k8).
+// The field's MLP by warps: the layers of 32 look-ups are products of a 32 x 16 and a 16 x 16 matrix, composed of 16 x
+// 8 by 8 x 8 products, each one step of the tensor cores (mma.m16n8k8).
 //
-// How these lie in a warp, with g = lane / 4 and t = lane % 4 (a fact of the hardware): a lane holds
+// Their hardware layout in a warp, with g = lane / 4 and t = lane % 4: a lane holds
 //   of the first factor the numbers (g, t), (g + 8, t), (g, t + 4), (g + 8, t + 4),
 //   of the second factor (t, g), (t + 4, g),
 //   of the product (g, 2t), (g, 2t + 1), (g + 8, 2t), (g + 8, 2t + 1).
-// Which of the eight numbers that are summed over stands at t and which at t + 4 is free where both factors agree. We
-// take 2t and 2t + 1: then a lane's numbers of a product are its numbers of the next layer's first factor, and the
-// layers follow each other in registers.
+// The inner index that is at t and at t + 4 is free if both factors agree. With 2t and 2t + 1 a lane's numbers of a
+// product are its numbers of the next layer's first factor, so layers chain in registers.
 #pragma once
 
 #include <type_traits>
@@ -23,8 +22,8 @@ template <class S> constexpr bool kTensorCores = std::is_same_v<S, float>;
 template <class S> constexpr bool kTensorCores = false;
 #endif
 
-// A lane's N numbers of a factor. Tensor cores take the first 11 bits of a float: each number is high + low, where high
-// has 11 bits and low, again cut to 11 bits, misses the number by at most 2^-20 of it.
+// A lane's N numbers of a factor. Tensor cores use the first 11 bits of a float: each number is split into high + low
+// of 11 bits each, with an error of at most 2^-20 of it.
 template <class S, int N> struct alignas(16) Factor {
   S high[N], low[N];
 };
@@ -54,8 +53,8 @@ __device__ inline void tensor_step(float (&c)[4], const float (&a)[4], const flo
 }
 #endif
 
-// c += a b, all as above. In float on tensor cores by three products, small ones first (low low is below what low
-// misses); in double, on older cards and in the emulator by shuffles.
+// Computes c += a b. In float by three products on tensor cores, small ones first (low low is below the error of low);
+// in double, on older GPUs and in the emulator by shuffles.
 template <class S> __device__ void multiply_add(S (&c)[4], const Factor<S, 4>& a, const Factor<S, 2>& b, int lane) {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
   if constexpr (kTensorCores<S>) {
@@ -76,7 +75,7 @@ template <class S> __device__ void multiply_add(S (&c)[4], const Factor<S, 4>& a
   }
 }
 
-// 32 x 16 numbers, a row per look-up, as products lie: v[m][n] of the rows from 16 m and the columns from 8 n.
+// 32 x 16 numbers, a row per look-up, in product layout: v[m][n] has the rows from 16 m and the columns from 8 n.
 template <class S> struct Rows {
   S v[2][2][4];
   // Calls take(look-up, column, two neighbours) for each of the lane's pairs.
@@ -99,7 +98,7 @@ template <class S> struct Rows {
 template <class S> struct alignas(2 * sizeof(S)) Pair {
   S v[2];
 };
-// From and to memory where row(p) is that of look-up p.
+// Loads and stores, where row(p) is the memory of look-up p.
 template <class S, class Row> __device__ Rows<S> load_rows(int lane, const Row& row) {
   Rows<S> r;
   r.pairs(lane, [&](int p, int column, S* v) {
@@ -115,17 +114,17 @@ template <class S> __device__ Rows<S> rectified(Rows<S> r) {
   r.each([](S& v, int) { v = relu(v); });
   return r;
 }
-// r where a layer's output is above 0, else 0.
+// Returns r where a layer's output is positive, else 0.
 template <class S> __device__ Rows<S> where_open(Rows<S> r, const Rows<S>& output) {
   r.each([&](S& v, int i) { v = output.v[i / 8][i / 4 % 2][i % 4] > S(0) ? v : S(0); });
   return r;
 }
 
-// N / 8 tiles of columns of a matrix with 16 rows, as second factors: tile[j][n] of the rows from 8 j.
+// N / 8 column tiles of a matrix with 16 rows, as second factors: tile[j][n] has the rows from 8 j.
 template <class S, int kTiles> struct Weights {
   Factor<S, 2> tile[2][kTiles][kWarp];
 };
-// The weights in shared memory; for gradients their transposes, and of w3 the plain numbers, too.
+// Weights in shared memory; for gradients also their transposes, and w3 itself.
 template <class S> struct ForwardMlp {
   Weights<S, 2> w1, w2;
   Weights<S, 1> w3;
@@ -135,7 +134,7 @@ template <class S> struct WarpMlp : ForwardMlp<S> {
   alignas(16) S output[kWidth][4];
 };
 
-// All threads of the block; ends with a barrier. M: one of the two above.
+// Loads the weights by all threads of the block; ends with a barrier. M: one of the two above.
 template <class S, class M> __device__ void load_mlp(const FieldArrays<S>& f, int thread, int threads, M& m) {
   constexpr bool kGradients = std::is_same_v<M, WarpMlp<S>>;
   const int inputs = f.levels * kFeatures;
@@ -165,7 +164,7 @@ template <class S, class M> __device__ void load_mlp(const FieldArrays<S>& f, in
   __syncthreads();
 }
 
-// c[m][n] = tiles of the product of in and w.
+// Computes c[m][n], the tiles of the product of in and w.
 template <class S, int kTiles>
 __device__ void product(const Rows<S>& in, const Weights<S, kTiles>& w, int lane, S (&c)[2][kTiles][4]) {
   BT_UNROLL
@@ -193,8 +192,8 @@ template <class S> __device__ Rows<S> layer(const Rows<S>& in, const Weights<S, 
   return out;
 }
 
-// A lane's share of the weights' gradients: its numbers of the products that give those of w1 and w2, and for w3 its
-// look-ups' share of its four rows.
+// A lane's share of the weights' gradients: of w1 and w2 its numbers in product layout, of w3 its look-ups' share of
+// four rows.
 template <class S> struct WeightSums {
   S w1[2][4], w2[2][4], w3[4][3];
   __device__ WeightSums() {
@@ -204,8 +203,8 @@ template <class S> struct WeightSums {
     for (int i = 0; i < 12; ++i) w3[i / 3][i % 3] = S(0);
   }
 
-  // Adds in^T out of 32 look-ups, both [32, 16] in memory, rows `stride` numbers apart. Tensor cores cut what they add
-  // up, so each sum of 32 starts at 0 and is added here.
+  // Adds in^T out of 32 look-ups, both [32, 16] in memory, rows `stride` numbers apart. Tensor cores truncate sums, so
+  // each sum of 32 starts at 0 and is added here.
   __device__ static void add_outer(S (&sums)[2][4], const S* in, const S* out, int stride, int lane) {
     const int g = lane / 4, t = lane % 4;
     S c[2][4] = {};
@@ -223,7 +222,7 @@ template <class S> struct WeightSums {
     BT_UNROLL
     for (int i = 0; i < 8; ++i) sums[i / 4][i % 4] += c[i / 4][i % 4];
   }
-  // Adds h2^T d; d: those of look-ups g, g + 8, g + 16, g + 24.
+  // Adds h2^T d, for look-ups g, g + 8, g + 16, g + 24.
   __device__ void add_last(const Rows<S>& h2, const Vec3<S> (&d)[4]) {
     BT_UNROLL
     for (int i = 0; i < 16; ++i) {
@@ -233,7 +232,7 @@ template <class S> struct WeightSums {
       to[0] += h * o.x, to[1] += h * o.y, to[2] += h * o.z;
     }
   }
-  // Adds to a block's sums [kMlpWeights] in shared memory.
+  // Adds the share to a block's sums [kMlpWeights] in shared memory.
   __device__ void add_to(S* to, int lane) {
     constexpr int kMatrix = kWidth * kWidth;
     const int g = lane / 4, t = lane % 4;

@@ -1,4 +1,4 @@
-// The viewer: what is shown, drawn when something has changed, and the elements that change it.
+// The viewer: state, drawing on change, and its controls.
 import type { Bundle } from './bundle/load';
 import type { Vec3 } from './bundle/manifest';
 import type { Depths, DrawOptions, Renderer } from './render/renderer';
@@ -18,11 +18,11 @@ import { type Shared, type Viewpoint, fromHash, toHash } from './view/share';
 import { extentOf, firstPose } from './view/start';
 import { length, subtract } from './view/vector';
 
-const MOVING_LAYERS = 4; // batches while the camera moves, and of a picture that stays
+const MOVING_LAYERS = 4; // batches per frame while the camera moves, and at rest
 const STILL_LAYERS = 16;
 const STILL_AFTER = 250; // milliseconds
 
-// What is beside the scene: the button that opens it, the one that closes it, and the section.
+// Side panels: button that opens it, button that closes it, section.
 const ASIDES = [
   ['tools', 'close', 'aside'],
   ['notes', 'close-notes', 'notes-panel'],
@@ -48,7 +48,7 @@ export class App implements Stage {
   private held: Vec3 | null = null;
   private flight: Flight | null = null;
   private show: Show = 'color';
-  private photograph: Promise<string> | null = null; // that is asked for
+  private photograph: Promise<string> | null = null; // requested
   private dirty = true;
   private still = false;
   private movedAt = 0;
@@ -60,7 +60,7 @@ export class App implements Stage {
     private readonly renderer: Renderer,
     private readonly bundle: Bundle,
     notes: Notes,
-    private readonly shown: () => void, // after a picture
+    private readonly shown: () => void, // called after each frame
   ) {
     const { info, surfels } = bundle;
     const { middle, size } = extentOf(surfels);
@@ -148,7 +148,7 @@ export class App implements Stage {
     this.go(shared);
   }
 
-  // The texture has come, or something else that changes the picture.
+  // Requests a new frame, for instance after texels have arrived.
   changed(): void {
     this.dirty = true;
     this.still = false;
@@ -186,7 +186,7 @@ export class App implements Stage {
     else this.go(flight.to);
   }
 
-  // Width and height of the canvas on the screen, as far as the device draws so many.
+  // Returns the canvas size in screen pixels, limited by the device.
   pixels(): [number, number] {
     const { clientWidth, clientHeight } = this.canvas;
     const most = this.renderer.largestSide / Math.max(clientWidth, clientHeight, 1);
@@ -200,7 +200,7 @@ export class App implements Stage {
     const view = this.view();
     if (view.width > 0 && view.height > 0) {
       const chosen = element<HTMLSelectElement>('resolution').value;
-      // of a film all pictures have one size
+      // frames of a film have one size
       const scale = chosen !== 'auto' ? Number(chosen) : still || this.path.filming ? 1 : this.pace.scale;
       const begin = performance.now();
       try {
@@ -260,7 +260,7 @@ export class App implements Stage {
     this.fillCameras();
   }
 
-  // Opens or closes one of the panels; of those aside one is open, and on a phone one of all.
+  // Opens or closes a panel; at most one side panel is open, on phones one panel of any kind.
   private open(panel: 'panel' | (typeof ASIDES)[number][2], open: boolean): void {
     element('panel').classList.toggle('open', panel === 'panel' && open);
     element('menu').setAttribute('aria-expanded', String(panel === 'panel' && open));
@@ -302,7 +302,7 @@ export class App implements Stage {
     this.changed();
   }
 
-  // Number of the camera in the list.
+  // Index of the camera in the list.
   private get chosen(): number {
     return Number(element<HTMLSelectElement>('camera').value);
   }
@@ -324,7 +324,7 @@ export class App implements Stage {
   }
 
   private jump(k: number): void {
-    if (!this.cameras.length) return; // by a key: the buttons are hidden
+    if (!this.cameras.length) return; // keys remain when the buttons are hidden
     this.chosen = (k + this.cameras.length) % this.cameras.length;
     this.go(this.cameras[this.chosen]);
     this.setPhotograph();

@@ -1,27 +1,27 @@
-// The page in the frame of another page, and the messages between them: docs/viewer.md describes them.
+// Embedding in another page, and the messages between them: docs/viewer.md.
 import { BESIDE } from './bundle/source';
 import { type Camera, type Shared, cameraOf, viewpointOf } from './view/share';
 
 const PREFIX = 'bitymi/1/';
 
-// What messages see and change of the viewer.
+// Interface of the viewer to messages.
 export interface Embedded {
   shared(): Shared;
   apply(shared: Shared): void;
-  readonly notes: { names: string[]; goTo(name: string): boolean }; // false where no saved view has the name
+  readonly notes: { names: string[]; goTo(name: string): boolean }; // false: no saved view of that name
 }
 
-// The origin of the page around: of the browser, of this page before it loaded another bundle, or of the referrer.
+// Returns the embedding page's origin: from the browser, this page before it loaded another bundle, or the referrer.
 function around(): string {
-  const { ancestorOrigins } = location as { ancestorOrigins?: DOMStringList }; // which not all browsers tell
+  const { ancestorOrigins } = location as { ancestorOrigins?: DOMStringList }; // not in all browsers
   const kept = new URLSearchParams(location.hash.slice(1)).get('embedder');
   const referrer = URL.canParse(document.referrer) ? new URL(document.referrer).origin : '';
   return ancestorOrigins?.[0] ?? kept ?? referrer;
 }
 
 export class Embed {
-  private readonly origins: Set<string>; // that may send messages, and get any
-  private readonly parent: string | null; // origin of the page around, where it may
+  private readonly origins: Set<string>; // allowed to exchange messages
+  private readonly parent: string | null; // origin of the embedding page, if allowed
   private viewer: Embedded | null = null;
   private last = '';
 
@@ -35,13 +35,13 @@ export class Embed {
     });
   }
 
-  // The bundle is shown.
+  // Called when the bundle is shown.
   ready(viewer: Embedded, title: string): void {
     this.viewer = viewer;
     this.send('ready', { title, camera: cameraOf(viewer.shared()) });
   }
 
-  // After each frame: report the camera if it has moved.
+  // Called after each frame: reports the camera if it has moved.
   shown(): void {
     if (!this.parent || !this.viewer) return;
     const camera = cameraOf(this.viewer.shared());
@@ -71,7 +71,7 @@ export class Embed {
       }
       const address = new URL(file ? `?file=${encodeURIComponent(file)}` : location.pathname, location.href);
       address.hash = `embedder=${encodeURIComponent(this.parent!)}`;
-      // where the bundle is the same, the fragment alone would change
+      // for the same bundle only the fragment would change, without a reload
       const same = address.search === location.search;
       location.replace(address);
       if (same) location.reload();

@@ -1,4 +1,4 @@
-// What stops the viewer, in words for a page of its own.
+// An error that stops the viewer, with the texts of its page.
 export class ViewerError extends Error {
   constructor(
     readonly title: string,
@@ -9,11 +9,11 @@ export class ViewerError extends Error {
   }
 }
 
-// More than the device, or the browser, has memory for.
+// Memory of the device or the browser is exceeded.
 export const tooLarge = (detail: string): ViewerError =>
   new ViewerError('This scene is too large for this device', detail, 'Open it on a device with more memory.');
 
-// What is said of an error of any kind; that of too large an array is a lack of memory.
+// Explains any error; a RangeError of a too large array is a lack of memory.
 export function reasonOf(error: unknown): ViewerError {
   if (error instanceof ViewerError) return error;
   if (error instanceof RangeError) return tooLarge('There is not enough memory for it.');

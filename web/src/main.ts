@@ -18,7 +18,7 @@ import { notify, onError, showError, showPoster, showProgress, showScene } from 
 import { type Notes, parseNotes } from './view/notes';
 import { fromHash } from './view/share';
 
-// The bundle beside the page: the file that the address asks for (?file=), the one that an export names, or a folder.
+// Opens the bundle beside the page: the file in the address (?file=), the one named by an export, or a folder.
 async function source(): Promise<Source> {
   const asked = new URLSearchParams(location.search).get('file');
   const file = asked ?? document.querySelector<HTMLMetaElement>('meta[name=bundle]')?.content ?? '';
@@ -30,7 +30,7 @@ async function source(): Promise<Source> {
   return SingleFile.open(file, showProgress);
 }
 
-// The scene's name, and whether there are notes beside it, which the service and an export write beside the page.
+// Reads the scene's name, and whether it has notes, from view.json, written by the server or an export.
 async function about(): Promise<{ title: string; notes: boolean }> {
   const file = new URLSearchParams(location.search).get('file');
   if (file) return { title: file.replace(/\.bitymi$/, ''), notes: false };
@@ -42,7 +42,7 @@ async function about(): Promise<{ title: string; notes: boolean }> {
   }
 }
 
-// A notes.json that cannot be used leaves the scene without.
+// Loads the notes; an invalid notes.json is ignored.
 async function notesOf(from: Source, stated: boolean): Promise<Notes> {
   try {
     const text = await from.notes(stated);
@@ -53,13 +53,13 @@ async function notesOf(from: Source, stated: boolean): Promise<Notes> {
   return { views: [], notes: [] };
 }
 
-// The poster is asked for first, where the first view is the one that it shows.
+// Loads the bundle, after the poster if that shows the first view.
 async function load(opened: Promise<Source>, opening: Promise<Graphics>): Promise<Bundle> {
   const from = await opened;
   const info = await loadManifest(from);
   if (!fromHash(location.hash)) void loadPoster(from, info).then(showPoster);
   return loadBundle(from, info, showProgress, async () => {
-    const { deviceMemory } = navigator as { deviceMemory?: number }; // which not all browsers tell
+    const { deviceMemory } = navigator as { deviceMemory?: number }; // not in all browsers
     checkRoom(info, (await opening).device.limits, deviceMemory);
   });
 }
@@ -68,7 +68,7 @@ async function main(): Promise<void> {
   const opening = openDevice();
   const opened = source();
   const loading = load(opened, opening);
-  loading.catch(() => undefined); // until it is waited for
+  loading.catch(() => undefined); // handled where it is awaited
   const graphics = await opening;
   const { device } = graphics;
   watch(device, showError);
@@ -99,5 +99,5 @@ onError((title, message) => embed.failed(title, message));
 document.documentElement.dataset.state = 'loading';
 element('page-late').hidden = true;
 addEventListener('unhandledrejection', ({ reason }) => showError(reason));
-addEventListener('error', ({ error }) => error && showError(error)); // notes of the browser have none
+addEventListener('error', ({ error }) => error && showError(error)); // browser notices have no error
 main().catch(showError);

@@ -1,7 +1,7 @@
 /* global document, location, addEventListener, HTMLScriptElement */
-// Stands in the page itself, whose scripts have to be found first. An address that ends in /fox, without a slash, is that
-// of the folder fox, from which names then start; or, on servers that hide endings, of fox.html: its scripts are asked
-// for there when the folder has none. And it says why the page does not start, where the page's own script cannot.
+// Inline script that locates the page's scripts. An address ending in /fox without a slash means the folder fox, to
+// which names are then relative, or, on servers that hide extensions, fox.html: scripts that the folder lacks are requested
+// beside it. It also explains why the page does not start, if the page's script cannot.
 (function () {
   const root = document.documentElement;
   const name = location.pathname.split('/').pop();
@@ -34,13 +34,13 @@
       );
     }
   }
-  // of the loading of a file, which does not come up to the window, and of what cannot be read
+  // a file failed to load (such events do not bubble to the window) or cannot be read
   function failed({ target }) {
     if (!folder || !(target.src || target.href) || asked.has(target)) return stopped();
     folder.remove();
     const again = document.createElement(target.localName);
     for (const { name, value } of target.attributes) again.setAttribute(name, value);
-    if (again.src) again.onload = stopped; // of another page's script, which has not started this one
+    if (again.src) again.onload = stopped; // another page's script, which did not start this one
     asked.add(again);
     target.replaceWith(again);
   }

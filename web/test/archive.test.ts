@@ -3,7 +3,7 @@ import { describe, expect, it } from 'vitest';
 import { type Entry, entriesOf, partOf, placeOf } from '../src/bundle/archive';
 import { DamagedBundle } from '../src/errors';
 
-// as bitymi_ns.bundle.single stores parts: archive_parts.py writes it
+// parts as stored by bitymi_ns.bundle.single, written by archive_parts.py
 const golden = JSON.parse(readFileSync(new URL('./archive.json', import.meta.url), 'utf8')) as {
   file: string;
   parts: Record<string, string>;

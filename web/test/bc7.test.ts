@@ -2,7 +2,7 @@ import { readFileSync } from 'node:fs';
 import { describe, expect, it } from 'vitest';
 import { decodeBc7 } from '../src/bundle/bc7';
 
-// Random blocks of every mode, and what Pillow decodes them to: bc7.json is made by bc7_blocks.py.
+// Random blocks of every mode and their texels by Pillow, written by bc7_blocks.py.
 const { blocks, texels } = JSON.parse(readFileSync(new URL('bc7.json', import.meta.url), 'utf8')) as Record<
   string,
   string

@@ -70,7 +70,7 @@ describe.each(Object.keys(BUNDLES))('the compact bundle %s', (name) => {
     expect(found.length).toBe(want.length);
     let others = 0;
     want.forEach((value, at) => {
-      // the package adds in single precision: what lies half way between two bytes may be either
+      // the package sums in single precision: ties between two bytes may go either way
       expect(Math.abs(found[at] - value)).toBeLessThanOrEqual(1);
       if (found[at] !== value) others++;
     });

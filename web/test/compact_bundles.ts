@@ -1,4 +1,4 @@
-// Little compact bundles, and what the package reads of them: compact.json is made by compact_bundles.py.
+// Small compact bundles and their contents as the package reads them, written by compact_bundles.py.
 import { readFileSync } from 'node:fs';
 
 export interface Written {
@@ -14,7 +14,7 @@ export const bytes = (text: string): Uint8Array => Uint8Array.from(Buffer.from(t
 export const floats = (text: string): Float32Array => new Float32Array(bytes(text).buffer);
 export const ints = (text: string): Int32Array => new Int32Array(bytes(text).buffer);
 
-// A Zstandard frame of bytes as they are.
+// Builds a Zstandard frame with raw bytes.
 export function frameOf(content: Uint8Array): Uint8Array {
   const out = [0x28, 0xb5, 0x2f, 0xfd, 0xa0, ...[0, 8, 16, 24].map((shift) => (content.length >>> shift) & 255)];
   for (let at = 0; at < content.length || at === 0; at += 1 << 17) {

@@ -1,5 +1,5 @@
-// Damaged compact bundles, past their hashes: an error that names the damage, or numbers within what a bundle may hold,
-// in a short time. VIEWER_FUZZ=10 makes ten times as many.
+// Damaged compact bundles with valid hashes give, in a short time, an error that names the damage, or numbers within
+// the limits. VIEWER_FUZZ=10 makes ten times as many.
 import { expect, it } from 'vitest';
 import { readCompactSurfels } from '../src/bundle/compact/surfels';
 import { readCompactTexels } from '../src/bundle/compact/texels';
@@ -9,7 +9,7 @@ import { DamagedBundle } from '../src/errors';
 import { BUNDLES, bytes, frameOf } from './compact_bundles';
 
 const EXAMPLES = 4000 * Number(process.env.VIEWER_FUZZ ?? 1);
-const MOST_TIME = 2000; // milliseconds of one
+const MOST_TIME = 2000; // milliseconds per bundle
 const LIMITS: [number, number, number][] = [
   // first word, words, largest size
   [WORD.mean, 3, 2.1e9],
@@ -22,7 +22,7 @@ const LIMITS: [number, number, number][] = [
   [WORD.base, 3, 256],
 ];
 
-// Numbers from 0 to 1, the same on every machine.
+// Random numbers from 0 to 1, the same on every machine.
 function draws(seed: number): () => number {
   let state = seed;
   return () => {
@@ -55,7 +55,7 @@ class Vandal {
     for (let k = this.of([1, 1, 3, 20]); k; k--) data[this.below(data.length)] ^= 1 << this.below(8);
   }
 
-  // The bytes of a frame, which is whole again; or how many there are.
+  // Changes the bytes of a frame, keeping it valid, or their number.
   replace(info: Described, files: Files): void {
     const name = this.of(['surfels.bin', 'texels.bin'] as const);
     const { columns } = name === 'surfels.bin' ? info.surfels : info.atlas;
@@ -109,7 +109,7 @@ function hold(good: boolean): void {
   if (!good) throw new Error('a number is beyond its limits');
 }
 
-// Whether what is there can be opened.
+// Returns true if the damaged bundle opens.
 function opens(info: Described, files: Files): boolean {
   try {
     const manifest = parseManifest(JSON.stringify(info));

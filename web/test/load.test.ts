@@ -1,4 +1,4 @@
-// What is fetched is bounded and compared with bundle.json, whatever it is.
+// Every fetched file is bounded and compared with bundle.json.
 import { createHash } from 'node:crypto';
 import { afterEach, describe, expect, it, vi } from 'vitest';
 import { loadBundle } from '../src/bundle/load';
@@ -28,7 +28,7 @@ class Sent implements Source {
   }
 }
 
-// Without surfels, which have no decoder here: what comes after them is asked for at the same time.
+// Without surfels, which have no decoder here; the files after them are requested at the same time.
 const open = (files: Record<string, Uint8Array>, about: Manifest, admit = (): Promise<void> => Promise.resolve()) =>
   loadBundle(new Sent({ 'surfels.bin': new Uint8Array(), ...files }), about, () => undefined, admit);
 const withFile = (name: string, entry: { bytes: number; sha256: string }): Manifest => ({

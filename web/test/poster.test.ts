@@ -3,7 +3,7 @@ import { loadPoster, isPoster } from '../src/bundle/poster';
 import { parseManifest } from '../src/bundle/manifest';
 import type { Source } from '../src/bundle/source';
 
-// 8 x 6 pixels, as Pillow writes it: Image.save(..., 'WEBP', quality=60)
+// 8 x 6 pixels, written by Pillow: Image.save(..., 'WEBP', quality=60)
 const PICTURE =
   'UklGRk4AAABXRUJQVlA4IEIAAAAQAgCdASoIAAYAAoBCJbACdLoAArrttTAAAP732ByCs6H23XwlH/5VpAC/5Sff/6OzD+d+//sN5xhOIGB+f4AAAAA=';
 const bytes = (): Uint8Array<ArrayBuffer> => Uint8Array.from(atob(PICTURE), (c) => c.charCodeAt(0));
@@ -36,7 +36,7 @@ describe('a poster', () => {
     expect(isPoster(new ArrayBuffer(0))).toBe(false);
     expect(isPoster(changed(15, 'X'.charCodeAt(0)))).toBe(false); // animated, or with colour profiles
     expect(isPoster(changed(27, 5))).toBe(false); // wider than 1,024
-    expect(isPoster(changed(29, 0x40))).toBe(false); // that would be enlarged
+    expect(isPoster(changed(29, 0x40))).toBe(false); // with scaling
     expect(isPoster(changed(28, 0))).toBe(false);
     expect(isPoster(new TextEncoder().encode(`<svg xmlns="http://www.w3.org/2000/svg"></svg>`).buffer)).toBe(false);
   });

@@ -1,22 +1,22 @@
-// The parts of a bundle in one file: a ZIP that stores them as they are, as bitymi_ns/bundle/single.py writes it.
+// Parts of a bundle in one file: an uncompressed ZIP, written by bitymi_ns/bundle/single.py.
 import { DamagedBundle } from '../errors';
 
 export interface Entry {
-  begin: number; // of the part with its header
+  begin: number; // of the part, header included
   end: number;
-  size: number; // of the part alone
+  size: number; // without header
 }
 
-export const TAIL = 1 << 14; // bytes from the end, in which the directory is looked for first
+export const TAIL = 1 << 14; // bytes at the end that are fetched first for the directory
 const END = { signature: 0x06054b50, bytes: 22 };
 const CENTRAL = { signature: 0x02014b50, bytes: 46 };
 const LOCAL = { signature: 0x04034b50, bytes: 30 };
-const LONGEST = 1 << 22; // of a directory
+const LONGEST = 1 << 22; // bytes of a directory
 const NAME = /^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$/;
 
 const damaged = (what: string): DamagedBundle => new DamagedBundle(`The file is no bundle in one file: ${what}.`);
 
-// Where the directory of a file of `total` bytes lies, by its end.
+// Locates the directory of a file of `total` bytes from its last bytes.
 export function placeOf(tail: Uint8Array<ArrayBuffer>, total: number): { begin: number; end: number; count: number } {
   const view = new DataView(tail.buffer, tail.byteOffset, tail.length);
   const at = tail.length - END.bytes;
@@ -31,7 +31,7 @@ export function placeOf(tail: Uint8Array<ArrayBuffer>, total: number): { begin: 
   return { begin, end, count };
 }
 
-// The parts by name, from the directory, which begins at byte `place` of the file.
+// Reads the parts by name from the directory, which begins at byte `place` of the file.
 export function entriesOf(directory: Uint8Array<ArrayBuffer>, place: number, count: number): Map<string, Entry> {
   const view = new DataView(directory.buffer, directory.byteOffset, directory.length);
   const found: [string, number, number][] = [];
@@ -63,7 +63,7 @@ export function entriesOf(directory: Uint8Array<ArrayBuffer>, place: number, cou
   return entries;
 }
 
-// A part, without its header.
+// Strips a part's header.
 export function partOf(stored: Uint8Array<ArrayBuffer>, name: string, size: number): ArrayBuffer {
   const view = new DataView(stored.buffer, stored.byteOffset, stored.length);
   if (stored.length < LOCAL.bytes || view.getUint32(0, true) !== LOCAL.signature) throw damaged(`${name} is not there`);

@@ -1,5 +1,5 @@
-// BC7 blocks to RGBA texels, for adapters whose texture unit does not know BC7. Written from the tables of the Khronos
-// Data Format Specification; a test compares it with another decoder, block by block.
+// Decodes BC7 blocks to RGBA texels, for adapters without BC7 textures. Written from the tables of the Khronos Data
+// Format Specification; a test compares it with another decoder, block by block.
 
 interface Mode {
   subsets: number;
@@ -8,7 +8,7 @@ interface Mode {
   selector: number;
   color: number;
   alpha: number;
-  shared: 'none' | 'endpoint' | 'subset'; // whose lowest bit is stored apart
+  shared: 'none' | 'endpoint' | 'subset'; // scope of the separate lowest bit
   index: number;
   index2: number;
 }
@@ -27,8 +27,8 @@ const WEIGHTS: Record<number, number[]> = {
   3: [0, 9, 18, 27, 37, 46, 55, 64],
   4: [0, 4, 9, 13, 17, 21, 26, 30, 34, 38, 43, 47, 51, 55, 60, 64],
 };
-// By partition: the subset of every texel, one bit or two of it each; and the texels whose highest index bit is 0, which
-// is not stored.
+// Per partition: each texel's subset, in one or two bits; and the anchor texels, whose highest index bit is 0 and not
+// stored.
 const TWO = [
   0xcccc, 0x8888, 0xeeee, 0xecc8, 0xc880, 0xfeec, 0xfec8, 0xec80, 0xc800, 0xffec, 0xfe80, 0xe800, 0xffe8, 0xff00,
   0xfff0, 0xf000, 0xf710, 0x8e, 0x7100, 0x8ce, 0x8c, 0x7310, 0x3100, 0x8cce, 0x88c, 0x3110, 0x6666, 0x366c, 0x17e8,
@@ -88,7 +88,7 @@ const widen = (value: number, bits: number): number => {
 };
 const mix = (a: number, b: number, weight: number): number => ((64 - weight) * a + weight * b + 32) >> 6;
 
-// Endpoints [subset][end][channel], 8 bits each.
+// Reads endpoints [subset][end][channel], 8 bits each.
 function endpoints(bits: Bits, m: Mode): number[][][] {
   const ends = Array.from({ length: m.subsets }, () => [
     [0, 0, 0, 255],
@@ -143,7 +143,7 @@ function decodeBlock(data: Uint8Array, start: number, out: Uint8Array, to: numbe
   }
 }
 
-// A page of width x height texels, both multiples of 4.
+// Decodes a page of width x height texels, both multiples of 4.
 export function decodeBc7(blocks: Uint8Array, width: number, height: number): Uint8Array<ArrayBuffer> {
   const out = new Uint8Array(width * height * 4);
   const row = width * 4;

@@ -1,4 +1,4 @@
-// Fetches a bundle's files, with progress, and checks their sizes and hashes.
+// Fetches a bundle's files with progress, checking sizes and hashes.
 import { DamagedBundle } from '../errors';
 import { type Pages, parseKtx2 } from './ktx2';
 import { type Atlas, type Manifest, parseManifest } from './manifest';
@@ -9,13 +9,13 @@ export interface Bundle {
   info: Manifest;
   surfels: Surfels;
   pages: Pages | null;
-  later: (() => Promise<Pages>) | null; // fetches the texels, where a first picture can be drawn without them
+  later: (() => Promise<Pages>) | null; // fetches the texels, if a first frame can be drawn without them
   cameras: string | null; // cameras.json
-  // What an image shows of a photograph that the cameras name.
+  // Returns a photograph's address for an image element.
   photograph(name: string): Promise<string>;
 }
 
-const MOST_BESIDE = 1 << 26; // bytes of a file that is neither surfels nor texels
+const MOST_BESIDE = 1 << 26; // bytes of any file but surfels and texels
 
 export type Progress = (done: number, total: number) => void;
 
@@ -24,7 +24,7 @@ const hex = (bytes: ArrayBuffer): string =>
 
 export const loadManifest = async (source: Source): Promise<Manifest> => parseManifest(await source.manifest());
 
-// A file that bundle.json lists, of the size and with the hash that stand there.
+// Reads a file listed in bundle.json and checks its size and hash.
 export async function readPart(source: Source, info: Manifest, name: string, came: Came): Promise<ArrayBuffer> {
   const entry = info.files.get(name);
   if (!entry) throw new DamagedBundle(`bundle.json does not list ${name}.`);
@@ -36,7 +36,7 @@ export async function readPart(source: Source, info: Manifest, name: string, cam
   return data;
 }
 
-// `admit` refuses a scene that is too large; nothing is decoded before.
+// Loads a bundle; `admit` rejects scenes that are too large, before anything is decoded.
 export async function loadBundle(
   source: Source,
   info: Manifest,

@@ -1,4 +1,4 @@
-// bundle.json: what the viewer needs of it. bitymi_ns/bundle/manifest.py is the whole description.
+// The part of bundle.json that the viewer needs; bitymi_ns/bundle/manifest.py has the whole schema.
 import { DamagedBundle, ViewerError } from '../errors';
 import type { Column } from './compact/columns';
 
@@ -9,13 +9,13 @@ export type ViewKind = 'sv' | 'sh' | 'sb' | 'sg';
 export type AtlasFormat = 'bc7' | 'uint8' | 'fp16';
 export type Vec3 = [number, number, number];
 
-// What bundle.json says of surfels.bin.
+// Description of surfels.bin.
 export interface CompactSurfels {
-  frame: { center: Vec3; scale: number; low: Vec3 }; // of the places
+  frame: { center: Vec3; scale: number; low: Vec3 }; // of the positions
   columns: Column[];
 }
 
-// What bundle.json says of texels.bin.
+// Description of texels.bin.
 export interface CodedTexels {
   texels: number;
   step: number;
@@ -33,8 +33,8 @@ export interface Atlas {
   extent: number;
   offset: number;
   scale: number;
-  alphaScale: number; // a texel's alpha times this multiplies sigma; 0: the scene is opaque
-  coded: CodedTexels | null; // of the format dct
+  alphaScale: number; // a texel's alpha times this multiplies sigma; 0: opaque scene
+  coded: CodedTexels | null; // format dct
 }
 
 export interface Manifest {
@@ -42,7 +42,7 @@ export interface Manifest {
   count: number;
   viewColor: ViewKind;
   terms: number | null;
-  compact: CompactSurfels | null; // of surfels.bin
+  compact: CompactSurfels | null; // if in surfels.bin
   atlas: Atlas | null;
   near: number;
   weightBound: number;
@@ -65,7 +65,7 @@ class Reader {
   private refuse(key: string, what: string): never {
     throw new DamagedBundle(`bundle.json: ${this.path}${key} must be ${what}.`);
   }
-  // What stands under a key, whose own keys are numbers.
+  // Reads the object under a key, whose own keys are numbers.
   at(key: string): Reader {
     return new Reader(this.value[key] as Json, `${this.path}${key}.`);
   }
@@ -131,8 +131,8 @@ class Reader {
 
 const SIDE = 1 << 20;
 const MOST_COLUMNS = 64;
-const MOST_NUMBERS = 16; // of a column
-const MOST_BYTES = 7; // of a number: what a double holds exactly
+const MOST_NUMBERS = 16; // per row of a column
+const MOST_BYTES = 7; // of a number that a double holds exactly
 const MOST_POINTS = 4096;
 const MOST_FILES = 1 << 14;
 const RATES = [1e-12, 1e12]; // pixels per unit of length
@@ -180,7 +180,7 @@ function atlas(r: Reader, isCompact: boolean, surfelBytes: number): Atlas {
   };
 }
 
-// Points of the scene, and with how many pixels per unit of length they were photographed.
+// Reads points of the scene with the pixels per unit of length of their photographs.
 function points(r: Reader): Float32Array {
   const text = r.text('photographed', /^[A-Za-z0-9+/]*={0,2}$/);
   const refuse = (): never => {

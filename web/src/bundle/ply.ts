@@ -4,7 +4,7 @@ import { DamagedBundle } from '../errors';
 export interface Element {
   count: number;
   stride: number; // bytes
-  start: number; // bytes from the beginning of the file
+  start: number; // byte offset in the file
   columns: Map<string, { at: number; type: 'float' | 'int' }>;
 }
 
@@ -44,7 +44,7 @@ export function parsePly(data: ArrayBuffer): Map<string, Element> {
   return elements;
 }
 
-// Reads columns of an element; every column has to be there.
+// Reads columns of an element; throws if one is missing.
 export class Table {
   readonly count: number;
   private readonly view: DataView;
@@ -60,7 +60,7 @@ export class Table {
   has(column: string): boolean {
     return this.element.columns.has(column);
   }
-  // Fills `to` from `first` on, `step` apart, with a column.
+  // Copies a column to `to`, from `first` on with stride `step`.
   into(column: string, to: Float32Array | Uint32Array | Int32Array, first: number, step: number): void {
     const found = this.element.columns.get(column);
     const type = to instanceof Float32Array ? 'float' : 'int';
@@ -72,7 +72,7 @@ export class Table {
       to[k] = type === 'float' ? this.view.getFloat32(at, true) : this.view.getInt32(at, true);
     }
   }
-  // How many columns name_0, name_1, ... there are.
+  // Counts the columns name_0, name_1, ...
   width(name: string): number {
     let n = 0;
     while (this.has(`${name}_${n}`)) n++;

@@ -1,4 +1,4 @@
-// The poster of a bundle: a picture of what is shown first, which comes before the surfels.
+// Poster of a bundle: a picture of the first view, shown before the surfels arrive.
 import { readPart } from './load';
 import type { Manifest } from './manifest';
 import type { Source } from './source';
@@ -11,17 +11,17 @@ const HEADER = 30;
 const letters = (view: DataView, at: number): string =>
   String.fromCharCode(...[0, 1, 2, 3].map((k) => view.getUint8(at + k)));
 
-// Whether these are the bytes of a lossy WebP picture of a poster's size, the one kind that is given to the browser.
+// Returns true for a lossy WebP picture of a poster's size, the only kind handed to the browser.
 export function isPoster(data: ArrayBuffer): boolean {
   const view = new DataView(data);
   if (data.byteLength < HEADER) return false;
   if (letters(view, 0) !== 'RIFF' || letters(view, 8) !== 'WEBP' || letters(view, 12) !== 'VP8 ') return false;
   if (view.getUint32(4, true) + 8 !== data.byteLength) return false;
-  const sides = [26, 28].map((at) => view.getUint16(at, true)); // the two highest bits would enlarge it: not taken
+  const sides = [26, 28].map((at) => view.getUint16(at, true)); // rejects scaling, in the two highest bits
   return sides.every((side) => side >= 1 && side <= MOST_SIDE);
 }
 
-// The poster, or null: where there is none, or it is damaged, the surfels are the first picture.
+// Loads the poster; null if missing or damaged.
 export async function loadPoster(source: Source, info: Manifest): Promise<Blob | null> {
   const entry = info.files.get(POSTER);
   if (!entry || entry.bytes > MOST_BYTES) return null;

@@ -1,22 +1,22 @@
-// Where the files of a bundle come from: a folder on the server, or one file of which ranges are asked for.
+// Sources of a bundle's files: a folder on the server, or byte ranges of one file.
 import { DamagedBundle, ViewerError } from '../errors';
 import { type Entry, TAIL, entriesOf, partOf, placeOf } from './archive';
 
 export type Came = (bytes: number) => void;
 const nothing: Came = () => undefined;
 const MANIFEST = 'bundle.json';
-// Names of bundles in one file that the page may be asked to show: they lie beside it.
+// Names of single-file bundles beside the page that it may be asked to show.
 export const BESIDE = /^[A-Za-z0-9][A-Za-z0-9._-]{0,99}\.bitymi$/;
 const MOST_MANIFEST = 1 << 22; // bytes
 const NOTES = 'notes.json';
 const MOST_NOTES = 1 << 18; // bytes
 
 export interface Source {
-  // A file of so many bytes.
+  // Reads a file of `size` bytes.
   read(name: string, size: number, came: Came): Promise<ArrayBuffer>;
-  // bundle.json, whose size is stated nowhere.
+  // Reads bundle.json, whose size is unknown.
   manifest(): Promise<string>;
-  // notes.json, null where there is none; `stated`: by view.json, for a folder.
+  // Reads notes.json, null if there is none; `stated`: whether view.json of a folder lists it.
   notes(stated: boolean): Promise<string | null>;
 }
 
@@ -37,7 +37,7 @@ async function get(url: string, range?: string): Promise<Response> {
   return response;
 }
 
-// The bytes of an answer, at most `most`; no memory is taken for what has not come.
+// Reads a response of at most `most` bytes, allocating only what has arrived.
 async function bytesOf(response: Response, name: string, most: number, came: Came): Promise<Uint8Array<ArrayBuffer>> {
   const parts: Uint8Array[] = [];
   let at = 0;
@@ -81,7 +81,7 @@ export class Folder implements Source {
   }
 }
 
-const LARGEST = 2 ** 32; // of a file without the extension for larger ones
+const LARGEST = 2 ** 32; // bytes of a file without ZIP64
 
 export class SingleFile implements Source {
   private constructor(
@@ -90,7 +90,7 @@ export class SingleFile implements Source {
     private readonly whole: Uint8Array<ArrayBuffer> | null,
   ) {}
 
-  // Asks for the end of the file, where its directory is; a server that knows no ranges sends all of it.
+  // Fetches the end of the file, with its directory; servers without ranges send all of it.
   static async open(url: string, progress: (done: number, total: number) => void): Promise<SingleFile> {
     const response = await get(url, `-${TAIL}`);
     const name = url.split('/').pop() ?? url;
@@ -105,7 +105,7 @@ export class SingleFile implements Source {
     if (!(size < LARGEST)) throw new DamagedBundle(`${name}: the server does not say how long it is.`);
     const tail = await bytesOf(response, name, TAIL, nothing);
     const { begin, end, count } = placeOf(tail, size);
-    const from = begin - (size - tail.length); // in the tail, if the directory is not longer than it
+    const from = begin - (size - tail.length); // in the tail, unless the directory is longer
     const directory =
       from >= 0
         ? tail.slice(from, from + end - begin)

@@ -1,4 +1,4 @@
-// Surfels as the shaders read them: the struct Surfel of scene.wgsl, and the terms of the view colours.
+// Surfels in the shaders' form: struct Surfel of scene.wgsl, and the terms of the view colours.
 import { DamagedBundle } from '../errors';
 import type { Manifest, Vec3, ViewKind } from './manifest';
 import { Table, parsePly } from './ply';
@@ -7,12 +7,12 @@ export const SURFEL_WORDS = 24;
 export const KINDS = { sv: 0, 'sv sites': 1, sh: 2, sb: 3, sg: 4 } as const; // VIEW_* of view_color.wgsl
 export const LEAN_WIDTH: Record<ViewKind, number> = { sv: 6, sh: 3, sb: 6, sg: 7 };
 const MAX_TERMS = 32;
-// Largest values: codec/limits.py.
+// Largest values, as codec/limits.py.
 export const MOST = { position: 1e9, logScale: 104, shape: 1e4, color: 256, direction: 1e6, vector: 2e7 } as const;
 export const EXTENTS: [number, number] = [1e-6, 16];
-const UNIT_SLACK = 0.01; // of the length of a rotation
+const UNIT_SLACK = 0.01; // tolerance of a rotation's length
 const of = (size: number, count = 3): number[] => new Array<number>(count).fill(size);
-// Of the numbers of a term.
+// Limits of the numbers of a term.
 export const TERM_LIMITS: Record<ViewKind | 'sv sites', number[]> = {
   sv: [...of(MOST.vector), ...of(MOST.color)],
   'sv sites': [...of(MOST.direction), MOST.shape, ...of(MOST.color)],
@@ -20,7 +20,7 @@ export const TERM_LIMITS: Record<ViewKind | 'sv sites', number[]> = {
   sb: [...of(MOST.color), ...of(MOST.shape)],
   sg: [...of(MOST.direction), MOST.shape, ...of(MOST.color)],
 };
-// First words of what a surfel has.
+// Offsets in a surfel, words.
 export const WORD = {
   mean: 0,
   opacity: 3,
@@ -29,7 +29,7 @@ export const WORD = {
   beta: 10,
   extent: 11,
   residual: 12,
-  layer: 15, // and the mean alpha: alphaWord
+  layer: 15, // with the mean alpha: alphaWord
   base: 16,
   firstTerm: 19,
   tile: 20,
@@ -42,19 +42,19 @@ export interface Surfels {
   words: Float32Array;
   terms: Float32Array;
   kind: number;
-  origin: Vec3; // taken off the means
-  means: boolean; // whether the mean residuals of tiles are there
+  origin: Vec3; // subtracted from the means
+  means: boolean; // whether mean residuals of tiles are known
 }
 
-// The mean alpha m of a surfel as it is beside its layer: scene.wgsl.
+// Encodes a surfel's mean alpha m for the layer's word: scene.wgsl.
 export const alphaWord = (m: number): number => (Math.min(Math.round(128 * m), 255) << 24) >>> 0;
 export const layerIn = (word: number): number => word & 0xffffff;
 export const alphaIn = (word: number): number => (word >>> 24) / 128;
 
-// The middle of the scene: far from the world's origin float32 would not place surfels.
+// Returns the scene's centre, the origin of float32 positions, which lack precision far from the world's.
 export const originOf = ({ bounds }: Manifest): Vec3 => bounds.min.map((low, c) => (low + bounds.max[c]) / 2) as Vec3;
 
-// Takes the origin off the means.
+// Subtracts the origin from the means.
 export function centred(words: Float32Array, origin: Vec3): void {
   for (let i = WORD.mean; i < words.length; i += SURFEL_WORDS) {
     for (let c = 0; c < 3; c++) words[i + c] -= origin[c];
@@ -73,7 +73,7 @@ export function setTile(
   numbers[WORD.layer] = layer;
 }
 
-// Sets where in a list of terms of so many numbers those of each surfel are; returns how many terms there are.
+// Sets each surfel's span in the list of terms of `width` numbers; returns the number of terms.
 export function setTerms(words: Float32Array, counts: ArrayLike<number>, width: number): number {
   const numbers = new Uint32Array(words.buffer);
   let first = 0;
@@ -100,7 +100,7 @@ function lean(rows: Table, terms: Table, words: Float32Array, kind: ViewKind): F
   return out;
 }
 
-// All terms of every surfel: [columns of a term as (name, width)], interleaved term by term.
+// Reads all terms of every surfel from columns (name, width), interleaved by term.
 function whole(rows: Table, words: Float32Array, parts: [string, number][], base: string | null): Float32Array {
   const width = parts.reduce((sum, [, w]) => sum + w, 0);
   const count = rows.width(parts[0][0]) / parts[0][1];
@@ -152,7 +152,7 @@ function tiles(rows: Table, words: Float32Array, info: Manifest): void {
   }
 }
 
-// Mean alphas of tiles, and those of surfels without one.
+// Reads mean alphas.
 function alphas(rows: Table, words: Float32Array): void {
   const numbers = new Uint32Array(words.buffer);
   const means = new Float32Array(rows.count);
@@ -172,7 +172,7 @@ const LIMITS: [name: string, first: number, words: number, most: number][] = [
   ['view_base', WORD.base, 3, MOST.color],
 ];
 
-// Refuses what the package's reader refuses: from_columns of bundle/surfel_table.py.
+// Checks the same limits as from_columns of bundle/surfel_table.py.
 function checkLimits(words: Float32Array, terms: Float32Array, ofTerm: number[]): void {
   const refuse = (name: string, i: number): never => {
     throw new DamagedBundle(`surfels.ply: ${name} is beyond its limit, or no number, in row ${i}.`);

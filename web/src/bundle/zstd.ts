@@ -1,12 +1,12 @@
-// Zstandard frames of a stated size. fzstd decodes them; what it does not look at is looked at here, so that a damaged
-// frame is an error: it trusts the sizes of a frame, and never ends with one kind of table.
+// Zstandard frames of a stated size, decoded by fzstd. It trusts the sizes in a frame and never ends on one kind of
+// table; both are checked here, so that a damaged frame is an error.
 import { decompress } from 'fzstd';
 import { DamagedBundle } from '../errors';
 
 const MAGIC = 0xfd2fb528;
-const MOST_IN_BLOCK = 1 << 17; // bytes, of what a block holds
-const MOST_ACCURACY = 6; // of the probabilities of a Huffman table's weights
-const SHORTEST_MATCH = 3; // bytes: so many more sequences than that a block cannot have
+const MOST_IN_BLOCK = 1 << 17; // bytes of a decoded block
+const MOST_ACCURACY = 6; // bits of the probabilities of a Huffman table's weights
+const SHORTEST_MATCH = 3; // bytes, which bounds the sequences of a block
 
 class Bytes {
   constructor(
@@ -14,7 +14,7 @@ class Bytes {
     public at: number,
     private readonly end: number,
   ) {}
-  // A little-endian number of `count` bytes.
+  // Reads a little-endian number of `count` bytes.
   number(count: number): number {
     if (this.at + count > this.end) throw new Error('it ends early');
     let value = 0;
@@ -27,17 +27,17 @@ class Bytes {
   }
 }
 
-// `count` bits from bit `at`, the lowest first; beyond the end they are 0.
+// Reads `count` bits from bit `at`, lowest first; 0 beyond the end.
 const bits = (data: Uint8Array, at: number, count: number): number => {
   const byte = (k: number): number => data[(at >> 3) + k] ?? 0;
   return ((byte(0) | (byte(1) << 8) | (byte(2) << 16)) >> (at & 7)) & ((1 << count) - 1);
 };
 
-// Whether a table of probabilities that begins at byte `at` gives all of them to one symbol. Its states then take no
-// bits, and whoever reads until the bits are used up reads forever. Nobody writes such a table: it says nothing.
+// Returns true if the table of probabilities at byte `at` has a single symbol. Its states take no bits, so decoding
+// until the bits are used up never ends; encoders do not write such tables.
 function oneSymbol(data: Uint8Array, at: number): boolean {
   const accuracy = bits(data, 8 * at, 4) + 5;
-  if (accuracy > MOST_ACCURACY) return false; // which is refused elsewhere
+  if (accuracy > MOST_ACCURACY) return false; // refused elsewhere
   let place = 8 * at + 4;
   for (let symbol = 0; symbol < 256;) {
     if (bits(data, place, accuracy + 1) === 2 ** (accuracy + 1) - 1) return true;
@@ -54,7 +54,7 @@ function oneSymbol(data: Uint8Array, at: number): boolean {
   return false;
 }
 
-// How many bytes a block of literals and sequences can hold: at least, at most.
+// Returns the least and most bytes that a block of literals and sequences can decode to.
 function heldBy(data: Uint8Array, begin: number, size: number): [number, number] {
   const bytes = new Bytes(data, begin, begin + size);
   const first = data[begin];
@@ -81,7 +81,7 @@ function heldBy(data: Uint8Array, begin: number, size: number): [number, number]
   return [least, sequences ? MOST_IN_BLOCK : literals];
 }
 
-// The number of bytes that a frame declares. Throws where it declares none, or its blocks do not fill it.
+// Returns the decoded size that a frame declares. Throws if there is none, or its blocks cannot have it.
 function declared(frame: Uint8Array): number {
   const bytes = new Bytes(frame, 0, frame.length);
   if (bytes.number(4) !== MAGIC) throw new Error('it is no frame');
@@ -109,13 +109,13 @@ function declared(frame: Uint8Array): number {
   return size;
 }
 
-// The bytes of a frame that must hold `size` of them; no memory is taken before its header has said so too.
+// Decodes a frame of exactly `size` bytes; its header is checked before allocating.
 export function frameBytes(frame: Uint8Array, size: number, name: string): Uint8Array {
   try {
     const found = declared(frame);
     if (found !== size) throw new Error(`it declares ${found} bytes, ${size} are wanted`);
     if (size === 0) return new Uint8Array();
-    // fzstd makes the memory itself: one that it is handed it compares with a number, by way of a text of all of it
+    // fzstd allocates: it would convert a buffer passed to it to a string, for a comparison with a number
     const data = decompress(frame);
     if (data.length !== size) throw new Error(`it holds ${data.length} bytes, ${size} are wanted`);
     return data;

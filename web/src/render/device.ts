@@ -1,4 +1,4 @@
-// The graphics device.
+// WebGPU device.
 import { ViewerError, tooLarge } from '../errors';
 
 const NEEDS =
@@ -9,8 +9,8 @@ export interface Graphics {
   device: GPUDevice;
   name: string;
   blocks: boolean; // BC7 textures
-  floats: boolean; // blends and filters rgba32float
-  software: boolean; // the processor draws
+  floats: boolean; // rgba32float can be blended and filtered
+  software: boolean; // software adapter
 }
 
 export async function openDevice(): Promise<Graphics> {
@@ -42,7 +42,7 @@ export async function openDevice(): Promise<Graphics> {
 
 const DRIVER = 'Reload the page. If it happens again, update the browser and the graphics driver.';
 
-// Has `stop` told what the device says of itself: that it refuses something, has no memory left, or is lost.
+// Calls `stop` with device errors: validation, out of memory, loss.
 export function watch(device: GPUDevice, stop: (error: unknown) => void): void {
   device.addEventListener('uncapturederror', ({ error }) => {
     if (error instanceof GPUOutOfMemoryError) stop(tooLarge('The graphics device has not enough memory for it.'));

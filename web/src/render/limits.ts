@@ -1,14 +1,14 @@
-// What a device has room for, asked before anything of a scene is decoded or made.
+// Limits of the device, checked before a scene is decoded.
 import type { Atlas, Manifest } from '../bundle/manifest';
 import { LEAN_WIDTH, SURFEL_WORDS } from '../bundle/surfels';
 import { tooLarge } from '../errors';
 
-const DECODED_NUMBERS = 19; // of a surfel of a compact bundle, besides its terms: doubles, all at once
-const TEXEL_BYTES = 12; // of a texel on its way: three coefficients
+const DECODED_NUMBERS = 19; // doubles per surfel while a compact bundle is decoded, without terms
+const TEXEL_BYTES = 12; // per texel while decoding: three coefficients
 const GIGABYTE = 2 ** 30;
-const UNKNOWN_MEMORY = 4; // gigabytes, where the browser does not say how many the device has
-const SHARE = 0.5; // of them, that a page may take
-const GROUP = 64; // surfels: prepare.wgsl
+const UNKNOWN_MEMORY = 4; // gigabytes, if the browser does not tell
+const SHARE = 0.5; // of the device's memory for a page
+const GROUP = 64; // surfels per workgroup of prepare.wgsl
 
 export type Limits = Pick<
   GPUSupportedLimits,
@@ -21,7 +21,7 @@ export type Limits = Pick<
 
 const texelsOf = (atlas: Atlas): number => atlas.width * atlas.height * atlas.layers;
 
-// Bytes that the page takes at its peak, at least.
+// Estimates the page's peak memory, bytes, from below.
 export function pageBytes({ count, terms, viewColor, compact, atlas, files }: Manifest): number {
   const width = LEAN_WIDTH[viewColor];
   const words = 4 * (SURFEL_WORDS * count + width * (terms ?? 0));
@@ -33,7 +33,7 @@ export function pageBytes({ count, terms, viewColor, compact, atlas, files }: Ma
   return words + ['surfels.ply', 'atlas.ktx2'].reduce((sum, name) => sum + (files.get(name)?.bytes ?? 0), 0);
 }
 
-// Refuses a scene that bundle.json says to be larger than the device takes.
+// Rejects a scene that exceeds the device's limits, by its bundle.json.
 export function checkRoom(info: Manifest, limits: Limits, gigabytes = UNKNOWN_MEMORY): void {
   const { count, terms, viewColor, atlas } = info;
   const largest = Math.max(4 * SURFEL_WORDS * count, 4 * LEAN_WIDTH[viewColor] * (terms ?? 0));

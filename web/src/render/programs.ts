@@ -1,4 +1,4 @@
-// The shaders, put together and compiled. bitymi_ns/ops/webgpu/programs.py does the same in Python.
+// Shader programs, assembled and compiled; bitymi_ns/ops/webgpu/programs.py does the same in Python.
 import batches from '../../../bitymi_ns/ops/shaders/batches.wgsl?raw';
 import bounds from '../../../bitymi_ns/ops/shaders/bounds.wgsl?raw';
 import draw from '../../../bitymi_ns/ops/shaders/draw.wgsl?raw';
@@ -98,7 +98,7 @@ export class Programs {
     });
   }
 
-  // Renders a page at half its size; `alpha`: with colours weighted by alpha.
+  // Pipeline that halves a page; `alpha`: colours weighted by alpha.
   halve(format: GPUTextureFormat, alpha: boolean): GPURenderPipeline {
     const entryPoint = `halve${alpha ? '_alpha' : ''}_${format === 'rgba8unorm' ? 'bytes' : 'floats'}`;
     return this.once(entryPoint, {

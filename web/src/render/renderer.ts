@@ -1,4 +1,4 @@
-// Draws frames of a scene: to a target of sums, and from there to a screen.
+// Draws frames of a scene to a target of sums, and from there to a screen.
 import type { Vec3 } from '../bundle/manifest';
 import type { View } from '../view/pose';
 import { type Sampling, samplingOf, sizeOf } from '../view/size';
@@ -9,33 +9,33 @@ import { type SceneOnDevice, STRIDE, group } from './scene';
 export interface DrawOptions {
   show: Show;
   residuals: boolean;
-  held: Vec3 | null; // from where view colours are seen; null: from the camera
+  held: Vec3 | null; // viewpoint of view colours; null: the camera
   background: Vec3;
   layers: number; // batches: draw.wgsl
-  fine: boolean; // in single precision, where the device blends it
-  farthest: number; // depth of the last colour of the map of depths
+  fine: boolean; // single precision, if the device can blend it
+  farthest: number; // upper end of the depth map
 }
 
 interface Target {
   width: number;
   height: number;
   format: TargetFormat;
-  samples: number; // of a pixel of the picture, along each axis
+  samples: number; // per pixel, along each axis
   sums: GPUTexture;
   before: GPUTexture;
   batch: GPUBindGroup;
 }
 
-// A map of depths along the camera's axis, by rows; infinite where surfels cover less than half of a pixel.
+// Depth map along the camera's axis, row-major; infinite where coverage is below one half.
 export interface Depths {
   width: number;
   height: number;
   depth: Float32Array;
 }
 
-const MOST_SAMPLES = 6; // per pixel, along each axis, of a picture that stays
-const MOST_PIXELS = 1 << 22; // of a target
-const MOST_OVERDRAW = 64; // of the last colour of the map
+const MOST_SAMPLES = 6; // per pixel and axis, at rest
+const MOST_PIXELS = 1 << 22; // in a target
+const MOST_OVERDRAW = 64; // upper end of the overdraw map
 
 export class Renderer {
   private target: Target | null = null;
@@ -52,7 +52,7 @@ export class Renderer {
     this.smooth = device.createSampler({ magFilter: 'linear', minFilter: 'linear' });
   }
 
-  // Pixels of a side of a picture, at most.
+  // Largest side of a picture, pixels.
   get largestSide(): number {
     return this.graphics.device.limits.maxTextureDimension2D;
   }
@@ -155,7 +155,7 @@ export class Renderer {
     work.end();
   }
 
-  // Draws a view for a screen, at `scale` of the screen's resolution; ends when it is drawn.
+  // Draws a view for a screen, at `scale` of its resolution; resolves when done.
   draw(view: View, to: GPUTexture, scale: number, options: DrawOptions): Promise<undefined> {
     const { queue } = this.graphics.device;
     const encoder = this.graphics.device.createCommandEncoder();
@@ -170,7 +170,7 @@ export class Renderer {
   async depths(view: View, options: DrawOptions): Promise<Depths> {
     const encoder = this.graphics.device.createCommandEncoder();
     const { width, height, format, sums } = this.encode(encoder, view, { ...options, show: 'depth' });
-    const bytes = format === 'rgba32float' ? 16 : 8; // of a pixel
+    const bytes = format === 'rgba32float' ? 16 : 8; // per pixel
     const rows = await this.rowsOf(encoder, sums, bytes);
     const depth = new Float32Array(width * height);
     for (let i = 0; i < depth.length; i++) {
@@ -198,7 +198,7 @@ export class Renderer {
     return image;
   }
 
-  // Has the work done, and reads a texture of so many bytes a pixel.
+  // Submits the work and reads a texture of `bytes` per pixel, row by row.
   private async rowsOf(encoder: GPUCommandEncoder, texture: GPUTexture, bytes: number): Promise<Uint8Array[]> {
     const { device } = this.graphics;
     const { width, height } = texture;
@@ -214,7 +214,7 @@ export class Renderer {
   }
 }
 
-// A number of half precision that is not negative.
+// Converts a non-negative half-precision number.
 const half = (bits: number): number => {
   const exponent = bits >> 10;
   return exponent ? 2 ** (exponent - 25) * (1024 + (bits & 1023)) : 2 ** -24 * bits;

@@ -1,4 +1,4 @@
-// A bundle in the memory of the graphics device.
+// A bundle in GPU memory.
 import { decodeBc7 } from '../bundle/bc7';
 import { type Pages, blockOf } from '../bundle/ktx2';
 import type { Manifest } from '../bundle/manifest';
@@ -8,7 +8,7 @@ import type { Graphics } from './device';
 import { type Programs, SORT_ENTRIES, type SortEntry } from './programs';
 
 export const MOST_LAYERS = 64;
-export const STRIDE = 256; // between the uniforms of batches, which devices want so
+export const STRIDE = 256; // offset alignment of the batches' uniforms
 const BLOCK = 1024; // of sort.wgsl: keys per block, digits, rounds
 const DIGITS = 16;
 const ROUNDS = 8;
@@ -31,9 +31,9 @@ export class SceneOnDevice {
   readonly draws: GPUBuffer;
   readonly layers: GPUBuffer;
   readonly drawn: GPUBindGroup;
-  readonly decoded: boolean; // BC7 that this device does not draw as it is
+  readonly decoded: boolean; // BC7 decoded on the CPU, if the device does not support it
   pages: GPUBindGroup;
-  complete: boolean; // with its texels, if it has any
+  complete: boolean; // texels, if any, are loaded
   private atlas: GPUTexture;
   private coarser: GPUTexture | null = null;
   private readonly device: GPUDevice;
@@ -102,7 +102,7 @@ export class SceneOnDevice {
     return this.complete ? (this.surfels.means ? 2 : 1) : 0;
   }
 
-  // Texels that were not there at first.
+  // Sets texels that arrived later.
   setTexels(pages: Pages): void {
     this.atlas = this.texture(pages);
     this.coarser = null;
@@ -110,7 +110,7 @@ export class SceneOnDevice {
     this.pages = this.boundPages();
   }
 
-  // Any texture stands for coarser levels that are not looked at.
+  // Coarser levels that are not sampled may be any texture.
   private boundPages(): GPUBindGroup {
     const [atlas, coarser] = [this.atlas, this.coarser ?? this.atlas].map((t) =>
       t.createView({ dimension: '2d-array' }),
@@ -119,7 +119,7 @@ export class SceneOnDevice {
     return group(this.device, this.programs.layouts[1], [atlas, sampler, coarser]);
   }
 
-  // Sees that the levels 1 and 2 of the tiles are there, for a view that is smaller than the photographs.
+  // Makes the levels 1 and 2 of the tiles once, for views smaller than the photographs.
   makeCoarser(): void {
     if (this.coarser || !this.complete) return;
     const { width, height, depthOrArrayLayers: layers } = this.atlas;
@@ -192,7 +192,7 @@ export class SceneOnDevice {
     return texture;
   }
 
-  // Projects, sorts, and shares out the surfels.
+  // Encodes projection, sorting, and division into batches.
   encodeSorting(encoder: GPUCommandEncoder): void {
     const work = encoder.beginComputePass();
     const run = (pipeline: GPUComputePipeline, bound: GPUBindGroup, groups: number): void => {

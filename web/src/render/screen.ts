@@ -1,4 +1,4 @@
-// What a frame is drawn to on the page.
+// Drawing to the page's canvas.
 import type { View } from '../view/pose';
 import type { Graphics } from './device';
 import type { DrawOptions, Renderer } from './renderer';
@@ -6,7 +6,7 @@ import type { DrawOptions, Renderer } from './renderer';
 const FRAME_MILLISECONDS = 1000 / 60;
 const LEAST_SCALE = 0.2;
 
-// Draws a view for the canvas, at `scale` of its resolution; ends when it is drawn.
+// Draws a view to the canvas, at `scale` of its resolution; resolves when done.
 export type Screen = (view: View, scale: number, options: DrawOptions) => Promise<unknown>;
 
 function direct(canvas: HTMLCanvasElement, renderer: Renderer, device: GPUDevice): Screen {
@@ -20,7 +20,7 @@ function direct(canvas: HTMLCanvasElement, renderer: Renderer, device: GPUDevice
   };
 }
 
-// Through the memory of the page: where the processor draws, there may be nothing to share a canvas with.
+// Copies frames through the page's memory, as software adapters may be unable to share a canvas.
 function copied(canvas: HTMLCanvasElement, renderer: Renderer): Screen {
   const context = canvas.getContext('2d', { alpha: false });
   if (!context) throw new Error('The canvas gives no 2D context.');
@@ -35,17 +35,17 @@ function copied(canvas: HTMLCanvasElement, renderer: Renderer): Screen {
 export const screenOf = (canvas: HTMLCanvasElement, renderer: Renderer, graphics: Graphics): Screen =>
   graphics.software ? copied(canvas, renderer) : direct(canvas, renderer, graphics.device);
 
-// The share of the screen's resolution that holds 60 frames a second while the camera moves.
+// Resolution scale that keeps 60 frames per second while the camera moves.
 export class Pace {
   scale = 1;
-  milliseconds = 0; // of a frame, smoothed
+  milliseconds = 0; // per frame, smoothed
 
-  // After a frame that took so long at the present scale.
+  // Updates the scale after a frame at the current one.
   took(milliseconds: number): void {
     this.milliseconds = this.milliseconds ? 0.7 * this.milliseconds + 0.3 * milliseconds : milliseconds;
     const wish = this.scale * Math.sqrt((0.85 * FRAME_MILLISECONDS) / Math.max(this.milliseconds, 0.5));
     const next = Math.min(1, Math.max(LEAST_SCALE, wish));
-    // small steps, and none for small differences: each asks for new targets
+    // small steps, and none for small differences, as each reallocates targets
     if (Math.abs(next - this.scale) > 0.08 * this.scale) {
       const step = 0.5 * (next - this.scale);
       this.scale += Math.sign(step) * Math.max(Math.abs(step), Math.min(0.05, Math.abs(2 * step)));

@@ -8,7 +8,7 @@ export function element<T extends HTMLElement = HTMLElement>(id: string): T {
 export const press = (button: HTMLElement, on: boolean): void => button.setAttribute('aria-pressed', String(on));
 export const pressed = (button: HTMLElement): boolean => button.getAttribute('aria-pressed') === 'true';
 
-// A new element, with properties and attributes of the same name, and what it holds.
+// Creates an element with properties, attributes of the same name, and children.
 export function make<K extends keyof HTMLElementTagNameMap>(
   tag: K,
   properties: Partial<HTMLElementTagNameMap[K]>,
@@ -21,17 +21,17 @@ export function make<K extends keyof HTMLElementTagNameMap>(
 
 export const onClick = (id: string, run: () => void): void => element(id).addEventListener('click', run);
 
-// A new button with a name for screen readers where its text is none.
+// Creates a button, with a name for screen readers if its text is none.
 export const button = (
   text: string,
   { run, ...properties }: { title: string; run: () => void; className?: string; ariaLabel?: string },
 ): HTMLButtonElement => make('button', { type: 'button', onclick: run, ...properties }, text);
 
-// Whether keys go to an element, and not to the scene.
+// Returns true if keys go to an element instead of the scene.
 export const typing = (target: EventTarget | null): boolean =>
   [HTMLSelectElement, HTMLInputElement, HTMLTextAreaElement].some((kind) => target instanceof kind);
 
-// Gives the reader a file.
+// Offers a file for download.
 export function download(name: string, data: Blob): void {
   const link = make('a', { href: URL.createObjectURL(data), download: name });
   link.click();

@@ -1,4 +1,4 @@
-// A film of what a canvas shows, in the time in which it shows it.
+// Real-time recording of a canvas.
 const TYPE = 'video/webm';
 const BITS = 16e6; // per second
 const SETTLING = 100; // milliseconds
@@ -21,7 +21,7 @@ export class Film {
   end(): Promise<Blob> {
     return new Promise((give) => {
       this.recorder.onstop = () => give(new Blob(this.parts, { type: TYPE }));
-      // the last picture is on its way still
+      // the last frame is still being encoded
       setTimeout(() => {
         this.recorder.stop();
         for (const track of this.recorder.stream.getTracks()) track.stop();

@@ -7,8 +7,8 @@ import { button, download, element, make, onClick, press, pressed } from './dom'
 import { notify } from './pages';
 import type { Stage } from './stage';
 
-const STILL_HAND = 5; // pixels that a click may move
-const BEHIND = 0.97; // of a note's depth: surfels nearer than that hide it
+const STILL_HAND = 5; // pixels of pointer movement that still count as a click
+const BEHIND = 0.97; // share of a note's depth; nearer surfels hide it
 
 type Entry = Notes['views'][number] | Note;
 
@@ -52,14 +52,14 @@ export class NotesPanel {
     return this.all.views.map(({ name }) => name);
   }
 
-  // Goes to the view of a name; whether there is one.
+  // Goes to a view by name; returns whether it exists.
   goTo(name: string): boolean {
     const found = this.all.views.find((view) => view.name === name);
     if (found) this.stage.fly(found.viewpoint);
     return found !== undefined;
   }
 
-  // Puts the markers where a view shows their notes; `still`: and finds which of them surfels hide.
+  // Moves the markers to their notes' positions in a view; `still`: also finds which are hidden by surfels.
   async drawn(view: View, still: boolean): Promise<void> {
     const seen: { marker: HTMLElement; x: number; y: number; z: number }[] = [];
     for (const [{ position }, marker] of this.markers) {
@@ -109,7 +109,7 @@ export class NotesPanel {
     this.canvas.classList.toggle('placing', on);
   }
 
-  // A new note where the surfels are that a pixel of the screen shows.
+  // Adds a note at the surface seen through a screen pixel.
   private async pin(clientX: number, clientY: number): Promise<void> {
     const [view, box] = [this.stage.view(), this.canvas.getBoundingClientRect()];
     const x = ((clientX - box.left) / box.width) * view.width;
@@ -169,7 +169,7 @@ export class NotesPanel {
     );
   }
 
-  // Where the name of a view or the text of a note is typed: Enter keeps it, Escape what was there.
+  // Text field for the name of a view or the text of a note: Enter saves, Escape restores.
   private field<T extends Entry>(list: T[], entry: T, before: string): HTMLElement {
     const isNote = 'text' in entry;
     const common = { value: before, maxLength: isNote ? LONGEST_TEXT : LONGEST_NAME, className: 'name' };
@@ -177,7 +177,7 @@ export class NotesPanel {
       ? make('textarea', { ...common, rows: 3, ariaLabel: 'Text of the note' })
       : make('input', { ...common, type: 'text', ariaLabel: 'Name of the view' });
     const end = (text: string): void => {
-      if (this.editing !== entry) return; // the field is removed, and loses the focus
+      if (this.editing !== entry) return; // the field was removed and loses focus
       this.editing = null;
       const taken = !isNote && text !== before && this.names.includes(text);
       if (taken) notify(`Another view has the name ${text}.`);

@@ -1,4 +1,4 @@
-// What stands in place of the scene: progress, the poster, or why there is none.
+// Pages in place of the scene: progress, poster, error.
 import { reasonOf } from '../errors';
 import { element } from './dom';
 
@@ -15,7 +15,7 @@ export const stopped = (): boolean => document.documentElement.dataset.state ===
 let told: (title: string, message: string) => void = () => undefined;
 export const onError = (tell: typeof told): void => void (told = tell);
 
-// The first error is the one that is shown: those that follow mostly follow from it.
+// Shows the first error only, as later ones mostly follow from it.
 export function showError(error: unknown): void {
   if (stopped()) return;
   const { title, message, advice } = reasonOf(error);
@@ -44,7 +44,7 @@ export function notify(text: string): void {
   setTimeout(() => (notice.hidden = true), 8000);
 }
 
-// The poster over the canvas, until there is a picture of the surfels.
+// The poster covers the canvas until the first frame.
 let posterEnded = false;
 
 export async function showPoster(poster: Blob | null): Promise<void> {
@@ -54,7 +54,7 @@ export async function showPoster(poster: Blob | null): Promise<void> {
   try {
     await image.decode();
   } catch {
-    posterEnded = true; // it is no picture
+    posterEnded = true; // not a picture
   }
   URL.revokeObjectURL(address);
   if (posterEnded) return;
@@ -62,7 +62,7 @@ export async function showPoster(poster: Blob | null): Promise<void> {
   if (document.documentElement.dataset.state === 'loading') document.documentElement.dataset.state = 'poster';
 }
 
-// There is a picture of the surfels, or there will be none.
+// Removes the poster: there is a first frame, or none will come.
 export function endPoster(): void {
   posterEnded = true;
   element('poster').hidden = true;

@@ -1,4 +1,4 @@
-// The path of the camera: its keyframes in a list, playing it, and saving it.
+// Panel of the camera path: list of keyframes, playback, saving.
 import { CameraPath, LONGEST, SECONDS, SHORTEST } from '../view/path';
 import type { Pose, View } from '../view/pose';
 import { button, download, element, make, onClick, press, pressed } from './dom';
@@ -6,13 +6,13 @@ import { Film, filmable } from './film';
 import { notify } from './pages';
 import type { Stage } from './stage';
 
-const MOST_BYTES = 1 << 26; // of a file that is read
+const MOST_BYTES = 1 << 26; // of a path file
 
 interface Playing {
   record: boolean;
-  film: Film | null; // from when the first view is drawn
+  film: Film | null; // from the first drawn view on
   since: number; // time, ms, of the first view
-  wanted: View | null; // the first view, and the last, until they are drawn
+  wanted: View | null; // the first and last view, until drawn
 }
 
 export class PathPanel {
@@ -43,7 +43,7 @@ export class PathPanel {
     this.show();
   }
 
-  // The view that the path shows now, while it plays.
+  // Returns the current view while the path plays.
   advance(now: number): View | null {
     const { playing, path } = this;
     if (!playing || playing.wanted) return playing?.wanted ?? null;
@@ -55,7 +55,7 @@ export class PathPanel {
     return last;
   }
 
-  // What is on the canvas now.
+  // Called with the pose that the canvas shows.
   drawn(pose: Pose): void {
     const { playing } = this;
     if (!playing || pose !== playing.wanted?.pose) return;
@@ -68,7 +68,7 @@ export class PathPanel {
     if (playing.record) playing.film = new Film(this.canvas);
   }
 
-  // Ends it, as where the reader moves the camera.
+  // Stops playback, for instance when the user moves the camera.
   stop(): void {
     if (!this.playing) return;
     const { film } = this.playing;
@@ -119,7 +119,7 @@ export class PathPanel {
     } catch (error) {
       notify(`${file.name} is no camera path: ${error instanceof Error ? error.message : String(error)}`);
     }
-    element<HTMLInputElement>('path-file').value = ''; // the same file can be chosen again
+    element<HTMLInputElement>('path-file').value = ''; // so that the same file can be chosen again
     for (const what of ['smooth', 'loop'] as const) press(element(what), this.path[what]);
     this.show();
   }
@@ -151,7 +151,7 @@ export class PathPanel {
   }
 }
 
-// How long a segment takes.
+// Input for the duration of a segment.
 function secondsOf(from: number, to: number, keyframe: { seconds: number }, changed: () => void): HTMLElement {
   const ariaLabel = `Seconds from keyframe ${from} to ${to}`;
   const limits = { min: `${SHORTEST}`, max: `${LONGEST}`, step: 'any' };

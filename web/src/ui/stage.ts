@@ -1,14 +1,14 @@
-// What the panels see and change of what is shown.
+// Interface of the viewer to its panels.
 import type { Depths } from '../render/renderer';
 import type { View } from '../view/pose';
 import type { Shared, Viewpoint } from '../view/share';
 
 export interface Stage {
   shared(): Shared;
-  go(to: Omit<Viewpoint, 'target'> & Partial<Viewpoint>): void; // by default the target is one ahead
-  fly(to: Viewpoint): void; // on the way there, as long as the reader does not move the camera
+  go(to: Omit<Viewpoint, 'target'> & Partial<Viewpoint>): void; // by default the target is one unit ahead
+  fly(to: Viewpoint): void; // animated, until the user moves the camera
   pixels(): [number, number]; // of the canvas
-  view(): View; // that the canvas shows
+  view(): View; // on the canvas
   depths(view: View): Promise<Depths>;
   fileName(ending: string): string;
 }

@@ -1,4 +1,4 @@
-// The capture's cameras, from cameras.json, which a bundle may have.
+// Cameras of the capture, from the optional cameras.json.
 import type { Vec3 } from '../bundle/manifest';
 import type { Lens, Pose } from './pose';
 import { add, dot, subtract, times } from './vector';
@@ -8,7 +8,7 @@ export interface CaptureCamera {
   heldOut: boolean;
   pose: Pose;
   lens: Lens;
-  photograph: string | null; // a file of the bundle
+  photograph: string | null; // file in the bundle
 }
 
 const FILE = /^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$/;
@@ -51,7 +51,7 @@ export function parseCameras(text: string): CaptureCamera[] {
     .filter((found) => found !== null);
 }
 
-// The point that is nearest to what all cameras look at, by least squares; null where they look the same way.
+// Computes the point nearest to all optical axes by least squares; null if they are parallel.
 export function commonTarget(cameras: CaptureCamera[]): Vec3 | null {
   // sum over cameras of (1 - f f^T) (x - p) = 0
   const a = [0, 0, 0, 0, 0, 0, 0, 0, 0];

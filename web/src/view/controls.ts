@@ -1,10 +1,10 @@
-// Mouse, touch and keys, as movements of a camera.
+// Camera control by mouse, touch and keys.
 import type { Vec3 } from '../bundle/manifest';
 import { typing } from '../ui/dom';
 import { type Pose, look, moved, orbit, rolled } from './pose';
 import { add, length, subtract } from './vector';
 
-const TAP = 50; // milliseconds, for which a key counts as held at least
+const TAP = 50; // milliseconds that a key counts as held at least
 
 export type Mode = 'orbit' | 'fly';
 
@@ -19,7 +19,7 @@ export class Controls {
     public pose: Pose,
     public target: Vec3,
     private readonly up: Vec3,
-    private readonly size: number, // of the scene, by which steps are measured
+    private readonly size: number, // of the scene, the unit of steps
     private readonly changed: () => void,
   ) {
     surface.addEventListener('pointerdown', (e) => {
@@ -44,7 +44,7 @@ export class Controls {
       e.preventDefault();
       if (this.held.has(e.code)) return;
       this.held.add(e.code);
-      // a key that is let go before the next frame moves, too
+      // a key released before the next frame also moves the camera
       this.last = e.timeStamp - TAP;
       this.advance(e.timeStamp);
     });
@@ -74,7 +74,7 @@ export class Controls {
     }
   }
 
-  // Turns by angles, as if the scene were dragged: in orbit what is nearer than the target goes with the pointer.
+  // Turns by angles as if dragging the scene: in orbit, points nearer than the target follow the pointer.
   private turn(across: number, downwards: number): void {
     if (this.mode === 'orbit') {
       this.pose = orbit(this.pose, this.target, this.up, across, -downwards);
@@ -90,7 +90,7 @@ export class Controls {
     this.target = moved(this.pose, 0, 0, away).position;
   }
 
-  // Slides across the screen, by parts of its shorter side.
+  // Pans, by fractions of the screen's shorter side.
   private slide(across: number, downwards: number): void {
     const k = this.mode === 'orbit' ? this.distance() : this.size;
     this.step(-across * k, -downwards * k, 0);
@@ -110,9 +110,9 @@ export class Controls {
     this.changed();
   }
 
-  // Moves on by the keys that are held; whether any is.
+  // Moves by the held keys; returns whether any is held.
   advance(now: number): boolean {
-    // a frame may have begun before the key that is drawn in it was pressed
+    // a frame may have begun before its key was pressed
     const seconds = Math.min(0.1, Math.max(0, now - this.last) / 1000);
     this.last = Math.max(now, this.last);
     if (!this.held.size) return false;

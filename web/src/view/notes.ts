@@ -1,4 +1,4 @@
-// Saved views and notes of a scene: notes.json beside the bundle, as bitymi_ns/bundle/notes.py describes it.
+// Saved views and notes of a scene: notes.json, as in bitymi_ns/bundle/notes.py.
 import type { Vec3 } from '../bundle/manifest';
 import { type Viewpoint, cameraOf, viewpointOf } from './share';
 
@@ -51,10 +51,10 @@ function textOf(value: unknown, where: string, most: number): string {
   return value;
 }
 
-// Text without control characters.
+// Removes control characters.
 export const cleared = (text: string): string => text.replace(CONTROLS, '');
 
-// Throws where an entry is not as it must be, and names it.
+// Parses notes.json; throws an error that names an invalid entry.
 export function parseNotes(text: string): Notes {
   const root = keysOf(JSON.parse(text), 'the whole', ['format', 'version', 'views', 'notes']);
   if (root.format !== FORMAT || root.version !== 1) refuse('format', `must be ${FORMAT}, version 1`);

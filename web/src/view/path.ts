@@ -1,4 +1,4 @@
-// A path of the camera through keyframes, and its file for `ns-render camera-path`.
+// Camera path through keyframes, and its file for `ns-render camera-path`.
 import type { Vec3 } from '../bundle/manifest';
 import { type Lens, type Pose, View } from './pose';
 import { type Quat, difference, exponential, poseOf, product, quatOf, slerp } from './rotation';
@@ -16,9 +16,9 @@ export const LONGEST = 600;
 export const SECONDS = 2; // of a new segment
 export const RATE = 30; // frames per second of the file
 const MOST_FRAMES = 36_000; // of the file: 20 minutes
-const MOST_KEYFRAMES = 1000; // that are read
+const MOST_KEYFRAMES = 1000; // in a file
 const FLIGHT_SECONDS = 0.8;
-const STEEPEST = 3; // times the slower of two segments: a tangent beyond overshoots
+const STEEPEST = 3; // times the slower of two segments: steeper tangents overshoot
 
 export class CameraPath {
   keyframes: Keyframe[] = [];
@@ -31,13 +31,13 @@ export class CameraPath {
   get seconds(): number {
     return this.keyframes.slice(0, this.segments).reduce((sum, { seconds }) => sum + seconds, 0);
   }
-  // Changes the speed of all segments alike.
+  // Scales all segments to a total duration.
   set seconds(wanted: number) {
     const k = wanted / this.seconds;
     for (const each of this.keyframes) each.seconds = Math.min(LONGEST, Math.max(SHORTEST, k * each.seconds));
   }
 
-  // The view at a time, of a picture of so many pixels; there are at least two keyframes.
+  // Returns the view at a time for a picture size; needs two keyframes.
   at(time: number, width: number, height: number): View {
     let [segment, rest] = [0, Math.min(Math.max(time, 0), this.seconds)];
     while (segment + 1 < this.segments && rest >= this.keyframes[segment].seconds) {
@@ -62,7 +62,7 @@ export class CameraPath {
     return new View(poseOf(along(place), rotation), fx, fy, cx, cy, width, height);
   }
 
-  // How fast what `step` measures between keyframes changes at the ends of a segment, per second.
+  // Computes the rates of change of `step` between keyframes at the ends of a segment, per second.
   private speeds(segment: number, step: (a: Keyframe, b: Keyframe) => Vec3): [Vec3, Vec3] {
     const count = this.keyframes.length;
     const speed = (k: number): Vec3 | null => {
@@ -82,8 +82,8 @@ export class CameraPath {
     return [joined(segment), joined(segment + 1)];
   }
 
-  // The file that `ns-render camera-path` takes, for pictures of a size. Frame: the scene's, OpenGL's axes. nerfstudio
-  // ignores principal points, parts of width and height, and the lens of keyframes: fx, fy, cx, cy, width, height.
+  // Serialises for `ns-render camera-path`, for a picture size. Scene frame, OpenGL axes. nerfstudio ignores principal
+  // points, fractional sizes, and the lens of keyframes: fx, fy, cx, cy, width, height.
   file(width: number, height: number): string {
     const { seconds } = this;
     const aspect = width / height;
@@ -99,7 +99,7 @@ export class CameraPath {
       fov: fovOf(View.contain(pose, lens, width, height).fy, height),
       aspect,
       override_transition_enabled: true,
-      override_transition_sec: this.keyframes.at(k - 1)!.seconds, // from the keyframe before
+      override_transition_sec: this.keyframes.at(k - 1)!.seconds, // from the previous keyframe
       lens: lensOf(lens),
     }));
     return JSON.stringify({
@@ -116,7 +116,7 @@ export class CameraPath {
     });
   }
 
-  // Takes the keyframes of such a file, or of one that nerfstudio's viewer wrote; throws where it cannot.
+  // Loads the keyframes of such a file, or of one written by nerfstudio's viewer; throws if invalid.
   load(text: string): void {
     const file = JSON.parse(text) as Record<string, unknown> | null;
     const rows = file?.keyframes;
@@ -132,7 +132,7 @@ export class CameraPath {
   }
 }
 
-// The way from one view to another.
+// Animated transition between two views.
 export class Flight {
   private readonly path = new CameraPath();
   private since: number | null = null; // time, ms, of the first view
@@ -144,7 +144,7 @@ export class Flight {
     this.path.keyframes = [from, to].map(({ pose, lens }) => ({ pose, lens, seconds: FLIGHT_SECONDS }));
   }
 
-  // The view at a time, of a picture of so many pixels; null at the end.
+  // Returns the view at a time for a picture size; null after the end.
   at(now: number, width: number, height: number): View | null {
     this.since ??= now;
     const t = (now - this.since) / (1000 * FLIGHT_SECONDS);
@@ -156,7 +156,7 @@ const fovOf = (fy: number, height: number): number => (360 / Math.PI) * Math.ata
 const secondsOf = (given: unknown): number | null =>
   typeof given === 'number' && given > 0 ? Math.min(LONGEST, Math.max(SHORTEST, given)) : null;
 
-// Keyframe k of a file; `seconds` are those from the keyframe before.
+// Reads keyframe k of a file; its seconds count from the previous keyframe.
 function keyframeOf(row: Record<string, unknown>, k: number, usual: number): Keyframe {
   const { matrix, fov, aspect, override_transition_enabled: own, override_transition_sec: seconds } = row;
   const m = Array.isArray(matrix) && matrix.length === 16 ? (matrix as number[]) : [];
@@ -172,20 +172,20 @@ function keyframeOf(row: Record<string, unknown>, k: number, usual: number): Key
   return { ...found, seconds: (own === true ? secondsOf(seconds) : null) ?? usual };
 }
 
-// By rows; x right, y up, z backward.
+// Converts to a row-major matrix; x right, y up, z backward.
 function cameraToWorld({ position, right, down, forward }: Pose): number[] {
   const row = (c: number): number[] => [right[c], -down[c], -forward[c], position[c]];
   return [...[0, 1, 2].flatMap(row), 0, 0, 0, 1];
 }
 
-// Cubic from a to b with the derivatives m and n there.
+// Interpolates from a to b by a cubic with end derivatives m and n.
 function hermite(a: Vec3, b: Vec3, m: Vec3, n: Vec3, t: number): Vec3 {
   const s = 1 - t;
   const ends = add(times(s * s * (1 + 2 * t), a), times(t * t * (1 + 2 * s), b));
   return add(ends, add(times(s * s * t, m), times(-s * t * t, n)));
 }
 
-// The same for rotations: Shoemake's Bezier curve, with the derivatives in the frames of its ends.
+// Interpolates rotations by Shoemake's Bezier curve, with derivatives in the frames of its ends.
 function bezier(a: Quat, b: Quat, m: Vec3, n: Vec3, t: number): Quat {
   let points = [a, product(a, exponential(times(1 / 3, m))), product(b, exponential(times(-1 / 3, n))), b];
   while (points.length > 1) points = points.slice(1).map((q, k) => slerp(points[k], q, t));

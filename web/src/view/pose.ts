@@ -1,4 +1,4 @@
-// Where a camera stands, how it looks, and its lens.
+// Camera pose and lens.
 import type { Vec3 } from '../bundle/manifest';
 import { add, cross, dot, length, subtract, times, turned, unit } from './vector';
 
@@ -9,7 +9,7 @@ export interface Pose {
   forward: Vec3;
 }
 
-// A lens, for an image of `width` x `height`.
+// Pinhole intrinsics for an image of `width` x `height`.
 export interface Lens {
   fx: number;
   fy: number;
@@ -30,12 +30,12 @@ export class View implements Lens {
     readonly height: number,
   ) {}
 
-  // The same view in another number of pixels.
+  // Returns the view at another resolution.
   scaledTo(width: number, height: number): View {
     const [x, y] = [width / this.width, height / this.height];
     return new View(this.pose, this.fx * x, this.fy * y, this.cx * x, this.cy * y, width, height);
   }
-  // The pixel coordinates of a point and its depth along the camera's axis; null where the picture does not show it.
+  // Projects a point to pixel coordinates and depth along the camera's axis; null outside the picture.
   project(point: Vec3): Vec3 | null {
     const from = subtract(point, this.pose.position);
     const z = dot(from, this.pose.forward);
@@ -43,7 +43,7 @@ export class View implements Lens {
     const y = (this.fy * dot(from, this.pose.down)) / z + this.cy;
     return z > 0 && x >= 0 && x < this.width && y >= 0 && y < this.height ? [x, y, z] : null;
   }
-  // The view through a lens, of which a screen shows all, and more on two sides.
+  // Fits a lens into a screen, showing more on two sides.
   static contain(pose: Pose, lens: Lens, width: number, height: number): View {
     const k = Math.min(width / lens.width, height / lens.height);
     const cx = width / 2 + k * (lens.cx - lens.width / 2);
@@ -70,22 +70,22 @@ function turnedPose(pose: Pose, axis: Vec3, angle: number): Pose {
   };
 }
 
-const STEEPEST = 0.998; // cosine between the view and the vertical, beyond which it does not tilt
+const STEEPEST = 0.998; // largest cosine between view and vertical when tilting
 
-// Whether a camera may tilt: it does not come too close to the vertical, nor turn over beyond it.
+// Returns true if a camera may tilt without coming too close to the vertical or turning over.
 function tilts(pose: Pose, up: Vec3, angle: number): boolean {
   const next = turnedPose(pose, pose.right, angle);
   const [before, after] = [Math.abs(dot(pose.forward, up)), Math.abs(dot(next.forward, up))];
   return (after < STEEPEST || after < before) && dot(pose.down, up) * dot(next.down, up) > 0;
 }
 
-// Looks elsewhere: `across` to the right, `upwards` towards the sky, radians.
+// Rotates the camera in place: `across` to the right, `upwards` towards the sky, radians.
 export function look(pose: Pose, up: Vec3, across: number, upwards: number): Pose {
   const aside = turnedPose(pose, up, -across);
   return tilts(aside, up, upwards) ? turnedPose(aside, aside.right, upwards) : aside;
 }
 
-// Goes around a point, which stays where it is on the screen.
+// Orbits a point, which keeps its position on the screen.
 export function orbit(pose: Pose, target: Vec3, up: Vec3, across: number, upwards: number): Pose {
   const from = subtract(pose.position, target);
   const coordinates: Vec3 = [dot(from, pose.right), dot(from, pose.down), dot(from, pose.forward)];

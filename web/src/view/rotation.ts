@@ -17,7 +17,7 @@ export function exponential(v: Vec3): Quat {
   return [Math.cos(angle), ...times(angle > 1e-9 ? Math.sin(angle) / angle : 1, v)];
 }
 
-// The logarithm of the rotation from a to b, in the frame of a, by the shorter way.
+// Computes the logarithm of the shorter rotation from a to b, in the frame of a.
 export function difference(a: Quat, b: Quat): Vec3 {
   const [w, x, y, z] = product([a[0], -a[1], -a[2], -a[3]], b);
   const sine = Math.hypot(x, y, z);
@@ -27,7 +27,7 @@ export function difference(a: Quat, b: Quat): Vec3 {
 
 export const slerp = (a: Quat, b: Quat, t: number): Quat => product(a, exponential(times(t, difference(a, b))));
 
-// The rotation from the camera to the world, whose columns are the rows right, down and forward of a pose.
+// Converts a pose to its camera-to-world rotation, whose columns are right, down and forward.
 export function quatOf({ right: r, down: d, forward: f }: Pose): Quat {
   const squares = [1 + r[0] + d[1] + f[2], 1 + r[0] - d[1] - f[2], 1 - r[0] + d[1] - f[2], 1 - r[0] - d[1] + f[2]];
   const largest = squares.indexOf(Math.max(...squares));

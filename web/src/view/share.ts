@@ -1,10 +1,10 @@
-// A view as the fragment of an address, and back.
+// Conversion of views to and from address fragments.
 import type { Vec3 } from '../bundle/manifest';
 import { SHOW, type Show } from '../render/programs';
 import type { Lens, Pose } from './pose';
 import { cross, dot, length } from './vector';
 
-// A camera and the point that it turns around.
+// A camera and its orbit centre.
 export interface Viewpoint {
   pose: Pose;
   lens: Lens;
@@ -36,7 +36,7 @@ export function toHash({ pose, lens, target, show, residuals }: Shared): string 
   return `#${parts.join('&')}`;
 }
 
-// A camera as messages hold it; lens: fx, fy, cx, cy, width, height.
+// A camera in messages; lens: fx, fy, cx, cy, width, height.
 export interface Camera {
   position: number[];
   right: number[];
@@ -55,7 +55,7 @@ export const cameraOf = ({ pose, lens, target }: Viewpoint): Camera => ({
 
 const FARTHEST = 1e9;
 
-// The view of a camera from elsewhere, or null where it is none.
+// Validates a camera from a message; null if invalid.
 export function viewpointOf(camera: unknown): Viewpoint | null {
   const given = (camera ?? {}) as Partial<Record<keyof Camera, unknown>>;
   const good = (list: unknown, count: number): list is number[] =>

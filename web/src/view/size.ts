@@ -1,10 +1,10 @@
-// How a view of another size than the photographs is drawn: bitymi_ns/scene/sampling.py does the same.
+// Sampling of views of another size than the photographs, as bitymi_ns/scene/sampling.py.
 import type { View } from './pose';
 
-const AS_TRAINED = [0.75, 1.5]; // views between these sizes are drawn as in training
-const [SMALLEST, LARGEST] = [0.5, 2]; // beyond, for what they are; in between it changes over
-const [ONE_SAMPLE, TWO_SAMPLES] = [0.6, 1 / 3]; // from these sizes on one sample per pixel, and two along each axis
-const SAMPLE = 0.58; // in smaller views a photograph's pixel is at least so many samples wide
+const AS_TRAINED = [0.75, 1.5]; // sizes drawn as in training
+const [SMALLEST, LARGEST] = [0.5, 2]; // beyond, fully adapted; blended in between
+const [ONE_SAMPLE, TWO_SAMPLES] = [0.6, 1 / 3]; // from these sizes on one sample per pixel, or two along each axis
+const SAMPLE = 0.58; // least width of a photograph's pixel in smaller views, samples
 const FARTHEST = [1 / 64, 64];
 
 export interface Sampling {
@@ -12,7 +12,7 @@ export interface Sampling {
   photoPixel: number; // side of a photograph's pixel in samples
 }
 
-// How large a view shows what was photographed: 1 = as large as the photographs. `photographed` has rows x, y, z, rate.
+// Computes the size of a view relative to the photographs. `photographed` has rows x, y, z, rate.
 export function sizeOf(photographed: Float32Array, view: View): number {
   const sizes: number[] = [];
   for (let i = 0; i < photographed.length; i += 4) {
@@ -24,7 +24,7 @@ export function sizeOf(photographed: Float32Array, view: View): number {
   return Math.min(Math.max(sizes[(sizes.length - 1) >> 1], FARTHEST[0]), FARTHEST[1]);
 }
 
-// `pixels` of the view; at most `mostSamples` per pixel along each axis, and `mostPixels` in all.
+// Chooses the sampling of a view with `pixels`; at most `mostSamples` per pixel and axis, and `mostPixels` in all.
 export function samplingOf(size: number, pixels: number, mostSamples: number, mostPixels: number): Sampling {
   const [low, high] = AS_TRAINED;
   if (low <= size && size <= high) return { samples: 1, photoPixel: 1 };

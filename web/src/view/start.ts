@@ -1,4 +1,4 @@
-// Where the first view is taken from, where no camera says it, and how large the scene is.
+// First view without cameras, and the size of the scene.
 import type { Vec3 } from '../bundle/manifest';
 import { SURFEL_WORDS, type Surfels } from '../bundle/surfels';
 import { type Pose, lookAt } from './pose';
@@ -6,7 +6,7 @@ import { add, cross, length, times, unit } from './vector';
 
 const SAMPLES = 4000;
 
-// The middle of the surfels, and the distance from there that half of them keep: far ones do not count.
+// Computes the surfels' median position and twice the median distance to it, robust to far surfels.
 export function extentOf(surfels: Surfels): { middle: Vec3; size: number } {
   const step = Math.max(1, Math.floor(surfels.count / SAMPLES));
   const rows: Vec3[] = [];
@@ -21,8 +21,8 @@ export function extentOf(surfels: Surfels): { middle: Vec3; size: number } {
   return { middle: add(middle, surfels.origin), size: Math.max(2 * size, 1e-6) };
 }
 
-// Captures are brought into a frame whose origin is the mean of their cameras, the farthest of which is about 1 from
-// it. So what is seen from one side alone is looked at from the origin's side, and what is around the origin from aside.
+// Chooses the first pose. The scene frame's origin is the mean of the cameras, the farthest of which is about 1
+// away. So a scene on one side is viewed from the origin's side, and a scene around the origin from aside.
 export function firstPose(middle: Vec3, size: number, up: Vec3): Pose {
   const distance = Math.min(Math.max(1, 0.5 * size), 1.6 * size);
   const across = unit(cross(up, Math.abs(up[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0]));

@@ -1,4 +1,4 @@
-// Columns of integers, a Zstandard frame for each byte of each number: docs/baking.md, "Columns of integers".
+// Integer columns, a Zstandard frame per byte of each number: docs/baking.md, "Columns of integers".
 import { DamagedBundle } from '../../errors';
 import { frameBytes } from '../zstd';
 
@@ -6,14 +6,14 @@ export interface Column {
   name: string;
   step: number | null;
   low: number[];
-  planes: number[][]; // sizes of the frames: by number, from its lowest byte
+  planes: number[][]; // frame sizes per number, lowest byte first
 }
 
 export type Codes = Float64Array | Int32Array;
 
 const bytesOf = (column: Column): number => column.planes.flat().reduce((sum, size) => sum + size, 0);
 
-// Refuses a file whose columns do not fill it, or are others than expected: [name, numbers in a row].
+// Checks that the columns are as expected ([name, numbers per row]) and fill the file.
 export function checkColumns(columns: Column[], expected: [string, number][], size: number, file: string): void {
   const names = (list: string[]): string => list.join(', ') || 'none';
   const [found, wanted] = [columns.map((c) => c.name), expected.map(([name]) => name)];
@@ -28,7 +28,7 @@ export function checkColumns(columns: Column[], expected: [string, number][], si
   if (stated !== size) throw new DamagedBundle(`${file} has ${size} bytes, its columns need ${stated}.`);
 }
 
-// Hands out the columns of a file one after the other.
+// Reads the columns of a file in order.
 export class ColumnReader {
   private at = 0;
   private next = 0;
@@ -43,7 +43,7 @@ export class ColumnReader {
     return this.columns[this.next]?.name;
   }
 
-  // The numbers of the next column: by number, of as many rows.
+  // Reads the next column: an array of `rows` codes per number.
   read<T extends Codes>(rows: number, make: (rows: number) => T): T[] {
     const { low, planes } = this.columns[this.next++];
     return low.map((least, k) => {

@@ -1,4 +1,4 @@
-// Decodes compact bundles beside the page, which goes on moving; a decoder that does not come to an end is ended.
+// Decodes compact bundles in a worker, to keep the page responsive; it is terminated after a timeout.
 import { DamagedBundle, ViewerError } from '../../errors';
 import type { Pages } from '../ktx2';
 import type { Atlas, Manifest } from '../manifest';
@@ -29,12 +29,12 @@ export class Decoder {
     });
   }
 
-  // The surfels of surfels.bin; the memory of `data` goes with it.
+  // Decodes surfels.bin; transfers `data`.
   async surfels(data: ArrayBuffer, info: Manifest): Promise<Surfels> {
     return this.ask({ what: 'surfels', data, info }, data);
   }
 
-  // The pages of texels.bin; the last that is asked.
+  // Decodes texels.bin to pages; the last request.
   async texels(data: ArrayBuffer, atlas: Atlas, surfels: Surfels): Promise<Pages> {
     try {
       return await this.ask({ what: 'texels', data, atlas, surfels: { ...surfels, terms: new Float32Array() } }, data);

@@ -1,4 +1,4 @@
-// Where tiles lie in the pages of an atlas, which follows from their sizes: bitymi_ns/codec/packing.py says how.
+// Packs tiles into the pages of an atlas from their sizes, as bitymi_ns/codec/packing.py.
 import { DamagedBundle } from '../../errors';
 
 const GRID = 4;
@@ -21,7 +21,7 @@ interface Shelf {
 
 const roundUp = (value: number, step: number): number => Math.ceil(value / step) * step;
 
-// Tiles of sides (u, v), powers of two; 0 where there is none.
+// Packs tiles of sides (u, v), powers of two; 0: no tile.
 export function pack(u: Uint16Array, v: Uint16Array, pageWidth: number, mostRows: number): Packing {
   const refuse = (): never => {
     throw new DamagedBundle('bundle.json: the tiles do not fit into pages of this size.');
@@ -30,7 +30,7 @@ export function pack(u: Uint16Array, v: Uint16Array, pageWidth: number, mostRows
   const n = u.length;
   const found = { x: new Uint32Array(n), y: new Uint32Array(n), layer: new Uint32Array(n) };
   let [area, widest, tallest] = [0, 0, 0];
-  const classes = new Map<number, number[]>(); // by sides, in the order of the tiles
+  const classes = new Map<number, number[]>(); // by sides, in tile order
   for (let i = 0; i < n; i++) {
     if (!u[i]) continue;
     area += u[i] * v[i];
@@ -46,7 +46,7 @@ export function pack(u: Uint16Array, v: Uint16Array, pageWidth: number, mostRows
   let width = Math.max(GRID, widest);
   while (width < pageWidth && width * width < area) width *= 2;
 
-  let shelves: Shelf[] = []; // with room left, the first opened first
+  let shelves: Shelf[] = []; // with room left, in order of opening
   let rows = 0;
   for (const key of [...classes.keys()].sort((a, b) => b - a)) {
     const tiles = classes.get(key)!;

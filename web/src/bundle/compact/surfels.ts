@@ -1,4 +1,4 @@
-// surfels.bin: docs/baking.md says what the numbers of its columns stand for; codec/surfel_codes.py is their writer.
+// Decodes surfels.bin: docs/baking.md describes its columns, codec/surfel_codes.py writes them.
 import { DamagedBundle } from '../../errors';
 import type { CompactSurfels, Manifest, ViewKind } from '../manifest';
 import { EXTENTS, KINDS, LEAN_WIDTH, MOST, SURFEL_WORDS, type Surfels, TERM_LIMITS, WORD } from '../surfels';
@@ -6,18 +6,18 @@ import { alphaWord, centred, originOf, setTerms, setTile } from '../surfels';
 import { ColumnReader, checkColumns } from './columns';
 import { pack } from './packing';
 
-export const SURFELS_PER_BYTE = 1; // a file that is said to hold more is refused, and so many beside
+export const SURFELS_PER_BYTE = 1; // upper bound of a file's claim, plus SPARE_SURFELS
 export const SPARE_SURFELS = 1 << 12;
 const POSITION_BITS = 17;
-const SHARE = 1 / 1024; // of their ranges: what opacities and betas keep from their ends
+const SHARE = 1 / 1024; // margin of opacities and betas to the ends of their ranges
 const ALPHA_MIN = 1 / 255;
-const EXTENT = 3; // of surfels without a tile
-const LEAST_EXPONENT = 2; // of two, in the side of a tile
+const EXTENT = 3; // without a tile
+const LEAST_EXPONENT = 2; // log2 of a tile side
 const MOST_EXPONENT = 12;
 const MOST_TERMS = 32;
-const BENT = 50; // of sinh: beyond all limits
+const BENT = 50; // largest argument of sinh: beyond all limits
 const FILE = 'surfels.bin';
-// The numbers of a lean term that are no colours: from where on, and their limits.
+// Numbers of a lean term that are not colours: first index, and limits.
 const SHAPES: Record<ViewKind, { at: number; limits: number[] }> = {
   sv: { at: 0, limits: TERM_LIMITS.sv.slice(0, 3) },
   sh: { at: 0, limits: [] },
@@ -54,14 +54,14 @@ function expected(kind: ViewKind, alpha: boolean): [string, number][] {
 }
 const STEPPED = ['place', 'rotation', 'log_scales', 'opacity', 'beta', 'residual', 'view_base', 'extent', 'term_shape'];
 
-// Every third bit of a number below 2^27, from the lowest.
+// Extracts every third bit of a number below 2^27, from the lowest.
 function thirds(key: number): number {
   let cell = 0;
   for (let i = 0; i < 9; i++) cell |= ((key >> (3 * i)) & 1) << i;
   return cell;
 }
 
-// Colours of columns green, red less green, blue less green: their `number`-th, of row i.
+// Colours from columns green, red - green, blue - green, starting at column `at`, row i.
 const red = (of: Float64Array[], at: number, i: number): number => of[at + 1][i] + of[at][i];
 const green = (of: Float64Array[], at: number, i: number): number => of[at][i];
 const blue = (of: Float64Array[], at: number, i: number): number => of[at + 2][i] + of[at][i];

@@ -1,19 +1,19 @@
-// texels.bin: the cosine transforms of the tiles (docs/baking.md), decoded to pages of bytes.
+// Decodes texels.bin, the cosine transforms of the tiles (docs/baking.md), to byte pages.
 import { DamagedBundle } from '../../errors';
 import type { Pages } from '../ktx2';
 import type { Atlas, CodedTexels } from '../manifest';
 import { SURFEL_WORDS, type Surfels, WORD, alphaIn, layerIn } from '../surfels';
 import { ColumnReader, checkColumns } from './columns';
 
-export const TEXELS_PER_BYTE = 64; // of both files; what is said to hold more is refused, and so many beside
+export const TEXELS_PER_BYTE = 64; // of both files: upper bound of their claim, plus SPARE_TEXELS
 export const SPARE_TEXELS = 1 << 20;
-const MOST_TEXELS = 2 ** 30; // of all pages: four gigabytes
+const MOST_TEXELS = 2 ** 30; // in all pages: four gigabytes
 const BLOCK = 8;
 const GRADES: [number, number] = [-8, 24];
 const MOST_PLANES = 3; // bytes of a coefficient
 const FILE = 'texels.bin';
 
-// The tiles of surfels, in their order.
+// Tiles in surfel order.
 interface Tile {
   surfel: number;
   u: number;
@@ -30,7 +30,7 @@ function tilesOf(surfels: Surfels): Tile[] {
   return tiles;
 }
 
-// C(k, i, count) of all frequencies k and places i.
+// Returns C(k, i, count) for all frequencies k and positions i.
 function cosines(count: number): number[][] {
   return Array.from({ length: count }, (_, k) =>
     Array.from({ length: count }, (_, i) => {
@@ -39,7 +39,7 @@ function cosines(count: number): number[][] {
   );
 }
 
-// What each coefficient adds to the texels of a block, in the order in which they are kept: one row for each.
+// Returns the contribution of each coefficient to a block's texels, a row per coefficient in stored order.
 function wavesOf(u: number, v: number): Float64Array[] {
   const [across, down] = [cosines(u), cosines(v)];
   const order: [number, number][] = [];
@@ -52,30 +52,30 @@ function wavesOf(u: number, v: number): Float64Array[] {
   );
 }
 
-// The texels of a block of one channel; every `stride`-th number from `first` on is a coefficient.
+// Computes a channel of a block's texels from every `stride`-th number from `first` on.
 function inverse(values: Int32Array, first: number, stride: number, waves: Float64Array[], texels: Float64Array): void {
   const count = waves.length;
   for (let t = 0; t < count; t++) texels[t] = 0;
   for (let f = 0, from = first; f < count; f++, from += stride) {
     const value = values[from];
-    if (value === 0) continue; // most of them
+    if (value === 0) continue; // most are 0
     const wave = waves[f];
     for (let t = 0; t < count; t++) texels[t] += value * wave[t];
   }
 }
 
-// The blocks of one size.
+// Blocks of one size.
 interface Blocks {
   u: number;
   v: number;
-  texels: number; // of all of them
+  texels: number; // in all of them
 }
 
-// The nearest byte.
+// Rounds to the nearest byte.
 const byteOf = (x: number): number => (x > 0 ? (x < 255 ? (x + 0.5) | 0 : 255) : 0);
 
 class Painter {
-  private readonly pages: Uint32Array; // all of them
+  private readonly pages: Uint32Array; // concatenated
   private readonly numbers: Uint32Array;
   private readonly offset: number;
   private readonly perByte: number;
@@ -97,12 +97,12 @@ class Painter {
   private byte(residual: number): number {
     return byteOf((residual - this.offset) * this.perByte);
   }
-  // An opaque texel of a residual colour.
+  // Encodes a residual colour as an opaque texel.
   private code(r: number, g: number, b: number): number {
     return (this.byte(r) | (this.byte(g) << 8) | (this.byte(b) << 16) | (255 << 24)) >>> 0;
   }
 
-  // Visits blocks of one size: the number of the tile, the row of its surfel, the block, and its first texel.
+  // Visits blocks of one size: index of the tile, row of its surfel, block, first texel.
   private each({ u, v }: Blocks, visit: (tile: number, row: number, block: number, first: number) => void): void {
     const { width, height } = this.atlas;
     let block = 0;
@@ -117,7 +117,7 @@ class Painter {
     });
   }
 
-  // Residual colours of blocks; [channel][frequency * blocks + block] are the coefficients.
+  // Writes the residual colours of blocks from coefficients [channel][frequency * blocks + block].
   colors(of: Blocks, coefficients: Int32Array[], steps: Float64Array): void {
     const { u, v } = of;
     const waves = wavesOf(u, v);
@@ -138,7 +138,7 @@ class Painter {
     });
   }
 
-  // Alphas of blocks, whose colours are there.
+  // Writes the alphas of blocks, after their colours.
   alphas(of: Blocks, [coefficients]: Int32Array[], steps: Float64Array): void {
     const { u, v } = of;
     const waves = wavesOf(u, v);
@@ -155,7 +155,7 @@ class Painter {
     });
   }
 
-  // The pages, each in memory of its own.
+  // Returns the pages, each in its own buffer.
   layers(): Uint8Array[] {
     const size = this.atlas.width * this.atlas.height;
     return Array.from({ length: this.atlas.layers }, (_, k) => {

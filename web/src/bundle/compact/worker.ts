@@ -1,4 +1,4 @@
-// Decodes what decoder.ts asks for.
+// Worker of decoder.ts.
 import { reasonOf } from '../../errors';
 import type { Pages } from '../ktx2';
 import type { Atlas, Manifest } from '../manifest';

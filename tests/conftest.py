@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-os.environ.setdefault("BITYMI_NO_DOWNLOAD", "1")  # nothing is fetched, here or in processes that tests start
+os.environ.setdefault("BITYMI_NO_DOWNLOAD", "1")  # no downloads, also in child processes
 
 _stack = inspect.stack
 
@@ -18,8 +18,8 @@ _stack = inspect.stack
 def _cheap_stack(context: int = 1) -> list[Any]:
     """Replace `inspect.stack` for nerfstudio's list of external methods.
 
-    Its import asks 26 times for the name of a caller. Each time `inspect` searches every loaded module for every frame,
-    which with pytest's frames takes most of the time of collecting the tests.
+    Its import asks 26 times for a caller's name, for which `inspect` searches every loaded module for every frame; with
+    pytest's frames that dominates the time of collection.
     """
     frame = sys._getframe(1)
     if frame.f_globals.get("__name__") != "nerfstudio.configs.external_methods":
@@ -35,7 +35,7 @@ inspect.stack = _cheap_stack
 
 
 class _MissingEncoder(ModuleType):
-    """BC7's encoder where there is none, on Python 3.10: a test that comes to use it is skipped."""
+    """Stub for the missing BC7 encoder (Python 3.10), which skips tests that use it."""
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -48,17 +48,17 @@ if importlib.util.find_spec("ispc_texcomp") is None:
 
 
 FIRST = ("e2e", "view")
-"""Folders whose files take longest: begun last, one worker would run on alone."""
+"""Folders with the slowest files, run first so that no worker is left alone with them."""
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Begin with the slow files where workers share the tests."""
+    """Run the slow files first when workers share the tests."""
     if hasattr(config, "workerinput"):
         items.sort(key=lambda item: item.path.parent.name not in FIRST)
 
 
 def pytest_collection_finish() -> None:
-    """Keep what has been imported and collected out of garbage collection, which would walk it in every large test."""
+    """Exclude imported modules and collected tests from garbage collection, which large tests trigger often."""
     gc.collect()
     gc.freeze()

@@ -1,4 +1,4 @@
-"""A small scene with an analytic field, so that every step of the bake has an exact answer."""
+"""A small scene with an analytic field, for which every step of the bake has an exact answer."""
 
 from types import SimpleNamespace
 
@@ -9,7 +9,7 @@ from bitymi_ns.scene.camera import Camera
 
 
 class WaveField:
-    """A smooth residual colour with voxels of one size everywhere."""
+    """A smooth residual colour, with voxels of one size."""
 
     def __init__(self, voxel: float = 0.05) -> None:
         self.voxel = voxel

@@ -24,14 +24,14 @@ def write(
     kind: str | None = None,
     **options: Any,
 ) -> Path:
-    """Write a bundle of these surfels.
+    """Write a bundle of N surfels.
 
     Args:
-        folder: of the bundle.
+        folder: bundle folder.
         surfels: N rows.
-        tiles: [N, 5] int32; None = no tiles.
-        atlas: encoded.
-        kind: of the view colour; lean ones need it.
+        tiles: [N, 5] int32; None: no tiles.
+        atlas: encoded atlas.
+        kind: view-colour kind, required for lean colours.
         options: of the scene and of `write_bundle`.
     """
     rows = torch.zeros(len(surfels["means"]), 5, dtype=torch.int32) if tiles is None else torch.from_numpy(tiles)

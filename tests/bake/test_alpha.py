@@ -25,7 +25,7 @@ COUNT, SIDE = 60, 8
 
 @pytest.fixture
 def trained() -> tuple[Scene, Camera]:
-    """Surfels whose left halves are cut away, and one without a tile."""
+    """Surfels with transparent left halves, and one without a tile."""
     case = random_scene(COUNT, 3, width=60, height=40)
     size = torch.full((COUNT, 2), SIDE)
     size[0] = 1

@@ -1,4 +1,4 @@
-"""What a bundle states of how near its texels are to those before they were stored is true, and is measured again."""
+"""Certificates in bundles are true, and `bitymi verify` measures them again."""
 
 import json
 import math
@@ -27,7 +27,7 @@ SIDES = ((0, 0), (4, 4), (8, 4), (8, 16))
 
 
 def mean_over(row: np.ndarray, center: float, width: float) -> float:
-    """Mean of a piecewise constant function of unit steps over a window."""
+    """Average a piecewise constant function of unit steps over a window."""
     low, high = center - width / 2, center + width / 2
     edges = np.arange(len(row))
     share = np.clip(np.minimum(high, edges + 1) - np.maximum(low, edges), 0, None)
@@ -35,7 +35,7 @@ def mean_over(row: np.ndarray, center: float, width: float) -> float:
 
 
 def by_hand(values: np.ndarray, cells: tuple[float, float]) -> np.ndarray:
-    """`averaged` of one channel [v, u], cell by cell."""
+    """Compute `averaged` of one channel [v, u], cell by cell."""
     for axis, width in ((1, cells[0]), (0, cells[1])):
         count = values.shape[axis]
         at = [min(max(i + 0.5, width / 2), count - width / 2) for i in range(count)]
@@ -118,7 +118,7 @@ def test_sketches_estimate_the_distance_of_texels(seed: int, count: int, few: bo
     generator = torch.Generator().manual_seed(seed)
     before = torch.randn(count, 3, generator=generator)
     change = torch.randn(count, 3, generator=generator)
-    if few:  # one number alone
+    if few:  # a single number
         change[1:] = 0.0
     stored = before + 0.02 * change
     two = sketches_of(sketches_text(before, stored))
@@ -133,7 +133,7 @@ def test_sketches_are_the_same_everywhere() -> None:
 
 
 EXPECTED = [-667.0, -141.0, -296.0, -144.0]
-"""By the same formula with whole numbers."""
+"""By the same formula in integers."""
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +143,7 @@ def truth(scene) -> Baked:
 
 @pytest.fixture(scope="module", params=[True, False], ids=["compact", "pages"])
 def tuned(scene, truth: Baked, request: pytest.FixtureRequest) -> Baked:
-    """A bake that was tuned, and encoded."""
+    """A tuned and encoded bake."""
     compact, made, views = request.param, scene(60), photographs(truth)
     made.surfels["log_scales"] += 1.5
     made.surfels["opacity_logits"] += 1.0

@@ -1,4 +1,4 @@
-"""A bake becomes compact: surfels are rounded as far as the pictures allow, texels learn through their coding."""
+"""Compact bakes: surfels rounded as far as the pictures allow, texels trained through their coding."""
 
 import math
 from dataclasses import replace
@@ -28,30 +28,30 @@ from tests.bake.test_tune import BACKGROUND, photographs, render, waving
 
 @pytest.fixture(scope="module")
 def truth(scene) -> Baked:
-    """The scene of the photographs."""
+    """The scene in the photographs."""
     return waving(scene(60))
 
 
 @pytest.fixture(scope="module")
 def views(truth: Baked) -> list[View]:
-    """Photographs of it, darker by a hundredth, so that there is an error to compare with."""
+    """Photographs of `truth`, darker by 0.01, for a nonzero error."""
     return [View(view.camera, (view.image - 0.01).clamp(0, 1)) for view in photographs(truth)]
 
 
 @pytest.fixture(scope="module")
 def rounded(truth: Baked, views: list[View]) -> Baked:
-    """The same with rounded surfels."""
+    """`truth` with rounded surfels."""
     return compacted(truth, views, BACKGROUND, Compact(share=0.05))[0]
 
 
 def error(a: Baked, b: Baked, views: list[View]) -> float:
-    """Mean square difference of their pictures."""
+    """Compute the mean squared difference of renders."""
     pictures = [(render(a, view.camera), render(b, view.camera)) for view in views]
     return sum(float((x.clamp(0, 1) - y.clamp(0, 1)).square().mean()) for x, y in pictures) / len(pictures)
 
 
 def from_photographs(baked: Baked, views: list[View]) -> float:
-    """Mean square difference of its pictures from the photographs."""
+    """Compute the mean squared difference from the photographs."""
     pictures = [(render(baked, view.camera).clamp(0, 1), view.image) for view in views]
     return sum(float((x - y).square().mean()) for x, y in pictures) / len(pictures)
 

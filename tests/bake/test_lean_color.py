@@ -1,4 +1,4 @@
-"""View colours keep what is needed of them: the bound holds, and little is kept where little is needed."""
+"""Reduced view colours: the error bound holds, and simple colours keep few terms."""
 
 import pytest
 import torch
@@ -19,7 +19,7 @@ KINDS = list(VIEW_COLORS)
 
 
 def views(n: int, count: int = 9, seed: int = 0, spread: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
-    """(seen [V, n], centers [V, 3]) of views on one side; surfel 0 is seen by none, surfel 1 by one."""
+    """Return (seen [V, n], centers [V, 3]) of views on one side; surfel 0 is unseen, surfel 1 seen by one view."""
     g = torch.Generator().manual_seed(seed)
     centers = torch.tensor([0.0, 0.0, -6.0]) + spread * torch.randn(count, 3, generator=g)
     seen = torch.rand(count, n, generator=g) < 0.6
@@ -28,7 +28,7 @@ def views(n: int, count: int = 9, seed: int = 0, spread: float = 1.0) -> tuple[t
 
 
 def exact_errors(kind, params, lean, means, seen, centers, opacity):
-    """Largest weighted error at the directions of the views alone, in double precision: [n]."""
+    """Compute the largest weighted error at the views' directions, in float64: [n]."""
     found = torch.zeros(len(means), dtype=torch.float64)
     full = [params[name].double() for name in VIEW_COLORS[kind].names]
     for view, center in zip(seen, centers, strict=True):
@@ -91,7 +91,7 @@ def test_a_colour_that_no_view_sees_change_is_one_colour(surfels):
 
 
 def test_sites_that_agree_are_merged(surfels):
-    """Six sites in two groups, alike within each: at most two sites are left, from wherever one looks."""
+    """Six sites in two groups of equal colour: at most two sites remain, for any views."""
     n = 20
     params = surfels(n, "sv")
     group = torch.tensor([0, 0, 0, 1, 1, 1])

@@ -1,4 +1,4 @@
-"""A fragment list is let go before the next one is made: memory is that of one view, however many there are."""
+"""Fragment lists are freed before the next one is made, so memory is that of one view."""
 
 import weakref
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ PHOTO = torch.full((40, 48, 3), 0.5)
 
 @pytest.fixture
 def made(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
-    """The lengths of the lists that were made, each when no other was there any more."""
+    """Record the lengths of lists, checking that no other list is alive."""
     alive: list[weakref.ref] = []
     lengths: list[int] = []
 

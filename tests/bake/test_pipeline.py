@@ -11,7 +11,7 @@ from bitymi_ns.train.init import tangents
 
 
 def bilinear(bundle, surfel, u, v, extent=3.0):
-    """The residual at (u, v) in [-3, 3]^2 of a surfel, clamped to the outer texel centres as in a renderer."""
+    """Evaluate the residual at (u, v) in [-3, 3]^2 of a surfel, clamped to the outer texel centres."""
     x, y, layer, r_u, r_v = bundle.scene.tiles[surfel].tolist()
     texels = bundle.scene.residuals()[layer, y : y + r_v, x : x + r_u].permute(2, 0, 1)[None]
     grid = torch.stack([u, v], dim=-1)[None, None] / extent
@@ -21,9 +21,9 @@ def bilinear(bundle, surfel, u, v, extent=3.0):
 
 @pytest.mark.parametrize("format, tolerance", [("fp16", 1e-3), ("uint8", 4e-3), ("bc7", 2e-2)])
 def test_the_bundle_gives_the_field_back_between_texels(scene, tmp_path, format, tolerance):
-    """Points inside the tiles, by bilinear sampling, against the analytic field."""
+    """Bilinear samples inside the tiles match the analytic field."""
     made = scene(60)
-    made.field.voxel = 0.02  # well below the wavelength, so that interpolation is not what is measured
+    made.field.voxel = 0.02  # well below the wavelength, to exclude interpolation error
     export(bake(made, options=BakeOptions(format=format, tolerance=0)), tmp_path / "b")
     bundle = read_bundle(tmp_path / "b")
     scales = bundle.scene.surfels["log_scales"].exp()
@@ -45,7 +45,7 @@ def test_what_cannot_be_drawn_is_left_out_and_counted(scene, tmp_path):
     made.surfels["log_scales"][8, 0] = 1e30
     made.surfels["quats"][9] = 0.0
     made.surfels["sv_rgb"][10, 3, 1] = float("inf")
-    made.surfels["sv_rgb"][11, 0, 0] = 1e4  # no bundle holds that
+    made.surfels["sv_rgb"][11, 0, 0] = 1e4  # beyond a bundle's limit
     made.surfels["means"][12, 2] = -1e12
     baked = bake(made)
     assert baked.statistics.surfels.model_dump() == {
@@ -92,7 +92,7 @@ def test_unseen_surfels_get_the_smallest_tile_or_are_dropped(scene, camera):
     made.surfels["means"][::2, 2] -= 100.0  # behind the camera
     kept = bake(made, [camera()], BakeOptions(drop_unseen=False, tolerance=0))
     assert (kept.packing.tiles[::2, 3:] == 4).all() and len(kept.rows) == 50
-    # of what no view sees nothing is known: it is treated as if nothing stood in front
+    # surfels that no view sees are treated as unoccluded
     within = bake(made, [camera()], BakeOptions(drop_unseen=False))
     assert within.packing.tiles[::2].any() and within.packing.tiles[::2, 3:].max() == 4
     assert (within.scene.surfels["view_span"][::2, 1] > 0).any()

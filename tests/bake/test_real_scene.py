@@ -1,4 +1,4 @@
-"""The bake of the project's own scene and hash field."""
+"""The bake of the package's own scene and hash field."""
 
 import pytest
 import torch
@@ -16,7 +16,7 @@ from bitymi_ns.train.init import tangents
 
 
 def real_scene(surfels, count=80, kind="sv", min_resolution=8):
-    """A scene whose field varies over whole voxels that the tiles resolve."""
+    """Make a scene whose field varies over whole voxels that the tiles resolve."""
     generator = torch.Generator().manual_seed(0)
     config = SceneConfig(view_color=kind, min_resolution=min_resolution, log2_table_size=14)
     field = HashField(config, (0.1, 0.2, -0.1), 1.0, True, 14, generator)

@@ -1,4 +1,4 @@
-"""Tiles are as small as the tolerance allows, and no smaller."""
+"""Tiles are as small as the tolerance allows, but not smaller."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -19,7 +19,7 @@ BOUND = 0.02
 
 
 class PlaneField:
-    """A residual that depends on one coordinate alone, linearly or as a wave."""
+    """A residual that depends on one coordinate, linearly or as a wave."""
 
     def __init__(self, direction: torch.Tensor, frequency: float, amplitude: float = 0.2, voxel: float = 0.02) -> None:
         self.direction, self.frequency, self.amplitude, self.voxel = direction, frequency, amplitude, voxel
@@ -33,7 +33,7 @@ class PlaneField:
 
 @pytest.fixture
 def discs(scene):
-    """make(field) -> eight soft discs of one size at the origin, turned at random, with the axes of the first."""
+    """make(field) -> eight soft discs of one size at the origin, randomly rotated, with the axes of the first."""
 
     def make(field=None):
         made = scene(8, field=field)
@@ -100,8 +100,8 @@ def test_the_error_stays_below_the_tolerance_and_the_next_smaller_grid_does_not(
 
 
 def test_the_error_is_the_one_that_independent_points_show(discs):
-    """Random points of the disc, the reference's bilinear fetch, and the kernel written out again. The fit is to the
-    probes, so the error between them is a little larger."""
+    """The stated error matches random points of the disc, evaluated independently. The fit uses the probes, so the
+    error between them is a little larger."""
     made, axes = discs()
     made.field = PlaneField(axes[:, 0], 25.0)
     baked = bake(made, options=replace(OPTIONS, tolerance=1.0))

@@ -1,4 +1,4 @@
-"""Fine-tuning of an atlas: photographs come from an atlas that is known, the bake starts from a wrong one."""
+"""Fine-tuning of a wrong atlas towards photographs of a known one."""
 
 from dataclasses import replace
 from functools import partial
@@ -36,12 +36,12 @@ def cameras() -> list[Camera]:
 
 
 def render(baked: Baked, camera: Camera) -> Tensor:
-    """What the baked renderer shows of the texels before quantisation."""
+    """Render a bake before quantisation."""
     return baked.unquantised().render(camera, BACKGROUND).rgb
 
 
 def waving(made: Any, **options: Any) -> Baked:
-    """A scene of large surfels with a waving residual; the first surfel's is constant, the last is seen by no view."""
+    """Bake large surfels with a waving residual; the first one's is constant, the last is unseen."""
     made.surfels["log_scales"] += 1.5
     made.surfels["opacity_logits"] += 1.0
     made.surfels["means"][59] = torch.tensor([0.0, 100.0, 0.0])
@@ -54,7 +54,7 @@ def waving(made: Any, **options: Any) -> Baked:
 
 
 def tuning_views(baked: Baked, views: list[View], budget: int = 1 << 30) -> TuningViews:
-    """Views of a bake, and its texels."""
+    """Collect views of a bake and its texels."""
     return TuningViews(TexelList(baked), views, BACKGROUND, MemoryBudget(budget))
 
 
@@ -63,25 +63,25 @@ def texels_of(baked: Baked) -> Tensor:
 
 
 def photographs(truth: Baked) -> list[View]:
-    """What the cameras see of a scene."""
+    """Photograph a scene."""
     return [View(camera, render(truth, camera).clamp(0.0, 1.0)) for camera in cameras()]
 
 
 @pytest.fixture(scope="module")
 def truth(scene) -> Baked:
-    """The scene of the photographs."""
+    """The scene in the photographs."""
     return waving(scene(60))
 
 
 @pytest.fixture(scope="module")
 def views(truth: Baked) -> list[View]:
-    """Photographs of it."""
+    """Photographs of `truth`."""
     return photographs(truth)
 
 
 @pytest.fixture(scope="module")
 def wrong(truth: Baked) -> Baked:
-    """The same scene with another constant for a residual."""
+    """`truth` with a constant residual."""
     grey = truth.with_constants(torch.full_like(truth.mean_residual, 0.1))
     return grey.with_texels(torch.full_like(truth.texels, 0.1))
 
@@ -168,7 +168,7 @@ def test_it_gives_up_without_a_gain_and_its_progress_ends_with_it(
 def test_the_texels_kept_are_those_of_the_best_evaluation(
     wrong: Baked, views: list[View], monkeypatch: pytest.MonkeyPatch, coded: bool
 ) -> None:
-    """Of a run that first gains and then loses, its rate rising instead of falling."""
+    """A run that gains, then loses, as its rate rises instead of falling."""
     seen: list[tuple[float, Tensor]] = []
     judge = TuningViews.psnr
 
@@ -234,7 +234,7 @@ def test_masked_pixels_and_alpha(wrong: Baked, views: list[View]) -> None:
 
 
 def with_exposures(truth: Baked, views: list[View]) -> list[View]:
-    """The photographs of a bake with a known exposure each."""
+    """Photograph a bake with known exposures."""
     exposed = []
     for view, log in zip(views, torch.linspace(-0.4, 0.4, len(views)), strict=True):
         alpha = truth.unquantised().render(view.camera, BACKGROUND).alpha
@@ -269,14 +269,15 @@ def test_options_out_of_range_are_refused(wrong: Baked, views: list[View], bad: 
 
 
 def error(baked: Baked, views: list[View]) -> float:
-    """Mean square error of the stored scene."""
+    """Compute the mean squared error of the stored scene."""
     scene = baked.stored()
     return fmean(float((scene.render(v.camera, BACKGROUND).rgb - v.image).square().mean()) for v in views)
 
 
 @pytest.mark.parametrize("format", ["bc7", "uint8"])
 def test_the_last_steps_see_what_is_stored(truth: Baked, views: list[View], format: str) -> None:
-    """Texels whose blocks cannot hold them: the picture of what is stored gets better, with views set aside or none."""
+    """With texels that BC7 blocks cannot hold, the render of the stored ones improves, with or without validation
+    views."""
     options = replace(truth.options, format=format)
     generator = torch.Generator().manual_seed(3)
     noise = 0.2 * torch.randn(truth.texels.shape, generator=generator)
@@ -288,13 +289,13 @@ def test_the_last_steps_see_what_is_stored(truth: Baked, views: list[View], form
         assert error(tuned, views) < 0.8 * error(plain, views)
         assert tuned.statistics.finetune.steps == 40
         decoded = listed_texels(torch.from_numpy(tuned.atlas.decoded()), tuned.packing, tuned.mean_residual)
-        assert float((decoded - tuned.texels).abs().max()) < 0.75  # what is stored is of these texels
+        assert float((decoded - tuned.texels).abs().max()) < 0.75  # stored texels are those
     few = tune_atlas(noisy, views[:1], BACKGROUND, TuneOptions.of_learned(5))
     assert few.atlas is not None and few.statistics.finetune.psnr_held_in is None
 
 
 def test_texels_that_have_learned_stay_when_nothing_is_left_to_learn(truth: Baked) -> None:
-    """Photographs of the scene itself: the steps do not walk away from it."""
+    """Fine-tuning towards photographs of the scene itself does not drift."""
     scene = replace(truth, options=replace(truth.options, format="fp16"))
     views = photographs(scene)
     tuned = tune_atlas(scene, views, BACKGROUND, TuneOptions.of_learned(20))

@@ -1,4 +1,4 @@
-"""View colours keep the terms that the pictures pay for: stated errors are those of pictures, prices decide."""
+"""View colours keep the terms that lambda allows, and stated errors are those of the pictures."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ def cameras(scene) -> list:
 
 @pytest.fixture
 def colored(scene):
-    """The scene with view colours of a kind, as they are stored."""
+    """The scene with stored view colours of a kind."""
 
     def make(kind: str) -> BakedScene:
         plain = waving(scene(COUNT)).unquantised()
@@ -53,7 +53,7 @@ def test_the_price_decides_from_all_terms_to_none(colored, cameras, kind: str) -
 
 
 def test_weights_are_those_of_the_fragments(colored, cameras) -> None:
-    """A surfel whose colour is changed by e changes the pictures by about its weights times e^2."""
+    """Changing a surfel's colour by e changes the pictures by about its weights times e^2."""
     scene = colored("sv")
     weights = shown_weights(scene, cameras)
     assert weights.shape == (len(cameras), COUNT)
@@ -69,11 +69,11 @@ def test_weights_are_those_of_the_fragments(colored, cameras) -> None:
 
 
 def test_views_that_pass_close_by_count_though_they_look_elsewhere(colored, cameras) -> None:
-    """Such a view shows nothing, and so adds what the colour may be wrong by from there."""
+    """Such a view adds the possible error of the colour from there, without showing anything."""
     scene = colored("sv")
     weights = shown_weights(scene, cameras)
     row = int(weights.sum(0).argmax())
-    turned = torch.diag(torch.tensor([-1.0, 1.0, -1.0]))  # the other way round
+    turned = torch.diag(torch.tensor([-1.0, 1.0, -1.0]))  # facing away
     viewmat = torch.eye(4)
     viewmat[:3, :3] = turned @ cameras[0].viewmat[:3, :3]
     toward = torch.nn.functional.normalize(cameras[0].center - scene.surfels["means"][row], dim=0)

@@ -23,7 +23,7 @@ RANGE = Range(-0.5, 2.0, "test")
 
 
 FINEST = {**REFERENCE, "place": 1e-9}
-"""Steps with which places need every bit of their grid."""
+"""Steps for which positions use every bit of their grid."""
 
 
 def make_codes(
@@ -33,7 +33,7 @@ def make_codes(
     steps: Mapping[str, float] = REFERENCE,
     alpha: bool = False,
 ) -> SceneCodes:
-    """SceneCodes of random surfels, every fourth of which has no tile, with alpha texels or opaque ones."""
+    """Build SceneCodes of random surfels, every fourth without a tile, with alpha texels or opaque."""
     params = {key: value.float() for key, value in random_scene(count, 0).params.items()}
     params = {key: value for key, value in params.items() if key not in VIEW_COLORS["sv"].names}
     params |= lean_parameters(kind, count, torch.float32)
@@ -50,7 +50,7 @@ def make_codes(
 
 
 def scene_of(codes: SceneCodes) -> BakedScene:
-    """The scene that the codes stand for, without its atlas."""
+    """Decode the scene without its atlas."""
     packing = pack(codes.surfels.sizes, codes.page_width, codes.page_rows)
     assert EXTENTS[0] < 3.0 < EXTENTS[1]
     return BakedScene(
@@ -64,13 +64,13 @@ def scene_of(codes: SceneCodes) -> BakedScene:
 
 
 def pages_of(codes: SceneCodes) -> tuple[np.ndarray, Packing]:
-    """Pages [layers, height, width, C] of the texels, and where the tiles lie in them."""
+    """Decode the texels to pages [layers, height, width, C], with their packing."""
     packing, alphas = pack(codes.surfels.sizes, codes.page_width, codes.page_rows), codes.texels.alphas()
     texels = codes.texels.texels()
     return paged_texels(texels if alphas is None else torch.cat([texels, alphas[:, None]], 1), packing).numpy(), packing
 
 
 def write_compact(folder: Path, codes: SceneCodes, **options) -> Path:
-    """Writes it as a bundle."""
+    """Write a compact bundle."""
     atlas = None if codes.texels is None else encode(*pages_of(codes), "uint8", RANGE)
     return write_bundle(folder, scene_of(codes), atlas, codes, **options)

@@ -1,4 +1,4 @@
-"""The small scenes of the bake's tests."""
+"""Small scenes of the bake's tests."""
 
 from tests.bake.conftest import camera, scene, surfels
 

@@ -1,4 +1,4 @@
-"""Bundles that were changed on purpose and signed again, as a determined forger would."""
+"""Damaged bundles with valid digests, as a determined forger would make them."""
 
 import hashlib
 import json
@@ -10,7 +10,7 @@ from bitymi_ns.bundle import ply, strict_json
 
 
 def signed(info: Mapping[str, Any], files: Mapping[str, bytes] | None = None) -> bytes:
-    """bundle.json of `info` with its digest, and with the sizes and hashes of `files`, where they are given."""
+    """Serialise bundle.json with its digest, and with the sizes and hashes of `files` if given."""
     info = {key: value for key, value in info.items() if key != "digest"}
     if files is not None:
         names = info["files"]
@@ -21,7 +21,7 @@ def signed(info: Mapping[str, Any], files: Mapping[str, bytes] | None = None) ->
 
 
 def amend(folder: Path, change: Callable[[dict[str, Any]], object] = lambda info: None) -> None:
-    """Rewrites bundle.json after change(bundle.json), with the hashes that the files have now and its digest."""
+    """Apply change(bundle.json) and write it with current hashes and digest."""
     info = json.loads((folder / "bundle.json").read_text())
     files = {name: (folder / name).read_bytes() for name in info["files"]}
     info = json.loads(signed(info, files))
@@ -30,7 +30,7 @@ def amend(folder: Path, change: Callable[[dict[str, Any]], object] = lambda info
 
 
 def change_columns(folder: Path, change: Callable[..., object], element: str = "vertex") -> None:
-    """Rewrites surfels.ply after change(columns of the element), its hash and the digest."""
+    """Apply change(columns of the element) to surfels.ply, with valid hash and digest."""
     elements = ply.parse_ply((folder / "surfels.ply").read_bytes())
     change(elements[element])
     columns = elements.pop("vertex")

@@ -1,4 +1,4 @@
-"""Compact bundles: what goes in comes out, what contradicts itself is refused before it takes memory."""
+"""Compact bundles round-trip, and contradictory ones are refused before they take memory."""
 
 import json
 import os
@@ -92,7 +92,7 @@ def test_many_texels_become_blocks_for_a_card_where_they_are_asked_for(tmp_path:
 
 
 def pixels_of(tiles: torch.Tensor, atlas: torch.Tensor) -> torch.Tensor:
-    """Which texels of pages belong to a tile: [layers, height, width] bool."""
+    """Compute the mask [layers, height, width] of texels that belong to a tile."""
     layers, height, width = atlas.shape[:3]
     owned = torch.from_numpy(covered_blocks(tiles.numpy(), width, height, layers))
     return owned.repeat_interleave(4, 1).repeat_interleave(4, 2)
@@ -135,7 +135,7 @@ def _column(info: dict, name: str) -> dict:
 def test_what_contradicts_itself_is_refused(tmp_path: Path, change, reason: str | None) -> None:
     folder = write_compact(tmp_path / "b", make_codes())
     amend(folder, change)
-    if reason is None:  # places elsewhere: numbers like any others
+    if reason is None:  # other positions are as valid
         assert len(read_bundle(folder)) == 12
         return
     with pytest.raises(BundleError, match=reason):
@@ -180,7 +180,7 @@ def test_files_of_another_size_are_refused_before_they_are_read(tmp_path: Path, 
 
 @pytest.mark.parametrize("what", ["count", "terms", "texels", "width"])
 def test_a_small_file_is_not_said_to_hold_what_takes_gigabytes(what: str, tmp_path: Path) -> None:
-    """Whatever its columns say: one of a single number takes no bytes at all."""
+    """Constant columns take no bytes, so the claim is bounded by the file size."""
     folder = write_compact(tmp_path / "b", make_codes())
     size = (folder / "surfels.bin").stat().st_size
     rows = size + (1 << 12) + 1

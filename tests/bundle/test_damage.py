@@ -1,4 +1,4 @@
-"""Bundles that are damaged, or contradict themselves, are refused by name; at random: tests/stress."""
+"""Damaged or contradictory bundles are refused with the file's name; random damage: tests/stress."""
 
 import numpy as np
 import pytest

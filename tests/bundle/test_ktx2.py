@@ -20,7 +20,7 @@ def make(folder, format, width=8, height=12, layers=3):
 
 
 def by_the_specification(data):
-    """The fields of a KTX2 file at the offsets of the specification's tables, sharing no code with the writer."""
+    """Parse the fields of a KTX2 file by the specification's tables, sharing no code with the writer."""
 
     def u32(at):
         return int.from_bytes(data[at : at + 4], "little")

@@ -1,4 +1,4 @@
-"""bundle.json: no change goes unnoticed, and every refusal is one sentence."""
+"""bundle.json: every change is detected, and refusals are one sentence."""
 
 import hashlib
 import json
@@ -60,7 +60,7 @@ def test_a_digest_covers_everything_else_and_not_the_layout():
         edited = {**info, **change}
         message = refusal(json.dumps(edited).encode())
         assert "is altered: its digest is not that of its contents" in message
-        right = message.rsplit('"', 2)[1]  # what the message says to do when the edit was meant
+        right = message.rsplit('"', 2)[1]  # the digest to insert for a deliberate edit
         assert parse(json.dumps({**edited, "digest": right}).encode()).digest == right
 
 
@@ -118,7 +118,7 @@ def test_the_limits_keep_colours_below_the_stated_bound():
 
 
 def quick(action: Callable[[], object]) -> None:
-    """Runs what takes much longer where the time grows with the square of the size."""
+    """Fail if an action takes time quadratic in the size."""
     begin = time.process_time()
     action()
     assert time.process_time() - begin < 2

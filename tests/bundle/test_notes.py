@@ -1,4 +1,4 @@
-"""notes.json beside a bundle: reading it, and what becomes of it where the bundle is written, packed or checked."""
+"""notes.json of a bundle: reading, and its fate when the bundle is written, packed or checked."""
 
 import copy
 import json
@@ -44,7 +44,7 @@ def test_views_and_notes_are_read() -> None:
 
 
 def change(path: str, value: Any) -> bytes:
-    """The file with another value at a path."""
+    """Return the file with another value at a path."""
     notes = copy.deepcopy(NOTES)
     *keys, last = (int(key) if key.isdigit() else key for key in path.split("."))
     at: Any = notes

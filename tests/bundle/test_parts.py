@@ -1,4 +1,4 @@
-"""How the files of a bundle are opened: whatever stands in their place, nothing is read before it is known to fit."""
+"""Opening of a bundle's files: sizes and types are checked before reading."""
 
 import os
 import struct
@@ -96,7 +96,7 @@ def test_neither_is_a_bundle_in_one_file_anything_but_a_regular_file(
 
 
 def test_a_link_to_a_file_as_it_is_stated_is_read_and_not_passed_on(folder: Path) -> None:
-    """Stores of large files keep links in the place of files."""
+    """Storage of large files may replace files by links."""
     (folder / "surfels.bin").rename(folder.parent / "blob")
     (folder / "surfels.bin").symlink_to("../blob")
     assert len(read_bundle(folder)) == 40
@@ -117,7 +117,7 @@ def test_a_large_file_beside_the_scene_is_not_taken_into_memory(folder: Path, tm
 
 
 def entries(path: Path, count: int, large: bool = False) -> None:
-    """A ZIP whose directory lists so many parts of no bytes."""
+    """Write a ZIP whose directory lists `count` empty parts."""
     one = struct.pack("<4s6H3L5H2L", b"PK\1\2", 20, 20, 0, 0, 0, 0, 0, 0, 0, 5, 0, 0, 0, 0, 0, 0)
     directory = b"".join(one + b"%05x" % (k % 16**5) for k in range(count))
     end = (b"PK\5\6", 0, 0, min(count, 0xFFFF), min(count, 0xFFFF), len(directory), 0, 0)
@@ -144,7 +144,7 @@ def test_a_directory_that_lies_elsewhere_than_it_says_is_refused(folder: Path, t
     data = (tmp_path / "b.bitymi").read_bytes()
     moved = struct.pack("<4sQ2H2L4Q", b"PK\6\6", 44, 45, 45, 0, 0, 1, 1, 10, 0)
     moved += struct.pack("<4sLQL", b"PK\6\7", 0, 5, 1)
-    # something behind it, a comment, other records, and something before it: a page, another such file
+    # trailing data, a comment, other records, and leading data: a page, another ZIP
     more = (data + b"x", data[:-1] + b"\1", data[:-22] + moved + data[-22:], data + data[-22:-1])
     for bad in (*more, b"<html>" + data, data + data):
         (tmp_path / "bad.bitymi").write_bytes(bad)

@@ -1,4 +1,4 @@
-"""The poster of a bundle: small, listed and checked as other files are."""
+"""The poster of a bundle: small, and listed and checked like other files."""
 
 import io
 import zipfile
@@ -75,10 +75,10 @@ def test_it_comes_second_in_one_file_and_is_checked(tmp_path: Path) -> None:
 
 
 def test_a_file_that_no_reader_knows_is_checked_and_not_looked_at(tmp_path: Path) -> None:
-    """So an optional part, as the poster is one, needs no version of its own."""
+    """So an optional part such as the poster needs no version of its own."""
     folder = write_compact(tmp_path / "b", make_codes(), extra_files={"later.bin": b"of a later version"})
     assert len(read_bundle(folder)) == 12
-    with pytest.raises(BundleError, match=POSTER):  # which a caller's file does not replace
+    with pytest.raises(BundleError, match=POSTER):  # a caller's file must not replace it
         write_compact(tmp_path / "c", make_codes(), extra_files={POSTER: b"x"})
     (folder / "later.bin").write_bytes(b"of a later Version")
     with pytest.raises(BundleError, match=r"later\.bin is altered"):

@@ -1,4 +1,4 @@
-"""What is read of a bundle, and how much: nothing before its size is known to be right, nothing twice."""
+"""Reading of bundles: sizes are checked before reading, and nothing is read twice."""
 
 import builtins
 import json
@@ -25,13 +25,13 @@ COUNT = 6
 
 
 def make(surfels, folder: Path, kind: str = "sv", **options) -> Path:
-    """A bundle with tiles that end within the disc, and with mean residuals."""
+    """Write a bundle with tiles that end within the disc, and with mean residuals."""
     made.make(surfels, folder, kind, extent=torch.full((COUNT,), 2.0), mean_residual=torch.zeros(COUNT, 3), **options)
     return folder
 
 
 def sparse(folder: Path, name: str, size: int) -> None:
-    """Makes a file `size` bytes long, of which nothing is on the disk, and bundle.json say so."""
+    """Make a sparse file of `size` bytes and record it in bundle.json."""
     os.truncate(folder / name, size)
     info = json.loads((folder / "bundle.json").read_text())
     info["files"][name]["bytes"] = size
@@ -39,7 +39,7 @@ def sparse(folder: Path, name: str, size: int) -> None:
 
 
 def peak(action) -> int:
-    """Most bytes that Python held while `action` ran."""
+    """Measure the peak memory of Python during an action."""
     tracemalloc.start()
     try:
         action()

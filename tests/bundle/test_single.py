@@ -1,4 +1,4 @@
-"""A bundle in one file: the parts in their order, and refused where it is damaged."""
+"""Bundles in one file: parts in order, damaged files refused."""
 
 import io
 import random
@@ -17,14 +17,14 @@ from tests.bundle.compact_scene import make_codes, write_compact
 
 @pytest.fixture
 def single(tmp_path: Path) -> bytes:
-    """A compact bundle in one file, with a large file that no viewer needs."""
+    """A compact bundle in one file, with a large file that viewers do not need."""
     folder = write_compact(tmp_path / "b", make_codes(count=40), extra_files={"preview.jpg": bytes(100_000)})
     write_single(folder, tmp_path / "b.bitymi.zip")
     return (tmp_path / "b.bitymi.zip").read_bytes()
 
 
 def middle_of(single: bytes, name: str) -> int:
-    """Where the middle of a part lies."""
+    """Return the offset of the middle of a part."""
     entry = zipfile.ZipFile(io.BytesIO(single)).getinfo(name)
     return entry.header_offset + 30 + len(name) + entry.file_size // 2
 

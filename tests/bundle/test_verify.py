@@ -1,4 +1,4 @@
-"""A bundle that was altered is found out."""
+"""`bitymi verify` detects alterations."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from tests.bundle.damage import amend, change_columns
 
 @pytest.fixture
 def made(scene, camera, tmp_path):
-    """(folder, scene, views) of a bundle with tiles."""
+    """Write a bundle with tiles: (folder, scene, views)."""
     trained, views = scene(60), [camera(3.0)]
     options = BakeOptions(format="uint8", tolerance=0.2)
     export(bake(trained, views, options), tmp_path / "b", statistics={"options": vars(options)})

@@ -1,4 +1,4 @@
-"""What is written is read, and a write that fails leaves what was there."""
+"""Written bundles round-trip, and a failed write leaves the earlier one."""
 
 import errno
 import hashlib
@@ -41,7 +41,7 @@ def test_what_is_written_is_read(surfels, tmp_path, kind, format):
     assert loaded.scene.atlas.dtype == (torch.float32 if format == "fp16" else torch.uint8)
     assert (loaded.scene.offset, loaded.scene.scale) == ((0, 1) if format == "fp16" else (-0.5, 2.0))
     error = float((loaded.scene.residuals() - torch.from_numpy(texels)).square().mean())
-    if format != "bc7":  # random texels are what block compression cannot hold
+    if format != "bc7":  # block compression cannot hold random texels
         assert error < (1e-6 if format == "fp16" else (2.0 / 255) ** 2 / 11)
     assert error == pytest.approx(atlas.mse, rel=0.2)
     assert loaded.info.atlas.psnr == pytest.approx(atlas.psnr)

@@ -1,4 +1,4 @@
-"""A few photographs of the sample room, taken along an arc, so that neighbours overlap well."""
+"""Photographs of the sample room along an arc, with large overlap."""
 
 import shutil
 from collections.abc import Callable
@@ -28,7 +28,7 @@ def pictures(views: list[View]) -> list[np.ndarray]:
 
 @pytest.fixture(scope="session")
 def arc(tmp_path_factory: pytest.TempPathFactory, pictures: list[np.ndarray]) -> Path:
-    """A folder with the photographs, to be left as it is."""
+    """The folder of photographs, not to be changed."""
     folder = tmp_path_factory.mktemp("arc")
     for i, picture in enumerate(pictures):
         Image.fromarray(picture).save(folder / f"photo_{i + 1}.png")
@@ -37,7 +37,7 @@ def arc(tmp_path_factory: pytest.TempPathFactory, pictures: list[np.ndarray]) ->
 
 @pytest.fixture
 def copied(arc: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
-    """Makes a folder with copies of the photographs."""
+    """Copy the photographs to a new folder."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
     def copy(name: str) -> Path:

@@ -1,4 +1,4 @@
-"""What is kept of earlier results, and what goes."""
+"""Cached results: kept, and removed."""
 
 import os
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from bitymi_ns.capture.types import CaptureError, SfmOptions
 
 @pytest.fixture
 def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
-    """Finds poses with these options, without looking for any; returns the folder of the work."""
+    """Find poses with these options by a stub; returns the working folder."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     works: list[Path] = []
     monkeypatch.setattr("bitymi_ns.capture.poses._find", lambda *arguments: works.append(arguments[-2]))
@@ -81,7 +81,7 @@ def test_what_is_read_from_stays(photographs: Path, kept: Callable[..., Path]) -
 
 @pytest.fixture
 def triangulated(photographs: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
-    """Triangulates points, without looking for any; returns the folder of the work."""
+    """Triangulate points by a stub; returns the working folder."""
     runs: list[Job] = []
     monkeypatch.setattr(process, "run", lambda job, *told: runs.append(job))
 

@@ -1,4 +1,4 @@
-"""Models that contradict their matches, and cameras that nothing links to the others."""
+"""Models that contradict their matches, and cameras that are not linked to others."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from bitymi_ns.capture.sfm.consistency import contradicted, drop_unlinked
 
 @pytest.fixture
 def model(tmp_path: Path) -> tuple[pycolmap.Reconstruction, Path]:
-    """Eight cameras around 200 points that all of them see, with noise, and their matches in a database."""
+    """Eight cameras around 200 points seen by all, with noise, and their matches in a database."""
     database = tmp_path / "database.db"
     options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=8,
                                                num_points3D=200)  # fmt: skip
@@ -28,7 +28,7 @@ def test_right_poses_contradict_no_match(model: tuple[pycolmap.Reconstruction, P
 def test_turned_cameras_contradict_their_matches_with_the_others(model: tuple[pycolmap.Reconstruction, Path]) -> None:
     made, database = model
     turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, 0.7, 0.0])), np.zeros(3))
-    for frame in (1, 2):  # 12 of 28 pairs hold one of them; they agree with each other
+    for frame in (1, 2):  # 12 of 28 pairs include one of them; they agree with each other
         made.frame(frame).rig_from_world = made.frame(frame).rig_from_world * turn
     share = contradicted(made, database, 1.0)
     assert 12 / 28 - 0.05 < share <= 12 / 28

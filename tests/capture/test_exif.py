@@ -74,7 +74,7 @@ def test_position_time_and_camera_are_read() -> None:
 
 
 def apple_note(*acceleration: float, first: int = 3) -> bytes:
-    """A maker note as phones write it: another entry, the acceleration, and where each is stored."""
+    """Build a phone's maker note: another entry, the acceleration, and their offsets."""
     entries = struct.pack(">HHII", first, 7, 4, 0) + struct.pack(">HHII", 8, 10, 3, 14 + 2 + 2 * 12 + 4)
     parts = [part for value in acceleration for part in (round(value * 10_000), 10_000)]
     return b"Apple iOS\0\0\1MM" + struct.pack(">H", 2) + entries + struct.pack(">I6i", 0, *parts)
@@ -91,13 +91,13 @@ def up_of(note: bytes, orientation: int = 1, lens: str = "iPhone 15 back camera"
 @pytest.mark.parametrize(
     ("acceleration", "orientation", "up"),
     [
-        ((-1.0, 0.0, 0.0), 1, (0, -1, 0)),  # held across, its right side up
-        ((1.0, 0.0, 0.0), 3, (0, -1, 0)),  # across, its left side up
+        ((-1.0, 0.0, 0.0), 1, (0, -1, 0)),  # landscape, right side up
+        ((1.0, 0.0, 0.0), 3, (0, -1, 0)),  # landscape, left side up
         ((0.0, -1.0, 0.0), 6, (0, -1, 0)),  # upright
-        ((0.0, 1.0, 0.0), 8, (0, -1, 0)),  # on its head
-        ((0.0, -0.8, -0.6), 6, (0, -0.8, -0.6)),  # upright, the camera turned to the ground
-        ((0.0, 0.0, -1.0), 6, (0, 0, -1)),  # lying on its back, the camera looks to the ground
-        ((0.17, -0.98, 0.0), 6, (-0.171, -0.985, 0)),  # upright, turned a little towards its right side
+        ((0.0, 1.0, 0.0), 8, (0, -1, 0)),  # upside down
+        ((0.0, -0.8, -0.6), 6, (0, -0.8, -0.6)),  # upright, tilted towards the ground
+        ((0.0, 0.0, -1.0), 6, (0, 0, -1)),  # flat, camera towards the ground
+        ((0.17, -0.98, 0.0), 6, (-0.171, -0.985, 0)),  # upright, slightly rotated to its right
     ],
 )
 def test_up_is_that_of_the_phones_accelerometer(

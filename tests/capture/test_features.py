@@ -1,4 +1,4 @@
-"""Features of a run that was killed."""
+"""Features of a killed run."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from bitymi_ns.capture.sfm.job import CameraGroup, Job
 
 @pytest.fixture
 def job(tmp_path: Path) -> Job:
-    """Four photographs by two cameras."""
+    """Four photographs from two cameras."""
     noise = np.random.default_rng(0).integers(0, 256, (60, 80, 3)).astype(np.uint8)
     names = [f"{i:06d}.png" for i in range(4)]
     for i, name in enumerate(names):

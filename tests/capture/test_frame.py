@@ -19,7 +19,7 @@ def centers(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
 
 
 def to_degrees(place: np.ndarray) -> tuple[float, float, float]:
-    """East, north and up in metres at 48 degrees north, by the lengths of a degree there."""
+    """Convert east, north and up in metres to degrees at 48 degrees north."""
     return 48.0 + place[1] / 111_199.5, 11.0 + place[0] / 74_628.4, 500.0 + place[2]
 
 
@@ -70,7 +70,7 @@ def test_without_gps_up_is_that_of_the_cameras(tmp_path: Path) -> None:
 
 
 def held(model: pycolmap.Reconstruction, up: np.ndarray, wrong: int = 0) -> dict[str, tuple[float, float, float]]:
-    """What the accelerometers say of this up, with an error of a degree; the first ones say something else."""
+    """Simulate accelerometers for this up vector with an error of a degree; the first `wrong` ones are wrong."""
     rng = np.random.default_rng(0)
     found = {}
     for i, image in enumerate(sorted(model.images.values(), key=lambda image: image.name)):

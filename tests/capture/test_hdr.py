@@ -1,4 +1,4 @@
-"""Frames of HLG and PQ videos become pictures as bright and as colourful as those of an ordinary video."""
+"""Frames of HLG and PQ videos become as bright and colourful as those of an SDR video."""
 
 from fractions import Fraction
 from pathlib import Path
@@ -12,14 +12,14 @@ from bitymi_ns.capture.video import _frames, _upright
 
 
 def scene() -> np.ndarray:
-    """[64, 64, 3] sRGB in [0, 1], below the knee: a grey ramp over a colourful one."""
+    """Build [64, 64, 3] sRGB in [0, 1], below the knee: a grey ramp over a colourful one."""
     ramp = np.linspace(0.05, 0.85, 64)
     grey = np.repeat(ramp[None, :, None], 32, 0).repeat(3, 2)
     return np.concatenate([grey, np.stack([grey[..., 0], grey[::-1, ::-1, 0], np.full((32, 64), 0.4)], -1)])
 
 
 def coded(picture: np.ndarray, transfer: int) -> np.ndarray:
-    """The picture as such a video has it, 10 bits: Y, Cb and Cr of limited range."""
+    """Encode the picture as 10-bit video: Y, Cb and Cr of limited range."""
     light = np.where(picture <= 0.04045, picture / 12.92, ((picture + 0.055) / 1.055) ** 2.4)
     nits = np.clip(WHITE * light @ np.linalg.inv(TO_709).T, 0.0, None)
     steps = np.linspace(0.0, 1.0, 20001).astype(np.float64)

@@ -1,4 +1,4 @@
-"""What other programs leave in a capture."""
+"""Files that other programs leave in a capture."""
 
 from pathlib import Path
 

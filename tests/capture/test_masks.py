@@ -1,4 +1,4 @@
-"""Which folder holds the masks of photographs, which file is that of one, and which of its pixels count."""
+"""Masks of photographs: their folder, their files, and which pixels count."""
 
 from pathlib import Path
 
@@ -70,7 +70,7 @@ def test_a_mask_is_found_by_the_name_of_its_photograph(tmp_path: Path, name: str
 
 
 def blob() -> np.ndarray:
-    """A round mask [48,64] bool, whose edge no block of a compressed picture follows."""
+    """A round mask [48,64] bool, whose edge crosses compression blocks."""
     y, x = np.mgrid[:48, :64]
     return (x - 30) ** 2 + (y - 22) ** 2 < 15**2
 

@@ -1,4 +1,4 @@
-"""Pictures of all directions at once are told from photographs of the same shape."""
+"""Panoramas are distinguished from photographs of the same shape."""
 
 import zlib
 from functools import cache
@@ -24,7 +24,7 @@ XMP = (
 
 
 def panorama(turn: float = 0.0, height: int = 256, centre: tuple[float, float, float] = (0.0, 0.0, 1.2)) -> np.ndarray:
-    """[h, 2 h, 3] what is seen of the sample room all round, rows from the zenith to the nadir."""
+    """Render [h, 2 h, 3] an equirectangular panorama of the sample room, rows from zenith to nadir."""
     theta, phi = np.meshgrid(
         (np.arange(height) + 0.5) / height * np.pi, turn + (np.arange(2 * height) + 0.5) / height * np.pi, indexing="ij"
     )
@@ -33,7 +33,7 @@ def panorama(turn: float = 0.0, height: int = 256, centre: tuple[float, float, f
 
 
 def photograph(turn: float, height: int = 256) -> np.ndarray:
-    """[h, 2 h, 3] a photograph of that shape."""
+    """Render [h, 2 h, 3] a photograph of that shape."""
     y, x = np.meshgrid((np.arange(height) + 0.5) / height - 0.5, np.arange(2 * height) / height - 1.0, indexing="ij")
     forward = np.array([np.cos(turn), np.sin(turn), -0.1])
     right = np.array([np.sin(turn), -np.cos(turn), 0.0])

@@ -94,7 +94,7 @@ def test_duplicates_are_found_and_neighbours_are_none(arc: Path, tmp_path: Path)
 
 
 def deep(pixels: np.ndarray) -> Image.Image:
-    """A grey picture of 16 bits per pixel."""
+    """Make a 16-bit grey picture."""
     return Image.fromarray(pixels.mean(axis=2).astype(np.uint16) * 257)
 
 

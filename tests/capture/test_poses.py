@@ -1,4 +1,4 @@
-"""The whole way, on a few small photographs, and what users see when it cannot be gone."""
+"""Pose estimation on small photographs, and the messages when it fails."""
 
 import json
 import os
@@ -29,7 +29,7 @@ B = ExifTags.Base
 
 @pytest.fixture(scope="module")
 def capture(arc: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with spaces and other letters in its names, a damaged photograph, a duplicate and one of elsewhere."""
+    """A folder with spaces and non-ASCII names, a damaged photograph, a duplicate and a foreign one."""
     folder = tmp_path_factory.mktemp("with spaces") / "Fotos für später"
     folder.mkdir()
     for path in arc.glob("*.png"):
@@ -70,7 +70,7 @@ def test_poses_are_found_once_however_the_path_is_written(
 
 
 def test_a_capture_whose_photographs_lie_below_is_theirs(copied: Copy, tmp_path: Path) -> None:
-    """As `ns-train` takes it, which names the folder of the photographs."""
+    """`ns-train` names the folder of the photographs."""
     (tmp_path / "cap").mkdir()
     copied("flat").rename(tmp_path / "cap/shots")
     assert _what(tmp_path / "cap")[1:] == _what(tmp_path / "cap/shots")[1:]
@@ -210,7 +210,7 @@ def noise(rng: np.random.Generator, size: tuple[int, int] = (50, 40)) -> Image.I
 
 
 def test_photographs_that_give_no_poses(arc: Path, tmp_path: Path) -> None:
-    """Too few, unreadable ones, copies of one, of different things, of nothing."""
+    """Too few, unreadable, identical, unrelated or blank photographs."""
     rng = np.random.default_rng(0)
     one, two = (Image.open(arc / f"photo_{i}.png") for i in (1, 2))
     for i, (pictures, message) in enumerate(
@@ -288,7 +288,7 @@ def test_photographs_share_a_camera_and_a_focal_length_that_all_of_them_state() 
 
 OTHER = dict(matching="sequential", mapper="global", camera_model="OPENCV", focal_length=321.0, max_image_size=800,
              max_features=1234, frames=30)  # fmt: skip
-"""Another value of every setting."""
+"""A different value for every setting."""
 
 
 def test_every_setting_is_part_of_the_key(copied: Copy, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -321,7 +321,7 @@ def test_photographs_are_in_the_order_of_their_times() -> None:
 
 
 def test_heic_photographs(tmp_path: Path, pictures: list[np.ndarray], views: list[View]) -> None:
-    """As phones take them: turned and the turn stored, with the lens, the time and gravity in EXIF."""
+    """HEIC files as phones take them: rotated, with lens, time and gravity in EXIF."""
     folder = tmp_path / "phone"
     folder.mkdir()
     for i, (picture, view) in enumerate(zip(pictures, views, strict=True)):

@@ -1,4 +1,4 @@
-"""PostScript that is called a photograph: opening it would run it."""
+"""PostScript named as a photograph must not be opened, as that would run it."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +16,7 @@ from bitymi_ns.plugin.data.images import file_has_transparency, orientation, rea
 
 @pytest.fixture
 def ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The file that what stands for Ghostscript leaves."""
+    """The file that the stub for Ghostscript writes."""
     script = tmp_path / "bin/gs"
     script.parent.mkdir()
     script.write_text(f"#!/bin/sh\ntouch {tmp_path / 'ran'}\n")

@@ -1,4 +1,4 @@
-"""Runs that are ended, or cannot write."""
+"""Runs that are interrupted or cannot write."""
 
 import json
 import os
@@ -26,7 +26,7 @@ def database(folder: Path) -> Path | None:
 
 def started(folder: Path, prepare: Callable[[], object] = lambda: None) -> subprocess.Popen:
     def preexec() -> None:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # a shell's background jobs, and what they start, ignore it
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # background jobs of a shell ignore it
         prepare()
 
     pipes = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -41,7 +41,7 @@ def wait_for(condition: Callable[[], bool], seconds: float = 120) -> None:
 
 
 def workers(folder: Path) -> list[str]:
-    """Processes that have a file of the folder open."""
+    """List the processes with an open file in the folder."""
     found = []
     for process in Path("/proc").iterdir():
         if process.name.isdecimal():
@@ -82,7 +82,7 @@ def test_ctrl_c_ends_it_without_a_traceback(copied: Copy) -> None:
 
 def test_a_full_disk_is_named(copied: Copy) -> None:
     folder = copied("full")
-    limit = 300_000  # no file may grow larger, as on a disk with as little space left
+    limit = 300_000  # largest file size, as on a nearly full disk
 
     def little_space() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))

@@ -1,4 +1,4 @@
-"""What a folder or a file is taken for."""
+"""Recognition of captures in folders and files."""
 
 import json
 import re
@@ -231,7 +231,7 @@ def test_pictures_among_photographs_that_are_none(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("wrapped", ["room", "room/room"])
 def test_a_capture_in_a_folder_of_its_own(tmp_path: Path, wrapped: str) -> None:
-    """As an archive leaves it that is unpacked into a new folder."""
+    """As after unpacking an archive into a new folder."""
     folder = tmp_path / wrapped
     photograph(folder / "images")
     photograph(tmp_path / "__MACOSX/images", "._a.jpg")

@@ -1,4 +1,4 @@
-"""What this package and nerfstudio wrote beside photographs is not read as photographs, and is named."""
+"""Results beside photographs are not read as photographs, and are named."""
 
 import json
 from pathlib import Path
@@ -46,7 +46,7 @@ def save(path: Path, **options: object) -> None:
 
 @pytest.fixture
 def photographs(tmp_path: Path) -> Path:
-    """A flat folder of three photographs, and every result in it."""
+    """A flat folder with three photographs and every kind of result."""
     folder = tmp_path / "walk"
     for name in "abc":
         save(folder / f"{name}.jpg")

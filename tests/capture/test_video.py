@@ -15,7 +15,7 @@ def silent(step: str, done: int, total: int) -> None: ...
 
 
 def write_video(path: Path, frames: list[np.ndarray], rate: int = 10, times: list[int] | None = None) -> None:
-    """Frames at a constant rate, or at these times in milliseconds."""
+    """Write frames at a constant rate, or at these times in milliseconds."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("mpeg4", rate=Fraction(rate))
         stream.height, stream.width = frames[0].shape[:2]
@@ -112,7 +112,7 @@ def test_the_rotation_of_a_phone_is_applied(tmp_path: Path, wide: np.ndarray) ->
 
 
 def test_frames_of_a_varying_rate_are_looked_at_by_their_times(tmp_path: Path, wide: np.ndarray) -> None:
-    """Half a second at 250 frames per second without motion, then four at 8, over which the camera moves."""
+    """Half a second at 250 fps without motion, then four at 8 fps with a moving camera."""
     times = [*range(0, 500, 4), *range(500, 4500, 125)]
     still = sum(time < 500 for time in times)
     write_video(tmp_path / "a.mp4", pan(wide, [0] * still + [25] * (len(times) - still)), times=times)
@@ -162,7 +162,7 @@ def test_every_rotation_is_applied(
 
 
 def entries(a: int, b: int, c: int, d: int) -> bytes:
-    """The matrix in the header of a track, without a shift."""
+    """Pack the matrix of a track's header, without translation."""
     values = (a << 16, b << 16, 0, c << 16, d << 16, 0, 0, 0, 1 << 30)
     return b"".join(value.to_bytes(4, "big", signed=True) for value in values)
 

@@ -6,7 +6,7 @@ from bitymi_ns.codec.quantise import Range, choose_range, decode, decode_pages, 
 
 
 def paint(packing, value):
-    """An atlas with value(tile index, [r_v, r_u] rows and columns) in every tile and zeros elsewhere."""
+    """Build an atlas with value(tile index, [r_v, r_u] rows and columns) in every tile and zeros elsewhere."""
     texels = np.zeros((packing.layers, packing.height, packing.width, 3), dtype=np.float32)
     for i, (x, y, layer, r_u, r_v) in enumerate(packing.tiles):
         texels[layer, y : y + r_v, x : x + r_u] = value(i, r_v, r_u)
@@ -14,13 +14,13 @@ def paint(packing, value):
 
 
 def listed(packing, texels):
-    """[T, 3] the texels of the tiles."""
+    """Gather the tiles' texels: [T, 3]."""
     return np.concatenate([texels[la, y : y + h, x : x + w].reshape(-1, 3) for x, y, la, w, h in packing.tiles])
 
 
 @pytest.fixture
 def atlas():
-    """Smooth tiles of many sizes around 0.5, on more than one page."""
+    """Smooth tiles of many sizes around 0.5, on several pages."""
     packing = pack(2 ** np.random.default_rng(0).integers(2, 6, (300, 2)), page_width=256, max_rows=256)
 
     def smooth(i, r_v, r_u):
@@ -89,13 +89,13 @@ def test_fp16_stores_the_values_themselves(atlas):
 def test_bc7_keeps_a_smooth_atlas_close(profile):
     packing = pack([[32, 32]] * 4)
 
-    def plane_of_colours(i, r_v, r_u):  # steep and two-dimensional: hard for a format of lines through colour space
+    def plane_of_colours(i, r_v, r_u):  # steep and two-dimensional: hard for BC7's lines through colour space
         v, u = np.mgrid[0:1:32j, 0:1:32j]
         return np.stack([v, u, np.full_like(u, 0.5)], axis=-1)
 
     texels = paint(packing, plane_of_colours)
     encoded = encode(texels, packing, "bc7", choose_range(listed(packing, texels), "minmax"), profile)
-    assert encoded.psnr > (33 if profile == "ultrafast" else 40)  # one line through colour space a block, or more
+    assert encoded.psnr > (33 if profile == "ultrafast" else 40)  # one line per block, or more
     assert encoded.nbytes == texels[..., 0].size
     assert profile in encoded.encoder
 

@@ -1,4 +1,4 @@
-"""Texels of a scene as a list: what projections cut with them is what the baked renderer draws."""
+"""A scene's texels as a list give the same projections as the baked renderer draws."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from tests.bake.conftest import make_camera, make_surfels
 
 
 def cut_scene(count: int = 12, as_bytes: bool = True, **more) -> BakedScene:
-    """Large surfels with random tiles of 8 x 4 texels, the first without one, colours and alpha."""
+    """Make large surfels with random tiles of 8 x 4 texels, the first without one, with colours and alpha."""
     surfels, g = make_surfels(count), torch.Generator().manual_seed(5)
     surfels["log_scales"] += 1.5
     tiles = torch.zeros(count, 5, dtype=torch.int32)
@@ -30,7 +30,7 @@ def cut_scene(count: int = 12, as_bytes: bool = True, **more) -> BakedScene:
 
 
 def coverage(scene: BakedScene, camera: Camera) -> torch.Tensor:
-    """[H, W, 1] sum of the blending weights of the projection's fragments."""
+    """Sum the blending weights of the projection's fragments: [H, W, 1]."""
     projection = ops.project(*(scene.surfels[name] for name in GEOMETRY), camera, scene.near)
     fragments = ops.trace(replace(projection, alpha=texel_alpha(scene)))
     total = torch.zeros(camera.height * camera.width).index_add(0, fragments.pixel.long(), fragments.weight)

@@ -1,4 +1,4 @@
-"""The kernel of sparse cosine coefficients against its definition in float64."""
+"""The kernel of sparse cosine coefficients against a float64 implementation."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ SIZES = [[0, 0], [4, 4], [8, 16], [0, 0], [32, 8], [2, 1], [1, 8], [64, 64], [4,
 
 
 def definition(blocks: Blocks, texels, weights, means, steps, rounds: int) -> torch.Tensor:
-    """[coefficients, B, C] in steps, before they are rounded: `rounds` iterations of ISTA by matrix products."""
+    """Compute [coefficients, B, C] in steps, unrounded: `rounds` iterations of ISTA by matrix products."""
     basis, mix = module._basis(blocks).double(), module._CHANNELS[texels.shape[1]].double()
     flat = blocks.texels.reshape(len(blocks.tile), -1)
     target = (texels[flat] - means[blocks.tile, None]) @ mix.T  # [B, texels, C]
@@ -23,7 +23,7 @@ def definition(blocks: Blocks, texels, weights, means, steps, rounds: int) -> to
     for _ in range(rounds):
         values = values + basis @ (weight / most * (target - basis.T @ values))
         shrunk = torch.sign(values) * (values.abs() - threshold).clamp(min=0)
-        values = torch.cat([values[:, :1], shrunk[:, 1:]], 1)  # the constant stays
+        values = torch.cat([values[:, :1], shrunk[:, 1:]], 1)  # the constant is not shrunk
     return (values / step).transpose(0, 1)
 
 
@@ -50,7 +50,7 @@ def test_coefficients_are_those_of_the_definition(dtype, channels, rounds):
         exact = definition(blocks, *(x.double() for x in (texels, weights, means, steps)), rounds)
         away = (codes - exact).abs()
         assert away.max() <= 0.5 + 1e-3
-        close = (exact - exact.floor() - 0.5).abs() > 1e-3  # not where rounding decides
+        close = (exact - exact.floor() - 0.5).abs() > 1e-3  # except near rounding ties
         expected = torch.sign(exact) * torch.floor(exact.abs() + 0.5)
         assert torch.equal(codes[close].double(), expected[close]) and close.double().mean() > 0.9
 

@@ -1,4 +1,4 @@
-"""Columns of integers: they come back, and a frame takes no more memory than it is asked for."""
+"""Integer columns round-trip, and decoding is bounded in memory."""
 
 import numpy as np
 import pytest

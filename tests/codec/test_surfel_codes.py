@@ -1,4 +1,4 @@
-"""Surfels as integers: errors are at most half a step, and the order is that of a Morton curve."""
+"""Integer codes of surfels: errors of at most half a step, in Morton order."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Texels as integers: fine steps lose nothing, unseen texels cost little, and weights decide where errors are."""
+"""Integer codes of texels: fine steps are lossless, unseen texels are cheap, weights decide where errors are."""
 
 import torch
 

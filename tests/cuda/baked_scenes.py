@@ -1,4 +1,4 @@
-"""Scenes and bounds of the tests of the baked renderer."""
+"""Scenes and error bounds for tests of the baked renderer."""
 
 import math
 from dataclasses import replace
@@ -16,8 +16,8 @@ from tests.bake.conftest import make_surfels
 from tests.ops.golden import SceneCase
 
 FLIP = 4 / 255
-"""By which a colour on a card may differ: its special function unit takes exponentials and logarithms to about 2^-21. A
-fragment whose opacity is 1/255 to within that is drawn there and not here, and colours are below 4."""
+"""Bound of colour differences on a GPU: its special function unit is accurate to about 2^-21, so fragments of opacity
+near 1/255 may be drawn there only, and colours are below 4."""
 
 
 def camera_of(case: SceneCase) -> Camera:
@@ -30,7 +30,7 @@ def scene_of(case: SceneCase, **kwargs) -> BakedScene:
 
 
 def textured(count: int, seed: int, dtype: torch.dtype = torch.uint8, kind: str = "sv") -> BakedScene:
-    """Surfels about the origin, two thirds with a tile of random texels, on two pages, with random extents."""
+    """Make surfels around the origin, two thirds with a tile of random texels, on two pages, with random extents."""
     g = torch.Generator().manual_seed(seed)
     atlas = torch.rand(2, 16, 16 * count, 4, generator=g)
     atlas = (atlas * 255).to(torch.uint8) if dtype == torch.uint8 else atlas
@@ -52,7 +52,7 @@ def textured(count: int, seed: int, dtype: torch.dtype = torch.uint8, kind: str 
 
 
 def cut_out(count: int, seed: int, dtype: torch.dtype = torch.uint8) -> BakedScene:
-    """The same with alpha texels, a third of them 0, some 2; other surfels have a constant between 0 and 2."""
+    """Make such surfels with alpha texels, a third of them 0, some 2, and constants between 0 and 2 without tiles."""
     scene, g = textured(count, seed, dtype), torch.Generator().manual_seed(seed)
     assert scene.atlas is not None
     m = (3 * torch.rand(scene.atlas.shape[:3], generator=g) - 1).clamp(0, 255 / 128)
@@ -62,13 +62,12 @@ def cut_out(count: int, seed: int, dtype: torch.dtype = torch.uint8) -> BakedSce
 
 
 FAR = [(True, 0.25, 43.0), (True, 0.125, 47.0), (False, 0.25, 59.0), (False, 0.125, 60.0)]
-"""Whether `layered` has alpha texels, the share of its size, and the least PSNR there against the average of its
-picture of full size."""
+"""Alpha texels of `layered`, relative size of the view, and least PSNR there against the averaged full-size render."""
 
 
 def layered(alpha: bool) -> tuple[BakedScene, Camera]:
-    """Make four layers of a tilted wall of surfels, and a camera that sees them as photographed. With `alpha` texels of
-    all layers are cut out along the same edges, finer than a pixel of a far view."""
+    """Make four layers of a tilted wall of surfels, and the camera of the photographs. With `alpha`, texels of all
+    layers are cut out along the same edges, finer than a pixel of a far view."""
     across, side, scale, tilt = 6, 16, 0.22, 0.5
     count = 4 * across**2
     scene, i = textured(count, 0), torch.arange(count)
@@ -82,7 +81,7 @@ def layered(alpha: bool) -> tuple[BakedScene, Camera]:
         "opacity_logits": torch.full((count,), 1.5),
     }
     u = scale * (6 * (torch.arange(side) + 0.5) / side - 3)
-    column, row = x[:, None] + math.cos(tilt) * u, y[:, None] + u  # [count, side]: where the texels are
+    column, row = x[:, None] + math.cos(tilt) * u, y[:, None] + u  # [count, side] texel positions
     texels = torch.zeros(side, count, side, 4)
     texels[..., :3] = 0.5 + 0.4 * torch.sin(9 * column)[None, :, :, None]
     texels[..., 3] = torch.sin(18 * column) + torch.sin(15 * row).T[:, :, None] > 0
@@ -105,7 +104,7 @@ def layered(alpha: bool) -> tuple[BakedScene, Camera]:
 
 
 def to_average(scene: BakedScene, camera: Camera, share: float) -> float:
-    """Measure the PSNR of a view of that share of a camera's size against the average of the view of full size."""
+    """Compute the PSNR of a view of relative size `share` against the averaged full-size view."""
     full = scene.render(camera).rgb
     return psnr(scene.render(camera.scaled(share)).rgb, averaged({"rgb": full[None]}, round(1 / share))["rgb"][0])
 
@@ -117,26 +116,26 @@ def front(width: int = 60, height: int = 44, distance: float = 4.0) -> Camera:
 
 
 def most(device: torch.device, emulated: float, card: float) -> float:
-    """The bound for that device."""
+    """Return the bound for a device."""
     return card if device.type == "cuda" else emulated
 
 
 class ListedPairs(NamedTuple):
-    """The lists of a frame."""
+    """Lists of a frame."""
 
-    ranges: Tensor  # [tiles, 2] where the list of each screen tile begins and ends, all views one after the other
-    depth: Tensor  # [surfels * views] keys in the order of depth, 2^32 - 1: not visible
+    ranges: Tensor  # [tiles, 2] begin and end of each screen tile's list, view by view
+    depth: Tensor  # [surfels * views] depth keys, 2^32 - 1: not visible
     pairs: Tensor  # row << 8 | mask of the 8 x 4 parts of the tile, tile by tile
 
     @property
     def visible(self) -> Tensor:
-        """[surfels * views] which of the surfels are visible."""
+        """Mask [surfels * views] of visible surfels."""
         return self.depth != 0xFFFFFFFF
 
 
 def listed_pairs(workspace: Workspace, surfels: int, views: int, width: int, height: int) -> ListedPairs:
-    """Read the lists that the latest frame, without normals, left in the working memory (`lay_out` of
-    csrc/cuda/baked_frame.cu), on the CPU."""
+    """Read the lists of the latest frame (without normals) from the working memory (`lay_out` of
+    csrc/cuda/baked_frame.cu), to the CPU."""
     assert workspace.memory is not None
     memory, at = workspace.memory.cpu(), 256
     tiles, rows, slots = tiles_of(views, width, height), surfels * views, workspace.slots

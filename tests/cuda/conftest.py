@@ -1,4 +1,4 @@
-"""Run every test on the CUDA kernels: thread by thread on the host, and on a card where there is one."""
+"""Run every test on the CUDA kernels: emulated on the host, and on a GPU if there is one."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +12,7 @@ from tests.required import REQUIRED, skip_without
 
 
 def why_not_on_a_card() -> str | None:
-    """Return why tests cannot run on a card here, None when they can."""
+    """Explain why tests cannot run on a GPU, None if they can."""
     if not torch.cuda.is_available():
         return "no CUDA device (or torch without CUDA)"
     try:
@@ -23,7 +23,7 @@ def why_not_on_a_card() -> str | None:
 
 
 def why_not_emulated() -> str | None:
-    """Return why tests cannot run on the host's emulation, None when they can."""
+    """Explain why tests cannot run in emulation, None if they can."""
     try:
         from bitymi_ns import _emulated  # noqa: F401
     except ImportError:
@@ -49,7 +49,7 @@ def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
 
 @pytest.fixture
 def cpu():
-    """A context in which tensors on the CPU go to the CPU kernels although `device` is emulated."""
+    """Return a context in which CPU tensors go to the CPU kernels although `device` is emulated."""
 
     @contextmanager
     def context() -> Iterator[None]:

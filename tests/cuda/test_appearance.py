@@ -12,7 +12,7 @@ from tests.ops.test_view_color import lean_parameters
 
 DTYPES = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
 TERMS = {"sv": (7, 3), "sh": (16, 4), "sb": (2, 5), "sg": (2, 3)}
-"""Of each view colour: what kernels are compiled for, and another number."""
+"""Numbers of terms per view colour: one with unrolled kernels, one without."""
 
 
 def parameters(kind: str, terms: int, n: int) -> dict[str, Tensor]:

@@ -1,4 +1,4 @@
-"""The atlas as a texture: how its pages lie, its coarser levels, and threads that share it."""
+"""The atlas as a texture: page layout, coarser levels, sharing between threads."""
 
 import threading
 import time
@@ -18,7 +18,7 @@ from tests.cuda.baked_scenes import front, textured
 def test_where_pages_lie_in_the_texture_does_not_show(
     prefilter: str, photo_pixel: float, device: torch.device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Below each other, beside, in a grid with a gap, and with pages whose sides are on no grid."""
+    """Pages in a column, a row, a grid with a gap, and with sides off any grid."""
     scene = replace(textured(30, 5), prefilter=prefilter)
     assert scene.atlas is not None
     atlas = torch.cat([scene.atlas, scene.atlas.flip(1)[:1]])
@@ -44,7 +44,7 @@ def test_where_pages_lie_in_the_texture_does_not_show(
 def test_levels_are_made_of_the_texture(
     dtype: torch.dtype, alpha: bool, device: torch.device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Those of blocks, too: nothing is decoded for a smaller view."""
+    """BC7 blocks included: smaller views need no decoding."""
     generator = torch.Generator().manual_seed(0)
     pages = torch.randint(256, (3, 8, 12, 4), generator=generator, dtype=torch.uint8)
     pages[..., 3] *= torch.rand(3, 8, 12, generator=generator) < 0.5

@@ -1,6 +1,6 @@
-"""The baked renderer by the CUDA kernels against the CPU's.
+"""The baked renderer on CUDA against the CPU.
 
-Colours of textured fragments differ by the 8 bits of the texture unit's weights: by 1.2e-3, with alpha by 6.3e-3.
+The texture unit's 8-bit weights change colours of textured fragments by up to 1.2e-3, with alpha by 6.3e-3.
 """
 
 import warnings
@@ -46,16 +46,16 @@ from tests.ops.test_view_color import lean_parameters
 FIELDS = ("rgb", "alpha", "beta", "depth", "normal", "overdraw")
 STEP = 1 / 255
 TEXEL = 2 / 256
-"""Of the texels' range, by which they may differ on a card: a texture unit's weights have 8 bits of fraction along each
-of two axes, and how it rounds the last bit is not written down."""
+"""Bound of texel differences on a GPU, relative to their range: texture weights have 8 fractional bits along each axis,
+with unspecified rounding."""
 EXTREME = extreme_scenes()
 
 
 def check(
     scene: BakedScene, camera: Camera, device: torch.device, cpu, background: Tensor | None = None, close: float = STEP
 ) -> float:
-    """Holds a view of the scene on the device against the CPU's, colours to `close`, but for a pixel in a thousand; the
-    largest difference of colours."""
+    """Compare a view on the device with the CPU's: colours to `close`, except one pixel in a thousand; returns the
+    largest colour difference."""
     got = scene.to(device).render(camera, None if background is None else background.to(device), maps=True)
     with cpu():
         want = scene.render(camera, background, maps=True)
@@ -79,7 +79,7 @@ def test_golden_textured_scene(device: torch.device, cpu) -> None:
 
 
 def test_the_low_pass_stays_where_the_near_plane_cuts_the_kernel(device: torch.device, cpu) -> None:
-    """Surfels right before the camera, whose kernels end at the near plane within the reach of their low passes."""
+    """Surfels right before the camera, clipped by the near plane within the reach of their low passes."""
     golden = load_golden("inside_the_scene")
     check(scene_of(golden), camera_of(golden), device, cpu, golden.background.float())
 
@@ -94,7 +94,7 @@ def test_random_scenes(seed: int, device: torch.device, cpu) -> None:
 @pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
 @pytest.mark.parametrize("case", EXTREME, ids=[case.name for case in EXTREME])
 def test_numbers_that_misbehave(case: SceneCase, prefilter: str, device: torch.device, cpu) -> None:
-    case = replace(case, width=min(case.width, 600), height=min(case.height, 600))  # test_sizes has the long ones
+    case = replace(case, width=min(case.width, 600), height=min(case.height, 600))  # longer ones: test_sizes
     check(scene_of(case, prefilter=prefilter), camera_of(case), device, cpu, case.background.float())
 
 
@@ -109,7 +109,7 @@ def test_textures_extents_and_constant_residuals(dtype: torch.dtype, device: tor
 )
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32], ids=["uint8", "half"])
 def test_alpha_texels(dtype: torch.dtype, prefilter: str, photo_pixel: float, device: torch.device, cpu) -> None:
-    """The texture unit's weights move sigma, and with it what lies behind: by more than they move colours."""
+    """The texture unit's weights change sigma, and so what is behind: more than colours."""
     scene = replace(cut_out(60, 0, dtype), prefilter=prefilter)
     background, names = torch.tensor([0.2, 0.4, 0.6]), ("rgb", "alpha", "beta", "depth", "overdraw")
     no_constants = {"mean_alpha": None, "mean_residual": None}
@@ -188,7 +188,7 @@ def test_bundles(format: str, device: torch.device, cpu, tmp_path) -> None:
 
 
 def check_blocks(scene: BakedScene, want: BakedScene, device: torch.device, cpu) -> None:
-    """A scene with BC7 blocks alone is drawn as the decoded one: by the texture unit, or decoded with a warning."""
+    """Check that BC7 blocks are drawn like their decoded texels: by the texture unit, or decoded with a warning."""
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         got = scene.to(device).render(front(48, 40)).rgb.cpu()
@@ -238,7 +238,7 @@ def test_views_drawn_together(device: torch.device) -> None:
 
 @pytest.mark.parametrize("least, share", [(0.0, (1.5, 1e9)), (FAST, (0.0, 1.0))])
 def test_pixels_end_at_the_least_transmittance(least: float, share: tuple, device: torch.device, cpu) -> None:
-    """All surfels are blended without one; with a large one pixels end early."""
+    """All surfels are blended with 0; with a large one pixels end early."""
     case = random_scene(200, 10, width=20, height=16)
     case.params["opacity_logits"] += 4.0
     scene, camera = scene_of(case, transmittance_min=least), camera_of(case)
@@ -296,7 +296,7 @@ def test_threads_share_a_renderer(device: torch.device) -> None:
 @pytest.mark.parametrize("width, height", [(1, 1), (17, 3), (3, 33), (8200, 2), (2, 8200)])
 def test_sizes(width: int, height: int, device: torch.device, cpu) -> None:
     case = random_scene(40, 8, width, height)
-    case.K[0, 0] = case.K[1, 1] = float(max(width, height))  # no grazing rays, at which float32 means little
+    case.K[0, 0] = case.K[1, 1] = float(max(width, height))  # avoids grazing rays, where float32 is inaccurate
     check(scene_of(case), camera_of(case), device, cpu)
 
 
@@ -345,7 +345,7 @@ def test_errors(device: torch.device, cpu) -> None:
 @pytest.mark.parametrize("photo_pixel", [0.2, 0.45, 2.5])
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32], ids=["uint8", "half"])
 def test_views_of_another_size(photo_pixel: float, dtype: torch.dtype, device: torch.device, cpu) -> None:
-    """Widened surfels, and texels of their level; half floats round otherwise."""
+    """Widened surfels and texels of their level; half floats round differently."""
     scene, camera = textured(80, 4, dtype), front()
     background = torch.tensor([0.2, 0.4, 0.6])
     names = ("rgb", "alpha", "beta", "depth", "overdraw")

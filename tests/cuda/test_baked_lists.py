@@ -1,4 +1,4 @@
-"""The baked renderer on CUDA: which surfels each tile lists, in which order, and what does not fit."""
+"""Tile lists of the baked renderer on CUDA: contents, order, overflow."""
 
 import pytest
 import torch
@@ -14,16 +14,15 @@ from tests.ops.golden import SURFEL_KEYS, crossing_scene, random_scene, referenc
 
 
 def mask_pixels(renderer: BakedRenderer, surfels: int, width: int, height: int) -> int:
-    """Pixels of all parts of tiles that pairs of a frame of one view name, within the image or not."""
+    """Count the pixels of all tile parts in a one-view frame's pairs, within the image or not."""
     masks = listed_pairs(renderer.workspace, surfels, 1, width, height).pairs & 0xFF
     return 32 * sum(int((masks >> part & 1).sum()) for part in range(8))
 
 
 def lists_of(renderer: BakedRenderer, surfels: int, width: int, height: int, views: int) -> list[Tensor]:
-    """The surfels that each tile lists after a frame, numbered through all views.
+    """Return the surfels listed in each tile after a frame, numbered across views.
 
-    They must be front to back, those of one depth by their number, each once; of a complete frame they must hold all
-    pairs.
+    Checks that they are unique and front to back, ties by number, and that a complete frame has all pairs.
     """
     ranges, depth, pairs = listed_pairs(renderer.workspace, surfels, views, width, height)
     if renderer.complete():
@@ -37,7 +36,7 @@ def lists_of(renderer: BakedRenderer, surfels: int, width: int, height: int, vie
 
 @pytest.mark.parametrize("count", [5, 140])
 def test_large_surfels(count: int, device: torch.device, cpu) -> None:
-    """More rows of tiles per surfel, and per block, than the block has threads, between small surfels."""
+    """More rows of tiles per surfel, and per block, than the block has threads, among small surfels."""
     case = random_scene(count, 20, width=90, height=360)
     case.params["log_scales"][::2] += 3.0
     case.params["opacity_logits"] -= 4.0  # so that few pixels end before the last surfel
@@ -52,7 +51,7 @@ def test_large_surfels(count: int, device: torch.device, cpu) -> None:
 
 @pytest.mark.parametrize("seed, prefilter", [(0, "low_pass"), (1, "low_pass"), (0, "pixel")])
 def test_no_pixel_of_thin_small_and_large_surfels_is_lost(seed: int, prefilter: str, device: torch.device, cpu) -> None:
-    """The bounds in single precision (core/plane_bounds.h) against the CPU's in double: the same fragments."""
+    """The single-precision bounds (core/plane_bounds.h) give the same fragments as the CPU's double ones."""
     case = random_scene(150, 100 + seed, width=72, height=56)
     g = torch.Generator().manual_seed(seed)
     case.params["log_scales"] += 2.0 * torch.randn(150, 2, generator=g, dtype=torch.float64)
@@ -68,7 +67,7 @@ def test_no_pixel_of_thin_small_and_large_surfels_is_lost(seed: int, prefilter: 
 def test_discs_across_the_camera_plane_are_listed_where_they_show(
     seed: int, width: int, height: int, device: torch.device, cpu
 ) -> None:
-    """They have no box: none beyond the image's borders, the others in tiles that they reach, and in parts of these."""
+    """Discs without a box are listed only in tiles and parts that they reach, and never beyond the borders."""
     case = crossing_scene(60, seed, width, height)
     scene, camera = scene_of(case), camera_of(case)
     renderer = BakedRenderer(scene.to(device), width, height, images=("overdraw",))
@@ -83,12 +82,12 @@ def test_discs_across_the_camera_plane_are_listed_where_they_show(
 
 @pytest.fixture
 def few_slots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tiles have the fewest slots that the kernels take."""
+    """Give tiles the fewest slots that the kernels support."""
     monkeypatch.setattr(baked_cuda, "slots_per_tile", lambda capacity, tiles: 32)
 
 
 def test_a_frame_that_does_not_fit_is_drawn_again(device: torch.device, cpu, few_slots: None) -> None:
-    """Neither the tiles' slots nor the room for other pairs are enough."""
+    """Both the tiles' slots and the shared list overflow."""
     case = random_scene(60, 0, width=70, height=60)
     case.params["log_scales"] += 3.0  # every surfel on nearly every tile
     case.params["opacity_logits"] -= 3.0
@@ -114,7 +113,7 @@ def test_a_frame_that_does_not_fit_is_drawn_again(device: torch.device, cpu, few
 @pytest.mark.parametrize("views", [1, 3])
 @pytest.mark.parametrize("count", [1, 33, 300, 1025, 3000])
 def test_lists_of_all_lengths_are_in_order(count: int, views: int, device: torch.device, cpu) -> None:
-    """Up to several runs of what a block sorts at once, with ties in depth, beside tiles without a surfel."""
+    """Several runs of a block sort, with ties in depth, beside empty tiles."""
     surfels = make_surfels(count, seed=30)
     surfels["means"] *= 0.05  # in the middle
     surfels["means"][count // 2 :, 2] = surfels["means"][0, 2]
@@ -144,7 +143,7 @@ def test_lists_of_all_lengths_are_in_order(count: int, views: int, device: torch
 def test_pairs_without_a_slot_are_listed_like_the_others(
     count: int, width: int, height: int, scale: float, views: int, device: torch.device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All pairs in one tile, some in several, those of surfels of many tiles, and tiles with and without."""
+    """All pairs in one tile, some in several, surfels with many tiles, empty tiles."""
     surfels = make_surfels(count, seed=31)
     surfels["log_scales"] += scale
     surfels["opacity_logits"] = surfels["opacity_logits"] - 4.0
@@ -169,7 +168,7 @@ def test_pairs_without_a_slot_are_listed_like_the_others(
 
 @pytest.mark.parametrize("pairs, width, height", [(8, 16, 16), (80_000, 320, 240), (10**7, 3840, 2160)])
 def test_memory_is_bounded_by_the_pairs(pairs: int, width: int, height: int, device: torch.device) -> None:
-    """20 bytes of each, 32 MB, and 36 bytes of each tile."""
+    """20 bytes per pair, 32 MB, and 36 bytes per tile."""
     workspace, tiles = Workspace(device), -(-width // 16) * -(-height // 16)
     workspace.resize(1, 1, width, height, False, pairs)
     assert workspace.memory.numel() < 20 * pairs + 2**25 + 36 * tiles + 4096
@@ -178,7 +177,7 @@ def test_memory_is_bounded_by_the_pairs(pairs: int, width: int, height: int, dev
 
 
 def test_many_tiles(device: torch.device) -> None:
-    """The tiles that a narrower image has as well must get the same lists."""
+    """Tiles that a narrower image also has get the same lists."""
     case = random_scene(30, 9, 1_000, 20)
     scene, ranges = scene_of(case).to(device), []
     for width in (1_000, 600_000):

@@ -17,7 +17,7 @@ def test_values_and_gradients_do_not_change(device: torch.device) -> None:
 
 @pytest.mark.parametrize("fit", [1000, 500])
 def test_lists_that_find_no_memory(device: torch.device, fit: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In bands of up to `fit` fragments the view can be drawn; where a row of tiles has more, the error says so."""
+    """Bands of up to `fit` fragments can be drawn; a row of tiles with more raises an error that says so."""
     empty_list = trace_cuda.empty_list
 
     def small_ones(geom: torch.Tensor, count: int) -> dict[str, torch.Tensor]:

@@ -1,4 +1,4 @@
-"""Shading and blending in one pass by the CUDA kernels: against the CPU's, in any order of threads."""
+"""Shading and blending in one pass on CUDA, against the CPU, in any thread order."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -20,7 +20,7 @@ HERE = torch.device("cpu")
 def run(
     case: SceneCase, device: torch.device, dtype: torch.dtype, textured: bool, maps: bool = True, moves: bool = True
 ) -> list[Tensor]:
-    """A picture and all gradients; on the CPU, in double."""
+    """Compute a picture and all gradients, on the CPU in double."""
     view = View(case, dtype, textured, device=device)
     image = view.image(maps, moves)
     return [t.detach().cpu().double() for t in (image, *view.gradients(image))]
@@ -32,7 +32,7 @@ def run(
 def test_pictures_and_gradients_are_those_of_the_cpu(
     textured: bool, moves: bool, maps: bool, dtype: torch.dtype, device: torch.device, cpu: Context
 ) -> None:
-    """Tiles have more fragments than shared memory holds, and more than 32 surfels; the image ends within one."""
+    """Tiles with more fragments than shared memory holds and more than 32 surfels; the image ends within one."""
     case = random_scene(150, 3, width=70, height=40)
     got = run(case, device, dtype, textured, maps, moves)
     with cpu():
@@ -45,8 +45,8 @@ def test_pictures_and_gradients_are_those_of_the_cpu(
 
 @pytest.mark.parametrize("scene", extreme_scenes(), ids=lambda case: case.name)
 def test_extreme_scenes(scene: SceneCase, device: torch.device) -> None:
-    """Against shading and compositing one after the other. Not against the CPU, where the normal of a surfel that is
-    seen edge-on may have the other sign."""
+    """Compare with shading and compositing in sequence; on the CPU the normal of an edge-on surfel may have the other
+    sign."""
     view = View(scene, torch.float64, True, device=device)
     image, wanted = view.image(maps=True), view.one_by_one(maps=True)
     assert relative(image, wanted) < 1e-13
@@ -63,7 +63,7 @@ def test_a_view_that_shows_nothing(textured: bool, device: torch.device) -> None
 
 
 def moved(case: SceneCase, device: torch.device, dtype: torch.dtype) -> list[Tensor]:
-    """Texels after a descent, and all gradients; on the CPU."""
+    """Compute texels after a descent and all gradients, on the CPU."""
     view = View(case, dtype, True, learns=False, device=device)
     share = torch.linspace(0.1, 2.0, len(view.given["texels"]), dtype=dtype, device=device)
     gradients = view.gradients(view.image(descent=ops.TexelDescent(share, 0.3)))
@@ -80,7 +80,7 @@ def test_a_descent_moves_the_texels_as_on_the_cpu(device: torch.device, cpu: Con
 
 
 def test_only_sums_of_texels_depend_on_the_order_of_threads(device: torch.device, exactly) -> None:
-    """And not even they where torch is asked for deterministic algorithms."""
+    """And not even they with deterministic algorithms."""
     case = random_scene(60, 3, width=70, height=40)
     with_seed = [emulated_cuda(seed) if device == HERE else nullcontext() for seed in range(4)]
     exact, plain = [], []

@@ -1,4 +1,4 @@
-"""The emulator finds faults of kernels: each is made on purpose here."""
+"""The emulator detects deliberate kernel faults."""
 
 from types import ModuleType
 
@@ -11,7 +11,7 @@ from tests.required import skip_without
 
 @pytest.fixture
 def emulated() -> ModuleType:
-    """The kernels on the host."""
+    """The emulated kernels."""
     if why := why_not_emulated():
         skip_without("emulated", why)
     return load("_emulated")
@@ -22,7 +22,7 @@ def test_nothing_is_left_in_shared_memory_by_another_block(emulated: ModuleType)
 
 
 def test_a_barrier_that_not_all_threads_reach_is_an_error(emulated: ModuleType) -> None:
-    for _ in range(2):  # and the emulator is as good as new
+    for _ in range(2):  # the emulator stays usable
         with pytest.raises(RuntimeError, match=r"barrier_kernel: threads wait at barriers"):
             emulated.open_barrier()
 

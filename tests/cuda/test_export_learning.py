@@ -1,4 +1,4 @@
-"""The learning of an export, on the device of the scene: coverage, rate-distortion search, polish and fine-tuning."""
+"""Optimisation during an export on the scene's device: coverage, rate-distortion search, polish, fine-tuning."""
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -22,7 +22,7 @@ BACKGROUND = torch.tensor([0.2, 0.4, 0.6])
 
 @pytest.fixture
 def learned_on() -> Iterator[set[bool]]:
-    """Record the backends of the kernels that move texels: True = CUDA or its emulation."""
+    """Record the backends of kernels that move texels: True = CUDA or emulated."""
     found: set[bool] = set()
     plain = backend.function
 
@@ -37,7 +37,7 @@ def learned_on() -> Iterator[set[bool]]:
 
 
 def trained() -> tuple[Scene, list[View]]:
-    """A scene whose texels have learned a little on the CPU, and four photographs."""
+    """A scene with slightly trained texels (on the CPU), and four photographs."""
     scene, views = scene_and_views()
     trainer = Trainer(scene, views, config(), 12)
     for _ in range(START + 3):
@@ -52,7 +52,7 @@ def exported(scene: Scene, views: list[View], device: torch.device, learning: Le
 
 
 def db(baked: Baked, views: list[View]) -> float:
-    """Against the photographs, where they count."""
+    """Compute the PSNR against the photographs, masked."""
     errors = [(baked.stored().render(v.camera, BACKGROUND).rgb - v.image).square() for v in views]
     return -10 * float(torch.stack([e.mean() for e in errors]).mean().log10())
 

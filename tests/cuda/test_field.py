@@ -1,4 +1,4 @@
-"""The residual field by the CUDA kernels: at points, at fragments and at texels."""
+"""The residual field on CUDA: at points, fragments and texels."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ from tests.ops.test_kernels import make_field, relative
 
 
 def points(count: int, device: torch.device, dtype: torch.dtype, close: bool = False) -> Tensor:
-    """[count, 3]; close: neighbours in the list share cells of the coarse levels."""
+    """Draw points [count, 3]; close: neighbours in the list share cells of coarse levels."""
     g = torch.Generator().manual_seed(count)
     x = torch.randn(count, 3, generator=g, dtype=torch.float64) * 2
     if close:
@@ -21,7 +21,7 @@ def points(count: int, device: torch.device, dtype: torch.dtype, close: bool = F
 
 
 def value_and_gradients(field: HashField, x: Tensor) -> list[Tensor]:
-    """rho, and the gradients of x, table and weights for a fixed direction; on the CPU, in double."""
+    """Compute rho, and the gradients of x, table and weights for a fixed direction, on the CPU in double."""
     x = x.clone().requires_grad_()
     field.zero_grad()
     rho = field(x)
@@ -35,7 +35,7 @@ def value_and_gradients(field: HashField, x: Tensor) -> list[Tensor]:
 def test_values_and_gradients_against_the_cpu(
     count: int, close: bool, contract: bool, dtype: torch.dtype, device: torch.device, cpu
 ) -> None:
-    """The CPU's are held against the reference and finite differences in tests/ops."""
+    """Against the CPU, which tests/ops checks against the reference and finite differences."""
     x = points(count, device, dtype, close)
     field = make_field(contract, dtype).to(device)
     got = value_and_gradients(field, x)
@@ -56,7 +56,7 @@ def test_no_points_and_points_far_away(device: torch.device) -> None:
 
 
 class Shading:
-    """A random view of surfels with a field, and its image with all gradients by either kernels."""
+    """A random view of surfels with a field; its image and gradients by either backend."""
 
     def __init__(self, dtype: torch.dtype, case=None) -> None:
         self.case, self.dtype = case or random_scene(25, 11, width=20, height=18, scale=0.4), dtype
@@ -64,7 +64,7 @@ class Shading:
         self.field = make_field(True, dtype, log2=6)
 
     def run(self, device: torch.device, mode: str, bound: float = 0.05) -> list[Tensor]:
-        """Image, and gradients of base colours, frames, uv, table and weights; those that the mode has."""
+        """Compute the image, and the gradients of base colours, frames, uv, table and weights that the mode has."""
         case = self.case
         camera = Camera(case.viewmat.to(self.dtype), case.K.to(self.dtype), case.width, case.height)
         with torch.no_grad():
@@ -77,7 +77,7 @@ class Shading:
         image = ops.blended_image(fragments, projection, leaves[0], residual=rho)
         along = torch.cos(torch.arange(image.numel(), device=device).double()).view_as(image).to(image)
         (image * along).sum().backward()
-        order = torch.argsort(fragments.pixel.long() * len(self.base) + fragments.surfel)  # the same by either kernels
+        order = torch.argsort(fragments.pixel.long() * len(self.base) + fragments.surfel)  # independent of the backend
         duv = None if fragments.uv.grad is None else fragments.uv.grad[:, order]
         grads = [*(t.grad for t in leaves), duv, *(t.grad for t in params)]
         return [t.detach().cpu().double() for t in (image, *grads) if t is not None]

@@ -1,4 +1,4 @@
-"""Losses and statistics of a training step by the CUDA kernels, against torch."""
+"""Losses and statistics of a training step on CUDA, against torch."""
 
 import math
 from types import SimpleNamespace
@@ -51,7 +51,7 @@ def test_losses_and_gradient(size: tuple[int, int], dtype: torch.dtype, device: 
 @DTYPES
 @pytest.mark.parametrize("share", [0.6, 0.0], ids=["some", "none"])
 def test_losses_and_gradient_where_a_mask_counts(share: float, dtype: torch.dtype, device: torch.device, cpu) -> None:
-    image, target = picture(37, 300, dtype)  # of more pixels than a block adds up
+    image, target = picture(37, 300, dtype)  # more pixels than a block sums
     view = SimpleNamespace(camera=SimpleNamespace(height=37, width=300))
     mask = torch.rand(37, 300, generator=torch.Generator().manual_seed(3)) < share
     target[~mask] = math.nan

@@ -1,4 +1,4 @@
-"""The gradient with respect to the camera's pose by the CUDA kernels, against that of the CPU's."""
+"""Gradients of the camera's pose on CUDA, against the CPU."""
 
 import pytest
 import torch
@@ -14,7 +14,7 @@ def test_equal_to_the_cpu(name: str, dtype: torch.dtype, device: torch.device, c
     got = gradient(loss_of(case, dtype, device))
     with cpu():
         want = gradient(loss_of(case, torch.float64))
-    hard = name in ("edge_on", "hard_discs", "offcentre_fx_fy")  # rims amplify the rounding of single precision
+    hard = name in ("edge_on", "hard_discs", "offcentre_fx_fy")  # rims amplify float32 rounding
     assert relative(got, want) < (1e-9 if dtype == torch.float64 else 0.1 if hard else 1e-2)
 
 

@@ -1,4 +1,4 @@
-"""Projection by the CUDA kernels against the CPU kernels, which are held against the float64 references."""
+"""Projection on CUDA against the CPU kernels, which are checked against the float64 references."""
 
 import pytest
 import torch
@@ -8,11 +8,11 @@ from bitymi_ns.scene import Camera
 from tests.ops.golden import GOLDEN_NAMES, load_golden
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
-RADII = 2  # place in what `run` returns
+RADII = 2  # index in the result of `run`
 
 
 def run(case, dtype: torch.dtype, device: torch.device):
-    """geom, frames, radii and the parameters' gradients for a fixed random direction."""
+    """Compute geom, frames, radii and the parameters' gradients for a fixed random direction."""
     params = [case.params[name].to(device, dtype).requires_grad_() for name in NAMES]
     camera = Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height)
     p = project(*params, camera, 0.2)
@@ -38,7 +38,7 @@ def test_projection_and_its_gradients(name: str, dtype: torch.dtype, device: tor
         if (
             i == RADII
         ):  # half extents of the level set, from planes in single precision here, from a conic in double there
-            # one that ends far outside of the image, next to the camera's plane, depends on every rounding
+            # ends far outside the image, near the camera's plane, are sensitive to rounding
             a, b = (t.clamp(max=8.0 * max(case.width, case.height)) for t in (a, b))
             wider, narrower = (a - b - 1e-3 * b).max(), (b - a - 1e-3 * b).max()
             assert wider <= 0.1 and narrower <= (0.02 if device.type == "cuda" else 0.01), (wider, narrower)

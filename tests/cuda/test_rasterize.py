@@ -1,4 +1,4 @@
-"""Pictures without lists of fragments: values and gradients against those of lists, in any order of threads."""
+"""Pictures without fragment lists: values and gradients against lists, in any thread order."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -26,13 +26,13 @@ BOUND = 0.03
 
 
 class Learned:
-    """Surfels with view colours, and texels of colour and alpha where asked for, as leaves of a graph.
+    """Surfels with view colours and optional colour and alpha texels, as leaves of a graph.
 
     Args:
         case: geometry and camera.
         texture: none, colors or alphas.
         extreme: alphas of 0, of 2, of 1 and far below it, and extents that end within the support.
-        moved: a backward pass moves the texels.
+        moved: the backward pass moves the texels.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class Learned:
             self.alpha = ops.TexelAlpha(tiles, self.leaves["alphas"], BOUND)
 
     def draw(self, listed: bool, moves: bool = True) -> dict[str, Tensor]:
-        """The picture, all gradients of a sum over it, and the texels after it."""
+        """Compute the picture, all gradients of a sum over it, and the texels afterwards."""
         projection = ops.project(*(self.leaves[name] for name in GEOMETRY), self.camera, prefilter=self.prefilter)
         projection.alpha = self.alpha
         how = {**self.texture, "move_surfels": moves}
@@ -103,7 +103,7 @@ def compare(got: dict[str, Tensor], want: dict[str, Tensor], tolerance: float) -
 def test_pictures_and_gradients_are_those_of_the_cpu(
     texture: str, moves: bool, prefilter: ops.Prefilter, dtype: torch.dtype, device: torch.device, cpu: Context
 ) -> None:
-    """Tiles have more fragments than shared memory holds, and more than 32 surfels; the image ends within one."""
+    """Tiles with more fragments than shared memory holds and more than 32 surfels; the image ends within one."""
     case = random_scene(150, 3, width=70, height=40)
     got = Learned(case, dtype, device, texture, prefilter).draw(False, moves)
     with cpu():
@@ -112,7 +112,7 @@ def test_pictures_and_gradients_are_those_of_the_cpu(
 
 
 def test_the_golden_picture_and_gradients(device: torch.device) -> None:
-    """Against the float64 reference, by which the file was made."""
+    """Against the file of the float64 reference."""
     golden = load_golden("textured")
     size = torch.tensor([[tile.shape[1], tile.shape[0]] for tile in golden.tiles], device=device)
     tiles = ops.TexelTiles.of_sizes(size, torch.full((len(size),), 3.0, dtype=torch.float64, device=device))
@@ -161,7 +161,7 @@ def test_nothing_to_see_and_pictures_smaller_than_a_tile(
 
 @pytest.mark.parametrize("opacity", [12.0, -5.0, -20.0], ids=["hides all behind", "faint", "shows nothing"])
 def test_surfels_of_one_opacity(opacity: float, device: torch.device) -> None:
-    """A tile has layers of surfels of which only the first are seen, or 1,000 that can hardly be."""
+    """Tiles with opaque layers that hide others, or 1,000 nearly invisible ones."""
     case = random_scene(300, 8, width=20, height=20)
     case.params["opacity_logits"].fill_(opacity)
     got, want = (Learned(case, torch.float64, device).draw(listed) for listed in (False, True))

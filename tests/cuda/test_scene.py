@@ -1,4 +1,4 @@
-"""Whole views and their gradients on the CUDA kernels against the CPU kernels: every operation of a training step."""
+"""Views and their gradients on CUDA against the CPU: every operation of a training step."""
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ from tests.scene.small import scene_of
 
 
 def step(case: SceneCase, device: torch.device, texture: bool, mode: str) -> dict[str, Tensor]:
-    """Images and gradients of 0.8 L1 + 0.2 (1 - SSIM) and of the maps."""
+    """Compute images and the gradients of 0.8 L1 + 0.2 (1 - SSIM) and of the maps."""
     scene, camera = scene_of(case, device, texture)
     output = scene.render(camera, case.background.to(device), field_mode=mode, maps=True)
     photo = torch.rand(output.rgb.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(device)
@@ -52,7 +52,7 @@ def test_masked_counts_equal_those_of_the_cpu(device: torch.device, cpu) -> None
 
 
 class Waits(TorchDispatchMode):
-    """Count the operations whose result the host waits for on a card."""
+    """Counter of operations that make the host wait for a GPU."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -68,7 +68,7 @@ def test_a_step_waits_for_no_more_than_the_lengths_of_lists(
     texture: bool, maps: bool, waits: int, device: torch.device
 ) -> None:
     scene, camera = scene_of(random_scene(40, 5, 33, 21), device, texture)
-    scene.render(camera, maps=maps)  # what is looked up once
+    scene.render(camera, maps=maps)  # warm-up, for cached values
     with Waits() as counted:
         scene.render(camera, maps=maps).rgb.mean().backward()
     assert counted.count == waits

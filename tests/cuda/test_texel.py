@@ -1,4 +1,4 @@
-"""Texels of surfels by the CUDA kernels: any tile, any number of fragments, lists of a part of them, coverage."""
+"""Texels on CUDA: any tile, any number of fragments, partial lists, coverage."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -19,7 +19,7 @@ Context = Callable[[], AbstractContextManager[None]]
 def of_one_surfel(
     device: torch.device, uv: Tensor, weight: Tensor, tiles: ops.TexelTiles, *leaves: Tensor
 ) -> list[Tensor]:
-    """Image and gradients of base, texels and uv; the last leaf is the image's gradient."""
+    """Compute the image and the gradients of base, texels and uv; the last leaf is the image's gradient."""
     base, texels, towards = (t.to(device) for t in leaves)
     learns = [t.clone().requires_grad_() for t in (base, texels, uv.to(device))]
     fragments, projection = one_surfel(learns[2], weight.to(device))
@@ -40,7 +40,7 @@ def of_one_surfel(
 def test_one_surfel_of_any_tile(
     device: torch.device, cpu: Context, size: tuple[int, int], extent: float, huge: float, count: int, seed: int
 ) -> None:
-    """Fragments of one tile, in cells together and apart, at texel centres, between and beyond them."""
+    """Fragments of one tile in the same and different cells, at texel centres, between and beyond them."""
     g = torch.Generator().manual_seed(seed)
     sides = torch.tensor(size, dtype=torch.float64)[:, None]
     cell = torch.stack([torch.randint(-2, side + 2, (count,), generator=g) for side in size])

@@ -1,5 +1,4 @@
-"""Alpha texels by the CUDA kernels: fragments and gradients against those of the CPU, which tests/ops holds against
-differences."""
+"""Alpha texels on CUDA: fragments and gradients against the CPU, which tests/ops checks by finite differences."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -19,7 +18,7 @@ CpuContext = Callable[[], AbstractContextManager[None]]
 
 @dataclass
 class Cut:
-    """A scene whose texels have alphas."""
+    """A scene with alpha texels."""
 
     case: SceneCase
     size: Tensor
@@ -30,8 +29,8 @@ class Cut:
 
 
 def cut_scene(seed: int, count: int = 60, width: int = 50, height: int = 40, extreme: bool = False, **options) -> Cut:
-    """Surfels with tiles of 1 x 1 to 8 x 8 texels and some without; extreme: alphas of 0, of 2, of 1 and far below it,
-    surfels that hide all behind them and such as can hardly be seen, and extents that end within the support."""
+    """Make surfels with tiles of 1 x 1 to 8 x 8 texels and some without; extreme: alphas of 0, of 2, of 1 and far below
+    it, opaque and nearly invisible surfels, and extents that end within the support."""
     case = random_scene(count, seed, width, height)
     g = torch.Generator().manual_seed(seed)
     size = torch.randint(1, 9, (count, 2), generator=g, dtype=torch.int32)
@@ -48,7 +47,7 @@ def cut_scene(seed: int, count: int = 60, width: int = 50, height: int = 40, ext
 
 
 def traced(cut: Cut, dtype: torch.dtype, device: torch.device, seen: str = "weight uv depth") -> tuple:
-    """The fragments, and gradients by name of a sum over what of them is seen."""
+    """Trace the fragments and compute gradients by name of a sum over the fields in `seen`."""
     leaves = {key: cut.case.params[key].to(device, dtype).clone().requires_grad_() for key in SURFEL_KEYS}
     leaves["alpha"] = cut.alpha.to(device, dtype).clone().requires_grad_()
     projection = ops.project(*(leaves[key] for key in SURFEL_KEYS), camera_of(cut.case, dtype), prefilter=cut.prefilter)
@@ -60,7 +59,7 @@ def traced(cut: Cut, dtype: torch.dtype, device: torch.device, seen: str = "weig
 
 
 def is_cut(cut: Cut, fragments: ops.Fragments) -> Tensor:
-    """[F] bool by pixel and surfel: the marks of the fragments of surfels with tiles."""
+    """Mask [F], by pixel and surfel, of marked fragments of surfels with tiles."""
     order = torch.argsort(fragments.pixel.cpu().long() * (1 << 32) + fragments.surfel.cpu().long())
     has_tile = cut.size[fragments.surfel.cpu().long(), 0] > 0
     marks = fragments.uv.detach()[1].cpu().contiguous().view(torch.int64) & 1
@@ -100,7 +99,7 @@ def test_alphas_of_one_change_nothing(device: torch.device) -> None:
     fragments, gradients = traced(cut, torch.float32, device)
     plain, expected = traced(replace(cut, size=torch.zeros_like(cut.size), alpha=cut.alpha[:0]), torch.float32, device)
     assert torch.equal(fragments.weight, plain.weight) and torch.equal(fragments.sigma, plain.sigma)
-    for key in SURFEL_KEYS:  # slopes along u and v are 0, and v differs in its last bit
+    for key in SURFEL_KEYS:  # slopes along u and v are 0, and v differs in its mark
         assert relative(gradients[key], expected[key]) < 1e-5, key
 
 
@@ -118,7 +117,7 @@ def test_single_precision(device: torch.device, cpu: CpuContext) -> None:
 @pytest.mark.usefixtures("exactly")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["single", "double"])
 def test_deterministic_gradients(dtype: torch.dtype, device: torch.device, cpu: CpuContext) -> None:
-    """The order of blocks does not show, and the sums are those of the CPU."""
+    """Sums do not depend on the order of blocks and equal the CPU's."""
     cut, found = cut_scene(9), []
     for seed in range(3):
         if device.type == "cuda":

@@ -1,4 +1,4 @@
-"""Scenes of texels on the device: pictures, tiles and whole runs as on the CPU, and what changes their number."""
+"""Texel scenes on the device: pictures, tiles and whole runs as on the CPU, and their changes in number."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -27,7 +27,7 @@ STEPS, START = 12, 6
 
 
 def drawn(device: torch.device, most: int = 0) -> tuple[dict[str, Tensor], int]:
-    """A picture and all gradients, and into how many lists it was divided."""
+    """Compute a picture and all gradients, and the number of lists it took."""
     scene, camera, _ = make(most=most, height=120, width=40)
     output = scene.to(device).render(camera.to(device))
     output.rgb.square().sum().backward()
@@ -47,7 +47,7 @@ def test_a_picture_and_its_gradients_are_those_of_the_cpu(most: int, device: tor
 
 
 def scene_and_views() -> tuple[Scene, list[View]]:
-    """A few discs that will have texels, and photographs of other colours, one of them with a mask."""
+    """Make a few discs that will have texels, and photographs of other colours, one with a mask."""
     case = random_scene(20, 5, width=24, height=20, scale=0.5)
     config = SceneConfig(texture="texels", near=0.2)
     scene = Scene(config, {key: value.float() for key, value in case.params.items()}, None)
@@ -58,7 +58,7 @@ def scene_and_views() -> tuple[Scene, list[View]]:
 
 
 def config(alpha_rate: float = 0.0) -> TrainConfig:
-    """Texels in the second half of the run, with the final prunes within it."""
+    """Configure texels in the second half of the run, including the final prunes."""
     prunes = {
         "min_surfels": 5,
         "final_prune_steps": (20_000, 22_500),
@@ -116,13 +116,13 @@ def test_a_run_is_that_of_the_cpu(alpha_rate: float, device: torch.device, cpu: 
     assert cpu_state["field.texels"].abs().max() > 0.1
     assert not alpha_rate or (cpu_state["field.alpha"] - 1).abs().max() > 0.1
     for name, value in cpu_state.items():
-        # Adam's first steps are as long as the rate whatever the gradient: where that is all but 0 its sign may differ
+        # Adam's first steps have the length of the rate: where a gradient is nearly 0 their sign may differ
         close = torch.isclose(state[name].double(), value.double(), rtol=1e-2, atol=2e-3)
         assert close.double().mean() > 0.95, name
 
 
 def test_a_run_resumes_before_and_after_its_texels_came(device: torch.device) -> None:
-    torch.use_deterministic_algorithms(True, warn_only=True)  # torch's own operations have not all such sums
+    torch.use_deterministic_algorithms(True, warn_only=True)  # not all torch operations support it
     try:
         straight, states = trainer_on(device), []
         for done in range(STEPS):
@@ -138,7 +138,7 @@ def test_a_run_resumes_before_and_after_its_texels_came(device: torch.device) ->
             got = state_of(resumed.scene)
             assert got.keys() == want.keys()
             for name, value in want.items():
-                if device.type == "cpu":  # the emulated one
+                if device.type == "cpu":  # emulated
                     assert torch.equal(got[name], value), name
                 else:
                     torch.testing.assert_close(got[name], value, rtol=1e-3, atol=1e-3)

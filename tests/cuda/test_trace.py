@@ -1,4 +1,4 @@
-"""Visibility and compositing by the CUDA kernels against the CPU kernels."""
+"""Visibility and compositing on CUDA against the CPU."""
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -39,7 +39,7 @@ EXACT_RIM = 1e-12  # the references bound nothing
 
 @dataclass
 class Rendered:
-    """Results that are compared; all on the CPU, in double."""
+    """Results for comparison, on the CPU in double."""
 
     fragments: ops.Fragments
     image: Tensor
@@ -63,7 +63,7 @@ def render(
     directions = reference_render.view_directions(leaves["means"], camera.viewmat.to(device))
     base = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions)
     image = ops.blended_image(fragments, projection, base, maps=maps)
-    # directions by pixel and surfel: they do not depend on the order in which the list has them
+    # directions by pixel and surfel, independent of the list's order
     by_fragment = torch.sin(fragments.pixel.double() * 0.7 + fragments.surfel.double() * 1.3).to(dtype)
     by_pixel = torch.cos(torch.arange(image.numel(), device=device).double() * 1.7).to(dtype).view_as(image)
     total = (image * by_pixel).sum() + (fragments.uv * by_fragment).sum() + (fragments.depth * by_fragment).sum()
@@ -74,7 +74,7 @@ def render(
 
 
 def by_pixel_and_surfel(fragments: ops.Fragments) -> list[Tensor]:
-    """The list in an order of its own: sorted key, weight, uv, depth, sigma, in double on the CPU."""
+    """Sort the list by pixel and surfel: key, weight, uv, depth, sigma, in double on the CPU."""
     key = fragments.pixel.cpu().long() * (1 << 32) + fragments.surfel.cpu().long()
     order = torch.argsort(key)
     values = (fragments.weight, *fragments.uv, fragments.depth, fragments.sigma)
@@ -82,7 +82,7 @@ def by_pixel_and_surfel(fragments: ops.Fragments) -> list[Tensor]:
 
 
 def compare(got: Rendered, want: Rendered, image: float = 1e-12, gradient: float = 1e-10) -> None:
-    """The same fragments with the same numbers, the same images and gradients."""
+    """Check for equal fragments, images and gradients."""
     for a, b in zip(by_pixel_and_surfel(got.fragments), by_pixel_and_surfel(want.fragments), strict=True):
         assert a.shape == b.shape
         assert relative(a.double(), b.double()) <= image
@@ -94,7 +94,7 @@ def compare(got: Rendered, want: Rendered, image: float = 1e-12, gradient: float
 
 
 def check_order(fragments: ops.Fragments) -> None:
-    """By tile, in a tile one run a surfel, and the tiles' offsets in the list are right."""
+    """Check the order by tile, one run per surfel in a tile, and the tiles' offsets."""
     x, y = fragments.pixel.cpu() % fragments.width, fragments.pixel.cpu() // fragments.width
     across = -(-fragments.width // 16)
     tile = (y // 16) * across + x // 16
@@ -108,13 +108,13 @@ def check_order(fragments: ops.Fragments) -> None:
 
 
 def scenes() -> Iterator[Any]:
-    """Scenes, options of `render`, and bounds of `compare`."""
+    """Yield scenes, options of `render`, and bounds of `compare`."""
     for name in GOLDEN_NAMES:
         if name != "textured":
             yield pytest.param(load_golden(name), {}, {}, id=name)
     for seed, width, height in ((0, 70, 50), (1, 16, 16), (2, 33, 17), (3, 8, 40)):
         yield pytest.param(random_scene(60, seed, width, height), {"maps": seed != 1}, {}, id=f"{width}x{height}")
-    # a surfel on 95 tiles, which its warp lists and its block sums
+    # a surfel on 95 tiles, listed by its warp and summed by its block
     yield pytest.param(random_scene(3, 0, 300, 80, scale=30.0), {}, {}, id="whole screen")
     for scale in (0.5, 0.01):
         case = random_scene(30, 4, 40, 24, scale=scale)
@@ -122,8 +122,8 @@ def scenes() -> Iterator[Any]:
     for case in extreme_scenes():
         case = replace(
             case, params={key: value[:400] for key, value in case.params.items()}
-        )  # for the emulation's sake
-        # of discs seen edge-on, rounding decides which side faces the camera
+        )  # to limit the emulation's time
+        # for edge-on discs, rounding decides which side faces the camera
         options = {"rim": 1e-3, "maps": case.name != "edge_on"}
         yield pytest.param(case, options, {"image": 1e-9, "gradient": 1e-7}, id=case.name)
 
@@ -132,7 +132,7 @@ def scenes() -> Iterator[Any]:
 def test_fragments_images_and_gradients_equal_those_of_the_cpu(
     case: SceneCase, options: dict[str, Any], bounds: dict[str, float], device: torch.device, cpu: CpuContext
 ) -> None:
-    """The CPU's are held against the golden renders and the references in tests/ops."""
+    """Against the CPU, which tests/ops checks against golden renders and references."""
     got = render(case, torch.float64, device, **options)
     with cpu():
         want = render(case, torch.float64, torch.device("cpu"), **options)
@@ -159,7 +159,7 @@ def test_single_precision(device: torch.device, cpu: CpuContext) -> None:
 def test_no_fragment_of_thin_small_and_large_surfels_is_lost(
     seed: int, dtype: torch.dtype, device: torch.device
 ) -> None:
-    """Bounds of the list's own precision (core/footprint.h) against the reference, which tries every pixel."""
+    """Single-precision bounds (core/footprint.h) against the reference, which tries every pixel."""
     case = random_scene(100, 100 + seed, width=72, height=56)
     g = torch.Generator().manual_seed(seed)
     case.params["log_scales"] += 2.0 * torch.randn(100, 2, generator=g, dtype=torch.float64)
@@ -175,7 +175,7 @@ def test_no_fragment_of_thin_small_and_large_surfels_is_lost(
 def test_more_surfels_in_a_tile_than_a_warp_has_lanes_and_pixels_that_close(
     device: torch.device, cpu: CpuContext
 ) -> None:
-    """Opaque layers close every pixel long before the list of the tile ends; translucent ones go through all of it."""
+    """Opaque layers end every pixel long before the tile's list ends; translucent ones use all of it."""
     case = random_scene(150, 7, 20, 20, scale=1.0)
     for logit, closes in ((3.0, True), (-4.0, False)):
         case.params["opacity_logits"] = torch.full((150,), logit, dtype=torch.float64)
@@ -201,12 +201,12 @@ def test_equal_depths_keep_the_order_of_the_surfels(device: torch.device) -> Non
 
 @pytest.mark.parametrize("fewer", ["listed", "counted"])
 def test_lists_that_differ_from_the_counts_stay_in_their_slots(fewer: str, device: torch.device) -> None:
-    """Were a surfel's tiles counted for an image that is wider, or less wide, than that for which they are listed."""
+    """As if a surfel's tiles were counted for a wider or narrower image than listed."""
     case = random_scene(30, 4, 160, 160)
     case.params["log_scales"][:4] += 3.0  # more tiles than a thread lists by itself
     case.params["opacity_logits"] -= 3.0
     large, small = (Camera(case.viewmat, case.K, size, size) for size in (160, 145))
-    projection = ops.project(*values_of(case, device=device), large)  # the rows of both
+    projection = ops.project(*values_of(case, device=device), large)  # rows for both
     geom, views = projection.geom, [projection, replace(projection, camera=small)]
     counted, listed = views if fewer == "listed" else reversed(views)
     bins, want = trace_cuda.tile_lists(geom, counted), trace_cuda.tile_lists(geom, listed)
@@ -324,7 +324,7 @@ def test_free_memory_is_looked_up_for_longer_lists_and_now_and_then(monkeypatch:
     for count in (few, 2 * few, 2 * few - 1, few + 1):
         trace_cuda.check_capacity(card, view, count, 0)
     assert len(asked) == 1
-    trace_cuda.check_capacity(card, view, 3 * few + 1, 0)  # longer than all before, and the memory has grown
+    trace_cuda.check_capacity(card, view, 3 * few + 1, 0)  # the longest yet, and free memory has grown
     assert len(asked) == 2
     for _ in range(trace_cuda.LISTS_PER_CHECK - 1):
         trace_cuda.check_capacity(card, view, 2 * few, 0)

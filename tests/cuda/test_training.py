@@ -1,4 +1,4 @@
-"""Whole training steps on the device: the same loss and parameters as on the CPU."""
+"""Training steps on the device give the same loss and parameters as on the CPU."""
 
 import math
 
@@ -18,7 +18,7 @@ STEPS = 3
 
 
 def scene_and_views(dtype: torch.dtype = torch.float32) -> tuple[Scene, list[View]]:
-    """A few discs with a texture, and photographs of other colours, of one with a mask."""
+    """Make a few textured discs, and photographs of other colours, one with a mask."""
     case = random_scene(20, 5, width=20, height=16, scale=0.5)
     config = SceneConfig(min_resolution=8, near=0.2)
     field = HashField(config, (0.0, 0.0, 0.0), 4.0, True, 6, torch.Generator().manual_seed(0))
@@ -32,7 +32,7 @@ def scene_and_views(dtype: torch.dtype = torch.float32) -> tuple[Scene, list[Vie
 
 
 def train(device: torch.device, background: str, exposure: str) -> tuple[list[float], float, dict[str, torch.Tensor]]:
-    """Losses of the steps, PSNR after them, and the parameters on the CPU."""
+    """Return the losses of the steps, PSNR after them, and the parameters on the CPU."""
     scene, views = scene_and_views()
     config = TrainConfig(
         background=background, exposure=exposure, resolution_schedule=0, freeze_after=1, freeze_every=2
@@ -55,13 +55,13 @@ def test_training_steps_equal_those_of_the_cpu(background: str, exposure: str, d
     assert losses == pytest.approx(want_losses, rel=1e-4)
     assert psnr == pytest.approx(want_psnr, abs=0.01)
     for name, value in want.items():
-        # Adam's first steps are as long as the rate whatever the gradient: where that is all but 0 its sign may differ
+        # Adam's first steps have the length of the rate: where a gradient is nearly 0 their sign may differ
         close = torch.isclose(parameters[name], value, rtol=1e-3, atol=1e-4)
         assert close.float().mean() > 0.97, name
 
 
 def motions(device: torch.device) -> torch.Tensor:
-    """How the cameras of the photographs have moved after a few steps."""
+    """Return the refined poses' motions after a few steps."""
     scene, views = scene_and_views()
     config = TrainConfig(resolution_schedule=0, refine_poses="on", poses=PoseConfig(start=0))
     trainer = Trainer(scene.to(device), views, config, STEPS)

@@ -1,4 +1,4 @@
-"""Levels that no surfel needs are not evaluated, and nothing changes."""
+"""Skipping levels that no surfel needs changes nothing."""
 
 import pytest
 import torch
@@ -28,7 +28,7 @@ def test_levels_without_content_at_the_ends_are_left_out(surfels, empty, kept):
 
 
 def test_a_change_is_what_the_measure_of_the_tiles_says(surfels):
-    """One surfel, opaque and hard, and a field that is its level 0 alone: the change is the residual itself."""
+    """One hard opaque surfel and a field with level 0 only: the change is the residual itself."""
     scene = real_scene(surfels, 1)
     scene.field.field_table.data[1:] = 0
     params = {name: value.detach() for name, value in scene.surfels.items()}

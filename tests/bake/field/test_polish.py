@@ -1,4 +1,4 @@
-"""The polish: photographs come from a baked scene that is known, the bake starts from one that was moved and faded."""
+"""Polish from a shifted and faded scene towards photographs of a known one."""
 
 import math
 from dataclasses import replace
@@ -29,19 +29,19 @@ OPTIONS = PolishOptions(steps=40, rate=0.3, share=1.0, val_every=4)
 
 @pytest.fixture(scope="module")
 def truth(scene) -> Baked:
-    """The scene of the photographs, with all of its view colours."""
+    """The scene in the photographs, with full view colours."""
     return waving(scene(60), pixels_per_texel=0.5)
 
 
 @pytest.fixture(scope="module")
 def views(truth: Baked) -> list[View]:
-    """Photographs of it."""
+    """Photographs of `truth`."""
     return photographs(truth)
 
 
 @pytest.fixture(scope="module")
 def wrong(truth: Baked) -> Baked:
-    """The same scene with one residual everywhere, its surfels moved and fainter."""
+    """`truth` with a constant residual, surfels shifted and fainter."""
     g = torch.Generator().manual_seed(0)
     surfels = {name: value.clone() for name, value in truth.scene.surfels.items()}
     surfels["means"] += 0.03 * torch.randn(surfels["means"].shape, generator=g)
@@ -51,7 +51,7 @@ def wrong(truth: Baked) -> Baked:
 
 
 def db(baked: Baked, views: list[View]) -> float:
-    """Mean PSNR of the pictures before quantisation."""
+    """Compute the mean PSNR before quantisation."""
     errors = [(render(baked, v.camera).clamp(0, 1) - v.image).square().mean() for v in views]
     return float(torch.stack(errors).log10().mean() * -10)
 
@@ -67,7 +67,7 @@ def test_everything_learns_and_the_gain_is_what_is_stated(wrong: Baked, views: l
     assert db(polished, views[10:]) == pytest.approx(told.psnr_held_out.after, abs=0.05)  # half floats
     for name, before in wrong.scene.surfels.items():
         after = polished.scene.surfels[name]
-        assert not torch.equal(after, before) and torch.equal(after[59], before[59]), name  # nobody sees the last one
+        assert not torch.equal(after, before) and torch.equal(after[59], before[59]), name  # no view sees the last one
     assert polished.statistics.error is None and polished.atlas is None
     assert torch.equal(polished.extent, wrong.extent) and (polished.packing.tiles == wrong.packing.tiles).all()
     assert (wrong.texels == 0.1).all() and wrong.statistics.polish is None  # the bake itself is as it was
@@ -75,7 +75,7 @@ def test_everything_learns_and_the_gain_is_what_is_stated(wrong: Baked, views: l
 
 def test_view_colours_are_reduced_afterwards_and_can_be_tuned(wrong: Baked, views: list[View]) -> None:
     polished = polish_scene(wrong, views[:10], BACKGROUND, OPTIONS)
-    polished.scene.surfels["opacity_logits"][5] = -9.0  # can be drawn no more
+    polished.scene.surfels["opacity_logits"][5] = -9.0  # no longer drawn
     lean = reduced(polished, [v.camera for v in views[:10]])
     assert "view_terms" in lean.scene.surfels and lean.statistics.view_color.error.p100 <= 0.76
     left = lean.statistics.surfels

@@ -8,7 +8,7 @@ from tests.bake.conftest import WaveField
 
 
 class Positions(WaveField):
-    """Positions as colours; those of negative x are not finite."""
+    """Positions as colours, not finite for negative x."""
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
         return torch.where(x[:, :1] < 0, torch.nan, x)

@@ -1,4 +1,4 @@
-"""One short training run on a small ray-traced room, in this process, shared by the tests of this folder."""
+"""A short training run on a small ray-traced room, shared by the tests of this folder."""
 
 import shutil
 from collections.abc import Callable
@@ -20,14 +20,14 @@ STEPS = 60
 
 @pytest.fixture(scope="session")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """12 views of 48 x 36 pixels with 200 points."""
+    """Twelve views of 48 x 36 pixels with 200 points."""
     folder = tmp_path_factory.mktemp("captures") / "room"
     generate(folder, views=12, width=48, height=36, seed=0, points=200)
     return folder
 
 
 def small_run(data: Path, output: Path, name: str = "run", method: str = "bitymi") -> BitymiTrainerConfig:
-    """The configuration of a run of a few seconds."""
+    """Configure a run of a few seconds."""
     config = method_config(method).config
     config.output_dir, config.experiment_name, config.timestamp = output, "room", name
     config.pipeline.datamanager.data = data
@@ -36,14 +36,14 @@ def small_run(data: Path, output: Path, name: str = "run", method: str = "bitymi
     config.pipeline.model.curve_points = 3
     scene, train = config.pipeline.model.scene, config.pipeline.model.train
     scene.log2_table_size, scene.min_resolution = 10, 16
-    train.densify.importance, train.densify.reset_interval = 1, 100_000  # densifies, and does not fall back
+    train.densify.importance, train.densify.reset_interval = 1, 100_000  # densifies, without rollbacks
     train.densify.max_surfels, train.densify.min_interval, train.densify.pixels_per_surfel = 800, 1, 0.0
     return config
 
 
 @pytest.fixture
 def start(room: Path, tmp_path: Path) -> Callable[..., BitymiTrainerConfig]:
-    """Make the configuration of a small run; `ns_train.main` runs it."""
+    """Return a function that configures a small run for `ns_train.main`."""
 
     def make(**options: Any) -> BitymiTrainerConfig:
         return small_run(options.pop("data", room), tmp_path / "outputs", **options)
@@ -53,7 +53,7 @@ def start(room: Path, tmp_path: Path) -> Callable[..., BitymiTrainerConfig]:
 
 @pytest.fixture(scope="session")
 def trained(room: Path, tmp_path_factory: pytest.TempPathFactory) -> BitymiTrainerConfig:
-    """A finished run that has kept all its checkpoints. Not to be changed."""
+    """A finished run with all its checkpoints. Not to be changed."""
     config = small_run(room, tmp_path_factory.mktemp("outputs"))
     config.save_only_latest_checkpoint = False
     ns_train.main(config)
@@ -62,10 +62,8 @@ def trained(room: Path, tmp_path_factory: pytest.TempPathFactory) -> BitymiTrain
 
 @pytest.fixture(scope="session")
 def bundle(trained: BitymiTrainerConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The trained room as a bundle, its texels as they were learned. Not to be changed.
-
-    After so few steps little of the residual is worth a tile.
-    """
+    """The trained room as a bundle with its texels as trained, at a tolerance low enough for a short run to have tiles.
+    Not to be changed."""
     folder = tmp_path_factory.mktemp("bundles") / "room-bc7"
     run_export(trained, folder, tolerance=TOLERANCE, finetune_steps=0)
     return folder
@@ -73,7 +71,7 @@ def bundle(trained: BitymiTrainerConfig, tmp_path_factory: pytest.TempPathFactor
 
 @pytest.fixture(scope="session")
 def field_run(room: Path, tmp_path_factory: pytest.TempPathFactory) -> BitymiTrainerConfig:
-    """A finished run with a field that has kept all its checkpoints. Not to be changed."""
+    """A finished run with a field and all its checkpoints. Not to be changed."""
     config = small_run(room, tmp_path_factory.mktemp("outputs"), method="bitymi-field")
     config.save_only_latest_checkpoint = False
     ns_train.main(config)
@@ -90,5 +88,5 @@ def field_bundle(field_run: BitymiTrainerConfig, tmp_path_factory: pytest.TempPa
 
 @pytest.fixture
 def copied(bundle: Path, tmp_path: Path) -> Path:
-    """The bundle in another place."""
+    """A copy of the bundle."""
     return Path(shutil.copytree(bundle, tmp_path / "elsewhere"))

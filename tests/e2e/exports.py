@@ -1,4 +1,4 @@
-"""Exports of runs, and what nerfstudio's evaluation says of them."""
+"""Exports of runs, and nerfstudio's evaluation of them."""
 
 import json
 from pathlib import Path
@@ -13,7 +13,7 @@ TOLERANCE = 0.02
 
 
 def run_export(config: BitymiTrainerConfig, folder: Path, **options: Any) -> None:
-    """Exports a run, with BC7 and without a polish where nothing else is asked for, which is quicker."""
+    """Export a run, by default with BC7 and without polish, which is faster."""
     given = {"polish_steps": 0, "format": "bc7", **options}
     ExportAtlas(load_config=config.get_base_dir() / "config.yml", output_dir=folder, **given).main()
 

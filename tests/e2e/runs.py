@@ -1,4 +1,4 @@
-"""Runs that are finished: their checkpoints and configurations."""
+"""Checkpoints and configurations of finished runs."""
 
 import shutil
 from collections.abc import Callable
@@ -18,12 +18,12 @@ def checkpoint(config: BitymiTrainerConfig, step: int) -> dict[str, Any]:
 
 
 def a_run_of(trained: BitymiTrainerConfig, folder: Path) -> Path:
-    """A copy of the run, in another place: its folder."""
+    """Copy the run to another folder and return it."""
     return Path(shutil.copytree(trained.get_base_dir(), folder / "run"))
 
 
 def config_of(folder: Path) -> BitymiTrainerConfig:
-    """The config.yml of a run."""
+    """Load the config.yml of a run."""
     return yaml.load((folder / "config.yml").read_text(), Loader=yaml.Loader)
 
 
@@ -35,7 +35,7 @@ def rewrite(folder: Path, change: Callable[[BitymiTrainerConfig], None]) -> None
 
 
 def different(a: Any, b: Any, path: str = "") -> list[str]:
-    """Where two checkpoints differ, clocks left out."""
+    """List the differences of two checkpoints, except clocks."""
     if path.endswith("seconds"):
         return []
     if isinstance(a, torch.Tensor):

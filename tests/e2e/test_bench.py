@@ -54,6 +54,6 @@ def test_the_parts_make_the_whole(config: Path) -> None:
         positive, negative = residual_parts(scene, output)
     assert positive.min() >= 0 and negative.min() >= 0 and positive.max() > 1e-3 and negative.max() > 1e-3
     gap = output.rgb - (plain + positive - negative)
-    assert gap.min() > -1e-4 and gap.mean() < 0.02  # above where a colour was cut off at 0
+    assert gap.min() > -1e-4 and gap.mean() < 0.02  # positive where a colour was clipped at 0
     pictures = decompose(scene, camera, torch.zeros(3), torch.zeros(36, 48, 3))
     assert list(pictures) == list(KINDS)

@@ -1,4 +1,4 @@
-"""The command lines of `bitymi bench` are understood by nerfstudio: standard layouts, seeds and own captures."""
+"""Command lines of `bitymi bench` work with nerfstudio: standard layouts, seeds, own captures."""
 
 import shutil
 import sys
@@ -20,14 +20,14 @@ SMALL = (
 
 
 def colmap_scene(room: Path, folder: Path) -> None:
-    """The room as COLMAP would leave it, its images half as large as those that COLMAP saw."""
+    """Write the room as COLMAP would, with images at half the size that COLMAP saw."""
     colmap_model(room, folder / "sparse/0")
     (folder / "sparse/0/cameras.txt").write_text("1 PINHOLE 96 72 80 80 48 36\n")
     shutil.copytree(room / "images", folder / "images_2")
 
 
 def train(work: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Run the command of a training in this process; returns its config.yml."""
+    """Run a training command in this process; returns its config.yml."""
     monkeypatch.setattr(sys, "argv", train_command(work, run))
     ns_train.entrypoint()
     return config_of(work, run)

@@ -1,4 +1,4 @@
-"""A path that was recorded in the browser, through `ns-render camera-path` on the same bundle."""
+"""A camera path recorded in the browser, rendered by `ns-render camera-path` on the same bundle."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""ns-train with learning rates far too high: a message, and a scene that can be used."""
+"""ns-train with far too high learning rates gives a message and a usable scene."""
 
 from collections.abc import Callable
 

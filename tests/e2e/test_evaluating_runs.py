@@ -1,4 +1,4 @@
-"""Which checkpoint of a run is evaluated, and which are refused."""
+"""Selection of the checkpoint to evaluate, and refusals."""
 
 import shutil
 from pathlib import Path
@@ -39,7 +39,7 @@ def test_evaluation_refuses_a_checkpoint_of_another_preset(trained: BitymiTraine
 
 def test_evaluation_of_a_resumed_run_takes_its_own_checkpoint(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
     folder = a_run_of(trained, tmp_path)
-    rewrite(folder, lambda config: setattr(config, "load_step", 7))  # of the run that it went on from
+    rewrite(folder, lambda config: setattr(config, "load_step", 7))  # of the run it resumed from
     assert eval_setup(folder / "config.yml")[3] == 59
 
 

@@ -101,8 +101,8 @@ def test_the_estimate_of_a_bundle_is_generous(trained: BitymiTrainerConfig, bund
 def test_texels_that_learned_in_training_become_the_atlas(
     trained: BitymiTrainerConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = tmp_path / "b [bold]" / "[" / "x]"  # brackets in a path are no markup
-    run_export(trained, folder, polish_steps=None, tolerance=0.2)  # as many steps as by default
+    folder = tmp_path / "b [bold]" / "[" / "x]"  # brackets in a path are not console markup
+    run_export(trained, folder, polish_steps=None, tolerance=0.2)  # default number of steps
     bundle, checks = check_files(folder)
     assert all(check.ok for check in checks) and bundle.scene.atlas is not None
     statistics = bundle.info.statistics

@@ -39,7 +39,7 @@ def test_it_is_the_default_smaller_and_shows_the_same(
 
 
 def test_it_can_be_as_small_as_is_asked_for(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
-    fine = {"tolerance": TOLERANCE, "format": "compact", "compact_error": 1e-4}  # so that the scene has many bytes
+    fine = {"tolerance": TOLERANCE, "format": "compact", "compact_error": 1e-4}  # makes the scene large
 
     def sizes(name: str, **options) -> dict[str, int]:
         run_export(trained, tmp_path / name, **fine, **options)
@@ -49,7 +49,7 @@ def test_it_can_be_as_small_as_is_asked_for(trained: BitymiTrainerConfig, tmp_pa
         return found["surfels.bin"] + found["texels.bin"]
 
     free = sizes("b", finetune_steps=0)
-    # what is set aside for bundle.json and pictures is some 9 kB more than those of so small a run take
+    # the bytes reserved for bundle.json and pictures are about 9 kB more than this small run needs
     target = sum(free.values()) + 7000
     bounded = sizes("c", finetune_steps=30, target_mb=target / 1e6)
     assert scene(bounded) < scene(free) and sum(bounded.values()) <= target

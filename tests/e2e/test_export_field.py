@@ -1,4 +1,4 @@
-"""Exports of runs whose texture is a field: baked, polished, fine-tuned, compared with the field."""
+"""Exports of runs with a field: baked, polished, fine-tuned, compared with the field."""
 
 import json
 from pathlib import Path
@@ -72,7 +72,7 @@ def test_verify_compares_a_bundle_with_its_run(
     assert "stated" in final[0].detail and final[0].name == "error of the view colours"
     first = min((run / "nerfstudio_models").glob("*.ckpt"))
     earlier = check_run(bundle, first, views=1)
-    # what the bundle holds was not there yet, its place was
+    # contents of the bundle did not exist yet, its folder did
     assert [check.ok for check in earlier] == [False, False, False, True]
     with pytest.raises(InputError, match="no checkpoint"):
         check_run(bundle, run / "step-7.ckpt", views=1)

@@ -1,4 +1,4 @@
-"""Ctrl-C in an export: nothing is left half-written, and the message says what is there."""
+"""Ctrl-C in an export leaves nothing half-written, and the message says what exists."""
 
 from pathlib import Path
 from typing import Any
@@ -53,9 +53,9 @@ def test_ctrl_c_leaves_nothing_half_written_and_the_message_names_what_is_there(
 @pytest.mark.parametrize(
     ("call", "name", "state"),
     [
-        ("mkdir", ".elsewhere.new", "is the earlier one"),  # the new one is begun
-        ("rename", "elsewhere", "is the earlier one"),  # the earlier one is out of the way
-        ("rename", ".elsewhere.new", "is complete"),  # the new one is in its place
+        ("mkdir", ".elsewhere.new", "is the earlier one"),  # the new one was started
+        ("rename", "elsewhere", "is the earlier one"),  # the earlier one was moved away
+        ("rename", ".elsewhere.new", "is complete"),  # the new one was moved into place
     ],
 )
 def test_ctrl_c_while_a_bundle_is_replaced_says_which_one_is_there(

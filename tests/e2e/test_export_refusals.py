@@ -1,4 +1,4 @@
-"""Exports that are refused before the work, and bundles that are not opened."""
+"""Exports refused before the work starts, and bundles that are not opened."""
 
 import json
 import math
@@ -34,7 +34,7 @@ def test_a_folder_that_is_no_bundle_is_never_replaced(trained: BitymiTrainerConf
         run_export(trained, tmp_path, overwrite=True)
     with pytest.raises(InputError, match="is not a bundle") as stop:
         run_export(trained, tmp_path)
-    assert "--overwrite" not in str(stop.value)  # which would not help
+    assert "--overwrite" not in str(stop.value)  # it would not help
     (tmp_path / "link").symlink_to(tmp_path / "nowhere")
     with pytest.raises(InputError, match="link is a link to nothing"):
         run_export(trained, tmp_path / "link")
@@ -58,7 +58,7 @@ def test_a_folder_that_is_no_bundle_is_never_replaced(trained: BitymiTrainerConf
 def test_options_out_of_range_are_found_before_the_work(
     trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: Any, message: str
 ) -> None:
-    monkeypatch.setattr(command, "load_trained", None)  # is not called
+    monkeypatch.setattr(command, "load_trained", None)  # not called
     with pytest.raises(InputError, match=message):
         run_export(trained, tmp_path / "b", **options)
     assert list(tmp_path.iterdir()) == []
@@ -67,7 +67,7 @@ def test_options_out_of_range_are_found_before_the_work(
 def test_a_place_that_will_not_do_is_found_before_the_work(
     trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(command, "load_trained", None)  # is not called
+    monkeypatch.setattr(command, "load_trained", None)  # not called
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="b cannot be written: .*file is not a folder.*--output-dir"):
         run_export(trained, tmp_path / "file" / "b")
@@ -79,7 +79,7 @@ def test_a_place_that_will_not_do_is_found_before_the_work(
         match=r"too little room .*: 34.5 kB are free, .* up to \d.* MB \(a generous estimate.*--check-room False",
     ):
         run_export(trained, tmp_path / "b")
-    with pytest.raises(TypeError):  # of the work, which is reached
+    with pytest.raises(TypeError):  # raised by the work, which is reached
         run_export(trained, tmp_path / "b", check_room=False)
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 

@@ -1,4 +1,4 @@
-"""Colour corrections through nerfstudio's entry points: in checkpoints, in the export, in what is said."""
+"""Exposure corrections through nerfstudio's entry points: checkpoints, export, messages."""
 
 import json
 from collections.abc import Callable
@@ -22,7 +22,7 @@ Start = Callable[..., BitymiTrainerConfig]
 
 @pytest.fixture
 def uneven(tmp_path: Path) -> Path:
-    """The room, with every other photograph at 0.7 of its light."""
+    """The room with every other photograph darkened to 0.7."""
     folder = generate(tmp_path / "uneven", views=12, width=48, height=36, seed=0, points=200)
     for path in sorted((folder / "images").iterdir())[::2]:
         Image.open(path).point(lambda value: round(0.7 * value)).save(path)

@@ -1,4 +1,4 @@
-"""A run on photographs keeps the poses that it was trained with, whatever becomes of the photographs."""
+"""A run on photographs keeps its poses, even if the photographs change or disappear."""
 
 import errno
 import json
@@ -30,12 +30,12 @@ STEPS = 4
 
 
 class Shot:
-    """Photographs that a run was trained on.
+    """A run on photographs.
 
     Attributes:
-        config: of the run.
+        config: configuration of the run.
         photographs: their folder.
-        work: what the finding of poses keeps, and with some captures the pictures that were trained on.
+        work: cached pose estimation, with some captures including the training pictures.
     """
 
     def __init__(self, room: Path, folder: Path, upright: bool, data: Path = Path()) -> None:
@@ -45,7 +45,7 @@ class Shot:
         write_frame(self.work / "result", WorldFrame("gps", 2.5, None, None, 0, torch.eye(4)[:3].tolist()))
         (self.work / "result/report.json").write_text("{}")
         self.images = self.photographs
-        if upright:  # the first was turned by EXIF, the others are links
+        if upright:  # the first was rotated by EXIF, the others are links
             self.images = self.work / "images"
             self.images.mkdir()
             for i, path in enumerate(sorted(self.photographs.iterdir())):
@@ -62,7 +62,7 @@ class Shot:
         return found_poses(self.work / "result/sparse/0", self.images, self.work / "result")
 
     def spoil(self) -> None:
-        """What gives the photographs another key: they are touched, one is added, and what was kept of them goes."""
+        """Invalidate the cache key: touch the photographs, add one, remove the cached results."""
         shutil.rmtree(self.work)
         paths = sorted(self.photographs.iterdir())
         for path in paths:
@@ -76,7 +76,7 @@ def never(*arguments: Any) -> Any:
 
 @pytest.fixture
 def shoot(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Shot]:
-    """Trains on photographs; after that no poses can be found any more."""
+    """Return a function that trains on photographs, after which pose estimation is disabled."""
 
     def make(upright: bool = False, sfm: SfmSettings | None = None, **options: Any) -> Shot:
         shot = Shot(room, tmp_path, upright, **options)
@@ -90,7 +90,7 @@ def shoot(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callab
 
 
 def seen(pipeline: Any) -> dict[str, torch.Tensor]:
-    """Names, poses and points of what was read."""
+    """Return names, poses and points as read."""
     manager = pipeline.datamanager
     result = {"points": manager.train_dataparser_outputs.metadata["points3D_xyz"]}
     for dataset in (manager.train_dataset, manager.eval_dataset):
@@ -106,7 +106,7 @@ def test_evaluation_has_the_poses_of_the_training(
     shot = shoot(upright)
     monkeypatch.setattr("bitymi_ns.capture.poses.find_poses", shot.find_poses)
     kept = shot.run / POSES
-    kept.rename(shot.run / "aside")  # as a run of an earlier version, which finds them again
+    kept.rename(shot.run / "aside")  # like a run of an earlier version, which estimates again
     _, before = load_trained(shot.run / "config.yml")
     trained, world = seen(before), world_of(before.datamanager).described()
     held_out = before.datamanager.eval_view(0)[1]["image"]
@@ -196,7 +196,7 @@ def test_options_for_poses_that_are_not_found_anew(
     assert str(shot.run / POSES) in text
     origin = shot.run / POSES / "origin.json"
     values = json.loads(origin.read_text())
-    del values["origin"]["settings"]  # as of an earlier version
+    del values["origin"]["settings"]  # as in earlier versions
     origin.write_text(json.dumps(values))
     config = small_run(shot.photographs, shot.outputs, "earlier")
     config.load_dir = shot.config.get_checkpoint_dir()
@@ -228,7 +228,7 @@ def test_a_run_that_was_moved_and_a_capture_with_other_files_by_now(shoot: Calla
     shot.spoil()
     capture = shot.photographs.parent
     shutil.copytree(shot.photographs, capture / "second")
-    (capture / "transforms.json").write_text("{}")  # read before photographs, were it not for the poses
+    (capture / "transforms.json").write_text("{}")  # takes precedence over photographs, but not over kept poses
     assert different(poses, seen(eval_setup(moved / "config.yml")[1])) == []
 
 
@@ -276,7 +276,7 @@ def test_poses_that_are_damaged_are_named_and_new_and_earlier_runs_find_their_ow
     shot = shoot()
     origin = shot.run / POSES / "origin.json"
     config = config_of(shot.run)
-    config.pipeline.datamanager.dataparser.poses = shot.run / POSES  # as that of a resumed run states
+    config.pipeline.datamanager.dataparser.poses = shot.run / POSES  # as in a resumed run
     config.timestamp = "new"
     with pytest.raises(pytest.fail.Exception, match="poses are found anew"):
         ns_train.main(config)

@@ -22,7 +22,7 @@ def mesh_of(load_config: Path, folder: Path, **options: object) -> open3d.geomet
 
 
 def place(bundle: Path, transform: np.ndarray) -> None:
-    """Say that the bundle lies elsewhere in the capture."""
+    """Move the bundle within the capture's frame."""
     info = read_bundle(bundle).info
     info.world = info.world.model_copy(update={"transform": transform.tolist()})
     (bundle / "bundle.json").write_bytes(dump(info))
@@ -35,10 +35,10 @@ def test_a_run_and_its_bundle_give_the_same_surface(trained: BitymiTrainerConfig
     a, b = (np.asarray(mesh.vertices) for mesh in (run, baked))
     side = np.ptp(a, axis=0).max()
     assert np.abs(a.mean(0) - b.mean(0)).max() < 0.1 * side
-    # the capture's frame is the scene's by a rotation, a scale and a shift
+    # the frames differ by a rotation, a scale and a shift
     captured = mesh_of(bundle / "config.yml", tmp_path / "capture")
     ratio = np.sqrt(captured.get_surface_area() / baked.get_surface_area())
-    assert ratio > 1.0  # nerfstudio scales cameras into a box from -1 to 1; the room is metres wide
+    assert ratio > 1.0  # nerfstudio scales cameras into [-1, 1]; the room is metres wide
     folder = tmp_path / "capture"
     before = (folder / "mesh.ply").read_bytes()
     for form in ("glb", "obj"):
@@ -59,7 +59,7 @@ def test_a_closed_mesh_is_closed(bundle: Path, tmp_path: Path, capsys: pytest.Ca
 def test_a_mesh_on_a_map_states_its_origin(
     copied: Path, bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The capture lies at coordinates of a map; sizes and shapes are those that it has at home."""
+    """A capture in map coordinates gives the same sizes and shapes."""
     turn = np.array(read_bundle(copied).info.world.transform)
     turn[:, 3] -= turn[:, :3] @ (500123.0, 4649876.0, 312.0)
     place(copied, turn)

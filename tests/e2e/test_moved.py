@@ -1,4 +1,4 @@
-"""Runs and bundles whose capture was moved or is gone, and nerfstudio's commands that cannot work on surfels."""
+"""Runs and bundles whose capture was moved or deleted, and nerfstudio commands that do not support surfels."""
 
 import hashlib
 import json
@@ -27,7 +27,7 @@ from tests.e2e.runs import a_run_of, rewrite
 
 @pytest.fixture
 def alone(copied: Path) -> Path:
-    """A bundle whose capture is gone."""
+    """A bundle without its capture."""
     for part in ("datamanager", "datamanager.dataparser"):
         of = attrgetter(f"pipeline.{part}")
         rewrite(copied, lambda config, of=of: setattr(of(config), "data", Path("/no/longer/there")))
@@ -97,7 +97,7 @@ def test_a_run_whose_capture_was_moved(
 ) -> None:
     run = a_run_of(trained, tmp_path)
     rewrite(run, lambda config: setattr(config.pipeline.datamanager, "data", Path("/no/longer/there")))
-    rewrite(run, lambda config: setattr(config, "output_dir", Path("outputs")))  # seen from where it was trained
+    rewrite(run, lambda config: setattr(config, "output_dir", Path("outputs")))  # relative to the training's folder
     with pytest.raises(InputError) as refused:
         eval_setup(run / "config.yml")
     assert "/no/longer/there does not exist. If it was moved, say where it is now: `BITYMI_DATA" in str(refused.value)
@@ -144,4 +144,4 @@ def test_photographs_through_a_lens_are_rendered(
     (picture,) = [path for path in (tmp_path / "out").rglob("*frame_00009*") if "gt-rgb" in str(path)]
     (drawn,) = [path for path in (tmp_path / "out").rglob("*frame_00009*") if path.parent.name == "rgb"]
     sizes = {Image.open(path).size for path in (picture, drawn)}
-    assert len(sizes) == 1 and sizes.pop()[0] < 48  # the edges are beyond the photograph
+    assert len(sizes) == 1 and sizes.pop()[0] < 48  # cropped, as the edges lie outside the photograph

@@ -1,4 +1,4 @@
-"""Training on captures with something wrong: what is learned all the same, and what stops the run before it starts."""
+"""Training on faulty captures: faults that are tolerated, and faults that stop the run before it starts."""
 
 import json
 import shutil
@@ -23,7 +23,7 @@ Start = Callable[..., BitymiTrainerConfig]
 
 @pytest.fixture
 def capture(room: Path, tmp_path: Path) -> Path:
-    """A copy of the room to spoil."""
+    """A copy of the room to damage."""
     return Path(shutil.copytree(room, tmp_path / "spoilt"))
 
 
@@ -63,7 +63,7 @@ def test_a_view_that_sees_none_of_the_points(
 def test_a_capture_of_several_cameras_trains_is_exported_and_evaluated(
     start: Start, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Landscape through a lens, portrait, and a fisheye, in one COLMAP model."""
+    """Landscape with distortion, portrait, and fisheye, in one COLMAP model."""
     mixed_project(tmp_path / "mixed")
     config = start(data=tmp_path / "mixed")
     ns_train.main(config)

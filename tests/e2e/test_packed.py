@@ -1,5 +1,5 @@
-"""A bundle in one file, and one without config.yml: read by our commands, refused in one line by nerfstudio's, and
-written as a folder that these open."""
+"""A bundle in one file, or without config.yml: read by our commands, refused in one line by nerfstudio's, and unpacked
+to a folder that these open."""
 
 import shutil
 import subprocess
@@ -47,7 +47,7 @@ def test_the_folder_of_a_file_is_opened_by_nerfstudio(
         render.RenderInterpolated(load_config=config, pose_source="train", **options).main()
         pictures[name] = np.stack([np.array(Image.open(path)) for path in sorted((tmp_path / name).iterdir())])
     difference = pictures["bundle"].astype(int) - pictures["unpacked"]
-    assert len(difference) > 3 and np.abs(difference).mean() < 0.1  # the capture's poses are read with other rounding
+    assert len(difference) > 3 and np.abs(difference).mean() < 0.1  # the capture's poses are rounded differently
     assert cli.main(["unpack", str(packed), "--output", str(folder)]) == 1
     assert "room is there already: choose another folder (--output)" in capsys.readouterr().err
 

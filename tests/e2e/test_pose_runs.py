@@ -1,4 +1,4 @@
-"""Refined poses through nerfstudio's entry points: in checkpoints, on resume, in the bundle's cameras, in ns-eval."""
+"""Refined poses through nerfstudio's entry points: checkpoints, resume, the bundle's cameras, ns-eval."""
 
 import json
 from collections.abc import Callable
@@ -22,7 +22,7 @@ Start = Callable[..., BitymiTrainerConfig]
 
 @pytest.fixture
 def askew(tmp_path: Path) -> Path:
-    """The room, with poses that are a pixel off."""
+    """The room with poses that are a pixel off."""
     folder = generate(tmp_path / "askew", views=12, width=48, height=36, seed=0, points=200)
     file, generator = folder / "transforms.json", torch.Generator().manual_seed(0)
     meta = json.loads(file.read_text())

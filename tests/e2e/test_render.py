@@ -1,4 +1,4 @@
-"""A camera path of a bundle, on the bundle and on the run that it came from; a dataset as pictures."""
+"""A bundle's camera path, rendered on the bundle and on its run; a dataset as pictures."""
 
 import gzip
 import json
@@ -19,7 +19,7 @@ from bitymi_ns.scene.baked import as_bytes
 
 @pytest.fixture
 def camera_path(bundle: Path, tmp_path: Path) -> Path:
-    """The bundle's cameras as nerfstudio's camera path: camera to world by rows, x right, y up, z backward."""
+    """The bundle's cameras as nerfstudio's camera path: row-major camera to world, x right, y up, z backward."""
     frames = []
     for row in read_bundle(bundle).cameras:
         pose = torch.linalg.inv(row.camera.viewmat.double()) @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).double()
@@ -40,17 +40,17 @@ def test_a_camera_path_is_that_of_the_bundle_and_of_its_run(
         files = sorted((tmp_path / name).iterdir())
         pictures[name] = np.stack([np.array(Image.open(file)) for file in files]).astype(int)
     scene = read_bundle(bundle)
-    # the path as it is read, in float32: next to an edge that alone moves a value by more than 2
+    # the path as read, in float32, which alone changes values near an edge by more than 2
     cameras = to_cameras(get_path_from_json(json.loads(camera_path.read_text())), "cpu")
     for camera, row in zip(cameras, scene.cameras, strict=True):
         torch.testing.assert_close(camera.viewmat, row.camera.viewmat, rtol=1e-5, atol=1e-5)
         torch.testing.assert_close(camera.K, row.camera.K, rtol=1e-5, atol=1e-5)
     drawn = np.stack([as_bytes(scene.render(camera).rgb).numpy() for camera in cameras]).astype(int)
-    # a path has the field of view alone: the principal point is in the middle, as the room's cameras have it
+    # a path has no principal point; the room's cameras have it in the middle
     assert np.abs(pictures["bundle"] - drawn).max() <= 2
     error = ((pictures["run"] - pictures["bundle"]) ** 2).mean()
     assert 10 * np.log10(255**2 / error) > 30
-    assert np.abs(drawn[0] - drawn[5]).mean() > 2  # not what any camera shows
+    assert np.abs(drawn[0] - drawn[5]).mean() > 2  # cameras differ
 
 
 def test_pictures_of_a_dataset(bundle: Path, tmp_path: Path) -> None:

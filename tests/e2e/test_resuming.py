@@ -1,4 +1,4 @@
-"""Runs that are interrupted and go on, and checkpoints from which none can."""
+"""Interrupted runs resume, and bad checkpoints are refused."""
 
 import copy
 import json
@@ -28,7 +28,7 @@ def test_a_resumed_run_ends_bit_for_bit_like_an_uninterrupted_one(
     trained: BitymiTrainerConfig, start: Start, by: str
 ) -> None:
     config = start(name="resumed")
-    config.max_num_iterations = None  # as long as the interrupted run was to be
+    config.max_num_iterations = None  # the interrupted run's length
     if by == "load_checkpoint":
         config.load_checkpoint = trained.get_checkpoint_dir() / "step-000000020.ckpt"
     else:
@@ -165,7 +165,7 @@ def test_a_recorded_configuration_with_rates_in_shares_of_the_extent_keeps_its_r
 ) -> None:
     config = start(name="earlier")
     lr, texels = (vars(part) for part in (config.pipeline.model.train.lr, config.pipeline.model.train.texels))
-    del lr["mean_pixels"], texels["mean_rates"]  # what an earlier version did not write
+    del lr["mean_pixels"], texels["mean_rates"]  # absent in earlier versions
     lr["means"] = (1.6e-4, 1.6e-6)
     (tmp_path / "earlier.yml").write_text(yaml.dump(config))
     config = yaml.load((tmp_path / "earlier.yml").read_text(), Loader=yaml.Loader)

@@ -1,4 +1,4 @@
-"""The folder of a run: one run at a time, and a disk that is full or cannot be written."""
+"""Folders of runs: exclusive use, full disks, read-only disks."""
 
 import copy
 import errno
@@ -63,7 +63,7 @@ def test_a_folder_takes_one_run_at_a_time(start: Start) -> None:
             InputError, match=f"is in use: process {other.pid} is writing there(.|\n)*--timestamp"
         ) as stop:
             ns_train.main(copy.deepcopy(config))
-        assert stop.value.code != 0 and [p.name for p in folder.iterdir()] == [".lock"]  # nothing of it is touched
+        assert stop.value.code != 0 and [p.name for p in folder.iterdir()] == [".lock"]  # untouched
     finally:
         other.kill()
         other.communicate()

@@ -1,4 +1,4 @@
-"""`ns-train --machine.num-devices 2` on the CPU: what it leaves, how it goes on, what it says when a process ends."""
+"""`ns-train --machine.num-devices 2` on the CPU: results, resuming, messages when a process ends."""
 
 import json
 import os
@@ -22,13 +22,13 @@ STEPS = 30
 
 
 def two(config: BitymiTrainerConfig) -> BitymiTrainerConfig:
-    """The run by two processes, with a third of its steps between two checkpoints."""
+    """Configure the run for two processes, with checkpoints every third of its steps."""
     config.machine.num_devices, config.max_num_iterations, config.steps_per_save = 2, STEPS, STEPS // 3
     return config
 
 
 def at_step(monkeypatch: pytest.MonkeyPatch, step: int, action: Any) -> None:
-    """Have the first process do something before a step."""
+    """Run an action in the first process before a step."""
     iterate = BitymiTrainer.train_iteration
 
     def train_iteration(self: BitymiTrainer, current: int) -> Any:
@@ -41,7 +41,7 @@ def at_step(monkeypatch: pytest.MonkeyPatch, step: int, action: Any) -> None:
 
 @pytest.fixture(scope="module")
 def pair(room: Path, tmp_path_factory: pytest.TempPathFactory) -> BitymiTrainerConfig:
-    """A finished run of two processes that has kept all its checkpoints. Not to be changed."""
+    """A finished run of two processes with all its checkpoints. Not to be changed."""
     config = two(small_run(room, tmp_path_factory.mktemp("outputs")))
     config.save_only_latest_checkpoint = False
     ns_train.main(config)

@@ -1,4 +1,4 @@
-"""Training through nerfstudio's own entry point: what it leaves behind, every method, and what it starts from."""
+"""Training through nerfstudio's entry point: results, every method, initial points."""
 
 import json
 import shutil

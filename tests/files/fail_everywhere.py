@@ -1,8 +1,8 @@
-"""Have every access to the disk fail, one after the other, in everything that writes results.
+"""Make each disk access fail in turn in every writer of results.
 
-Run with an empty folder and names of writers (none = all), with faults.c preloaded and named in BITYMI_FAULTS_LIBRARY.
-BITYMI_FAULTS=all tries every access; otherwise each writer has a few, spread from the first to the last. After each
-the earlier result is as it was or the new one is complete, nothing else is left, and the user was told in a line.
+Run with an empty folder and names of writers (none: all), with faults.c preloaded and named in BITYMI_FAULTS_LIBRARY.
+BITYMI_FAULTS=all tries every access; by default each writer gets a few, from the first to the last. After each fault
+the earlier result is unchanged or the new one complete, nothing else is left, and the message is one line.
 """
 
 import ctypes
@@ -49,12 +49,12 @@ CASES = [
     (errno.EIO, OPEN | WRITE | RENAME | MKDIR | FSYNC | READ, 0),
     (errno.EMFILE, OPEN | FOLDER | READ, 0),
 ]
-SOME = 2  # accesses of a case that are tried where not all are
-SLOW = ("sample", "bundle", "mesh", "maps", "pictures", "eval")  # of these only one
-GOLDEN = 0.618  # parts of the whole in which these follow each other
+SOME = 2  # accesses tried per case by default
+SLOW = ("sample", "bundle", "mesh", "maps", "pictures", "eval")  # one access only
+GOLDEN = 0.618  # spacing of the tried accesses, as a share of all
 
 Contents = dict[str, bytes | None]
-Write = Callable[[int], Any]  # writes one of two versions; returns the status of a command, if it is one
+Write = Callable[[int], Any]  # writes version 0 or 1; returns the exit status if it is a command
 
 
 class Faults:
@@ -70,20 +70,20 @@ class Faults:
         self._library.faults_arm(f"{folder}/".encode(), kinds, step, error, later)
 
     def disarm(self) -> tuple[int, int, str]:
-        """Returns how many accesses there were, and the kind and the path of the one that failed."""
+        """Return the number of accesses, and kind and path of the one that failed."""
         found = self._library.faults_count(), self._library.faults_kind(), self._library.faults_path().decode()
         self._library.faults_arm(b"", 0, 0, 0, 0)
         return found
 
 
 def contents(folder: Path, folders: bool = True) -> Contents:
-    """Everything below a folder, folders as None."""
+    """Read everything below a folder; folders are None."""
     there = [path for path in folder.rglob("*") if folders or path.is_file()]
     return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None for path in there}
 
 
 def put(folder: Path, what: Contents) -> None:
-    """Make a folder have these contents and no others."""
+    """Make a folder have exactly these contents."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     for name, data in sorted(what.items()):
@@ -95,7 +95,7 @@ def put(folder: Path, what: Contents) -> None:
 
 
 def said(write: Write) -> str | None:
-    """Write the second version; returns what a user was told where that ended early, None = it did not."""
+    """Write the second version; returns the message if that ended early, else None."""
     told = io.StringIO()
     with redirect_stderr(told), redirect_stdout(io.StringIO()):
         try:
@@ -113,13 +113,13 @@ def said(write: Write) -> str | None:
     return line.strip()
 
 
-SEPARATE = ("maps",)  # files that are written one by one, each of them whole
+SEPARATE = ("maps",)  # writers of independent files, each written atomically
 REPLACE_NOTHING = ("capture",)
-FOLDERS_STAY = ("maps", "begin")  # empty ones, which nobody takes for a result
+FOLDERS_STAY = ("maps", "begin")  # may leave empty folders
 
 
 def check(name: str, write: Write, place: Path, faults: Faults, every: bool) -> str:
-    """Try faults in one writer; returns what was done."""
+    """Try faults in one writer; returns a summary."""
     start, there = time.perf_counter(), partial(contents, place, name not in FOLDERS_STAY)
     versions: list[Contents] = []
     for version in (1, 1, 0):
@@ -128,8 +128,8 @@ def check(name: str, write: Write, place: Path, faults: Faults, every: bool) -> 
             assert not write(version), told.getvalue()
         versions.append(there())
     newer, again, older = versions
-    steady = {key for key in newer if newer[key] == again[key]}  # the others hold times
-    steady -= {"a/bundle.json"}  # which is complete without the comparison that is put into it last
+    steady = {key for key in newer if newer[key] == again[key]}  # others contain times
+    steady -= {"a/bundle.json"}  # complete before the comparison is added to it
     assert newer.keys() == again.keys() and newer != older, newer.keys() ^ again.keys()
     tried, lines = 0, set()
     for before in ({},) if name in REPLACE_NOTHING else ({}, older):
@@ -148,9 +148,7 @@ def check(name: str, write: Write, place: Path, faults: Faults, every: bool) -> 
                     _, kind, path = faults.disarm()
                 found, tried = there(), tried + 1
                 where = f"{name}: {errno.errorcode[error]} at {step} ({kind}, {path}): {line}"
-                if (
-                    kind == FOLDER or path.endswith(".new") and kind == RENAME
-                ):  # cleaning up, which the next writer does
+                if kind == FOLDER or path.endswith(".new") and kind == RENAME:  # cleaning up, left to the next writer
                     assert said(write) is None, where
                     found, line = there(), None
                 whole = found.keys() == newer.keys() and all(found[key] == newer[key] for key in steady)
@@ -163,7 +161,7 @@ def check(name: str, write: Write, place: Path, faults: Faults, every: bool) -> 
 
 
 def writers(work: Path) -> dict[str, Callable[[Path], Write]]:
-    """What writes results, by name: each is given the folder that it writes to."""
+    """Return the writers by name; each takes its folder."""
     room = generate(work / "room", views=10, width=48, height=36, seed=0, points=200)
     config = small_run(room, work / "outputs")
     config.max_num_iterations, config.steps_per_save = 10, 10
@@ -227,7 +225,7 @@ def writers(work: Path) -> dict[str, Callable[[Path], Write]]:
 
     def capture(place: Path, version: int) -> None:
         found = Poses(models[version], room / "images", models[version], {}, 10, 10, 0.1, 3.0, {})
-        shutil.rmtree(place / "a", ignore_errors=True)  # a capture replaces nothing
+        shutil.rmtree(place / "a", ignore_errors=True)  # a capture never replaces files
         with explained(place / "a", InputError):
             write_capture(found, place / "a", lambda *told: None)
 

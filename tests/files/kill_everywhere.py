@@ -1,7 +1,7 @@
-"""Kill a write at every step: run with the name of what is written and an empty folder.
+"""Kill a write at every step: run with the name of a result and an empty folder.
 
-The write runs in forked children, the n-th of which ends without any cleaning up just before its n-th access to the
-folder; then the same write is done to the end. Fails where something is lost, mixed or left over after that.
+The write runs in forked children, the n-th of which ends without cleanup just before its n-th access to the folder;
+then the write is repeated to the end. Fails if anything is lost, mixed or left over.
 """
 
 import os
@@ -18,16 +18,16 @@ EVENTS = ("mkdir", "rename", "remove", "rmdir", "truncate", "listdir", "scandir"
 
 
 def accesses(folder: Path, event: str, arguments: tuple[Any, ...]) -> bool:
-    """Whether Python is about to touch something in the folder, by the events that it audits."""
+    """Return True if Python is about to access the folder, by its audit events."""
     if event != "open" and event not in {f"os.{name}" for name in EVENTS}:
         return False
     inside = any(isinstance(path, (str, Path)) and str(path).startswith(str(folder)) for path in arguments[:2])
     relative = event in ("os.remove", "os.rmdir", "open") and len(arguments) > 1 and "/" not in str(arguments[0])
-    return inside or relative  # shutil.rmtree names files relative to a folder that it has open
+    return inside or relative  # shutil.rmtree names files relative to an open folder
 
 
 def killed_at(step: int, folder: Path, write: Callable[[], None]) -> bool:
-    """Write in a child that is killed before its access number `step`; False = it came to the end before that."""
+    """Write in a child that is killed before access number `step`; returns False if it finished first."""
     child = os.fork()
     if child == 0:
         count = 0
@@ -48,7 +48,7 @@ def killed_at(step: int, folder: Path, write: Callable[[], None]) -> bool:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """All files below a folder, hidden ones included."""
+    """Read all files below a folder, including hidden ones."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
@@ -60,17 +60,17 @@ def put(folder: Path, value: bytes, names: tuple[str, ...]) -> None:
 
 
 def of_a_folder(folder: Path) -> tuple[Callable[[], None], Callable[[], None]]:
-    """Two versions of a folder."""
+    """Return writers of two versions of a folder."""
     return lambda: put(folder, b"old" * 999, ("x", "y")), lambda: put(folder, b"new" * 999, ("x", "z"))
 
 
 def of_a_file(folder: Path) -> tuple[Callable[[], None], Callable[[], None]]:
-    """Two versions of a file."""
+    """Return writers of two versions of a file."""
     return lambda: files.write_file(folder / "b", b"old" * 999), lambda: files.write_file(folder / "b", b"new" * 999)
 
 
 def of_a_bundle(folder: Path) -> tuple[Callable[[], None], Callable[[], None]]:
-    """Two versions of a bundle."""
+    """Return writers of two versions of a bundle."""
     import torch
 
     from bitymi_ns.bundle import write_bundle
@@ -96,7 +96,7 @@ def main(kind: str, folder: Path) -> None:
     old()
     older = contents(folder)
     assert older != newer
-    for first in (False, True):  # over an earlier version; where there is none
+    for first in (False, True):  # over an earlier version; without one
         step = 0
         while True:
             for path in folder.iterdir() if first else ():
@@ -104,7 +104,7 @@ def main(kind: str, folder: Path) -> None:
             killed = killed_at(step, folder, new)
             found = {name: data for name, data in contents(folder).items() if name.split("/")[0] == "b"}
             assert found in (newer, older, {}), (step, sorted(found))  # {}: nothing yet, or between two renames
-            with files.reserved(folder / "b"):  # what the next writer begins with
+            with files.reserved(folder / "b"):  # first action of the next writer
                 if kind == "file":
                     files.remove_unfinished(folder)
                 settled = {k: v for k, v in contents(folder).items() if k != ".b.lock"}

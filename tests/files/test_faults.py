@@ -1,4 +1,4 @@
-"""Every writer of results, with accesses to the disk that fail."""
+"""Every writer of results with failing disk accesses."""
 
 import os
 import shutil

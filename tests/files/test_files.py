@@ -1,4 +1,4 @@
-"""Writing whole or not at all: kills at every step, locks of living and dead processes, and reasons that are true."""
+"""Atomic writes: kills at every step, locks of live and dead processes, correct error messages."""
 
 import errno
 import os
@@ -28,7 +28,7 @@ with files.{call}:
 
 @contextmanager
 def another_process(call: str, path: Path) -> Iterator[subprocess.Popen]:
-    """A process that is within `with files.<call>`; it is killed in the end."""
+    """Run a process within `with files.<call>` until it is killed."""
     code = WAITS.format(call=call)
     process = subprocess.Popen(
         [sys.executable, "-c", code, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -61,7 +61,7 @@ def test_a_folder_has_one_writer_and_the_next_one_cleans_up(tmp_path: Path, call
             with files.complete_folder(tmp_path / "b"):
                 pass
         assert names(tmp_path) == before and ".b.lock" in before
-    assert names(tmp_path) == before  # it was killed
+    assert names(tmp_path) == before  # killed
     with files.complete_folder(tmp_path / "b") as new:
         (new / "x").write_text("y")
     assert names(tmp_path) == ["b"] and names(tmp_path / "b") == ["x"]
@@ -104,7 +104,7 @@ def test_a_file_system_without_locks_costs_a_warning(tmp_path: Path, monkeypatch
 def test_parents_that_were_made_for_nothing_go_again(tmp_path: Path) -> None:
     files.check_writable(Path("/dev/null"))
     files.write_file(Path("/dev/null"), b"x")
-    assert not Path("/dev/null").is_file()  # a device is written to as it is
+    assert not Path("/dev/null").is_file()  # devices are written directly
     files.check_writable(tmp_path / "a" / "b" / "c")
     assert names(tmp_path) == []
     with files.complete_folder(tmp_path / "a" / "b" / "c"):
@@ -141,7 +141,7 @@ def test_what_cannot_be_written_is_explained(tmp_path: Path, place: Callable[[Pa
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 1 MB."""
+    """Mount a file system of 1 MB."""
     folder = tmp_path / "disk"
     folder.mkdir()
     mounted = subprocess.run(

@@ -1,4 +1,4 @@
-"""The small scenes of the bake's tests, and a bundle with texels."""
+"""Small scenes of the bake's tests, and a bundle with texels."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ TURN = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed
 
 @pytest.fixture
 def bundle(surfels, tmp_path: Path) -> Bundle:
-    """Of twelve surfels with texels, whose scene lies turned, moved and scaled in the capture's frame."""
+    """A bundle of twelve surfels with texels, rotated, shifted and scaled in the capture's frame."""
     turn = TURN * torch.linalg.det(TURN)
     transform = np.concatenate([turn.numpy(), [[0.3], [-1.0], [2.0]]], axis=1)
     make(surfels, tmp_path / "bundle", count=12, mean_residual=torch.full((12, 3), 0.1), world=World(transform, 0.4))

@@ -10,7 +10,7 @@ from bitymi_ns.interchange.quads import Quads
 
 
 def read_glb(path: str | Path) -> Quads:
-    """The quads of a file of `quads_glb`, where its nodes put them."""
+    """Read the quads of a `quads_glb` file, transformed by their nodes."""
     scene = trimesh.load_scene(path, process=False)
     corners, coordinates, page, pages = [], [], [], []
     for node in sorted(scene.graph.nodes_geometry):

@@ -1,4 +1,4 @@
-"""Alpha texels in files for other programs, against the baked renderer of the CPU."""
+"""Alpha texels in files for other programs, against the CPU's baked renderer."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,7 +26,7 @@ COUNT, SIDE, LEVEL = 40, 16, 0.15
 
 @pytest.fixture
 def cut(surfels) -> BakedScene:
-    """Large surfels, each cut along a straight line; the last one has no tile."""
+    """Large surfels, each cut along a straight line; the last has no tile."""
     params, g = surfels(COUNT), torch.Generator().manual_seed(1)
     params["log_scales"] += 1.5
     params["opacity_logits"] = params["opacity_logits"].abs() + 0.5
@@ -47,7 +47,7 @@ def opaque(scene: BakedScene) -> BakedScene:
 
 
 def files(scene: BakedScene) -> tuple[Gaussians, Quads]:
-    """As `write_extras` makes them without cameras."""
+    """Convert as `write_extras` without cameras."""
     nobody = torch.zeros(0, COUNT, dtype=torch.bool), torch.zeros(0, 3, dtype=torch.float64)
     colors = fit_colors(scene, weighted_residuals(scene), *nobody)
     return gaussians_of(scene, colors.harmonics), quads_of(scene, colors.color, LEVEL)
@@ -122,7 +122,7 @@ def test_quads_end_where_the_opacity_falls_to_the_level(cut: BakedScene) -> None
     sigma = opacity[row] * (1 - (u**2 + v[:, None] ** 2) / 9).clamp(min=0) ** beta[row] * m
     sure = (sigma - LEVEL).abs() > 0.01
     assert torch.equal(alpha[sure], (sigma >= LEVEL)[sure]) and 0.2 < float(alpha.float().mean()) < 0.75
-    cut.atlas[0, : SIDE * (COUNT - 1), :, 3] = 0.0  # only the surfel without a tile is left
+    cut.atlas[0, : SIDE * (COUNT - 1), :, 3] = 0.0  # leaves only the surfel without a tile
     assert len(quads_of(cut, torch.full((COUNT, 3), 0.5), LEVEL)) == 1
 
 

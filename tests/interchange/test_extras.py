@@ -1,4 +1,4 @@
-"""The folder beside a bundle: its files, its place, and what is refused."""
+"""The folder of extras beside a bundle: files, location, refusals."""
 
 import io
 import json
@@ -32,14 +32,14 @@ def row(camera, name: str, held_out: bool, **more) -> dict:
 
 
 def positions(path: Path) -> torch.Tensor:
-    """[N, 3] of a PLY file."""
+    """Read [N, 3] positions of a PLY file."""
     vertex = parse_ply(path.read_bytes())["vertex"]
     return torch.from_numpy(np.stack([vertex[name] for name in "xyz"], 1))
 
 
 @pytest.fixture
 def with_cameras(surfels, camera, tmp_path: Path) -> Path:
-    """A bundle with cameras.json and a photograph of half the size of its camera's image."""
+    """Write a bundle with cameras.json and a photograph of half its camera's size."""
     buffer = io.BytesIO()
     Image.fromarray(np.full((24, 32, 3), 90, np.uint8)).save(buffer, format="PNG")
     rows = [row(camera(6.0), "a.jpg", False), row(camera(7.0), "b.jpg", False)]
@@ -79,7 +79,7 @@ def test_the_captures_frame_is_reached(bundle: Bundle, tmp_path: Path) -> None:
     old, new = (positions(tmp_path / frame / "gaussians.ply") for frame in ("scene", "capture"))
     assert torch.allclose(back(new), old, atol=2e-5)
     old, new = (read_glb(tmp_path / frame / "mesh.glb").corners for frame in ("scene", "capture"))
-    old = torch.stack([old[..., 0], -old[..., 2], old[..., 1]], -1)  # its up is z
+    old = torch.stack([old[..., 0], -old[..., 2], old[..., 1]], -1)  # z up
     assert torch.allclose(back(unturned(new, up_of(place, to_capture(place)))), old, atol=2e-5)
 
 

@@ -1,4 +1,4 @@
-"""From the scene's frame to the capture's: points, discs and colours are where they were."""
+"""Scene to capture frame: points, discs and colours keep their positions."""
 
 import json
 import math
@@ -76,7 +76,7 @@ def test_far_away_positions_are_relative_to_an_origin(scale: float) -> None:
 
 
 def test_up_is_an_axis_of_the_captures_frame() -> None:
-    tilted = Rotation.from_euler("xz", [80.0, 10.0], degrees=True).as_matrix()  # of the scene in the capture
+    tilted = Rotation.from_euler("xz", [80.0, 10.0], degrees=True).as_matrix()  # scene to capture
     where = place(torch.from_numpy(tilted.T.copy()), 1.0)
     assert up_of(where, None).tolist() == [0, 0, 1]
     up = up_of(where, to_capture(where))

@@ -1,4 +1,4 @@
-"""The preview's file has the layout of 3DGS, and its Gaussians the moments of the kernels."""
+"""The preview file has the layout of 3DGS, and its Gaussians have the kernels' moments."""
 
 from pathlib import Path
 

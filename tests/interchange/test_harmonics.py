@@ -1,4 +1,4 @@
-"""Spherical harmonics for other programs: against the float64 reference, and turned exactly."""
+"""Spherical harmonics for other programs: against the float64 reference, with exact rotation."""
 
 import torch
 

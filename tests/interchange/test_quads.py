@@ -1,4 +1,4 @@
-"""The mesh: its geometry and texels, its file, its picture, and its colours from pictures."""
+"""The quad mesh: geometry, texels, file, render, and colours from pictures."""
 
 from pathlib import Path
 
@@ -46,7 +46,7 @@ def test_quads_hold_the_disc_and_what_the_tile_shows(bundle: Bundle, color: torc
         found = _fetch(quads.pages, quads.page[row].expand(50), inside.double())
         at = radius / float(scene.extent[i]) * torch.stack([2 * s - 1, 2 * t - 1], 1) * 3  # of [-3, 3]
         shown = torch.relu(color[i].double() + texel(tile, at)).clamp(max=1)
-        # another grid than the tile's: kinks are cut off, but the mean stays
+        # a grid other than the tile's cuts off kinks but keeps the mean
         assert float((found[:, :3].double() - shown).mean().abs()) < 0.06
         r2 = (2 * s - 1) ** 2 + (2 * t - 1) ** 2
         assert bool((found[:, 3].double() >= 0.5)[r2 < 0.6].all()) and not bool((found[:, 3] >= 0.5)[r2 > 1.4].any())
@@ -94,7 +94,7 @@ def square(z: float, half: float, rgb: tuple[int, int, int]) -> tuple[torch.Tens
 
 
 def two_squares() -> Quads:
-    """A red one before a larger green one, each with a page of its own; the first column of the red one is a hole."""
+    """A red square in front of a larger green one, each with a page; the first column of the red one is a hole."""
     (near, red), (far, green) = square(-1.0, 1.0, (200, 0, 0)), square(1.0, 3.0, (0, 100, 0))
     red[:, 0, 3] = 0
     inset = torch.tensor([[0.125, 0.125], [0.875, 0.125], [0.875, 0.875], [0.125, 0.875]])
@@ -111,7 +111,7 @@ def test_the_nearest_quad_hides_the_others_but_for_its_holes(camera) -> None:
 
 
 def test_quads_that_reach_behind_the_camera_are_drawn_in_front_of_it(camera) -> None:
-    """A floor beneath the camera: what is seen of it lies below the horizon."""
+    """A floor beneath the camera: its visible part lies below the horizon."""
     floor = torch.tensor([[[-50.0, 1, -50], [50, 1, -50], [50, 1, 50], [-50, 1, 50]]])
     white = torch.full((1, 4, 4, 4), 255, dtype=torch.uint8)
     uv = torch.tensor([[[0.2, 0.2], [0.8, 0.2], [0.8, 0.8], [0.2, 0.8]]])

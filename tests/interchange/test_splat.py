@@ -1,4 +1,4 @@
-"""The renderer of Gaussians against the published formulas, pixel by pixel, in float64."""
+"""The Gaussian renderer against the published formulas, per pixel, in float64."""
 
 import numpy as np
 import pytest
@@ -72,12 +72,12 @@ def test_pictures_are_those_of_the_formulas(camera, discs: bool) -> None:
     background = torch.tensor([0.1, 0.5, 0.9])
     found = draw_gaussians(gs, view, background, discs=discs).double().numpy()
     difference = np.abs(found - expected(gs, view, background.double().numpy(), 0.2, discs))
-    # a footprint ends at three standard deviations of its longer axis, where alpha may be up to 0.011
+    # footprints end at three standard deviations of the longer axis, where alpha may be up to 0.011
     assert difference.max() < 0.03 and np.median(difference) < 1e-5
 
 
 def test_many_gaussians_in_a_pixel_are_blended_as_few(camera, monkeypatch) -> None:
-    """More than are blended at once."""
+    """More Gaussians than one batch blends."""
     gs, view = gaussians(1200), camera(4.0, 20, 18)
     at_once = draw_gaussians(gs, view)
     monkeypatch.setattr(splat, "_AT_ONCE", 7)

@@ -1,4 +1,4 @@
-"""Median depth against the float64 reference, and the surface fused from it against known geometry."""
+"""Median depth against the float64 reference, and the fused surface against known geometry."""
 
 import math
 
@@ -17,7 +17,7 @@ from tests.ops.golden import GOLDEN_NAMES, SURFEL_KEYS, camera_of, load_golden, 
 
 
 def plane(side: int, opacity: float = 0.95) -> dict[str, torch.Tensor]:
-    """A dense grid of discs in the plane z = 0, from -1 to 1."""
+    """Make a dense grid of discs in the plane z = 0, from -1 to 1."""
     at = torch.linspace(-1, 1, side)
     means = torch.stack([*torch.meshgrid(at, at, indexing="xy"), torch.zeros(side, side)], -1).reshape(-1, 3)
     count = len(means)
@@ -31,7 +31,7 @@ def plane(side: int, opacity: float = 0.95) -> dict[str, torch.Tensor]:
 
 
 def looking_down(x: float, y: float, distance: float = 2.0) -> Camera:
-    """A camera above the plane z = 0 that looks along -z."""
+    """Make a camera above the plane z = 0 that looks along -z."""
     viewmat = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
     viewmat[:3, 3] = -viewmat[:3, :3] @ torch.tensor([x, y, distance])
     return Camera(viewmat, torch.tensor([[60.0, 0, 31.3], [0, 62.0, 25.1], [0, 0, 1]]), 64, 48)
@@ -47,7 +47,7 @@ def test_median_depth_is_that_of_the_reference(name: str) -> None:
     z = t.depth[:, t.order].gather(1, reached.double().argmax(1, keepdim=True))[:, 0]
     expected = torch.where(reached.any(1), z, 0.0).view(case.height, case.width)
     close = (depth - expected).abs() <= 1e-6
-    assert close.double().mean() > 0.999  # the sum may reach one half a surfel earlier by rounding
+    assert close.double().mean() > 0.999  # rounding may shift the crossing of one half by a surfel
 
 
 def test_what_is_cut_away_has_no_depth() -> None:
@@ -70,7 +70,7 @@ def test_a_plane_is_fused_where_it_lies() -> None:
     vertices, colors = mesh.vertices, mesh.colors
     assert len(mesh) > 500 and np.abs(vertices[:, 2]).max() < 2e-3
     assert np.abs(colors - 0.5).max() < 0.01
-    x, y = vertices[:, 0], vertices[:, 1]  # what the outermost cameras see, and no more
+    x, y = vertices[:, 0], vertices[:, 1]  # limited to what the outermost cameras see
     assert 0.6 < x.max() < 1.06 and abs(x.max() + x.min()) < 0.1 and 0.4 < y.max() < 1.06
     shape = trimesh.Trimesh(vertices, mesh.faces, process=False)
     assert shape.face_normals[:, 2].min() > 0.9  # towards the cameras
@@ -100,7 +100,7 @@ def test_large_views_are_drawn_no_finer_than_the_voxels_need() -> None:
 
     large = [camera.scaled(10.0) for camera in CAMERAS]
     mesh = extract_surface(plane(60), render, large, 0.02, SurfaceOptions(resolution=128))
-    width = 64 / 62 * 2 * 2.0 / (2.04 / 128)  # two pixels for a voxel of the box, at the distance of 2
+    width = 64 / 62 * 2 * 2.0 / (2.04 / 128)  # two pixels per voxel of the box at distance 2
     assert all(abs(w / width - 1.0) < 0.05 and abs(h / w - 0.75) < 0.01 for w, h in sizes)
     assert np.abs(mesh.vertices[:, 2]).max() < 2e-3
     sizes.clear()

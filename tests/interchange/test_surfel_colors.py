@@ -43,7 +43,7 @@ def test_harmonics_that_stay_positive_are_found_again(surfels) -> None:
 
 @pytest.mark.parametrize("residual", [None, -0.2])
 def test_the_fit_follows_the_colour_where_cameras_look_from(surfels, residual: float | None) -> None:
-    """Voronoi colours, with what both ReLUs cut off."""
+    """Spherical Voronoi colours, including clipping by both ReLUs."""
     params, g = surfels(40, "sv"), torch.Generator().manual_seed(0)
     away = torch.tensor([0.0, 0.0, 1.0]) + 0.2 * torch.randn(6, 3, generator=g)
     centers = params["means"].mean(0).double() + 9 * torch.nn.functional.normalize(away, dim=1)
@@ -72,7 +72,7 @@ def test_the_residual_is_the_mean_over_the_disc(bundle: Bundle) -> None:
         assert torch.allclose(found[i].double(), (tile * weight[..., None]).sum((0, 1)) / weight.sum(), atol=1e-5)
     scene.atlas[..., 3], scene.alpha_scale = 0, 255 / 128
     x, y, layer, r_u, r_v = scene.tiles[0].tolist()
-    scene.atlas[layer, y + 1, x + 2, 3] = 128  # all else is cut away
+    scene.atlas[layer, y + 1, x + 2, 3] = 128  # everything else is transparent
     cut = weighted_residuals(scene)
     assert torch.allclose(cut[0], scene.residuals()[layer, y + 1, x + 2], atol=1e-3)
     assert torch.allclose(cut[1:], found[1:], atol=1e-5)

@@ -1,5 +1,5 @@
-"""Meshes are closed whatever they were, and have no faces without area; trimesh, which joins vertices by their
-positions, agrees."""
+"""Meshes are closed and have no degenerate faces, whatever the input; trimesh, which merges vertices by position,
+agrees."""
 
 import numpy as np
 import pytest
@@ -9,13 +9,13 @@ from bitymi_ns.interchange.triangles import Triangles, cleaned, solid
 
 
 def triangles(mesh: trimesh.Trimesh, faces: np.ndarray | None = None) -> Triangles:
-    """A gray mesh of these faces, or of its own."""
+    """Make a grey mesh of these faces, or of the mesh's own."""
     faces = np.array(mesh.faces if faces is None else faces, np.int64)
     return Triangles(mesh.vertices.astype(np.float32), faces, np.full(mesh.vertices.shape, 0.5, np.float32))
 
 
 def as_read(mesh: Triangles) -> trimesh.Trimesh:
-    """The mesh as a program reads it that joins vertices."""
+    """Read the mesh with merged vertices."""
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
 
 
@@ -35,7 +35,7 @@ def turned_over() -> np.ndarray:
 
 
 def with_fins() -> np.ndarray:
-    """Triangles on edges that have two already."""
+    """Build triangles on edges that have two already."""
     far = (SPHERE.faces[:30, 0] + 1000) % len(SPHERE.vertices)
     return np.concatenate([SPHERE.faces, np.column_stack([SPHERE.faces[:30, :2], far])])
 

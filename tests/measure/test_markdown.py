@@ -1,4 +1,4 @@
-"""Templates escape what they are given, and miss no value in silence."""
+"""Templates escape their values and report missing ones."""
 
 import jinja2
 import pytest

@@ -1,4 +1,4 @@
-"""Pictures of what each part of a scene contributes."""
+"""Pictures of the contribution of each part of a scene."""
 
 import torch
 
@@ -23,7 +23,7 @@ def test_the_residual_of_a_view_that_is_drawn_in_bands() -> None:
 def test_the_view_colour_and_the_residual_are_cut_alike() -> None:
     scene, camera, _ = make()
     g = torch.Generator().manual_seed(1)
-    scene.surfels["sv_rgb"].abs_()  # no colour is cut off at 0
+    scene.surfels["sv_rgb"].abs_()  # avoids clipping at 0
     scene.field.texels.mul_(0.1)
     scene.field.alpha = torch.nn.Parameter(2 * torch.rand(len(scene.field.texels), generator=g, dtype=torch.float64))
     output, plain = scene.render(camera, field_mode="frozen"), scene.render(camera, field_mode="off")

@@ -1,4 +1,4 @@
-"""Bundles and captures whose files are opened."""
+"""Bundles and captures to be opened by other programs."""
 
 from tests.bake.conftest import surfels
 from tests.capture.conftest import arc, pictures, views

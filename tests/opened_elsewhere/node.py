@@ -1,4 +1,4 @@
-"""Programs of npm that `make web-test` installs beside the page's sources."""
+"""npm programs that `make web-test` installs."""
 
 import json
 import shutil
@@ -13,8 +13,8 @@ MODULES = HERE.parents[1] / "web" / "node_modules"
 
 
 def said_by(script: str, package: str, file: Path) -> Any:
-    """Return what a script of this folder, which reads a file by a package of npm, prints as JSON; skip the test
-    without it."""
+    """Run a script of this folder that reads a file with an npm package; returns its JSON output, or skips the test
+    without the package."""
     node = shutil.which("node")
     if node is None:
         skip_without("npm", "no node: apt install nodejs npm")

@@ -1,5 +1,4 @@
-"""Captures that `bitymi sfm` and `bitymi sample` write as pycolmap, plyfile, Pillow and nerfstudio's own parser read
-them."""
+"""Captures by `bitymi sfm` and `bitymi sample`, read by pycolmap, plyfile, Pillow and nerfstudio's parser."""
 
 import json
 from pathlib import Path
@@ -26,7 +25,7 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def found(arc: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The capture that sfm writes of the photographs."""
+    """The capture that sfm writes from the photographs."""
     folder = tmp_path_factory.mktemp("sfm") / "capture"
     assert main(["sfm", str(arc), "--output", str(folder), "--max-features", "400"]) == 0
     return folder
@@ -43,7 +42,7 @@ def test_nerfstudio_reads_the_poses(capture: Path) -> None:
     read = NerfstudioDataParserConfig(data=capture, load_3D_points=True, **options).setup().get_dataparser_outputs()
     by_name = {Path(frame["file_path"]).name: frame["transform_matrix"] for frame in meta["frames"]}
     stated = torch.tensor([by_name[path.name] for path in read.image_filenames])
-    # the dataparser turns the world, and says how
+    # the dataparser rotates the world and states the transform
     turn = read.dataparser_transform @ torch.eye(4)
     expected = turn[:, :3] @ stated[:, :3, :3], stated[:, :3, 3] @ turn[:, :3].T + turn[:, 3]
     assert torch.allclose(read.cameras.camera_to_worlds[:, :, :3], expected[0], atol=1e-5)

@@ -1,4 +1,4 @@
-"""Films, pictures, packed bundles and camera paths as other programs read them."""
+"""Films, pictures, packed bundles and camera paths, read by other programs."""
 
 import json
 import shutil

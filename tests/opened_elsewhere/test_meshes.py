@@ -1,4 +1,4 @@
-"""Meshes and Gaussians as Khronos's validator, trimesh and plyfile read them."""
+"""Meshes and Gaussians, read by Khronos's validator, trimesh and plyfile."""
 
 from pathlib import Path
 from typing import get_args
@@ -23,7 +23,7 @@ FORMATS = get_args(MeshFormat)
 
 @pytest.fixture(scope="module")
 def surface() -> Triangles:
-    """An ellipsoid with more vertices than 16 bits count, and with colours of every lightness."""
+    """An ellipsoid with more than 2^16 vertices and colours of every lightness."""
     shape = trimesh.creation.uv_sphere(1.0, [190, 190])
     vertices = (shape.vertices * (1.0, 2.0, 3.0) + (3.0, 0.0, 33_000.0 / 256)).astype(np.float32)
     colors = np.linspace(0, 1, 3 * len(vertices), dtype=np.float32).reshape(-1, 3)
@@ -31,7 +31,7 @@ def surface() -> Triangles:
 
 
 def issues_of(file: Path) -> list[dict]:
-    """The validator's errors and warnings; notes and hints ask for nothing that is needed."""
+    """Return the validator's errors and warnings, without infos and hints."""
     found = said_by("validate_gltf.mjs", "gltf-validator", file)
     assert found["info"]["totalTriangleCount"] > 0
     return [each for each in found["issues"]["messages"] if each["severity"] < 2]

@@ -1,4 +1,4 @@
-"""Atlases as ktx-parse and another decoder of BC7 read them."""
+"""Atlases, read by ktx-parse and another BC7 decoder."""
 
 import base64
 from pathlib import Path
@@ -31,7 +31,7 @@ def test_ktx_parse_reads_an_atlas(surfels, format: str, tmp_path: Path) -> None:
 
 
 def other_decoder(blocks: bytes, width: int, height: int) -> np.ndarray:
-    """[height, width, 4] RGBA by texture2ddecoder, which gives blue first."""
+    """Decode to [height, width, 4] RGBA by texture2ddecoder, which returns BGRA."""
     read = np.frombuffer(texture2ddecoder.decode_bc7(blocks, width, height), np.uint8)
     return read.reshape(height, width, 4)[..., [2, 1, 0, 3]]
 

@@ -1,4 +1,4 @@
-"""The golden renders and how a case is drawn; scenes that other tests use, too, are in bitymi_ns.measure.stability."""
+"""Golden renders and their drawing; scenes shared with other code are in bitymi_ns.measure.stability."""
 
 import math
 from collections.abc import Sequence
@@ -52,7 +52,7 @@ GOLDEN_NAMES = sorted(path.stem for path in GOLDEN.glob("*.npz"))
 
 @dataclass
 class Golden(SceneCase):
-    """A golden render: the case, its images, and the gradients of loss = sum of loss_weights[k] * outputs[k]."""
+    """A golden render: case, images, and gradients of loss = sum of loss_weights[k] * outputs[k]."""
 
     outputs: dict[str, Tensor] = field(default_factory=dict)  # rgb, alpha, depth, beta_map, overdraw
     loss_weights: dict[str, Tensor] = field(default_factory=dict)  # rgb, alpha, depth, beta_map
@@ -62,9 +62,9 @@ class Golden(SceneCase):
 
 
 def reference_ssim(a: Tensor, b: Tensor) -> Tensor:
-    """Mean SSIM of two images [H, W, C] in [0, 1] over the pixels whose window lies inside, by torchmetrics; some of
-    its versions average padded windows, too."""
-    from torchmetrics.functional.image.ssim import _ssim_update  # imported by few tests: it takes seconds
+    """Compute the mean SSIM of two images [H, W, C] in [0, 1] over pixels with a complete window, by torchmetrics, some
+    versions of which include padded windows."""
+    from torchmetrics.functional.image.ssim import _ssim_update  # here because the import takes seconds
 
     pair = (image.permute(2, 0, 1)[None] for image in (a, b))
     _, values = _ssim_update(*pair, data_range=1.0, return_full_image=True)
@@ -72,7 +72,7 @@ def reference_ssim(a: Tensor, b: Tensor) -> Tensor:
 
 
 def load_golden(name: str) -> Golden:
-    """One of GOLDEN_NAMES, from tests/golden (conventions: the README there)."""
+    """Load one of GOLDEN_NAMES from tests/golden (conventions: the README there)."""
     with np.load(GOLDEN / f"{name}.npz") as file:
         data = {key: torch.from_numpy(file[key]) for key in file.files}
 
@@ -103,7 +103,7 @@ def load_golden(name: str) -> Golden:
 
 
 def atlas_of(golden: Golden) -> tuple[Tensor, Tensor]:
-    """The tiles [N, 5] int32 of a textured scene, side by side on one page [1, 64, 1024, 4] float32."""
+    """Lay out a textured scene's tiles [N, 5] int32 side by side on a page [1, 64, 1024, 4] float32."""
     atlas, tiles, x = torch.zeros(1, 64, 1024, 4), [], 0
     for tile in golden.tiles:
         rows, columns = tile.shape[:2]
@@ -114,20 +114,20 @@ def atlas_of(golden: Golden) -> tuple[Tensor, Tensor]:
 
 
 def camera_of(case: SceneCase, dtype: torch.dtype = torch.float64) -> Camera:
-    """The camera of a case."""
+    """Return the camera of a case."""
     return Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height)
 
 
 def values_of(
     case: SceneCase, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu", grad: bool = False
 ) -> list[Tensor]:
-    """The values of SURFEL_KEYS; grad: leaves of their own."""
+    """Return the values of SURFEL_KEYS; grad: as new leaves."""
     values = [case.params[key].to(device, dtype) for key in SURFEL_KEYS]
     return [value.clone().requires_grad_() for value in values] if grad else values
 
 
 def relative(a: Tensor, b: Tensor) -> float:
-    """Largest error over the largest value; absolute where all values are 0."""
+    """Compute the largest error relative to the largest value; absolute if all values are 0."""
     scale = b.abs().max().item() if b.numel() else 0.0
     error = (a.double() - b.double()).abs().max().item() if b.numel() else 0.0
     return error / scale if scale > 0 else error
@@ -136,24 +136,24 @@ def relative(a: Tensor, b: Tensor) -> float:
 def traced(
     case: SceneCase, values: Sequence[Tensor], prefilter: str = "low_pass"
 ) -> tuple[ops.Fragments, ops.Projection]:
-    """The kernels' fragments of a case; values: those of SURFEL_KEYS."""
+    """Trace the fragments of a case; values: those of SURFEL_KEYS."""
     projection = ops.project(*values, camera_of(case, values[0].dtype), prefilter=prefilter)
     return ops.trace(projection, 0.0), projection
 
 
 def reference(case: SceneCase, values: Sequence[Tensor], prefilter: str = "low_pass") -> reference_trace.Trace:
-    """Every surfel at every pixel of a case; values: those of SURFEL_KEYS."""
+    """Evaluate every surfel at every pixel of a case; values: those of SURFEL_KEYS."""
     projected = reference_project.project(*values, case.viewmat, case.K)
     return reference_trace.trace(projected, case.width, case.height, prefilter=prefilter)
 
 
 def crossing_scene(n: int, seed: int, width: int = 96, height: int = 80) -> SceneCase:
-    """n faint surfels whose discs cross the camera's plane: centres in front of it, most of them beside the view."""
+    """Make n faint surfels across the camera's plane: centres in front of it, mostly beside the view."""
     case = random_scene(n, seed, width, height, name="crossing")
     g = torch.Generator().manual_seed(seed)
     depth = 0.25 + 1.25 * torch.rand(n, generator=g, dtype=torch.float64)
     turn = 2 * math.pi * torch.rand(n, generator=g, dtype=torch.float64)
-    lateral = torch.exp(2.5 * torch.rand(n, generator=g, dtype=torch.float64) - 0.7)  # 0.5 to 6 depths off the axis
+    lateral = torch.exp(2.5 * torch.rand(n, generator=g, dtype=torch.float64) - 0.7)  # 0.5 to 6 depths off-axis
     camera = depth[:, None] * torch.stack([lateral * turn.cos(), lateral * turn.sin(), torch.ones_like(turn)], dim=-1)
     case.params["means"] = (camera - case.viewmat[:3, 3]) @ case.viewmat[:3, :3]
     size = depth.log()[:, None] + 0.4 * torch.randn(n, 2, generator=g, dtype=torch.float64)
@@ -162,7 +162,7 @@ def crossing_scene(n: int, seed: int, width: int = 96, height: int = 80) -> Scen
 
 
 def far_floor() -> SceneCase:
-    """A floor below the camera whose centre lies beside it, just behind the near plane: millions of pixels away."""
+    """Make a floor below the camera with its centre to the side, just beyond `near`: millions of pixels away."""
     case = replace(crossing_scene(1, 0, width=40, height=30), viewmat=torch.eye(4, dtype=torch.float64))
     x, z = torch.eye(3, dtype=torch.float64)[[0, 2]]
     case.params |= {
@@ -175,7 +175,7 @@ def far_floor() -> SceneCase:
 
 
 def tiles_reached(weights: Tensor, width: int, height: int) -> Tensor:
-    """[N]: in how many screen tiles of 16 x 16 pixels each surfel has a fragment; weights [H W, N]."""
+    """Count the 16 x 16 screen tiles in which each surfel has a fragment: [N], from weights [H W, N]."""
     across, down = -(-width // 16), -(-height // 16)
     padded = weights.new_zeros(16 * down, 16 * across, weights.shape[1])
     padded[:height, :width] = weights.view(height, width, -1)
@@ -185,7 +185,7 @@ def tiles_reached(weights: Tensor, width: int, height: int) -> Tensor:
 def composite_colors(
     fragments: ops.Fragments, projection: ops.Projection, colors: Tensor, maps: bool = False
 ) -> Tensor:
-    """Image of `ops.blended_image` for colours [F, 3] of the fragments, by torch."""
+    """Composite fragments' colours [F, 3] like `ops.blended_image`, in torch."""
     geom = projection.geom.index_select(0, fragments.surfel)
     values = [colors, torch.ones_like(colors[:, :1]), geom[:, 11:12]]
     values += [fragments.depth[:, None], geom[:, 12:15]] if maps else []
@@ -193,7 +193,7 @@ def composite_colors(
 
 
 def dense(fragments: ops.Fragments, values: Tensor, n: int) -> Tensor:
-    """[P, N] of one number per fragment."""
+    """Scatter one number per fragment to [P, N]."""
     out = values.new_zeros(fragments.width * fragments.height, n)
     return out.index_put((fragments.pixel.long(), fragments.surfel.long()), values)
 
@@ -201,8 +201,8 @@ def dense(fragments: ops.Fragments, values: Tensor, n: int) -> Tensor:
 def reference_colors(
     fragments: ops.Fragments, base: Tensor, texels: Tensor, tiles: ops.TexelTiles, bound: float
 ) -> Tensor:
-    """[F, 3] colours ReLU(ReLU(base + 0.5) + texel(u, v)) of fragments by `reference.texel`, in the dtype of their
-    weights; those of smaller weight than the bound have no residual."""
+    """Compute the colours ReLU(ReLU(base + 0.5) + texel(u, v)) [F, 3] of fragments by `reference.texel`, in the dtype
+    of their weights; those of weight below the bound have no residual."""
     weight = fragments.weight.detach()
     color = torch.relu(base + 0.5)[fragments.surfel.long()]
     residual = torch.zeros_like(color)

@@ -1,4 +1,4 @@
-"""The CPU kernels that are loaded are the best that this CPU can run, and none where it can run none."""
+"""Selection of the best CPU kernels that this CPU can run, or none."""
 
 import subprocess
 import sys
@@ -31,7 +31,7 @@ print([name for name in sys.modules if name.startswith("bitymi_ns._cpu")])
 
 @pytest.fixture
 def cpuinfo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Stand-in for /proc/cpuinfo; the modules are those of a wheel."""
+    """A stub of /proc/cpuinfo, with the modules of a wheel."""
     monkeypatch.setattr(backend, "CPUINFO", tmp_path / "cpuinfo")
     monkeypatch.setattr(_cpu_features, "FEATURES", BUILT)
     backend.cpu_module.cache_clear()

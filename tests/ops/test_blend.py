@@ -1,4 +1,4 @@
-"""Shading and blending in one pass: against the operations it stands for, finite differences and the golden render."""
+"""Shading and blending in one pass: against separate operations, finite differences and the golden render."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ BOUND = 0.03
 
 
 class View:
-    """A view of a random scene, with everything that learns as leaves."""
+    """A view of a random scene with all parameters as leaves."""
 
     def __init__(
         self,
@@ -96,7 +96,7 @@ def test_a_descent_moves_the_texels_by_their_gradient() -> None:
     texels = moving.given["texels"]
     before, share = texels.clone(), torch.linspace(0.1, 2.0, len(texels), dtype=torch.float64)
     moved = moving.gradients(moving.image(descent=ops.TexelDescent(share, 0.3)))
-    assert all(torch.equal(a, b) for a, b in zip(moved, surfels, strict=True))  # by the texels before they moved
+    assert all(torch.equal(a, b) for a, b in zip(moved, surfels, strict=True))  # from the texels before the step
     torch.testing.assert_close(texels, before - 0.3 * share[:, None] * dtexels, rtol=1e-12, atol=1e-12)
     with pytest.raises(ValueError, match="ask for no gradient"):
         learning.image(descent=ops.TexelDescent(share, 0.3))

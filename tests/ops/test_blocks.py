@@ -1,4 +1,4 @@
-"""Fragment lists of the CPU kernels by blocks of 4 x 4 pixels."""
+"""Fragment lists of the CPU kernels, by blocks of 4 x 4 pixels."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ from tests.ops.golden import SURFEL_KEYS, camera_of, random_scene
 
 
 def blocks_of(projection: ops.Projection) -> dict[str, torch.Tensor]:
-    """The list of a view and the arrays of its layout, by name."""
+    """Trace a view: the list and its layout's arrays, by name."""
     geom = projection.geom
     tracer = kernel_class("Trace", geom)()
     n = tracer.run(**projection.view(geom), most=0)
@@ -30,7 +30,7 @@ def test_blocks_have_the_surfels_and_pixels_of_the_fragments(
 ) -> None:
     case = random_scene(surfels, seed, width=width, height=height)
     camera = camera_of(case, dtype)
-    case.params["log_scales"][::3, 0] -= 3  # needles
+    case.params["log_scales"][::3, 0] -= 3  # long and thin
     projection = ops.project(*(case.params[key].to(dtype) for key in SURFEL_KEYS), camera)
     found = blocks_of(projection)
     across = -(-width // TILE)
@@ -62,7 +62,7 @@ def test_blocks_have_the_surfels_and_pixels_of_the_fragments(
 
 
 def test_places_are_listed_when_they_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A step without a field, and what it is looked at for, need none: 8 bytes per fragment."""
+    """Steps without a field need none, which saves 8 bytes per fragment."""
     made = []
     monkeypatch.setattr(trace_cpu, "empty_ids", lambda *given: made.append(given) or empty_ids(*given))
     case = random_scene(80, 1, width=64, height=48)

@@ -1,4 +1,4 @@
-"""Tile bounds: no fragment is lost. Every scene is drawn with and without bounds and must come out the same."""
+"""Tile bounds lose no fragment: scenes are drawn with and without bounds and must agree."""
 
 from dataclasses import replace
 
@@ -34,7 +34,7 @@ from tests.ops.golden import (
 def test_every_fragment_of_the_brute_force_is_found(
     prefilter: str, seed: int, scale: float, ratio: float, opacity: float, beta: float, closer: float
 ) -> None:
-    """One surfel a scene, so that transmittance ends nothing: sizes, axis ratios to 1e5, any tilt, near the camera."""
+    """One surfel per scene, so that nothing is occluded: sizes, axis ratios to 1e5, any tilt, near the camera."""
     case = random_scene(1, seed, width=70, height=50)
     p = case.params
     camera_position = -case.viewmat[:3, :3].T @ case.viewmat[:3, 3]
@@ -61,7 +61,7 @@ def test_bounds_leave_most_tiles_out() -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 @pytest.mark.parametrize("seed", range(4))
 def test_discs_across_the_camera_plane_are_listed_where_they_show(seed: int, dtype: torch.dtype) -> None:
-    """Such a disc has no box. It is left out beyond the image's borders, and listed in tiles that it reaches."""
+    """Discs without a box are culled beyond the borders and listed in tiles that they reach."""
     case = crossing_scene(120, seed)
     fragments, projection = traced(case, [case.params[name].to(dtype) for name in SURFEL_KEYS])
     want = reference(case, [case.params[name] for name in SURFEL_KEYS]).weight
@@ -70,14 +70,14 @@ def test_discs_across_the_camera_plane_are_listed_where_they_show(seed: int, dty
     shown, seen = tiles_reached(want, case.width, case.height), projection.radii[:, 0] > 0
     assert (shown == 0).sum() > 40 and (shown > 0).sum() > 40
     assert not ((shown > 0) & ~seen).any()
-    assert (seen & (shown == 0)).sum() <= 20  # by no one border alone
+    assert (seen & (shown == 0)).sum() <= 20  # not beyond a single border
     tracer = backend.kernel_class("Trace", projection.geom)()
     tracer.run(**projection.view(projection.geom.detach()), most=0)
     assert tracer.pairs <= 1.25 * int(shown.sum())
 
 
 def test_a_disc_out_of_view_keeps_its_low_pass() -> None:
-    """A disc along the plane of the left border, a third of a pixel beyond it, that crosses the camera's plane."""
+    """A disc parallel to the plane of the left border, a third of a pixel beyond it, across the camera's plane."""
     case = crossing_scene(1, 0, width=40, height=30)
     case = replace(case, viewmat=torch.eye(4, dtype=torch.float64))
     fx, cx = case.K[0, 0].item(), case.K[0, 2].item()

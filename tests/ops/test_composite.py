@@ -8,7 +8,7 @@ from bitymi_ns.ops.fragment_list import Layout
 
 
 def a_list(weight: torch.Tensor, width: int = 4, height: int = 3) -> Fragments:
-    """Fragments that lie in turn on the pixels."""
+    """Make fragments that cycle through the pixels."""
     n = len(weight)
     pixel = torch.arange(n, dtype=torch.int32) % (width * height)
     nothing = torch.zeros(n)
@@ -23,7 +23,7 @@ def test_soft_overdraw_is_the_sum_over_a_pixel():
     for pixel, weight in zip(fragments.pixel.tolist(), w.double().tolist(), strict=True):
         expected[pixel] += weight / (weight + 0.005)
     torch.testing.assert_close(soft_overdraw(fragments, 0.005).double(), expected, rtol=1e-6, atol=0)
-    # with a half of next to nothing it counts
+    # a tiny half gives the count
     count = fragments.overdraw().flatten().float()
     torch.testing.assert_close(soft_overdraw(fragments, 1e-12), count, rtol=1e-6, atol=0)
     w = torch.linspace(1e-4, 1, 50, dtype=torch.float64, requires_grad=True)

@@ -1,4 +1,4 @@
-"""Numbers of the formulas: stated once in csrc, read from there, and the same in the float64 twins."""
+"""Constants are stated once in csrc, read from there, and equal in the float64 twins."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Operations that one kind of device has no kernel for say so."""
+"""Operations report devices for which they have no kernel."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""The compiled kernels against the golden renders, the float64 references and finite differences."""
+"""Compiled kernels against golden renders, float64 references and finite differences."""
 
 from dataclasses import replace
 
@@ -44,8 +44,8 @@ def images(output) -> dict[str, Tensor]:
 
 
 def check_gradient(got: Tensor, want: Tensor, name: str) -> None:
-    """Double agrees everywhere, single in 97 % of the numbers to 1e-4: where a rim passes within rounding of a pixel
-    centre the kernel's derivative amplifies that rounding by up to 1 / rim."""
+    """Compare gradients: double everywhere, single to 1e-4 in 97 % of the numbers, as the kernel's derivative amplifies
+    rounding by up to 1 / rim where a rim passes near a pixel centre."""
     if got.dtype == torch.float64:
         assert relative(got, want) < 1e-10, name
         return
@@ -80,7 +80,7 @@ def test_golden_images_and_gradients(name: str, dtype: torch.dtype) -> None:
         else:  # the thresholds of alpha and transmittance may flip in single precision
             assert (error < 1e-4).double().mean() > 0.999, key
     assert torch.equal(output.overdraw[..., 0].double(), golden.outputs["overdraw"].double())
-    # single precision is held against double with the same bound at the rim
+    # single precision is compared with double at the same rim bound
     wanted = run(torch.float64, 1e-3)[2] if single else golden.grads
     for key, want in wanted.items():
         check_gradient(grads[key], want, key)
@@ -93,7 +93,7 @@ def test_golden_textured_scene_through_the_baked_renderer(dtype: torch.dtype) ->
     scene = BakedScene(params, "sv", *atlas_of(golden), weight_bound=0.0)
     output = scene.render(camera_of(golden, dtype), golden.background.to(dtype), maps=True)
     for key, image in images(output).items():
-        # texels are single precision in either case
+        # texels are always single precision
         assert relative(image, golden.outputs[key]) < (3e-8 if dtype == torch.float64 else 1e-4), key
     assert torch.equal(output.overdraw[..., 0].double(), golden.outputs["overdraw"].double())
 
@@ -122,7 +122,7 @@ def test_texels_of_bytes_are_those_of_floats() -> None:
 
 
 def test_every_tile_has_its_own_extent() -> None:
-    """Texels that are linear in u and v: smaller tiles give the same between their outer texel centres."""
+    """Texels linear in u and v: smaller tiles agree between their outer texel centres."""
     params = {
         "means": torch.tensor([[0.0, 0.0, 4.0]]),
         "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
@@ -221,7 +221,7 @@ def test_field_against_the_reference(contract: bool, count: int) -> None:
         atol=1e-11,
     )
     single = make_field(contract, torch.float32)
-    # a position within rounding of a cell's face may fall in the neighbouring cell, where the value is the same
+    # a position near a cell's face may round into the neighbouring cell, where the value is the same
     torch.testing.assert_close(single(x.float()).double(), field_reference(single, x.float()), rtol=1e-3, atol=1e-3)
 
 

@@ -1,4 +1,4 @@
-"""The gradient of a view with respect to its camera's pose, against finite differences."""
+"""Gradients of a view with respect to the camera's pose, against finite differences."""
 
 import pytest
 import torch
@@ -8,12 +8,12 @@ from bitymi_ns.scene import Camera, Scene, SceneConfig
 from bitymi_ns.train.poses import moved
 from tests.ops.golden import SceneCase, load_golden, random_scene, relative
 
-SMOOTH = ["inside_the_scene", "many_layers", "soft_discs", "subpixel", "thin"]  # no threshold flips within a difference
+SMOOTH = ["inside_the_scene", "many_layers", "soft_discs", "subpixel", "thin"]  # no threshold within a difference
 STEP = 1e-7
 
 
 def loss_of(case: SceneCase, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu"):
-    """Return a function from a motion of the camera to a weighted sum of colours and depths."""
+    """Return a function from a camera motion to a weighted sum of colours and depths."""
     params = {name: value.to(device, dtype) for name, value in case.params.items()}
     scene = Scene(SceneConfig(texture="none", rim=1e-12, near=0.2), params, None)
     shape = (case.height, case.width, 3)
@@ -52,7 +52,7 @@ def test_random_surfels_and_quaternions_of_any_length(seed: int, length: float) 
     case = random_scene(40, seed, width=24, height=20)
     case.params["quats"] *= length
     loss = loss_of(case)
-    assert relative(gradient(loss), differences(loss)) < 2e-3  # discs' rims pass pixels
+    assert relative(gradient(loss), differences(loss)) < 2e-3  # rims cross pixels
 
 
 def test_surfels_that_are_not_finite_or_behind_the_camera_count_for_nothing() -> None:

@@ -1,4 +1,4 @@
-"""The kernel seen through a pixel: against the reference, its moments, no holes, no jumps."""
+"""The pixel prefilter: against the reference, its moments, continuity, no holes."""
 
 import math
 from dataclasses import replace
@@ -63,7 +63,7 @@ def test_fragments_and_gradients_agree_with_the_reference(scale: float, dtype: t
 def disc(
     scale: tuple[float, float], tilt: float, beta: float, at: tuple[float, float]
 ) -> tuple[SceneCase, list[Tensor]]:
-    """One disc at depth 10 in a 32 x 32 view of focal length 100, its centre at the given pixel position."""
+    """Make one disc at depth 10 in a 32 x 32 view of focal length 100, centred at a pixel position."""
     case = random_scene(1, 0, 32, 32)
     case.viewmat = torch.eye(4, dtype=torch.float64)
     case.K = torch.tensor([[100.0, 0, 16], [0, 100.0, 16], [0, 0, 1]], dtype=torch.float64)
@@ -77,8 +77,8 @@ def disc(
 @pytest.mark.parametrize("beta", [0.2, 1.0, 3.5])
 @pytest.mark.parametrize("size", [0.3, 0.1, 0.02])
 def test_small_discs_cover_their_area_wherever_they_lie(size: float, beta: float) -> None:
-    """Over all places in a pixel, the mean of the sum of the kernel is the projected area 9 pi s_u s_v f^2 / z^2 /
-    (beta + 1) and its centre the disc's; at none of them is it lost."""
+    """Averaged over positions in a pixel, the kernel's sum is the projected area 9 pi s_u s_v f^2 / z^2 / (beta + 1),
+    centred on the disc; it is lost at none of them."""
     area = math.pi * 9 * size**2 / (beta + 1)
     pixels = reference_trace.pixel_centers(32, 32)
     sums, centers = [], []
@@ -86,7 +86,7 @@ def test_small_discs_cover_their_area_wherever_they_lie(size: float, beta: float
         at = (15 + (k % 6) / 6, 15 + (k // 6) / 6)
         case, values = disc((size / 10, size / 10), 0.0, beta, at)
         projected = reference_project.project(*values, case.viewmat, case.K)
-        kernel, _, _ = reference_trace._filtered(projected, pixels, 0.2)  # without the threshold of 1/255
+        kernel, _, _ = reference_trace._filtered(projected, pixels, 0.2)  # without the threshold 1/255
         sums.append(float(kernel.sum()))
         centers.append((kernel * pixels).sum(0) / kernel.sum() - torch.tensor(at))
     assert sum(sums) / len(sums) == pytest.approx(area, rel=0.02)
@@ -95,7 +95,7 @@ def test_small_discs_cover_their_area_wherever_they_lie(size: float, beta: float
 
 
 def test_discs_that_turn_edge_on_fade_with_the_cosine() -> None:
-    """The low pass leaves a blob of three pixels' worth at any angle."""
+    """The low pass leaves a blob of about three pixels at any angle."""
     angles = (60.0, 85.0, 89.0, 89.5, 89.9, 89.99)
     covered, blob = [], []
     for degrees in angles:

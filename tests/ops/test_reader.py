@@ -1,4 +1,4 @@
-"""Kernels take their arguments by keyword, and name the one that is wrong."""
+"""Kernels take keyword arguments, and name a wrong one."""
 
 import pytest
 import torch
@@ -55,7 +55,7 @@ def test_arrays_are_tensors_parameters_or_of_numpy() -> None:
         kernels.ssim_f32(**given)
         found.append(float(given["value"]))
     assert len(set(found)) == 1 and 0.0 < found[0] < 1.0
-    memory = torch.zeros(4 * 144 + 1, dtype=torch.uint8).numpy()  # askew, which numpy permits
+    memory = torch.zeros(4 * 144 + 1, dtype=torch.uint8).numpy()  # misaligned, which numpy permits
     with pytest.raises((TypeError, ValueError), match="ssim_f32: a must"):
         kernels.ssim_f32(**arguments(a=memory[1:].view("f4")))
 

@@ -1,4 +1,4 @@
-"""The residual field's float64 reference against nerfstudio's hash encoding and closed forms."""
+"""The field's float64 reference against nerfstudio's hash encoding and closed forms."""
 
 import pytest
 import torch
@@ -11,11 +11,11 @@ def rand(*shape: int, seed: int = 0) -> torch.Tensor:
 
 
 def test_encoding_agrees_with_nerfstudio() -> None:
-    """nerfstudio's levels have floor(min_res growth^l) cells; with growth 2 the two scale alike."""
+    """nerfstudio's levels have floor(min_res growth^l) cells; with growth 2 both agree."""
     encodings = pytest.importorskip("nerfstudio.field_components.encodings")
     levels, size, features = 4, 12, 4
     other = encodings.HashEncoding(levels, 16, 128, size, features, implementation="torch")
-    other.scalings = 16.0 * 2.0 ** torch.arange(levels)  # its floor of an inexact power may be one short
+    other.scalings = 16.0 * 2.0 ** torch.arange(levels)  # avoids its floor of inexact powers
     other.hash_table.data = other.hash_table.data.double()
     c = torch.cat([rand(200, 3), torch.tensor([[0.0, 0.5, 1.0], [0.25, 0.25, 0.75]], dtype=torch.float64)])
     mine = c.clone().requires_grad_()
@@ -26,7 +26,7 @@ def test_encoding_agrees_with_nerfstudio() -> None:
     (other(theirs) * weight).sum().backward()
     assert torch.allclose(encode(c, table, 16), other(c), atol=1e-12)
     assert torch.allclose(table.grad, other.hash_table.grad.reshape(table.shape), atol=1e-12)
-    assert torch.allclose(mine.grad[:200], theirs.grad[:200], atol=1e-9)  # on a cell's face the slope is one-sided
+    assert torch.allclose(mine.grad[:200], theirs.grad[:200], atol=1e-9)  # slopes on a cell's face are one-sided
 
 
 def test_hash_is_uint32_arithmetic() -> None:
@@ -50,7 +50,7 @@ def test_contraction() -> None:
 
 
 def test_gradients() -> None:
-    """By finite differences, inside and outside the unit ball."""
+    """Finite differences inside and outside the unit ball."""
     table, mid = 0.5 * rand(2, 2**6, 4), torch.zeros(3, dtype=torch.float64)
     w1, w2, w3 = rand(8, 16, seed=1) - 0.5, rand(16, 16, seed=2) - 0.5, rand(16, 3, seed=3) - 0.5
     x = torch.cat([rand(4, 3, seed=4), 3 * rand(4, 3, seed=5) + 1])

@@ -1,4 +1,4 @@
-"""The brute-force float64 renderer against the golden renders, against gsplat, and on numbers that misbehave."""
+"""The brute-force float64 renderer against golden renders, gsplat, and extreme numbers."""
 
 from types import SimpleNamespace
 
@@ -98,7 +98,7 @@ def test_homography_and_normal_agree_with_gsplat() -> None:
 
 
 def test_a_disc_facing_the_camera_has_a_normal_towards_it() -> None:
-    """A disc in the plane z = 2 in front of a camera at the origin: its normal is (0, 0, -1) wherever it is seen."""
+    """A disc in the plane z = 2 before a camera at the origin has the normal (0, 0, -1) everywhere."""
     one = torch.ones(1, dtype=torch.float64)
     K = torch.tensor([[10.0, 0, 8], [0, 10, 8], [0, 0, 1]], dtype=torch.float64)
     camera = SimpleNamespace(viewmat=torch.eye(4, dtype=torch.float64), K=K, width=16, height=16)
@@ -118,7 +118,7 @@ def test_a_disc_facing_the_camera_has_a_normal_towards_it() -> None:
 
 
 def test_a_residual_field_equal_to_a_tile_gives_the_same_picture() -> None:
-    """A constant tile and a constant field are the same texture."""
+    """A constant tile equals a constant field."""
     case = random_scene(10, 5)
     add = torch.tensor([0.2, -0.3, 0.1], dtype=torch.float64)
     colors = sv(*(case.params[key] for key in SV_KEYS), view_directions(case.params["means"], case.viewmat))

@@ -1,4 +1,4 @@
-"""The bilinear tile fetch's float64 reference."""
+"""The float64 reference of the bilinear texel fetch."""
 
 import torch
 

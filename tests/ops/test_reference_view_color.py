@@ -1,4 +1,4 @@
-"""The view colours' float64 references against other implementations and closed forms."""
+"""The float64 references of view colours against other implementations and closed forms."""
 
 import math
 
@@ -23,7 +23,7 @@ def test_sh_agrees_with_gsplat(degree: int) -> None:
 
 
 def test_sh_basis_is_orthonormal() -> None:
-    """Integrals over the sphere by Gauss-Legendre in z and a trapezoid in longitude, exact for degree 6."""
+    """Integrates over the sphere by Gauss-Legendre in z and the trapezoidal rule in longitude, exact for degree 6."""
     z = torch.tensor([-0.932469514203152, -0.661209386466265, -0.238619186083197], dtype=torch.float64)
     weight = torch.tensor([0.171324492379170, 0.360761573048139, 0.467913934572691], dtype=torch.float64)
     z, weight = torch.cat([z, -z]), torch.cat([weight, weight])
@@ -57,7 +57,7 @@ def test_sv_ignores_the_length_of_a_site_and_takes_length_zero() -> None:
 
 
 def test_sb_on_the_lobe_axis_behind_it_and_beside_it() -> None:
-    """At d = mu the lobe adds softplus(rgb), 0.1 for rgb = 0; behind, nothing."""
+    """At d = mu the lobe adds softplus(rgb), 0.1 for rgb = 0; behind it, nothing."""
     theta, phi = 0.7, 2.1
     mu = torch.tensor([[math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)]]).double()
     lobes = torch.tensor([[[0.0, 0.0, 0.0, theta, phi, 0.3]]], dtype=torch.float64, requires_grad=True)

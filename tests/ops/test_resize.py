@@ -1,4 +1,4 @@
-"""Surfels in views of another size than the photographs: against the reference, and what a pixel averages."""
+"""Surfels in views of another size than the photographs: against the reference and pixel averages."""
 
 import math
 
@@ -20,7 +20,7 @@ from tests.ops.golden import camera_of
 
 
 def drawn(case: SceneCase, photo_pixel: float) -> torch.Tensor:
-    """[H, W, 4] rgb and alpha of a case, float32."""
+    """Render [H, W, 4] rgb and alpha of a case, float32."""
     return baked_cpu.frame(scene_of(case), camera_of(case, torch.float32), False, photo_pixel)[0]
 
 
@@ -38,7 +38,7 @@ def test_coverage_depth_and_normals_agree_with_the_reference(scale: float, photo
         4: want.weight @ projected.beta,
         5: torch.where(want.blended, want.weight * want.depth, 0.0).sum(1),
     }
-    same = overdraw[..., 0] == want.blended.sum(1).reshape(shape)  # a fragment of 1/255 may be drawn by one alone
+    same = overdraw[..., 0] == want.blended.sum(1).reshape(shape)  # fragments near 1/255 may differ
     assert same.double().mean() > 0.998
     for channel, expected in pairs.items():
         error = (image[..., channel].double() - expected.reshape(shape)).abs()[same]
@@ -49,7 +49,7 @@ def test_coverage_depth_and_normals_agree_with_the_reference(scale: float, photo
 @pytest.mark.parametrize("size", [3.0, 0.4, 0.05])
 @pytest.mark.parametrize("beta", [0.3, 2.0, 3.8])
 def test_a_disc_keeps_what_it_covers_when_it_is_drawn_smaller(size: float, beta: float) -> None:
-    """Over all places in a pixel, the mean of a disc's coverage at a quarter of the size is that of the photograph."""
+    """Averaged over positions in a pixel, the coverage of a disc at a quarter of the size equals the photograph's."""
 
     def covered(scale: float, photo_pixel: float) -> float:
         width, total = 48, 0.0
@@ -100,7 +100,7 @@ def test_resized_surfels_are_neither_traced_nor_learned() -> None:
 
 
 def checkerboard(side: int, tiles: list[list[int]] | None = None) -> tuple[BakedScene, SceneCase]:
-    """A square that fills the view, with a tile of black and white texels."""
+    """Make a square that fills the view, with a tile of black and white texels."""
     case = random_scene(1, 0, 16, 16)
     case.viewmat = torch.eye(4, dtype=torch.float64)
     params = {

@@ -1,5 +1,4 @@
-"""Texels of surfels: against the float64 reference, finite differences and the baked renderer; lists of a part of the
-fragments, and coverage."""
+"""Texels: against the float64 reference, finite differences and the baked renderer; partial lists; coverage."""
 
 import functools
 from dataclasses import replace
@@ -22,7 +21,7 @@ SIZES = [(4, 8), (1, 1), (8, 4), (0, 0), (4, 4), (16, 4)]
 def listed(
     case: SceneCase, dtype: torch.dtype, device: torch.device | str = "cpu"
 ) -> tuple[ops.Fragments, ops.Projection]:
-    """The fragments of a scene and its projection."""
+    """Trace a scene: fragments and projection."""
     camera = Camera(case.viewmat.to(device, dtype), case.K.to(device, dtype), case.width, case.height)
     with torch.no_grad():
         projection = ops.project(*(case.params[key].to(device, dtype) for key in SURFEL_KEYS), camera)
@@ -30,7 +29,7 @@ def listed(
 
 
 class Case:
-    """A view of a random scene whose surfels have tiles of several sizes and extents."""
+    """A view of a random scene whose tiles have several sizes and extents."""
 
     def __init__(
         self,
@@ -54,7 +53,7 @@ class Case:
         self.texels = uniform(-0.6, 0.6, self.tiles.count, 3)
 
     def image(self, base: Tensor, texels: Tensor, fragments: ops.Fragments | None = None, **options) -> Tensor:
-        """[H W, 3]."""
+        """Render [H W, 3]."""
         drawn = (self.fragments if fragments is None else fragments, self.projection, base, texels, self.tiles)
         return ops.blended_image(*drawn, **options)[:, :3]
 
@@ -84,7 +83,7 @@ def test_image_and_gradients_against_the_reference(dtype: torch.dtype, bound: fl
 
 
 def one_surfel(uv: Tensor, weight: Tensor) -> tuple[ops.Fragments, ops.Projection]:
-    """Fragments of one surfel in a row of pixels, given their coordinates [2, F] and weights [F]."""
+    """Make fragments of one surfel in a row of pixels from coordinates [2, F] and weights [F]."""
     fragments, projection = row_of_pixels(len(weight), weight.dtype, weight.device, cuda_backend(weight.device))
     order = fragments.pixel.long()
     return replace(fragments, uv=uv[:, order], weight=weight[order]), projection
@@ -94,7 +93,7 @@ def one_surfel(uv: Tensor, weight: Tensor) -> tuple[ops.Fragments, ops.Projectio
 def row_of_pixels(
     count: int, dtype: torch.dtype, device: torch.device, cuda: bool
 ) -> tuple[ops.Fragments, ops.Projection]:
-    """A surfel that covers a row of pixels; `cuda`: by those kernels."""
+    """Make a surfel that covers a row of pixels; `cuda`: with CUDA's layout."""
     like = torch.empty(0, dtype=dtype, device=device)
     K = torch.tensor([[100.0, 0.0, count / 2], [0.0, 100.0, 0.5], [0.0, 0.0, 1.0]]).to(like)
     surfel = [[0.0, 0.0, 2.0]], [[1.0, 0.0, 0.0, 0.0]], [[2.0, 2.0]], [4.0], [0.0]
@@ -113,7 +112,7 @@ def row_of_pixels(
     st.integers(0, 2**31),
 )
 def test_gradients_by_finite_differences(size: tuple[int, int], extent: float, seed: int) -> None:
-    """Between the texel centres and beyond the outer ones, in tiles of any size."""
+    """Between texel centres and beyond the outer ones, for tiles of any size."""
     g = torch.Generator().manual_seed(seed)
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
@@ -121,7 +120,7 @@ def test_gradients_by_finite_differences(size: tuple[int, int], extent: float, s
 
     cell = torch.stack([torch.randint(-2, side + 2, (12,), generator=g) for side in size]) + uniform(0.05, 0.95, 2, 12)
     sides = torch.tensor(size, dtype=torch.float64)[:, None]
-    uv = (cell + 0.5) / sides * 2 * extent - extent  # `cell` texels from the first one's centre
+    uv = (cell + 0.5) / sides * 2 * extent - extent  # `cell` in texels from the first centre
     tiles = ops.TexelTiles.of_sizes(torch.tensor([size]), torch.tensor([extent], dtype=torch.float64))
     base, texels = uniform(-0.4, 0.5, 1, 3), uniform(0.1, 0.6, tiles.count, 3)
     weight = torch.where(torch.arange(12) % 4 == 0, 0.01, 0.02).double()
@@ -139,7 +138,7 @@ def test_gradients_by_finite_differences(size: tuple[int, int], extent: float, s
 
 
 def test_colors_at_the_borders() -> None:
-    """At the outer centres the slope is 0, and a weight at the bound has its residual."""
+    """At the outer centres the slope is 0, and a weight at the bound has a residual."""
     tiles = ops.TexelTiles.of_sizes(torch.tensor([[4, 4]]), torch.tensor([2.0]))
     texels = torch.arange(16.0)[:, None].expand(-1, 3).contiguous()
     centre = 1.5
@@ -168,7 +167,7 @@ def test_it_is_what_the_baked_renderer_shows() -> None:
 
 
 def check_parts(case: Case) -> None:
-    """Two lists of a part of the fragments each: their numbers, ids, images and gradients."""
+    """Check two partial lists: numbers, ids, images and gradients."""
     f = case.fragments
     keep = f.weight >= 0.1
     parts = [ops.select(f, each) for each in (keep, ~keep, torch.zeros_like(keep), torch.ones_like(keep))]
@@ -188,7 +187,7 @@ def check_parts(case: Case) -> None:
     bright, faint, none, every = map(drawn, parts)
     whole = drawn(f)
     assert not any(t.any() for t in none) and torch.equal(every[0], whole[0])
-    torch.testing.assert_close(every[1], whole[1], rtol=1e-12, atol=1e-12)  # in another order of sums, on CUDA
+    torch.testing.assert_close(every[1], whole[1], rtol=1e-12, atol=1e-12)  # sums in another order on CUDA
     for a, b, both in zip(bright, faint, whole, strict=True):
         assert a.any() and b.any()
         torch.testing.assert_close(a + b, both, rtol=1e-12, atol=1e-12)
@@ -201,7 +200,7 @@ def test_a_part_of_the_fragments_gives_its_part_of_the_image() -> None:
 
 
 def check_coverage(case: Case, masked: bool) -> None:
-    """Against the gradient of the image of all pixels that count, of surfels so bright that no channel is cut off."""
+    """Compare coverage with the gradient of the summed image of bright surfels, whose channels are not clipped."""
     f = case.fragments
     mask = None
     if masked:
@@ -212,7 +211,7 @@ def check_coverage(case: Case, masked: bool) -> None:
     for power in (1, 2):
         weighed = replace(f, weight=f.weight.pow(power))
         image = case.image(torch.zeros_like(case.base), texels, weighed, bound=0.05**power)
-        want.append(1 + torch.autograd.grad((image * counts).sum(), texels)[0])  # 1: of views before
+        want.append(1 + torch.autograd.grad((image * counts).sum(), texels)[0])  # 1: initial value
     got = [torch.ones_like(case.texels) for _ in want]
     ops.add_texel_coverage([f], case.tiles, mask, 0.05, *got)
     assert want[0].max() > 2

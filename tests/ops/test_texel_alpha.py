@@ -1,4 +1,4 @@
-"""Alpha texels: the fragments they leave, and gradients, against differences and a loop over pixels."""
+"""Alpha texels: fragments and gradients against finite differences and a loop over pixels."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_gradients_are_those_of_differences(scene, bound, prefilter):
     def loss() -> Tensor:
         projection = ops.project(*(values[name] for name in NAMES[:5]), camera, 0.05, prefilter)
         cut = replace(projection, alpha=ops.TexelAlpha(tiles, values["alpha"], bound))
-        fragments = ops.trace(cut, rim=0.0 if prefilter == "pixel" else 1e-3)  # 0: the exact derivative there
+        fragments = ops.trace(cut, rim=0.0 if prefilter == "pixel" else 1e-3)  # 0: exact derivative
         return (ops.blended_image(fragments, projection, values["base"], values["texels"], tiles, 0.0) * weights).sum()
 
     for value in values.values():

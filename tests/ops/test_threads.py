@@ -1,4 +1,4 @@
-"""Idle threads sleep: between parallel regions no processor time passes."""
+"""Idle threads sleep: they take no CPU time between parallel regions."""
 
 import os
 import subprocess
@@ -40,7 +40,7 @@ print(before, imported, threads())
 
 
 def printed(script: str, **environment: str) -> list[float]:
-    """The numbers that a script prints in a fresh process."""
+    """Run a script in a new process; returns the numbers it prints."""
     inherited = {k: v for k, v in os.environ.items() if not k.startswith(("OMP_", "GOMP_"))}
     done = subprocess.run(
         [sys.executable, "-c", script], env={**inherited, **environment}, capture_output=True, text=True, check=True
@@ -49,7 +49,7 @@ def printed(script: str, **environment: str) -> list[float]:
 
 
 def processor_time(**environment: str) -> tuple[float, float]:
-    """CPU seconds of mostly idling, before and after the kernels are made ready, in a fresh process."""
+    """Measure the CPU seconds of idling in a new process, before and after kernels are set up."""
     before, after = printed(SCRIPT, **environment)
     return before, after
 
@@ -65,7 +65,7 @@ def test_the_import_starts_no_threads() -> None:
 @spinning
 @pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="threads are counted under /proc")
 def test_a_process_of_one_thread_stays_one() -> None:
-    """Many such processes on a machine of many processors would else have thousands of threads."""
+    """Otherwise many such processes on a large machine would have thousands of threads."""
     _, imported, ready = printed(IMPORT, OMP_NUM_THREADS="1")
     assert ready == imported
 

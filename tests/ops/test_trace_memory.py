@@ -1,4 +1,4 @@
-"""Memory of the CPU kernels for a long fragment list, in a process of its own."""
+"""Memory of the CPU kernels for a long fragment list, in its own process."""
 
 import os
 import subprocess

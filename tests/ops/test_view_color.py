@@ -1,4 +1,4 @@
-"""View colours, all or lean, against the float64 references."""
+"""View colours, full or lean, against the float64 references."""
 
 import pytest
 import torch
@@ -41,7 +41,7 @@ def test_view_colors_against_the_reference_and_gradcheck(kind: str) -> None:
 
 
 def lean_parameters(kind: str, n: int, dtype: torch.dtype = torch.float64) -> dict[str, Tensor]:
-    """Lean colours with 0, 1, 2, ... terms, or those of whole degrees; the terms of the last surfel come first."""
+    """Make lean colours with 0, 1, 2, ... terms, or whole degrees; the last surfel's terms come first."""
     g = torch.Generator().manual_seed(6)
     counts = torch.tensor([(0, 3, 8, 15)[i % 4] if kind == "sh" else i % 7 for i in range(n)])
     ends = counts.flip(0).cumsum(0).flip(0)
@@ -71,7 +71,7 @@ def test_lean_spherical_voronoi_is_the_same_colour_relative_to_its_first_site() 
     g = torch.Generator().manual_seed(8)
     n = 9
     sites, log_tau, rgb = (torch.randn(n, 7, *s, generator=g, dtype=torch.float64) for s in ((3,), (), (3,)))
-    log_tau[0] = 9.0  # one site takes all
+    log_tau[0] = 9.0  # one site dominates
     vectors = torch.nn.functional.normalize(sites, dim=-1) * log_tau.exp()[..., None]
     terms = torch.cat([vectors[:, 1:] - vectors[:, :1], rgb[:, 1:]], dim=-1)
     span = torch.stack([6 * torch.arange(n), torch.full((n,), 6)], dim=1).int()

@@ -1,4 +1,4 @@
-"""The entries of `VIEW_COLORS`: each agrees with itself, the kernels and the float64 twin."""
+"""Entries of `VIEW_COLORS` are consistent with themselves, the kernels and the float64 twin."""
 
 from typing import get_type_hints
 
@@ -38,7 +38,7 @@ def test_an_entry_agrees_with_itself_the_kernels_and_the_twin(kind: str) -> None
         assert len(parameter.limit) in (1, parameter.shape[-1]) and 0 < parameter.share <= 1
         assert hasattr(LearningRates(), parameter.rate)
     assert len(entry.lean_limit) in (1, entry.lean_width)
-    if entry.sites is None:  # a lean colour is then the parameters themselves
+    if entry.sites is None:  # the lean colour has the same parameters
         first, second = entry.parameters
         assert first.shape == (3,) and second.width == entry.lean_width and second.limit == entry.lean_limit
 

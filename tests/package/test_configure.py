@@ -1,4 +1,4 @@
-"""What CMake makes of the machine: which CPU and which cards the kernels are compiled for."""
+"""CMake's detection of the machine: CPU and GPU architectures to compile for."""
 
 import shutil
 import subprocess
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.skipif(not (CMAKE and NINJA), reason="cmake or ninja is
 
 
 def configure(folder: Path, **definitions: str) -> str:
-    """Configures a build in `folder`; what CMake printed."""
+    """Configure a build in `folder`; returns CMake's output."""
     definitions = {"Python_EXECUTABLE": sys.executable, "CMAKE_MAKE_PROGRAM": str(NINJA), **definitions}
     options = [f"-D{name}={value}" for name, value in definitions.items()]
     command = [str(CMAKE), "-S", str(ROOT), "-B", str(folder), "-G", "Ninja", *options]
@@ -25,14 +25,14 @@ def configure(folder: Path, **definitions: str) -> str:
 
 
 def cpu_features(folder: Path) -> dict[str, set[str]]:
-    """What the record in a build folder says that each module needs of a CPU."""
+    """Read from a build folder which CPU features each module needs."""
     names: dict[str, dict[str, str]] = {}
     exec((folder / "_cpu_features.py").read_text("utf8"), names)
     return {name: set(features.split()) for name, features in names["FEATURES"].items()}
 
 
 def march(folder: Path) -> set[str]:
-    """The CPUs that files in a build folder are compiled for."""
+    """List the CPUs that a build folder's files are compiled for."""
     words = (folder / "compile_commands.json").read_text("utf8").split()
     return {word.removeprefix("-march=") for word in words if word.startswith("-march=")}
 

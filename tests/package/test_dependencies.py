@@ -1,4 +1,4 @@
-"""What the package imports itself is what it declares: nothing comes by way of another package."""
+"""Imports equal the declared dependencies, without transitive ones."""
 
 import ast
 import re
@@ -18,11 +18,11 @@ else:
 PACKAGE = Path(bitymi_ns.__file__).parent
 PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text("utf8"))["project"]
 MODULES = {"opencv_python_headless": "cv2", "pillow": "PIL", "pyyaml": yaml.__name__}
-"""Import names that are not the package's own."""
+"""Import names that differ from the package's name."""
 
 
 def declared() -> set[str]:
-    """Import names of the dependencies and of what extends the package for its users."""
+    """List the import names of dependencies and extras."""
     extras = PROJECT["optional-dependencies"]
     listed = PROJECT["dependencies"] + [line for name, lines in extras.items() if name != "dev" for line in lines]
     names = [re.split(r"[^\w-]", line)[0].replace("-", "_") for line in listed]
@@ -30,7 +30,7 @@ def declared() -> set[str]:
 
 
 def imported() -> dict[str, Path]:
-    """Top-level names of other packages that some module imports, and one that does."""
+    """Map top-level names of imported packages to a module that imports them."""
     found = {}
     for path in PACKAGE.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text("utf8"))):

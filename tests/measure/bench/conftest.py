@@ -1,4 +1,4 @@
-"""Stand-ins for nerfstudio's console scripts: they write what the real ones would, in no time, and keep a log."""
+"""Stubs of nerfstudio's console scripts, which write what the real ones would and keep a log."""
 
 import json
 import os
@@ -62,7 +62,7 @@ elif "pictures" in sys.argv:
 
 
 def manifest(format: str) -> str:
-    """bundle.json of a scene of 100 surfels."""
+    """Write the bundle.json of a scene of 100 surfels."""
     files = {name: {"bytes": size, "sha256": "0" * 64} for name, size in (("surfels.ply", 1000), ("atlas.ktx2", 5000))}
     info = {
         "version": "1.3",
@@ -85,7 +85,7 @@ TOOLS = ("ns-train", "ns-export", "ns-eval", "bitymi")
 
 
 class Fakes:
-    """The stand-ins: what was called, which calls fail, and (`slow`) which wait until they are no longer named."""
+    """The stubs: calls so far, calls that fail, and calls that block (`slow`) until no longer named."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -99,17 +99,17 @@ class Fakes:
             (folder / name).chmod(0o755)
 
     def calls(self) -> list[str]:
-        """Command lines so far, and forget them."""
+        """Return and clear the command lines so far."""
         lines = self.log.read_text().splitlines()
         self.log.write_text("")
         return lines
 
     def fail(self, *lines: str) -> None:
-        """Calls that contain all words of one of the lines end with status 3."""
+        """Make calls with all words of one of the lines exit with status 3."""
         self.plan.write_text("\n".join(lines))
 
     def python(self, monkeypatch: pytest.MonkeyPatch) -> str:
-        """A Python that finds the stand-ins beside it, for code in other processes."""
+        """Return a Python that finds the stubs beside it, for other processes."""
         link = self.folder / "python"
         link.symlink_to(Path(sys.executable).resolve())
         started = self.folder / "site"
@@ -122,7 +122,7 @@ class Fakes:
 
 @pytest.fixture
 def fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fakes:
-    """Stand-ins in the place of the console scripts."""
+    """Stubs in place of the console scripts."""
     folder = tmp_path / "bin"
     folder.mkdir()
     found = Fakes(folder)
@@ -132,7 +132,7 @@ def fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fakes:
 
 @pytest.fixture
 def capture(tmp_path: Path) -> Callable[[str], Path]:
-    """Make the folder of a capture."""
+    """Return a function that makes a capture's folder."""
 
     def make(name: str) -> Path:
         folder = tmp_path / "captures" / name

@@ -1,4 +1,4 @@
-"""The matrix engine: what is done, what is skipped, and what a failure or a kill costs."""
+"""The matrix engine: what runs, what is skipped, and recovery from failures and kills."""
 
 import json
 import re
@@ -66,7 +66,7 @@ def test_a_kill_costs_one_cell(fakes, matrix: Matrix, tmp_path: Path, monkeypatc
 
     def killed(command: list[str], log: Path, lock: Lock) -> object:
         if next(calls) == at:
-            if "--output-dir" in command:  # half of its files are there
+            if "--output-dir" in command:  # half-written
                 Path(command[command.index("--output-dir") + 1]).mkdir(parents=True, exist_ok=True)
             raise KeyboardInterrupt
         return run_measured(command, log, lock)

@@ -12,7 +12,7 @@ from bitymi_ns.presets import preset_names
 
 
 def make_suite(root: Path, name: str) -> Path:
-    """The folders that a standard data set has."""
+    """Make the folders of a standard dataset."""
     for scene, factor in suites()[name].scenes.items():
         for part in suites()[name].needed:
             (root / scene / part.format(images=f"images_{factor}" if factor > 1 else "images")).mkdir(parents=True)

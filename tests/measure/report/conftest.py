@@ -1,4 +1,4 @@
-"""Results as short runs leave them (two scenes, two methods, three atlas formats), and a benchmark's work folder."""
+"""Results of short runs (two scenes, two methods, three atlas formats), and a benchmark's work folder."""
 
 import json
 import math
@@ -24,7 +24,7 @@ FORMATS = {"fp16": (0.001, 6, 0.24), "uint8": (-0.004, 4, 0.22), "bc7": (-0.031,
 
 
 def evaluation(scene: str, method: str, checkpoint: str, **results: float) -> dict:
-    """ns-eval's JSON object, with the standard deviations and rates that ns-eval adds."""
+    """Write ns-eval's JSON object, with its standard deviations and rates."""
     results = {"lpips": math.nan, "num_rays_per_sec": 81_234.5, "fps": 0.63, **results}
     spread = {f"{key}_std": abs(value) * 0.04 for key, value in results.items()}
     names = {"experiment_name": scene, "method_name": method, "checkpoint": checkpoint}
@@ -32,7 +32,7 @@ def evaluation(scene: str, method: str, checkpoint: str, **results: float) -> di
 
 
 def view(path: Path, index: int, noise: float, phase: float) -> None:
-    """A photograph beside its rendering, as the method's `img` is written."""
+    """Write a photograph beside its render, like the method's `img`."""
     y, x = np.mgrid[0:90, 0:160] / 90.0
     photo = np.stack([x / 1.8, 0.5 + 0.5 * np.sin(9 * x + index + phase), 1 - y], -1)
     rendered = photo + noise * np.random.default_rng(index).normal(size=photo.shape)
@@ -87,7 +87,7 @@ POSES: dict[str, Any] = {
     "left_out": {"IMG <1>.jpg": "no other photograph shows the same", **{f"{i:03d}.jpg": "blurred" for i in range(99)}},
     "notes": {"IMG_3.jpg": "too dark"}, "seconds": {"finding features": 12.34, "all": 56.78},
 }  # fmt: skip
-"""report.json of found poses."""
+"""report.json of pose estimation."""
 
 
 def write_poses(folder: Path, **changes: Any) -> Path:
@@ -98,7 +98,7 @@ def write_poses(folder: Path, **changes: Any) -> Path:
 
 
 def cell(kind: str, value: dict[str, Any], bundle: str = "", **key: Any) -> dict[str, Any]:
-    """A line of cells.jsonl."""
+    """Format a line of cells.jsonl."""
     settings = {
         "cell": kind, "suite": "local", "row": "bitymi", "scene": "fox", "data": "/data/fox", "parser": [],
         "method": "bitymi", "options": [], "steps": 100, "seed": 0, **key,
@@ -119,7 +119,7 @@ def write_lines(path: Path, lines: list[dict[str, Any]]) -> Path:
 
 
 def write_work(folder: Path) -> Path:
-    """A work folder: two seeds of one row, baked, with pictures."""
+    """Write a work folder: two seeds of one row, baked, with pictures."""
     cells = []
     for seed, shift in ((0, 0.0), (1, 0.2)):
         curve = folder / "runs" / str(seed) / "training_curve.jsonl"
@@ -143,8 +143,7 @@ def write_work(folder: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with four runs, sixteen evaluations, rendered views, poses of one capture, broken files. Not to be
-    changed."""
+    """Four runs, sixteen evaluations, rendered views, poses of one capture, broken files. Not to be changed."""
     root = write_results(tmp_path_factory.mktemp("report") / "results")
     for run in root.glob("outputs/*/bitymi/*"):
         write_poses(run / "poses")
@@ -157,7 +156,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def page(results: Path) -> str:
     """The report of `results`."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(matplotlib.rcParams, "text.usetex", True)  # as a matplotlibrc in the current folder may ask
+        patch.setitem(matplotlib.rcParams, "text.usetex", True)  # a local matplotlibrc may set this
         return build([results], results.with_name("report"), title="Two <scenes>").read_text("utf8")
 
 
@@ -169,7 +168,7 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def eval_json(tmp_path: Path):
-    """Writes one evaluation; returns its path."""
+    """Return a function that writes an evaluation and returns its path."""
 
     def write(name: str = "eval.json", scene: str = "fox", method: str = "bitymi", checkpoint: str = "", **results):
         path = tmp_path / name

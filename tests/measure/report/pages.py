@@ -1,4 +1,4 @@
-"""Pages of reports with few parts."""
+"""Report pages with few parts."""
 
 from typing import Any
 
@@ -7,5 +7,5 @@ from bitymi_ns.measure.report.records import Records
 
 
 def page_of(**parts: Any) -> str:
-    """The HTML page of a report that shows these parts alone."""
+    """Render the HTML page of a report with only these parts."""
     return to_page({**compose(Records(), ""), **parts})

@@ -1,4 +1,4 @@
-"""The report as a whole: what the page shows, and how a report fails."""
+"""The report as a whole: contents and errors."""
 
 import base64
 import io
@@ -16,12 +16,12 @@ from bitymi_ns.measure.report.records import ReportError
 from tests.measure.report.conftest import POSES, write_poses
 
 PLOTS = 12
-"""Of three metrics against three costs, and of training curves."""
+"""Plots of three metrics against three costs, and of training curves."""
 VOID = {"meta", "img", "br"}
 
 
 class Checker(HTMLParser):
-    """Every element that is opened is closed, in order."""
+    """Parser that checks that elements are closed in order."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -40,7 +40,7 @@ class Checker(HTMLParser):
 
 
 def pictures(page: str) -> list[Image.Image]:
-    """Every image embedded in a page, decoded."""
+    """Decode every embedded image of a page."""
     found = re.findall(r"data:image/(?:png|jpeg);base64,([A-Za-z0-9+/=]+)", page)
     images = [Image.open(io.BytesIO(base64.b64decode(data))) for data in found]
     for image in images:
@@ -56,7 +56,7 @@ def test_the_page_is_whole_and_needs_no_other_file(page: str, results: Path) -> 
     assert "LPIPS" not in re.sub("<p.*", "", page) and ">nan<" not in page.lower()
     assert [path.name for path in results.with_name("report").iterdir()] == ["index.html"]
     images = pictures(page)
-    # of two scenes three views: photograph, two renders, two errors; and the cameras of one capture
+    # two scenes with three views each: photograph, two renders, two errors; and the cameras of one capture
     assert len(images) == PLOTS + 2 * 3 * 5 + 1
     plots = [image for image in images if image.width > 600]
     assert len(plots) == PLOTS and all(image.convert("L").getextrema() != (255, 255) for image in plots)

@@ -1,4 +1,4 @@
-"""Reading evaluations and curves: what they hold, and what broken files say."""
+"""Reading of evaluations and curves, including broken files."""
 
 import json
 import shutil
@@ -32,7 +32,7 @@ def test_nan_and_infinity_tokens_are_missing_values(tmp_path: Path):
         ("bitymi-bundle", "", 0, True),
         ("bitymi", "/demo/bundle/nerfstudio_models/step-000000000.ckpt", 0, True),
         ("bitymi", "C:\\demo\\bundle\\nerfstudio_models\\step-0.ckpt", 0, True),
-        # the data set's name says bundle, the run does not
+        # "bundle" is in the dataset's name, not the run's
         ("bitymi", "/bundle/outputs/fox/bitymi/2025/nerfstudio_models/step-1.ckpt", 0, False),
         ("bitymi", "/data/bundler/2025/nerfstudio_models/step-1.ckpt", 0, False),
     ],

@@ -1,4 +1,4 @@
-"""Tables: columns that are there, bold values, differences, means."""
+"""Tables: present columns, bold values, differences, means."""
 
 from pathlib import Path
 
@@ -23,14 +23,14 @@ def test_layout_before_and_after_baking():
     assert before.section and after.section
     assert trained.cells == ("bitymi", "27.40", "0.120", "12,345", "50.0", "20.0", "–", "–")
     assert baked.cells == ("bitymi", "27.38", "0.120", "12,345", "10.0", "100", "2.50", "−0.020")
-    assert trained.best == {1} and baked.best == {4, 5}  # a column without a difference has no best
+    assert trained.best == {1} and baked.best == {4, 5}  # equal columns have no best
 
 
 def test_missing_values_are_dashes_and_never_best():
     rows = [make(psnr=20.0, lpips=float("nan")), make(method="other", psnr=21.0, lpips=0.2)]
     (table,) = quality_tables(rows)
     assert table.rows[1].cells[2] == "–" and 2 not in table.rows[1].best
-    (table,) = quality_tables([make(psnr=20.0, ssim=0.9)])  # columns that no row fills are left out
+    (table,) = quality_tables([make(psnr=20.0, ssim=0.9)])  # empty columns are omitted
     assert table.header == ("Method", "PSNR ↑", "SSIM ↑")
 
 

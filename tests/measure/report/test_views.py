@@ -1,4 +1,4 @@
-"""Held-out views: which are shown, and what is shown of them."""
+"""Held-out views: selection and captions."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from tests.measure.report.pages import page_of
 
 
 def write(folder: Path, name: str, errors: list[float], tint: float = 0.0) -> list[Path]:
-    """Views whose renders differ from grey photographs by these amounts everywhere."""
+    """Write views whose renders differ from grey photographs by constant errors."""
     paths = []
     (folder / name).mkdir(parents=True)
     for index, error in enumerate(errors):
@@ -34,7 +34,7 @@ def test_worst_median_and_best_of_trained_scene_and_bundle_side_by_side(tmp_path
         assert photograph == ["photograph"]
         assert [error for _, error in renders] == ["error of trained", "error of baked"]
         assert all((p.width, p.height) == (8, 6) for column in view.columns for p in column)
-    # of 8-bit pictures: errors of 12 and 2 steps
+    # 8-bit errors of 12 and 2 steps
     best = [column[0].caption for column in views[2].columns]
     assert best == ["photograph", "trained: 26.55 dB", "baked: 42.11 dB"]
     html = page_of(views=views)

@@ -1,4 +1,4 @@
-"""The page of errors, on a few scenes of it."""
+"""The error page on a few scenes."""
 
 import dataclasses
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A graphics device that draws, be it one in software."""
+"""A WebGPU device, possibly a software adapter."""
 
 import pytest
 
@@ -8,7 +8,7 @@ from tests.required import skip_without
 
 @pytest.fixture(autouse=True, scope="session")
 def device() -> None:
-    """Skips where nothing can be drawn through WebGPU."""
+    """Skip tests without a WebGPU device."""
     try:
         webgpu.device.device()
     except webgpu.WebGpuUnavailable as error:

@@ -1,8 +1,8 @@
-"""Scenes drawn through WebGPU against the CPU renderer.
+"""Rendering through WebGPU against the CPU.
 
-On the golden scenes, whose targets are in single precision, images agreed to 2.5e-5 on llvmpipe; the bounds leave a
-card room for its exponentials. Where a weight bound is set, the weight is judged from above (shaders/draw.wgsl), so
-that residuals are added which are not in the picture of the CPU: by at most the bound times the residual.
+On the golden scenes, with single-precision targets, images agreed to 2.5e-5 on llvmpipe; the bounds allow for a GPU's
+exponentials. With a weight bound, weights are estimated from above (shaders/draw.wgsl), which adds residuals that the
+CPU does not: at most the bound times the residual.
 """
 
 from collections.abc import Sequence
@@ -38,8 +38,8 @@ from tests.ops.test_view_color import lean_parameters
 
 FIELDS = ("rgb", "alpha", "beta", "depth", "normal", "overdraw")
 PICTURE = ("rgb", "alpha", "beta", "depth")
-"""Without the side of a surfel that is seen exactly edge-on, and without fragments behind the end of a pixel, which
-count here as long as their batch goes on."""
+"""Images compared: not the normal, whose sign is undefined edge-on, nor overdraw, which counts fragments behind the end
+of a pixel within their batch."""
 STEP = 1 / 255
 EXTREME = extreme_scenes()
 
@@ -47,8 +47,8 @@ EXTREME = extreme_scenes()
 def check(
     scene: BakedScene, camera: Camera, background: Tensor | None = None, fields: Sequence[str] = FIELDS
 ) -> Tensor:
-    """Holds a view against the CPU's, colours to a step, but for a pixel in a thousand; the differences of colours. A
-    texture unit's weights have 8 bits of fraction, which alpha carries to all images."""
+    """Compare a view with the CPU's: colours to a step, except one pixel in a thousand; returns the colour differences.
+    A texture unit's weights have 8 fractional bits, which alpha carries to all images."""
     got = replace(scene, through_webgpu=True).render(camera, background, maps=True)
     want = scene.render(camera, background, maps=True)
     for name in fields:
@@ -79,8 +79,8 @@ def test_numbers_that_misbehave(case: SceneCase, prefilter: str) -> None:
 
 
 def rectangles(scene: on_device.SceneOnDevice) -> NDArray[np.float32]:
-    """Rectangles of the latest view's surfels, front to back: [M, 6] axis (a unit vector on the screen), middle, half
-    the size along the axis and across, pixels: columns of `Seen` in scene.wgsl."""
+    """Read the rectangles of the latest view's surfels, front to back: [M, 6] axis (unit vector), middle, half size
+    along the axis and across, pixels: columns of `Seen` in scene.wgsl."""
     queue = scene._device.queue
     count = int(np.frombuffer(queue.read_buffer(scene._visible), np.uint32)[0])
     order = np.frombuffer(queue.read_buffer(scene._order[0]), np.uint32)[:count]
@@ -88,7 +88,7 @@ def rectangles(scene: on_device.SceneOnDevice) -> NDArray[np.float32]:
 
 
 def covered(rectangle: NDArray[np.float32], width: int, height: int) -> int:
-    """Pixels of the image within a row of `rectangles`."""
+    """Count the pixels of the image within a row of `rectangles`."""
     axis, middle, half_size = rectangle.reshape(3, 2).astype(np.float64)
     y, x = np.mgrid[:height, :width] + 0.5 - middle[::-1, None, None]
     along, across = x * axis[0] + y * axis[1], y * axis[0] - x * axis[1]
@@ -98,7 +98,7 @@ def covered(rectangle: NDArray[np.float32], width: int, height: int) -> int:
 @pytest.mark.parametrize("photo_pixel", [1.0, 0.5])
 @pytest.mark.parametrize("seed", range(3))
 def test_discs_across_the_camera_plane_are_drawn_where_they_show(seed: int, photo_pixel: float) -> None:
-    """They have no ellipse: none beyond the image's borders, and of the others no more than the box of what shows."""
+    """Discs without an ellipse are culled beyond the borders; others get at most the box of their visible part."""
     case = crossing_scene(80, seed, 150, 120)
     scene, camera = scene_of(case), camera_of(case)
     device = on_device.SceneOnDevice(scene)
@@ -110,7 +110,7 @@ def test_discs_across_the_camera_plane_are_drawn_where_they_show(seed: int, phot
     shows = (reference(case, [case.params[name] for name in SURFEL_KEYS]).weight > 0).view(120, 150, -1)
     boxes = [(x.any(0).sum() * x.any(1).sum()).item() for x in shows.unbind(-1) if x.any()]
     drawn = [covered(r, 150, 120) for r in rectangles(device)]
-    assert len(drawn) <= len(boxes) + 8  # by no one border alone
+    assert len(drawn) <= len(boxes) + 8  # not beyond a single border
     assert sum(drawn) <= 1.25 * sum(boxes)
 
 
@@ -139,12 +139,12 @@ def test_view_colours(kind: str, lean: bool) -> None:
 def test_texels_are_fetched_within_their_tile(prefilter: str) -> None:
     for dtype in (torch.uint8, torch.float32):
         scene = replace(textured(60, 0, dtype), weight_bound=0.0, prefilter=prefilter)
-        # a texture unit's weights have 8 bits of fraction
+        # a texture unit's weights have 8 fractional bits
         assert check(scene, front(), torch.tensor([0.2, 0.4, 0.6])).max() < 2 * STEP
 
 
 def cutting(scene: BakedScene) -> BakedScene:
-    """The scene with alpha texels, which its atlas's fourth channel then are, and without a weight bound."""
+    """Give the scene alpha texels from its atlas's fourth channel, and no weight bound."""
     mean = torch.randint(0, 256, (len(scene),), generator=torch.Generator().manual_seed(5)) / 128
     return replace(scene, alpha_scale=255 / 128, mean_alpha=mean, weight_bound=0.0)
 
@@ -160,7 +160,7 @@ def test_alpha_texels_cut_surfels(dtype: torch.dtype, prefilter: str) -> None:
 
 @pytest.fixture
 def as_a_card(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Blocks are left to the device even where it is the processor."""
+    """Keep BC7 blocks on the device even for a software adapter."""
     monkeypatch.setattr(on_device, "in_software", lambda: False)
 
 
@@ -174,7 +174,7 @@ def encoded(scene: BakedScene) -> BakedScene:
 
 
 def test_the_processor_gets_decoded_texels(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It would decode a block for each texel that it fetches."""
+    """A software adapter would decode a block per texel fetch."""
     scene = replace(encoded(textured(20, 0)), atlas=None, weight_bound=0.0)
     formats: list[str] = []
     monkeypatch.setattr(on_device, "in_software", lambda: True)
@@ -191,7 +191,7 @@ def test_the_processor_gets_decoded_texels(monkeypatch: pytest.MonkeyPatch) -> N
 def test_bc7_blocks_are_drawn_by_the_texture_unit_as_they_are_decoded(as_a_card: None) -> None:
     scene = replace(encoded(textured(60, 0)), weight_bound=0.0)
     assert check(scene, front()).max() < 2 * STEP
-    # nothing but the blocks is needed
+    # the blocks suffice
     alone = replace(scene, atlas=None, through_webgpu=True).render(front())
     assert (alone.rgb - replace(scene, through_webgpu=True).render(front()).rgb).abs().max() == 0
     assert check(cutting(scene), front()).max() < 2 * STEP
@@ -239,7 +239,7 @@ def test_a_scene_without_surfels_and_one_far_away() -> None:
 
 
 def photographed(scene: BakedScene, camera: Camera) -> BakedScene:
-    """The scene as if it had been photographed by this camera, 4 units away."""
+    """Make the scene photographed by this camera, 4 units away."""
     rate = float(torch.sqrt(camera.K[0, 0] * camera.K[1, 1])) / 4
     points = torch.cat([scene.surfels["means"], torch.full((len(scene), 1), rate)], 1)
     return replace(scene, photographed=points, weight_bound=0.0)

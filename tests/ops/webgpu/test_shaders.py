@@ -1,4 +1,4 @@
-"""The numbers that the shaders state are those that csrc states."""
+"""Constants of the shaders equal those of csrc."""
 
 import re
 from pathlib import Path

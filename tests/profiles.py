@@ -6,7 +6,7 @@ from PIL import ImageCms
 
 
 def profile(red: tuple[float, ...], green: tuple[float, ...], blue: tuple[float, ...]) -> bytes:
-    """A profile like that of sRGB, but with these primaries (XYZ, D50)."""
+    """Build a profile like sRGB's with other primaries (XYZ, D50)."""
     data = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
     tags = {
         bytes(data[at : at + 4]): struct.unpack_from(">I", data, at + 4)[0]

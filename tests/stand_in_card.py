@@ -1,4 +1,4 @@
-"""A stand-in for a card where no kernels run: tensors on `CARD` lie in the host's memory, and reads are noted."""
+"""A stub GPU without kernels: tensors on `CARD` are in host memory, and reads are recorded."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,11 +14,11 @@ READS = (Tensor.cpu, Tensor.item, Tensor.tolist, Tensor.__bool__, Tensor.__float
 
 
 class _OnCard(Tensor):
-    """A tensor of the stand-in; so are the results of what is computed with it."""
+    """A tensor on the stub GPU, as are results computed with it."""
 
 
 def on_card(tensor: Tensor) -> Tensor:
-    """A copy of a tensor on the stand-in."""
+    """Copy a tensor to the stub GPU."""
     return tensor.clone().as_subclass(_OnCard)
 
 
@@ -49,6 +49,6 @@ class _Mode(TorchFunctionMode):
 
 @contextmanager
 def noted_reads() -> Iterator[list[int]]:
-    """Let tensors go to the stand-in; yields the numbers that each read of the host brought from it: it waits then."""
+    """Enable the stub; yields the sizes of the host's reads from it, at which it would wait."""
     with _Mode() as mode:
         yield mode.reads

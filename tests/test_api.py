@@ -1,4 +1,4 @@
-"""The public functions, and the examples that use them."""
+"""The public functions and the examples."""
 
 import copy
 import importlib.util
@@ -76,7 +76,7 @@ def test_rasterize_gives_values_and_gradients_of_the_float64_reference() -> None
 
 
 def flat(**changes: float) -> dict[str, torch.Tensor]:
-    """One surfel in float32 that faces the camera."""
+    """Make a float32 surfel that faces the camera."""
     values = {"opacities": 0.7, "betas": 2.0, **changes}
     numbers = {name: torch.tensor([value]) for name, value in values.items() if name in ("opacities", "betas")}
     scales = torch.full((1, 2), values.get("scales", 0.5))
@@ -94,7 +94,7 @@ def test_opacities_and_betas_at_the_ends_of_their_ranges(name: str, edge: float,
     for value in (edge, near):
         values = flat(**{name: value})
         image = bitymi_ns.rasterize(**values, camera=camera_of()).rgb
-        image[9, 15].sum().backward()  # off the centre, where the weight is below its bound
+        image[9, 15].sum().backward()  # off-centre, where the weight is not clamped
         assert all(bool(each.grad.isfinite().all()) for each in values.values())
         drawn.append(image.detach())
         gradients.append(float(values[name].grad))
@@ -149,7 +149,7 @@ def test_a_scene_is_trained_baked_read_and_rendered_from_arrays(room: Path, tmp_
     bundle = bitymi_ns.read_bundle(tmp_path / "bundle")
     drawn = bundle.render(camera_of()).rgb
     assert drawn.shape == (18, 24, 3)
-    with torch.inference_mode():  # its tensors do not count how often they are written to
+    with torch.inference_mode():  # its tensors have no version counter
         read = bitymi_ns.read_bundle(tmp_path / "bundle")
         assert torch.equal(read.render(camera_of()).rgb, drawn)
     assert torch.equal(read.render(camera_of()).rgb, drawn)
@@ -166,7 +166,7 @@ def test_bundles_of_every_format_with_their_cameras(room: Path, tmp_path: Path) 
     views = example("train_from_arrays").load_views(room)
     points = torch.rand(5600, 3) * 2 - 1
     scene, _ = bitymi_ns.train_scene(views, points, torch.rand(5600, 3), steps=1, method="bitymi-notexture")
-    assert len(scene) <= 5000 * 1.1  # as ns-train starts, with as many at the back as it adds
+    assert len(scene) <= 5000 * 1.1  # like ns-train, with its added background points
     scene, _ = bitymi_ns.train_scene(views, points[:100], torch.rand(100, 3), steps=6)
     for options, atlas in (
         (None, "texels.bin"),

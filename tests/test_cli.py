@@ -1,4 +1,4 @@
-"""The `bitymi` console script: thin calls, and mistakes answered in one line."""
+"""The `bitymi` console script: thin calls, and errors in one line."""
 
 import subprocess
 import sys
@@ -43,7 +43,7 @@ def test_mistakes_are_one_line(
 
 
 def test_what_nobody_can_act_on_is_not_said_and_nothing_is_written_elsewhere(tmp_path: Path) -> None:
-    assert cli.Stability().output == Path("stability.md")  # in the folder where it is called
+    assert cli.Stability().output == Path("stability.md")  # in the current folder
     old = "warnings.warn_explicit('old', FutureWarning, 'a.py', 1, '{}.activations')"
     code = ["import sys, warnings", "from bitymi_ns.__main__ import main", "sys.argv[1:] = ['report']", "main()"]
     for module, said in (("nerfstudio", False), ("mine", True)):

@@ -1,4 +1,4 @@
-"""Links between the pages of the documentation lead somewhere; files and names that they mention are in the code."""
+"""Links in the documentation resolve, and files and names it mentions exist."""
 
 import ast
 import re
@@ -14,7 +14,7 @@ OUTSIDE = re.compile(r"[a-z][a-z0-9+.-]*:")
 SOURCE = re.compile(r"(?<![\w./-])[\w/]+\.(?:py|h|cpp|cu|cmake)\b")
 DOTTED = re.compile(r"`([a-zA-Z_]\w*(?:\.\w+)+)`")
 FOREIGN = {"activations.py"}
-"""Files of other projects that the pages mention."""
+"""Files of other projects in the pages."""
 DATA = set("json jsonl ply glb usdc ktx2 webp png jpg yml yaml toml py h txt pth wgsl bin".split())
 MENTION = re.compile(r"\b(?:docs|benchmarks)/[\w/]+\.md\b")
 
@@ -32,18 +32,18 @@ PAGES = tracked("*.md")
 
 
 def without_blocks(text: str) -> str:
-    """The text without its blocks of code."""
+    """Remove code blocks."""
     return re.sub(r"^(```|~~~).*?^\1", "", text, flags=re.MULTILINE | re.DOTALL)
 
 
 def without_code(text: str) -> str:
-    """The text without its code, in which brackets are no links and # begins no heading."""
+    """Remove code, in which brackets are not links and # is no heading."""
     text = without_blocks(text)
     return re.sub(r"`[^`\n]*`", lambda code: "" if "](" in code[0] else code[0], text)
 
 
 def anchors(page: Path) -> set[str]:
-    """The anchors that GitHub makes of the headings of a page."""
+    """List the anchors that GitHub makes from a page's headings."""
     found: dict[str, int] = {}
     names = set()
     for heading in re.findall(r"^#{1,6} +(.*?) *#*$", without_code(page.read_text("utf8")), re.MULTILINE):
@@ -56,7 +56,7 @@ def anchors(page: Path) -> set[str]:
 
 
 def dead_links(page: Path) -> list[str]:
-    """Relative links of a page that lead nowhere."""
+    """List a page's broken relative links."""
     dead = []
     for link in LINK.findall(without_code(page.read_text("utf8"))):
         if OUTSIDE.match(link):
@@ -69,8 +69,8 @@ def dead_links(page: Path) -> list[str]:
 
 
 def owners(paths: list[Path]) -> dict[str, set[str]]:
-    """The names that modules and classes define, by the name of the module, of its package and of the class, in lower
-    case and without a final Config: as `scene.rim` names an option of `SceneConfig` and `ops.trace` a function."""
+    """Map names of modules, packages and classes (lower case, without a final Config) to the names they define: so
+    `scene.rim` is an option of `SceneConfig`, and `ops.trace` a function."""
     found: dict[str, set[str]] = defaultdict(set)
     for path in paths:
         tree = ast.parse(path.read_text("utf8"))

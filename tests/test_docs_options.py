@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 ROOTS: dict[str, Any] = {
     "--pipeline.model.scene.": load_preset("bitymi").scene,
     "--pipeline.model.train.": TrainConfig(),
-    "--": TrainConfig().densify,  # of its options, the short names
+    "--": TrainConfig().densify,  # short names of its options
     "ns-export ... --": BakeOptions(),
 }
 ELSEWHERE = {"--machine.num-devices", "--machine.seed", "--max-num-iterations", "--pipeline.model.train.first-surfels"}
@@ -21,11 +21,11 @@ ELSEWHERE |= {
     f"ns-export ... --{name}"
     for name in "exact finetune-steps format photographs polish-steps compact-error target-mb".split()
 }
-"""Options that are declared with the commands, which need nerfstudio."""
+"""Options declared with the commands, which need nerfstudio."""
 
 
 def value_of(option: str) -> Any:
-    """Look up the default of an option as the tables write it."""
+    """Look up the default of an option named as in the tables."""
     prefix = max((root for root in ROOTS if option.startswith(root)), key=len)
     value = ROOTS[prefix]
     for name in option.removeprefix(prefix).replace("-", "_").split("."):

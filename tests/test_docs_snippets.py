@@ -1,4 +1,4 @@
-"""Python snippets of the documentation run, in the order of their page, on a tiny scene."""
+"""Python snippets of the documentation run in page order on a tiny scene."""
 
 import json
 import re
@@ -15,21 +15,21 @@ from tests.test_docs import PAGES, ROOT
 
 FENCE = re.compile(r"^```python[ \t]*([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 UNTOUCHED = re.compile(r"no-run: \S.*")
-"""Info string of a snippet that does not run: ```python no-run: the reason."""
+"""Info string of a snippet that is not run: ```python no-run: the reason."""
 N = 200
 """Points and surfels."""
 STEPS = re.compile(r"\bsteps=\d+")
 
 
 def snippets(text: str) -> tuple[list[str], list[str]]:
-    """The snippets of a page that run, and info strings that say neither nothing nor a reason."""
+    """Split a page's snippets into those that run, and info strings without a reason."""
     found = FENCE.findall(text)
     return [code for info, code in found if not info], [info for info, _ in found if info and not UNTOUCHED.match(info)]
 
 
 @pytest.fixture(scope="module")
 def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
-    """What snippets may use without defining it: views and points of a room, and surfels at these points."""
+    """Names that snippets may use undefined: views and points of a room, and surfels at these points."""
     room = sample.generate(tmp_path_factory.mktemp("snippets") / "room", views=6, width=48, height=36, points=200)
     info = json.loads((room / "transforms.json").read_text("utf8"))
     views = []

@@ -1,4 +1,4 @@
-"""Prose uses the field's words: documentation, comments, docstrings, messages; docstrings begin with the deed."""
+"""Prose uses the field's words: documentation, comments, docstrings, messages; docstrings begin with a verb."""
 
 import ast
 import io
@@ -23,11 +23,11 @@ WORDS = (
     "bitymi_ns/ops/shaders/*",
     "bitymi_ns/measure/templates/*",
 )
-"""Files whose prose is held to BANNED."""
+"""Files checked for BANNED."""
 DOCSTRINGS = ("examples/*.py", "benchmarks/*.py", "scripts/*.py", "bitymi_ns/*.py")
-"""Python files whose docstrings begin with what is done."""
+"""Python files whose docstrings are checked for QUESTION."""
 COMMENTS = ("csrc/*",)
-"""C++ files whose comments do."""
+"""C++ files whose comments are."""
 BANNED = {
     r"\bby lot\b": "at random",
     r"\bset(?:s|ting)?[- ]aside\b": "validation views; held back",
@@ -47,13 +47,13 @@ BANNED = {
     r"\blot of surfels\b|\bhouse word": "surfels",
     r"\b(?:through_pixel|kPacks?|list_places)\b|\bPack<": "prefilter; blocks; ids; Lanes",
 }
-"""Pattern: what to write instead."""
+"""Pattern: replacement."""
 QUESTION = re.compile(r"(?:What|Whether|How|Where|Who|Which|When)\b")
-"""A docstring that begins so does not say what the thing does."""
+"""Start of a docstring that does not say what the code does."""
 
 
 def prose(path: Path) -> Iterator[tuple[int, str]]:
-    """Line numbers and prose: Markdown without code, comments and strings of Python, all of other files."""
+    """Yield line numbers and prose: Markdown without code, comments and strings of Python, other files whole."""
     text = path.read_text("utf8")
     if path.suffix == ".py":
         for token in tokenize.generate_tokens(io.StringIO(text).readline):
@@ -67,7 +67,7 @@ def prose(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def found(path: Path) -> list[str]:
-    """Banned words of a file, with line and remedy."""
+    """List banned words of a file, with line and replacement."""
     return [
         f"{path}:{number}: '{match[0]}', say: {instead}"
         for number, line in prose(path)
@@ -77,7 +77,7 @@ def found(path: Path) -> list[str]:
 
 
 def questions(path: Path) -> list[str]:
-    """Docstrings of a Python file, or comments of another one, that begin with a question word."""
+    """List docstrings of a Python file, or comments of another one, that begin with a question word."""
     if path.suffix != ".py":
         comments = re.findall(r"(?:^[ \t]*//.*\n)+", path.read_text("utf8"), re.MULTILINE)
         texts = [comment.splitlines()[0].strip("/ ") for comment in comments]

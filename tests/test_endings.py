@@ -1,4 +1,4 @@
-"""Commands that are interrupted, whose reader goes away, or whose disk is full: one line, no traceback."""
+"""Interrupted commands, closed pipes and full disks end in one line without a traceback."""
 
 import os
 import signal
@@ -20,14 +20,14 @@ def test_a_reader_that_goes_away_is_no_error() -> None:
     for words in (["--help"], ["sample", "--help"]):
         with subprocess.Popen([*BITYMI, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
             assert process.stdout is not None and process.stderr is not None
-            process.stdout.close()  # as `| head -c0`
+            process.stdout.close()  # like `| head -c0`
             said = process.stderr.read().decode()
         assert process.returncode == endings.NO_READER and said == ""
 
 
 @pytest.mark.parametrize("after", [0.15, 0.6])
 def test_ctrl_c_in_the_first_second(after: float) -> None:
-    """Modules are imported then."""
+    """While modules are imported."""
     code = (
         "import sys, time, importlib.abc\n"
         "class Slow(importlib.abc.MetaPathFinder):\n"
@@ -38,7 +38,7 @@ def test_ctrl_c_in_the_first_second(after: float) -> None:
         "sys.exit(main())"
     )
     command = [sys.executable, "-c", code, "--help"]
-    heeds = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # what a shell runs in the background ignores it
+    heeds = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # background jobs of a shell ignore it
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heeds
     ) as process:
@@ -63,11 +63,11 @@ def test_ctrl_c_in_the_first_second(after: float) -> None:
     ],
 )
 def test_commands_of_others_end_in_one_line(error: str, line: str) -> None:
-    """Commands of nerfstudio catch nothing themselves."""
+    """nerfstudio's commands catch nothing themselves."""
     code = f"from bitymi_ns import endings; endings.install(); endings.install(); raise {error}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stderr.startswith(line) and done.stderr.count("\n") == 1
-    assert done.returncode in (1, -signal.SIGINT)  # which a shell shows as 130
+    assert done.returncode in (1, -signal.SIGINT)  # shells show 130
 
 
 def test_faults_of_the_program_keep_their_traceback() -> None:

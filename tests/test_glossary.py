@@ -1,4 +1,4 @@
-"""docs/glossary.md names files and functions that exist, for every numbered equation of the paper."""
+"""docs/glossary.md names existing files and functions for every numbered equation of the paper."""
 
 import re
 from pathlib import Path
@@ -11,7 +11,7 @@ CODE = r"`(\w+)`"
 
 
 def rows(section: str) -> list[list[str]]:
-    """The rows of the first table of a section, cells without white space."""
+    """Parse the rows of a section's first table, cells stripped."""
     text = (ROOT / "docs" / "glossary.md").read_text("utf8")
     table = text.split(f"## {section}\n")[1].split("\n## ")[0].split("\n\n| ", 1)[-1]
     lines = [line for line in ("| " + table).split("\n\n")[0].splitlines() if line.startswith("| ")]
@@ -19,7 +19,7 @@ def rows(section: str) -> list[list[str]]:
 
 
 def defines(file: str, text: str, name: str) -> bool:
-    """Whether a file has the body of a function of this name, or of a C++ constant: calls and declarations are none."""
+    """Return True if a file defines a function of this name, or a C++ constant; calls and declarations do not count."""
     if file.endswith(".py"):
         return re.search(rf"^def {name}\(", text, re.MULTILINE) is not None
     if re.search(rf"^constexpr double {name} =", text, re.MULTILINE):

@@ -1,5 +1,5 @@
-"""A layer imports only what stands below it, no two modules import each other, and nerfstudio is known to `plugin`
-and to what measures it alone."""
+"""A layer imports only lower layers, no two modules import each other, and only `plugin` and its measurements import
+nerfstudio."""
 
 import ast
 import subprocess
@@ -15,7 +15,7 @@ import bitymi_ns
 PACKAGE = Path(bitymi_ns.__file__).parent
 ORDER = ["ops", "scene", "codec", "bundle", "train", "bake", "interchange", "view", "plugin", "measure"]
 BESIDE = ["endings", "files", "ply", "presets", "progress", "ranges", "reading", "sample", "capture", "trust"]
-"""ORDER has the innermost first. These stand beside them and import none of them."""
+"""Modules beside the layers (ORDER, innermost first); these import no layer."""
 KNOW_NERFSTUDIO = ("plugin", "host", "measure/pictures.py")
 
 
@@ -28,8 +28,8 @@ MODULES = {name_of(path): path for path in PACKAGE.rglob("*.py")}
 
 
 def imports(path: Path) -> Iterator[tuple[str, bool]]:
-    """Full names of what a module imports, relative ones and those for the type checker included, and whether it does
-    so when it is loaded itself: not within a function, and not for the type checker alone."""
+    """Yield the full names of a module's imports, including relative and type-checking ones, and whether they run on
+    import (not in a function or for type checking only)."""
     name = name_of(path)
     package = name if path.name == "__init__.py" else name.rpartition(".")[0]
     pending: list[tuple[ast.AST, bool]] = [(ast.parse(path.read_text("utf8")), True)]
@@ -47,7 +47,7 @@ def imports(path: Path) -> Iterator[tuple[str, bool]]:
 
 
 def module_of(name: str) -> str | None:
-    """The module of this package that an imported name is, or stands in."""
+    """Return the module of this package that an import refers to."""
     while name and name not in MODULES:
         name = name.rpartition(".")[0]
     return name or None
@@ -77,11 +77,11 @@ def test_nerfstudio_is_known_to_the_plugin_and_to_what_measures_it_alone() -> No
 
 
 def test_no_two_modules_import_each_other() -> None:
-    """Also not through others. Imports within functions and for the type checker count, but for a package's own."""
+    """Nor indirectly. Imports in functions and for type checking count, except a package's own."""
     graph = {}
     for name, path in MODULES.items():
         found = {module_of(imported) for imported, _ in imports(path)} - {None, name}
-        if path.name == "__init__.py":  # re-exports its modules, which know one another and not it
+        if path.name == "__init__.py":  # re-exports its modules, which do not import it
             found = {other for other in found if not other.startswith(name + ".")}
         graph[name] = {other for other in found if not name.startswith(f"{other}.")}
     try:

@@ -1,4 +1,4 @@
-"""docs/licences.md names the packages of this environment that are not permissive."""
+"""docs/licences.md names the installed packages without a permissive licence."""
 
 import importlib.metadata
 import re
@@ -14,16 +14,16 @@ LIBRARIES = {
     "libheif": "libheif",
     "libqt5core": "qt",
 }
-"""Files of wheels, and what the page calls them."""
+"""Files of wheels, and their names on the page."""
 
 
 def needed(name: str, seen: dict[str, importlib.metadata.Distribution]) -> None:
-    """All distributions that one needs here, it included."""
+    """Collect a distribution and all that it depends on here."""
     key = re.sub(r"[-_.]+", "-", name).lower()
     try:
         found = importlib.metadata.distribution(name)
     except importlib.metadata.PackageNotFoundError:
-        return  # of another platform
+        return  # for another platform
     if key in seen:
         return
     seen[key] = found

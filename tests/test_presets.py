@@ -1,4 +1,4 @@
-"""Preset files are found in a source checkout and inside an installed package."""
+"""Preset files are found in a checkout and in an installed package."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Processes of Python run nothing that lies in the current folder."""
+"""Python processes run no code from the current folder."""
 
 import subprocess
 from pathlib import Path
@@ -16,7 +16,7 @@ PACKAGE = Path(bitymi_ns.__file__).parent
 
 @pytest.fixture
 def hostile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder, with modules that leave a mark when they are run."""
+    """A current folder with modules that leave a mark when run."""
     for name in ("getpass", "json", "os", "numpy", "pycolmap"):
         (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w').close()")
     monkeypatch.chdir(tmp_path)
@@ -32,13 +32,13 @@ def test_the_function_is_called_and_no_module_of_the_current_folder(hostile: Pat
 
 def test_colmap_is_started_beside_hostile_modules(hostile: Path) -> None:
     job = Job(str(hostile), str(hostile), None, [], [], {}, False, {})
-    with pytest.raises(CaptureError):  # there are no photographs
+    with pytest.raises(CaptureError):  # no photographs
         process.run(job, hostile, lambda *told: None)
     assert not (hostile / "ran").exists()
 
 
 def test_python_is_started_this_way_alone() -> None:
-    here = {"trust.py", "measure/bench/process.py"}  # which looks for programs beside Python
+    here = {"trust.py", "measure/bench/process.py"}  # finds programs beside Python
     for path in PACKAGE.rglob("*.py"):
         text = path.read_text("utf8")
         starts = "sys.executable" in text and path.relative_to(PACKAGE).as_posix() not in here

@@ -1,4 +1,4 @@
-"""What somebody else may have put where this package writes, and names that lead elsewhere."""
+"""Files that others may have planted where this package writes, and names that lead elsewhere."""
 
 import os
 import re
@@ -89,7 +89,7 @@ PLACES = {
     lock: "planted", reserve: ".x.lock", write: ".x.unfinished", cell: "planted", measured: "planted",
     log: process.LOG, curve: "planted",
 }  # fmt: skip
-"""What opens a file for writing under a name that others can foresee, and that name."""
+"""Calls that write under a predictable name, and that name."""
 
 
 @pytest.mark.parametrize("plant", [link, hard_link, no_such, pipe])
@@ -128,7 +128,7 @@ def test_files_and_folders_of_others(victim: Path, tmp_path: Path, monkeypatch: 
     (tmp_path / "own").mkdir()
     monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
     with open(victim, "a", opener=no_links):
-        pass  # of the owner of the folder
+        pass  # owned by the folder's owner
     stat = os.stat
     elsewhere = os.stat_result([*stat(tmp_path)[:4], os.getuid() + 2, *stat(tmp_path)[5:]])
     monkeypatch.setattr(os, "stat", lambda path, **how: elsewhere if Path(path) == tmp_path else stat(path, **how))
@@ -147,7 +147,7 @@ def photographs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def used(photographs: Path) -> tuple[str, list[str]]:
-    """Where the work of a capture is done, cache or capture, and what is said."""
+    """Return where the work on a capture is kept (cache or capture), and the messages."""
     said: list[str] = []
     with work_folder(photographs, "0", said.append) as work:
         return work.parent.parent.name, said
@@ -284,7 +284,7 @@ def test_what_was_not_made_is_named_and_stays(tmp_path: Path, name: str, named: 
     for each in made:
         (tmp_path / each).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / each).touch()
-    (tmp_path / "images/.b.png.unfinished").touch()  # as a killed process leaves it
+    (tmp_path / "images/.b.png.unfinished").touch()  # as after a kill
     keep(tmp_path, made)
     if name.startswith("a.png"):
         (tmp_path / "a.png").unlink()
@@ -292,7 +292,7 @@ def test_what_was_not_made_is_named_and_stays(tmp_path: Path, name: str, named: 
     (tmp_path / name).mkdir() if name.endswith("/") else (tmp_path / name).touch()
     with pytest.raises(Refused, match=re.escape(f"also holds {named.split(', ')[0]}")):
         keep(tmp_path, made)
-    (tmp_path / "new").mkdir()  # links under names that were made
+    (tmp_path / "new").mkdir()  # links with generated names
     (tmp_path / "new/a.png").symlink_to(tmp_path)
     (tmp_path / "new/images").symlink_to(tmp_path)
     with pytest.raises(Refused, match="holds a.png, images, which"):

@@ -15,7 +15,7 @@ from tests.plugin.data.captures import colmap_model
 
 @pytest.fixture(autouse=True)
 def no_triangulation(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Captures without points start from random ones: COLMAP would take seconds in each test that has such a one."""
+    """Start captures without points from random ones, as COLMAP would take seconds per test."""
 
     def triangulate(*given: Any) -> Path:
         raise CaptureError("not in this test")
@@ -33,13 +33,13 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def capture(original: Path, tmp_path: Path) -> Path:
-    """A copy of it to spoil."""
+    """A copy of the room to damage."""
     return Path(shutil.copytree(original, tmp_path / "room"))
 
 
 @pytest.fixture
 def project(capture: Path) -> Path:
-    """The room as a COLMAP project, a model in text in sparse/0."""
+    """The room as a COLMAP project, with a text model in sparse/0."""
     colmap_model(capture, capture / "sparse/0")
     for name in ("transforms.json", "sparse_pc.ply"):
         (capture / name).unlink()

@@ -1,4 +1,4 @@
-"""What a run prints: a few lines of its own, none of nerfstudio's about itself, and nothing before it is checked."""
+"""Console output of a run: a few lines of its own, none of nerfstudio's about itself, nothing before the checks."""
 
 import io
 import warnings

@@ -1,4 +1,4 @@
-"""The registry entries, what they do on a machine without a GPU, and that they never break nerfstudio."""
+"""Registry entries, without a GPU, and without breaking nerfstudio."""
 
 import importlib
 import re
@@ -49,14 +49,14 @@ def test_the_help_explains_every_option_that_does_something(capsys: pytest.Captu
     with pytest.raises(SystemExit):
         tyro.cli(type(default), default=default, args=["--help"])
     text = capsys.readouterr().out
-    # an option is a line of its own, what it means the indented lines below it
+    # an option on a line, its help indented below
     lines = [line.strip("│| ") for line in text.splitlines()]
     options = [i for i, line in enumerate(lines) if re.match("--[a-z]", line)]
     assert len(options) > 100
     for i in options:
         following = " ".join(lines[i + 1 : i + 3])
         assert len(following.split("(default")[0]) > 10, lines[i]
-    # these are nerfstudio's and have no effect here
+    # nerfstudio's options without effect
     for dead in ("--optimizers.", "collider", "fps", "loss-coefficients", "eval-num-rays", "prompt"):
         assert dead not in text
 
@@ -92,7 +92,7 @@ def test_a_given_length_is_kept_where_it_makes_sense() -> None:
 
 
 def test_a_failing_configuration_leaves_nerfstudio_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "bitymi_ns.plugin.run.config", None)  # its import raises ImportError
+    monkeypatch.setitem(sys.modules, "bitymi_ns.plugin.run.config", None)  # importing it raises ImportError
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("default")
@@ -129,7 +129,7 @@ def test_a_config_of_an_earlier_version_loads(model: BakedModelConfig | None) ->
     for new, old in OLD_MODULES.items():
         text = text.replace(f"bitymi_ns.{new}", f"bitymi_ns.{old}")
     assert "plugin" not in text
-    text = re.sub("( +)falloff_gamma", r"\1falloff_error: l1_sum\n\1falloff_gamma", text)  # an option that is gone
+    text = re.sub("( +)falloff_gamma", r"\1falloff_error: l1_sum\n\1falloff_gamma", text)  # a removed option
     assert yaml.load(text, yaml.Loader) == run
 
 

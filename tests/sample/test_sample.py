@@ -1,4 +1,4 @@
-"""The sample capture: its geometry is exact, its pictures are right, and nerfstudio reads it."""
+"""The sample capture: exact geometry, correct pictures, readable by nerfstudio."""
 
 import json
 from pathlib import Path
@@ -47,7 +47,7 @@ def test_files(capture: Path, meta: dict, images: np.ndarray, cloud: tuple[np.nd
 
 
 def project(meta: dict, frame: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixel x and y and depth, each [n], by the textbook formulas from the file alone."""
+    """Project points to pixel x, y and depth, each [n], by textbook formulas from the file alone."""
     world_to_camera = np.linalg.inv(np.array(meta["frames"][frame]["transform_matrix"]))
     p = points @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
     depth = -p[:, 2]
@@ -69,7 +69,7 @@ def test_points_have_the_colour_of_the_pixels_they_fall_on(
         seen, hits = first_hits(room, path[k], flat)
         near = np.linalg.norm(seen - points[index], axis=1) < 0.03 * depth[index]
         plain = near & (hits.surface != SPHERE)
-        # the 3 x 3 pixels around, since a point may fall on the edge of a pattern
+        # 3 x 3 pixels, as a point may fall on the edge of a pattern
         best = np.full(len(index), np.inf)
         for dy in (-1, 0, 1):
             for dx in (-1, 0, 1):
@@ -82,7 +82,7 @@ def test_points_have_the_colour_of_the_pixels_they_fall_on(
 
 
 def test_own_view_reproduces_the_points_exactly(meta: dict, cloud: tuple[np.ndarray, np.ndarray]) -> None:
-    """Points were drawn view by view: the first ones lie on pixel centres of the first view."""
+    """Points were drawn view by view; the first ones lie on pixel centres of the first view."""
     x, y, _ = project(meta, 0, cloud[0][: 3000 // VIEWS])
     assert np.abs(x - np.floor(x) - 0.5).max() < 2e-3
     assert np.abs(y - np.floor(y) - 0.5).max() < 2e-3
@@ -105,7 +105,7 @@ def test_cameras_stand_in_the_room_upright_and_clear(meta: dict) -> None:
 
 
 def test_sphere_mirrors() -> None:
-    """A point of the sphere, seen from two sides, has two colours; a point of the floor has one."""
+    """A point of the sphere has two colours from two sides; a point of the floor has one."""
     room = Room(0)
 
     def seen(eye: list[float], point: np.ndarray) -> np.ndarray:

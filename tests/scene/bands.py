@@ -1,4 +1,4 @@
-"""A training step whose view is drawn in bands, against the same step with all fragments at once."""
+"""A training step drawn in bands, against the same step with all fragments at once."""
 
 import torch
 from torch import Tensor
@@ -10,7 +10,7 @@ from tests.ops.golden import random_scene
 from tests.scene.small import scene_of
 
 WIDTH, HEIGHT = 24, 150
-"""Ten rows of tiles, the last one cut off."""
+"""Ten rows of tiles, the last one partial."""
 
 
 def make(device: torch.device, most: int, **options: object) -> tuple[Scene, Camera]:
@@ -18,7 +18,7 @@ def make(device: torch.device, most: int, **options: object) -> tuple[Scene, Cam
 
 
 def step(device: torch.device, most: int) -> tuple[Bands | object, dict[str, Tensor]]:
-    """The fragments, and all that a training step gives."""
+    """Compute the fragments and all results of a training step."""
     scene, camera = make(device, most, texture_moves_surfels=True)
     background = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64, device=device)
     output = scene.render(camera, background, maps=True, overdraw_half=0.005)
@@ -39,7 +39,7 @@ def step(device: torch.device, most: int) -> tuple[Bands | object, dict[str, Ten
 
 
 def texel_step(device: torch.device, most: int, alpha: bool = False) -> tuple[Bands | object, dict[str, Tensor]]:
-    """The fragments, and what a training step gives whose backward pass moves texels, with alphas or without."""
+    """Compute the fragments and the results of a training step that moves texels, with or without alphas."""
     scene, camera = make(device, most, texture_moves_surfels=True)
     g = torch.Generator().manual_seed(2)
     texels = torch.randn(60 * 16, 3, generator=g, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""The surfels and cameras that the tests of the bake have, too."""
+"""Surfels and cameras shared with the tests of the bake."""
 
 from tests.bake.conftest import camera, surfels
 

@@ -1,4 +1,4 @@
-"""A textured scene of a few surfels, for comparing one way of drawing it with another."""
+"""A small textured scene for comparing renderers."""
 
 import torch
 
@@ -7,7 +7,7 @@ from tests.ops.golden import SceneCase
 
 
 def scene_of(case: SceneCase, device: torch.device, texture: bool = True, **options: object) -> tuple[Scene, Camera]:
-    """The case in float64, with a random field."""
+    """Build the case in float64, with a random field."""
     config = SceneConfig(texture="hash" if texture else "none", min_resolution=8, near=0.2, **options)
     field = None
     if texture:

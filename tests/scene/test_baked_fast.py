@@ -1,4 +1,4 @@
-"""Pixels that end where half of an 8-bit step of light is left."""
+"""Pixels that end at a transmittance of half an 8-bit step."""
 
 from dataclasses import replace
 
@@ -22,12 +22,12 @@ def test_a_pixel_changes_by_no_more_than_what_is_left(seed: int) -> None:
     assert (after.rgb <= before.rgb + 1e-6).all()
     assert (before.rgb - after.rgb).max() <= 4 * FAST * largest
     ended = after.overdraw < before.overdraw
-    assert (1 - after.alpha[ended] < FAST).all()  # what ends a pixel is itself blended
+    assert (1 - after.alpha[ended] < FAST).all()  # the surfel that ends a pixel is blended
     torch.testing.assert_close(after.rgb[~ended[..., 0]], before.rgb[~ended[..., 0]], rtol=0, atol=0)
 
 
 def test_a_surfel_that_ends_a_pixel_is_blended() -> None:
-    """0.85, then 0.99: 0.15 is left in front of the second, 0.0015 behind it."""
+    """0.85, then 0.99: transmittance 0.15 in front of the second, 0.0015 behind it."""
     surfels = {
         "means": torch.tensor([[0.0, 0, -0.2], [0, 0, 0], [0, 0, 0.2]]),
         "quats": torch.tensor([[1.0, 0, 0, 0]] * 3),

@@ -1,4 +1,4 @@
-"""Views with more fragments than allowed are drawn in bands: same image, same gradients, less at a time."""
+"""Views with more fragments than allowed are drawn in bands: same image and gradients, less memory."""
 
 import pytest
 import torch
@@ -31,7 +31,7 @@ def test_values_and_gradients_do_not_change(share: float, monkeypatch: pytest.Mo
     assert isinstance(parts, ops.Bands) and len(parts) == len(whole)
     assert parts.rows[0][0] == 0 and parts.rows[-1][1] == bands.HEIGHT
     assert all(a[1] == b[0] and a[1] % 16 == 0 for a, b in zip(parts.rows, parts.rows[1:], strict=False))
-    # each band once in the forward pass and once in the backward pass
+    # each band once forward and once backward
     assert max(lengths) <= most and len(lengths) == 2 * len(parts.rows)
     bands.assert_same(got, want)
 

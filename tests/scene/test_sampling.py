@@ -1,4 +1,4 @@
-"""How large a view shows what was photographed, and how it is drawn then."""
+"""Size of a view relative to the photographs, and its sampling."""
 
 import math
 from dataclasses import replace
@@ -57,7 +57,7 @@ def test_nothing_jumps_while_the_samples_stay() -> None:
         assert a.samples != b.samples or abs(math.log2(b.photo_pixel / a.photo_pixel)) < 0.02
     assert sampling_of(1.0, 1000) == sampling_of(0.8, 1000) == sampling_of(1.4, 1000)
     assert sampling_of(2 * LARGEST, 1000).photo_pixel == 2 * LARGEST
-    assert sampling_of(0.5, 1000).photo_pixel == 1.0  # as the photographs, then averaged
+    assert sampling_of(0.5, 1000).photo_pixel == 1.0  # at the photographs' size, then averaged
 
 
 def test_images_are_means_and_counts_sums() -> None:

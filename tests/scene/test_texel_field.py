@@ -1,4 +1,4 @@
-"""A scene whose residual colours are texels: what the baked renderer shows, with gradients that steps confirm."""
+"""A scene with texels equals the baked renderer, with gradients confirmed by steps."""
 
 import pytest
 import torch
@@ -10,11 +10,11 @@ from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.field import TexelField
 from tests.ops.golden import random_scene
 
-BOUND = 0.03125  # the same number in either precision
+BOUND = 0.03125  # exact in both precisions
 
 
 def make(count: int = 40, most: int = 0, alpha: bool = False, **options: float) -> tuple[Scene, Camera, Tensor]:
-    """A scene in float64, a view of it, and its atlas [1, 16, 8 N, 4]: tiles of 8 x 16 texels side by side."""
+    """Make a float64 scene, a view of it, and its atlas [1, 16, 8 N, 4]: tiles of 8 x 16 texels side by side."""
     case = random_scene(count, 3, **{"width": 60, "height": 40, **options})
     g = torch.Generator().manual_seed(0)
     atlas = torch.rand(1, 16, 8 * count, 4, generator=g) - 0.3
@@ -44,7 +44,7 @@ def test_it_is_what_the_baked_renderer_shows(alpha: bool) -> None:
 
 @pytest.mark.parametrize("name", ["means", "quats", "log_scales", "opacity_logits", "sv_rgb", "texels", "alpha"])
 def test_gradients_against_steps_in_a_direction(name: str) -> None:
-    """The picture is piecewise smooth: a small step along the gradient changes it as the gradient says."""
+    """The picture is piecewise smooth: a small step along the gradient changes it accordingly."""
     scene, camera, _ = make(count=12, width=24, height=18, alpha=name == "alpha")
     weights = torch.linspace(-1, 1, 24 * 18 * 3, dtype=torch.float64).view(18, 24, 3)
     parameter = getattr(scene.field, name) if name in ("texels", "alpha") else scene.surfels[name]

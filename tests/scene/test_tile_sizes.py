@@ -60,7 +60,7 @@ def test_projected_extent_of_a_facing_disc(camera):
 def test_surfels_behind_the_camera_or_far_outside_the_image_are_unseen(camera):
     means = torch.tensor([[0.0, 0.0, -7.0], [0.0, 0.0, -5.9], [50.0, 0.0, 0.0], [3.3, 0.0, 0.0]])
     pixels = max_projected_extent(means, tangents(FACING.expand(4, 4)), torch.full((4, 2), 0.1), [camera(6.0)])
-    assert (pixels[:3] == 0).all() and (pixels[3] > 0).all()  # the last one's centre is outside, its edge is not
+    assert (pixels[:3] == 0).all() and (pixels[3] > 0).all()  # the last one's centre is outside, its edge inside
 
 
 def test_coarsened_halves_the_longer_side_until_it_fits():

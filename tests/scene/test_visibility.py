@@ -6,11 +6,11 @@ from bitymi_ns.scene.visibility import visibility
 
 
 def test_what_stands_in_front_is_counted(surfels, camera):
-    """Three discs in a row on the axis of the camera, and one beside the image."""
+    """Three discs in a row on the camera's axis, and one beside the image."""
     params = surfels(4)
     params["means"] = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [90.0, 0.0, 0.0]])
     params["quats"] = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(4, 4).clone()
-    params["log_scales"] = torch.tensor([4.0, 4.0, -2.0, -2.0])[:, None].expand(4, 2).clone()  # the first two fill all
+    params["log_scales"] = torch.tensor([4.0, 4.0, -2.0, -2.0])[:, None].expand(4, 2).clone()  # two fill the view
     params["opacity_logits"] = torch.tensor([0.0, 1.0, 3.0, 3.0])
     params["beta_raw"] = torch.full((4,), -9.0)  # hard discs: the opacity everywhere
     first, second = torch.sigmoid(torch.tensor([0.0, 1.0])).tolist()
@@ -24,12 +24,12 @@ def test_what_stands_in_front_is_counted(surfels, camera):
     assert seen.tolist() == [[True, True, True, False]] * 2
     both = visibility(params, [camera(6.0), behind], 0.2).transmittance
     assert both.tolist() == pytest.approx([1 - second, 1.0, 1.0, 0.0], abs=2e-3) or both[2] == pytest.approx(1.0)
-    assert visibility(params, [camera(6.0)], 0.2).in_front[3] == 1.0  # nothing is known of it
+    assert visibility(params, [camera(6.0)], 0.2).in_front[3] == 1.0  # unseen
     assert visibility(params, [], 0.2).transmittance.tolist() == [0.0] * 4
 
 
 def two_hard_discs(surfels, second: list[float]) -> dict[str, torch.Tensor]:
-    """One at the origin, and another one, facing the camera."""
+    """Make one at the origin and another one, facing the camera."""
     params = surfels(2)
     params["means"] = torch.tensor([[0.0, 0.0, 0.0], second])
     params["quats"] = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(2, 4).clone()

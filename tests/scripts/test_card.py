@@ -1,4 +1,4 @@
-"""What is brought to a bare machine with a card, and the commands that run there."""
+"""Files and commands for a bare machine with a GPU."""
 
 import importlib
 import json
@@ -30,7 +30,7 @@ except RuntimeError as error:
 
 @pytest.fixture
 def card(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """The script of nerfstudio's commands."""
+    """The script that runs nerfstudio's commands."""
     monkeypatch.syspath_prepend(BENCHMARKS)
     return importlib.import_module("card_nerfstudio")
 

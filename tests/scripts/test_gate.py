@@ -1,4 +1,4 @@
-"""The gate: what it lets pass and what it does not."""
+"""The gate: what passes and what fails."""
 
 import importlib.util
 import json
@@ -27,7 +27,7 @@ def gate(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def run(gate: ModuleType, monkeypatch: pytest.MonkeyPatch, baseline: Path, *measured: Any, accept: bool = False) -> int:
-    """Runs the gate on measurements that are given, one after the other; how many of them it asked for."""
+    """Run the gate on given measurements; returns how many it used."""
     left = [{"room": {**GOOD, **change}} for change in measured]
     monkeypatch.setattr(gate, "measure", lambda *_: left.pop(0))
     monkeypatch.setattr(sys, "argv", ["gate.py", "--baseline", str(baseline), *(["--accept"] if accept else [])])

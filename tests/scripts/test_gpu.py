@@ -1,4 +1,4 @@
-"""The card's frame times, run on the host's emulation of a card: the table is whole."""
+"""The GPU benchmark of frame times, run in emulation: its table is complete."""
 
 import subprocess
 import sys
@@ -11,7 +11,7 @@ SCRIPT = Path(__file__).resolve().parents[2] / "benchmarks" / "gpu.py"
 
 
 def test_frames_without_a_card(tmp_path: Path) -> None:
-    """A row that fails is a line of the page and not its end, so that it could go unnoticed."""
+    """A failing row is a line of the page and could go unnoticed."""
     if reason := why_not_emulated():
         skip_without("emulated", reason)
     page = tmp_path / "page.md"

@@ -1,4 +1,4 @@
-"""The torchvision remedy: what it writes, and that nerfstudio's parts of torchvision import with it."""
+"""The torchvision remedy: its files, and that nerfstudio's torchvision imports work with it."""
 
 import importlib.util
 import subprocess
@@ -21,7 +21,7 @@ def remedy() -> ModuleType:
 
 
 def python(code: str, *path: Path) -> subprocess.CompletedProcess[str]:
-    """Run code in a fresh interpreter without site's .pth files' effect on `path`, which comes first."""
+    """Run code in a new interpreter, with `path` first and unaffected by site's .pth files."""
     setup = f"import sys; sys.path[:0] = {[str(p) for p in path]!r}\n"
     return subprocess.run([sys.executable, "-c", setup + code], capture_output=True, text=True, check=False)
 
@@ -37,7 +37,7 @@ def test_torchvision_imports_here() -> None:
 
 
 def fake(folder: Path, version: str, cuda: str | None) -> None:
-    """A torchvision that fails as the real one does when nms is missing, and a torch that records declarations."""
+    """Write a torchvision that fails like the real one without nms, and a torch that records declarations."""
     (folder / "torchvision").mkdir(parents=True)
     (folder / "torchvision" / "version.py").write_text(f"__version__ = '{version}'\n")
     (folder / "torchvision" / "__init__.py").write_text(

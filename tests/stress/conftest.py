@@ -1,4 +1,4 @@
-"""Run every test that takes `backend` on all backends, on a card where there is one; a new one is a BACKENDS entry."""
+"""Run tests that take `backend` on all BACKENDS, including a GPU if available."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""Places where an index is one step from being wrong: faces of hash cells, edges of atlas pages."""
+"""Borders of index ranges: faces of hash cells, edges of atlas pages."""
 
 import math
 from dataclasses import replace
@@ -18,8 +18,8 @@ from bitymi_ns.scene.baked import BakedScene
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
 def test_points_exactly_on_the_faces_of_hash_cells(dtype: torch.dtype, backend: Backend) -> None:
-    """Coordinates k / 8 of a grid of 8 cells, the two ends of the domain included: exact in float32, so each point lies
-    on faces of every level and both sides pick the same cell; values and all gradients agree with the reference."""
+    """Coordinates k / 8 of a grid of 8 cells, including both ends, exact in float32: points lie on faces of every
+    level, both sides select the same cell, and values and gradients agree with the reference."""
     generator = torch.Generator().manual_seed(3)
     field = HashField(SceneConfig(min_resolution=8), (0.0, 0.0, 0.0), 1.0, False, 9, generator)
     with torch.no_grad():
@@ -37,7 +37,7 @@ def test_points_exactly_on_the_faces_of_hash_cells(dtype: torch.dtype, backend: 
     wanted = torch.autograd.grad((want * weights).sum(), leaves)
     tolerance = 1e-12 if dtype == torch.float64 else 2e-6
     assert (got.detach().double().cpu() - want).abs().max() < tolerance * want.abs().max()
-    # at the ends of the domain the clamp passes no gradient in the kernels, and half of it in torch's clamp
+    # at the ends, clamping passes no gradient in the kernels but half of it in torch
     inside = (grid.abs() < 1).all(-1)
     pairs = [(grads[0][inside.to(x.device)], wanted[0][inside]), *zip(grads[1:], wanted[1:], strict=True)]
     for a, b in pairs:
@@ -45,7 +45,7 @@ def test_points_exactly_on_the_faces_of_hash_cells(dtype: torch.dtype, backend: 
 
 
 def page_edges(width: int, height: int, r_u: int, r_v: int) -> list[tuple[int, int]]:
-    """Corners and middles of the edges of a page where a tile can lie."""
+    """List the corners and edge middles of a page where a tile can lie."""
     right, bottom = width - r_u, height - r_v
     return [
         (x, y) for y in (0, bottom // 2, bottom) for x in (0, right // 2, right) if (x, y) != (right // 2, bottom // 2)
@@ -54,8 +54,8 @@ def page_edges(width: int, height: int, r_u: int, r_v: int) -> list[tuple[int, i
 
 @pytest.mark.parametrize("sides", [(4, 4), (8, 4), (4, 16)])
 def test_atlas_tiles_at_every_page_edge(sides: tuple[int, int], backend: Backend) -> None:
-    """Whatever no tile owns is NaN: a texel fetched beside a tile, above a page or below it would show. Texture units
-    fetch a neighbour of weight 0 at the outer texel centres, where 0 times NaN would; for them it is a large number."""
+    """Texels outside tiles are NaN, so a stray fetch shows. Texture units fetch neighbours with weight 0 at the outer
+    texel centres, where 0 times NaN would show; for them it is a large number."""
     r_u, r_v = sides
     width, height, layers = 64, 48, 3
     places = [(x, y, layer) for layer in range(layers) for x, y in page_edges(width, height, r_u, r_v)]
@@ -87,13 +87,13 @@ def test_atlas_tiles_at_every_page_edge(sides: tuple[int, int], backend: Backend
     assert len(drawn) == n, "every tile is seen"
     assert got.isfinite().all()
     error = (got - want.rgb).abs().amax(-1)
-    # texture units weigh texels in steps of 1/256
+    # texture units have weights in steps of 1/256
     assert (error < (1e-4 if backend.name == "cpu" else 4e-3)).double().mean() > 0.999, error.max()
     assert error.max() < 2e-2
 
 
 def test_pixels_at_the_edges_of_wide_and_tall_images_are_drawn(backend: Backend) -> None:
-    """One disc over the whole of a 1 x 8192 and an 8192 x 1 image: first and last pixel have it."""
+    """One disc over a whole 1 x 8192 and 8192 x 1 image: first and last pixel are drawn."""
     for width, height in ((1, 1), (1, 8192), (8192, 1)):
         f = float(max(width, height))
         K = torch.tensor([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])

@@ -1,4 +1,4 @@
-"""Numbers that misbehave: finite in, finite out, forward and backward; errors as stated."""
+"""Extreme numbers: finite inputs give finite results and gradients, with errors as stated."""
 
 import pytest
 import torch
@@ -20,7 +20,7 @@ from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig
 CASES = cases()
 NAMES = [case.name for case in CASES]
 LONG = "thousands_on_one_pixel"
-"""Measured one way: it takes as long as all the others together, and lists are the same whatever colours them."""
+"""Measured with one colouring only: it takes as long as all others together, and lists are the same."""
 EVERY = [case for way in (PLAIN, *WAYS) for case in cases(way) if way is PLAIN or case.name != LONG]
 
 
@@ -56,7 +56,7 @@ def test_errors_are_within_the_stated_figures(case: Case, backend: Backend) -> N
     assert errors.forward <= case.forward, errors
     assert errors.gradient <= case.gradient, errors
     assert errors.flipped <= case.flipped, errors
-    # where nothing else is known, what is stated is no more than what the inputs' rounding explains
+    # otherwise the stated error is explained by the inputs' rounding
     assert case.forward <= max(ACCURATE, 12 * errors.input_forward)
     assert case.gradient <= max(ACCURATE, 12 * errors.input_gradient)
 
@@ -72,13 +72,13 @@ def test_errors_grow_no_faster_than_those_of_rounded_inputs(sweep: Sweep, backen
 
 @pytest.mark.parametrize("name", ["huge_scales", "axis_ratio_1e6", "edge_on", "through_the_camera_plane"])
 def test_double_precision_agrees_with_extended_precision(name: str, backend: Backend) -> None:
-    """On discs of 10^8 units the reference's own gradients are off by 1e-3; the kernels' are not."""
+    """On discs of 10^8 units the reference's gradients are off by 1e-3; the kernels' are not."""
     trust = against_extended(CASES[NAMES.index(name)].scene, backend)
     assert trust.forward < 1e-11 and trust.gradient < 1e-9, trust
 
 
 def test_far_from_the_origin_only_the_rounding_of_positions_shows(backend: Backend) -> None:
-    """A scene at 10^6 units: against the same rounded numbers the error is that at the origin."""
+    """At 10^6 units, compared with equally rounded numbers, the error is that at the origin."""
     sweep = next(sweep for sweep in SWEEPS if sweep.name == "world size")
     errors = measure(sweep.make(1e6), backend)
     assert errors.forward < 1e-5 and errors.gradient < 2e-5 and errors.flipped == 0

@@ -1,4 +1,4 @@
-"""Damaged bundles: an error that names the damage, or a bundle that renders; never a crash."""
+"""Damaged bundles give an error that names the damage, or render; they never crash."""
 
 import copy
 import json
@@ -34,7 +34,7 @@ N, SIDE = 12, 16
 
 @pytest.fixture(scope="module", params=FORMATS)
 def bundle(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """The files of a small bundle, by name."""
+    """Files of a small bundle, by name."""
     params = {key: value.float() for key, value in random_scene(N, 0).params.items()}
     packing = pack([[8, 4]] * N)
     texels = np.random.default_rng(0).random((packing.layers, packing.height, packing.width, 3)).astype(np.float32)
@@ -49,7 +49,7 @@ def bundle(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 
 def load_and_draw(folder: Path, verify: bool) -> bool:
-    """Whether the bundle could be opened; what can be opened can be drawn, in finite colours of a bounded size."""
+    """Return whether the bundle opens; if so, check that it renders in finite, bounded colours."""
     try:
         loaded = read_bundle(folder, verify=verify)
     except BundleError as error:
@@ -77,19 +77,19 @@ def test_an_undamaged_bundle_opens(bundle: dict[str, bytes], tmp_path: Path) -> 
 
 @pytest.mark.parametrize("name", ["bundle.json", "surfels.ply", "atlas.ktx2"])
 def test_bit_flips(bundle: dict[str, bytes], name: str, tmp_path: Path) -> None:
-    """With hashes: every flip in a file is found. Without, or with hashes that were made after the damage, what is
-    read has been checked well enough to be drawn."""
+    """With hashes, every flip in a file is detected. Without, or with hashes made after the damage, what is read is
+    valid enough to be drawn."""
     rng = random.Random(f"flip {name}")
     folder = put(tmp_path / "b", bundle)
     for example in range(EXAMPLES):
         data = bytearray(bundle[name])
-        # half of the flips in the head, where the structure is
+        # half of the flips in the header
         end = len(data) if example % 2 else min(len(data), 600)
         for _ in range(rng.choice((1, 1, 3, 20))):
             data[rng.randrange(end)] ^= 1 << rng.randrange(8)
         (folder / name).write_bytes(data)
         opened = load_and_draw(folder, verify=True)
-        same = parse if name == "bundle.json" else bytes  # of JSON, white space may differ
+        same = parse if name == "bundle.json" else bytes  # white space in JSON may differ
         assert not opened or same(data) == same(bundle[name])
         if name != "bundle.json":
             load_and_draw(folder, verify=False)
@@ -107,7 +107,7 @@ def test_truncation_and_growth(bundle: dict[str, bytes], name: str, tmp_path: Pa
     lengths = [0, 1, len(whole) - 1, *(rng.randrange(len(whole)) for _ in range(EXAMPLES // 2))]
     for data in [whole[:length] for length in lengths] + [whole + b"\0", whole + whole, whole * 3]:
         (folder / name).write_bytes(data)
-        # JSON may be followed by white space, and by nothing else
+        # JSON may be followed by white space only
         assert not load_and_draw(folder, verify=False) or (name == "bundle.json" and data.strip() == whole.strip())
         if name != "bundle.json":
             (folder / "bundle.json").write_bytes(signed(json.loads(bundle["bundle.json"]), {**bundle, name: data}))
@@ -116,7 +116,7 @@ def test_truncation_and_growth(bundle: dict[str, bytes], name: str, tmp_path: Pa
 
 
 def flips(manifest: bytes) -> Iterator[bytes]:
-    """Every byte in turn with one bit changed; with BITYMI_FUZZ above 1, with each bit."""
+    """Yield the manifest with one bit of each byte flipped in turn; with BITYMI_FUZZ above 1, each bit."""
     for at, byte in enumerate(manifest):
         for bit in range(8) if MORE > 1 else (at % 8,):
             yield manifest[:at] + bytes([byte ^ 1 << bit]) + manifest[at + 1 :]
@@ -130,7 +130,7 @@ def test_every_flip_of_the_manifest_is_refused_or_changes_nothing(bundle: dict[s
             opened += 1
         except BundleError as error:
             assert "\n" not in str(error)
-    assert opened < len(bundle["bundle.json"]) * (8 if MORE > 1 else 1) // 20  # white space, e as E in a number
+    assert opened < len(bundle["bundle.json"]) * (8 if MORE > 1 else 1) // 20  # white space, e or E in a number
 
 
 NUMBERS = (-1, 0, 1, 2, 255, 10**30, -0.0, 1.5, 1e-300, 5e-324, 1e9, 1e308, -1e308)
@@ -139,7 +139,7 @@ STRANGE = (None, True, False, [], {}, [[]], [1, 2, 3], [1e30] * 3, {"p100": -1},
 
 
 def mutated(info: Any, rng: random.Random) -> Any:
-    """`info` with one to three changes anywhere: a value replaced, removed, copied, scaled, or its key renamed."""
+    """Change `info` in one to three places: replace, remove, copy or scale a value, or rename its key."""
     info = copy.deepcopy(info)
     for _ in range(rng.choice((1, 1, 2, 3))):
         places = []
@@ -167,7 +167,7 @@ def mutated(info: Any, rng: random.Random) -> Any:
 
 
 def test_changed_structures_of_the_manifest(bundle: dict[str, bytes], tmp_path: Path) -> None:
-    """Values of bundle.json of other types and sizes, in other places or gone, signed again: refused or drawn."""
+    """Values of bundle.json with other types, sizes or positions, signed again: refused or drawn."""
     folder = put(tmp_path / "b", bundle)
     whole, rng = json.loads(bundle["bundle.json"]), random.Random("manifest")
     opened = 0
@@ -182,7 +182,7 @@ def test_changed_structures_of_the_manifest(bundle: dict[str, bytes], tmp_path: 
 
 
 def test_columns_of_extreme_values(bundle: dict[str, bytes], tmp_path: Path) -> None:
-    """Numbers of surfels.ply that are NaN, infinite or huge: refused, or drawn in bounded colours."""
+    """NaN, infinite or huge numbers in surfels.ply: refused, or drawn in bounded colours."""
     elements = parse_ply(bundle["surfels.ply"])
     rng = random.Random("columns")
     for element, name in [(element, name) for element, columns in elements.items() for name in columns]:

@@ -1,7 +1,7 @@
-"""Damaged compact bundles, past their hashes: an error that names the damage, or a scene of bounded numbers.
+"""Damaged compact bundles with valid hashes give an error that names the damage, or a scene of bounded numbers.
 
-BITYMI_FUZZ=500 makes 10^5 of them, in some minutes: then memory is measured, and bundle.json read as bytes, in every
-twentieth alone.
+BITYMI_FUZZ=500 makes 10^5 of them in some minutes; memory is then measured, and bundle.json read as bytes, in every
+twentieth only.
 """
 
 import json
@@ -26,7 +26,7 @@ from tests.bundle.damage import signed
 MORE = int(os.environ.get("BITYMI_FUZZ", "1"))
 EXAMPLES = 200 * MORE
 MEMORY = 48 << 20
-"""More than the largest scene that so few bytes may be said to hold."""
+"""More than the largest scene that so few bytes may claim."""
 
 
 @pytest.fixture(scope="module")
@@ -38,9 +38,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], dic
 
 
 def opened(info: dict[str, Any], files: dict[str, bytes], as_bytes: bool = True) -> bool:
-    """Whether what is there can be opened; then its numbers are within what a bundle may hold.
+    """Return whether the bundle opens; if so, check that its numbers are within the limits.
 
-    `as_bytes` reads bundle.json as it lies in a file, with its digest; else its contents alone are checked.
+    `as_bytes` reads bundle.json from a file with its digest; else only its contents are checked.
     """
     try:
         manifest = parse(signed(info, files)) if as_bytes else describe(info)
@@ -66,7 +66,7 @@ def opened(info: dict[str, Any], files: dict[str, bytes], as_bytes: bool = True)
 
 
 def flipped(rng: random.Random, info: dict[str, Any], files: dict[str, bytes]) -> None:
-    """Bits of a file."""
+    """Flip bits of a file."""
     name = rng.choice(sorted(files))
     data = bytearray(files[name])
     for _ in range(rng.choice((1, 1, 3, 20))):
@@ -79,7 +79,7 @@ def columns_of(rng: random.Random, info: dict[str, Any]) -> tuple[str, list[dict
 
 
 def replaced(rng: random.Random, info: dict[str, Any], files: dict[str, bytes]) -> None:
-    """The bytes within a frame, which is whole again; or how many there are."""
+    """Replace the bytes in a frame, keeping it valid, or change their number."""
     name, columns = columns_of(rng, info)
     places, at = [], 0
     for column in columns:
@@ -99,7 +99,7 @@ def replaced(rng: random.Random, info: dict[str, Any], files: dict[str, bytes]) 
 
 
 def misstated(rng: random.Random, info: dict[str, Any], files: dict[str, bytes]) -> None:
-    """A number of bundle.json."""
+    """Change a number of bundle.json."""
     places = [(info["surfels"], key) for key in ("count", "terms")]
     places += [(info["surfels"]["frame"], "scale")] + [(info["surfels"]["frame"]["low"], i) for i in range(3)]
     keys = ("texels", "step", "width", "height", "layers", "page_width", "page_rows", "offset", "scale")
@@ -124,7 +124,7 @@ def test_damage_past_the_hashes(whole: tuple[dict[str, Any], dict[str, bytes]]) 
             try:
                 rng.choice((flipped, replaced, replaced, misstated))(rng, changed, data)
             except (zstandard.ZstdError, ValueError):
-                pass  # a frame that was damaged before
+                pass  # a frame damaged before
         if not whole_way:
             found += opened(changed, data, as_bytes=False)
             continue

@@ -1,6 +1,6 @@
-"""Any argument of a public operation: the right answer or a clear error, never a crash, never silently something else.
+"""Any arguments of public operations give the right answer or a clear error, never a crash or silent error.
 
-Examples are derived from the test alone (the same on every machine); BITYMI_FUZZ=n runs n times as many.
+Examples depend on the test only (the same on every machine); BITYMI_FUZZ=n runs n times as many.
 """
 
 import os
@@ -32,7 +32,7 @@ def fuzz(examples: int):
 
 @st.composite
 def surfels(draw: st.DrawFn, broken: bool) -> dict[str, Tensor]:
-    """Random surfels, some numbers of them replaced by extreme ones."""
+    """Draw random surfels with some extreme numbers."""
     n = draw(st.integers(0, 20))
     case = random_scene(max(n, 1), draw(st.integers(0, 1000)), 16, 16)
     params = {key: value[:n].float() for key, value in case.params.items()}
@@ -46,7 +46,7 @@ def surfels(draw: st.DrawFn, broken: bool) -> dict[str, Tensor]:
 
 @st.composite
 def cameras(draw: st.DrawFn) -> Camera:
-    """Any size to 40 pixels, odd focal lengths, a principal point outside, a pose anywhere."""
+    """Draw cameras of any size up to 40 pixels, odd focal lengths, principal points outside, any pose."""
     width, height = draw(st.integers(1, 40)), draw(st.integers(1, 40))
     case = random_scene(1, draw(st.integers(0, 1000)), 16, 16)
     viewmat = case.viewmat.float()
@@ -64,7 +64,7 @@ def cameras(draw: st.DrawFn) -> Camera:
     near=st.sampled_from((1e-6, 0.2, 5.0)),
 )
 def test_rendering_any_numbers(params: dict[str, Tensor], camera: Camera, prefilter: str, near: float) -> None:
-    """Images and gradients are finite whatever the surfels are, as long as their colours are."""
+    """Images and gradients are finite for any surfels with finite colours."""
     finite = {key: bool(value.isfinite().all()) for key, value in params.items()}
     leaves = {key: value.clone().requires_grad_() for key, value in params.items()}
     n = len(leaves["means"])
@@ -92,7 +92,7 @@ def test_rendering_any_numbers(params: dict[str, Tensor], camera: Camera, prefil
 @fuzz(60)
 @given(data=st.data())
 def test_shapes_and_dtypes_that_do_not_fit_are_refused(data: st.DataObject) -> None:
-    """One argument of the pipeline is spoiled: an error, or (broadcastable by nothing here) the same as before."""
+    """With one argument of the pipeline spoiled, an error is raised, or the result unchanged if it was valid."""
     case = random_scene(7, 1, 16, 12)
     params = {key: value.float() for key, value in case.params.items()}
     camera = Camera(case.viewmat.float(), case.K.float(), 16, 12)
@@ -260,7 +260,7 @@ def test_view_colors_of_any_size(kind: str, seed: int, terms: int, value: float)
 @fuzz(40)
 @given(data=st.data())
 def test_the_baked_renderer_with_any_tiles(data: st.DataObject) -> None:
-    """Tiles inside the pages, at any place and of any size, with any texels."""
+    """Tiles anywhere inside the pages, of any size, with any texels."""
     params = data.draw(surfels(broken=True))
     n = len(params["means"])
     width, height, layers = data.draw(st.integers(1, 24)), data.draw(st.integers(1, 24)), data.draw(st.integers(1, 2))

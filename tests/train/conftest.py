@@ -1,4 +1,4 @@
-"""A ball of coloured discs seen from a ring of cameras."""
+"""A ball of coloured discs, seen by a ring of cameras."""
 
 import math
 
@@ -32,7 +32,7 @@ def cameras() -> list[Camera]:
 
 @pytest.fixture(scope="session")
 def ball() -> tuple[torch.Tensor, torch.Tensor]:
-    """[600, 3] points on the unit sphere and their colours."""
+    """[600, 3] points on the unit sphere, and their colours."""
     xyz = torch.nn.functional.normalize(torch.randn(600, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
     return xyz, 0.5 + 0.45 * torch.sin(4 * xyz)
 
@@ -49,7 +49,7 @@ def views(cameras, ball) -> list[View]:
 
 @pytest.fixture
 def make_scene(cameras, ball):
-    """(texture, every n-th point of the ball) -> a fresh scene."""
+    """make(texture, every n-th point of the ball) -> a new scene."""
 
     def make(texture: bool = True, every: int = 6, config: SceneConfig | None = None) -> Scene:
         config = config or SceneConfig()

@@ -1,5 +1,4 @@
-"""One of the processes of a run, as a program: part_of_a_run.py FOLDER RANK COUNT; and states of runs, to resume
-them from."""
+"""A process of a run as a program: part_of_a_run.py FOLDER RANK COUNT; and saving and restoring a run's state."""
 
 import copy
 import hashlib
@@ -23,7 +22,7 @@ LOST = 3
 
 
 def options(exposure: ExposureKind, poses: RefinePoses) -> TrainConfig:
-    """Densifications, a reset, final prunes, and texels from step 36 on."""
+    """Configure densification, a reset, final prunes, and texels from step 36 on."""
     densify = DensifyConfig(
         max_surfels=300, min_interval=1, min_reset_interval=1, pixels_per_surfel=0, views=5, reset_interval=9_000
     )
@@ -33,7 +32,7 @@ def options(exposure: ExposureKind, poses: RefinePoses) -> TrainConfig:
 
 
 def state_of(trainer: Trainer) -> dict[str, Any]:
-    """Everything that an exact resume needs."""
+    """Collect the state for an exact resume."""
     scene, optimizers = trainer.scene.state_dict(), trainer.optimizers
     return copy.deepcopy(
         {
@@ -46,7 +45,7 @@ def state_of(trainer: Trainer) -> dict[str, Any]:
 
 
 def resume(trainer: Trainer, state: dict[str, Any]) -> None:
-    """Go on where `state_of` was taken; the run has the same options, views and length."""
+    """Restore `state_of`; the run has the same options, views and length."""
     trainer.scene.make_room(state["scene"])
     trainer.scene.load_state_dict(state["scene"])
     for name, optimizer in trainer.optimizers.items():
@@ -56,7 +55,7 @@ def resume(trainer: Trainer, state: dict[str, Any]) -> None:
 
 
 def train(inputs: dict[str, Any], processes: Processes) -> dict[str, Any]:
-    """The run's end, and what it looked like on the way: a digest of all parameters every ten steps."""
+    """Train; returns the final state, and digests of all parameters every ten steps."""
     config, field = SceneConfig(texture=inputs["texture"]), None
     if config.texture == "hash":
         field = HashField(config, (0.0, 0.0, 0.0), 1.5, False, 10, torch.Generator().manual_seed(processes.rank))

@@ -1,4 +1,4 @@
-"""A bench for the strategy: surfels in a row, and scores that a test sets."""
+"""A test bench for the strategy: surfels in a row with given scores."""
 
 import math
 from types import SimpleNamespace
@@ -19,7 +19,7 @@ LARGE, SMALL = math.log(0.01), math.log(0.0001)  # against dense * extent = 0.00
 
 
 class Bench:
-    """A scene of n opaque surfels in a row, its optimisers with some momentum, and scores that a test sets."""
+    """A scene of n opaque surfels in a row, optimisers with momentum, and given scores."""
 
     def __init__(self, monkeypatch, n=40, **densify):
         xyz = torch.stack([torch.arange(float(n)), torch.zeros(n), torch.zeros(n)], -1)
@@ -30,7 +30,7 @@ class Bench:
         self.optimizers = make_optimizers(self.scene)
         for name, optimizer in self.optimizers.items():
             self.scene.surfels[name].grad = torch.ones_like(self.scene.surfels[name])
-            optimizer.step()  # with rate 0: moments only
+            optimizer.step()  # rate 0: moments only
         densify = {"min_surfels": 1, **densify}
         self.config = TrainConfig(densify=DensifyConfig(**densify))
         self.strategy = Strategy(Schedule(self.config, 30_000))
@@ -42,7 +42,7 @@ class Bench:
         monkeypatch.setattr(module, "removal_errors", lambda *_: (self.added[self._rows()], self.present))
 
     def _rows(self):
-        # rows are known by their x: scores stay with their surfels when rows were dropped before
+        # rows are identified by x, so scores stay with their surfels after pruning
         return self.scene.surfels["means"][:, 0].detach().nan_to_num(0).round().long()
 
     def _scores(self, scene, views, config, processes):
@@ -53,7 +53,7 @@ class Bench:
         return []
 
     def see(self, grad=0.0, absgrad=0.0, radius=5.0, visible=None):
-        """One accumulated view of 200 x 100 pixels; gradients [n] or numbers in NDC along x."""
+        """Accumulate a view of 200 x 100 pixels; gradients [n] or numbers in NDC along x."""
         n = len(self.scene)
         ndc = [torch.as_tensor(g, dtype=torch.float32).expand(n) for g in (grad, absgrad)]
         pixels = [torch.stack([g / 100.0, torch.zeros(n)], -1) for g in ndc]

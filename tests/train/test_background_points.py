@@ -1,4 +1,4 @@
-"""Points behind the cells of photographs that no sparse point projects to."""
+"""Background points in cells of photographs without sparse points."""
 
 import math
 
@@ -27,7 +27,7 @@ EYE = torch.tensor([1.0, 2.0, -3.0])
 
 
 def turned(degrees: float) -> Camera:
-    """A camera at EYE that is turned about the y axis."""
+    """Make a camera at EYE, rotated about the y axis."""
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     viewmat = torch.eye(4)
     viewmat[:3, :3] = torch.tensor([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
@@ -41,7 +41,7 @@ def camera() -> Camera:
 
 
 def world(camera: Camera, pixels: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
-    """Points [N, 3] at pixels [N, 2] with depth [N]."""
+    """Unproject pixels [N, 2] with depth [N] to points [N, 3]."""
     K = camera.K
     local = torch.stack(
         [(pixels[:, 0] - K[0, 2]) / K[0, 0], (pixels[:, 1] - K[1, 2]) / K[1, 1], torch.ones(len(pixels))], 1
@@ -57,7 +57,7 @@ def projected(camera: Camera, points: torch.Tensor) -> tuple[torch.Tensor, torch
 
 @pytest.fixture
 def left(camera: Camera) -> torch.Tensor:
-    """Points in every cell of the left half."""
+    """Make points in every cell of the left half."""
     side = W / CELLS
     cells = torch.cartesian_prod(torch.arange(CELLS // 2), torch.arange(int(H / side))).repeat(2 * POINTS_PER_CELL, 1)
     return world(camera, (cells + 0.5) * side, DEPTH * torch.linspace(0.9999, 1.0001, len(cells)))
@@ -90,7 +90,7 @@ def test_a_view_without_points_takes_the_depth_of_the_others(camera: Camera, lef
     away = turned(200.0)
     image = torch.rand(H, W, 3)
     both = background_points(left, [View(camera, image), *[View(away, image)] * SUPPORT], 0)
-    _, depth = projected(away, both.xyz)  # one view has the empty cells of the first: too few
+    _, depth = projected(away, both.xyz)  # only one view has the first one's empty cells: too few
     assert len(depth) == SUPPORT * CELLS * 12 and bool((depth > NEAREST * DEPTH * 0.999).all())
     assert len(background_points(left, [View(away, image)] * SUPPORT, 0).xyz) == 0
     assert len(background_points(torch.full((5, 3), math.nan), [View(camera, image)] * SUPPORT, 0).xyz) == 0
@@ -102,7 +102,7 @@ def test_points_that_few_views_show_or_that_hide_others_go(camera: Camera, left:
     ahead = turned(0.0)
     points = world(ahead, projected(camera, left)[0], torch.full((len(left),), DEPTH))
     assert len(background_points(points, [View(ahead, image)] * SUPPORT, 0).xyz) == SUPPORT * 144
-    viewmat = torch.eye(4)  # to the right of what is empty, looking left
+    viewmat = torch.eye(4)  # right of the empty cells, looking left
     viewmat[:3, :3] = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     viewmat[:3, 3] = -viewmat[:3, :3] @ (EYE + torch.tensor([10.0, 0.0, 4.0]))
     side = Camera(viewmat, torch.tensor([[15.0, 0.0, 48.0], [0.0, 15.0, 24.0], [0.0, 0.0, 1.0]]), W, H)

@@ -1,4 +1,4 @@
-"""Views that see nothing of what training starts from."""
+"""Views that see no initial point."""
 
 import pytest
 import torch
@@ -19,7 +19,7 @@ def scene_at(points: torch.Tensor, scale: float = 0.01) -> Scene:
 
 
 def camera(turned: bool = False) -> Camera:
-    """At the origin, looking along z, or against it."""
+    """Make a camera at the origin, looking along z or -z."""
     viewmat = torch.eye(4)
     if turned:
         viewmat[0, 0] = viewmat[2, 2] = -1.0

@@ -1,4 +1,4 @@
-"""Building a scene without nerfstudio."""
+"""Building scenes without nerfstudio."""
 
 import pytest
 import torch
@@ -47,7 +47,7 @@ def test_a_declared_box_is_the_domain_if_it_is_small(cloud) -> None:
     assert build(cloud, declared=2.21 * box)[0].field.geometry.contract is True
     assert build(cloud, declared=box, contraction="on")[0].field.geometry.contract is True
     assert build(cloud, declared=4 * box, contraction="off")[0].field.geometry.half == pytest.approx(8.8)
-    assert build(cloud, bounded=True, contraction="on")[0].field.geometry.contract is True  # the option comes first
+    assert build(cloud, bounded=True, contraction="on")[0].field.geometry.contract is True  # the option overrides
     assert build(cloud, bounded=False, contraction="off")[0].field.geometry.contract is False
 
 

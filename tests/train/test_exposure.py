@@ -1,4 +1,4 @@
-"""Colour corrections of the photographs: the formula, what is kept of them, when there are any, and resuming."""
+"""Exposure corrections of photographs: formula, state, conditions, resuming."""
 
 import math
 from collections.abc import Sequence
@@ -26,13 +26,13 @@ def config(kind: str, **more) -> TrainConfig:
 
 @pytest.fixture
 def uneven(views) -> list[View]:
-    """The views, exposed differently."""
+    """Expose the views differently."""
     logs = torch.tensor([0.3, -0.2, 0.1, -0.3, 0.25, -0.15])
     return [v._replace(image=(v.image * g.exp()).clamp(0, 1)) for v, g in zip(views, logs, strict=True)]
 
 
 def started(kind: str, log_gains: Tensor, stops: Sequence[float] | None = None, points: int = 10**6) -> Exposure:
-    """An exposure whose photographs were found to have these gains."""
+    """Make an exposure from photographs with these gains."""
     exposure = Exposure(kind, stops)
     found = ExposureGains(log_gains, torch.full((len(log_gains),), points), 0.5)
     with pytest.MonkeyPatch.context() as patch:
@@ -57,7 +57,7 @@ def test_gradients_of_the_corrected_image(columns: int, background: Tensor | Non
         return shown(rgb, exposure.of(2), alpha, background)
 
     def dense(table: Tensor, rgb: Tensor, alpha: Tensor) -> Tensor:
-        with pytest.MonkeyPatch.context() as patch:  # gradcheck knows no sparse gradients
+        with pytest.MonkeyPatch.context() as patch:  # gradcheck does not support sparse gradients
             patch.setattr(module, "embedding", lambda number, weight, sparse: weight[number])
             return image(table, rgb, alpha)
 
@@ -118,7 +118,7 @@ def test_a_photograph_that_is_not_shown_keeps_its_moments() -> None:
         exposure.of(1).sum().backward()
         exposure.step(0.01)
     before = exposure.table.detach().clone()
-    torch.testing.assert_close(before[0], before[2])  # both were only moved by the mean
+    torch.testing.assert_close(before[0], before[2])  # both were moved by the mean only
     assert bool((before[1] < before[0]).all())
 
 
@@ -148,7 +148,7 @@ def test_exif_is_where_the_corrections_start_from() -> None:
         (None, math.nan, False),
         ([0.0, 1.0, 2.0], math.nan, True),
         ([0.0, 0.01, 0.0], math.nan, False),
-        ([0.0, 1.0, 2.0], 0.0, False),  # the photographs say that the camera evened it out
+        ([0.0, 1.0, 2.0], 0.0, False),  # stated exposures that the camera compensated
     ],
 )
 def test_auto_asks_the_photographs_and_then_exif(monkeypatch, stops, explained, on) -> None:
@@ -213,7 +213,7 @@ def test_states_of_earlier_versions_other_options_and_other_photographs(make_sce
     for kind, count in (("affine", 6), ("gain", 5)):
         other = Exposure(kind)
         other.load_state_dict(state, count)
-        assert not other.decided  # it starts anew
+        assert not other.decided  # starts over
     off = Exposure("off")
     off.load_state_dict(state, 6)
     assert off.decided and off.table is None

@@ -1,4 +1,4 @@
-"""How photographs agree at the points: gains are found, and what hides points, masks or clips is not taken for them."""
+"""Agreement of photographs at points: gains are found, and occlusion, masks and clipping are not mistaken for them."""
 
 import math
 
@@ -15,10 +15,10 @@ SIZE = 64
 
 
 def plane_views(gains: torch.Tensor, noise: float = 0.0) -> tuple[torch.Tensor, list[View]]:
-    """Points [1500, 3] of a coloured plane, and photographs [V] of it by cameras that are shifted along it.
+    """Make points [1500, 3] of a coloured plane, and photographs [V] of it by shifted cameras.
 
     Args:
-        gains: [V, 3] of the photographs.
+        gains: [V, 3] gain of each photograph.
         noise: standard deviation of the pixels.
     """
     g = torch.Generator().manual_seed(0)
@@ -85,7 +85,7 @@ def test_clipped_and_black_pixels_do_not_count() -> None:
 
 
 def test_points_on_the_far_side_are_not_taken_for_exposure(views, ball) -> None:
-    """The ball's colours differ from side to side: a point that shines through would make each view its own gain."""
+    """The ball's colours differ by side: points seen through it would give each view its own gain."""
     many = torch.nn.functional.normalize(torch.randn(6000, 3, generator=torch.Generator().manual_seed(2)), dim=-1)
     found = estimate_gains(many, views, 0.02)
     assert math.isnan(found.explained) or found.explained < 0.05

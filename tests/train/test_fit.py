@@ -1,4 +1,4 @@
-"""Training with the real renderer, small and short."""
+"""Short training with the real renderer."""
 
 import math
 from dataclasses import replace
@@ -68,7 +68,7 @@ def test_a_resumed_run_is_the_same_run(make_scene, views, options):
     state = state_of(straight)
     resumed = Trainer(make_scene(every=5), views, config, 60)
     resume(resumed, state)
-    for _ in range(14, 40):  # over densifications, resets and a final prune
+    for _ in range(14, 40):  # across densifications, resets and a final prune
         straight.advance()
         resumed.advance()
     assert len(resumed.scene) == len(straight.scene) != len(state["scene"]["surfels.means"])
@@ -110,7 +110,7 @@ def test_images_with_alpha_and_bytes_and_masks(make_scene, views):
     schedule = Schedule(config, 100)
     camera, image, *_ = views[0]
     rgba = torch.cat([image, torch.ones(48, 48, 1)], -1)
-    rgba[:, :10] = torch.tensor([0.3, 0.9, 0.1, 0.0])  # nothing there: the background shows
+    rgba[:, :10] = torch.tensor([0.3, 0.9, 0.1, 0.0])  # transparent: the background shows
     white = image.clone()
     white[:, :10] = 1.0
     mask = torch.zeros(48, 48, 1, dtype=torch.bool)

@@ -1,4 +1,4 @@
-"""Depth and normals as supervision: the loss terms, and a run with and without them."""
+"""Supervision by depth and normals: loss terms, and runs with and without."""
 
 import math
 
@@ -101,7 +101,7 @@ def run(make_scene, views: list[View], steps: int = 60, **loss) -> tuple[Scene, 
 
 
 def with_depth(views: list[View], make_scene) -> list[View]:
-    """Views with the depth of the unit ball that they show."""
+    """Add the depth of the unit ball to views."""
     result = []
     for view in views:
         camera = view.camera

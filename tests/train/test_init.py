@@ -35,11 +35,11 @@ def cloud():
 def test_colours_are_those_of_the_points(cloud, kind):
     xyz, rgb = cloud
     surfels, _ = start(xyz, rgb, kind=kind)
-    Scene(SceneConfig(view_color=kind), surfels, None)  # has all parameters, of the right shape
+    Scene(SceneConfig(view_color=kind), surfels, None)  # checks names and shapes of the parameters
     everywhere = torch.zeros(len(xyz), 3)
     directions = fibonacci_sphere(400)
     for d in directions:
-        # a camera far away sees every surfel from the direction d
+        # a distant camera sees every surfel from direction d
         everywhere += view_color(kind, surfels, surfels["means"], -1e4 * d, torch.ones(len(xyz), dtype=torch.bool))
     tolerance = 5e-3 if kind == "sb" else 1e-4
     torch.testing.assert_close(everywhere / len(directions) + 0.5, rgb, atol=tolerance, rtol=0)
@@ -58,7 +58,7 @@ def test_discs_face_the_nearest_camera(cloud):
     to_camera = CENTERS[torch.cdist(xyz, CENTERS).argmin(-1)] - xyz
     normal = torch.linalg.cross(u, v)
     torch.testing.assert_close((normal * to_camera).sum(-1), to_camera.norm(dim=-1))
-    assert (u - u[0]).abs().max() > 0.5  # turned at random in the plane
+    assert (u - u[0]).abs().max() > 0.5  # random rotation in the plane
 
 
 def test_facing_down_and_zero_quaternions():

@@ -1,4 +1,4 @@
-"""No bound is met in silence."""
+"""Limits that take effect are reported."""
 
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train import limits

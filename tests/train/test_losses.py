@@ -99,7 +99,7 @@ def test_objective_has_the_terms_that_are_on(make_scene, views):
 
 
 def test_a_picture_over_a_background_is_one_tensor(make_scene, views):
-    """On a card its losses have kernels of their own, which take that tensor."""
+    """On CUDA its losses have kernels that take this tensor."""
     scene, background = make_scene(), torch.tensor([0.2, 0.7, 0.4])
     over, black = (scene.render(views[0].camera, b) for b in (background, None))
     assert over.image.shape[-1] == 5 and torch.equal(over.rgb, over.image[..., :3])
@@ -114,7 +114,7 @@ def test_psnr_of_a_known_error() -> None:
     mask = torch.zeros(8, 8, 1, dtype=torch.bool)
     mask[:2] = True
     b = a.clone()
-    b[2:] = 0.0  # where it does not count
+    b[2:] = 0.0  # masked out
     assert psnr(b, a, mask) == 100.0
     assert psnr(b, a, ~mask) < 10
     assert math.isnan(psnr(a, a, torch.zeros(8, 8, dtype=torch.bool)))
@@ -149,11 +149,11 @@ def test_no_half_is_judged_by_a_fit_of_its_own() -> None:
     g = torch.Generator().manual_seed(0)
     image = 0.2 + 0.5 * torch.rand(16, 20, 3, generator=g)
     left = (torch.arange(20) < 10)[None, :, None]
-    target = torch.where(left, 1.3 * image, image)  # as the left half alone is brighter
+    target = torch.where(left, 1.3 * image, image)  # like with a brighter left half only
     fitted = color_fitted(image, target)
     torch.testing.assert_close(fitted, torch.where(left, image, 1.3 * image).clamp(max=1.0), atol=2e-3, rtol=0)
     assert fitted_psnr(image, target) < psnr(image, target)
-    # the left half counts nowhere, or is not finite: the right one stays as it is
+    # the left half is masked out or not finite: the right one is unchanged
     few = ~left[..., 0].expand(16, 20)
     few = few | (torch.arange(320).view(16, 20) == 21)  # one pixel of the left half
     broken = image.clone()

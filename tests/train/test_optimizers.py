@@ -1,4 +1,4 @@
-"""Optimisers that step together do what each does alone, to the last bit."""
+"""Fused optimiser steps equal separate ones bit for bit."""
 
 import pytest
 import torch
@@ -52,7 +52,7 @@ def test_a_step_together_is_a_step_of_each(left_out: tuple[int, ...]) -> None:
 
 
 def test_steps_of_rows_are_scaled() -> None:
-    """Also the first one, which an optimiser does itself."""
+    """Including the first step, which the optimiser itself takes."""
     scaled, plain = optimizers(), optimizers()
     factor = torch.linspace(0.0, 3.0, 7)
     g = torch.Generator().manual_seed(1)

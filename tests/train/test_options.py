@@ -14,7 +14,7 @@ UNBOUNDED = {"loss.overdraw_start", "loss.overdraw_stop", "densify.start", "dens
 
 
 def numbers(config: Any, before: str = "") -> dict[str, bool]:
-    """Every number among the options, and whether it has a range."""
+    """Map every numeric option to whether it has a range."""
     hints, found = get_type_hints(type(config), include_extras=True), {}
     for f in fields(config):
         value = getattr(config, f.name)

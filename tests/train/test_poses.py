@@ -1,4 +1,4 @@
-"""Poses of photographs that are refined beside the scene."""
+"""Pose refinement during training."""
 
 import math
 from dataclasses import replace
@@ -52,7 +52,7 @@ def wrong(views) -> list[View]:
 
 @pytest.fixture(scope="module")
 def ring(truth) -> tuple[list[View], list[View]]:
-    """Photographs from a ring of cameras, and the same with poses that are half a pixel off, the world in its place."""
+    """Photographs from a ring of cameras, and the same with poses half a pixel off, without a global motion."""
     angles = [2 * math.pi * i / 24 for i in range(24)]
     cameras = [
         look_at_origin([3 * math.cos(a), 3 * math.sin(a), 0.8 + 1.1 * math.sin(3 * i)]) for i, a in enumerate(angles)
@@ -77,7 +77,7 @@ def scene_of(ball, views: list[View]) -> Scene:
 
 
 def apart(some: list[Camera], others: list[Camera], points: Tensor) -> float:
-    """Median distance in pixels of the points in one set of cameras and in another."""
+    """Compute the median pixel distance of points between two sets of cameras."""
     pairs = [(torch.stack(camera.project(points)[:2]) for camera in pair) for pair in zip(some, others, strict=True)]
     return float(torch.stack([(a - b).norm(dim=0) for a, b in pairs]).median())
 
@@ -150,7 +150,7 @@ def test_training_finds_the_poses_and_leaves_the_world_where_it_is(ring, ball):
 def test_cameras_are_carried_along_with_their_neighbours(ring):
     right, wrong = ring
     poses = Poses(Schedule(options("on"), 60), [view.camera for view in right])
-    # the smooth error of a bent walk round the object
+    # smooth drift of a path around the object
     x, y, z = poses._centers.unbind(1)
     poses.motions = 0.01 * torch.stack([0.3 * x, 0.2 * y, 0.1 * z, y, -x, 0.5 * x], 1)
     between = look_at_origin([3 * math.cos(0.1), 3 * math.sin(0.1), 0.9])
@@ -189,7 +189,7 @@ def test_a_resumed_run_goes_on_from_the_poses(make_scene, wrong):
     motions = [run.training.poses.motions for run in (straight, resumed)]
     torch.testing.assert_close(*motions, rtol=1e-4, atol=1e-8)
     assert not torch.equal(motions[0], state["training"]["poses"]["motions"])
-    fixed = Trainer(make_scene(texture=False), wrong, options("off"), 60)  # refined so far, no further
+    fixed = Trainer(make_scene(texture=False), wrong, options("off"), 60)  # keeps the refined poses
     resume(fixed, state)
     fixed.advance()
     assert torch.equal(fixed.training.poses.motions, state["training"]["poses"]["motions"])

@@ -1,4 +1,4 @@
-"""Runs of two processes: those of one process that looks at the same views, and what happens when one ends."""
+"""Runs of two processes equal a run of one with the same views; and the loss of a process."""
 
 import os
 import subprocess
@@ -20,7 +20,7 @@ from tests.train.part_of_a_run import LOST, STEPS, train
 
 @pytest.fixture
 def inputs(cameras, ball, views) -> dict[str, Any]:
-    """A quarter of the ball's points, and six views, one with a mask, one darker."""
+    """A quarter of the ball's points, and six views, one masked, one darker."""
     centers = torch.stack([camera.center for camera in cameras])
     surfels, _ = surfels_from_points(*(t[::4] for t in ball), centers, TrainConfig(), SceneConfig())
     mask = torch.zeros(48, 48, 1, dtype=torch.bool)
@@ -30,7 +30,7 @@ def inputs(cameras, ball, views) -> dict[str, Any]:
 
 
 def start(folder: Path, inputs: dict[str, Any]) -> list[subprocess.Popen[str]]:
-    """Two processes."""
+    """Start two processes."""
     torch.save(inputs, folder / "inputs.pt")
     root = Path(__file__).parents[2]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(root)}
@@ -41,7 +41,7 @@ def start(folder: Path, inputs: dict[str, Any]) -> list[subprocess.Popen[str]]:
 
 
 def flat(value: Any, name: str = "") -> dict[str, Any]:
-    """Tensors and numbers of nested states by their names."""
+    """Flatten nested states to tensors and numbers by name."""
     if isinstance(value, (dict, list, tuple)):
         items = value.items() if isinstance(value, dict) else enumerate(value)
         return {key: v for k, inner in items for key, v in flat(inner, f"{name}/{k}").items()}
@@ -50,7 +50,7 @@ def flat(value: Any, name: str = "") -> dict[str, Any]:
 
 @pytest.fixture
 def one_thread() -> Iterator[None]:
-    """As the processes have: torch adds up in another order with more threads, and Adam's first steps follow signs."""
+    """Use one thread, like the processes: torch's order of summation varies, and Adam's first steps follow signs."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -107,7 +107,7 @@ except ProcessLost:
 
 @pytest.mark.slow
 def test_sums_that_are_lost_do_not_abort_the_process_as_it_ends(tmp_path):
-    """Works left to gloo's threads hold tensors of Python's, whose end there aborts the interpreter."""
+    """Pending gloo operations hold Python tensors, whose destruction at exit aborts the interpreter."""
     command = [sys.executable, "-c", SUMS, str(tmp_path)]
     first, second = (subprocess.Popen([*command, rank], stderr=subprocess.PIPE, text=True) for rank in "01")
     assert second.wait(timeout=60) == 1
@@ -134,6 +134,6 @@ def test_one_process_alone_asks_nobody():
 
 
 def test_processes_that_have_come_apart_do_not_add_their_gradients(monkeypatch):
-    monkeypatch.setattr(Processes, "_largest", lambda self, values: [1, 7, -6])  # another one has 6 surfels
+    monkeypatch.setattr(Processes, "_largest", lambda self, values: [1, 7, -6])  # another process has 6 surfels
     with pytest.raises(ProcessesApart, match="one has 7 surfels, another 6"):
         Processes(0, 2).average_gradients([torch.nn.Parameter(torch.rand(3))], 7)

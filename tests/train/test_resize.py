@@ -34,7 +34,7 @@ def test_rows_keep_their_moments_and_new_rows_start_from_zero():
     for name, p in surfels.items():
         state = optimizers[name].state[p]
         assert told[name] is p and optimizers[name].param_groups[0]["params"] == [p]
-        assert len(optimizers[name].state) == 1  # nothing of the old parameter is left
+        assert len(optimizers[name].state) == 1  # nothing of the old parameter remains
         assert p.requires_grad and p.is_contiguous() and p.shape[0] == 5
         torch.testing.assert_close(p[:3], before[name][keep])
         torch.testing.assert_close(state["exp_avg"][:3], moments[name][keep])

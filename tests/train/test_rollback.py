@@ -1,4 +1,4 @@
-"""Runs that diverge: they recover or say why, and never end with a scene that is not finite."""
+"""Diverging runs recover or say why, and never end with a scene that is not finite."""
 
 import math
 import warnings
@@ -84,7 +84,7 @@ def test_a_field_that_breaks_on_the_way_is_restored(begun, views):
 
 
 def test_a_field_that_breaks_just_before_a_prune_is_restored(make_scene, views):
-    """The prune finds it, not the next loss."""
+    """The prune detects it before the next loss."""
     scene = make_scene()
     trainer = Trainer(scene, views, config_of(), 120)
     schedule = trainer.training.schedule
@@ -110,7 +110,7 @@ def test_views_drawn_worse_than_before_take_the_run_back(begun, views):
     trainer = begun(96)
     scene = trainer.scene
     good, *_ = evaluate(scene, views, trainer.config)
-    assert trainer.training.guard.window == 24  # four epochs; the windows end with the run
+    assert trainer.training.guard.window == 24  # four epochs; windows end with the run
     with torch.no_grad():
         scene.surfels["sv_rgb"] += 0.3
     damaged, *_ = evaluate(scene, views, trainer.config)
@@ -142,7 +142,7 @@ def test_rates_return_to_normal_after_a_good_window_but_once(begun):
 
 
 def test_texels_begin_a_window_of_their_own(make_scene, views):
-    """A rise of the loss when texels begin is compared with what was before only where it lasts."""
+    """A rise of the loss at the start of texels is compared with earlier losses only if it lasts."""
     config = config_of()
     config.texels.start = 18_000
     trainer = Trainer(make_scene(texture=False, config=SceneConfig(texture="texels")), views, config, 250)
@@ -157,7 +157,7 @@ def test_texels_begin_a_window_of_their_own(make_scene, views):
 
 
 def test_losses_are_compared_across_resolutions(make_scene, views):
-    """Small pictures have smaller losses here: too small for a window of SSIM, they have none."""
+    """Small pictures have smaller losses here, as they are smaller than a window of SSIM."""
     scene, config = make_scene(), config_of()
     config.resolution_schedule, config.num_downscales = 12_000, 3
     trainer = Trainer(scene, views, config, 120)
@@ -185,7 +185,7 @@ def test_a_few_broken_surfels_are_dropped_and_many_take_the_run_back(begun):
     before = len(scene)
     with torch.no_grad():
         scene.surfels["sv_rgb"][3] = math.nan  # the loss is not finite
-        scene.surfels["quats"][7] = math.inf  # not drawn, no loss
+        scene.surfels["quats"][7] = math.inf  # not drawn, without effect on the loss
     with pytest.warns(UserWarning, match="2 surfels were no longer finite and were dropped"):
         trainer.advance()
     assert len(scene) == before - 2 and not describe_broken(scene) and trainer.training.guard.rollbacks == 0

@@ -1,4 +1,4 @@
-"""Short runs are proper runs: the same events, as often, at the same share of the run."""
+"""Short runs have the same events, as often, at the same share of the run."""
 
 import itertools
 
@@ -9,7 +9,7 @@ from bitymi_ns.train.schedules import Schedule
 
 
 def every_event() -> TrainConfig:
-    """Options of a run that leaves out no event, however short it is."""
+    """Configure a run that skips no event, however short it is."""
     return TrainConfig(densify=DensifyConfig(min_interval=1, min_reset_interval=1))
 
 
@@ -87,7 +87,7 @@ def test_resolution_doubles_up_to_full_size():
 
 
 def doublings(config: TrainConfig, steps: int, pixels: float = 1e6) -> list[int]:
-    """Steps at which the pictures of a run whose texels learn in its last part become larger."""
+    """List the steps at which pictures double in size, in a run whose last part trains texels."""
     schedule = Schedule(config, steps, texels=True, pixels=pixels)
     factors = [schedule.resolution_factor(step) for step in range(steps)]
     assert all(now in (before, 2 * before) for before, now in itertools.pairwise(factors)) and factors[-1] == 1.0
@@ -121,7 +121,7 @@ def test_learning_rates():
     assert schedule.lr("field_mlp", 29_999) == pytest.approx(1e-3)
     names = "means quats log_scales opacity_logits beta_raw sv_sites sv_log_tau sv_rgb sh_dc sh_rest sb_base sb_lobes"
     for name in (names + " sg_base sg_lobes field_table field_mlp").split():
-        assert type(schedule.lr(name, 1234)) is float  # checkpoints must hold no numpy scalars
+        assert type(schedule.lr(name, 1234)) is float  # no numpy scalars in checkpoints
         assert schedule.lr(name, 1234) > 0
     with pytest.raises(AttributeError, match="colour"):
         schedule.lr("colour", 0)
@@ -133,7 +133,7 @@ def test_resets_leave_time_to_recover(max_steps, opacity):
 
 
 def test_positions_move_less_than_the_rest_when_texels_begin() -> None:
-    """Other rates of the surfels do, as of a run as long as the texels' part."""
+    """Other rates follow a run as long as the texels' part."""
     for steps in (1000, 30_000):
         schedule = Schedule(TrainConfig(), steps, texels=True)
         begin, part = schedule.texels_start, Schedule(TrainConfig(), schedule.texel_steps)

@@ -63,7 +63,7 @@ def test_removal_errors_are_those_of_removed_surfels(make_scene, views):
     mask = torch.arange(48)[:, None].expand(48, 48) > 20
     chosen = [views[0], views[1], views[2]._replace(mask=mask)]
     with torch.no_grad():
-        scene.surfels["means"][0] = torch.tensor([0.0, 0.0, 500.0])  # no view shows it
+        scene.surfels["means"][0] = torch.tensor([0.0, 0.0, 500.0])  # seen by no view
         full = [scene.render(view.camera).rgb for view in chosen]
         exact, logits = torch.zeros(len(scene), dtype=torch.float64), scene.surfels["opacity_logits"]
         for row, logit in enumerate(logits.tolist()):

@@ -1,4 +1,4 @@
-"""Steps in pixels: footprints against float64, one number for every scale, scenes of large extent and fine detail."""
+"""Steps in pixels: footprints against float64, scale invariance, scenes of large extent and fine detail."""
 
 import math
 import warnings
@@ -21,7 +21,7 @@ from tests.train.part_of_a_run import resume, state_of
 
 
 def reference(means: Tensor, cameras: list[Camera], near: float) -> Tensor:
-    """Measure footprints one by one in float64; inf where no view holds a centre."""
+    """Compute footprints in float64; inf where no view holds a centre."""
     found = []
     for mean in means.double():
         sides = [math.inf]
@@ -70,7 +70,7 @@ def test_a_step_moves_near_and_far_surfels_by_as_many_pixels(make_scene, views: 
         scene.surfels["means"][::2] *= 0.3
     trainer = Trainer(scene, views, TrainConfig(resolution_schedule=0), 100)
     before = scene.surfels["means"].detach().clone()
-    trainer.advance()  # Adam's first step is its rate in every coordinate
+    trainer.advance()  # Adam's first step equals its rate in every coordinate
     moved = (scene.surfels["means"].detach() - before).abs()
     footprints = trainer.training.step_sizes.footprints
     pixels = trainer.training.schedule.lr("means", 0)
@@ -82,7 +82,7 @@ def test_a_step_moves_near_and_far_surfels_by_as_many_pixels(make_scene, views: 
 
 
 def scaled(views: list[View], by: float) -> list[View]:
-    """Return the same photographs of a world that is larger."""
+    """Scale the world of the photographs."""
     found = []
     for view in views:
         viewmat = view.camera.viewmat.clone()
@@ -105,8 +105,8 @@ def test_the_scale_of_a_capture_changes_nothing(views: list[View], ball: tuple[T
 
 
 def fine(views: list[View], by: float, ball: tuple[Tensor, Tensor]) -> tuple[list[View], Tensor, Tensor]:
-    """Return the photographs as of a scene that is small in its capture: cameras farther away with longer lenses, one
-    of them on the other side of the world, so that the extent is large."""
+    """Make the scene small in its capture: cameras farther away with longer lenses, one of them on the other side of
+    the world, so that the extent is large."""
     found = []
     for view in views:
         camera = view.camera
@@ -122,7 +122,7 @@ def fine(views: list[View], by: float, ball: tuple[Tensor, Tensor]) -> tuple[lis
 def test_texels_keep_the_picture_of_a_scene_with_a_large_extent(
     views: list[View], ball: tuple[Tensor, Tensor], by: float
 ) -> None:
-    """With steps in shares of the extent, 30 times as many pixels per step, the picture comes apart."""
+    """With steps relative to the extent, 30 times as many pixels per step, training diverges."""
     here, xyz, rgb = fine(views, by, ball)
     losses = {}
     for name, rates in {"pixels": LearningRates(), "extent": LearningRates(means=(1.6e-4, 1.6e-6))}.items():

@@ -1,4 +1,4 @@
-"""Rules of densification and pruning, with the multi-view scores given."""
+"""Rules of densification and pruning for given multi-view scores."""
 
 import itertools
 import math
@@ -116,7 +116,7 @@ def test_half_of_the_candidates_are_drawn_from_all(bench):
     b.set("opacity_logits", slice(0, 500), -5.3)  # 0.00497: candidate, but visible
     b.step(DENSIFY)
     removed = 1000 - len(b.scene)
-    # 250 draws out of 1000 rows of equal weight: about 125 of them hit a candidate
+    # 250 draws out of 1000 rows of equal weight hit a candidate about 125 times
     assert 95 <= removed <= 155
     assert set(range(500, 1000)) <= set(b.x)
 
@@ -132,7 +132,7 @@ def test_scores_stay_aligned_when_others_are_split_or_dropped(bench):
     report = b.step(DENSIFY)
     assert report["split"] == 30 and report["not_finite"] == 1
     gone = set(range(100)) - set(b.x)
-    # children stay within a few hundredths of their parents, so they round to them
+    # children stay within a few hundredths of their parents, to which they round
     assert gone == set(range(40, 50)) | {30}
     check(b)
 
@@ -178,7 +178,7 @@ def test_surfels_grow_to_the_cap_in_equal_parts_and_reach_it(bench, cap):
         b.strategy.step(step, b.scene, b.optimizers, b.views)
         counts.append(len(b.scene))
     assert counts[-1] == cap
-    if cap == 2000:  # a surfel has at most two children at a time
+    if cap == 2000:  # at most two children per surfel at a time
         shares = [later - n for n, later in itertools.pairwise(counts)]
         assert max(shares[3:]) - min(shares[3:]) <= 1 and counts[1:4] != sorted(counts[1:4], reverse=True)
     check(b)
@@ -221,11 +221,11 @@ def test_the_bound_follows_the_pixels_of_all_photographs(bench, views, surfels):
         (0, 300.0, 0, 0, 0),
         (0, 300.0, 3000, 0, 10),
         (7, 300.0, 3000, 0, 7),
-        (70, 300.0, 3000, 0, 70),  # what is asked for replaces the bound by pixels
+        (70, 300.0, 3000, 0, 70),  # the option replaces the bound by pixels
         (0, 0.0, 3000, 0, 0),
         (7, 0.0, 3, 0, 7),
         (0, 300.0, 3000, 4, 10),
-        (0, 300.0, 3000, 9, 18),  # there is room to grow, however few the pixels
+        (0, 300.0, 3000, 9, 18),  # room to grow, however few the pixels
         (12, 300.0, 3000, 9, 12),
         (0, 0.0, 3000, 9, 0),
         (0, 300.0, 0, 9, 0),  # of unknown size
@@ -253,11 +253,11 @@ def test_faint_surfels_make_room_for_important_ones_at_the_cap(bench):
     b.importance[2:30] = 10
     b.see(1.0, 1.0)
     report = b.step(LAST_DENSIFY)
-    # 28 ask for children, there is room for two, and 0 and 1 alone are faint and do not ask
+    # 28 request children, there is room for two, and only 0 and 1 are faint and do not
     assert (report["replaced"], report["cloned"]) == (2, 4)
     assert len(b.scene) == 42 and b.x[:38] == [*range(2, 40)]
     check(b)
-    b = bench(40, max_surfels=42, prune_budget=0.0)  # no more of them than are needed, the faintest
+    b = bench(40, max_surfels=42, prune_budget=0.0)  # only as many as needed, the faintest
     b.set("opacity_logits", slice(0, 8), torch.linspace(-3.1, -4.0, 8))
     b.importance[30:35] = 9
     b.see(1.0, 1.0)
@@ -302,7 +302,7 @@ def test_a_scene_without_a_finite_row_is_an_error(bench):
 
 def test_the_error_prune_removes_what_hardly_matters(bench):
     b = bench(10, prune_error=0.02)
-    b.set("opacity_logits", 3, -9.0)  # can never be seen again
+    b.set("opacity_logits", 3, -9.0)  # invisible for good
     b.added[:6] = torch.tensor([5.0, 0.0, 9.0, 1.0, 8.5, 7.0])  # no drawn view shows row 1
     report = b.step(ERROR)
     assert b.x == [1, 2, 4, 6, 7, 8, 9]  # 5 + 7 <= 0.02 x 1000 < 5 + 7 + 8.5
@@ -348,7 +348,7 @@ def test_state_survives_a_round_trip_and_the_lots_are_the_same(bench):
     for b in (first, second):
         b.set("opacity_logits", slice(0, 200, 2), -5.3)
         b.see(1e-4, 2e-4)
-    first.strategy._draw(torch.ones(10, dtype=torch.float64), 3)  # move the generator on
+    first.strategy._draw(torch.ones(10, dtype=torch.float64), 3)  # advances the generator
     state = first.strategy.state_dict()
     second.strategy.load_state_dict(state)
     for b in (first, second):

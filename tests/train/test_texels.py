@@ -1,4 +1,4 @@
-"""Texels that learn in the last part of a run."""
+"""Texels trained in the last part of a run."""
 
 from dataclasses import replace
 
@@ -36,7 +36,7 @@ def config(**options) -> TrainConfig:
 
 @pytest.fixture
 def textured(make_scene):
-    """make(**options) -> a scene that is going to have texels."""
+    """make(**options) -> a scene that will have texels."""
 
     def make(**options):
         scene = make_scene(texture=False, **options)
@@ -89,7 +89,7 @@ def test_there_are_no_more_texels_than_a_run_can_use(textured, views, monkeypatc
     scene, cameras = textured(), [view.camera for view in views]
     pixels = sum(camera.width * camera.height for camera in cameras) / len(cameras)
     options = replace(OPTIONS, pixels_per_texel=0.01, rendered_pixels_per_texel=8.0)
-    free = blank_texels(scene, views, len(views), options, to_come=1)  # few enough for any run
+    free = blank_texels(scene, views, len(views), options, to_come=1)  # below any limit
     smallest = SMALLEST**2 * len(scene)
     assert len(free.texels) > 2 * smallest
     monkeypatch.setattr(texels, "FEW", smallest)
@@ -140,12 +140,12 @@ def test_coverage_is_the_gradient_of_the_summed_picture(textured, views) -> None
     field = blank_texels(scene, views, len(views), OPTIONS)
     found = coverage(scene, field, views)
     assert torch.allclose(field.share, 1 / (found + OPTIONS.prior))
-    half = blank_texels(scene, views, 2 * len(views), OPTIONS)  # half of the views stand for all
+    half = blank_texels(scene, views, 2 * len(views), OPTIONS)  # half of the views represent all
     cameras = [view.camera for view in views]
     least = LEAST_SHARE * single_view_coverage(scene.surfels, cameras, half.size, half.extent, scene.near).detach()
     assert torch.allclose(half.share, 1 / (torch.maximum(2 * found, least) + OPTIONS.prior))
     with torch.no_grad():
-        scene.surfels["sv_rgb"].fill_(0.2)  # no colour is cut off
+        scene.surfels["sv_rgb"].fill_(0.2)  # avoids clipping
     scene.field, total = field, 0.0
     for view in views:
         image = scene.render(view.camera).rgb[..., 0]
@@ -235,7 +235,7 @@ def test_a_run_that_diverges_goes_back_to_its_texels(textured, views) -> None:
     for _ in range(45):
         trainer.advance()
     gone = torch.arange(len(scene)) == 5
-    trainer.training.strategy.remove(gone, scene, trainer.optimizers)  # since the state that it goes back to
+    trainer.training.strategy.remove(gone, scene, trainer.optimizers)  # since the state it rolls back to
     with torch.no_grad():
         scene.field.texels[7] = float("nan")
         scene.surfels["means"][:] = float("nan")

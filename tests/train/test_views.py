@@ -28,7 +28,7 @@ def test_area_average():
     image[0, 0], image[0, 1] = torch.tensor([1.0, 0.5, 0.0, 1.0]), torch.tensor([0.0, 1.0, 1.0, 0.0])
     torch.testing.assert_close(downscale_image(image, 1, 1)[0, 0], torch.tensor([1.0, 0.5, 0.0, 0.25]))
     mask = torch.ones(4, 4, dtype=torch.bool)
-    mask[0, 3] = False  # a reduced pixel counts when all of it does
+    mask[0, 3] = False  # a reduced pixel counts only if all of it does
     assert downscale_mask(mask, 2, 2)[..., 0].tolist() == [[True, False], [True, True]]
     assert as_float(torch.tensor([0, 255], dtype=torch.uint8)).tolist() == [0, 1]
 
@@ -84,7 +84,7 @@ def test_reduced_views_take_only_so_much_memory(views, monkeypatch: pytest.Monke
     assert len(everything.draw(10, torch.Generator(), 1.0)) == len(views)
     monkeypatch.setattr(views_module, "DOWNSCALED_BYTES", 2 * everything.at(0, 0.5).nbytes)
     few = DownscaledViews(views)
-    for factor in (0.5, 0.25, 0.5):  # the room is there again at every size
+    for factor in (0.5, 0.25, 0.5):  # memory is reused at every size
         for _ in range(2):
             pairs = [(few.at(i, factor), everything.at(i, factor)) for i in range(len(views))]
         assert all(torch.equal(a.image, b.image) for a, b in pairs)
@@ -93,7 +93,7 @@ def test_reduced_views_take_only_so_much_memory(views, monkeypatch: pytest.Monke
 
 
 def test_a_card_keeps_photographs_within_one_budget(views) -> None:
-    """Full-size and reduced pictures together stay below it at every size, and all views come out the same."""
+    """Full-size and reduced pictures together stay within it at every size, and all views come out the same."""
     everything, full = DownscaledViews(views), views[0].nbytes
     bounded = DownscaledViews(views, resident_bytes=2 * full + full // 2)
     for factor in (0.5, 0.25, 1.0, 0.5):

@@ -1,4 +1,4 @@
-"""A headless Chromium, which the tests of a process share; each has a context of its own."""
+"""A headless Chromium shared by the tests of a process, with a separate context for each."""
 
 import atexit
 import http.server
@@ -24,7 +24,7 @@ MODULES = HERE.parents[1] / "web" / "node_modules"
 
 @dataclass
 class Outcome:
-    """Results of the steps, and the errors on the page's console."""
+    """Results of the steps, and errors on the page's console."""
 
     results: list[Any]
     problems: list[str]
@@ -32,7 +32,7 @@ class Outcome:
 
 @lru_cache(maxsize=1)
 def driver() -> subprocess.Popen[str]:
-    """Start drive.mjs, which ends with this process; skip the test where there is no browser."""
+    """Start drive.mjs, which ends with this process; skip the test without a browser."""
     node, chromium = shutil.which("node"), shutil.which("chromium") or shutil.which("google-chrome")
     if node is None or chromium is None:
         skip_without("browser", "no node or no chromium: apt install nodejs chromium")
@@ -60,7 +60,7 @@ def drive(
     ratio: float = 1.0,
     patience: float = 90.0,
 ) -> Outcome:
-    """Run steps of drive.mjs in a new page; `patience`: seconds that one step may take."""
+    """Run steps of drive.mjs in a new page; `patience`: seconds allowed per step."""
     process = driver()
     assert process.stdin is not None and process.stdout is not None
     job = {
@@ -84,7 +84,7 @@ def drive(
 
 @contextmanager
 def running(server: Any) -> Iterator[str]:
-    """Run a server of the viewer in a thread of this process; yields its address."""
+    """Run a server of the viewer in a thread; yields its address."""
     thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
     thread.start()
     try:
@@ -96,15 +96,15 @@ def running(server: Any) -> Iterator[str]:
 
 
 def served(site: Site, **options: Any) -> AbstractContextManager[str]:
-    """Serve a site from a thread of this process; yields its address."""
+    """Serve a site in a thread; yields its address."""
     return running(serve(site, **options))
 
 
 @contextmanager
 def plain_server(folder: Path, ranges: bool) -> Iterator[tuple[str, list[tuple[str, int]]]]:
-    """Serve a folder as any file server would.
+    """Serve a folder like a plain file server.
 
-    Yields its address, and of requests for bundles in one file the range and the bytes of the answer.
+    Yields its address, and range and response bytes of requests for bundles in one file.
     """
     asked: list[tuple[str, int]] = []
 

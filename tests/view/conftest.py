@@ -24,12 +24,12 @@ WIDTH, HEIGHT = 160, 120
 
 
 def view() -> Camera:
-    """A camera before the scene, of the size of the tests' screens."""
+    """A camera in front of the scene, with the size of the tests' screens."""
     return front(WIDTH, HEIGHT, 3.0)
 
 
 def with_alpha(baked: Baked) -> Baked:
-    """The bake with random alphas from 0 to 2."""
+    """Add random alphas from 0 to 2 to a bake."""
     random = torch.Generator().manual_seed(0)
     texels = joined(baked.texels, 2 * torch.rand(len(baked.texels), generator=random))
     return replace(baked, texels=texels, atlas=None).with_constants(tile_means(texels, baked.sizes))
@@ -47,8 +47,8 @@ def baked_scene(
     alpha: bool,
     options: tuple[tuple[str, object], ...],
 ) -> Baked:
-    """The bake's test scene; `compact`: for version 3; `seen`: photographed by the camera, so that it is drawn for the
-    size of a view; `larger`: added to the logarithms of the scales; `alpha`: with alpha texels."""
+    """Bake the test scene; `compact`: version 3; `seen`: photographed by the camera, so that views adapt to their size;
+    `larger`: added to the log scales; `alpha`: with alpha texels."""
     made = real_scene(make_surfels, count=count, kind=kind)
     made.surfels["log_scales"] += larger
     baked = bake(made, [view()] if seen else [], options=BakeOptions(format=format, **dict(options)))
@@ -70,7 +70,7 @@ def write(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     **options: object,
 ) -> Path:
-    """Write a bundle of `baked_scene`, with a camera and its photograph; `poster`: with a poster."""
+    """Write a bundle of `baked_scene` with a camera and its photograph, and optionally a poster."""
     camera = view()
     picture = io.BytesIO()
     Image.new("RGB", (WIDTH, HEIGHT), (200, 80, 40)).save(picture, "JPEG")

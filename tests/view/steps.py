@@ -1,4 +1,4 @@
-"""Steps in a page of the viewer, and the views that its links state."""
+"""Steps in a page of the viewer, and the views in its links."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from tests.view.browser import Outcome, drive, served
 SCREEN = (900, 500)
 PHONE = (390, 780)
 MIDDLE = (420, 180)
-"""A point on the canvas that nothing covers."""
+"""An uncovered point of the canvas."""
 QUARTER = (
     "addEventListener('DOMContentLoaded', () => {"
     "const list = document.getElementById('resolution'); if (list) list.value = '0.25'; })"
 )
-"""Fewer pixels, where only the camera matters."""
+"""Low resolution, where only the camera matters."""
 START = "#p=0,-3,0&r=1,0,0,0,1,0&t=0,0,0&l=500,500,250,250,500,500"
-"""A camera that looks along y, at the origin, z upwards."""
+"""A camera at (0, -3, 0) that looks along y, with z up and the origin as target."""
 
 
 @dataclass
 class Seen:
-    """A view, as its link says it: position, axes of the camera, target, focal length."""
+    """A view in a link: position, camera axes, target, focal length."""
 
     position: np.ndarray
     right: np.ndarray
@@ -45,29 +45,29 @@ class Seen:
         return float(np.linalg.norm(self.target - self.position))
 
     def steps_to(self, other: Seen) -> np.ndarray:
-        """How far the other one is to the right, down and forward."""
+        """Return how far the other view is to the right, down and forward."""
         moved = other.position - self.position
         return np.array([moved @ self.right, moved @ self.down, moved @ self.forward])
 
     def on_screen(self, point: np.ndarray) -> np.ndarray:
-        """To the right and down from the middle."""
+        """Project a point: offset to the right and down from the middle."""
         ray = point - self.position
         return np.array([ray @ self.right, ray @ self.down]) / (ray @ self.forward)
 
     def turned_to(self, other: Seen) -> np.ndarray:
-        """Where the other one looks: to the right, down; and how far it is rolled clockwise."""
+        """Return the other view's rotation: to the right, down, and clockwise roll."""
         return np.array([other.forward @ self.right, other.forward @ self.down, other.right @ self.down])
 
 
 def seen(link: str) -> Seen:
-    """The view of a link."""
+    """Parse the view of a link."""
     given = parse_qs(link[1:])
     place, axes, target, lens = (np.array([float(x) for x in given[key][0].split(",")]) for key in "prtl")
     return Seen(place, axes[:3], axes[3:], target, lens[0])
 
 
 class Steps:
-    """Steps in a page, and which of their results mean something."""
+    """Steps in a page, some with a result."""
 
     def __init__(self) -> None:
         self.steps: list[Sequence[Any]] = []
@@ -77,17 +77,17 @@ class Steps:
         self.steps += steps
 
     def ask(self, what: str) -> int:
-        """Number of the result of an expression."""
+        """Evaluate an expression; returns the index of its result."""
         self.do(["ask", what])
         return len(self.steps) - 1
 
     def view(self) -> int:
-        """Number of the result that is the link to what is shown."""
+        """Read the link of the current view; returns the index of the result."""
         self.do(["press", "#share"])
         return self.ask("location.hash")
 
     def run(self, bundle: Path, start: str = "", **options: Any) -> None:
-        """All of it on a page of the bundle; nothing may be complained of."""
+        """Run all steps on a page of the bundle; fails on console errors."""
         with served(site_of(bundle)) as address:
             before = [["goto", address + start], ["settle"]]
             if options.pop("quarter", True):

@@ -1,4 +1,4 @@
-"""An exported page at every address that servers give it, and a page whose scripts are not there."""
+"""An exported page at every address that servers use for it, and a page without its scripts."""
 
 import shutil
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ PLACE = "location.pathname + ' ' + document.documentElement.dataset.state + ' ' 
 
 
 class _Clean(SimpleHTTPRequestHandler):
-    """Hides endings, and sends the page of a folder without a slash, as `npx serve` does."""
+    """Server that hides extensions and serves a folder's page without a slash, like `npx serve`."""
 
     def send_head(self):  # type: ignore[no-untyped-def]
         path = Path(self.directory) / unquote(urlsplit(self.path).path).lstrip("/")
@@ -43,7 +43,7 @@ def clean_server(folder: Path) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def splats(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A web site: a page of another kind, whose script has the name of ours, and exported pages below it."""
+    """A web site with another page, whose script has the same name as ours, and exported pages below it."""
     folder = tmp_path_factory.mktemp("web")
     (folder / "index.js").write_text("document.title = 'other';")
     write_static(site_of(bundle), folder / "splats" / "fox")

@@ -1,4 +1,4 @@
-"""What the page and Python's reader think of the same bundle, damaged past its hashes, in a table."""
+"""The page and Python's reader agree on damaged bundles with valid hashes: a table."""
 
 import json
 from collections.abc import Callable
@@ -18,7 +18,7 @@ COUNT = 120  # surfels of the bundles
 
 
 def column(name: str, value: float, element: str = "vertex") -> Damage:
-    """A number in the second row of surfels.ply."""
+    """Change a number in the second row of surfels.ply."""
 
     def damage(bundle: Path) -> None:
         elements = ply.parse_ply((bundle / "surfels.ply").read_bytes())
@@ -30,7 +30,7 @@ def column(name: str, value: float, element: str = "vertex") -> Damage:
 
 
 def rotation(length: float) -> Damage:
-    """The rotation of the second surfel, of another length."""
+    """Change the length of the second surfel's rotation."""
 
     def damage(bundle: Path) -> None:
         for k in range(4):
@@ -40,7 +40,7 @@ def rotation(length: float) -> Damage:
 
 
 def texel(value: float, channel: int = 0) -> Damage:
-    """A number of the first texel of atlas.ktx2 in fp16."""
+    """Change a number of the first texel of atlas.ktx2 in fp16."""
 
     def damage(bundle: Path) -> None:
         path = bundle / "atlas.ktx2"
@@ -54,7 +54,7 @@ def texel(value: float, channel: int = 0) -> Damage:
 
 
 def frame(held: int) -> Damage:
-    """The first frame of surfels.bin, of one block of equal bytes, which declares a byte for each surfel."""
+    """Change the first frame of surfels.bin to one block of equal bytes that declares a byte per surfel."""
 
     def damage(bundle: Path) -> None:
         data = (bundle / "surfels.bin").read_bytes()

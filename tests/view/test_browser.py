@@ -1,7 +1,7 @@
-"""The viewer in a browser whose graphics are drawn in software, against the CPU renderer.
+"""The viewer in a browser with software graphics, against the CPU renderer.
 
-It is slow there, so bundles and screens are small. Pictures that stay are drawn in single precision where the device
-blends it, else in half.
+It is slow there, so bundles and screens are small. Still pictures are drawn in single precision if the device can blend
+it, else in half.
 """
 
 import hashlib
@@ -28,12 +28,12 @@ from tests.view.conftest import HEIGHT, WIDTH, view, write
 
 SCREEN = (WIDTH, HEIGHT)
 MEAN = 1 / 255
-"""Largest mean difference of colours; the largest of a single pixel is stated in docs/viewer.md."""
+"""Largest mean colour difference; docs/viewer.md states that of a single pixel."""
 STATE = "document.documentElement.dataset.state"
 
 
 def difference(path: Path, bundle: Path | BakedScene, share: float = 1.0) -> tuple[float, float]:
-    """Mean and largest difference of a saved picture, of that share of the size, from the CPU's."""
+    """Compute the mean and largest difference of a saved picture (of relative size `share`) from the CPU's."""
     scene = bundle if isinstance(bundle, BakedScene) else read_bundle(bundle).scene
     want = scene.render(view().scaled(share)).rgb.clamp(0, 1).numpy()
     got = np.asarray(Image.open(path).convert("RGB"), np.float32) / 255
@@ -43,7 +43,7 @@ def difference(path: Path, bundle: Path | BakedScene, share: float = 1.0) -> tup
 
 
 def page_of(site: Site, *before: list[object], path: str = "") -> tuple[str, str]:
-    """Open a page and return its state and its text."""
+    """Open a page; returns its state and text."""
     with served(site) as address:
         ask = [["ask", STATE], ["ask", "document.body.innerText"]]
         state, text = drive([*before, ["goto", address + path], ["settle"], *ask], SCREEN).results[-2:]
@@ -61,7 +61,7 @@ def page_of(site: Site, *before: list[object], path: str = "") -> tuple[str, str
 def test_frames_are_those_of_the_cpu_renderer(
     format: str, seen: bool, share: float, alpha: bool, tmp_path: Path
 ) -> None:
-    """Of formats, and of sizes for which surfels are filtered; of kinds of view colours: test_frames.py."""
+    """Formats, and sizes at which surfels are filtered; kinds of view colours: test_frames.py."""
     compact = format == "compact"
     bundle = write(tmp_path / "b", "uint8" if compact else format, compact=compact, seen=seen, alpha=alpha)
     screen = (round(WIDTH * share), round(HEIGHT * share))
@@ -84,7 +84,7 @@ def test_far_views_are_averages_of_near_ones(share: float, least: float, tmp_pat
 
 
 def test_the_first_picture_needs_no_texels(tmp_path: Path) -> None:
-    """The server keeps them back until that picture is saved; the bundle is one file."""
+    """The server withholds them until that picture is saved; the bundle is one file."""
     bundle = write(tmp_path / "b", "uint8", compact=True, alpha=True)
     single, first = tmp_path / "b.bitymi", tmp_path / "first.png"
     write_single(bundle, single)
@@ -110,10 +110,10 @@ def test_the_first_picture_needs_no_texels(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["surfels.bin", "texels.bin"])
 def test_a_damaged_compact_bundle_gets_a_page_that_says_so(name: str, tmp_path: Path) -> None:
-    """Damaged past its hash, as whoever writes one on purpose would."""
+    """With a valid hash, as for deliberate damage."""
     bundle = write(tmp_path / "b", "uint8", compact=True)
     data = bytearray((bundle / name).read_bytes())
-    data[4] ^= 8  # of the first frame's header
+    data[4] ^= 8  # in the first frame's header
     (bundle / name).write_bytes(data)
     amend(bundle, lambda info: info["files"][name].update(sha256=hashlib.sha256(data).hexdigest()))
     state, text = page_of(site_of(bundle))
@@ -142,7 +142,7 @@ def test_a_browser_without_webgpu_gets_a_page_that_says_so(bundle: Path) -> None
 
 @pytest.mark.parametrize("damage", ["altered", "newer"])
 def test_a_damaged_bundle_gets_a_page_that_says_so(damage: str, bundle: Path) -> None:
-    """On a server that sends files as they are: nothing but the browser could see it."""
+    """On a plain server, so that only the browser can detect it."""
     site, name, data = site_of(bundle), "bundle/surfels.ply", (bundle / "surfels.ply").read_bytes()
     newer = json.dumps({**json.loads((bundle / "bundle.json").read_text()), "version": "9.0"}).encode()
 
@@ -196,7 +196,7 @@ ERRORS = {
 
 @pytest.mark.parametrize("what", ERRORS)
 def test_what_the_device_says_of_itself_has_a_page(what: str, bundle: Path) -> None:
-    """And it stays, whatever the page still does; of a lost device also after the picture was there."""
+    """The page stays whatever happens later; for a lost device also after the first picture."""
     script, said = ERRORS[what]
     wait = "new Promise((resolve) => setTimeout(resolve, 2000))"
     with served(site_of(bundle)) as address:
@@ -206,7 +206,7 @@ def test_what_the_device_says_of_itself_has_a_page(what: str, bundle: Path) -> N
 
 
 def test_a_page_that_is_opened_as_a_file_says_what_to_do(bundle: Path, tmp_path: Path) -> None:
-    """Browsers load no modules from files."""
+    """Browsers do not load modules from files."""
     write_static(site_of(bundle), tmp_path / "site")
     ask = [["ask", STATE], ["ask", "document.getElementById('page').innerText"]]
     found = drive([["goto", f"file://{tmp_path}/site/index.html"], ["settle"], *ask], SCREEN)

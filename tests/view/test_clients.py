@@ -1,4 +1,4 @@
-"""Many clients of the viewer's server at once, slow ones too: one copy of a file for all, a limit on connections."""
+"""Many and slow clients of the viewer's server: one shared copy of a file, a limit on connections."""
 
 import http.client
 import socket
@@ -16,7 +16,7 @@ from tests.view.test_serve import ask
 
 
 def clients(address: str, path: str, count: int) -> list[socket.socket]:
-    """Connections that ask for a file and read nothing of it."""
+    """Open connections that request a file and read nothing."""
     parts = urlsplit(address)
     found = []
     for _ in range(count):
@@ -38,7 +38,7 @@ def test_slow_clients_share_one_copy_of_a_file() -> None:
     server = serve(site)
     with running(server) as address:
         waiting = clients(address, "/large", 20)
-        assert [client.recv(8) for client in waiting] == [b"HTTP/1.1"] * 20  # all are being sent it
+        assert [client.recv(8) for client in waiting] == [b"HTTP/1.1"] * 20  # all are served
         assert len(made) == 1
         for client in waiting:
             client.close()
@@ -46,7 +46,7 @@ def test_slow_clients_share_one_copy_of_a_file() -> None:
             if not server._held:
                 break
             time.sleep(0.1)
-        assert not server._held  # nobody keeps it
+        assert not server._held  # freed
         assert ask(address, "/large")[2] == bytes(16 << 20) and len(made) == 2
 
 
@@ -56,7 +56,7 @@ def test_connections_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
         waiting = clients(address, "/large", 3)
         assert [client.recv(8) for client in waiting] == [b"HTTP/1.1"] * 3
         said = b""
-        with suppress(ConnectionError):  # the answer is lost where the request comes after the end of the connection
+        with suppress(ConnectionError):  # the response is lost if the connection ends first
             said = clients(address, "/", 1)[0].recv(12)
         assert said in (b"HTTP/1.1 503", b"")
         waiting.pop().close()

@@ -1,6 +1,6 @@
-"""Every control of the viewer, in a browser: the view or the picture changes as it says.
+"""Every control of the viewer in a browser changes the view or the picture as documented.
 
-Views are read from their links. `docs/viewer.md` lists the controls.
+Views are read from links; `docs/viewer.md` lists the controls.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from tests.view.steps import MIDDLE, PHONE, START, Steps
 
 
 def by(across: int, down: int) -> list[tuple[int, int]]:
-    """From the middle to where a pointer is dragged."""
+    """Return drag points from the middle."""
     return [MIDDLE, (MIDDLE[0] + across, MIDDLE[1] + down)]
 
 
@@ -49,7 +49,7 @@ def test_orbit_slide_and_wheel(bundle: Path) -> None:
         after = page.seen(number)
         assert np.allclose(after.target, first.target) and after.away == pytest.approx(first.away)
         assert np.allclose(after.on_screen(after.target), 0, atol=1e-6)
-        # what is in front of the target goes with the pointer
+        # points in front of the target follow the pointer
         assert after.on_screen(near)[axis] > 0.05 and abs(after.on_screen(near)[1 - axis]) < 1e-6
     view = page.seen(down)
     for number, expected in zip(slides, ([-1, 0, 0], [0, -1, 0], [1, 0, 0]), strict=True):
@@ -105,7 +105,7 @@ def test_keys_walk_turn_and_roll(bundle: Path) -> None:
         way, rest = (steps, turns) if key in KEYS else (turns, steps)
         expected = np.array(KEYS.get(key) or TURNS[key])
         assert np.dot(way, expected) > 0.01, key
-        # an arrow turns about the vertical, which a rolled camera does not have upright
+        # arrow keys rotate about the vertical, which is not the rolled camera's up
         assert np.allclose(way * (1 - abs(expected)), 0, atol=1e-4) and np.allclose(rest, 0, atol=1e-6), key
     walked = [page.seen(number).position for number in (views[-1], *slow, *fast)]
     lengths = np.linalg.norm(np.diff(walked, axis=0), axis=1)
@@ -132,7 +132,7 @@ def test_fly_looks_around_and_the_wheel_walks(bundle: Path) -> None:
     assert page[by_button] == page[by_key] == "false,true" and page[orbit] == page[again] == "true,false"
     first, across, down, walked = (page.seen(number) for number in views)
     assert np.allclose(first.position, across.position) and np.allclose(first.position, down.position)
-    # the scene goes with the pointer: right and down, so the camera looks left and up
+    # the scene follows the pointer: right and down, so the camera turns left and up
     assert first.turned_to(across)[0] < -0.1 and abs(first.turned_to(across)[1]) < 1e-6
     assert across.turned_to(down)[1] < -0.1
     assert down.steps_to(walked)[2] > 0.05 and walked.away == pytest.approx(down.away)
@@ -170,7 +170,7 @@ def test_the_capture_s_cameras_and_the_way_home(bundle: Path) -> None:
             assert np.allclose(view.position, places[k], atol=1e-6)
             assert view.focal == pytest.approx(rows[k]["fx"])
     assert not np.allclose(seen[9].position, places[0], atol=1e-3)
-    assert page[last] == "1"  # home is the first view, not a camera that was chosen
+    assert page[last] == "1"  # home is the first view, not a chosen camera
 
 
 def test_keys_for_cameras_do_nothing_without_cameras(tmp_path: Path) -> None:
@@ -201,7 +201,7 @@ def test_the_photograph_is_beside_the_picture(bundle: Path) -> None:
 
     assert page[shown] and page[again] and not page[hidden]
     assert page[half] < 0.51 * page[before] and page[side] == 160
-    # of a camera without one it says so; asked for again, it goes to one that has one
+    # without a photograph a notice says so; the next request goes to a camera with one
     assert "No photograph" in page[none] and page[back] == "Photograph"
     assert np.allclose(page.seen(view).position[0], 0, atol=1e-6)
 
@@ -250,7 +250,7 @@ def test_screenshot_link_resolution_and_theme(bundle: Path, tmp_path: Path) -> N
     named = len(page.steps) - 1
     before = page.ask("location.hash")
     page.do(["key", "l"])
-    # copying takes a moment; the notice before it says that no graphics card draws
+    # copying takes a moment; the earlier notice says that there is no graphics card
     notice = "document.getElementById('notice').textContent"
     told = page.ask(
         "new Promise((give) => { const look = () => "

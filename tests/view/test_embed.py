@@ -1,4 +1,4 @@
-"""The page in the frame of a page of another origin: messages (`docs/viewer.md`), and which are heeded."""
+"""The page embedded in another origin: messages (`docs/viewer.md`) and their permissions."""
 
 import json
 import shutil

@@ -1,6 +1,6 @@
 """Frames of every kind of bundle, in a browser and through wgpu, against the CPU renderer (table: docs/viewer.md).
 
-Both draw in software where there is no card. The bundles are random surfels with tiles, with a weight bound.
+Both draw in software without a GPU. The bundles are random surfels with tiles and a weight bound.
 """
 
 import re
@@ -30,7 +30,7 @@ CASES = {
     "sb all": {"kind": "sb", **ALL},
     "sg compact": {"kind": "sg", **COMPACT},
 }
-"""Every kind, with all terms or lean; tests/ops/webgpu has each with both."""
+"""Every kind, with all terms or lean; tests/ops/webgpu has both for each."""
 CASES |= {"sv alpha": {"alpha": True}, "sv alpha compact": {"alpha": True, "seen": True, **COMPACT}}
 ELSEWHERE = ("sv compact",)  # in a browser: test_browser.py
 CASES |= {"near 3, colour": {"near": 3.0, "background": (0.2, 0.5, 0.9), **COMPACT}}
@@ -38,7 +38,7 @@ CASES |= {"near 3, colour": {"near": 3.0, "background": (0.2, 0.5, 0.9), **COMPA
 
 @pytest.fixture(scope="module")
 def bundles(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Of all cases, by name."""
+    """Bundles of all cases, by name."""
     folder = tmp_path_factory.mktemp("frames")
     given = {name: {"format": "uint8", **options} for name, options in CASES.items()}
     return {
@@ -48,7 +48,7 @@ def bundles(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 def wanted(bundle: Path, background: tuple[float, ...] | None = None) -> np.ndarray:
-    """The frame of the CPU renderer, over the bundle's background or another one."""
+    """Render a frame on the CPU, over the bundle's background or another one."""
     opened = read_bundle(bundle)
     color = torch.tensor(background or opened.info.render.background)
     return opened.scene.render(view(), color).rgb.clamp(0, 1).numpy()
@@ -63,7 +63,7 @@ def check(name: str, got: np.ndarray, want: np.ndarray) -> None:
 
 
 def test_cases_differ(bundles: dict[str, Path]) -> None:
-    """A near plane takes surfels away, a background shows."""
+    """The near plane removes surfels, and a background shows."""
     near = bundles["near 3, colour"]
     over_black = wanted(near, (0.0, 0.0, 0.0))
     assert np.abs(wanted(bundles["sv compact"]) - over_black).mean() > 0.02

@@ -1,4 +1,4 @@
-"""Saved views and notes in a browser: their lists, markers and file. `docs/viewer.md` describes them."""
+"""Saved views and notes in a browser: lists, markers, file (`docs/viewer.md`)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ HTML = "<img src=x onerror=alert(1)>"
 
 @pytest.fixture(scope="module")
 def solid(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bundle whose surfels leave no gaps in the middle."""
+    """A bundle whose surfels have no gaps in the middle."""
     return write(tmp_path_factory.mktemp("notes") / "solid", larger=1.5)
 
 
@@ -98,7 +98,7 @@ def test_a_note_is_pinned_to_the_surface_that_was_clicked(solid: Path, tmp_path:
     assert [page[center]["x"], page[center]["y"]] == pytest.approx([50, 50], abs=0.1)
     note = parse_notes((tmp_path / "notes.json").read_bytes()).notes[0]
     assert note.text == HTML and np.allclose(page.seen(view).target, note.position, atol=1e-5)
-    # on the line through the pixel, in the scene
+    # on the pixel's ray, in the scene frame
     row = json.loads((solid / "cameras.json").read_text())["cameras"][0]
     x, y, z = (np.array(row["viewmat"]).reshape(4, 4) @ [*note.position, 1])[:3]
     k = min(900 / row["width"], 500 / row["height"])
@@ -140,7 +140,7 @@ def test_a_damaged_file_leaves_the_scene_without(noted: Path, tmp_path: Path) ->
 
 @pytest.mark.parametrize("phone", [False, True])
 def test_the_panels_fit_the_screen(noted: Path, phone: bool) -> None:
-    """That of the path, then that of notes."""
+    """First the path's panel, then the notes'."""
     page, size = Steps(), "40" if phone else "30"
     page.do(*[["click", "#menu"]] * phone, ["click", "#tools"])
     for _ in range(3):

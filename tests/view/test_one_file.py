@@ -1,4 +1,4 @@
-"""An exported page with its bundle as one file, on servers that know ranges and on those that do not."""
+"""An exported page with its bundle as one file, on servers with and without ranges."""
 
 import json
 from pathlib import Path
@@ -27,7 +27,7 @@ def test_the_command_writes_the_page_and_one_file(bundle: Path, tmp_path: Path, 
     assert len(read_bundle(folder / NAME)) == len(read_bundle(bundle))
     single = tmp_path / "little.bitymi"
     write_single(bundle, single)
-    # a folder that was written so is replaced by one of its like, of either kind
+    # an earlier export of either kind is replaced
     assert main(["view", str(single), "--export", str(folder), "--one-file", "--overwrite"]) == 0
     assert (folder / NAME).read_bytes() == single.read_bytes()
     assert main(["view", str(single), "--export", str(folder), "--overwrite"]) == 0
@@ -50,7 +50,7 @@ def test_one_file_is_shown(ranges: bool, tmp_path: Path) -> None:
     if not ranges:
         assert [count for _, count in asked] == [size]
         return
-    # the end, bundle.json, cameras.json, surfels, texels and the photograph, each once, in the order of need
+    # the end, bundle.json, cameras.json, surfels, texels and the photograph, once each, in order of need
     assert asked[0][0] == "bytes=-16384" and len(asked) == 6
     texels = (bundle / "texels.bin").stat().st_size
     assert [texels <= count <= texels + 200 for _, count in asked].index(True) == 4

@@ -1,4 +1,4 @@
-"""The path of the camera in a browser: keyframes, playing, its file and its film. `docs/viewer.md` describes them."""
+"""The camera path in a browser: keyframes, playback, file, film (`docs/viewer.md`)."""
 
 import json
 from pathlib import Path
@@ -21,7 +21,7 @@ FITS = (
 
 
 def there(link: str) -> list[object]:
-    """The step that goes to a link."""
+    """Return the step that opens a link."""
     return ["ask", f"location.hash = '{link}'"]
 
 
@@ -48,15 +48,15 @@ def test_keyframes_and_the_file_of_a_path(bundle: Path, tmp_path: Path) -> None:
     page.run(bundle, START, viewport=(901, 500))
 
     assert page[alone] and page[rows] == "Keyframe 1,Keyframe 2,Keyframe 3" and page[removed] == "Keyframe 1,Keyframe 2"
-    assert page[longer] == "4" and page[segment] == "1" and page[before] == page[unmoved]  # typing moves no camera
+    assert page[longer] == "4" and page[segment] == "1" and page[before] == page[unmoved]  # typing does not move it
     assert np.allclose(page.seen(back).position, [0, -3, 0], atol=1e-6) and page[looped] == "1.5" and page[closed]
     screen, hd = (json.loads((tmp_path / name).read_text()) for name in ("screen.json", "hd.json"))
     assert page[named] == "camera_path.json"
-    assert (screen["render_width"], screen["render_height"]) == (900, 500)  # even, as films have to be
+    assert (screen["render_width"], screen["render_height"]) == (900, 500)  # even, as required for films
     assert (hd["render_width"], hd["render_height"], hd["is_cycle"], hd["smoothness_value"]) == (1280, 720, True, 1)
     assert len(screen["camera_path"]) == 30 and len(hd["camera_path"]) == 45
     poses = [np.array(frame["camera_to_world"]).reshape(4, 4) for frame in screen["camera_path"]]
-    # looks along y, z upwards: OpenGL's axes
+    # looks along y, z up: OpenGL axes
     want = np.array([[1, 0, 0, 0], [0, 0, -1, -3], [0, 1, 0, 0], [0, 0, 0, 1]])
     assert np.allclose(poses[0], want) and np.allclose(poses[-1][:3, 3], [1, -3, 0])
     assert screen["camera_path"][0]["fov"] == pytest.approx(2 * np.degrees(np.arctan(0.5)))

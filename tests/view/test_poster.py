@@ -1,4 +1,4 @@
-"""The poster on the page: there before the surfels, where the first picture will be, and gone with it."""
+"""The poster on the page: shown before the surfels, aligned with the first picture, removed with it."""
 
 import hashlib
 import json
@@ -32,7 +32,7 @@ BARE = (
 
 
 def held_back(site: Site, name: str, until: Path) -> Site:
-    """The site, of which a file is sent when another is there."""
+    """Make the site withhold a file until another one exists."""
 
     def late() -> bytes:
         for _ in range(600):
@@ -45,7 +45,7 @@ def held_back(site: Site, name: str, until: Path) -> Site:
 
 
 def kept(site: Site, asked: list[str]) -> Site:
-    """The site, which writes down what of the bundle was asked for."""
+    """Make the site record which files of the bundle are requested."""
 
     def noted(name: str) -> Callable[[], bytes]:
         def read() -> bytes:
@@ -58,7 +58,7 @@ def kept(site: Site, asked: list[str]) -> Site:
 
 
 def shots(bundle: Path, folder: Path, size: tuple[int, int], **options: Any) -> tuple[np.ndarray, np.ndarray, Outcome]:
-    """The page with the poster, and with the picture of the surfels; without the bars before it."""
+    """Take pictures of the page with the poster, and with the surfels, without toolbars."""
     first, second = folder / "poster.png", folder / "picture.png"
     steps: list[list[Any]] = [["goto"], ["poster"], ["ask", STATE], ["ask", BARE]]
     steps += [["shot", first], ["settle"], ["ask", SHOWN], ["ask", BARE], ["shot", second]]
@@ -109,14 +109,14 @@ def test_a_link_to_another_view_shows_none(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("damage", ["no picture", "missing"])
 def test_a_damaged_poster_is_not_shown_and_the_scene_is(damage: str, tmp_path: Path) -> None:
-    """What else is no poster: web/test/poster.test.ts."""
+    """Other invalid posters: web/test/poster.test.ts."""
     bundle = write(tmp_path / "b", "uint8", compact=True, poster=True)
     site, path = site_of(bundle), bundle / POSTER
     data = path.read_bytes()
     if damage == "missing":
         path.unlink()
-    else:  # past its hash
-        data = data[:23] + bytes(3) + data[26:]  # of the start code
+    else:  # with a valid hash
+        data = data[:23] + bytes(3) + data[26:]  # the start code
         path.write_bytes(data)
         info = json.loads((bundle / "bundle.json").read_text())
         info["files"][POSTER] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
@@ -131,7 +131,7 @@ def test_a_damaged_poster_is_not_shown_and_the_scene_is(damage: str, tmp_path: P
         steps[1] = ["goto", address]
         found = drive([*steps, ["save", "#screenshot", tmp_path / "p.png"]], SCREEN)
     assert found.results[3] == "ready" and found.results[4] is False
-    if damage != "missing":  # the browser speaks of the answer 404
+    if damage != "missing":  # the browser logs a 404
         assert not found.problems
     info = json.loads((bundle / "bundle.json").read_text())
     del info["files"][POSTER]

@@ -1,4 +1,4 @@
-"""What the server sends, and what not."""
+"""Files that the server sends and withholds."""
 
 import hashlib
 import http.client
@@ -103,7 +103,7 @@ FILE = {"bytes": 25, "sha256": hashlib.sha256(b"<script>alert(1)</script>").hexd
 
 
 def whole(folder: Path, path: Path) -> None:
-    """A bundle in one file as another program could write it: with all files of the folder."""
+    """Write a bundle in one file with all files of the folder, as another program could."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
         for file in sorted(folder.iterdir()):
             archive.write(file, file.name)
@@ -121,7 +121,7 @@ def test_what_is_no_longer_what_bundle_json_says_is_not_sent_at_any_time(bundle:
         for target in (secret, elsewhere / "same" / "surfels.ply", Path("/dev/zero"), Path("/etc/passwd")):
             (copy / "surfels.ply").unlink()
             (copy / "surfels.ply").symlink_to(target)
-            for _ in range(100):  # whoever asks while others are still sent the file as it was shares theirs
+            for _ in range(100):  # requests during a transfer share its old copy
                 status, _, data = ask(address, "/bundle/surfels.ply")
                 if status == 404:
                     break
@@ -143,7 +143,7 @@ def test_a_bundle_that_is_exported_again_with_other_files_is_served_as_it_is_the
     with served(site_of(copy)) as address:
         assert ask(address, "/bundle/photograph-0001.jpg")[0] == 404
         shutil.copy(bundle / "bundle.json", copy)
-        assert ask(address, "/bundle/photograph-0001.jpg")[0] == 200  # as bundle.json says now
+        assert ask(address, "/bundle/photograph-0001.jpg")[0] == 200  # in the current bundle.json
         assert ask(address, "/bundle/bundle.json")[2] == (bundle / "bundle.json").read_bytes()
         amend(copy, lambda info: info["files"].pop("photograph-0001.jpg"))
         assert ask(address, "/bundle/photograph-0001.jpg")[0] == 404
@@ -158,7 +158,7 @@ STRANGE = ["a.htm", "a.svg", "a.xhtml", "shell.php", "run.cgi", "index.html", "A
 def test_files_that_the_format_does_not_name_are_not_passed_on_and_that_is_said(
     bundle: Path, tmp_path: Path, capsys
 ) -> None:
-    """Neither served nor exported, in either form, nor packed; what is passed on is a whole bundle again."""
+    """Foreign files are not served, exported or packed in either form; copies are valid bundles."""
     strange = shutil.copytree(bundle, tmp_path / "strange")
     for name in STRANGE:
         (strange / name).write_text("<script>alert(1)</script>")
@@ -228,7 +228,7 @@ def test_notes_come_and_go_while_a_bundle_is_served_and_are_exported_with_it(
         assert asked(address) == (True, 200)
         assert ask(address, "/bundle/notes.json")[2] == text(NOTES)
         (copy / "notes.json").write_text("{}")
-        assert asked(address) == (True, 404)  # the page states that it cannot be read
+        assert asked(address) == (True, 404)  # the page reports that it cannot be read
     (copy / "notes.json").write_bytes(text(NOTES))
     write_static(site_of(copy), site)
     write_static(single_site(copy), one)
@@ -257,7 +257,7 @@ def test_a_bundle_in_one_file_is_sent_and_exported_as_its_parts(bundle: Path, tm
 
 def test_the_command_says_where_and_ends_with_ctrl_c(bundle: Path) -> None:
     command = [sys.executable, "-m", "bitymi_ns.cli", "view", str(bundle), "--no-open-browser"]
-    # a shell's background jobs, and what they start, ignore Ctrl-C
+    # background jobs of a shell ignore Ctrl-C
     heeds = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=heeds) as process:
         assert process.stdout is not None
@@ -267,11 +267,11 @@ def test_the_command_says_where_and_ends_with_ctrl_c(bundle: Path) -> None:
         try:
             assert process.wait(timeout=60) == 0
         finally:
-            process.kill()  # else leaving the block waits for ever
+            process.kill()  # or leaving the block would block
 
 
 def raw(address: str, data: bytes, finish: bool = False) -> bytes:
-    """All that is answered to some bytes, until the server ends the connection."""
+    """Send bytes and return the response until the server closes the connection."""
     parts = urlsplit(address)
     with socket.create_connection((parts.hostname, parts.port), timeout=20) as connection:
         connection.sendall(data)

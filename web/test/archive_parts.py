@@ -1,4 +1,4 @@
-"""Makes archive.json: a file with little parts, stored as `bitymi_ns.bundle.single` stores those of a bundle."""
+"""Write archive.json: small parts stored like those of a bundle by `bitymi_ns.bundle.single`."""
 
 import base64
 import io

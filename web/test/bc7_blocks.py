@@ -1,4 +1,4 @@
-"""Makes bc7.json: random BC7 blocks, as many of every mode, and their texels by the package's decoder."""
+"""Write bc7.json: random BC7 blocks, equally many of every mode, and their texels by the package's decoder."""
 
 import base64
 import json

@@ -1,4 +1,4 @@
-"""Writes compact.json: little compact bundles, and what the package reads of them; from the root of a checkout."""
+"""Write compact.json: small compact bundles and their contents as the package reads them; run from a checkout."""
 
 import base64
 import json
@@ -14,13 +14,13 @@ from tests.bundle.compact_scene import FINEST, make_codes, write_compact
 
 
 def text(data: bytes | Tensor) -> str:
-    """Bytes, or the numbers of a tensor, as base64."""
+    """Encode bytes, or a tensor's numbers, in base64."""
     raw = data if isinstance(data, bytes) else np.ascontiguousarray(data.numpy()).tobytes()
     return base64.b64encode(raw).decode()
 
 
 def described(folder: Path) -> dict[str, object]:
-    """The files of a bundle, and its scene."""
+    """Collect the files of a bundle and its scene."""
     scene = read_bundle(folder).scene
     found = {**scene.surfels, "tiles": scene.tiles, "extent": scene.extent, "mean_residual": scene.mean_residual}
     if scene.mean_alpha is not None:
@@ -34,7 +34,7 @@ def described(folder: Path) -> dict[str, object]:
 
 
 def main() -> None:
-    """Writes the file beside this one."""
+    """Write the file beside this one."""
     bundles = {}
     with tempfile.TemporaryDirectory() as folder:
         for kind in sorted(VIEW_COLORS):

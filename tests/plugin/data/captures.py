@@ -1,4 +1,4 @@
-"""How tests read a capture."""
+"""Loading and editing of captures in tests."""
 
 import json
 from collections.abc import Callable
@@ -18,22 +18,22 @@ from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 
 
 def load(data: Path, device: Any = "cpu", **dataparser: Any) -> BitymiDataManager:
-    """The data manager of a capture in nerfstudio's format, every eighth view held out."""
+    """Load a capture in nerfstudio's format, every eighth view held out."""
     return load_with(data, BitymiDataParserConfig(format="nerfstudio", **dataparser), device)
 
 
 def load_with(data: Path, dataparser: Any, device: Any = "cpu") -> BitymiDataManager:
-    """The data manager of a capture in another format."""
+    """Load a capture with another dataparser."""
     return BitymiDataManagerConfig(data=data, dataparser=dataparser).setup(device=device, test_mode="val")
 
 
 def load_any(data: Path, **options: Any) -> BitymiDataManager:
-    """The data manager of whatever the path holds, as the presets read it."""
+    """Load any capture with the presets' dataparser."""
     return load_with(data, BitymiDataParserConfig(**options))
 
 
 def images_of(capture: Path) -> list[Path]:
-    """Its photographs in order; the first and the ninth are held out."""
+    """List its photographs in order; the first and the ninth are held out."""
     return sorted(p for p in (capture / "images").iterdir() if p.is_file())
 
 
@@ -54,7 +54,7 @@ def edit_frames(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
 
 
 def save_masks(capture: Path, mask: Any, folder: str = "masks", ending: str = ".png") -> None:
-    """Masks beside the photographs, of an array or one value; `mask(i)` gives that of the i-th."""
+    """Write masks beside the photographs from an array or a value; `mask(i)` gives the i-th."""
     (capture / folder).mkdir()
     for i, path in enumerate(images_of(capture)):
         values = np.full((36, 48), mask(i) if callable(mask) else mask, np.uint8)
@@ -62,7 +62,7 @@ def save_masks(capture: Path, mask: Any, folder: str = "masks", ending: str = ".
 
 
 def add_masks(capture: Path, mask: Any) -> None:
-    """Masks that transforms.json names."""
+    """Write masks and name them in transforms.json."""
     save_masks(capture, mask)
     edit_frames(capture, lambda frame: frame.update(mask_path=f"masks/{Path(frame['file_path']).stem}.png"))
 
@@ -75,7 +75,7 @@ def reduce_photographs(capture: Path, factor: int, size: tuple[int, int]) -> Non
 
 
 def write_cloud(path: Path, xyz: Any, rgb: str | None = "200 10 10") -> None:
-    """A point cloud in text, all of one color."""
+    """Write a text point cloud of one colour."""
     header = f"ply\nformat ascii 1.0\nelement vertex {len(xyz)}\n" + "".join(f"property double {c}\n" for c in "xyz")
     header += "" if rgb is None else "".join(f"property uchar {c}\n" for c in ("red", "green", "blue"))
     rows = [f"{x!r} {y!r} {z!r} {rgb or ''}\n" for x, y, z in np.asarray(xyz, float).tolist()]
@@ -87,18 +87,18 @@ def expect(message: str) -> Any:
 
 
 def printed(capsys: pytest.CaptureFixture[str]) -> str:
-    """What was printed, on one line."""
+    """Return what was printed, on one line."""
     return " ".join(capsys.readouterr().out.split())
 
 
 def found_poses(model: Path, images: Path, report: Path, **changes: Any) -> Poses:
-    """Poses of twelve photographs, as the finding of poses gives them; one was left out."""
+    """Make poses of twelve photographs, as pose estimation returns them; one was left out."""
     found = dict(left_out={"frame_00099.png": "blurred"}, registered=12, given=13, reprojection_error=0.5)
     return Poses(model, images, report, **{**found, "track_length": 3.0, "seconds": {}, **changes})
 
 
 def colmap_model(capture: Path, folder: Path, scale: float = 1.0) -> None:
-    """The capture's views as a COLMAP model in text; the quaternion of the fourth is `scale` long."""
+    """Write the capture's views as a COLMAP text model; the fourth quaternion has length `scale`."""
     folder.mkdir(parents=True)
     (folder / "cameras.txt").write_text("1 PINHOLE 48 36 40 40 24 18\n")
     lines = []
@@ -113,7 +113,7 @@ def colmap_model(capture: Path, folder: Path, scale: float = 1.0) -> None:
 
 
 def as_binary(model: Path) -> None:
-    """Write a text model anew in binary form."""
+    """Convert a text model to binary."""
     for what in ("cameras", "images", "points3D"):
         read, write = getattr(reader, f"read_{what}_text"), getattr(reader, f"write_{what}_binary")
         write(read(model / f"{what}.txt"), model / f"{what}.bin")
@@ -121,7 +121,7 @@ def as_binary(model: Path) -> None:
 
 
 def mixed_project(folder: Path) -> Path:
-    """A COLMAP project of nine photographs by three cameras: landscape through a lens, portrait, and a fisheye."""
+    """Make a COLMAP project of nine photographs by three cameras: landscape with distortion, portrait, fisheye."""
     sizes = {1: (48, 36), 2: (30, 40), 3: (40, 40)}
     cameras = {
         1: "SIMPLE_RADIAL 48 36 40 24 18 0.08",

@@ -1,4 +1,4 @@
-"""nerfstudio's cameras and ours see the same."""
+"""nerfstudio's cameras and ours agree."""
 
 import pytest
 import torch

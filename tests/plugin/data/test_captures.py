@@ -1,4 +1,4 @@
-"""What the data manager makes of captures, good and bad."""
+"""The data manager on good and bad captures."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -57,7 +57,7 @@ def test_photographs_of_a_run_on_a_card_stay_in_memory_of_the_host(
 
 
 def add_alpha(paths: list[Path], alpha: int) -> None:
-    """Give photographs an alpha channel that is 255 but for one pixel."""
+    """Add an alpha channel to photographs, 255 except for one pixel."""
     for path in paths:
         image = Image.open(path).convert("RGBA")
         image.putpixel((0, 0), (0, 0, 0, alpha))
@@ -70,7 +70,7 @@ def test_alpha_is_kept_for_the_model(capture: Path) -> None:
     assert manager.train_dataset.metadata["has_alpha"] is True
     assert manager.train_dataset.metadata["transparent"] is True
     assert manager.cached_train[0]["image"].shape[-1] == 4
-    assert manager.train_dataset[0]["image"].shape[-1] == 3  # what viewer and ns-render show
+    assert manager.train_dataset[0]["image"].shape[-1] == 3  # for viewer and ns-render
 
 
 def test_an_alpha_channel_without_a_transparent_pixel_is_none(capture: Path) -> None:
@@ -83,7 +83,7 @@ def test_an_alpha_channel_without_a_transparent_pixel_is_none(capture: Path) -> 
 
 
 def test_the_colour_behind_transparent_photographs() -> None:
-    """What the capture states stands for any one colour, as in runs before there was another choice."""
+    """The stated colour replaces any fixed one, as in runs of earlier versions."""
     white = torch.ones(3)
     for given, transparent, wanted in (
         ("auto", True, "auto"), ("auto", False, "white"), ("random", True, "random"), ("black", True, "white")
@@ -120,4 +120,4 @@ def test_few_views_and_one(capture: Path, capsys: pytest.CaptureFixture[str]) ->
 def test_options_that_leave_no_capture(capture: Path, options: dict[str, Any], message: str) -> None:
     with expect(message):
         load(capture, **options)
-    assert len(load(capture, eval_mode="interval", train_split_fraction=2.0).train_dataset) == 10  # nothing reads it
+    assert len(load(capture, eval_mode="interval", train_split_fraction=2.0).train_dataset) == 10  # unused

@@ -1,4 +1,4 @@
-"""Models as other programs and editors write them."""
+"""COLMAP models as other programs and editors write them."""
 
 from pathlib import Path
 
@@ -115,7 +115,7 @@ def test_every_camera_of_a_rig_has_its_own_pose_in_a_model(tmp_path: Path, form:
         assert (image.camera_id, image.frame) == (other.camera_id, other.frame_id)
     (turn,) = {round(image.cam_from_world().rotation.angle_to(image.frame.rig_from_world.rotation), 9)
                for image in by_name.values() if image.camera_id == 2}  # fmt: skip
-    assert turn > 0.01  # else the poses would say nothing
+    assert turn > 0.01  # or the poses would prove nothing
 
 
 @pytest.mark.parametrize("cut", [3, 5, 6, 7])

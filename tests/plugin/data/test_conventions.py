@@ -1,4 +1,4 @@
-"""Poses in another convention than that of their file, told by the capture's points."""
+"""Poses in another convention than their file's, detected by the capture's points."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +17,7 @@ WRONG = "As they are, the scene will be wrong."
 
 @pytest.fixture
 def model(capture: Path) -> Path:
-    """The room as a COLMAP model with its 200 points; images.txt."""
+    """images.txt of the room as a COLMAP model with 200 points."""
     folder = capture / "sparse/0"
     colmap_model(capture, folder)
     points = read_points(capture / "sparse_pc.ply")[0]

@@ -1,4 +1,4 @@
-"""Photographs of wide cameras as faces of a cube."""
+"""Wide photographs as cube faces."""
 
 import math
 from pathlib import Path
@@ -18,7 +18,7 @@ FISHEYE = ColmapCamera("OPENCV_FISHEYE", 200, 200, (FOCAL, FOCAL, RADIUS, RADIUS
 
 
 def rays_of(lens: Lens) -> np.ndarray:
-    """Unit rays [h, w, 3] of the pixels of a view in the axes of the photograph's camera."""
+    """Compute unit rays [h, w, 3] of a view's pixels in the axes of the photograph's camera."""
     to = lens.pinhole
     x, y = np.meshgrid((np.arange(to.width) + 0.5 - to.cx) / to.fx, (np.arange(to.height) + 0.5 - to.cy) / to.fy)
     rays = np.stack([x, y, np.ones_like(x)], -1) @ lens.turn[:3, :3].T
@@ -26,7 +26,7 @@ def rays_of(lens: Lens) -> np.ndarray:
 
 
 def directions(lens: Lens, width: int, height: int) -> np.ndarray:
-    """Photograph of a scene whose color is the direction, [height, width, 3]."""
+    """Render a photograph whose colours are the directions, [height, width, 3]."""
     camera = lens.camera.colmap
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = camera.cam_ray_from_img(np.stack([x, y], -1).reshape(-1, 2)).reshape(height, width, 3)
@@ -43,7 +43,7 @@ def test_a_panorama_becomes_six_faces_that_show_each_direction_once() -> None:
         cosine = rays @ lens.turn[:3, 2]
         solid += float((cosine**3 / (lens.pinhole.fx * lens.pinhole.fy)).sum())
         got = np.asarray(lens.undistort(Image.fromarray(directions(lens, 256, 128)))).astype(float)
-        assert np.abs(got - (rays * 0.5 + 0.5) * 255.0).max() < 4.0  # at the seam and at the poles, too
+        assert np.abs(got - (rays * 0.5 + 0.5) * 255.0).max() < 4.0  # including the seam and the poles
     assert solid == pytest.approx(4.0 * math.pi, rel=1e-3)
 
 

@@ -1,4 +1,4 @@
-"""The presets' parser: what it makes of captures with a transforms.json, of Blender's and of instant-ngp's."""
+"""The presets' dataparser on captures with a transforms.json, of Blender and of instant-ngp."""
 
 import json
 import math
@@ -38,7 +38,7 @@ from tests.plugin.data.captures import (
 
 
 def sides(of: Any) -> tuple[Any, Any, Any]:
-    """Views for training and for evaluation, and the outputs with points, of a data manager or a nerfstudio parser."""
+    """Return training and evaluation views and the outputs with points, of a data manager or a nerfstudio parser."""
     if isinstance(of, DataParser):
         train = of.get_dataparser_outputs("train")
         return train, of.get_dataparser_outputs("val"), train
@@ -46,7 +46,7 @@ def sides(of: Any) -> tuple[Any, Any, Any]:
 
 
 def equal(one: Any, other: Any) -> None:
-    """Compare views, points and world frame, but for float32's rounding."""
+    """Compare views, points and world frame up to float32 rounding."""
     (*views, a), (*other_views, b) = sides(one), sides(other)
     for mine, theirs in zip(views, other_views, strict=True):
         assert mine.image_filenames == theirs.image_filenames
@@ -61,7 +61,7 @@ def equal(one: Any, other: Any) -> None:
 
 
 def stock(capture: Path, **options: Any) -> DataParser:
-    """nerfstudio's own parser, not by way of our data manager."""
+    """Make nerfstudio's own parser, without our data manager."""
     return NerfstudioDataParserConfig(data=capture, load_3D_points=True, **options).setup()
 
 
@@ -102,7 +102,7 @@ def test_every_camera_is_turned_with_its_capture(capture: Path, monkeypatch: pyt
     given, eigh = {}, torch.linalg.eigh
 
     def one_sign(matrix: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Processors differ in the signs of eigenvectors, and with them in which capture is upside down."""
+        """Fix the signs of eigenvectors, which vary between processors and decide which capture is upside down."""
         values, vectors = eigh(matrix)
         return values, vectors * vectors.gather(0, vectors.abs().argmax(0, keepdim=True)).sign()
 
@@ -123,7 +123,7 @@ def test_every_camera_is_turned_with_its_capture(capture: Path, monkeypatch: pyt
         np.testing.assert_allclose(found, transform[:3, :3].numpy() @ given[path.name], atol=1e-5)
     works = bool((torch.linalg.det(nerfstudios.cameras.camera_to_worlds[:, :, :3]) > 0).all())
     assert torch.allclose(cameras, nerfstudios.cameras.camera_to_worlds, atol=1e-5) is works
-    assert works is turned  # else one of the two captures shows nothing
+    assert works is turned  # or one of the two captures proves nothing
 
 
 def test_the_captures_own_lists_decide_what_is_held_out(capture: Path) -> None:
@@ -132,7 +132,7 @@ def test_the_captures_own_lists_decide_what_is_held_out(capture: Path) -> None:
     one = load_any(capture)
     equal(one, stock(capture))
     assert held_out(one) == ["frame_00002.png", "frame_00003.png"]
-    other = load_any(capture, eval_names=("frame_00012.png",))  # what is asked for goes before the file
+    other = load_any(capture, eval_names=("frame_00012.png",))  # options override the file
     assert held_out(other) == ["frame_00012.png"]
     assert len(other.train_dataset) == 11
 
@@ -187,12 +187,12 @@ def test_options_that_are_for_something_else_are_refused(capture: Path, name: st
 
 
 def test_points_of_the_model_that_a_capture_was_made_of(capture: Path) -> None:
-    """nerfstudio's parser would ask whether to convert them."""
+    """nerfstudio's parser would offer to convert them."""
     applied = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
     colmap_model(capture, capture / "colmap/sparse/0")
     edit(capture, lambda meta: meta.pop("ply_file_path"))
     outputs = load_any(capture).train_dataparser_outputs
-    edit(capture, lambda meta: meta.update(applied_transform=applied))  # what nerfstudio takes where there is none
+    edit(capture, lambda meta: meta.update(applied_transform=applied))  # nerfstudio's default
     parser = NerfstudioDataParserConfig(data=capture, eval_mode="interval").setup()
     theirs = parser.get_dataparser_outputs("train")
     same(outputs.dataparser_transform, theirs.dataparser_transform)
@@ -207,7 +207,7 @@ def test_points_of_the_model_that_a_capture_was_made_of(capture: Path) -> None:
 
 @pytest.fixture
 def blender(tmp_path: Path) -> Path:
-    """Six views of 8 x 8 pixels with alpha for training, two for each of the other files."""
+    """Six views of 8 x 8 pixels with alpha for training, two in each of the other files."""
     for split, count in (("train", 6), ("val", 2), ("test", 2)):
         (tmp_path / split).mkdir()
         frames = []
@@ -240,10 +240,10 @@ def test_one_file_of_held_out_views_is_enough(blender: Path) -> None:
     (blender / "transforms_val.json").unlink()
     assert [path.parent.name for path in load_any(blender).eval_dataset.image_filenames] == ["test", "test"]
     (blender / "transforms_test.json").unlink()
-    manager = load_any(blender)  # held out of those for training, by the common rule
+    manager = load_any(blender)  # held out from training views by the common rule
     assert held_out(manager) == ["r_0.png"]
     assert len(manager.train_dataset) == 5
-    path = blender / "transforms_train.json"  # a name with its ending
+    path = blender / "transforms_train.json"  # named with its extension
     path.write_text(path.read_text().replace('"./train/r_1"', '"./train/r_1.png"'))
     assert load_any(blender).train_dataset.image_filenames[0] == blender / "train/r_1.png"
 
@@ -253,7 +253,7 @@ def test_one_file_of_held_out_views_is_enough(blender: Path) -> None:
 
 @pytest.fixture
 def ngp(capture: Path) -> Path:
-    """The capture as instant-ngp's tools write it, its frames out of order and without endings."""
+    """The capture as instant-ngp writes it, frames unsorted and without extensions."""
     frames = json.loads((capture / "transforms.json").read_text())["frames"][::-1]
     for frame in frames:
         frame["file_path"] = "./" + frame["file_path"].removesuffix(".png")
@@ -318,7 +318,7 @@ def test_it_is_what_the_presets_read_with() -> None:
 
 @pytest.mark.parametrize("parser", ["bitymi-data", "nerfstudio-data", "blender-data"])
 def test_two_captures_are_refused(tmp_path: Path, parser: str) -> None:
-    """nerfstudio reads the first of them silently."""
+    """nerfstudio silently reads the first."""
     for first in ("--data", "--pipeline.datamanager.data"):
         with expect(rf"two are given: .*a \({first}\) and .*b \(--data after the name of the parser\). Leave out one"):
             parsed(first, str(tmp_path / "a"), parser, "--data", str(tmp_path / "b"))
@@ -349,7 +349,7 @@ def test_nerfstudios_parsers_are_read_by_ours(blender: Path) -> None:
 
 
 def test_parsers_of_other_formats_are_undistorted_by_lenses(capture: Path) -> None:
-    """What nerfstudio itself reads becomes the views of our own parser."""
+    """Captures read by nerfstudio become the views of our parser."""
     for distortion in ({}, {"k1": 0.08, "p2": 0.004}, {"k1": 0.05, "k3": 0.01}, {"camera_model": "OPENCV_FISHEYE"}):
         edit(capture, lambda meta, distortion=distortion: meta.update(camera_model="OPENCV", k1=0, p2=0, k3=0) or
              meta.update(distortion))  # fmt: skip

@@ -1,4 +1,4 @@
-"""The presets' parser: what it makes of COLMAP models."""
+"""The presets' dataparser on COLMAP models."""
 
 import shutil
 from pathlib import Path
@@ -90,7 +90,7 @@ def test_cameras_of_several_kinds_and_sizes_in_one_capture(mixed: Path, capsys: 
 
 
 def test_renders_of_photographs_are_not_taken_for_them(project: Path) -> None:
-    """They have the same names, and their folder comes first by name."""
+    """They have the same names, in a folder that sorts first."""
     (project / "shots").mkdir()
     shutil.copytree(project / "images", project / "maps/test/rgb")
     (project / "maps/test/raw-depth").mkdir()
@@ -111,7 +111,7 @@ def test_reduced_photographs_are_used_as_they_are(project: Path, size: tuple[int
     assert image.shape[:2] == size[::-1]
     assert float(cameras.fx[0]) == pytest.approx(40 * size[0] / 48) and float(cameras.cy[0]) == size[1] / 2
     stored = np.asarray(Image.open(manager.train_dataset.image_filenames[0]).convert("RGB"))
-    assert np.array_equal(image.numpy(), stored)  # and not scaled again
+    assert np.array_equal(image.numpy(), stored)  # not scaled again
 
 
 def test_reduced_photographs_of_another_size(project: Path) -> None:

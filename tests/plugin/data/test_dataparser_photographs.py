@@ -1,4 +1,4 @@
-"""The presets' parser: what it makes of photographs and videos, whose poses are found first."""
+"""The presets' dataparser on photographs and videos without poses."""
 
 import sys
 import types
@@ -17,7 +17,7 @@ from tests.plugin.data.test_dataparser import parsed
 
 @pytest.fixture
 def finder(project: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, SfmOptions]]:
-    """Finding poses stands in: it gives the project's model, and records what it was asked for."""
+    """Stub of pose estimation, which returns the project's model and records its arguments."""
     asked: list[tuple[Path, SfmOptions]] = []
 
     def find_poses(source: Path, options: Any, progress: Any, *told: Any) -> Any:
@@ -68,7 +68,7 @@ def test_options_of_structure_from_motion_reach_it(project: Path, finder: list[A
     load_with(project / "images", config)
     settings = SfmSettings(matching="sequential", max_features=4000, camera_model="OPENCV", frames=50)
     assert [options for _, options in finder] == [SfmOptions(**vars(settings))]
-    again = yaml.load(yaml.dump(config), Loader=yaml.Loader)  # as config.yml is
+    again = yaml.load(yaml.dump(config), Loader=yaml.Loader)  # like config.yml
     assert again.sfm == settings
 
 

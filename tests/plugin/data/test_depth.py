@@ -1,4 +1,4 @@
-"""Depth and normals of a capture: files, units, fits, initial points, and what is wrong with them."""
+"""Depth and normals of a capture: files, units, fits, initial points, and faults."""
 
 import io
 import json
@@ -65,7 +65,7 @@ def capture(room, tmp_path):
 
 
 def check(manager: BitymiDataManager, depths: list[np.ndarray], tolerance: float = 0.01) -> None:
-    """Every training view has the exact depth, scaled as the poses were."""
+    """Check that every training view has the exact depth, scaled like the poses."""
     scale = manager.train_dataparser_outputs.dataparser_scale
     names = [path.name for path in manager.train_dataset.image_filenames]
     for view, name in zip(manager.train_views, names, strict=True):
@@ -78,7 +78,7 @@ def check(manager: BitymiDataManager, depths: list[np.ndarray], tolerance: float
 
 
 def on_surface(manager: BitymiDataManager, depths: list[np.ndarray]) -> None:
-    """Points come from training views, and lie on what they show."""
+    """Check that points come from training views and lie on their surfaces."""
     outputs = manager.train_dataparser_outputs
     xyz = outputs.metadata["points3D_xyz"].double().numpy()
     assert len(xyz) == 14 * WIDTH * HEIGHT // 30 and len(outputs.metadata["points3D_rgb"]) == len(xyz)
@@ -166,7 +166,7 @@ LENS = lenses_of(ColmapCamera("PINHOLE", 64, 64, (60.0, 60.0, 32.0, 32.0)), (64,
 
 
 def header(shape: str, descr: str = "<f8") -> bytes:
-    """A .npy file without its numbers."""
+    """Build the header of a .npy file."""
     text = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
     return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode()
 
@@ -179,7 +179,7 @@ def zipped(data: bytes) -> bytes:
 
 
 def png(width: int, height: int) -> bytes:
-    """A PNG file of one number that declares others."""
+    """Build a PNG of one pixel that declares another size."""
     data = bytearray(cv2.imencode(".png", np.zeros((1, 1), np.uint16))[1].tobytes())
     data[16:24] = struct.pack(">2I", width, height)
     data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
@@ -200,7 +200,7 @@ def exr(width: int, height: int, tmp_path: Path) -> bytes:
     [
         ("a.npy", header("(1000000, 1000000)"), "declares 1000000 x 1000000 numbers for a photograph of 64 x 64"),
         ("a.npz", zipped(header("(30000, 30000)") + bytes(1 << 20)), "declares 30000 x 30000 numbers"),
-        ("a.npy", header("(520, 520)") + bytes(520 * 520 * 8), "declares 520 x 520 numbers"),  # more than 8 times 64
+        ("a.npy", header("(520, 520)") + bytes(520 * 520 * 8), "declares 520 x 520 numbers"),  # above 8 times 64
         ("a.npy", header("(64, 64, 100000000)"), "declares 64 x 64 x 100000000 numbers"),
         ("a.npy", header("(64, 32)"), "32 x 64 pixels, but its camera is for 64 x 64"),
         ("a.npy", header("(64, 64)") + bytes(64), "a.npy cannot be read: it is cut off: it has 64 of 32768 bytes"),
@@ -339,5 +339,5 @@ def test_distorted_photographs_have_their_depth_moved(tmp_path) -> None:
     np.save(tmp_path / "depth.npy", columns)
     read = read_depth(MapFiles(tmp_path / "depth.npy"), lens)
     assert read.shape == (lens.pinhole.height, lens.pinhole.width)
-    assert set(np.unique(read)) <= set(np.arange(1.0, 65.0))  # nearest: no blends
+    assert set(np.unique(read)) <= set(np.arange(1.0, 65.0))  # nearest, not interpolated
     assert (np.diff(read[len(read) // 2]) >= 0).all()

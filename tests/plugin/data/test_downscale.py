@@ -1,4 +1,4 @@
-"""Large photographs are reduced as they are read: cameras, pictures, masks and messages go with it."""
+"""Large photographs are reduced on reading: cameras, pictures, masks and messages agree."""
 
 import json
 from pathlib import Path
@@ -23,7 +23,7 @@ def load(capture: Path, longest_side: int) -> BitymiDataManager:
 
 
 def test_cameras_and_pictures_are_reduced_together(capture: Path, capsys: pytest.CaptureFixture) -> None:
-    """Half the size: a pixel is the mean of four, and shows the same rays."""
+    """At half the size a pixel is the mean of four and has the same rays."""
     whole, half = load(capture, 0), load(capture, 24)
     said = " ".join(capsys.readouterr().out.split())
     assert "10 of 10 training photographs have more than 24 pixels along a side (up to 48 x 36)" in said
@@ -59,7 +59,7 @@ def test_a_photograph_of_another_size_is_named_by_its_size_in_the_file(capture: 
 
 
 def test_transparent_photographs_keep_their_colours(tmp_path: Path, capture: Path) -> None:
-    """Colours under transparent pixels do not bleed into the others."""
+    """Colours of transparent pixels do not bleed into others."""
     pixels = np.zeros((36, 48, 4), np.uint8)
     pixels[:, ::2] = (200, 100, 50, 255)  # every other column; the rest is transparent black
     for path in (capture / "images").iterdir():

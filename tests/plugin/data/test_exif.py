@@ -1,4 +1,4 @@
-"""Exposure settings in the EXIF data of photographs."""
+"""Exposure settings in EXIF."""
 
 import math
 from pathlib import Path
@@ -12,7 +12,7 @@ from bitymi_ns.plugin.data.images import exposure_stops
 
 
 def photograph(path: Path, **settings: object) -> Path:
-    """A photograph with these EXIF tags, by their names."""
+    """Write a photograph with these EXIF tags, by name."""
     exif = Image.Exif()
     exif.get_ifd(IFD.Exif).update({int(Base[name]): value for name, value in settings.items()})
     Image.new("RGB", (8, 8)).save(path, exif=exif.tobytes() if settings else b"")

@@ -1,5 +1,5 @@
-"""Files of a capture that are none, or that hold what no reader expects: one line with the file and the entry, and no
-hang. A table of readers by what may be in their place."""
+"""Files of a capture that are of another type or malformed give one line with file and entry, and never hang: a table
+of readers by replacements."""
 
 import json
 import os
@@ -93,7 +93,7 @@ def test_what_is_no_file_of_its_kind_is_one_line(
         load_any(place)
     message = str(stop.value)
     assert "Errno" not in message and "\n" not in message
-    # what cannot be opened may also count as not there, where something else is said to be missing then
+    # unreadable files may count as missing, with a message about something else
     assert (
         Path(name).stem in message
         or "has poses, but no file with the camera" in message
@@ -110,7 +110,7 @@ def test_what_may_lie_beside_a_capture_is_no_hindrance(
     kind(place / name)
     try:
         assert len(load_any(place).train_dataset) > 5
-    except InputError as stop:  # whose lines are no names of its photographs
+    except InputError as stop:  # its lines are not photograph names
         assert (
             name == "train_list.txt" and kind in (binary, deep) and "own lists" in str(stop) and len(str(stop)) < 2000
         )
@@ -223,7 +223,7 @@ def test_a_pose_of_five_numbers_is_not_repeated(capture: Path, tmp_path: Path) -
 
 
 def test_exif_that_breaks_pillow_counts_as_none(tmp_path: Path) -> None:
-    """Its pointer to the exposure is a number of 64 bits."""
+    """Its exposure pointer is a 64-bit number."""
     entry = (0x8769).to_bytes(2, "little") + (16).to_bytes(2, "little") + (1).to_bytes(4, "little")
     exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0" + entry + (26).to_bytes(4, "little") + bytes(4) + b"\xff" * 8
     paths = [tmp_path / f"{i}.jpg" for i in range(2)]
@@ -252,6 +252,6 @@ def test_names_in_a_report_that_no_file_can_have(tmp_path: Path) -> None:
     view = {"view": 0, "rank": 1, "of": 1, "metrics": {"psnr": 1.0}, "files": {"final": "a\0.png"}}
     value = {"bitymi_pictures": 1, "scene": "a", "method": "b", "captions": {"final": "x"}, "views": [view]}
     (tmp_path / "pictures.json").write_text(json.dumps(value))
-    assert build([tmp_path / "pictures.json"], tmp_path / "report").is_file()  # as without a picture
+    assert build([tmp_path / "pictures.json"], tmp_path / "report").is_file()  # like without a picture
     with pytest.raises(OSError, match="no file can have this name"):
         open_regular(tmp_path / "a\0")

@@ -1,4 +1,4 @@
-"""Photographs and masks of all kinds, and which of them there is anything to learn from."""
+"""Photographs and masks of all kinds, and which can be trained on."""
 
 import shutil
 import struct
@@ -21,7 +21,7 @@ from tests.profiles import DISPLAY_P3
 
 @pytest.fixture
 def picture() -> np.ndarray:
-    """[36, 48, 3] uint8 with black and white in it."""
+    """[36, 48, 3] uint8 with black and white pixels."""
     picture = np.random.default_rng(0).integers(0, 256, (36, 48, 3), dtype=np.uint8)
     picture[0, 0], picture[0, 1] = 0, 255
     return picture
@@ -157,7 +157,7 @@ def test_photographs_that_show_nothing(capture: Path, capsys: pytest.CaptureFixt
 def test_what_is_remembered_of_a_photograph(picture: np.ndarray) -> None:
     large = np.zeros((500, 400, 3), np.uint8)
     assert summarize(large).empty == "of one color throughout"
-    large[1, 1] = 1  # between the pixels that are looked at first
+    large[1, 1] = 1  # between the pixels sampled first
     assert summarize(large).empty == ""
     assert summarize(picture) == ImageSummary("", summarize(picture.copy()).fingerprint)
     assert summarize(picture).fingerprint != summarize(255 - picture).fingerprint
@@ -203,7 +203,7 @@ def test_turned_photographs(capture: Path, capsys: pytest.CaptureFixture[str]) -
 
 
 def declared(path: Path, width: int, height: int) -> None:
-    """A PNG file that says it has this size; there are no pixels in it."""
+    """Write a PNG header with this size, without pixels."""
     ihdr = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     chunks = [ihdr, b"IDAT" + zlib.compress(b""), b"IEND"]
     path.write_bytes(
@@ -215,7 +215,7 @@ def declared(path: Path, width: int, height: int) -> None:
 @pytest.mark.parametrize("index", [0, 4])
 def test_photographs_beyond_all_sizes(capture: Path, index: int) -> None:
     path = images_of(capture)[index]
-    declared(path, 16320, 12240)  # of a phone's sensor of 200 million pixels
+    declared(path, 16320, 12240)  # a phone's 200-megapixel sensor
     manager = load(capture, points="random")
     assert len(manager.train_dataset) == 10
     declared(path, 60000, 60000)

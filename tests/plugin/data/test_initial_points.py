@@ -1,4 +1,4 @@
-"""What training starts from: the points of a capture, triangulated ones, or random ones."""
+"""Initial points: of the capture, triangulated, or random."""
 
 import json
 import shutil
@@ -19,7 +19,7 @@ from tests.plugin.data.captures import edit, edit_frames, load_any, printed, wri
 from tests.plugin.data.test_true_captures import ALL, blender, colmap, move
 
 SIZE = (200, 150)
-TRIANGULATE = known_poses.triangulate  # before fixtures replace it
+TRIANGULATE = known_poses.triangulate  # before fixtures patch it
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ def test_what_cannot_be_triangulated(
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[list[known_poses.KnownView]]:
-    """Triangulation gives a model of two points; what it was asked for."""
+    """Record the arguments of a stubbed triangulation, which returns two points."""
     calls: list[list[known_poses.KnownView]] = []
 
     def triangulate(home: Path, views: list[known_poses.KnownView], *told: Any) -> Path:
@@ -116,7 +116,7 @@ def test_every_format_without_points(capture: Path, form: Any, asked: list[Any])
     assert len(views) == 12 and views[3].camera.model == "PINHOLE" and views[3].camera.size == (48, 36)
     assert "points3D_xyz" not in load_any(capture, points="random").train_dataparser_outputs.metadata
     config = BitymiDataManagerConfig(data=capture, dataparser=BitymiDataParserConfig())
-    for mode in ("test", "inference"):  # the scene is there already
+    for mode in ("test", "inference"):  # the scene exists already
         assert "points3D_xyz" not in config.setup(device="cpu", test_mode=mode).train_dataparser_outputs.metadata
     assert len(asked) == 1
 

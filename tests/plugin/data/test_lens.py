@@ -1,4 +1,4 @@
-"""Pinhole pictures of photographs that were taken through a lens."""
+"""Pinhole pictures from distorted photographs."""
 
 import math
 from pathlib import Path
@@ -21,7 +21,7 @@ MODELS = [name for name in pycolmap.CameraModelId.__members__ if name not in ("I
 
 
 def camera_of(model: str, f: float, size: tuple[int, int] = SIZE, first: float = 0.02) -> ColmapCamera:
-    """A camera with a slight distortion, where the model has any."""
+    """Make a camera with slight distortion, if the model has any."""
     camera = pycolmap.Camera.create_from_model_name(1, model, f, *size)
     params, extra = np.array(camera.params), camera.extra_params_idxs()
     if extra:
@@ -30,7 +30,7 @@ def camera_of(model: str, f: float, size: tuple[int, int] = SIZE, first: float =
 
 
 def picture(one: Lens) -> np.ndarray:
-    """Of a photograph whose red and green state where a pixel lies in it, in units of 1/255 of its sides."""
+    """Undistort a photograph whose red and green encode a pixel's position in units of 1/255 of its sides."""
     width, height = one.stored
     x, y = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
     image = np.stack([x, y, 0 * x], -1) * 255.0
@@ -50,8 +50,8 @@ def test_pixels_come_from_where_the_camera_saw_their_rays(model: str, f: float) 
         rays = rays @ one.turn[:3, :3].T
         seen = camera.img_from_cam(rays).reshape(to.height, to.width, 2)
         shown = np.ones(seen.shape[:2], bool) if one.whole else one.coverage
-        assert (seen[shown] >= 0.0).all() and (seen[shown] <= SIZE).all()  # nothing is made up
-        # rounding to a step, the step that the photograph is rounded to, and the half pixel at its edges
+        assert (seen[shown] >= 0.0).all() and (seen[shown] <= SIZE).all()  # no extrapolation
+        # rounding of result and photograph, and the half pixel at its edges
         error = np.abs(picture(one)[..., :2] - seen / SIZE * 255.0)[shown]
         assert np.quantile(error, 0.99) < 2.0 and error.max() < 4.0
 
@@ -60,7 +60,7 @@ def test_pixels_come_from_where_the_camera_saw_their_rays(model: str, f: float) 
 @given(st.floats(-0.1, 0.2), st.floats(0.35, 0.65), st.floats(40.0, 400.0))
 @settings(max_examples=25, deadline=None)
 def test_windows_are_as_large_as_they_can_be(k: float, center: float, f: float) -> None:
-    """Their edge touches that of the photograph, within a few pixels, unless they are as wide as allowed."""
+    """Their edges touch the photograph's within a few pixels, unless they are as wide as allowed."""
     camera = ColmapCamera("SIMPLE_RADIAL", *SIZE, (f, center * SIZE[0], 0.5 * SIZE[1], k))
     lenses, _ = lenses_of(camera, SIZE, "camera 1")
     to = lenses[0].pinhole
@@ -69,7 +69,7 @@ def test_windows_are_as_large_as_they_can_be(k: float, center: float, f: float) 
     rays = np.stack([(x - to.cx) / to.fx, (y - to.cy) / to.fy, np.ones_like(x)], -1)
     seen = camera.colmap.img_from_cam(rays)
     margin = min(seen.min(), (np.array(SIZE) - seen).min())
-    # a wider window gives way to faces of a cube, which are masked where the photograph ends
+    # wider windows become cube faces, masked beyond the photograph
     assert -0.01 < margin < 2.5 or max(to.view) > MAX_VIEW_ANGLE - 3.0 or len(lenses) > 1
 
 

@@ -1,5 +1,4 @@
-"""Masks beside the photographs of any capture are used, with a line that says how to leave them out; what nothing names
-is named."""
+"""Masks beside the photographs of any capture are used, with a message how to ignore them; unused ones are reported."""
 
 import json
 import shutil
@@ -29,7 +28,7 @@ LEFT = np.uint8(np.arange(48) < 24)[None].repeat(36, 0) * 255
 
 
 def blender(capture: Path) -> Path:
-    """Photographs in `train`, so that masks are in `masks/train`."""
+    """Photographs in `train`, with masks in `masks/train`."""
     edit(capture, lambda meta: (meta.pop("ply_file_path"), meta.update(camera_angle_x=1.0)))
     edit_frames(capture, lambda f: f.update(file_path=f["file_path"].replace("images", "train")))
     (capture / "images").rename(capture / "train")
@@ -78,7 +77,7 @@ def test_masks_that_are_black_leave_nothing(capture: Path) -> None:
 
 @pytest.mark.parametrize("form", [nerfstudio, instant_ngp])
 def test_masks_of_instant_ngp(capture: Path, form: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    """They are white where something moves; a photograph without one counts as a whole."""
+    """They are white on moving objects; a photograph without one is not masked."""
     form(capture)
     for path in images_of(capture)[2:4]:
         Image.fromarray(LEFT).save(path.with_name(f"dynamic_mask_{path.stem}.png"))
@@ -101,7 +100,7 @@ def test_a_folder_with_some_of_the_masks_or_of_something_else(
         load_any(capture)
     for path in sorted((capture / "masks").iterdir())[1:]:
         path.unlink()
-    next((capture / "masks").iterdir()).rename(capture / "masks/mask.png")  # as ns-process-data calls that of all
+    next((capture / "masks").iterdir()).rename(capture / "masks/mask.png")  # ns-process-data's name for a common mask
     assert "mask" not in load_any(capture).cached_train[0]
     assert "Not taken for photographs" in (text := printed(capsys)) and "masks (1 masks)" in text
 

@@ -1,4 +1,4 @@
-"""Photographs beyond what may be kept are read anew: the same pixels, and only so many at once."""
+"""Photographs beyond the memory limit are read again: same pixels, bounded number in memory."""
 
 import weakref
 from pathlib import Path
@@ -29,7 +29,7 @@ def many(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def alive(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Pictures that were read, and of them those that are still held."""
+    """Count the pictures read and those still alive."""
     pictures: weakref.WeakSet = weakref.WeakSet()
     reads: list[int] = []
     read = BitymiDataset.get_data
@@ -45,7 +45,7 @@ def alive(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def look_at_all(manager: BitymiDataManager, pictures: Any) -> int:
-    """Walks through all views as training and evaluation do; the most pictures that were held at once."""
+    """Visit all views as training and evaluation do; returns the most pictures alive at once."""
     most = 0
     for step in range(2 * TRAIN):
         _, batch = manager.next_train(step)
@@ -61,7 +61,7 @@ def look_at_all(manager: BitymiDataManager, pictures: Any) -> int:
 def test_only_so_many_pictures_are_held(many: Path, alive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "PHOTOGRAPH_BYTES", 6 * PICTURE)
     pictures, _ = alive
-    # what is kept, the latest of both sets, and the one in the caller's hand
+    # the cache, the latest of both sets, and the caller's
     assert look_at_all(load_any(many), pictures) <= 6 + 2 * RECENT + 1
 
 

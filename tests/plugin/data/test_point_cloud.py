@@ -1,4 +1,4 @@
-"""Point clouds that are cut off, whatever their format."""
+"""Truncated point clouds of every format."""
 
 from pathlib import Path
 
@@ -84,7 +84,7 @@ def test_a_handful_of_points_is_doubted(capsys: pytest.CaptureFixture[str]) -> N
 
 
 def colored(path: Path, kind: str, values: np.ndarray, format: str) -> Path:
-    """A cloud of which only the colors matter, [N, 3]."""
+    """Write a cloud in which only the colours [N, 3] matter."""
     order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(format)
     names = [f"property float {name}\n" for name in "xyz"] + [
         f"property {kind} {n}\n" for n in ("red", "green", "blue")

@@ -1,4 +1,4 @@
-"""Poses that are no rotations, and cameras that are somewhere else."""
+"""Poses that are not rotations, and cameras far from the others."""
 
 import json
 from pathlib import Path
@@ -100,7 +100,7 @@ def test_three_rows_are_enough(capture: Path) -> None:
 
 
 def blender(capture: Path, scale: float = 1.0, shear: float = 0.0, **common: Any) -> None:
-    """The capture in Blender's format; `common` are entries of each file."""
+    """Write the capture in Blender's format; `common`: entries of each file."""
     meta = json.loads((capture / "transforms.json").read_text())
     frames = []
     for i, frame in enumerate(meta["frames"]):
@@ -181,7 +181,7 @@ def test_a_cloud_in_another_unit(
     capture: Path, capsys: pytest.CaptureFixture[str], factor: float, message: str
 ) -> None:
     points = np.random.default_rng(0).normal(size=(500, 3)) * factor
-    points[0], points[1] = np.nan, 1e9  # outliers say nothing
+    points[0], points[1] = np.nan, 1e9  # outliers
     write_cloud(capture / "sparse_pc.ply", points, None)
     load(capture)
     warning = printed(capsys)

@@ -1,4 +1,4 @@
-"""Up and metres of a capture whose poses were found here, from its reader to the bundle."""
+"""Up vector and metric scale of a capture with estimated poses, from reader to bundle."""
 
 import json
 import shutil
@@ -22,7 +22,7 @@ from tests.plugin.data.captures import colmap_model, found_poses, images_of, loa
 __all__ = ["surfels"]
 
 UNIT = 2.5
-"""Metres per unit of the room's world, in which z is up."""
+"""Metres per unit of the room's world, which has z up."""
 
 
 def frame(up: str = "gps", metres: float | None = UNIT) -> WorldFrame:
@@ -30,14 +30,14 @@ def frame(up: str = "gps", metres: float | None = UNIT) -> WorldFrame:
 
 
 def known_places(capture: Path) -> np.ndarray:
-    """[n, 3] where the training photographs were taken from, in metres, z up."""
+    """Return the positions [n, 3] of the training cameras, metres, z up."""
     frames = json.loads((capture / "transforms.json").read_text())["frames"]
     places = {Path(f["file_path"]).name: np.array(f["transform_matrix"])[:3, 3] for f in frames}
     return UNIT * np.array([places[path.name] for path in images_of(capture)])
 
 
 def photographs(capture: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The capture's photographs alone, of which the finding of poses gives the capture's own."""
+    """The capture's photographs alone; pose estimation is stubbed to return its own poses."""
     colmap_model(capture, capture / "found/sparse/0")
     write_frame(capture / "found", frame())
 
@@ -99,7 +99,7 @@ def test_up_without_a_scale(capture: Path, tmp_path: Path, surfels: Any) -> None
 def test_a_capture_that_came_with_its_poses_states_neither(
     capture: Path, tmp_path: Path, surfels: Any, text: str | None
 ) -> None:
-    if text is not None:  # another program's
+    if text is not None:  # by another program
         (capture / "frame.json").write_text(text)
     manager = load_any(capture)
     assert world_of(manager).up is None

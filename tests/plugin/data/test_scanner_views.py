@@ -1,4 +1,4 @@
-"""What scanning programs write is read with its poses, and only the photographs of it."""
+"""Captures of scanning programs are read with their poses, and only their photographs."""
 
 import json
 import shutil
@@ -16,7 +16,7 @@ from bitymi_ns.plugin.data.depth_files import read_depth
 from tests.plugin.data.captures import expect, load_any, printed
 
 Y_UP = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-"""From a world with z up to ARKit's."""
+"""From a world with z up to ARKit's axes."""
 
 
 def frames_of(capture: Path) -> tuple[list[tuple[Path, np.ndarray]], dict[str, Any]]:
@@ -129,7 +129,7 @@ def test_scans_are_read_with_their_poses(
     a = one.cameras.camera_to_worlds.double().numpy()[shown]
     b = other.cameras.camera_to_worlds.double().numpy()
     scale = np.linalg.norm(a[1:, :, 3] - a[0, :, 3]) / np.linalg.norm(b[1:, :, 3] - b[0, :, 3])
-    for x, y in zip(a, b, strict=True):  # seen from the first camera
+    for x, y in zip(a, b, strict=True):  # relative to the first camera
         np.testing.assert_allclose(a[0, :, :3].T @ x[:, :3], b[0, :, :3].T @ y[:, :3], atol=1e-4)
         here, there = (m[0, :, :3].T @ (n[:, 3] - m[0, :, 3]) for m, n in ((a, x), (b, y)))
         np.testing.assert_allclose(here, scale * there, atol=1e-4)
@@ -227,7 +227,7 @@ def test_a_capture_of_stray_scanner(capture: Path, tmp_path: Path, capsys: pytes
     for x, y in zip(a, b, strict=True):
         np.testing.assert_allclose(a[0, :, :3].T @ x[:, :3], b[0, :, :3].T @ y[:, :3], atol=1e-4)
     assert b[:, 2, 1].mean() > 0.5 and np.allclose(other.cameras.fx, one.cameras.fx[:1], atol=1e-3)
-    for i, number in enumerate(shown):  # the picture is that of the pose
+    for i, number in enumerate(shown):  # picture and pose belong together
         difference = np.abs(other.get_numpy_image(i).astype(int) - one.get_numpy_image(number).astype(int))
         assert difference.mean() < 12
     maps = other.metadata["maps"]

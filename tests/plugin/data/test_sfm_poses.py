@@ -1,4 +1,4 @@
-"""Photographs without poses: what the finding of poses is given of a capture."""
+"""Photographs without poses: arguments of pose estimation."""
 
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from bitymi_ns.plugin.data import sfm_poses
 @pytest.mark.parametrize(
     ("photographs", "data", "given", "masks"),
     [
-        ("bed/shots", "bed", None, "bed/masks"),  # not a usual name, but below what was named
+        ("bed/shots", "bed", None, "bed/masks"),  # not a usual name, but below the given folder
         ("bed/images", "bed/images", None, "bed/masks"),
         ("bed/images", "bed", Path("mine"), "bed/mine"),
         ("bed", "bed", None, "bed/masks"),

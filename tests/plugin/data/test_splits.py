@@ -1,4 +1,4 @@
-"""Which photographs are held out."""
+"""Selection of held-out photographs."""
 
 from pathlib import Path
 
@@ -60,5 +60,5 @@ def test_names_in_another_case_or_with_another_ending() -> None:
 def test_names_of_another_machine() -> None:
     names = ["D:\\scan\\left\\a.jpg", "/home/me/scan/right/a.jpg", "b c.jpg"]
     assert splits.find(TWINS, names, "the lists", any_folder=True) == [0, 2, 1]
-    with expect("2 of 3 names are of no photograph"):  # a name that a user gives is meant as it is
+    with expect("2 of 3 names are of no photograph"):  # user-given names match exactly
         splits.find(TWINS, names, "--eval-names")

@@ -1,4 +1,4 @@
-"""What stands in transforms.json beside poses, well meant or not."""
+"""Entries of transforms.json beside the poses, valid and invalid."""
 
 import math
 from pathlib import Path

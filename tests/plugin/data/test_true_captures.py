@@ -1,5 +1,4 @@
-"""Captures that other programs are known to read as another scene than they show, or not at all; each case by what is
-special about it, in every format that can have it."""
+"""Captures that other programs misread or fail to read; each case in every format that can have it."""
 
 import json
 import unicodedata
@@ -68,7 +67,7 @@ def poses_of(manager: BitymiDataManager) -> np.ndarray:
 
 
 def move(place: Path, shift: np.ndarray) -> None:
-    """The capture, its points included, that much further from the origin."""
+    """Shift the capture, points included, away from the origin."""
     if place.is_dir():
         lines = (place / "images.txt").read_text().split("\n")
         for i, line in enumerate(lines[::2]):
@@ -114,7 +113,7 @@ def test_coordinates_of_a_map(
     np.testing.assert_allclose(a[:, :, :3], b[:, :, :3], atol=1e-5)
     if p is not None and q is not None:
         np.testing.assert_allclose(p - a[:, :, 3].mean(0), q - b[:, :, 3].mean(0), atol=1e-5)
-    # the place of the scene in the capture is kept to less than a hundredth of a unit, seven digits before the point
+    # positions in the capture are kept to less than a hundredth of a unit, seven digits before the point
     for manager, offset in ((one, np.zeros(3)), (other, UTM)):
         world = world_of(manager).described()
         transform = np.asarray(world["transform"], float)
@@ -196,7 +195,7 @@ def test_entries_that_nothing_reads_are_named(
 
 
 def test_aria_s_camera(capture: Path) -> None:
-    """FISHEYE624 is COLMAP's RAD_TAN_THIN_PRISM_FISHEYE: rays are seen at the same pixels."""
+    """FISHEYE624 is COLMAP's RAD_TAN_THIN_PRISM_FISHEYE: both map rays to the same pixels."""
     params = [0.02, -0.01, 0.004, 0.001, -0.0005, 0.0001, 0.002, -0.001, 0.0015, -0.0007, 0.0004, 0.0003]
     camera = {"camera_model": "FISHEYE624", "fl_x": 20.0, "fl_y": 20.0, "distortion_params": params}
     edit(capture, lambda meta: meta.update(camera))
@@ -212,7 +211,7 @@ def test_aria_s_camera(capture: Path) -> None:
 
 
 def name_frames(place: Path, change: Callable[[str], str]) -> None:
-    """Change the names of the photographs in the capture's file, seen from the folder of the capture."""
+    """Rename the photographs in the capture's file, relative to the capture's folder."""
     if place.is_dir():
         text = (place / "images.txt").read_text("utf8").split("\n")
         for i in range(0, len(text) - 1, 2):
@@ -317,7 +316,7 @@ def test_points_of_a_model_that_are_no_numbers(project: Path, capsys: pytest.Cap
 
 @pytest.mark.parametrize("form", ALL)
 def test_reduced_as_they_are_read(capture: Path, form: Callable[[Path], Path]) -> None:
-    """`--downscale-factor` without a folder of copies is the same for every format."""
+    """`--downscale-factor` without a folder of reduced copies is the same for every format."""
     manager = load_any(form(capture), downscale_factor=2)
     assert manager.cached_train[0]["image"].shape == (18, 24, 3)
     assert int(manager.train_dataset.cameras.width[0]) == 24

@@ -1,4 +1,4 @@
-"""Captures with photographs of wide cameras, some or all of them."""
+"""Captures with photographs of wide cameras, some or all."""
 
 import struct
 from pathlib import Path
@@ -28,7 +28,7 @@ SIZE = (96, 48)
 
 
 def panoramas(capture: Path, count: int) -> list[str]:
-    """Make the first photographs pictures of all directions; their names."""
+    """Turn the first photographs into panoramas; returns their names."""
     names = [file.name for file in images_of(capture)[:count]]
     for i, name in enumerate(names):
         noise = np.random.default_rng(i).integers(0, 255, (*SIZE[::-1], 3), np.uint8)
@@ -70,7 +70,7 @@ def test_a_mask_goes_with_each_face_and_a_face_without_pixels_is_left_out(
     count = len(images_of(capture))
     panoramas(capture, count)
     mask = np.full(SIZE[::-1], 255, np.uint8)
-    mask[30:] = 0  # all of the face down, and parts of those around it
+    mask[30:] = 0  # the whole bottom face, and parts of those around it
     Image.fromarray(mask).save(capture / "mask.png")
     edit_frames(capture, lambda frame: frame.update(mask_path="mask.png"))
     manager = load_any(capture)
@@ -130,7 +130,7 @@ def test_panoramas_that_cannot_be_used(capture: Path, entries: dict[str, Any], m
 
 
 def rig_of_two(project: Path, form: str) -> None:
-    """State that photographs 1 and 2 of a COLMAP project, 3 and 4, and so on were taken together."""
+    """Declare pairs of photographs (1 and 2, 3 and 4, ...) of a COLMAP project as taken together."""
     count = len(images_of(project))
     model = project / "sparse/0"
     if form == "txt":

@@ -1,4 +1,4 @@
-"""What the export says of the size that was asked for."""
+"""Messages of the export about the requested size."""
 
 import pytest
 

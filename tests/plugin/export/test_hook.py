@@ -1,4 +1,4 @@
-"""`ns-export` gets one more command, however and whenever the plugin is loaded."""
+"""`ns-export` gets its additional command, in any order of loading the plugin."""
 
 import importlib
 import sys

@@ -1,4 +1,4 @@
-"""Checkpoints that cannot be used are refused with the file's name and what to do."""
+"""Unusable checkpoints are refused with the file's name and a remedy."""
 
 import dataclasses
 import errno
@@ -24,7 +24,7 @@ from bitymi_ns.train.strategy import STATISTICS
 
 
 def state(scene: SceneConfig, rows: int = 5, step: int = 7) -> dict[str, Any]:
-    """A whole checkpoint of a run."""
+    """Make a complete checkpoint of a run."""
     torch.manual_seed(0)
     kind = VIEW_COLORS[scene.view_color]
     geometry = {"means": (3,), "quats": (4,), "log_scales": (2,), "opacity_logits": (), "beta_raw": ()}
@@ -75,7 +75,7 @@ def state(scene: SceneConfig, rows: int = 5, step: int = 7) -> dict[str, Any]:
 
 
 def moved(value: torch.Tensor) -> torch.optim.Optimizer:
-    """The optimiser of a parameter after a step."""
+    """Make a parameter's optimiser after one step."""
     parameter = torch.nn.Parameter(value.clone())
     optimizer = adam([parameter])
     parameter.grad = torch.ones_like(parameter)
@@ -99,7 +99,7 @@ def refused(path: Path, message: str, scene: SceneConfig | None = None) -> None:
 def test_a_whole_checkpoint_loads(saved: Path) -> None:
     assert checkpoints.load(saved, SceneConfig())["step"] == 7
     assert checkpoints.newest_step(saved.parent) == 7
-    other = SceneConfig(near=0.1, weight_bound=0.0, rim=1e-2, texture_moves_surfels=True)  # no parameter depends on it
+    other = SceneConfig(near=0.1, weight_bound=0.0, rim=1e-2, texture_moves_surfels=True)  # without effect on shapes
     assert checkpoints.load(saved, other)["step"] == 7
     refused(saved, "another preset:\n  --pipeline.model.scene.view-color: sv there, sh here", SceneConfig("sh"))
 
@@ -115,7 +115,7 @@ def test_every_altered_byte_of_a_tensor_is_noticed(saved: Path) -> None:
     whole = bytearray(saved.read_bytes())
     ones = torch.ones(5, 4).numpy().tobytes()
     at = whole.index(ones) + 2
-    whole[at] ^= 1  # still a number, and no longer the one that was saved
+    whole[at] ^= 1  # another valid number
     saved.write_bytes(whole)
     refused(saved, "checksum.*damaged")
     earlier = checkpoints.path_of(saved.parent, 3)
@@ -188,7 +188,7 @@ MEANS, SIZE, EXTRA = "_model.scene.surfels.means", "_model.scene.field.size", "_
 
 
 def at(*keys: object) -> Callable[[dict[str, Any], Any], None]:
-    """Replace the entry of these keys."""
+    """Return a function that replaces the entry of these keys."""
 
     def replace(whole: dict[str, Any], value: Any) -> None:
         for key in keys[:-1]:

@@ -1,4 +1,4 @@
-"""The GPU is used where the kernels can run on it; else a message says why and what to do."""
+"""The GPU is used if the kernels can run on it; otherwise a message says why and what to do."""
 
 import sys
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from bitymi_ns.plugin.run import device
 
 @pytest.fixture
 def card(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
-    """A card that torch sees, and a module of kernels that finds nothing wrong with it."""
+    """A stub GPU and a stub module of kernels that accepts it."""
     kernels = ModuleType("bitymi_ns._cuda")
     kernels.device_problem = lambda number: ""
     monkeypatch.setitem(sys.modules, "bitymi_ns._cuda", kernels)
@@ -55,7 +55,7 @@ def test_why_a_card_is_not_used(card: ModuleType, monkeypatch: pytest.MonkeyPatc
 
 @pytest.fixture
 def config():
-    """Of a run. nerfstudio is imported before a card is made up: its libraries ask for one."""
+    """Make a run's configuration; nerfstudio is imported before the stub, as its libraries query a GPU."""
     pytest.importorskip("nerfstudio")
     from bitymi_ns.plugin.run.config import method_config
 

@@ -1,4 +1,4 @@
-"""What the first process of a run says when another one is lost. Whole runs: tests/e2e/test_several_processes.py."""
+"""Messages of the first process when another one is lost. Whole runs: tests/e2e/test_several_processes.py."""
 
 from types import SimpleNamespace
 
@@ -15,7 +15,7 @@ def process(status: int | None) -> SimpleNamespace:
 
 @pytest.fixture
 def others(monkeypatch: pytest.MonkeyPatch) -> launcher.Workers:
-    """Two that run."""
+    """Two running processes."""
     monkeypatch.setattr(launcher, "PATIENCE", 0.0)
     found = launcher.Workers.__new__(launcher.Workers)
     found._store = dist.TCPStore("127.0.0.1", 0, 3, is_master=True, wait_for_workers=False)

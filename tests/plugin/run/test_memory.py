@@ -1,4 +1,4 @@
-"""The statement of the memory that a run will take."""
+"""The estimate of a run's memory."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -65,7 +65,7 @@ def test_one_line_says_what_will_be_taken(
 
 
 class OnCard:
-    """Stands for a scene on a card: its tensors say so, and can be copied to the CPU."""
+    """A scene with stub CUDA tensors, which can be copied to the CPU."""
 
     def __init__(self, scene: Scene) -> None:
         self.config, self.near, self.field, self._count = scene.config, scene.near, scene.field, len(scene)
@@ -84,7 +84,7 @@ def test_a_card_is_compared_with_its_own_memory(
     scene: tuple[Scene, Camera], what: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     state = {"training": memory.state_training, "export": memory.state_export}[what]
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=0))  # the host's does not matter
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=0))  # host memory is irrelevant
     monkeypatch.setattr(memory, "photograph_budget", lambda device: 2**30)
     monkeypatch.setattr(memory, "PER_SURFEL" if what == "training" else "PER_PIXEL", 1e8)
     needed = []
@@ -95,7 +95,7 @@ def test_a_card_is_compared_with_its_own_memory(
         assert "GB of memory of the card for 20 training photographs" in text
         assert ("more than the 1.0 GB that the card has available" in text) == (free == 10**9)
         needed.append(gigabytes(text))
-    assert needed[0] > 1 and needed[1] <= needed[0]  # views with more fragments than it holds are drawn in bands
+    assert needed[0] > 1 and needed[1] <= needed[0]  # views with more fragments than fit are drawn in bands
 
 
 def test_lists_that_training_makes_on_a_card_count(
@@ -153,7 +153,7 @@ def test_it_grows_with_fragments_up_to_the_bound_and_not_with_views(
         few, many = said(capsys).split("Training will take")[1:]
         most = memory.SMALLEST**2 * len(one) + views * camera.width * camera.height
         assert gigabytes(many) - gigabytes(few) == pytest.approx(1e-3 * most, rel=0.1)
-    large = Camera(camera.viewmat, camera.K, 4000, 4000)  # photographs alone: more than are kept
+    large = Camera(camera.viewmat, camera.K, 4000, 4000)  # photographs exceed the cache
     monkeypatch.setattr(memory, "most_fragments", lambda *_: 0)
     needed = []
     for views in (100, 1000):
@@ -187,7 +187,7 @@ def test_an_export_holds_what_every_view_shows_of_every_surfel(
 ) -> None:
     monkeypatch.setattr(memory, "_state", lambda what, needed, *more: stated.append(needed))
     stated: list[float] = []
-    for views in (30_000, 40_000):  # whose photographs are more than are kept
+    for views in (30_000, 40_000):  # photographs exceed the cache
         memory.state_export(scene[0], [scene[1]] * views, 0, compact=compact)
     assert stated[1] - stated[0] == 10_000 * bytes_each * len(scene[0])
     options = TexelConfig(pixels_per_texel=2.0, rendered_pixels_per_texel=10.0)
@@ -197,7 +197,7 @@ def test_an_export_holds_what_every_view_shows_of_every_surfel(
 
 
 class Peak(TorchDispatchMode):
-    """Count the bytes of the tensors that are made and live at once."""
+    """Counter of the peak bytes of live tensors."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -226,7 +226,7 @@ def test_lists_of_an_export_take_what_is_stated_on_a_card() -> None:
     surfels["log_scales"], surfels["opacity_logits"] = torch.full((count, 2), 2.0), torch.full((count,), -3.0)
     surfels["beta_raw"] = torch.zeros(count)
     camera = Camera(torch.eye(4), torch.tensor([[64.0, 0, 32], [0, 64.0, 32], [0, 0, 1]]), size, size)
-    bound = 0.0471 * 0.953**16.5  # of the weight of the seventeenth, so that 43 % show a texel
+    bound = 0.0471 * 0.953**16.5  # between the weights of two fragments, so that 43 % show a texel
     stands = SimpleNamespace(
         surfels=surfels, near=0.2, config=SimpleNamespace(weight_bound=bound, prefilter="low_pass")
     )

@@ -1,4 +1,4 @@
-"""Image metrics, the training curve and honest clocks."""
+"""Image metrics, training curve and timers."""
 
 import json
 import math
@@ -109,7 +109,7 @@ def test_a_resumed_curve_goes_on_where_the_checkpoint_was(tmp_path: Path) -> Non
     for step in (10, 20, 30):
         first.add({"step": step})
     with open(tmp_path / "a.jsonl", "a") as file:
-        file.write('{"step": 4')  # the run was killed here
+        file.write('{"step": 4')  # killed here
     TrainingCurve(tmp_path / "b.jsonl", tmp_path / "a.jsonl", steps_done=20).add({"step": 40})
     assert [json.loads(line)["step"] for line in (tmp_path / "b.jsonl").read_text().splitlines()] == [10, 20, 40]
     TrainingCurve(tmp_path / "a.jsonl")

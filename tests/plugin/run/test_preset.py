@@ -1,4 +1,4 @@
-"""Presets state what differs from the declared defaults, and errors name the file and the key."""
+"""Presets state only differences from the defaults, and errors name the file and the key."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ def test_the_default_preset_is_the_declared_defaults_but_for_the_texture() -> No
 
 
 def repeated(values: dict, defaults: object, prefix: str = "") -> list[str]:
-    """Keys to which a preset gives the default again."""
+    """List the keys for which a preset repeats the default."""
     found = []
     for key, value in values.items():
         default = getattr(defaults, key)

@@ -1,4 +1,4 @@
-"""`ns-render` on our scenes: films and frames by PyAV, whole or not at all; one line says what cannot be rendered."""
+"""`ns-render` on our scenes: films and frames by PyAV, atomically; refusals in one line."""
 
 import json
 import math
@@ -31,7 +31,7 @@ DISTANCE = 3.0
 
 
 class Wall(SurfelModel):
-    """A coloured wall in front of every camera, at one depth; its blue tells the frame."""
+    """A coloured wall at constant depth in front of every camera; its blue encodes the frame."""
 
     def __init__(self) -> None:
         torch.nn.Module.__init__(self)
@@ -55,7 +55,7 @@ class Wall(SurfelModel):
 
 @pytest.fixture
 def wall(monkeypatch: pytest.MonkeyPatch) -> Wall:
-    """The scene that nerfstudio's commands load."""
+    """The scene loaded by nerfstudio's commands."""
     model = Wall()
     for name in ("install_checks", "_render_trajectory_video", "get_crop_from_json", "VanillaDataManager", "media"):
         monkeypatch.setattr(render, name, getattr(render, name))
@@ -75,7 +75,7 @@ def wall(monkeypatch: pytest.MonkeyPatch) -> Wall:
 
 
 class HeldOut:
-    """What is read of a data set."""
+    """Stub of a dataset."""
 
     count = 3
 
@@ -88,7 +88,7 @@ class HeldOut:
 
 
 def cameras(count: int) -> Cameras:
-    """Cameras in a row whose principal point is off the middle."""
+    """Make cameras in a row with off-centre principal points."""
     poses = torch.eye(4)[:3].repeat(count, 1, 1)
     poses[:, 0, 3] = torch.arange(count) * 0.1
     cy = 11.0 + torch.arange(count)[:, None]
@@ -96,7 +96,7 @@ def cameras(count: int) -> Cameras:
 
 
 def path_of(count: int = 12, **changes: Any) -> dict[str, Any]:
-    """A camera path as nerfstudio's viewer writes it."""
+    """Make a camera path like nerfstudio's viewer."""
     pose = np.eye(4).flatten().tolist()
     frames = [{"camera_to_world": pose, "fov": 60.0, "aspect": 4 / 3} for _ in range(count)]
     found = {"camera_type": "perspective", "render_width": 32, "render_height": 24, "fps": 24, "crop": None}
@@ -105,7 +105,7 @@ def path_of(count: int = 12, **changes: Any) -> dict[str, Any]:
 
 @pytest.fixture
 def camera_path(tmp_path: Path) -> Callable[..., None]:
-    """Render a camera path to tmp_path / "film.mp4", or with other options."""
+    """Return a function that renders a camera path to tmp_path / "film.mp4", or with other options."""
 
     def command(found: Any = None, **options: Any) -> None:
         file = tmp_path / "path.json"
@@ -132,8 +132,8 @@ def test_a_camera_path_becomes_a_film_that_browsers_play(wall: Wall, camera_path
     focal = float(wall.drawn[0].K[1, 1])
     assert focal == pytest.approx(12 / math.tan(math.radians(30)), rel=1e-5)
     data = (tmp_path / "film.mp4").read_bytes()
-    assert data.index(b"moov") < data.index(b"mdat")  # plays before it is there as a whole
-    assert is_rendered_film(tmp_path / "film.mp4")  # and is not taken for a capture
+    assert data.index(b"moov") < data.index(b"mdat")  # can play while downloading
+    assert is_rendered_film(tmp_path / "film.mp4")  # is not mistaken for a capture
     assert sorted(path.name for path in tmp_path.iterdir()) == ["film.mp4", "path.json"]
 
 
@@ -215,8 +215,8 @@ def test_a_spiral_turns_to_what_the_camera_shows_and_does_not_roll(wall: Wall) -
     target = turn @ torch.tensor([0.0, 0.0, -DISTANCE])
     for pose in path.camera_to_worlds:
         toward = torch.nn.functional.normalize(target - pose[:, 3], dim=0)
-        assert float(toward @ -pose[:, 2]) > 0.995  # depth is that along the ray: a little more than that of the wall
-        assert abs(float(pose[1, 0])) < 1e-6  # level, as the first camera is
+        assert float(toward @ -pose[:, 2]) > 0.995  # depth along the ray is slightly larger than the wall's
+        assert abs(float(pose[1, 0])) < 1e-6  # level, like the first camera
         assert float((pose[:, 3] - start.camera_to_worlds[0, :, 3]).norm()) <= 0.2 * math.sqrt(2) + 1e-6
 
 
@@ -364,7 +364,7 @@ def test_scenes_of_other_methods_are_rendered_as_before(
     checks = SimpleNamespace(check_ffmpeg_installed=lambda: stock.append("checked"))
     monkeypatch.setattr(render, "install_checks", checks)
     loaded = render.eval_setup
-    camera_path()  # one of ours was loaded before, in the same process
+    camera_path()  # as if one of ours had been loaded before
     assert stock == []
 
     def eval_setup(*_: Any, **__: Any) -> tuple:

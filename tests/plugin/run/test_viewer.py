@@ -1,4 +1,4 @@
-"""The viewer is for this machine alone unless it is told otherwise, and Ctrl-C ends it without a traceback."""
+"""The viewer listens on this machine only by default, and Ctrl-C ends it without a traceback."""
 
 import sys
 from pathlib import Path
@@ -18,7 +18,7 @@ from bitymi_ns.plugin.run.config import method_config
 
 @pytest.fixture
 def hosts(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The addresses at which a viewer was started; each is ended by Ctrl-C at once."""
+    """Record the addresses of started viewers, each ended at once by Ctrl-C."""
     started: list[str] = []
 
     def start_viewer(config: Any, *_: Any) -> None:
@@ -30,7 +30,7 @@ def hosts(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def view(monkeypatch: pytest.MonkeyPatch, config: Any, arguments: list[str], ours: bool = True) -> None:
-    """What ns-viewer does with these arguments once the scene is loaded."""
+    """Run ns-viewer with these arguments on a loaded scene."""
 
     def load(*_: Any, **__: Any) -> tuple:
         if ours:
@@ -70,7 +70,7 @@ def test_ns_viewer_listens_where_it_is_told(
 def test_scenes_of_other_methods_are_shown_as_before(hosts: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(KeyboardInterrupt):
         view(monkeypatch, method_config("bitymi").config, [], ours=False)
-    adopt_viewer(method_config("bitymi").config)  # one of ours was loaded before, in the same process
+    adopt_viewer(method_config("bitymi").config)  # as if one of ours had been loaded before
     with pytest.raises(KeyboardInterrupt):
         view(monkeypatch, method_config("bitymi").config, [], ours=False)
     assert hosts == ["0.0.0.0", "0.0.0.0"]

@@ -18,7 +18,6 @@ class _OnCard(Tensor):
 
 
 def on_card(tensor: Tensor) -> Tensor:
-    """Copy a tensor to the stub GPU."""
     return tensor.clone().as_subclass(_OnCard)
 
 

@@ -32,7 +32,6 @@ PAGES = tracked("*.md")
 
 
 def without_blocks(text: str) -> str:
-    """Remove code blocks."""
     return re.sub(r"^(```|~~~).*?^\1", "", text, flags=re.MULTILINE | re.DOTALL)
 
 

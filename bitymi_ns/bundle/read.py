@@ -298,7 +298,6 @@ def _blocks(texels: Tensor, alpha: bool) -> Tensor | None:
 
 
 def _check_tiles(tiles: Tensor, info: Manifest, source: Path) -> None:
-    """Check that tiles lie inside the atlas."""
     layers, height, width = (info.atlas.layers, info.atlas.height, info.atlas.width) if info.atlas else (1, 0, 0)
     x, y, layer, r_u, r_v = tiles.long().unbind(1)
     good = (tiles >= 0).all(1) & (x + r_u <= width) & (y + r_v <= height) & (layer < layers)

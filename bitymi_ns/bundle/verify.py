@@ -71,7 +71,6 @@ def _check_parts(parts: Parts) -> tuple[Bundle | None, list[Check]]:
 
 
 def _check_notes(parts: Parts) -> list[Check]:
-    """Check notes.json if present."""
     try:
         found = read_notes(parts)
     except BundleError as error:

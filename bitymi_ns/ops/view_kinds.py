@@ -168,7 +168,6 @@ def _with_lobes(
     start: Callable[[Tensor, int, torch.Generator], tuple[Tensor, ...]],
     mean: Callable[[Tensor, Tensor], Tensor],
 ) -> ViewColor:
-    """Build a kind with a base colour and lobes."""
     return ViewColor(
         title=title,
         term="lobe",

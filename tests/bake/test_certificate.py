@@ -143,7 +143,6 @@ def truth(scene) -> Baked:
 
 @pytest.fixture(scope="module", params=[True, False], ids=["compact", "pages"])
 def tuned(scene, truth: Baked, request: pytest.FixtureRequest) -> Baked:
-    """A tuned and encoded bake."""
     compact, made, views = request.param, scene(60), photographs(truth)
     made.surfels["log_scales"] += 1.5
     made.surfels["opacity_logits"] += 1.0

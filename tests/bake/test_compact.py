@@ -40,7 +40,6 @@ def views(truth: Baked) -> list[View]:
 
 @pytest.fixture(scope="module")
 def rounded(truth: Baked, views: list[View]) -> Baked:
-    """`truth` with rounded surfels."""
     return compacted(truth, views, BACKGROUND, Compact(share=0.05))[0]
 
 

@@ -36,7 +36,6 @@ def cameras() -> list[Camera]:
 
 
 def render(baked: Baked, camera: Camera) -> Tensor:
-    """Render a bake before quantisation."""
     return baked.unquantised().render(camera, BACKGROUND).rgb
 
 
@@ -54,7 +53,6 @@ def waving(made: Any, **options: Any) -> Baked:
 
 
 def tuning_views(baked: Baked, views: list[View], budget: int = 1 << 30) -> TuningViews:
-    """Collect views of a bake and its texels."""
     return TuningViews(TexelList(baked), views, BACKGROUND, MemoryBudget(budget))
 
 
@@ -63,7 +61,6 @@ def texels_of(baked: Baked) -> Tensor:
 
 
 def photographs(truth: Baked) -> list[View]:
-    """Photograph a scene."""
     return [View(camera, render(truth, camera).clamp(0.0, 1.0)) for camera in cameras()]
 
 
@@ -75,7 +72,6 @@ def truth(scene) -> Baked:
 
 @pytest.fixture(scope="module")
 def views(truth: Baked) -> list[View]:
-    """Photographs of `truth`."""
     return photographs(truth)
 
 
@@ -234,7 +230,6 @@ def test_masked_pixels_and_alpha(wrong: Baked, views: list[View]) -> None:
 
 
 def with_exposures(truth: Baked, views: list[View]) -> list[View]:
-    """Photograph a bake with known exposures."""
     exposed = []
     for view, log in zip(views, torch.linspace(-0.4, 0.4, len(views)), strict=True):
         alpha = truth.unquantised().render(view.camera, BACKGROUND).alpha

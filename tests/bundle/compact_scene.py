@@ -71,6 +71,5 @@ def pages_of(codes: SceneCodes) -> tuple[np.ndarray, Packing]:
 
 
 def write_compact(folder: Path, codes: SceneCodes, **options) -> Path:
-    """Write a compact bundle."""
     atlas = None if codes.texels is None else encode(*pages_of(codes), "uint8", RANGE)
     return write_bundle(folder, scene_of(codes), atlas, codes, **options)

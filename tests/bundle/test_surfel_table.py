@@ -18,7 +18,6 @@ TILES = np.arange(25, dtype=np.int32).reshape(5, 5)
 
 
 def columns_of(params, tiles=TILES, **means):
-    """The columns of surfels and their tiles."""
     return to_columns(BakedScene(params, kind_of(params), torch.from_numpy(tiles), **means))
 
 

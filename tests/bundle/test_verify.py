@@ -14,7 +14,6 @@ from tests.bundle.damage import amend, change_columns
 
 @pytest.fixture
 def made(scene, camera, tmp_path):
-    """Write a bundle with tiles: (folder, scene, views)."""
     trained, views = scene(60), [camera(3.0)]
     options = BakeOptions(format="uint8", tolerance=0.2)
     export(bake(trained, views, options), tmp_path / "b", statistics={"options": vars(options)})

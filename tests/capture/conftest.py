@@ -37,7 +37,6 @@ def arc(tmp_path_factory: pytest.TempPathFactory, pictures: list[np.ndarray]) ->
 
 @pytest.fixture
 def copied(arc: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
-    """Copy the photographs to a new folder."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
     def copy(name: str) -> Path:

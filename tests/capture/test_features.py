@@ -14,7 +14,6 @@ from bitymi_ns.capture.sfm.job import CameraGroup, Job
 
 @pytest.fixture
 def job(tmp_path: Path) -> Job:
-    """Four photographs from two cameras."""
     noise = np.random.default_rng(0).integers(0, 256, (60, 80, 3)).astype(np.uint8)
     names = [f"{i:06d}.png" for i in range(4)]
     for i, name in enumerate(names):

@@ -116,7 +116,6 @@ def front(width: int = 60, height: int = 44, distance: float = 4.0) -> Camera:
 
 
 def most(device: torch.device, emulated: float, card: float) -> float:
-    """Return the bound for a device."""
     return card if device.type == "cuda" else emulated
 
 

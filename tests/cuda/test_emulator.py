@@ -11,7 +11,6 @@ from tests.required import skip_without
 
 @pytest.fixture
 def emulated() -> ModuleType:
-    """The emulated kernels."""
     if why := why_not_emulated():
         skip_without("emulated", why)
     return load("_emulated")

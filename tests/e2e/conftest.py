@@ -88,5 +88,4 @@ def field_bundle(field_run: BitymiTrainerConfig, tmp_path_factory: pytest.TempPa
 
 @pytest.fixture
 def copied(bundle: Path, tmp_path: Path) -> Path:
-    """A copy of the bundle."""
     return Path(shutil.copytree(bundle, tmp_path / "elsewhere"))

@@ -23,7 +23,6 @@ def a_run_of(trained: BitymiTrainerConfig, folder: Path) -> Path:
 
 
 def config_of(folder: Path) -> BitymiTrainerConfig:
-    """Load the config.yml of a run."""
     return yaml.load((folder / "config.yml").read_text(), Loader=yaml.Loader)
 
 

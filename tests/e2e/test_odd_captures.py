@@ -23,7 +23,6 @@ Start = Callable[..., BitymiTrainerConfig]
 
 @pytest.fixture
 def capture(room: Path, tmp_path: Path) -> Path:
-    """A copy of the room to damage."""
     return Path(shutil.copytree(room, tmp_path / "spoilt"))
 
 

@@ -94,7 +94,6 @@ def test_every_method_trains_and_loads_again(start: Start, method: str) -> None:
 
 @pytest.fixture
 def spoiled(room: Path, tmp_path: Path) -> Path:
-    """A copy of the room."""
     return Path(shutil.copytree(room, tmp_path / "spoiled"))
 
 

@@ -53,24 +53,20 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def put(folder: Path, value: bytes, names: tuple[str, ...]) -> None:
-    """Write a folder of small files."""
     with files.complete_folder(folder / "b") as new:
         for name in names:
             (new / name).write_bytes(value)
 
 
 def of_a_folder(folder: Path) -> tuple[Callable[[], None], Callable[[], None]]:
-    """Return writers of two versions of a folder."""
     return lambda: put(folder, b"old" * 999, ("x", "y")), lambda: put(folder, b"new" * 999, ("x", "z"))
 
 
 def of_a_file(folder: Path) -> tuple[Callable[[], None], Callable[[], None]]:
-    """Return writers of two versions of a file."""
     return lambda: files.write_file(folder / "b", b"old" * 999), lambda: files.write_file(folder / "b", b"new" * 999)
 
 
 def of_a_bundle(folder: Path) -> tuple[Callable[[], None], Callable[[], None]]:
-    """Return writers of two versions of a bundle."""
     import torch
 
     from bitymi_ns.bundle import write_bundle

@@ -141,7 +141,6 @@ def test_what_cannot_be_written_is_explained(tmp_path: Path, place: Callable[[Pa
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """Mount a file system of 1 MB."""
     folder = tmp_path / "disk"
     folder.mkdir()
     mounted = subprocess.run(

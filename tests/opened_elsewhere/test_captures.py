@@ -25,7 +25,6 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def found(arc: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The capture that sfm writes from the photographs."""
     folder = tmp_path_factory.mktemp("sfm") / "capture"
     assert main(["sfm", str(arc), "--output", str(folder), "--max-features", "400"]) == 0
     return folder

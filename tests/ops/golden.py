@@ -114,7 +114,6 @@ def atlas_of(golden: Golden) -> tuple[Tensor, Tensor]:
 
 
 def camera_of(case: SceneCase, dtype: torch.dtype = torch.float64) -> Camera:
-    """Return the camera of a case."""
     return Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height)
 
 

@@ -15,7 +15,6 @@ pytestmark = pytest.mark.skipif(not (CMAKE and NINJA), reason="cmake or ninja is
 
 
 def configure(folder: Path, **definitions: str) -> str:
-    """Configure a build in `folder`; returns CMake's output."""
     definitions = {"Python_EXECUTABLE": sys.executable, "CMAKE_MAKE_PROGRAM": str(NINJA), **definitions}
     options = [f"-D{name}={value}" for name, value in definitions.items()]
     command = [str(CMAKE), "-S", str(ROOT), "-B", str(folder), "-G", "Ninja", *options]

@@ -33,7 +33,6 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def capture(original: Path, tmp_path: Path) -> Path:
-    """A copy of the room to damage."""
     return Path(shutil.copytree(original, tmp_path / "room"))
 
 

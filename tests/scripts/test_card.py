@@ -30,7 +30,6 @@ except RuntimeError as error:
 
 @pytest.fixture
 def card(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """The script that runs nerfstudio's commands."""
     monkeypatch.syspath_prepend(BENCHMARKS)
     return importlib.import_module("card_nerfstudio")
 

@@ -34,7 +34,6 @@ N, SIDE = 12, 16
 
 @pytest.fixture(scope="module", params=FORMATS)
 def bundle(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """Files of a small bundle, by name."""
     params = {key: value.float() for key, value in random_scene(N, 0).params.items()}
     packing = pack([[8, 4]] * N)
     texels = np.random.default_rng(0).random((packing.layers, packing.height, packing.width, 3)).astype(np.float32)

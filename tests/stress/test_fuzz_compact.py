@@ -66,7 +66,6 @@ def opened(info: dict[str, Any], files: dict[str, bytes], as_bytes: bool = True)
 
 
 def flipped(rng: random.Random, info: dict[str, Any], files: dict[str, bytes]) -> None:
-    """Flip bits of a file."""
     name = rng.choice(sorted(files))
     data = bytearray(files[name])
     for _ in range(rng.choice((1, 1, 3, 20))):

@@ -26,7 +26,6 @@ def config(kind: str, **more) -> TrainConfig:
 
 @pytest.fixture
 def uneven(views) -> list[View]:
-    """Expose the views differently."""
     logs = torch.tensor([0.3, -0.2, 0.1, -0.3, 0.25, -0.15])
     return [v._replace(image=(v.image * g.exp()).clamp(0, 1)) for v, g in zip(views, logs, strict=True)]
 

@@ -30,7 +30,6 @@ def inputs(cameras, ball, views) -> dict[str, Any]:
 
 
 def start(folder: Path, inputs: dict[str, Any]) -> list[subprocess.Popen[str]]:
-    """Start two processes."""
     torch.save(inputs, folder / "inputs.pt")
     root = Path(__file__).parents[2]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(root)}

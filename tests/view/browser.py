@@ -96,7 +96,6 @@ def running(server: Any) -> Iterator[str]:
 
 
 def served(site: Site, **options: Any) -> AbstractContextManager[str]:
-    """Serve a site in a thread; yields its address."""
     return running(serve(site, **options))
 
 

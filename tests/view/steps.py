@@ -60,7 +60,6 @@ class Seen:
 
 
 def seen(link: str) -> Seen:
-    """Parse the view of a link."""
     given = parse_qs(link[1:])
     place, axes, target, lens = (np.array([float(x) for x in given[key][0].split(",")]) for key in "prtl")
     return Seen(place, axes[:3], axes[3:], target, lens[0])

@@ -18,7 +18,6 @@ from tests.view.steps import MIDDLE, PHONE, START, Steps
 
 
 def by(across: int, down: int) -> list[tuple[int, int]]:
-    """Return drag points from the middle."""
     return [MIDDLE, (MIDDLE[0] + across, MIDDLE[1] + down)]
 
 

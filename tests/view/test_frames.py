@@ -38,7 +38,6 @@ CASES |= {"near 3, colour": {"near": 3.0, "background": (0.2, 0.5, 0.9), **COMPA
 
 @pytest.fixture(scope="module")
 def bundles(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Bundles of all cases, by name."""
     folder = tmp_path_factory.mktemp("frames")
     given = {name: {"format": "uint8", **options} for name, options in CASES.items()}
     return {

@@ -36,7 +36,6 @@ def solid(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def noted(solid: Path, tmp_path: Path) -> Path:
-    """A bundle with views and notes."""
     copy = tmp_path / "noted"
     shutil.copytree(solid, copy)
     (copy / "notes.json").write_bytes(text())

@@ -21,7 +21,6 @@ FITS = (
 
 
 def there(link: str) -> list[object]:
-    """Return the step that opens a link."""
     return ["ask", f"location.hash = '{link}'"]
 
 

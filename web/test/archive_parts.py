@@ -15,7 +15,6 @@ PARTS = {
 
 
 def main() -> None:
-    """Write the file beside this one."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
         for name, text in PARTS.items():

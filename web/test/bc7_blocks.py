@@ -11,7 +11,6 @@ EACH = 64
 
 
 def main() -> None:
-    """Write the file beside this one."""
     draw = random.Random(0)
     blocks = b""
     for mode in range(8):

@@ -34,7 +34,6 @@ def described(folder: Path) -> dict[str, object]:
 
 
 def main() -> None:
-    """Write the file beside this one."""
     bundles = {}
     with tempfile.TemporaryDirectory() as folder:
         for kind in sorted(VIEW_COLORS):

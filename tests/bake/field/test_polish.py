@@ -35,7 +35,6 @@ def truth(scene) -> Baked:
 
 @pytest.fixture(scope="module")
 def views(truth: Baked) -> list[View]:
-    """Photographs of `truth`."""
     return photographs(truth)
 
 

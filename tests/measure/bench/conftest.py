@@ -122,7 +122,6 @@ class Fakes:
 
 @pytest.fixture
 def fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fakes:
-    """Stubs in place of the console scripts."""
     folder = tmp_path / "bin"
     folder.mkdir()
     found = Fakes(folder)
@@ -132,8 +131,6 @@ def fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fakes:
 
 @pytest.fixture
 def capture(tmp_path: Path) -> Callable[[str], Path]:
-    """Return a function that makes a capture's folder."""
-
     def make(name: str) -> Path:
         folder = tmp_path / "captures" / name
         folder.mkdir(parents=True)

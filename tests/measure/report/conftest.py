@@ -42,7 +42,6 @@ def view(path: Path, index: int, noise: float, phase: float) -> None:
 
 
 def write_results(root: Path) -> Path:
-    """Write a results folder and return it."""
     for (scene, method), (psnr, ssim, flip, surfels, ms) in RUNS.items():
         run = root / "outputs" / scene / method / "2025-03-01_101500"
         run.mkdir(parents=True)
@@ -98,7 +97,6 @@ def write_poses(folder: Path, **changes: Any) -> Path:
 
 
 def cell(kind: str, value: dict[str, Any], bundle: str = "", **key: Any) -> dict[str, Any]:
-    """Format a line of cells.jsonl."""
     settings = {
         "cell": kind, "suite": "local", "row": "bitymi", "scene": "fox", "data": "/data/fox", "parser": [],
         "method": "bitymi", "options": [], "steps": 100, "seed": 0, **key,
@@ -154,7 +152,6 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def page(results: Path) -> str:
-    """The report of `results`."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(matplotlib.rcParams, "text.usetex", True)  # a local matplotlibrc may set this
         return build([results], results.with_name("report"), title="Two <scenes>").read_text("utf8")

@@ -40,7 +40,6 @@ class Checker(HTMLParser):
 
 
 def pictures(page: str) -> list[Image.Image]:
-    """Decode every embedded image of a page."""
     found = re.findall(r"data:image/(?:png|jpeg);base64,([A-Za-z0-9+/=]+)", page)
     images = [Image.open(io.BytesIO(base64.b64decode(data))) for data in found]
     for image in images:

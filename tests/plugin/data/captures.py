@@ -23,12 +23,10 @@ def load(data: Path, device: Any = "cpu", **dataparser: Any) -> BitymiDataManage
 
 
 def load_with(data: Path, dataparser: Any, device: Any = "cpu") -> BitymiDataManager:
-    """Load a capture with another dataparser."""
     return BitymiDataManagerConfig(data=data, dataparser=dataparser).setup(device=device, test_mode="val")
 
 
 def load_any(data: Path, **options: Any) -> BitymiDataManager:
-    """Load any capture with the presets' dataparser."""
     return load_with(data, BitymiDataParserConfig(**options))
 
 
@@ -113,7 +111,6 @@ def colmap_model(capture: Path, folder: Path, scale: float = 1.0) -> None:
 
 
 def as_binary(model: Path) -> None:
-    """Convert a text model to binary."""
     for what in ("cameras", "images", "points3D"):
         read, write = getattr(reader, f"read_{what}_text"), getattr(reader, f"write_{what}_binary")
         write(read(model / f"{what}.txt"), model / f"{what}.bin")

@@ -24,7 +24,6 @@ from bitymi_ns.train.strategy import STATISTICS
 
 
 def state(scene: SceneConfig, rows: int = 5, step: int = 7) -> dict[str, Any]:
-    """Make a complete checkpoint of a run."""
     torch.manual_seed(0)
     kind = VIEW_COLORS[scene.view_color]
     geometry = {"means": (3,), "quats": (4,), "log_scales": (2,), "opacity_logits": (), "beta_raw": ()}

@@ -15,7 +15,6 @@ def process(status: int | None) -> SimpleNamespace:
 
 @pytest.fixture
 def others(monkeypatch: pytest.MonkeyPatch) -> launcher.Workers:
-    """Two running processes."""
     monkeypatch.setattr(launcher, "PATIENCE", 0.0)
     found = launcher.Workers.__new__(launcher.Workers)
     found._store = dist.TCPStore("127.0.0.1", 0, 3, is_master=True, wait_for_workers=False)

@@ -31,7 +31,6 @@ def random_weights(backbone: str) -> dict[str, np.ndarray]:
 
 @pytest.fixture
 def kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """An empty cache folder."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     lpips._on_device.cache_clear()
     yield tmp_path

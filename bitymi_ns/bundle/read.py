@@ -167,13 +167,13 @@ def read_file(parts: Parts, info: Manifest, name: str, verify: bool = True, keep
         if keep and name in SCENE_FILES:
             check_memory(parts.bundle, info, name)
         sha256 = hashlib.sha256() if verify else None
-        data = _whole(file, head, size if keep or verify else 0, keep, path, sha256)
+        data = _read_whole(file, head, size if keep or verify else 0, keep, path, sha256)
     if sha256 is not None and sha256.hexdigest() != entry.sha256:
         raise BundleError(f"{path} is altered: its sha256 is not the one in {MANIFEST}")
     return data
 
 
-def _whole(file: IO[bytes], head: bytes, size: int, keep: bool, path: Path, sha256: Any) -> bytearray:
+def _read_whole(file: IO[bytes], head: bytes, size: int, keep: bool, path: Path, sha256: Any) -> bytearray:
     """Read the `size` bytes of a file after `head`, feeding `sha256`; returns nothing of it unless `keep`."""
     data, at = bytearray(size if keep else min(size, max(_CHUNK, len(head)))), len(head)
     view = memoryview(data)
@@ -249,9 +249,9 @@ def _compact_contents(folder: Path, info: Manifest, files: Mapping[str, bytearra
             packing = compact.packing_of(atlas, sizes)
             tiles, where = torch.from_numpy(packing.tiles), folder / TEXELS
             found = compact.decode_texels(atlas, sizes, residual, step, memoryview(files[TEXELS]), alpha)
-            texels = _rounded(found, packing, Range(atlas.offset, atlas.scale, ""))
+            texels = _byte_pages(found, packing, Range(atlas.offset, atlas.scale, ""))
             if not decode and texels.numel() >= LARGE_ATLAS:
-                blocks = _blocks(texels, info.has_alpha)
+                blocks = _encode_blocks(texels, info.has_alpha)
                 texels = texels if blocks is None else None
         elif bool((sizes > 0).any()):
             raise StreamError("a surfel has a tile, and there is no atlas")
@@ -268,7 +268,7 @@ def _compact_contents(folder: Path, info: Manifest, files: Mapping[str, bytearra
     }
 
 
-def _rounded(codes: TexelCodes, packing: Packing, value_range: Range) -> Tensor:
+def _byte_pages(codes: TexelCodes, packing: Packing, value_range: Range) -> Tensor:
     """Round coded texels to pages [layers, height, width, 4] uint8; rounding first moves one int32 per texel."""
 
     def whole(colors: np.ndarray, alphas: np.ndarray | None) -> np.ndarray:
@@ -284,7 +284,7 @@ def _rounded(codes: TexelCodes, packing: Packing, value_range: Range) -> Tensor:
     return paged_texels(listed, packing, nothing)[..., None].view(torch.uint8)
 
 
-def _blocks(texels: Tensor, alpha: bool) -> Tensor | None:
+def _encode_blocks(texels: Tensor, alpha: bool) -> Tensor | None:
     """Encode decoded texels to BC7 blocks; None, with a warning, without the encoder."""
     try:
         return torch.from_numpy(bc7_blocks(texels.numpy(), LOAD_PROFILE, alpha))

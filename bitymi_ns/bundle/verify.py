@@ -51,7 +51,7 @@ def _check_parts(parts: Parts) -> tuple[Bundle | None, list[Check]]:
     except BundleError as error:
         return None, [Check(MANIFEST, False, str(error))]
     signed = "" if info.digest else ", without a digest (of an earlier version)"
-    checks = [Check(MANIFEST, True, f"version {info.version}, by {info.generator}{signed}{_real_world(info.world)}")]
+    checks = [Check(MANIFEST, True, f"version {info.version}, by {info.generator}{signed}{_format_world(info.world)}")]
     files: dict[str, bytearray] = {}
     try:
         with enough_memory(parts.bundle, info):
@@ -67,7 +67,7 @@ def _check_parts(parts: Parts) -> tuple[Bundle | None, list[Check]]:
     except BundleError as error:
         return None, [*checks, Check("contents", False, str(error))]
     checks.append(Check("contents", True, f"{len(bundle):,} surfels, all numbers finite, tiles inside the atlas"))
-    return bundle, [*checks, _tiles(bundle), _statements(bundle), *check_certificate(bundle), *_check_notes(parts)]
+    return bundle, [*checks, _tiles(bundle), _check_counts(bundle), *check_certificate(bundle), *_check_notes(parts)]
 
 
 def _check_notes(parts: Parts) -> list[Check]:
@@ -78,10 +78,10 @@ def _check_notes(parts: Parts) -> list[Check]:
     return [] if found is None else [Check(NOTES, True, f"{len(found[1].views)} views, {len(found[1].notes)} notes")]
 
 
-def _real_world(place: WorldFrame) -> str:
+def _format_world(frame: WorldFrame) -> str:
     """Format up vector and metres per unit, if stated."""
-    text = "" if place.up is None else f", up ({', '.join(f'{x:.3f}' for x in place.up)}) by {place.up_from}"
-    return text + ("" if place.metres_per_unit is None else f", {place.metres_per_unit:.4g} m per unit")
+    text = "" if frame.up is None else f", up ({', '.join(f'{x:.3f}' for x in frame.up)}) by {frame.up_from}"
+    return text + ("" if frame.metres_per_unit is None else f", {frame.metres_per_unit:.4g} m per unit")
 
 
 def check_world(stated: WorldFrame, world: World) -> Check:
@@ -139,13 +139,13 @@ def _tiles(bundle: Bundle) -> Check:
     if ((sides & (sides - 1)) != 0).any() or (tiled[:, [0, 1, 3, 4]] % 4 != 0).any():
         return Check("tiles", False, "a tile is not a power of two on the grid of 4 x 4 blocks")
     blocks = int((sides // 4).prod(1).sum())
-    owned = _blocks(tiled, bundle.scene.atlas)
+    owned = _count_tiles(tiled, bundle.scene.atlas)
     if int((owned > 0).sum()) != blocks:
         return Check("tiles", False, f"{blocks - int((owned > 0).sum()):,} blocks belong to more than one tile")
     return Check("tiles", True, f"{len(tiled):,} of {len(bundle):,} surfels, {16 * blocks:,} texels, no two overlap")
 
 
-def _blocks(tiles: Tensor, atlas: Tensor | None) -> Tensor:
+def _count_tiles(tiles: Tensor, atlas: Tensor | None) -> Tensor:
     """Count the tiles over each 4 x 4 block, [layers, height / 4, width / 4], by 2D prefix sums of corner marks."""
     layers, height, width = (1, 4, 4) if atlas is None else atlas.shape[:3]
     counts = torch.zeros(layers, height // 4 + 1, width // 4 + 1, dtype=torch.int32)
@@ -156,7 +156,7 @@ def _blocks(tiles: Tensor, atlas: Tensor | None) -> Tensor:
     return counts.cumsum(1).cumsum(2)[:, :-1, :-1]
 
 
-def _statements(bundle: Bundle) -> Check:
+def _check_counts(bundle: Bundle) -> Check:
     """Compare the counts in bundle.json with the files."""
     statistics = bundle.info.statistics
     surfels, texels, lean = statistics.surfels, statistics.texels, statistics.view_color

@@ -61,14 +61,14 @@ class World:
     def described(self) -> dict[str, Any]:
         """Convert to `manifest.WorldFrame`, with up and length in the scene frame."""
         transform = np.asarray(self.transform, dtype=np.float64)[:3]
-        place: dict[str, Any] = {"transform": transform, "scale": float(self.scale)}
+        frame: dict[str, Any] = {"transform": transform, "scale": float(self.scale)}
         if self.up is not None:
             up = transform[:, :3] @ np.asarray(self.up, dtype=np.float64)
-            place |= {"up": up / np.linalg.norm(up), "up_from": self.up_from}
+            frame |= {"up": up / np.linalg.norm(up), "up_from": self.up_from}
         if self.metres_per_unit is not None:
             stretch = abs(float(np.linalg.det(transform[:, :3]))) ** (1 / 3) * float(self.scale)
-            place["metres_per_unit"] = float(self.metres_per_unit) / stretch
-        return place
+            frame["metres_per_unit"] = float(self.metres_per_unit) / stretch
+        return frame
 
 
 def write_bundle(

@@ -89,7 +89,7 @@ class SurfelCodes:
         entry, (colors, shapes) = VIEW_COLORS[self.kind], term_numbers(self.kind)
         terms = np.zeros((len(self.codes["term_color"]), entry.lean_width))
         count = self.codes["view_count"][:, 0]
-        terms[:, colors] = self.steps["term_color"] * _rgb(self.codes["term_color"])
+        terms[:, colors] = self.steps["term_color"] * _from_differences(self.codes["term_color"])
         terms[:, shapes] = _sinh(self._linear("term_shape"))
         values = {
             "means": self._means(),
@@ -97,10 +97,10 @@ class SurfelCodes:
             "log_scales": self._linear("log_scales"),
             "opacity_logits": _logit(self._linear("opacity")[:, 0], ALPHA_MIN),
             "beta_raw": _logit(self._linear("beta")[:, 0], SMALLEST_SHARE),
-            "view_base": self.steps["view_base"] * _rgb(self.codes["view_base"]),
+            "view_base": self.steps["view_base"] * _from_differences(self.codes["view_base"]),
             "view_terms": terms,
         }
-        found = {name: _within(name, self.kind, value) for name, value in values.items()}
+        found = {name: _clip_to_limits(name, self.kind, value) for name, value in values.items()}
         span = np.stack([np.cumsum(count) - count, count], axis=1).astype(np.int32)
         return {**found, "view_span": torch.from_numpy(span)}
 
@@ -151,21 +151,21 @@ def code_surfels(
     per_surfel = {
         "place": position[:, None],
         "largest": largest[:, None],
-        "rotation": _codes(rest, steps["rotation"]),
-        "log_scales": _codes(values["log_scales"], steps["log_scales"]),
-        "opacity": _codes(_sigmoid(values["opacity_logits"])[:, None], steps["opacity"]),
-        "beta": _codes(_sigmoid(values["beta_raw"])[:, None], steps["beta"]),
+        "rotation": _quantise(rest, steps["rotation"]),
+        "log_scales": _quantise(values["log_scales"], steps["log_scales"]),
+        "opacity": _quantise(_sigmoid(values["opacity_logits"])[:, None], steps["opacity"]),
+        "beta": _quantise(_sigmoid(values["beta_raw"])[:, None], steps["beta"]),
         "size": np.where(tiled, 16 * exponents[:, 0] + exponents[:, 1], 0)[:, None],
-        "view_base": _differences(_codes(values["view_base"], steps["view_base"])),
+        "view_base": _to_differences(_quantise(values["view_base"], steps["view_base"])),
         "view_count": values["view_span"][:, 1:].astype(np.int64),
     }
     codes = {name: np.ascontiguousarray(value[order]) for name, value in per_surfel.items()}
     tiles = order[tiled[order]]
-    codes["extent"] = _codes(extent.double().numpy()[tiles, None], steps["extent"])
+    codes["extent"] = _quantise(extent.double().numpy()[tiles, None], steps["extent"])
     colors, shapes = term_numbers(kind)
     terms = values["view_terms"][_term_rows(values["view_span"].astype(np.int64)[order])]
-    codes["term_shape"] = _codes(np.arcsinh(terms[:, shapes]), steps["term_shape"])
-    codes["term_color"] = _differences(_codes(terms[:, colors], steps["term_color"]))
+    codes["term_shape"] = _quantise(np.arcsinh(terms[:, shapes]), steps["term_shape"])
+    codes["term_color"] = _to_differences(_quantise(terms[:, colors], steps["term_color"]))
     return SurfelCodes(kind, frame, steps, codes), torch.from_numpy(order)
 
 
@@ -216,17 +216,17 @@ def _term_rows(span: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     return np.repeat(first - start, count) + np.arange(int(count.sum()))
 
 
-def _codes(values: npt.NDArray[np.float64], step: float) -> Codes:
+def _quantise(values: npt.NDArray[np.float64], step: float) -> Codes:
     return np.rint(values / step).astype(np.int64)
 
 
-def _differences(rgb: Codes) -> Codes:
+def _to_differences(rgb: Codes) -> Codes:
     """Convert channels (r, g, b repeated) to green, red - green, blue - green."""
     r, g, b = (rgb[:, i::3] for i in range(3))
     return np.stack([g, r - g, b - g], axis=2).reshape(rgb.shape)
 
 
-def _rgb(differences: Codes) -> Codes:
+def _from_differences(differences: Codes) -> Codes:
     g, r, b = (differences[:, i::3] for i in range(3))
     return np.stack([r + g, g, b + g], axis=2).reshape(differences.shape)
 
@@ -244,7 +244,7 @@ def _logit(share: npt.NDArray[np.float64], least: float) -> npt.NDArray[np.float
     return np.log(share) - np.log1p(-share)
 
 
-def _within(name: str, kind: str, values: npt.NDArray[np.float64]) -> Tensor:
+def _clip_to_limits(name: str, kind: str, values: npt.NDArray[np.float64]) -> Tensor:
     """Clip to the limits of a bundle, which rounding may exceed, as float32."""
     limit = np.array(limit_of(name, kind) if name == "view_terms" else LIMITS.get(name, (np.inf,)))
     return torch.from_numpy(np.clip(values, -limit, limit).astype(np.float32))

@@ -109,8 +109,8 @@ class AlphaCodes:
 
     def values(self, sizes: Tensor, grades: Tensor) -> Tensor:
         """Decode the alphas [T] float32 of tiles of sizes [N, 2] and grades [tiles]: bytes / 128, as drawn."""
-        found = _decoded(self.means[:, None], self.coefficients, sizes, _steps(self.step, grades))
-        return _bytes(found[:, 0]) / ALPHA_ONE
+        found = _decode(self.means[:, None], self.coefficients, sizes, _steps(self.step, grades))
+        return _round_to_bytes(found[:, 0]) / ALPHA_ONE
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class TexelCodes:
 
     def texels(self) -> Tensor:
         """Decode the residual colours [T, 3], in the order of `TexelTiles`."""
-        return _decoded(self.constants, self.coefficients, self.sizes, _steps(self.step, self.grades))
+        return _decode(self.constants, self.coefficients, self.sizes, _steps(self.step, self.grades))
 
     def alphas(self) -> Tensor | None:
         """Decode the alphas [T], in the same order; None if opaque."""
@@ -264,7 +264,7 @@ class TexelCoder:
     def code_alpha(self, alpha: Tensor, rounds: int = SPARSE_ROUNDS) -> Tensor:
         """Code alphas [T], 0 to 2, for all later `code` calls; returns them decoded, [T]."""
         step = ALPHA_GAIN * self._step
-        mean = _bytes(self._means(alpha[:, None])[:, 0])
+        mean = _round_to_bytes(self._means(alpha[:, None])[:, 0])
         codes = AlphaCodes(mean.numpy().astype(np.int64), step, [])
         found = self._coefficients(alpha[:, None], codes.means[:, None], step, rounds)
         self.alpha = replace(codes, coefficients=found)
@@ -302,7 +302,7 @@ class TexelCoder:
         return coefficients
 
 
-def _decoded(means: Tensor, coefficients: Sequence[Tensor], sizes: Tensor, steps: Tensor) -> Tensor:
+def _decode(means: Tensor, coefficients: Sequence[Tensor], sizes: Tensor, steps: Tensor) -> Tensor:
     """Decode texels [T, C] from means [N, C] and coefficients of tiles of sizes [N, 2] and steps [tiles]."""
     texels, of_tile = means.repeat_interleave(sizes.clamp(min=1).prod(dim=1), dim=0), means[sizes[:, 0] > 0]
     for blocks, values in zip(blocks_of(sizes), coefficients, strict=True):
@@ -314,7 +314,7 @@ def _decoded(means: Tensor, coefficients: Sequence[Tensor], sizes: Tensor, steps
     return texels
 
 
-def _bytes(alpha: Tensor) -> Tensor:
+def _round_to_bytes(alpha: Tensor) -> Tensor:
     """Round alphas to bytes as floats, 128 = 1."""
     return torch.floor(alpha * ALPHA_ONE + 0.5).clamp(0, 255)
 

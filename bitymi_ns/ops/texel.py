@@ -83,7 +83,7 @@ class TexelAlpha:
 
 @dataclass(frozen=True)
 class TexelDescent:
-    """Step on texels within a backward pass: texel t moves by -rate share[t] times its gradient.
+    """Texel step of a backward pass: texel t moves by -rate share[t] times its gradient.
 
     Attributes:
         share: [T] of the texels' dtype.

@@ -11,8 +11,8 @@
 namespace bt::cuda {
 
 namespace {
-constexpr int64_t kMostBlocks = 1024;  // up to this many, blocks take fewer surfels, to fill a large GPU,
-constexpr int kLeastOwned = 4;         // but at least this many
+constexpr int64_t kMostBlocks = 1024;  // a block takes fewer surfels while there are at most this many blocks,
+constexpr int kLeastOwned = 4;         // but at least this many surfels
 constexpr int kLargeParts = 16;        // shares of the tile rows of a surfel with many tiles
 constexpr int kLargeBlocks = 528;      // four per multiprocessor of a large GPU
 

@@ -35,7 +35,7 @@ struct alignas(16) TileList {
 };
 static_assert(sizeof(TileList) == 32);
 struct alignas(8) SpilledPair {
-  uint32_t pair, before;  // as in `pairs`; as in `chains`
+  uint32_t pair, before;  // entries as in `pairs` and in `chains`
 };
 
 struct BakedMemory {

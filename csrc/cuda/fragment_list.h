@@ -158,8 +158,8 @@ __device__ inline void each_fragment_back(const Pairs& p, const TileThread& s, L
 }
 
 // A chunk of the list that a tile's block processes in shared memory: the next pairs, at most 32, with at most kHeld
-// fragments. A warp has about ten fragments of a pair, the block some hundreds of a chunk: all its threads read,
-// compute or write them in sequence, and lanes find those of their pixels by the masks.
+// fragments. A warp has about ten fragments of a pair, a chunk some hundreds: all threads of the block read, compute or
+// write them in sequence, and lanes find those of their pixels by the masks.
 template <int kHeld> class Stretch {
   static_assert(kHeld >= kTileThreads, "no pair has more than a tile's pixels");
 

@@ -1,15 +1,15 @@
 """Textured Beta-surfel splatting: a nerfstudio method.
 
-The public functions are `rasterize`, `train_scene`, `bake_scene` and `read_bundle` (bitymi_ns/api.py).
+The public functions are `load_capture`, `train_scene`, `bake_scene`, `read_bundle` and `rasterize` (bitymi_ns/api.py).
 """
 
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from bitymi_ns.api import Bundle, Camera, View, bake_scene, rasterize, read_bundle, train_scene
+    from bitymi_ns.api import Bundle, Camera, View, bake_scene, load_capture, rasterize, read_bundle, train_scene
 
 __version__ = "0.1.0"
-__all__ = ["Bundle", "Camera", "View", "bake_scene", "rasterize", "read_bundle", "train_scene"]
+__all__ = ["Bundle", "Camera", "View", "bake_scene", "load_capture", "rasterize", "read_bundle", "train_scene"]
 
 
 class KernelsUnavailable(RuntimeError):

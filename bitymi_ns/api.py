@@ -1,10 +1,13 @@
-"""Public functions: rasterize surfels, train a scene, bake it, read a bundle. None of them needs nerfstudio."""
+"""Public functions: load a capture, rasterize surfels, train a scene, bake it, read a bundle. None of them needs
+nerfstudio."""
 
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,6 +16,12 @@ from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bundle import Bundle, check_target, read_bundle
 from bitymi_ns.bundle.cameras import CapturedCamera, cameras_data
 from bitymi_ns.bundle.parts import CAMERAS
+from bitymi_ns.capture.camera import OPENCV_AXES, Photograph
+from bitymi_ns.capture.images import in_threads, pixels_of, read_image
+from bitymi_ns.capture.lens import Lens, make_lenses
+from bitymi_ns.capture.masks import checked_mask
+from bitymi_ns.capture.points import Points
+from bitymi_ns.capture.read import CaptureOptions, read_capture
 from bitymi_ns.ops import blended_image, can_rasterize, project, rasterize_image, trace
 from bitymi_ns.ops.constants import COLOR_BIAS
 from bitymi_ns.scene.camera import Camera
@@ -23,7 +32,53 @@ from bitymi_ns.train.init import scene_for_views
 from bitymi_ns.train.preset import load_preset
 from bitymi_ns.train.views import View
 
-__all__ = ["Bundle", "Camera", "View", "bake_scene", "rasterize", "read_bundle", "train_scene"]
+__all__ = ["Bundle", "Camera", "View", "bake_scene", "load_capture", "rasterize", "read_bundle", "train_scene"]
+
+
+def load_capture(
+    path: str | Path, part: Literal["all", "train", "val", "test"] = "all", **options: Any
+) -> tuple[list[View], Tensor, Tensor]:
+    """Load a capture of any format that `ns-train` reads: photographs with cameras and masks, and points.
+
+    Photographs are undistorted; those of wide cameras become several views. All stay in memory as bytes. Poses, scale
+    and axes of the world are those of the capture's files, but a COLMAP model's are turned so that up, about -y, is z.
+    Cameras and points are float32: move captures whose coordinates have many digits before the point first.
+
+    Args:
+        path: a folder, or a file: transforms.json or a video.
+        part: photographs to load: all in the order of their names, or a part of the capture's own split; where it has
+            none, every eighth is "val" and "test".
+        options: fields of `capture.read.CaptureOptions`, as `downscale_factor=2` or `points="random"` (no points).
+
+    Returns:
+        views: `Camera`s are world to camera with OpenCV axes (x right, y down, z forward), in pixels; images uint8
+            [H, W, 3], or [H, W, 4] with straight alpha; masks [H, W] bool or None.
+        points: [M, 3] of the capture, triangulated (and kept beside the photographs) where it has none; M may be 0.
+        colors: [M, 3] in [0, 1].
+
+    Raises:
+        CaptureError: a ValueError; the capture cannot be used. Names the file and the entry, and says what to do.
+        TypeError, KeyError: there is no such option, or part.
+    """
+    capture = read_capture(CaptureOptions(data=Path(path), **options))
+    every = capture.photographs
+    chosen = every if part == "all" else [every[i] for i in capture.parts[part]]
+    pairs = zip(chosen, make_lenses(chosen, capture.downscale), strict=True)
+    views = in_threads(_view, [(photograph, lens) for photograph, lenses in pairs for lens in lenses])
+    points = capture.points or Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    return views, torch.from_numpy(points.xyz).float(), torch.from_numpy(points.rgb).float() / 255
+
+
+def _view(source: tuple[Photograph, Lens]) -> View:
+    photograph, lens = source
+    to = lens.pinhole
+    image = lens.undistort(read_image(photograph.file, lens.stored, lens.camera.size))
+    viewmat = torch.from_numpy(np.linalg.inv(photograph.pose @ OPENCV_AXES @ lens.turn)).float()
+    K = torch.tensor([[to.fx, 0.0, to.cx], [0.0, to.fy, to.cy], [0.0, 0.0, 1.0]])
+    mask = None if photograph.mask is None else checked_mask(photograph.mask)
+    whole = mask is None and lens.whole
+    counts = None if whole else torch.from_numpy(np.array(lens.undistort_mask(mask, photograph.mask)))
+    return View(Camera(viewmat, K, to.width, to.height), torch.from_numpy(pixels_of(image)), counts)
 
 
 def rasterize(

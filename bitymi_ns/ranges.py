@@ -1,4 +1,4 @@
-"""Ranges of options as types of their fields, and validation errors of such data."""
+"""Ranges of options as types of their fields, validation errors of such data, and samples of a range."""
 
 from dataclasses import asdict
 from typing import Annotated, Any
@@ -33,3 +33,9 @@ def check_ranges(options: Any) -> None:
         name, rule = first_problem(error)
         rule = rule.removeprefix("Input should be ")
         raise ValueError(f"{name} must be {rule}, not {error.errors()[0]['input']}") from error
+
+
+def spread(count: int, most: int) -> list[int]:
+    """Choose at most `most` of the numbers below `count`, evenly spread; 0 is one of them."""
+    used = min(count, most)
+    return [i * count // used for i in range(used)]

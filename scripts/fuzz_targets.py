@@ -18,23 +18,23 @@ from PIL import ExifTags, Image
 
 from bitymi_ns.capture import exif
 from bitymi_ns.capture.camera import ColmapCamera
-from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.capture.colmap_model import forget_model
+from bitymi_ns.capture.lens import lenses_of
+from bitymi_ns.capture.maps import read_depth, read_normal
+from bitymi_ns.capture.points import ply_fault, read_points
+from bitymi_ns.capture.types import CaptureError, MapFiles
 from bitymi_ns.measure.report.page import compose, to_page
 from bitymi_ns.measure.report.read import collect
 from bitymi_ns.measure.report.records import ReportError
 from bitymi_ns.plugin.console import InputError
-from bitymi_ns.plugin.data.colmap_model import forget_model
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
-from bitymi_ns.plugin.data.depth_files import MapFiles, read_depth, read_normal
-from bitymi_ns.plugin.data.lens import lenses_of
-from bitymi_ns.plugin.data.point_files import ply_fault, read_points
 from bitymi_ns.plugin.run import checkpoints
 from bitymi_ns.plugin.run.camera_path import read_camera_path
 from bitymi_ns.plugin.run.checkpoint_schema import Entry, restore_optimizer
 from bitymi_ns.ply import PlyError
 from bitymi_ns.sample import generate
 from bitymi_ns.scene.config import SceneConfig
-from tests.plugin.data.captures import as_binary, colmap_model
+from tests.captures import as_binary, colmap_model
 from tests.plugin.run.test_checkpoints import moved, state
 
 CUT = b"\n--8<--\n"  # separates the files of an input
@@ -171,7 +171,7 @@ def maps(work: Path) -> Target:
         for read, files in ((read_depth, MapFiles(depth=path)), (read_normal, MapFiles(normal=path))):
             try:
                 read(files, lens)
-            except InputError:
+            except CaptureError:
                 pass
 
     return Target(run, seeds)
@@ -190,7 +190,7 @@ def ply(work: Path) -> Target:
         if ply_fault(path) is None:
             read_points(path)
 
-    return Target(run, seeds, (PlyError, InputError))
+    return Target(run, seeds, (PlyError, CaptureError))
 
 
 def camera_path(work: Path) -> Target:

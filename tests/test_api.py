@@ -3,7 +3,9 @@
 import copy
 import importlib.util
 import io
+import json
 import pickle
+import shutil
 from pathlib import Path
 from types import ModuleType
 
@@ -141,8 +143,29 @@ def test_a_view_moves_with_all_its_maps() -> None:
     assert moved.counted == 7 and all(getattr(moved, name).device.type == "meta" for name in maps)
 
 
+def test_a_capture_is_loaded_in_its_own_frame(room: Path, tmp_path: Path) -> None:
+    views, points, colors = bitymi_ns.load_capture(room)
+    assert len(views) == 9 and points.shape == colors.shape == (200, 3) and 0 <= colors.min() < colors.max() <= 1
+    meta = json.loads((room / "transforms.json").read_text())
+    for view, frame in zip(views, meta["frames"], strict=True):
+        pose = np.array(frame["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        np.testing.assert_allclose(view.camera.viewmat, np.linalg.inv(pose), atol=1e-6)
+        assert np.array_equal(view.image, Image.open(room / frame["file_path"])) and view.mask is None
+    parts = {name: bitymi_ns.load_capture(room, name, points="random") for name in ("train", "val", "test")}
+    assert [len(part[0]) for part in parts.values()] == [7, 2, 2] and len(parts["val"][1]) == 0
+    assert torch.equal(parts["test"][0][1].image, views[8].image)
+    wide = tmp_path / "wide"
+    shutil.copytree(room, wide)
+    fisheye = {"camera_model": "OPENCV_FISHEYE", "fl_x": 12.0, "fl_y": 12.0}
+    (wide / "transforms.json").write_text(json.dumps(meta | fisheye))
+    faces, *_ = bitymi_ns.load_capture(wide, "val", points="random")
+    assert len(faces) == 10 and any(face.mask is not None and not face.mask.all() for face in faces)
+    with pytest.raises(ValueError, match="nowhere does not exist"):
+        bitymi_ns.load_capture(tmp_path / "nowhere")
+
+
 def test_a_scene_is_trained_baked_read_and_rendered_from_arrays(room: Path, tmp_path: Path) -> None:
-    psnr = example("train_from_arrays").main(room, tmp_path / "bundle", steps=60, points=300)
+    psnr = example("train_from_arrays").main(room, tmp_path / "bundle", steps=60)
     assert psnr > 8.0
     paths = example("render_bundle").main(tmp_path / "bundle", tmp_path / "pictures", most=2)
     assert [Image.open(path).size for path in paths] == [(48, 36)] * 2
@@ -163,7 +186,7 @@ def test_a_scene_is_trained_baked_read_and_rendered_from_arrays(room: Path, tmp_
 
 
 def test_bundles_of_every_format_with_their_cameras(room: Path, tmp_path: Path) -> None:
-    views = example("train_from_arrays").load_views(room)
+    views = bitymi_ns.load_capture(room, points="random")[0]
     points = torch.rand(5600, 3) * 2 - 1
     scene, _ = bitymi_ns.train_scene(views, points, torch.rand(5600, 3), steps=1, method="bitymi-notexture")
     assert len(scene) <= 5000 * 1.1  # like ns-train, with its added background points
@@ -191,7 +214,7 @@ def test_bundles_of_every_format_with_their_cameras(room: Path, tmp_path: Path) 
 
 def test_a_bundle_of_an_earlier_version_is_replaced(room: Path, tmp_path: Path) -> None:
     """Its cameras.json was not listed."""
-    views = example("train_from_arrays").load_views(room)
+    views = bitymi_ns.load_capture(room, points="random")[0]
     scene, _ = bitymi_ns.train_scene(views, torch.rand(50, 3), torch.rand(50, 3), steps=2, method="bitymi-notexture")
     info = bitymi_ns.bake_scene(scene, views, tmp_path / "bundle").info
     del info.files["cameras.json"]
@@ -207,7 +230,7 @@ def test_a_bundle_of_an_earlier_version_is_replaced(room: Path, tmp_path: Path) 
 
 @pytest.mark.parametrize("method", ["bitymi-field", "bitymi-notexture"])
 def test_a_field_and_a_scene_without_texture_are_baked_too(room: Path, tmp_path: Path, method: str) -> None:
-    views = example("train_from_arrays").load_views(room)
+    views = bitymi_ns.load_capture(room, points="random")[0]
     steps = []
     points = torch.rand(100, 3) * 2 - 1
     how = dict(steps=6, method=method, eval_views=views[:1], callback=lambda *s: steps.append(s))

@@ -1,13 +1,11 @@
 """Python snippets of the documentation run in page order on a tiny scene."""
 
-import json
 import re
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 import bitymi_ns
 from bitymi_ns import sample
@@ -28,18 +26,10 @@ def snippets(text: str) -> tuple[list[str], list[str]]:
 
 
 @pytest.fixture(scope="module")
-def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
+def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """Names that snippets may use undefined: views and points of a room, and surfels at these points."""
     room = sample.generate(tmp_path_factory.mktemp("snippets") / "room", views=6, width=48, height=36, points=200)
-    info = json.loads((room / "transforms.json").read_text("utf8"))
-    views = []
-    for frame in info["frames"]:
-        image = torch.from_numpy(np.array(Image.open(room / frame["file_path"])))
-        viewmat = np.linalg.inv(np.array(frame["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0]))
-        fx, fy, cx, cy = (info.get(name, frame.get(name)) for name in ("fl_x", "fl_y", "cx", "cy"))
-        K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        camera = bitymi_ns.Camera(torch.from_numpy(viewmat).float(), K, image.shape[1], image.shape[0])
-        views.append(bitymi_ns.View(camera, image))
+    views = bitymi_ns.load_capture(room)[0]
     g = torch.Generator().manual_seed(0)
     centers = torch.stack([view.camera.center for view in views])
     surfels = {
@@ -50,14 +40,15 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
         "betas": 0.5 + 3.0 * torch.rand(N, generator=g),
         "colors": torch.rand(N, 3, generator=g),
     }
-    return {"views": views, "camera": views[0].camera, "points": surfels["means"], **surfels}
+    return {"room": room, "views": views, "camera": views[0].camera, "points": surfels["means"], **surfels}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_snippets_run(page: Path, names: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_snippets_run(page: Path, names: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     runnable, wrong = snippets(page.read_text("utf8"))
     assert not wrong, f"{page.name}: {wrong} is no reason: write ```python no-run: the reason"
     monkeypatch.chdir(tmp_path)
     namespace = dict(names)
+    (tmp_path / "room").symlink_to(namespace.pop("room"))
     for code in runnable:
         exec(compile(STEPS.sub("steps=10", code), str(page), "exec"), namespace)

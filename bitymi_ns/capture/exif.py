@@ -122,6 +122,11 @@ def exposure_settings(image: Image.Image) -> tuple[float | None, ...] | None:
     return tuple(values) if values[0] else None
 
 
+def exif_stops(seconds: float, f_number: float, iso: float) -> float:
+    """Compute log2 of the exposure by a photograph's settings: shutter time times ISO over the f-number's square."""
+    return math.log2(seconds * iso / (f_number * f_number))
+
+
 def _up(
     image: Image.Image, tags: Mapping[int, object], detail: Mapping[int, object]
 ) -> tuple[float, float, float] | None:

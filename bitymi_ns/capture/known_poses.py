@@ -12,16 +12,20 @@ import numpy as np
 from PIL import Image
 
 from bitymi_ns.capture.cache import content_key, finished, replace_stale, work_folder
-from bitymi_ns.capture.camera import ColmapCamera
+from bitymi_ns.capture.camera import OPENCV_AXES, ColmapCamera, Photograph
+from bitymi_ns.capture.colmap_model import read_model
+from bitymi_ns.capture.images import image_size
 from bitymi_ns.capture.photos import check_names, eight_bits, in_srgb, is_plain
 from bitymi_ns.capture.pictures import open_picture
+from bitymi_ns.capture.points import Points
 from bitymi_ns.capture.prepare import colmap_mask, emptied
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
-from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.capture.types import CaptureError, say, warn
 from bitymi_ns.files import Tell, explained, write_file
-from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.progress import Progress, no_progress, rich_progress
 
+MIRROR = np.diag([1.0, 1.0, -1.0])
 DONE = "points"  # file that is written when the model is whole
 
 
@@ -75,6 +79,33 @@ def triangulate(
             folder = Path(os.path.commonpath([os.path.abspath(view.file.parent) for view in views]))
             replace_stale(work, folder, content_key(inputs, "contents"))
         return work / MODEL
+
+
+def triangulated(photographs: Sequence[Photograph], folder: Path, source: str) -> Points | None:
+    """Triangulate points from photographs with poses; None (with a warning) where that is not possible."""
+    middle = np.mean([photograph.pose[:3, 3] for photograph in photographs], axis=0)
+    mirrored = [bool(np.linalg.det(photograph.pose[:3, :3]) < 0.0) for photograph in photographs]
+    mirror = MIRROR if all(mirrored) else np.eye(3)  # the photographs of a mirrored capture are not mirrored
+    views = []
+    for photograph in photographs:
+        camera = photograph.camera
+        stored = (photograph.downscaled and image_size(photograph.file)) or camera.size
+        c2w = photograph.pose @ OPENCV_AXES
+        rotation = (mirror @ c2w[:3, :3]).T
+        translation = -rotation @ mirror @ (c2w[:3, 3] - middle)
+        pose = np.column_stack([rotation, translation])
+        views.append(KnownView(photograph.file, camera.rescaled(*stored), pose, photograph.mask))
+    say(f"{source} has no points: they are triangulated from the photographs, once. --points random does without.")
+    try:
+        if any(mirrored) and not all(mirrored):
+            raise CaptureError("some poses are mirrored against the others")
+        with rich_progress() as progress:
+            model = read_model(triangulate(folder, views, progress, warn))
+    except CaptureError as error:
+        warn(f"No points can be triangulated: {error}. Training starts from random points.")
+        return None
+    say(f"{len(model.xyz):,} points have been triangulated; they are kept for later runs.")
+    return Points(model.xyz @ mirror + middle, model.rgb)
 
 
 def _job(stated: Sequence[str], views: Sequence[KnownView], work: Path) -> Job:

@@ -1,23 +1,29 @@
 """Masks of photographs: their folder, the mask file of a photograph, and the pixels that count. Structure from motion
-and training share these rules."""
+and training share these rules. Those that files of a capture name are checked before anything uses them."""
 
 import os
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from bitymi_ns.capture.camera import Photograph
+from bitymi_ns.capture.images import has_transparency, image_size, in_proportion, in_threads, wrong_size
 from bitymi_ns.capture.photos import COPY
 from bitymi_ns.capture.pictures import DYNAMIC_MASK, PHOTOGRAPHS, open_picture
-from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.capture.types import fail, parsing, say
+from bitymi_ns.trust import listed
 
+LEAVE_OUT = "`bitymi-data --use-masks False` leaves masks out"
+"""Says in messages how to do without the masks of a capture."""
 USUAL_FOLDERS = ("images", "input", "image", "photos", "photographs", "rgb", "color")
 """Names of a capture's folder of photographs, the most usual first."""
 LOSSY = {"JPEG", "MPO", "WEBP", "JPEG2000", "HEIF", "AVIF"}
 """Lossy formats by Pillow's names, in which black may come back as almost black."""
 MIDDLE = 127  # threshold of lossy masks, of 255
-PROPORTIONS = 0.02  # relative difference of aspect ratios that counts as rounding
 
 
 def mask_folder(photographs: Path, data: Path, stated: Path | None = None, downscale: int = 1) -> Path | None:
@@ -34,7 +40,7 @@ def mask_folder(photographs: Path, data: Path, stated: Path | None = None, downs
     """
     if stated is not None:
         if not _exists(stated, downscale):
-            raise CaptureError(f"the folder of masks {stated} does not exist")
+            fail(f"the folder of masks {stated} does not exist")
         return stated
     shown, named = Path(os.path.abspath(photographs)), Path(os.path.abspath(data))
     folders = [shown, named]
@@ -88,11 +94,78 @@ def mask_pixels(image: Image.Image) -> npt.NDArray[np.bool_]:
     return result
 
 
-def has_transparency(image: Image.Image) -> bool:
-    """Test for an alpha channel or a transparent color."""
-    return image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
+def checked_mask(path: Path) -> Image.Image:
+    """Read a mask, see `read_mask`.
+
+    Raises:
+        CaptureError: it is missing, or cannot be read.
+    """
+    if not path.exists():
+        fail(f"the mask {path} is missing")
+    with parsing(f"the mask {path}", "Replace it, or remove the masks from the capture."):
+        return read_mask(path)
 
 
-def in_proportion(mask: tuple[int, int], photograph: tuple[int, int]) -> bool:
-    """Test if a mask (width, height) has the aspect ratio of its photograph, so that it can be resized."""
-    return abs(mask[0] / mask[1] / (photograph[0] / photograph[1]) - 1.0) <= PROPORTIONS
+def masks_named(masks: Path, names: Sequence[str], needed: bool = True) -> list[Path] | None:
+    """Find the masks of photographs by their names in a folder of masks; None = it has none of them, where none is
+    `needed`.
+
+    Raises:
+        CaptureError: some photographs have a mask, and others none.
+    """
+    found = {name: mask_of(masks, name) for name in names}
+    missing = [name for name, file in found.items() if file is None]
+    if len(missing) == len(found) and not needed:
+        return None
+    if missing:
+        others = "" if len(missing) == len(found) else ", but of others"
+        fail(
+            f"{masks} has no mask of {listed(missing)}{others}. Give every photograph a mask of its name with .png (a "
+            f"white picture lets all pixels count); {LEAVE_OUT}."
+        )
+    return [file for name in names if (file := found[name]) is not None]
+
+
+def with_masks(photographs: Sequence[Photograph], capture: Path, base: Path | None = None) -> list[Photograph]:
+    """Give photographs without masks those that lie beside them, with a line that says so: instant-ngp's, of which
+    some may be missing, or those of a folder `masks`; see `mask_folder`.
+
+    Args:
+        capture: folder of the capture.
+        base: folder to which the names of masks are relative; None = the one that holds all photographs.
+
+    Raises:
+        CaptureError: the folder has masks of some photographs only.
+    """
+    files = [each.file for each in photographs]
+    dynamic = [file.with_name(f"{DYNAMIC_MASK}{file.stem}.png") for file in files]
+    found: Sequence[Path | None] | None = [file if file.is_file() else None for file in dynamic]
+    if any(found):
+        count = sum(file is not None for file in found)
+        said = f"{count} masks {DYNAMIC_MASK}*.png beside {len(files)} photographs are used, of which black counts"
+    else:
+        base = base or Path(os.path.commonpath([os.path.abspath(file.parent) for file in files]))
+        masks = mask_folder(base, capture)
+        names = [os.path.relpath(file, base) for file in files]
+        found = None if masks is None else masks_named(masks, names, needed=False)
+        said = f"The masks of {masks} are used, of which black does not count"
+    if found is None:
+        return list(photographs)
+    say(f"{said}; {LEAVE_OUT}.")
+    return [replace(each, mask=mask) for each, mask in zip(photographs, found, strict=True)]
+
+
+def check_masks(photographs: Sequence[Photograph]) -> None:
+    """Fail where masks are missing or cannot be used, before time is spent on the photographs."""
+    masked = {each.mask: each for each in photographs if each.mask is not None}
+    missing = [mask for mask in masked if not mask.exists()]
+    if missing:
+        fail(
+            f"{len(missing)} of {len(masked)} masks of the capture are missing: {listed(missing)}. Put them there, or "
+            f"correct their names; {LEAVE_OUT}."
+        )
+    sizes = in_threads(image_size, masked)
+    for (mask, photograph), known in zip(masked.items(), sizes, strict=True):
+        size = known or checked_mask(mask).size  # which says what is wrong with it
+        if not in_proportion(size, photograph.camera.size):
+            fail(f"{wrong_size(mask, size, photograph.camera.size)} {LEAVE_OUT[0].upper()}{LEAVE_OUT[1:]}.")

@@ -1,17 +1,16 @@
-"""Photographs among the pictures of a folder, and what the others are."""
+"""Photographs among the pictures of a folder, and what the others are: results of this package and of nerfstudio,
+wherever they lie, and files of cameras and other programs that are not read."""
 
 import os
 import re
 from collections import defaultdict
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 import pillow_heif
 from PIL import Image
 
-from bitymi_ns.capture import ignored_files
-from bitymi_ns.capture.results import is_capture, is_rendered_film, result_in
-from bitymi_ns.reading import open_regular
+from bitymi_ns.reading import open_regular, read_bytes
 
 pillow_heif.register_heif_opener()  # so that Pillow opens all of these, whoever asks it to
 
@@ -24,6 +23,57 @@ program that Ghostscript runs."""
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp")
 DYNAMIC_MASK = "dynamic_mask_"
 """Begins the name of the mask that instant-ngp reads beside a photograph: all that is not black does not count."""
+RENDERED = b"rendered by bitymi-ns"
+"""Comment in the pictures and films that ns-render writes of our scenes: frames are called as photographs are."""
+BUNDLE, RUN = "pictures of a bundle", "pictures of a training run"
+RESULT_FILES = {
+    "bundle.json": (b'"bitymi-bundle"', BUNDLE),
+    "config.yml": (b"!!python/object", RUN),
+    "pictures.json": (b'"bitymi_pictures"', "pictures of `bitymi bench pictures`"),
+    "transforms_eval.json": (b'[\n    {\n        "file_path"', "pictures beside cameras of ns-export"),
+}
+"""Files that mark a folder as a result: what stands in them, and what the pictures of the folder are."""
+HEAD = 1 << 20  # bytes of a file in which its mark stands
+_RENDERS = "renders of ns-render"
+_SPLIT_FOLDERS = {"train", "val", "test", "train+test"}
+_MAPS = {"accumulation", "beta", "overdraw", "expected_depth"}
+"""Folders that ns-render writes beside `rgb`, and captures do not have; and all that begin with raw- or gt-."""
+RAW = "raw data of a camera"
+UNREAD = {
+    **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"), RAW),
+    ".jxl": "JPEG XL",
+    ".exr": "OpenEXR",
+    ".hdr": "Radiance HDR",
+    ".psd": "Photoshop",
+}
+"""Extensions of unread images, and their formats."""
+UNREAD_POSES = {
+    "poses_bounds.npy": "LLFF",
+    "cameras_sphere.npz": "NeuS",
+    "cameras.npz": "IDR",
+    "cameras.sfm": "Meshroom",
+    "sfm_data.json": "OpenMVG",
+    "reconstruction.json": "OpenSfM",
+    "bundle.out": "Bundler",
+    "bundle.rd.out": "Bundler",
+}
+"""Files of poses, in lower case, and the programs that write them."""
+METASHAPE = b"<camera "  # content of the XML file to which Metashape exports cameras, whatever its name
+OTHER_FOLDERS = {
+    "mask": "masks", "masks": "masks", "depth": "depth maps", "depths": "depth maps", "depth_maps": "depth maps",
+    "confidence": "confidence maps", "confidences": "confidence maps", "conf": "confidence maps",
+    "normal": "normal maps", "normals": "normal maps", "normal_maps": "normal maps", "thumbnail": "thumbnails",
+    "thumbnails": "thumbnails", "thumbs": "thumbnails", "sparse": "a model", "colmap": "a model", "dense": "a model",
+    "stereo": "a model", "outputs": "outputs of training", "renders": "renders", "@eadir": "thumbnails",
+    "segmentation": "segmentations", "segmentations": "segmentations", "semantic": "segmentations",
+    "exports": "exports", "wandb": "pictures of a log", "planar_projections": "pictures made of panoramas",
+}  # fmt: skip
+"""Folders of a capture that hold no photographs, by their names in lower case, and what they hold."""
+OTHER_FILES = {
+    r"thumb(nail)?(_\d+)?": "a thumbnail", r"material_0|textured_output": "a texture", r"dynamic_mask_.*":
+    "a mask of instant-ngp", r"depth_\d+|.*[._-]depth": "a depth map", r"conf_\d+": "a confidence map",
+}  # fmt: skip
+"""Names files among photographs that are none: patterns of their names in lower case, without their endings."""
 
 
 def open_picture(file: Path) -> Image.Image:
@@ -45,14 +95,14 @@ def is_picture(path: Path) -> bool:
 
 def _no_photograph(path: Path) -> str:
     """Describe an image that is no photograph, by its name; empty = a photograph."""
-    matching = (what for pattern, what in ignored_files.FILES.items() if re.fullmatch(pattern, path.stem.lower()))
+    matching = (what for pattern, what in OTHER_FILES.items() if re.fullmatch(pattern, path.stem.lower()))
     return next(matching, "")
 
 
 def no_photographs(folder: Path, beside: Collection[str] = ()) -> str:
     """Describe the pictures in a folder that are no photographs, by its name, the names of folders `beside` it and the
     results in it; empty = there may be photographs."""
-    known = "hidden" if folder.name.startswith(".") else ignored_files.FOLDERS.get(folder.name.lower())
+    known = "hidden" if folder.name.startswith(".") else OTHER_FOLDERS.get(folder.name.lower())
     return known or _copies(folder.name, beside) or result_in(folder)
 
 
@@ -129,8 +179,8 @@ def passed_over(folder: Path, used: Collection[Path] | None = None) -> list[str]
             found.append(f"{len(unnamed)} pictures of {parent} that nothing names ({few})")
         films = videos_in(Path(parent), rendered=True)
         found += [f"{film.relative_to(folder)} (a film of ns-render)" for film in films]
-        for ending, count in ignored_files.pictures_among(names, read).items():
-            found.append(f"{count} {ending} of {parent} ({ignored_files.PICTURES[ending]}, which is not read)")
+        for ending, count in pictures_among(names, read).items():
+            found.append(f"{count} {ending} of {parent} ({UNREAD[ending]}, which is not read)")
     return found
 
 
@@ -138,3 +188,80 @@ def _pictures(folder: Path, used: Collection[Path]) -> int:
     """Count the pictures in and below a folder that are not used."""
     walked = (Path(parent, name) for parent, _, names in os.walk(folder) for name in names)
     return sum(is_picture(path) and path not in used for path in walked)
+
+
+def result_in(folder: Path) -> str:
+    """Say of what result the pictures in a folder are, by the files in it; empty = of none."""
+    try:
+        names = sorted(os.listdir(folder))
+    except OSError:  # it may not be read, and need not be
+        return ""
+    for name, (mark, what) in RESULT_FILES.items():
+        if name in names and _holds(folder / name, mark):
+            return what
+    if folder.name in _SPLIT_FOLDERS and any(name in _MAPS or name.startswith(("raw-", "gt-")) for name in names):
+        return _RENDERS
+    pictures = [name for name in names if name.endswith((".jpg", ".png"))]
+    if not pictures:
+        return ""
+    if re.fullmatch(r"eval_img_\d{4,}\.png", pictures[-1]) and all(name.startswith("eval_") for name in pictures):
+        return "renders of ns-eval"
+    return _RENDERS if _holds(folder / pictures[0], RENDERED, 1 << 10) else ""
+
+
+def is_capture(folder: Path) -> bool:
+    """Test for a capture as ns-process-data and `bitymi sfm` write it, with copies of the photographs."""
+    return _holds(folder / "transforms.json", b'"transform_matrix"')
+
+
+def refusal(folder: Path) -> str:
+    """Say why a folder cannot be trained on, and what to do, where it is a bundle or a run; empty = it may be."""
+    what = result_in(folder) if folder.is_dir() else ""
+    if what == BUNDLE:
+        return (
+            f"{folder} is a bundle, not a capture: give the folder of its photographs. `bitymi view {folder}` shows "
+            "the bundle."
+        )
+    if what == RUN:
+        return (
+            f"{folder} is a training run, not a capture: give the folder of its photographs, and --load-dir "
+            f"{folder}/nerfstudio_models to go on with the run."
+        )
+    return ""
+
+
+def is_rendered_film(path: Path) -> bool:
+    """Test for a film that ns-render wrote of a scene of ours."""
+    return _holds(path, RENDERED)
+
+
+def _holds(path: Path, mark: bytes, most: int = HEAD) -> bool:
+    try:
+        with open_regular(path) as file:
+            return mark in file.read(most)
+    except OSError:
+        return False
+
+
+def poses_in(folder: Path) -> Iterator[tuple[Path, str]]:
+    """Yield files of poses in a folder, each with the program that wrote it."""
+    for path in sorted(path for path in folder.iterdir() if path.is_file()):
+        if path.name.lower() in UNREAD_POSES:
+            yield path, UNREAD_POSES[path.name.lower()]
+        elif path.suffix.lower() == ".xml" and _is_metashapes(path):
+            yield path, "Metashape"
+
+
+def _is_metashapes(path: Path) -> bool:
+    try:
+        return METASHAPE in read_bytes(path)
+    except OSError:  # it may not be read, and need not be
+        return False
+
+
+def pictures_among(names: Sequence[str], read: Sequence[str]) -> dict[str, int]:
+    """Count unread images of a folder by extension. Raw data beside a photograph of the same name in `read` do not
+    count."""
+    stems = {Path(name).stem.lower() for name in read}
+    endings = [path.suffix.lower() for path in map(Path, names) if path.stem.lower() not in stems]
+    return {ending: endings.count(ending) for ending in UNREAD if ending in endings}

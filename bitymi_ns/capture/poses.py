@@ -19,11 +19,10 @@ from bitymi_ns.capture.camera import SPHERICAL_MODEL, ColmapCamera, is_full_sphe
 from bitymi_ns.capture.frame import local_positions, move_to_world, write_frame
 from bitymi_ns.capture.masks import mask_folder
 from bitymi_ns.capture.photos import Photo, blurred, check_names, duplicates, find_photos, photo_folder, read_photos
-from bitymi_ns.capture.pictures import VIDEOS, videos_in
+from bitymi_ns.capture.pictures import VIDEOS, refusal, videos_in
 from bitymi_ns.capture.prepare import IMAGES, colmap_masks, emptied, upright_photos
 from bitymi_ns.capture.recognise import is_model
 from bitymi_ns.capture.report import write_report
-from bitymi_ns.capture.results import refusal
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
 from bitymi_ns.capture.types import CaptureError, Poses, SfmOptions

@@ -7,17 +7,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from bitymi_ns.capture import ignored_files
 from bitymi_ns.capture.pictures import (
     PHOTOGRAPHS,
+    UNREAD,
     VIDEOS,
     folders_in,
     has_photographs,
     no_photographs,
     passed_over,
+    pictures_among,
+    poses_in,
+    refusal,
     videos_in,
 )
-from bitymi_ns.capture.results import refusal
+from bitymi_ns.capture.types import fail
 from bitymi_ns.reading import open_regular, open_text, read_bytes, read_json
 from bitymi_ns.trust import listed
 
@@ -34,10 +37,6 @@ POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 STRAY = ("odometry.csv", "camera_matrix.csv", "rgb.mp4")  # files of Stray Scanner: poses, camera, video
 SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")  # files of a Blender data set
 INTRINSICS = {"fl_x", "fl_y", "cx", "cy", "w", "h"}
-
-
-class NotRecognised(ValueError):
-    """A path holds nothing to train on; the message says what to do."""
 
 
 @dataclass(frozen=True)
@@ -76,16 +75,16 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
         colmap_path: folder of a COLMAP model to read, relative to the capture.
 
     Raises:
-        NotRecognised: there is nothing of that format.
+        CaptureError: there is nothing of that format.
     """
     if not data.exists():
-        raise NotRecognised(f"the capture {data} does not exist. Give a folder or a file with --data.")
+        fail(f"the capture {data} does not exist. Give a folder or a file with --data.")
     if colmap_path is not None:
         if format not in ("auto", "colmap"):
-            raise NotRecognised(f"--colmap-path is for COLMAP models: leave out --format {format}, or the path.")
+            fail(f"--colmap-path is for COLMAP models: leave out --format {format}, or the path.")
         return _colmap_given(data, colmap_path)
     if why := refusal(data):
-        raise NotRecognised(why)
+        fail(why)
     folder = data if data.is_dir() else data.parent
     candidates = list(_in_folder(data) if data.is_dir() else _of_file(data))
     fitting = [each for each in candidates if format in ("auto", each[0])]
@@ -98,7 +97,7 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
     elif format == "nerfstudio" and not fitting:
         fitting = [("nerfstudio", path) for found, path in candidates if found == "instant-ngp"]
     if not fitting:
-        raise NotRecognised(_nothing(data, format, candidates))
+        fail(_nothing(data, format, candidates))
     (chosen, path), *_ = fitting
     # photographs lie beside every capture: they are another capture only beside a video
     others = tuple(
@@ -108,7 +107,7 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
         and (each[0] != "photographs" or chosen == "video")
         and (chosen != "stray-scanner" or each[1].name != STRAY[2])
     )
-    poses = tuple(ignored_files.poses_in(folder)) if chosen in ("photographs", "video") else ()
+    poses = tuple(poses_in(folder)) if chosen in ("photographs", "video") else ()
     return Found(chosen, path, path if chosen == "blender" else folder, others, poses)
 
 
@@ -265,8 +264,8 @@ def _colmap_given(data: Path, colmap_path: Path) -> Found:
     what = "has no cameras.bin or cameras.txt" if model.is_dir() else "does not exist"
     there = models_in(folder)
     if not there:
-        raise NotRecognised(f"the COLMAP model {model} {what}, and there is none in other folders of {folder}.")
-    raise NotRecognised(f"the COLMAP model {model} {what}. Give `--colmap-path {there[0]}`.")
+        fail(f"the COLMAP model {model} {what}, and there is none in other folders of {folder}.")
+    fail(f"the COLMAP model {model} {what}. Give `--colmap-path {there[0]}`.")
 
 
 def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> str:
@@ -293,10 +292,10 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
     several = captures_in(data)
     if several:
         hint = f" It holds {len(several)} captures: give one of them, as {several[0]}."
-    counts = ignored_files.pictures_among([path.name for path in data.rglob("*")], [])
+    counts = pictures_among([path.name for path in data.rglob("*")], [])
     if counts and not several:
         most = max(counts, key=counts.__getitem__)
-        hint = f" It holds {counts[most]} files {most} ({ignored_files.PICTURES[most]}): save them as JPEG or TIFF."
+        hint = f" It holds {counts[most]} files {most} ({UNREAD[most]}): save them as JPEG or TIFF."
     archive = next((path for path in sorted(data.iterdir()) if path.suffix.lower() in (".zip", ".tar", ".7z")), None)
     if archive is not None and not several:
         hint = f" Unpack {archive.name} first."

@@ -1,8 +1,15 @@
-"""Options and result of structure from motion."""
+"""Reports of the package, `CaptureError` and a logger of its name; options of captures, and options and result of
+structure from motion."""
 
+import logging
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NoReturn
+
+from bitymi_ns.reading import reading
+
+Orientation = Literal["pca", "up", "vertical", "none"]
 
 CONTRADICTED = 0.1
 """Share of contradicted matches above which poses are doubtful. Right poses of two real captures have 0.012 to 0.016;
@@ -10,7 +17,59 @@ wrong ones of a room with a box whose faces are alike have 0.20 and 0.27."""
 
 
 class CaptureError(ValueError):
-    """Photographs or a video of which no poses can be found: what is wrong, in which file, and what to do."""
+    """A capture, photographs or a video that cannot be used: what is wrong, in which file, and what to do."""
+
+
+_log = logging.getLogger("bitymi_ns.capture")
+say, warn = _log.info, _log.warning
+"""Report what is read, and what is missing, in one line each."""
+
+
+def fail(message: str, cause: BaseException | None = None) -> NoReturn:
+    """Raise CaptureError(message), remembering `cause` for debuggers."""
+    raise CaptureError(message) from cause
+
+
+def parsing(
+    what: object, advice: str = "", passing: tuple[type[BaseException], ...] = ()
+) -> AbstractContextManager[None]:
+    """Turn whatever goes wrong in the block into a CaptureError, see `reading`."""
+    return reading(what, fail, advice, (CaptureError, *passing))
+
+
+MAP_FILES = (".png", ".tif", ".tiff", ".npy", ".npz", ".exr")
+"""Extensions of depth and normal maps."""
+
+
+@dataclass(frozen=True)
+class MapFiles:
+    """Files with what is known of a photograph's pixels beside their colors; None = none.
+
+    Attributes:
+        depth: of camera z, see `read_depth`.
+        confidence: of the depth, 0 = low, at most of the size of the depth.
+        normal: see `read_normal`.
+    """
+
+    depth: Path | None = None
+    confidence: Path | None = None
+    normal: Path | None = None
+
+
+@dataclass
+class FrameOptions:
+    """Orientation, centering and scaling of a capture, as in nerfstudio's parsers."""
+
+    scale_factor: float = 1.0
+    """Factor on the positions of the cameras."""
+    orientation_method: Orientation = "up"
+    """Orientation of the capture: up = the cameras' mean up is z."""
+    center_method: Literal["poses", "focus", "none"] = "poses"
+    """Origin: the middle of the cameras, or the point that they look at."""
+    auto_scale_poses: bool = True
+    """Scale the capture so that the cameras fit into a box from -1 to 1."""
+    scene_scale: float = 1.0
+    """Half the side of the box of random points."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Console messages: errors without a traceback, warnings, a step bar; filtering of nerfstudio's own lines."""
 
 import functools
+import logging
 import re
 import warnings
 from collections.abc import Callable, Iterator
@@ -14,6 +15,7 @@ from rich.markup import escape
 from rich.panel import Panel
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.endings import INTERRUPTED as INTERRUPTED
 from bitymi_ns.trust import listed as listed
 from bitymi_ns.trust import printable
@@ -118,5 +120,25 @@ def warn(message: str) -> None:
     """Tell the user about something that goes on without what it should have had."""
     CONSOLE.print(f"[bold yellow]{escape(printable(message))}", soft_wrap=True)
 
+
+@contextmanager
+def as_input_error() -> Iterator[None]:
+    """End with one line where a capture cannot be used; also a decorator."""
+    try:
+        yield
+    except CaptureError as error:
+        fail(str(error), error)
+
+
+class _Console(logging.Handler):
+    """Prints what the reading of captures reports."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        (warn if record.levelno >= logging.WARNING else say)(record.getMessage())
+
+
+_captures = logging.getLogger("bitymi_ns.capture")
+_captures.handlers, _captures.propagate = [_Console()], False
+_captures.setLevel(logging.INFO)
 
 warn_once = functools.cache(warn)  # the same message only once in a process

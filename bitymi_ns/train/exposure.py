@@ -265,11 +265,6 @@ def _diagonal(table: Tensor) -> slice:
     return slice(None) if table.shape[-1] == 3 else slice(0, None, 5)
 
 
-def exif_stops(seconds: float, f_number: float, iso: float) -> float:
-    """Compute the log2 exposure of a photograph: shutter time times ISO over f-number squared."""
-    return math.log2(seconds * iso / (f_number * f_number))
-
-
 def seeds(stops: Sequence[float] | None, count: int) -> Tensor:
     """Compute initial log gains [V, 3] from EXIF exposures, for gamma-encoded colours; 0 if unknown.
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from bitymi_ns.ranges import spread as spread
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.config import TrainConfig
 
@@ -70,7 +71,7 @@ class TrainingData:
         image_pixels: total over all training views.
         first_surfels: initial number of surfels, also in a resumed run.
         covered: share of opaque, unmasked pixels (`covered_share`).
-        exif_stops: log2 exposure of each view (`exposure.exif_stops`), NaN: unknown; None: unknown for every view.
+        exif_stops: log2 exposure of each view (`capture.exif.exif_stops`), NaN: unknown; None: unknown for every view.
         photographs: index of each view's photograph; None: one view per photograph.
         cameras: of the views; None: taken from the views, which may read the photographs for it.
     """
@@ -89,12 +90,6 @@ def _moved(value: Tensor | None, device: torch.device | str) -> Tensor | None:
     if value is None or value.device.type != "cpu" or torch.device(device).type != "cuda":
         return None if value is None else value.to(device)
     return value.pin_memory().to(device, non_blocking=True)
-
-
-def spread(count: int, most: int) -> list[int]:
-    """List up to `most` evenly spaced indices below `count`, including the first."""
-    used = min(count, most)
-    return [i * count // used for i in range(used)]
 
 
 def covered_share(views: Sequence[View]) -> float:

@@ -1,7 +1,8 @@
 """Photographs of the sample room along an arc, with large overlap."""
 
+import logging
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -45,3 +46,14 @@ def copied(arc: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callab
         return folder
 
     return copy
+
+
+@pytest.fixture
+def reported() -> Iterator[list[str]]:
+    """What the reading of captures reports."""
+    messages: list[str] = []
+    handler, logger = logging.Handler(), logging.getLogger("bitymi_ns.capture")
+    handler.emit = lambda record: messages.append(record.getMessage())  # type: ignore[method-assign]
+    logger.addHandler(handler)
+    yield messages
+    logger.removeHandler(handler)

@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 from PIL import EpsImagePlugin, Image
 
+from bitymi_ns.capture.images import file_has_transparency, orientation, read_image, set_up_pillow
+from bitymi_ns.capture.masks import checked_mask
 from bitymi_ns.capture.photos import read_photo
 from bitymi_ns.capture.prepare import colmap_mask
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.measure.report.pictures import open_image
-from bitymi_ns.plugin.console import InputError
-from bitymi_ns.plugin.data.images import file_has_transparency, orientation, read_image, read_mask, set_up_pillow
 
 
 @pytest.fixture
@@ -37,14 +37,14 @@ READERS: dict[str, Callable[[Path], object]] = {
     "photograph": lambda path: read_photo(path.parent, path.name),
     "mask of a photograph": lambda path: colmap_mask(path, path.name, (64, 48)),
     "image": read_image,
-    "mask": read_mask,
+    "mask": checked_mask,
     "picture of a report": open_image,
 }
 
 
 @pytest.mark.parametrize("reader", READERS)
 def test_it_is_not_run(reader: str, disguised: Path, ran: Path) -> None:
-    with pytest.raises((CaptureError, InputError, OSError), match="cannot"):
+    with pytest.raises((CaptureError, CaptureError, OSError), match="cannot"):
         READERS[reader](disguised)
     assert not ran.exists()
     assert orientation(disguised) == 1 and not file_has_transparency(disguised)

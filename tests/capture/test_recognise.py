@@ -11,7 +11,8 @@ from PIL import Image
 
 from bitymi_ns.capture.photos import find_photos, photo_folder
 from bitymi_ns.capture.pictures import passed_over
-from bitymi_ns.capture.recognise import NotRecognised, image_count, models_in, recognise
+from bitymi_ns.capture.recognise import image_count, models_in, recognise
+from bitymi_ns.capture.types import CaptureError
 
 POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 FRAME = {"file_path": "images/a.jpg", "transform_matrix": POSE}
@@ -144,7 +145,7 @@ def test_a_video_alone_beside_photographs_or_in_a_folder(tmp_path: Path) -> None
 def test_folders_with_nothing_to_train_on(tmp_path: Path, names: list[str], message: str) -> None:
     for name in names:
         photograph((tmp_path / name).parent, Path(name).name)
-    with pytest.raises(NotRecognised, match=message):
+    with pytest.raises(CaptureError, match=message):
         recognise(tmp_path)
 
 
@@ -156,20 +157,20 @@ def test_files_that_cannot_be_trained_on(tmp_path: Path) -> None:
         ("a.jpg", "is one photograph"), ("a.odt", "no file that can be"), ("b", "does not exist"),
         ("a.zip", "a.zip is an archive. Unpack it"),
     ):  # fmt: skip
-        with pytest.raises(NotRecognised, match=message):
+        with pytest.raises(CaptureError, match=message):
             recognise(tmp_path / name)
 
 
 def test_a_format_that_is_not_there(tmp_path: Path) -> None:
     transforms(tmp_path, **PINHOLE)
-    with pytest.raises(NotRecognised, match=r"nothing of the format blender. It holds transforms.json \(nerfstudio\)"):
+    with pytest.raises(CaptureError, match=r"nothing of the format blender. It holds transforms.json \(nerfstudio\)"):
         recognise(tmp_path, "blender")
-    with pytest.raises(NotRecognised, match="--colmap-path is for COLMAP models"):
+    with pytest.raises(CaptureError, match="--colmap-path is for COLMAP models"):
         recognise(tmp_path, "blender", Path("sparse/0"))
-    with pytest.raises(NotRecognised, match="sparse/0 does not exist, and there is none"):
+    with pytest.raises(CaptureError, match="sparse/0 does not exist, and there is none"):
         recognise(tmp_path, colmap_path=Path("sparse/0"))
     model(tmp_path / "sparse/1")
-    with pytest.raises(NotRecognised, match="does not exist. Give `--colmap-path sparse/1`"):
+    with pytest.raises(CaptureError, match="does not exist. Give `--colmap-path sparse/1`"):
         recognise(tmp_path, colmap_path=Path("sparse/0"))
 
 
@@ -199,11 +200,11 @@ def test_several_captures_in_one_folder(tmp_path: Path) -> None:
     for name in ("garden", "kitchen"):
         (tmp_path / name / "images").mkdir(parents=True)
         Image.new("RGB", (8, 8)).save(tmp_path / name / "images/a.jpg")
-    with pytest.raises(NotRecognised, match="It holds 2 captures: give one of them, as .*garden"):
+    with pytest.raises(CaptureError, match="It holds 2 captures: give one of them, as .*garden"):
         recognise(tmp_path)
     for name in ("garden", "kitchen"):
         transforms(tmp_path / name, **PINHOLE)
-    with pytest.raises(NotRecognised, match=f"It holds 2 captures: give one of them, as {tmp_path}/garden"):
+    with pytest.raises(CaptureError, match=f"It holds 2 captures: give one of them, as {tmp_path}/garden"):
         recognise(tmp_path)
 
 
@@ -265,7 +266,7 @@ def test_poses_in_a_file_of_another_name(tmp_path: Path) -> None:
 def test_pictures_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     for name in ("a.CR2", "b.CR2", "c.jxl"):
         photograph(tmp_path / "photos", name)
-    with pytest.raises(NotRecognised, match="holds 2 files .cr2 .raw data of a camera.: save them as JPEG or TIFF"):
+    with pytest.raises(CaptureError, match="holds 2 files .cr2 .raw data of a camera.: save them as JPEG or TIFF"):
         recognise(tmp_path)
     for name in ("a.JPG", "b.JPG"):
         photograph(tmp_path / "photos", name)

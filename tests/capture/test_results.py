@@ -8,10 +8,9 @@ from PIL import Image
 
 from bitymi_ns.bundle.manifest import FORMAT
 from bitymi_ns.capture.photos import find_photos
-from bitymi_ns.capture.pictures import passed_over
+from bitymi_ns.capture.pictures import RENDERED, passed_over, result_in
 from bitymi_ns.capture.poses import find_poses
-from bitymi_ns.capture.recognise import NotRecognised, recognise
-from bitymi_ns.capture.results import RENDERED, result_in
+from bitymi_ns.capture.recognise import recognise
 from bitymi_ns.capture.types import CaptureError
 
 MANIFEST = json.dumps({"format": FORMAT})
@@ -86,13 +85,13 @@ def test_a_result_is_no_capture(tmp_path: Path, mark: str, text: str, message: s
     for name in "abcd":
         save(tmp_path / f"{name}.jpg")
     (tmp_path / mark).write_text(text)
-    with pytest.raises(NotRecognised, match=message):
+    with pytest.raises(CaptureError, match=message):
         recognise(tmp_path)
     with pytest.raises(CaptureError, match=message):
         find_poses(tmp_path)
     assert len(list(tmp_path.iterdir())) == 5
     (tmp_path / "room.bitymi").write_bytes(b"PK")
-    with pytest.raises(NotRecognised, match="is a bundle in one file"):
+    with pytest.raises(CaptureError, match="is a bundle in one file"):
         recognise(tmp_path / "room.bitymi")
 
 
@@ -102,7 +101,7 @@ def test_a_folder_of_results_alone_says_what_it_holds(photographs: Path) -> None
     (photographs / "processed/transforms.json").unlink()
     for path in (photographs / "processed").rglob("*.jpg"):
         path.unlink()
-    with pytest.raises(NotRecognised, match=r"not taken for photographs: compared \(1 renders of ns-eval\)"):
+    with pytest.raises(CaptureError, match=r"not taken for photographs: compared \(1 renders of ns-eval\)"):
         recognise(photographs)
 
 

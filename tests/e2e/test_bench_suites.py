@@ -11,7 +11,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from bitymi_ns.measure.bench.engine import CURVE, config_of, train_command
 from bitymi_ns.measure.bench.matrix import Row, Run, standard_scenes
 from bitymi_ns.measure.report.read import read_jsonl
-from tests.plugin.data.captures import colmap_model
+from tests.captures import colmap_model
 
 SMALL = (
     "--pipeline.model.scene.log2-table-size", "10", "--pipeline.model.scene.min-resolution", "16",

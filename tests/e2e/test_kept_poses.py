@@ -21,10 +21,10 @@ from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export.trained import load_trained, world_of
 from bitymi_ns.plugin.run import run_folder
 from bitymi_ns.plugin.run.run_folder import POSES
+from tests.captures import colmap_model, found_poses, printed
 from tests.e2e.conftest import small_run
 from tests.e2e.exports import run_export
 from tests.e2e.runs import a_run_of, checkpoint, config_of, different, rewrite
-from tests.plugin.data.captures import colmap_model, found_poses, printed
 
 STEPS = 4
 

@@ -16,7 +16,7 @@ from bitymi_ns.plugin.export.command import ExportAtlas
 from bitymi_ns.plugin.run import callbacks
 from bitymi_ns.plugin.run.callbacks import FILE
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
-from tests.plugin.data.captures import add_masks, mixed_project, write_cloud
+from tests.captures import add_masks, mixed_project, write_cloud
 
 Start = Callable[..., BitymiTrainerConfig]
 

@@ -19,8 +19,8 @@ from bitymi_ns.plugin.run.callbacks import FILE
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from bitymi_ns.plugin.run.trainer import BitymiTrainer
 from bitymi_ns.train.schedules import Schedule
+from tests.captures import edit
 from tests.e2e.runs import Start, a_run_of, checkpoint, different
-from tests.plugin.data.captures import edit
 
 
 @pytest.mark.parametrize("by", ["load_checkpoint", "load_dir"])

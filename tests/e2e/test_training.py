@@ -15,8 +15,8 @@ from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run.callbacks import FILE
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from bitymi_ns.train import init
+from tests.captures import edit, write_cloud
 from tests.e2e.runs import Start, checkpoint, config_of
-from tests.plugin.data.captures import edit, write_cloud
 
 
 def test_a_run_leaves_a_configuration_checkpoints_and_a_curve(trained: BitymiTrainerConfig) -> None:

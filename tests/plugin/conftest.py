@@ -10,7 +10,7 @@ pytest.importorskip("nerfstudio")
 
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.sample import generate
-from tests.plugin.data.captures import colmap_model
+from tests.captures import colmap_model
 
 
 @pytest.fixture(autouse=True)

@@ -9,10 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from bitymi_ns.capture.exif import exif_stops
 from bitymi_ns.train import exposure as module
 from bitymi_ns.train.config import DensifyConfig, LearningRates, TrainConfig
 from bitymi_ns.train.evaluate import evaluate
-from bitymi_ns.train.exposure import LIMIT, OTHER_LIMIT, Exposure, ExposureGains, corrected, exif_stops, seeds, settled
+from bitymi_ns.train.exposure import LIMIT, OTHER_LIMIT, Exposure, ExposureGains, corrected, seeds, settled
 from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.score import multi_view_scores
 from bitymi_ns.train.views import View, shown

@@ -11,7 +11,8 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from bitymi_ns.capture.recognise import NotRecognised, recognise
+from bitymi_ns.capture.recognise import recognise
+from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.measure.bench.process import BenchError
 from bitymi_ns.presets import preset_names
 from bitymi_ns.trust import inside
@@ -196,7 +197,7 @@ def local_scenes(folders: Sequence[Path]) -> list[SceneSpec]:
         folder = Path(os.path.expanduser(folder)).resolve()
         try:
             found = recognise(folder)
-        except NotRecognised as error:
+        except CaptureError as error:
             raise BenchError(f"{folder} is not a capture: {error}") from error
         if found.format == "blender":
             points = ("--ply-path", "hull_pc.ply") if (found.path / "hull_pc.ply").is_file() else ()

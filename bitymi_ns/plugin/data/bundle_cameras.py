@@ -14,9 +14,10 @@ from bitymi_ns.bundle import BundleError
 from bitymi_ns.bundle.cameras import CapturedCamera
 from bitymi_ns.bundle.parts import CAMERAS
 from bitymi_ns.bundle.read import read_cameras, read_manifest
+from bitymi_ns.capture.camera import OPENCV_AXES
+from bitymi_ns.capture.lens import Pinhole
 from bitymi_ns.plugin.console import fail
-from bitymi_ns.plugin.data.lens import Pinhole
-from bitymi_ns.plugin.data.views import NO_PHOTOS, OPENCV_AXES, Views, pinhole_cameras
+from bitymi_ns.plugin.data.views import NO_PHOTOS, Views, pinhole_cameras
 from bitymi_ns.trust import inside
 
 

@@ -18,12 +18,13 @@ from nerfstudio.data.dataparsers.sdfstudio_dataparser import SDFStudioDataParser
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image, UnidentifiedImageError
 
+from bitymi_ns.capture.colmap_model import forget_model
+from bitymi_ns.capture.images import MAX_PIXELS
 from bitymi_ns.capture.recognise import Format
-from bitymi_ns.plugin.console import fail
-from bitymi_ns.plugin.data.colmap_model import forget_model
+from bitymi_ns.capture.transforms import HOW_TO_GET_ONE
+from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.plugin.console import as_input_error, fail
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
-from bitymi_ns.plugin.data.images import MAX_PIXELS
-from bitymi_ns.plugin.data.transforms import HOW_TO_GET_ONE
 from bitymi_ns.plugin.run.commands import folder_being_evaluated, how_to_say_where
 from bitymi_ns.reading import read_json, why
 
@@ -63,6 +64,7 @@ def bitymi_parser(config: DataParserConfig) -> DataParserConfig:
     return BitymiDataParserConfig(format=format, **options)
 
 
+@as_input_error()
 def check_capture(config: FullImageDatamanagerConfig, read: bool = False) -> None:
     """Check that there is a capture where the data manager's configuration points; parsers of nerfstudio are replaced
     by `bitymi_parser`. With `read`, views with poses are read as well; they say nothing, as they will be read again.
@@ -130,6 +132,8 @@ def reporting_input_errors(config: Any) -> Iterator[None]:
             f"the capture {_folder_of(config)} has a photograph of more than {MAX_PIXELS:,} pixels: make it smaller",
             error,
         )
+    except CaptureError as error:
+        fail(str(error), error)
     except (NameError, AssertionError):  # no fault of the capture
         raise
     except Exception as error:

@@ -18,17 +18,16 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, Datapa
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from torch import Tensor
 
-from bitymi_ns.plugin.console import fail, listed, warn
-from bitymi_ns.plugin.data import images
+from bitymi_ns.capture import images
+from bitymi_ns.capture.find_files import check_photographs_exist
+from bitymi_ns.capture.pose_checks import check_outliers, check_point_unit, warn_of_mirrored
+from bitymi_ns.plugin.console import as_input_error, fail, listed, warn
 from bitymi_ns.plugin.data.bundle_cameras import BundleCamerasConfig
 from bitymi_ns.plugin.data.cameras import check_cameras, to_camera, to_cameras
 from bitymi_ns.plugin.data.capture_checks import check_capture, declares_box, reporting_input_errors
-from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
+from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig, reading_points
 from bitymi_ns.plugin.data.dataset import BitymiDataset, CachedImages, drop_blank_views, photograph_bytes
 from bitymi_ns.plugin.data.depth import with_depth
-from bitymi_ns.plugin.data.find_files import check_photographs_exist
-from bitymi_ns.plugin.data.initial_points import reading_points
-from bitymi_ns.plugin.data.pose_checks import check_outliers, check_point_unit, warn_of_mirrored
 from bitymi_ns.plugin.data.views import LONGEST_SIDE, NO_PHOTOS, limit_size, with_lenses
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.background_points import background_points
@@ -93,6 +92,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
 
     config: BitymiDataManagerConfig
 
+    @as_input_error()
     def __init__(
         self,
         config: BitymiDataManagerConfig,

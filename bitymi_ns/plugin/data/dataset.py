@@ -18,11 +18,12 @@ from rich.progress import track
 from torch import Tensor
 
 from bitymi_ns.bundle.sizes import memory_limit
-from bitymi_ns.plugin.console import fail, listed, warn
+from bitymi_ns.capture.images import ImageSummary, in_threads, pixels_of, read_image, summarize, wrong_size
+from bitymi_ns.capture.lens import Lens
+from bitymi_ns.capture.masks import checked_mask
+from bitymi_ns.capture.pose_checks import rotations
+from bitymi_ns.plugin.console import as_input_error, fail, listed, warn
 from bitymi_ns.plugin.data.depth import FITTED
-from bitymi_ns.plugin.data.images import ImageSummary, in_threads, read_image, read_mask, summarize, wrong_size
-from bitymi_ns.plugin.data.lens import Lens
-from bitymi_ns.plugin.data.pose_checks import rotations
 from bitymi_ns.plugin.data.views import NO_PHOTOS, photograph_files, select_views
 from bitymi_ns.plugin.run.commands import MOVED
 from bitymi_ns.train.views import MemoryBudget, nearest, over_background
@@ -64,6 +65,7 @@ class BitymiDataset(InputDataset):
         numbers = {file: i for i, file in enumerate(dict.fromkeys(self.files))}
         return [numbers[file] for file in self.files]
 
+    @as_input_error()
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
         """Read image [H, W, 3 or 4]."""
         path = self.files[image_idx]
@@ -79,9 +81,7 @@ class BitymiDataset(InputDataset):
         image = self._scaled(image, Image.Resampling.BILINEAR)
         if image.size != declared:
             fail(wrong_size(path, image.size, declared))
-        pixels = np.array(image, dtype=np.uint8)
-        if pixels.shape[-1] == 4 and pixels[..., 3].min(initial=255) == 255:
-            pixels = np.ascontiguousarray(pixels[..., :3])  # nothing is transparent
+        pixels = pixels_of(image)
         self._summaries[image_idx] = summarize(pixels)
         return pixels
 
@@ -106,6 +106,7 @@ class BitymiDataset(InputDataset):
         data["image"] = over_background(data["image"], None if color is None else torch.as_tensor(color).float())
         return data
 
+    @as_input_error()
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
         """Read the image; its mask [H, W, 1] bool where the capture has masks; in training depth [H, W], in units of
         the scene, and normal [H, W, 3], both float16, where they are used."""
@@ -158,7 +159,7 @@ def photograph_bytes(device: torch.device, processes: int = 1) -> int:
 def view_mask(outputs: DataparserOutputs, index: int) -> Image.Image:
     """Read the mask of a view whose photograph has one, or does not cover it."""
     path = None if outputs.mask_filenames is None else outputs.mask_filenames[index]
-    return outputs.metadata["lenses"][index].undistort_mask(None if path is None else read_mask(path), path)
+    return outputs.metadata["lenses"][index].undistort_mask(None if path is None else checked_mask(path), path)
 
 
 def _fill(image: Tensor, mask: Tensor, color: tuple[float, float, float]) -> Tensor:

@@ -13,11 +13,12 @@ import numpy.typing as npt
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 
+from bitymi_ns.capture.images import in_threads, read_image
+from bitymi_ns.capture.lens import Lens, Pinhole
+from bitymi_ns.capture.maps import MAPS, Values, read_depth, read_normal
+from bitymi_ns.capture.points import GREY
+from bitymi_ns.capture.types import MapFiles
 from bitymi_ns.plugin.console import say, warn
-from bitymi_ns.plugin.data.depth_files import MAPS, MapFiles, Values, read_depth, read_normal
-from bitymi_ns.plugin.data.images import in_threads, read_image
-from bitymi_ns.plugin.data.initial_points import GREY
-from bitymi_ns.plugin.data.lens import Lens, Pinhole
 from bitymi_ns.train.views import spread
 
 DepthKind = Literal["auto", "metric", "relative", "off"]

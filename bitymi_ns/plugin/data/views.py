@@ -3,85 +3,26 @@ those of wide cameras several."""
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 
-from bitymi_ns.capture.camera import SPHERICAL_MODEL, ColmapCamera
+from bitymi_ns.capture.camera import OPENCV_AXES, SPHERICAL_MODEL, ColmapCamera, Photograph, Pose, colmap_distortion
+from bitymi_ns.capture.lens import Lens, Pinhole, make_lenses
+from bitymi_ns.capture.maps import MAPS
+from bitymi_ns.capture.pose_checks import check_spread, far_from_origin
+from bitymi_ns.capture.read import Capture
+from bitymi_ns.capture.types import FrameOptions, MapFiles
 from bitymi_ns.plugin.console import fail, listed, say
-from bitymi_ns.plugin.data.depth_files import MAPS, MapFiles
-from bitymi_ns.plugin.data.images import image_size, in_threads
-from bitymi_ns.plugin.data.lens import Lens, Pinhole, colmap_distortion, lenses_of
-from bitymi_ns.plugin.data.point_files import Points
-from bitymi_ns.plugin.data.pose_checks import check_spread, far_from_origin
 
-Pose = npt.NDArray[np.float64]
-OPENCV_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
-"""[4, 4] between camera frames with OpenCV axes and with nerfstudio's (OpenGL)."""
-USUAL_SPREAD, MAX_SPREAD = 2.5, 25.0
-"""Median distance of cameras from their middle, in half sides of the scene box: of NeRF-Synthetic, and from which on a
-capture is taken to be in another unit."""
 NO_PHOTOS = "without photographs"  # metadata key of views whose photographs are gone
 LONGEST_SIDE = 1600  # default longest side of a training photograph, pixels; as in papers on such captures
-
-
-@dataclass(frozen=True)
-class Photograph:
-    """A photograph with its camera."""
-
-    file: Path  # image file
-    camera: ColmapCamera  # in pixels of the photograph before any downscaling
-    pose: Pose  # [4, 4] float64, camera to world in nerfstudio's axes (camera: x right, y up, z backward)
-    label: str  # names the camera in messages
-    mask: Path | None = None  # mask file; None = none
-    downscaled: bool = False  # `file` is a copy that is downscaled already
-    frame: int | None = None  # number that photographs share which a rig took together; None = it stands alone
-    maps: MapFiles = MapFiles()  # depth and normals
-
-
-Orientation = Literal["pca", "up", "vertical", "none"]
-
-
-@dataclass
-class FrameOptions:
-    """Orientation, centering and scaling of a capture, as in nerfstudio's parsers."""
-
-    scale_factor: float = 1.0
-    """Factor on the positions of the cameras."""
-    orientation_method: Orientation = "up"
-    """Orientation of the capture: up = the cameras' mean up is z."""
-    center_method: Literal["poses", "focus", "none"] = "poses"
-    """Origin: the middle of the cameras, or the point that they look at."""
-    auto_scale_poses: bool = True
-    """Scale the capture so that the cameras fit into a box from -1 to 1."""
-    scene_scale: float = 1.0
-    """Half the side of the box of random points."""
-
-
-def fit_scale(frame: FrameOptions, photographs: Sequence[Photograph], source: str) -> FrameOptions:
-    """Reduce the scale of a capture whose cameras lie far outside of the scene box: in millimetres they would, and
-    random points would all fall on one spot of the pictures. `frame` is the format's default, without
-    auto_scale_poses."""
-    centers = np.stack([photograph.pose[:3, 3] for photograph in photographs])
-    spread = float(np.median(np.linalg.norm(centers - centers.mean(0), axis=1)))
-    ratio = spread * frame.scale_factor / frame.scene_scale
-    if ratio <= MAX_SPREAD:
-        return frame
-    scale = frame.scale_factor * USUAL_SPREAD / ratio
-    say(
-        f"The cameras of {source} lie {spread:,.4g} units from their middle, where those of this format usually lie "
-        f"{USUAL_SPREAD * frame.scene_scale / frame.scale_factor:.2g}: the capture is scaled by {scale:.3g}. Bundles "
-        "state that."
-    )
-    return replace(frame, scale_factor=scale)
 
 
 class Views(DataparserOutputs):
@@ -92,35 +33,20 @@ class Views(DataparserOutputs):
         return super().transform_poses_to_original_space(poses.double(), *args, **kwargs)
 
 
-def make_views(
-    photographs: Sequence[Photograph],
-    frame: FrameOptions,
-    points: Points | None,
-    source: str,
-    downscale: int = 1,
-    need_photos: bool = True,
-    applied: Pose | None = None,
-    applied_scale: float = 1.0,
-    alpha_color: torch.Tensor | None = None,
-) -> Views:
+def make_views(capture: Capture, need_photos: bool = True) -> Views:
     """Build the views of a capture, in the order of the photographs. metadata has for each view its `Lens` ("lenses"),
-    photograph ("files"), the number of the photograph ("photographs"), which views of one share, and that of the first
-    photograph of the rig's frame ("frames").
+    photograph ("files"), and the number of the photograph ("photographs"), which views of one share.
 
     Args:
-        photographs: at least two.
-        points: in the frame of the poses; None = none.
-        downscale: use photographs that are smaller by this factor.
         need_photos: open downscaled copies for their size; else they may be missing.
-        applied, applied_scale: [4, 4] and scale that were applied to the capture before `photographs` state it.
-        alpha_color: behind transparent pixels.
 
     Raises:
-        InputError: a camera or a photograph cannot be used.
+        CaptureError: a camera or a photograph cannot be used.
     """
+    photographs, frame, points, source = capture.photographs, capture.frame, capture.points, capture.source
     if len(photographs) == 1:
         fail(f"{source} has one image only. A scene cannot be learned from one view: add photographs.")
-    parts = make_lenses(photographs, downscale, need_photos)
+    parts = make_lenses(photographs, capture.downscale, need_photos)
     poses = np.stack([photograph.pose for photograph in photographs])
     if frame.auto_scale_poses:
         check_spread(poses[:, :3, 3], source)
@@ -129,11 +55,7 @@ def make_views(
     moved[:, :3, 3] *= scale
     lenses, of, moved = _split(parts, moved)
     files = [photographs[i].file for i in of]
-    first: dict[Any, int] = {}
-    frames = [
-        first.setdefault(i if each.frame is None else ("frame", each.frame), i) for i, each in enumerate(photographs)
-    ]
-    metadata: dict[str, Any] = {"lenses": lenses, "files": files, "photographs": of, "frames": [frames[i] for i in of]}
+    metadata: dict[str, Any] = {"lenses": lenses, "files": files, "photographs": of}
     maps = [MapFiles() if lens.face else photographs[i].maps for i, lens in zip(of, lenses, strict=True)]
     if any(each != MapFiles() for each in maps):
         metadata[MAPS] = maps
@@ -141,19 +63,18 @@ def make_views(
     if wide:
         say(f"Depth of photographs that become faces of a cube is not used: {listed(list(dict.fromkeys(wide)))}.")
     if points is not None and len(points.xyz):
-        xyz = (points.xyz @ transform[:, :3].T + transform[:, 3]) * scale * applied_scale
+        xyz = (points.xyz @ transform[:, :3].T + transform[:, 3]) * scale * capture.applied_scale
         metadata["points3D_xyz"] = torch.from_numpy(xyz.astype(np.float32))
         metadata["points3D_rgb"] = torch.from_numpy(points.rgb)
     masks = [photographs[i].mask for i in of]
     side = frame.scene_scale
     return Views(
-        image_filenames=view_names(files, lenses),
+        image_filenames=[lens.name(file) for file, lens in zip(files, lenses, strict=True)],
         cameras=pinhole_cameras([each.pinhole for each in lenses], torch.from_numpy(moved.astype(np.float32))),
-        alpha_color=alpha_color,
         scene_box=SceneBox(aabb=torch.tensor([[-side] * 3, [side] * 3], dtype=torch.float32)),
         mask_filenames=masks if any(masks) else None,  # type: ignore[arg-type]  # some may have none
-        dataparser_scale=scale * applied_scale,
-        dataparser_transform=torch.from_numpy(transform if applied is None else transform @ applied),
+        dataparser_scale=scale * capture.applied_scale,
+        dataparser_transform=torch.from_numpy(transform if capture.applied is None else transform @ capture.applied),
         metadata=metadata,
     )
 
@@ -165,14 +86,6 @@ def _split(parts: Sequence[Sequence[Lens]], poses: Pose) -> tuple[list[Lens], li
     of = [i for i, some in enumerate(parts) for _ in some]
     turns = np.stack([OPENCV_AXES @ lens.turn @ OPENCV_AXES for lens in lenses])
     return lenses, of, poses[of] @ turns
-
-
-def view_names(files: Sequence[Path], lenses: Sequence[Lens]) -> list[Path]:
-    """Name views: by their photograph, and the face of the cube where it is split."""
-    return [
-        file.with_name(f"{file.stem}-{lens.face}{file.suffix}") if lens.face else file
-        for file, lens in zip(files, lenses, strict=True)
-    ]
 
 
 def photograph_files(outputs: DataparserOutputs) -> list[Path]:
@@ -225,35 +138,6 @@ def pinhole_cameras(pinholes: Sequence[Pinhole], poses: torch.Tensor) -> Cameras
     )
 
 
-def make_lenses(photographs: Sequence[Photograph], downscale: int = 1, need_photos: bool = True) -> list[list[Lens]]:
-    """Make the lenses of each photograph, equal ones once; see `make_views`."""
-    sizes = in_threads(lambda each: image_size(each.file) if each.downscaled and need_photos else None, photographs)
-    made: dict[tuple[Any, ...], list[Lens]] = {}
-    lenses, messages = [], []
-    for photograph, size in zip(photographs, sizes, strict=True):
-        camera = photograph.camera
-        full = camera.size
-        small = full if downscale == 1 else (max(1, round(full[0] / downscale)), max(1, round(full[1] / downscale)))
-        if size is not None and max(abs(size[0] - small[0]), abs(size[1] - small[1])) > 1:
-            fail(
-                f"the image {photograph.file} has {size[0]} x {size[1]} pixels, but its camera is for {full[0]} x "
-                f"{full[1]}, of which 1/{downscale} is {small[0]} x {small[1]}. Make the folder "
-                f"{photograph.file.parent} again, or leave --downscale-factor out."
-            )
-        used = size or small
-        key = (camera, used, photograph.downscaled)
-        if key not in made:
-            stored = used if photograph.downscaled else full
-            made[key], lost = lenses_of(camera.rescaled(*used), stored, photograph.label)
-            messages += lost
-        lenses.append(made[key])
-    for message in messages[:3]:
-        say(f"{message[0].upper()}{message[1:]}")
-    if len(messages) > 3:
-        say(f"So are those of {len(messages) - 3} more cameras.")
-    return lenses
-
-
 def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
     """Give the outputs of any nerfstudio parser lenses, and the lenses' pinhole cameras in place of distorted ones."""
     if "lenses" in outputs.metadata or NO_PHOTOS in outputs.metadata:
@@ -268,7 +152,7 @@ def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
     photographs = []
     for i, file in enumerate(outputs.image_filenames):
         values = [0.0] * 6 if distortion is None else distortion[i].tolist()
-        model, coefficients = colmap_distortion(CameraType(int(cameras.camera_type[i])), values, f"of {file}")
+        model, coefficients = colmap_distortion(CameraType(int(cameras.camera_type[i])).name, values, f"of {file}")
         pinhole = [float(getattr(cameras, name)[i]) for name in ("fx", "fy", "cx", "cy")]
         size = (int(cameras.width[i]), int(cameras.height[i]))
         camera = ColmapCamera(model, *size, size if model == SPHERICAL_MODEL else (*pinhole, *coefficients))
@@ -278,7 +162,7 @@ def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
     files = outputs.image_filenames
     return dataclasses.replace(
         outputs,
-        image_filenames=view_names(files, lenses),
+        image_filenames=[lens.name(file) for file, lens in zip(files, lenses, strict=True)],
         cameras=pinhole_cameras([lens.pinhole for lens in lenses], torch.from_numpy(poses).float()),
         metadata={**outputs.metadata, "lenses": lenses, "files": files, "photographs": of},
     )

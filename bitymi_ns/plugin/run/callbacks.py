@@ -14,11 +14,11 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.nn import Parameter
 
+from bitymi_ns.capture.images import exposure_stops
 from bitymi_ns.files import explained, reason, write_file
 from bitymi_ns.plugin.console import InputError, fail, listed, say, warn
 from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.plugin.data.dataset import capture_fingerprint, warn_of_other_capture
-from bitymi_ns.plugin.data.images import exposure_stops
 from bitymi_ns.plugin.run.memory import state_training
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train import limits

@@ -14,13 +14,13 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from bitymi_ns import endings
+from bitymi_ns.capture.sfm_poses import has_kept_poses, kept_settings
 from bitymi_ns.files import explained, write_file
-from bitymi_ns.plugin.console import InputError, fail, say, warn
+from bitymi_ns.plugin.console import InputError, as_input_error, fail, say, warn
 from bitymi_ns.plugin.data.bundle_cameras import BundleCamerasConfig, has_cameras
 from bitymi_ns.plugin.data.capture_checks import check_capture
 from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
-from bitymi_ns.plugin.data.sfm_poses import has_kept_poses, kept_settings
 from bitymi_ns.plugin.run import checkpoints, run_folder
 from bitymi_ns.plugin.run.bundle_model import BakedModelConfig, find_bundle, stub_checkpoint_dir
 from bitymi_ns.plugin.run.commands import LOOPBACK, adopt_viewer, folder_being_evaluated, moved_capture, refuse_others
@@ -200,6 +200,7 @@ class BitymiTrainerConfig(TrainerConfig):
         if isinstance(datamanager.dataparser, BitymiDataParserConfig):
             datamanager.dataparser.resolve_names()
 
+    @as_input_error()
     def _take_poses_of_resumed(self) -> None:
         """Have a resumed run read the poses of the run that it goes on from; a new one finds its own."""
         checkpoints_of = self.load_dir or (None if self.load_checkpoint is None else Path(self.load_checkpoint).parent)

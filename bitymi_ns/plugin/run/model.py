@@ -13,10 +13,10 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from torch import Tensor
 from torch.nn import Parameter
 
+from bitymi_ns.capture.points import reporting_time
 from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.view_kinds import VIEW_PARAMETERS
 from bitymi_ns.plugin.console import fail, say, warn
-from bitymi_ns.plugin.data.point_files import reporting_time
 from bitymi_ns.plugin.run.callbacks import TrainingRun
 from bitymi_ns.plugin.run.checkpoints import STATE_VERSION
 from bitymi_ns.plugin.run.surfel_model import SurfelModel, SurfelModelConfig

@@ -5,10 +5,10 @@ import shutil
 from pathlib import Path
 
 from bitymi_ns import files
+from bitymi_ns.capture.colmap_views import Source
 from bitymi_ns.capture.report import FILES
+from bitymi_ns.capture.sfm_poses import write_kept_poses
 from bitymi_ns.plugin.console import InputError, fail, warn
-from bitymi_ns.plugin.data.colmap_views import Source
-from bitymi_ns.plugin.data.sfm_poses import write_kept_poses
 from bitymi_ns.trust import check_no_links
 
 LOCK = ".lock"  # name of the file that lies in a run folder while a process trains into it

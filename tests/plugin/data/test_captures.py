@@ -12,7 +12,7 @@ from PIL import Image
 from bitymi_ns.plugin.data import dataset
 from bitymi_ns.plugin.run.model import train_config_for
 from bitymi_ns.train.config import TrainConfig
-from tests.plugin.data.captures import edit, expect, images_of, load, printed
+from tests.captures import edit, expect, images_of, load, printed
 from tests.stand_in_card import CARD
 
 

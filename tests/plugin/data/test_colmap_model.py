@@ -6,8 +6,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from bitymi_ns.plugin.data.colmap_model import read_model
-from tests.plugin.data.captures import as_binary, expect, held_out, images_of, load_any, printed
+from bitymi_ns.capture.colmap_model import read_model
+from tests.captures import as_binary, expect, held_out, images_of, load_any, printed, refused
 
 
 def points(project: Path, *rows: str) -> Path:
@@ -68,7 +68,7 @@ def test_points_without_colours_get_them_of_the_photographs(
 
 def test_points_of_two_kinds(project: Path) -> None:
     folder = points(project, "0 0 0.5 200 10 10", "0.1 0 0.5")
-    with expect("points3D.txt cannot be read: .*three coordinates and three colors"):
+    with refused("points3D.txt cannot be read: .*three coordinates and three colors"):
         read_model(folder)
 
 

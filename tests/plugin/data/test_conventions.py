@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bitymi_ns.plugin.data.point_files import read_points
-from tests.plugin.data.captures import colmap_model, edit_frames, load_any, printed, write_cloud
+from bitymi_ns.capture.points import read_points
+from tests.captures import colmap_model, edit_frames, load_any, printed, write_cloud
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 Pose = np.ndarray

@@ -18,11 +18,12 @@ from nerfstudio.data.dataparsers.minimal_dataparser import MinimalDataParserConf
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
+from bitymi_ns.capture.read import OPTION_FORMATS
 from bitymi_ns.plugin import methods
 from bitymi_ns.plugin.data.capture_checks import bitymi_parser
-from bitymi_ns.plugin.data.dataparser import OPTION_FORMATS, BitymiDataParserConfig
+from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.data.views import with_lenses
-from tests.plugin.data.captures import (
+from tests.captures import (
     colmap_model,
     edit,
     edit_frames,

@@ -11,7 +11,7 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from PIL import Image
 
 from bitymi_ns.train.views import View
-from tests.plugin.data.captures import (
+from tests.captures import (
     as_binary,
     expect,
     images_of,

@@ -11,7 +11,7 @@ import yaml
 from PIL import Image
 
 from bitymi_ns.capture.types import CaptureError, SfmOptions, SfmSettings
-from tests.plugin.data.captures import expect, found_poses, load_any, load_with, printed
+from tests.captures import expect, found_poses, load_any, load_with, printed
 from tests.plugin.data.test_dataparser import parsed
 
 

@@ -15,13 +15,12 @@ import pytest
 import torch
 
 from bitymi_ns.capture.camera import ColmapCamera
+from bitymi_ns.capture.lens import lenses_of
+from bitymi_ns.capture.maps import MAPS, MapFiles, maps_beside, read_depth
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
-from bitymi_ns.plugin.data.depth_files import MAPS, MapFiles, maps_beside, read_depth
-from bitymi_ns.plugin.data.lens import lenses_of
 from bitymi_ns.sample.capture import View, first_hits, generate
 from bitymi_ns.sample.room import Room
-
-from .captures import expect, load
+from tests.captures import expect, load, refused
 
 WIDTH, HEIGHT = 64, 48
 
@@ -139,7 +138,7 @@ def test_useless_depth_is_not_used(capture, change, message, capsys) -> None:
 
 
 def test_without_points_photographs_are_compared(capture, room, capsys, monkeypatch) -> None:
-    monkeypatch.setattr("bitymi_ns.plugin.data.dataparser.initial_points", lambda *_: None)
+    monkeypatch.setattr("bitymi_ns.capture.read._Reader._points", lambda *_: None)
     manager = load(capture(points=False))
     check(manager, room[1])
     on_surface(manager, room[1])
@@ -220,22 +219,22 @@ def exr(width: int, height: int, tmp_path: Path) -> bytes:
 def test_headers_are_compared_with_the_photograph_before_numbers_are_read(tmp_path, name, data, message) -> None:
     (tmp_path / name).write_bytes(exr(data, data, tmp_path) if isinstance(data, int) else data)
     tracemalloc.start()
-    with expect(message):
+    with refused(message):
         read_depth(MapFiles(tmp_path / name), LENS)
     assert tracemalloc.get_traced_memory()[1] < 20 << 20
     tracemalloc.stop()
     np.save(tmp_path / "depth.npy", np.ones((64, 64)))
-    with expect(f"{name} cannot be read|declares"):
+    with refused(f"{name} cannot be read|declares"):
         (tmp_path / name).write_bytes(png(1 << 20, 1 << 20))
         read_depth(MapFiles(tmp_path / "depth.npy", confidence=tmp_path / name), LENS)
 
 
 @pytest.mark.parametrize("name", ["a.npy", "a.npz", "a.png", "a.exr"])
 def test_maps_that_are_no_files(tmp_path, name) -> None:
-    with expect(f"{name} cannot be read: it does not exist"):
+    with refused(f"{name} cannot be read: it does not exist"):
         read_depth(MapFiles(tmp_path / name), LENS)
     os.mkfifo(tmp_path / name)
-    with expect(f"{name} cannot be read: it is not a regular file"):
+    with refused(f"{name} cannot be read: it is not a regular file"):
         read_depth(MapFiles(tmp_path / name), LENS)
 
 

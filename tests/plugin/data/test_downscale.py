@@ -9,11 +9,11 @@ import torch
 from PIL import Image
 
 from bitymi_ns.capture.camera import ColmapCamera
+from bitymi_ns.capture.images import read_image
+from bitymi_ns.capture.lens import lenses_of
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
-from bitymi_ns.plugin.data.images import read_image
-from bitymi_ns.plugin.data.lens import lenses_of
-from tests.plugin.data.captures import expect
+from tests.captures import expect
 
 
 def load(capture: Path, longest_side: int) -> BitymiDataManager:

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from bitymi_ns.capture.images import exposure_stops
 from bitymi_ns.measure.report.page import build
 from bitymi_ns.measure.report.records import ReportError
 from bitymi_ns.plugin.console import InputError
-from bitymi_ns.plugin.data.images import exposure_stops
 from bitymi_ns.reading import open_regular
-from tests.plugin.data.captures import edit, edit_frames, expect, load_any
+from tests.captures import edit, edit_frames, expect, load_any
 from tests.plugin.data.test_scanner_views import polycam, record3d, scannet
 
 
@@ -62,7 +62,7 @@ def nerfstudio(capture: Path, place: Path) -> Path:
 
 
 def colmap(capture: Path, place: Path) -> Path:
-    from tests.plugin.data.captures import colmap_model
+    from tests.captures import colmap_model
 
     place = nerfstudio(capture, place)
     colmap_model(place, place / "sparse/0")

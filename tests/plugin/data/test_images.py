@@ -13,9 +13,10 @@ import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
+from bitymi_ns.capture.images import ImageSummary, read_image, summarize
+from bitymi_ns.capture.masks import checked_mask
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
-from bitymi_ns.plugin.data.images import ImageSummary, read_image, read_mask, summarize
-from tests.plugin.data.captures import add_masks, edit, expect, images_of, load, load_with, printed
+from tests.captures import add_masks, edit, expect, images_of, load, load_with, printed, refused
 from tests.profiles import DISPLAY_P3
 
 
@@ -64,7 +65,7 @@ def test_deep_colour_is_scaled(picture: np.ndarray, tmp_path: Path) -> None:
 def test_floats_beyond_white_are_refused(tmp_path: Path) -> None:
     for values, message in (([[0.0, 900.0]], "lie between 0 and 900"), ([[0.0, np.nan]], "lie between nan and nan")):
         Image.fromarray(np.float32(values)).save(tmp_path / "a.tiff")
-        with expect(f"a.tiff cannot be read: its values {message}.*save it with 8 or 16 bits"):
+        with refused(f"a.tiff cannot be read: its values {message}.*save it with 8 or 16 bits"):
             read_image(tmp_path / "a.tiff")
 
 
@@ -97,10 +98,10 @@ def test_masks_of_any_mode_say_the_same(tmp_path: Path) -> None:
     others = [Image.merge("LA", [grey, Image.new("L", grey.size, 255)]), Image.fromarray(np.uint16(counts * 256))]
     for i, mask in enumerate((grey, swapped, cut_out, grey.convert("1"), grey.convert("RGB"), *others)):
         mask.save(tmp_path / f"{i}.png")
-        assert np.array_equal(np.asarray(read_mask(tmp_path / f"{i}.png")), counts), mask.mode
+        assert np.array_equal(np.asarray(checked_mask(tmp_path / f"{i}.png")), counts), mask.mode
     (tmp_path / "bad.png").write_bytes(b"no picture")
-    with expect("the mask .*bad.png cannot be read"):
-        read_mask(tmp_path / "bad.png")
+    with refused("the mask .*bad.png cannot be read"):
+        checked_mask(tmp_path / "bad.png")
 
 
 def test_masks_without_a_pixel(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:

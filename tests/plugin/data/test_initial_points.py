@@ -10,12 +10,12 @@ import pytest
 from PIL import Image
 
 from bitymi_ns.capture import known_poses
+from bitymi_ns.capture.points import read_points
 from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
-from bitymi_ns.plugin.data.point_files import read_points
 from bitymi_ns.sample.capture import camera_path, render
 from bitymi_ns.sample.room import Room
-from tests.plugin.data.captures import edit, edit_frames, load_any, printed, write_cloud
+from tests.captures import edit, edit_frames, load_any, printed, write_cloud
 from tests.plugin.data.test_true_captures import ALL, blender, colmap, move
 
 SIZE = (200, 150)

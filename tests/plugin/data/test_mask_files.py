@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.plugin.data.captures import (
+from tests.captures import (
     add_masks,
     colmap_model,
     edit,
@@ -108,7 +108,7 @@ def test_a_folder_with_some_of_the_masks_or_of_something_else(
 def test_masks_are_checked_before_points_are_triangulated(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     add_masks(capture, 255)
     edit(capture, lambda meta: meta.pop("ply_file_path"))
-    monkeypatch.setattr("bitymi_ns.plugin.data.dataparser.initial_points", None)  # not reached
+    monkeypatch.setattr("bitymi_ns.capture.read._Reader._points", None)  # not reached
     mask = capture / "masks/frame_00004.png"
     for spoil, message in (
         (lambda: Image.new("L", (36, 48)).save(mask), "frame_00004.png has 36 x 48 pixels.*--use-masks False"),

@@ -12,7 +12,7 @@ from bitymi_ns.plugin.data import dataset as module
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.data.dataset import RECENT, BitymiDataset
 from bitymi_ns.sample import generate
-from tests.plugin.data.captures import edit, load_any
+from tests.captures import edit, load_any
 
 WIDTH, HEIGHT = 48, 36
 PICTURE = WIDTH * HEIGHT * 3

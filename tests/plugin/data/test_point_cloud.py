@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.plugin.data.point_files import ply_fault, read_points
+from bitymi_ns.capture.points import ply_fault, read_points
 from bitymi_ns.plugin.run.model import new_scene
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import TrainConfig
-from tests.plugin.data.captures import load, printed
+from tests.captures import load, printed
 
 HEADER = (
     "ply\nformat {}\ncomment by hand\nelement vertex {}\n"

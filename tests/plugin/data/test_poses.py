@@ -11,8 +11,8 @@ from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConf
 from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
 from scipy.spatial.transform import Rotation
 
-from bitymi_ns.plugin.data.pose_checks import check_outliers, check_point_unit, rotations
-from tests.plugin.data.captures import edit, edit_frames, expect, load, load_with, printed, write_cloud
+from bitymi_ns.capture.pose_checks import check_outliers, check_point_unit, rotations
+from tests.captures import edit, edit_frames, expect, load, load_with, printed, write_cloud
 
 
 def pose_of(frame: dict[str, Any]) -> np.ndarray:

@@ -17,7 +17,7 @@ from bitymi_ns.plugin.export.trained import world_of
 from bitymi_ns.plugin.run.run_folder import keep_poses_report
 from tests.bake.conftest import surfels
 from tests.bake.scenes import write
-from tests.plugin.data.captures import colmap_model, found_poses, images_of, load_any
+from tests.captures import colmap_model, found_poses, images_of, load_any
 
 __all__ = ["surfels"]
 

@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from bitymi_ns.plugin.data.depth_files import read_depth
-from tests.plugin.data.captures import expect, load_any, printed
+from bitymi_ns.capture.maps import read_depth
+from tests.captures import expect, load_any, printed
 
 Y_UP = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """From a world with z up to ARKit's axes."""

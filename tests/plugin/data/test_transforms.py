@@ -10,7 +10,7 @@ from PIL import Image
 
 from bitymi_ns.capture.recognise import recognise
 from bitymi_ns.plugin.console import InputError, say, warn
-from tests.plugin.data.captures import (
+from tests.captures import (
     edit,
     edit_frames,
     expect,

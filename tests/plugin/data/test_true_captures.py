@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.export.trained import world_of
-from tests.plugin.data.captures import (
+from tests.captures import (
     colmap_model,
     edit,
     edit_frames,

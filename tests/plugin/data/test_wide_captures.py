@@ -10,9 +10,9 @@ import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
-from bitymi_ns.plugin.data.cube_faces import FACES
+from bitymi_ns.capture.lens import FACES
 from bitymi_ns.plugin.data.views import photograph_files, with_lenses
-from tests.plugin.data.captures import (
+from tests.captures import (
     as_binary,
     colmap_model,
     edit,

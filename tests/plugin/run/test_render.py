@@ -19,7 +19,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.scripts import render
 from PIL import Image
 
-from bitymi_ns.capture.results import is_rendered_film, result_in
+from bitymi_ns.capture.pictures import is_rendered_film, result_in
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.run.films import write_image

@@ -6,13 +6,15 @@ import re
 import unicodedata
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
+from typing import Any
 
-from bitymi_ns.capture.pictures import PHOTOGRAPHS, passed_over
-from bitymi_ns.capture.results import result_in
-from bitymi_ns.plugin.console import fail, listed, say
-from bitymi_ns.trust import leads_inside
+from bitymi_ns.capture.camera import Photograph
+from bitymi_ns.capture.pictures import PHOTOGRAPHS, passed_over, result_in
+from bitymi_ns.capture.types import MAP_FILES, MapFiles, fail, say, warn
+from bitymi_ns.trust import leads_inside, listed
 
 Parts = tuple[str, ...]  # folders and file of a name, folded to one case and one Unicode form
 _DRIVE = re.compile(r"^[A-Za-z]:")
@@ -175,3 +177,94 @@ def renamed_message(names: Sequence[str], files: Sequence[Path], folder: Path) -
         if file.is_relative_to(folder) and not is_usual(name, file)
     ]
     return f"{len(other)} of {len(names)} photographs have other names than it says: {listed(other)}." if other else ""
+
+
+def report_files(path: Path, names: Sequence[str], files: Sequence[Path], masks: Sequence[Path | None]) -> None:
+    """Report files that have other names than stated, and those outside of the folder: results show them."""
+    other = renamed_message(names, files, path.parent)
+    if other:
+        say(f"{path}: {other}")
+    folder = os.path.normpath(path.parent)
+    pictures = dict.fromkeys(Path(os.path.normpath(file)) for file in (*files, *masks) if file is not None)
+    outside = [file for file in pictures if not file.is_relative_to(folder) and file.is_file()]
+    if outside:
+        warn(f"{path} names pictures outside of its folder, which are read there: {listed(outside)}.")
+
+
+def find_photographs(path: Path, names: Sequence[str], need_photos: bool) -> list[Path]:
+    """Find the photographs of a file; missing ones keep the stated names. Fails where a name fits more than one
+    file."""
+    folder = path.parent
+    finder = FileFinder(folder, outside=True)
+    found = finder.find_all(names)
+    if need_photos and None in found and (folder / "images").is_dir():
+        taken = set(found)
+        images = FileFinder(folder / "images").find_all(names)
+        found = [one or (other if other not in taken else None) for one, other in zip(found, images, strict=True)]
+    for i, (name, file) in enumerate(zip(names, found, strict=True)):
+        ambiguous = finder.ambiguous(name) if need_photos and file is None else []
+        if ambiguous:
+            fail(
+                f"{path}: frame {i} is of {name}, but there are {listed(ambiguous)}. Write the ending of the right one."
+            )
+    return [Path(os.path.normpath(file or folder / name)) for name, file in zip(names, found, strict=True)]
+
+
+def find_masks(
+    folder: Path, names: Sequence[str | None], photographs: Sequence[Path], need_photos: bool
+) -> list[Path | None]:
+    """Find the masks of these names, which may serve several photographs; missing ones keep the stated names."""
+    finder = FileFinder(folder, outside=True)
+    found = {name: finder.find(name) if need_photos else None for name in dict.fromkeys(names) if name is not None}
+    taken = set(photographs)
+    paths = {name: folder / name if path is None or path in taken else path for name, path in found.items()}
+    return [None if name is None else paths[name] for name in names]
+
+
+def find_maps(path: Path, frames: Sequence[dict[str, Any]], need_photos: bool) -> list[MapFiles]:
+    """Find the maps of depth and normals, with a warning on those that are missing."""
+    finder = FileFinder(path.parent, outside=True, extensions=MAP_FILES)
+    found: dict[str, list[Path | None]] = {}
+    for key in ("depth_file_path", "normal_file_path"):
+        names = [frame.get(key) for frame in frames]
+        found[key] = [None if name is None else finder.find(name) for name in names]
+        lacking = [name for name, file in zip(names, found[key], strict=True) if name is not None and file is None]
+        if lacking and need_photos:
+            warn(f"{path}: {len(lacking)} files of {key} are missing, and not used: {listed(lacking)}.")
+    return [MapFiles(depth, normal=normal) for depth, normal in zip(*found.values(), strict=True)]
+
+
+def downscaled(photographs: list[Photograph], folder: Path, downscale: int) -> list[Photograph]:
+    """Replace photographs by their downscaled copies, where there are such, in `images_2` beside `images`, under the
+    same names or, as nerfstudio's tool writes them, without folders; else they are downscaled as they are read."""
+
+    def copies(file: Path) -> list[Path]:
+        inside = file.relative_to(folder).parts if file.is_relative_to(folder) else (file.parent.name, file.name)
+        flat = folder / f"images_{downscale}" / file.name
+        if len(inside) == 1:
+            return [flat]
+        return list(dict.fromkeys((folder.joinpath(f"{inside[0]}_{downscale}", *inside[1:]), flat)))
+
+    def mask_copy(mask: Path | None) -> Path | None:
+        small = None if mask is None else folder / f"masks_{downscale}" / mask.name
+        return small if small is not None and small.is_file() else mask
+
+    found = [next((copy for copy in copies(each.file) if copy.is_file()), None) for each in photographs]
+    if not any(found):
+        return photographs
+    lacking = [copies(each.file)[0] for each, copy in zip(photographs, found, strict=True) if copy is None]
+    if lacking:
+        fail(
+            f"{len(lacking)} of {len(found)} images of the capture are missing:\n  {listed(lacking)}\nOthers have a "
+            f"copy that is {downscale} times smaller: make the missing ones, or move that folder away to have all "
+            "photographs reduced as they are read."
+        )
+    if len(set(found)) < len(set(each.file for each in photographs)):
+        twins = sorted({each.file.relative_to(folder).as_posix() for each, copy in zip(photographs, found, strict=True)
+                        if found.count(copy) > 1})  # fmt: skip
+        fail(
+            f"{listed(twins)} have the same names in different folders, but {found[0].parent} can have one of each "  # type: ignore[union-attr]
+            "alone. Use the photographs as they are (`bitymi-data --downscale-factor 1`), or give them different names."
+        )
+    return [replace(each, file=copy, mask=mask_copy(each.mask), downscaled=True)
+            for each, copy in zip(photographs, found, strict=True) if copy is not None]  # fmt: skip

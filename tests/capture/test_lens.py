@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from bitymi_ns.capture.camera import ColmapCamera
-from bitymi_ns.plugin.data.images import read_image
-from bitymi_ns.plugin.data.lens import MAX_VIEW_ANGLE, Lens, lenses_of
-from tests.plugin.data.captures import expect, printed
+from bitymi_ns.capture.images import read_image
+from bitymi_ns.capture.lens import MAX_VIEW_ANGLE, Lens, lenses_of
+from tests.captures import refused
 
 SIZE = (96, 72)
 RADIAL = ColmapCamera("SIMPLE_RADIAL", *SIZE, (80.0, 48.0, 36.0, 0.1))
@@ -106,9 +106,9 @@ def test_larger_photographs_are_averaged_down() -> None:
 def test_a_photograph_of_another_size_is_named(tmp_path: Path) -> None:
     (one, *_), _ = lenses_of(RADIAL, SIZE, "camera 1")
     Image.new("RGB", (10, 20)).save(tmp_path / "b.png")
-    with expect("b.png has 10 x 20 pixels, but its camera is for 96 x 72"):
+    with refused("b.png has 10 x 20 pixels, but its camera is for 96 x 72"):
         read_image(tmp_path / "b.png", one.stored, one.camera.size)
-    with expect("m.png has 10 x 20 pixels, but its camera is for 96 x 72"):
+    with refused("m.png has 10 x 20 pixels, but its camera is for 96 x 72"):
         one.undistort_mask(Image.new("1", (10, 20)), Path("m.png"))
 
 
@@ -124,10 +124,10 @@ def test_a_photograph_of_another_size_is_named(tmp_path: Path) -> None:
     ],
 )
 def test_cameras_that_cannot_be_used(model: str, params: tuple[float, ...], message: str) -> None:
-    with expect(message):
+    with refused(message):
         lenses_of(ColmapCamera(model, *SIZE, params), SIZE, "camera 1")
 
 
-def test_little_that_is_left_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+def test_little_that_is_left_is_said(reported: list[str]) -> None:
     lenses_of(RADIAL._replace(params=(80.0, 48.0, 36.0, -6.0)), SIZE, "camera 1")
-    assert "of camera 1. The lens distortion may be wrong" in printed(capsys)
+    assert "of camera 1. The lens distortion may be wrong" in reported[0]

@@ -1,11 +1,17 @@
 """Checks of poses: rotations (or mirrored ones), positions that belong together, and points in their unit."""
 
+import os
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from bitymi_ns.plugin.console import fail, listed, warn
+from bitymi_ns.capture.camera import Photograph
+from bitymi_ns.capture.types import FrameOptions, fail, say, warn
+from bitymi_ns.trust import listed
 
 EXACT = 1e-3  # matrices this close to a rotation are taken as they are: float32, or four written digits
 ROUNDED = 2e-2  # matrices this close to a rotation, up to a common factor, are meant to be one: two written digits
@@ -14,6 +20,9 @@ TOO_FAR = 1000.0  # relative distance beside which the other cameras shrink to o
 FAR_FROM_ORIGIN = 100.0  # distance from the origin relative to that from their middle at which float32 blurs cameras
 OTHER_UNIT = 150.0
 """Distance of points relative to that between cameras, or their extent as a part of the picture, in another unit."""
+USUAL_SPREAD, MAX_SPREAD = 2.5, 25.0
+"""Median distance of cameras from their middle, in half sides of the scene box: of NeRF-Synthetic, and from which on a
+capture is taken to be in another unit."""
 
 
 def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source: str) -> npt.NDArray[np.float64]:
@@ -24,7 +33,7 @@ def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source
     messages.
 
     Raises:
-        InputError: a matrix is not finite, zero or sheared.
+        CaptureError: a matrix is not finite, zero or sheared.
     """
     result = matrices.copy()
     finite = np.isfinite(matrices).all((1, 2))
@@ -63,6 +72,56 @@ def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source
             f"{listed([names[i] for i in only_rounded.nonzero()[0]])}. The nearest ones are used."
         )
     return result
+
+
+def correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
+    """Fail at matrices that are no poses; recover rotations, see `rotations`. Frames are those of a
+    transforms.json, which are changed."""
+    names = [frame["file_path"] for frame in frames]
+    poses = []
+    for frame, name in zip(frames, names, strict=True):
+        pose = as_matrix(frame["transform_matrix"])
+        if pose is None:
+            fail(
+                f"{path}: the transform_matrix of {name} is not a matrix of 4 x 4 finite numbers. "
+                "Correct it or remove the frame."
+            )
+        if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
+            row = " ".join(f"{x:g}" for x in pose[3])
+            fail(
+                f"{path}: the last row of the transform_matrix of {name} is {row}, not 0 0 0 1. A matrix whose "
+                "position stands in its last row has to be transposed."
+            )
+        poses.append(pose)
+    matrices = np.stack(poses)
+    matrices[:, :3, :3] = rotations(matrices[:, :3, :3], names, str(path))
+    for frame, pose in zip(frames, matrices, strict=True):
+        frame["transform_matrix"] = pose.tolist()
+
+
+def check_repeated(path: Path, frames: list[dict[str, Any]]) -> None:
+    """Fail where one photograph has two poses."""
+    first: dict[str, int] = {}
+    for i, frame in enumerate(frames):
+        name = os.path.normpath(frame["file_path"])
+        before = first.setdefault(name, i)
+        poses = [np.asarray(frames[j]["transform_matrix"]) for j in (before, i)]
+        if before != i and not np.allclose(*poses, rtol=1e-5, atol=1e-5):
+            fail(
+                f"{path}: frames {before} and {i} (counted from 0) are both of {name}, but with different poses. "
+                "Correct the name of one of them or remove it."
+            )
+
+
+def as_matrix(value: Any) -> np.ndarray | None:
+    """Convert 3 x 4 or 4 x 4 finite numbers to [4, 4]; None for anything else."""
+    try:
+        matrix = np.asarray(value, dtype=np.float64)
+    except (ValueError, TypeError, OverflowError):
+        return None
+    if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
+        return None
+    return matrix if len(matrix) == 4 else np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
 
 
 def warn_of_mirrored(rotations: npt.NDArray[np.float64], names: Sequence[object]) -> None:
@@ -110,6 +169,24 @@ def far_from_origin(centers: npt.NDArray[np.float64]) -> bool:
     middle = centers.mean(0)
     spread = np.linalg.norm(centers - middle, axis=1).max()
     return bool(0.0 < FAR_FROM_ORIGIN * spread < np.linalg.norm(middle))
+
+
+def fit_scale(frame: FrameOptions, photographs: Sequence[Photograph], source: str) -> FrameOptions:
+    """Reduce the scale of a capture whose cameras lie far outside of the scene box: in millimetres they would, and
+    random points would all fall on one spot of the pictures. `frame` is the format's default, without
+    auto_scale_poses."""
+    centers = np.stack([photograph.pose[:3, 3] for photograph in photographs])
+    spread = float(np.median(np.linalg.norm(centers - centers.mean(0), axis=1)))
+    ratio = spread * frame.scale_factor / frame.scene_scale
+    if ratio <= MAX_SPREAD:
+        return frame
+    scale = frame.scale_factor * USUAL_SPREAD / ratio
+    say(
+        f"The cameras of {source} lie {spread:,.4g} units from their middle, where those of this format usually lie "
+        f"{USUAL_SPREAD * frame.scene_scale / frame.scale_factor:.2g}: the capture is scaled by {scale:.3g}. Bundles "
+        "state that."
+    )
+    return replace(frame, scale_factor=scale)
 
 
 def check_point_unit(

@@ -8,8 +8,7 @@ import pytest
 from PIL import Image
 
 from bitymi_ns.capture.camera import ColmapCamera
-from bitymi_ns.plugin.data.cube_faces import FACES
-from bitymi_ns.plugin.data.lens import Lens, lenses_of
+from bitymi_ns.capture.lens import FACES, Lens, lenses_of
 
 PANORAMA = ColmapCamera("EQUIRECTANGULAR", 256, 128, (256.0, 128.0))
 RADIUS = 100.0

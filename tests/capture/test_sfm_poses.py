@@ -6,10 +6,9 @@ from typing import Any
 import pytest
 from PIL import Image
 
+from bitymi_ns.capture import sfm_poses
 from bitymi_ns.capture.recognise import recognise
 from bitymi_ns.capture.types import CaptureError, SfmSettings
-from bitymi_ns.plugin.console import InputError
-from bitymi_ns.plugin.data import sfm_poses
 
 
 @pytest.mark.parametrize(
@@ -41,6 +40,6 @@ def test_poses_are_found_with_the_masks_of_the_training(
         (tmp_path / folder).mkdir(parents=True, exist_ok=True)
     Image.new("RGB", (8, 6)).save(tmp_path / photographs / "a.png")
     found = recognise(tmp_path / data, "photographs")
-    with pytest.raises(InputError, match="not now"):
+    with pytest.raises(CaptureError, match="not now"):
         sfm_poses.find_sfm_source(found, given, 1, SfmSettings())
     assert asked == [None if masks is None else tmp_path / masks]

@@ -7,19 +7,16 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from nerfstudio.data.utils.colmap_parsing_utils import qvec2rotmat
+import pycolmap
 
-from bitymi_ns.capture.masks import USUAL_FOLDERS, downscaled_masks, mask_folder
-from bitymi_ns.capture.pictures import is_photograph, photographs_below
-from bitymi_ns.capture.results import result_in
-from bitymi_ns.capture.types import CaptureError, SfmSettings
-from bitymi_ns.plugin.console import fail, listed, say, warn
-from bitymi_ns.plugin.data.colmap_model import Model, ModelImage, read_model
-from bitymi_ns.plugin.data.find_files import FileFinder, renamed_message
-from bitymi_ns.plugin.data.mask_files import LEAVE_OUT, masks_named
-from bitymi_ns.plugin.data.point_files import Points
-from bitymi_ns.plugin.data.views import OPENCV_AXES, Photograph, Pose
-from bitymi_ns.trust import leads_inside
+from bitymi_ns.capture.camera import OPENCV_AXES, Photograph, Pose
+from bitymi_ns.capture.colmap_model import Model, ModelImage, read_model
+from bitymi_ns.capture.find_files import FileFinder, renamed_message
+from bitymi_ns.capture.masks import LEAVE_OUT, USUAL_FOLDERS, downscaled_masks, mask_folder, masks_named
+from bitymi_ns.capture.pictures import is_photograph, photographs_below, result_in
+from bitymi_ns.capture.points import Points
+from bitymi_ns.capture.types import CaptureError, SfmSettings, fail, say, warn
+from bitymi_ns.trust import leads_inside, listed
 
 TO_NERFSTUDIO = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """[4, 4] COLMAP's world, in which up is about -y, to nerfstudio's with z up; nerfstudio's parser does the same."""
@@ -99,7 +96,7 @@ def find_source(
         downscale: use photographs that are smaller by this factor.
 
     Raises:
-        InputError: no folder has the model's photographs, or the masks are incomplete.
+        CaptureError: no folder has the model's photographs, or the masks are incomplete.
     """
     names = [image.name for image in read_model(folder).images]
     photographs = _photo_folder(names, folder, capture, images_path, downscale, need_photos)
@@ -178,7 +175,7 @@ def find_masks(photographs: Path, capture: Path, stated: Path | None, downscale:
     """Find the folder of masks, or the stated one relative to the capture; see `mask_folder`.
 
     Raises:
-        InputError: the stated one does not exist.
+        CaptureError: the stated one does not exist.
     """
     try:
         return mask_folder(photographs, capture, None if stated is None else capture / stated, downscale)
@@ -190,7 +187,7 @@ def mask_files(source: Source) -> list[Path] | None:
     """Find the masks of the model's images, by the names of the photographs; None without masks.
 
     Raises:
-        InputError: some photographs have a mask, and others none.
+        CaptureError: some photographs have a mask, and others none.
     """
     if source.masks is None:
         return None
@@ -246,7 +243,8 @@ def model_points(model: Model, frame: Pose) -> Points:
 
 def _camera_to_world(image: ModelImage) -> Pose:
     """[4, 4] camera to world in nerfstudio's camera axes (x right, y up, z backward)."""
-    rotation = qvec2rotmat(image.qvec / np.linalg.norm(image.qvec))
+    w, *xyz = image.qvec / np.linalg.norm(image.qvec)
+    rotation = pycolmap.Rotation3d(np.array([*xyz, w])).matrix()
     c2w = np.eye(4)
     c2w[:3, :3], c2w[:3, 3] = rotation.T, -rotation.T @ image.tvec
     return c2w @ OPENCV_AXES

@@ -1,7 +1,7 @@
 """COLMAP models on disk: cameras, poses and points in COLMAP's frame, checked by file and entry.
 
 pycolmap's reader accepts truncated files, ends photograph names in text files at the first space, and reads no model
-without points. So files are parsed here; camera models and their geometry are pycolmap's (`plugin/data/lens.py`).
+without points. So files are parsed here; camera models and their geometry are pycolmap's (`capture/lens.py`).
 """
 
 import functools
@@ -18,11 +18,12 @@ import numpy.typing as npt
 import pycolmap
 
 from bitymi_ns.capture.camera import ColmapCamera
+from bitymi_ns.capture.points import color_bytes, ply_fault, read_points
 from bitymi_ns.capture.recognise import image_count
-from bitymi_ns.plugin.console import fail, listed, warn
-from bitymi_ns.plugin.data.point_files import color_bytes, ply_fault, read_points
-from bitymi_ns.plugin.data.transforms import MAX_SIDE
-from bitymi_ns.reading import open_text, read_bytes, reading
+from bitymi_ns.capture.transforms import MAX_SIDE
+from bitymi_ns.capture.types import fail, parsing, warn
+from bitymi_ns.reading import open_text, read_bytes
+from bitymi_ns.trust import listed
 
 FORMS = (".txt", ".bin")
 MOST_MODEL = 1 << 36  # bytes of a file of a model; 100 million points take a twentieth of it
@@ -56,7 +57,7 @@ def read_model(folder: Path) -> Model:
     where they differ. The last model is cached, as several commands of a run ask for it.
 
     Raises:
-        InputError: it cannot be used; names file and entry.
+        CaptureError: it cannot be used; names file and entry.
     """
     names = [f"{name}{form}" for name in ("cameras", "images", "frames", "points3D") for form in FORMS]
     files = [*(folder / name for name in names), folder / "points3D.ply"]
@@ -142,7 +143,7 @@ def _naming_file(path: Path) -> Iterator[None]:
         fail(f"the COLMAP model lacks {path}. Copy the whole model: cameras, images and points3D.")
     hint = "It is cut off or damaged. " * (path.suffix == ".bin")
     hint += "Each image has two lines; the second, of its 2D points, may be empty. " * (path.name == "images.txt")
-    with reading(path, fail, f"{hint}Copy the model again, or export it from COLMAP again."):
+    with parsing(path, f"{hint}Copy the model again, or export it from COLMAP again."):
         yield
 
 

@@ -1,29 +1,33 @@
-"""Initial points of training: those of the capture, triangulated ones, or random ones; colored by the photographs where
-they have no colors, and projected into these to detect poses in another convention."""
+"""Point clouds: PLY files validated and read, colored by photographs where they have no colors, and projected into
+these to detect poses in another convention.
 
+The PLY reader that nerfstudio uses returns uninitialized memory for points that the file lacks, and divides every color
+by 255, also those in [0, 1].
+"""
+
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from contextvars import ContextVar
 from dataclasses import replace
+from functools import lru_cache
+from itertools import islice
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from bitymi_ns.capture.types import CaptureError
-from bitymi_ns.plugin.console import fail, say, warn
-from bitymi_ns.plugin.data.colmap_model import read_model
-from bitymi_ns.plugin.data.images import image_size, read_image
-from bitymi_ns.plugin.data.point_files import Points, ply_fault, read_points
-from bitymi_ns.plugin.data.views import OPENCV_AXES, Photograph, Pose
-from bitymi_ns.ply import PlyError
-from bitymi_ns.train.views import spread
+from bitymi_ns.capture.camera import OPENCV_AXES, Photograph, Pose
+from bitymi_ns.capture.images import read_image
+from bitymi_ns.capture.types import fail, say, warn
+from bitymi_ns.ply import PlyError, read_header, read_rows, rows_there, text_lines
+from bitymi_ns.ranges import spread
 
-Choice = Literal["auto", "triangulate", "random"]
-"""auto = those of the capture, triangulated ones where it has none; triangulate = in any case; random = in any case."""
-MIRROR = np.diag([1.0, 1.0, -1.0])
+VERTEX = "vertex"
+COLOR_NAMES = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+"""Property names by which programs write colors."""
+MANY_POINTS = 500_000  # number of points from which on slow steps are announced and timed
 COLOR_VIEWS = 24  # photographs, spread over all, in which colors are looked up
 COLOR_CHUNK = 100_000  # points that are colored together
 GREY = 128
@@ -40,86 +44,137 @@ ALIKE = 0.4
 """With a correlation so much higher, poses are the right ones however few points they show: a room has points on all
 sides."""
 
-_wanted: ContextVar[bool] = ContextVar("points_wanted", default=False)
+
+class Points(NamedTuple):
+    """Initial points: positions [N, 3] float64, and colors [N, 3] uint8, or [0, 3] where they have none."""
+
+    xyz: npt.NDArray[np.float64]
+    rgb: npt.NDArray[np.uint8]
+
+
+def read_points(path: Path) -> tuple[Points, str]:
+    """Read the points of a file in which `ply_fault` finds no fault.
+
+    Returns:
+        the points, and why they have no colors, in words that follow "points: "; empty where they have.
+
+    Raises:
+        PlyError: its points have lists, or stand behind some.
+    """
+    header = read_header(path)
+    rows = read_rows(path, header, VERTEX)
+    xyz = np.stack([rows[name] for name in "xyz"], -1).astype(np.float64)
+    names = next((names for names in COLOR_NAMES if set(names) <= set(header.elements[VERTEX].names)), None)
+    if names is None:
+        return Points(xyz, np.zeros((0, 3), np.uint8)), "its points have none"
+    values = np.stack([rows[name] for name in names], -1)
+    if values.dtype == np.uint8:
+        return Points(xyz, values), ""
+    rgb, without = color_bytes(values.astype(np.float64), values.dtype.kind == "f")
+    return Points(xyz, rgb), without
+
+
+def color_bytes(values: npt.NDArray[np.float64], floating: bool) -> tuple[npt.NDArray[np.uint8], str]:
+    """Convert colors [N, 3] to bytes by the smallest white (1, 255 or 65535) that bounds them, or to none [0, 3] and
+    why that cannot be done. `floating`: white may be 1."""
+    none = np.zeros((0, 3), np.uint8)
+    if not len(values):
+        return none, ""
+    values[~np.isfinite(values)] = 0.0
+    low, high = values.min(), values.max()
+    white = next((white for white in ((1.0, 255.0) if floating else (255.0, 65535.0)) if high <= white), None)
+    if white is None or low < 0.0:
+        return none, f"its colors lie between {low:g} and {high:g}, which is neither 0 to 1 nor 0 to 255 nor 0 to 65535"
+    return np.uint8(values * (255.0 / white) + 0.5), ""
+
+
+def ply_fault(path: Path) -> str | None:
+    """Describe why the file is no complete PLY file of points, in words that follow its name; None = it is one."""
+    try:
+        header = read_header(path)
+        points = header.elements.get(VERTEX)
+        if points is None:
+            return f"declares no points (element {VERTEX})"
+        missing = [name for name in "xyz" if name not in points.names]
+        if missing:
+            return f"gives no {' and no '.join(missing)} of its points (property float {missing[0]})"
+        there = rows_there(path, header, VERTEX)
+        if there is not None and there < points.count:
+            return f"is cut off: it has {there} of {points.count} points"
+        line = _bad_line(path, path.stat().st_mtime_ns)
+    except PlyError as error:
+        return f"is {error}" if str(error).startswith("not ") else f"is damaged, no points can be read: {error}"
+    except OSError as error:
+        return f"cannot be read: {error}"
+    return None if line is None else f"is damaged: {line}"
+
+
+@lru_cache(maxsize=2)  # a capture is checked twice before it is read, which takes seconds for large clouds
+def _bad_line(path: Path, changed: int) -> str | None:
+    """Find the first line of a text file that is no point; None = none."""
+    header = read_header(path)
+    points = header.elements[VERTEX]
+    if header.order or points.row is None or not points.count:
+        return None
+    try:
+        values = read_rows(path, header, VERTEX)
+        if not any(np.isinf(values[name]).any() for name in points.names):
+            return None
+    except PlyError:
+        pass
+    types = [points.row[name] for name in points.names]
+    for number, line in islice(text_lines(path, header, VERTEX), points.count):
+        words = line.split()
+        if len(words) != len(types):
+            return f"line {number} has {len(words)} numbers, but its points have {len(types)}"
+        for word, name, kind in zip(words, points.names, types, strict=True):
+            if not _fits(word, kind):
+                return f"line {number} has {word[:30]!r} for {name}, which is no number of that kind ({kind.name})"
+    return None
+
+
+def _fits(word: str, kind: np.dtype) -> bool:
+    try:
+        if kind.kind == "f":
+            return not abs(float(word)) > float(np.finfo(kind).max)
+        return np.iinfo(kind).min <= int(word) <= np.iinfo(kind).max
+    except ValueError:
+        return False
 
 
 @contextmanager
-def reading_points(wanted: bool) -> Iterator[None]:
-    """Read captures for a scene that starts from points, if `wanted`. Evaluation and the viewer spend no time on
-    them."""
-    token = _wanted.set(wanted)
-    try:
+def reporting_time(what: str, points: int) -> Iterator[None]:
+    """Announce a step on many points, and report the time that it took."""
+    if points < MANY_POINTS:
         yield
-    finally:
-        _wanted.reset(token)
+        return
+    say(f"{what} {points:,} points. This may take minutes.")
+    start = time.perf_counter()
+    yield
+    say(f"{what} {points:,} points took {time.perf_counter() - start:.1f} s.")
 
 
-def points_wanted() -> bool:
-    """True if the capture is read for a scene that starts from points."""
-    return _wanted.get()
+def read_cloud(path: Path, without: str) -> tuple[Points, str]:
+    """Read the points of a PLY file, see `read_points`; `without` says how to do without it.
 
-
-def initial_points(
-    own: Points | None, choice: Choice, photographs: Sequence[Photograph], folder: Path, source: str
-) -> Points | None:
-    """Choose the points to start from: the capture's `own`, or triangulated ones, which are kept in its `folder`; None
-    = random ones. `source` of the poses is for messages."""
-    if choice == "random":
-        return None
-    if own is not None and len(own.xyz) and choice == "auto":
-        return own
-    return triangulated(photographs, folder, source) if points_wanted() else None
-
-
-def triangulated(photographs: Sequence[Photograph], folder: Path, source: str) -> Points | None:
-    """Triangulate points from photographs with poses; None (with a warning) where that is not possible."""
-    from bitymi_ns.capture.known_poses import KnownView, triangulate  # slow to import, and seldom needed
-    from bitymi_ns.progress import rich_progress
-
-    middle = np.mean([photograph.pose[:3, 3] for photograph in photographs], axis=0)
-    mirrored = [bool(np.linalg.det(photograph.pose[:3, :3]) < 0.0) for photograph in photographs]
-    mirror = MIRROR if all(mirrored) else np.eye(3)  # the photographs of a mirrored capture are not mirrored
-    views = []
-    for photograph in photographs:
-        camera = photograph.camera
-        stored = (photograph.downscaled and image_size(photograph.file)) or camera.size
-        c2w = photograph.pose @ OPENCV_AXES
-        rotation = (mirror @ c2w[:3, :3]).T
-        translation = -rotation @ mirror @ (c2w[:3, 3] - middle)
-        pose = np.column_stack([rotation, translation])
-        views.append(KnownView(photograph.file, camera.rescaled(*stored), pose, photograph.mask))
-    say(f"{source} has no points: they are triangulated from the photographs, once. --points random does without.")
-    try:
-        if any(mirrored) and not all(mirrored):
-            raise CaptureError("some poses are mirrored against the others")
-        with rich_progress() as progress:
-            model = read_model(triangulate(folder, views, progress, warn))
-    except CaptureError as error:
-        warn(f"No points can be triangulated: {error}. Training starts from random points.")
-        return None
-    say(f"{len(model.xyz):,} points have been triangulated; they are kept for later runs.")
-    return Points(model.xyz @ mirror + middle, model.rgb)
-
-
-def read_colored_points(path: Path, without: str, photographs: Sequence[Photograph]) -> Points:
-    """Read the points of a PLY file, with colors from the photographs where it has none; see `with_colors`. `without`
-    says how to do without it."""
+    Raises:
+        CaptureError: it is missing, or cannot be read.
+    """
     fault = ply_fault(path) if path.is_file() else "does not exist"
     if fault is not None:
         fail(f"the point cloud {path} {fault}. Put it there again, or {without} to start from random points.")
     try:
-        points, without_colors = read_points(path)
+        return read_points(path)
     except PlyError as error:
         fail(f"the point cloud {path} cannot be read: {error}. Write its points without lists.", error)
-    return with_colors(points, without_colors, photographs, path)
 
 
 def with_colors(points: Points, without: str, photographs: Sequence[Photograph], source: Path) -> Points:
-    """Color points in the frame of the photographs that have no colors, for the reason `without`, by `color_points`,
-    where a scene starts from them."""
+    """Color points in the frame of the photographs that have no colors, for the reason `without`; see
+    `color_points`."""
     if not without and not points.rgb.any():
         without = "its own are all black"
-    if not without or not len(points.xyz) or not points_wanted():
+    if not without or not len(points.xyz):
         return points
     say(f"The points of {source} get the colors of the photographs that see them: {without}.")
     return color_points(points, photographs)

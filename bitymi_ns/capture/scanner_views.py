@@ -10,21 +10,20 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from bitymi_ns.capture.camera import ColmapCamera
+from bitymi_ns.capture.camera import OPENCV_AXES, ColmapCamera, Photograph
+from bitymi_ns.capture.find_files import check_photographs_exist
+from bitymi_ns.capture.images import image_size
+from bitymi_ns.capture.maps import MapFiles, maps_beside, maps_called
 from bitymi_ns.capture.masks import in_proportion
 from bitymi_ns.capture.photos import natural
 from bitymi_ns.capture.pictures import is_photograph
+from bitymi_ns.capture.pose_checks import rotations
 from bitymi_ns.capture.recognise import POLYCAM, STRAY, Found
-from bitymi_ns.capture.types import CaptureError
-from bitymi_ns.plugin.console import fail, listed, warn
-from bitymi_ns.plugin.data.depth_files import MapFiles, maps_beside, maps_called
-from bitymi_ns.plugin.data.find_files import check_photographs_exist
-from bitymi_ns.plugin.data.images import image_size
-from bitymi_ns.plugin.data.pose_checks import rotations
-from bitymi_ns.plugin.data.transforms import MAX_SIDE
-from bitymi_ns.plugin.data.views import OPENCV_AXES, Photograph
+from bitymi_ns.capture.transforms import MAX_SIDE
+from bitymi_ns.capture.types import fail, parsing, warn
 from bitymi_ns.progress import rich_progress
-from bitymi_ns.reading import read_json, read_text, reading
+from bitymi_ns.reading import read_json, read_text
+from bitymi_ns.trust import listed
 
 
 class Row(NamedTuple):
@@ -47,7 +46,7 @@ def scanner_photographs(found: Found, need_photos: bool) -> list[Photograph]:
     """Read the photographs of a scanning program or RGB-D set, with cameras and poses, in the order of their names.
 
     Raises:
-        InputError: a file is damaged, or photographs that are needed are missing.
+        CaptureError: a file is damaged, or photographs that are needed are missing.
     """
     readers: dict[str, Callable[[Path], list[Row]]] = {
         "polycam": _polycam, "record3d": _record3d, "pose-files": _pose_files,
@@ -87,7 +86,7 @@ def _polycam(folder: Path) -> list[Row]:
     images, cameras = next((keyframes / i, keyframes / c) for i, c in POLYCAM if (keyframes / c).is_dir())
     rows: list[Row] = []
     for path in sorted(cameras.glob("*.json"), key=lambda path: natural(path.name)):
-        with reading(path, fail, AGAIN):
+        with parsing(path, AGAIN):
             values = read_json(path)
             pose = np.eye(4)
             pose[:3] = [[float(values[f"t_{i}{j}"]) for j in range(4)] for i in range(3)]
@@ -105,7 +104,7 @@ def _record3d(folder: Path) -> list[Row]:
     from scipy.spatial.transform import Rotation  # slow to import
 
     path = folder / "metadata" if (folder / "metadata").is_file() else folder / "metadata.json"
-    with reading(path, fail, AGAIN):
+    with parsing(path, AGAIN):
         values = read_json(path)
         K, size = [float(x) for x in values["K"]], (int(values["w"]), int(values["h"]))
         camera = (K[0], K[4], K[6], K[7])
@@ -115,7 +114,7 @@ def _record3d(folder: Path) -> list[Row]:
     files = {file.stem: file for file in images.iterdir() if is_photograph(file)}
     rows: list[Row] = []
     for i, each in enumerate(poses):
-        with reading(f"{path}: pose {i} (counted from 0)", fail, AGAIN):
+        with parsing(f"{path}: pose {i} (counted from 0)", AGAIN):
             *quaternion, x, y, z = _numbers(each, 7)
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = Rotation.from_quat(quaternion).as_matrix(), (x, y, z)
@@ -133,7 +132,7 @@ def _scanner_app(folder: Path) -> list[Row]:
         picture = next((file for file in folder.glob(f"{path.stem}.*") if is_photograph(file)), None)
         if picture is None:
             continue
-        with reading(path, fail, AGAIN):
+        with parsing(path, AGAIN):
             values = read_json(path)
             pose = np.array(_numbers(values["cameraPoseARFrame"], 16)).reshape(4, 4)
             fx, _, cx, _, fy, cy, *_ = _numbers(values["intrinsics"], 9)
@@ -152,24 +151,21 @@ def _stray_scanner(folder: Path) -> list[Row]:
     from bitymi_ns.capture.video import frames_with_poses
 
     odometry, matrix, video = (folder / name for name in STRAY)
-    with reading(matrix, fail, AGAIN):
+    with parsing(matrix, AGAIN):
         K = np.loadtxt(StringIO(read_text(matrix, MOST_POSE)), delimiter=",").reshape(3, 3)
-    with reading(odometry, fail, AGAIN):
+    with parsing(odometry, AGAIN):
         poses = [
             {str(name).strip(): value for name, value in line.items()}
             for line in csv.DictReader(StringIO(read_text(odometry)))
         ]
-    try:
-        with rich_progress() as progress:
-            images = frames_with_poses(video, len(poses), progress, warn)
-    except CaptureError as error:
-        fail(str(error), error)
+    with rich_progress() as progress:
+        images = frames_with_poses(video, len(poses), progress, warn)
     rows = []
     for file in sorted(images.iterdir()):
         number = int(file.stem.removeprefix("frame_"))
         if number >= len(poses):  # the app ended while it wrote
             continue
-        with reading(f"{odometry}: pose {number} (counted from 0)", fail, AGAIN):
+        with parsing(f"{odometry}: pose {number} (counted from 0)", AGAIN):
             x, y, z, *quaternion = (float(poses[number][name]) for name in ("x", "y", "z", "qx", "qy", "qz", "qw"))
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = Rotation.from_quat(quaternion).as_matrix(), (x, y, z)
@@ -192,7 +188,7 @@ def _pose_files(folder: Path) -> list[Row]:
         name = path.stem.removesuffix(".pose")
         if name not in files:
             continue
-        with reading(path, fail, AGAIN):
+        with parsing(path, AGAIN):
             pose = np.loadtxt(StringIO(read_text(path, MOST_POSE))).reshape(4, 4)
         if not np.isfinite(pose).all():
             lost.append(name)
@@ -213,7 +209,7 @@ def _intrinsics(folder: Path) -> tuple[float, ...]:
             f"{folder} has poses, but no file with the camera ({', '.join(names[:4])}). Put one there with the matrix "
             "fx 0 cx, 0 fy cy, 0 0 1, a row on each line; or compute the poses: `bitymi-data --format photographs`."
         )
-    with reading(path, fail, AGAIN):
+    with parsing(path, AGAIN):
         values = np.loadtxt(StringIO(read_text(path, MOST_POSE)))
         if values.ndim == 2 and min(values.shape) >= 3:
             return float(values[0, 0]), float(values[1, 1]), float(values[0, 2]), float(values[1, 2])

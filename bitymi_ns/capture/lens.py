@@ -13,14 +13,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import pycolmap
-from nerfstudio.cameras.cameras import CameraType
 from PIL import Image
 
-from bitymi_ns.capture.camera import SPHERICAL_MODEL, ColmapCamera, is_full_sphere
-from bitymi_ns.capture.masks import in_proportion
-from bitymi_ns.plugin.console import fail, warn
-from bitymi_ns.plugin.data.cube_faces import FACES, covered, resample, windows
-from bitymi_ns.plugin.data.images import wrong_size
+from bitymi_ns.capture.camera import ColmapCamera, Photograph, is_full_sphere
+from bitymi_ns.capture.images import image_size, in_proportion, in_threads, wrong_size
+from bitymi_ns.capture.types import fail, say, warn
 
 MAX_VIEW_ANGLE = 110.0
 """Largest horizontal and vertical view angle of a pinhole picture, degrees. Wider pictures spend ever more pixels on
@@ -28,9 +25,32 @@ ever less of the photograph: wider cameras become faces of a cube."""
 NODE_STEP = 4
 """Pixels between the nodes at which the distortion is evaluated; linear interpolation between them is accurate to far
 less than a pixel."""
-RADIAL_SAMPLES = 32  # samples of each ray that is tested for folding
 EDGE_SAMPLES = 64
 """Rays per picture edge for testing what the photograph shows."""
+FACES: dict[str, tuple[tuple[float, float, float], ...]] = {
+    "front": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    "right": ((0.0, 0.0, -1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)),
+    "back": ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0)),
+    "left": ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)),
+    "up": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
+    "down": ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
+}
+"""Right, down and forward of each face in the axes of the whole camera (OpenCV); a face is 90 degrees wide and high."""
+MAX_ANGLE = math.radians(89.9)
+"""Largest angle to the axis; COLMAP's fisheye models end before 90 degrees."""
+NODES = 361
+"""Rays along a side of a face at which coverage is tested."""
+LEAST_SHARE = 0.05
+"""A face of which less is covered is left out: it would be a view as any other, for a strip at the edge."""
+ANGLES, AZIMUTHS = 360, 64
+"""Rays for testing where the distortion folds the picture."""
+SAMPLES = 2
+"""Samples of the photograph along and across a pixel of a face: where a photograph is denser than the face, as
+equirectangular ones at the poles, one sample would alias."""
+BAND = 256
+"""Rows of a face that are resampled together."""
+PAD = 2
+"""Columns of the other edge that continue a picture of all directions."""
 CACHED_MAPS = 4
 """Lenses whose remapping tables are cached; 72 MB for 12 megapixels."""
 DOUBTFUL_AREA, ABSURD_AREA = 0.25, 0.05
@@ -99,6 +119,10 @@ class Lens:
             return np.ones((self.pinhole.height, self.pinhole.width), bool)
         return covered(self.camera, self.face, self.pinhole.rays)
 
+    def name(self, photograph: Path) -> Path:
+        """Name the view of a photograph: by it, and by the face of the cube where it is split."""
+        return photograph.with_stem(f"{photograph.stem}-{self.face}") if self.face else photograph
+
     def undistort(self, image: Image.Image) -> Image.Image:
         """Undistort an 8-bit image of any mode, decoded at `stored` or less, but not below the size of `camera`."""
         if image.size != self.camera.size:
@@ -153,7 +177,7 @@ def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tupl
         the lenses, and messages on what becomes of the photographs.
 
     Raises:
-        InputError: the camera cannot be used.
+        CaptureError: the camera cannot be used.
     """
     model, width, height, params = colmap
     camera = colmap.colmap
@@ -198,13 +222,50 @@ def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tupl
     return [Lens(colmap, stored, pinhole)], messages
 
 
+def make_lenses(photographs: Sequence[Photograph], downscale: int = 1, need_photos: bool = True) -> list[list[Lens]]:
+    """Make the lenses of each photograph, equal ones once; see `make_views`."""
+    sizes = in_threads(lambda each: image_size(each.file) if each.downscaled and need_photos else None, photographs)
+    made: dict[tuple[Any, ...], list[Lens]] = {}
+    lenses, messages = [], []
+    for photograph, size in zip(photographs, sizes, strict=True):
+        camera = photograph.camera
+        full = camera.size
+        small = full if downscale == 1 else (max(1, round(full[0] / downscale)), max(1, round(full[1] / downscale)))
+        if size is not None and max(abs(size[0] - small[0]), abs(size[1] - small[1])) > 1:
+            fail(
+                f"the image {photograph.file} has {size[0]} x {size[1]} pixels, but its camera is for {full[0]} x "
+                f"{full[1]}, of which 1/{downscale} is {small[0]} x {small[1]}. Make the folder "
+                f"{photograph.file.parent} again, or leave --downscale-factor out."
+            )
+        used = size or small
+        key = (camera, used, photograph.downscaled)
+        if key not in made:
+            stored = used if photograph.downscaled else full
+            made[key], lost = lenses_of(camera.rescaled(*used), stored, photograph.label)
+            messages += lost
+        lenses.append(made[key])
+    for message in messages[:3]:
+        say(f"{message[0].upper()}{message[1:]}")
+    if len(messages) > 3:
+        say(f"So are those of {len(messages) - 3} more cameras.")
+    return lenses
+
+
 def _faces(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tuple[list[Lens], list[str]]:
     """Lenses of the faces of the cube that a wide camera covers, with its focal length; see `lenses_of`."""
     camera = colmap.colmap
     around = colmap.width / (2.0 * math.pi)
     fx, fy = (around, around) if camera.is_spherical() else (camera.focal_length_x, camera.focal_length_y)
+    t = np.linspace(-1.0, 1.0, NODES)  # in focal lengths
+    rays = np.stack(np.broadcast_arrays(t[None, :], t[:, None], 1.0), -1)
     lenses = []
-    for face, (left, right, top, bottom, whole) in windows(colmap).items():
+    for face in FACES:
+        seen = covered(colmap, face, rays)
+        if seen.mean() < LEAST_SHARE:
+            continue
+        (up, down), (first, last) = (np.flatnonzero(seen.any(axis))[[0, -1]] for axis in (1, 0))
+        whole = bool(seen[up : down + 1, first : last + 1].all())
+        left, right, top, bottom = t[[first, last, up, down]].tolist()
         w, h = max(1, round((right - left) * fx)), max(1, round((bottom - top) * fy))
         u, v = w / (right - left), h / (bottom - top)
         lenses.append(Lens(colmap, stored, Pinhole(u, v, -left * u, -top * v, w, h), face, whole))
@@ -212,46 +273,6 @@ def _faces(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tuple[l
     return lenses, [
         f"{label} is {colmap.model}: each of its photographs becomes {len(lenses)} pinhole pictures ({named})."
     ]
-
-
-def colmap_distortion(kind: CameraType, values: Sequence[float], label: str) -> tuple[str, tuple[float, ...]]:
-    """Convert nerfstudio's camera type and distortion_params (k1, k2, k3, k4, p1, p2; FISHEYE624: 12) to COLMAP's.
-
-    Returns:
-        COLMAP camera model with separate focal lengths, and its parameters after fx, fy, cx, cy; for
-        equirectangular ones SPHERICAL_MODEL and none.
-
-    Raises:
-        InputError: there is no such COLMAP camera.
-    """
-    if kind == CameraType.EQUIRECTANGULAR:
-        return SPHERICAL_MODEL, ()
-    if kind not in (CameraType.PERSPECTIVE, CameraType.FISHEYE, CameraType.FISHEYE624):
-        fail(
-            f"the camera {label} cannot be used: it is neither a perspective, a fisheye nor an equirectangular camera, "
-            f"which are the kinds that can be trained on, but {kind.name}. Correct the capture."
-        )
-    counts, needs = {
-        CameraType.PERSPECTIVE: ((6,), "perspective cameras need six: k1, k2, k3, k4, p1, p2"),
-        CameraType.FISHEYE: ((4, 6), "fisheye cameras need four: k1, k2, k3, k4"),
-        CameraType.FISHEYE624: ((12,), "FISHEYE624 needs twelve"),
-    }[kind]
-    if len(values) not in counts:
-        fail(f"the camera {label} has {len(values)} distortion_params; {needs}. Correct the capture.")
-    if kind == CameraType.FISHEYE624:
-        return "RAD_TAN_THIN_PRISM_FISHEYE", tuple(values)
-    if kind == CameraType.FISHEYE:
-        return "OPENCV_FISHEYE", tuple(values[:4])
-    k1, k2, k3, k4, p1, p2 = values
-    if k4 != 0.0:
-        fail(
-            f"the camera {label} cannot be used: its k4 is {k4:g}, but perspective cameras are undistorted by k1, k2, "
-            "k3, p1 and p2 alone. For a fisheye write camera_model OPENCV_FISHEYE; else undistort the photographs "
-            "first (COLMAP's image_undistorter)."
-        )
-    if k3 != 0.0:
-        return "FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
-    return ("OPENCV", (k1, k2, p1, p2)) if any((k1, k2, p1, p2)) else ("PINHOLE", ())
 
 
 def _distorts(camera: pycolmap.Camera) -> bool:
@@ -262,23 +283,25 @@ def _distorts(camera: pycolmap.Camera) -> bool:
 def _window(camera: ColmapCamera) -> tuple[float, float, float, float]:
     """Largest extent of the pinhole picture to the left, right, top and bottom of the axis, in focal lengths.
 
-    It shows nothing that the photograph does not: neither beyond its edges, nor where the model folds the picture. Each
-    side is maximized on its own, then all are scaled until the corners fit, too.
+    It shows nothing that the photograph does not, see `covered`. Each side is maximized on its own, then all are scaled
+    until the corners fit, too.
     """
     most = math.tan(math.radians(0.5 * MAX_VIEW_ANGLE))
     reach = np.zeros(4)
-    for side, direction in enumerate(((-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0))):
-        reach[side] = most * _largest(lambda s, d=direction: _is_seen(camera, s * most * np.array([d])))
 
-    def border(scale: float) -> npt.NDArray[np.float64]:
+    def seen(x: npt.ArrayLike, y: npt.ArrayLike) -> bool:
+        return bool(covered(camera, "front", np.stack(np.broadcast_arrays(x, y, 1.0), -1)).all())
+
+    for side, (x, y) in enumerate(((-most, 0.0), (most, 0.0), (0.0, -most), (0.0, most))):
+        reach[side] = most * _largest(lambda s, x=x, y=y: seen(s * x, s * y))
+
+    def border(scale: float) -> bool:
         left, right, top, bottom = scale * reach
         t = np.linspace(0.0, 1.0, EDGE_SAMPLES)
         x, y = -left + t * (left + right), -top + t * (top + bottom)
-        edges = [(x, np.full_like(t, -top)), (x, np.full_like(t, bottom))]
-        edges += [(np.full_like(t, -left), y), (np.full_like(t, right), y)]
-        return np.concatenate([np.stack(edge, -1) for edge in edges])
+        return seen(x, np.array([[-top], [bottom]])) and seen(np.array([[-left], [right]]), y)
 
-    left, right, top, bottom = reach * _largest(lambda s: _is_seen(camera, border(s)))
+    left, right, top, bottom = reach * _largest(border)
     return left, right, top, bottom
 
 
@@ -293,18 +316,6 @@ def _largest(fits: Callable[[float], bool]) -> float:
     return low
 
 
-def _is_seen(camera: ColmapCamera, rays: npt.NDArray[np.float64]) -> bool:
-    """Test that the photograph shows all rays (x, y, 1), [N, 2], and that pixels move outwards along each of them."""
-    lens, t = camera.colmap, np.linspace(0.0, 1.0, RADIAL_SAMPLES + 1)[1:]
-    points = (t[:, None, None] * rays).reshape(-1, 2)
-    pixels = lens.img_from_cam(np.concatenate([points, np.ones((len(points), 1))], 1)).reshape(len(t), -1, 2)
-    if not np.isfinite(pixels).all():
-        return False
-    inside = (pixels >= 0.0).all() and (pixels <= camera.size).all()
-    away = np.linalg.norm(pixels - (lens.principal_point_x, lens.principal_point_y), axis=-1)
-    return bool(inside and (np.diff(away, axis=0) > 0.0).all())
-
-
 @lru_cache(maxsize=CACHED_MAPS)
 def _maps(lens: Lens) -> tuple[npt.NDArray[np.int16], npt.NDArray[np.uint16]]:
     """Position in the photograph of each pixel of the result, as fixed-point maps for cv2.remap."""
@@ -317,3 +328,61 @@ def _maps(lens: Lens) -> tuple[npt.NDArray[np.int16], npt.NDArray[np.uint16]]:
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     whole = cv2.warpAffine(nodes, scale, (to.width, to.height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
     return cv2.convertMaps(whole, None, cv2.CV_16SC2)
+
+
+def covered(camera: ColmapCamera, face: str, rays: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    """Test which rays [..., 3] of a face a photograph shows, where the model does not fold it."""
+    if camera.colmap.is_spherical():
+        return np.ones(rays.shape[:-1], bool)
+    directions = (rays @ FACES[face]).reshape(-1, 3)
+    near = directions[:, 2] > np.linalg.norm(directions, axis=1) * math.cos(_field(camera))
+    pixels = np.full((len(directions), 2), np.nan)
+    pixels[near] = camera.colmap.img_from_cam(directions[near])
+    with np.errstate(invalid="ignore"):
+        return ((pixels >= 0.0) & (pixels <= camera.size)).all(1).reshape(rays.shape[:-1])
+
+
+@lru_cache(maxsize=64)
+def _field(camera: ColmapCamera) -> float:
+    """Largest angle to the axis up to which pixels move outwards with it, radians."""
+    lens = camera.colmap
+    angles = np.linspace(0.0, MAX_ANGLE, ANGLES + 1)[1:]
+    azimuths = np.linspace(0.0, 2.0 * np.pi, AZIMUTHS, endpoint=False)
+    angle, azimuth = np.meshgrid(angles, azimuths, indexing="ij")
+    rays = np.stack([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)], -1)
+    pixels = lens.img_from_cam(rays.reshape(-1, 3)).reshape(*rays.shape[:2], 2)
+    away = np.linalg.norm(pixels - (lens.principal_point_x, lens.principal_point_y), axis=-1)
+    outwards = (np.diff(away, axis=0, prepend=0.0) > 0.0).all(1)
+    return float(MAX_ANGLE if outwards.all() else angles[max(0, int(outwards.argmin()) - 1)])
+
+
+def resample(
+    pixels: npt.NDArray[np.uint8],
+    camera: ColmapCamera,
+    face: str,
+    pinhole: tuple[float, float, float, float, int, int],
+    nearest: bool = False,
+) -> npt.NDArray[np.uint8]:
+    """Resample a photograph [H, W] or [H, W, C], of the size that its wide camera is for, to a face of the cube.
+
+    Args:
+        pinhole: fx, fy, cx, cy, width and height of the result in pixels.
+        nearest: take the nearest pixel, for masks.
+    """
+    lens = camera.colmap
+    fx, fy, cx, cy, width, height = pinhole
+    samples = 1 if nearest else SAMPLES
+    pad = PAD if lens.is_spherical() else 0
+    if pad:
+        pixels = cv2.copyMakeBorder(pixels, 0, 0, pad, pad, cv2.BORDER_WRAP)
+    x = ((np.arange(width * samples) + 0.5) / samples - cx) / fx
+    bands = []
+    for start in range(0, height, BAND):
+        rows = min(BAND, height - start)
+        y = (start + (np.arange(rows * samples) + 0.5) / samples - cy) / fy
+        rays = np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), -1).reshape(-1, 3) @ FACES[face]
+        at = lens.img_from_cam(rays).astype(np.float32).reshape(len(y), len(x), 2) + np.float32([pad - 0.5, -0.5])
+        how = cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC  # linear blurs: 1 dB on a ray-traced room
+        band = cv2.remap(pixels, at, None, how, borderMode=cv2.BORDER_REPLICATE)
+        bands.append(band if samples == 1 else cv2.resize(band, (width, rows), interpolation=cv2.INTER_AREA))
+    return np.concatenate(bands)

@@ -10,17 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from bitymi_ns.capture.cache import keep_work_folder
+from bitymi_ns.capture.colmap_model import Model
+from bitymi_ns.capture.colmap_views import Origin, Source, find_masks, make_source
+from bitymi_ns.capture.images import image_size, in_threads
 from bitymi_ns.capture.photos import photo_folder
 from bitymi_ns.capture.pictures import passed_over, videos_in
 from bitymi_ns.capture.recognise import Found
-from bitymi_ns.capture.types import SfmSettings
+from bitymi_ns.capture.types import SfmOptions, SfmSettings, fail, parsing, say, warn
 from bitymi_ns.files import copy_files
-from bitymi_ns.plugin.console import fail, listed, say, warn
-from bitymi_ns.plugin.data.colmap_model import Model
-from bitymi_ns.plugin.data.colmap_views import Origin, Source, find_masks, make_source
-from bitymi_ns.plugin.data.images import image_size, in_threads
-from bitymi_ns.reading import read_json, reading
-from bitymi_ns.trust import Refused, leads_inside
+from bitymi_ns.reading import read_json
+from bitymi_ns.trust import Refused, leads_inside, listed
 
 MODEL = Path("sparse/0")
 IMAGES = "images"
@@ -58,10 +57,9 @@ def find_sfm_source(
     are used smaller by `downscale`; `masks_path` is relative to the capture, None = find it.
 
     Raises:
-        InputError: no poses can be found; says what to photograph differently.
+        CaptureError: no poses can be found; says what to photograph differently.
     """
     from bitymi_ns.capture.poses import find_poses  # slow to import, and seldom needed
-    from bitymi_ns.capture.types import CaptureError, SfmOptions
     from bitymi_ns.progress import rich_progress
 
     masks = _masks(found, masks_path) if use_masks else None
@@ -71,14 +69,10 @@ def find_sfm_source(
         others = [f"{film.name} (a film of ns-render)" for film in videos_in(found.path.parent, rendered=True)]
     if others:
         say(f"Not taken for photographs in {found.folder}: {listed(others, most=12)}.")
-    try:
-        with rich_progress() as progress:
-            poses = find_poses(
-                found.path, SfmOptions(**asdict(settings), masks=masks, use_masks=use_masks), progress, warn
-            )
-        keep_work_folder(poses.report.parent)
-    except CaptureError as error:
-        fail(str(error), error)
+    with rich_progress() as progress:
+        options = SfmOptions(**asdict(settings), masks=masks, use_masks=use_masks)
+        poses = find_poses(found.path, options, progress, warn)
+    keep_work_folder(poses.report.parent)
     say(
         f"Poses of {poses.registered} of {poses.given} photographs of {found.path}, to {poses.reprojection_error:.2f} "
         f"pixels; how they were found is in {poses.report}."
@@ -98,7 +92,7 @@ def kept_source(found: Found, kept: KeptPoses, masks_path: Path | None, downscal
     """Return the COLMAP model that a run was trained with; see `find_sfm_source`.
 
     Raises:
-        InputError: photographs of the model that are needed are missing, or have another size than they had.
+        CaptureError: photographs of the model that are needed are missing, or have another size than they had.
     """
     masks = _masks(found, masks_path, downscale)
     source = make_source(kept.model, kept.images(found.folder), masks, downscale, kept.left_out)
@@ -123,13 +117,13 @@ def read_kept_poses(folder: Path) -> KeptPoses | None:
     """Read the poses that a run keeps in this folder; None = none.
 
     Raises:
-        InputError: ORIGIN cannot be read.
+        CaptureError: ORIGIN cannot be read.
     """
     path = folder / ORIGIN
     if not path.is_file():
         return None
     which = f"{path}, which says of what the poses of the run were found,"
-    with reading(which, fail, f"Put the folder {folder} back as it was, or train again."):
+    with parsing(which, f"Put the folder {folder} back as it was, or train again."):
         values: dict[str, Any] = read_json(path)
         entries, left_out = dict(values["origin"]), dict(values["left_out"])
         if entries.get("settings") is not None:  # runs of earlier versions do not state them

@@ -7,27 +7,27 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nerfstudio.data.utils import colmap_parsing_utils as reader
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from bitymi_ns.capture.types import Poses
-from bitymi_ns.plugin.console import InputError
-from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManagerConfig
-from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
+from bitymi_ns.capture.types import CaptureError, Poses
 
 
-def load(data: Path, device: Any = "cpu", **dataparser: Any) -> BitymiDataManager:
+def load(data: Path, device: Any = "cpu", **options: Any) -> Any:
     """Load a capture in nerfstudio's format, every eighth view held out."""
-    return load_with(data, BitymiDataParserConfig(format="nerfstudio", **dataparser), device)
+    return load_any(data, device, format="nerfstudio", **options)
 
 
-def load_with(data: Path, dataparser: Any, device: Any = "cpu") -> BitymiDataManager:
+def load_any(data: Path, device: Any = "cpu", **options: Any) -> Any:
+    from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
+
+    return load_with(data, BitymiDataParserConfig(**options), device)
+
+
+def load_with(data: Path, dataparser: Any, device: Any = "cpu") -> Any:
+    from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
+
     return BitymiDataManagerConfig(data=data, dataparser=dataparser).setup(device=device, test_mode="val")
-
-
-def load_any(data: Path, **options: Any) -> BitymiDataManager:
-    return load_with(data, BitymiDataParserConfig(**options))
 
 
 def images_of(capture: Path) -> list[Path]:
@@ -35,7 +35,7 @@ def images_of(capture: Path) -> list[Path]:
     return sorted(p for p in (capture / "images").iterdir() if p.is_file())
 
 
-def held_out(manager: BitymiDataManager) -> list[str]:
+def held_out(manager: Any) -> list[str]:
     return [path.name for path in manager.eval_dataset.image_filenames]
 
 
@@ -81,7 +81,15 @@ def write_cloud(path: Path, xyz: Any, rgb: str | None = "200 10 10") -> None:
 
 
 def expect(message: str) -> Any:
+    """The line with which a command of nerfstudio's ends."""
+    from bitymi_ns.plugin.console import InputError
+
     return pytest.raises(InputError, match=message)
+
+
+def refused(message: str) -> Any:
+    """The exception of the package that reads captures."""
+    return pytest.raises(CaptureError, match=message)
 
 
 def printed(capsys: pytest.CaptureFixture[str]) -> str:
@@ -111,6 +119,8 @@ def colmap_model(capture: Path, folder: Path, scale: float = 1.0) -> None:
 
 
 def as_binary(model: Path) -> None:
+    from nerfstudio.data.utils import colmap_parsing_utils as reader
+
     for what in ("cameras", "images", "points3D"):
         read, write = getattr(reader, f"read_{what}_text"), getattr(reader, f"write_{what}_binary")
         write(read(model / f"{what}.txt"), model / f"{what}.bin")

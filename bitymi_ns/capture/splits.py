@@ -1,20 +1,38 @@
 """Splits of a capture into training and held-out photographs: by rule, or by names."""
 
+import math
 import os
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Literal, NamedTuple
 
 import numpy as np
-from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_filename, get_train_eval_split_fraction
 
-from bitymi_ns.plugin.console import fail, listed
-from bitymi_ns.plugin.data.find_files import folded, without_extension
-from bitymi_ns.reading import read_text, reading
+from bitymi_ns.capture.camera import Photograph
+from bitymi_ns.capture.find_files import folded, without_extension
+from bitymi_ns.capture.types import fail, parsing
+from bitymi_ns.reading import read_text
+from bitymi_ns.trust import listed
 
 Mode = Literal["fraction", "filename", "interval", "all"]
 NameLists = dict[str, list[str]]  # names of photographs by split: train, val, test
+
+
+@dataclass
+class SplitOptions:
+    """Photographs to hold out for evaluation."""
+
+    eval_mode: Mode = "interval"
+    """Photographs to hold out: evenly spaced ones, those with eval in their names, every n-th, or none (all are used
+    for both)."""
+    eval_interval: int = 8
+    """Hold out every n-th photograph by name, with --eval-mode interval."""
+    train_split_fraction: float = 0.9
+    """Share of the photographs to train on, with --eval-mode fraction."""
+    eval_names: tuple[str, ...] = ()
+    """Names of photographs to hold out, or a text file (.txt) with one per line; overrides --eval-mode."""
 
 
 class Split(NamedTuple):
@@ -48,6 +66,30 @@ def ordinal(number: int) -> str:
     return f"{number}{suffix}"
 
 
+def choose_split(photographs: Sequence[Photograph], lists: NameLists, options: SplitOptions) -> Split:
+    """Split photographs by the stated names, else by the capture's lists, else by a rule; those that a rig took
+    together stay together.
+
+    Raises:
+        CaptureError: a name is that of no photograph, or of several.
+    """
+    names = [photograph.file for photograph in photographs]
+    first: dict[object, int] = {}
+    frames = [first.setdefault(i if each.frame is None else ("frame", each.frame), i)
+              for i, each in enumerate(photographs)]  # fmt: skip
+    groups = sorted(set(frames))
+    if options.eval_names:
+        split = by_names(names, options.eval_names, "--eval-names")
+        held = {frames[i] for i in split.held_out}
+        return of_members(Split(sorted(set(frames) - held), sorted(held), split.rule), frames)
+    if lists:
+        return by_lists(names, lists)
+    of_first = [names[i] for i in groups]
+    split = by_mode(of_first, options.eval_mode, options.eval_interval, options.train_split_fraction)
+    sides = ([groups[i] for i in side] for side in (split.train, split.held_out))
+    return of_members(Split(*sides, split.rule), frames)
+
+
 def by_mode(names: Sequence[Path], mode: Mode, interval: int, fraction: float) -> Split:
     """Split photographs in this order by nerfstudio's rules."""
     indices = list(range(len(names)))
@@ -57,22 +99,25 @@ def by_mode(names: Sequence[Path], mode: Mode, interval: int, fraction: float) -
     if mode == "all":
         return Split(indices, indices, "all")
     if mode == "fraction":
-        train, held_out = get_train_eval_split_fraction(list(names), fraction)
+        train = sorted(set(np.linspace(0, len(names) - 1, math.ceil(len(names) * fraction), dtype=int).tolist()))
         rule = f"evenly spaced ones (--train-split-fraction {fraction:g})"
-    else:
-        try:
-            train, held_out = get_train_eval_split_filename(list(names))
-        except ValueError as error:
-            fail(f"--eval-mode filename: {error}. Use `--eval-names`, or another mode.", error)
-        rule = "those with eval in their names"
-    return Split(np.asarray(train, int).tolist(), np.asarray(held_out, int).tolist(), rule)
+        return Split(train, sorted(set(indices) - set(train)), rule)
+    train = [i for i in indices if "train" in names[i].name]
+    held_out = [i for i in indices if "train" not in names[i].name and "eval" in names[i].name]
+    neither = [names[i].name for i in sorted(set(indices) - {*train, *held_out})]
+    if neither:
+        fail(
+            f"--eval-mode filename: the names of photographs must contain train or eval, {listed(neither)} does not. "
+            "Use `--eval-names`, or another mode."
+        )
+    return Split(train, held_out, "those with eval in their names")
 
 
 def by_names(names: Sequence[Path], wanted: Sequence[str], source: str) -> Split:
     """Hold out the photographs of the wanted names, each with as many folders as make it unambiguous.
 
     Raises:
-        InputError: one of them is the name of no photograph, or of several.
+        CaptureError: one of them is the name of no photograph, or of several.
     """
     held_out = set(find(names, wanted, source))
     return Split([i for i in range(len(names)) if i not in held_out], sorted(held_out), f"by {source}")
@@ -137,7 +182,7 @@ def read_names(names_or_file: Sequence[str]) -> tuple[str, ...]:
     if len(names_or_file) != 1 or not names_or_file[0].lower().endswith((".txt", ".lst", ".list")):
         return tuple(names_or_file)
     path = Path(os.path.expanduser(names_or_file[0]))
-    with reading(f"--eval-names: {path}", fail, "Give names, or a text file with one per line."):
+    with parsing(f"--eval-names: {path}", "Give names, or a text file with one per line."):
         lines = read_text(path).splitlines()
     names = tuple(line.strip() for line in lines if line.strip() and not line.startswith("#"))
     if not names:
@@ -151,6 +196,6 @@ def list_files(folder: Path) -> NameLists:
     for split, name in (("train", "train"), ("val", "val"), ("val", "validation"), ("test", "test")):
         path = folder / f"{name}_list.txt"
         if path.is_file():
-            with reading(path, fail, "Write one name on each line, in UTF-8."):
+            with parsing(path, "Write one name on each line, in UTF-8."):
                 lists[split] = [line.strip() for line in read_text(path).splitlines() if line.strip()]
     return lists

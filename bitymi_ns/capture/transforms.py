@@ -1,17 +1,27 @@
-"""Load and check the JSON files of nerfstudio, instant-ngp and Blender captures."""
+"""Read the JSON files of captures: nerfstudio's transforms.json, instant-ngp's, and Blender's.
+
+The three differ in how they state a focal length and where photographs lie; every entry is read wherever it stands, in
+a frame before the top of the file. Entries that nothing reads are reported.
+"""
 
 import math
 import os
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bitymi_ns.capture.recognise import is_model
-from bitymi_ns.plugin.console import fail, listed, warn
-from bitymi_ns.plugin.data.pose_checks import rotations
-from bitymi_ns.plugin.data.splits import NameLists
-from bitymi_ns.reading import read_json, reading
+from bitymi_ns.capture.camera import CAMERA_TYPES, SPHERICAL_MODEL, ColmapCamera, Photograph, colmap_distortion
+from bitymi_ns.capture.find_files import FileFinder, downscaled, find_maps, find_masks, find_photographs, report_files
+from bitymi_ns.capture.images import image_size
+from bitymi_ns.capture.masks import with_masks
+from bitymi_ns.capture.pose_checks import as_matrix, check_repeated, correct_poses
+from bitymi_ns.capture.recognise import SPLITS, is_model
+from bitymi_ns.capture.splits import NameLists
+from bitymi_ns.capture.types import fail, parsing, say, warn
+from bitymi_ns.reading import read_json
+from bitymi_ns.trust import listed
 
 HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data <photos> --output-dir <capture>`."
 HOW_TO_CORRECT = "Correct it there (JSON has neither comments nor a comma behind the last entry), or write it again."
@@ -26,6 +36,95 @@ FOCALS = {"x": ("fl_x", "camera_angle_x", "x_fov"), "y": ("fl_y", "camera_angle_
 """Entries that state a focal length: in pixels, or by the view angle in radians, or in degrees."""
 STATED_BY = {"fl_x": FOCALS["x"], "fl_y": (*FOCALS["y"], *FOCALS["x"][1:])}
 """Entries that serve as another; an angle of one side is that of square pixels."""
+EQUAL_AREA = ("equirectangular", "is_equirectangular")
+"""Entries of instant-ngp's for pictures of all directions of which rows show equal areas."""
+USED = {
+    "frames", *FILE_KEYS, "transform_matrix", "camera_model", "is_fisheye", "fisheye", "ply_file_path",
+    *LATLONG, *EQUAL_AREA, "applied_transform", "applied_scale", "orientation_override", "aabb_scale",
+    *INTRINSICS, *DISTORTION, *FOCALS["x"], *FOCALS["y"],
+}  # fmt: skip
+IRRELEVANT = {"rotation", "sharpness", "colmap_im_id", "made_by"}
+"""Unused entries that are not reported: turntable step, sharpness, number in another file, program."""
+UNKNOWN_SIZE = 800
+"""Pixels along a side of a picture whose size is not stated and that is missing, where none is needed."""
+
+
+@dataclass(frozen=True)
+class Transforms:
+    """JSON file of a capture."""
+
+    path: Path  # the file
+    meta: dict[str, Any]  # its content
+    photographs: list[Photograph]  # sorted by file name
+    lists: NameLists  # of names for training and evaluation
+    named: frozenset[Path]  # its pictures, masks and maps, before they are replaced by downscaled copies
+
+    @property
+    def files(self) -> list[Path]:
+        """Files of the photographs."""
+        return [photograph.file for photograph in self.photographs]
+
+
+def read_transforms(
+    path: Path, own_format: bool, downscale: int = 1, need_photos: bool = True, use_masks: bool = True
+) -> Transforms:
+    """Read and check a JSON file, see `load_transforms`, and find its photographs, or copies that are smaller by
+    `downscale`, and masks, those beside the photographs where it names none; see `with_masks`. Photographs may be
+    missing where they are not needed.
+
+    Raises:
+        CaptureError: the file cannot be used, or lacks photographs.
+    """
+    meta = load_transforms(path, own_format)
+    frames = meta["frames"]
+    for holder in (meta, *frames):
+        for key in EQUAL_AREA:
+            if holder.get(key) and "camera_model" not in holder:
+                fail(
+                    f"{path}: {key} is set, by which instant-ngp means pictures whose rows show equal areas, which "
+                    'cannot be read. For rows of equal angles write "camera_model": "EQUIRECTANGULAR" instead.'
+                )
+    lists = take_lists(meta)
+    names = [frame["file_path"] for frame in frames]
+    files = find_photographs(path, names, need_photos)
+    masks = find_masks(path.parent, [frame.get("mask_path") if use_masks else None for frame in frames], files,
+                        need_photos)  # fmt: skip
+    maps = find_maps(path, frames, need_photos)
+    cloud = meta.get("ply_file_path")
+    if cloud is not None and (not isinstance(cloud, str) or not cloud):
+        fail(f"{path}: ply_file_path is {cloud!r}, not the name of a file. Correct it or remove it.")
+    if cloud and not (path.parent / cloud).is_file():
+        there = FileFinder(path.parent, extensions=(".ply",)).find(cloud)
+        meta["ply_file_path"] = cloud if there is None else there.relative_to(path.parent).as_posix()
+    if need_photos:
+        report_files(path, names, files, masks)
+    _report_unused(path, meta, own_format)
+    made: dict[ColmapCamera, ColmapCamera] = {}
+    photographs = []
+    for frame, file, mask, beside in zip(frames, files, masks, maps, strict=True):
+        label = f"the camera of {frame['file_path']} in {path}"
+        with parsing(label, "Correct its entries."):
+            camera = _camera(path, meta, frame, file)
+        pose = np.array(frame["transform_matrix"])
+        photographs.append(Photograph(file, made.setdefault(camera, camera), pose, label, mask, maps=beside))
+    photographs.sort(key=lambda photograph: photograph.file)
+    if use_masks and need_photos and not any(masks):
+        photographs = with_masks(photographs, path.parent, path.parent if path.name in SPLITS else None)
+    used = [*files, *(each.mask for each in photographs), *(file for each in maps for file in astuple(each))]
+    if downscale > 1:
+        photographs = downscaled(photographs, path.parent, downscale)
+    named = frozenset(Path(os.path.normpath(file)) for file in used if file is not None)
+    return Transforms(path, meta, photographs, lists, named)
+
+
+def _report_unused(path: Path, meta: dict[str, Any], own_format: bool) -> None:
+    known = USED | IRRELEVANT
+    unused = [key for key in meta if key not in known]
+    unused += [f"{key} of frames" for key in dict.fromkeys(k for f in meta["frames"] for k in f) if key not in known]
+    if own_format and "aabb_scale" in meta:
+        unused.append("aabb_scale")
+    if unused:
+        say(f"Entries of {path} that are not used: {listed(unused, most=12)}.")
 
 
 def load_transforms(path: Path, own_format: bool) -> dict[str, Any]:
@@ -33,11 +132,11 @@ def load_transforms(path: Path, own_format: bool) -> dict[str, Any]:
     names; poses become rotations. nerfstudio's own format states each camera in full.
 
     Raises:
-        InputError: the file cannot be used; names the frame.
+        CaptureError: the file cannot be used; names the frame.
     """
     if not os.path.lexists(path):
         fail(f"{path} does not exist, which this kind of capture needs. {HOW_TO_GET_ONE}")
-    with reading(path, fail, HOW_TO_CORRECT if path.is_file() else HOW_TO_GET_ONE):
+    with parsing(path, HOW_TO_CORRECT if path.is_file() else HOW_TO_GET_ONE):
         meta = read_json(path)
         _drop_nulls(meta)
         _check_frames(path, meta, own_format)
@@ -46,8 +145,8 @@ def load_transforms(path: Path, own_format: bool) -> dict[str, Any]:
             _warn_of_contradictions(path, meta)
         _check_applied(path, meta)
         _check_lists(path, meta)
-        _correct_poses(path, meta["frames"])
-        _check_repeated(path, meta["frames"])
+        correct_poses(path, meta["frames"])
+        check_repeated(path, meta["frames"])
     return meta
 
 
@@ -135,7 +234,7 @@ def check_number(path: Path, key: str, value: Any, label: str) -> float | int:
     """Convert an entry, which may be in quotes, to a number; `label` is for the message.
 
     Raises:
-        InputError: it is no number, or for w and h no number of pixels.
+        CaptureError: it is no number, or for w and h no number of pixels.
     """
     try:
         number = float(None if isinstance(value, bool) else value)  # type: ignore[arg-type]
@@ -151,7 +250,7 @@ def check_number(path: Path, key: str, value: Any, label: str) -> float | int:
 def _check_applied(path: Path, meta: dict[str, Any]) -> None:
     """Check the transform [3, 4] and the scale that were applied to the capture as a whole."""
     if "applied_transform" in meta:
-        transform = _matrix(meta["applied_transform"])
+        transform = as_matrix(meta["applied_transform"])
         singular = "maps the capture to a plane, a line or a point, which cannot be undone"
         if transform is None or abs(np.linalg.det(transform[:3, :3])) < 1e-12:
             fault = "is not a matrix of 3 x 4 finite numbers" if transform is None else singular
@@ -211,50 +310,76 @@ def applied_transform(meta: dict[str, Any], folder: Path) -> np.ndarray | None:
     return None if rows is None else np.vstack([np.array(rows, float)[:3], [0.0, 0.0, 0.0, 1.0]])
 
 
-def _correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
-    """Fail at matrices that are no poses; recover rotations, see `rotations`."""
-    names = [frame["file_path"] for frame in frames]
-    poses = []
-    for frame, name in zip(frames, names, strict=True):
-        pose = _matrix(frame["transform_matrix"])
-        if pose is None:
-            fail(
-                f"{path}: the transform_matrix of {name} is not a matrix of 4 x 4 finite numbers. "
-                "Correct it or remove the frame."
-            )
-        if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
-            row = " ".join(f"{x:g}" for x in pose[3])
-            fail(
-                f"{path}: the last row of the transform_matrix of {name} is {row}, not 0 0 0 1. A matrix whose "
-                "position stands in its last row has to be transposed."
-            )
-        poses.append(pose)
-    matrices = np.stack(poses)
-    matrices[:, :3, :3] = rotations(matrices[:, :3, :3], names, str(path))
-    for frame, pose in zip(frames, matrices, strict=True):
-        frame["transform_matrix"] = pose.tolist()
+def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path) -> ColmapCamera:
+    """Convert the camera of a frame to COLMAP's terms."""
+    name = frame["file_path"]
 
-
-def _check_repeated(path: Path, frames: list[dict[str, Any]]) -> None:
-    """Fail where one photograph has two poses."""
-    first: dict[str, int] = {}
-    for i, frame in enumerate(frames):
-        name = os.path.normpath(frame["file_path"])
-        before = first.setdefault(name, i)
-        poses = [np.asarray(frames[j]["transform_matrix"]) for j in (before, i)]
-        if before != i and not np.allclose(*poses, rtol=1e-5, atol=1e-5):
-            fail(
-                f"{path}: frames {before} and {i} (counted from 0) are both of {name}, but with different poses. "
-                "Correct the name of one of them or remove it."
-            )
-
-
-def _matrix(value: Any) -> np.ndarray | None:
-    """Convert 3 x 4 or 4 x 4 finite numbers to [4, 4]; None for anything else."""
-    try:
-        matrix = np.asarray(value, dtype=np.float64)
-    except (ValueError, TypeError, OverflowError):
+    def value(*keys: str) -> tuple[str, float] | None:
+        """The first of these that the frame has, else the file."""
+        for holder, label in ((frame, f"of {name}"), (meta, "for all frames")):
+            for key in keys:
+                if key in holder:
+                    return key, check_number(path, key, holder[key], label)
         return None
-    if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
-        return None
-    return matrix if len(matrix) == 4 else np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
+
+    width, height, cx, cy = (None if (found := value(key)) is None else found[1] for key in ("w", "h", "cx", "cy"))
+    if width is None or height is None:
+        size = image_size(file)
+        if size is not None:
+            width, height = width or size[0], height or size[1]
+        else:  # reported where it is read; and what opens no photograph needs some size
+            width, height = width or height or UNKNOWN_SIZE, height or width or UNKNOWN_SIZE
+    if is_equirectangular(meta, frame):
+        middle = (width / 2.0 if cx is None else cx, height / 2.0 if cy is None else cy)
+        if max(abs(middle[0] - width / 2.0), abs(middle[1] - height / 2.0)) > 1.0:
+            fail(
+                f"{path}: {name} is EQUIRECTANGULAR, but its cx and cy are {middle[0]:g} and {middle[1]:g}, not the "
+                f"middle of its {width} x {height} pixels. Remove them, or shift the picture and turn the pose."
+            )
+        return ColmapCamera(SPHERICAL_MODEL, int(width), int(height), (float(width), float(height)))
+    sides = {"x": width, "y": height}
+    focal: dict[str, float] = {}
+    for axis, keys in FOCALS.items():
+        found = value(*keys)
+        if found is not None:
+            focal[axis] = _focal_length(path, *found, sides[axis])
+    if not focal:
+        fail(
+            f"{path} gives no focal length of {name}: neither fl_x nor camera_angle_x (radians) is in the frame or at "
+            "the top of the file. Add one of them."
+        )
+    fx, fy = focal.get("x", focal.get("y", 0.0)), focal.get("y", focal.get("x", 0.0))
+    pinhole = (fx, fy, width / 2.0 if cx is None else cx, height / 2.0 if cy is None else cy)
+    model, coefficients = _distortion(path, meta, frame)
+    return ColmapCamera(model, int(width), int(height), (*pinhole, *coefficients))
+
+
+def _focal_length(path: Path, key: str, value: float, side: float) -> float:
+    """Convert an entry of FOCALS to pixels; `side` of the picture in pixels."""
+    if key.startswith("fl_"):
+        return value
+    angle = math.radians(value) if key.endswith("fov") else value
+    if not 0.0 < angle < math.pi:
+        degrees = f" ({value:g} degrees are {math.radians(value):.6g})" if math.pi <= value < 180.0 else ""
+        fail(f"{path}: {key} is {value:g}, but lies between 0 and pi: it is in radians, not degrees{degrees}.")
+    return 0.5 * side / math.tan(0.5 * angle)
+
+
+def _distortion(path: Path, meta: dict[str, Any], frame: dict[str, Any]) -> tuple[str, tuple[float, ...]]:
+    """Convert camera model and distortion of a frame; see `colmap_distortion`."""
+    label = f"of {frame['file_path']}"
+    model = stated_model(meta, frame)
+    if not isinstance(model, str) or model not in CAMERA_TYPES:
+        fail(
+            f"{path}: the camera_model {model!r} {label} is unknown. nerfstudio knows "
+            f"{', '.join(CAMERA_TYPES)}; for undistorted photographs write PINHOLE."
+        )
+    kind = CAMERA_TYPES[model]
+    holder = frame if any(key in frame for key in DISTORTION) else meta
+    stated = holder.get("distortion_params")
+    if stated is None:
+        values = [check_number(path, key, holder.get(key, 0.0), label) for key in COEFFICIENTS]
+        values += [0.0] * (6 if kind == "FISHEYE624" else 0)
+    else:
+        values = [check_number(path, "distortion_params", each, label) for each in np.ravel(stated).tolist()]
+    return colmap_distortion(kind, values, f"{label} in {path}")

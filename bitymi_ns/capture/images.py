@@ -13,19 +13,17 @@ import numpy as np
 import numpy.typing as npt
 from PIL import EpsImagePlugin, Image
 
-from bitymi_ns.capture import masks
-from bitymi_ns.capture.exif import exposure_settings
-from bitymi_ns.capture.masks import has_transparency
+from bitymi_ns.capture.exif import exif_stops, exposure_settings
 from bitymi_ns.capture.photos import eight_bits, in_srgb
 from bitymi_ns.capture.pictures import open_picture
-from bitymi_ns.plugin.console import fail, listed, warn
-from bitymi_ns.reading import reading
-from bitymi_ns.train.exposure import exif_stops
+from bitymi_ns.capture.types import fail, parsing, warn
+from bitymi_ns.trust import listed
 
 S, T = TypeVar("S"), TypeVar("T")
 ORIENTATION = 0x0112  # EXIF tag that asks viewers to turn a photograph; 1 = as it is stored
 MAX_PIXELS = 1_000_000_000  # photographs with more pixels are refused; phones take some of 200 million
 THREADS = 4
+PROPORTIONS = 0.02  # relative difference of aspect ratios that counts as rounding
 FINGERPRINT_SIZE = 64  # pixels across, and down, by which photographs are compared
 
 
@@ -59,6 +57,16 @@ def image_size(path: Path) -> tuple[int, int] | None:
 def file_has_transparency(path: Path) -> bool:
     """Read from the header if the image has transparency; False for files that cannot be opened."""
     return from_header(path, has_transparency, False)
+
+
+def has_transparency(image: Image.Image) -> bool:
+    """Test for an alpha channel or a transparent color."""
+    return image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
+
+
+def in_proportion(mask: tuple[int, int], photograph: tuple[int, int]) -> bool:
+    """Test if a mask (width, height) has the aspect ratio of its photograph, so that it can be resized."""
+    return abs(mask[0] / mask[1] / (photograph[0] / photograph[1]) - 1.0) <= PROPORTIONS
 
 
 def orientation(path: Path) -> int:
@@ -138,10 +146,10 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
             eighth of its size, but no smaller than this.
 
     Raises:
-        InputError: it is missing, cannot be read, or has another size.
+        CaptureError: it is missing, cannot be read, or has another size.
     """
     try:
-        with reading(f"the image {path}", fail, _REPLACE, _WORDED), open_picture(path) as file:
+        with parsing(f"the image {path}", _REPLACE, _WORDED), open_picture(path) as file:
             if stored is not None and file.size != stored:
                 fail(wrong_size(path, file.size, stored))
             if wanted is not None:
@@ -154,12 +162,11 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
         fail(_too_large([path]), error)
 
 
-def read_mask(path: Path) -> Image.Image:
-    """Read a mask as a 1-bit image, True where pixels count; see `mask_pixels`."""
-    if not path.exists():
-        fail(f"the mask {path} is missing")
-    with reading(f"the mask {path}", fail, "Replace it, or remove the masks from the capture."):
-        return masks.read_mask(path)
+def pixels_of(image: Image.Image) -> npt.NDArray[np.uint8]:
+    """Convert an image to [H, W, 3], or to [H, W, 4] where some of it is transparent."""
+    pixels = np.array(image, np.uint8)
+    opaque = pixels.shape[-1] == 4 and pixels[..., 3].min(initial=255) == 255
+    return np.ascontiguousarray(pixels[..., :3]) if opaque else pixels
 
 
 _REPLACE = "Replace it or remove it from the capture."

@@ -2,24 +2,25 @@
 
 import math
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+import struct
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import IO
+from zipfile import ZipFile
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from PIL import TiffImagePlugin
 
+from bitymi_ns.capture.images import wrong_size
+from bitymi_ns.capture.lens import Lens
 from bitymi_ns.capture.masks import in_proportion
-from bitymi_ns.plugin.console import fail, warn
-from bitymi_ns.plugin.data.images import wrong_size
-from bitymi_ns.plugin.data.lens import Lens
-from bitymi_ns.plugin.data.map_headers import image_shape, read_array
-from bitymi_ns.reading import reading
-from bitymi_ns.train.views import spread
+from bitymi_ns.capture.pictures import open_picture
+from bitymi_ns.capture.types import MAP_FILES, MapFiles, fail, parsing, warn
+from bitymi_ns.ranges import spread
+from bitymi_ns.reading import open_regular
 
-MAP_FILES = (".png", ".tif", ".tiff", ".npy", ".npz", ".exr")
-"""Extensions of depth and normal maps."""
 MILLIMETER = 1e-3
 """Metres of a unit of integer depth, where no other is stated: nerfstudio's convention."""
 MAPS = "maps"
@@ -33,22 +34,12 @@ MOST_NUMBERS = 1 << 28
 FARTHEST = 65504.0
 """Depth from which on a number stands for "no depth": the largest of half floats, below Blender's 1e10."""
 
+Check = Callable[[tuple[int, ...]], None]
+"""Receives the shape that a header declares, and raises where it must not be read."""
+TIFFS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+EXR = b"v/1\x01"
+
 Values = npt.NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class MapFiles:
-    """Files with what is known of a photograph's pixels beside their colors; None = none.
-
-    Attributes:
-        depth: of camera z, see `read_depth`.
-        confidence: of the depth, 0 = low, at most of the size of the depth.
-        normal: see `read_normal`.
-    """
-
-    depth: Path | None = None
-    confidence: Path | None = None
-    normal: Path | None = None
 
 
 def maps_called(folder: Path, depth: str, confidence: str) -> MapFiles:
@@ -99,7 +90,7 @@ def read_depth(files: MapFiles, lens: Lens, unit: float | None = None) -> Values
     in metres.
 
     Raises:
-        InputError: a file cannot be read, or has another shape than the photograph.
+        CaptureError: a file cannot be read, or has another shape than the photograph.
     """
     assert files.depth is not None
     stored = _read(files.depth, lens.stored)
@@ -122,7 +113,7 @@ def read_normal(files: MapFiles, lens: Lens) -> Values:
     colors (n + 1) / 2, of which black is unknown.
 
     Raises:
-        InputError: a file cannot be read, or has another shape than the photograph.
+        CaptureError: a file cannot be read, or has another shape than the photograph.
     """
     assert files.normal is not None
     stored = _read(files.normal, lens.stored)
@@ -155,7 +146,7 @@ def _read(path: Path, photograph: tuple[int, int], alike: bool = True) -> npt.ND
                 f"{_WITHOUT}"
             )
 
-    with reading(path, fail, _WITHOUT):
+    with parsing(path, _WITHOUT):
         if path.suffix.lower() in (".npy", ".npz"):
             values = read_array(path, check)
             values = values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
@@ -171,3 +162,78 @@ def _read(path: Path, photograph: tuple[int, int], alike: bool = True) -> npt.ND
     if values.dtype.kind not in "iuf":
         fail(f"{path} is no map of numbers, but of {values.dtype}. {_WITHOUT}")
     return values.astype(np.float32) if values.dtype.itemsize > 4 or values.dtype == np.float16 else values
+
+
+def read_array(path: Path, check: Check) -> npt.NDArray[np.generic]:
+    """Read a .npy file, or the first array of a .npz file, if `check` lets its shape pass.
+
+    Raises:
+        OSError, ValueError: it cannot be read, is no array of numbers, or ends before its last number.
+    """
+    with open_regular(path) as file:
+        if path.suffix.lower() != ".npz":
+            return _array(file, check)
+        with ZipFile(file) as archive, archive.open(archive.namelist()[0]) as part:
+            return _array(part, check)
+
+
+def _array(file: IO[bytes], check: Check) -> npt.NDArray[np.generic]:
+    version = np.lib.format.read_magic(file)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"it is of version {version[0]} of the format, which is for tables")
+    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, by_columns, dtype = read_header(file)
+    if dtype.kind not in "iuf":
+        raise ValueError(f"it holds no numbers, but {dtype}")
+    check(shape)
+    values = np.frombuffer(_whole(file, int(np.prod(shape, dtype=object)) * dtype.itemsize), dtype)
+    return values.reshape(shape, order="F" if by_columns else "C")
+
+
+def _whole(file: IO[bytes], count: int) -> bytes:
+    data = file.read(count)
+    if len(data) < count:
+        raise ValueError(f"it is cut off: it has {len(data)} of {count} bytes")
+    return data
+
+
+def image_shape(path: Path) -> tuple[int, int]:
+    """Read height and width of an image that OpenCV may read, from its header.
+
+    Raises:
+        OSError, ValueError: it is no such image.
+    """
+    with open_regular(path) as file:
+        start = file.read(16)
+        if start.startswith(EXR):
+            file.seek(8)
+            return _exr_shape(file)
+        if start.startswith(TIFFS):
+            entries = TiffImagePlugin.ImageFileDirectory_v2(start if start[2:4] in (b"+\0", b"\0+") else start[:8])
+            file.seek(entries.next)
+            entries.load(file)
+            return int(entries[TiffImagePlugin.IMAGELENGTH]), int(entries[TiffImagePlugin.IMAGEWIDTH])
+    with open_picture(path) as image:
+        return image.size[1], image.size[0]
+
+
+def _exr_shape(file: IO[bytes]) -> tuple[int, int]:
+    """The data window, among the attributes: names and types that end with 0, sizes, and values."""
+    size = os.fstat(file.fileno()).st_size
+    while file.tell() < size:
+        name, kind = _text(file), _text(file)
+        (count,) = struct.unpack("<I", _whole(file, 4))
+        if (name, kind, count) == (b"dataWindow", b"box2i", 16):
+            left, top, right, bottom = struct.unpack("<4i", _whole(file, 16))
+            return bottom - top + 1, right - left + 1
+        file.seek(count, os.SEEK_CUR)
+    raise ValueError("it has no data window")
+
+
+def _text(file: IO[bytes]) -> bytes:
+    text = b""
+    while (letter := _whole(file, 1)) != b"\0":
+        text += letter
+        if len(text) > 255:
+            raise ValueError("a name in its header has no end")
+    return text

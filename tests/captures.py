@@ -81,14 +81,14 @@ def write_cloud(path: Path, xyz: Any, rgb: str | None = "200 10 10") -> None:
 
 
 def expect(message: str) -> Any:
-    """The line with which a command of nerfstudio's ends."""
+    """Expect the line with which a command of nerfstudio's ends."""
     from bitymi_ns.plugin.console import InputError
 
     return pytest.raises(InputError, match=message)
 
 
 def refused(message: str) -> Any:
-    """The exception of the package that reads captures."""
+    """Expect the exception of the package that reads captures."""
     return pytest.raises(CaptureError, match=message)
 
 

@@ -1,81 +1,19 @@
-"""Console messages: errors without a traceback, warnings, a step bar; filtering of nerfstudio's own lines."""
+"""Console messages: errors without a traceback, warnings, a step bar."""
 
 import functools
 import logging
-import re
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, NoReturn
+from typing import NoReturn
 
-import rich
 from nerfstudio.utils.rich_utils import CONSOLE
-from rich.errors import MarkupError
 from rich.markup import escape
-from rich.panel import Panel
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.endings import INTERRUPTED as INTERRUPTED
 from bitymi_ns.trust import listed as listed
 from bitymi_ns.trust import printable
-
-REMARKS = re.compile(
-    r"Saving config to|Saving checkpoints to"  # our summary of the run says where
-    r"|Mixed precision is disabled|Auto image downscale factor of 1$"
-    r"|\[NOTE\] Not running eval iterations"  # the training curve is of held-out views
-    r"|\[bold yellow\]Disabled comet|disabled local writer"
-)
-"""Beginnings of the lines that are dropped. Everything else is shown: it may be about the capture."""
-
-
-@contextmanager
-def filter_console() -> Iterator[None]:
-    """Drop these lines, the box in which the viewer's server states its address, and torch's
-    warnings about nerfstudio's code. Afterwards all is as before: other methods are not concerned."""
-
-    def remark(said: Any) -> bool:
-        return isinstance(said, str) and REMARKS.match(said) is not None
-
-    def box(said: Any) -> bool:
-        return isinstance(said, Panel) and "viser" in str(said.title)
-
-    with (
-        ignore_torch_warnings(),
-        _dropping(CONSOLE, "print", remark),
-        _dropping(CONSOLE, "log", remark, _stack_offset=2),  # it states its caller
-        _dropping(rich, "print", box),
-    ):
-        yield
-
-
-@contextmanager
-def ignore_torch_warnings() -> Iterator[None]:
-    """Ignore torch's warnings about nerfstudio's code: no user can act on them."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", category=FutureWarning, module="nerfstudio")
-        warnings.filterwarnings("ignore", "Converting a tensor with requires_grad", UserWarning, module="nerfstudio")
-        yield
-
-
-@contextmanager
-def _dropping(owner: Any, name: str, dropped: Callable[[Any], bool], **always: Any) -> Iterator[None]:
-    """Have the function `name` of `owner` do nothing where `dropped` holds for its first argument."""
-    write = getattr(owner, name)
-
-    def filtered(*said: Any, **options: Any) -> None:
-        if said and dropped(said[0]):
-            return
-        try:
-            write(*said, **{**always, **options})
-        except MarkupError:  # brackets in a path
-            write(*map(escape, map(str, said)), **{**always, **options})
-
-    setattr(owner, name, filtered)
-    try:
-        yield
-    finally:
-        setattr(owner, name, write)
 
 
 @contextmanager
@@ -138,7 +76,8 @@ class _Console(logging.Handler):
 
 
 _captures = logging.getLogger("bitymi_ns.capture")
-_captures.handlers, _captures.propagate = [_Console()], False
+_captures.addHandler(_Console())
 _captures.setLevel(logging.INFO)
+_captures.propagate = False
 
 warn_once = functools.cache(warn)  # the same message only once in a process

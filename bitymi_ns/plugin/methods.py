@@ -4,6 +4,7 @@ name and says why when it is used."""
 
 import warnings
 from dataclasses import dataclass
+from typing import Annotated, Any
 
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
@@ -36,30 +37,36 @@ def _specification(name: str) -> MethodSpecification:
 
 
 def _install() -> None:
-    """Additions to nerfstudio that do not pass through its registry."""
+    """Change what does not pass through nerfstudio's registry; see `hooks`."""
     try:
-        from bitymi_ns.plugin.run import checkpoints
+        from bitymi_ns.plugin import hooks
 
-        checkpoints.allow_numpy_scalars()
+        hooks.allow_numpy_scalars()
+        hooks.extend_exporter(_exports)
     except Exception as error:  # noqa: BLE001 - see the module's docstring
-        why = f"{type(error).__name__}: {error}"
-        warnings.warn(f"bitymi-ns: checkpoints of nerfstudio's own methods may not load ({why})", stacklevel=1)
-    try:
-        from bitymi_ns.plugin.export import hook
-
-        hook.install()
-    except Exception as error:  # noqa: BLE001
         warnings.warn(
-            f"bitymi-ns: `ns-export bitymi-atlas` is not available ({type(error).__name__}: {error}); "
-            "use `python -m bitymi_ns.plugin.export.command` instead",
+            "bitymi-ns: `ns-export bitymi-atlas` is not available, and checkpoints of nerfstudio's own methods may not "
+            f"load ({type(error).__name__}: {error})",
             stacklevel=1,
         )
-    try:
-        from bitymi_ns.plugin.export.hook import MESH_COMMAND
-        from bitymi_ns.plugin.run.commands import refuse_without_config
-    except Exception:  # noqa: BLE001 - a method that is not available says so
         return
-    refuse_without_config(MESH_COMMAND)
+    hooks.refuse_without_config()
+
+
+def _exports() -> list[Any]:
+    """Commands of ns-export."""
+    import tyro
+
+    from bitymi_ns.plugin.export.command import ExportAtlas
+    from bitymi_ns.plugin.export.mesh import ExportMesh
+    from bitymi_ns.plugin.hooks import COMMAND, MESH_COMMAND
+
+    atlas = "Bake a trained bitymi scene into a bundle: surfels, a compressed texture atlas and a manifest."
+    mesh = "Extract the surface of a trained bitymi scene or of a bundle as a triangle mesh with vertex colors."
+    return [
+        Annotated[ExportAtlas, tyro.conf.subcommand(name=COMMAND, description=atlas)],
+        Annotated[ExportMesh, tyro.conf.subcommand(name=MESH_COMMAND, description=mesh)],
+    ]
 
 
 _install()

@@ -19,7 +19,7 @@ from PIL import Image
 
 from bitymi_ns.bundle import strict_json
 from bitymi_ns.plugin.console import InputError
-from bitymi_ns.plugin.run.commands import REFUSED
+from bitymi_ns.plugin.hooks import REFUSED
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from tests.e2e.exports import evaluate
 from tests.e2e.runs import a_run_of, rewrite

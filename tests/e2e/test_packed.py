@@ -17,10 +17,9 @@ from bitymi_ns import cli
 from bitymi_ns.bundle import check_files, read_bundle
 from bitymi_ns.bundle.manifest import dump
 from bitymi_ns.plugin.console import InputError
-from bitymi_ns.plugin.export.hook import MESH_COMMAND
 from bitymi_ns.plugin.export.mesh import ExportMesh
 from bitymi_ns.plugin.export.trained import load_trained
-from bitymi_ns.plugin.run.commands import refuse_without_config
+from bitymi_ns.plugin.hooks import refuse_without_config
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from bitymi_ns.trust import python_command
 
@@ -74,14 +73,14 @@ def test_nerfstudios_commands_name_the_command(
     packed: Path, copied: Path, command: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "argv", [*command, "--load-config", str(copied / "config.yml")])
-    refuse_without_config(MESH_COMMAND)
+    refuse_without_config()
     (copied / "config.yml").unlink()
     for given in (packed, packed / "config.yml", copied / "config.yml"):
         monkeypatch.setattr(sys, "argv", [*command, f"--load-config={given}"])
         with pytest.raises(InputError, match="has no config.yml for nerfstudio's commands: `bitymi unpack "):
-            refuse_without_config(MESH_COMMAND)
+            refuse_without_config()
         monkeypatch.setattr(sys, "argv", ["ns-export", "bitymi-mesh", "--load-config", str(given)])
-        refuse_without_config(MESH_COMMAND)
+        refuse_without_config()
     with pytest.raises(InputError, match="that of a bundle, which is baked already"):
         load_trained(packed)
 

@@ -8,12 +8,9 @@ import pytest
 
 pytest.importorskip("nerfstudio")
 
-import rich
 import yaml
 from nerfstudio.scripts import train as ns_train
-from nerfstudio.utils.rich_utils import CONSOLE
 from rich.console import Console
-from rich.panel import Panel
 
 from bitymi_ns.plugin import console
 from bitymi_ns.plugin.console import InputError
@@ -57,32 +54,6 @@ def test_a_run_without_a_terminal_prints_what_it_is_and_a_line_a_report(
     assert saved.pipeline.model.train.densify.interval == 500 and saved.optimizers  # it is all there
 
 
-def test_only_known_remarks_are_dropped_and_only_for_a_while(capsys: pytest.CaptureFixture[str]) -> None:
-    def say() -> str:
-        CONSOLE.print("Mixed precision is disabled for CPU training.")
-        CONSOLE.log("Auto image downscale factor of 1")
-        CONSOLE.log("Auto image downscale factor of 16")
-        CONSOLE.print("[bold yellow]Warning: load_3D_points set to true but no point cloud found.")
-        rich.print(Panel("http", title="[bold]viser[/bold]"))
-        rich.print("a line")
-        warnings.warn_explicit("old", FutureWarning, "trainer.py", 1, "nerfstudio.engine.trainer")
-        return capsys.readouterr().out
-
-    with warnings.catch_warnings(record=True) as warned:
-        warnings.simplefilter("always")
-        with console.filter_console():
-            said = say()
-        assert not warned
-        for kept in ("factor of 16", "test_console.py", "no point cloud found", "a line"):
-            assert kept in said
-        for dropped in ("Mixed", "factor of 1 ", "http"):
-            assert dropped not in said
-        said = say()
-        assert len(warned) == 1
-    for shown in ("Mixed", "factor of 1 ", "http"):
-        assert shown in said
-
-
 def test_a_terminal_shows_a_bar_below_the_reports(monkeypatch: pytest.MonkeyPatch) -> None:
     screen = io.StringIO()
     monkeypatch.setattr(console, "CONSOLE", Console(file=screen, force_terminal=True, width=80))
@@ -90,9 +61,3 @@ def test_a_terminal_shows_a_bar_below_the_reports(monkeypatch: pytest.MonkeyPatc
         show_step(19)
         console.CONSOLE.print("a report")
     assert "20/40" in screen.getvalue() and "a report\n" in screen.getvalue()
-
-
-def test_brackets_in_what_the_host_says_are_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
-    with console.filter_console():
-        CONSOLE.print("logging events to: o[/b]/run")
-    assert "o[/b]/run" in capsys.readouterr().out

@@ -25,7 +25,7 @@ from bitymi_ns.capture.transforms import HOW_TO_GET_ONE
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.plugin.console import as_input_error, fail
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
-from bitymi_ns.plugin.run.commands import folder_being_evaluated, how_to_say_where
+from bitymi_ns.plugin.data.views import MOVED
 from bitymi_ns.reading import read_json, why
 
 STOCK_FORMATS: dict[type[DataParserConfig], Format] = {
@@ -65,9 +65,10 @@ def bitymi_parser(config: DataParserConfig) -> DataParserConfig:
 
 
 @as_input_error()
-def check_capture(config: FullImageDatamanagerConfig, read: bool = False) -> None:
+def check_capture(config: FullImageDatamanagerConfig, read: bool = False, trains: bool = True) -> None:
     """Check that there is a capture where the data manager's configuration points; parsers of nerfstudio are replaced
     by `bitymi_parser`. With `read`, views with poses are read as well; they say nothing, as they will be read again.
+    `trains`: there is an option for the capture, see MOVED.
 
     Raises:
         InputError: there is none.
@@ -75,8 +76,8 @@ def check_capture(config: FullImageDatamanagerConfig, read: bool = False) -> Non
     config.dataparser = dataparser = bitymi_parser(config.dataparser)
     data = Path(config.data if config.data is not None else dataparser.data)
     if not data.exists():
-        made = "" if folder_being_evaluated() else f" {HOW_TO_GET_ONE}"
-        fail(f"the capture {data} does not exist. {how_to_say_where()}{made}")
+        advice = f"Give its folder with --data. {HOW_TO_GET_ONE}" if trains else MOVED
+        fail(f"the capture {data} does not exist. {advice}")
     _check_options(dataparser)
     if isinstance(dataparser, BitymiDataParserConfig):
         dataparser.data = data
@@ -132,9 +133,7 @@ def reporting_input_errors(config: Any) -> Iterator[None]:
             f"the capture {_folder_of(config)} has a photograph of more than {MAX_PIXELS:,} pixels: make it smaller",
             error,
         )
-    except CaptureError as error:
-        fail(str(error), error)
-    except (NameError, AssertionError):  # no fault of the capture
+    except (CaptureError, NameError, AssertionError):  # says it all already, or is no fault of the capture
         raise
     except Exception as error:
         detail = why(error)

@@ -104,7 +104,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
     ) -> None:
         self.step_view: Callable[[int], View] = lambda index: self.train_views[index]
         images.set_up_pillow()
-        check_capture(config)
+        check_capture(config, trains=test_mode == "val")
         with reporting_input_errors(config), reading_points(test_mode == "val"):
             super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
         self._check_images(test_mode)

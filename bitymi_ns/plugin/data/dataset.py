@@ -24,8 +24,7 @@ from bitymi_ns.capture.masks import checked_mask
 from bitymi_ns.capture.pose_checks import rotations
 from bitymi_ns.plugin.console import as_input_error, fail, listed, warn
 from bitymi_ns.plugin.data.depth import FITTED
-from bitymi_ns.plugin.data.views import NO_PHOTOS, photograph_files, select_views
-from bitymi_ns.plugin.run.commands import MOVED
+from bitymi_ns.plugin.data.views import MOVED, NO_PHOTOS, photograph_files, select_views
 from bitymi_ns.train.views import MemoryBudget, nearest, over_background
 
 PHOTOGRAPH_BYTES = 1 << 28

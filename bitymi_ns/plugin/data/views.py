@@ -21,6 +21,9 @@ from bitymi_ns.capture.read import Capture
 from bitymi_ns.capture.types import FrameOptions, MapFiles
 from bitymi_ns.plugin.console import fail, listed, say
 
+DATA = "BITYMI_DATA"
+"""Environment variable: where a capture is now; most of nerfstudio's commands that read a run have no option for it."""
+MOVED = f"If it was moved, say where it is now: `{DATA}=/where/it/is` before the command."
 NO_PHOTOS = "without photographs"  # metadata key of views whose photographs are gone
 LONGEST_SIDE = 1600  # default longest side of a training photograph, pixels; as in papers on such captures
 

@@ -1,12 +1,8 @@
-"""A bundle as a nerfstudio model, for ns-eval, ns-viewer and ns-render, which look for a checkpoint beside config.yml:
-`find_bundle` finds a bundle that may have been moved, and `stub_checkpoint_dir` writes a stand-in."""
+"""A bundle as a nerfstudio model, for ns-eval, ns-viewer and ns-render."""
 
 from __future__ import annotations
 
-import atexit
 import os
-import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -17,11 +13,9 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bundle import REMEDY, BundleError, read_bundle
-from bitymi_ns.bundle.manifest import MANIFEST
 from bitymi_ns.bundle.read import download_bytes
 from bitymi_ns.ops import webgpu
 from bitymi_ns.plugin.console import fail
-from bitymi_ns.plugin.run.commands import folder_being_evaluated, given_config
 from bitymi_ns.plugin.run.device import kernel_device
 from bitymi_ns.plugin.run.surfel_model import SurfelModel, SurfelModelConfig
 from bitymi_ns.scene.baked import FAST, BakedOutput
@@ -113,32 +107,3 @@ def _webgpu_needed() -> Iterator[None]:
         yield
     except webgpu.WebGpuUnavailable as error:
         fail(f"{error}. Or draw with the kernels: leave {RENDERER} and the option renderer as they are.", error)
-
-
-def find_bundle(recorded: Path) -> Path:
-    """The folder of the bundle whose config.yml is being loaded."""
-    evaluated = folder_being_evaluated()
-    candidates = [] if evaluated is None else [evaluated]
-    given = given_config()
-    candidates += [recorded] if given is None else [given.parent, recorded]
-    for folder in candidates:
-        if (folder / MANIFEST).is_file() or folder.is_file():
-            return folder.absolute()
-    tried = ", ".join(str(folder) for folder in dict.fromkeys(candidates))
-    fail(f"no bundle found ({MANIFEST} is not in {tried}). Keep config.yml in the bundle's folder.")
-
-
-def stub_checkpoint_dir(bundle: Path) -> Path:
-    """A temporary folder with an empty checkpoint, named after the bundle.
-
-    nerfstudio insists on a checkpoint file. It is not kept in the bundle, so that a bundle holds no pickled data. Its
-    path ends up in the results of ns-eval, where `bitymi report` tells by it that they are those of a bundle.
-    """
-    scratch = Path(tempfile.mkdtemp(prefix="bitymi-bundle-"))
-    atexit.register(shutil.rmtree, scratch, ignore_errors=True)
-    folder = scratch / bundle.name / "nerfstudio_models"
-    folder.mkdir(parents=True)
-    torch.save(
-        {"step": 0, "pipeline": {}, "optimizers": {}, "schedulers": {}, "scalers": {}}, folder / "step-000000000.ckpt"
-    )
-    return folder

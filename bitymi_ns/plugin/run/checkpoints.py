@@ -6,7 +6,6 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from bitymi_ns.files import complete_file, reason
@@ -20,15 +19,6 @@ STATE_VERSION = 2
 MAY_DIFFER = ("near", "weight_bound", "rim", "texture_moves_surfels", "max_fragments")
 """Scene options that may differ from those that a checkpoint was trained with: they do not decide what its parameters
 mean, only how they are drawn or learned."""
-
-
-def allow_numpy_scalars() -> None:
-    """Let torch.load's safe mode read the numpy numbers that nerfstudio's own schedulers leave in checkpoints."""
-    try:
-        from numpy._core.multiarray import scalar
-    except ImportError:  # numpy 1
-        from numpy.core.multiarray import scalar
-    torch.serialization.add_safe_globals([scalar, np.dtype, type(np.dtype("float64")), type(np.dtype("float32"))])
 
 
 def save(state: dict[str, Any], path: Path, scratch: Path) -> None:

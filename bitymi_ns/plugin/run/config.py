@@ -13,20 +13,16 @@ from nerfstudio.engine.optimizers import OptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from bitymi_ns import endings
 from bitymi_ns.capture.sfm_poses import has_kept_poses, kept_settings
 from bitymi_ns.files import explained, write_file
+from bitymi_ns.plugin import hooks
 from bitymi_ns.plugin.console import InputError, as_input_error, fail, say, warn
-from bitymi_ns.plugin.data.bundle_cameras import BundleCamerasConfig, has_cameras
 from bitymi_ns.plugin.data.capture_checks import check_capture
 from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
-from bitymi_ns.plugin.run import checkpoints, run_folder
-from bitymi_ns.plugin.run.bundle_model import BakedModelConfig, find_bundle, stub_checkpoint_dir
-from bitymi_ns.plugin.run.commands import LOOPBACK, adopt_viewer, folder_being_evaluated, moved_capture, refuse_others
+from bitymi_ns.plugin.run import run_folder
 from bitymi_ns.plugin.run.device import has_cuda_kernels, why_not_cuda
 from bitymi_ns.plugin.run.model import PARAMETER_GROUPS, BitymiModelConfig
-from bitymi_ns.plugin.run.render import adopt_render
 from bitymi_ns.plugin.run.trainer import BitymiPipelineConfig, BitymiTrainer
 from bitymi_ns.ranges import check_ranges
 from bitymi_ns.train.optimizers import BETAS, EPS, FIELD_BETAS
@@ -205,7 +201,7 @@ class BitymiTrainerConfig(TrainerConfig):
         """Have a resumed run read the poses of the run that it goes on from; a new one finds its own."""
         checkpoints_of = self.load_dir or (None if self.load_checkpoint is None else Path(self.load_checkpoint).parent)
         if checkpoints_of is not None:
-            self._take_poses_of(Path(os.path.expanduser(checkpoints_of)).absolute().parent)
+            self.take_poses_of(Path(os.path.expanduser(checkpoints_of)).absolute().parent)
             dataparser = self.pipeline.datamanager.dataparser
             poses = getattr(dataparser, "poses", None)
             if poses is not None and has_kept_poses(Path(poses)):
@@ -213,7 +209,7 @@ class BitymiTrainerConfig(TrainerConfig):
         elif isinstance(self.pipeline.datamanager.dataparser, BitymiDataParserConfig):
             self.pipeline.datamanager.dataparser.poses = None
 
-    def _take_poses_of(self, run: Path) -> None:
+    def take_poses_of(self, run: Path) -> None:
         """Have the data read with the poses in this run's folder, where it keeps any."""
         dataparser = self.pipeline.datamanager.dataparser
         if isinstance(dataparser, BitymiDataParserConfig) and has_kept_poses(run / run_folder.POSES):
@@ -223,47 +219,13 @@ class BitymiTrainerConfig(TrainerConfig):
         return self.vis != "none" and super().is_viewer_enabled()
 
     def get_checkpoint_dir(self) -> Path:
-        """The folder of the checkpoints; for the configuration in a bundle, a stand-in that satisfies nerfstudio.
-
-        nerfstudio's tools ask here before they build the model. So this is also where a bundle or a run is found that
-        was moved, or that is used from another folder than it was trained in.
-        """
-        model, evaluated = self.pipeline.model, folder_being_evaluated()
-        if evaluated is not None:
-            endings.install()
-            refuse_others()
-            adopt_viewer(self)
-            adopt_render()
-            moved_capture(self.pipeline.datamanager)
-        if isinstance(model, BakedModelConfig):
-            model.bundle = find_bundle(model.bundle)
-            self.read_from = evaluated
-            self._read_cameras_of(model.bundle)
-            return stub_checkpoint_dir(model.bundle)
-        folder = super().get_checkpoint_dir()
-        if evaluated is not None:
-            if (evaluated / self.relative_model_dir).is_dir():
-                folder, self.read_from = evaluated / self.relative_model_dir, evaluated
-            # in a resumed run the recorded step is that of the run it went on from
-            if self.load_step is None or not checkpoints.path_of(folder, self.load_step).is_file():
-                self.load_step = checkpoints.newest_step(folder)
-            # stop now if it cannot be used: nerfstudio's tools would report that with a traceback
-            checkpoints.load(checkpoints.path_of(folder, self.load_step), model.scene)
-            self._take_poses_of(evaluated)
-        return folder
+        """Return the folder of the checkpoints; see `hooks.answer_checkpoint_dir`."""
+        return hooks.answer_checkpoint_dir(self, super().get_checkpoint_dir)
 
     def get_base_dir(self) -> Path:
         """The folder of the run; of one that is evaluated, that of its config.yml, from whatever folder that is done
         and wherever the run was moved."""
         return super().get_base_dir() if self.read_from is None else self.read_from
-
-    def _read_cameras_of(self, bundle: Path) -> None:
-        """Read the bundle's own cameras where its capture is gone."""
-        datamanager = self.pipeline.datamanager
-        data = datamanager.data or getattr(datamanager.dataparser, "data", None)
-        if data is not None and not Path(data).exists() and has_cameras(bundle):
-            datamanager.dataparser = BundleCamerasConfig(data=bundle, capture=Path(data))
-            datamanager.data = bundle
 
 
 @dataclass
@@ -298,6 +260,6 @@ def method_config(name: str) -> MethodSpecification:
         optimizers={group: {"optimizer": adam(group), "scheduler": None} for group in PARAMETER_GROUPS},
         # instead of the table there is a progress bar; profiles of nerfstudio's functions say nothing about ours
         logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False), profiler="none"),
-        viewer=ViewerConfig(websocket_host=LOOPBACK, quit_on_train_completion=True),
+        viewer=ViewerConfig(websocket_host=hooks.LOOPBACK, quit_on_train_completion=True),
     )
     return MethodSpecification(config=config, description=preset.description)

@@ -1,14 +1,13 @@
 """`ns-render` on our scenes: films and frames without a program ffmpeg, options checked before a scene is loaded.
 
 nerfstudio's script reads a camera path, or makes one of the capture's cameras, and hands it to a function that renders
-and writes. `adopt_render` puts functions of this module into the script.
+and writes. `hooks.adopt_render` puts functions of this module into the script.
 """
 
 import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,10 +19,8 @@ from torch import Tensor
 from bitymi_ns.files import check_writable, explained, size_text
 from bitymi_ns.plugin.console import INTERRUPTED, InputError, fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_camera
-from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.run.camera_path import MOST_PIXELS, read_camera_path
-from bitymi_ns.plugin.run.commands import running_command
-from bitymi_ns.plugin.run.films import RATES, WholeText, check_frames, film, frames, open_gzip, write_image
+from bitymi_ns.plugin.run.films import RATES, check_frames, film, frames
 from bitymi_ns.plugin.run.surfel_model import SurfelModel
 from bitymi_ns.progress import rich_progress
 from bitymi_ns.scene.baked import as_bytes
@@ -37,54 +34,7 @@ DEPTH_VIEWS, DEPTH_SIDE, DEPTH_SHARE = 16, 160, 0.01
 """Depth colours of a film span the depths of so many frames of this size, without this share at either end."""
 TURNS = 2  # of a spiral
 FAINT = 1 / 255  # accumulation of a pixel that shows nothing
-_OPTION = " (--output-path)."
-
-
-def adopt_render() -> None:
-    """Have ns-render or ns-eval, where it is the command that is about to load a scene of ours, write by our rules.
-
-    Raises:
-        InputError: an option or the camera path cannot be used.
-    """
-    found = running_command()
-    if found is None:
-        return
-    command, script = found
-    kind = type(command).__name__
-    if kind in (*TRAJECTORIES, "DatasetRender"):
-        _check(command)
-    if kind == "ComputePSNR":
-        command.output_path = WholeText(command.output_path)
-        with explained(command.output_path, InputError, _OPTION):
-            check_writable(command.output_path)
-    if kind == "DatasetRender":
-        script["media"], script["gzip"] = SimpleNamespace(write_image=write_image), SimpleNamespace(open=open_gzip)
-    if kind not in TRAJECTORIES:
-        return
-
-    def render_trajectory(pipeline: Any, cameras: Cameras, seconds: float, **options: Any) -> None:
-        script.update(stock)  # for another method in the same process
-        if not isinstance(pipeline.model, SurfelModel):
-            script["_render_trajectory_video"](pipeline, cameras, seconds=seconds, **options)
-            return
-        if kind == "SpiralRender":
-            cameras = spiral(pipeline.model, cameras, _spiral_frames(command), command.radius)
-        rate = len(cameras) / seconds if kind == "RenderCameraPath" else float(command.frame_rate)
-        write_trajectory(pipeline.model, cameras, command, rate)
-
-    ours = dict(
-        install_checks=SimpleNamespace(check_ffmpeg_installed=lambda: None),
-        get_crop_from_json=lambda path: None,  # crops are not supported
-        get_path_from_json=lambda found: _with_principal_points(stock["get_path_from_json"](found), found),
-        get_interpolated_camera_path=lambda **options: _interpolated(stock["get_interpolated_camera_path"], **options),
-        get_spiral_path=lambda camera, **options: camera,
-        _render_trajectory_video=render_trajectory,
-    )
-    names = (*ours, "VanillaDataManager")
-    stock = getattr(script["_render_trajectory_video"], "stock", {name: script[name] for name in names})
-    ours["VanillaDataManager"] = (stock["VanillaDataManager"], BitymiDataManager)  # those that a spiral is allowed for
-    render_trajectory.stock = stock  # type: ignore[attr-defined]
-    script.update(ours)
+OPTION = " (--output-path)."
 
 
 def _spiral_frames(command: Any) -> int:
@@ -101,7 +51,7 @@ def target_of(command: Any) -> Path:
     return path if path.suffix else path.with_suffix(".mp4")
 
 
-def _check(command: Any) -> None:
+def check_options(command: Any) -> None:
     """Stop where options of a command cannot be used."""
     as_film = getattr(command, "output_format", "images") == "video"
     for name, low, high in (
@@ -125,7 +75,7 @@ def _check(command: Any) -> None:
     path = target_of(command)
     if as_film and path.suffix.lower() != ".mp4":
         fail(f"films are MP4: --output-path must end in .mp4, {path} does not. Frames: --output-format images.")
-    with explained(path, InputError, _OPTION):
+    with explained(path, InputError, OPTION):
         check_writable(path)
     if as_film and path.is_dir():
         fail(f"{path} is a folder: choose another --output-path.")
@@ -159,7 +109,7 @@ def _check_outputs(command: Any, transparency: bool) -> None:
         fail("rgba cannot stand beside other outputs in a frame: name it alone in --rendered-output-names.")
 
 
-def _interpolated(stock: Any, cameras: Cameras, **options: Any) -> Cameras:
+def interpolated(stock: Any, cameras: Cameras, **options: Any) -> Cameras:
     """nerfstudio's path between cameras, in the size of the first one: nerfstudio takes the principal point for the
     middle, and that of the first camera for all."""
     if len(cameras) < 2:
@@ -176,7 +126,7 @@ def _interpolated(stock: Any, cameras: Cameras, **options: Any) -> Cameras:
     return path
 
 
-def _with_principal_points(path: Cameras, found: dict[str, Any]) -> Cameras:
+def with_principal_points(path: Cameras, found: dict[str, Any]) -> Cameras:
     """Give the cameras of a path the `principal_point` of their frames, parts of width and height, which our viewer
     writes and nerfstudio ignores."""
     points = torch.tensor([frame["principal_point"] for frame in found["camera_path"]]).float()
@@ -212,12 +162,15 @@ def spiral(model: SurfelModel, start: Cameras, steps: int, radius: float) -> Cam
 
 
 @torch.no_grad()
-def write_trajectory(model: SurfelModel, cameras: Cameras, command: Any, fps: float) -> None:
-    """Render cameras as a film or as frames, whole or not at all.
+def write_trajectory(model: SurfelModel, cameras: Cameras, command: Any, seconds: float) -> None:
+    """Render a path of so many seconds, or a spiral around a camera, as a film or as frames, whole or not at all.
 
     Raises:
         InputError: the target cannot be written.
     """
+    if hasattr(command, "radius"):
+        cameras = spiral(model, cameras, _spiral_frames(command), command.radius)
+    fps = len(cameras) / seconds if hasattr(command, "camera_path_filename") else float(command.frame_rate)
     target, names = target_of(command), command.rendered_output_names
     images, started = command.output_format == "images", time.monotonic()
     cameras.rescale_output_resolution(1.0 / command.downscale_factor)
@@ -230,7 +183,7 @@ def write_trajectory(model: SurfelModel, cameras: Cameras, command: Any, fps: fl
     planes = _depth_planes(model, views, command) if "depth" in names else {}
     empty = 0
     try:
-        with explained(target, InputError, _OPTION):
+        with explained(target, InputError, OPTION):
             output = frames(target, command.image_format, command.jpeg_quality) if images else film(target, fps)
             with output as add, rich_progress() as progress:
                 for i, camera in enumerate(views):

@@ -20,7 +20,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from bitymi_ns import files
-from bitymi_ns.plugin.console import INTERRUPTED, fail, filter_console, ignore_torch_warnings, say, step_bar, warn
+from bitymi_ns.plugin.console import INTERRUPTED, fail, say, step_bar, warn
+from bitymi_ns.plugin.hooks import filter_console, ignore_torch_warnings
 from bitymi_ns.plugin.run import checkpoints, run_folder
 from bitymi_ns.plugin.run.checkpoint_schema import Entry, restore_optimizer
 from bitymi_ns.plugin.run.launcher import Workers

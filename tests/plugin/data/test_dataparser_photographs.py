@@ -10,7 +10,7 @@ import pytest
 import yaml
 from PIL import Image
 
-from bitymi_ns.capture.types import CaptureError, SfmOptions, SfmSettings
+from bitymi_ns.capture.types import SfmOptions, SfmSettings
 from tests.captures import expect, found_poses, load_any, load_with, printed
 from tests.plugin.data.test_dataparser import parsed
 
@@ -23,8 +23,6 @@ def finder(project: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, S
     def find_poses(source: Path, options: Any, progress: Any, *told: Any) -> Any:
         asked.append((source, options))
         progress("matching", 1, 2)
-        if source.name == "bad":
-            raise CaptureError("photographs of bad share too little: take more of them")
         doubtful = {"contradicted": 0.27} if source.name == "walk.mp4" else {}
         return found_poses(project / "sparse/0", project / "images", project / "report", **doubtful)
 
@@ -53,13 +51,6 @@ def test_photographs_and_videos_are_given_to_the_finding_of_poses(
     assert ("27% of what photographs have in common contradicts their poses" in text) == (name == "walk.mp4")
     assert "have no pose in the model and are left out: frame_00099.png (blurred)." in text
     assert "Held out for evaluation: 2 of 12 photographs" in text
-
-
-def test_what_is_wrong_with_photographs_is_a_message(project: Path, finder: list[Any], tmp_path: Path) -> None:
-    (tmp_path / "bad").mkdir()
-    Image.new("RGB", (8, 8)).save(tmp_path / "bad/a.png")
-    with expect("photographs of bad share too little: take more of them"):
-        load_any(tmp_path / "bad")
 
 
 def test_options_of_structure_from_motion_reach_it(project: Path, finder: list[Any]) -> None:

@@ -69,12 +69,6 @@ def test_a_folder_of_masks_beside_the_photographs(
     assert "masks (12 masks)" in printed(capsys)
 
 
-def test_masks_that_are_black_leave_nothing(capture: Path) -> None:
-    save_masks(capture, 0)
-    with expect("the masks of all 10 training photographs exclude every pixel"):
-        load_any(capture)
-
-
 @pytest.mark.parametrize("form", [nerfstudio, instant_ngp])
 def test_masks_of_instant_ngp(capture: Path, form: Any, capsys: pytest.CaptureFixture[str]) -> None:
     """They are white on moving objects; a photograph without one is not masked."""

@@ -22,8 +22,9 @@ from PIL import Image
 from bitymi_ns.capture.pictures import is_rendered_film, result_in
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
+from bitymi_ns.plugin.hooks import adopt_render
 from bitymi_ns.plugin.run.films import write_image
-from bitymi_ns.plugin.run.render import adopt_render, spiral
+from bitymi_ns.plugin.run.render import spiral
 from bitymi_ns.plugin.run.surfel_model import SurfelModel
 from bitymi_ns.scene.camera import Camera
 

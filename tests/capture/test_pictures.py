@@ -8,7 +8,7 @@ from PIL import Image
 
 from bitymi_ns.bundle.manifest import FORMAT
 from bitymi_ns.capture.photos import find_photos
-from bitymi_ns.capture.pictures import RENDERED, passed_over, result_in
+from bitymi_ns.capture.pictures import RENDERED, passed_over, pictures_among, poses_in, result_in
 from bitymi_ns.capture.poses import find_poses
 from bitymi_ns.capture.recognise import recognise
 from bitymi_ns.capture.types import CaptureError
@@ -120,3 +120,18 @@ def test_a_film_of_ours_is_no_video_to_train_on(tmp_path: Path) -> None:
     found = recognise(tmp_path)
     assert (found.path, found.others) == (tmp_path / "walk.mp4", ())
     assert passed_over(tmp_path) == ["film.mp4 (a film of ns-render)"]
+
+
+def test_poses_of_other_programs(tmp_path: Path) -> None:
+    (tmp_path / "Cameras.xml").write_text('<document><chunk><cameras><camera id="0"/></cameras></chunk></document>')
+    (tmp_path / "config.xml").write_text("<settings/>")
+    (tmp_path / "poses_bounds.npy").touch()
+    (tmp_path / "cameras.npz").mkdir()
+    found = {path.name: program for path, program in poses_in(tmp_path)}
+    assert found == {"Cameras.xml": "Metashape", "poses_bounds.npy": "LLFF"}
+
+
+def test_raw_data_beside_photographs_do_not_count() -> None:
+    names = ["a.DNG", "b.dng", "c.nef", "d.jxl", "a.jpg", "notes.txt"]
+    assert pictures_among(names, ["a.jpg"]) == {".dng": 1, ".nef": 1, ".jxl": 1}
+    assert pictures_among(["a.jpg"], ["a.jpg"]) == {}

@@ -1,0 +1,398 @@
+"""Changes to nerfstudio's functions and to what they read; no other module makes any. nerfstudio's registry and
+subclasses serve for the rest.
+
+Each function says what it changes, for which command, what a user would lose without it, and what in nerfstudio would
+make it superfluous.
+"""
+
+import atexit
+import os
+import re
+import shutil
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from types import FrameType, SimpleNamespace, UnionType
+from typing import Annotated, Any, Union, get_args, get_origin
+
+import numpy as np
+import rich
+import torch
+from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.errors import MarkupError
+from rich.markup import escape
+from rich.panel import Panel
+
+from bitymi_ns import endings
+from bitymi_ns.bundle.manifest import MANIFEST
+from bitymi_ns.bundle.parts import CONFIG, bundle_at
+from bitymi_ns.files import check_writable, explained
+from bitymi_ns.plugin.console import InputError, fail
+from bitymi_ns.plugin.data.bundle_cameras import BundleCamerasConfig, has_cameras
+from bitymi_ns.plugin.data.datamanager import BitymiDataManager
+from bitymi_ns.plugin.data.views import DATA
+from bitymi_ns.plugin.run import checkpoints, render
+from bitymi_ns.plugin.run.bundle_model import BakedModelConfig
+from bitymi_ns.plugin.run.films import WholeText, open_gzip, write_image
+from bitymi_ns.plugin.run.surfel_model import SurfelModel
+
+_MESH = (
+    "`ns-export bitymi-mesh` writes the surface, a mesh whose vertices are points with colors; `bitymi extras BUNDLE` "
+    "Gaussian splats."
+)
+REFUSED = {
+    "ExportPointCloud": f"ns-export pointcloud needs rays, and surfels are drawn as whole pictures. {_MESH}",
+    "ExportTSDFMesh": f"ns-export tsdf needs rays, and surfels are drawn as whole pictures. {_MESH}",
+    "ExportPoissonMesh": f"ns-export poisson needs rays, and surfels are drawn as whole pictures. {_MESH}",
+    "ExportMarchingCubesMesh": f"ns-export marching-cubes needs a field of distances, which surfels have not. {_MESH}",
+    "ExportGaussianSplat": f"ns-export gaussian-splat is for splatfacto. {_MESH}",
+}
+"""Classes of nerfstudio's scripts that cannot work on surfels, and what does instead."""
+REMARKS = re.compile(
+    r"Saving config to|Saving checkpoints to"  # our summary of the run says where
+    r"|Mixed precision is disabled|Auto image downscale factor of 1$"
+    r"|\[NOTE\] Not running eval iterations"  # the training curve is of held-out views
+    r"|\[bold yellow\]Disabled comet|disabled local writer"
+)
+"""Beginnings of the lines that are dropped. Everything else is shown: it may be about the capture."""
+COMMAND, MESH_COMMAND = "bitymi-atlas", "bitymi-mesh"
+EXPORTER, VIEWER = "nerfstudio.scripts.exporter", "nerfstudio.scripts.viewer.run_viewer"
+LOOPBACK = "127.0.0.1"
+"""The address that only this machine can reach. nerfstudio's default, 0.0.0.0, is open to the network."""
+HOST_OPTION = "--viewer.websocket-host"
+
+
+def allow_numpy_scalars() -> None:
+    """Let torch.load's safe mode read numpy's numbers.
+
+    Changes: torch's list of safe types. For: every command that loads a run of nerfstudio's own methods or of ours.
+    Without: checkpoints whose schedulers left such numbers do not load with torch 2.6 or later. Superfluous once
+    nerfstudio saves plain numbers.
+    """
+    try:
+        from numpy._core.multiarray import scalar
+    except ImportError:  # numpy 1
+        from numpy.core.multiarray import scalar
+    torch.serialization.add_safe_globals([scalar, np.dtype, type(np.dtype("float64")), type(np.dtype("float32"))])
+
+
+def extend_exporter(commands: Callable[[], Sequence[Any]]) -> None:
+    """Add commands to ns-export.
+
+    Changes: `tyro` in the namespace of nerfstudio's script, which loads the plugin before it builds the union of its
+    commands: its `cli` gets the union with ours. tyro itself stays. For: ns-export. Without: `ns-export bitymi-atlas`
+    and `bitymi-mesh` are unknown. Superfluous once nerfstudio has a registry of exports.
+
+    Args:
+        commands: called with the first command line; what is wrong then leaves nerfstudio's own commands working.
+    """
+    main = sys.modules.get("__main__")
+    as_main = str(getattr(main, "__file__", "") or "").replace("\\", "/").endswith("nerfstudio/scripts/exporter.py")
+    for module in (sys.modules.get(EXPORTER), main if as_main else None):
+        tyro = getattr(module, "tyro", None)
+        if tyro is None or isinstance(tyro, SimpleNamespace):
+            continue
+
+        def cli(f: Any, *args: Any, module: Any = module, tyro: Any = tyro, **options: Any) -> Any:
+            if f is getattr(module, "Commands", None):
+                try:
+                    f = _with_members(f, commands())
+                except Exception as error:  # noqa: BLE001 - nerfstudio's own commands have to go on working
+                    warnings.warn(f"bitymi-ns: `ns-export {COMMAND}` is not available: {error}", stacklevel=2)
+            return tyro.cli(f, *args, **options)
+
+        module.tyro = SimpleNamespace(**{**vars(tyro), "cli": cli})  # type: ignore[union-attr]
+
+
+def _with_members(union: Any, more: Sequence[Any]) -> Any:
+    """The union with further members; markers around it are kept."""
+    if get_origin(union) is Annotated:
+        inner, *markers = get_args(union)
+        return Annotated[(_with_members(inner, more), *markers)]  # type: ignore[return-value]
+    members = get_args(union) if get_origin(union) in (Union, UnionType) else (union,)
+    return Union[(*members, *more)]  # noqa: UP007 - built at run time
+
+
+def refuse_without_config() -> None:
+    """Stop where nerfstudio is about to load, as its own YAML, a bundle that has none.
+
+    Changes: nothing; reads `sys.argv` as the plugin is loaded. For: every command with --load-config but
+    MESH_COMMAND, which reads such bundles. Without: a traceback of yaml's on binary data. Superfluous once nerfstudio
+    reports a config.yml that it cannot read.
+    """
+    path = _given_config()
+    bundle = None if path is None else bundle_at(path)
+    if bundle is None or MESH_COMMAND in sys.argv[1:2]:
+        return
+    if bundle.is_file() or not (bundle / CONFIG).is_file():
+        fail(
+            f"{bundle} has no {CONFIG} for nerfstudio's commands: `bitymi unpack {bundle}` writes it as a folder with "
+            "one; give that."
+        )
+
+
+def _given_config() -> Path | None:
+    """The --load-config of this process's command line; None without."""
+    for i, argument in enumerate(sys.argv):
+        name, _, value = argument.partition("=")
+        if name in ("--load-config", "--load_config") and (value or i + 1 < len(sys.argv)):
+            return Path(value or sys.argv[i + 1]).absolute()
+    return None
+
+
+def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
+    """Find the folder of the checkpoints; for the configuration in a bundle, make a stand-in that satisfies nerfstudio.
+
+    Changes: the answer of the trainer configuration's `get_checkpoint_dir`, which eval_setup asks before it builds the
+    pipeline; reads eval_setup's frame for the config.yml that it loads, and the calling script's for its options. For:
+    ns-eval, ns-render, ns-viewer, ns-export. Without: no bundle could be opened, no run or bundle that was moved or is
+    used from another folder, and commands that cannot work fail with tracebacks. Superfluous once eval_setup passes on
+    the path that it loads, and asks the method for its state.
+    """
+    model, evaluated = config.pipeline.model, _folder_being_evaluated()
+    if evaluated is not None:
+        endings.install()
+        refuse_others()
+        adopt_viewer(config)
+        adopt_render()
+        moved_capture(config.pipeline.datamanager)
+    if isinstance(model, BakedModelConfig):
+        model.bundle = _find_bundle(model.bundle, evaluated)
+        config.read_from = evaluated
+        _read_cameras_of(model.bundle, config.pipeline.datamanager)
+        return _stub_checkpoint_dir(model.bundle)
+    folder = usual()
+    if evaluated is not None:
+        if (evaluated / config.relative_model_dir).is_dir():
+            folder, config.read_from = evaluated / config.relative_model_dir, evaluated
+        # in a resumed run the recorded step is that of the run it went on from
+        if config.load_step is None or not checkpoints.path_of(folder, config.load_step).is_file():
+            config.load_step = checkpoints.newest_step(folder)
+        # stop now if it cannot be used: nerfstudio's tools would report that with a traceback
+        checkpoints.load(checkpoints.path_of(folder, config.load_step), model.scene)
+        config.take_poses_of(evaluated)
+    return folder
+
+
+def _callers() -> Iterator[FrameType]:
+    frame: FrameType | None = sys._getframe(1)
+    while frame is not None:
+        yield frame
+        frame = frame.f_back
+
+
+def _folder_being_evaluated() -> Path | None:
+    """The folder of the config.yml that nerfstudio's eval_setup is loading; else None."""
+    for frame in _callers():
+        if frame.f_code.co_name == "eval_setup" and isinstance(frame.f_locals.get("config_path"), Path):
+            return frame.f_locals["config_path"].absolute().parent
+    return None
+
+
+def _running_command() -> tuple[Any, dict[str, Any]] | None:
+    """The object of nerfstudio's script whose main function is loading a scene, and its module's namespace; or None."""
+    for frame in _callers():
+        command = frame.f_locals.get("self")
+        if frame.f_code.co_name == "main" and type(command).__module__.startswith(("nerfstudio.scripts.", "__main__")):
+            return command, frame.f_globals
+    return None
+
+
+def _find_bundle(recorded: Path, evaluated: Path | None) -> Path:
+    """The folder of the bundle whose config.yml is being loaded."""
+    candidates = [] if evaluated is None else [evaluated]
+    given = _given_config()
+    candidates += [recorded] if given is None else [given.parent, recorded]
+    for folder in candidates:
+        if (folder / MANIFEST).is_file() or folder.is_file():
+            return folder.absolute()
+    tried = ", ".join(str(folder) for folder in dict.fromkeys(candidates))
+    fail(f"no bundle found ({MANIFEST} is not in {tried}). Keep config.yml in the bundle's folder.")
+
+
+def _stub_checkpoint_dir(bundle: Path) -> Path:
+    """A temporary folder with an empty checkpoint, named after the bundle.
+
+    It is not kept in the bundle, so that a bundle holds no pickled data. Its path ends up in the results of ns-eval,
+    where `bitymi report` tells by it that they are those of a bundle.
+    """
+    scratch = Path(tempfile.mkdtemp(prefix="bitymi-bundle-"))
+    atexit.register(shutil.rmtree, scratch, ignore_errors=True)
+    folder = scratch / bundle.name / "nerfstudio_models"
+    folder.mkdir(parents=True)
+    torch.save({"step": 0, **{name: {} for name in ("pipeline", "optimizers", "schedulers", "scalers")}},
+               folder / "step-000000000.ckpt")  # fmt: skip
+    return folder
+
+
+def _read_cameras_of(bundle: Path, datamanager: Any) -> None:
+    """Read the bundle's own cameras where its capture is gone."""
+    data = datamanager.data or getattr(datamanager.dataparser, "data", None)
+    if data is not None and not Path(data).exists() and has_cameras(bundle):
+        datamanager.dataparser = BundleCamerasConfig(data=bundle, capture=Path(data))
+        datamanager.data = bundle
+
+
+def refuse_others() -> None:
+    """Stop where the command that loads a scene cannot work on it, before it is loaded.
+
+    Changes: nothing. For: the commands of ns-export that need rays. Without: they fail in their middle with tracebacks.
+    Superfluous once methods say which exports they support.
+    """
+    found = _running_command()
+    if found is not None and type(found[0]).__name__ in REFUSED:
+        fail(REFUSED[type(found[0]).__name__])
+
+
+def moved_capture(datamanager: Any) -> None:
+    """Read the capture where the environment variable `DATA` says it is now, if it says anything.
+
+    Changes: the recorded path. For: ns-eval, ns-render, ns-viewer, ns-export. Without: runs and bundles are lost with
+    the folder of their capture. Superfluous once these have an option --data.
+    """
+    if not os.environ.get(DATA):
+        return
+    folder = Path(os.path.expanduser(os.environ[DATA])).absolute()
+    if not folder.exists():
+        fail(f"{DATA} names {folder} as the capture, which does not exist. Correct it.")
+    datamanager.data = datamanager.dataparser.data = folder
+
+
+def adopt_viewer(config: Any) -> None:
+    """Have ns-viewer, where it is the command that loads `config`, show this scene by our rules.
+
+    Changes: `_start_viewer` in nerfstudio's script, for this scene. For: ns-viewer. Without: the viewer is open to the
+    network, as its command line replaces the recorded host; Ctrl-C ends in a traceback; a bundle whose photographs are
+    gone cannot be shown. Superfluous once ns-viewer keeps recorded options, listens on this machine alone, and catches
+    Ctrl-C.
+    """
+    for script in map(sys.modules.get, (VIEWER, "__main__")):
+        if hasattr(script, "_start_viewer"):
+            script._start_viewer = partial(_start_viewer, config, script._start_viewer)  # type: ignore[union-attr]
+
+
+def _start_viewer(ours: Any, start: Callable[..., None], config: Any, *args: Any) -> None:
+    if config is not ours:
+        start(config, *args)
+        return
+    for pipeline in args[:1]:  # photographs may be missing
+        for name in ("train_dataset", "eval_dataset"):
+            dataset = getattr(getattr(pipeline, "datamanager", None), name, None)
+            if dataset is not None:
+                dataset.gray_images = True
+    given = any(argument.partition("=")[0].replace("_", "-") == HOST_OPTION for argument in sys.argv)
+    if config.viewer.websocket_host == ViewerConfig().websocket_host and not given:
+        config.viewer.websocket_host = LOOPBACK
+    CONSOLE.print("Ctrl-C ends the viewer.")
+    try:
+        start(config, *args)
+    except KeyboardInterrupt:
+        CONSOLE.print("\nThe viewer has ended.")
+
+
+def adopt_render() -> None:
+    """Have ns-render or ns-eval, where it is the command that is about to load a scene of ours, write by our rules.
+
+    Changes: functions in the namespace of the script that render and write, until it has rendered; the output path of
+    ns-eval. For: ns-render, ns-eval. Without: films need a program ffmpeg, spirals roll, principal points are ignored,
+    options are checked after the scene was loaded, and a full disk leaves half of a file. Superfluous once nerfstudio
+    does these itself.
+
+    Raises:
+        InputError: an option or the camera path cannot be used.
+    """
+    found = _running_command()
+    if found is None:
+        return
+    command, script = found
+    kind = type(command).__name__
+    if kind in (*render.TRAJECTORIES, "DatasetRender"):
+        render.check_options(command)
+    if kind == "ComputePSNR":
+        command.output_path = WholeText(command.output_path)
+        with explained(command.output_path, InputError, render.OPTION):
+            check_writable(command.output_path)
+    if kind == "DatasetRender":
+        script["media"], script["gzip"] = SimpleNamespace(write_image=write_image), SimpleNamespace(open=open_gzip)
+    if kind not in render.TRAJECTORIES:
+        return
+
+    def render_trajectory(pipeline: Any, cameras: Any, seconds: float, **options: Any) -> None:
+        script.update(stock)  # for another method in the same process
+        if isinstance(pipeline.model, SurfelModel):
+            render.write_trajectory(pipeline.model, cameras, command, seconds)
+        else:
+            script["_render_trajectory_video"](pipeline, cameras, seconds=seconds, **options)
+
+    ours = dict(
+        install_checks=SimpleNamespace(check_ffmpeg_installed=lambda: None),
+        get_path_from_json=lambda found: render.with_principal_points(stock["get_path_from_json"](found), found),
+        get_interpolated_camera_path=lambda **options: render.interpolated(
+            stock["get_interpolated_camera_path"], **options
+        ),
+        get_spiral_path=lambda camera, **options: camera,
+        _render_trajectory_video=render_trajectory,
+    )
+    names = (*ours, "VanillaDataManager")
+    stock = getattr(script["_render_trajectory_video"], "stock", {name: script[name] for name in names})
+    ours["VanillaDataManager"] = (stock["VanillaDataManager"], BitymiDataManager)  # those that a spiral is allowed for
+    render_trajectory.stock = stock  # type: ignore[attr-defined]
+    script.update(ours)
+
+
+@contextmanager
+def filter_console() -> Iterator[None]:
+    """Drop REMARKS, the box in which the viewer's server states its address, and torch's warnings about nerfstudio's
+    code. Afterwards all is as before: other methods are not concerned.
+
+    Changes: `print` and `log` of nerfstudio's console, and rich's `print`. For: ns-train. Without: the run's own lines
+    are lost among a screen of others, and a bracket in a path ends it. Superfluous once nerfstudio logs by levels.
+    """
+
+    def remark(said: Any) -> bool:
+        return isinstance(said, str) and REMARKS.match(said) is not None
+
+    def box(said: Any) -> bool:
+        return isinstance(said, Panel) and "viser" in str(said.title)
+
+    with (
+        ignore_torch_warnings(),
+        _dropping(CONSOLE, "print", remark),
+        _dropping(CONSOLE, "log", remark, _stack_offset=2),  # it states its caller
+        _dropping(rich, "print", box),
+    ):
+        yield
+
+
+@contextmanager
+def ignore_torch_warnings() -> Iterator[None]:
+    """Ignore torch's warnings about nerfstudio's code: no user can act on them."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", category=FutureWarning, module="nerfstudio")
+        warnings.filterwarnings("ignore", "Converting a tensor with requires_grad", UserWarning, module="nerfstudio")
+        yield
+
+
+@contextmanager
+def _dropping(owner: Any, name: str, dropped: Callable[[Any], bool], **always: Any) -> Iterator[None]:
+    """Have the function `name` of `owner` do nothing where `dropped` holds for its first argument."""
+    write = getattr(owner, name)
+
+    def filtered(*said: Any, **options: Any) -> None:
+        if said and dropped(said[0]):
+            return
+        try:
+            write(*said, **{**always, **options})
+        except MarkupError:  # brackets in a path
+            write(*map(escape, map(str, said)), **{**always, **options})
+
+    setattr(owner, name, filtered)
+    try:
+        yield
+    finally:
+        setattr(owner, name, write)

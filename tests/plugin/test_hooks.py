@@ -1,0 +1,163 @@
+"""Changes to nerfstudio: its exporter's commands, its viewer, what its console shows."""
+
+import sys
+import warnings
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Annotated, Any, Union
+
+import pytest
+
+pytest.importorskip("nerfstudio")
+
+import rich
+import tyro
+from nerfstudio.scripts.viewer import run_viewer
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.panel import Panel
+
+from bitymi_ns.plugin import hooks
+from bitymi_ns.plugin.run.config import method_config
+
+First, Second, Third = (type(name, (), {}) for name in ("First", "Second", "Third"))
+
+
+def test_only_the_exporters_own_union_is_extended(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    fake_tyro = ModuleType("fake_tyro")
+    fake_tyro.cli = lambda f, *args, **kwargs: seen.append(f)
+    fake_tyro.conf = object()
+    module = ModuleType("exporter")
+    module.tyro, module.Commands = fake_tyro, Annotated[Union[First, Second], "marker"]  # noqa: UP007
+    monkeypatch.setitem(sys.modules, hooks.EXPORTER, module)
+    for _ in range(2):  # a second call changes nothing
+        hooks.extend_exporter(lambda: [Third])
+    module.tyro.cli(First)
+    module.tyro.cli(module.Commands)
+    assert seen[0] is First
+    assert seen[1] == Annotated[Union[First, Second, Third], "marker"]  # noqa: UP007
+    assert module.tyro.conf is fake_tyro.conf
+    assert fake_tyro.cli is not module.tyro.cli
+
+
+@pytest.mark.slow
+def test_ns_export_lists_the_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    from nerfstudio.scripts import exporter
+
+    from bitymi_ns.plugin import methods
+
+    hooks.extend_exporter(methods._exports)
+    monkeypatch.setattr(sys, "argv", ["ns-export", "--help"])
+    with pytest.raises(SystemExit) as stop:
+        exporter.entrypoint()
+    assert stop.value.code == 0
+    output = capsys.readouterr().out
+    assert "bitymi-atlas" in output and "gaussian-splat" in output
+
+
+@pytest.fixture
+def hosts(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Record the addresses of started viewers, each ended at once by Ctrl-C."""
+    started: list[str] = []
+
+    def start_viewer(config: Any, *_: Any) -> None:
+        started.append(config.viewer.websocket_host)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run_viewer, "_start_viewer", start_viewer)
+    return started
+
+
+def view(monkeypatch: pytest.MonkeyPatch, config: Any, arguments: list[str], ours: bool = True) -> None:
+    """Run ns-viewer with these arguments on a loaded scene."""
+
+    def load(*_: Any, **__: Any) -> tuple:
+        if ours:
+            hooks.adopt_viewer(config)
+        return config, SimpleNamespace(), None, 0
+
+    arguments = ["--load-config", "config.yml", *arguments]
+    monkeypatch.setattr(run_viewer, "eval_setup", load)
+    monkeypatch.setattr(sys, "argv", ["ns-viewer", *arguments])
+    tyro.cli(tyro.conf.FlagConversionOff[run_viewer.RunViewer], args=arguments).main()
+
+
+def test_training_serves_this_machine_alone() -> None:
+    default = method_config("bitymi").config
+    assert default.viewer.websocket_host == "127.0.0.1"
+    args = ["--viewer.websocket-host", "0.0.0.0"]
+    assert tyro.cli(type(default), default=default, args=args).viewer.websocket_host == "0.0.0.0"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "host"),
+    [
+        ([], "127.0.0.1"),
+        (["--viewer.websocket-host", "0.0.0.0"], "0.0.0.0"),
+        (["--viewer.websocket_host=0.0.0.0"], "0.0.0.0"),
+        (["--viewer.websocket-host", "10.0.0.5"], "10.0.0.5"),
+    ],
+)
+def test_ns_viewer_listens_where_it_is_told(
+    hosts: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: Any, host: str
+) -> None:
+    view(monkeypatch, method_config("bitymi").config, arguments)
+    assert hosts == [host]
+    assert "The viewer has ended." in capsys.readouterr().out
+
+
+def test_scenes_of_other_methods_are_shown_as_before(hosts: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        view(monkeypatch, method_config("bitymi").config, [], ours=False)
+    hooks.adopt_viewer(method_config("bitymi").config)  # as if one of ours had been loaded before
+    with pytest.raises(KeyboardInterrupt):
+        view(monkeypatch, method_config("bitymi").config, [], ours=False)
+    assert hosts == ["0.0.0.0", "0.0.0.0"]
+
+
+def test_whatever_loads_a_run_adopts_the_viewer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    adopted = []
+    monkeypatch.setattr("bitymi_ns.plugin.hooks.adopt_viewer", adopted.append)
+    config = method_config("bitymi").config
+    config.output_dir, config.experiment_name = tmp_path, "room"
+    config.get_checkpoint_dir()
+    assert adopted == []
+
+    def eval_setup(config_path: Path) -> None:
+        with pytest.raises(SystemExit, match="no checkpoint folder"):
+            config.get_checkpoint_dir()
+
+    eval_setup(tmp_path / "config.yml")
+    assert adopted == [config]
+
+
+def test_only_known_remarks_are_dropped_and_only_for_a_while(capsys: pytest.CaptureFixture[str]) -> None:
+    def say() -> str:
+        CONSOLE.print("Mixed precision is disabled for CPU training.")
+        CONSOLE.log("Auto image downscale factor of 1")
+        CONSOLE.log("Auto image downscale factor of 16")
+        CONSOLE.print("[bold yellow]Warning: load_3D_points set to true but no point cloud found.")
+        rich.print(Panel("http", title="[bold]viser[/bold]"))
+        rich.print("a line")
+        warnings.warn_explicit("old", FutureWarning, "trainer.py", 1, "nerfstudio.engine.trainer")
+        return capsys.readouterr().out
+
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        with hooks.filter_console():
+            said = say()
+        assert not warned
+        for kept in ("factor of 16", "test_hooks.py", "no point cloud found", "a line"):
+            assert kept in said
+        for dropped in ("Mixed", "factor of 1 ", "http"):
+            assert dropped not in said
+        said = say()
+        assert len(warned) == 1
+    for shown in ("Mixed", "factor of 1 ", "http"):
+        assert shown in said
+
+
+def test_brackets_in_what_the_host_says_are_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
+    with hooks.filter_console():
+        CONSOLE.print("logging events to: o[/b]/run")
+    assert "o[/b]/run" in capsys.readouterr().out

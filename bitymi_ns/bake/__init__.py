@@ -3,8 +3,7 @@
 from bitymi_ns.bake.baked import Baked, export
 from bitymi_ns.bake.field.bake import bake
 from bitymi_ns.bake.field.polish import PolishOptions, polish_scene
-from bitymi_ns.bake.learn import Learning, bake_and_learn
-from bitymi_ns.bake.pipeline import reduced
+from bitymi_ns.bake.pipeline import Learning, bake_and_learn, reduced
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.progress import rich_progress

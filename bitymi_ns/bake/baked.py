@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.tiles import Tiles
+from bitymi_ns.bake.view_colors import ColorChoices
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.poster import draw_poster
 from bitymi_ns.bundle.statistics import AtlasCost, Statistics
@@ -59,6 +60,10 @@ class Baked:
     alpha_codes: TexelCodes | None = None  # codes whose alphas those of the bundle keep; None = not coded, or opaque
     # [N] transmittance in front of the surfels, by which errors of their tiles count; None = 1
     in_front: Tensor | None = None
+    colors: ColorChoices | None = None  # view colours of fewer terms; None = they were not reduced
+    # [T, 2] in pixels, the sums over views and fragments of blending weight, and of its square, times bilinear weight;
+    # None = not measured yet
+    coverage: Tensor | None = None
 
     @classmethod
     def of(
@@ -78,10 +83,6 @@ class Baked:
             prefilter=scene.config.prefilter,
         )
         return cls(baked, rows.cpu(), pack(()), tiles.texels, None, options).with_tiles(tiles)
-
-    def with_statistics(self, **changes: Any) -> Baked:
-        """Copy with other statistics."""
-        return replace(self, statistics=self.statistics.but(**changes))
 
     @property
     def mean_residual(self) -> Tensor:
@@ -150,7 +151,7 @@ class Baked:
         packing = pack(tiles.sizes, self.options.page_width, self.options.page_rows)
         scene = replace(self.scene, tiles=torch.from_numpy(packing.tiles), extent=tiles.extent)
         scene = with_means(scene, tile_means(tiles.texels, tiles.sizes))
-        return replace(self, scene=scene, packing=packing, texels=tiles.texels, atlas=None)
+        return replace(self, scene=scene, packing=packing, texels=tiles.texels, atlas=None, coverage=None)
 
     def only(self, kept: Tensor) -> Baked:
         """Copy with the surfels of the mask `kept` [N] and their tiles, packed again, not encoded yet."""

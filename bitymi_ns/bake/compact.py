@@ -3,15 +3,15 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from bitymi_ns.bake.baked import Baked, joined
 from bitymi_ns.bake.precision import PER_BIT, Pictures, column_noise
-from bitymi_ns.bake.texel_list import TexelList
 from bitymi_ns.bake.tiles import Tiles
-from bitymi_ns.bake.view_color_rate import color_choices
+from bitymi_ns.bake.tuning_views import TexelList
 from bitymi_ns.bundle.statistics import Rounding, ViewColorError
 from bitymi_ns.codec import streams
 from bitymi_ns.codec.surfel_codes import code_surfels
@@ -20,10 +20,10 @@ from bitymi_ns.codec.texel_codes import (
     SceneCodes,
     TexelCodeOptions,
     TexelCoder,
+    TexelCodes,
     residual_codes,
 )
 from bitymi_ns.progress import Progress, no_progress
-from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.train.views import View
 
 START = 8.0 / 255**2  # first lambda of the search: squared error per bit, colours from 0 to 1
@@ -73,10 +73,17 @@ class RatePoint:
 
     baked: Baked  # with the surfels that are kept, and their codes; its texels are as they were
     coding: TexelCodeOptions  # of the texels
-    shown: BakedScene  # the scene as it is drawn then, its texels coded
-    bytes: int  # of surfels and texels, about
+    texels: TexelCodes | None  # codes of its texels; None without
     error: float  # mean square error against the training photographs
     psnr: float  # of them, dB
+
+    @cached_property
+    def bytes(self) -> int:
+        """Of surfels and texels, about: compressed only where it is asked for."""
+        codes = self.baked.codes
+        assert codes is not None
+        rest = len(streams.compress(codes.residual, _FAST).data) if self.texels is None else self.texels.nbytes(_FAST)
+        return codes.surfels.nbytes() + rest
 
 
 class Coder:
@@ -104,15 +111,14 @@ class Coder:
         drawn = self._pictures.of(scene)
         self.error, self.psnr = self._pictures.square(drawn), self._pictures.psnr(drawn)
         self._numbers = self._pictures.numbers / max(1, self._pictures.views) * len(views)
-        self._colors = color_choices(scene, [view.camera.to(device) for view in views], progress)
-        reduced = replace(scene, surfels={**scene.surfels, **self._colors.at(START)})
+        reduced = replace(scene, surfels={**scene.surfels, **self._view_colors(START)})
         self._noise = column_noise(reduced, self._sizes, self._pictures, progress)
-        self._tiles = self._texels = self._weights = self._alphas = None
+        self._tiles = self._texels = self._coverage = self._alphas = None
         if baked.textured:
             texels = TexelList(baked, device)
             self._tiles, self._texels = texels.tiles, texels.values.cpu()
             self._alphas = None if baked.alpha is None else baked.alpha.values
-            self._weights = texels.coverage(views, progress, (2,))[0].cpu()
+            self._coverage = texels.coverage(views, progress).cpu()
 
     @property
     def measured(self) -> bool:
@@ -123,24 +129,26 @@ class Coder:
         """The mean square error against the photographs, where so much of that of the bake may be added."""
         return self.error + max(LEAST_ERROR, share * self.error)
 
+    def _view_colors(self, lmbda: float) -> dict[str, Tensor]:
+        """The view colours at a lambda; none where they were not reduced, or there is nothing to measure with."""
+        return self._baked.colors.at(lmbda) if self._baked.colors is not None and self.measured else {}
+
     @torch.no_grad()
     def at(self, lmbda: float) -> RatePoint:
         """Point of the curve at a lambda: squared error per bit, colours from 0 to 1, summed over the pixels and
         channels of all views."""
         baked = self._baked
-        surfels = dict(baked.scene.surfels)
-        if self.measured:
-            surfels |= self._colors.at(lmbda)
+        surfels = {**baked.scene.surfels, **self._view_colors(lmbda)}
         steps = self._noise.steps(lmbda / self._numbers if self.measured else 0.0)
         codes, order = code_surfels(surfels, baked.scene.view_color, self._sizes, baked.extent, steps)
         residual = baked.mean_residual[order]
-        listed, coded = residual, None
+        listed, coded, coverage = residual, None, None
         coding = TexelCodeOptions(step=min(1000.0, max(0.01, 255 * math.sqrt(TEXEL_SHARE * 12 * lmbda / PER_BIT))))
         constants = residual
         if self._texels is not None:
             moved = self._tiles.rows_of(order.to(self._tiles.size.device)).cpu()
-            texels, weights = self._texels[moved], self._weights[moved]
-            coder, listed = TexelCoder(self._sizes[order], weights, coding), texels
+            texels, coverage = self._texels[moved], self._coverage[moved]
+            coder, listed = TexelCoder(self._sizes[order], coverage[:, 1], coding), texels
             if self._alphas is not None:
                 listed = joined(texels, coder.code_alpha(self._alphas[moved]))
                 assert coder.alpha is not None
@@ -151,16 +159,14 @@ class Coder:
         in_front = None if baked.in_front is None else baked.in_front[order]
         rounded = replace(baked, rows=baked.rows[order], codes=kept, in_front=in_front).with_surfels(codes.surfels())
         rounded = rounded.with_tiles(Tiles(self._sizes[order], codes.extent(baked.options.extent), listed))
-        rounded = replace(rounded.with_constants(constants), alpha_codes=coded if self._alphas is not None else None)
-        size, shown = kept.surfels.nbytes(), rounded
-        if coded is None:
-            size += len(streams.compress(kept.residual, _FAST).data)
-        else:
-            size += coded.nbytes(_FAST)
+        rounded = replace(rounded.with_constants(constants), coverage=coverage)
+        if self._alphas is not None:
+            rounded = replace(rounded, alpha_codes=coded)
+        shown = rounded
+        if coded is not None:
             shown = replace(rounded, texels=rounded.cut(coded.texels())).with_constants(coded.constants)
-        scene = shown.unquantised()
-        pictures = self._pictures.of(scene)
-        return RatePoint(rounded, coding, scene, size, self._pictures.square(pictures), self._pictures.psnr(pictures))
+        drawn = self._pictures.of(shown.unquantised())
+        return RatePoint(rounded, coding, coded, self._pictures.square(drawn), self._pictures.psnr(drawn))
 
 
 def compacted(
@@ -187,18 +193,13 @@ def compacted(
 
 
 def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> tuple[Baked, TexelCodeOptions]:
-    """`compacted` with a coder that exists already.
-
-    Args:
-        coder: measured with options that differ at most in what decides lambda.
-
-    Raises:
-        ValueError: as `compacted` does.
-    """
+    """Do what `compacted` does with a coder whose options differ at most in what decides lambda."""
     if options.most_bytes is not None:
         enough = coder.allowed(ENOUGH) if coder.measured else -math.inf
         most = 0.97 * options.most_bytes
-        more, less = _search(coder, lambda point: point.bytes > most or point.error <= enough, progress)
+        more, less = _search(
+            coder, lambda point: 0.0 if point.bytes > most or point.error <= enough else math.inf, progress
+        )
         found = more if more.bytes <= most else less
         if found.baked.codes.surfels.nbytes() + LEAST_TEXEL_BYTES > options.most_bytes:
             raise ValueError(
@@ -213,10 +214,12 @@ def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> 
                 f"the bake shows the training photographs at {coder.psnr:.2f} dB, so {options.psnr:g} dB cannot be "
                 "reached: ask for less, or train for longer"
             )
-        found, _ = _search(coder, lambda point: point.psnr >= options.psnr, progress)
+        lost = max(1e-6, coder.psnr - options.psnr)
+        found, _ = _search(coder, lambda point: (coder.psnr - point.psnr) / lost, progress)
     else:
         allowed = coder.allowed(options.share)
-        found, _ = _search(coder, lambda point: point.error <= allowed, progress, most=MAX_LAMBDA)
+        added = allowed - coder.error
+        found, _ = _search(coder, lambda point: (point.error - coder.error) / added, progress, most=MAX_LAMBDA)
     baked, coding = found.baked, found.coding
     assert baked.codes is not None
     if options.most_bytes is not None:
@@ -229,25 +232,26 @@ def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> 
 
 
 def _search(
-    coder: Coder, more: Callable[[RatePoint], bool], progress: Progress, most: float = math.inf
+    coder: Coder, excess: Callable[[RatePoint], float], progress: Progress, most: float = math.inf
 ) -> tuple[RatePoint, RatePoint]:
-    """Points of the largest lambda up to `most` of which `more` holds, and of the smallest of which it does not, within
-    a tenth. Where there is none of a kind, the nearest that was tried stands for it."""
+    """Bisect lambda up to `most`: points of the largest whose excess is at most 1, and of the smallest whose excess is
+    larger, within a tenth. An excess that is finite and above 0 gives the next lambda, as nearly proportional.
+    Where there is no point of a kind, the nearest that was tried stands for it."""
     low, high, found = None, None, {}
     lmbda = min(START, most)
     for step in range(_SEARCH):
         found[lmbda] = coder.at(lmbda)
         progress("choosing the precision", step + 1, _SEARCH)
-        if more(found[lmbda]):
-            low = lmbda
-        else:
-            high = lmbda
-        if low == most:
+        share = excess(found[lmbda])
+        low, high = (lmbda, high) if share <= 1 else (low, lmbda)
+        found = {tried: found[tried] for tried in {low, high, min(found), max(found)} - {None}}  # the rest is memory
+        if low == most or 0.9 <= share <= 1:
             break
-        if low is None or high is None:
-            lmbda = min(most, lmbda * 8) if high is None else lmbda / 8
-        else:
-            lmbda = math.sqrt(low * high)
+        least, largest = low or lmbda / 8, high or min(most, lmbda * 8)
+        guess = 0.95 * lmbda / share if 0 < share < math.inf else 0.0
+        if not 1.05 * least < guess < largest / 1.05:
+            guess = math.sqrt(least * largest) if low and high else least if low is None else largest
+        lmbda = guess
     progress("choosing the precision", _SEARCH, _SEARCH)
     return found[min(found) if low is None else low], found[max(found) if high is None else high]
 

@@ -39,13 +39,6 @@ class BakeInput:
         """[N] largest transmittance in front of each surfel; None = 1."""
         return None if self.views is None else self.views.in_front
 
-    @property
-    def seen(self) -> Tensor:
-        """[V, N] bool, the views that see each surfel; V = 0 without visibility."""
-        means = self.surfels["means"]
-        nothing = torch.zeros(0, len(means), dtype=torch.bool, device=means.device)
-        return nothing if self.views is None else self.views.seen
-
     def of(self, rows: Tensor) -> BakeInput:
         """Inputs of some of the surfels."""
         surfels = {name: value[rows] for name, value in self.surfels.items()}

@@ -1,21 +1,30 @@
-"""First stages of the bake of trained texels: all of them as tiles, and reduced to a tolerance."""
+"""From a trained scene and its photographs to the contents of a bundle, stage by stage."""
+
+from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import torch
+from torch import Tensor
 
 from bitymi_ns.bake.baked import BakeableScene, Baked, joined
+from bitymi_ns.bake.compact import Compact, compacted, with_coded_texels
+from bitymi_ns.bake.field.bake import bake
+from bitymi_ns.bake.field.polish import PolishOptions, polish_scene
 from bitymi_ns.bake.inputs import BakeInput, device_of, drawable, photo_resolution, visible
-from bitymi_ns.bake.lean_color import kept_view_colors
-from bitymi_ns.bake.reduce import reduced_tiles
-from bitymi_ns.bake.tiles import Tiles
+from bitymi_ns.bake.tile_errors import certified
+from bitymi_ns.bake.tiles import Tiles, reduced_tiles
+from bitymi_ns.bake.tune import TuneOptions, tune_atlas
+from bitymi_ns.bake.view_colors import reduce_view_colors
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.statistics import KeptSurfels, KeptTexels, Statistics
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
+from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.views import View
 
 
 @torch.no_grad()
@@ -78,14 +87,14 @@ def reduced(baked: Baked, cameras: Sequence[Camera], progress: Progress = no_pro
         kept[rows] = seen.cpu()
     if not bool(kept.any()):
         raise ValueError("no surfel is left to bake")
-    lean, view_color = kept_view_colors(inputs, options, progress)
+    surfels, colors, view_color = reduce_view_colors(inputs, options, progress)
     result = baked.only(kept)
     if options.tolerance > 0 and result.textured:
         tiles = Tiles(result.sizes, result.extent, result.texels)
         result = result.with_tiles(reduced_tiles(tiles, inputs, options, progress))
     in_front = None if inputs.transmittance is None else inputs.transmittance.cpu()
-    result = replace(result.with_surfels(lean), in_front=in_front)
-    result = replace(result, scene=replace(result.scene, photographed=photo_resolution(inputs)))
+    result = replace(result.with_surfels(surfels), in_front=in_front, colors=colors)
+    result.scene.photographed = photo_resolution(inputs)
     counts = baked.statistics.surfels
     assert counts is not None and counts.left_out is not None
     left_out = counts.left_out.but(**{name: (getattr(counts.left_out, name) or 0) + n for name, n in gone if n})
@@ -97,6 +106,97 @@ def reduced(baked: Baked, cameras: Sequence[Camera], progress: Progress = no_pro
     )
     if statistics.texels is not None:
         statistics = statistics.but(texels=statistics.texels.but(kept=result.packing.texels))
-    if not result.textured:
-        statistics = statistics.but(atlas=None)
     return replace(result, statistics=statistics)
+
+
+FEWEST_PASSES = 4  # steps of polish or fine-tuning per photograph; more may gain where there are fewer
+STEPS_AFTER_LEARNING = 100
+"""Fine-tuning steps of texels that were trained already: they recover what the reduction of tiles and colours cost."""
+
+
+@dataclass(frozen=True)
+class Learning:
+    """Optimisation after the training, against the photographs."""
+
+    polish: PolishOptions | None = None  # of texels and surfels together; None = none
+    tune: TuneOptions | None = None  # of texels alone, after that; None = none
+    train: TrainConfig = field(default_factory=TrainConfig)  # options of the training, for the rates of the polish
+    compact: Compact | None = None  # rounding for a compact bundle, before the texels are tuned alone; None = none
+
+    @classmethod
+    def of_scene(
+        cls,
+        scene: BakeableScene,
+        views: int,
+        polish_steps: int | None = None,
+        tune_steps: int | None = None,
+        cache_bytes: int = TuneOptions.cache_bytes,
+        train: TrainConfig | None = None,
+        compact: Compact | None = None,
+    ) -> Learning:
+        """Choose the steps by what the scene's texture has learned from.
+
+        Args:
+            scene: trained, with its texture as texels, as a field, or without texture.
+            polish_steps: 0 = no polish; None = none for texels, which training has learned; for a field 300, or
+                `FEWEST_PASSES` for each photograph where that is more.
+            tune_steps: 0 = no fine-tuning; None = `STEPS_AFTER_LEARNING`, or 400 where a field is not polished.
+            cache_bytes, train, compact: as in `TuneOptions` and here.
+        """
+        train = TrainConfig() if train is None else train
+        if scene.field is None:
+            return cls(train=train, compact=compact)
+        trained = isinstance(scene.field, TexelField)
+        if polish_steps is None:
+            polish_steps = 0 if trained else max(PolishOptions.steps, FEWEST_PASSES * views)
+        if tune_steps is None:
+            tune_steps = STEPS_AFTER_LEARNING if trained or polish_steps else TuneOptions.steps
+        options = TuneOptions.of_learned if trained else TuneOptions
+        polish = PolishOptions(steps=polish_steps) if polish_steps else None
+        tune = options(steps=tune_steps, cache_bytes=cache_bytes) if tune_steps else None
+        return cls(polish, tune, train, compact)
+
+
+def bake_and_learn(
+    scene: BakeableScene,
+    cameras: Sequence[Camera],
+    photographs: Sequence[View],
+    background: Tensor,
+    options: BakeOptions,
+    learning: Learning,
+    progress: Progress = no_progress,
+    held_out: Sequence[View] = (),
+) -> Baked:
+    """Bake a trained scene, optimise it against the photographs, and encode it for a bundle.
+
+    Stages: tiles of the trained texels, or of the field; polish of texels and surfels (field only); reduction of tiles
+    and view colours; rounding of the surfels (compact only); fine-tuning of the texels; coding; certificate.
+
+    Args:
+        cameras: of the training views, on the scene's device.
+        photographs: the training views, with the corrections that training found.
+        background: [3] colour behind the scene, on the CPU.
+        held_out: views of which the gains are stated; they decide nothing.
+
+    Raises:
+        ValueError: no surfel is left, an option is out of range, or the atlas would be too large.
+    """
+    tune, coding, device = learning.tune, None, device_of(cameras)
+    form = "compact" if learning.compact is not None else options.format
+    options = replace(options, format=replace(options, format=form).texel_format)  # as bundle.json states it
+    polish, trained = learning.polish, isinstance(scene.field, TexelField)
+    if trained:
+        baked = trained_texels(scene, options)
+    else:
+        baked = bake(scene, cameras, options, progress, None if polish is None else polish.pixels_per_texel)
+    if polish is not None and baked.textured:
+        baked = polish_scene(baked, photographs, background, polish, learning.train, progress, held_out, device)
+    if polish is not None or trained:
+        baked = reduced(baked, cameras, progress)
+    if learning.compact is not None:
+        baked, coding = compacted(baked, photographs, background, learning.compact, progress, device)
+    if tune is not None and baked.textured:
+        baked = tune_atlas(baked, photographs, background, tune, progress, held_out, coding, device)
+    if baked.codes is not None and baked.codes.texels is None:
+        baked = with_coded_texels(baked, coding)
+    return certified(baked.encoded(progress), [camera.to("cpu") for camera in cameras])

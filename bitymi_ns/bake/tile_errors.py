@@ -2,13 +2,14 @@
 the certificate of a bake, their errors by quantisation."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import chain
 
 import torch
 from torch import Tensor
 
 from bitymi_ns.bake.baked import Baked
-from bitymi_ns.bake.tiles import Shown, weights
+from bitymi_ns.bake.tiles import Shown, weighted_rms, weights
 from bitymi_ns.bundle.sketch import sketches_text
 from bitymi_ns.bundle.statistics import Certificate
 from bitymi_ns.codec.pages import first_texels, listed_texels, listed_tiles
@@ -17,19 +18,7 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.tile_sizes import kernel_parameters, max_projected_extent
 from bitymi_ns.train.init import tangents
 
-ALPHA_CONTRAST = 0.25  # of an error of alpha: how far a surfel's colour differs from that behind it, as a rule
 _CONSTANT = (8, 8)  # grid on which the weight of a surfel without a tile is evaluated
-
-
-def weighted_rms(difference: Tensor, weight: Tensor) -> Tensor:
-    """Root mean square of difference [n, C, v, u] times weight [n, v, u] where that is not 0, in 8-bit steps: [n].
-    Alpha, the fourth of four channels, counts by `ALPHA_CONTRAST`."""
-    count = 3 * (weight > 0).flatten(1).sum(1).clamp(min=1)
-    squares = difference[:, :3].square().sum(1)
-    if difference.shape[1] == 4:
-        squares = squares + (ALPHA_CONTRAST * difference[:, 3]).square()
-    square = (squares * weight.square()).flatten(1).sum(1)
-    return STEPS * (square / count).sqrt()
 
 
 def seen_rms(difference: Tensor, weight: Tensor, cells: Tensor) -> Tensor:
@@ -132,4 +121,4 @@ def certified(baked: Baked, cameras: Sequence[Camera]) -> Baked:
     certificate = Certificate.of(errors[seen], options.tolerance, "texels").but(
         texel_rms=round(rms, 4), marks=sketches_text(before, stored)
     )
-    return baked.with_statistics(certificate=certificate)
+    return replace(baked, statistics=baked.statistics.but(certificate=certificate))

@@ -1,4 +1,4 @@
-"""Training views of surfels that stand still, whose texels learn: their fragments are traced once and kept."""
+"""Texels of a bake as they learn against the photographs: their list, and the views, traced once and kept."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -6,12 +6,68 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from bitymi_ns.bake.baked import Baked
 from bitymi_ns.bake.early_stopping import evaluate
-from bitymi_ns.bake.texel_list import TexelList
-from bitymi_ns.ops import Fragments, Projection, TexelDescent, blended_image, fitting_lists, select, view_color
+from bitymi_ns.ops import (
+    Fragments,
+    Projection,
+    TexelDescent,
+    TexelTiles,
+    add_texel_coverage,
+    blended_image,
+    fitting_lists,
+    project,
+    select,
+    view_color,
+)
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.losses import numbers, photometric
 from bitymi_ns.train.views import MemoryBudget, View, shown
+
+
+class TexelList:
+    """The texels of a bake, tile after tile. A surfel without a tile has one texel, its constant residual.
+
+    Attributes:
+        scene: the surfels, on the device.
+        tiles: where the texels lie.
+        values: [T, 3] residual colours as baked, on the device.
+        alpha: opacities of the texels on the device, which stand still; None = opaque texels.
+    """
+
+    def __init__(self, baked: Baked, device: torch.device | str = "cpu") -> None:
+        """
+        Args:
+            baked: with an atlas.
+
+        Raises:
+            ValueError: there is no atlas.
+        """
+        if not baked.textured:
+            raise ValueError("a scene without texture has no texels to tune")
+        self.device = torch.device(device)
+        self.scene = baked.scene.to(device)
+        self.tiles = TexelTiles.of_sizes(baked.sizes.clamp(min=1).to(device), baked.extent.float().to(device))
+        self.values = baked.texels[:, :3].contiguous().to(device, copy=True)
+        self.alpha = None if baked.alpha is None else baked.alpha.to(device)
+
+    def projection(self, camera: Camera) -> Projection:
+        """Of the surfels into a view."""
+        geometry = (self.scene.surfels[name] for name in GEOMETRY)
+        return project(*geometry, camera.to(self.device), self.scene.near, self.scene.prefilter, alpha=self.alpha)
+
+    def coverage(self, views: Sequence[View], progress: Progress = no_progress) -> Tensor:
+        """Coverage of every texel, in pixels that count: [T, 2], the sums over views and fragments of the blending
+        weight, and of its square, times the bilinear weight; 0 where no view sees it."""
+        totals = torch.zeros_like(self.values), torch.zeros_like(self.values)
+        for done, view in enumerate(views, start=1):
+            lists = fitting_lists(self.projection(view.camera))
+            add_texel_coverage(lists, self.tiles, view.mask, self.scene.weight_bound, *totals)
+            progress("tracing the training views", done, len(views))
+        return torch.stack([total[:, 0] for total in totals], 1)
+
 
 LEAST_KEPT = 1 / 8
 """Share of the views that fits where any are kept: of fewer, the memory is worth more than the time that they save."""

@@ -8,7 +8,7 @@ from torch import Tensor
 from bitymi_ns.bake.field.errors import tile_errors
 from bitymi_ns.bake.field.plan import Field, make_plan
 from bitymi_ns.bake.inputs import BakeInput
-from bitymi_ns.bake.lean_color import centers_of, view_color_errors
+from bitymi_ns.bake.view_colors import centers_of, view_color_errors
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.read import Bundle
 from bitymi_ns.bundle.verify import SLACK_STEPS, Check, steps_text

@@ -1,11 +1,14 @@
 """Integer columns as Zstandard frames: one frame per byte plane, of known size."""
 
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 import zstandard
+
+from bitymi_ns.ops.backend import load
 
 LEVEL = 19
 MOST_PLANES = 7  # bytes of an integer that a float64 holds exactly
@@ -27,17 +30,18 @@ class Compressed:
 
 def compress(codes: npt.NDArray[np.int64], level: int = LEVEL) -> Compressed:
     """Compress int64 [rows, n] of magnitude below 2^53; `level` is Zstandard's, 1 to 22."""
-    compressor = zstandard.ZstdCompressor(level=level, write_content_size=True)
     low = [int(column.min()) if len(column) else 0 for column in codes.T]
-    frames: list[list[bytes]] = []
-    for column, least in zip(codes.T, low, strict=True):
-        rest, planes = (column - least).astype(np.uint64), []
-        while rest.any():
-            planes.append(compressor.compress((rest & np.uint64(255)).astype(np.uint8).tobytes()))
-            rest = rest >> np.uint64(8)
-        frames.append(planes)
-    sizes = [[len(frame) for frame in planes] for planes in frames]
-    return Compressed(low, sizes, b"".join(frame for planes in frames for frame in planes))
+    planes: list[list[Future[bytes]]] = []
+    with ThreadPoolExecutor(load("_cpu").num_threads()) as pool:
+        for column, least in zip(codes.T, low, strict=True):
+            rest = (column - least).astype(np.uint64)
+            planes.append([])
+            while rest.any():
+                plane = (rest & np.uint64(255)).astype(np.uint8).tobytes()
+                planes[-1].append(pool.submit(zstandard.compress, plane, level))
+                rest = rest >> np.uint64(8)
+    frames = [[plane.result() for plane in number] for number in planes]
+    return Compressed(low, [[len(f) for f in number] for number in frames], b"".join(f for n in frames for f in n))
 
 
 def decompress(

@@ -11,7 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.lean_color import centers_of
+from bitymi_ns.bake.view_colors import centers_of
 from bitymi_ns.bundle import Bundle, BundleError
 from bitymi_ns.codec.pages import texel_alpha
 from bitymi_ns.files import complete_folder, explained

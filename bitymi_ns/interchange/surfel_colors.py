@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.directions import view_directions
-from bitymi_ns.bake.lean_color import shown_at
 from bitymi_ns.bake.tiles import texel_centers
+from bitymi_ns.bake.view_colors import shown_at
 from bitymi_ns.codec.pages import size_classes, texel_index
 from bitymi_ns.interchange import harmonics
 from bitymi_ns.ops.constants import COLOR_BIAS, SUPPORT

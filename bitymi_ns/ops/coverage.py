@@ -17,7 +17,7 @@ def add_texel_coverage(
     tiles: TexelTiles,
     mask: Tensor | None,
     bound: float,
-    total: Tensor | None,
+    total: Tensor,
     squares: Tensor | None = None,
 ) -> None:
     """Add the coverage of each texel in a view, in pixels: sum over fragments of blending weight times bilinear weight.
@@ -27,7 +27,7 @@ def add_texel_coverage(
         tiles: of the T texels.
         mask: [H, W] or [H, W, 1] bool, True for pixels that count; None: all.
         bound: fragments of smaller weight are ignored.
-        total: [T, 3] of the tiles' dtype, dense, equal columns, added to; None: skip.
+        total: [T, 3] of the tiles' dtype, dense, equal columns, added to.
         squares: [T, 3], added to: the same sum with squared blending weights; None: skip.
     """
     like, top = tiles.extent, 0
@@ -37,8 +37,7 @@ def add_texel_coverage(
         pixels = fragments.width * fragments.height
         counts = like.new_ones(pixels) if mask is None else mask[top : top + pixels].to(like.dtype)
         weight = dense(fragments.weight, like)
-        if total is not None:
-            _add(fragments, weight, tiles, counts, bound, total, share)
+        _add(fragments, weight, tiles, counts, bound, total, share)
         if squares is not None:
             _add(fragments, weight.square(), tiles, counts, bound * bound, squares, share)
         top += pixels

@@ -24,12 +24,18 @@ class Visibility:
             weight = sigma T); 0 for a surfel that no view blends.
         pixels: [N] float32, maximum over the views of the sum of the surfel's blending weights, without those that get
             no residual.
-        seen: [V, N] bool, True if the view blends a fragment of the surfel.
+        squares: [V, N] bfloat16, sum over the view's pixels of the surfel's squared blending weight: an error e of its
+            colour adds e^2 times as much to the picture.
     """
 
     transmittance: Tensor
     pixels: Tensor
-    seen: Tensor
+    squares: Tensor
+
+    @property
+    def seen(self) -> Tensor:
+        """[V, N] bool, whether the view blends a fragment of the surfel."""
+        return self.squares > 0
 
     @property
     def in_front(self) -> Tensor:
@@ -38,7 +44,7 @@ class Visibility:
 
     def of(self, rows: Tensor) -> Visibility:
         """Select surfels by row."""
-        return Visibility(self.transmittance[rows], self.pixels[rows], self.seen[:, rows])
+        return Visibility(self.transmittance[rows], self.pixels[rows], self.squares[:, rows])
 
 
 @torch.no_grad()
@@ -64,9 +70,9 @@ def visibility(
     geometry = [surfels[name] for name in ("quats", "log_scales", "opacity_logits", "beta_raw")]
     largest = means.new_zeros(len(means))
     pixels = torch.zeros_like(largest)
-    seen = torch.zeros(len(cameras), len(means), dtype=torch.bool, device=means.device)
+    squares = torch.zeros(len(cameras), len(means), dtype=torch.bfloat16, device=means.device)
     for done, camera in enumerate(cameras, start=1):
-        here = torch.zeros_like(pixels)
+        here, square = torch.zeros_like(pixels), torch.zeros_like(pixels)
         projection = project(means, *geometry, camera.to(means.device), near, prefilter, alpha=alpha)
         for fragments in fitting_lists(projection):
             lists = (fragments.surfel, fragments.weight, fragments.sigma)
@@ -74,8 +80,8 @@ def visibility(
                 rows = surfel.long()
                 largest.scatter_reduce_(0, rows, weight / sigma.abs(), "amax")  # sigma's sign is the low-pass branch
                 here.index_add_(0, rows, torch.where(weight >= weight_bound, weight, 0.0).to(here.dtype))
-                seen[done - 1, rows] = True
+                square.index_add_(0, rows, weight.square().to(square.dtype))
             del fragments, lists, surfel, weight, sigma  # frees memory before the next list
-        pixels = torch.maximum(pixels, here)
+        pixels, squares[done - 1] = torch.maximum(pixels, here), square
         progress("looking through the training views", done, len(cameras))
-    return Visibility(largest, pixels, seen)
+    return Visibility(largest, pixels, squares)

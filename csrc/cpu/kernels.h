@@ -17,6 +17,7 @@
 #include "ops/field.h"
 #include "ops/texel.h"
 #include "ops/visibility.h"
+#include "ops/voronoi.h"
 
 namespace bt {
 
@@ -26,6 +27,7 @@ void set_num_threads(int n);
 template <class S> void project_forward(const ProjectForward<S>& a);
 template <class S> void project_backward(const ProjectBackward<S>& a);
 template <class S> void sparse_cosines(const SparseCosines<S>& a);
+template <class S> void fit_sites(const FitSites<S>& a);
 
 // Visible surfels per tile, front to back, and the squared radii of each surfel's level set in scale units, and of its
 // low pass in pixels, 0 where the kernel covers that.

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from bitymi_ns.bake import BakeOptions, export
 from bitymi_ns.bake.compact import Compact
-from bitymi_ns.bake.learn import Learning, bake_and_learn
-from bitymi_ns.bake.pipeline import reduced, trained_texels
+from bitymi_ns.bake.pipeline import Learning, bake_and_learn, reduced, trained_texels
 from bitymi_ns.bake.tune import TuneOptions
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.bundle.verify import check_files

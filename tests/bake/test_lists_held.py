@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from bitymi_ns.bake import BakeOptions, bake
-from bitymi_ns.bake.texel_list import TexelList
-from bitymi_ns.bake.tuning_views import TuningViews
+from bitymi_ns.bake.tuning_views import TexelList, TuningViews
 from bitymi_ns.ops import Fragments, trace_cpu
 from bitymi_ns.ops import bands as bands_module
 from bitymi_ns.ops import trace as whole_trace

@@ -9,7 +9,7 @@ import torch
 from bitymi_ns.bake import BakeOptions, bake
 from bitymi_ns.bake.field.plan import make_plan, references
 from bitymi_ns.bake.inputs import BakeInput
-from bitymi_ns.bake.reduce import fit, interpolation
+from bitymi_ns.bake.tiles import fit, interpolation
 from bitymi_ns.ops.reference.render import texel, texel_centers
 from bitymi_ns.scene.tile_sizes import kernel_parameters, visible_extent
 from bitymi_ns.train.init import tangents

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from bitymi_ns.bake import learn as bake_learn
+from bitymi_ns.bake import pipeline as bake_pipeline
 from bitymi_ns.bake import tuning_views
 from bitymi_ns.bundle import check_files
 from bitymi_ns.plugin.export import command
@@ -21,8 +21,8 @@ def interrupted(*args: Any, **kwargs: Any) -> None:
     "module, function, options, replaces, message",
     [
         (tuning_views, "photometric", {"tolerance": TOLERANCE}, False, "was not written"),
-        (bake_learn, "trained_texels", {}, False, "was not written"),
-        (bake_learn, "trained_texels", {"overwrite": True}, True, "is the earlier one"),
+        (bake_pipeline, "trained_texels", {}, False, "was not written"),
+        (bake_pipeline, "trained_texels", {"overwrite": True}, True, "is the earlier one"),
         (command, "read_bundle", {"finetune_steps": 0}, False, "is complete"),
     ],
     ids=["fine-tuning", "bake", "bake of a replacement", "comparison"],

@@ -11,9 +11,8 @@ from bitymi_ns.bake.field.errors import tile_errors
 from bitymi_ns.bake.field.lean_field import lean_field
 from bitymi_ns.bake.field.plan import Field, Plan, make_plan, paper_texels, references
 from bitymi_ns.bake.inputs import BakeInput, drawable, photo_resolution, visible
-from bitymi_ns.bake.lean_color import kept_view_colors
-from bitymi_ns.bake.reduce import Reduced, reduce_tiles
-from bitymi_ns.bake.tiles import Tiles
+from bitymi_ns.bake.tiles import Reduced, Tiles, reduce_tiles
+from bitymi_ns.bake.view_colors import reduce_view_colors
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.statistics import KeptSurfels, Statistics
 from bitymi_ns.codec.packing import pack
@@ -70,14 +69,14 @@ def bake(
         paper = paper_texels(candidates.surfels, field, options)
         tiles, atlas, statistics = _textured(field, inputs, paper, statistics, options, pixels_per_texel, progress)
     if pixels_per_texel is None:
-        surfels, view_color = kept_view_colors(inputs, options, progress)
+        surfels, colors, view_color = reduce_view_colors(inputs, options, progress)
     else:
-        surfels, view_color = dict(inputs.surfels), None
+        surfels, colors, view_color = dict(inputs.surfels), None, None
     baked = Baked.of(scene, surfels, rows, tiles, options)
     baked.scene.photographed = photo_resolution(inputs)
     statistics = statistics.but(view_color=view_color, seconds=round(time.perf_counter() - started, 3))
     in_front = None if inputs.transmittance is None else inputs.transmittance.cpu()
-    return replace(baked, atlas=atlas, statistics=statistics, in_front=in_front)
+    return replace(baked, atlas=atlas, statistics=statistics, in_front=in_front, colors=colors)
 
 
 def _textured(

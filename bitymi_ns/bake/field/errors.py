@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.field.plan import Field, Plan, references
-from bitymi_ns.bake.reduce import read_at
 from bitymi_ns.bake.tile_errors import cells_per_pixel, seen_rms, weighted_rms
+from bitymi_ns.bake.tiles import read_at
 from bitymi_ns.bundle.statistics import Certificate, Percentiles, TileError
 from bitymi_ns.codec.pages import first_texels, size_classes
 from bitymi_ns.codec.quantise import STEPS

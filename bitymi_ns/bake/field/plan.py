@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.inputs import BakeInput
-from bitymi_ns.bake.reduce import fitted
 from bitymi_ns.bake.tile_errors import closest_pixels
-from bitymi_ns.bake.tiles import Shown, TileValues, grid, weights
+from bitymi_ns.bake.tiles import Shown, TileValues, fitted, grid, weights
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.statistics import KeptTexels
 from bitymi_ns.scene.tile_sizes import kernel_parameters, nyquist_resolution, visible_extent, voxel_along_axes

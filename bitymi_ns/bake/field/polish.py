@@ -11,8 +11,8 @@ from torch import Tensor
 
 from bitymi_ns.bake.baked import Baked
 from bitymi_ns.bake.early_stopping import FEWEST_VIEWS, EarlyStopping, evaluate, gain, validation_split
-from bitymi_ns.bake.texel_list import TexelList
 from bitymi_ns.bake.tune import TuneOptions
+from bitymi_ns.bake.tuning_views import TexelList
 from bitymi_ns.bundle.statistics import FineTuning
 from bitymi_ns.ops import TexelDescent
 from bitymi_ns.progress import Progress, no_progress
@@ -181,7 +181,7 @@ def _optimise(
     options = run.options
     before = run.psnr(validation, progress)
     stopping = EarlyStopping(options.steps, options.checks, options.patience, before, run.state())
-    share, attempts = 1.0 / (run.texels.coverage(views, progress)[0] + options.prior), 0  # [T]
+    share, attempts = 1.0 / (run.texels.coverage(views, progress)[:, 0] + options.prior), 0  # [T]
     for number in range(options.steps):
         view = views[training_order(len(views), options.seed, number)]
         if not run.step(number, view, share):

@@ -12,7 +12,7 @@ import tyro
 from bitymi_ns import endings
 from bitymi_ns.bake import BakeOptions, Learning, TuneOptions, bake_and_learn, export, rich_progress
 from bitymi_ns.bake.compact import Compact
-from bitymi_ns.bake.learn import FEWEST_PASSES
+from bitymi_ns.bake.pipeline import FEWEST_PASSES
 from bitymi_ns.bundle import Bundle, BundleError, read_bundle
 from bitymi_ns.bundle.bake_options import BundleFormat
 from bitymi_ns.bundle.manifest import MANIFEST, dump

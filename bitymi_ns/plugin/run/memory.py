@@ -8,7 +8,7 @@ import psutil
 import torch
 
 from bitymi_ns.bake.tuning_views import LEAST_KEPT
-from bitymi_ns.bake.view_color_rate import choice_bytes
+from bitymi_ns.bake.view_colors import choice_bytes
 from bitymi_ns.bundle.sizes import memory_limit
 from bitymi_ns.ops import can_rasterize, project
 from bitymi_ns.ops.project import GEOMETRY
@@ -141,7 +141,7 @@ def state_export(
     entry = VIEW_COLORS[kind]
     terms = scene.surfels[entry.parameters[1].name].shape[1] - entry.base_terms
     chosen = choice_bytes(kind, len(scene), len(cameras), terms) if compact else 0
-    seen = 2 * len(cameras) * len(scene)  # of `Visibility`, and of those of its surfels that are drawn
+    seen = 4 * len(cameras) * len(scene)  # of `Visibility`, and of those of its surfels that are drawn
     needed += max(seen, chosen, finetune_bytes + PER_SURFEL * learning)  # one after the other
     if isinstance(scene.field, TexelField):
         needed += PER_BAKED_TEXEL * len(scene.field.texels)

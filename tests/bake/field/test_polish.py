@@ -81,7 +81,7 @@ def test_view_colours_are_reduced_afterwards_and_can_be_tuned(wrong: Baked, view
     assert (left.kept, left.left_out.transparent, left.left_out.unseen) == (58, 1, 1)
     assert lean.rows.tolist() == [i for i in range(60) if i not in (5, 59)] and lean.atlas is None
     assert db(lean, views[10:]) == pytest.approx(db(polished, views[10:]), abs=0.1)
-    again = tune_atlas(lean, views[:10], BACKGROUND, TuneOptions(steps=8, coded_steps=0))
+    again = tune_atlas(lean, views[:10], BACKGROUND, TuneOptions(steps=8, coded_steps=0, patience=8))
     assert again.statistics.polish == polished.statistics.polish and again.statistics.finetune.steps == 8
     with pytest.raises(ValueError, match="reduced already"):
         polish_scene(lean, views, BACKGROUND, OPTIONS)

@@ -13,15 +13,14 @@ from torch.utils._pytree import tree_leaves
 
 from bitymi_ns.bake import BakeOptions
 from bitymi_ns.bake.baked import Baked
-from bitymi_ns.bake.texel_list import TexelList
 from bitymi_ns.bake.tiles import Tiles
-from bitymi_ns.bake.tuning_views import TuningViews
-from bitymi_ns.bake.view_color_rate import shown_weights
+from bitymi_ns.bake.tuning_views import TexelList, TuningViews
 from bitymi_ns.ops.backend import emulated_cuda
 from bitymi_ns.plugin.run import memory
 from bitymi_ns.scene import Camera, Scene
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import TexelField
+from bitymi_ns.scene.visibility import visibility
 from bitymi_ns.train import texels
 from bitymi_ns.train.config import TexelConfig
 from bitymi_ns.train.views import MemoryBudget, View
@@ -214,7 +213,7 @@ class Peak(TorchDispatchMode):
         return made
 
 
-def test_lists_of_an_export_take_what_is_stated_on_a_card() -> None:
+def test_lists_of_an_export_take_what_is_stated_on_a_card(monkeypatch: pytest.MonkeyPatch) -> None:
     try:
         from bitymi_ns import _emulated  # noqa: F401
     except ImportError:
@@ -233,11 +232,12 @@ def test_lists_of_an_export_take_what_is_stated_on_a_card() -> None:
     tiles = Tiles(torch.full((count, 2), 4), torch.full((count,), 3.0), torch.zeros(16 * count, 3))
     baked = Baked.of(stands, surfels, torch.arange(count), tiles, BakeOptions(format="fp16"))
     view = View(camera, torch.zeros(size, size, 3))
+    monkeypatch.setattr("bitymi_ns.scene.visibility.PART", 1 << 12)  # large views have many parts
     taken = []
     with emulated_cuda(seed=1):
         for use in (
-            lambda: TexelList(baked).coverage([view], powers=(1, 2)),
-            lambda: shown_weights(baked.scene, [camera]),
+            lambda: TexelList(baked).coverage([view]),
+            lambda: visibility(surfels, [camera], 0.2, bound),
             lambda: TuningViews(TexelList(baked), [view], torch.zeros(3), MemoryBudget(0))[0],
         ):
             with Peak() as peak:

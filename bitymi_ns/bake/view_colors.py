@@ -1,0 +1,334 @@
+"""View colours of fewer terms: within the tolerance, and for compact bundles as the pictures pay for them."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from bitymi_ns.bake.directions import Directions, view_directions
+from bitymi_ns.bake.inputs import BakeInput
+from bitymi_ns.bundle.bake_options import BakeOptions
+from bitymi_ns.bundle.statistics import Kept, Percentiles, ViewColorError
+from bitymi_ns.codec.limits import beyond
+from bitymi_ns.codec.quantise import STEPS
+from bitymi_ns.ops import backend, view_color
+from bitymi_ns.ops.constants import COLOR_BIAS
+from bitymi_ns.ops.view_color import LEAN, view_base
+from bitymi_ns.ops.view_kinds import VIEW_COLORS, fibonacci_sphere, kind_of
+from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.tile_sizes import kernel_parameters
+
+BITS_PER_NUMBER = 5.5  # bits of a number of a term in a compact bundle, about
+LEAST_WEIGHT = 1e-12  # weight of any direction: a surfel that no view shows has a colour, too
+VIEW_SHARE = 0.5  # weight of the training views; the rest are directions between and around them
+BLIND = 4  # directions from so many of the nearest views that do not show the surfel count, too
+BLIND_SHARE = 0.1
+"""Weight of these as a share of what a view would show of the surfel from there: a new view may show it."""
+
+
+@dataclass(frozen=True)
+class ColorChoices:
+    """View colours of N surfels, from the most terms that a tolerance needs down to one colour."""
+
+    # [N, most + 1] squared error in the views, summed over pixels and channels, of every number of terms; infinite
+    # where that number is no choice
+    error: Tensor
+    largest: Tensor  # [N] largest error of the most terms over all directions, times the blending weight, 8-bit steps
+    width: int  # numbers of a term
+    # rows [n] int64 of surfels, and their base colours [n, 3] and terms [n, number, width] for a number of terms
+    choices: Sequence[tuple[Tensor, Tensor, Tensor]]
+
+    def at(self, lmbda: float | None = None) -> dict[str, Tensor]:
+        """Lean view colours of the least error + lambda bits.
+
+        Args:
+            lmbda: squared error per bit, colours from 0 to 1; None = those within the tolerance.
+        """
+        numbers = torch.arange(self.error.shape[1])
+        if lmbda is None:
+            count = torch.where(self.error.isfinite(), numbers, 0).amax(1)
+        else:
+            count = (self.error + lmbda * BITS_PER_NUMBER * self.width * numbers).argmin(1)
+        first, base = count.cumsum(0) - count, self.error.new_zeros(len(count), 3)
+        listed = self.error.new_zeros(int(count.sum()), self.width)
+        for rows, bases, terms in self.choices:
+            chosen = count[rows] == terms.shape[1]
+            base[rows[chosen]] = bases[chosen]
+            listed[first[rows[chosen], None] + torch.arange(terms.shape[1])] = terms[chosen]
+        return dict(zip(LEAN, (base, torch.stack([first, count], dim=1).int(), listed), strict=True))
+
+
+def choice_bytes(kind: str, surfels: int, views: int, most: int) -> int:
+    """Memory of `color_choices`, bytes.
+
+    Args:
+        most: lean terms of a surfel.
+    """
+    entry = VIEW_COLORS[kind]
+    numbers = range(most + 1) if entry.sites is not None else sorted({0, most})
+    of_surfel = 4 * (most + 1) + sum(8 + 4 * (3 + entry.lean_width * number) for number in numbers)
+    return surfels * (of_surfel + views)  # whether a view shows a surfel
+
+
+def shown_at(kind: str, params: Mapping[str, Tensor], directions: Tensor) -> Tensor:
+    """max(f_view + 0.5, 0), the colour that is blended, by the renderers' own kernels: [n, D, 3].
+
+    Args:
+        kind: a name of `ops.VIEW_COLORS`.
+        params: parameters of n surfels, all or lean.
+        directions: [n, D, 3] unit vectors.
+    """
+    origin = directions.new_zeros(3)
+    columns = [view_color(kind, params, d.contiguous(), origin) for d in directions.unbind(1)]
+    return view_base(torch.stack(columns, dim=1))
+
+
+def centers_of(cameras: Sequence[Camera], like: Tensor) -> Tensor:
+    """[V, 3] float64 centres of the cameras on the device of `like`."""
+    centers = [camera.exact_center.double().cpu() for camera in cameras]
+    return torch.stack(centers).to(like.device) if centers else torch.zeros(0, 3, dtype=torch.float64)
+
+
+@torch.no_grad()
+def color_choices(
+    surfels: Mapping[str, Tensor],
+    kind: str,
+    squares: Tensor,
+    centers: Tensor,
+    opacity: Tensor,
+    tolerance: float,
+    near: float = 0.0,
+    progress: Progress = no_progress,
+) -> ColorChoices:
+    """Fit view colours of fewer terms, from one colour up to the fewest terms within a tolerance.
+
+    The tolerance bounds the largest error over all directions of `view_directions` and the channels, of
+    max(f_view + 0.5, 0), times the largest blending weight that the surfel can have. One colour is tried first, the
+    middle between the extremes; then 2, 3, ... sites: those that are hardest to do without, fitted together by least
+    squares. A surfel for which none is good enough keeps all sites. Surfels of a kind without sites (`ViewColor.sites`)
+    keep one colour, or all terms.
+
+    Colours of fewer terms are choices, too, with the error that they make in the pictures: squared, in every view times
+    what it shows of the surfel. Half of it is that in the training views, half the mean of directions between and
+    around them. Beside these, views that pass close by a surfel without looking at it count by what they would show of
+    it: the next view does look, and has nothing else to go by. Sites are fitted to this error.
+
+    Args:
+        surfels: per-surfel parameters, N rows; their device does the work.
+        kind: a name of `ops.VIEW_COLORS`.
+        squares: [V, N] what the training views show of each surfel (`Visibility.squares`); V may be 0.
+        centers: [V, 3] float64 camera centres.
+        opacity: [N] largest blending weight.
+        tolerance: 8-bit steps.
+        near: nearest drawn depth.
+
+    Returns:
+        on the CPU.
+    """
+    means, entry = surfels["means"], VIEW_COLORS[kind]
+    most = entry.terms(surfels) - entry.base_terms
+    error = means.new_full((len(means), most + 1), torch.inf)
+    largest, choices, done = means.new_zeros(len(means)), [], 0
+    for at in view_directions(means, squares > 0, centers):
+        own = [surfels[name][at.rows] for name in entry.names]
+        shown = squares[:, at.rows].float()
+        blind, of_blind = _blind(means[at.rows], shown, centers, near)
+        weight = torch.cat([_weights(at, shown), of_blind], dim=1)
+        at = replace(at, unit=torch.cat([at.unit, blind], dim=1), valid=F.pad(at.valid, (0, blind.shape[1])))
+        target = shown_at(kind, dict(zip(entry.names, own, strict=True)), at.unit)
+
+        def rest_of(rows: Tensor, base: Tensor, terms: Tensor, shown: Tensor) -> Tensor:
+            """Add a choice for rows of the chunk; returns those that it does not keep within the tolerance."""
+            away = shown - target[rows]  # noqa: B023 - called in this round alone
+            square = (away.square().sum(2) * weight[rows]).sum(1)  # noqa: B023
+            bad = beyond("view_base", kind, base).any(1) | beyond("view_terms", kind, terms).flatten(1).any(1)
+            held, of_scene = ~bad & square.isfinite(), at.rows[rows]  # noqa: B023
+            found = opacity[of_scene] * STEPS * (away.abs().amax(2) * at.valid[rows]).amax(1)  # noqa: B023
+            fits = held & (found <= tolerance)
+            kept = held if len(squares) else fits  # without views nothing is known of the pictures
+            error[of_scene, terms.shape[1]] = square.masked_fill(~kept, torch.inf)
+            largest[of_scene] = found
+            choices.append(tuple(value[kept].cpu() for value in (of_scene, base, terms)))
+            return rows[~fits]
+
+        rest = torch.arange(len(at.rows), device=means.device)
+        color = _one_color(target, at.valid, weight, tolerance / opacity[at.rows])
+        base = (color - COLOR_BIAS) / entry.base_unit
+        rest = rest_of(rest, base, base.new_zeros(len(base), 0, entry.lean_width), color[:, None])
+        if entry.sites is not None:
+            vectors, colors = entry.sites(*own)
+            counts = at.subset(weight, FIT_VIEWS)
+            fit = fewer_sites(at, counts / counts.mean(1, keepdim=True).clamp(min=1e-20), vectors, colors)
+            for number in range(2, vectors.shape[1]):
+                if len(rest):
+                    base, terms = fit(number, rest)
+                    weights = site_weights(F.pad(terms[..., :3], (0, 0, 1, 0)), at.unit[rest])
+                    color = view_base(weights @ torch.cat([base[:, None], terms[..., 3:]], dim=1))
+                    rest = rest_of(rest, base, terms, color)
+            own = colors[:, 0], torch.cat([vectors[:, 1:] - vectors[:, :1], colors[:, 1:]], dim=2)
+        rows = at.rows[rest]
+        error[rows, most], largest[rows] = 0.0, 0.0
+        choices.append((rows.cpu(), *(value[rest].cpu() for value in own)))
+        done += len(at.rows)
+        progress("reducing the view colours", done, len(means))
+    return ColorChoices(error.cpu(), largest.cpu(), entry.lean_width, choices)
+
+
+def _weights(at: Directions, weights: Tensor) -> Tensor:
+    """[n, D] how much an error at each direction counts, of the weights [V, n] of the views."""
+    of_views = weights.T.gather(1, at.view) * at.valid[:, : at.views]
+    rest = at.valid.shape[1] - at.views
+    between = (1 - VIEW_SHARE) * of_views.sum(1, keepdim=True) / max(1, rest)
+    return torch.cat([VIEW_SHARE * of_views, between.expand(-1, rest)], dim=1)
+
+
+def _blind(means: Tensor, weights: Tensor, centers: Tensor, near: float) -> tuple[Tensor, Tensor]:
+    """Directions [n, BLIND, 3] from the nearest views that do not show a surfel, and how much each counts: by what the
+    views that do show would show from there, by the square of the distance; none from where there is no such view.
+    `means` [n, 3], `weights` [V, n] of the views, `centers` [V, 3] float64."""
+    offset = means.double()[:, None] - centers.to(means.device)  # [n, V, 3]
+    square, shows = offset.square().sum(2).clamp(min=near * near), weights.T > 0
+    from_unit = (weights.T * square).sum(1) / shows.sum(1).clamp(min=1)
+    nearest = square.masked_fill(shows, torch.inf).topk(min(BLIND, len(centers)), largest=False)
+    unit = F.normalize(offset.gather(1, nearest.indices[..., None].expand(-1, -1, 3)), dim=2)
+    return unit.to(means), (BLIND_SHARE * from_unit[:, None] / nearest.values).to(means)
+
+
+def _one_color(target: Tensor, valid: Tensor, weight: Tensor, allowed: Tensor) -> Tensor:
+    """[n, 3] the middle of the extremes of colours [n, D, 3] where it is within `allowed` [n] 8-bit steps, else their
+    mean."""
+    low = target.masked_fill(~valid[..., None], torch.inf).amin(1)
+    high = target.masked_fill(~valid[..., None], -torch.inf).amax(1)
+    weight = weight + LEAST_WEIGHT
+    mean = (target * weight[..., None]).sum(1) / weight.sum(1, keepdim=True)
+    return torch.where((STEPS * 0.5 * (high - low).amax(1) <= allowed)[:, None], 0.5 * (low + high), mean)
+
+
+@torch.no_grad()
+def view_color_errors(
+    kind: str,
+    full: Mapping[str, Tensor],
+    lean: Mapping[str, Tensor],
+    means: Tensor,
+    seen: Tensor,
+    centers: Tensor,
+    opacity: Tensor,
+) -> Tensor:
+    """Largest error of every surfel's view colour over the directions of `view_directions`, times its largest blending
+    weight, in 8-bit steps: [N].
+
+    Args:
+        full, lean: parameters of N surfels as they were trained, and their lean ones.
+        seen: [V, N] bool, the training views that see each surfel; V may be 0.
+        kind, centers, opacity: as in `color_choices`.
+    """
+    error = means.new_zeros(len(means))
+    for at in view_directions(means, seen, centers):
+        exact = shown_at(kind, {name: full[name][at.rows] for name in VIEW_COLORS[kind].names}, at.unit)
+        rows = {name: lean[name][at.rows] for name in ("view_base", "view_span")}
+        found = shown_at(kind, {**rows, "view_terms": lean["view_terms"]}, at.unit)
+        error[at.rows] = STEPS * ((exact - found).abs().amax(2) * at.valid).amax(1) * opacity[at.rows]
+    return error
+
+
+def reduce_view_colors(
+    inputs: BakeInput, options: BakeOptions, progress: Progress = no_progress
+) -> tuple[dict[str, Tensor], ColorChoices | None, ViewColorError | None]:
+    """Surfels with the view colours that the tolerance keeps, the choices of fewer terms, and the error; without a
+    tolerance all of the view colours."""
+    surfels, tolerance = dict(inputs.surfels), options.tolerance
+    if tolerance == 0:
+        return surfels, None, None
+    kind, means = kind_of(surfels), surfels["means"]
+    opacity, _ = kernel_parameters(surfels, inputs.transmittance)
+    squares = means.new_zeros(0, len(means)) if inputs.views is None else inputs.views.squares
+    at = (squares, centers_of(inputs.cameras, means), opacity)
+    choices = color_choices(surfels, kind, *at, tolerance, inputs.near, progress)
+    lean, entry = choices.at(), VIEW_COLORS[kind]
+    before = sum(each[0].numel() for each in entry.of(surfels)) if len(means) else 0
+    sites = 1 + entry.terms(surfels) - entry.base_terms  # the base of a lean colour, and its terms
+    stated = ViewColorError(
+        kind=kind,
+        tolerance=tolerance,
+        unit="8-bit steps, largest over the directions and channels, weighted by the blending weight",
+        sites=Kept(before=sites * len(means), after=len(means) + len(lean["view_terms"])),
+        one_color=int((lean["view_span"][:, 1] == 0).sum()),
+        bytes=Kept(before=4 * before * len(means), after=4 * (4 * len(means) + lean["view_terms"].numel())),
+        error=Percentiles.of(choices.largest),
+    )
+    kept = {name: value for name, value in surfels.items() if name not in entry.names}
+    return kept | lean, choices, stated
+
+
+FIT_STEPS = 6
+FIT_VIEWS = 16  # views of a surfel in the fit; the error is measured in all of them
+OUTSIDE, OUTSIDE_WEIGHT = 12, 0.05
+"""Directions over the whole sphere, and their weight, in the fit: where no view is, the colour follows the trained one
+loosely instead of diverging."""
+
+
+def site_weights(vectors: Tensor, directions: Tensor) -> Tensor:
+    """softmax_k(v_k . d): [n, D, K] from [n, K, 3] and [n, D, 3]."""
+    return torch.softmax(directions @ vectors.transpose(1, 2), dim=2)
+
+
+def least_needed(vectors: Tensor, rgb: Tensor, directions: Tensor, weight: Tensor) -> list[Tensor]:
+    """Sites in the order in which they can be done without.
+
+    Without site k the colour changes by w_k / (1 - w_k) (c - rgb_k); the site goes for which the weighted sum of its
+    squares is least.
+
+    Args:
+        vectors, rgb: [n, K, 3].
+        directions: [n, D, 3].
+        weight: [n, D] how much a direction counts.
+
+    Returns:
+        for every number of sites from 1 to K - 1 the sites that are left, [n, number] int64.
+    """
+    n, count = vectors.shape[:2]
+    alive = torch.ones(n, count, dtype=torch.bool, device=vectors.device)
+    logits = directions @ vectors.transpose(1, 2)
+    left: list[Tensor] = []
+    for size in range(count - 1, 0, -1):
+        w = torch.softmax(logits.masked_fill(~alive[:, None], -torch.inf), dim=2)  # [n, D, K]
+        c = w @ rgb
+        square = (rgb[:, None] - c[:, :, None]).square().sum(3)  # [n, D, K]
+        cost = ((w / (1 - w).clamp(min=1e-6)).square() * square * weight[..., None]).sum(1)
+        gone = cost.masked_fill(~alive, torch.inf).argmin(1, keepdim=True)
+        alive = alive.scatter(1, gone, False)
+        left.insert(0, alive.to(torch.uint8).topk(size, dim=1).indices)
+    return left
+
+
+def fewer_sites(
+    at: Directions, weight: Tensor, vectors: Tensor, rgb: Tensor
+) -> Callable[[int, Tensor], tuple[Tensor, Tensor]]:
+    """Fit the sites that are hardest to do without to the colour of all, by Levenberg-Marquardt.
+
+    Args:
+        weight: [n, D'] of those that `Directions.subset` leaves.
+        vectors, rgb: [n, K, 3] of all sites.
+
+    Returns:
+        a function of a number of sites below K, and of rows, to base [m, 3] and terms [m, number - 1, 6].
+    """
+    outside = fibonacci_sphere(OUTSIDE).to(vectors).expand(len(vectors), -1, -1)
+    unit = torch.cat([at.subset(at.unit, FIT_VIEWS), outside], dim=1)
+    weight = F.pad(weight, (0, OUTSIDE), value=OUTSIDE_WEIGHT)
+    left = least_needed(vectors, rgb, unit, weight)
+    samples = torch.cat([unit, site_weights(vectors, unit) @ rgb, weight[..., None]], dim=2)
+
+    def fit(number: int, rows: Tensor) -> tuple[Tensor, Tensor]:
+        kept = left[number - 1][rows, :, None].expand(-1, -1, 3)
+        v, r = vectors[rows].gather(1, kept), rgb[rows].gather(1, kept)
+        found = {"vectors": (v[:, 1:] - v[:, :1]).cpu().contiguous(), "colors": r.cpu()}
+        counts = {"sites": number, "directions": samples.shape[1], "rounds": FIT_STEPS}
+        backend.load("_cpu").fit_sites_f32(**found, **counts, samples=samples[rows].cpu())  # whatever the device is
+        v, r = (value.to(rgb.device) for value in found.values())
+        return r[:, 0], torch.cat([v, r[:, 1:]], dim=2)
+
+    return fit

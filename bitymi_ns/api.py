@@ -23,7 +23,7 @@ from bitymi_ns.capture.masks import checked_mask
 from bitymi_ns.capture.points import Points
 from bitymi_ns.capture.read import CaptureOptions, read_capture
 from bitymi_ns.ops import blended_image, can_rasterize, project, rasterize_image, trace
-from bitymi_ns.ops.constants import COLOR_BIAS
+from bitymi_ns.ops.constants import BETA_MAX, COLOR_BIAS
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import NEAR, RenderOutput, Scene
 from bitymi_ns.train.config import RefinePoses
@@ -122,8 +122,8 @@ def rasterize(
     """
     _check_range("scales", scales, torch.finfo(scales.dtype).tiny, torch.finfo(scales.dtype).max)
     _check_range("opacities", opacities, 0.0, 1.0)
-    _check_range("betas", betas, 0.0, 4.0)
-    geometry = (means, quats, scales.log(), _logit(opacities), _logit(betas / 4.0))
+    _check_range("betas", betas, 0.0, BETA_MAX)
+    geometry = (means, quats, scales.log(), _logit(opacities), _logit(betas / BETA_MAX))
     projection = project(*geometry, camera, near)
     base = colors - COLOR_BIAS
     if not maps and can_rasterize(means.device):
@@ -139,12 +139,16 @@ def _check_range(name: str, values: Tensor, low: float, high: float) -> None:
     if bool(wrong.any()):
         row = tuple(wrong.nonzero()[0].tolist())
         least = "above 0" if 0.0 < low else f"from {low:g}"
-        most = "finite" if high > 4.0 else f"to {high:g}"
+        most = "finite" if high > BETA_MAX else f"to {high:g}"
         raise ValueError(f"{name} have to be {least} and {most}: {name}{list(row)} is {values[row].item():g}")
 
 
 def _logit(share: Tensor) -> Tensor:
-    """Compute logits, which the operations invert, clamped to finite values with a straight-through gradient."""
+    """Compute logits, which the operations invert, clamped to finite values with a straight-through gradient.
+
+    The operations take parameters as training has them: the slope of a sigmoid follows from its argument alone, as in
+    float32 nothing is left of 1 - o where o -> 1.
+    """
     nearest = share.clamp(1e-12, 1.0 - 8 * torch.finfo(share.dtype).eps)
     return torch.logit(share + (nearest - share).detach())
 

@@ -6,6 +6,8 @@ import io
 import json
 import pickle
 import shutil
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -20,10 +22,15 @@ from bitymi_ns.bake import BakeOptions
 from bitymi_ns.bake.early_stopping import EarlyStopping
 from bitymi_ns.bundle import BundleError
 from bitymi_ns.bundle.manifest import dump
+from bitymi_ns.ops.backend import emulated_cuda
+from bitymi_ns.ops.reference.project import Projection
+from bitymi_ns.ops.reference.project import project as reference_project
 from bitymi_ns.ops.reference.render import render as reference_render
 from bitymi_ns.scene.baked_renderer import SceneRenderer
+from tests.cuda.conftest import why_not_emulated
 
 ROOT = Path(__file__).resolve().parents[1]
+EMULATED = pytest.mark.skipif(why_not_emulated() is not None, reason=str(why_not_emulated()))
 
 
 def example(name: str) -> ModuleType:
@@ -87,21 +94,34 @@ def flat(**changes: float) -> dict[str, torch.Tensor]:
     return {name: value.requires_grad_() for name, value in found.items()}
 
 
-@pytest.mark.parametrize(
-    ("name", "edge", "near"),
-    [("opacities", 1.0, 0.9999), ("opacities", 0.0, 1e-5), ("betas", 0.0, 1e-5), ("betas", 4.0, 3.9999)],
-)
-def test_opacities_and_betas_at_the_ends_of_their_ranges(name: str, edge: float, near: float) -> None:
-    drawn, gradients = [], []
-    for value in (edge, near):
-        values = flat(**{name: value})
-        image = bitymi_ns.rasterize(**values, camera=camera_of()).rgb
-        image[9, 15].sum().backward()  # off-centre, where the weight is not clamped
-        assert all(bool(each.grad.isfinite().all()) for each in values.values())
-        drawn.append(image.detach())
-        gradients.append(float(values[name].grad))
-    assert torch.allclose(*drawn, atol=1e-3) and (edge == 0.0 and name == "opacities") == (float(drawn[0].max()) < 1e-3)
-    assert gradients[0] == pytest.approx(gradients[1], rel=0.1)
+@pytest.mark.parametrize("cuda", [False, pytest.param(True, marks=EMULATED)])
+@pytest.mark.parametrize(("dtype", "error"), [(torch.float64, 1e-9), (torch.float32, 1e-5)])
+def test_the_ends_of_the_ranges_have_values_and_gradients_of_the_float64_reference(
+    dtype: torch.dtype, error: float, cuda: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values, camera = {name: value.detach().to(dtype) for name, value in surfels().items()}, camera_of()
+    values["opacities"][:4] = torch.tensor([1.0, 1.0, 1.0, 0.0])
+    values["betas"][[0, 2, 3, 4, 5, 6, 7]] = torch.tensor([4.0, 0.0, 0.0, 0.0, 4.0, 4.0, 4.0], dtype=dtype)
+    twin = {name: value.double().requires_grad_() for name, value in values.items()}
+    values = {name: value.requires_grad_() for name, value in values.items()}
+    weights = torch.rand(18, 24, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    with emulated_cuda() if cuda else nullcontext():
+        drawn = bitymi_ns.rasterize(**values, camera=camera).rgb
+        (drawn * weights.to(dtype)).sum().backward()
+
+    def projected(*raw: torch.Tensor) -> Projection:  # a logit has no gradient at the ends
+        means, quats, scales, opacities, betas, *view = raw
+        found = reference_project(means, quats, scales.log(), *torch.zeros_like(betas).expand(2, -1), *view)
+        return replace(found, opacity=opacities, beta=betas)
+
+    monkeypatch.setitem(reference_render.__globals__, "project", projected)
+    exact = bitymi_ns.Camera(camera.viewmat.double(), camera.K.double(), camera.width, camera.height)
+    *geometry, colors = twin.values()
+    expected = reference_render(geometry, colors - 0.5, exact, near=0.02).rgb
+    (expected * weights).sum().backward()
+    torch.testing.assert_close(drawn.double(), expected, atol=error, rtol=0)
+    for name, value in values.items():
+        torch.testing.assert_close(value.grad.double(), twin[name].grad, atol=10 * error, rtol=error, msg=name)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from bitymi_ns.ops.baked import DrawCache, common_size, draw, packed
 from bitymi_ns.ops.constants import TRANSMITTANCE_MIN
 
 from .camera import Camera
-from .sampling import Sampling, averaged, sampling_of, size_of
+from .sampling import TWO_SAMPLES, Sampling, averaged, padded, part_of, sampling_of, size_of
 
 FAST = 1 / 512  # transmittance at which fast rendering ends a pixel: at most half an 8-bit step is lost
 
@@ -177,8 +177,12 @@ class BakedScene:
         """Choose the sampling of a batch of views, by the geometric mean of their scales."""
         if self.photographed is None or not len(self.photographed):
             return Sampling()
-        sizes = [size_of(self.photographed, camera) for camera in cameras]
-        return sampling_of(math.exp(sum(map(math.log, sizes)) / len(sizes)), cameras[0].width * cameras[0].height)
+        size = math.exp(sum(math.log(size_of(self.photographed, camera)) for camera in cameras) / len(cameras))
+        if size >= TWO_SAMPLES:
+            return sampling_of(size, cameras[0].width * cameras[0].height)
+        device = self.tiles.device
+        left, top, right, bottom = part = part_of(self.surfels, [camera.to(device) for camera in cameras], self.near)
+        return replace(sampling_of(size, (right - left) * (bottom - top)), part=part)
 
     def _draw(self, cameras: Sequence[Camera], background: Tensor | None, images: Sequence[str]) -> dict[str, Tensor]:
         """Render with `ops.baked.draw`, at the sampling of the views."""
@@ -189,8 +193,13 @@ class BakedScene:
         names = [name for name in images if name != "packed"]
         if "packed" in images:  # bytes cannot be averaged
             names += [name for name in ("rgb", "alpha") if name not in names]
-        views = [camera.scaled(sampling.samples) for camera in cameras]
+        left, top, right, bottom = sampling.part or (0, 0, cameras[0].width, cameras[0].height)
+        views = [camera.part(left, top, right, bottom).scaled(sampling.samples) for camera in cameras]
         drawn = averaged(draw(self, views, background, names, sampling.photo_pixel), sampling.samples)
+        if sampling.part is not None:
+            around = {"rgb": background} if background is not None else {}
+            size = cameras[0].height, cameras[0].width
+            drawn = {name: padded(image, sampling.part, size, around.get(name)) for name, image in drawn.items()}
         if "packed" in images:
             drawn["packed"] = packed(drawn["rgb"], drawn["alpha"])
         return {name: drawn[name] for name in images}

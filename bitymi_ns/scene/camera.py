@@ -95,9 +95,13 @@ class Camera:
 
     def rows(self, top: int, bottom: int) -> Camera:
         """Crop the image to rows `top` to `bottom` (exclusive)."""
+        return self.part(0, top, self.width, bottom)
+
+    def part(self, left: int, top: int, right: int, bottom: int) -> Camera:
+        """Crop the image to columns `left` to `right` and rows `top` to `bottom` (both ends exclusive)."""
         shift = torch.zeros_like(self.K)
-        shift[1, 2] = top
-        return self._with(K=self.K - shift, height=bottom - top)
+        shift[0, 2], shift[1, 2] = left, top
+        return self._with(K=self.K - shift, width=right - left, height=bottom - top)
 
     def within(self, side: int) -> Camera:
         """Scale the image down to at most `side` pixels along its longer side."""

@@ -1,10 +1,14 @@
 """Supersampling and texture filtering of views that show the scene smaller or larger than the photographs."""
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from torch import Tensor
+
+from bitymi_ns.ops.constants import SUPPORT
 
 from .camera import Camera
 
@@ -15,12 +19,15 @@ SMALLEST, LARGEST = 0.5, 2.0
 ONE_SAMPLE, TWO_SAMPLES = 0.6, 1 / 3
 """Smallest scales with one sample per pixel, and with two along each axis."""
 SAMPLE = 0.58
-"""Minimum number of samples across a photograph's pixel at smaller scales, within MOST_SAMPLES and MOST_PIXELS. Coarser
-samples blur edges that the alpha texels of several surfels share: the mean transmittance of a stack is not the product
-of the means."""
-MOST_SAMPLES = 6  # maximum number of samples per pixel along each axis
+"""Minimum number of samples across a photograph's pixel at smaller scales, within the limits below. Coarser samples
+blur edges that the alpha texels of several surfels share: the mean transmittance of a stack is not the product of the
+means."""
+MOST_SAMPLES, FEW_PIXELS = 6, 1 << 21  # maximum per pixel along each axis; more where the view has fewer samples in all
 MOST_PIXELS = 1 << 24  # maximum number of samples of a view
 FARTHEST = (1.0 / 64, 64.0)  # range of scales
+RIM = 3  # pixels around discs that the low pass and widened kernels may reach
+
+Part = tuple[int, int, int, int]  # of an image: left, top, right, bottom in pixels, the last two exclusive
 
 
 @dataclass(frozen=True)
@@ -30,10 +37,12 @@ class Sampling:
     Attributes:
         samples: per pixel along each axis.
         photo_pixel: side of a photograph's pixel in samples (csrc/core/resize.h).
+        part: that is rendered, as surfels reach no other pixels; None = the whole view.
     """
 
     samples: int = 1
     photo_pixel: float = 1.0
+    part: Part | None = None
 
 
 def size_of(photographed: Tensor, camera: Camera) -> float:
@@ -58,13 +67,43 @@ def size_of(photographed: Tensor, camera: Camera) -> float:
     return float(np.clip(np.partition(sizes, middle)[middle], *FARTHEST))
 
 
+def part_of(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], near: float) -> Part:
+    """Bound the part of views of one size in which surfels can be seen, by spheres around their discs.
+
+    Args:
+        surfels: means [N, 3] and log_scales [N, 2], on the device of the cameras.
+        near: nearest rendered depth of a centre.
+
+    Returns:
+        one part for all views, at least one pixel.
+    """
+    reach = SUPPORT * surfels["log_scales"].amax(1).exp()
+    bounds = []
+    for camera in cameras:
+        local = camera.local(surfels["means"])
+        shown = local.isfinite().all(1) & (local[:, 2] > near)
+        (x, y, z), radius = local[shown].unbind(1), reach[shown]
+        for axis, at in enumerate((x / z, y / z)):
+            half = torch.where(z > radius, radius * (1 + at.abs()) / (z - radius), math.inf)
+            ends = torch.stack([at - half, -at - half]).amin(1) if len(z) else at.new_zeros(2)
+            bounds.append(ends * camera.K[axis, axis] + torch.stack([camera.K[axis, 2], -camera.K[axis, 2]]))
+    low, high = torch.stack(bounds).view(-1, 2, 2).amin(0).unbind(1)
+    size = cameras[0].width, cameras[0].height
+    first = [int(min(max(at - RIM, 0), side - 1)) for at, side in zip(low.tolist(), size, strict=True)]
+    last = [
+        math.ceil(max(min(RIM - at, side), to + 1)) for at, side, to in zip(high.tolist(), size, first, strict=True)
+    ]
+    return first[0], first[1], last[0], last[1]
+
+
 def sampling_of(size: float, pixels: int) -> Sampling:
     """Choose the sampling of a view of some scale and number of pixels."""
     low, high = AS_TRAINED
     if low <= size <= high:
         return Sampling()
     wanted = 1 if size >= ONE_SAMPLE else 2 if size >= TWO_SAMPLES else max(3, math.ceil(SAMPLE / size))
-    samples = max(1, min(wanted, MOST_SAMPLES, math.isqrt(MOST_PIXELS // max(pixels, 1))))
+    few, most = (math.isqrt(limit // max(pixels, 1)) for limit in (FEW_PIXELS, MOST_PIXELS))
+    samples = max(1, min(wanted, max(MOST_SAMPLES, few), most))
     shown = samples * size
     if samples > 1:
         return Sampling(samples, shown)
@@ -94,3 +133,19 @@ def averaged(images: dict[str, Tensor], samples: int) -> dict[str, Tensor]:
             total = total.unflatten(axis, (-1, samples)).sum(axis + 1, dtype=image.dtype)
         out[name] = total / samples**2 if image.is_floating_point() else total
     return out
+
+
+def padded(image: Tensor, part: Part, size: tuple[int, int], around: Tensor | None = None) -> Tensor:
+    """Pad images of a part of views to whole views.
+
+    Args:
+        image: [views, rows, columns, channels] of the part.
+        size: height and width of the views.
+        around: [channels] the padding; None = 0.
+    """
+    left, top, right, bottom = part
+    whole = image.new_zeros(len(image), *size, image.shape[-1])
+    if around is not None:
+        whole += around.to(image)
+    whole[:, top:bottom, left:right] = image
+    return whole

@@ -61,7 +61,8 @@ def cut_out(count: int, seed: int, dtype: torch.dtype = torch.uint8) -> BakedSce
     return replace(scene, alpha_scale=255 / 128 if dtype == torch.uint8 else 1.0, mean_alpha=mean)
 
 
-FAR = [(True, 0.25, 43.0), (True, 0.125, 47.0), (False, 0.25, 59.0), (False, 0.125, 60.0)]
+FAR = [(True, 0.25, 43.0), (True, 0.125, 47.0), (True, 0.0625, 52.0), (False, 0.25, 59.0), (False, 0.125, 60.0)]
+FAR += [(False, 0.0625, 64.0)]
 """Alpha texels of `layered`, relative size of the view, and least PSNR there against the averaged full-size render."""
 
 

@@ -13,11 +13,11 @@ from bitymi_ns.scene import Camera
 from bitymi_ns.scene.sampling import (
     LARGEST,
     MOST_PIXELS,
-    MOST_SAMPLES,
     ONE_SAMPLE,
     SAMPLE,
     Sampling,
     averaged,
+    part_of,
     sampling_of,
     size_of,
 )
@@ -40,9 +40,9 @@ def test_size_is_that_of_the_points_in_the_picture() -> None:
 @given(st.floats(1 / 64, 64), st.integers(1, 1 << 26))
 def test_samples_are_close_enough_and_few_enough(size: float, pixels: int) -> None:
     how = sampling_of(size, pixels)
-    assert 1 <= how.samples <= MOST_SAMPLES and how.photo_pixel > 0
+    assert how.samples >= 1 and how.photo_pixel > 0
     assert how.samples == 1 or how.samples**2 * pixels <= MOST_PIXELS
-    if pixels < 1e5 and size >= SAMPLE / MOST_SAMPLES:
+    if pixels < 1000:
         assert how.photo_pixel >= SAMPLE - 1e-9
     if how.samples > 1:
         assert how.photo_pixel < 2 * ONE_SAMPLE
@@ -55,9 +55,42 @@ def test_nothing_jumps_while_the_samples_stay() -> None:
     found = [sampling_of(size, 1000) for size in sizes]
     for a, b in zip(found, found[1:], strict=False):
         assert a.samples != b.samples or abs(math.log2(b.photo_pixel / a.photo_pixel)) < 0.02
+    assert sampling_of(0.01, 1 << 17).samples == 6 and sampling_of(0.01, 1 << 21).samples == 2
     assert sampling_of(1.0, 1000) == sampling_of(0.8, 1000) == sampling_of(1.4, 1000)
     assert sampling_of(2 * LARGEST, 1000).photo_pixel == 2 * LARGEST
     assert sampling_of(0.5, 1000).photo_pixel == 1.0  # at the photographs' size, then averaged
+
+
+def test_the_part_of_a_view_with_the_scene_is_bounded() -> None:
+    """web/test/view.test.ts has the same numbers."""
+    camera = Camera(front(distance=8.0).viewmat, torch.tensor([[60.0, 0, 60], [0, 50, 40], [0, 0, 1]]), 120, 80)
+
+    def part(*rows: tuple[float, float, float, float]) -> tuple[int, int, int, int]:
+        x, y, z, scale = torch.tensor(rows).unbind(1)
+        logs = torch.stack([scale.log(), scale * 0 - 9], 1)
+        return part_of({"means": torch.stack([x, y, z], 1), "log_scales": logs}, [camera], 0.01)
+
+    assert part((1, 0, 0, 0.1), (-1, 1, 0, 0.1), (0, 0, -99, 50)) == (46, 35, 74, 52)
+    assert part((1, 0, 0, 3)) == part((1, 0, 0, math.nan)) == part((1, 0, 0, 1e38)) == (0, 0, 120, 80)
+    assert part((0, 0, -99, 1)) == (57, 37, 63, 43)
+    assert part((100, 0, 0, 0.1)) == (119, 35, 120, 45) and part((-100, 0, 0, 0.1))[0::2] == (0, 1)
+
+
+def test_far_views_draw_the_part_with_the_scene_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, far = textured(200, 3), front(240, 176, distance=48.0)
+    scene.photographed = torch.cat([scene.surfels["means"], torch.full((200, 1), math.sqrt(60 * 55) / 4)], 1)
+    how = scene.sampling([far])
+    left, top, right, bottom = how.part
+    assert how.samples == 7 and (right - left) * (bottom - top) < 0.03 * 240 * 176
+    background = torch.tensor([0.2, 0.4, 0.6])
+    found = scene.render(far, background, maps=True)
+    monkeypatch.setattr("bitymi_ns.scene.baked.part_of", lambda *_: (0, 0, 240, 176))
+    whole = scene.render(far, background, maps=True)
+    for name in ("rgb", "alpha", "beta", "depth", "normal"):
+        torch.testing.assert_close(getattr(found, name), getattr(whole, name), atol=1e-3, rtol=0)
+    assert torch.equal(found.rgb[0, 0], background) and int(found.overdraw.sum()) == pytest.approx(
+        int(whole.overdraw.sum()), rel=1e-3
+    )
 
 
 def test_images_are_means_and_counts_sums() -> None:

@@ -23,6 +23,7 @@ from bitymi_ns.scene.sampling import averaged
 from bitymi_ns.train.losses import psnr
 from bitymi_ns.view import Site, site_of, write_static
 from tests.bundle.damage import amend
+from tests.cuda.baked_scenes import front
 from tests.view.browser import drive, plain_server, served
 from tests.view.conftest import HEIGHT, WIDTH, view, write
 
@@ -81,6 +82,22 @@ def test_far_views_are_averages_of_near_ones(share: float, least: float, tmp_pat
     got = torch.from_numpy(np.asarray(Image.open(tmp_path / "p.png").convert("RGB"), np.float32) / 255)
     full = read_bundle(bundle).scene.render(view()).rgb[None]
     assert psnr(got, averaged({"rgb": full}, round(1 / share))["rgb"][0].clamp(0, 1)) > least
+
+
+def test_of_far_scenes_the_part_with_the_scene_is_drawn(tmp_path: Path) -> None:
+    bundle = write(tmp_path / "b", "uint8", compact=True, seen=True, alpha=True, larger=0.7)
+    camera = front(WIDTH, HEIGHT, 48.0)  # a sixteenth of the size
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+    place = f"#p=0,0,-48&r=1,0,0,0,0,1&t=0,0,0&l={fx},{fy},{cx},{cy},{WIDTH},{HEIGHT}"
+    with served(site_of(bundle)) as address:
+        steps = [["goto", address + place], ["settle"], ["save", "#screenshot", tmp_path / "p.png"]]
+        assert not drive(steps, SCREEN).problems
+    scene = read_bundle(bundle).scene
+    how = scene.sampling([camera])
+    assert how.samples == 9 and how.part is not None and how.part[2] - how.part[0] < WIDTH // 4
+    got = torch.from_numpy(np.asarray(Image.open(tmp_path / "p.png").convert("RGB"), np.float32) / 255)
+    want = scene.render(camera).rgb.clamp(0, 1)
+    assert psnr(got, want) > 50.0 and float(want.max()) > 0.2
 
 
 def test_the_first_picture_needs_no_texels(tmp_path: Path) -> None:

@@ -5,8 +5,9 @@ import { Pace } from '../src/render/screen';
 import { DEFAULT_LENS, View, look, lookAt, orbit } from '../src/view/pose';
 import { fromHash, toHash } from '../src/view/share';
 import { firstPose } from '../src/view/start';
-import { samplingOf, sizeOf } from '../src/view/size';
+import { partOf, samplingOf, sizeOf } from '../src/view/size';
 import { dot, length, subtract } from '../src/view/vector';
+import { SURFEL_WORDS, WORD } from '../src/bundle/surfels';
 
 const UP: Vec3 = [0, 0, 1];
 const pose = lookAt([4, 0, 1], [0, 0, 0], UP);
@@ -107,7 +108,7 @@ describe('the pace', () => {
 describe('views of other sizes', () => {
   // what bitymi_ns.scene.sampling gives for a thousand pixels
   it.each([
-    [1 / 64, 6, 0.09375],
+    [1 / 64, 38, 0.59375],
     [0.1, 6, 0.6],
     [0.25, 3, 0.75],
     [0.3, 3, 0.9],
@@ -122,7 +123,7 @@ describe('views of other sizes', () => {
     [1.9, 1, 1.76748927],
     [3, 1, 3],
   ])('of %d are drawn as the package draws them', (size, samples, photoPixel) => {
-    const found = samplingOf(size, 1000, 6, 1 << 24);
+    const found = samplingOf(size, 1000, 100, 1 << 24);
     expect(found.samples).toBe(samples);
     expect(found.photoPixel).toBeCloseTo(photoPixel, 8);
   });
@@ -136,5 +137,24 @@ describe('views of other sizes', () => {
     expect(sizeOf(points([0, 0, 0, 15], [0.5, 0, 0, 15], [0, 0, -9, 1], [99, 0, 0, 1]), view)).toBeCloseTo(1);
     expect(sizeOf(points([0, 0, 0, 30]), view)).toBeCloseTo(0.5);
     expect(sizeOf(points([0, 0, -9, 1]), view)).toBe(1);
+  });
+  it('are drawn where surfels can be seen', () => {
+    const view = new View(lookAt([0, 0, -8], [0, 0, 0], [0, -1, 0]), 60, 50, 60, 40, 120, 80);
+    const surfels = (...rows: number[][]): Float32Array => {
+      const words = new Float32Array(SURFEL_WORDS * rows.length);
+      rows.forEach(([x, y, z, scale], i) => {
+        words.set([x, y, z], SURFEL_WORDS * i + WORD.mean);
+        words.set([Math.log(scale), -9], SURFEL_WORDS * i + WORD.logScale);
+      });
+      return words;
+    };
+    const [whole, none] = [
+      [0, 0, 120, 80],
+      [119, 79, 120, 80],
+    ];
+    expect(partOf(surfels([1, 0, 0, 0.1], [-1, 1, 0, 0.1], [0, 0, -99, 50]), view, 0.01)).toEqual([46, 35, 74, 52]);
+    expect(partOf(surfels([1, 0, 0, 3]), view, 0.01)).toEqual(whole);
+    expect(partOf(surfels([0, 0, -99, 1]), view, 0.01)).toEqual(none);
+    expect(view.part(46, 35, 74, 52)).toMatchObject({ fx: 60, cx: 14, cy: 5, width: 28, height: 17 });
   });
 });

@@ -5,6 +5,8 @@ struct Screen {
   size: vec2f,  // viewport, pixels
   show: u32,  // SHOW_*
   most: f32,  // upper end of a map's range
+  pixels: vec2f,  // size of the view
+  first: vec2u,  // top left pixel of the part that was rendered; nothing covers the others
   samples: u32,  // per pixel and axis
 }
 
@@ -32,8 +34,10 @@ fn ramp(x: f32) -> vec3f {
 // Resamples the sums at a pixel: interpolated, or the mean of its samples.
 fn drawn(position: vec2f) -> vec4f {
   if screen.samples <= 1 { return textureSampleLevel(sums, smooth_sampler, position / screen.size, 0.0); }
-  let pixels = vec2f(textureDimensions(sums) / screen.samples);
-  let first = screen.samples * vec2u(position / screen.size * pixels);
+  let part = textureDimensions(sums) / screen.samples;
+  let at = vec2u(position / screen.size * screen.pixels) - screen.first;  // from 2^32 down where it is less
+  if any(at >= part) { return vec4f(0.0, 0.0, 0.0, 1.0); }
+  let first = screen.samples * at;
   var total = vec4f(0.0);
   for (var y = 0u; y < screen.samples; y++) {
     for (var x = 0u; x < screen.samples; x++) { total += textureLoad(sums, first + vec2u(x, y), 0); }

@@ -1,7 +1,7 @@
 // Draws frames of a scene to a target of sums, and from there to a screen.
 import type { Vec3 } from '../bundle/manifest';
 import type { View } from '../view/pose';
-import { type Sampling, samplingOf, sizeOf } from '../view/size';
+import { type Part, type Sampling, isFar, partOf, samplingOf, sizeOf } from '../view/size';
 import type { Graphics } from './device';
 import { type Programs, SHOW, type Show, type TargetFormat } from './programs';
 import { type SceneOnDevice, STRIDE, group } from './scene';
@@ -26,6 +26,14 @@ interface Target {
   batch: GPUBindGroup;
 }
 
+// A rendered view, of which the target has a part.
+interface Drawn {
+  target: Target;
+  width: number; // of the whole view, pixels
+  height: number;
+  part: Part;
+}
+
 // Depth map along the camera's axis, row-major; infinite where coverage is below one half.
 export interface Depths {
   width: number;
@@ -33,8 +41,8 @@ export interface Depths {
   depth: Float32Array;
 }
 
-const MOST_SAMPLES = 6; // per pixel and axis, at rest
 const MOST_PIXELS = 1 << 22; // in a target
+const SCREEN_BYTES = 64; // of present.wgsl's uniforms
 const MOST_OVERDRAW = 64; // upper end of the overdraw map
 
 export class Renderer {
@@ -48,7 +56,7 @@ export class Renderer {
     readonly scene: SceneOnDevice,
   ) {
     const { device } = graphics;
-    this.screen = device.createBuffer({ size: 48, usage: GPUBufferUsage.UNIFORM | GPUBufferUsage.COPY_DST });
+    this.screen = device.createBuffer({ size: SCREEN_BYTES, usage: GPUBufferUsage.UNIFORM | GPUBufferUsage.COPY_DST });
     this.smooth = device.createSampler({ magFilter: 'linear', minFilter: 'linear' });
   }
 
@@ -78,13 +86,18 @@ export class Renderer {
     return this.target;
   }
 
-  private samplingOf(view: View, width: number, height: number, options: DrawOptions): Sampling {
-    const { photographed } = this.scene.info;
-    if (!photographed?.length) return { samples: 1, photoPixel: 1 };
-    const most = options.fine
-      ? Math.max(1, Math.min(MOST_SAMPLES, Math.floor(this.largestSide / Math.max(width, height))))
-      : 1;
-    return samplingOf(sizeOf(photographed, view), width * height, most, MOST_PIXELS);
+  // Samples a view at rest several times per pixel, a far one only where surfels can be seen.
+  private samplingOf(view: View, options: DrawOptions): [Sampling, Part] {
+    const whole: Part = [0, 0, view.width, view.height];
+    const { info, surfels } = this.scene;
+    if (!info.photographed?.length) return [{ samples: 1, photoPixel: 1 }, whole];
+    const size = sizeOf(info.photographed, view);
+    const found = isFar(size) && options.fine ? partOf(surfels.words, view.from(surfels.origin), info.near) : whole;
+    const [left, top, right, bottom] = found;
+    const [width, height] = [right - left, bottom - top];
+    const most = options.fine ? Math.max(1, Math.floor(this.largestSide / Math.max(width, height))) : 1;
+    const sampling = samplingOf(size, width * height, most, MOST_PIXELS);
+    return [sampling, sampling.samples > 1 ? found : whole];
   }
 
   private setFrame(view: View, width: number, height: number, photoPixel: number, options: DrawOptions): void {
@@ -106,15 +119,15 @@ export class Renderer {
     this.graphics.device.queue.writeBuffer(this.scene.frame, 0, data);
   }
 
-  private encode(encoder: GPUCommandEncoder, view: View, options: DrawOptions): Target {
-    const { width: pixelsAcross, height: pixelsDown } = view;
+  private encode(encoder: GPUCommandEncoder, view: View, options: DrawOptions): Drawn {
     const { scene, programs } = this;
-    const { samples, photoPixel } = this.samplingOf(view, pixelsAcross, pixelsDown, options);
-    const [width, height] = [samples * pixelsAcross, samples * pixelsDown];
+    const [{ samples, photoPixel }, part] = this.samplingOf(view, options);
+    const seen = view.part(...part);
+    const [width, height] = [samples * seen.width, samples * seen.height];
     const format = options.fine && this.graphics.floats ? 'rgba32float' : 'rgba16float';
     const target = this.targetOf(width, height, samples, format);
     if (photoPixel < 1) scene.makeCoarser();
-    this.setFrame(view.scaledTo(width, height), width, height, photoPixel, options);
+    this.setFrame(seen.scaledTo(width, height), width, height, photoPixel, options);
     encoder.clearBuffer(scene.visible);
     scene.encodeSorting(encoder);
     const pipeline = programs.draw(target.format, options.show === 'overdraw' ? 'count' : 'blend');
@@ -133,17 +146,19 @@ export class Renderer {
       work.drawIndirect(scene.draws, 16 * k);
       work.end();
     }
-    return target;
+    return { target, width: view.width, height: view.height, part };
   }
 
-  private encodePresent(encoder: GPUCommandEncoder, target: Target, to: GPUTexture, options: DrawOptions): void {
+  private encodePresent(encoder: GPUCommandEncoder, drawn: Drawn, to: GPUTexture, options: DrawOptions): void {
     const { device } = this.graphics;
+    const { target, width, height, part } = drawn;
     const pipeline = this.programs.present(to.format);
-    const data = new ArrayBuffer(48);
-    new Float32Array(data).set([...options.background, 1, to.width, to.height]);
-    new Uint32Array(data)[6] = SHOW[options.show];
-    new Float32Array(data)[7] = options.show === 'overdraw' ? MOST_OVERDRAW : options.farthest;
-    new Uint32Array(data)[8] = target.samples;
+    const data = new ArrayBuffer(SCREEN_BYTES);
+    const [f, u] = [new Float32Array(data), new Uint32Array(data)];
+    f.set([...options.background, 1, to.width, to.height]);
+    u[6] = SHOW[options.show];
+    f.set([options.show === 'overdraw' ? MOST_OVERDRAW : options.farthest, width, height], 7);
+    u.set([part[0], part[1], target.samples], 10);
     device.queue.writeBuffer(this.screen, 0, data);
     const bound = group(device, pipeline.getBindGroupLayout(0), [this.screen, target.sums.createView(), this.smooth]);
     const work = encoder.beginRenderPass({
@@ -160,8 +175,8 @@ export class Renderer {
     const { queue } = this.graphics.device;
     const encoder = this.graphics.device.createCommandEncoder();
     const [width, height] = [to.width, to.height].map((side) => Math.max(1, Math.round(side * scale)));
-    const target = this.encode(encoder, view.scaledTo(width, height), options);
-    this.encodePresent(encoder, target, to, options);
+    const drawn = this.encode(encoder, view.scaledTo(width, height), options);
+    this.encodePresent(encoder, drawn, to, options);
     queue.submit([encoder.finish()]);
     return queue.onSubmittedWorkDone();
   }
@@ -169,7 +184,7 @@ export class Renderer {
   // Draws the depths of a view.
   async depths(view: View, options: DrawOptions): Promise<Depths> {
     const encoder = this.graphics.device.createCommandEncoder();
-    const { width, height, format, sums } = this.encode(encoder, view, { ...options, show: 'depth' });
+    const { width, height, format, sums } = this.encode(encoder, view, { ...options, show: 'depth' }).target;
     const bytes = format === 'rgba32float' ? 16 : 8; // per pixel
     const rows = await this.rowsOf(encoder, sums, bytes);
     const depth = new Float32Array(width * height);

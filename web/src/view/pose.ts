@@ -35,6 +35,15 @@ export class View implements Lens {
     const [x, y] = [width / this.width, height / this.height];
     return new View(this.pose, this.fx * x, this.fy * y, this.cx * x, this.cy * y, width, height);
   }
+  // Moves the origin of the world's frame.
+  from(origin: Vec3): View {
+    const pose = { ...this.pose, position: subtract(this.pose.position, origin) };
+    return new View(pose, this.fx, this.fy, this.cx, this.cy, this.width, this.height);
+  }
+  // Crops the view; right and bottom are exclusive.
+  part(left: number, top: number, right: number, bottom: number): View {
+    return new View(this.pose, this.fx, this.fy, this.cx - left, this.cy - top, right - left, bottom - top);
+  }
   // Projects a point to pixel coordinates and depth along the camera's axis; null outside the picture.
   project(point: Vec3): Vec3 | null {
     const from = subtract(point, this.pose.position);

@@ -1,11 +1,18 @@
 // Sampling of views of another size than the photographs, as bitymi_ns/scene/sampling.py.
+import type { Vec3 } from '../bundle/manifest';
+import { SURFEL_WORDS, WORD } from '../bundle/surfels';
 import type { View } from './pose';
+import { dot } from './vector';
 
 const AS_TRAINED = [0.75, 1.5]; // sizes drawn as in training
 const [SMALLEST, LARGEST] = [0.5, 2]; // beyond, fully adapted; blended in between
 const [ONE_SAMPLE, TWO_SAMPLES] = [0.6, 1 / 3]; // from these sizes on one sample per pixel, or two along each axis
 const SAMPLE = 0.58; // least width of a photograph's pixel in smaller views, samples
 const FARTHEST = [1 / 64, 64];
+const SUPPORT = 3; // discs end there, in their scales
+const RIM = 3; // pixels around discs that the low pass and wider kernels may reach
+
+export type Part = [left: number, top: number, right: number, bottom: number]; // of a picture, in pixels
 
 export interface Sampling {
   samples: number; // per pixel, along each axis
@@ -22,6 +29,37 @@ export function sizeOf(photographed: Float32Array, view: View): number {
   if (!sizes.length) return 1;
   sizes.sort((a, b) => a - b);
   return Math.min(Math.max(sizes[(sizes.length - 1) >> 1], FARTHEST[0]), FARTHEST[1]);
+}
+
+// Returns whether a view of that size is cropped to `partOf`.
+export const isFar = (size: number): boolean => size < TWO_SAMPLES;
+
+// Bounds the pixels in which surfels can be seen, by spheres around their discs; at least one pixel.
+export function partOf(words: Float32Array, view: View, near: number): Part {
+  const { position, right, down, forward } = view.pose; // relative to the surfels' origin
+  const [low, high] = [
+    [Infinity, Infinity],
+    [-Infinity, -Infinity],
+  ];
+  for (let i = 0; i < words.length; i += SURFEL_WORDS) {
+    const from: Vec3 = [words[i] - position[0], words[i + 1] - position[1], words[i + 2] - position[2]];
+    const z = dot(from, forward);
+    if (!(z > near)) continue;
+    const radius = SUPPORT * Math.exp(Math.max(words[i + WORD.logScale], words[i + WORD.logScale + 1]));
+    for (const [axis, row] of [right, down].entries()) {
+      const at = dot(from, row) / z;
+      const half = z > radius ? (radius * (1 + Math.abs(at))) / (z - radius) : Infinity;
+      low[axis] = Math.min(low[axis], at - half);
+      high[axis] = Math.max(high[axis], at + half);
+    }
+  }
+  const side = (axis: number, focal: number, middle: number, pixels: number): [number, number] => {
+    const first = Math.floor(Math.min(Math.max(low[axis] * focal + middle - RIM, 0), pixels - 1));
+    return [first, Math.ceil(Math.max(Math.min(high[axis] * focal + middle + RIM, pixels), first + 1))];
+  };
+  const [left, end] = side(0, view.fx, view.cx, view.width);
+  const [top, bottom] = side(1, view.fy, view.cy, view.height);
+  return [left, top, end, bottom];
 }
 
 // Chooses the sampling of a view with `pixels`; at most `mostSamples` per pixel and axis, and `mostPixels` in all.

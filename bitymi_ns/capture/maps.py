@@ -3,6 +3,7 @@
 import math
 import os
 import struct
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO
@@ -38,6 +39,7 @@ Check = Callable[[tuple[int, ...]], None]
 """Receives the shape that a header declares, and raises where it must not be read."""
 TIFFS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 EXR = b"v/1\x01"
+_PARSING = threading.Lock()  # ast.literal_eval, which numpy parses headers with, fails in threads of Python 3.11
 
 Values = npt.NDArray[np.float32]
 
@@ -182,7 +184,8 @@ def _array(file: IO[bytes], check: Check) -> npt.NDArray[np.generic]:
     if version not in ((1, 0), (2, 0)):
         raise ValueError(f"it is of version {version[0]} of the format, which is for tables")
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, by_columns, dtype = read_header(file)
+    with _PARSING:
+        shape, by_columns, dtype = read_header(file)
     if dtype.kind not in "iuf":
         raise ValueError(f"it holds no numbers, but {dtype}")
     check(shape)

@@ -10,7 +10,7 @@ import torch
 from nerfstudio.scripts import train as ns_train
 from PIL import Image
 
-from bitymi_ns.bake import learn
+from bitymi_ns.bake import pipeline
 from bitymi_ns.plugin.export.command import ExportAtlas
 from bitymi_ns.plugin.run.callbacks import FILE
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
@@ -57,7 +57,7 @@ def test_a_resumed_run_goes_on_with_its_corrections(
         given.extend(view.correction for view in views)
         return baked
 
-    monkeypatch.setattr(learn, "tune_atlas", tune)
+    monkeypatch.setattr(pipeline, "tune_atlas", tune)
     ExportAtlas(
         load_config=whole.get_base_dir() / "config.yml", output_dir=tmp_path / "bundle", polish_steps=0, tolerance=0.02
     ).main()

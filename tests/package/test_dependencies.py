@@ -17,7 +17,7 @@ else:
 
 PACKAGE = Path(bitymi_ns.__file__).parent
 PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text("utf8"))["project"]
-MODULES = {"opencv_python_headless": "cv2", "pillow": "PIL", "pyyaml": yaml.__name__}
+MODULES = {"opencv_python_headless": "cv2", "pillow": "PIL", "pyyaml": yaml.__name__, "usd_core": "pxr"}
 """Import names that differ from the package's name."""
 
 

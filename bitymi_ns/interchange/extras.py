@@ -4,7 +4,7 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Literal
 
@@ -17,7 +17,7 @@ from bitymi_ns.codec.pages import texel_alpha
 from bitymi_ns.files import complete_folder, explained
 from bitymi_ns.interchange.draw_quads import draw_quads
 from bitymi_ns.interchange.frame import to_capture, up_of
-from bitymi_ns.interchange.gaussians import gaussians_of, write_gaussians
+from bitymi_ns.interchange.gaussians import Gaussians, gaussians_of, write_gaussians
 from bitymi_ns.interchange.glb import quads_glb, upright
 from bitymi_ns.interchange.quads import quads_of
 from bitymi_ns.interchange.recolor import recolored
@@ -138,23 +138,27 @@ def write_extras(
         return scene.render(camera, background).rgb
 
     base = _psnr(picture, views, background)
-    gaussians = gaussians_of(scene, colors.harmonics)
-    placed = gaussians if to is None else gaussians.moved(to)
     place = upright(up_of(bundle.info.world, to), None if to is None else to.origin)
-    comments = [note] if note else []
 
+    @cache
+    def gaussians() -> Gaussians:
+        return gaussians_of(scene, colors.harmonics)
+
+    @cache
     def gaussians_psnr(discs: bool) -> float | None:
-        return _psnr(lambda camera: draw_gaussians(gaussians, camera, background, scene.near, discs), views, background)
+        splats = gaussians()
+        return _psnr(lambda camera: draw_gaussians(splats, camera, background, scene.near, discs), views, background)
 
     def write(kind: Kind, path: Path) -> tuple[int, float | None]:
-        """Write a file; how many Gaussians or quads it has, and its PSNR."""
+        """Write a file; returns its number of Gaussians or quads, and its PSNR."""
         if kind == "mesh":
             return write_mesh(path)
+        placed = gaussians() if to is None else gaussians().moved(to)
         if kind == "usd":
             write_usd(path, placed, place)
         else:
-            write_gaussians(path, placed, comments, flat=kind == "surfels")
-        return len(gaussians), gaussians_psnr(discs=kind == "usd")
+            write_gaussians(path, placed, [note] if note else [], flat=kind == "surfels")
+        return len(placed), gaussians_psnr(discs=kind == "usd")
 
     def write_mesh(path: Path) -> tuple[int, float | None]:
         quads = quads_of(scene, colors.color, LEVEL)

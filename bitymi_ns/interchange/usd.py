@@ -46,10 +46,10 @@ def write_usd(path: str | Path, gaussians: Gaussians, place: np.ndarray) -> None
     root.AddTransformOp().Set(Gf.Matrix4d(place.T.tolist()))  # USD multiplies row vectors
     stage.SetDefaultPrim(root.GetPrim())
     kernels = {
-        "gaussian_surflets": (UsdVol.ParticleFieldKernelGaussianSurfletAPI, ~gaussians.hard, 1.0),
-        "constant_surflets": (UsdVol.ParticleFieldKernelConstantSurfletAPI, gaussians.hard, 2.0),
+        "gaussian_surflets": (UsdVol.ParticleFieldKernelGaussianSurfletAPI, ~gaussians.hard, 1.0, 3.0),
+        "constant_surflets": (UsdVol.ParticleFieldKernelConstantSurfletAPI, gaussians.hard, 2.0, 1.0),
     }
-    for name, (kernel, chosen, radius) in kernels.items():
+    for name, (kernel, chosen, radius, support) in kernels.items():
         if not bool(chosen.any()):
             continue
         part = gaussians[chosen]
@@ -58,7 +58,7 @@ def write_usd(path: str | Path, gaussians: Gaussians, place: np.ndarray) -> None
         kernel.Apply(prim)
         scales = radius * part.log_scales.exp()
         scales[:, 2] = 1.0  # the kernel has no depth
-        reach = scales[:, :2].amax(1, keepdim=True) * (3.0 if radius == 1.0 else 1.0)
+        reach = scales[:, :2].amax(1, keepdim=True) * support
         position = UsdVol.ParticleFieldPositionAttributeAPI.Apply(prim)
         position.CreatePositionsAttr(_vectors(Vt.Vec3fArray, part.means))
         orientation = UsdVol.ParticleFieldOrientationAttributeAPI.Apply(prim)

@@ -8,22 +8,13 @@ import torch
 
 from bitymi_ns.bundle import Bundle, BundleError
 from bitymi_ns.interchange import extras, write_extras
-from bitymi_ns.interchange.gaussians import HARD_BETA, Gaussians
+from bitymi_ns.interchange.gaussians import HARD_BETA
 from bitymi_ns.interchange.usd import write_usd
 from bitymi_ns.ops.constants import BETA_MAX
+from tests.interchange.test_splat import gaussians
 
 pxr = pytest.importorskip("pxr")
 KERNELS = ("gaussian_surflets", "constant_surflets")
-
-
-def gaussians(n: int) -> Gaussians:
-    generator = torch.Generator().manual_seed(3)
-    random = {name: torch.randn(n, *shape, generator=generator) for name, shape in SHAPES.items()}
-    random["quats"] = torch.nn.functional.normalize(random["quats"], dim=1)
-    return Gaussians(**random, hard=torch.arange(n) % 3 == 0)
-
-
-SHAPES = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": (), "harmonics": (16, 3)}
 
 
 def complaints(path: Path) -> list[str]:

@@ -79,7 +79,7 @@ class RatePoint:
 
     @cached_property
     def bytes(self) -> int:
-        """Of surfels and texels, about: compressed only where it is asked for."""
+        """Estimate the bytes of surfels and texels; compressed on first use."""
         codes = self.baked.codes
         assert codes is not None
         rest = len(streams.compress(codes.residual, _FAST).data) if self.texels is None else self.texels.nbytes(_FAST)

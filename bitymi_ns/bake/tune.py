@@ -74,14 +74,14 @@ class Pages:
         self._baked, self._range = baked, None
 
     def first(self, texels: Tensor) -> Coded:
-        """As `Cosines.first`."""
+        """Encode the start, see `Cosines.first`."""
         self._range = None
         coded = self.again(texels)
         self._range = coded.stored.range
         return coded
 
     def again(self, texels: Tensor) -> Coded:
-        """As `Cosines.again`."""
+        """Encode later texels, see `Cosines.again`."""
         baked, packing = self._baked, self._baked.packing
         atlas = encoded_texels(baked.cut(texels), packing, baked.options, value_range=self._range)
         constants = texels[first_texels(baked.sizes)]
@@ -89,7 +89,7 @@ class Pages:
         return Coded(texels.clone(), drawn, atlas)
 
     def last(self, coded: Coded) -> Coded:
-        """As `Cosines.last`."""
+        """Return what is stored, see `Cosines.last`."""
         return coded
 
 

@@ -54,7 +54,7 @@ class TexelList:
         self.alpha = None if baked.alpha is None else baked.alpha.to(device)
 
     def projection(self, camera: Camera) -> Projection:
-        """Of the surfels into a view."""
+        """Project the surfels into a view."""
         geometry = (self.scene.surfels[name] for name in GEOMETRY)
         return project(*geometry, camera.to(self.device), self.scene.near, self.scene.prefilter, alpha=self.alpha)
 

@@ -65,7 +65,7 @@ class FrameOptions:
     orientation_method: Orientation = "up"
     """Orientation of the capture: up = the cameras' mean up is z."""
     center_method: Literal["poses", "focus", "none"] = "poses"
-    """Origin: the middle of the cameras, or the point that they look at."""
+    """Origin: the middle of the cameras, or the point that they face."""
     auto_scale_poses: bool = True
     """Scale the capture so that the cameras fit into a box from -1 to 1."""
     scene_scale: float = 1.0

@@ -229,7 +229,7 @@ def test_weights_are_those_of_the_fragments(colored, cameras) -> None:
 
 
 def test_views_that_pass_close_by_count_though_they_look_elsewhere(colored, cameras) -> None:
-    """Such a view shows nothing, and so adds what the colour may be wrong by from there."""
+    """Count the error of the colour in the direction of a view that shows nothing of the surfel."""
     scene = colored("sv")
     row = int(squares(scene, cameras).float().sum(0).argmax())
     turned = torch.diag(torch.tensor([-1.0, 1.0, -1.0]))  # the other way round

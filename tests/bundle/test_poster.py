@@ -75,7 +75,7 @@ def test_it_comes_second_in_one_file_and_is_checked(tmp_path: Path) -> None:
 
 
 def test_a_file_that_no_reader_knows_is_checked_and_not_looked_at(tmp_path: Path) -> None:
-    """So an optional part such as the poster needs no version of its own."""
+    """Add an optional part, such as the poster, without a version of its own."""
     folder = write_compact(tmp_path / "b", make_codes(), extra_files={"later.bin": b"of a later version"})
     assert len(read_bundle(folder)) == 12
     with pytest.raises(BundleError, match=POSTER):  # a caller's file must not replace it

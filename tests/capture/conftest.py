@@ -50,7 +50,7 @@ def copied(arc: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callab
 
 @pytest.fixture
 def reported() -> Iterator[list[str]]:
-    """What the reading of captures reports."""
+    """Collect the messages of the capture reader."""
     messages: list[str] = []
     handler, logger = logging.Handler(), logging.getLogger("bitymi_ns.capture")
     handler.emit = lambda record: messages.append(record.getMessage())  # type: ignore[method-assign]

@@ -138,7 +138,7 @@ STRANGE = (None, True, False, [], {}, [[]], [1, 2, 3], [1e30] * 3, {"p100": -1},
 
 
 def mutated(info: Any, rng: random.Random) -> Any:
-    """Change `info` in one to three places: replace, remove, copy or scale a value, or rename its key."""
+    """Change `info` at one to three entries: replace, remove, copy or scale a value, or rename its key."""
     info = copy.deepcopy(info)
     for _ in range(rng.choice((1, 1, 2, 3))):
         places = []

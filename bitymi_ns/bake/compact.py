@@ -37,7 +37,6 @@ LEAST_ERROR = 1e-7  # mean square error that is always allowed, of colours from 
 LEAST_TEXEL_BYTES = 1000  # that are left for the texels where a size is asked for
 _SEARCH = 7
 _CPU = torch.device("cpu")
-_FAST = 9
 
 
 @dataclass(frozen=True)
@@ -79,10 +78,10 @@ class RatePoint:
 
     @cached_property
     def bytes(self) -> int:
-        """Estimate the bytes of surfels and texels; compressed on first use."""
+        """Count the bytes of surfels and texels; compressed on first use."""
         codes = self.baked.codes
         assert codes is not None
-        rest = len(streams.compress(codes.residual, _FAST).data) if self.texels is None else self.texels.nbytes(_FAST)
+        rest = len(streams.compress(codes.residual).data) if self.texels is None else self.texels.nbytes()
         return codes.surfels.nbytes() + rest
 
 

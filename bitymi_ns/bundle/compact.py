@@ -21,7 +21,7 @@ scenes have a surfel per 12 bytes or more and at most 5 texels per byte. Flat ti
 the sum of both files counts for texels."""
 SPARE_SURFELS, SPARE_TEXELS = 1 << 12, 1 << 20
 MOST_EXPONENT = 12  # largest log2 of a tile side
-_COEFFICIENT_PLANES = 3
+_MOST_COEFFICIENT = 1 << 24
 
 
 def encode_surfels(
@@ -60,7 +60,7 @@ def decode_surfels(
     for column, part in zip(info.columns, _parts(data, info.columns), strict=True):
         if column.name == "extent":
             rows["extent"] = int((codes["size"] > 0).sum())
-        codes[column.name] = streams.decompress(part, rows[column.name], column.low, column.planes)
+        codes[column.name] = _decompressed(part, rows[column.name], column)
         _check_codes(column.name, codes[column.name], info)
     codes["place"] = np.cumsum(codes["place"], axis=0)
     f, residual = info.frame, codes.pop("residual")
@@ -82,8 +82,16 @@ def encode_texels(codes: TexelCodes) -> tuple[dict[str, Any], bytes]:
 def _compressed(columns: Mapping[str, Codes], steps: Mapping[str, float]) -> tuple[list[dict[str, Any]], bytes]:
     """Compress columns; returns their entries in bundle.json and the bytes."""
     found = {name: streams.compress(values) for name, values in columns.items()}
-    entries = [{"name": name, "step": steps.get(name), "low": c.low, "planes": c.planes} for name, c in found.items()]
+    entries = [{"name": name, "step": steps.get(name), "bytes": c.sizes} for name, c in found.items()]
     return entries, b"".join(c.data for c in found.values())
+
+
+def _decompressed(data: memoryview, rows: int, column: Column, blocks: int = 0) -> Codes:
+    """Decompress a column of any version."""
+    if column.bytes is not None:
+        return streams.decompress(data, rows, column.bytes, blocks)
+    assert column.low is not None and column.planes is not None
+    return streams.decompress_planes(data, rows, column.low, column.planes)
 
 
 def decode_texels(
@@ -112,15 +120,16 @@ def decode_texels(
         raise StreamError("the columns of alphas have different steps")
     parts = _parts(data, info.columns)
     column, tiles = info.columns[0], int((sizes[:, 0] > 0).sum())
-    grades = streams.decompress(next(parts), tiles, column.low, column.planes)[:, 0]
+    grades = _decompressed(next(parts), tiles, column)[:, 0]
     if tiles and not (GRADES[0] <= grades.min() and grades.max() <= GRADES[1]):
         raise StreamError(f"a grade is not from {GRADES[0]} to {GRADES[1]}")
     coefficients = []
     for each, column, part in zip([*blocks, *blocks[: len(alphas)]], info.columns[1:], parts, strict=True):
-        if any(len(planes) > _COEFFICIENT_PLANES for planes in column.planes):
-            raise StreamError(f"the coefficients {column.name} have more than {_COEFFICIENT_PLANES} bytes")
-        values = streams.decompress(part, each.texels.numel(), column.low, column.planes, np.int32)
-        coefficients.append(torch.from_numpy(values).view(-1, len(each.texels), values.shape[1]))
+        values = _decompressed(part, each.texels.numel(), column, len(each.texels))
+        if np.abs(values).max(initial=0) > _MOST_COEFFICIENT:
+            raise StreamError(f"a coefficient of {column.name} is beyond {_MOST_COEFFICIENT}")
+        narrow = torch.from_numpy(values.astype(np.int32, order="C"))
+        coefficients.append(narrow.view(-1, len(each.texels), values.shape[1]))
     coded = None if alpha is None else AlphaCodes(alpha, steps.pop() if steps else 1.0, coefficients[len(blocks) :])
     colors = coefficients[: len(blocks)]
     return TexelCodes(sizes, info.step, residual, residual_step, torch.from_numpy(grades), colors, coded)
@@ -184,8 +193,8 @@ def _check_columns(
         raise StreamError(f"the columns are {found}, not {list(names)}")
     steps = {}
     for column in columns:
-        if len(column.low) != numbers[column.name] or len(column.planes) != numbers[column.name]:
-            raise StreamError(f"the column {column.name} needs {numbers[column.name]} numbers, not {len(column.low)}")
+        if column.numbers != numbers[column.name]:
+            raise StreamError(f"the column {column.name} needs {numbers[column.name]} numbers, not {column.numbers}")
         if column.name in stepped:
             if column.step is None:
                 raise StreamError(f"the column {column.name} has no step")
@@ -217,12 +226,11 @@ def _check_codes(name: str, codes: Codes, info: Surfels) -> None:
 def _parts(data: memoryview, columns: Sequence[Column]) -> Iterator[memoryview]:
     at = 0
     for column in columns:
-        size = sum(map(sum, column.planes))
-        yield data[at : at + size]
-        at += size
+        yield data[at : at + column.size]
+        at += column.size
 
 
 def _check_size(columns: Sequence[Column], size: int) -> None:
-    stated = sum(sum(map(sum, column.planes)) for column in columns)
+    stated = sum(column.size for column in columns)
     if stated != size:
         raise StreamError(f"truncated or too long: the columns need {stated} bytes, the file has {size}")

@@ -23,8 +23,8 @@ from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, SUPPORT, T
 from bitymi_ns.ops.view_kinds import Kind
 
 FORMAT = "bitymi-bundle"
-VERSION = (4, 0)  # newest version that is read: alphas of texels, which readers of version 3 would draw opaque
-COMPACT_VERSION = (3, 0)  # integer columns
+COMPACT_VERSION = (5, 0)  # entropy-coded columns; the newest version that is read
+ALPHA_VERSION = (4, 0)  # alphas of texels, which readers of version 3 would draw opaque
 LEAN_VERSION = (2, 3)  # lean view colours in a PLY file, refused by readers of version 1
 FULL_VERSION = (1, 4)  # surfels with all parameters
 _DIGEST_SINCE = {1: 2, 2: 1, 3: 0}  # major version: first minor version with a digest
@@ -111,15 +111,37 @@ Row = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 
 
 class Column(Part):
-    """An integer column, as written by `streams.compress`."""
+    """An integer column: `bytes` of `streams.compress`, or, before version 5, `low` and `planes` of
+    `streams.decompress_planes`."""
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9_]{1,20}$")]
     step: Annotated[float, Field(ge=1e-12, le=1e6)] | None = None
-    low: Annotated[list[Annotated[int, Field(ge=-(1 << 53), le=1 << 53)]], Field(max_length=16)]
-    planes: Annotated[
-        list[Annotated[list[Annotated[int, Field(ge=1, le=1 << 40)]], Field(max_length=MOST_PLANES)]],
-        Field(max_length=16),
-    ]
+    bytes: Annotated[list[Annotated[int, Field(ge=0, le=1 << 40)]], Field(max_length=16)] | None = None
+    low: Annotated[list[Annotated[int, Field(ge=-(1 << 53), le=1 << 53)]], Field(max_length=16)] | None = None
+    planes: (
+        Annotated[
+            list[Annotated[list[Annotated[int, Field(ge=1, le=1 << 40)]], Field(max_length=MOST_PLANES)]],
+            Field(max_length=16),
+        ]
+        | None
+    ) = None
+
+    @model_validator(mode="after")
+    def _is_of_one_kind(self) -> Column:
+        of_planes = self.low is not None and self.planes is not None and len(self.low) == len(self.planes)
+        if of_planes == (self.bytes is not None):
+            raise PydanticCustomError("column", "a column needs bytes, or as many numbers in low as in planes")
+        return self
+
+    @property
+    def numbers(self) -> int:
+        """Numbers per row."""
+        return len(self.bytes if self.bytes is not None else self.low or ())
+
+    @property
+    def size(self) -> int:
+        """Bytes of all numbers."""
+        return sum(self.bytes if self.bytes is not None else map(sum, self.planes or ()))
 
 
 class PositionFrame(Part):
@@ -283,15 +305,20 @@ class Manifest(Part):
     @model_validator(mode="after")
     def _surfels_fit(self) -> Manifest:
         surfels, compact = self.surfels, self.surfels.file == COMPACT_SURFELS
-        major = self.version.split(".")[0]
-        if major != "4" and compact != (major == "3"):
-            raise PydanticCustomError("file", "surfels.file must be surfels.bin in version 3, and in no earlier one")
+        major = int(self.version.split(".")[0])
+        if major != 4 and compact != (major in (3, 5)):
+            raise PydanticCustomError(
+                "file", "surfels.file must be surfels.bin in versions 3 and 5, and in no earlier one"
+            )
+        columns = [*(surfels.columns or ()), *(self.atlas and self.atlas.columns or ())]
+        if any((column.bytes is not None) != (major == 5) for column in columns):
+            raise PydanticCustomError("column", "columns must have bytes in version 5, low and planes in earlier ones")
         if compact and None in (surfels.frame, surfels.columns, surfels.terms):
             raise PydanticCustomError("file", "surfels.bin needs surfels.frame, columns and terms")
         if self.atlas is not None and compact != (self.atlas.file == TEXELS):
             raise PydanticCustomError("file", "atlas.file must be texels.bin beside surfels.bin, and atlas.ktx2 else")
-        if self.has_alpha != (major == "4"):
-            raise PydanticCustomError("alpha", "atlas.alpha_scale must be stated in version 4, and in no other")
+        if major != 5 and self.has_alpha != (major == 4):
+            raise PydanticCustomError("alpha", "atlas.alpha_scale must be stated in version 4, and in no earlier one")
         return self
 
     @property
@@ -361,9 +388,10 @@ def _version(version: Any, source: str) -> tuple[int, int]:
     found = re.fullmatch(r"([0-9]{1,6})\.([0-9]{1,6})", version) if isinstance(version, str) else None
     if found is None:
         raise BundleError(f"{source}: version must look like 1.0, not {_short(version)}")
-    if int(found[1]) > VERSION[0]:
+    if int(found[1]) > COMPACT_VERSION[0]:
         raise BundleError(
-            f"{source} has version {found[0]}, this program reads up to {VERSION[0]}.x: update bitymi-ns to open it"
+            f"{source} has version {found[0]}, this program reads up to {COMPACT_VERSION[0]}.x: update bitymi-ns to "
+            "open it"
         )
     return int(found[1]), int(found[2])
 

@@ -17,6 +17,7 @@ from bitymi_ns import __version__
 from bitymi_ns.bundle import compact, ktx2, ply
 from bitymi_ns.bundle.manifest import (
     ACTIVATIONS,
+    ALPHA_VERSION,
     ATLAS,
     COMPACT_SURFELS,
     COMPACT_VERSION,
@@ -26,7 +27,6 @@ from bitymi_ns.bundle.manifest import (
     POSTER,
     SURFELS,
     TEXELS,
-    VERSION,
     BundleError,
     check_file_name,
     describe,
@@ -153,8 +153,7 @@ def _compact_parts(codes: SceneCodes, info: dict[str, Any]) -> dict[str, bytes]:
     """Encode the two files of a compact bundle, adding their description to `info`."""
     of_surfels, surfels = compact.encode_surfels(codes.surfels, codes.residual, codes.residual_step, codes.alpha)
     info["surfels"] |= {"file": COMPACT_SURFELS, **of_surfels}
-    if codes.alpha is None:
-        info["version"] = "{}.{}".format(*COMPACT_VERSION)
+    info["version"] = "{}.{}".format(*COMPACT_VERSION)
     parts = {COMPACT_SURFELS: surfels}
     if codes.texels is not None:
         of_texels, parts[TEXELS] = compact.encode_texels(codes.texels)
@@ -178,7 +177,7 @@ def _describe(
     surfels, kind = scene.surfels, scene.view_color
     entry = VIEW_COLORS[kind]
     means, lean = surfels["means"].detach(), "view_terms" in surfels
-    version = VERSION if _has_alpha(atlas) else LEAN_VERSION if lean else FULL_VERSION
+    version = ALPHA_VERSION if _has_alpha(atlas) else LEAN_VERSION if lean else FULL_VERSION
     empty = len(means) == 0
     described: dict[str, Any] = {
         "version": f"{version[0]}.{version[1]}",

@@ -1,7 +1,8 @@
-"""Integer columns as Zstandard frames: one frame per byte plane, of known size."""
+"""Integer columns as bytes: entropy-coded since version 5, a Zstandard frame per byte plane before."""
 
+import math
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +11,9 @@ import zstandard
 
 from bitymi_ns.ops.backend import load
 
-LEVEL = 19
 MOST_PLANES = 7  # bytes of an integer that a float64 holds exactly
 _WINDOW = 1 << 23
+_OTHERS = 2  # largest context from a row's earlier numbers
 
 
 class StreamError(ValueError):
@@ -21,43 +22,66 @@ class StreamError(ValueError):
 
 @dataclass(frozen=True)
 class Compressed:
-    """A compressed integer column of n numbers per row."""
+    """A compressed integer column."""
 
-    low: list[int]  # [n] smallest value of each number, subtracted before packing
-    planes: list[list[int]]  # [n] byte sizes of the frames, lowest byte first; empty if all values are equal
-    data: bytes  # concatenated frames
-
-
-def compress(codes: npt.NDArray[np.int64], level: int = LEVEL) -> Compressed:
-    """Compress int64 [rows, n] of magnitude below 2^53; `level` is Zstandard's, 1 to 22."""
-    low = [int(column.min()) if len(column) else 0 for column in codes.T]
-    planes: list[list[Future[bytes]]] = []
-    with ThreadPoolExecutor(load("_cpu").num_threads()) as pool:
-        for column, least in zip(codes.T, low, strict=True):
-            rest = (column - least).astype(np.uint64)
-            planes.append([])
-            while rest.any():
-                plane = (rest & np.uint64(255)).astype(np.uint8).tobytes()
-                planes[-1].append(pool.submit(zstandard.compress, plane, level))
-                rest = rest >> np.uint64(8)
-    frames = [[plane.result() for plane in number] for number in planes]
-    return Compressed(low, [[len(f) for f in number] for number in frames], b"".join(f for n in frames for f in n))
+    sizes: list[int]  # bytes of each number
+    data: bytes
 
 
-def decompress(
-    view: memoryview, rows: int, low: Sequence[int], planes: Sequence[Sequence[int]], dtype: type[np.integer] = np.int64
-) -> npt.NDArray:
-    """Decompress the integers [rows, n] of `compress`, in memory bounded by `rows`.
+def compress(codes: npt.NDArray[np.integer]) -> Compressed:
+    """Compress int64 [rows, n], or coefficients of blocks [coefficients, blocks, n], of magnitude below 2^51."""
+    blocks = codes.shape[1] if codes.ndim == 3 else 0
+    rows = math.prod(codes.shape[:-1])
+    numbers = np.ascontiguousarray(codes.reshape(rows, codes.shape[-1]).T, dtype=np.int64)
+    others = _others(numbers) if blocks else [None] * len(numbers)
+    module = load("_cpu")
+    with ThreadPoolExecutor(module.num_threads()) as pool:
+        parts = list(pool.map(lambda number, of: module.encode_integers(number, blocks, of), numbers, others))
+    return Compressed([len(part) for part in parts], b"".join(parts))
+
+
+def decompress(view: memoryview, rows: int, sizes: Sequence[int], blocks: int = 0) -> npt.NDArray[np.int64]:
+    """Decompress `compress`: int64 [rows, n], the coefficients of all blocks as rows.
+
+    Raises:
+        StreamError: the bytes are damaged or do not match `rows` and `sizes`.
+    """
+    if sum(sizes) != len(view):
+        raise StreamError(f"the numbers have {sum(sizes)} bytes, not {len(view)}")
+    numbers, at, module = np.empty((len(sizes), rows), dtype=np.int64), 0, load("_cpu")
+    for k, size in enumerate(sizes):
+        of = _others(numbers[: k + 1])[k] if blocks else None
+        try:
+            module.decode_integers(bytes(view[at : at + size]), numbers[k], blocks, of)
+        except module.DamagedStream as error:
+            raise StreamError(f"a column is damaged ({error})") from error
+        at += size
+    return numbers.T
+
+
+def _others(numbers: npt.NDArray[np.int64]) -> list[npt.NDArray[np.uint8] | None]:
+    """Sum the magnitudes of the numbers [n, rows] before each, at most `_OTHERS`; None for the first."""
+    found: list[npt.NDArray[np.uint8] | None] = [None]
+    for number in numbers[:-1]:
+        least = np.clip(np.abs(number), 0, _OTHERS).astype(np.uint8)
+        found.append(least if found[-1] is None else np.minimum(found[-1] + least, _OTHERS).astype(np.uint8))
+    return found
+
+
+def decompress_planes(
+    view: memoryview, rows: int, low: Sequence[int], planes: Sequence[Sequence[int]]
+) -> npt.NDArray[np.int64]:
+    """Decompress a column [rows, n] of versions 3 and 4: smallest values `low`, sizes of the frames of the byte planes.
 
     Raises:
         StreamError: a frame is damaged or its size does not match `rows`.
     """
-    codes = np.empty((rows, len(low)), dtype=dtype)
+    codes = np.empty((rows, len(low)), dtype=np.int64)
     at = 0
     for number, sizes in enumerate(planes):
-        column = np.zeros(rows, dtype=dtype)
+        column = np.zeros(rows, dtype=np.int64)
         for plane, size in enumerate(sizes):
-            column += plane_bytes(view[at : at + size], rows).astype(dtype) << (8 * plane)
+            column += plane_bytes(view[at : at + size], rows).astype(np.int64) << (8 * plane)
             at += size
         codes[:, number] = column + low[number]
     if at != len(view):

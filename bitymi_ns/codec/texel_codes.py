@@ -27,7 +27,6 @@ ALPHA_GAIN = 6.0
 At equal bytes 4 to 8 give the same PSNR."""
 SHRINK = 0.6  # soft threshold of an iteration relative to the step, for equally weighted texels
 _ATTEMPTS = 16
-_FAST = 9
 _SMALLEST_STEP, _LARGEST_STEP = 1e-5, 50.0
 # Brightness and two differences: orthonormal, so that errors keep their size.
 _OPPONENT = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, -1.0], [1.0, -2.0, 1.0]])
@@ -129,23 +128,23 @@ class TexelCodes:
     alpha: AlphaCodes | None = None  # None = opaque texels
 
     @property
-    def columns(self) -> dict[str, npt.NDArray[np.int64]]:
-        """The columns of texels.bin: name to [rows, numbers]."""
+    def columns(self) -> dict[str, npt.NDArray[np.integer]]:
+        """The columns of texels.bin: name to [tiles, 1] grades, or [coefficients, blocks, numbers]."""
         columns = {"grade": self.grades.numpy()[:, None]}
         names, alphas = coefficient_columns(blocks_of(self.sizes))
         parts = zip(names, self.coefficients, strict=True)
         if self.alpha is not None:
             parts = chain(parts, zip(alphas, self.alpha.coefficients, strict=True))
         for name, values in parts:
-            columns[name] = values.reshape(-1, values.shape[2]).numpy().astype(np.int64)
+            columns[name] = values.numpy()
         return columns
 
-    def nbytes(self, level: int = streams.LEVEL) -> int:
+    def nbytes(self) -> int:
         """Count the bytes of texels.bin, and of residuals and mean alphas in surfels.bin."""
         columns = [*self.columns.values(), self.residual]
         if self.alpha is not None:
             columns.append(self.alpha.mean[:, None])
-        return sum(len(streams.compress(column, level).data) for column in columns)
+        return sum(len(streams.compress(column).data) for column in columns)
 
     @property
     def constants(self) -> Tensor:
@@ -227,16 +226,15 @@ class TexelCoder:
         low, high = GRADES
         self.grades = (-torch.log2(mean[tiled])).round().long().clamp(low, high) if first is None else first.grades
         self.alpha: AlphaCodes | None = None if first is None else first.alpha
-        self._packing = 0.0  # final bytes relative to those of fast compression; 0: unknown
 
     def fit(self, texels: Tensor, most_bytes: float, rounds: int = SPARSE_ROUNDS) -> TexelCodes:
         """Code texels [T, 3] in at most `most_bytes`, alphas included, enlarging the step if needed.
 
-        Bytes fall about as 1 / step; the first attempt is sized by fast compression, later ones are counted.
+        Bytes fall about as 1 / step.
         """
         codes = self.code(texels, rounds)
-        for attempt in range(_ATTEMPTS):
-            found = codes.nbytes(_FAST if attempt == 0 else streams.LEVEL)
+        for _ in range(_ATTEMPTS):
+            found = codes.nbytes()
             if found <= most_bytes:
                 break
             self._step = min(_LARGEST_STEP, self._step * min(4.0, max(1.06, (found / most_bytes) ** 1.2)))
@@ -245,10 +243,7 @@ class TexelCoder:
 
     def aim(self, codes: TexelCodes, most_bytes: float) -> None:
         """Adjust the step so that codes of nearly the same texels take `most_bytes`."""
-        fast = codes.nbytes(_FAST)
-        if self._packing == 0:
-            self._packing = codes.nbytes() / max(1, fast)
-        ratio = self._packing * fast / most_bytes
+        ratio = codes.nbytes() / most_bytes
         self._step = min(_LARGEST_STEP, max(_SMALLEST_STEP, self._step * min(2.0, max(0.5, ratio))))
 
     def _sums(self, values: Tensor) -> Tensor:

@@ -9,6 +9,7 @@
 #endif
 
 #include "core/shading.h"
+#include "cpu/entropy.h"
 #include "cpu/kernels.h"
 #include "cpu/threads.h"
 
@@ -95,6 +96,40 @@ template <class S> void bind_tracer(nb::module_& m) {
       });
 }
 
+using Numbers = nb::ndarray<int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Others = std::optional<nb::ndarray<const uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>>;
+
+IntegerColumn integer_column(const Numbers& values, int64_t blocks, const Others& others) {
+  const int64_t rows = int64_t(values.size());
+  if (blocks < 0 || (blocks && rows % blocks) || (others && int64_t(others->size()) != rows))
+    throw std::invalid_argument("blocks or others do not fit the rows");
+  return {rows, blocks, others ? others->data() : nullptr};
+}
+
+void bind_entropy(nb::module_& m) {
+  nb::exception<DamagedStream>(m, "DamagedStream", PyExc_ValueError);
+  m.def(
+      "encode_integers",
+      [](const Numbers& values, int64_t blocks, const Others& others) {
+        const IntegerColumn column = integer_column(values, blocks, others);
+        std::string found;
+        {
+          nb::gil_scoped_release release;
+          found = encode_integers(column, values.data());
+        }
+        return nb::bytes(found.data(), found.size());
+      },
+      "values"_a, "blocks"_a, "others"_a.none(), "Code a number of every row of a column (cpu/entropy.h).");
+  m.def(
+      "decode_integers",
+      [](const nb::bytes& data, const Numbers& values, int64_t blocks, const Others& others) {
+        const IntegerColumn column = integer_column(values, blocks, others);
+        nb::gil_scoped_release release;
+        decode_integers(column, reinterpret_cast<const uint8_t*>(data.c_str()), data.size(), values.data());
+      },
+      "data"_a, "values"_a, "blocks"_a, "others"_a.none(), "Fill `values` from what encode_integers gave.");
+}
+
 template <class S> void bind_operations(nb::module_& m) {
   const auto name = [](const char* base) { return std::string(base) + kSuffix<S>; };
   bind_class<FieldArrays<S>>(m, name("Field"), kHost, "The parameters of a residual field.");
@@ -127,6 +162,7 @@ NB_MODULE(BITYMI_MODULE, m) {
   bind_class<TileBlocks>(m, "TileBlocks", kHost, "The tiles and blocks of a fragment list.");
   bind_operations<float>(m);
   bind_operations<double>(m);
+  bind_entropy(m);
   bind_operation(m, "masked_counts", &masked_counts);
   bind_operation(m, "list_ids", &list_ids);
   bind_operation(m, "select_fragments", &select_fragments);

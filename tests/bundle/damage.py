@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from bitymi_ns.bundle import ply, strict_json
+from bitymi_ns.codec.streams import compress, decompress
 
 
 def signed(info: Mapping[str, Any], files: Mapping[str, bytes] | None = None) -> bytes:
@@ -27,6 +28,24 @@ def amend(folder: Path, change: Callable[[dict[str, Any]], object] = lambda info
     info = json.loads(signed(info, files))
     change(info)
     (folder / "bundle.json").write_bytes(signed(info))
+
+
+def recode(folder: Path, name: str, change: Callable[..., object], rows: int) -> None:
+    """Apply change(codes [rows, n]), in place, to a column of a compact bundle, with valid hashes and digest."""
+    info = json.loads((folder / "bundle.json").read_text())
+    for part in (info["surfels"], info["atlas"]):
+        at, data = 0, (folder / part["file"]).read_bytes()
+        for column in part["columns"]:
+            size = sum(column["bytes"])
+            if column["name"] == name:
+                codes = decompress(memoryview(data)[at : at + size], rows, column["bytes"])
+                change(codes)
+                found = compress(codes)
+                (folder / part["file"]).write_bytes(data[:at] + found.data + data[at + size :])
+                column["bytes"] = found.sizes
+            at += size
+    (folder / "bundle.json").write_text(json.dumps(info))
+    amend(folder)
 
 
 def change_columns(folder: Path, change: Callable[..., object], element: str = "vertex") -> None:

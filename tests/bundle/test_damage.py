@@ -54,7 +54,7 @@ def test_versions(surfels, tmp_path):
     make(surfels, target)
     amend(target, lambda info: info.update(version="1.7", holograms={"yes": True}))
     assert read_bundle(target).info.holograms == {"yes": True}
-    amend(target, lambda info: info.update(version="5.0"))
+    amend(target, lambda info: info.update(version="6.0"))
     with pytest.raises(BundleError, match="update bitymi-ns"):
         read_bundle(target)
     amend(target, lambda info: info.update(version="one"))

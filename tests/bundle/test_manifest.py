@@ -73,7 +73,7 @@ def test_bundles_of_earlier_versions_have_no_digest_and_later_ones_must():
     for version in ("1.2", "1.10", "2.1", "0.9"):
         message = refusal(json.dumps({**INFO, "version": version}).encode())
         assert 'digest is missing; if you have edited it on purpose, set "digest" to "' in message
-    assert "update bitymi-ns" in refusal(signed({**INFO, "version": "5.0"}))
+    assert "update bitymi-ns" in refusal(signed({**INFO, "version": "6.0"}))
 
 
 @pytest.mark.parametrize(

@@ -6,12 +6,17 @@ import { parseManifest } from '../src/bundle/manifest';
 import { KINDS, LEAN_WIDTH, SURFEL_WORDS, WORD, alphaIn, layerIn } from '../src/bundle/surfels';
 import { frameBytes } from '../src/bundle/zstd';
 import { DamagedBundle } from '../src/errors';
-import { BUNDLES, bytes, floats, frameOf, ints } from './compact_bundles';
+import { BUNDLES, PLANES, type Written, bytes, floats, frameOf, ints } from './compact_bundles';
 
 const textOf = (data: Uint8Array): string => new TextDecoder().decode(data);
 
-describe.each(Object.keys(BUNDLES))('the compact bundle %s', (name) => {
-  const { files, scene } = BUNDLES[name];
+const WRITTEN: [string, string, Written][] = [
+  ...Object.entries(BUNDLES).map(([name, of]): [string, string, Written] => [name, '5.0', of]),
+  ['alpha', '4.0', PLANES.alpha],
+  ['sg', '3.0', PLANES.sg],
+];
+
+describe.each(WRITTEN)('the compact bundle %s of version %s', (_, version, { files, scene }) => {
   const info = parseManifest(textOf(bytes(files['bundle.json'])));
   const surfels = readCompactSurfels(bytes(files['surfels.bin']), info);
   const numbers = new Uint32Array(surfels.words.buffer);
@@ -27,6 +32,7 @@ describe.each(Object.keys(BUNDLES))('the compact bundle %s', (name) => {
   };
 
   it('has the numbers that the package reads', () => {
+    expect(info.version).toBe(version);
     expect([surfels.count, surfels.kind, surfels.means]).toEqual([info.count, KINDS[info.viewColor], true]);
     compare('means', WORD.mean, 3, surfels.origin);
     compare('quats', WORD.quat, 4);

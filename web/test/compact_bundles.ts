@@ -6,10 +6,10 @@ export interface Written {
   scene: Record<string, string>;
 }
 
-export const BUNDLES = JSON.parse(readFileSync(new URL('compact.json', import.meta.url), 'utf8')) as Record<
-  string,
-  Written
->;
+const read = (file: string): Record<string, Written> =>
+  JSON.parse(readFileSync(new URL(file, import.meta.url), 'utf8')) as Record<string, Written>;
+export const BUNDLES = read('compact.json');
+export const PLANES = read('compact_planes.json'); // of versions 3 and 4: Zstandard frames
 export const bytes = (text: string): Uint8Array => Uint8Array.from(Buffer.from(text, 'base64'));
 export const floats = (text: string): Float32Array => new Float32Array(bytes(text).buffer);
 export const ints = (text: string): Int32Array => new Int32Array(bytes(text).buffer);

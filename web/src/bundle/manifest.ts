@@ -3,7 +3,8 @@ import { DamagedBundle, ViewerError } from '../errors';
 import type { Column } from './compact/columns';
 
 export const FORMAT = 'bitymi-bundle';
-export const NEWEST_MAJOR = 4;
+export const NEWEST_MAJOR = 5;
+const CODED_MAJOR = 5; // entropy-coded columns
 
 export type ViewKind = 'sv' | 'sh' | 'sb' | 'sg';
 export type AtlasFormat = 'bc7' | 'uint8' | 'fp16';
@@ -137,35 +138,38 @@ const MOST_POINTS = 4096;
 const MOST_FILES = 1 << 14;
 const RATES = [1e-12, 1e12]; // pixels per unit of length
 
-function columns(r: Reader): Column[] {
+function columns(r: Reader, coded: boolean): Column[] {
   return r.parts('columns', MOST_COLUMNS).map((column) => ({
     name: column.text('name', /^[a-z0-9_]{1,20}$/),
     step: column.has('step') ? column.number('step', 1e-12, 1e6) : null,
-    low: column.wholes('low', MOST_NUMBERS, -(2 ** 53), 2 ** 53),
-    planes: column.list('planes', MOST_NUMBERS).map((_, k) => {
-      return column.at('planes').wholes(`${k}`, MOST_BYTES, 1, 2 ** 40);
-    }),
+    bytes: coded ? column.wholes('bytes', MOST_NUMBERS, 0, 2 ** 40) : null,
+    low: coded ? [] : column.wholes('low', MOST_NUMBERS, -(2 ** 53), 2 ** 53),
+    planes: coded
+      ? []
+      : column.list('planes', MOST_NUMBERS).map((_, k) => {
+          return column.at('planes').wholes(`${k}`, MOST_BYTES, 1, 2 ** 40);
+        }),
   }));
 }
 
-function compact(r: Reader): CompactSurfels {
+function compact(r: Reader, coded: boolean): CompactSurfels {
   const frame = r.part('frame');
   const [center, low] = [frame.point('center', 1e9), frame.point('low', 100)];
-  return { frame: { center, scale: frame.number('scale', 1e-300, 1e9), low }, columns: columns(r) };
+  return { frame: { center, scale: frame.number('scale', 1e-300, 1e9), low }, columns: columns(r, coded) };
 }
 
-function coded(r: Reader, surfelBytes: number): CodedTexels {
+function texels(r: Reader, coded: boolean, surfelBytes: number): CodedTexels {
   return {
     texels: r.whole('texels', 0, 2 ** 50),
     step: r.number('step', 1e-6, 100),
     pageWidth: r.whole('page_width', 1, SIDE),
     pageRows: r.whole('page_rows', 1, SIDE),
-    columns: columns(r),
+    columns: columns(r, coded),
     surfelBytes,
   };
 }
 
-function atlas(r: Reader, isCompact: boolean, surfelBytes: number): Atlas {
+function atlas(r: Reader, isCompact: boolean, coded: boolean, surfelBytes: number): Atlas {
   const format = r.choice('format', isCompact ? ['dct'] : ['bc7', 'uint8', 'fp16']);
   return {
     format,
@@ -176,7 +180,7 @@ function atlas(r: Reader, isCompact: boolean, surfelBytes: number): Atlas {
     offset: r.number('offset', -256, 256),
     scale: r.number('scale', 0, 512),
     alphaScale: r.has('alpha_scale') ? r.number('alpha_scale', 1e-6, 2) : 0,
-    coded: isCompact ? coded(r, surfelBytes) : null,
+    coded: isCompact ? texels(r, coded, surfelBytes) : null,
   };
 }
 
@@ -230,16 +234,19 @@ export function parseManifest(text: string): Manifest {
       .map(([name, r]) => [name, { bytes: r.whole('bytes', 0, 2 ** 36), sha256: r.text('sha256', /^[0-9a-f]{64}$/) }]),
   );
   const isCompact = files.has('surfels.bin');
-  const texture = root.has('atlas') ? atlas(root.part('atlas'), isCompact, files.get('surfels.bin')?.bytes ?? 0) : null;
-  if (Boolean(texture?.alphaScale) !== (major === 4)) {
-    throw new DamagedBundle('bundle.json: atlas.alpha_scale must be stated in version 4, and in no other.');
+  const coded = major >= CODED_MAJOR;
+  const texture = root.has('atlas')
+    ? atlas(root.part('atlas'), isCompact, coded, files.get('surfels.bin')?.bytes ?? 0)
+    : null;
+  if (!coded && Boolean(texture?.alphaScale) !== (major === 4)) {
+    throw new DamagedBundle('bundle.json: atlas.alpha_scale must be stated in version 4, and in no earlier one.');
   }
   return {
     version,
     count: surfels.whole('count', 0, 2 ** 28),
     viewColor: surfels.choice('view_color', ['sv', 'sh', 'sb', 'sg']),
     terms: surfels.has('terms') || isCompact ? surfels.whole('terms', 0, 2 ** 31) : null,
-    compact: isCompact ? compact(surfels) : null,
+    compact: isCompact ? compact(surfels, coded) : null,
     atlas: texture,
     near: render.number('near', 1e-9, 1e6),
     weightBound: render.number('weight_bound', 0, 1),

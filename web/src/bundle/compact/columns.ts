@@ -1,17 +1,19 @@
-// Integer columns, a Zstandard frame per byte of each number: docs/baking.md, "Columns of integers".
+// Integer columns: docs/baking.md, "Columns of integers".
 import { DamagedBundle } from '../../errors';
 import { frameBytes } from '../zstd';
+import { decodeIntegers } from './integers';
 
 export interface Column {
   name: string;
   step: number | null;
+  bytes: number[] | null; // of each number; null before version 5, which has these:
   low: number[];
-  planes: number[][]; // frame sizes per number, lowest byte first
+  planes: number[][]; // sizes of Zstandard frames per number, lowest byte first
 }
 
 export type Codes = Float64Array | Int32Array;
 
-const bytesOf = (column: Column): number => column.planes.flat().reduce((sum, size) => sum + size, 0);
+const bytesOf = ({ bytes, planes }: Column): number => (bytes ?? planes.flat()).reduce((sum, size) => sum + size, 0);
 
 // Checks that the columns are as expected ([name, numbers per row]) and fill the file.
 export function checkColumns(columns: Column[], expected: [string, number][], size: number, file: string): void {
@@ -20,7 +22,7 @@ export function checkColumns(columns: Column[], expected: [string, number][], si
   if (names(found) !== names(wanted)) throw new DamagedBundle(`${file}: its columns are ${names(found)}.`);
   columns.forEach((column, k) => {
     const [name, numbers] = expected[k];
-    if (column.low.length !== numbers || column.planes.length !== numbers) {
+    if ((column.bytes ?? column.low).length !== numbers || (!column.bytes && column.planes.length !== numbers)) {
       throw new DamagedBundle(`${file}: the column ${name} needs ${numbers} numbers.`);
     }
   });
@@ -43,9 +45,11 @@ export class ColumnReader {
     return this.columns[this.next]?.name;
   }
 
-  // Reads the next column: an array of `rows` codes per number.
-  read<T extends Codes>(rows: number, make: (rows: number) => T): T[] {
-    const { low, planes } = this.columns[this.next++];
+  // Reads the next column: an array of `rows` codes per number. blocks: of which they are coefficients, 0 = of none.
+  read<T extends Codes>(rows: number, make: (rows: number) => T, blocks = 0): T[] {
+    const { bytes, low, planes } = this.columns[this.next++];
+    const others = blocks && bytes && bytes.length > 1 ? new Uint8Array(rows) : null;
+    if (bytes) return bytes.map((size, k) => this.decode(size, make(rows), blocks, k ? others : null, others));
     return low.map((least, k) => {
       const codes = make(rows).fill(least) as T;
       planes[k].forEach((size, plane) => {
@@ -56,5 +60,25 @@ export class ColumnReader {
       });
       return codes;
     });
+  }
+
+  // Decodes a number with the contexts of the earlier ones, and adds its own to `sums`.
+  private decode<T extends Codes>(
+    size: number,
+    codes: T,
+    blocks: number,
+    others: Uint8Array | null,
+    sums: Uint8Array | null,
+  ): T {
+    try {
+      decodeIntegers(this.data.subarray(this.at, this.at + size), codes, blocks, others);
+    } catch (error) {
+      throw new DamagedBundle(`${this.file}: a column is damaged: ${error instanceof Error ? error.message : error}.`);
+    }
+    this.at += size;
+    if (sums) {
+      for (let i = 0; i < codes.length; i++) if (codes[i]) sums[i] = sums[i] || codes[i] ** 2 > 1 ? 2 : 1;
+    }
+    return codes;
   }
 }

@@ -10,7 +10,7 @@ export const SPARE_TEXELS = 1 << 20;
 const MOST_TEXELS = 2 ** 30; // in all pages: four gigabytes
 const BLOCK = 8;
 const GRADES: [number, number] = [-8, 24];
-const MOST_PLANES = 3; // bytes of a coefficient
+const MOST_COEFFICIENT = 2 ** 24;
 const FILE = 'texels.bin';
 
 // Tiles in surfel order.
@@ -117,10 +117,15 @@ class Painter {
     });
   }
 
+  // Returns where a block's texels lie in the pages, from its first on.
+  private offsets({ u, v }: Blocks): Int32Array {
+    return Int32Array.from({ length: u * v }, (_, t) => Math.floor(t / u) * this.atlas.width + (t % u));
+  }
+
   // Writes the residual colours of blocks from coefficients [channel][frequency * blocks + block].
   colors(of: Blocks, coefficients: Int32Array[], steps: Float64Array): void {
     const { u, v } = of;
-    const waves = wavesOf(u, v);
+    const [waves, offsets] = [wavesOf(u, v), this.offsets(of)];
     const [p0, p1, p2] = this.sums;
     this.each(of, (tile, row, block, first) => {
       const [red, green, blue] = this.surfels.words.subarray(row + WORD.residual, row + WORD.residual + 3);
@@ -132,8 +137,11 @@ class Painter {
         const grey = a * p0[t];
         const tilt = b * p1[t];
         const bend = c * p2[t];
-        const to = first + Math.floor(t / u) * this.atlas.width + (t % u);
-        this.pages[to] = this.code(red + grey + tilt + bend, green + grey - 2 * bend, blue + grey - tilt + bend);
+        this.pages[first + offsets[t]] = this.code(
+          red + grey + tilt + bend,
+          green + grey - 2 * bend,
+          blue + grey - tilt + bend,
+        );
       }
     });
   }
@@ -141,14 +149,14 @@ class Painter {
   // Writes the alphas of blocks, after their colours.
   alphas(of: Blocks, [coefficients]: Int32Array[], steps: Float64Array): void {
     const { u, v } = of;
-    const waves = wavesOf(u, v);
+    const [waves, offsets] = [wavesOf(u, v), this.offsets(of)];
     const [sums] = this.sums;
     const perByte = 255 / this.atlas.alphaScale;
     this.each(of, (tile, row, block, first) => {
       const mean = alphaIn(this.numbers[row + WORD.layer]);
       inverse(coefficients, block, of.texels / (u * v), waves, sums);
       for (let t = 0; t < u * v; t++) {
-        const to = first + Math.floor(t / u) * this.atlas.width + (t % u);
+        const to = first + offsets[t];
         const byte = byteOf((mean + steps[tile] * sums[t]) * perByte);
         this.pages[to] = (this.pages[to] & 0xffffff) | (byte << 24);
       }
@@ -162,6 +170,12 @@ class Painter {
       return new Uint8Array(this.pages.slice(k * size, (k + 1) * size).buffer);
     });
   }
+}
+
+function tooLarge(values: Int32Array): boolean {
+  for (let i = 0; i < values.length; i++)
+    if (values[i] > MOST_COEFFICIENT || values[i] < -MOST_COEFFICIENT) return true;
+  return false;
 }
 
 function check(data: Uint8Array, atlas: Atlas, coded: CodedTexels, found: number): void {
@@ -204,14 +218,14 @@ export function readCompactTexels(data: Uint8Array, atlas: Atlas, surfels: Surfe
   }
   const painter = new Painter(atlas, surfels, tiles);
   const stepsOf = (step: number): Float64Array => grades.map((grade) => step * 2 ** (grade / 2));
-  for (const { name, step, planes } of coded.columns.slice(1)) {
-    if (planes.some((bytes) => bytes.length > MOST_PLANES)) {
-      throw new DamagedBundle(`${FILE}: the coefficients ${name} have more than ${MOST_PLANES} bytes.`);
-    }
+  for (const { name, step } of coded.columns.slice(1)) {
     const isAlpha = name.startsWith('alpha_');
     if (isAlpha && step === null) throw new DamagedBundle(`${FILE}: ${name} has no step.`);
     const of = held.get(name.replace('alpha_', ''))!;
-    const coefficients = reader.read(of.texels, (rows) => new Int32Array(rows));
+    const coefficients = reader.read(of.texels, (rows) => new Int32Array(rows), of.texels / (of.u * of.v));
+    if (coefficients.some(tooLarge)) {
+      throw new DamagedBundle(`${FILE}: a coefficient of ${name} is beyond ${MOST_COEFFICIENT}.`);
+    }
     if (isAlpha) painter.alphas(of, coefficients, stepsOf(step!));
     else painter.colors(of, coefficients, stepsOf(coded.step));
   }

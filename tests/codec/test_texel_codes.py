@@ -88,7 +88,7 @@ def test_alphas_of_one_cost_next_to_nothing() -> None:
     coder = TexelCoder(sizes, torch.ones(len(texels)), TexelCodeOptions())
     opaque = coder.code(texels).nbytes()
     assert bool((coder.code_alpha(torch.ones(len(texels))) == 1).all())
-    assert coder.code(texels).nbytes() == opaque
+    assert coder.code(texels).nbytes() < opaque + 100  # a dozen bytes per constant column
 
 
 def _tiled() -> torch.Tensor:

@@ -142,8 +142,8 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
 
     Args:
         stored: width and height that it must have; None = any.
-        wanted: width and height to which it will be downscaled. A JPEG may then be decoded at a half, a quarter or an
-            eighth of its size, but no smaller than this.
+        wanted: width and height to which it is downscaled, averaging over pixels. A JPEG is decoded at a half, a quarter
+            or an eighth of its size if that is at least twice as large: of fewer pixels the average is the nearest one.
 
     Raises:
         CaptureError: it is missing, cannot be read, or has another size.
@@ -152,10 +152,13 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
         with parsing(f"the image {path}", _REPLACE, _WORDED), open_picture(path) as file:
             if stored is not None and file.size != stored:
                 fail(wrong_size(path, file.size, stored))
-            if wanted is not None:
-                file.draft(None, wanted)
+            size, drafted = file.size, None if wanted is None else file.draft(None, (2 * wanted[0], 2 * wanted[1]))
             picture = in_srgb(eight_bits(file))
-            return picture.convert("RGBA" if has_transparency(file) else "RGB")
+            picture = picture.convert("RGBA" if has_transparency(file) else "RGB")
+            if wanted is None or picture.size == wanted == size:
+                return picture
+            # half of an odd number of pixels is rounded up: what is beyond the photograph is not part of the picture
+            return picture.resize(wanted, Image.Resampling.BOX, drafted[1] if drafted else (0, 0, *size))
     except FileNotFoundError as error:
         fail(f"the image {path} is missing, but the capture has a pose for it", error)
     except Image.DecompressionBombError as error:

@@ -8,6 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
+from bitymi_ns.capture import images
 from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.capture.images import read_image
 from bitymi_ns.capture.lens import lenses_of
@@ -88,12 +89,23 @@ def test_a_lens_is_reduced_with_its_photographs() -> None:
     assert np.abs(a[:h, :w] - b[:h, :w]).mean() < 1.0
 
 
-def test_jpegs_are_decoded_no_larger_than_needed(tmp_path: Path) -> None:
-    rows, columns = np.mgrid[0:1200, 0:1600]
-    pixels = np.stack([rows / 5, columns / 7, 127 + 100 * np.sin(columns / 40)], -1).astype(np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "a.jpg", quality=95)
-    whole = read_image(tmp_path / "a.jpg", (1600, 1200))
-    small = read_image(tmp_path / "a.jpg", (1600, 1200), (300, 225))
-    assert whole.size == (1600, 1200) and small.size == (400, 300)
-    a, b = (np.asarray(each.resize((200, 150), Image.Resampling.BOX)).astype(float) for each in (whole, small))
-    assert np.abs(a - b).mean() < 1.0
+@pytest.mark.parametrize("size", [(800, 600), (801, 533), (807, 603)])
+@pytest.mark.parametrize("reduction", [1, 2, 4, 5.3, 8])
+def test_jpegs_are_decoded_small_and_stay_in_their_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int], reduction: float
+) -> None:
+    """Decoders round half of an odd size up; a picture of that is not the photograph's."""
+    x, y = np.arange(size[0])[None, :], np.arange(size[1])[:, None]
+    waves = 127 + 100 * np.sin(x / 40 + y / 30)
+    pixels = np.stack(np.broadcast_arrays(waves, x / 7, y / 5), -1)
+    Image.fromarray(pixels.astype(np.uint8)).save(tmp_path / "a.jpg", quality=95, subsampling=0)
+    decoded = []
+    monkeypatch.setattr(images, "in_srgb", lambda image: decoded.append(image.size) or image)
+    wanted = (round(size[0] / reduction), round(size[1] / reduction))
+    small = read_image(tmp_path / "a.jpg", size, wanted)
+    whole = read_image(tmp_path / "a.jpg", size)
+    assert small.size == wanted and decoded[1] == size
+    assert decoded[0] == size or 2 * wanted[0] <= decoded[0][0] <= 4 * wanted[0] + 2
+    expected = np.asarray(whole.resize(wanted, Image.Resampling.BOX)).astype(float)
+    error = np.asarray(small).astype(float) - expected
+    assert np.abs(error).mean() < 1.0 and np.abs(error[:, :, 1:].mean((0, 1))).max() < 0.5

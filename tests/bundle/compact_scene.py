@@ -1,5 +1,7 @@
 """A compact bundle of a few random surfels."""
 
+import base64
+import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -68,6 +70,24 @@ def pages_of(codes: SceneCodes) -> tuple[np.ndarray, Packing]:
     packing, alphas = pack(codes.surfels.sizes, codes.page_width, codes.page_rows), codes.texels.alphas()
     texels = codes.texels.texels()
     return paged_texels(texels if alphas is None else torch.cat([texels, alphas[:, None]], 1), packing).numpy(), packing
+
+
+STORED = 12  # surfels of the stored bundles
+
+
+def stored(name: str) -> dict[str, dict[str, bytes]]:
+    """Read a bundle of version 3 or 4 that the web tests have, and the numbers that the package read from it then."""
+    path = Path(__file__).parents[2] / "web" / "test" / "compact_planes.json"
+    parts = json.loads(path.read_text("utf8"))[name]
+    return {part: {key: base64.b64decode(text) for key, text in values.items()} for part, values in parts.items()}
+
+
+def write_stored(name: str, folder: Path) -> Path:
+    """Write the files of such a bundle."""
+    folder.mkdir()
+    for file, data in stored(name)["files"].items():
+        (folder / file).write_bytes(data)
+    return folder
 
 
 def write_compact(folder: Path, codes: SceneCodes, **options) -> Path:

@@ -1,6 +1,5 @@
 """Compact bundles round-trip, and contradictory ones are refused before they take memory."""
 
-import base64
 import json
 import os
 import sys
@@ -19,7 +18,16 @@ from bitymi_ns.codec.pages import covered_blocks, texel_alpha
 from bitymi_ns.codec.quantise import encode
 from bitymi_ns.ops.baked_cuda import decoded
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
-from tests.bundle.compact_scene import FINEST, RANGE, make_codes, pages_of, scene_of, write_compact
+from tests.bundle.compact_scene import (
+    FINEST,
+    RANGE,
+    make_codes,
+    pages_of,
+    scene_of,
+    stored,
+    write_compact,
+    write_stored,
+)
 from tests.bundle.damage import amend, recode, signed
 from tests.bundle.test_read import peak
 
@@ -171,21 +179,17 @@ def test_numbers_that_no_column_has_are_refused(tmp_path: Path, name: str, chang
 @pytest.mark.parametrize("name", ["alpha", "sg"])
 def test_bundles_of_versions_3_and_4_are_read_as_they_were(tmp_path: Path, name: str) -> None:
     """The web tests' bundles with Zstandard frames, and the numbers that the package read from them then."""
-    stored = Path(__file__).parents[2] / "web" / "test" / "compact_planes.json"
-    written = json.loads(stored.read_text("utf8"))[name]
-    folder = tmp_path / "b"
-    folder.mkdir()
-    for file, text in written["files"].items():
-        (folder / file).write_bytes(base64.b64decode(text))
+    folder = write_stored(name, tmp_path / "b")
     bundle, checks = check_files(folder)
     assert bundle is not None and all(check.ok for check in checks), checks
     assert bundle.info.version == ("4.0" if name == "alpha" else "3.0")
     scene = bundle.scene
     found = {**scene.surfels, "tiles": scene.tiles, "extent": scene.extent, "mean_residual": scene.mean_residual}
     found |= {"atlas": scene.atlas} | ({} if scene.mean_alpha is None else {"mean_alpha": scene.mean_alpha})
-    assert set(found) == set(written["scene"])
-    for key, text in written["scene"].items():
-        assert np.ascontiguousarray(found[key].numpy()).tobytes() == base64.b64decode(text), key
+    want = stored(name)["scene"]
+    assert set(found) == set(want)
+    for key, data in want.items():
+        assert np.ascontiguousarray(found[key].numpy()).tobytes() == data, key
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from bitymi_ns.bundle import BundleError, ktx2, ply, read_bundle
+from bitymi_ns.codec.streams import compress
 from bitymi_ns.view import site_of
+from tests.bundle.compact_scene import STORED, write_stored
 from tests.bundle.damage import amend
 from tests.view.conftest import write
 from tests.view.test_browser import page_of
@@ -54,11 +56,11 @@ def texel(value: float, channel: int = 0) -> Damage:
 
 
 def frame(held: int) -> Damage:
-    """Change the first frame of surfels.bin to one block of equal bytes that declares a byte per surfel."""
+    """Change the first frame of a surfels.bin of version 3 to one block of equal bytes, a byte declared per surfel."""
 
     def damage(bundle: Path) -> None:
         data = (bundle / "surfels.bin").read_bytes()
-        header = b"\x28\xb5\x2f\xfd" + bytes([0x20, COUNT]) + (held << 3 | 0b011).to_bytes(3, "little")
+        header = b"\x28\xb5\x2f\xfd" + bytes([0x20, STORED]) + (held << 3 | 0b011).to_bytes(3, "little")
         stated = json.loads((bundle / "bundle.json").read_text())["surfels"]["columns"][0]["planes"][0]
         made = header + b"\0"
         (bundle / "surfels.bin").write_bytes(made + data[stated[0] :])
@@ -70,6 +72,24 @@ def frame(held: int) -> Damage:
         amend(bundle, change)
 
     return damage
+
+
+def numbers(data: bytes) -> Damage:
+    """Replace the first column of surfels.bin."""
+
+    def damage(bundle: Path) -> None:
+        surfels = (bundle / "surfels.bin").read_bytes()
+        info = json.loads((bundle / "bundle.json").read_text())
+        size = info["surfels"]["columns"][0]["bytes"][0]
+        (bundle / "surfels.bin").write_bytes(data + surfels[size:])
+        amend(bundle, lambda info: info["surfels"]["columns"][0].update(bytes=[len(data)]))
+
+    return damage
+
+
+def places(rows: int, first: int = 0) -> bytes:
+    """Encode differences of positions."""
+    return compress(np.array([first, *range(rows - 1)])[:, None]).data
 
 
 NAN = float("nan")
@@ -96,9 +116,16 @@ TABLE: list[tuple[str, str, Damage, bool]] = [
     ("a colour beyond its limit", "bc7", column("view_base_2", 300.0), False),
     ("a term beyond its limit", "bc7", column("term_0", 3e7, "view_term"), False),
     ("a colour of a term of NaN", "bc7", column("term_4", NAN, "view_term"), False),
-    ("a frame that holds what it declares", "compact", frame(COUNT), True),
-    ("a frame that holds more", "compact", frame(COUNT + 5), False),
-    ("a frame that holds less", "compact", frame(COUNT - 5), False),
+    ("a frame that holds what it declares", "planes", frame(STORED), True),
+    ("a frame that holds more", "planes", frame(STORED + 5), False),
+    ("a frame that holds less", "planes", frame(STORED - 5), False),
+    ("a column of other numbers", "compact", numbers(places(COUNT)), True),
+    ("a column of more rows", "compact", numbers(places(COUNT + 5)), False),
+    ("a column of fewer rows", "compact", numbers(places(COUNT - 5)), False),
+    ("a column that descends", "compact", numbers(places(COUNT, -5)), False),
+    ("a column that a byte follows", "compact", numbers(places(COUNT) + b"\0"), False),
+    ("a column without bytes", "compact", numbers(b""), False),
+    ("a column with a long head", "compact", numbers(b"\xff" * 40), False),
 ]
 
 
@@ -110,6 +137,7 @@ def bundles(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "fp16": write(folder / "fp16", "fp16", COUNT),
         "fp16 alpha": write(folder / "alpha", "fp16", COUNT, alpha=True),
         "compact": write(folder / "compact", "uint8", COUNT, compact=True),
+        "planes": write_stored("sg", folder / "planes"),
     }
 
 

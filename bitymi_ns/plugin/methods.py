@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
+from nerfstudio.utils.rich_utils import CONSOLE
 
 from bitymi_ns import KernelsUnavailable
 
@@ -40,7 +41,9 @@ def _install() -> None:
     """Change what does not pass through nerfstudio's registry; see `hooks`."""
     try:
         from bitymi_ns.plugin import hooks
+        from bitymi_ns.plugin.run import torchrun
 
+        CONSOLE.quiet = CONSOLE.quiet or not torchrun.own().first  # of several processes the first prints
         hooks.allow_numpy_scalars()
         hooks.extend_exporter(_exports)
     except Exception as error:  # noqa: BLE001 - see the module's docstring

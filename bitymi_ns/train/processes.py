@@ -67,7 +67,7 @@ class Processes:
         if self.count == 1 or not self.any(own is not None):
             return own
         found: list[str | None] = [None] * self.count
-        with _raise_process_lost():
+        with raise_process_lost():
             dist.all_gather_object(found, own)
         return next(text for text in found if text is not None)
 
@@ -85,7 +85,7 @@ class Processes:
         if self.first:
             torch.save(state, packed)
         box = [packed.getvalue()]
-        with _raise_process_lost():
+        with raise_process_lost():
             dist.broadcast_object_list(box, src=0, device=torch.device("cpu"))
         return state if self.first else torch.load(io.BytesIO(box[0]), map_location=device, weights_only=True)
 
@@ -93,7 +93,7 @@ class Processes:
         """Broadcast tensors from rank 0, in place."""
         if self.count == 1:
             return
-        with _raise_process_lost(), torch.no_grad():
+        with raise_process_lost(), torch.no_grad():
             for tensor in tensors:
                 dist.broadcast(tensor, src=0)
 
@@ -149,7 +149,7 @@ class Processes:
         for dtype in dict.fromkeys(tensor.dtype for tensor in tensors):
             same_dtype = [tensor for tensor in tensors if tensor.dtype == dtype]
             flat = torch.cat([tensor.reshape(-1) for tensor in same_dtype])
-            with _raise_process_lost():
+            with raise_process_lost():
                 dist.all_reduce(flat, op)
             parts = flat.split([tensor.numel() for tensor in same_dtype])
             for tensor, part in zip(same_dtype, parts, strict=True):
@@ -160,7 +160,7 @@ ALONE = Processes()
 
 
 @contextmanager
-def _raise_process_lost() -> Iterator[None]:
+def raise_process_lost() -> Iterator[None]:
     """Turn torch's connection errors into ProcessLost."""
     try:
         yield

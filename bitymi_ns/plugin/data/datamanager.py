@@ -263,7 +263,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
 
     def train_index(self, step: int) -> int:
         """Return the index of the training view of a step of this process."""
-        (number,) = Processes(self.local_rank, self.world_size).numbers(step)
+        (number,) = Processes.joined().numbers(step)
         return training_order(len(self.train_dataset), self.config.train_cameras_sampling_seed, number)
 
     def next_train(self, step: int) -> tuple[View, dict[str, Any]]:  # type: ignore[override]

@@ -90,7 +90,7 @@ class TrainingRun:
         texels, to_come = config.texels if learns else None, self.training.texels.views_to_come
         most = self.training.strategy.most
         lists = self.training.schedule.lists_fragments(self.datamanager.train_dataset.has_maps)
-        state_training(scene, cameras, most, texels, to_come, processes.count, lists)
+        state_training(scene, cameras, most, texels, to_come, trainer.world_size, lists)
         self.datamanager.step_view = self.training.view
 
     def _check_start(self) -> None:

@@ -20,7 +20,7 @@ from bitymi_ns.plugin.console import InputError, as_input_error, fail, say, warn
 from bitymi_ns.plugin.data.capture_checks import check_capture
 from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
-from bitymi_ns.plugin.run import run_folder
+from bitymi_ns.plugin.run import run_folder, torchrun
 from bitymi_ns.plugin.run.device import has_cuda_kernels, why_not_cuda
 from bitymi_ns.plugin.run.model import PARAMETER_GROUPS, BitymiModelConfig
 from bitymi_ns.plugin.run.trainer import BitymiPipelineConfig, BitymiTrainer
@@ -37,7 +37,6 @@ class BitymiTrainerConfig(TrainerConfig):
 
     _target: type = field(default_factory=lambda: BitymiTrainer)
     read_from = None  # folder of the config.yml that was loaded for evaluation; no field: config.yml is not to state it
-    processes = 1  # of the run; no field: --machine.num-devices says it, which nerfstudio is not to see
     vis: Literal[
         "none",
         "viewer",
@@ -82,23 +81,30 @@ class BitymiTrainerConfig(TrainerConfig):
             fail(f"a run is of one capture, and two are given: {named}. Leave out one of them.")
 
     def set_timestamp(self) -> None:
-        """Fix what depends on the moment and the machine. nerfstudio calls this before it writes config.yml."""
+        """Fix what depends on the moment and the machine. nerfstudio calls this before it writes config.yml.
+
+        What starts a run of several processes ends here, with them; those after the first take what that has fixed.
+        """
+        if not torchrun.own().first:
+            torchrun.join(self)
+            return
         super().set_timestamp()
         if not 0 <= self.machine.seed < SEEDS:
             fail(f"--machine.seed must be from 0 to {SEEDS - 1}, not {self.machine.seed}")
+        if several := torchrun.own().count > 1:
+            machines, cards = torchrun.own("GROUP_").count, torchrun.own("LOCAL_").count
+            self.machine = replace(self.machine, num_machines=machines, num_devices=cards)
+        self._check_options()
+        if not several and (self.machine.num_machines, self.machine.num_devices) != (1, 1):
+            torchrun.run(self)
         self._seed_by_machine()
         if self.machine.device_type != "cpu" and (why := why_not_cuda()):
             warn(f"Training on the CPU instead of {self.machine.device_type}: {why}.")
             self.machine.device_type = "cpu"
-        self._check_options()
         self._make_paths_absolute()
         self._take_poses_of_resumed()
         if self.load_dir is None and self.load_checkpoint is None:
             self.resolve_length()  # a resumed run learns its length from the checkpoint
-
-    def setup(self, **kwargs: Any) -> Any:
-        """The trainer of a process; that of the first starts the others."""
-        return super().setup(**{**kwargs, "world_size": self.processes})
 
     def _seed_by_machine(self) -> None:
         """Have a --machine.seed that is not the default seed all that has a seed of its own and was not given one."""
@@ -109,7 +115,6 @@ class BitymiTrainerConfig(TrainerConfig):
                     setattr(owner, name, seed)
 
     def _check_options(self) -> None:
-        machine = self.machine
         for options in (self.pipeline.model.scene, self.pipeline.model.train):
             try:
                 check_ranges(options)
@@ -122,12 +127,9 @@ class BitymiTrainerConfig(TrainerConfig):
                     "by which texels move and surfels are densified. The kernels compute in single precision anyway; "
                     "leave the option out"
                 )
-        if machine.num_machines != 1:
-            fail(f"a run is of one machine, not {machine.num_machines} (--machine.num-machines)")
-        if machine.num_devices < 1:
-            fail(f"--machine.num-devices must be at least 1, not {machine.num_devices}")
-        if machine.device_type == "cuda" and machine.num_devices > (cards := torch.cuda.device_count()):
-            fail(f"there are {cards} of {machine.num_devices} GPUs that --machine.num-devices asks for")
+        asked, cards = self.machine.num_devices, torch.cuda.device_count()
+        if self.machine.device_type == "cuda" and has_cuda_kernels() and asked > cards:
+            fail(f"there are {cards} of {asked} GPUs that --machine.num-devices asks for")
 
     def print_to_terminal(self) -> None:
         """Nothing: nerfstudio would print every option here, before anything is checked. All of them are in config.yml,
@@ -136,6 +138,8 @@ class BitymiTrainerConfig(TrainerConfig):
     def save_config(self) -> None:
         """Write config.yml and say in a few lines what is going to happen. This is the first that a run writes, so a
         folder that cannot be used shows here. What can be checked before anything is written is checked now."""
+        if not torchrun.own().first:
+            return
         check_capture(self.pipeline.datamanager, read=True)
         folder = self.get_base_dir()
         if self.load_dir is None and self.load_checkpoint is None:
@@ -143,8 +147,8 @@ class BitymiTrainerConfig(TrainerConfig):
         run_folder.take(folder)
         with explained(folder, InputError, " (--output-dir)."):
             write_file(folder / "config.yml", yaml.dump(self).encode("utf8"))
-        # what follows in nerfstudio would start the processes its own way, see `launcher`
-        self.processes, self.machine = self.machine.num_devices, replace(self.machine, num_devices=1)
+        # what follows in nerfstudio would start the processes its own way, see `torchrun`
+        self.machine = replace(self.machine, num_machines=1, num_devices=1)
         say(self.summary())
 
     def summary(self) -> str:
@@ -176,8 +180,8 @@ class BitymiTrainerConfig(TrainerConfig):
     def length(self) -> str:
         """The number of steps and the device, with the reason where the run is shorter than on a GPU."""
         text = f"{self.max_num_iterations:,} steps on {self.machine.device_type}"
-        if self.processes > 1:
-            text += f", each on {self.processes} views by as many processes"
+        if (count := torchrun.own().count) > 1:
+            text += f", each on {count} views by as many processes"
         short = self.max_num_iterations == self.default_iterations_cpu != self.default_iterations
         if self.machine.device_type == "cpu" and short:
             why = "this installation has no kernels for the GPU" if torch.cuda.is_available() else "no GPU was found"

@@ -88,7 +88,7 @@ def state_training(
         most_surfels: that densification may make; 0 = any number.
         texels: of those that will learn; None = none will.
         to_come: views that they learn from, counted with repetition.
-        processes: of the run, each of which takes as much.
+        processes: of the run on this machine, each of which takes as much.
         lists: its losses need lists of fragments on a card, too.
     """
     (pixels, total), device = _pixels(cameras), scene.surfels["means"].device

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 import signal
 import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
+import torch.distributed as dist
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
-from nerfstudio.engine.trainer import Trainer
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -22,16 +24,17 @@ from torch import Tensor
 from bitymi_ns import files
 from bitymi_ns.plugin.console import INTERRUPTED, fail, say, step_bar, warn
 from bitymi_ns.plugin.hooks import filter_console, ignore_torch_warnings
-from bitymi_ns.plugin.run import checkpoints, run_folder
+from bitymi_ns.plugin.run import checkpoints, run_folder, torchrun
 from bitymi_ns.plugin.run.checkpoint_schema import Entry, restore_optimizer
-from bitymi_ns.plugin.run.launcher import Workers
 from bitymi_ns.plugin.run.model import BitymiModel
 from bitymi_ns.reading import reading
 from bitymi_ns.train import optimizers
-from bitymi_ns.train.processes import Processes, ProcessesApart, ProcessLost
+from bitymi_ns.train.processes import ProcessesApart, ProcessLost
 
 if TYPE_CHECKING:
     from torch.cuda.amp.grad_scaler import GradScaler
+
+AGAIN = 1.0  # seconds; signals within are one: a batch system's comes from it and from torchrun
 
 
 class _StopAfterStep(Exception):
@@ -62,14 +65,14 @@ class BitymiTrainer(Trainer):
     In a run of several processes each has one, in step with the others; that of the first is as it would be alone.
     """
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
+    def __init__(self, config: TrainerConfig, **alone: Any) -> None:
+        here = torchrun.own("LOCAL_")  # nerfstudio, which has not started the process, takes it for the only one
         with filter_console():
-            super().__init__(*args, **kwargs)
-        self.processes = Processes(self.local_rank, self.world_size)
-        self._workers: Workers | None = None
+            super().__init__(config, here.rank, here.count)
+        self.processes = torchrun.own()
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        self._stop_requested = False
+        self._stop_requested = 0.0  # when; 0 = it was not
         try:
             with filter_console():
                 super().setup(test_mode)
@@ -90,7 +93,7 @@ class BitymiTrainer(Trainer):
 
     def _end_of_step(self, step: int) -> None:
         self._show_step(step)
-        if self.processes.any(self._stop_requested):
+        if self.processes.any(self._stop_requested > 0):
             raise _StopAfterStep
 
     def _load_checkpoint(self) -> None:
@@ -121,17 +124,18 @@ class BitymiTrainer(Trainer):
         """Train to step `max_num_iterations`. nerfstudio's loop would train that many steps more on a resumed run."""
         orderly = False
         try:
+            if self.processes.count > 1 and self.processes.first:
+                torchrun.join(self.config)
             self._train_to_the_end()
             orderly = True
-        except ProcessLost:
-            if self._workers is None:
-                raise
-            self._workers.explain()
+        except ProcessLost as error:
+            fail(str(error), error)
         except ProcessesApart as error:
             fail(f"training cannot go on at step {self.step}: {error}.", error)
         finally:
-            if self._workers is not None:
-                self._workers.end(orderly)
+            # a card may wait for a process that is lost: then the end of this one is the remedy
+            if dist.is_initialized() and (orderly or self.config.machine.device_type != "cuda"):
+                dist.destroy_process_group()
             run_folder.leave(self.base_dir)
 
     def _train_to_the_end(self) -> None:
@@ -149,9 +153,6 @@ class BitymiTrainer(Trainer):
             say(f"{self.config.length()}, {total - self._start_step:,} of them left")
         restore_handler = self._catch_interrupt()
         try:
-            if self.processes.count > 1 and self.processes.first:
-                self._workers = Workers(self.config, self.processes.count)
-                self._workers.start()
             self.config.max_num_iterations = total - self._start_step
             with ignore_torch_warnings(), step_bar(self._start_step, total) as self._show_step:
                 super().train()
@@ -173,10 +174,12 @@ class BitymiTrainer(Trainer):
         previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
         def on_interrupt(number: int, frame: Any) -> None:
-            if self._stop_requested or self.training_state == "completed":
+            now, before = time.monotonic(), self._stop_requested
+            if self.training_state == "completed" or (before and now > before + AGAIN):
                 raise KeyboardInterrupt
-            self._stop_requested = True
-            CONSOLE.print("\nStopping after this step and saving a checkpoint; Ctrl-C again stops at once.")
+            self._stop_requested = before or now
+            if number == signal.SIGINT:  # else of a batch system, or of torchrun after another process has ended
+                CONSOLE.print("\nStopping after this step and saving a checkpoint; Ctrl-C again stops at once.")
 
         for number in previous:
             signal.signal(number, on_interrupt)
@@ -221,8 +224,7 @@ class BitymiPipeline(VanillaPipeline):
     def __init__(self, *args: Any, world_size: int = 1, local_rank: int = 0, **kwargs: Any) -> None:
         # as if alone: nerfstudio would wrap the model, to add gradients of parameters that keep their size
         super().__init__(*args, **kwargs)
-        self.world_size = self.datamanager.world_size = world_size
-        self.datamanager.local_rank = local_rank
+        self.datamanager.world_size = world_size
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load the parameters of a checkpoint."""

@@ -142,8 +142,8 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
 
     Args:
         stored: width and height that it must have; None = any.
-        wanted: width and height to which it is downscaled, averaging over pixels. A JPEG is decoded at a half, a quarter
-            or an eighth of its size if that is at least twice as large: of fewer pixels the average is the nearest one.
+        wanted: width and height to which it is downscaled, averaging over pixels. A JPEG is decoded at a half, a
+            quarter or an eighth of its size if that is at least twice as large: the average of fewer is the nearest.
 
     Raises:
         CaptureError: it is missing, cannot be read, or has another size.

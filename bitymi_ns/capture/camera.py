@@ -14,26 +14,25 @@ import pycolmap
 from bitymi_ns.capture.types import MapFiles, fail
 
 Pose = npt.NDArray[np.float64]
-OPENCV_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
-"""[4, 4] between camera frames with OpenCV axes and with OpenGL's."""
+OPENCV_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # [4, 4] between camera frames with OpenCV axes and with OpenGL's
 SPHERICAL_MODEL = "EQUIRECTANGULAR"  # COLMAP camera model of 360-degree pictures; its parameters are width and height
-ASPECT = 0.01  # relative difference from aspect ratio 2 that counts as rounding
+ASPECT = 0.01  # rounding of the aspect ratio 2 of 360-degree pictures, relative
 CAMERA_TYPES = {
     **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), "PERSPECTIVE"),
     "OPENCV_FISHEYE": "FISHEYE", "EQUIRECTANGULAR": "EQUIRECTANGULAR", "FISHEYE624": "FISHEYE624",
     "OMNIDIRECTIONALSTEREO_L": "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R": "OMNIDIRECTIONALSTEREO_R",
     "VR180_L": "VR180_L", "VR180_R": "VR180_R", "ORTHOPHOTO": "ORTHOPHOTO",
 }  # fmt: skip
-"""nerfstudio's types of cameras by their camera_model; those of the last two lines cannot be trained on."""
+"""nerfstudio's camera types by camera_model; the last two lines cannot be trained on."""
 
 
 def is_full_sphere(width: float, height: float) -> bool:
-    """Test the shape of a picture of all directions, but for rounding."""
+    """Test for the aspect ratio of a 360-degree picture, up to rounding."""
     return abs(width / (2.0 * height) - 1.0) <= ASPECT + 1.0 / height
 
 
 class ColmapCamera(NamedTuple):
-    """Camera: COLMAP camera model, width and height of its pictures in pixels, and parameters in COLMAP's order."""
+    """Camera model of COLMAP, width and height of the pictures in pixels, and parameters in COLMAP's order."""
 
     model: str
     width: int
@@ -42,16 +41,16 @@ class ColmapCamera(NamedTuple):
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of its pictures, pixels."""
+        """Width and height, pixels."""
         return self.width, self.height
 
     @property
     def colmap(self) -> pycolmap.Camera:
-        """The camera as pycolmap's object."""
+        """pycolmap's camera."""
         return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
 
     def rescaled(self, width: int, height: int) -> ColmapCamera:
-        """The camera for the same pictures in another size."""
+        """Return the camera for the same pictures in another size."""
         if (width, height) == self.size:
             return self
         if self.model == SPHERICAL_MODEL:
@@ -65,26 +64,27 @@ class ColmapCamera(NamedTuple):
 class Photograph:
     """A photograph with its camera."""
 
-    file: Path  # image file
-    camera: ColmapCamera  # in pixels of the photograph before any downscaling
+    file: Path
+    camera: ColmapCamera  # in pixels before downscaling
     pose: Pose  # [4, 4] float64, camera to world, OpenGL axes (camera: x right, y up, z backward)
     label: str  # names the camera in messages
-    mask: Path | None = None  # mask file; None = none
-    downscaled: bool = False  # `file` is a copy that is downscaled already
-    frame: int | None = None  # number that photographs share which a rig took together; None = it stands alone
-    maps: MapFiles = MapFiles()  # depth and normals
+    mask: Path | None = None
+    downscaled: bool = False  # `file` is a downscaled copy
+    frame: int | None = None  # shared by photographs that a rig took together; None = it stands alone
+    maps: MapFiles = MapFiles()
 
 
 def colmap_distortion(kind: str, values: Sequence[float], label: str) -> tuple[str, tuple[float, ...]]:
-    """Convert nerfstudio's type of camera, see CAMERA_TYPES, and distortion_params (k1, k2, k3, k4, p1, p2; FISHEYE624:
-    12) to COLMAP's.
+    """Convert nerfstudio's camera type, see CAMERA_TYPES, and its distortion_params to COLMAP's.
+
+    Args:
+        values: k1, k2, k3, k4, p1, p2; twelve of FISHEYE624.
 
     Returns:
-        COLMAP camera model with separate focal lengths, and its parameters after fx, fy, cx, cy; for
-        equirectangular ones SPHERICAL_MODEL and none.
+        camera model with separate focal lengths, and its parameters after fx, fy, cx, cy (none if SPHERICAL_MODEL).
 
     Raises:
-        CaptureError: there is no such COLMAP camera.
+        CaptureError: COLMAP has no such camera.
     """
     if kind == "EQUIRECTANGULAR":
         return SPHERICAL_MODEL, ()

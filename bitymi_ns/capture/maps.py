@@ -22,16 +22,11 @@ from bitymi_ns.capture.types import MAP_FILES, MapFiles, fail, parsing, warn
 from bitymi_ns.ranges import spread
 from bitymi_ns.reading import open_regular
 
-MILLIMETER = 1e-3
-"""Metres of a unit of integer depth, where no other is stated: nerfstudio's convention."""
-MAPS = "maps"
-"""Metadata key of the `MapFiles` of each view."""
-COLOR_SAMPLES = 8
-"""Files of a scanner's depth that are tested for color pictures; all have to be."""
-MOST_LARGER = 8
-"""Sides of a map in those of its photograph, at most: photographs may be reduced copies."""
-MOST_NUMBERS = 1 << 28
-"""Numbers of a map, at most: those of 80 million normals, or 260 million depths."""
+MILLIMETER = 1e-3  # metres of a unit of integer depth, where no other is stated: nerfstudio's convention
+MAPS = "maps"  # metadata key of the `MapFiles` of each view
+COLOR_SAMPLES = 8  # files of a scanner's depth that are tested for color pictures; all have to be
+MOST_LARGER = 8  # sides of a map in those of its photograph, at most: photographs may be reduced copies
+MOST_NUMBERS = 1 << 28  # numbers of a map, at most: those of 80 million normals, or 260 million depths
 FARTHEST = 65504.0
 """Depth from which on a number stands for "no depth": the largest of half floats, below Blender's 1e10."""
 

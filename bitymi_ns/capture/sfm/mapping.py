@@ -16,8 +16,7 @@ from bitymi_ns.capture.types import CONTRADICTED
 
 Mapper = Callable[[Job, Path, Path, StageProgress], dict[int, pycolmap.Reconstruction]]
 """Maps the features and matches of a database with a folder for its files; returns connected components."""
-ENOUGH = 0.9
-"""The global mapper's poses are taken as they are if they are of this share of the connected photographs."""
+ENOUGH = 0.9  # the global mapper's poses are taken as they are if they are of this share of the connected photographs
 GOOD_ERROR = 1.0
 """... and their reprojection error is below so many pixels of the photographs as features were found on them, and few
 matches contradict them."""

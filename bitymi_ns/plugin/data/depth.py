@@ -23,29 +23,20 @@ from bitymi_ns.train.views import spread
 
 DepthKind = Literal["auto", "metric", "relative", "off"]
 """metric = one scale for all maps; relative = scale and shift of each map; auto = as the points say; off = not used."""
-FITTED = "fitted maps"
-"""Metadata key of the `FittedMaps` of each view."""
-SIDE = 320
-"""Longest side in pixels at which maps are compared with points and with each other."""
-TOLERANCE = 0.05
-"""Relative difference of two depths that are of one surface."""
-FEW_PAIRS = 20
-"""Points in a photograph from which scale and shift of its depth can be told."""
+FITTED = "fitted maps"  # metadata key of the `FittedMaps` of each view
+SIDE = 320  # longest side in pixels at which maps are compared with points and with each other
+TOLERANCE = 0.05  # relative difference of two depths that are of one surface
+FEW_PAIRS = 20  # points in a photograph from which scale and shift of its depth can be told
 AGREES = 0.25
 """Share of the points that usable depth agrees with: many are hidden in the pictures that they project into."""
 AGREE_MUTUALLY = 0.45
 """Share of the pixels that another photograph confirms, of those that it confirms or sees through, where depth is
 usable. In the sample room 0.95; 0.57 with noise of 5 %; at most 0.39 in another unit, from 0.001 to 1,000 times."""
-BETTER = 0.15
-"""Share by which scale and shift of each map fit better where maps are not metric."""
-TRIALS = 200
-"""Pairs of points that scale and shift are computed from."""
-SEEN_BY = 16
-"""Photographs that a new point is compared with."""
-PIXELS_PER_POINT = 30
-"""Pixels of the training photographs per initial point."""
-MOST_POINTS = 200_000
-"""Initial points at most."""
+BETTER = 0.15  # share by which scale and shift of each map fit better where maps are not metric
+TRIALS = 200  # pairs of points that scale and shift are computed from
+SEEN_BY = 16  # photographs that a new point is compared with
+PIXELS_PER_POINT = 30  # pixels of the training photographs per initial point
+MOST_POINTS = 200_000  # initial points at most
 
 Floats = npt.NDArray[np.float64]
 

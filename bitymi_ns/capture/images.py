@@ -1,5 +1,4 @@
-"""Image files of a capture: photographs and masks by their bit depth, sizes and EXIF from headers, blank and duplicate
-photographs."""
+"""Image files of a capture: bit depth, sizes and EXIF from headers, blank and duplicate photographs."""
 
 import hashlib
 import math
@@ -20,42 +19,44 @@ from bitymi_ns.capture.types import fail, parsing, warn
 from bitymi_ns.trust import listed
 
 S, T = TypeVar("S"), TypeVar("T")
-ORIENTATION = 0x0112  # EXIF tag that asks viewers to turn a photograph; 1 = as it is stored
+ORIENTATION = 0x0112  # EXIF tag that asks viewers to turn a photograph; 1 = as stored
+MAX_PIXELS = 1_000_000_000  # most pixels of a photograph; phones take 200 million
 MAX_PIXELS = 1_000_000_000  # photographs with more pixels are refused; phones take some of 200 million
 THREADS = 4
-PROPORTIONS = 0.02  # relative difference of aspect ratios that counts as rounding
+PROPORTIONS = 0.02  # relative difference of aspect ratios by rounding
+FINGERPRINT_SIZE = 64  # pixels across and down that fingerprints compare
 FINGERPRINT_SIZE = 64  # pixels across, and down, by which photographs are compared
 
 
 def set_up_pillow() -> None:
-    """Raise Pillow's pixel limit from 179 million to MAX_PIXELS, and keep it, in nerfstudio's readers too, from running
-    Ghostscript on files that are PostScript whatever their name."""
+    """Raise Pillow's limit from 179 million pixels to MAX_PIXELS, and keep it, in nerfstudio's readers too, from
+    running Ghostscript on PostScript files of any name."""
     EpsImagePlugin.gs_binary = False
     Image.MAX_IMAGE_PIXELS = MAX_PIXELS // 2  # PIL refuses twice as many
 
 
 def in_threads(function: Callable[[S], T], items: Iterable[S]) -> list[T]:
-    """Apply a function that reads files to each item, in a few threads."""
+    """Apply a function that reads files to the items in a few threads."""
     with ThreadPoolExecutor(THREADS) as pool:
         return list(pool.map(function, items))
 
 
 def from_header(path: Path, read: Callable[[Image.Image], T], default: T) -> T:
-    """Apply `read` to an opened image whose pixels are not decoded; `default` for files that cannot be opened."""
+    """Apply `read` to an opened, undecoded image; `default` for unreadable files."""
     try:
         with open_picture(path) as image:
             return read(image)
-    except Exception:  # Pillow raises many kinds on broken files, and on broken EXIF
+    except Exception:  # Pillow raises many kinds on broken files and EXIF
         return default
 
 
 def image_size(path: Path) -> tuple[int, int] | None:
-    """Read width and height from the header; None for files that cannot be opened."""
+    """Read width and height from the header; None for unreadable files."""
     return from_header(path, lambda image: image.size, None)
 
 
 def file_has_transparency(path: Path) -> bool:
-    """Read from the header if the image has transparency; False for files that cannot be opened."""
+    """Test for transparency by the header; False for unreadable files."""
     return from_header(path, has_transparency, False)
 
 
@@ -65,16 +66,16 @@ def has_transparency(image: Image.Image) -> bool:
 
 
 def in_proportion(mask: tuple[int, int], photograph: tuple[int, int]) -> bool:
-    """Test if a mask (width, height) has the aspect ratio of its photograph, so that it can be resized."""
+    """Test if a mask (width, height) has its photograph's aspect ratio, to be resized to it."""
     return abs(mask[0] / mask[1] / (photograph[0] / photograph[1]) - 1.0) <= PROPORTIONS
 
 
 def orientation(path: Path) -> int:
-    """Read the EXIF orientation, 1 to 8; 1 where there is none."""
+    """Read the EXIF orientation, 1 to 8; 1 without one."""
 
     def read(image: Image.Image) -> int:
         if image.format == "PNG" and "exif" not in image.info:
-            return 1  # else PIL would decode the whole image in search of it
+            return 1  # else PIL decodes the whole image in search of it
         return image.getexif().get(ORIENTATION, 1)
 
     value = from_header(path, read, 1)
@@ -82,10 +83,10 @@ def orientation(path: Path) -> int:
 
 
 def exposure_stops(paths: Sequence[Path]) -> list[float]:
-    """Compute log2 of the exposure of photographs from shutter time, aperture and ISO in EXIF; NaN where unknown.
+    """Compute log2 of the exposure of photographs from shutter time, aperture and ISO in EXIF; NaN = unknown.
 
-    A lens without electronics writes no f-number, and some cameras no ISO: what no photograph has counts as equal for
-    all. Photographs that lack what most have cannot be compared with these, and are NaN.
+    Lenses without electronics write no f-number, some cameras no ISO: what most photographs lack counts as equal for
+    all. Photographs with other entries than most cannot be compared, and are NaN.
     """
     found = in_threads(lambda path: from_header(path, exposure_settings, None), paths)
     kinds = Counter(tuple(value is not None for value in each) for each in found if each is not None)
@@ -101,7 +102,7 @@ def exposure_stops(paths: Sequence[Path]) -> list[float]:
 
 
 def check_sizes(paths: Sequence[Path]) -> None:
-    """Fail at photographs with more than MAX_PIXELS, by their headers."""
+    """Fail at photographs of more than MAX_PIXELS, by their headers."""
 
     def too_large(path: Path) -> bool:
         try:
@@ -110,7 +111,7 @@ def check_sizes(paths: Sequence[Path]) -> None:
         except Image.DecompressionBombError:
             return True
         except Exception:
-            return False  # other faults are reported where the file is read
+            return False  # reported where the file is read
 
     large = [path for path, refused in zip(paths, in_threads(too_large, paths), strict=True) if refused]
     if large:
@@ -125,7 +126,7 @@ def _too_large(paths: Sequence[Path]) -> str:
 
 
 def check_orientation(paths: Sequence[Path]) -> None:
-    """Warn of photographs with an EXIF orientation: they are used as they are stored."""
+    """Warn of photographs with an EXIF orientation, which is ignored."""
     turned = [path for path, value in zip(paths, in_threads(orientation, paths), strict=True) if value != 1]
     if turned:
         warn(
@@ -136,14 +137,13 @@ def check_orientation(paths: Sequence[Path]) -> None:
 
 
 def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[int, int] | None = None) -> Image.Image:
-    """Read a photograph as 8-bit sRGB, mode RGB or, where it has transparency, RGBA.
-
-    Deep grey images are scaled to 8 bits, where PIL would clip them to white.
+    """Read a photograph as 8-bit sRGB, mode RGB, or RGBA with transparency. Deep grey is scaled to 8 bits, which PIL
+    would clip to white.
 
     Args:
         stored: width and height that it must have; None = any.
-        wanted: width and height to which it will be downscaled. A JPEG may then be decoded at a half, a quarter or an
-            eighth of its size, but no smaller than this.
+        wanted: width and height to which it will be downscaled: decode a JPEG at a half, a quarter or an eighth of its
+            size, but no smaller than this.
 
     Raises:
         CaptureError: it is missing, cannot be read, or has another size.
@@ -163,7 +163,7 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
 
 
 def pixels_of(image: Image.Image) -> npt.NDArray[np.uint8]:
-    """Convert an image to [H, W, 3], or to [H, W, 4] where some of it is transparent."""
+    """Convert an image to [H, W, 3], or [H, W, 4] if some of it is transparent."""
     pixels = np.array(image, np.uint8)
     opaque = pixels.shape[-1] == 4 and pixels[..., 3].min(initial=255) == 255
     return np.ascontiguousarray(pixels[..., :3]) if opaque else pixels
@@ -174,7 +174,7 @@ _WORDED = (FileNotFoundError, Image.DecompressionBombError)
 
 
 def wrong_size(path: Path, size: tuple[int, int], declared: tuple[int, int]) -> str:
-    """Message for an image whose `size` (width, height) is not the one `declared` by its camera."""
+    """Explain that an image's `size` (width, height) is not the one `declared` by its camera."""
     shown = f"{size[0]} x {size[1]} pixels, but its camera is for {declared[0]} x {declared[1]}"
     if size == declared[::-1] and orientation(path) >= 5:
         return (
@@ -188,8 +188,7 @@ def wrong_size(path: Path, size: tuple[int, int], declared: tuple[int, int]) -> 
 
 
 class ImageSummary(NamedTuple):
-    """Kept of a photograph once it has been read: why nothing can be learned from it ("" = something can), and a
-    fingerprint that is equal for equal pixels."""
+    """Why nothing can be learned from a photograph ("" = something can), and a fingerprint equal for equal pixels."""
 
     empty: str
     fingerprint: bytes
@@ -220,30 +219,29 @@ Pair = tuple[int, int]  # index of a training photograph, and of a held-out one
 
 
 def duplicate_files(train: Sequence[Path], held_out: Sequence[Path]) -> list[Pair]:
-    """Pairs of files with the same bytes. Only files of equal size are read."""
+    """Pair files of the same bytes, reading only files of equal size."""
     sizes = [[path.stat().st_size for path in paths] for paths in (train, held_out)]
     shared = set(sizes[0]) & set(sizes[1])
     contents = [
-        [_digest(path) if size in shared else path for path, size in zip(paths, of, strict=True)]
+        [
+            hashlib.sha256(path.read_bytes()).digest() if size in shared else path
+            for path, size in zip(paths, of, strict=True)
+        ]
         for paths, of in zip((train, held_out), sizes, strict=True)
     ]
     return duplicates(*contents)
 
 
 def duplicates(train: Sequence[Any], held_out: Sequence[Any]) -> list[Pair]:
-    """Pairs of equal items, each held-out one with the first of its equals; None equals nothing."""
+    """Pair equal items, each held-out one with its first equal; None equals nothing."""
     first: dict[Any, int] = {}
     for i, content in enumerate(train):
         first.setdefault(content, i)
     return [(first[content], j) for j, content in enumerate(held_out) if content is not None and content in first]
 
 
-def _digest(path: Path) -> bytes:
-    return hashlib.sha256(path.read_bytes()).digest()
-
-
 def warn_of_duplicates(pairs: Sequence[Pair], train: Sequence[Path], held_out: Sequence[Path]) -> None:
-    """Warn of held-out photographs that are trained on, unless all views are used for both on request."""
+    """Warn of held-out photographs that are trained on, unless all views serve for both."""
     if not pairs or list(train) == list(held_out):
         return
     named = listed([f"{held_out[j]} = {train[i]}" for i, j in pairs])

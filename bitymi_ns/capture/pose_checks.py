@@ -1,4 +1,4 @@
-"""Checks of poses: rotations (or mirrored ones), positions that belong together, and points in their unit."""
+"""Check poses: rotations (or mirrored ones), positions that belong together, and points in their unit."""
 
 import os
 from collections.abc import Sequence
@@ -13,24 +13,22 @@ from bitymi_ns.capture.camera import Photograph
 from bitymi_ns.capture.types import FrameOptions, fail, say, warn
 from bitymi_ns.trust import listed
 
-EXACT = 1e-3  # matrices this close to a rotation are taken as they are: float32, or four written digits
-ROUNDED = 2e-2  # matrices this close to a rotation, up to a common factor, are meant to be one: two written digits
-FAR = 100.0  # distance relative to all the others from which a camera may be misplaced
-TOO_FAR = 1000.0  # relative distance beside which the other cameras shrink to one point
-FAR_FROM_ORIGIN = 100.0  # distance from the origin relative to that from their middle at which float32 blurs cameras
-OTHER_UNIT = 150.0
-"""Distance of points relative to that between cameras, or their extent as a part of the picture, in another unit."""
+EXACT = 1e-3  # error of rotations taken as they are: float32, or four written digits
+ROUNDED = 2e-2  # error of rounded rotations, up to a common factor: two written digits
+FAR = 100.0  # distance relative to the others' from which a camera may be misplaced
+TOO_FAR = 1000.0  # relative distance that shrinks the other cameras to one point
+FAR_FROM_ORIGIN = 100.0  # distance from the origin, relative to that from their middle, at which float32 blurs cameras
+OTHER_UNIT = 150.0  # ratio of points' and cameras' distances, or of picture and cloud, that tells another unit
 USUAL_SPREAD, MAX_SPREAD = 2.5, 25.0
-"""Median distance of cameras from their middle, in half sides of the scene box: of NeRF-Synthetic, and from which on a
-capture is taken to be in another unit."""
+"""Median distance of cameras from their middle in half sides of the scene box: NeRF-Synthetic's, and the largest in the
+format's unit."""
 
 
 def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source: str) -> npt.NDArray[np.float64]:
-    """Recover rotations from the 3 x 3 parts [N, 3, 3] of poses, camera to world; rows that need no change stay equal.
+    """Recover rotations from the 3 x 3 parts [N, 3, 3] of poses, camera to world; valid ones stay equal.
 
-    A factor common to a matrix is divided out, and rounding is undone by the nearest rotation. Mirrored rotations
-    (determinant -1) stay mirrored: captures may be mirrored as a whole. Names of the frames and `source` are for
-    messages.
+    Divide out each matrix's common factor, and undo rounding by the nearest rotation. Mirrored rotations (determinant
+    -1) stay mirrored, as whole captures may be. `names` of the frames and `source` are for messages.
 
     Raises:
         CaptureError: a matrix is not finite, zero or sheared.
@@ -75,8 +73,7 @@ def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source
 
 
 def correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
-    """Fail at matrices that are no poses; recover rotations, see `rotations`. Frames are those of a
-    transforms.json, which are changed."""
+    """Check the poses of a transforms.json's frames, and replace them by rotations, see `rotations`."""
     names = [frame["file_path"] for frame in frames]
     poses = []
     for frame, name in zip(frames, names, strict=True):
@@ -100,7 +97,7 @@ def correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
 
 
 def check_repeated(path: Path, frames: list[dict[str, Any]]) -> None:
-    """Fail where one photograph has two poses."""
+    """Fail if a photograph has two poses."""
     first: dict[str, int] = {}
     for i, frame in enumerate(frames):
         name = os.path.normpath(frame["file_path"])
@@ -114,7 +111,7 @@ def check_repeated(path: Path, frames: list[dict[str, Any]]) -> None:
 
 
 def as_matrix(value: Any) -> np.ndarray | None:
-    """Convert 3 x 4 or 4 x 4 finite numbers to [4, 4]; None for anything else."""
+    """Convert 3 x 4 or 4 x 4 finite numbers to [4, 4]; else None."""
     try:
         matrix = np.asarray(value, dtype=np.float64)
     except (ValueError, TypeError, OverflowError):
@@ -125,7 +122,7 @@ def as_matrix(value: Any) -> np.ndarray | None:
 
 
 def warn_of_mirrored(rotations: npt.NDArray[np.float64], names: Sequence[object]) -> None:
-    """Warn of frames that are mirrored where the others are not; rotations [N, 3, 3], names for messages."""
+    """Warn of frames that are mirrored against the others; rotations [N, 3, 3], `names` for messages."""
     mirrored = np.linalg.det(rotations) < 0.0
     few = mirrored if 2 * mirrored.sum() <= len(mirrored) else ~mirrored
     if few.any():
@@ -136,7 +133,7 @@ def warn_of_mirrored(rotations: npt.NDArray[np.float64], names: Sequence[object]
 
 
 def check_spread(centers: npt.NDArray[np.float64], source: str) -> None:
-    """Fail where all cameras [N, 3] are at one place."""
+    """Fail if all cameras [N, 3] are at one place."""
     if not np.ptp(centers, axis=0).any():
         fail(
             f"{source}: all cameras are at one place. Depth cannot be learned: take photographs from different places."
@@ -144,7 +141,7 @@ def check_spread(centers: npt.NDArray[np.float64], source: str) -> None:
 
 
 def check_outliers(centers: npt.NDArray[np.float64], names: Sequence[object]) -> None:
-    """Fail or warn at single cameras that are far from all the others; centers [N, 3] finite, names for messages."""
+    """Fail or warn at single cameras far from all others; centers [N, 3] finite, `names` for messages."""
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     order = np.argsort(distances)
     sorted_distances = distances[order]
@@ -165,16 +162,15 @@ def check_outliers(centers: npt.NDArray[np.float64], names: Sequence[object]) ->
 
 
 def far_from_origin(centers: npt.NDArray[np.float64]) -> bool:
-    """Test if cameras [N, 3] are so far from the origin that float32 cannot tell their positions."""
+    """Test for cameras [N, 3] too far from the origin for float32."""
     middle = centers.mean(0)
     spread = np.linalg.norm(centers - middle, axis=1).max()
     return bool(0.0 < FAR_FROM_ORIGIN * spread < np.linalg.norm(middle))
 
 
 def fit_scale(frame: FrameOptions, photographs: Sequence[Photograph], source: str) -> FrameOptions:
-    """Reduce the scale of a capture whose cameras lie far outside of the scene box: in millimetres they would, and
-    random points would all fall on one spot of the pictures. `frame` is the format's default, without
-    auto_scale_poses."""
+    """Reduce the scale of a capture whose cameras lie far outside the scene box, as in millimetres: random points would
+    all be one spot of the pictures. `frame`: the format's default, without auto_scale_poses."""
     centers = np.stack([photograph.pose[:3, 3] for photograph in photographs])
     spread = float(np.median(np.linalg.norm(centers - centers.mean(0), axis=1)))
     ratio = spread * frame.scale_factor / frame.scene_scale
@@ -192,11 +188,11 @@ def fit_scale(frame: FrameOptions, photographs: Sequence[Photograph], source: st
 def check_point_unit(
     points: npt.NDArray[np.float64], centers: npt.NDArray[np.float64], widths: npt.NDArray[np.float64]
 ) -> None:
-    """Warn where the points [N, 3] seem to be in another unit than the camera positions [M, 3], finite; `widths` [M] of
-    the pictures are in focal lengths.
+    """Warn if points [N, 3] seem to be in another unit than finite camera positions [M, 3]; `widths` [M] of the
+    pictures in focal lengths.
 
-    Points are then far beyond the cameras, or all in a spot of the picture: both leave training next to nothing to
-    start from. Medians and percentiles are used because clouds and captures have outliers.
+    Such points are far beyond the cameras or a spot of the pictures, and training starts from next to nothing. Medians
+    and percentiles are robust to outliers.
     """
     points = points[:: max(1, len(points) // 100_000)]
     points = points[np.isfinite(points).all(1)]

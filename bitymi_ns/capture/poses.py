@@ -1,8 +1,7 @@
-"""Structure from motion: camera poses of photographs or of the frames of a video."""
+"""Find camera poses of photographs or of a video's frames by structure from motion."""
 
 import json
 import os
-import shutil
 import statistics
 import time
 import warnings
@@ -31,23 +30,21 @@ from bitymi_ns.files import Tell, complete_folder, explained, write_file
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.reading import read_json
 
-GUESSED_FOCAL = 1.2  # initial focal length where it is unknown, in units of the longer side; COLMAP's own
-TELLING = 0.25  # share of 360-degree pictures among photographs of one size from which on all of them count as such
-LEAST = 3  # least number of photographs
-SPARSE = Path("sparse/0")  # path of the model in a result
+GUESSED_FOCAL = 1.2  # initial focal length if unknown, in longer sides; COLMAP's own
+TELLING = 0.25  # share of 360-degree pictures from which on all photographs of one size count as such
+LEAST = 3  # photographs
+SPARSE = Path("sparse/0")  # the model's path in a result
 
 
 def find_poses(
     source: Path, options: SfmOptions | None = None, progress: Progress | None = None, warn: Tell = warnings.warn
 ) -> Poses:
-    """Find the camera poses of photographs or of the frames of a video.
-
-    The result is cached beside the photographs, or in the user's cache folder if nothing can be written there. An
-    interrupted run continues.
+    """Find camera poses of photographs or of a video's frames; cache them beside the photographs, or in the user's
+    cache folder if nothing can be written there; continue an interrupted run.
 
     Args:
-        source: a folder of photographs, a folder that holds them in `images` (and masks in `masks`), or a video.
-        warn: called with the location of the result, if not beside writable photographs.
+        source: a folder of photographs, a folder with `images` (and `masks`), or a video.
+        warn: called with the location of the result if not beside writable photographs.
 
     Raises:
         CaptureError: no poses can be found; says what to photograph differently.
@@ -77,7 +74,7 @@ def find_poses(
 
 
 def _what(source: Path) -> tuple[Path, Path, list[str]]:
-    """Return the source, the folder of its photographs and their names; for a video no names."""
+    """Return the source, its folder of photographs and their names; for a video no names."""
     if source.suffix.lower() in VIDEOS and source.is_file():
         return source, source, []
     if not source.exists():
@@ -94,7 +91,7 @@ def _what(source: Path) -> tuple[Path, Path, list[str]]:
     if len(names) < LEAST:
         also = f" Of its {len(videos)} videos, name one." if videos and not names else ""
         raise CaptureError(f"{folder} holds {_few(len(names))}.{also}")
-    below = os.path.commonpath([f"./{os.path.dirname(name)}" for name in names])  # as if that folder had been named
+    below = os.path.commonpath([f"./{os.path.dirname(name)}" for name in names])  # as if this folder were named
     return source, folder / below, [os.path.relpath(name, below) for name in names]
 
 
@@ -107,16 +104,15 @@ def _few(count: int) -> str:
 
 
 def _finished(work: Path, folder: Path) -> Poses | None:
-    """Read the poses of an earlier run by poses.json, which marks a result as complete; None where there are none, or
-    they are damaged."""
+    """Read an earlier run's poses by poses.json, which marks complete results; None = none, or damaged ones."""
     result = work / "result"
     try:
         kept = read_json(result / "poses.json")
-        made = kept.pop("made")  # the photographs of the model are copies or frames in the work folder
+        made = kept.pop("made")  # photographs of the model are copies or frames in the work folder
         images = work / IMAGES if made else Path(os.path.abspath(folder))
         values = {**kept, "model": result / SPARSE, "images": images, "report": result}
         poses = TypeAdapter(Poses).validate_python(values)
-    except Exception:  # it is damaged, in whatever way
+    except Exception:  # damaged in any way
         return None
     whole = images.is_dir() and all(path.exists() for path in images.rglob("*")) if made else True
     return poses if whole and is_model(result / SPARSE) else None
@@ -158,8 +154,8 @@ def _find(
 
 
 def _with_panoramas(source: Path, photos: list[Photo], left_out: dict[str, str], every: bool) -> list[Photo]:
-    """Mark 360-degree pictures, one that was not detected by others of its size, or `every` one. Panoramas of another
-    shape do not show all directions: they are left out, and it fails where they are the most."""
+    """Mark 360-degree pictures: detected ones, others of their size, or `every` one. Leave out panoramas of another
+    shape, which do not show all directions; fail if most are."""
     groups: dict[tuple[int, int], list[Photo]] = defaultdict(list)
     for photo in photos:
         groups[photo.width, photo.height].append(photo)
@@ -201,7 +197,7 @@ def _too_few_left(
 
 
 def ordered(photos: list[Photo]) -> list[Photo]:
-    """Sort by time, if all have one and not all the same; else keep the order by name."""
+    """Sort by time if all photographs have one and they differ; else keep the order by name."""
     times = {photo.exif.time for photo in photos}
     return sorted(photos, key=lambda photo: photo.exif.time) if "" not in times and len(times) > 1 else photos
 
@@ -215,9 +211,9 @@ def make_job(
     work: Path,
     sequence: bool,
 ) -> Job:
-    """Make the job for these photographs in their order, with links to them in the work folder under names without
-    spaces for COLMAP's lists. `images` is the folder of the upright photographs, `used` their names in it; neighbours
-    overlap in a `sequence`, as a video's frames do."""
+    """Make the job of these photographs in their order, linked in the work folder under names without spaces for
+    COLMAP's lists. `images`: folder of the upright photographs, `used` their names in it; neighbours overlap in a
+    `sequence`."""
     links, mask_files = emptied(work / "links"), emptied(work / "masks")
     plain = {photo.name: f"{i:06d}{Path(used[photo.name]).suffix.lower()}" for i, photo in enumerate(photos)}
     for photo in photos:
@@ -251,7 +247,7 @@ def by_camera(photos: Sequence[Photo]) -> list[list[Photo]]:
 
 
 def camera_group(photos: Sequence[Photo], names: list[str], options: SfmOptions) -> CameraGroup:
-    """Initial camera of these photographs."""
+    """Make the initial camera of these photographs."""
     width, height = photos[0].width, photos[0].height
     if photos[0].panorama:
         return CameraGroup(ColmapCamera(SPHERICAL_MODEL, width, height, (float(width), float(height))), True, names)
@@ -265,7 +261,7 @@ def camera_group(photos: Sequence[Photo], names: list[str], options: SfmOptions)
 
 
 def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence[Photo], job: Job) -> Poses:
-    """Move the model to its world frame and write it with its report; remove temporary files."""
+    """Move the model to its world frame, write it with its report, and remove temporary files."""
     model = pycolmap.Reconstruction(work / MODEL)
     by_used = {job.names[plain]: photo for plain, photo in zip(job.order, photos, strict=True)}
     frame = move_to_world(
@@ -294,9 +290,7 @@ def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence
         write_frame(result, frame)
         write_report(result, values, model)
         write_file(result / "poses.json", json.dumps({"made": images == work / IMAGES, **kept}).encode())
-    for name in ("links", "masks", MODEL):
-        shutil.rmtree(work / name, ignore_errors=True)
-    process.forget(work)
+    process.forget(work, "links", "masks", MODEL)
     found = _finished(work, images)
     assert found is not None
     return found

@@ -89,11 +89,7 @@ class CaptureOptions(SplitOptions, FrameOptions):
     """Folder of the poses that a run was trained with."""
 
     def find(self) -> Found:
-        """Recognize the capture.
-
-        Raises:
-            CaptureError: there is none, or an option is for another format.
-        """
+        """Recognize the capture. Raises CaptureError: there is none, or an option is for another format."""
         kept, data = self.kept(), Path(self.data)
         found = recognise(data, self.format, self.colmap_path) if kept is None else kept.found(data)
         for name, formats in OPTION_FORMATS.items():
@@ -236,7 +232,7 @@ class _Reader:
             what += f", points of {earlier}"
         self._check(what, photographs, read.named)
         if auto and "ply_file_path" in meta:
-            hint = f"remove ply_file_path from {read.path}"
+            hint = f"Put it there again, or remove ply_file_path from {read.path} to start from random points."
             own = self._cloud(found.folder / meta["ply_file_path"], hint, photographs)
         elif model is not None:
             own = self._colored(model_points(model, applied), model.without_colors, photographs, earlier)
@@ -296,7 +292,8 @@ class _Reader:
         self._check(f"{train.path} (blender, {len(train.photographs)} photographs)", every, named)
         own = None
         if options.ply_path is not None and options.points == "auto":
-            own = self._cloud(found.path / options.ply_path, "leave --ply-path out", train.photographs)
+            hint = "Put it there again, or leave --ply-path out to start from random points."
+            own = self._cloud(found.path / options.ply_path, hint, train.photographs)
         frame = FrameOptions(options.scale_factor, "none", "none", auto_scale_poses=False, scene_scale=BLENDER_SIDE)
         if options.scale_factor == 1.0:  # else the user has chosen it
             frame = fit_scale(frame, train.photographs, source)
@@ -318,8 +315,8 @@ class _Reader:
             if named is not None:
                 name_unused(self.found.folder, named, self.options.downscale_factor)
 
-    def _cloud(self, path: Path, without: str, photographs: Sequence[Photograph]) -> Points:
-        points, reason = read_cloud(path, without)
+    def _cloud(self, path: Path, remedy: str, photographs: Sequence[Photograph]) -> Points:
+        points, reason = read_cloud(path, remedy)
         return self._colored(points, reason, photographs, path)
 
     def _colored(self, points: Points, without: str, photographs: Sequence[Photograph], source: Path) -> Points:

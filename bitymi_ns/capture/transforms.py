@@ -66,11 +66,7 @@ def read_transforms(
     path: Path, own_format: bool, downscale: int = 1, need_photos: bool = True, use_masks: bool = True
 ) -> Transforms:
     """Read a JSON file, see `load_transforms`, and find its photographs, or copies smaller by `downscale`, its maps and
-    masks, see `with_masks`.
-
-    Raises:
-        CaptureError: the file cannot be used, or lacks photographs that are needed.
-    """
+    masks, see `with_masks`. Raises CaptureError: the file cannot be used, or lacks photographs that are needed."""
     meta = load_transforms(path, own_format)
     frames = meta["frames"]
     for holder in (meta, *frames):
@@ -120,11 +116,8 @@ def read_transforms(
 
 def load_transforms(path: Path, own_format: bool) -> dict[str, Any]:
     """Load a file in any Unicode encoding, with or without byte order mark; check its frames, poses and lists of names,
-    and make poses rotations. nerfstudio's own format states each camera in full.
-
-    Raises:
-        CaptureError: the file cannot be used; names the frame.
-    """
+    and make poses rotations. nerfstudio's own format states each camera in full. Raises CaptureError: the file cannot
+    be used; names the frame."""
     if not os.path.lexists(path):
         fail(f"{path} does not exist, which this kind of capture needs. {HOW_TO_GET_ONE}")
     with parsing(path, HOW_TO_CORRECT if path.is_file() else HOW_TO_GET_ONE):
@@ -221,11 +214,8 @@ def _warn_of_contradictions(path: Path, meta: dict[str, Any]) -> None:
 
 
 def check_number(path: Path, key: str, value: Any, label: str) -> float | int:
-    """Convert an entry, also in quotes, to a number; `label` is for the message.
-
-    Raises:
-        CaptureError: it is no number, or for w and h no number of pixels.
-    """
+    """Convert an entry, also in quotes, to a number; `label` is for the message. Raises CaptureError: it is no number,
+    or for w and h no number of pixels."""
     try:
         number = float(None if isinstance(value, bool) else value)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):

@@ -92,11 +92,7 @@ class SfmSettings:
 
 @dataclass(frozen=True)
 class SfmOptions(SfmSettings):
-    """Settings, and the folder of masks.
-
-    Raises:
-        CaptureError: one is out of its range.
-    """
+    """Settings, and the folder of masks. Raises CaptureError: one is out of its range."""
 
     masks: Path | None = None
     """Folder of masks; black pixels get no features. None = `masks` beside the photographs or in their folder, if

@@ -1,4 +1,4 @@
-"""Consistency of a model: cameras that no points link to the others, and matches that contradict the poses."""
+"""Check a model: cameras that no points link to the others, and matches that contradict the poses."""
 
 from pathlib import Path
 
@@ -9,15 +9,13 @@ from scipy.sparse.csgraph import connected_components
 
 from bitymi_ns.capture.sfm.job import MAX_ERROR
 
-LINK = 15
-"""Points that two photographs see together, from which on they link each other; COLMAP's least number of inliers of a
-pair."""
+LINK = 15  # points seen together that link two photographs; COLMAP's least number of inliers of a pair
 
 
 def drop_unlinked(model: pycolmap.Reconstruction) -> None:
-    """Take the pose from cameras that points do not link to most of the others: their pose is arbitrary.
+    """Remove arbitrary poses: of cameras that points do not link to most others.
 
-    Mappers place them by directions between pairs, whose points the filters may have removed.
+    Mappers find them by directions between pairs, whose points the filters may have removed.
     """
     placed = [image for image in model.images.values() if image.has_pose]
     column = {image.image_id: i for i, image in enumerate(placed)}
@@ -35,8 +33,8 @@ def drop_unlinked(model: pycolmap.Reconstruction) -> None:
 
 
 def contradicted(model: pycolmap.Reconstruction, database: Path, pixel: float) -> float:
-    """Share of the verified matches of a database between placed photographs that their poses contradict: the rays pass
-    each other by more than `MAX_ERROR` pixels of `Job.pixel`, or meet behind a camera."""
+    """Compute the share of verified matches between placed photographs that poses contradict: the rays pass each other
+    by more than `MAX_ERROR` pixels of `Job.pixel`, or meet behind a camera."""
     placed = {i: image for i, image in model.images.items() if image.has_pose}
     total = against = 0
     with pycolmap.Database.open(database) as opened:
@@ -58,14 +56,13 @@ def contradicted(model: pycolmap.Reconstruction, database: Path, pixel: float) -
 
 
 def pixels_per_radian(camera: pycolmap.Camera) -> float:
-    """Pixels per radian in the middle of a picture."""
+    """Return the pixels per radian in the middle of a picture."""
     return camera.width / (2.0 * np.pi) if camera.is_spherical() else camera.mean_focal_length()
 
 
 def _rays_meet(a: np.ndarray, b: np.ndarray, move: pycolmap.Rigid3d, limit: float) -> np.ndarray:
-    """Test [n] which pairs of unit rays [n,3], each in the axes of its camera, meet in front of both cameras. `move` is
-    from the first camera to the second, `limit` the largest angle in radians between a ray and the plane of the other
-    one and both centres."""
+    """Test [n] which pairs of unit rays [n,3], in the axes of their cameras, meet in front of both. `move`: first
+    camera to second; `limit`: largest angle in radians between a ray and the plane of the other and both centres."""
     a, step = a @ move.rotation.matrix().T, move.translation
     normal = np.cross(np.broadcast_to(step, a.shape), a)
     off = np.abs((normal * b).sum(1)) / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)

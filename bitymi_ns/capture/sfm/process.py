@@ -1,4 +1,4 @@
-"""COLMAP in a process of its own: Ctrl-C ends it at once, and where it aborts, which its library does, only it does."""
+"""Run COLMAP in a process of its own: Ctrl-C ends it at once, and only it ends where COLMAP aborts."""
 
 import json
 import os
@@ -18,15 +18,12 @@ from bitymi_ns.progress import Progress
 from bitymi_ns.trust import no_links, python_command
 
 LOG = "colmap.log"
-LITTLE_SPACE = 50_000_000  # bytes; where less is left, the disk is what stopped COLMAP
+LITTLE_SPACE = 50_000_000  # bytes free below which the disk has stopped COLMAP
 
 
 def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:
-    """Run a job to its end, and return what the worker found; `source` is for messages.
-
-    Raises:
-        CaptureError: there are no poses, or COLMAP ended otherwise.
-    """
+    """Run a job, and return what the worker found; `source` is for messages. Raises CaptureError: there are no poses,
+    or COLMAP ended otherwise."""
     work = Path(job.work)
     watching = ExitStack()
     with open(work / LOG, "wb", opener=no_links) as log:
@@ -37,7 +34,7 @@ def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:
             stderr=log,
             text=True,
             encoding="utf8",
-            start_new_session=True,  # Ctrl-C comes to us, and we end it
+            start_new_session=True,  # Ctrl-C comes to this process alone
             env={**os.environ, "PYTHONUNBUFFERED": "1"},
         )
         try:
@@ -67,9 +64,9 @@ def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:
 
 @contextmanager
 def _watched(database: Path, table: str, progress: Progress, stage: str, total: int) -> Iterator[None]:
-    """Tell how many rows a table of COLMAP's database has while COLMAP fills it.
+    """Report the rows of a table of COLMAP's database while COLMAP fills it.
 
-    From this process, because two copies of SQLite in one, COLMAP's and Python's, undo each other's locks on a file.
+    From this process: COLMAP's copy of SQLite and Python's in one process would undo each other's locks on a file.
     """
     ended = threading.Event()
 
@@ -87,7 +84,7 @@ def _watched(database: Path, table: str, progress: Progress, stage: str, total: 
 
 
 def rows(database: Path, table: str) -> int:
-    """Count the rows of a database table; 0 while it cannot be read. Not for a process in which COLMAP has it open."""
+    """Count the rows of a table; 0 if it cannot be read. Not in a process in which COLMAP has the database open."""
     try:
         connection = sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True, timeout=5)
         try:
@@ -98,11 +95,13 @@ def rows(database: Path, table: str) -> int:
         return 0
 
 
-def forget(work: Path) -> None:
-    """Remove what features and matches are kept in."""
+def forget(work: Path, *folders: str) -> None:
+    """Remove features and matches, and these folders."""
     for name in (DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm", PAIRS):
         with suppress(OSError):
             (work / name).unlink()
+    for name in folders:
+        shutil.rmtree(work / name, ignore_errors=True)
 
 
 def _why_ended(work: Path, source: Path, code: int) -> str:

@@ -1,5 +1,4 @@
-"""Views of a capture for training: photographs with cameras and poses become pinhole pictures in nerfstudio's frame,
-those of wide cameras several."""
+"""Make training views of a capture: pinhole pictures in nerfstudio's frame, several of a wide camera's photograph."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -22,14 +21,15 @@ from bitymi_ns.capture.types import FrameOptions, MapFiles
 from bitymi_ns.plugin.console import fail, listed, say
 
 DATA = "BITYMI_DATA"
-"""Environment variable: where a capture is now; most of nerfstudio's commands that read a run have no option for it."""
+"""Environment variable with a capture's location; most of nerfstudio's commands that read a run have no option for
+it."""
 MOVED = f"If it was moved, say where it is now: `{DATA}=/where/it/is` before the command."
-NO_PHOTOS = "without photographs"  # metadata key of views whose photographs are gone
-LONGEST_SIDE = 1600  # default longest side of a training photograph, pixels; as in papers on such captures
+NO_PHOTOS = "without photographs"  # metadata key of views of lost photographs
+LONGEST_SIDE = 1600  # default longest side of training photographs, pixels; as in papers on such captures
 
 
 class Views(DataparserOutputs):
-    """DataparserOutputs with a float64 dataparser_transform: a capture may lie millions of units from its origin."""
+    """DataparserOutputs with a float64 dataparser_transform: captures may lie millions of units from the origin."""
 
     def transform_poses_to_original_space(self, poses: torch.Tensor, *args: Any, **kwargs: Any) -> torch.Tensor:
         """Call nerfstudio's method in float64."""
@@ -37,8 +37,8 @@ class Views(DataparserOutputs):
 
 
 def make_views(capture: Capture, need_photos: bool = True) -> Views:
-    """Build the views of a capture, in the order of the photographs. metadata has for each view its `Lens` ("lenses"),
-    photograph ("files"), and the number of the photograph ("photographs"), which views of one share.
+    """Build a capture's views in the order of its photographs. Lists in metadata: `Lens` ("lenses"), photograph
+    ("files"), and number of the photograph ("photographs"), which several views may share.
 
     Args:
         need_photos: open downscaled copies for their size; else they may be missing.
@@ -83,8 +83,8 @@ def make_views(capture: Capture, need_photos: bool = True) -> Views:
 
 
 def _split(parts: Sequence[Sequence[Lens]], poses: Pose) -> tuple[list[Lens], list[int], Pose]:
-    """Split photographs into the views of their lenses (`parts`, of each photograph), with poses [N, 3 or 4, 4] camera
-    to world in nerfstudio's axes. Returns lens, number of the photograph and pose of each view."""
+    """Split photographs into views of their lenses (`parts`); poses [N, 3 or 4, 4] are camera to world in nerfstudio's
+    axes. Return lens, number of the photograph and pose of each view."""
     lenses = [lens for some in parts for lens in some]
     of = [i for i, some in enumerate(parts) for _ in some]
     turns = np.stack([OPENCV_AXES @ lens.turn @ OPENCV_AXES for lens in lenses])
@@ -97,16 +97,15 @@ def photograph_files(outputs: DataparserOutputs) -> list[Path]:
 
 
 def training_frame(poses: Pose, frame: FrameOptions, source: str) -> tuple[Pose, float]:
-    """Compute the transform [3, 4] that orients and centers poses [N, 4, 4] camera to world, and the scale that follows
-    it.
+    """Compute the transform [3, 4] that orients and centers poses [N, 4, 4] camera to world, and the scale after it.
 
-    Both are nerfstudio's, but the capture is centered in float64 first: UTM or ECEF positions have seven digits before
-    the point, which is all that float32 has.
+    Center in float64 before nerfstudio's functions: UTM or ECEF positions have seven digits before the point, all of
+    float32's.
     """
     middle = poses[:, :3, 3].mean(0)
     local = poses.copy()
     local[:, :3, 3] -= middle
-    # the transform alone: for `pca`, nerfstudio 1.1.5 turns cameras that come out upside down, but two of them only
+    # not the poses: for `pca`, nerfstudio 1.1.5 turns upside-down cameras, but two of them only
     _, oriented = auto_orient_and_center_poses(
         torch.from_numpy(local.astype(np.float32)), frame.orientation_method, frame.center_method
     )
@@ -142,7 +141,7 @@ def pinhole_cameras(pinholes: Sequence[Pinhole], poses: torch.Tensor) -> Cameras
 
 
 def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
-    """Give the outputs of any nerfstudio parser lenses, and the lenses' pinhole cameras in place of distorted ones."""
+    """Give outputs of any nerfstudio parser lenses, and the lenses' pinhole cameras."""
     if "lenses" in outputs.metadata or NO_PHOTOS in outputs.metadata:
         return outputs
     cameras = outputs.cameras
@@ -172,11 +171,8 @@ def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
 
 
 def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> DataparserOutputs:
-    """Downscale views with more than `longest` pixels along a side (0 = no limit), by their lenses.
-
-    Raises:
-        InputError: `longest` is negative.
-    """
+    """Downscale views of more than `longest` pixels along a side (0 = no limit), by their lenses. Raises InputError:
+    `longest` is negative."""
     if longest < 0:
         fail(
             f"--pipeline.datamanager.longest-side is {longest}: give a number of pixels, or 0 to use photographs as "
@@ -205,7 +201,7 @@ def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> Datap
 
 
 def select_views(outputs: DataparserOutputs, indices: Sequence[int]) -> DataparserOutputs:
-    """Return a subset of the views, with all that belongs to them."""
+    """Select views, with all that belongs to them."""
     count = len(outputs.image_filenames)
     masks = outputs.mask_filenames
     metadata = {

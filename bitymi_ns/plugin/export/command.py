@@ -1,6 +1,7 @@
-"""`ns-export bitymi-atlas`: bake a trained scene into a bundle, and measure what the bake cost.
+"""`ns-export bitymi-atlas`: bake a trained scene into a bundle, and measure the loss.
 
-Also `python -m bitymi_ns.plugin.export.command`, should a future nerfstudio not take the command in.
+Also `python -m bitymi_ns.plugin.export.command`, should nerfstudio not take the command in.
+
 """
 
 from collections.abc import Sequence
@@ -23,11 +24,9 @@ from bitymi_ns.files import reason, write_file
 from bitymi_ns.interchange import Frame, Kind, check_extras, extras_folder, summary_line, write_extras
 from bitymi_ns.plugin.console import INTERRUPTED, fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
-from bitymi_ns.plugin.export.cameras import camera_files
-from bitymi_ns.plugin.export.nerfstudio_config import bundle_config
 from bitymi_ns.plugin.export.summary import print_summary
-from bitymi_ns.plugin.export.target import bundle_version, check_room, reserve_bundle
-from bitymi_ns.plugin.export.trained import compare, load_trained, preview, world_of
+from bitymi_ns.plugin.export.target import bundle_config, bundle_version, check_room, reserve_bundle
+from bitymi_ns.plugin.export.trained import camera_files, compare, load_trained, preview, world_of
 from bitymi_ns.plugin.run.memory import state_export
 from bitymi_ns.plugin.run.model import BitymiModel
 from bitymi_ns.scene.camera import Camera
@@ -44,20 +43,20 @@ class CompactOptions:
     """Size and quality of a compact bundle."""
 
     interchange: bool = False
-    """Write surfels.ply into a compact bundle, too, for other programs; those of other formats have it."""
+    """Write surfels.ply into a compact bundle, too; those of other formats have it."""
     compact_error: float = Compact.share
-    """Share by which compacting may raise the mean square error against the training photographs,
-    before the texels are tuned; less where texels would then be too coarse to learn. The bytes go where they save most
-    of it: to surfels, view colours or texels."""
+    """Share by which compacting may raise the mean square error against the training photographs before texels are
+    tuned; less if texels were too coarse to learn. The bytes go where they save most of it: to surfels, view colours or
+    texels."""
     target_mb: float | None = None
-    """Bytes of a compact bundle, in MB (10^6), in the place of compact_error: everything becomes as coarse as it
-    takes. Where fewer bytes show the photographs as well, to 0.01 dB, these are taken."""
+    """Bytes of a compact bundle, in MB (10^6), instead of compact_error: everything becomes as coarse as it takes, or
+    less if fewer bytes show the photographs as well, to 0.01 dB."""
     target_psnr: float | None = None
-    """PSNR in dB against the training photographs, before the texels are tuned, in the place of compact_error:
-    everything becomes as coarse as it may. Held-out views are shown less well than these."""
+    """PSNR in dB against the training photographs before texels are tuned, instead of compact_error: everything becomes
+    as coarse as it may. Held-out views reach less."""
 
     def check_compact(self, form: BundleFormat) -> None:
-        """Stop where an option is out of its range, or is for another format than that of the bundle."""
+        """Stop at options out of range, or for another format."""
         compact = form == "compact"
         for name in ("interchange", "compact_error", "target_mb", "target_psnr"):
             if not compact and getattr(self, name) != getattr(CompactOptions, name):
@@ -72,7 +71,7 @@ class CompactOptions:
             fail(f"--compact-error must lie between 0 and 1, not at {self.compact_error}")
 
     def state_size(self, written: int) -> None:
-        """Print a note where the bundle is much smaller than --target-mb."""
+        """Report a bundle much smaller than --target-mb."""
         if self.target_mb is not None and written < _MUCH_SMALLER * 1e6 * self.target_mb:
             say(
                 f"{written / 1e6:.2f} MB suffice, of the {self.target_mb:g} MB that were asked for: with more, the "
@@ -80,11 +79,7 @@ class CompactOptions:
             )
 
     def compact_of(self, beside: int) -> Compact:
-        """Make the options of the compact bake.
-
-        Args:
-            beside: bytes of other files, such as the preview.
-        """
+        """Make options of the compact bake; `beside`: bytes of other files, such as the preview."""
         most = None
         if self.target_mb is not None:
             beside += MANIFEST_BYTES + most_bytes(int(1e6 * self.target_mb))
@@ -101,40 +96,37 @@ class CompactOptions:
 class ExportAtlas(BakeOptions, CompactOptions):
     """Bake a trained bitymi scene into a bundle: surfels, a compressed texture atlas and a manifest.
 
-    The bundle is written aside and renamed, opened again, and compared with the trained scene and with the photographs
-    on the held-out views.
+    Writes the bundle aside, renames and opens it, and compares it with the trained scene and the photographs on the
+    held-out views.
     """
 
     load_config: Path  # config.yml of a trained scene.
     output_dir: Path  # Folder of the bundle.
-    overwrite: bool = False  # Replace a bundle that is there already.
+    overwrite: bool = False  # Replace an existing bundle.
     exact: bool = False
-    """Keep everything: every tile at the Nyquist rate of the field, no cap by views, no surfel dropped as unseen, all
-    sites of the view colours, and texels as the field gives them, without fine-tuning."""
+    """Keep everything: tiles at the Nyquist rate of the field, not capped by views, unseen surfels, all sites of view
+    colours, and the field's texels without fine-tuning."""
     polish_steps: int | None = None
     """Steps in which texels, geometry, opacities and view colours learn together against the training photographs,
-    without the network, before tiles and view colours are reduced; 0 = surfels stay as they were trained. Not given:
-    0 where texels learned in training already, and on a GPU, for which there are no kernels; else 300, or 4 for each
-    photograph where that is more."""
+    without the network, before tiles and view colours are reduced; 0 = surfels stay as trained. Not given: 0 if texels
+    learned in training already, and on a GPU, which lacks kernels for it; else 300, or 4 per photograph if more."""
     finetune_steps: int | None = None
-    """Steps of fine-tuning the texels alone, after that; 0 = none. Not given: 400 where nothing but a field has learned
-    yet, 100 after a polish, both with 120 further ones that see what is stored of the texels; 100 that do so where
-    texels learned in training."""
+    """Steps of fine-tuning the texels alone, after that; 0 = none. Not given: 400 if only a field has learned yet, 100
+    after a polish, both with 120 further ones on texels as stored; 100 such ones if texels learned in training."""
     finetune_memory: float = TuneOptions.cache_bytes / 1e9
-    """GB of memory in which the fine-tuning keeps views that it has traced; its time depends on it, its result does
-    not."""
+    """GB of memory for traced views in the fine-tuning; changes its time, not its result."""
     compare: bool = True
-    """Render the held-out views from the bundle and from the trained scene and state the difference."""
+    """Render the held-out views from bundle and trained scene, and state the difference."""
 
     extras: tuple[Kind, ...] = ()
-    """Also write the scene for other programs, into a folder beside the bundle with its name and .extras: gaussians (a
+    """Also write the scene for other programs, beside the bundle into a folder of its name and .extras: gaussians (a
     preview as Gaussian splats), surfels (with two scales), usd (OpenUSD's surflets), mesh (textured quads). `bitymi
     extras BUNDLE` does so later."""
     extras_frame: Frame = "scene"  # Frame of these files: the scene's, or the capture's own.
     check_room: bool = True
-    """Stop before the work where the disk may have too little room, by an estimate that can be many times too high."""
+    """Stop if the disk may have too little room, by an estimate that can be many times too high."""
     photographs: bool = False
-    """Put the held-out photographs into the bundle, so that a viewer can show them beside the renders."""
+    """Put the held-out photographs into the bundle, for viewers to show beside renders."""
 
     def main(self) -> None:
         """Run the export."""
@@ -158,7 +150,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
             fail(str(error), error)
 
     def _options(self) -> BakeOptions:
-        """Options of the bake; stops where one is out of its range, before anything is loaded."""
+        """Make options of the bake; stop at one out of range, before loading anything."""
         options = BakeOptions(**{f.name: getattr(self, f.name) for f in fields(BakeOptions)})
         if self.exact:
             options = replace(options, tolerance=0.0, cap_by_views=False, drop_unseen=False)
@@ -176,7 +168,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
         return options
 
     def _learning(self, model: BitymiModel, views: int, compact: Compact | None) -> Learning:
-        """Optimisation after the bake for so many training photographs."""
+        """Make options of the optimisation after the bake, for this number of training photographs."""
         if self.exact:
             return Learning()
         kept = int(self.finetune_memory * 1e9)
@@ -244,7 +236,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
             self._write_extras(bundle, views, datamanager.eval_views)
 
     def _write_extras(self, bundle: Bundle, cameras: Sequence[Camera], held_out: Sequence[View]) -> None:
-        """Beside the bundle, which is complete already; says what was written."""
+        """Write and report the files beside the complete bundle."""
         folder = extras_folder(self.output_dir)
         with rich_progress() as progress:
             written = write_extras(

@@ -1,4 +1,4 @@
-"""`ns-export bitymi-mesh`: the surface of a trained scene or of a bundle as a triangle mesh."""
+"""`ns-export bitymi-mesh`: extract the surface of a trained scene or of a bundle as a triangle mesh."""
 
 import json
 import os
@@ -29,20 +29,20 @@ from bitymi_ns.ranges import check_ranges
 from bitymi_ns.scene.camera import Camera
 
 NAME = "mesh"
-MOST_VIEWS = 400  # training views that are fused at most, evenly spaced
+MOST_VIEWS = 400  # most fused training views, evenly spaced
 
 
 @dataclass(frozen=True)
 class Source:
     """Scene that a mesh is made of."""
 
-    surfels: Mapping[str, Tensor]  # geometry by name, on the device where it is drawn
+    surfels: Mapping[str, Tensor]  # geometry by name, on the renderer's device, as all tensors here
     render: Callable[[Camera], Tensor]  # [H, W, 3] colors of a view
-    cameras: Sequence[Camera]  # of the training views, on that device
-    near: float  # nearest depth that is drawn, camera z
+    cameras: Sequence[Camera]  # of the training views
+    near: float  # nearest drawn depth, camera z
     prefilter: Prefilter  # as in `ops.project`
-    world: WorldFrame  # how the scene lies in the capture
-    alpha: TexelAlpha | None  # opacities of the texels, on that device; None = opaque texels
+    world: WorldFrame  # of the scene in the capture
+    alpha: TexelAlpha | None  # opacities of the texels; None = opaque
 
 
 @dataclass(kw_only=True)
@@ -53,8 +53,8 @@ class ExportMesh(SurfaceOptions):
     output_dir: Path  # Folder of the mesh: mesh.ply, mesh.glb or mesh.obj.
     format: MeshFormat = "ply"  # Of the file. Those of other formats stay.
     frame: Frame = "capture"
-    """Frame of the vertices: the capture's own, with its unit of length, or the scene's, in which nerfstudio trains."""
-    overwrite: bool = False  # Replace a mesh that is there already.
+    """Frame of the vertices: the capture's, with its unit of length, or the scene's, in which nerfstudio trains."""
+    overwrite: bool = False  # Replace an existing mesh.
 
     def main(self) -> None:
         """Run the export."""
@@ -79,12 +79,12 @@ class ExportMesh(SurfaceOptions):
         say(f"{path}: {size_text(path.stat().st_size)}, in the {self.frame}'s frame" + (note and f"; {note}"))
 
     def _check_target(self, path: Path) -> None:
-        """Stop where the file is there and may not be replaced."""
+        """Stop if the file exists and may not be replaced."""
         if os.path.lexists(path) and not self.overwrite:
             fail(f"{path} is there already: choose another --output-dir, or add --overwrite True.")
 
     def _write(self, source: Source, path: Path) -> str:
-        """Write the mesh; returns what is to be said of its positions."""
+        """Write the mesh; return a note on its positions."""
         to = to_capture(source.world) if self.frame == "capture" else None
         step = max(1, -(-len(source.cameras) // MOST_VIEWS))
         cameras = source.cameras[::step]
@@ -106,7 +106,7 @@ class ExportMesh(SurfaceOptions):
 
 
 def from_run(load_config: Path) -> Source:
-    """The scene of a training run's last checkpoint."""
+    """Load the scene of a training run's last checkpoint."""
     _, pipeline = load_trained(load_config)
     model, datamanager = pipeline.model, pipeline.datamanager
     cameras = to_cameras(datamanager.train_dataset.cameras, model.device)
@@ -124,11 +124,8 @@ def from_run(load_config: Path) -> Source:
 
 
 def from_bundle(folder: Path) -> Source:
-    """A bundle, a folder or one file, from the training cameras that it holds.
-
-    Raises:
-        BundleError: it cannot be read, or has no cameras.
-    """
+    """Load a bundle, a folder or one file, with its training cameras. Raises BundleError: it cannot be read, or has no
+    cameras."""
     bundle = read_bundle(folder)
     scene = bundle.scene
     cameras = training_cameras(bundle) or [row.camera for row in bundle.cameras]

@@ -1,4 +1,4 @@
-"""A training run inside nerfstudio's loop: what it calls before, in and after a step, and the curve of progress."""
+"""Run training inside nerfstudio's loop: before, in and after a step; append the curve of progress."""
 
 import errno
 import json
@@ -66,21 +66,21 @@ class TrainingRun:
             self._random_state = resume_state["random"]
             if "capture" in resume_state:  # checkpoints of earlier versions have none
                 warn_of_other_capture(resume_state["capture"], self.capture)
-        # after which the curve gets a point: evenly spaced, the last step included
+        # steps after which the curve gets a point: evenly spaced, with the last one
         self.curve_steps = {max(0, round(self.total * (i + 1) / curve_points) - 1) for i in range(curve_points)}
         resumed_from = trainer.config.load_dir or getattr(trainer.config.load_checkpoint, "parent", None)
         self.curve = TrainingCurve(
             trainer.base_dir / FILE, None if resumed_from is None else resumed_from.parent / FILE, self.first_step
         )
         self.names = {"experiment_name": trainer.config.experiment_name, "method_name": trainer.config.method_name}
-        self._held_back = False  # whether it was said that densification meets its bound
+        self._held_back = False  # densification has met its bound, and a warning said so
         for sentence in (
             *limits.other_options(model.recorded_options, config),
             *limits.recorded_rules(config),
             *limits.short_run(self.training.schedule, len(train), scene.config.texture == "hash", processes.views),
         ):
             say(sentence)
-        _ = self.datamanager.cached_train  # read the images now: loading is not training time
+        _ = self.datamanager.cached_train  # read images now: loading is not training time
         if self.curve_steps:
             _ = self.datamanager.cached_eval
         self.datamanager.check_pictures()
@@ -94,7 +94,7 @@ class TrainingRun:
         self.datamanager.step_view = self.training.view
 
     def _check_start(self) -> None:
-        """Stop, or warn, when views see nothing of what training starts from: no gradient would come from them."""
+        """Stop, or warn, if views see nothing of what training starts from: they would give no gradient."""
         dataset = self.datamanager.train_dataset
         cameras = [to_camera(dataset.cameras[i : i + 1]) for i in range(len(dataset))]
         blind = [dataset.image_filenames[i] for i in views_without_surfels(self.scene, cameras)]
@@ -117,13 +117,13 @@ class TrainingRun:
         ]
 
     def state(self) -> dict[str, Any]:
-        """Everything beside parameters and optimisers that decides how the run goes on."""
+        """Return all but parameters and optimisers that decides how the run goes on."""
         return {**self.training.state_dict(), "random": torch.get_rng_state(), "capture": self.capture}
 
     # a step
 
     def before(self, step: int) -> None:
-        """Set the learning rates of the step."""
+        """Set the step's learning rates."""
         if self._random_state is not None:
             torch.set_rng_state(self._random_state)
             self._random_state = None
@@ -136,14 +136,14 @@ class TrainingRun:
             say(self.training.exposure.sentence)
 
     def losses(self, view: View) -> dict[str, Tensor]:
-        """Render the step's view and compare it with its photograph."""
+        """Compare a render of the step's view with its photograph."""
         try:
             return self.training.losses(view)[0]
         except ValueError as error:
             self._diverged(error)
 
     def after(self, step: int) -> None:
-        """Densify and prune; then, with the clock stopped, note how far the run has come."""
+        """Densify and prune; then stop the clock and note progress."""
         try:
             if step in self.curve_steps:
                 self.training.watch.finish(self.scene)
@@ -202,7 +202,7 @@ FILE = "training_curve.jsonl"
 
 
 class TrainingCurve:
-    """Appends points to the file of a run; a resumed run keeps the points up to its checkpoint."""
+    """Appends points to a run's file; a resumed run keeps those up to its checkpoint."""
 
     def __init__(self, path: Path, resumed_from: Path | None = None, steps_done: int = 0) -> None:
         self.path = path
@@ -212,11 +212,11 @@ class TrainingCurve:
             write_file(path, "".join(line + "\n" for line in kept).encode("utf8"))
 
     def add(self, point: dict[str, Any]) -> None:
-        """Write one point, whole and at once. A full disk costs the point, not the run."""
+        """Write a point whole and at once; a full disk costs the point, not the run."""
         try:
             with open(self.path, "ab", buffering=0, opener=no_links) as file:
                 line, kept = f"{json.dumps(point)}\n".encode(), file.tell()
-                if file.write(line) < len(line):  # the next point must not follow half a one
+                if file.write(line) < len(line):  # no point may follow half a one
                     file.truncate(kept)
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:

@@ -32,7 +32,7 @@ from bitymi_ns.train.poses import aligned, view_psnr
 from bitymi_ns.train.views import View, eval_background
 
 PARAMETER_GROUPS = (*GEOMETRY, *VIEW_PARAMETERS, "field_table", "field_mlp")
-"""Groups that an optimiser is configured for; a scene has those that its view colour and texture call for."""
+"""Groups with a configured optimiser; a scene has those of its view colour and texture."""
 
 
 @dataclass
@@ -45,16 +45,16 @@ class BitymiModelConfig(SurfelModelConfig):
     train: TrainConfig = field(default_factory=TrainConfig)
     """Training options."""
     steps: tyro.conf.Suppress[int | None] = None
-    """Length of the run, where one is going to be made."""
+    """Length of a run to come."""
     curve_points: int = 20
-    """Evaluations over a run, for the curve of quality against time (training_curve.jsonl); 0 = none."""
+    """Evaluations over a run for the curve of quality against time (training_curve.jsonl); 0 = none."""
     curve_views: int = 8
-    """Held-out views rendered for a point of that curve, all for the last one; 0 = all."""
+    """Held-out views per point of that curve, all for the last one; 0 = all."""
 
 
 def train_config_for(config: TrainConfig, alpha_color: Tensor | None, transparent: bool) -> TrainConfig:
-    """The training options with the colour that the capture states for its transparent images, if any: it is their
-    `alpha_color`, and stands for a `background` of one colour. Where none is transparent, also for auto."""
+    """Return training options with the colour that the capture states for transparent images, if any: as `alpha_color`,
+    and for a `background` of one colour, or auto without transparent images."""
     color = config.alpha_color if alpha_color is None else _name_of(alpha_color)
     one = config.background in ("black", "white") and alpha_color is not None
     background = color if one or (config.background == "auto" and not transparent) else config.background
@@ -71,8 +71,8 @@ def _name_of(alpha_color: Tensor) -> Literal["black", "white"]:
 class BitymiModel(SurfelModel):
     """Textured Beta surfels.
 
-    The checkpoint holds, beside the parameters, everything that a resumed run needs to go on as if it had not been
-    interrupted: the state of the strategy, of the random generators and of the clocks.
+    Checkpoints hold, beside parameters, all that a resumed run needs to go on as if uninterrupted: the state of
+    strategy, random generators and clocks.
     """
 
     config: BitymiModelConfig
@@ -87,10 +87,10 @@ class BitymiModel(SurfelModel):
         self.scene = new_scene(
             points, self.scene_box, self.config.scene, self.train_config, self.metadata, self.config.steps
         )
-        self.metadata["first_surfels"] = len(self.scene)  # a checkpoint that is loaded may have another number
+        self.metadata["first_surfels"] = len(self.scene)  # checkpoints may have another number
         self.trained_for: int | None = None
         self.resume_state: dict[str, Any] = {}
-        self.recorded_options: str | None = None  # of the run that is resumed
+        self.recorded_options: str | None = None  # of a resumed run
         self._run: TrainingRun | None = None
         self.carry: Callable[[Camera], Camera] | None = None  # of a finished run that refined poses
 
@@ -110,7 +110,7 @@ class BitymiModel(SurfelModel):
         return {"surfels": float(len(self.scene))}
 
     def get_outputs(self, ray_bundle: Any) -> dict[str, Any]:
-        """Loss terms of a training view, or pictures of cameras."""
+        """Return loss terms of a training view, or pictures of cameras."""
         if isinstance(ray_bundle, View):
             if self._run is None:
                 raise RuntimeError("losses exist in training only")
@@ -120,8 +120,8 @@ class BitymiModel(SurfelModel):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Judge a held-out view as it is posed; after a run that refined poses also with its pose carried along with
-        those of the photographs, and from where it fits the scene."""
+        """Judge a held-out view; after a run that refined poses also with its pose carried along with theirs, and from
+        where it fits the scene."""
         metrics, images = super().get_image_metrics_and_images(outputs, batch)
         camera = getattr(self, "_last_camera", None)
         if self.carry is not None and camera is not None:
@@ -150,7 +150,7 @@ class BitymiModel(SurfelModel):
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: Any = None
     ) -> dict[str, Tensor]:
-        """Loss terms from `get_outputs`; of a held-out view (--steps-per-eval-batch) the photometric loss."""
+        """Return loss terms from `get_outputs`; the photometric loss of a held-out view (--steps-per-eval-batch)."""
         if "losses" in outputs:
             return outputs["losses"]
         target, mask = self.photograph(batch, outputs["rgb"])
@@ -159,7 +159,7 @@ class BitymiModel(SurfelModel):
     # checkpoints
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Tensors, numbers and text only, so that torch loads it in its safe mode."""
+        """Return tensors, numbers and text only, for torch's safe mode."""
         state: dict[str, Any] = {"version": STATE_VERSION, "scene": json.dumps(dataclasses.asdict(self.config.scene))}
         state["train"] = limits.recorded(self.train_config)
         state["near"], state["first_surfels"] = self.scene.near, self.metadata["first_surfels"]
@@ -175,21 +175,20 @@ class BitymiModel(SurfelModel):
         self.resume_state, self.recorded_options = state.get("run", {}), state.get("train")
         self.metadata["first_surfels"] = state.get("first_surfels", self.metadata["first_surfels"])
         if self.config.scene.near is None:
-            self.scene.near = state.get("near", 0.2)  # older checkpoints: what all scenes had
+            self.scene.near = state.get("near", 0.2)  # all scenes' value in older checkpoints
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """Load a checkpoint (`checkpoints.load` has checked that it belongs to this preset), whatever its number of
-        surfels."""
+        """Load a checkpoint of any number of surfels; `checkpoints.load` has checked that it fits this preset."""
         self.scene.make_room(state_dict, "scene.")
         for name, parameter in self.named_parameters():
             saved = state_dict.get(name)
             if saved is not None and saved.shape != parameter.shape:
-                # the same Parameter object: nerfstudio's optimisers hold it already
+                # nerfstudio's optimisers hold the Parameter object already
                 parameter.data = torch.zeros(saved.shape, dtype=parameter.dtype, device=parameter.device)
         return super().load_state_dict(state_dict, strict=True)
 
 
-FEW_POINTS = 50  # number of points below which much of a scene may have none near it
+FEW_POINTS = 50  # points below which much of a scene may have none near it
 
 
 def new_scene(
@@ -200,12 +199,12 @@ def new_scene(
     metadata: dict[str, Any],
     steps: int | None = None,
 ) -> Scene:
-    """Surfels at the capture's points, or at random in its box, and an empty texture field around them.
+    """Make surfels at the capture's points, or at random in its box, and an empty texture field around them.
 
     Args:
-        points: positions [N, 3] and colours [N, 3] (uint8, or empty when the cloud has none).
-        metadata: what the data manager says about the capture.
-        steps: length of the run that is going to be made.
+        points: positions [N, 3] and colours [N, 3] (uint8, or empty without colours).
+        metadata: of the data manager on the capture.
+        steps: length of a run to come.
     """
     centers, pixels = metadata.get("camera_centers", torch.zeros(0, 3)), metadata.get("train_pixels", 0)
     if steps is not None:
@@ -257,7 +256,7 @@ def _points(points: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:
 
 
 def _corners(scene_box: SceneBox) -> Tensor:
-    """[2, 3]: low and high corner."""
+    """Return low and high corner [2, 3]."""
     corners = scene_box.aabb.float().cpu().reshape(2, 3)
     low, high = corners
     if not bool(torch.isfinite(corners).all()) or not bool((high > low).all()):

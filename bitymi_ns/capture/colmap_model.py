@@ -80,10 +80,8 @@ def _read_model(folder: Path, stamps: tuple[Any, ...]) -> Model:
         xyz, rgb, without_colors = _parsed(path, _points_text, _points_binary, tuple)
         finite = np.isfinite(xyz).all(1)
         if not finite.all():
-            warn(
-                f"{path}: {np.sum(~finite):,} of {len(xyz):,} points, the first is point {np.argmin(finite) + 1}, are "
-                "not finite. They are left out."
-            )
+            first = f"the first is point {np.argmin(finite) + 1}"
+            warn(f"{path}: {np.sum(~finite):,} of {len(xyz):,} points, {first}, are not finite. They are left out.")
             xyz, rgb = xyz[finite], rgb[finite] if len(rgb) else rgb
     elif (cloud := folder / "points3D.ply").is_file():  # as programs leave it that have read the model
         (xyz, rgb), without_colors = read_cloud(cloud, "Copy it again, or move it away to have points triangulated.")
@@ -152,16 +150,14 @@ def _check_cameras(path: Path, cameras: dict[int, ColmapCamera]) -> None:
         count = parameter_count(camera.model)
         if not all(1 <= side <= MAX_SIDE for side in camera.size) or not np.isfinite(camera.params).all():
             written = " ".join([*(str(side)[:20] for side in camera.size), *(f"{value:g}" for value in camera.params)])
+            line, what = _line_of(path, number), f"camera {number} ({camera.model} {written})"
             fail(
-                f"{path}{_line_of(path, number)}: camera {number} ({camera.model} {written}) cannot be used: its size "
-                f"has to be from 1 to {MAX_SIDE:,} pixels and all numbers finite. Correct it, or export the model from "
-                "COLMAP again."
+                f"{path}{line}: {what} cannot be used: its size has to be from 1 to {MAX_SIDE:,} pixels and all "
+                "numbers finite. Correct it, or export the model from COLMAP again."
             )
         if count is not None and len(camera.params) != count:
-            fail(
-                f"{path}: camera {number} has {len(camera.params)} parameters, but a {camera.model} has {count}. "
-                "Correct its line."
-            )
+            what = f"camera {number} has {len(camera.params)} parameters, but a {camera.model} has {count}"
+            fail(f"{path}: {what}. Correct its line.")
 
 
 def _check_images(path: Path, images: dict[int, ModelImage], cameras: dict[int, ColmapCamera]) -> None:
@@ -181,10 +177,8 @@ def _check_images(path: Path, images: dict[int, ModelImage], cameras: dict[int, 
                 "rotation is zero. Correct its line or remove the image."
             )
         if first.setdefault(image.name, number) != number:
-            fail(
-                f"{path}: images {first[image.name]} and {number} are both of {image.name}. Correct the name of one of "
-                "them or remove it."
-            )
+            twice = f"images {first[image.name]} and {number} are both of {image.name}"
+            fail(f"{path}: {twice}. Correct the name of one of them or remove it.")
 
 
 def _line_of(path: Path, number: int) -> str:

@@ -18,7 +18,7 @@ from bitymi_ns.capture.points import Points
 from bitymi_ns.capture.types import CaptureError, SfmSettings, fail, say, warn
 from bitymi_ns.trust import leads_inside, listed
 
-TO_NERFSTUDIO = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+TO_Z_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """[4, 4] COLMAP's world, up about -y, to nerfstudio's with z up, as nerfstudio's parser does."""
 
 
@@ -178,7 +178,7 @@ def _name_in(folder: Path, path: Path) -> str:
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name
 
 
-def warn_of_left_out(source: Source) -> set[Path]:
+def warn_left_out(source: Source) -> set[Path]:
     """Report photographs that the model lacks, and those with other names than it states; return them all."""
     files = source.files()
     other = renamed_message([image.name for image in source.model.images], files, source.image_folder)
@@ -191,14 +191,12 @@ def warn_of_left_out(source: Source) -> set[Path]:
     unused = sorted((names | source.left_out.keys()) - used)
     if unused:
         named = [f"{name} ({source.left_out[name]})" if name in source.left_out else name for name in unused]
-        warn(
-            f"{len(unused)} of {len(used) + len(unused)} photographs have no pose in the model and are left out: "
-            f"{listed(named)}."
-        )
+        total = len(used) + len(unused)
+        warn(f"{len(unused)} of {total} photographs have no pose in the model and are left out: {listed(named)}.")
     return {*files, *(source.photographs / name for name in names)}
 
 
-def model_photographs(source: Source, need_photos: bool) -> list[Photograph]:
+def photographs_of(source: Source, need_photos: bool) -> list[Photograph]:
     """List the photographs of a model in the order of their names, with cameras and poses."""
     model, files = source.model, source.files()
     masks = None
@@ -208,7 +206,7 @@ def model_photographs(source: Source, need_photos: bool) -> list[Photograph]:
         Photograph(
             file=file,
             camera=model.cameras[image.camera_id],
-            pose=TO_NERFSTUDIO @ _camera_to_world(image),
+            pose=TO_Z_UP @ _camera_to_world(image),
             label=f"camera {image.camera_id} of {source.folder}",
             mask=None if masks is None else masks[i],
             downscaled=source.copies is not None,

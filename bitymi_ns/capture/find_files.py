@@ -202,9 +202,7 @@ def find_photographs(path: Path, names: Sequence[str], need_photos: bool) -> lis
     for i, (name, file) in enumerate(zip(names, found, strict=True)):
         ambiguous = finder.ambiguous(name) if need_photos and file is None else []
         if ambiguous:
-            fail(
-                f"{path}: frame {i} is of {name}, but there are {listed(ambiguous)}. Write the ending of the right one."
-            )
+            fail(f"{path}: frame {i} is of {name}, but there are {listed(ambiguous)}. Write the right one's ending.")
     return [Path(os.path.normpath(file or folder / name)) for name, file in zip(names, found, strict=True)]
 
 
@@ -254,8 +252,7 @@ def downscaled(photographs: list[Photograph], folder: Path, downscale: int) -> l
     if lacking:
         fail(
             f"{len(lacking)} of {len(found)} images of the capture are missing:\n  {listed(lacking)}\nOthers have a "
-            f"copy that is {downscale} times smaller: make the missing ones, or move that folder away to have all "
-            "photographs reduced as they are read."
+            f"copy {downscale} times smaller: make the missing ones, or move that folder away to reduce all on reading."
         )
     if len(set(found)) < len(set(each.file for each in photographs)):
         twins = sorted({each.file.relative_to(folder).as_posix() for each, copy in zip(photographs, found, strict=True)

@@ -119,10 +119,8 @@ def check_sizes(paths: Sequence[Path]) -> None:
 
 
 def _too_large(paths: Sequence[Path]) -> str:
-    return (
-        f"{listed(paths)} has more than {MAX_PIXELS:,} pixels. Make it smaller, and w, h, fl_x, fl_y, cx and cy of its "
-        "camera with it."
-    )
+    camera = "w, h, fl_x, fl_y, cx and cy of its camera"
+    return f"{listed(paths)} has more than {MAX_PIXELS:,} pixels. Make it smaller, and {camera} with it."
 
 
 def check_orientation(paths: Sequence[Path]) -> None:
@@ -130,9 +128,8 @@ def check_orientation(paths: Sequence[Path]) -> None:
     turned = [path for path, value in zip(paths, in_threads(orientation, paths), strict=True) if value != 1]
     if turned:
         warn(
-            f"{listed(turned)} has an EXIF tag that asks viewers to turn the photograph. It is used as it is stored, "
-            "as COLMAP and nerfstudio do. If the pose was made from the turned picture, write the turn into the pixels "
-            "(`mogrify -auto-orient <photos>`)."
+            f"{listed(turned)} has an EXIF tag that asks viewers to turn the photograph. It is used as it is stored. "
+            "If the pose is that of the turned picture, turn the pixels (`mogrify -auto-orient <photos>`)."
         )
 
 
@@ -182,9 +179,7 @@ def wrong_size(path: Path, size: tuple[int, int], declared: tuple[int, int]) -> 
             "and the camera and pose are for the turned picture. Write the turn into the pixels with "
             "`mogrify -auto-orient <photos>`, or swap w and h (and fl_x and fl_y, cx and cy) and turn the pose."
         )
-    return (
-        f"the image {path} has {shown}. Correct w and h (and fl_x, fl_y, cx, cy) in the capture, or resize the image."
-    )
+    return f"the image {path} has {shown}. Correct w, h, fl_x, fl_y, cx, cy in the capture, or resize the image."
 
 
 class ImageSummary(NamedTuple):

@@ -205,9 +205,8 @@ def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tupl
     share = w * h / (width * height)
     if share < ABSURD_AREA or min(w, h) < 1:
         fail(
-            f"the lens distortion of {label} is absurd: with {model} {camera.params_to_string()} undistorting would "
-            f"leave {100.0 * share:.2g} % of the picture. Correct the numbers, or calibrate again with a simpler model "
-            "(SIMPLE_RADIAL)."
+            f"the lens distortion of {label} is absurd: with {model} {camera.params_to_string()} undistorting leaves "
+            f"{100.0 * share:.2g} % of the picture. Correct it, or calibrate with a simpler model (SIMPLE_RADIAL)."
         )
     if share < DOUBTFUL_AREA:
         warn(f"Undistorting leaves only {100.0 * share:.2g} % of {label}. The lens distortion may be wrong.")
@@ -272,9 +271,8 @@ def _faces(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tuple[l
         u, v = w / (right - left), h / (bottom - top)
         lenses.append(Lens(colmap, stored, Pinhole(u, v, -left * u, -top * v, w, h), face, whole))
     named = ", ".join(f"{lens.face} {lens.pinhole.width} x {lens.pinhole.height}" for lens in lenses)
-    return lenses, [
-        f"{label} is {colmap.model}: each of its photographs becomes {len(lenses)} pinhole pictures ({named})."
-    ]
+    becomes = f"each of its photographs becomes {len(lenses)} pinhole pictures ({named})"
+    return lenses, [f"{label} is {colmap.model}: {becomes}."]
 
 
 def _distorts(camera: pycolmap.Camera) -> bool:

@@ -147,10 +147,8 @@ def check_masks(photographs: Sequence[Photograph]) -> None:
     masked = {each.mask: each for each in photographs if each.mask is not None}
     missing = [mask for mask in masked if not mask.exists()]
     if missing:
-        fail(
-            f"{len(missing)} of {len(masked)} masks of the capture are missing: {listed(missing)}. Put them there, or "
-            f"correct their names; {LEAVE_OUT}."
-        )
+        where = f"{len(missing)} of {len(masked)} masks of the capture are missing: {listed(missing)}"
+        fail(f"{where}. Put them there, or correct their names; {LEAVE_OUT}.")
     sizes = in_threads(image_size, masked)
     for (mask, photograph), known in zip(masked.items(), sizes, strict=True):
         size = known or checked_mask(mask).size  # fails with the reason

@@ -218,10 +218,8 @@ def refusal(folder: Path) -> str:
     """Say why a folder cannot be trained on, and what to do, if it is a bundle or a run; empty = it can."""
     what = result_in(folder) if folder.is_dir() else ""
     if what == BUNDLE:
-        return (
-            f"{folder} is a bundle, not a capture: give the folder of its photographs. `bitymi view {folder}` shows "
-            "the bundle."
-        )
+        bundle = f"{folder} is a bundle, not a capture: give the folder of its photographs."
+        return f"{bundle} `bitymi view {folder}` shows the bundle."
     if what == RUN:
         return (
             f"{folder} is a training run, not a capture: give the folder of its photographs, and --load-dir "

@@ -210,7 +210,7 @@ def _from_xyzw(pose: Pose) -> Pose:
     return np.linalg.inv(meant) @ OPENCV_AXES
 
 
-JSON_CONVENTIONS: dict[str, Callable[[Pose], Pose]] = {
+JSON_POSES: dict[str, Callable[[Pose], Pose]] = {
     "the cameras have OpenCV's axes (y down, z forward): negate the second and third column": lambda pose: (
         pose @ OPENCV_AXES
     ),
@@ -222,7 +222,7 @@ JSON_CONVENTIONS: dict[str, Callable[[Pose], Pose]] = {
 }
 """Conversions of poses in a transforms.json that was written in another convention than camera to world with OpenGL
 axes, by the remedy."""
-COLMAP_CONVENTIONS: dict[str, Callable[[Pose], Pose]] = {
+COLMAP_POSES: dict[str, Callable[[Pose], Pose]] = {
     "the cameras have OpenGL's axes (y up, z backward)": lambda pose: pose @ OPENCV_AXES,
     "they are camera to world: invert them": lambda pose: OPENCV_AXES @ np.linalg.inv(pose) @ OPENCV_AXES,
     "they are camera to world with OpenGL's axes": lambda pose: OPENCV_AXES @ np.linalg.inv(pose),

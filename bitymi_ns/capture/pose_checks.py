@@ -79,10 +79,8 @@ def correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
     for frame, name in zip(frames, names, strict=True):
         pose = as_matrix(frame["transform_matrix"])
         if pose is None:
-            fail(
-                f"{path}: the transform_matrix of {name} is not a matrix of 4 x 4 finite numbers. "
-                "Correct it or remove the frame."
-            )
+            what = f"the transform_matrix of {name} is not a matrix of 4 x 4 finite numbers"
+            fail(f"{path}: {what}. Correct it or remove the frame.")
         if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
             row = " ".join(f"{x:g}" for x in pose[3])
             fail(
@@ -104,10 +102,8 @@ def check_repeated(path: Path, frames: list[dict[str, Any]]) -> None:
         before = first.setdefault(name, i)
         poses = [np.asarray(frames[j]["transform_matrix"]) for j in (before, i)]
         if before != i and not np.allclose(*poses, rtol=1e-5, atol=1e-5):
-            fail(
-                f"{path}: frames {before} and {i} (counted from 0) are both of {name}, but with different poses. "
-                "Correct the name of one of them or remove it."
-            )
+            twice = f"frames {before} and {i} (counted from 0) are both of {name}, but with different poses"
+            fail(f"{path}: {twice}. Correct the name of one of them or remove it.")
 
 
 def as_matrix(value: Any) -> np.ndarray | None:
@@ -135,9 +131,7 @@ def warn_of_mirrored(rotations: npt.NDArray[np.float64], names: Sequence[object]
 def check_spread(centers: npt.NDArray[np.float64], source: str) -> None:
     """Fail if all cameras [N, 3] are at one place."""
     if not np.ptp(centers, axis=0).any():
-        fail(
-            f"{source}: all cameras are at one place. Depth cannot be learned: take photographs from different places."
-        )
+        fail(f"{source}: all cameras are at one place. Depth cannot be learned: photograph from different places.")
 
 
 def check_outliers(centers: npt.NDArray[np.float64], names: Sequence[object]) -> None:
@@ -150,10 +144,8 @@ def check_outliers(centers: npt.NDArray[np.float64], names: Sequence[object]) ->
         near, far = sorted_distances[k - 1], sorted_distances[k]
         if near <= 0.0 or far < FAR * near:
             continue
-        message = (
-            f"the camera of {listed([names[i] for i in order[k:]])} is {far / near:,.0f} times as far from the middle "
-            "of the capture as the others."
-        )
+        away = f"{far / near:,.0f} times as far from the middle of the capture as the others"
+        message = f"the camera of {listed([names[i] for i in order[k:]])} is {away}."
         if far < TOO_FAR * near:
             warn(f"{message[0].upper()}{message[1:]} If that is a mistake, correct the pose or remove the frame.")
         else:
@@ -177,10 +169,10 @@ def fit_scale(frame: FrameOptions, photographs: Sequence[Photograph], source: st
     if ratio <= MAX_SPREAD:
         return frame
     scale = frame.scale_factor * USUAL_SPREAD / ratio
+    usual = f"{USUAL_SPREAD * frame.scene_scale / frame.scale_factor:.2g}"
     say(
-        f"The cameras of {source} lie {spread:,.4g} units from their middle, where those of this format usually lie "
-        f"{USUAL_SPREAD * frame.scene_scale / frame.scale_factor:.2g}: the capture is scaled by {scale:.3g}. Bundles "
-        "state that."
+        f"The cameras of {source} lie {spread:,.4g} units from their middle, {usual} are usual: the capture is scaled "
+        f"by {scale:.3g}. Bundles state that."
     )
     return replace(frame, scale_factor=scale)
 

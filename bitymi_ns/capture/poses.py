@@ -25,7 +25,7 @@ from bitymi_ns.capture.report import write_report
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
 from bitymi_ns.capture.types import CaptureError, Poses, SfmOptions
-from bitymi_ns.capture.video import extract_frames
+from bitymi_ns.capture.video import NO_MOTION, extract_frames
 from bitymi_ns.files import Tell, complete_folder, explained, write_file
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.reading import read_json
@@ -160,9 +160,7 @@ def _with_panoramas(source: Path, photos: list[Photo], left_out: dict[str, str],
     for photo in photos:
         groups[photo.width, photo.height].append(photo)
     panoramic = {size for size, of_size in groups.items() if sum(p.panorama for p in of_size) >= TELLING * len(of_size)}
-    photos = [
-        replace(photo, panorama=every or photo.panorama or (photo.width, photo.height) in panoramic) for photo in photos
-    ]
+    photos = [replace(p, panorama=every or p.panorama or (p.width, p.height) in panoramic) for p in photos]
     partial = [photo.name for photo in photos if photo.panorama and not is_full_sphere(photo.width, photo.height)]
     if len(partial) > len(photos) / 2:
         raise CaptureError(
@@ -182,16 +180,12 @@ def _too_few_left(
     video: bool,
 ) -> str:
     if video:
-        return (
-            f"{source} shows no motion: its frames are all alike. Film while you walk slowly round the scene, and turn "
-            "the camera to keep it in view"
-        )
+        return f"{source} {NO_MOTION}"
     some = "; ".join(f"{name}: {why}" for name, why in list(left_out.items())[:3])
     more = f"; and {len(left_out) - 3} more" if len(left_out) > 3 else ""
     if len(twins) >= len(left_out) - len(twins):
         return (
-            f"of the photographs in {folder}, only {len(photos)} differ ({some}{more}): take photographs from "
-            "different places"
+            f"only {len(photos)} of the photographs in {folder} differ ({some}{more}): take them from different places"
         )
     return f"of the photographs in {folder}, only {len(photos)} can be used ({some}{more}). Copy or export them again"
 
@@ -254,9 +248,8 @@ def camera_group(photos: Sequence[Photo], names: list[str], options: SfmOptions)
     stated = [photo.exif.focal_length for photo in photos]
     focal = options.focal_length or (statistics.median(stated) if all(stated) else None)
     model = "SIMPLE_RADIAL" if options.camera_model == "auto" else options.camera_model
-    camera = pycolmap.Camera.create_from_model_name(
-        0, model, focal or GUESSED_FOCAL * max(width, height), width, height
-    )
+    start = focal or GUESSED_FOCAL * max(width, height)
+    camera = pycolmap.Camera.create_from_model_name(0, model, start, width, height)
     return CameraGroup(ColmapCamera(model, width, height, tuple(camera.params.tolist())), focal is not None, names)
 
 

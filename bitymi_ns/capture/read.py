@@ -10,25 +10,11 @@ import numpy as np
 
 from bitymi_ns.capture.camera import Photograph, Pose
 from bitymi_ns.capture.colmap_model import read_model
-from bitymi_ns.capture.colmap_views import (
-    TO_NERFSTUDIO,
-    Source,
-    find_source,
-    model_photographs,
-    model_points,
-    warn_of_left_out,
-)
+from bitymi_ns.capture.colmap_views import TO_Z_UP, Source, find_source, model_points, photographs_of, warn_left_out
 from bitymi_ns.capture.find_files import check_photographs_exist, name_unused
 from bitymi_ns.capture.frame import read_frame
 from bitymi_ns.capture.masks import check_masks, with_masks
-from bitymi_ns.capture.points import (
-    COLMAP_CONVENTIONS,
-    JSON_CONVENTIONS,
-    Points,
-    check_conventions,
-    read_cloud,
-    with_colors,
-)
+from bitymi_ns.capture.points import COLMAP_POSES, JSON_POSES, Points, check_conventions, read_cloud, with_colors
 from bitymi_ns.capture.pose_checks import fit_scale
 from bitymi_ns.capture.recognise import Format, Found, is_model, recognise
 from bitymi_ns.capture.scanner_views import scanner_photographs
@@ -237,7 +223,7 @@ class _Reader:
         elif model is not None:
             own = self._colored(model_points(model, applied), model.without_colors, photographs, earlier)
         if own is not None and self.need_photos and self.want_points:
-            check_conventions(own, photographs, JSON_CONVENTIONS, source)
+            check_conventions(own, photographs, JSON_POSES, source)
         scale = float(meta.get("applied_scale", 1.0))
         points = self._points(own, photographs, source)
         return Capture(found.format, source, photographs, points, frame, read.lists, {}, self.downscale, applied, scale)
@@ -249,17 +235,17 @@ class _Reader:
         model = source.model
         if need_photos and found.format == "colmap":
             check_photographs_exist(found.path, source.files())
-        named = warn_of_left_out(source) if need_photos else set()
-        photographs, where = model_photographs(source, need_photos), str(source.folder)
+        named = warn_left_out(source) if need_photos else set()
+        photographs, where = photographs_of(source, need_photos), str(source.folder)
         masked = {*named, *(each.mask for each in photographs)} if found.format == "colmap" else None
         self._check(source.describe(), photographs, masked)
-        own = model_points(model, TO_NERFSTUDIO)
+        own = model_points(model, TO_Z_UP)
         if need_photos and self.want_points and options.points == "auto":
             own = self._colored(own, model.without_colors, photographs, source.folder)
-            check_conventions(own, photographs, COLMAP_CONVENTIONS, where, TO_NERFSTUDIO)
+            check_conventions(own, photographs, COLMAP_POSES, where, TO_Z_UP)
         points, lists = self._points(own, photographs, where), list_files(found.folder)
         return Capture(
-            found.format, where, photographs, points, options, lists, {}, source.downscale, TO_NERFSTUDIO,
+            found.format, where, photographs, points, options, lists, {}, source.downscale, TO_Z_UP,
             report=source.report, model=None if source.origin is None else source,
         )  # fmt: skip
 

@@ -52,10 +52,8 @@ def scanner_photographs(found: Found, need_photos: bool) -> list[Photograph]:
     for row in rows:
         sides = row.size or ()
         if not np.isfinite([*row.pose.ravel(), *row.pinhole]).all() or not all(1 <= side <= MAX_SIDE for side in sides):
-            fail(
-                f"{what} is damaged: the pose or camera of {row.file.name} is not finite, or its picture has no "
-                f"pixels. {AGAIN}"
-            )
+            bad = f"the pose or camera of {row.file.name} is not finite, or its picture has no pixels"
+            fail(f"{what} is damaged: {bad}. {AGAIN}")
     if len(rows) < 2:
         fail(f"{what} has {len(rows)} photographs with poses: a scene needs many.")
     files = [row.file for row in rows]
@@ -69,10 +67,8 @@ def scanner_photographs(found: Found, need_photos: bool) -> list[Photograph]:
         size = image_size(path) or stated or (1, 1)
         camera = ColmapCamera("PINHOLE", *(stated or size), pinhole)
         if not in_proportion(camera.size, size):
-            fail(
-                f"{path} has {size[0]} x {size[1]} pixels, but its camera is for {camera.width} x {camera.height}, "
-                "which is another shape. Export it again."
-            )
+            there, size_of = "{} x {}".format(*size), f"{camera.width} x {camera.height}, which is another shape"
+            fail(f"{path} has {there} pixels, but its camera is for {size_of}. Export it again.")
         result.append(Photograph(path, camera.rescaled(*size), pose, f"the camera of {path}", maps=own or beside))
     return result
 

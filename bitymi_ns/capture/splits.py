@@ -96,10 +96,7 @@ def by_mode(names: Sequence[Path], mode: Mode, interval: int, fraction: float) -
     held_out = [i for i in indices if "train" not in names[i].name and "eval" in names[i].name]
     neither = [names[i].name for i in sorted(set(indices) - {*train, *held_out})]
     if neither:
-        fail(
-            f"--eval-mode filename: the names of photographs must contain train or eval, {listed(neither)} does not. "
-            "Use `--eval-names`, or another mode."
-        )
+        fail(f"--eval-mode filename: {listed(neither)} has neither train nor eval in its name. Use --eval-names.")
     return Split(train, held_out, "those with eval in their names")
 
 
@@ -150,10 +147,8 @@ def find(names: Sequence[Path], wanted: Sequence[str], source: str, any_folder: 
     for name in wanted:
         fitting = fit(name)
         if len(fitting) > 1:
-            fail(
-                f"{source}: {name} is the name of {len(fitting)} photographs, {listed([names[i] for i in fitting])}. "
-                "Give its folder, too."
-            )
+            several = f"{len(fitting)} photographs, {listed([names[i] for i in fitting])}"
+            fail(f"{source}: {name} is the name of {several}. Give its folder, too.")
         found += fitting
         unknown += [] if fitting else [name]
     if unknown:

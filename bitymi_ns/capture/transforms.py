@@ -234,10 +234,7 @@ def _check_applied(path: Path, meta: dict[str, Any]) -> None:
         singular = "maps the capture to a plane, a line or a point, which cannot be undone"
         if transform is None or abs(np.linalg.det(transform[:3, :3])) < 1e-12:
             fault = "is not a matrix of 3 x 4 finite numbers" if transform is None else singular
-            fail(
-                f"{path}: applied_transform {fault}. Correct it, or remove it: then exports are in the frame of this "
-                "file."
-            )
+            fail(f"{path}: applied_transform {fault}. Correct it, or remove it: then exports are in this file's frame.")
         meta["applied_transform"] = transform
     if "applied_scale" in meta:
         scale = check_number(path, "applied_scale", meta["applied_scale"], "for all frames")
@@ -297,10 +294,8 @@ def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path)
         if found is not None:
             focal[axis] = _focal_length(path, *found, sides[axis])
     if not focal:
-        fail(
-            f"{path} gives no focal length of {name}: neither fl_x nor camera_angle_x (radians) is in the frame or at "
-            "the top of the file. Add one of them."
-        )
+        where = "neither fl_x nor camera_angle_x (radians) is in the frame or at the top of the file"
+        fail(f"{path} gives no focal length of {name}: {where}. Add one of them.")
     fx, fy = focal.get("x", focal.get("y", 0.0)), focal.get("y", focal.get("x", 0.0))
     pinhole = (fx, fy, width / 2.0 if cx is None else cx, height / 2.0 if cy is None else cy)
     model, coefficients = _distortion(path, meta, frame)

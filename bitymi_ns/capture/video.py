@@ -31,6 +31,7 @@ TRUSTED = {
 }
 """FFmpeg options: a file of any name may be a list of files and URLs to read."""
 LEAST_SURVEYED = 60  # least number of surveyed frames: all of a clip of a second or two
+NO_MOTION = "shows no motion: its frames are all alike. Film while you walk slowly round the scene, with it in view"
 PQ, HLG = 16, 18  # transfer functions of high dynamic range, as ITU-T H.273 numbers them
 FULL_RANGE = 2
 WHITE = 203.0  # cd/m^2 of white paper in such films (ITU-R BT.2408), which becomes a screen's white
@@ -66,14 +67,9 @@ def extract_frames(video: Path, work: Path, count: int | None, progress: Progres
         return target
     seen, motion, sharp = _survey(video, progress)
     if len(seen) < 3:
-        raise CaptureError(
-            f"{video} holds {len(seen)} frames: film for at least ten seconds while you walk round the scene"
-        )
+        raise CaptureError(f"{video} holds {len(seen)} frames: film for ten seconds while you walk round the scene")
     if motion[-1] < STILL:
-        raise CaptureError(
-            f"{video} shows no motion: its frames are all alike. Film while you walk slowly round the scene, and turn "
-            "the camera to keep it in view"
-        )
+        raise CaptureError(f"{video} {NO_MOTION}")
     wanted = count or int(np.clip(round(motion[-1] / STRIDE), FEWEST, MOST))
     chosen = choose(np.array(motion), np.array(sharp), wanted)
     numbers = {seen[i] for i in chosen}

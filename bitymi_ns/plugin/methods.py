@@ -29,9 +29,8 @@ def _specification(name: str) -> MethodSpecification:
     except Exception as error:  # noqa: BLE001 - see the module's docstring
         reason = str(error) if isinstance(error, KernelsUnavailable) else f"{type(error).__name__}: {error}"
         warnings.warn(f"bitymi-ns: its methods are not available: {reason}", stacklevel=1)
-        return MethodSpecification(
-            config=UnavailableConfig(method_name=name, reason=reason), description=f"not available: {reason}"
-        )
+        config = UnavailableConfig(method_name=name, reason=reason)
+        return MethodSpecification(config=config, description=f"not available: {reason}")
 
 
 def _install() -> None:

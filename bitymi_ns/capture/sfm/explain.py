@@ -129,9 +129,8 @@ def only_turned(job: Job, database: Path) -> bool:
     for pair, geometry in tried:
         matches = np.asarray(geometry.inlier_matches)
         first, second = pycolmap.pair_id_to_image_pair(pair)
-        pair_of = [
-            (groups[images[i].name], points[i][column]) for i, column in zip((first, second), matches.T, strict=True)
-        ]
+        of_pair = zip((first, second), matches.T, strict=True)
+        pair_of = [(groups[images[i].name], points[i][column]) for i, column in of_pair]
         limit = ROTATED * max(1.0, max(pair_of[0][0].camera.size) / job.max_image_size)
         for guess in GUESSES[: 1 if all(each.prior for each, _ in pair_of) else None]:
             (a, focal), (b, _) = (_rays(*each, guess) for each in pair_of)

@@ -35,9 +35,8 @@ def match(job: Job, database: Path, tell: StageProgress, every: bool = False) ->
     tell("comparing photographs", 0, total, counts="two_view_geometries")
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
-    pycolmap.match_image_pairs(
-        database, pairing_options=options, verification_options=verification, device=pycolmap.Device.cpu
-    )
+    settings = {"pairing_options": options, "verification_options": verification}
+    pycolmap.match_image_pairs(database, **settings, device=pycolmap.Device.cpu)
     tell("comparing photographs", total, total)
 
 

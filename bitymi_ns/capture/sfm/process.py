@@ -109,10 +109,8 @@ def _why_ended(work: Path, source: Path, code: int) -> str:
     said = [line for line in log.splitlines() if line.strip() and not re.match(r"\*\*\* |PC: @| +@ ", line)]
     last = said[-1].split("] ", 1)[-1].strip() if said else ""
     free = shutil.disk_usage(work).free
-    full = any(
-        word in log
-        for word in ("disk is full", "No space left", "disk I/O error", "File too large", "readonly database")
-    )
+    signs = ("disk is full", "No space left", "disk I/O error", "File too large", "readonly database")
+    full = any(sign in log for sign in signs)
     if full or free < LITTLE_SPACE:
         return (
             f"{work} cannot be written: the disk or the quota is full ({size_text(free)} free on the disk). Free some "

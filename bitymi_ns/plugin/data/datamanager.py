@@ -126,9 +126,8 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         if test_mode == "val" and points is not None and len(points):
             seed = config.train_cameras_sampling_seed
             # called if a scene starts with these points: it reads the photographs
-            self.train_dataset.metadata["background_points"] = partial(
-                background_points, points, self.train_views, seed
-            )
+            found = partial(background_points, points, self.train_views, seed)
+            self.train_dataset.metadata["background_points"] = found
 
     def _has_photos(self, test_mode: str) -> bool:
         return test_mode != "inference" and NO_PHOTOS not in self.train_dataparser_outputs.metadata
@@ -170,10 +169,8 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         self._duplicates = images.duplicate_files(*files)
         images.warn_of_duplicates(self._duplicates, train, held_out)
         if count == 1 and test_mode == "val":
-            fail(
-                f"only one training view in {self.config.data}. A scene cannot be learned from one image: take "
-                "photographs from more sides."
-            )
+            one = f"only one training view in {self.config.data}"
+            fail(f"{one}. A scene cannot be learned from one image: take photographs from more sides.")
         if count < FEW_VIEWS and test_mode == "val":
             warn(
                 f"Only {count} training views: all of them are used for multi-view scoring, and views "

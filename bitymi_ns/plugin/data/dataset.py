@@ -207,10 +207,8 @@ def drop_blank_views(outputs: DataparserOutputs, split: str) -> DataparserOutput
             f"the masks of all {len(masks)} {split} photographs exclude every pixel: {named}. Pixels count where the "
             "mask is not black; if the masks are inverted, invert them."
         )
-    warn(
-        f"The masks of {len(blank)} of {len(masks)} {split} photographs exclude every pixel: {named}. These views are "
-        "left out."
-    )
+    blank_of = f"{len(blank)} of {len(masks)} {split} photographs"
+    warn(f"The masks of {blank_of} exclude every pixel: {named}. These views are left out.")
     return select_views(outputs, [i for i in range(len(masks)) if i not in blank])
 
 

@@ -174,10 +174,8 @@ def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> Datap
     """Downscale views of more than `longest` pixels along a side (0 = no limit), by their lenses. Raises InputError:
     `longest` is negative."""
     if longest < 0:
-        fail(
-            f"--pipeline.datamanager.longest-side is {longest}: give a number of pixels, or 0 to use photographs as "
-            "they are."
-        )
+        how = "give a number of pixels, or 0 to use photographs as they are"
+        fail(f"--pipeline.datamanager.longest-side is {longest}: {how}.")
     lenses: list[Lens] = outputs.metadata.get("lenses", [])
     sizes = [(lens.pinhole.width, lens.pinhole.height) for lens in lenses]
     large = [size for size in sizes if longest and max(size) > longest]
@@ -189,9 +187,8 @@ def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> Datap
     if verbose:
         width, height = max(large, key=max)
         say(
-            f"{len(large)} of {len(sizes)} training photographs have more than {longest} pixels along a side (up to "
-            f"{width} x {height}): they are reduced to that as they are read. --pipeline.datamanager.longest-side 0 "
-            "uses them as they are."
+            f"{len(large)} of {len(sizes)} training photographs, up to {width} x {height}, are reduced to {longest} "
+            "pixels along a side as they are read. --pipeline.datamanager.longest-side 0 uses them as they are."
         )
     return dataclasses.replace(
         outputs,

@@ -85,10 +85,8 @@ class CompactOptions:
             beside += MANIFEST_BYTES + most_bytes(int(1e6 * self.target_mb))
             most = int(1e6 * self.target_mb) - beside
             if most < 1:
-                fail(
-                    f"a bundle of {self.target_mb} MB leaves no bytes for the scene, as other files take "
-                    f"{beside:,}: ask for more (--target-mb)"
-                )
+                others = f"as other files take {beside:,}: ask for more (--target-mb)"
+                fail(f"a bundle of {self.target_mb} MB leaves no bytes for the scene, {others}")
         return Compact(self.compact_error, most, self.target_psnr)
 
 
@@ -189,10 +187,8 @@ class ExportAtlas(BakeOptions, CompactOptions):
         for name, options_of in (("polish", polish), ("finetune", None if polish or has_learned else tune)):
             if options_of is not None and options_of.steps < FEWEST_PASSES * len(views):
                 passes = options_of.steps / len(views)
-                say(
-                    f"The {name} has {options_of.steps:,} steps for {len(views):,} training photographs, {passes:.1f} "
-                    f"for each: more may gain (--{name}-steps)."
-                )
+                each = f"{len(views):,} training photographs, {passes:.1f} for each"
+                say(f"The {name} has {options_of.steps:,} steps for {each}: more may gain (--{name}-steps).")
         kept, learning_surfels = tune.cache_bytes if tune else 0, len(model.scene) if polish else 0
         state_export(model.scene, views, kept, learning_surfels, compact)
         try:
@@ -201,12 +197,10 @@ class ExportAtlas(BakeOptions, CompactOptions):
                 background = model.background.cpu()
                 photographs = datamanager.train_views
                 if polish or tune or learning.compact:
-                    photographs = corrected(
-                        photographs, model.resume_state.get("exposure"), datamanager.train_dataset.photographs
-                    )
-                baked = bake_and_learn(
-                    model.scene, views, photographs, background, options, learning, progress, held_out
-                )
+                    exposure = model.resume_state.get("exposure")
+                    photographs = corrected(photographs, exposure, datamanager.train_dataset.photographs)
+                learned = (options, learning, progress, held_out)
+                baked = bake_and_learn(model.scene, views, photographs, background, *learned)
         except (ValueError, RuntimeError) as error:
             fail(f"the scene cannot be baked: {error}", error)
         background = tuple(model.background.tolist())

@@ -57,9 +57,8 @@ def print_summary(folder: Path, info: Manifest) -> None:
         table.add_row("Bundle against trained scene", decibels(held_out.psnr_baked_against_neural))
         for name, form in (("Trained scene", "neural"), ("Bundle", "baked")):
             plain, fitted = (getattr(held_out, f"{kind}_{form}_against_photos") for kind in ("psnr", "fitted_psnr"))
-            table.add_row(
-                f"{name} against photographs", f"{decibels(plain)}, {decibels(fitted)} after a fit of the colours"
-            )
+            fit = f"{decibels(plain)}, {decibels(fitted)} after a fit of the colours"
+            table.add_row(f"{name} against photographs", fit)
     CONSOLE.print(table)
     say(f"Evaluate it with: ns-eval --load-config {shlex.quote(str(folder / 'config.yml'))}")
 

@@ -41,10 +41,8 @@ def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
         return config
 
     if bundle_at(load_config) is not None:
-        fail(
-            f"{load_config} is that of a bundle, which is baked already. Give the config.yml of the training run that "
-            "it was made from."
-        )
+        what = f"{load_config} is that of a bundle, which is baked already"
+        fail(f"{what}. Give the config.yml of the training run that it was made from.")
     if not load_config.is_file():
         fail(f"there is no {load_config}. Give the config.yml of a trained scene (ns-train says where it is).")
     try:
@@ -57,10 +55,8 @@ def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
             fail(f"{load_config} is not the configuration of a trained scene. ns-train says where it is.", error)
         fail(f"the checkpoint of {load_config} cannot be loaded: {detail or type(error).__name__}", error)
     if not isinstance(pipeline.model, BitymiModel):
-        fail(
-            f"{load_config} is a run of the method {config.method_name}, which cannot be baked; "
-            "give the config.yml of a bitymi training run"
-        )
+        what = f"{load_config} is a run of the method {config.method_name}, which cannot be baked"
+        fail(f"{what}; give the config.yml of a bitymi training run")
     return config, pipeline
 
 

@@ -105,10 +105,8 @@ class TrainingRun:
                 "look the other way (nerfstudio's axes are x right, y up, z back)."
             )
         if blind:
-            warn(
-                f"{listed(blind)} sees none of the points that training starts from: the pose may be wrong, or the "
-                "point cloud has no points there."
-            )
+            none = f"{listed(blind)} sees none of the points that training starts from"
+            warn(f"{none}: the pose may be wrong, or the point cloud has no points there.")
 
     def callbacks(self) -> list[TrainingCallback]:
         return [

@@ -90,8 +90,6 @@ def read_camera_path(file: Path) -> CameraPath:
         warn("Crop boxes are not supported: the whole scene is rendered.")
     widest = max(frame.fov for frame in path.camera_path)
     if widest < math.pi:
-        warn(
-            f"The fields of view of {file} are at most {widest:.3g} degrees. If radians were meant, fov has to be "
-            f"{math.degrees(widest):.3g}."
-        )
+        radians = f"If radians were meant, fov has to be {math.degrees(widest):.3g}."
+        warn(f"The fields of view of {file} are at most {widest:.3g} degrees. {radians}")
     return path

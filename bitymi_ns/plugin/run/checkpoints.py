@@ -67,9 +67,7 @@ def path_of(folder: Path, step: int) -> Path:
 def load(path: Path, scene: SceneConfig) -> dict[str, Any]:
     """Read a checkpoint of a scene of this kind."""
     if path.is_dir():
-        fail(
-            f"{path} is a folder: give one of the files step-*.ckpt with --load-checkpoint, or a folder with --load-dir"
-        )
+        fail(f"{path} is a folder: give one of its files step-*.ckpt with --load-checkpoint, or --load-dir")
     if not path.is_file():
         fail(f"there is no checkpoint {path}")
     others = sorted(p.name for p in path.parent.glob("step-*.ckpt") if p != path)
@@ -86,10 +84,8 @@ def load(path: Path, scene: SceneConfig) -> dict[str, Any]:
     except Misfit as error:
         fail(f"the checkpoint {path} was altered, or is not of this method: {error}. {way_out}.", error)
     if broken:
-        warn(
-            f"The checkpoint {path} holds numbers that are not finite, or too large to be drawn, in {listed(broken)}: "
-            "expect holes, or black."
-        )
+        where = f"holds numbers that are not finite, or too large to be drawn, in {listed(broken)}"
+        warn(f"The checkpoint {path} {where}: expect holes, or black.")
     return state
 
 

@@ -117,10 +117,10 @@ class BitymiTrainerConfig(TrainerConfig):
                 fail(f"an option is out of range (--pipeline.model.*): {error}", error)
         for name in ("mixed_precision", "use_grad_scaler"):
             if getattr(self, name):
+                option = f"--{name.replace('_', '-')} True"
                 fail(
-                    f"--{name.replace('_', '-')} True is not supported: it scales the loss, and with it the gradients "
-                    "by which texels move and surfels are densified. The kernels compute in single precision anyway; "
-                    "leave the option out"
+                    f"{option} is not supported: it scales the loss, and with it the gradients by which texels move "
+                    "and surfels are densified. The kernels compute in single precision anyway; leave the option out"
                 )
         if machine.num_machines != 1:
             fail(f"a run is of one machine, not {machine.num_machines} (--machine.num-machines)")

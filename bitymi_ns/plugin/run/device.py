@@ -43,9 +43,8 @@ def kernel_device(device: torch.device | str) -> torch.device:
     """Return the device, or the CPU if the kernels cannot run on it: nerfstudio's tools pick any GPU."""
     device = torch.device(device)
     if device.type != "cpu":
-        problem = (
-            why_not_cuda(device.index) if device.type == "cuda" else f"there are no kernels for the device '{device}'"
-        )
+        none = f"there are no kernels for the device '{device}'"
+        problem = why_not_cuda(device.index) if device.type == "cuda" else none
         if problem is None:
             return device
         warn_once(f"The scene stays on the CPU: {problem}.")

@@ -67,10 +67,7 @@ def film(path: Path, fps: float) -> Iterator[Add]:
         except av.FFmpegError as error:
             if isinstance(error, OSError) and error.errno:
                 raise OSError(error.errno, error.strerror) from error
-            fail(
-                f"{path}: H.264 cannot encode it ({error}). Choose another size, or --output-format images.",
-                error,
-            )
+            fail(f"{path}: H.264 cannot encode it ({error}). Choose another size, or --output-format images.", error)
 
 
 @contextmanager

@@ -96,9 +96,8 @@ def state_training(
         needed += (PER_TEXEL + card * PER_TEXEL_SUM) * (SMALLEST**2 * surfels + most)
         needed += len(cameras) * surfels  # of `Visibility`, at most a byte for each surfel and view
     if card:  # a bound on fragments would bring lists, which take more memory
-        advice = (
-            f"train fewer surfels (--max-surfels {max(1, surfels // 2)}) or smaller photographs (--downscale-factor 2)"
-        )
+        fewer = f"train fewer surfels (--max-surfels {max(1, surfels // 2)})"
+        advice = f"{fewer} or smaller photographs (--downscale-factor 2)"
     else:
         option = f"--pipeline.model.scene.max-fragments {max(1, fragments // 4)}"
         advice = f"draw large views in smaller parts, which takes longer: {option}"
@@ -161,7 +160,5 @@ def _state(what: str, needed: float, cameras: Sequence[Camera], advice: str, dev
     of_machine = min(psutil.virtual_memory().available + psutil.Process().memory_info().rss, memory_limit())
     available = free_memory(device) if card else of_machine
     if needed > available:
-        warn(
-            f"That is more than the {available / 1e9:.1f} GB that {where} has available. Close other programs, or "
-            f"{advice}."
-        )
+        there = f"the {available / 1e9:.1f} GB that {where} has available"
+        warn(f"That is more than {there}. Close other programs, or {advice}.")

@@ -84,9 +84,8 @@ class BitymiModel(SurfelModel):
             self.config.train, self.metadata.get("alpha_color"), bool(self.metadata.get("transparent"))
         )
         points = self.kwargs.pop("seed_points", None)
-        self.scene = new_scene(
-            points, self.scene_box, self.config.scene, self.train_config, self.metadata, self.config.steps
-        )
+        config, steps = self.config.scene, self.config.steps
+        self.scene = new_scene(points, self.scene_box, config, self.train_config, self.metadata, steps)
         self.metadata["first_surfels"] = len(self.scene)  # checkpoints may have another number
         self.trained_for: int | None = None
         self.resume_state: dict[str, Any] = {}
@@ -238,10 +237,8 @@ def new_scene(
         )
     if report.not_finite:
         row = int(torch.nonzero(~torch.isfinite(xyz).all(1))[0])
-        warn(
-            f"{report.not_finite} of {report.given} points of the capture are NaN or infinite (the "
-            f"first is point {row}); they are left out."
-        )
+        what = f"{report.not_finite} of {report.given} points of the capture are NaN or infinite"
+        warn(f"{what} (the first is point {row}); they are left out.")
     return scene
 
 

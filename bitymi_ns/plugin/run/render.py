@@ -196,10 +196,8 @@ def write_trajectory(model: SurfelModel, cameras: Cameras, command: Any, seconds
         what += f", {fps:.3g} per second, {size_text(target.stat().st_size)}"
     say(f"{target}: {what}; {time.monotonic() - started:.1f} s")
     if empty:
-        warn(
-            f"{empty} of {len(views)} frames show nothing of the scene: the cameras look past it, or the path was made "
-            "for another one."
-        )
+        nothing = f"{empty} of {len(views)} frames show nothing of the scene"
+        warn(f"{nothing}: the cameras look past it, or the path was made for another one.")
 
 
 def _picture(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from abc import abstractmethod
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
@@ -133,9 +134,8 @@ class SurfelModel(Model):
         metrics.update(self.sizes())
         camera = getattr(self, "_last_camera", None)
         if self.measure_time and camera is not None and (camera.width, camera.height) == (width, height):
-            metrics["render_ms"] = render_milliseconds(
-                lambda: self.render(camera, self.background, maps=False), self.device
-            )
+            draw = partial(self.render, camera, self.background, maps=False)
+            metrics["render_ms"] = render_milliseconds(draw, self.device)
         return metrics, {"img": torch.cat([target, rgb], dim=1)}
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:

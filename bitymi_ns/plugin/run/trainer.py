@@ -76,9 +76,8 @@ class BitymiTrainer(Trainer):
             CONSOLE.print("[bold yellow]Interrupted before the first step; there is nothing to save.")
             raise SystemExit(INTERRUPTED) from None
         parser = self.pipeline.datamanager.dataparser
-        run_folder.keep_poses_report(
-            self.base_dir, getattr(parser, "poses_report", None), getattr(parser, "sfm_source", None)
-        )
+        found = (getattr(parser, name, None) for name in ("poses_report", "sfm_source"))
+        run_folder.keep_poses_report(self.base_dir, *found)
         for line in getattr(self.viewer_state, "viewer_info", []):
             CONSOLE.print(line, soft_wrap=True)
         # last callback of a step: the complete state can be saved
@@ -136,10 +135,8 @@ class BitymiTrainer(Trainer):
     def _train_to_the_end(self) -> None:
         total = self.config.max_num_iterations
         if self._start_step >= total:
-            warn(
-                f"Nothing to do: the checkpoint has {self._start_step:,} of {total:,} steps. For a longer run give a "
-                "larger --max-num-iterations."
-            )
+            done = f"the checkpoint has {self._start_step:,} of {total:,} steps"
+            warn(f"Nothing to do: {done}. For a longer run give a larger --max-num-iterations.")
             return
         if self.processes.first:  # of every parameter a checkpoint holds the value and Adam's two moments
             learned = [p.nbytes for p in self.pipeline.parameters() if p.requires_grad]

@@ -96,7 +96,7 @@ def replace_stale(work: Path, photographs: Path, contents: str) -> None:
     source = os.path.relpath(os.path.realpath(photographs), os.path.realpath(work))  # lasts if both move
     write_file(work / OF, json.dumps({"source": source, "contents": contents}).encode())
     for other in work.parent.glob(f"{work.name.partition('-')[0]}-*"):
-        if other != work and _is_stale(other, source, contents):
+        if other != work and is_own(other) and _is_stale(other, source, contents):
             try:
                 with files.Lock(other / ".lock", tell=lambda text: None):
                     shutil.rmtree(other, ignore_errors=True)
@@ -105,8 +105,6 @@ def replace_stale(work: Path, photographs: Path, contents: str) -> None:
 
 
 def _is_stale(other: Path, source: str, contents: str) -> bool:
-    if not is_own(other):
-        return False
     try:
         of = read_json(other / OF)
         if of["source"] != source or of["contents"] == contents:

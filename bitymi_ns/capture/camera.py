@@ -107,7 +107,7 @@ def colmap_distortion(kind: str, values: Sequence[float], label: str) -> tuple[s
     k1, k2, k3, k4, p1, p2 = values
     if k4 != 0.0:
         fail(
-            f"the camera {label} cannot be used: its k4 is {k4:g}, but perspective cameras have k1 to k3, p1, p2 alone. "
+            f"the camera {label} cannot be used: its k4 is {k4:g}, but perspective cameras have k1 to k3, p1, p2 only. "
             "For a fisheye write camera_model OPENCV_FISHEYE; else undistort first (COLMAP's image_undistorter)."
         )
     if k3 != 0.0:

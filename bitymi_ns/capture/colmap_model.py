@@ -115,10 +115,8 @@ def _warn_of_other_form(folder: Path, cameras: dict[int, ColmapCamera], images: 
     if path.is_file() and _parsed(path, _cameras_text, _cameras_binary, dict) != cameras:
         differences.append("other cameras in text than in binary form")
     if differences:
-        warn(
-            f"{folder} holds two models: {' and '.join(differences)}. The text is read. To have the binary one read, "
-            "move cameras.txt, images.txt and points3D.txt away."
-        )
+        advice = "To have the binary one read, move cameras.txt, images.txt and points3D.txt away."
+        warn(f"{folder} holds two models: {' and '.join(differences)}. The text is read. {advice}")
 
 
 def _parsed(

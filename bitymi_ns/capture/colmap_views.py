@@ -84,15 +84,9 @@ def find_source(
     downscale: int = 1,
     need_photos: bool = True,
 ) -> Source:
-    """Find a model's photographs and masks; photographs may be missing unless needed.
-
-    Args:
-        capture: folder to which paths are relative, and below which photographs are searched; above it, too, if it is
-            that of the model.
-
-    Raises:
-        CaptureError: no folder has the model's photographs, or masks are incomplete.
-    """
+    """Find a model's photographs and masks; photographs may be missing unless needed. `capture`: folder to which paths
+    are relative, and below which photographs are searched; above it, too, if it is that of the model. Raises
+    CaptureError: no folder has the model's photographs, or masks are incomplete."""
     names = [image.name for image in read_model(folder).images]
     photographs = _photo_folder(names, folder, capture, images_path, downscale, need_photos)
     return make_source(folder, photographs, find_masks(photographs, capture, masks_path, downscale), downscale)
@@ -121,10 +115,8 @@ def _photo_folder(
     if stated is not None:
         if not need_photos or (capture / stated).is_dir() or (capture / f"{stated}_{downscale}").is_dir():
             return capture / stated
-        fail(
-            f"the folder of photographs {capture / stated} does not exist. Give it, seen from {capture}, with "
-            "--images-path, or leave that out to have it found."
-        )
+        advice = f"Give it, seen from {capture}, with --images-path, or leave that out to have it found."
+        fail(f"the folder of photographs {capture / stated} does not exist. {advice}")
     bases = [capture]
     if folder.is_relative_to(capture):
         bases += [path for path in folder.parents if path.is_relative_to(capture) and path != capture]

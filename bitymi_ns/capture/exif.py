@@ -18,8 +18,7 @@ STILL = 0.1  # tolerance of the acceleration of a phone held still, g
 class Exif:
     """EXIF of one photograph."""
 
-    camera: str = ""
-    """Make, model, lens and focal length; photographs of equal ones and equal size share a camera."""
+    camera: str = ""  # Make, model, lens and focal length; photographs of equal ones and equal size share a camera.
     focal_length: float | None = None  # pixels; None = none plausible
     doubt: str = ""  # why a stated focal length is not used
     position: tuple[float, float, float] | None = None  # latitude and longitude in degrees, altitude in metres

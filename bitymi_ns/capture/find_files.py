@@ -4,9 +4,9 @@ import difflib
 import os
 import re
 import unicodedata
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -33,22 +33,17 @@ def without_extension(parts: Parts) -> Parts:
     return (*parts[:-1], stem if ending in PHOTOGRAPHS else parts[-1])
 
 
+@dataclass
 class FileFinder:
     """Finds files below a folder by names that machines and programs may have changed, if only one file fits.
 
     Tries, in order: the exact name; other separators, case, Unicode form or leading folders, as of absolute names;
     another extension, or none.
-
-    Args:
-        folder: to which the names are relative.
-        outside: allow names that lead out of the folder.
-        extensions: of the files, in lower case.
     """
 
-    def __init__(self, folder: Path, outside: bool = False, extensions: tuple[str, ...] = PHOTOGRAPHS) -> None:
-        self.folder = folder
-        self.outside = outside
-        self.extensions = extensions
+    folder: Path  # to which names are relative
+    outside: bool = False  # allow names that lead out of it
+    extensions: tuple[str, ...] = PHOTOGRAPHS  # of the files, in lower case
 
     def find(self, name: str) -> Path | None:
         """Find a file; None = none, or more than one."""
@@ -64,17 +59,10 @@ class FileFinder:
     def find_all(self, names: Sequence[str]) -> list[Path | None]:
         """Find files of several names. A file that fits two names is that of the exact one, or of none."""
         found = [self.find(name) for name in names]
-        users: dict[Path, list[int]] = defaultdict(list)
-        for i, path in enumerate(found):
-            if path is not None:
-                users[path].append(i)
-        for path, numbers in users.items():
-            if len(numbers) > 1:
-                exact = [i for i in numbers if self.folder / names[i] == path]
-                for i in numbers:
-                    if len(exact) != 1 or i != exact[0]:
-                        found[i] = None
-        return found
+        exact = [self.folder / name == path for name, path in zip(names, found, strict=True)]
+        users, sure = Counter(found), Counter(path for path, same in zip(found, exact, strict=True) if same)
+        unique = [users[path] == 1 or (same and sure[path] == 1) for path, same in zip(found, exact, strict=True)]
+        return [path if alone else None for path, alone in zip(found, unique, strict=True)]
 
     def _allowed(self, name: str) -> bool:
         return self.outside or leads_inside(name)

@@ -66,15 +66,9 @@ def local_positions(
     w = 1 - eccentricity * np.sin(latitude) ** 2
     north = EARTH * (1 - eccentricity) / w**1.5
     east = EARTH / np.sqrt(w) * np.cos(latitude)
-    local = {
-        name: [
-            float(np.radians(lon - middle[1]) * east),
-            float(np.radians(lat - middle[0]) * north),
-            float(alt - middle[2]),
-        ]
-        for name, (lat, lon, alt) in gps.items()
-    }
-    return local, (float(middle[0]), float(middle[1]), float(middle[2]))
+    values = np.array(list(gps.values()))
+    local = np.column_stack([np.radians(values[:, 1::-1] - middle[1::-1]) * (east, north), values[:, 2] - middle[2]])
+    return dict(zip(gps, local.tolist(), strict=True)), tuple(middle.tolist())
 
 
 def move_to_world(

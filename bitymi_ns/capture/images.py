@@ -25,6 +25,11 @@ MAX_PIXELS = 1_000_000_000  # photographs with more pixels are refused; phones t
 THREADS = 4
 PROPORTIONS = 0.02  # relative difference of aspect ratios by rounding
 FINGERPRINT_SIZE = 64  # pixels across and down that fingerprints compare
+EMPTY: dict[str, Callable[[npt.NDArray[np.uint8]], bool]] = {
+    "transparent everywhere": lambda image: image.shape[-1] == 4 and not image[..., 3].any(),
+    "of one color throughout": lambda image: bool((image == image[0, 0]).all()),
+}
+"""Photographs from which nothing can be learned."""
 FINGERPRINT_SIZE = 64  # pixels across, and down, by which photographs are compared
 
 
@@ -194,20 +199,8 @@ def summarize(image: npt.NDArray[np.uint8]) -> ImageSummary:
     height, width = image.shape[:2]
     sample = image[:: max(1, height // FINGERPRINT_SIZE), :: max(1, width // FINGERPRINT_SIZE)]
     fingerprint = hashlib.sha256(repr(image.shape).encode() + sample.tobytes()).digest()
-    empty = ""
-    if _transparent(sample) and _transparent(image):
-        empty = "transparent everywhere"
-    elif _plain(sample) and _plain(image):
-        empty = "of one color throughout"
+    empty = next((what for what, test in EMPTY.items() if test(sample) and test(image)), "")
     return ImageSummary(empty, fingerprint)
-
-
-def _transparent(image: npt.NDArray[np.uint8]) -> bool:
-    return image.shape[-1] == 4 and not image[..., 3].any()
-
-
-def _plain(image: npt.NDArray[np.uint8]) -> bool:
-    return bool((image == image[0, 0]).all())
 
 
 Pair = tuple[int, int]  # index of a training photograph, and of a held-out one
@@ -240,7 +233,5 @@ def warn_of_duplicates(pairs: Sequence[Pair], train: Sequence[Path], held_out: S
     if not pairs or list(train) == list(held_out):
         return
     named = listed([f"{held_out[j]} = {train[i]}" for i, j in pairs])
-    warn(
-        f"{len(pairs)} of {len(held_out)} held-out photographs are training photographs, too: {named}. Figures on them "
-        "say nothing about new views: remove the duplicates from the capture."
-    )
+    advice = "Figures on them say nothing about new views: remove the duplicates from the capture."
+    warn(f"{len(pairs)} of {len(held_out)} held-out photographs are training photographs, too: {named}. {advice}")

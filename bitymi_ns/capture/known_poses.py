@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from bitymi_ns.capture.cache import content_key, made_once, replace_stale
 from bitymi_ns.capture.camera import OPENCV_AXES, ColmapCamera, Photograph
@@ -105,7 +104,11 @@ def _job(stated: Sequence[str], views: Sequence[KnownView], work: Path) -> Job:
     names, poses = {}, {}
     for i, (name, view) in enumerate(zip(stated, views, strict=True)):
         suffix = view.file.suffix.lower()
-        converted = _converted(view.file)
+        try:
+            with open_picture(view.file) as image:
+                converted = None if is_plain(image, view.file) else in_srgb(eight_bits(image)).convert("RGB")
+        except Exception as error:
+            raise CaptureError(f"{view.file} cannot be read as a picture: save it again") from error
         plain = f"{i:06d}{suffix if converted is None else '.png'}"
         if converted is None:
             (links / plain).symlink_to(view.file.resolve())
@@ -125,12 +128,3 @@ def _job(stated: Sequence[str], views: Sequence[KnownView], work: Path) -> Job:
         names=names,
         poses=poses,
     )
-
-
-def _converted(file: Path) -> Image.Image | None:
-    """Convert a photograph for COLMAP; None = COLMAP reads the file itself."""
-    try:
-        with open_picture(file) as image:
-            return None if is_plain(image, file) else in_srgb(eight_bits(image)).convert("RGB")
-    except Exception as error:
-        raise CaptureError(f"{file} cannot be read as a picture: save it again") from error

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import numpy.typing as npt
-import pycolmap
 from PIL import Image
 
 from bitymi_ns.capture.camera import ColmapCamera, Photograph, is_full_sphere
@@ -87,7 +86,8 @@ class Lens:
     @property
     def distorts(self) -> bool:
         """True if undistorting moves pixels."""
-        return bool(self.face) or _distorts(self.camera.colmap)
+        camera = self.camera.colmap  # pycolmap tests coefficients alone; fisheye models distort without any
+        return bool(self.face) or camera.is_perspective_fisheye() or not camera.is_undistorted()
 
     @property
     def turn(self) -> npt.NDArray[np.float64]:
@@ -197,9 +197,9 @@ def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tupl
             "lengths have to be positive and all parameters finite. Correct it, or export the model from COLMAP again."
         )
     center = (camera.principal_point_x, camera.principal_point_y)
-    if not _distorts(camera):
-        pinhole = Pinhole(*focal, *center, width, height)
-        return [Lens(colmap, stored, pinhole)], []
+    lens = Lens(colmap, stored, Pinhole(*focal, *center, width, height))
+    if not lens.distorts:
+        return [lens], []
     left, right, top, bottom = _window(colmap)
     w, h = int((left + right) * focal[0]), int((top + bottom) * focal[1])
     share = w * h / (width * height)
@@ -220,7 +220,7 @@ def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tupl
             f"{label} is {model}: its photographs are used as pinhole pictures of {across:.0f} x {down:.0f} degrees "
             f"({w} x {h} pixels); what they show beyond is not used."
         )
-    return [Lens(colmap, stored, pinhole)], messages
+    return [replace(lens, pinhole=pinhole)], messages
 
 
 def make_lenses(photographs: Sequence[Photograph], downscale: int = 1, need_photos: bool = True) -> list[list[Lens]]:
@@ -273,11 +273,6 @@ def _faces(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tuple[l
     named = ", ".join(f"{lens.face} {lens.pinhole.width} x {lens.pinhole.height}" for lens in lenses)
     becomes = f"each of its photographs becomes {len(lenses)} pinhole pictures ({named})"
     return lenses, [f"{label} is {colmap.model}: {becomes}."]
-
-
-def _distorts(camera: pycolmap.Camera) -> bool:
-    # pycolmap tests coefficients alone; fisheye models distort without any
-    return camera.is_perspective_fisheye() or not camera.is_undistorted()
 
 
 def _window(camera: ColmapCamera) -> tuple[float, float, float, float]:

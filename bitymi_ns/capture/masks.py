@@ -116,14 +116,8 @@ def masks_named(masks: Path, names: Sequence[str], needed: bool = True) -> list[
 
 def with_masks(photographs: Sequence[Photograph], capture: Path, base: Path | None = None) -> list[Photograph]:
     """Give photographs the masks beside them, and report so: instant-ngp's, of which some may be missing, or those of a
-    folder `masks`; see `mask_folder`.
-
-    Args:
-        base: folder to which names of masks are relative; None = that of all photographs.
-
-    Raises:
-        CaptureError: the folder has masks of some photographs only.
-    """
+    folder `masks`; see `mask_folder`. `base`: folder to which names of masks are relative; None = that of all
+    photographs. Raises CaptureError: the folder has masks of some photographs only."""
     files = [each.file for each in photographs]
     dynamic = [file.with_name(f"{DYNAMIC_MASK}{file.stem}.png") for file in files]
     found: Sequence[Path | None] | None = [file if file.is_file() else None for file in dynamic]

@@ -14,6 +14,7 @@ from bitymi_ns.progress import Progress
 from bitymi_ns.trust import inside
 
 CLOUD = "sparse_pc.ply"
+SIZES = ("w", "h", "fl_x", "fl_y", "cx", "cy")
 
 
 def write_capture(poses: Poses, folder: Path, progress: Progress) -> None:
@@ -66,13 +67,6 @@ def intrinsics(camera: pycolmap.Camera) -> dict[str, object]:
     distortion = dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
     first = sum(len(part) for part in (camera.focal_length_idxs(), camera.principal_point_idxs()))
     distortion |= dict(zip(distortion, camera.params[first:].tolist(), strict=False))
-    return {
-        "camera_model": "OPENCV",
-        "w": camera.width,
-        "h": camera.height,
-        "fl_x": camera.focal_length_x,
-        "fl_y": camera.focal_length_y,
-        "cx": camera.principal_point_x,
-        "cy": camera.principal_point_y,
-        **distortion,
-    }
+    focal = (camera.focal_length_x, camera.focal_length_y)
+    sizes = (camera.width, camera.height, *focal, camera.principal_point_x, camera.principal_point_y)
+    return {"camera_model": "OPENCV", **dict(zip(SIZES, sizes, strict=True)), **distortion}

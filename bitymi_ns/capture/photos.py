@@ -85,10 +85,8 @@ def check_names(folder: Path, names: Sequence[str]) -> None:
     wrong = [name for name in (where, *names) if not is_text(name)]
     if wrong:
         more = f" and of {len(wrong) - 1} more" if len(wrong) > 1 else ""
-        raise CaptureError(
-            f"in {where}, the name of {wrong[0]}{more} is not UTF-8: rename it (`convmv -r -f latin1 -t utf8 --notest "
-            "FOLDER` does so for names in an older encoding)"
-        )
+        advice = "rename it (`convmv -r -f latin1 -t utf8 --notest FOLDER` does so for names in an older encoding)"
+        raise CaptureError(f"in {where}, the name of {wrong[0]}{more} is not UTF-8: {advice}")
 
 
 def read_photos(folder: Path, names: list[str], progress: Progress) -> tuple[list[Photo], dict[str, str]]:

@@ -221,10 +221,8 @@ def refusal(folder: Path) -> str:
         bundle = f"{folder} is a bundle, not a capture: give the folder of its photographs."
         return f"{bundle} `bitymi view {folder}` shows the bundle."
     if what == RUN:
-        return (
-            f"{folder} is a training run, not a capture: give the folder of its photographs, and --load-dir "
-            f"{folder}/nerfstudio_models to go on with the run."
-        )
+        advice = f"give the folder of its photographs, and --load-dir {folder}/nerfstudio_models to go on with the run."
+        return f"{folder} is a training run, not a capture: {advice}"
     return ""
 
 

@@ -41,16 +41,18 @@ def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source
     length = np.sqrt(np.square(unit).sum((1, 2)) / 3.0)
     scale, unit = largest * length, unit / length[:, None, None]
     error = np.abs(unit.transpose(0, 2, 1) @ unit - np.eye(3)).max((1, 2))
+
+    def named(wrong: npt.NDArray[np.bool_]) -> str:
+        return listed([names[i] for i in wrong.nonzero()[0]])
+
     for what, wrong in (
         ("is not finite", ~finite),
         ("is zero", finite & ~usable),
         ("is sheared or stretched: its columns are not at right angles and equally long", usable & (error > ROUNDED)),
     ):
         if wrong.any():
-            fail(
-                f"{source}: the 3 x 3 part of the pose of {listed([names[i] for i in wrong.nonzero()[0]])} is no "
-                f"rotation, it {what}. Correct the pose or remove the frame."
-            )
+            advice = "Correct the pose or remove the frame."
+            fail(f"{source}: the 3 x 3 part of the pose of {named(wrong)} is no rotation, it {what}. {advice}")
     scaled = np.abs(scale - 1.0) > EXACT
     result[scaled] = unit[scaled]
     rounded = error > EXACT
@@ -59,16 +61,12 @@ def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source
     if scaled.any():
         low, high = scale[scaled].min(), scale[scaled].max()
         factor = f"{low:.4g}" if high - low <= EXACT * high else f"{low:.4g} to {high:.4g}"
-        warn(
-            f"{source}: rotations are scaled by {factor} in the poses of "
-            f"{listed([names[i] for i in scaled.nonzero()[0]])}. The factor is divided out; positions stay as they are."
-        )
+        advice = "The factor is divided out; positions stay as they are."
+        warn(f"{source}: rotations are scaled by {factor} in the poses of {named(scaled)}. {advice}")
     only_rounded = rounded & ~scaled
     if only_rounded.any():
-        warn(
-            f"{source}: rotations are off by up to {error[only_rounded].max():.1g} in the poses of "
-            f"{listed([names[i] for i in only_rounded.nonzero()[0]])}. The nearest ones are used."
-        )
+        off = f"rotations are off by up to {error[only_rounded].max():.1g} in the poses of {named(only_rounded)}"
+        warn(f"{source}: {off}. The nearest ones are used.")
     return result
 
 
@@ -83,10 +81,8 @@ def correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
             fail(f"{path}: {what}. Correct it or remove the frame.")
         if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
             row = " ".join(f"{x:g}" for x in pose[3])
-            fail(
-                f"{path}: the last row of the transform_matrix of {name} is {row}, not 0 0 0 1. A matrix whose "
-                "position stands in its last row has to be transposed."
-            )
+            advice = "A matrix whose position stands in its last row has to be transposed."
+            fail(f"{path}: the last row of the transform_matrix of {name} is {row}, not 0 0 0 1. {advice}")
         poses.append(pose)
     matrices = np.stack(poses)
     matrices[:, :3, :3] = rotations(matrices[:, :3, :3], names, str(path))
@@ -170,10 +166,8 @@ def fit_scale(frame: FrameOptions, photographs: Sequence[Photograph], source: st
         return frame
     scale = frame.scale_factor * USUAL_SPREAD / ratio
     usual = f"{USUAL_SPREAD * frame.scene_scale / frame.scale_factor:.2g}"
-    say(
-        f"The cameras of {source} lie {spread:,.4g} units from their middle, {usual} are usual: the capture is scaled "
-        f"by {scale:.3g}. Bundles state that."
-    )
+    more = f"the capture is scaled by {scale:.3g}. Bundles state that."
+    say(f"The cameras of {source} lie {spread:,.4g} units from their middle, {usual} are usual: {more}")
     return replace(frame, scale_factor=scale)
 
 
@@ -202,10 +196,8 @@ def check_point_unit(
             f"{_rounded(away / apart)} times as far from the cameras as these are from their middle. {hint}"
         )
     elif 0.0 < spread < picture / OTHER_UNIT:
-        warn(
-            "The point cloud seems to be in another unit than the poses: half of its points lie in a spot that is "
-            f"1/{_rounded(picture / spread)} of a picture's width. {hint}"
-        )
+        advice = f"half of its points lie in a spot that is 1/{_rounded(picture / spread)} of a picture's width. {hint}"
+        warn(f"The point cloud seems to be in another unit than the poses: {advice}")
 
 
 def _rounded(ratio: float) -> str:

@@ -90,17 +90,13 @@ def _what(source: Path) -> tuple[Path, Path, list[str]]:
         return videos[0], videos[0], []
     if len(names) < LEAST:
         also = f" Of its {len(videos)} videos, name one." if videos and not names else ""
-        raise CaptureError(f"{folder} holds {_few(len(names))}.{also}")
+        held = {0: "no photographs", 1: "one photograph"}.get(len(names), f"{len(names)} photographs")
+        raise CaptureError(
+            f"{folder} holds {held}: camera poses need at least {LEAST}, and a scene 20 to 200. Walk round it and take "
+            f"photographs of which each shares at least two thirds with the one before.{also}"
+        )
     below = os.path.commonpath([f"./{os.path.dirname(name)}" for name in names])  # as if this folder were named
     return source, folder / below, [os.path.relpath(name, below) for name in names]
-
-
-def _few(count: int) -> str:
-    held = {0: "no photographs", 1: "one photograph"}.get(count, f"{count} photographs")
-    return (
-        f"{held}: camera poses need at least {LEAST}, and a scene 20 to 200. Walk round it and take photographs of "
-        "which each shares at least two thirds with the one before"
-    )
 
 
 def _finished(work: Path, folder: Path) -> Poses | None:
@@ -123,12 +119,11 @@ def _find(
 ) -> Poses:
     begun = time.monotonic()
     seconds: dict[str, float] = {}
-    video = not names
+    given, video = len(names), not names
     if video:
         folder = extract_frames(source, work, options.frames, tell)
         names = find_photos(folder)
-        seconds["taking frames"] = time.monotonic() - begun
-    given = len(names)
+        given, seconds["taking frames"] = len(names), time.monotonic() - begun
     read = time.monotonic()
     photos, left_out = read_photos(folder, names, tell)
     photos = _with_panoramas(source, photos, left_out, options.camera_model == SPHERICAL_MODEL)
@@ -137,7 +132,14 @@ def _find(
     photos = [photo for photo in photos if photo.name not in twins]
     seconds["reading photographs"] = time.monotonic() - read
     if len(photos) < LEAST:
-        raise CaptureError(_too_few_left(source, folder, photos, left_out, twins, video))
+        if video:
+            raise CaptureError(f"{source} {NO_MOTION}")
+        some = "; ".join(f"{name}: {why}" for name, why in list(left_out.items())[:3])
+        some += f"; and {len(left_out) - 3} more" if len(left_out) > 3 else ""
+        use, then = "can be used", "copy or export them again"
+        if len(twins) >= len(left_out) - len(twins):
+            use, then = "differ", "take photographs from different places"
+        raise CaptureError(f"of the photographs in {folder}, only {len(photos)} {use} ({some}): {then}")
     photos = ordered(photos)
     started = time.monotonic()
     images, used = upright_photos(photos, folder, work, tell)
@@ -169,25 +171,6 @@ def _with_panoramas(source: Path, photos: list[Photo], left_out: dict[str, str],
         )
     left_out |= dict.fromkeys(partial, "a panorama, but not of all directions (twice as wide as high)")
     return [photo for photo in photos if photo.name not in left_out]
-
-
-def _too_few_left(
-    source: Path,
-    folder: Path,
-    photos: Sequence[Photo],
-    left_out: Mapping[str, str],
-    twins: Mapping[str, str],
-    video: bool,
-) -> str:
-    if video:
-        return f"{source} {NO_MOTION}"
-    some = "; ".join(f"{name}: {why}" for name, why in list(left_out.items())[:3])
-    more = f"; and {len(left_out) - 3} more" if len(left_out) > 3 else ""
-    if len(twins) >= len(left_out) - len(twins):
-        return (
-            f"only {len(photos)} of the photographs in {folder} differ ({some}{more}): take them from different places"
-        )
-    return f"of the photographs in {folder}, only {len(photos)} can be used ({some}{more}). Copy or export them again"
 
 
 def ordered(photos: list[Photo]) -> list[Photo]:

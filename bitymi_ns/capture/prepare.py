@@ -55,10 +55,8 @@ def colmap_masks(photos: Iterable[Photo], names: dict[str, str], masks: Path, ta
     Raises CaptureError: a mask cannot be read, or has another aspect ratio than its photograph, or there is none."""
     found = [(photo, path) for photo in photos if (path := mask_of(masks, photo.name)) is not None]
     if not found:
-        raise CaptureError(
-            f"no mask in {masks} belongs to a photograph: give them the photographs' names, as photo.png for "
-            "photo.jpg, or leave masks out (--use-masks False)"
-        )
+        advice = "give them the photographs' names, as photo.png for photo.jpg, or leave masks out (--use-masks False)"
+        raise CaptureError(f"no mask in {masks} belongs to a photograph: {advice}")
     for photo, path in found:
         colmap_mask(path, photo.name, (photo.width, photo.height)).save(target / f"{names[photo.name]}.png")
 

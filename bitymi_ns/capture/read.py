@@ -55,24 +55,19 @@ class CaptureOptions(SplitOptions, FrameOptions):
     """Format to read where there are several; auto = one with poses before one without."""
     downscale_factor: int | None = None
     """Use photographs that are smaller by this factor: those in images_2, images_4, ... where that folder exists."""
-    images_path: Path | None = None
-    """Folder of a COLMAP model's photographs, relative to --data; None = find it."""
+    images_path: Path | None = None  # Folder of a COLMAP model's photographs, relative to --data; None = find it.
     masks_path: Path | None = None
     """Folder of masks for a COLMAP model or photographs, relative to --data; None = `masks` beside the photographs, in
     their folder or in that of the data."""
-    use_masks: bool = True
-    """Use the masks of the capture: those that it names, or those beside its photographs."""
-    colmap_path: Path | None = None
-    """Folder of the COLMAP model, relative to --data; None = find it."""
-    ply_path: Path | None = None
-    """Points of a Blender data set, a PLY file relative to --data; None = see --points."""
+    use_masks: bool = True  # Use the masks of the capture: those that it names, or those beside its photographs.
+    colmap_path: Path | None = None  # Folder of the COLMAP model, relative to --data; None = find it.
+    ply_path: Path | None = None  # Points of a Blender data set, a PLY file relative to --data; None = see --points.
     points: Choice = "auto"
     """Points to start from: those of the capture, else triangulated ones (auto); triangulated ones in any case; or
     random ones."""
     sfm: SfmSettings = SfmSettings()  # noqa: RUF009 - it is frozen
     """Structure from motion for photographs and videos."""
-    poses: Path | None = None
-    """Folder of the poses that a run was trained with."""
+    poses: Path | None = None  # Folder of the poses that a run was trained with.
 
     def find(self) -> Found:
         """Recognize the capture. Raises CaptureError: there is none, or an option is for another format."""
@@ -193,7 +188,7 @@ class _Reader:
         options, found = self.options, self.found
         read = self._read_transforms(found.path)
         if self.need_photos:
-            check_photographs_exist(read.path, read.files)
+            check_photographs_exist(read.path, [each.file for each in read.photographs])
         photographs, source = read.photographs, str(found.path)
         meta, frame = read.meta, options
         if found.format == "instant-ngp":  # whose scale is that of its bounding box
@@ -266,7 +261,7 @@ class _Reader:
         options, found, need_photos = self.options, self.found, self.need_photos
         train = self._read_transforms(found.folder / "transforms_train.json")
         if need_photos:
-            check_photographs_exist(train.path, train.files)
+            check_photographs_exist(train.path, [each.file for each in train.photographs])
         parts: dict[str, list[Photograph]] = {"train": train.photographs}
         named = set(train.named)
         for name in ("val", "test"):

@@ -5,7 +5,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from bitymi_ns.capture.pictures import (
     PHOTOGRAPHS,
@@ -301,6 +301,3 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
 
 def _seen_from(path: Path, folder: Path) -> str:
     return str(path.relative_to(folder)) if path != folder and path.is_relative_to(folder) else str(path)
-
-
-FORMATS: tuple[Format, ...] = get_args(Format)

@@ -35,15 +35,6 @@ class KeptPoses:
     origin: Origin  # its photographs are IMAGES if it names no folder
     left_out: Mapping[str, str] = field(default_factory=dict)  # photographs without a pose, and why
 
-    @property
-    def model(self) -> Path:
-        """Folder of the COLMAP model."""
-        return self.folder / MODEL
-
-    def images(self, capture: Path) -> Path:
-        """Return the folder to which names in the model are relative."""
-        return self.folder / IMAGES if self.origin.photographs is None else capture / self.origin.photographs
-
     def found(self, data: Path) -> Found:
         """Return the capture at `data`, whatever else lies beside it by now."""
         folder = data if data.is_dir() else data.parent
@@ -88,7 +79,9 @@ def kept_source(found: Found, kept: KeptPoses, masks_path: Path | None, downscal
     """Return the model that a run was trained with. Raises CaptureError: needed photographs of it are missing, or have
     changed their size."""
     masks = _masks(found, masks_path, downscale)
-    source = make_source(kept.model, kept.images(found.folder), masks, downscale, kept.left_out)
+    photographs = kept.origin.photographs
+    images = kept.folder / IMAGES if photographs is None else found.folder / photographs
+    source = make_source(kept.folder / MODEL, images, masks, downscale, kept.left_out)
     if need_photos:
         files = source.files()
         missing = [file.readlink() if file.is_symlink() else file for file in files if not file.is_file()]

@@ -27,10 +27,8 @@ class SplitOptions:
     eval_mode: Mode = "interval"
     """Photographs to hold out: evenly spaced ones, those with eval in their names, every n-th, or none (all serve for
     both)."""
-    eval_interval: int = 8
-    """Hold out every n-th photograph by name, with --eval-mode interval."""
-    train_split_fraction: float = 0.9
-    """Share of the photographs to train on, with --eval-mode fraction."""
+    eval_interval: int = 8  # Hold out every n-th photograph by name, with --eval-mode interval.
+    train_split_fraction: float = 0.9  # Share of the photographs to train on, with --eval-mode fraction.
     eval_names: tuple[str, ...] = ()
     """Names of photographs to hold out, or a text file (.txt) with one per line; overrides --eval-mode."""
 
@@ -152,10 +150,8 @@ def find(names: Sequence[Path], wanted: Sequence[str], source: str, any_folder: 
         found += fitting
         unknown += [] if fitting else [name]
     if unknown:
-        fail(
-            f"{source}: {len(unknown)} of {len(wanted)} names are of no photograph of the capture: {listed(unknown)}. "
-            f"Its photographs are {listed([name.name for name in names])}."
-        )
+        advice = f"{listed(unknown)}. Its photographs are {listed([name.name for name in names])}."
+        fail(f"{source}: {len(unknown)} of {len(wanted)} names are of no photograph of the capture: {advice}")
     return found
 
 

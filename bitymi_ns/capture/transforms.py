@@ -56,11 +56,6 @@ class Transforms:
     lists: NameLists  # of names for training and evaluation
     named: frozenset[Path]  # pictures, masks and maps, before downscaled copies replace them
 
-    @property
-    def files(self) -> list[Path]:
-        """Image files."""
-        return [photograph.file for photograph in self.photographs]
-
 
 def read_transforms(
     path: Path, own_format: bool, downscale: int = 1, need_photos: bool = True, use_masks: bool = True
@@ -166,10 +161,8 @@ def _check_frames(path: Path, meta: Any, own_format: bool) -> None:
                 frame[key] = name.replace("\\", "/")
     without = [frame["file_path"] for frame in frames if "mask_path" not in frame]
     if 0 < len(without) < len(frames):
-        fail(
-            f"{path}: {listed(without)} has no mask_path, but other frames have one. Give every frame a mask (a white "
-            "picture lets all pixels count), or none."
-        )
+        advice = "Give every frame a mask (a white picture lets all pixels count), or none."
+        fail(f"{path}: {listed(without)} has no mask_path, but other frames have one. {advice}")
 
 
 def _check_intrinsics(path: Path, meta: dict[str, Any]) -> None:
@@ -318,10 +311,8 @@ def _distortion(path: Path, meta: dict[str, Any], frame: dict[str, Any]) -> tupl
     label = f"of {frame['file_path']}"
     model = stated_model(meta, frame)
     if not isinstance(model, str) or model not in CAMERA_TYPES:
-        fail(
-            f"{path}: the camera_model {model!r} {label} is unknown. nerfstudio knows "
-            f"{', '.join(CAMERA_TYPES)}; for undistorted photographs write PINHOLE."
-        )
+        advice = f"nerfstudio knows {', '.join(CAMERA_TYPES)}; for undistorted photographs write PINHOLE."
+        fail(f"{path}: the camera_model {model!r} {label} is unknown. {advice}")
     kind = CAMERA_TYPES[model]
     holder = frame if any(key in frame for key in DISTORTION) else meta
     stated = holder.get("distortion_params")

@@ -57,16 +57,12 @@ class MapFiles:
 class FrameOptions:
     """Orientation, centering and scaling of a capture, as in nerfstudio's parsers."""
 
-    scale_factor: float = 1.0
-    """Factor on the positions of the cameras."""
-    orientation_method: Orientation = "up"
-    """Orientation of the capture: up = the cameras' mean up is z."""
+    scale_factor: float = 1.0  # Factor on the positions of the cameras.
+    orientation_method: Orientation = "up"  # Orientation of the capture: up = the cameras' mean up is z.
     center_method: Literal["poses", "focus", "none"] = "poses"
     """Origin: the middle of the cameras, or the point that they face."""
-    auto_scale_poses: bool = True
-    """Scale the capture so that the cameras fit into a box from -1 to 1."""
-    scene_scale: float = 1.0
-    """Half the side of the box of random points."""
+    auto_scale_poses: bool = True  # Scale the capture so that the cameras fit into a box from -1 to 1.
+    scene_scale: float = 1.0  # Half the side of the box of random points.
 
 
 @dataclass(frozen=True)
@@ -84,8 +80,7 @@ class SfmSettings:
     """Camera model of COLMAP; auto = SIMPLE_RADIAL, OPENCV if that lowers the reprojection error, and EQUIRECTANGULAR
     for detected 360-degree pictures."""
     focal_length: float | None = None  # Focal length of all photographs in pixels; None = from EXIF or estimated.
-    max_image_size: int = 1600
-    """Detect features on photographs downscaled to this many pixels along the longer side."""
+    max_image_size: int = 1600  # Detect features on photographs downscaled to this many pixels along the longer side.
     max_features: int = 8192  # Most features per photograph.
     frames: int | None = None  # Number of frames of a video; None = by camera motion.
 
@@ -114,8 +109,7 @@ class Poses:
     model: Path
     """Folder of a COLMAP model (cameras.bin, images.bin, points3D.bin) in full-size pixels of `images`, distorted as
     they are. frame.json in `report` states its up and metres, as far as they are known."""
-    images: Path
-    """Folder that image names are relative to: of the photographs, of upright copies or of frames."""
+    images: Path  # Folder that image names are relative to: of the photographs, of upright copies or of frames.
     report: Path  # Folder with report.json, report.md, cameras.png and frame.json.
     left_out: dict[str, str]  # Photographs that have no pose, by name, and why.
     registered: int  # Number of photographs that have a pose.

@@ -74,7 +74,9 @@ def extract_frames(video: Path, work: Path, count: int | None, progress: Progres
     chosen = choose(np.array(motion), np.array(sharp), wanted)
     numbers = {seen[i] for i in chosen}
     with complete_folder(target) as folder:
-        shape = _shape_of_pixels(video)
+        with _opened(video) as container:  # pixels of some camcorders and anamorphic lenses are not square
+            shape = float(_pictures(container).sample_aspect_ratio or 1.0)
+            shape = shape if 0.25 < shape < 4.0 else 1.0
         wanted_frames = islice((each for each in _frames(video) if each[0] in numbers), len(numbers))
         for written, (number, frame, turn) in enumerate(wanted_frames, 1):
             image = _upright(frame, turn if upright else 0, shape)
@@ -103,7 +105,9 @@ def _survey(video: Path, progress: Progress) -> tuple[list[int], list[float], li
         if 0.0 <= time - last < gap:  # times may run backwards
             continue
         last = time
-        small = frame.reformat(*_size(frame, FINE), format="gray8").to_ndarray().astype(np.float32)
+        scale = min(1.0, FINE / max(frame.width, frame.height))
+        size = (max(16, round(side * scale)) for side in (frame.width, frame.height))
+        small = frame.reformat(*size, format="gray8").to_ndarray().astype(np.float32)
         sharp.append(sharpness(small) * float(np.sqrt(np.mean(np.diff(small, axis=1) ** 2))))
         factor = max(1, round(max(small.shape) / SMALL))
         rows, columns = (side // factor * factor for side in small.shape)
@@ -190,18 +194,6 @@ def _frames(video: Path) -> Iterator[tuple[int, av.VideoFrame, int]]:
                 raise CaptureError(
                     f"{video} cannot be decoded ({error.strerror}): record or export it again"
                 ) from error
-
-
-def _size(frame: av.VideoFrame, longer: int) -> tuple[int, int]:
-    scale = min(1.0, longer / max(frame.width, frame.height))
-    return max(16, round(frame.width * scale)), max(16, round(frame.height * scale))
-
-
-def _shape_of_pixels(video: Path) -> float:
-    """Return the pixel aspect ratio, not 1 for some camcorders and anamorphic lenses."""
-    with _opened(video) as container:
-        shape = float(_pictures(container).sample_aspect_ratio or 1.0)
-    return shape if 0.25 < shape < 4.0 else 1.0
 
 
 def _upright(frame: av.VideoFrame, turn: int, shape: float = 1.0) -> Image.Image:

@@ -112,16 +112,12 @@ def _why_ended(work: Path, source: Path, code: int) -> str:
     signs = ("disk is full", "No space left", "disk I/O error", "File too large", "readonly database")
     full = any(sign in log for sign in signs)
     if full or free < LITTLE_SPACE:
-        return (
-            f"{work} cannot be written: the disk or the quota is full ({size_text(free)} free on the disk). Free some "
-            "space, and start again: what is done is kept"
-        )
+        advice = "Free some space, and start again: what is done is kept"
+        return f"{work} cannot be written: the disk or the quota is full ({size_text(free)} free on the disk). {advice}"
     if "database disk image is malformed" in log:
         forget(work)
         return f"what was kept of an earlier run in {work} was damaged and has been removed: start again"
     if code in (-9, 137):
-        return (
-            f"the finding of poses of {source} was killed: the machine may have run out of memory. Start it again, it "
-            "goes on where it stopped; a smaller max_image_size needs less"
-        )
+        advice = "Start it again, it goes on where it stopped; a smaller max_image_size needs less"
+        return f"the finding of poses of {source} was killed: the machine may have run out of memory. {advice}"
     return f"COLMAP failed on {source}: {last or f'it ended with status {code}'}. All it said is in {work / LOG}"

@@ -58,8 +58,7 @@ class BitymiDataManagerConfig(FullImageDatamanagerConfig):
     """Configuration of the data manager."""
 
     _target: type = field(default_factory=lambda: BitymiDataManager)
-    dataparser: AnyDataParser = field(default_factory=NerfstudioDataParserConfig)
-    """Parser of the capture."""
+    dataparser: AnyDataParser = field(default_factory=NerfstudioDataParserConfig)  # Parser of the capture.
     cache_images_type: Literal["uint8", "float32"] = "uint8"
     """Type of the images in memory; uint8 takes a quarter of the space."""
     longest_side: int = LONGEST_SIDE

@@ -103,10 +103,8 @@ class BundleCamerasConfig(DataParserConfig):
     """Cameras of a bundle."""
 
     _target: type = field(default_factory=lambda: BundleCameras)
-    data: Path = Path()
-    """Folder of the bundle."""
-    capture: Path = Path()
-    """Folder of the lost capture."""
+    data: Path = Path()  # Folder of the bundle.
+    capture: Path = Path()  # Folder of the lost capture.
 
 
 class BundleCameras(DataParser):

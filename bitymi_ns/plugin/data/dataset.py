@@ -203,10 +203,8 @@ def drop_blank_views(outputs: DataparserOutputs, split: str) -> DataparserOutput
         return outputs
     named = listed([outputs.image_filenames[i] for i in blank])
     if split == "training" and len(blank) == len(masks):
-        fail(
-            f"the masks of all {len(masks)} {split} photographs exclude every pixel: {named}. Pixels count where the "
-            "mask is not black; if the masks are inverted, invert them."
-        )
+        advice = "Pixels count where the mask is not black; if the masks are inverted, invert them."
+        fail(f"the masks of all {len(masks)} {split} photographs exclude every pixel: {named}. {advice}")
     blank_of = f"{len(blank)} of {len(masks)} {split} photographs"
     warn(f"The masks of {blank_of} exclude every pixel: {named}. These views are left out.")
     return select_views(outputs, [i for i in range(len(masks)) if i not in blank])

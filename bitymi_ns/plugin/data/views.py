@@ -187,8 +187,8 @@ def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> Datap
     if verbose:
         width, height = max(large, key=max)
         say(
-            f"{len(large)} of {len(sizes)} training photographs, up to {width} x {height}, are reduced to {longest} "
-            "pixels along a side as they are read. --pipeline.datamanager.longest-side 0 uses them as they are."
+            f"{len(large)} of {len(sizes)} training photographs have more than {longest} pixels along a side (up to "
+            f"{width} x {height}): they are reduced. --pipeline.datamanager.longest-side 0 uses them as they are."
         )
     return dataclasses.replace(
         outputs,

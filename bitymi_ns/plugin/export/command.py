@@ -42,8 +42,7 @@ MANIFEST_BYTES = 28_000  # upper estimate of bundle.json and config.yml
 class CompactOptions:
     """Size and quality of a compact bundle."""
 
-    interchange: bool = False
-    """Write surfels.ply into a compact bundle, too; those of other formats have it."""
+    interchange: bool = False  # Write surfels.ply into a compact bundle, too; those of other formats have it.
     compact_error: float = Compact.share
     """Share by which compacting may raise the mean square error against the training photographs before texels are
     tuned; less if texels were too coarse to learn. The bytes go where they save most of it: to surfels, view colours or
@@ -73,10 +72,8 @@ class CompactOptions:
     def state_size(self, written: int) -> None:
         """Report a bundle much smaller than --target-mb."""
         if self.target_mb is not None and written < _MUCH_SMALLER * 1e6 * self.target_mb:
-            say(
-                f"{written / 1e6:.2f} MB suffice, of the {self.target_mb:g} MB that were asked for: with more, the "
-                "training photographs are shown no better by 0.01 dB."
-            )
+            more = "with more, the training photographs are shown no better by 0.01 dB."
+            say(f"{written / 1e6:.2f} MB suffice, of the {self.target_mb:g} MB that were asked for: {more}")
 
     def compact_of(self, beside: int) -> Compact:
         """Make options of the compact bake; `beside`: bytes of other files, such as the preview."""
@@ -113,8 +110,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
     after a polish, both with 120 further ones on texels as stored; 100 such ones if texels learned in training."""
     finetune_memory: float = TuneOptions.cache_bytes / 1e9
     """GB of memory for traced views in the fine-tuning; changes its time, not its result."""
-    compare: bool = True
-    """Render the held-out views from bundle and trained scene, and state the difference."""
+    compare: bool = True  # Render the held-out views from bundle and trained scene, and state the difference.
 
     extras: tuple[Kind, ...] = ()
     """Also write the scene for other programs, beside the bundle into a folder of its name and .extras: gaussians (a
@@ -123,8 +119,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
     extras_frame: Frame = "scene"  # Frame of these files: the scene's, or the capture's own.
     check_room: bool = True
     """Stop if the disk may have too little room, by an estimate that can be many times too high."""
-    photographs: bool = False
-    """Put the held-out photographs into the bundle, for viewers to show beside renders."""
+    photographs: bool = False  # Put the held-out photographs into the bundle, for viewers to show beside renders.
 
     def main(self) -> None:
         """Run the export."""

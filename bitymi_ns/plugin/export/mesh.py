@@ -130,9 +130,7 @@ def from_bundle(folder: Path) -> Source:
     scene = bundle.scene
     cameras = training_cameras(bundle) or [row.camera for row in bundle.cameras]
     if not cameras:
-        raise BundleError(
-            f"{folder} has no cameras ({CAMERAS}) to see the surface from: give the config.yml of the run that it was "
-            "made from"
-        )
+        advice = "give the config.yml of the run that it was made from"
+        raise BundleError(f"{folder} has no cameras ({CAMERAS}) to see the surface from: {advice}")
     drawn = (cameras, scene.near, scene.prefilter, bundle.info.world, texel_alpha(scene))
     return Source(scene.surfels, lambda camera: bundle.render(camera).rgb, *drawn)

@@ -31,10 +31,8 @@ class BakedModelConfig(SurfelModelConfig):
     """A scene baked into a bundle."""
 
     _target: type = field(default_factory=lambda: BakedModel)
-    bundle: Path = Path()
-    """Folder of the bundle when written; a moved one is found beside its config.yml."""
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Colour behind the scene."""
+    bundle: Path = Path()  # Folder of the bundle when written; a moved one is found beside its config.yml.
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Colour behind the scene.
     renderer: Literal["kernels", "fast", "webgpu"] = "kernels"
     """kernels: on CUDA or the CPU; fast: the same, but pixels end at less than half an 8-bit step of light; webgpu: on
     graphics of any maker, by the package wgpu."""

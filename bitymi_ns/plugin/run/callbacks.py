@@ -190,10 +190,8 @@ class TrainingRun:
                 shown += f"{quality.refined_psnr:.2f} dB with their poses refined, "
             writer.put_scalar("Held-out PSNR", torch.tensor(quality.psnr), step)
         self.curve.add({**point, **self.names})
-        CONSOLE.print(
-            f"step {step + 1:6,d} of {self.total:,}: {shown}{point['surfels']:,} surfels, "
-            f"{self.training.clock.seconds:.0f} s of training"
-        )
+        more = f"{shown}{point['surfels']:,} surfels, {self.training.clock.seconds:.0f} s of training"
+        CONSOLE.print(f"step {step + 1:6,d} of {self.total:,}: {more}")
 
 
 FILE = "training_curve.jsonl"

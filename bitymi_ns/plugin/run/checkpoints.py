@@ -46,10 +46,8 @@ def _of_the_system(error: BaseException) -> OSError:
 def newest_step(folder: Path) -> int:
     """Find the folder's largest step with a checkpoint."""
     if not folder.is_dir():
-        fail(
-            f"there is no checkpoint folder {folder}. "
-            "Give the nerfstudio_models folder of a run: --load-dir outputs/.../nerfstudio_models"
-        )
+        advice = "Give the nerfstudio_models folder of a run: --load-dir outputs/.../nerfstudio_models"
+        fail(f"there is no checkpoint folder {folder}. {advice}")
     steps = [int(p.stem[5:]) for p in folder.glob("step-*.ckpt") if p.stem[5:].isdigit()]
     deeper = next((p.parent for p in sorted(folder.glob("*/step-*.ckpt"))), None)
     if not steps and deeper is not None:

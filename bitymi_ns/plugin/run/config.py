@@ -52,16 +52,13 @@ class BitymiTrainerConfig(TrainerConfig):
     """Visualizer; none = no viewer, and no log but the training curve."""
     max_num_iterations: int | None = None
     """Length of the run in steps; schedules scale. Not given: --default-iterations; a resumed run: as before."""
-    default_iterations: int = 30_000
-    """Steps of a run on a GPU when --max-num-iterations is not given."""
+    default_iterations: int = 30_000  # Steps of a run on a GPU when --max-num-iterations is not given.
     default_iterations_cpu: int = 3_000
     """Steps of a run without a supported GPU when --max-num-iterations is not given."""
     steps_per_save: int | None = None
     """Number of steps between checkpoints; not given: see --default-saves."""
-    default_saves: int = 5
-    """Checkpoints written over a run when --steps-per-save is not given."""
-    prompt: tyro.conf.Suppress[str | None] = None
-    """Of nerfstudio's text-to-scene methods."""
+    default_saves: int = 5  # Checkpoints written over a run when --steps-per-save is not given.
+    prompt: tyro.conf.Suppress[str | None] = None  # Of nerfstudio's text-to-scene methods.
     optimizers: tyro.conf.Suppress[dict[str, Any]] = field(default_factory=dict)
     """By parameter group; the rates come from --pipeline.model.train.lr."""
 
@@ -226,10 +223,8 @@ class BitymiTrainerConfig(TrainerConfig):
 class BitymiAdamConfig(OptimizerConfig):
     """Adam; the preset's schedule sets the learning rate at every step."""
 
-    betas: tuple[float, float] = BETAS
-    """Decay of the running averages."""
-    fused: bool = True
-    """Update all entries of a tensor in one pass."""
+    betas: tuple[float, float] = BETAS  # Decay of the running averages.
+    fused: bool = True  # Update all entries of a tensor in one pass.
 
 
 def method_config(name: str) -> MethodSpecification:

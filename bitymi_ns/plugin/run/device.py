@@ -22,10 +22,8 @@ def why_not_cuda(index: int | None = None) -> str | None:
             return f"torch {torch.__version__} is a build without CUDA"
         return "there is no NVIDIA GPU, or its driver is missing or too old for this torch"
     if importlib.util.find_spec("bitymi_ns._cuda") is None:
-        return (
-            "this installation has no CUDA kernels, because no nvcc was found when it was built: install the CUDA "
-            "toolkit (12 or 13), put its bin folder on PATH and install bitymi-ns again"
-        )
+        advice = "install the CUDA toolkit (12 or 13), put its bin folder on PATH and install bitymi-ns again"
+        return f"this installation has no CUDA kernels, because no nvcc was found when it was built: {advice}"
     try:
         kernels = importlib.import_module("bitymi_ns._cuda")
     except ImportError as error:

@@ -40,16 +40,12 @@ class BitymiModelConfig(SurfelModelConfig):
     """Configuration of the model."""
 
     _target: type = field(default_factory=lambda: BitymiModel)
-    scene: SceneConfig = field(default_factory=SceneConfig)
-    """Representation of the scene."""
-    train: TrainConfig = field(default_factory=TrainConfig)
-    """Training options."""
-    steps: tyro.conf.Suppress[int | None] = None
-    """Length of a run to come."""
+    scene: SceneConfig = field(default_factory=SceneConfig)  # Representation of the scene.
+    train: TrainConfig = field(default_factory=TrainConfig)  # Training options.
+    steps: tyro.conf.Suppress[int | None] = None  # Length of a run to come.
     curve_points: int = 20
     """Evaluations over a run for the curve of quality against time (training_curve.jsonl); 0 = none."""
-    curve_views: int = 8
-    """Held-out views per point of that curve, all for the last one; 0 = all."""
+    curve_views: int = 8  # Held-out views per point of that curve, all for the last one; 0 = all.
 
 
 def train_config_for(config: TrainConfig, alpha_color: Tensor | None, transparent: bool) -> TrainConfig:
@@ -214,10 +210,8 @@ def new_scene(
     box = None
     if not bool(torch.isfinite(xyz).all(1).any()):
         if len(xyz):
-            fail(
-                f"all {len(xyz)} points of the capture's point cloud are NaN or infinite. Make the cloud again, or "
-                "remove ply_file_path from transforms.json to start from random points."
-            )
+            advice = "Make the cloud again, or remove ply_file_path from transforms.json to start from random points."
+            fail(f"all {len(xyz)} points of the capture's point cloud are NaN or infinite. {advice}")
         box = None if scene_box is None else _corners(scene_box)
     with reporting_time("Making surfels of", len(xyz)):
         background = find_background() if find_background and train.background_points else None
@@ -231,10 +225,8 @@ def new_scene(
         say(f"{report.background:,} more surfels start where the photographs show no point.")
     usable = report.given - report.not_finite - report.duplicates
     if 0 < usable < FEW_POINTS:
-        warn(
-            f"The capture's point cloud has only {usable} different points to start from. If little appears, remove it "
-            "(ply_file_path in transforms.json) to start from random points."
-        )
+        advice = "If little appears, remove it (ply_file_path in transforms.json) to start from random points."
+        warn(f"The capture's point cloud has only {usable} different points to start from. {advice}")
     if report.not_finite:
         row = int(torch.nonzero(~torch.isfinite(xyz).all(1))[0])
         what = f"{report.not_finite} of {report.given} points of the capture are NaN or infinite"

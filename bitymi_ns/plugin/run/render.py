@@ -138,11 +138,8 @@ def with_principal_points(path: Cameras, found: dict[str, Any]) -> Cameras:
 @torch.no_grad()
 def spiral(model: SurfelModel, start: Cameras, steps: int, radius: float) -> Cameras:
     """Make cameras on a spiral around one, turned to the point in the middle of its picture; nerfstudio's spiral rolls,
-    as it takes the camera's axis in the world for the upward one in the camera.
-
-    Args:
-        radius: in units of the scene, along all axes of the camera.
-    """
+    as it takes the camera's axis in the world for the upward one in the camera. `radius`: in units of the scene, along
+    all axes of the camera."""
     camera = to_camera(start, model.device).within(DEPTH_SIDE)
     outputs = model.outputs_of(camera, maps=True)
     y, x = camera.height // 3, camera.width // 3

@@ -165,9 +165,9 @@ def fit_scale(frame: FrameOptions, photographs: Sequence[Photograph], source: st
     if ratio <= MAX_SPREAD:
         return frame
     scale = frame.scale_factor * USUAL_SPREAD / ratio
-    usual = f"{USUAL_SPREAD * frame.scene_scale / frame.scale_factor:.2g}"
+    usual = f"where those of this format usually lie {USUAL_SPREAD * frame.scene_scale / frame.scale_factor:.2g}"
     more = f"the capture is scaled by {scale:.3g}. Bundles state that."
-    say(f"The cameras of {source} lie {spread:,.4g} units from their middle, {usual} are usual: {more}")
+    say(f"The cameras of {source} lie {spread:,.4g} units from their middle, {usual}: {more}")
     return replace(frame, scale_factor=scale)
 
 

@@ -7,20 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from bitymi_ns.capture.pictures import (
-    PHOTOGRAPHS,
-    UNREAD,
-    VIDEOS,
-    folders_in,
-    has_photographs,
-    holds,
-    no_photographs,
-    passed_over,
-    pictures_among,
-    poses_in,
-    refusal,
-    videos_in,
-)
+from bitymi_ns.capture import pictures
 from bitymi_ns.capture.types import fail
 from bitymi_ns.reading import MOST_TEXT, open_regular, open_text, read_json
 from bitymi_ns.trust import listed
@@ -84,7 +71,7 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
         if format not in ("auto", "colmap"):
             fail(f"--colmap-path is for COLMAP models: leave out --format {format}, or the path.")
         return _colmap_given(data, colmap_path)
-    if why := refusal(data):
+    if why := pictures.refusal(data):
         fail(why)
     folder = data if data.is_dir() else data.parent
     candidates = list(_in_folder(data) if data.is_dir() else _of_file(data))
@@ -107,17 +94,17 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
         and (each[0] != "photographs" or chosen == "video")
         and (chosen != "stray-scanner" or each[1].name != STRAY[2])
     )
-    poses = tuple(poses_in(folder)) if chosen in ("photographs", "video") else ()
+    poses = tuple(pictures.poses_in(folder)) if chosen in ("photographs", "video") else ()
     return Found(chosen, path, path if chosen == "blender" else folder, others, poses)
 
 
 def _capture_within(folder: Path, format: Format | Literal["auto"]) -> Path | None:
     """Find the only subfolder that is a capture with poses, as archives unpack to; None = none, several, or photographs
     beside it."""
-    if has_photographs(folder):
+    if pictures.has_photographs(folder):
         return None
     found = []
-    for path in sorted(path for path in folder.iterdir() if path.is_dir() and not no_photographs(path)):
+    for path in sorted(path for path in folder.iterdir() if path.is_dir() and not pictures.no_photographs(path)):
         candidates = [*_transforms_in(path), *_scanned(path)]
         if any(format in ("auto", each) for each, _ in candidates):
             found.append(path)
@@ -130,7 +117,7 @@ def _of_file(file: Path) -> Iterator[tuple[Format, Path]]:
         yield "blender", file.parent
     elif suffix == ".json":
         yield _kind_of(file), file
-    elif suffix in VIDEOS:
+    elif suffix in pictures.VIDEOS:
         yield "video", file
     elif file.stem in ("cameras", "images", "points3D") and is_model(file.parent):
         yield "colmap", file.parent
@@ -145,7 +132,7 @@ def _in_folder(folder: Path) -> Iterator[tuple[Format, Path]]:
     photographs = _photographs_in(folder)
     if photographs is not None:
         yield "photographs", photographs
-    yield from (("video", video) for video in videos_in(folder))
+    yield from (("video", video) for video in pictures.videos_in(folder))
 
 
 def _transforms_in(folder: Path) -> Iterator[tuple[Format, Path]]:
@@ -158,7 +145,7 @@ def _transforms_in(folder: Path) -> Iterator[tuple[Format, Path]]:
         yield "blender", folder
     elif not there:
         for path in sorted(folder.glob("*.json")):
-            if path.name not in SPLITS and holds(path, b'"transform_matrix"', MOST_TEXT):
+            if path.name not in SPLITS and pictures.holds(path, b'"transform_matrix"', MOST_TEXT):
                 yield _kind_of(path), path
 
 
@@ -168,11 +155,11 @@ def _scanned(folder: Path) -> Iterator[tuple[Format, Path]]:
     if any((keyframes / i).is_dir() and any((keyframes / c).glob("*.json")) for i, c in POLYCAM):
         yield "polycam", folder
     for name in ("metadata", "metadata.json"):
-        if holds(folder / name, b'"poses"', MOST_TEXT):
+        if pictures.holds(folder / name, b'"poses"', MOST_TEXT):
             yield "record3d", folder
             break
     first = min(folder.glob("frame_*.json"), default=None)
-    if first is not None and holds(first, b'"cameraPoseARFrame"', MOST_TEXT):
+    if first is not None and pictures.holds(first, b'"cameraPoseARFrame"', MOST_TEXT):
         yield "3d-scanner", folder
     if all((folder / name).is_file() for name in STRAY):
         yield "stray-scanner", folder
@@ -232,11 +219,11 @@ def image_count(model: Path) -> int:
 
 
 def _photographs_in(folder: Path) -> Path | None:
-    """Choose the folder to search for photographs: this one if it or its `images` holds some, or several subfolders do;
-    else the only subfolder that does. None = no photographs, or captures of their own."""
-    if has_photographs(folder) or has_photographs(folder / "images", below=True):
+    """Choose the folder to search for photographs: this one if it or its `images` holds some, or several
+    subfolders do; else the only subfolder that does. None = no photographs, or captures of their own."""
+    if pictures.has_photographs(folder) or pictures.has_photographs(folder / "images", below=True):
         return folder
-    holding = [path for path in folders_in(folder) if has_photographs(path, below=True)]
+    holding = [path for path in pictures.folders_in(folder) if pictures.has_photographs(path, below=True)]
     if not holding or captures_in(folder):
         return None
     return _photographs_in(holding[0]) if len(holding) == 1 else folder
@@ -244,7 +231,7 @@ def _photographs_in(folder: Path) -> Path | None:
 
 def captures_in(folder: Path) -> list[Path]:
     """List subfolders that are captures of their own: more than one has `images` with photographs."""
-    found = [path for path in folders_in(folder) if has_photographs(path / "images", below=True)]
+    found = [path for path in pictures.folders_in(folder) if pictures.has_photographs(path / "images", below=True)]
     return found if len(found) > 1 else []
 
 
@@ -271,11 +258,11 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
             return f"{data} is a bundle in one file, not a capture: give the folder of its photographs."
         if data.suffix.lower() in (".zip", ".tar", ".7z", ".gz", ".rar"):
             return f"{data} is an archive. Unpack it, and give the folder."
-        if data.suffix.lower() in PHOTOGRAPHS:
+        if data.suffix.lower() in pictures.PHOTOGRAPHS:
             return f"{data} is one photograph. A scene needs many: give the folder that holds them."
         return (
             f"{data} is no file that can be trained on. Give a folder of photographs, a video "
-            f"({', '.join(VIDEOS[:4])}, ...), a transforms.json, or the folder of a capture."
+            f"({', '.join(pictures.VIDEOS[:4])}, ...), a transforms.json, or the folder of a capture."
         )
     if not any(data.iterdir()):
         return f"the folder {data} is empty. Give a folder of photographs, a video, or a capture with poses."
@@ -284,14 +271,14 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
     several = captures_in(data)
     if several:
         hint = f" It holds {len(several)} captures: give one of them, as {several[0]}."
-    counts = pictures_among([path.name for path in data.rglob("*")], [])
+    counts = pictures.pictures_among([path.name for path in data.rglob("*")], [])
     if counts and not several:
         most = max(counts, key=counts.__getitem__)
-        hint = f" It holds {counts[most]} files {most} ({UNREAD[most]}): save them as JPEG or TIFF."
+        hint = f" It holds {counts[most]} files {most} ({pictures.UNREAD[most]}): save them as JPEG or TIFF."
     archive = next((path for path in sorted(data.iterdir()) if path.suffix.lower() in (".zip", ".tar", ".7z")), None)
     if archive is not None and not several:
         hint = f" Unpack {archive.name} first."
-    if not hint and (others := passed_over(data)):
+    if not hint and (others := pictures.passed_over(data)):
         hint = f" It holds what is not taken for photographs: {listed(others)}."
     return (
         f"{data} holds nothing to train on: no transforms.json, no transforms_train.json, no COLMAP model (sparse/0), "

@@ -72,7 +72,15 @@ def check_capture(config: FullImageDatamanagerConfig, read: bool = False, trains
     if not data.exists():
         advice = f"Give its folder with --data. {HOW_TO_GET_ONE}" if trains else MOVED
         fail(f"the capture {data} does not exist. {advice}")
-    _check_options(dataparser)
+    mode = getattr(dataparser, "eval_mode", None)
+    for name, used, within, what in (
+        ("scale_factor", True, lambda value: 0.0 < value < math.inf, "above 0"),
+        ("downscale_factor", True, lambda value: value is None or value >= 1, "1 or more"),
+        ("train_split_fraction", mode == "fraction", lambda value: 0.0 < value <= 1.0, "above 0 and at most 1"),
+        ("eval_interval", mode == "interval", lambda value: value >= 1, "1 or more"),
+    ):
+        if used and hasattr(dataparser, name) and not within(value := getattr(dataparser, name)):
+            fail(f"--{name.replace('_', '-')} is {value}, but has to be {what}. Correct it, or leave it out.")
     if isinstance(dataparser, BitymiDataParserConfig):
         dataparser.data = data
         if read and dataparser.find().format not in ("photographs", "video"):
@@ -83,19 +91,6 @@ def check_capture(config: FullImageDatamanagerConfig, read: bool = False, trains
             finally:
                 CONSOLE.quiet = quiet
                 forget_model()
-
-
-def _check_options(dataparser: DataParserConfig) -> None:
-    """Fail at options out of range, by their names on the command line."""
-    mode = getattr(dataparser, "eval_mode", None)
-    for name, used, within, what in (
-        ("scale_factor", True, lambda value: 0.0 < value < math.inf, "above 0"),
-        ("downscale_factor", True, lambda value: value is None or value >= 1, "1 or more"),
-        ("train_split_fraction", mode == "fraction", lambda value: 0.0 < value <= 1.0, "above 0 and at most 1"),
-        ("eval_interval", mode == "interval", lambda value: value >= 1, "1 or more"),
-    ):
-        if used and hasattr(dataparser, name) and not within(value := getattr(dataparser, name)):
-            fail(f"--{name.replace('_', '-')} is {value}, but has to be {what}. Correct it, or leave it out.")
 
 
 def declares_box(dataparser: DataParserConfig) -> bool:
@@ -114,6 +109,7 @@ def declares_box(dataparser: DataParserConfig) -> bool:
 @contextmanager
 def reporting_input_errors(config: Any) -> Iterator[None]:
     """Report errors of nerfstudio's loaders in one line."""
+    capture = f"the capture {config.data if config.data is not None else config.dataparser.data}"
     try:
         yield
     except ImportError as error:
@@ -123,16 +119,11 @@ def reporting_input_errors(config: Any) -> Iterator[None]:
             error,
         )
     except Image.DecompressionBombError as error:  # nerfstudio opens photographs before they are checked
-        most = f"has a photograph of more than {MAX_PIXELS:,} pixels: make it smaller"
-        fail(f"the capture {_folder_of(config)} {most}", error)
+        fail(f"{capture} has a photograph of more than {MAX_PIXELS:,} pixels: make it smaller", error)
     except (CaptureError, NameError, AssertionError):  # clear already, or no fault of the capture
         raise
     except Exception as error:
         detail = why(error)
         if isinstance(error, UnidentifiedImageError):
             detail += ". Save the photographs as PNG or JPEG"
-        fail(f"the capture {_folder_of(config)} cannot be loaded: {detail}", error)
-
-
-def _folder_of(config: Any) -> Any:
-    return config.data if config.data is not None else config.dataparser.data
+        fail(f"{capture} cannot be loaded: {detail}", error)

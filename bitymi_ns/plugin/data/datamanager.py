@@ -91,42 +91,36 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
 
     @as_input_error()
     def __init__(
-        self,
-        config: BitymiDataManagerConfig,
-        device: torch.device | str = "cpu",
-        test_mode: Literal["test", "val", "inference"] = "val",
-        world_size: int = 1,
-        local_rank: int = 0,
-        **kwargs: Any,
+        self, config: BitymiDataManagerConfig, test_mode: Literal["test", "val", "inference"] = "val", **kwargs: Any
     ) -> None:
         self.step_view: Callable[[int], View] = lambda index: self.train_views[index]
         images.set_up_pillow()
         check_capture(config, trains=test_mode == "val")
         with reporting_input_errors(config), reading_points(test_mode == "val"):
-            super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
+            super().__init__(config, test_mode=test_mode, **kwargs)
         self._check_images(test_mode)
         if test_mode == "val":
             self._check_points()
-        outputs = self.train_dataparser_outputs
-        color = outputs.alpha_color
-        self.train_dataset.metadata["alpha_color"] = None if color is None else torch.as_tensor(color).float()
-        files = self.train_dataset.files
-        self.train_dataset.metadata["has_alpha"] = bool(files) and images.file_has_transparency(files[0])
-        # a run with a background; photographs may be missing without training
-        self.train_dataset.metadata["transparent"] = self._has_photos(test_mode) and any(
-            images.file_has_transparency(files[i]) and self.train_dataset.get_numpy_image(i).shape[-1] == 4
-            for i in spread(len(files), ALPHA_SAMPLES)
-        )
-        self.train_dataset.metadata["declares_box"] = declares_box(config.dataparser)
-        cameras = outputs.cameras
-        self.train_dataset.metadata["train_pixels"] = int((cameras.width.long() * cameras.height.long()).sum())
-        self.train_dataset.metadata["camera_centers"] = outputs.cameras.camera_to_worlds[..., :3, 3].reshape(-1, 3)
+        outputs, dataset = self.train_dataparser_outputs, self.train_dataset
+        cameras, color, files = outputs.cameras, outputs.alpha_color, dataset.files
+        dataset.metadata |= {
+            "alpha_color": None if color is None else torch.as_tensor(color).float(),
+            "has_alpha": bool(files) and images.file_has_transparency(files[0]),
+            # for a run with a background; photographs may be missing without training
+            "transparent": self._has_photos(test_mode)
+            and any(
+                images.file_has_transparency(files[i]) and dataset.get_numpy_image(i).shape[-1] == 4
+                for i in spread(len(files), ALPHA_SAMPLES)
+            ),
+            "declares_box": declares_box(config.dataparser),
+            "train_pixels": int((cameras.width.long() * cameras.height.long()).sum()),
+            "camera_centers": cameras.camera_to_worlds[..., :3, 3].reshape(-1, 3),
+        }
         points = outputs.metadata.get("points3D_xyz")
         if test_mode == "val" and points is not None and len(points):
-            seed = config.train_cameras_sampling_seed
             # called if a scene starts with these points: it reads the photographs
-            found = partial(background_points, points, self.train_views, seed)
-            self.train_dataset.metadata["background_points"] = found
+            found = partial(background_points, points, self.train_views, config.train_cameras_sampling_seed)
+            dataset.metadata["background_points"] = found
 
     def _has_photos(self, test_mode: str) -> bool:
         return test_mode != "inference" and NO_PHOTOS not in self.train_dataparser_outputs.metadata

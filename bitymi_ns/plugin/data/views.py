@@ -56,9 +56,9 @@ def make_views(capture: Capture, need_photos: bool = True) -> Views:
     transform, scale = training_frame(poses, frame, source)
     moved = transform @ poses
     moved[:, :3, 3] *= scale
-    lenses, of, moved = _split(parts, moved)
-    files = [photographs[i].file for i in of]
-    metadata: dict[str, Any] = {"lenses": lenses, "files": files, "photographs": of}
+    views = _split(parts, moved, [photograph.file for photograph in photographs])
+    metadata = views["metadata"]
+    lenses, of = metadata["lenses"], metadata["photographs"]
     maps = [MapFiles() if lens.face else photographs[i].maps for i, lens in zip(of, lenses, strict=True)]
     if any(each != MapFiles() for each in maps):
         metadata[MAPS] = maps
@@ -72,23 +72,26 @@ def make_views(capture: Capture, need_photos: bool = True) -> Views:
     masks = [photographs[i].mask for i in of]
     side = frame.scene_scale
     return Views(
-        image_filenames=[lens.name(file) for file, lens in zip(files, lenses, strict=True)],
-        cameras=pinhole_cameras([each.pinhole for each in lenses], torch.from_numpy(moved.astype(np.float32))),
+        **views,
         scene_box=SceneBox(aabb=torch.tensor([[-side] * 3, [side] * 3], dtype=torch.float32)),
         mask_filenames=masks if any(masks) else None,  # type: ignore[arg-type]  # some may have none
         dataparser_scale=scale * capture.applied_scale,
         dataparser_transform=torch.from_numpy(transform if capture.applied is None else transform @ capture.applied),
-        metadata=metadata,
     )
 
 
-def _split(parts: Sequence[Sequence[Lens]], poses: Pose) -> tuple[list[Lens], list[int], Pose]:
+def _split(parts: Sequence[Sequence[Lens]], poses: Pose, photographs: Sequence[Path]) -> dict[str, Any]:
     """Split photographs into views of their lenses (`parts`); poses [N, 3 or 4, 4] are camera to world in nerfstudio's
-    axes. Return lens, number of the photograph and pose of each view."""
+    axes. Return names, cameras and metadata of the views' outputs."""
     lenses = [lens for some in parts for lens in some]
     of = [i for i, some in enumerate(parts) for _ in some]
     turns = np.stack([OPENCV_AXES @ lens.turn @ OPENCV_AXES for lens in lenses])
-    return lenses, of, poses[of] @ turns
+    files = [photographs[i] for i in of]
+    return {
+        "image_filenames": [lens.name(file) for file, lens in zip(files, lenses, strict=True)],
+        "cameras": pinhole_cameras([each.pinhole for each in lenses], torch.from_numpy(poses[of] @ turns).float()),
+        "metadata": {"lenses": lenses, "files": files, "photographs": of},
+    }
 
 
 def photograph_files(outputs: DataparserOutputs) -> list[Path]:
@@ -159,15 +162,10 @@ def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
         size = (int(cameras.width[i]), int(cameras.height[i]))
         camera = ColmapCamera(model, *size, size if model == SPHERICAL_MODEL else (*pinhole, *coefficients))
         photographs.append(Photograph(file, camera, np.eye(4), f"the camera of {file}"))
-    lenses, of, poses = _split(make_lenses(photographs), cameras.camera_to_worlds.double().numpy())
-    outputs = select_views(outputs, of)
-    files = outputs.image_filenames
-    return dataclasses.replace(
-        outputs,
-        image_filenames=[lens.name(file) for file, lens in zip(files, lenses, strict=True)],
-        cameras=pinhole_cameras([lens.pinhole for lens in lenses], torch.from_numpy(poses).float()),
-        metadata={**outputs.metadata, "lenses": lenses, "files": files, "photographs": of},
-    )
+    views = _split(make_lenses(photographs), cameras.camera_to_worlds.double().numpy(), outputs.image_filenames)
+    outputs = select_views(outputs, views["metadata"]["photographs"])
+    views["metadata"] = {**outputs.metadata, **views["metadata"]}
+    return dataclasses.replace(outputs, **views)
 
 
 def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> DataparserOutputs:

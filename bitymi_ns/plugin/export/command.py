@@ -4,7 +4,6 @@ Also `python -m bitymi_ns.plugin.export.command`, should nerfstudio not take the
 
 """
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from bitymi_ns import endings
 from bitymi_ns.bake import BakeOptions, Learning, TuneOptions, bake_and_learn, export, rich_progress
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bake.pipeline import FEWEST_PASSES
-from bitymi_ns.bundle import Bundle, BundleError, read_bundle
+from bitymi_ns.bundle import BundleError, read_bundle
 from bitymi_ns.bundle.bake_options import BundleFormat
 from bitymi_ns.bundle.manifest import MANIFEST, dump
 from bitymi_ns.bundle.parts import CONFIG
@@ -28,11 +27,8 @@ from bitymi_ns.plugin.export.summary import print_summary
 from bitymi_ns.plugin.export.target import bundle_config, bundle_version, check_room, reserve_bundle
 from bitymi_ns.plugin.export.trained import camera_files, compare, load_trained, preview, world_of
 from bitymi_ns.plugin.run.memory import state_export
-from bitymi_ns.plugin.run.model import BitymiModel
-from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.exposure import corrected
-from bitymi_ns.train.views import View
 
 _MUCH_SMALLER = 0.9
 MANIFEST_BYTES = 28_000  # upper estimate of bundle.json and config.yml
@@ -160,14 +156,6 @@ class ExportAtlas(BakeOptions, CompactOptions):
         self.check_compact(options.bundle_format)
         return options
 
-    def _learning(self, model: BitymiModel, views: int, compact: Compact | None) -> Learning:
-        """Make options of the optimisation after the bake, for this number of training photographs."""
-        if self.exact:
-            return Learning()
-        kept = int(self.finetune_memory * 1e9)
-        steps = self.polish_steps, self.finetune_steps
-        return Learning.of_scene(model.scene, views, *steps, kept, model.train_config, compact)
-
     def _run(self, options: BakeOptions) -> None:
         config, pipeline = load_trained(self.load_config)
         model, datamanager = pipeline.model, pipeline.datamanager
@@ -177,7 +165,11 @@ class ExportAtlas(BakeOptions, CompactOptions):
         shown = preview(model, first, "JPEG" if compact else "PNG")
         cameras_of = camera_files(datamanager, views, self.photographs)
         beside = len(shown) + sum(map(len, cameras_of.values()))
-        learning = self._learning(model, len(views), self.compact_of(beside) if compact else None)
+        compacting = self.compact_of(beside) if compact else None
+        learning, memory = Learning(), int(self.finetune_memory * 1e9)
+        if not self.exact:
+            steps = (self.polish_steps, self.finetune_steps, memory)
+            learning = Learning.of_scene(model.scene, len(views), *steps, model.train_config, compacting)
         polish, tune, has_learned = learning.polish, learning.tune, isinstance(model.scene.field, TexelField)
         for name, options_of in (("polish", polish), ("finetune", None if polish or has_learned else tune)):
             if options_of is not None and options_of.steps < FEWEST_PASSES * len(views):
@@ -222,24 +214,13 @@ class ExportAtlas(BakeOptions, CompactOptions):
         print_summary(self.output_dir, bundle.info)
         self.state_size(download_bytes(self.output_dir, bundle.info))
         if self.extras:
-            self._write_extras(bundle, views, datamanager.eval_views)
-
-    def _write_extras(self, bundle: Bundle, cameras: Sequence[Camera], held_out: Sequence[View]) -> None:
-        """Write and report the files beside the complete bundle."""
-        folder = extras_folder(self.output_dir)
-        with rich_progress() as progress:
-            written = write_extras(
-                bundle,
-                folder,
-                self.extras,
-                frame=self.extras_frame,
-                cameras=[camera.to("cpu") for camera in cameras],
-                held_out=held_out if self.compare else (),
-                overwrite=self.overwrite,
-                progress=progress,
-            )
-        for each in written.values():
-            say(f"In {folder}: {summary_line(each)}")
+            folder = extras_folder(self.output_dir)
+            how = {"frame": self.extras_frame, "overwrite": self.overwrite}
+            how |= {"cameras": [camera.to("cpu") for camera in views], "held_out": held_out}
+            with rich_progress() as progress:
+                written = write_extras(bundle, folder, self.extras, progress=progress, **how)
+            for each in written.values():
+                say(f"In {folder}: {summary_line(each)}")
 
 
 def main() -> None:

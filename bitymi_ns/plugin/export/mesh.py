@@ -5,6 +5,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -32,11 +33,10 @@ NAME = "mesh"
 MOST_VIEWS = 400  # most fused training views, evenly spaced
 
 
-@dataclass(frozen=True)
-class Source:
-    """Scene that a mesh is made of."""
+class Source(NamedTuple):
+    """Scene that a mesh is made of, on the device that draws it."""
 
-    surfels: Mapping[str, Tensor]  # geometry by name, on the renderer's device, as all tensors here
+    surfels: Mapping[str, Tensor]  # geometry by name
     render: Callable[[Camera], Tensor]  # [H, W, 3] colors of a view
     cameras: Sequence[Camera]  # of the training views
     near: float  # nearest drawn depth, camera z
@@ -69,14 +69,13 @@ class ExportMesh(SurfaceOptions):
                 self._check_target(path)
                 bundle = bundle_at(self.load_config)
                 source = from_run(self.load_config) if bundle is None else from_bundle(bundle)
-                note = self._write(source, path)
+                say(f"{path}: {self._write(source, path)}")
         except BundleError as error:
             fail(str(error), error)
         except NoSurface as error:
             fail(f"{self.load_config}: {error}.", error)
         except OSError as error:
             fail(f"{path} cannot be written: {reason(error, path)} (--output-dir).", error)
-        say(f"{path}: {size_text(path.stat().st_size)}, in the {self.frame}'s frame" + (note and f"; {note}"))
 
     def _check_target(self, path: Path) -> None:
         """Stop if the file exists and may not be replaced."""
@@ -84,7 +83,7 @@ class ExportMesh(SurfaceOptions):
             fail(f"{path} is there already: choose another --output-dir, or add --overwrite True.")
 
     def _write(self, source: Source, path: Path) -> str:
-        """Write the mesh; return a note on its positions."""
+        """Write the mesh; return a summary."""
         to = to_capture(source.world) if self.frame == "capture" else None
         step = max(1, -(-len(source.cameras) // MOST_VIEWS))
         cameras = source.cameras[::step]
@@ -102,7 +101,8 @@ class ExportMesh(SurfaceOptions):
         say(f"{counts}, of {len(cameras)} views")
         if self.watertight and (left := mesh.open_edges()):
             warn(f"{left:,} edges could not be closed, so that the mesh is not watertight: try another --resolution.")
-        return note and note + (" (its node is moved there)" if self.format == "glb" else " (a comment of the file)")
+        where = " (its node is moved there)" if self.format == "glb" else " (a comment of the file)"
+        return f"{size_text(path.stat().st_size)}, in the {self.frame}'s frame" + (note and f"; {note}{where}")
 
 
 def from_run(load_config: Path) -> Source:

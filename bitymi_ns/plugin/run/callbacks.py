@@ -4,6 +4,7 @@ import errno
 import json
 import math
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -204,7 +205,11 @@ class TrainingCurve:
         self.path = path
         source = resumed_from if resumed_from is not None else path if steps_done > 0 else None
         with explained(path, InputError, "."):
-            kept = _points_until(source, steps_done) if source is not None and source.is_file() else []
+            kept = []
+            for line in source.read_text("utf8").splitlines() if source is not None and source.is_file() else ():
+                with suppress(ValueError, KeyError, TypeError):  # cut off when the run was killed
+                    if json_of(line)["step"] <= steps_done:
+                        kept.append(line)
             write_file(path, "".join(line + "\n" for line in kept).encode("utf8"))
 
     def add(self, point: dict[str, Any]) -> None:
@@ -217,14 +222,3 @@ class TrainingCurve:
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
             warn(f"A point of the training curve {self.path} could not be written: {reason(error, self.path)}.")
-
-
-def _points_until(path: Path, steps: int) -> list[str]:
-    kept = []
-    for line in path.read_text("utf8").splitlines():
-        try:
-            if json_of(line)["step"] <= steps:
-                kept.append(line)
-        except (ValueError, KeyError, TypeError):
-            continue  # cut off when the run was killed
-    return kept

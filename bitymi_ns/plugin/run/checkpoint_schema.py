@@ -130,29 +130,23 @@ def check(state: Mapping[str, Any], scene: SceneConfig) -> list[str]:
         if (count := extra.get(name)) is not None:
             count.count(low)
     if (options := extra.get("train")) is not None:
-        _check_options(options)
+        try:
+            Entry(json_of(options.text()), options.name).table()
+        except ValueError as error:
+            raise Misfit(f"{options.name} has to be a table of options as JSON") from error
     if (run := extra.get("run")) is not None and run.table():
         _check_run(run, rows)
     for entry in (root["optimizers"], root.get("schedulers"), root.get("scalers")):
         if entry is not None:
             entry.table()
-    drawable = {name.removeprefix("_model."): _drawable(value) for name, value in parameters.items()}
+    drawable = {
+        name.removeprefix("_model."): (values.abs() <= LARGEST).reshape(len(values), -1).all(1)
+        for name, values in parameters.items()
+    }
     broken = [name for name, rows in drawable.items() if not bool(rows.all())]
     if not bool(torch.stack([drawable[f"scene.surfels.{name}"] for name in _GEOMETRY]).all(0).any()):
         raise Misfit(f"{broken[0]} holds numbers that are too large, or none, for every surfel")
     return broken
-
-
-def _check_options(options: Entry) -> None:
-    try:
-        Entry(json_of(options.text()), options.name).table()
-    except ValueError as error:
-        raise Misfit(f"{options.name} has to be a table of options as JSON") from error
-
-
-def _drawable(values: Tensor) -> Tensor:
-    """Test which rows [N] are finite and not too large."""
-    return (values.abs() <= LARGEST).reshape(len(values), -1).all(1)
 
 
 def _parameters(pipeline: Entry, scene: SceneConfig) -> dict[str, Tensor]:
@@ -165,7 +159,12 @@ def _parameters(pipeline: Entry, scene: SceneConfig) -> dict[str, Tensor]:
     found = {
         f"{SURFELS}{name}": pipeline[f"{SURFELS}{name}"].tensor(n, *row) for name, row in (*_GEOMETRY.items(), *view)
     }
-    field = {name: pipeline[f"{SCENE}field.{name}"] for name in _field_names(pipeline, scene)}
+    names: tuple[str, ...] = ("field_table", "field_w1", "field_w2", "field_w3", "domain")
+    if scene.texture != "hash":
+        there = pipeline.table().keys()
+        names = ("texels", "size", "extent", "share") if f"{SCENE}field.texels" in there else ()
+        names += ("alpha",) if names and f"{SCENE}field.alpha" in there else ()
+    field = {name: pipeline[f"{SCENE}field.{name}"] for name in names}
     if "field_table" in field:
         table = field["field_table"].tensor(scene.levels, None, FEATURES)
         if table.shape[1] & (table.shape[1] - 1) or table.shape[1] == 0:
@@ -190,15 +189,6 @@ def _parameters(pipeline: Entry, scene: SceneConfig) -> dict[str, Tensor]:
     if unknown:
         raise Misfit(f"pipeline.{str(unknown[0]).removeprefix('_model.')} belongs to no scene of this preset")
     return found
-
-
-def _field_names(pipeline: Entry, scene: SceneConfig) -> tuple[str, ...]:
-    if scene.texture == "hash":
-        return "field_table", "field_w1", "field_w2", "field_w3", "domain"
-    if f"{SCENE}field.texels" not in pipeline.table():
-        return ()
-    alpha = ("alpha",) if f"{SCENE}field.alpha" in pipeline.table() else ()
-    return "texels", "size", "extent", "share", *alpha
 
 
 def check_optimizer(optimizer: Entry, parameters: Sequence[Tensor]) -> None:

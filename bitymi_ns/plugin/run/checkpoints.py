@@ -65,7 +65,7 @@ def path_of(folder: Path, step: int) -> Path:
 def load(path: Path, scene: SceneConfig) -> dict[str, Any]:
     """Read a checkpoint of a scene of this kind."""
     if path.is_dir():
-        fail(f"{path} is a folder: give one of its files step-*.ckpt with --load-checkpoint, or --load-dir")
+        fail(f"{path} is a folder: give one of the files step-*.ckpt with --load-checkpoint, or --load-dir")
     if not path.is_file():
         fail(f"there is no checkpoint {path}")
     others = sorted(p.name for p in path.parent.glob("step-*.ckpt") if p != path)

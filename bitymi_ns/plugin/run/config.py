@@ -39,16 +39,9 @@ class BitymiTrainerConfig(TrainerConfig):
     read_from = None  # folder of a config.yml loaded for evaluation; no field, to stay out of config.yml
     processes = 1  # of the run; no field: --machine.num-devices states it, hidden from nerfstudio
     vis: Literal[
-        "none",
-        "viewer",
-        "wandb",
-        "tensorboard",
-        "comet",
-        "viewer+wandb",
-        "viewer+tensorboard",
-        "viewer+comet",
+        "none", "viewer", "wandb", "tensorboard", "comet", "viewer+wandb", "viewer+tensorboard", "viewer+comet",
         "viewer_legacy",
-    ] = "viewer"
+    ] = "viewer"  # fmt: skip
     """Visualizer; none = no viewer, and no log but the training curve."""
     max_num_iterations: int | None = None
     """Length of the run in steps; schedules scale. Not given: --default-iterations; a resumed run: as before."""

@@ -51,17 +51,16 @@ class BitymiModelConfig(SurfelModelConfig):
 def train_config_for(config: TrainConfig, alpha_color: Tensor | None, transparent: bool) -> TrainConfig:
     """Return training options with the colour that the capture states for transparent images, if any: as `alpha_color`,
     and for a `background` of one colour, or auto without transparent images."""
-    color = config.alpha_color if alpha_color is None else _name_of(alpha_color)
+    color = config.alpha_color
+    if alpha_color is not None:
+        names: dict[float, Literal["black", "white"]] = {0.0: "black", 1.0: "white"}
+        values = alpha_color.unique().tolist()
+        if len(values) != 1 or values[0] not in names:
+            fail(f"the capture's alpha colour {alpha_color.tolist()} cannot be trained on; choose black or white")
+        color = names[values[0]]
     one = config.background in ("black", "white") and alpha_color is not None
     background = color if one or (config.background == "auto" and not transparent) else config.background
     return dataclasses.replace(config, background=background, alpha_color=color)
-
-
-def _name_of(alpha_color: Tensor) -> Literal["black", "white"]:
-    for name, value in (("black", 0.0), ("white", 1.0)):
-        if bool((alpha_color == value).all()):
-            return name  # type: ignore[return-value]
-    fail(f"the capture's alpha colour {alpha_color.tolist()} cannot be trained on; choose black or white")
 
 
 class BitymiModel(SurfelModel):

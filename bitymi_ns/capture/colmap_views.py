@@ -15,6 +15,7 @@ from bitymi_ns.capture.find_files import FileFinder, renamed_message
 from bitymi_ns.capture.masks import LEAVE_OUT, USUAL_FOLDERS, downscaled_masks, mask_folder, masks_named
 from bitymi_ns.capture.pictures import is_photograph, photographs_below, result_in
 from bitymi_ns.capture.points import Points
+from bitymi_ns.capture.recognise import Found
 from bitymi_ns.capture.types import CaptureError, SfmSettings, fail, say, warn
 from bitymi_ns.trust import leads_inside, listed
 
@@ -76,28 +77,16 @@ class Source:
         return text
 
 
-def find_source(
-    folder: Path,
-    capture: Path,
-    images_path: Path | None = None,
-    masks_path: Path | None = None,
-    downscale: int = 1,
-    need_photos: bool = True,
-) -> Source:
-    """Find a model's photographs and masks; photographs may be missing unless needed. `capture`: folder to which paths
-    are relative, and below which photographs are searched; above it, too, if it is that of the model. Raises
-    CaptureError: no folder has the model's photographs, or masks are incomplete."""
-    names = [image.name for image in read_model(folder).images]
-    photographs = _photo_folder(names, folder, capture, images_path, downscale, need_photos)
-    return make_source(folder, photographs, find_masks(photographs, capture, masks_path, downscale), downscale)
+def find_source(found: Found, images: Path | None, masks: Path | None, downscale: int, need_photos: bool) -> Source:
+    """Find photographs and masks of a COLMAP model, at stated paths in the capture, or below it."""
+    names = [image.name for image in read_model(found.path).images]
+    photographs = _find_folder(names, found.path, found.folder, images, downscale, need_photos)
+    masks = find_masks(photographs, found.folder, masks, downscale)
+    return make_source(found.path, photographs, masks, downscale, {})
 
 
 def make_source(
-    folder: Path,
-    photographs: Path,
-    masks: Path | None = None,
-    downscale: int = 1,
-    left_out: Mapping[str, str] | None = None,
+    folder: Path, photographs: Path, masks: Path | None, downscale: int, left_out: Mapping[str, str]
 ) -> Source:
     """Make a source of known folders, with downscaled copies (`images_2`, `masks_2`) if there are any."""
     smaller = photographs.with_name(f"{photographs.name}_{downscale}")
@@ -105,13 +94,14 @@ def make_source(
     if masks is not None and downscale > 1 and (copies is not None or not masks.is_dir()):
         small = downscaled_masks(masks, downscale)
         masks = small if small.is_dir() else masks  # reduced on reading
-    return Source(folder, photographs, masks, downscale, copies, dict(left_out or {}))
+    return Source(folder, photographs, masks, downscale, copies, dict(left_out))
 
 
-def _photo_folder(
+def _find_folder(
     names: Sequence[str], folder: Path, capture: Path, stated: Path | None, downscale: int, need_photos: bool
 ) -> Path:
-    """Find the folder with most of these photographs."""
+    """Find the folder with most of these photographs of a model, which may be missing unless needed: `stated`, or below
+    the capture; above it, too, if it is the model's `folder`. Raises CaptureError: none has any."""
     if stated is not None:
         if not need_photos or (capture / stated).is_dir() or (capture / f"{stated}_{downscale}").is_dir():
             return capture / stated
@@ -134,16 +124,15 @@ def _photo_folder(
     def exact_count(path: Path) -> int:
         return max((sum((each / name).is_file() for name in portable) for each in with_copies(path)), default=0)
 
-    def similar_count(path: Path) -> int:
-        found = (FileFinder(each).find_all(names) for each in with_copies(path))
-        return max((sum(path is not None for path in files) for files in found), default=0)
-
     best = max(folders, key=exact_count)  # the first of equals
     if not need_photos or exact_count(best) == len(names):
         return best
     # a folder above the capture may be the root of a disk, which is not searched
     searched = [each for each in folders if each.is_relative_to(capture) or each.name in USUAL_FOLDERS]
-    counts = {each: similar_count(each) for each in dict.fromkeys(searched)}
+    counts = {}
+    for each in dict.fromkeys(searched):
+        found = (FileFinder(one).find_all(names) for one in with_copies(each))
+        counts[each] = max((sum(path is not None for path in files) for files in found), default=0)
     other = max(counts, key=counts.__getitem__)
     if counts[other] > exact_count(best):
         return other
@@ -194,18 +183,12 @@ def photographs_of(source: Source, need_photos: bool) -> list[Photograph]:
     masks = None
     if need_photos and source.masks is not None:
         masks = masks_named(source.masks, [_name_in(source.image_folder, path) for path in files])
-    return [
-        Photograph(
-            file=file,
-            camera=model.cameras[image.camera_id],
-            pose=TO_Z_UP @ _camera_to_world(image),
-            label=f"camera {image.camera_id} of {source.folder}",
-            mask=None if masks is None else masks[i],
-            downscaled=source.copies is not None,
-            frame=image.frame,
-        )
-        for i, (image, file) in enumerate(zip(model.images, files, strict=True))
-    ]
+    found = []
+    for i, (image, file) in enumerate(zip(model.images, files, strict=True)):
+        camera, pose = model.cameras[image.camera_id], TO_Z_UP @ _camera_to_world(image)
+        label, mask = f"camera {image.camera_id} of {source.folder}", None if masks is None else masks[i]
+        found.append(Photograph(file, camera, pose, label, mask, source.copies is not None, image.frame))
+    return found
 
 
 def model_points(model: Model, frame: Pose) -> Points:

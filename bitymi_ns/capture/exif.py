@@ -40,16 +40,9 @@ def read_exif(image: Image.Image) -> Exif:
     focal, doubt = focal_length(detail, image.size)
     fraction = str(detail.get(ExifTags.Base.SubsecTimeOriginal) or "").strip()
     time = str(detail.get(ExifTags.Base.DateTimeOriginal) or "").strip()
-    return Exif(
-        camera=" ".join(
-            [str(name).strip("\0 ") for name in names if name] + ([f"{millimetres:g} mm"] if millimetres else [])
-        ),
-        focal_length=focal,
-        doubt=doubt,
-        position=_position(gps),
-        time=f"{time}.{fraction}" if time and fraction else time,
-        up=_up(image, tags, detail),
-    )
+    time = f"{time}.{fraction}" if time and fraction else time
+    parts = [str(name).strip("\0 ") for name in names if name] + [f"{millimetres:g} mm"] * bool(millimetres)
+    return Exif(" ".join(parts), focal, doubt, _position(gps), time, _up(image, tags, detail))
 
 
 def focal_length(detail: Mapping[int, object], size: tuple[int, int]) -> tuple[float | None, str]:

@@ -94,15 +94,11 @@ def exposure_stops(paths: Sequence[Path]) -> list[float]:
     all. Photographs with other entries than most cannot be compared, and are NaN.
     """
     found = in_threads(lambda path: from_header(path, exposure_settings, None), paths)
-    kinds = Counter(tuple(value is not None for value in each) for each in found if each is not None)
-    if not kinds:
-        return [math.nan] * len(paths)
-    usual = kinds.most_common(1)[0][0]
+    kinds = [None if each is None else tuple(value is not None for value in each) for each in found]
+    usual = Counter(kind for kind in kinds if kind is not None).most_common(1)
     return [
-        math.nan
-        if each is None or tuple(value is not None for value in each) != usual
-        else exif_stops(*(value or 1.0 for value in each))
-        for each in found
+        exif_stops(*(value or 1.0 for value in each)) if usual and kind == usual[0][0] else math.nan
+        for each, kind in zip(found, kinds, strict=True)
     ]
 
 
@@ -208,16 +204,10 @@ Pair = tuple[int, int]  # index of a training photograph, and of a held-out one
 
 def duplicate_files(train: Sequence[Path], held_out: Sequence[Path]) -> list[Pair]:
     """Pair files of the same bytes, reading only files of equal size."""
-    sizes = [[path.stat().st_size for path in paths] for paths in (train, held_out)]
-    shared = set(sizes[0]) & set(sizes[1])
-    contents = [
-        [
-            hashlib.sha256(path.read_bytes()).digest() if size in shared else path
-            for path, size in zip(paths, of, strict=True)
-        ]
-        for paths, of in zip((train, held_out), sizes, strict=True)
-    ]
-    return duplicates(*contents)
+    sizes = {path: path.stat().st_size for path in (*train, *held_out)}
+    shared = {sizes[path] for path in train} & {sizes[path] for path in held_out}
+    digest = {path: hashlib.sha256(path.read_bytes()).digest() for path, size in sizes.items() if size in shared}
+    return duplicates(*([digest.get(path) for path in paths] for paths in (train, held_out)))
 
 
 def duplicates(train: Sequence[Any], held_out: Sequence[Any]) -> list[Pair]:

@@ -119,12 +119,6 @@ def _job(stated: Sequence[str], views: Sequence[KnownView], work: Path) -> Job:
         poses[plain] = np.asarray(view.world_to_camera, float)[:3].tolist()
         if view.mask is not None and view.mask.is_file():
             colmap_mask(view.mask, view.file.name, view.camera.size).save(masks / f"{plain}.png")
-    return Job(
-        work=str(work.resolve()),
-        images=str(links.resolve()),
-        masks=str(masks.resolve()) if any(masks.iterdir()) else None,
-        cameras=[CameraGroup(camera, True, members) for camera, members in groups.items()],
-        order=list(names),
-        names=names,
-        poses=poses,
-    )
+    mask_folder = str(masks.resolve()) if any(masks.iterdir()) else None
+    cameras = [CameraGroup(camera, True, members) for camera, members in groups.items()]
+    return Job(str(work.resolve()), str(links.resolve()), mask_folder, cameras, list(names), names, poses=poses)

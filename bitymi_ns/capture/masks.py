@@ -143,7 +143,7 @@ def check_masks(photographs: Sequence[Photograph]) -> None:
     if missing:
         where = f"{len(missing)} of {len(masked)} masks of the capture are missing: {listed(missing)}"
         fail(f"{where}. Put them there, or correct their names; {LEAVE_OUT}.")
-    sizes = in_threads(image_size, masked)
+    sizes = in_threads(image_size, masked) if masked else []
     for (mask, photograph), known in zip(masked.items(), sizes, strict=True):
         size = known or checked_mask(mask).size  # fails with the reason
         if not in_proportion(size, photograph.camera.size):

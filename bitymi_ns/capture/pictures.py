@@ -41,22 +41,13 @@ _MAPS = {"accumulation", "beta", "overdraw", "expected_depth"}
 RAW = "raw data of a camera"
 UNREAD = {
     **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"), RAW),
-    ".jxl": "JPEG XL",
-    ".exr": "OpenEXR",
-    ".hdr": "Radiance HDR",
-    ".psd": "Photoshop",
-}
+    ".jxl": "JPEG XL", ".exr": "OpenEXR", ".hdr": "Radiance HDR", ".psd": "Photoshop",
+}  # fmt: skip
 """Formats of unread images by extension."""
 UNREAD_POSES = {
-    "poses_bounds.npy": "LLFF",
-    "cameras_sphere.npz": "NeuS",
-    "cameras.npz": "IDR",
-    "cameras.sfm": "Meshroom",
-    "sfm_data.json": "OpenMVG",
-    "reconstruction.json": "OpenSfM",
-    "bundle.out": "Bundler",
-    "bundle.rd.out": "Bundler",
-}
+    "poses_bounds.npy": "LLFF", "cameras_sphere.npz": "NeuS", "cameras.npz": "IDR", "cameras.sfm": "Meshroom",
+    "sfm_data.json": "OpenMVG", "reconstruction.json": "OpenSfM", "bundle.out": "Bundler", "bundle.rd.out": "Bundler",
+}  # fmt: skip
 """Programs by their files of poses, in lower case."""
 METASHAPE = b"<camera "  # in the XML file of cameras that Metashape exports under any name
 OTHER_FOLDERS = {
@@ -145,7 +136,8 @@ def _skipped(parent: Path, below: Collection[str]) -> dict[str, str]:
     """Map names of folders below a searched one to what they hold if they are not searched; empty = search them.
     Captures beside photographs hold copies of these."""
     found = {name: no_photographs(parent / name, below) for name in sorted(below)}
-    captures = [name for name, what in found.items() if not what and is_capture(parent / name)]
+    marks = {name: parent / name / "transforms.json" for name, what in found.items() if not what}
+    captures = [name for name, file in marks.items() if holds(file, b'"transform_matrix"')]
     if captures and (has_photographs(parent) or has_photographs(parent / "images")):
         found |= dict.fromkeys(captures, "pictures of another capture")
     return found
@@ -207,11 +199,6 @@ def result_in(folder: Path) -> str:
     if re.fullmatch(r"eval_img_\d{4,}\.png", pictures[-1]) and all(name.startswith("eval_") for name in pictures):
         return "renders of ns-eval"
     return _RENDERS if holds(folder / pictures[0], RENDERED, 1 << 10) else ""
-
-
-def is_capture(folder: Path) -> bool:
-    """Test for a capture of ns-process-data or `bitymi sfm`, with copies of the photographs."""
-    return holds(folder / "transforms.json", b'"transform_matrix"')
 
 
 def refusal(folder: Path) -> str:

@@ -201,6 +201,9 @@ def sample_colors(
     return colors
 
 
+Conventions = dict[str, Callable[[Pose], Pose]]
+
+
 def _from_xyzw(pose: Pose) -> Pose:
     """Convert a COLMAP pose whose quaternion x, y, z, w was read as w, x, y, z."""
     read = np.linalg.inv(pose @ OPENCV_AXES)
@@ -210,19 +213,17 @@ def _from_xyzw(pose: Pose) -> Pose:
     return np.linalg.inv(meant) @ OPENCV_AXES
 
 
-JSON_POSES: dict[str, Callable[[Pose], Pose]] = {
-    "the cameras have OpenCV's axes (y down, z forward): negate the second and third column": lambda pose: (
-        pose @ OPENCV_AXES
-    ),
+JSON_POSES: Conventions = {
+    "the cameras have OpenCV's axes (y down, z forward): negate the second and third column": lambda c: c @ OPENCV_AXES,
     "they are world to camera: invert them": np.linalg.inv,
-    "they are world to camera with OpenCV's axes: invert them, then negate the second and third column": lambda pose: (
-        np.linalg.inv(pose) @ OPENCV_AXES
+    "they are world to camera with OpenCV's axes: invert them, then negate the second and third column": lambda c: (
+        np.linalg.inv(c) @ OPENCV_AXES
     ),
-    "they are left-handed, as Unity's: negate the third column": lambda pose: pose @ np.diag([1.0, 1.0, -1.0, 1.0]),
+    "they are left-handed, as Unity's: negate the third column": lambda c: c @ np.diag([1.0, 1.0, -1.0, 1.0]),
 }
 """Conversions of poses in a transforms.json that was written in another convention than camera to world with OpenGL
 axes, by the remedy."""
-COLMAP_POSES: dict[str, Callable[[Pose], Pose]] = {
+COLMAP_POSES: Conventions = {
     "the cameras have OpenGL's axes (y up, z backward)": lambda pose: pose @ OPENCV_AXES,
     "they are camera to world: invert them": lambda pose: OPENCV_AXES @ np.linalg.inv(pose) @ OPENCV_AXES,
     "they are camera to world with OpenGL's axes": lambda pose: OPENCV_AXES @ np.linalg.inv(pose),
@@ -239,11 +240,7 @@ class _Fit(NamedTuple):
 
 
 def check_conventions(
-    points: Points,
-    photographs: Sequence[Photograph],
-    conventions: dict[str, Callable[[Pose], Pose]],
-    source: str,
-    frame: Pose | None = None,
+    points: Points, photographs: Sequence[Photograph], conventions: Conventions, source: str, frame: Pose | None = None
 ) -> None:
     """Warn if the photographs do not show the points by their poses, but would by another of the `conventions`. `frame`
     [4, 4] leads from the poses' frame to that of points and photographs; None = the same."""

@@ -198,20 +198,15 @@ def make_job(
     if masks is not None:
         colmap_masks(photos, plain, masks, mask_files)
     positions, _ = local_positions({p.name: p.exif.position for p in photos if p.exif.position is not None})
+    cameras = [camera_group(members, [plain[p.name] for p in members], options) for members in by_camera(photos)]
+    mask_folder = None if masks is None else str(mask_files.resolve())
     return Job(
-        work=str(work.resolve()),
-        images=str(links.resolve()),
-        masks=None if masks is None else str(mask_files.resolve()),
-        cameras=[camera_group(members, [plain[p.name] for p in members], options) for members in by_camera(photos)],
-        order=[plain[photo.name] for photo in photos],
+        *(str(work.resolve()), str(links.resolve()), mask_folder, cameras, list(plain.values())),
         names={plain[photo.name]: used[photo.name] for photo in photos},
         sequence=sequence,
         positions={plain[name]: position for name, position in positions.items()},
-        matching=options.matching,
-        mapper=options.mapper,
         opencv_if_better=options.camera_model == "auto",
-        max_image_size=options.max_image_size,
-        max_features=options.max_features,
+        **{name: getattr(options, name) for name in ("matching", "mapper", "max_image_size", "max_features")},
     )
 
 
@@ -240,24 +235,15 @@ def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence
     """Move the model to its world frame, write it with its report, and remove temporary files."""
     model = pycolmap.Reconstruction(work / MODEL)
     by_used = {job.names[plain]: photo for plain, photo in zip(job.order, photos, strict=True)}
-    frame = move_to_world(
-        model,
-        {n: p.exif.position for n, p in by_used.items() if p.exif.position is not None},
-        {n: p.exif.up for n, p in by_used.items() if p.exif.up is not None},
-    )
+    gps = {name: photo.exif.position for name, photo in by_used.items() if photo.exif.position is not None}
+    ups = {name: photo.exif.up for name, photo in by_used.items() if photo.exif.up is not None}
+    frame = move_to_world(model, gps, ups)
     values |= {"up": frame.up, "metres_per_unit": frame.metres_per_unit, "gps_error": frame.gps_error}
     known = {job.names[plain] for group in job.cameras if group.prior for plain in group.names}
     stated = {image.camera_id for image in model.images.values() if image.name in known}  # a model's file has no priors
-    values["cameras"] = [
-        {
-            "model": c.model_name,
-            "width": c.width,
-            "height": c.height,
-            "params": c.params.tolist(),
-            "prior": c.camera_id in stated,
-        }
-        for c in model.cameras.values()
-    ]
+    names, cameras = ("model", "width", "height", "params", "prior"), model.cameras.values()
+    rows = ((c.model_name, c.width, c.height, c.params.tolist(), c.camera_id in stated) for c in cameras)
+    values["cameras"] = [dict(zip(names, row, strict=True)) for row in rows]
     kept = {each.name: values[each.name] for each in fields(Poses) if each.name in values}
     with complete_folder(work / "result") as result:
         sparse = result / SPARSE

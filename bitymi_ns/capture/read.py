@@ -90,7 +90,7 @@ class CaptureOptions(SplitOptions, FrameOptions):
         """Find the COLMAP model and its photographs; photographs without poses go through structure from motion."""
         downscale, kept = self.downscale_factor or 1, self.kept()
         if found.format == "colmap":
-            source = find_source(found.path, found.folder, self.images_path, self.masks_path, downscale, need_photos)
+            source = find_source(found, self.images_path, self.masks_path, downscale, need_photos)
         elif kept is not None:
             source = kept_source(found, kept, self.masks_path, downscale, need_photos)
         else:
@@ -267,7 +267,11 @@ class _Reader:
         for name in ("val", "test"):
             if (found.path / f"transforms_{name}.json").is_file():
                 part = self._read_transforms(found.folder / f"transforms_{name}.json")
-                parts[name] = _existing(part) if need_photos else part.photographs
+                parts[name] = [each for each in part.photographs if not need_photos or each.file.is_file()]
+                if lacking := [each.file for each in part.photographs if each not in parts[name]]:
+                    what = str(len(lacking)) if parts[name] else "all"
+                    left = f"left out: {listed(lacking)}"
+                    warn(f"{part.path} lacks {what} of its {len(part.photographs)} photographs, {left}.")
                 named |= part.named
         source, every = str(train.path), [each for part in parts.values() for each in part]
         self._check(f"{train.path} (blender, {len(train.photographs)} photographs)", every, named)
@@ -315,13 +319,3 @@ class _Reader:
         from bitymi_ns.capture.known_poses import triangulated  # slow to import, and seldom needed
 
         return triangulated(photographs, self.found.folder, source)
-
-
-def _existing(part: Transforms) -> list[Photograph]:
-    """List a held-out file's photographs that exist; warn of the others."""
-    there = [each for each in part.photographs if each.file.is_file()]
-    lacking = [each.file for each in part.photographs if not each.file.is_file()]
-    if lacking:
-        what = "all" if not there else str(len(lacking))
-        warn(f"{part.path} lacks {what} of its {len(part.photographs)} photographs, left out: {listed(lacking)}.")
-    return there

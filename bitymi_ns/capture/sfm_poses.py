@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from bitymi_ns.capture.cache import keep_work_folder
-from bitymi_ns.capture.colmap_model import Model
 from bitymi_ns.capture.colmap_views import Origin, Source, find_masks, make_source
 from bitymi_ns.capture.images import image_size, in_threads
 from bitymi_ns.capture.photos import photo_folder
@@ -85,7 +84,12 @@ def kept_source(found: Found, kept: KeptPoses, masks_path: Path | None, downscal
     if need_photos:
         files = source.files()
         missing = [file.readlink() if file.is_symlink() else file for file in files if not file.is_file()]
-        changed = [] if source.copies is not None else _other_sizes(source.model, files)
+        changed = []
+        sizes = in_threads(image_size, files) if source.copies is None else [None] * len(files)
+        for image, file, size in zip(source.model.images, files, sizes, strict=True):
+            camera = source.model.cameras[image.camera_id]
+            if size not in (None, camera.size):
+                changed.append(f"{file}: {size[0]} x {size[1]} pixels, {camera.width} x {camera.height} then")
         what = [f"{len(missing)} are missing ({listed(missing)})"] if missing else []
         what += [f"{len(changed)} have another size ({listed(changed)})"] if changed else []
         if what:
@@ -162,13 +166,3 @@ def write_kept_poses(folder: Path, source: Source, origin: Origin) -> None:
                 shutil.copyfile(file, target)
     values = {"origin": asdict(origin), "left_out": dict(source.left_out)}
     (folder / ORIGIN).write_text(json.dumps(values, indent=2, ensure_ascii=False) + "\n", "utf8")
-
-
-def _other_sizes(model: Model, files: list[Path]) -> list[str]:
-    """Describe photographs whose size is not their camera's, without unreadable ones."""
-    changed = []
-    for image, file, size in zip(model.images, files, in_threads(image_size, files), strict=True):
-        camera = model.cameras[image.camera_id]
-        if size is not None and size != camera.size:
-            changed.append(f"{file}: {size[0]} x {size[1]} pixels, {camera.width} x {camera.height} then")
-    return changed

@@ -161,7 +161,11 @@ def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
     if isinstance(model, BakedModelConfig):
         model.bundle = _find_bundle(model.bundle, evaluated)
         config.read_from = evaluated
-        _read_cameras_of(model.bundle, config.pipeline.datamanager)
+        datamanager = config.pipeline.datamanager
+        data = datamanager.data or getattr(datamanager.dataparser, "data", None)
+        if data is not None and not Path(data).exists() and has_cameras(model.bundle):  # its capture is gone
+            datamanager.dataparser = BundleCamerasConfig(data=model.bundle, capture=Path(data))
+            datamanager.data = model.bundle
         return _stub_checkpoint_dir(model.bundle)
     folder = usual()
     if evaluated is not None:
@@ -224,14 +228,6 @@ def _stub_checkpoint_dir(bundle: Path) -> Path:
     torch.save({"step": 0, **{name: {} for name in ("pipeline", "optimizers", "schedulers", "scalers")}},
                folder / "step-000000000.ckpt")  # fmt: skip
     return folder
-
-
-def _read_cameras_of(bundle: Path, datamanager: Any) -> None:
-    """Read the bundle's own cameras if its capture is gone."""
-    data = datamanager.data or getattr(datamanager.dataparser, "data", None)
-    if data is not None and not Path(data).exists() and has_cameras(bundle):
-        datamanager.dataparser = BundleCamerasConfig(data=bundle, capture=Path(data))
-        datamanager.data = bundle
 
 
 def refuse_others() -> None:

@@ -47,17 +47,14 @@ def contradicted(model: pycolmap.Reconstruction, database: Path, pixel: float) -
             matches = np.asarray(geometry.inlier_matches)
             if first not in placed or second not in placed or len(matches) < LINK:
                 continue
-            limit = MAX_ERROR * pixel / pixels_per_radian(placed[second].camera)
+            camera = placed[second].camera
+            focal = camera.width / (2.0 * np.pi) if camera.is_spherical() else camera.mean_focal_length()
+            limit = MAX_ERROR * pixel / focal  # angle in the middle of the picture
             a, b = (rays[i][column] for i, column in zip((first, second), matches.T, strict=True))
             move = placed[second].cam_from_world() * placed[first].cam_from_world().inverse()
             total += len(matches)
             against += int((~_rays_meet(a, b, move, limit)).sum())
     return against / max(total, 1)
-
-
-def pixels_per_radian(camera: pycolmap.Camera) -> float:
-    """Return the pixels per radian in the middle of a picture."""
-    return camera.width / (2.0 * np.pi) if camera.is_spherical() else camera.mean_focal_length()
 
 
 def _rays_meet(a: np.ndarray, b: np.ndarray, move: pycolmap.Rigid3d, limit: float) -> np.ndarray:

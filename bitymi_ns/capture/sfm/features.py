@@ -17,25 +17,15 @@ def extract(job: Job, database: Path, tell: StageProgress) -> None:
     """Find features of photographs without any yet."""
     total = len(job.order)
     tell("finding features", 0, total, counts="keypoints")
-    groups = list(zip(job.cameras, camera_ids(job, database), strict=True))
-    for group, camera_id in groups:  # number photographs in an order that threads do not change
-        pycolmap.import_images(
-            database,
-            job.images,
-            image_names=group.names,
-            camera_mode=pycolmap.CameraMode.SINGLE,
-            options=_reader(job, group, camera_id),
-        )
-    for group, camera_id in groups:
-        pycolmap.extract_features(
-            database,
-            job.images,
-            image_names=group.names,
-            camera_mode=pycolmap.CameraMode.SINGLE,
-            reader_options=_reader(job, group, camera_id),
-            extraction_options=_extraction(job, group),
-            device=pycolmap.Device.cpu,
-        )
+    ids = zip(job.cameras, camera_ids(job, database), strict=True)
+    groups = [(group, _reader(job, group, camera_id)) for group, camera_id in ids]
+    single = {"camera_mode": pycolmap.CameraMode.SINGLE}
+    for group, reader in groups:  # number photographs in an order that threads do not change
+        pycolmap.import_images(database, job.images, image_names=group.names, options=reader, **single)
+    for group, reader in groups:
+        options = {"reader_options": reader, "extraction_options": _extraction(job, group), **single}
+        how = {"image_names": group.names, "device": pycolmap.Device.cpu}
+        pycolmap.extract_features(database, job.images, **how, **options)
     tell("finding features", total, total)
 
 

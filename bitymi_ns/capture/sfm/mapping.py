@@ -30,8 +30,12 @@ def reconstruct(job: Job, database: Path, connected: int, tell: StageProgress) -
     found = None
     if job.mapper in ("auto", "global"):
         found = _mapped(_global, job, database, tell)
-        if job.mapper == "global" or (found is not None and _satisfies(found, job, database, connected)):
+        if job.mapper == "global":
             return found
+        if found is not None and found.num_reg_images() >= ENOUGH * connected:
+            exact = found.compute_mean_reprojection_error() <= GOOD_ERROR * job.pixel
+            if exact and contradicted(found, database, job.pixel) <= CONTRADICTED:
+                return found
     return better(job, database, found, _mapped(_incremental, job, database, tell))
 
 
@@ -43,14 +47,6 @@ def better(job: Job, database: Path, *models: pycolmap.Reconstruction | None) ->
     if len(equal) < 2:
         return equal[0] if equal else None
     return min(equal, key=lambda model: contradicted(model, database, job.pixel))
-
-
-def _satisfies(model: pycolmap.Reconstruction, job: Job, database: Path, connected: int) -> bool:
-    return (
-        model.num_reg_images() >= ENOUGH * connected
-        and model.compute_mean_reprojection_error() <= GOOD_ERROR * job.pixel
-        and contradicted(model, database, job.pixel) <= CONTRADICTED
-    )
 
 
 def _mapped(mapper: Mapper, job: Job, database: Path, tell: StageProgress) -> pycolmap.Reconstruction | None:

@@ -27,16 +27,10 @@ def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:
     work = Path(job.work)
     watching = ExitStack()
     with open(work / LOG, "wb", opener=no_links) as log:
-        process = subprocess.Popen(
-            python_command("bitymi_ns.capture.sfm.worker", "main"),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=log,
-            text=True,
-            encoding="utf8",
-            start_new_session=True,  # Ctrl-C comes to this process alone
-            env={**os.environ, "PYTHONUNBUFFERED": "1"},
-        )
+        streams = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": log}
+        how = {"text": True, "encoding": "utf8", "env": {**os.environ, "PYTHONUNBUFFERED": "1"}}
+        how["start_new_session"] = True  # Ctrl-C comes to this process alone
+        process = subprocess.Popen(python_command("bitymi_ns.capture.sfm.worker", "main"), **streams, **how)
         try:
             assert process.stdin is not None and process.stdout is not None
             process.stdin.write(job.text() + "\n")

@@ -131,9 +131,17 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
     """Check a bundle against its run, named by config.yml, folder or a checkpoint."""
     if views < 1:
         fail(f"--views must be at least 1, not {views}")
-    config, step = find_run(run)
+    step = None
+    if run.suffix == ".ckpt":
+        number = run.stem.removeprefix("step-")
+        if not run.is_file() or not number.isdecimal():
+            fail(f"there is no checkpoint {run}")
+        run, step = run.parent.parent / "config.yml", int(number)
+    elif run.is_dir():  # of the run or of its checkpoints
+        folders = [folder for folder in (run, run.parent) if (folder / "config.yml").is_file()]
+        run = (folders[0] if folders else run) / "config.yml"
     with CONSOLE.capture():  # nerfstudio reports at length what it loads
-        _, pipeline = load_trained(config, step)
+        _, pipeline = load_trained(run, step)
     model, datamanager = pipeline.model, pipeline.datamanager
     train = to_cameras(datamanager.train_dataset.cameras, "cpu")
     checks = [check_view_color(bundle, model.scene.surfels, train)]
@@ -148,15 +156,3 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
         detail += f"; against the photographs {photos:+.3f} dB"
         checks.append(Check("PSNR against the trained scene", stated is None or worst >= stated - _PSNR_SLACK, detail))
     return [*checks, check_world(bundle.info.world, world_of(datamanager))]
-
-
-def find_run(run: Path) -> tuple[Path, int | None]:
-    """Find the config.yml of a run named by it, its folder or a checkpoint, and the checkpoint's step."""
-    if run.suffix == ".ckpt":
-        step = run.stem.removeprefix("step-")
-        if not run.is_file() or not step.isdecimal():
-            fail(f"there is no checkpoint {run}")
-        return run.parent.parent / "config.yml", int(step)
-    if run.is_dir() and not (run / "config.yml").is_file() and (run.parent / "config.yml").is_file():
-        run = run.parent  # the folder of its checkpoints
-    return (run / "config.yml" if run.is_dir() else run), None

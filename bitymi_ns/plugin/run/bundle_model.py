@@ -45,8 +45,13 @@ class BakedModel(SurfelModel):
 
     def populate_modules(self) -> None:
         super().populate_modules()
-        folder, renderer = Path(self.config.bundle), self._renderer_name()
+        folder, renderer = Path(self.config.bundle), os.environ.get(RENDERER) or self.config.renderer
+        if renderer not in ("kernels", "fast", "webgpu"):
+            fail(f"{RENDERER} must be kernels, fast or webgpu, not {renderer!r}")
         through_webgpu = renderer == "webgpu"
+        if through_webgpu:
+            with _webgpu_needed():
+                webgpu.device.device()
         on_card = kernel_device(self.kwargs.get("device", "cpu")).type == "cuda" and not through_webgpu
         try:
             bundle = read_bundle(folder, decode=not on_card)
@@ -62,16 +67,6 @@ class BakedModel(SurfelModel):
         if renderer == "fast":
             bundle.scene.transmittance_min = FAST
         self._renderer = SceneRenderer(bundle.scene)
-
-    def _renderer_name(self) -> str:
-        """Choose the renderer; stop if it is unknown, or WebGPU is not available."""
-        asked = os.environ.get(RENDERER) or self.config.renderer
-        if asked not in ("kernels", "fast", "webgpu"):
-            fail(f"{RENDERER} must be kernels, fast or webgpu, not {asked!r}")
-        if asked == "webgpu":
-            with _webgpu_needed():
-                webgpu.device.device()
-        return asked
 
     def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
         with _webgpu_needed():

@@ -119,8 +119,6 @@ class TrainingRun:
         """Return all but parameters and optimisers that decides how the run goes on."""
         return {**self.training.state_dict(), "random": torch.get_rng_state(), "capture": self.capture}
 
-    # a step
-
     def before(self, step: int) -> None:
         """Set the step's learning rates."""
         if self._random_state is not None:
@@ -167,8 +165,6 @@ class TrainingRun:
 
     def _on_resize(self, name: str, parameter: Parameter) -> None:
         self._parameters[name] = [parameter]  # used by gradient clipping
-
-    # the curve
 
     def _add_point(self, step: int) -> None:
         views = self.datamanager.eval_views

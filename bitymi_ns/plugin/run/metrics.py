@@ -74,7 +74,10 @@ def lpips_metrics(image: Tensor, reference: Tensor, names: Sequence[str]) -> dic
     return found
 
 
-def render_milliseconds(render: Callable[[], Any], device: torch.device, repeats: int = 3) -> float:
+REPEATS = 3  # of timed renders
+
+
+def render_milliseconds(render: Callable[[], Any], device: torch.device) -> float:
     """Measure the median time of rendering alone, after a warm-up, waiting for the device each time."""
 
     def timed() -> float:
@@ -86,7 +89,7 @@ def render_milliseconds(render: Callable[[], Any], device: torch.device, repeats
 
     with torch.no_grad():
         timed()
-        return sorted(timed() for _ in range(repeats))[repeats // 2]
+        return sorted(timed() for _ in range(REPEATS))[REPEATS // 2]
 
 
 def _synchronize(device: torch.device) -> None:

@@ -88,8 +88,6 @@ class BitymiModel(SurfelModel):
         self._run: TrainingRun | None = None
         self.carry: Callable[[Camera], Camera] | None = None  # of a finished run that refined poses
 
-    # rendering
-
     @property
     def background(self) -> Tensor:
         """[3]: see `eval_background`."""
@@ -125,8 +123,6 @@ class BitymiModel(SurfelModel):
             metrics["refined_psnr"] = view_psnr(self.scene, view, self.background)
         return metrics, images
 
-    # training
-
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         groups = {name: [parameter] for name, parameter in self.scene.surfels.items()}
         if isinstance(self.scene.field, HashField):
@@ -149,8 +145,6 @@ class BitymiModel(SurfelModel):
             return outputs["losses"]
         target, mask = self.photograph(batch, outputs["rgb"])
         return {"photometric": photometric(outputs["rgb"], target, self.train_config.loss.ssim_weight, mask)}
-
-    # checkpoints
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return tensors, numbers and text only, for torch's safe mode."""

@@ -143,7 +143,7 @@ class BitymiTrainer(Trainer):
             run_folder.check_space(self.base_dir, 3 * sum(learned))
         if self._start_step > 0:
             say(f"{self.config.length()}, {total - self._start_step:,} of them left")
-        restore_handler = self._catch_interrupt()
+        previous = self._catch_interrupt()
         try:
             if self.processes.count > 1 and self.processes.first:
                 self._workers = Workers(self.config, self.processes.count)
@@ -159,14 +159,15 @@ class BitymiTrainer(Trainer):
                 self._report_interruption()
         finally:
             self.config.max_num_iterations = total
-            restore_handler()
+            for number, handler in previous.items():
+                signal.signal(number, handler)
 
-    def _catch_interrupt(self) -> Callable[[], None]:
-        """Let the first Ctrl-C, or a batch system's request to end, stop the run after the current step; return a
-        function that undoes this."""
+    def _catch_interrupt(self) -> dict[int, Any]:
+        """Let the first Ctrl-C, or a batch system's request to end, stop the run after the current step; return the
+        previous handlers."""
         if threading.current_thread() is not threading.main_thread():
-            return lambda: None
-        previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+            return {}
+        previous: dict[int, Any] = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
         def on_interrupt(number: int, frame: Any) -> None:
             if self._stop_requested or self.training_state == "completed":
@@ -176,12 +177,7 @@ class BitymiTrainer(Trainer):
 
         for number in previous:
             signal.signal(number, on_interrupt)
-
-        def restore() -> None:
-            for number, handler in previous.items():
-                signal.signal(number, handler)
-
-        return restore
+        return previous
 
     def _report_interruption(self) -> None:
         saved = sorted(self.checkpoint_dir.glob("step-*.ckpt"))

@@ -41,7 +41,7 @@ def read_exif(image: Image.Image) -> Exif:
     fraction = str(detail.get(ExifTags.Base.SubsecTimeOriginal) or "").strip()
     time = str(detail.get(ExifTags.Base.DateTimeOriginal) or "").strip()
     time = f"{time}.{fraction}" if time and fraction else time
-    parts = [str(name).strip("\0 ") for name in names if name] + [f"{millimetres:g} mm"] * bool(millimetres)
+    parts = [str(name).strip("\0 ") for name in names if name] + ([f"{millimetres:g} mm"] if millimetres else [])
     return Exif(" ".join(parts), focal, doubt, _position(gps), time, _up(image, tags, detail))
 
 

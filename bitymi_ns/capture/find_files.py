@@ -11,9 +11,8 @@ from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from bitymi_ns.capture.camera import Photograph
 from bitymi_ns.capture.pictures import PHOTOGRAPHS, passed_over, result_in
-from bitymi_ns.capture.types import MAP_FILES, MapFiles, fail, say, warn
+from bitymi_ns.capture.types import MAP_FILES, MapFiles, Photograph, fail, say, warn
 from bitymi_ns.trust import leads_inside, listed
 
 Parts = tuple[str, ...]  # folders and file of a name, in one case and one Unicode form

@@ -113,11 +113,8 @@ def _gps_error(similarity: pycolmap.Sim3d, centers: np.ndarray, positions: np.nd
 
 def _by_gravity(model: pycolmap.Reconstruction, ups: Mapping[str, tuple[float, float, float]]) -> np.ndarray | None:
     """Average up [3] by accelerometers in the model's world; None unless three or more, and most of them, agree."""
-    found = [
-        image.cam_from_world().rotation.matrix().T @ np.array(ups[image.name])
-        for image in model.images.values()
-        if image.has_pose and image.name in ups
-    ]
+    images = [image for image in model.images.values() if image.has_pose and image.name in ups]
+    found = [image.cam_from_world().rotation.matrix().T @ np.array(ups[image.name]) for image in images]
     if len(found) < 3:
         return None
     directions = np.array(found)

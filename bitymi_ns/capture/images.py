@@ -5,21 +5,21 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from PIL import EpsImagePlugin, Image
+from PIL import EpsImagePlugin, ExifTags, Image, ImageCms
 
 from bitymi_ns.capture.exif import exif_stops, exposure_settings
-from bitymi_ns.capture.photos import eight_bits, in_srgb
 from bitymi_ns.capture.pictures import open_picture
 from bitymi_ns.capture.types import fail, parsing, warn
 from bitymi_ns.trust import listed
 
 S, T = TypeVar("S"), TypeVar("T")
-ORIENTATION = 0x0112  # EXIF tag that asks viewers to turn a photograph; 1 = as stored
 MAX_PIXELS = 1_000_000_000  # most pixels of a photograph; phones take 200 million
 MAX_PIXELS = 1_000_000_000  # photographs with more pixels are refused; phones take some of 200 million
 THREADS = 4
@@ -81,7 +81,7 @@ def orientation(path: Path) -> int:
     def read(image: Image.Image) -> int:
         if image.format == "PNG" and "exif" not in image.info:
             return 1  # else PIL decodes the whole image in search of it
-        return image.getexif().get(ORIENTATION, 1)
+        return image.getexif().get(ExifTags.Base.Orientation, 1)
 
     value = from_header(path, read, 1)
     return value if value in range(1, 9) else 1
@@ -158,6 +158,55 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
         fail(f"the image {path} is missing, but the capture has a pose for it", error)
     except Image.DecompressionBombError as error:
         fail(_too_large([path]), error)
+
+
+def eight_bits(image: Image.Image) -> Image.Image:
+    """Scale deep grey modes to 8 bits, with their EXIF orientation. Raises ValueError: their range is unknown."""
+    if not image.mode.startswith(("I", "F")):
+        return image
+    values = np.asarray(image, dtype=np.float64)
+    low, high = float(values.min()), float(values.max())
+    if image.mode.startswith("I;16") or image.format == "PNG":
+        whites = (65535.0,)
+    else:  # TIFF and the like, which do not say what white is
+        whites = (1.0, 255.0) if image.mode == "F" else (255.0, 65535.0)
+    white = next((white for white in whites if high <= white), None)
+    if white is None or not low >= 0.0:  # also NaN
+        raise ValueError(
+            f"its values lie between {low:g} and {high:g}, those of such a file should between 0 and {whites[-1]:g} "
+            f"(PIL's mode {image.mode}); save it with 8 or 16 bits per channel"
+        )
+    grey = Image.fromarray((values * (255.0 / white) + 0.5).astype(np.uint8))
+    turn = Image.Exif()
+    turn[ExifTags.Base.Orientation] = image.getexif().get(ExifTags.Base.Orientation, 1)
+    grey.info["exif"] = turn.tobytes()
+    return grey
+
+
+def in_srgb(image: Image.Image) -> Image.Image:
+    """Convert an image with a color profile (Display P3, Adobe RGB) to sRGB."""
+    profile = image.info.get("icc_profile")
+    convert = _to_srgb(profile) if profile and image.mode in ("RGB", "RGBA") else None
+    if convert is None:
+        return image
+    converted = convert.apply(image.convert("RGB"))
+    if image.mode == "RGBA":
+        converted.putalpha(image.getchannel("A"))
+    return converted
+
+
+@lru_cache(maxsize=8)
+def _to_srgb(profile: bytes) -> ImageCms.ImageCmsTransform | None:
+    """Make the transform of an RGB profile to sRGB; None = it changes next to nothing, or there is none."""
+    try:
+        source = ImageCms.ImageCmsProfile(BytesIO(profile))
+        convert = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), "RGB", "RGB")
+    except (ImageCms.PyCMSError, OSError):
+        return None
+    levels = np.array([0, 64, 128, 192, 255], np.uint8)
+    probe = np.stack(np.meshgrid(levels, levels, levels), -1).reshape(5, 25, 3)
+    changed = np.asarray(convert.apply(Image.fromarray(probe)), int)
+    return convert if np.abs(changed - probe).max() > 4 else None
 
 
 def pixels_of(image: Image.Image) -> npt.NDArray[np.uint8]:

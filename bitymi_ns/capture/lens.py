@@ -14,9 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from bitymi_ns.capture.camera import ColmapCamera, Photograph, is_full_sphere
 from bitymi_ns.capture.images import image_size, in_proportion, in_threads, wrong_size
-from bitymi_ns.capture.types import fail, say, warn
+from bitymi_ns.capture.types import ColmapCamera, Photograph, fail, is_full_sphere, say, warn
 
 MAX_VIEW_ANGLE = 110.0  # degrees, across and down; a wider pinhole picture wastes pixels: it becomes faces of a cube
 NODE_STEP = 4  # pixels between the nodes of the distortion; interpolating between them is far more exact than a pixel
@@ -231,12 +230,12 @@ def make_lenses(photographs: Sequence[Photograph], downscale: int = 1, need_phot
     for photograph, size in zip(photographs, sizes, strict=True):
         camera = photograph.camera
         full = camera.size
-        small = full if downscale == 1 else (max(1, round(full[0] / downscale)), max(1, round(full[1] / downscale)))
+        small = (max(1, round(full[0] / downscale)), max(1, round(full[1] / downscale)))
         if size is not None and max(abs(size[0] - small[0]), abs(size[1] - small[1])) > 1:
+            there, file = f"{small[0]} x {small[1]}", photograph.file
             fail(
-                f"the image {photograph.file} has {size[0]} x {size[1]} pixels, but its camera is for {full[0]} x "
-                f"{full[1]}, of which 1/{downscale} is {small[0]} x {small[1]}. Make the folder "
-                f"{photograph.file.parent} again, or leave --downscale-factor out."
+                f"the image {file} has {size[0]} x {size[1]} pixels, but its camera is for {full[0]} x {full[1]}, "
+                f"of which 1/{downscale} is {there}. Make {file.parent} again, or leave --downscale-factor out."
             )
         used = size or small
         key = (camera, used, photograph.downscaled)

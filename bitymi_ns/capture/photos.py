@@ -8,18 +8,16 @@ import re
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from PIL import ExifTags, Image, ImageCms, ImageOps
+from PIL import ExifTags, Image, ImageOps
 
-from bitymi_ns.capture.camera import is_full_sphere
 from bitymi_ns.capture.exif import Exif, exposure_exif, read_exif
+from bitymi_ns.capture.images import eight_bits, in_srgb
 from bitymi_ns.capture.pictures import is_photograph, open_picture, photographs_below
-from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.capture.types import CaptureError, is_full_sphere
 from bitymi_ns.progress import Progress
 from bitymi_ns.reading import open_regular, why
 from bitymi_ns.trust import is_text
@@ -115,7 +113,7 @@ def read_photo(folder: Path, name: str) -> Photo:
     try:
         with open_picture(path) as image:
             exif = read_exif(image)
-            orientation = image.getexif().get(0x0112, 1)
+            orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
             width, height = image.size[::-1] if orientation in (5, 6, 7, 8) else image.size
             mode, plain = image.mode, is_plain(image, path)
             if image.format == "JPEG":
@@ -164,58 +162,9 @@ def looks_panoramic(grey: npt.NDArray[np.float32]) -> bool:
     return bool(np.corrcoef(detail)[0, 1] > ALIKE)
 
 
-def eight_bits(image: Image.Image) -> Image.Image:
-    """Scale deep grey modes to 8 bits, with their EXIF orientation. Raises ValueError: their range is unknown."""
-    if not image.mode.startswith(("I", "F")):
-        return image
-    values = np.asarray(image, dtype=np.float64)
-    low, high = float(values.min()), float(values.max())
-    if image.mode.startswith("I;16") or image.format == "PNG":
-        whites = (65535.0,)
-    else:  # TIFF and the like, which do not say what white is
-        whites = (1.0, 255.0) if image.mode == "F" else (255.0, 65535.0)
-    white = next((white for white in whites if high <= white), None)
-    if white is None or not low >= 0.0:  # also NaN
-        raise ValueError(
-            f"its values lie between {low:g} and {high:g}, those of such a file should between 0 and {whites[-1]:g} "
-            f"(PIL's mode {image.mode}); save it with 8 or 16 bits per channel"
-        )
-    grey = Image.fromarray((values * (255.0 / white) + 0.5).astype(np.uint8))
-    turn = Image.Exif()
-    turn[ExifTags.Base.Orientation] = image.getexif().get(ExifTags.Base.Orientation, 1)
-    grey.info["exif"] = turn.tobytes()
-    return grey
-
-
 def is_plain(image: Image.Image, path: Path) -> bool:
     """Test for an opened file in a format that everything reads, with the right extension."""
     return path.suffix.lower() in PLAIN.get(image.format or "", ())
-
-
-def in_srgb(image: Image.Image) -> Image.Image:
-    """Convert an image with a color profile (Display P3, Adobe RGB) to sRGB."""
-    profile = image.info.get("icc_profile")
-    convert = _to_srgb(profile) if profile and image.mode in ("RGB", "RGBA") else None
-    if convert is None:
-        return image
-    converted = convert.apply(image.convert("RGB"))
-    if image.mode == "RGBA":
-        converted.putalpha(image.getchannel("A"))
-    return converted
-
-
-@lru_cache(maxsize=8)
-def _to_srgb(profile: bytes) -> ImageCms.ImageCmsTransform | None:
-    """Make the transform of an RGB profile to sRGB; None = it changes next to nothing, or there is none."""
-    try:
-        source = ImageCms.ImageCmsProfile(BytesIO(profile))
-        convert = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), "RGB", "RGB")
-    except (ImageCms.PyCMSError, OSError):
-        return None
-    levels = np.array([0, 64, 128, 192, 255], np.uint8)
-    probe = np.stack(np.meshgrid(levels, levels, levels), -1).reshape(5, 25, 3)
-    changed = np.asarray(convert.apply(Image.fromarray(probe)), int)
-    return convert if np.abs(changed - probe).max() > 4 else None
 
 
 def _reduced(image: Image.Image, size: int) -> Image.Image:

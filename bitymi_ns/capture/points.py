@@ -18,9 +18,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from bitymi_ns.capture.camera import OPENCV_AXES, Photograph, Pose
 from bitymi_ns.capture.images import read_image
-from bitymi_ns.capture.types import fail, say, warn
+from bitymi_ns.capture.types import OPENCV_AXES, Photograph, Pose, fail, say, warn
 from bitymi_ns.ply import PlyError, read_header, read_rows, rows_there, text_lines
 from bitymi_ns.ranges import spread
 

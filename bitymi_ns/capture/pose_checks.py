@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bitymi_ns.capture.camera import Photograph
-from bitymi_ns.capture.types import FrameOptions, fail, say, warn
+from bitymi_ns.capture.types import FrameOptions, Photograph, fail, say, warn
 from bitymi_ns.trust import listed
 
 EXACT = 1e-3  # error of rotations taken as they are: float32, or four written digits

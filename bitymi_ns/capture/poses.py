@@ -14,7 +14,6 @@ import pycolmap
 from pydantic import TypeAdapter
 
 from bitymi_ns.capture.cache import content_key, replace_stale, work_folder
-from bitymi_ns.capture.camera import SPHERICAL_MODEL, ColmapCamera, is_full_sphere
 from bitymi_ns.capture.frame import local_positions, move_to_world, write_frame
 from bitymi_ns.capture.masks import mask_folder
 from bitymi_ns.capture.photos import Photo, blurred, check_names, duplicates, find_photos, photo_folder, read_photos
@@ -24,7 +23,7 @@ from bitymi_ns.capture.recognise import is_model
 from bitymi_ns.capture.report import write_report
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
-from bitymi_ns.capture.types import CaptureError, Poses, SfmOptions
+from bitymi_ns.capture.types import SPHERICAL_MODEL, CaptureError, ColmapCamera, Poses, SfmOptions, is_full_sphere
 from bitymi_ns.capture.video import NO_MOTION, extract_frames
 from bitymi_ns.files import Tell, complete_folder, explained, write_file
 from bitymi_ns.progress import Progress, no_progress

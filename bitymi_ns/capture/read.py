@@ -8,7 +8,6 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from bitymi_ns.capture.camera import Photograph, Pose
 from bitymi_ns.capture.colmap_model import read_model
 from bitymi_ns.capture.colmap_views import TO_Z_UP, Source, find_source, model_points, photographs_of, warn_left_out
 from bitymi_ns.capture.find_files import check_photographs_exist, name_unused
@@ -21,7 +20,7 @@ from bitymi_ns.capture.scanner_views import scanner_photographs
 from bitymi_ns.capture.sfm_poses import KeptPoses, find_sfm_source, kept_source, read_kept_poses
 from bitymi_ns.capture.splits import NameLists, SplitOptions, choose_split, list_files
 from bitymi_ns.capture.transforms import Transforms, check_number, read_transforms
-from bitymi_ns.capture.types import FrameOptions, Orientation, SfmSettings, fail, say, warn
+from bitymi_ns.capture.types import FrameOptions, Orientation, Photograph, Pose, SfmSettings, fail, say, warn
 from bitymi_ns.trust import listed
 
 Choice = Literal["auto", "triangulate", "random"]

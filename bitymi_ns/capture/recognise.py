@@ -87,15 +87,11 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
         fail(_nothing(data, format, candidates))
     (chosen, path), *_ = fitting
     # photographs belong to the capture beside them, but not to a video
-    others = tuple(
-        each
-        for each in candidates
-        if each[1] != path
-        and (each[0] != "photographs" or chosen == "video")
-        and (chosen != "stray-scanner" or each[1].name != STRAY[2])
-    )
+    others = [each for each in candidates if each[1] != path and (each[0] != "photographs" or chosen == "video")]
+    if chosen == "stray-scanner":
+        others = [each for each in others if each[1].name != STRAY[2]]
     poses = tuple(pictures.poses_in(folder)) if chosen in ("photographs", "video") else ()
-    return Found(chosen, path, path if chosen == "blender" else folder, others, poses)
+    return Found(chosen, path, path if chosen == "blender" else folder, tuple(others), poses)
 
 
 def _capture_within(folder: Path, format: Format | Literal["auto"]) -> Path | None:

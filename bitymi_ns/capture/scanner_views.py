@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bitymi_ns.capture.camera import OPENCV_AXES, ColmapCamera, Photograph, Pose
 from bitymi_ns.capture.find_files import check_photographs_exist
 from bitymi_ns.capture.images import image_size, in_proportion
 from bitymi_ns.capture.maps import MapFiles, maps_beside, maps_called
@@ -19,7 +18,7 @@ from bitymi_ns.capture.pictures import is_photograph
 from bitymi_ns.capture.pose_checks import rotations
 from bitymi_ns.capture.recognise import POLYCAM, STRAY, Found
 from bitymi_ns.capture.transforms import MAX_SIDE
-from bitymi_ns.capture.types import fail, parsing, warn
+from bitymi_ns.capture.types import OPENCV_AXES, ColmapCamera, Photograph, Pose, fail, parsing, warn
 from bitymi_ns.progress import rich_progress
 from bitymi_ns.reading import read_json, read_text
 from bitymi_ns.trust import listed

@@ -10,9 +10,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from bitymi_ns.capture.camera import Photograph
 from bitymi_ns.capture.find_files import folded, without_extension
-from bitymi_ns.capture.types import fail, parsing
+from bitymi_ns.capture.types import Photograph, fail, parsing
 from bitymi_ns.reading import read_text
 from bitymi_ns.trust import listed
 

@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from bitymi_ns.capture.camera import SPHERICAL_MODEL, ColmapCamera, Photograph
 from bitymi_ns.capture.find_files import FileFinder, downscaled, find_maps, find_masks, find_photographs, report_files
 from bitymi_ns.capture.images import image_size
 from bitymi_ns.capture.masks import with_masks
 from bitymi_ns.capture.pose_checks import as_matrix, check_repeated, correct_poses
 from bitymi_ns.capture.recognise import SPLITS
 from bitymi_ns.capture.splits import NameLists
-from bitymi_ns.capture.types import fail, parsing, say, warn
+from bitymi_ns.capture.types import SPHERICAL_MODEL, ColmapCamera, Photograph, fail, parsing, say, warn
 from bitymi_ns.reading import read_json
 from bitymi_ns.trust import listed
 

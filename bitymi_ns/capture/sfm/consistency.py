@@ -38,10 +38,8 @@ def contradicted(model: pycolmap.Reconstruction, database: Path, pixel: float) -
     placed = {i: image for i, image in model.images.items() if image.has_pose}
     total = against = 0
     with pycolmap.Database.open(database) as opened:
-        rays = {
-            i: np.asarray(image.camera.cam_ray_from_img(opened.read_keypoints(i)[:, :2].astype(np.float64)))
-            for i, image in placed.items()
-        }
+        pixels = {i: opened.read_keypoints(i)[:, :2].astype(np.float64) for i in placed}
+        rays = {i: np.asarray(image.camera.cam_ray_from_img(pixels[i])) for i, image in placed.items()}
         for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
             first, second = pycolmap.pair_id_to_image_pair(pair)
             matches = np.asarray(geometry.inlier_matches)

@@ -8,8 +8,8 @@ import numpy as np
 import pycolmap
 from scipy.cluster.hierarchy import DisjointSet
 
-from bitymi_ns.capture.camera import SPHERICAL_MODEL
 from bitymi_ns.capture.sfm.job import CameraGroup, Job, NoPoses
+from bitymi_ns.capture.types import SPHERICAL_MODEL
 
 FEW_FEATURES = 60  # features of a photograph with hardly any detail
 PARALLAX = 1.0  # largest angle in degrees between rays to the points of photographs from one spot

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pycolmap
 
-from bitymi_ns.capture.camera import SPHERICAL_MODEL
 from bitymi_ns.capture.sfm.job import CameraGroup, Job, StageProgress
+from bitymi_ns.capture.types import SPHERICAL_MODEL
 
 SMALL = 1000  # double photographs with fewer pixels along the longer side; larger ones have enough features
 SPHERICAL_SCALE = 2

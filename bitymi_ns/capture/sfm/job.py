@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from bitymi_ns.capture.camera import ColmapCamera
+from bitymi_ns.capture.types import ColmapCamera
 
 DATABASE = "database.db"
 PAIRS = "pairs.txt"

@@ -19,10 +19,10 @@ from bitymi_ns.bundle import BundleError
 from bitymi_ns.bundle.parts import CAMERAS
 from bitymi_ns.bundle.read import read_cameras, read_manifest
 from bitymi_ns.capture import splits
-from bitymi_ns.capture.camera import OPENCV_AXES
 from bitymi_ns.capture.colmap_views import Source
 from bitymi_ns.capture.lens import Pinhole
 from bitymi_ns.capture.read import CaptureOptions, read_capture
+from bitymi_ns.capture.types import OPENCV_AXES
 from bitymi_ns.plugin.console import as_input_error, fail
 from bitymi_ns.plugin.data.depth import DepthKind
 from bitymi_ns.plugin.data.views import NO_PHOTOS, Views, make_views, pinhole_cameras, select_views

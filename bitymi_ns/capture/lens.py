@@ -66,21 +66,13 @@ class Pinhole(NamedTuple):
 
 @dataclass(frozen=True)
 class Lens:
-    """Resamples a photograph, or a face of the cube around a wide camera, to a pinhole picture.
+    """Resamples a photograph, or a face of the cube around a wide camera, to a pinhole picture."""
 
-    Attributes:
-        camera: of the photograph, for the size to which it is downscaled first.
-        stored: width and height of the image file.
-        pinhole: camera of the result.
-        face: of the cube; empty = the photograph becomes one picture.
-        whole: True if the photograph covers the whole result; else `coverage` is its mask.
-    """
-
-    camera: ColmapCamera
-    stored: tuple[int, int]
-    pinhole: Pinhole
-    face: str = ""
-    whole: bool = True
+    camera: ColmapCamera  # of the photograph, for the size to which it is downscaled first
+    stored: tuple[int, int]  # width and height of the image file
+    pinhole: Pinhole  # camera of the result
+    face: str = ""  # of the cube; empty = the photograph becomes one picture
+    whole: bool = True  # the photograph covers the whole result; else `coverage` is its mask
 
     @property
     def distorts(self) -> bool:

@@ -101,34 +101,20 @@ class CaptureOptions(SplitOptions, FrameOptions):
 
 @dataclass
 class Capture:
-    """A capture in the frame that its files state; up of a COLMAP model (-y) becomes z.
-
-    Attributes:
-        format: it was read as.
-        source: names it in messages.
-        photographs: in the order of their names, Blender's train, val and test after one another.
-        points: to start from; None = random ones.
-        frame: orientation, center and scale for training.
-        lists: its lists of names for training and evaluation.
-        parts: numbers of the photographs to train on ("train") and to hold out ("val", "test").
-        downscale: factor by which photographs are reduced.
-        applied, applied_scale: [4, 4] and scale that its files state as applied to the capture.
-        report: folder of the report on structure from motion; None = none.
-        model: found by structure from motion; None = the capture came with poses.
-    """
+    """A capture in the frame that its files state; up of a COLMAP model (-y) becomes z."""
 
     format: Format
-    source: str
-    photographs: list[Photograph]
-    points: Points | None
+    source: str  # names it in messages
+    photographs: list[Photograph]  # in the order of their names, Blender's train, val and test after one another
+    points: Points | None  # to start from; None = random ones
     frame: FrameOptions
-    lists: NameLists = field(default_factory=dict)
-    parts: dict[str, Sequence[int]] = field(default_factory=dict)
-    downscale: int = 1
-    applied: Pose | None = None
+    lists: NameLists = field(default_factory=dict)  # its own lists for training and evaluation
+    parts: dict[str, Sequence[int]] = field(default_factory=dict)  # photographs of "train", and held out "val", "test"
+    downscale: int = 1  # factor by which photographs are reduced
+    applied: Pose | None = None  # [4, 4] that its files state as applied, and scale
     applied_scale: float = 1.0
-    report: Path | None = None
-    model: Source | None = None
+    report: Path | None = None  # folder of the report on structure from motion; None = none
+    model: Source | None = None  # found by structure from motion; None = the capture came with poses
 
 
 def read_capture(options: CaptureOptions, need_photos: bool = True, want_points: bool = True) -> Capture:

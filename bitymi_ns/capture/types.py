@@ -50,17 +50,11 @@ MAP_FILES = (".png", ".tif", ".tiff", ".npy", ".npz", ".exr")  # extensions of d
 
 @dataclass(frozen=True)
 class MapFiles:
-    """Files of depth and normals beside a photograph; None = none.
+    """Files of depth and normals beside a photograph; None = none."""
 
-    Attributes:
-        depth: camera z, see `read_depth`.
-        confidence: of the depth, 0 = low, at most of the size of the depth.
-        normal: see `read_normal`.
-    """
-
-    depth: Path | None = None
-    confidence: Path | None = None
-    normal: Path | None = None
+    depth: Path | None = None  # camera z, see `read_depth`
+    confidence: Path | None = None  # of the depth, 0 = low, at most of the size of the depth
+    normal: Path | None = None  # see `read_normal`
 
 
 def is_full_sphere(width: float, height: float) -> bool:

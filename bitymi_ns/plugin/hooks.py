@@ -86,10 +86,8 @@ def extend_exporter(commands: Callable[[], Sequence[Any]]) -> None:
 
     Changes: `tyro` in the namespace of nerfstudio's script, which loads the plugin before it builds its commands'
     union: `cli` gets the union with ours. For: ns-export. Without: `ns-export bitymi-atlas` and `bitymi-mesh` are
-    unknown. Superfluous once nerfstudio has a registry of exports.
-
-    Args:
-        commands: called with the first command line; its errors leave nerfstudio's own commands working.
+    unknown. Superfluous once nerfstudio has a registry of exports. Errors of `commands`, called with the first command
+    line, leave nerfstudio's own commands working.
     """
     main = sys.modules.get("__main__")
     as_main = str(getattr(main, "__file__", "") or "").replace("\\", "/").endswith("nerfstudio/scripts/exporter.py")

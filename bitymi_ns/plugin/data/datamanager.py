@@ -81,10 +81,6 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
 
     The view of a training step is a function of seed and step alone, so that resumed runs see the views of
     uninterrupted ones: each epoch of n steps permutes the n views.
-
-    Attributes:
-        step_view: returns a training view by its index in the size of the current step; full size unless a run
-            replaces it.
     """
 
     config: BitymiDataManagerConfig
@@ -93,6 +89,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
     def __init__(
         self, config: BitymiDataManagerConfig, test_mode: Literal["test", "val", "inference"] = "val", **kwargs: Any
     ) -> None:
+        # makes a training view by its index, at full size; a run replaces it by one for the size of its step
         self.step_view: Callable[[int], View] = lambda index: self.train_views[index]
         images.set_up_pillow()
         check_capture(config, trains=test_mode == "val")

@@ -64,19 +64,14 @@ class BitymiDataParserConfig(CaptureOptions, DataParserConfig):
 
 
 class BitymiDataParser(DataParser):
-    """Views of a capture in any format.
-
-    Attributes:
-        downscale_factor: set by nerfstudio if photographs are not needed, so that none is opened; else None.
-        poses_report: folder of the report on structure from motion, after reading; None = none.
-        sfm_source: model by structure from motion, after reading; None = the capture came with it.
-    """
+    """Views of a capture in any format."""
 
     config: BitymiDataParserConfig
 
     def __init__(self, config: BitymiDataParserConfig) -> None:
         super().__init__(config)
-        self.downscale_factor: int | None = None
+        self.downscale_factor: int | None = None  # set by nerfstudio if photographs are not needed: none is opened then
+        # after reading: report on structure from motion, and its model; None = the capture came with poses
         self.poses_report: Path | None = None
         self.sfm_source: Source | None = None
 

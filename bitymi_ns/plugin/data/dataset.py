@@ -36,11 +36,7 @@ POSE_STEP = 1e-4  # resolution of compared poses, in units of the scene
 
 class BitymiDataset(InputDataset):
     """nerfstudio's dataset with images undistorted by their lenses, transparent ones as [H, W, 4]: the model composes
-    them over a background.
-
-    Attributes:
-        gray_images: show missing photographs grey, for the viewer; else fail.
-    """
+    them over a background."""
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
         c2w = dataparser_outputs.cameras.camera_to_worlds
@@ -48,7 +44,7 @@ class BitymiDataset(InputDataset):
         c2w[:, :3, :3] = torch.from_numpy(parts)
         super().__init__(dataparser_outputs, scale_factor)
         self._summaries: dict[int, ImageSummary] = {}
-        self.gray_images = False
+        self.gray_images = False  # show missing photographs grey, for the viewer; else fail
         self._read_shared = lru_cache(maxsize=RECENT)(read_image)  # views of one photograph follow each other
 
     @property

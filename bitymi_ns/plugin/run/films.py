@@ -31,14 +31,9 @@ Add = Callable[[np.ndarray], None]
 
 @contextmanager
 def film(path: Path, fps: float) -> Iterator[Add]:
-    """Open a film for all browsers: 8 bits, yuv420p of BT.709, index in front. It replaces an earlier one at the end.
-
-    H.264 with halved colour needs even sizes: odd ones lose the last row or column.
-
-    Raises:
-        InputError: the frames are too small or too large for H.264.
-        OSError: it cannot be written.
-    """
+    """Open a film for all browsers: 8 bits, yuv420p of BT.709, index in front; it replaces an earlier one at the end.
+    H.264 with halved colour needs even sizes: odd ones lose the last row or column. Raises InputError: the frames are
+    too small or too large for H.264; OSError: it cannot be written."""
     import av
     from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
@@ -73,11 +68,7 @@ def film(path: Path, fps: float) -> Iterator[Add]:
 @contextmanager
 def frames(folder: Path, form: str, quality: int) -> Iterator[Add]:
     """Open a folder of pictures 00000.jpg, 00001.jpg and so on, or .png; it replaces a folder of frames at the end.
-
-    Raises:
-        InputError: the existing folder holds other files.
-        OSError: it cannot be written.
-    """
+    Raises InputError: the existing folder holds other files; OSError: it cannot be written."""
     count = 0
 
     def add(image: np.ndarray) -> None:

@@ -68,17 +68,9 @@ def state_training(
     processes: int = 1,
     lists: bool = False,
 ) -> None:
-    """Print the memory estimate of a training run.
-
-    Args:
-        scene: at the start.
-        cameras: of the training views, on the CPU.
-        most_surfels: after densification; 0 = any number.
-        texels: options of texels that will learn; None = none.
-        to_come: views that they learn from, with repetition.
-        processes: of the run, each with the same need.
-        lists: losses need lists of fragments on a card, too.
-    """
+    """Print the memory estimate of a training run from its first scene and the cameras of its views, on the CPU: with
+    at most `most_surfels` (0 = any number), `texels` that learn from `to_come` views with repetition (None = none), in
+    `processes` of equal need; `lists`: losses need lists of fragments on a card, too."""
     (pixels, total), device = _pixels(cameras), scene.surfels["means"].device
     card = device.type == "cuda"
     fragments = most_fragments(scene, cameras, scene.config.max_fragments)
@@ -107,15 +99,9 @@ def state_training(
 def state_export(
     scene: Scene, cameras: Sequence[Camera], finetune_bytes: float, learning: int = 0, compact: bool = False
 ) -> None:
-    """Print the memory estimate of an export.
-
-    Args:
-        scene: a trained one.
-        cameras: of the training views, on the CPU.
-        finetune_bytes: of views in the fine-tuning; 0 = there is none.
-        learning: surfels that learn after the bake.
-        compact: the view colours have the terms that pictures pay for.
-    """
+    """Print the memory estimate of an export from its scene and the cameras of its training views, on the CPU: with
+    `finetune_bytes` of views in the fine-tuning (0 = there is none), and `learning` surfels after the bake; `compact`:
+    view colours have the terms that pictures pay for."""
     pixels, total = _pixels(cameras)
     kept = min(PHOTOGRAPH_BYTES, 3 * total)
     fragments = most_fragments(scene, cameras)

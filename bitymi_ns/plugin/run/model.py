@@ -187,13 +187,8 @@ def new_scene(
     metadata: dict[str, Any],
     steps: int | None = None,
 ) -> Scene:
-    """Make surfels at the capture's points, or at random in its box, and an empty texture field around them.
-
-    Args:
-        points: positions [N, 3] and colours [N, 3] (uint8, or empty without colours).
-        metadata: of the data manager on the capture.
-        steps: length of a run to come.
-    """
+    """Make surfels at points (positions [N, 3], colours [N, 3] uint8 or empty), or at random in the capture's box, and
+    an empty texture field around them; `metadata` is the data manager's, `steps` the length of a run to come."""
     centers, pixels = metadata.get("camera_centers", torch.zeros(0, 3)), metadata.get("train_pixels", 0)
     if steps is not None:
         train = limit_first_surfels(train, steps, pixels, len(centers))

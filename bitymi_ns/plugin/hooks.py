@@ -286,14 +286,12 @@ def _start_viewer(ours: Any, start: Callable[..., None], config: Any, *args: Any
 
 
 def adopt_render() -> None:
-    """Have ns-render or ns-eval, if about to load a scene of ours, write by our rules.
+    """Have ns-render or ns-eval, if about to load a scene of ours, write by our rules. Raises InputError: an option or
+    the camera path cannot be used.
 
     Changes: functions in the script's namespace that render and write, until it has rendered; ns-eval's output path.
     For: ns-render, ns-eval. Without: films need a program ffmpeg, spirals roll, principal points are ignored, options
     are checked after loading the scene, and a full disk leaves half a file. Superfluous once nerfstudio does these.
-
-    Raises:
-        InputError: an option or the camera path cannot be used.
     """
     found = _running_command()
     if found is None:

@@ -85,15 +85,8 @@ def check_cameras(cameras: Sequence[Cameras], names: Sequence[object]) -> None:
 
 
 def ray_distance(depth: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
-    """Convert blended depth to the expected distance along each pixel's ray, nerfstudio's depth.
-
-    Args:
-        depth: [H, W, 1] sum of w z, camera z.
-        alpha: [H, W, 1] sum of w.
-
-    Returns:
-        [H, W, 1], the picture's largest distance in empty pixels.
-    """
+    """Convert blended depth [H, W, 1], the sum of w z over camera z, and alpha [H, W, 1], the sum of w, to the expected
+    distance [H, W, 1] along each pixel's ray, nerfstudio's depth; empty pixels get the picture's largest."""
     height, width = depth.shape[:2]
     x = (torch.arange(width, device=depth.device) + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
     y = (torch.arange(height, device=depth.device) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]

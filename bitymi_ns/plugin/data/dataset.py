@@ -111,7 +111,11 @@ class BitymiDataset(InputDataset):
             mask = self._scaled(mask, Image.Resampling.NEAREST)
             data["mask"] = torch.from_numpy(np.array(mask, dtype=bool))[..., None]
             if self.mask_color:
-                data["image"] = _fill(data["image"], data["mask"], self.mask_color)
+                fill, image = torch.tensor(self.mask_color), data["image"]
+                if not image.is_floating_point():
+                    fill = fill.mul(255.0).round().to(image.dtype)
+                colors = torch.where(data["mask"], image[..., :3], fill)
+                data["image"] = torch.cat([colors, image[..., 3:]], -1)
         if fitted := self._dataparser_outputs.metadata.get(FITTED):
             size = (data["image"].shape[1], data["image"].shape[0])
             maps = fitted[image_idx].read(self._lens(image_idx))
@@ -150,12 +154,6 @@ def view_mask(outputs: DataparserOutputs, index: int) -> Image.Image:
     """Read the mask of a view whose photograph has one, or does not cover the view."""
     path = None if outputs.mask_filenames is None else outputs.mask_filenames[index]
     return outputs.metadata["lenses"][index].undistort_mask(None if path is None else checked_mask(path), path)
-
-
-def _fill(image: Tensor, mask: Tensor, color: tuple[float, float, float]) -> Tensor:
-    """Fill an image with `color`, in [0, 1], where the mask is False."""
-    fill = torch.tensor(color) if image.is_floating_point() else torch.tensor(color).mul(255.0).round().to(image.dtype)
-    return torch.cat([torch.where(mask, image[..., :3], fill), image[..., 3:]], -1)
 
 
 class CachedImages(Sequence):
@@ -210,11 +208,8 @@ def capture_fingerprint(dataset: BitymiDataset) -> dict[str, Any]:
     """Summarize the training views for checkpoints: number, and digests of names and poses."""
     poses = (dataset.cameras.camera_to_worlds / POSE_STEP).round().cpu().numpy()
     names = "\n".join(path.name for path in dataset.image_filenames)
-    return {
-        "views": len(dataset),
-        "names": hashlib.sha256(names.encode("utf8", "surrogateescape")).hexdigest(),
-        "poses": hashlib.sha256(poses.tobytes()).hexdigest(),
-    }
+    digests = {"names": names.encode("utf8", "surrogateescape"), "poses": poses.tobytes()}
+    return {"views": len(dataset), **{name: hashlib.sha256(data).hexdigest() for name, data in digests.items()}}
 
 
 def warn_of_other_capture(before: Mapping[str, Any], now: Mapping[str, Any]) -> None:

@@ -38,14 +38,9 @@ class Views(DataparserOutputs):
 
 def make_views(capture: Capture, need_photos: bool = True) -> Views:
     """Build a capture's views in the order of its photographs. Lists in metadata: `Lens` ("lenses"), photograph
-    ("files"), and number of the photograph ("photographs"), which several views may share.
-
-    Args:
-        need_photos: open downscaled copies for their size; else they may be missing.
-
-    Raises:
-        CaptureError: a camera or a photograph cannot be used.
-    """
+    ("files"), and number of the photograph ("photographs"), which several views may share. `need_photos`: open
+    downscaled copies for their size; else they may be missing. Raises CaptureError: a camera or a photograph cannot be
+    used."""
     photographs, frame, points, source = capture.photographs, capture.frame, capture.points, capture.source
     if len(photographs) == 1:
         fail(f"{source} has one image only. A scene cannot be learned from one view: add photographs.")

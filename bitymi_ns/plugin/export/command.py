@@ -41,8 +41,7 @@ class CompactOptions:
     interchange: bool = False  # Write surfels.ply into a compact bundle, too; those of other formats have it.
     compact_error: float = Compact.share
     """Share by which compacting may raise the mean square error against the training photographs before texels are
-    tuned; less if texels were too coarse to learn. The bytes go where they save most of it: to surfels, view colours or
-    texels."""
+    tuned, or less if texels were too coarse to learn; the bytes go to surfels, view colours or texels as they help."""
     target_mb: float | None = None
     """Bytes of a compact bundle, in MB (10^6), instead of compact_error: everything becomes as coarse as it takes, or
     less if fewer bytes show the photographs as well, to 0.01 dB."""
@@ -98,12 +97,12 @@ class ExportAtlas(BakeOptions, CompactOptions):
     """Keep everything: tiles at the Nyquist rate of the field, not capped by views, unseen surfels, all sites of view
     colours, and the field's texels without fine-tuning."""
     polish_steps: int | None = None
-    """Steps in which texels, geometry, opacities and view colours learn together against the training photographs,
-    without the network, before tiles and view colours are reduced; 0 = surfels stay as trained. Not given: 0 if texels
-    learned in training already, and on a GPU, which lacks kernels for it; else 300, or 4 per photograph if more."""
+    """Steps in which texels, geometry, opacities and view colours learn together from the training photographs, without
+    the network, before tiles and view colours are reduced; 0 = surfels stay as trained. Not given: 0 if texels learned
+    in training, and on a GPU, which lacks kernels for it; else 300, or 4 per photograph if more."""
     finetune_steps: int | None = None
-    """Steps of fine-tuning the texels alone, after that; 0 = none. Not given: 400 if only a field has learned yet, 100
-    after a polish, both with 120 further ones on texels as stored; 100 such ones if texels learned in training."""
+    """Steps of fine-tuning texels alone, after that; 0 = none. Not given: 400 if only a field has learned yet, 100
+    after a polish, both with 120 more on texels as stored; 100 on these if texels learned in training."""
     finetune_memory: float = TuneOptions.cache_bytes / 1e9
     """GB of memory for traced views in the fine-tuning; changes its time, not its result."""
     compare: bool = True  # Render the held-out views from bundle and trained scene, and state the difference.

@@ -38,11 +38,11 @@ def check_room(folder: Path, load_config: Path, options: BakeOptions, exact: boo
     needed, free = space_needed(load_config, options, exact), free_bytes(folder)
     if free < needed:
         beside = " beside the earlier one" if folder.exists() else ""
+        most = f"up to {size_text(needed)}{beside} (a generous estimate by the size of its checkpoint)"
         fail(
             f"there may be too little room for {folder}: {size_text(free)} are free, and a bundle of this scene may "
-            f"take up to {size_text(needed)}{beside} (a generous estimate by the size of its checkpoint). Free some "
-            "space, give an --output-dir on another disk, or try it all the same with --check-room False: if the disk "
-            "gets full, nothing is left behind."
+            f"take {most}. Free some space, give an --output-dir on another disk, or try --check-room False: if the "
+            "disk gets full, nothing is left behind."
         )
 
 

@@ -45,22 +45,15 @@ class TrainingRun:
         self.total: int = trainer.config.max_num_iterations
         self.first_step: int = trainer._start_step
         self._parameters = attributes.optimizers.parameters
-        train = self.datamanager.train_dataset.cameras
+        dataset, views, metadata = self.datamanager.train_dataset, self.datamanager.train_views, model.metadata
+        train, extent = dataset.cameras, scene_extent(metadata["camera_centers"], scene.surfels["means"])
         cameras = OnDemand(len(train), lambda i: to_camera(train[i : i + 1], "cpu"))
-        data = TrainingData(
-            self.datamanager.train_views,
-            scene_extent(model.metadata["camera_centers"], scene.surfels["means"]),
-            model.metadata["train_pixels"],
-            model.metadata["first_surfels"],
-            covered_share(self.datamanager.train_views),
-            exposure_stops(self.datamanager.train_dataset.files),
-            self.datamanager.train_dataset.photographs,
-            cameras,
-        )
+        counts = (metadata["train_pixels"], metadata["first_surfels"], covered_share(views))
+        data = TrainingData(views, extent, *counts, exposure_stops(dataset.files), dataset.photographs, cameras)
         optimizers, processes = attributes.optimizers.optimizers, trainer.processes
         self.training = Training(scene, data, optimizers, config, self.total, self._on_resize, warn, processes)
         attributes.optimizers.before_step = self.training.combine
-        self.capture = capture_fingerprint(self.datamanager.train_dataset)
+        self.capture = capture_fingerprint(dataset)
         self._random_state: Tensor | None = None
         if resume_state := model.resume_state:
             self.training.load_state_dict(resume_state)
@@ -172,12 +165,9 @@ class TrainingRun:
         refined = self.training.poses.refined and step + 1 >= self.total
         poses = self.training.poses if refined else None
         quality = evaluate(self.scene, OnDemand(len(rows), lambda i: views[rows[i]]), self.config, poses)
-        point = {
-            "step": step + 1,
-            "seconds": round(self.training.clock.seconds, 4),
-            "cpu_seconds": round(self.training.clock.cpu_seconds, 4),
-            "surfels": len(self.scene),
-        }
+        clock = self.training.clock
+        times = {"seconds": round(clock.seconds, 4), "cpu_seconds": round(clock.cpu_seconds, 4)}
+        point = {"step": step + 1, **times, "surfels": len(self.scene)}
         shown = ""
         if not math.isnan(quality.psnr):
             point |= {k: round(value, 4) for k, value in quality._asdict().items() if not math.isnan(value)}

@@ -88,14 +88,12 @@ class Entry:
         value = self.value
         plain = type(value) in (Tensor, Parameter) and value.layout == torch.strided and value.device.type == "cpu"
         fits = plain and dtype in (None, value.dtype) and value.is_contiguous()
-        if not fits or (dtype is not None and not _fits(value.shape, shape)):
+        if fits and dtype is not None:
+            fits = len(shape) == value.ndim and all(a in (None, b) for a, b in zip(shape, value.shape, strict=True))
+        if not fits:
             sizes = ", ".join("any" if size is None else str(size) for size in shape)
             self.refuse("numbers" if dtype is None else f"{_name(dtype)} [{sizes}]")
         return value
-
-
-def _fits(there: torch.Size, shape: tuple[int | None, ...]) -> bool:
-    return len(there) == len(shape) and all(want in (None, size) for size, want in zip(there, shape, strict=True))
 
 
 def _name(dtype: torch.dtype) -> str:

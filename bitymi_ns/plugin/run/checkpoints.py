@@ -28,19 +28,14 @@ def save(state: dict[str, Any], path: Path, scratch: Path) -> None:
         with complete_file(path, scratch) as file:
             torch.save(state, file)
     except (OSError, RuntimeError) as error:
+        # torch writes an archive's end after a failed write, and reports only that it does not fit
+        behind: BaseException | None = error
+        while behind is not None and not isinstance(behind, OSError):
+            behind = behind.__context__
         kept = sorted(p.name for p in path.parent.glob("*.ckpt"))
-        detail = reason(_of_the_system(error), path)
+        detail = reason(behind or OSError(0, "the disk took only a part of it"), path)
         then = f"Resume with --load-dir {path.parent} (from {kept[-1]}, which is intact)" if kept else "Train again"
         fail(f"the checkpoint {path} could not be written: {detail}.\n  {then}.", error)
-
-
-def _of_the_system(error: BaseException) -> OSError:
-    """Find the system's error behind torch's, which writes an archive's end after a failed write and reports only that
-    it does not fit."""
-    behind: BaseException | None = error
-    while behind is not None and not isinstance(behind, OSError):
-        behind = behind.__context__
-    return behind or OSError(0, "the disk took only a part of it")
 
 
 def newest_step(folder: Path) -> int:

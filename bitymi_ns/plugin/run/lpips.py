@@ -45,16 +45,10 @@ class LpipsUnavailable(RuntimeError):
 
 
 def lpips(image: Tensor, reference: Tensor, backbone: str) -> float:
-    """Measure LPIPS of two images, averaged over pixels.
-
-    Args:
-        image, reference: [H, W, 3] float in [0, 1], at least `LEAST_SIDE` pixels along each side.
-        backbone: "alex": AlexNet fed with [-1, 1], as LPIPS' package, nerfstudio and gsplat state it; "vgg": VGG16 fed
-            with [0, 1], as 3D Gaussian Splatting's code and later papers do.
-
-    Raises:
-        LpipsUnavailable: the weights are missing and cannot be fetched.
-    """
+    """Measure LPIPS of two images [H, W, 3] float in [0, 1], of `LEAST_SIDE` pixels or more along each side, averaged
+    over pixels. Backbone "alex" is AlexNet fed with [-1, 1], as LPIPS' package, nerfstudio and gsplat state it; "vgg"
+    is VGG16 fed with [0, 1], as 3D Gaussian Splatting's code and later papers do. Raises LpipsUnavailable: the weights
+    are missing and cannot be fetched."""
     weights = _on_device(backbone, str(image.device))
     pair = torch.stack([image, reference]).permute(0, 3, 1, 2).float()
     if backbone == "alex":

@@ -17,13 +17,9 @@ _lpips_missing: list[str] = []
 
 
 def image_metrics(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> dict[str, float]:
-    """Measure psnr, ssim, flip (if its package is installed), lpips and lpips_vgg (if their weights can be had), and
-    fitted_psnr, fitted_ssim and fitted_lpips of the `color_fitted` image.
-
-    Args:
-        image, reference: [H, W, 3] in [0, 1].
-        mask: [H, W, 1] bool; False pixels are equal in both for every metric and left out of both PSNR and the fit.
-    """
+    """Measure psnr, ssim, flip (if its package is installed), lpips and lpips_vgg (if their weights can be had) of
+    images [H, W, 3] in [0, 1], and fitted_psnr, fitted_ssim and fitted_lpips of the `color_fitted` image. Pixels that a
+    mask [H, W, 1] excludes are equal in both for every metric and left out of both PSNR and the fit."""
     image, reference = image.detach().float().clamp(0.0, 1.0), reference.detach().float().clamp(0.0, 1.0)
     if mask is not None:
         mask = mask.to(image.device).bool().reshape(*image.shape[:2], 1)

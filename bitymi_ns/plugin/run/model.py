@@ -192,7 +192,13 @@ def new_scene(
     centers, pixels = metadata.get("camera_centers", torch.zeros(0, 3)), metadata.get("train_pixels", 0)
     if steps is not None:
         train = limit_first_surfels(train, steps, pixels, len(centers))
-    xyz, rgb = _points(points)
+    xyz, rgb = points or (torch.zeros(0, 3), torch.zeros(0, 3))
+    xyz, rgb = xyz.detach().reshape(-1, 3), rgb.detach()
+    if rgb.shape[:1] == xyz.shape[:1]:
+        rgb = rgb.float().reshape(-1, 3) / (255.0 if rgb.dtype == torch.uint8 else 1.0)
+    else:  # a cloud without colours
+        rgb = torch.full_like(xyz, 0.5, dtype=torch.float32)
+    xyz = xyz.float()
     find_background = metadata.get("background_points")
     declared = _corners(scene_box) if metadata.get("declares_box") else None
     box = None
@@ -220,16 +226,6 @@ def new_scene(
         what = f"{report.not_finite} of {report.given} points of the capture are NaN or infinite"
         warn(f"{what} (the first is point {row}); they are left out.")
     return scene
-
-
-def _points(points: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:
-    if points is None:
-        return torch.zeros(0, 3), torch.zeros(0, 3)
-    xyz, rgb = points
-    xyz = xyz.detach().float().reshape(-1, 3)
-    if rgb.shape[:1] != xyz.shape[:1]:
-        return xyz, torch.full_like(xyz, 0.5)  # a cloud without colours
-    return xyz, rgb.detach().float().reshape(-1, 3) / (255.0 if rgb.dtype == torch.uint8 else 1.0)
 
 
 def _corners(scene_box: SceneBox) -> Tensor:

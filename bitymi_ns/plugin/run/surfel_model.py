@@ -105,14 +105,10 @@ class SurfelModel(Model):
             if threading.current_thread() is threading.main_thread():
                 raise
             warn_once(str(error))
-            return self._empty(int(camera.height.flatten()[0]), int(camera.width.flatten()[0]))
+            black = torch.zeros(int(camera.height.flatten()[0]), int(camera.width.flatten()[0]), 3, device=self.device)
+            one = dict.fromkeys(("accumulation", "depth", "beta", "overdraw"), black[..., :1])
+            return {"rgb": black + self.background.to(black), "normal": black, **one}
         return {name: value for name, value in outputs.items() if isinstance(value, Tensor)}
-
-    def _empty(self, height: int, width: int) -> dict[str, Tensor]:
-        """Make the outputs of `get_outputs` for an empty picture."""
-        black = torch.zeros(height, width, 3, device=self.device)
-        one = dict.fromkeys(("accumulation", "depth", "beta", "overdraw"), black[..., :1])
-        return {"rgb": black + self.background.to(black), "normal": black, **one}
 
     def photograph(self, batch: dict[str, Any], rgb: Tensor) -> tuple[Tensor, Tensor | None]:
         """Return the batch's photograph [H, W, 3] over the background, and its mask [H, W, 1], at a render's size."""

@@ -196,8 +196,8 @@ def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tupl
     share = w * h / (width * height)
     if share < ABSURD_AREA or min(w, h) < 1:
         fail(
-            f"the lens distortion of {label} is absurd: with {model} {camera.params_to_string()} undistorting "
-            f"would leave {100.0 * share:.2g} % of the picture. Correct it, or calibrate with a simpler model (SIMPLE_RADIAL)."
+            f"the lens distortion of {label} is absurd: with {model} {camera.params_to_string()} undistorting would "
+            f"leave {100.0 * share:.2g} % of the picture. Correct it, or calibrate a simpler model (SIMPLE_RADIAL)."
         )
     if share < DOUBTFUL_AREA:
         warn(f"Undistorting leaves only {100.0 * share:.2g} % of {label}. The lens distortion may be wrong.")

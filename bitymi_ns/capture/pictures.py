@@ -222,7 +222,7 @@ def holds(path: Path, mark: bytes, most: int = HEAD) -> bool:
     """Test if the first bytes of a file hold `mark`; False for unreadable files."""
     try:
         with open_regular(path) as file:
-            return mark in file.read(most)
+            return mark in file.read(min(most, os.fstat(file.fileno()).st_size))
     except OSError:
         return False
 

@@ -3,7 +3,6 @@ rest.
 
 Each function states what it changes, for which commands, what is lost without it, and what would make it superfluous.
 subclasses serve for the rest.
-
 """
 
 import atexit

@@ -1,5 +1,4 @@
-"""Convert nerfstudio's cameras to the renderer's, check a capture's cameras, and convert depth and normals for
-nerfstudio's tools."""
+"""Convert nerfstudio's cameras to the renderer's, check them, and convert depth and normals for nerfstudio's tools."""
 
 import math
 from collections.abc import Sequence
@@ -17,7 +16,7 @@ POSSIBLE_VIEW = (0.01, 178.0)  # view angles of accepted focal lengths, degrees
 
 
 def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Camera:
-    """Convert one of nerfstudio's cameras, of shape () or (1,) (OpenGL axes: x right, y up, z backward), to
+    """Convert a camera of nerfstudio's, of shape () or (1,) (OpenGL axes: x right, y up, z backward), to
     world-to-camera in OpenCV axes, on its device unless stated. Raises InputError: it is no perspective camera, or has
     distortion."""
     cameras = cameras.reshape((-1,))
@@ -50,8 +49,7 @@ def to_cameras(cameras: Cameras, device: torch.device | str | None = None) -> li
 
 
 def check_cameras(cameras: Sequence[Cameras], names: Sequence[object]) -> None:
-    """Fail or warn at pinhole cameras of training and held-out views that see nothing, or whose focal length and
-    picture size do not go together."""
+    """Fail or warn at pinhole cameras of both splits that see nothing, or whose focal length and size do not fit."""
 
     def column(name: str) -> Tensor:
         return torch.cat([getattr(some, name).flatten() for some in cameras]).double()

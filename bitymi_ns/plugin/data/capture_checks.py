@@ -41,8 +41,8 @@ STOCK_IGNORED = ("_target", "depths_path", "max_2D_matches_per_3D_point",
 
 
 def bitymi_parser(config: DataParserConfig) -> DataParserConfig:
-    """Translate nerfstudio's parsers to `bitymi-data`, which checks more; keep those of other formats, and those with
-    an option that it lacks."""
+    """Translate nerfstudio's parsers to `bitymi-data`, which checks more, unless their format or an option lacks
+    there."""
     format = STOCK_FORMATS.get(type(config))
     if format is None:
         return config
@@ -64,9 +64,9 @@ def bitymi_parser(config: DataParserConfig) -> DataParserConfig:
 
 @as_input_error()
 def check_capture(config: FullImageDatamanagerConfig, read: bool = False, trains: bool = True) -> None:
-    """Check that there is a capture where the data manager's configuration points; replace nerfstudio's parsers by
-    `bitymi_parser`. `read`: read views with poses, too, silently, as they will be read again. `trains`: there is an
-    option for the capture, see MOVED. Raises InputError: there is none."""
+    """Check that there is a capture at the data manager's path; replace nerfstudio's parsers by `bitymi_parser`.
+    `read`: read views with poses, too, silently. `trains`: there is an option for the path. Raises InputError: there is
+    none."""
     config.dataparser = dataparser = bitymi_parser(config.dataparser)
     data = Path(config.data if config.data is not None else dataparser.data)
     if not data.exists():

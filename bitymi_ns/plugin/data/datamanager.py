@@ -176,11 +176,8 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         if len(points) and not len(outputs.metadata["points3D_rgb"]):  # of a parser of nerfstudio
             warn("The points of the capture have no colors: they start grey.")
         cameras = outputs.cameras
-        check_point_unit(
-            points.double().numpy(),
-            cameras.camera_to_worlds[:, :, 3].double().numpy(),
-            (cameras.width / cameras.fx).flatten().double().numpy(),
-        )
+        centers, widths = cameras.camera_to_worlds[:, :, 3].double(), (cameras.width / cameras.fx).flatten().double()
+        check_point_unit(points.double().numpy(), centers.numpy(), widths.numpy())
 
     def create_train_dataset(self) -> BitymiDataset:
         self.train_dataparser_outputs = self._prepared(self.train_dataparser_outputs, "training")

@@ -35,8 +35,7 @@ POSE_STEP = 1e-4  # resolution of compared poses, in units of the scene
 
 
 class BitymiDataset(InputDataset):
-    """nerfstudio's dataset with images undistorted by their lenses, transparent ones as [H, W, 4]: the model composes
-    them over a background."""
+    """nerfstudio's dataset with images undistorted by lenses; the model composes transparent ones, [H, W, 4]."""
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
         c2w = dataparser_outputs.cameras.camera_to_worlds
@@ -186,8 +185,8 @@ class CachedImages(Sequence):
 
 
 def drop_blank_views(outputs: DataparserOutputs, split: str) -> DataparserOutputs:
-    """Leave out views whose masks exclude every pixel; `split` is "training" or "held-out". Raises InputError: no
-    training view is left."""
+    """Leave out fully masked views; `split` is "training" or "held-out". Raises InputError: no training view is
+    left."""
     masks = outputs.mask_filenames
     if not masks:
         return outputs

@@ -164,8 +164,8 @@ def _unproject(pixels: npt.NDArray[np.intp], view: _Seen) -> Floats:
 
 
 def _fits(seen: Sequence[_Seen], xyz: Floats, kind: DepthKind, unit: float) -> list[DepthFit | None] | None:
-    """Fit each map to points [N, 3] of the scene, or take it as metric without any, with `unit` units of the scene per
-    metre; None = depth is of no use."""
+    """Fit each map to points [N, 3], or take it as metric without any, `unit` units per metre; None = depth is
+    unused."""
     if not any(each.values.any() for each in seen):
         warn("The depth maps have no valid pixel: depth is not used.")
         return None
@@ -287,12 +287,8 @@ def _votes(xyz: Floats, own: int, seen: Sequence[_Seen]) -> npt.NDArray[np.int64
 
 
 def _new_points(seen: Sequence[_Seen], files: Sequence[Path], count: int) -> tuple[Floats, npt.NDArray[np.uint8]]:
-    """Sample at most `count` points [N, 3] with colors [N, 3] evenly from the maps.
-
-    Leave out points that more views see through than agree with. Weight points by one over the views that show them, so
-    that these give no more points than others.
-
-    """
+    """Sample at most `count` points [N, 3] with colors [N, 3] evenly from the maps, weighted by one over the views that
+    show them; leave out points that more views see through than agree with."""
     if count < 1 or not seen:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     rng = np.random.default_rng(0)

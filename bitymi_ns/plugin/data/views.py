@@ -21,8 +21,7 @@ from bitymi_ns.capture.types import OPENCV_AXES, SPHERICAL_MODEL, ColmapCamera, 
 from bitymi_ns.plugin.console import fail, listed, say
 
 DATA = "BITYMI_DATA"
-"""Environment variable with a capture's location; most of nerfstudio's commands that read a run have no option for
-it."""
+"""Environment variable with a capture's location, for which most of nerfstudio's commands have no option."""
 MOVED = f"If it was moved, say where it is now: `{DATA}=/where/it/is` before the command."
 NO_PHOTOS = "without photographs"  # metadata key of views of lost photographs
 LONGEST_SIDE = 1600  # default longest side of training photographs, pixels; as in papers on such captures
@@ -38,9 +37,8 @@ class Views(DataparserOutputs):
 
 def make_views(capture: Capture, need_photos: bool = True) -> Views:
     """Build a capture's views in the order of its photographs. Lists in metadata: `Lens` ("lenses"), photograph
-    ("files"), and number of the photograph ("photographs"), which several views may share. `need_photos`: open
-    downscaled copies for their size; else they may be missing. Raises CaptureError: a camera or a photograph cannot be
-    used."""
+    ("files"), and its number ("photographs"), which views may share. `need_photos`: open downscaled copies for their
+    size; else they may be missing. Raises CaptureError: a camera or a photograph cannot be used."""
     photographs, frame, points, source = capture.photographs, capture.frame, capture.points, capture.source
     if len(photographs) == 1:
         fail(f"{source} has one image only. A scene cannot be learned from one view: add photographs.")
@@ -164,8 +162,8 @@ def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
 
 
 def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> DataparserOutputs:
-    """Downscale views of more than `longest` pixels along a side (0 = no limit), by their lenses. Raises InputError:
-    `longest` is negative."""
+    """Downscale views of more than `longest` pixels along a side (0 = any) by their lenses. Raises InputError: it is
+    negative."""
     if longest < 0:
         how = "give a number of pixels, or 0 to use photographs as they are"
         fail(f"--pipeline.datamanager.longest-side is {longest}: {how}.")
@@ -183,11 +181,8 @@ def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> Datap
             f"{len(large)} of {len(sizes)} training photographs have more than {longest} pixels along a side (up to "
             f"{width} x {height}): they are reduced. --pipeline.datamanager.longest-side 0 uses them as they are."
         )
-    return dataclasses.replace(
-        outputs,
-        cameras=pinhole_cameras([lens.pinhole for lens in lenses], outputs.cameras.camera_to_worlds),
-        metadata={**outputs.metadata, "lenses": lenses},
-    )
+    cameras = pinhole_cameras([lens.pinhole for lens in lenses], outputs.cameras.camera_to_worlds)
+    return dataclasses.replace(outputs, cameras=cameras, metadata={**outputs.metadata, "lenses": lenses})
 
 
 def select_views(outputs: DataparserOutputs, indices: Sequence[int]) -> DataparserOutputs:

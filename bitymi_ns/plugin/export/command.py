@@ -1,7 +1,6 @@
 """`ns-export bitymi-atlas`: bake a trained scene into a bundle, and measure the loss.
 
 Also `python -m bitymi_ns.plugin.export.command`, should nerfstudio not take the command in.
-
 """
 
 from dataclasses import asdict, dataclass, fields, replace
@@ -190,18 +189,13 @@ class ExportAtlas(BakeOptions, CompactOptions):
         except (ValueError, RuntimeError) as error:
             fail(f"the scene cannot be baked: {error}", error)
         background = tuple(model.background.tolist())
-        export(
-            baked,
-            self.output_dir,
-            background=background,
-            world=world_of(datamanager),
-            statistics={"options": asdict(baked.options), "method": config.method_name},
-            extra_files={"preview.jpg" if compact else "preview.png": shown, **cameras_of},
-            loose_files={CONFIG: bundle_config(config, self.output_dir, background)},
-            overwrite=self.overwrite,
-            interchange=self.interchange,
-            first=first,
-        )
+        written = {
+            "statistics": {"options": asdict(baked.options), "method": config.method_name},
+            "extra_files": {"preview.jpg" if compact else "preview.png": shown, **cameras_of},
+            "loose_files": {CONFIG: bundle_config(config, self.output_dir, background)},
+        }
+        how = {"overwrite": self.overwrite, "interchange": self.interchange, "first": first, "background": background}
+        export(baked, self.output_dir, world=world_of(datamanager), **written, **how)
         bundle = read_bundle(self.output_dir)
         if self.compare and len(datamanager.eval_dataset):
             bundle.info.statistics.held_out = compare(model, datamanager, bundle.scene)

@@ -112,20 +112,14 @@ def from_run(load_config: Path) -> Source:
     cameras = to_cameras(datamanager.train_dataset.cameras, model.device)
     scene = model.scene
     surfels = {name: value.detach() for name, value in scene.surfels.items()}
-    return Source(
-        surfels,
-        lambda camera: model.render(camera, model.background, maps=False).rgb,
-        cameras,
-        scene.near,
-        scene.config.prefilter,
-        WorldFrame.model_validate_json(json.dumps(plain(world_of(datamanager).described()))),
-        None if scene.field is None else scene.field.opacity(scene.config.weight_bound, learns=False),
-    )
+    world = WorldFrame.model_validate_json(json.dumps(plain(world_of(datamanager).described())))
+    alpha = None if scene.field is None else scene.field.opacity(scene.config.weight_bound, learns=False)
+    drawn = (cameras, scene.near, scene.config.prefilter, world, alpha)
+    return Source(surfels, lambda camera: model.render(camera, model.background, maps=False).rgb, *drawn)
 
 
 def from_bundle(folder: Path) -> Source:
-    """Load a bundle, a folder or one file, with its training cameras. Raises BundleError: it cannot be read, or has no
-    cameras."""
+    """Load a bundle with its training cameras. Raises BundleError: it cannot be read, or has no cameras."""
     bundle = read_bundle(folder)
     scene = bundle.scene
     cameras = training_cameras(bundle) or [row.camera for row in bundle.cameras]

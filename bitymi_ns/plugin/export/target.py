@@ -24,8 +24,7 @@ TYPICAL_SIDE = 32  # side of a tile in texels, generously: within a tolerance mo
 
 @contextmanager
 def reserve_bundle(folder: Path, overwrite: bool) -> Iterator[None]:
-    """Lock the folder of a bundle; stop if another process has it, or it cannot be written. Raises BundleError: a
-    bundle or other files are there."""
+    """Lock a bundle's folder; stop if it is in use or cannot be written. Raises BundleError: other files are there."""
     with ExitStack() as stack:
         with explained(folder, InputError, " (--output-dir)."):
             stack.enter_context(reserved(folder, warn))
@@ -79,8 +78,7 @@ def bundle_config(config: Any, folder: Path, background: Sequence[float]) -> byt
 
 
 def config_without_run(folder: Path, background: Sequence[float]) -> bytes:
-    """Make the config.yml of a bundle without run and capture, so that its own cameras are used; `BITYMI_DATA` names a
-    capture."""
+    """Make the config.yml of a bundle without run, which uses its own cameras; `BITYMI_DATA` names a capture."""
     config = method_config("bitymi").config
     config.experiment_name = folder.name
     config.pipeline.datamanager.data = folder.absolute() / "photographs"

@@ -113,8 +113,7 @@ def compare(model: BitymiModel, datamanager: Any, scene: BakedScene) -> HeldOut:
 @torch.no_grad()
 def held_out_psnr(model: BitymiModel, datamanager: Any, scene: BakedScene, views: int) -> list[list[float]]:
     """Compute PSNR of the first `views` held-out views on the model's device, a row each: bundle against trained scene,
-    trained scene against photograph, bundle against photograph, and the last two after the affine fit of the
-    colours."""
+    trained scene against photograph, bundle against photograph, and these two after the affine fit of colours."""
     rows = []
     scene, background = scene.to(model.device), model.background
     for index in range(min(views, len(datamanager.eval_views))):

@@ -1,5 +1,4 @@
-"""Read camera paths of `ns-render camera-path`: check them before the scene is loaded, and write the checked form for
-nerfstudio."""
+"""Read and check camera paths of `ns-render camera-path` before loading the scene, and write them for nerfstudio."""
 
 import atexit
 import math
@@ -70,8 +69,7 @@ class CameraPath(BaseModel):
 
 
 def read_camera_path(file: Path) -> CameraPath:
-    """Read and check a camera path; warn of what is ignored, or looks mistaken. Raises InputError: it cannot be
-    rendered; names file, field and fault."""
+    """Read a camera path; warn of what is ignored or looks mistaken. Raises InputError: it cannot be rendered."""
     with reading(f"the camera path {file}", fail, f"{HELP} (--camera-path-filename)"):
         found = read_json(file)
     if isinstance(found, dict) and (found.get("seconds") == 0 or found.get("camera_path") == []):

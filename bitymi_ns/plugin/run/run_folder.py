@@ -45,8 +45,7 @@ def leave(folder: Path) -> None:
 
 
 def keep_poses_report(folder: Path, report: Path | None, source: Source | None = None) -> None:
-    """Copy found poses and their report to POSES, to stay when photographs change; None = the capture came with
-    poses."""
+    """Copy found poses and their report to POSES, to outlast the photographs; None = the capture came with poses."""
     there = [] if report is None else [report / name for name in FILES if (report / name).is_file()]
     origin = None if source is None else source.origin
     if origin is None and not there:

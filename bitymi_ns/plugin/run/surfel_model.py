@@ -70,13 +70,9 @@ class SurfelModel(Model):
         return self.outputs_of(to_camera(ray_bundle, self.device), maps=True)
 
     def outputs_of(self, camera: Camera, maps: bool) -> dict[str, Tensor]:
-        """Draw the outputs of viewer and ns-render, each [H, W, C] float32:
-
-        rgb, accumulation; with maps also depth = expected distance along the ray (not z), normal = world normal as
-        (n + 1) / 2 (0 for none), beta = blended kernel exponent / 4, overdraw = surfels blended at the pixel /
-        OVERDRAW_SCALE (colour maps span 0 to 1).
-
-        """
+        """Draw the outputs of viewer and ns-render, each [H, W, C] float32: rgb, accumulation; with maps also depth =
+        expected distance along the ray (not z), normal = world normal as (n + 1) / 2 (0 for none), beta = blended
+        kernel exponent / 4, overdraw = surfels blended at the pixel / OVERDRAW_SCALE (colour maps span 0 to 1)."""
         output = self.render(camera, self.background, maps=maps)
         outputs = {"rgb": output.rgb.clamp(0.0, 1.0), "accumulation": output.alpha}
         if output.depth is not None:
@@ -91,11 +87,8 @@ class SurfelModel(Model):
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Render a camera; warn of a crop box, which is not supported.
-
-        In the viewer's thread, which a refusal would end for good, a camera that cannot be rendered gives an empty
-        picture.
-        """
+        """Render a camera; warn of a crop box, which is not supported. In the viewer's thread, which a refusal would
+        end for good, a camera that cannot be rendered gives an empty picture."""
         if obb_box is not None:
             warn_once("Crop boxes are not supported: the whole scene is rendered.")
         try:

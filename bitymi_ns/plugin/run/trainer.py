@@ -57,9 +57,8 @@ class TogetherOptimizers(Optimizers):
 
 
 class BitymiTrainer(Trainer):
-    """Trains to a total number of steps, so that interrupted and resumed runs end like uninterrupted ones; with one
-    trainer in each process of a run, in step.
-    """
+    """Trains to a total number of steps, so that interrupted and resumed runs end like uninterrupted ones; each process
+    of a run has one, in step."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         with filter_console():

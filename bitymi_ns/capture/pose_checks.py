@@ -60,8 +60,8 @@ def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source
     if scaled.any():
         low, high = scale[scaled].min(), scale[scaled].max()
         factor = f"{low:.4g}" if high - low <= EXACT * high else f"{low:.4g} to {high:.4g}"
-        advice = "The factor is divided out; positions stay as they are."
-        warn(f"{source}: rotations are scaled by {factor} in the poses of {named(scaled)}. {advice}")
+        then = "The factor is divided out; positions stay as they are."
+        warn(f"{source}: rotations are scaled by {factor} in the poses of {named(scaled)}. {then}")
     only_rounded = rounded & ~scaled
     if only_rounded.any():
         off = f"rotations are off by up to {error[only_rounded].max():.1g} in the poses of {named(only_rounded)}"
@@ -80,8 +80,8 @@ def correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
             fail(f"{path}: {what}. Correct it or remove the frame.")
         if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
             row = " ".join(f"{x:g}" for x in pose[3])
-            advice = "A matrix whose position stands in its last row has to be transposed."
-            fail(f"{path}: the last row of the transform_matrix of {name} is {row}, not 0 0 0 1. {advice}")
+            why = "A matrix whose position stands in its last row has to be transposed."
+            fail(f"{path}: the last row of the transform_matrix of {name} is {row}, not 0 0 0 1. {why}")
         poses.append(pose)
     matrices = np.stack(poses)
     matrices[:, :3, :3] = rotations(matrices[:, :3, :3], names, str(path))
@@ -195,8 +195,8 @@ def check_point_unit(
             f"{_rounded(away / apart)} times as far from the cameras as these are from their middle. {hint}"
         )
     elif 0.0 < spread < picture / OTHER_UNIT:
-        advice = f"half of its points lie in a spot that is 1/{_rounded(picture / spread)} of a picture's width. {hint}"
-        warn(f"The point cloud seems to be in another unit than the poses: {advice}")
+        what = f"half of its points lie in a spot that is 1/{_rounded(picture / spread)} of a picture's width. {hint}"
+        warn(f"The point cloud seems to be in another unit than the poses: {what}")
 
 
 def _rounded(ratio: float) -> str:

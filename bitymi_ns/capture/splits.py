@@ -149,8 +149,8 @@ def find(names: Sequence[Path], wanted: Sequence[str], source: str, any_folder: 
         found += fitting
         unknown += [] if fitting else [name]
     if unknown:
-        advice = f"{listed(unknown)}. Its photographs are {listed([name.name for name in names])}."
-        fail(f"{source}: {len(unknown)} of {len(wanted)} names are of no photograph of the capture: {advice}")
+        which = f"{listed(unknown)}. Its photographs are {listed([name.name for name in names])}."
+        fail(f"{source}: {len(unknown)} of {len(wanted)} names are of no photograph of the capture: {which}")
     return found
 
 

@@ -1,9 +1,6 @@
-"""Change nerfstudio's functions and what they read; no other module does. Its registry and subclasses serve for the
-rest.
-
-Each function states what it changes, for which commands, what is lost without it, and what would make it superfluous.
-subclasses serve for the rest.
-"""
+"""Change nerfstudio's functions and what they read, which no other module does: its registry and subclasses serve for
+the rest. Each function states what it changes, for which commands, what is lost without it, and what would make it
+superfluous."""
 
 import atexit
 import os
@@ -69,9 +66,8 @@ HOST_OPTION = "--viewer.websocket-host"
 def allow_numpy_scalars() -> None:
     """Let torch.load's safe mode read numpy's numbers.
 
-    Changes: torch's list of safe types. For: commands that load a run of nerfstudio's own methods or of ours. Without:
-    checkpoints whose schedulers left such numbers do not load with torch 2.6 or later. Superfluous once nerfstudio
-    saves plain numbers.
+    Changes: torch's list of safe types. For: commands that load a run. Without: checkpoints whose schedulers left such
+    numbers do not load with torch 2.6 or later. Superfluous once nerfstudio saves plain numbers.
     """
     try:
         from numpy._core.multiarray import scalar
@@ -214,10 +210,8 @@ def _find_bundle(recorded: Path, evaluated: Path | None) -> Path:
 
 
 def _stub_checkpoint_dir(bundle: Path) -> Path:
-    """Make a temporary folder with an empty checkpoint, named after the bundle, in which no pickled data may lie.
-
-    Results of ns-eval state its path, by which `bitymi report` tells a bundle.
-    """
+    """Make a temporary folder with an empty checkpoint, named after the bundle, in which no pickled data may lie; by
+    its path in results of ns-eval `bitymi report` tells a bundle."""
     scratch = Path(tempfile.mkdtemp(prefix="bitymi-bundle-"))
     atexit.register(shutil.rmtree, scratch, ignore_errors=True)
     folder = scratch / bundle.name / "nerfstudio_models"

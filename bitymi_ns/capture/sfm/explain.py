@@ -96,8 +96,8 @@ def why_none(job: Job, graph: ViewGraph) -> NoPoses:
     if not parts or len(parts[0]) < max(3, 0.2 * count):
         together = f"at most {len(parts[0])} of {count} are connected" if parts else "no two of them show the same"
         return NoPoses(f"the photographs do not overlap: {together}. {SHOOT}")
-    advice = f"the scene may have moved between them, or the camera hardly did. {SHOOT}"
-    return NoPoses(f"{len(parts[0])} of {count} photographs overlap, but no poses explain what they show: {advice}")
+    why = f"the scene may have moved between them, or the camera hardly did. {SHOOT}"
+    return NoPoses(f"{len(parts[0])} of {count} photographs overlap, but no poses explain what they show: {why}")
 
 
 def parallax(model: pycolmap.Reconstruction) -> float:

@@ -198,8 +198,8 @@ def _fits(seen: Sequence[_Seen], xyz: Floats, kind: DepthKind, unit: float) -> l
     use_relative = kind == "relative" or (kind == "auto" and share > metric + BETTER)
     if (share if use_relative else metric) < AGREES:
         what = "with scale and shift fitted to each" if use_relative else "with one scale for all"
-        advice = "depth is not used. They may be of other photographs, or not of camera z."
-        warn(f"The depth maps agree with {max(share, metric):.0%} of the points in the pictures, {what}: {advice}")
+        then = "depth is not used. They may be of other photographs, or not of camera z."
+        warn(f"The depth maps agree with {max(share, metric):.0%} of the points in the pictures, {what}: {then}")
         return None
     if use_relative:
         inverse = any(fit is not None and fit.inverse for fit in relative)

@@ -93,7 +93,8 @@ def by_mode(names: Sequence[Path], mode: Mode, interval: int, fraction: float) -
     held_out = [i for i in indices if "train" not in names[i].name and "eval" in names[i].name]
     neither = [names[i].name for i in sorted(set(indices) - {*train, *held_out})]
     if neither:
-        fail(f"--eval-mode filename: {listed(neither)} has neither train nor eval in its name. Use --eval-names.")
+        advice = "Use `--eval-names`, or another mode."
+        fail(f"--eval-mode filename: {listed(neither)} has neither train nor eval in its name. {advice}")
     return Split(train, held_out, "those with eval in their names")
 
 

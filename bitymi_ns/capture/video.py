@@ -67,7 +67,7 @@ def extract_frames(video: Path, work: Path, count: int | None, progress: Progres
         return target
     seen, motion, sharp = _survey(video, progress)
     if len(seen) < 3:
-        raise CaptureError(f"{video} holds {len(seen)} frames: film for ten seconds while you walk round the scene")
+        raise CaptureError(f"{video} holds {len(seen)} frames: film for at least ten seconds, walking round the scene")
     if motion[-1] < STILL:
         raise CaptureError(f"{video} {NO_MOTION}")
     wanted = count or int(np.clip(round(motion[-1] / STRIDE), FEWEST, MOST))

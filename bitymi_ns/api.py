@@ -16,12 +16,12 @@ from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bundle import Bundle, check_target, read_bundle
 from bitymi_ns.bundle.cameras import CapturedCamera, cameras_data
 from bitymi_ns.bundle.parts import CAMERAS
-from bitymi_ns.capture.camera import OPENCV_AXES, Photograph
 from bitymi_ns.capture.images import in_threads, pixels_of, read_image
 from bitymi_ns.capture.lens import Lens, make_lenses
 from bitymi_ns.capture.masks import checked_mask
 from bitymi_ns.capture.points import Points
 from bitymi_ns.capture.read import CaptureOptions, read_capture
+from bitymi_ns.capture.types import OPENCV_AXES, Photograph
 from bitymi_ns.ops import blended_image, can_rasterize, project, rasterize_image, trace
 from bitymi_ns.ops.constants import BETA_MAX, COLOR_BIAS
 from bitymi_ns.scene.camera import Camera

@@ -228,7 +228,7 @@ class Unpack:
     def run(self) -> None:
         from bitymi_ns.bundle.read import read_manifest
         from bitymi_ns.bundle.single import SUFFIX, write_folder
-        from bitymi_ns.plugin.export.nerfstudio_config import CONFIG, config_without_run
+        from bitymi_ns.plugin.export.target import CONFIG, config_without_run
 
         folder = self.output or self.bundle.with_name(self.bundle.name.removesuffix(SUFFIX))
         config = config_without_run(folder, read_manifest(self.bundle).render.background)

@@ -1,11 +1,11 @@
-"""Cache folders of structure from motion, beside the photographs or in the user's cache, locked while in use."""
+"""Cache folders of structure from motion, beside the photographs or in the user's cache, locked in use."""
 
 import atexit
 import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal
@@ -17,16 +17,16 @@ from bitymi_ns.reading import read_json
 from bitymi_ns.trust import Refused, check_no_links, is_own, own_folder
 
 FOLDER = ".bitymi"
-OF = "of.json"  # file in a work folder with the source and the key of its content
+OF = "of.json"  # file in a work folder with its source and key
 Kind = Literal["poses", "points", "frames"]
-"""First part of the name of a work folder: poses, points of known poses, or frames of a video with known poses."""
-IN_USE = ".in-use-"  # prefix of the locks of processes that read from a work folder
-VERSION = 5  # increased where the same photographs and options give other poses than before, to invalidate cached ones
+"""Content of a work folder, and begin of its name: poses, points of known poses, or frames of a video with known poses.
+A file of that name marks the latter two as complete."""
+IN_USE = ".in-use-"  # prefix of the locks of reading processes
+VERSION = 5  # increase to invalidate cached poses when equal input gives others
 
 
 def content_key(inputs: Iterable[tuple[str, Path]], settings: object) -> str:
-    """Hash files, each with its name in the capture, and settings (plain values) to a key. Names, sizes and times of
-    change count; how the paths are written does not."""
+    """Hash files, each with its name in the capture, its size and time of change, and settings (plain values)."""
     stats = [(name, path.stat()) for name, path in inputs]
     content = [VERSION, [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats], settings]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
@@ -34,12 +34,9 @@ def content_key(inputs: Iterable[tuple[str, Path]], settings: object) -> str:
 
 @contextmanager
 def work_folder(photographs: Path, key: str, tell: Tell, kind: Kind = "poses") -> Iterator[Path]:
-    """Make and lock the folder of this key for one process: in `.bitymi` beside the photographs (or a video), or in the
-    user's cache folder where nothing can be written there, or others can write there, which `tell` reports.
-
-    Raises:
-        CaptureError: another process is at work there, or neither can be written.
-    """
+    """Make and lock the folder of this key: in `.bitymi` beside the photographs (or video), or in the user's cache
+    folder if that cannot be written or, as `tell` reports, others can write there. Raises CaptureError: another process
+    works there, or neither can be written."""
     beside, cache = home(photographs), user_cache()
     problem: OSError | None = None
     for root in (beside, cache):
@@ -70,32 +67,36 @@ def work_folder(photographs: Path, key: str, tell: Tell, kind: Kind = "poses") -
 
 
 def home(photographs: Path) -> Path:
-    """The folder beside photographs or a video for what is found of them; the same one, whether a capture is named or
-    its folder `images`. Beside a mount point it would not stay with the photographs."""
+    """Return the cache folder beside photographs or a video, the same for a capture and its folder `images`, but not
+    beside a mount point, where it would not stay with them."""
     folder = Path(os.path.abspath(photographs if photographs.is_dir() else photographs.parent))
     return (folder.parent if folder.name == "images" and not os.path.ismount(folder) else folder) / FOLDER
 
 
-def finished(photographs: Path, key: str, mark: str, kind: Kind = "poses") -> Path | None:
-    """The folder of this key in which a file of this name says that the work is done; None = there is none that others
-    cannot write to."""
+def made_once(photographs: Path, key: str, kind: Kind, tell: Tell, make: Callable[[Path], None]) -> Path:
+    """Return the work folder of this key, filled by `make` unless it is complete; several processes may read it. Raises
+    CaptureError: see `work_folder`."""
     for root in (home(photographs), user_cache()):
         if root is not None and is_own(root) and is_own(folder := root / f"{kind}-{key}"):
             with suppress(OSError):
                 check_no_links(folder.iterdir())
-                if (folder / mark).is_file():
+                if (folder / kind).is_file():
                     return folder
-    return None
+    with work_folder(photographs, key, tell, kind) as work:
+        if not (work / kind).is_file():
+            with files.explained(work, CaptureError):
+                make(work)
+                write_file(work / kind, b"")
+    return work
 
 
 def replace_stale(work: Path, photographs: Path, contents: str) -> None:
-    """State the source of a work folder, which this process holds, and remove folders of an earlier state of that
-    source: their key cannot recur. Those with other options stay, because runs were trained on them; so do those that a
-    process uses. `contents` is the key of the files alone."""
-    source = os.path.relpath(os.path.realpath(photographs), os.path.realpath(work))  # still so when both are moved
+    """State the source of a locked work folder, and remove folders of an earlier state of it, whose keys cannot recur.
+    Keep those of other options, on which runs were trained, and those in use. `contents`: key of the files alone."""
+    source = os.path.relpath(os.path.realpath(photographs), os.path.realpath(work))  # lasts if both move
     write_file(work / OF, json.dumps({"source": source, "contents": contents}).encode())
     for other in work.parent.glob(f"{work.name.partition('-')[0]}-*"):
-        if other != work and _is_stale(other, source, contents):
+        if other != work and is_own(other) and _is_stale(other, source, contents):
             try:
                 with files.Lock(other / ".lock", tell=lambda text: None):
                     shutil.rmtree(other, ignore_errors=True)
@@ -104,8 +105,6 @@ def replace_stale(work: Path, photographs: Path, contents: str) -> None:
 
 
 def _is_stale(other: Path, source: str, contents: str) -> bool:
-    if not is_own(other):
-        return False
     try:
         of = read_json(other / OF)
         if of["source"] != source or of["contents"] == contents:
@@ -121,15 +120,15 @@ def _is_stale(other: Path, source: str, contents: str) -> bool:
 
 
 def keep_work_folder(work: Path) -> None:
-    """Keep other processes from removing a work folder until this one ends."""
-    with suppress(files.Busy, OSError):  # a folder that cannot be written is not removed either
+    """Keep other processes from removing a work folder while this one runs."""
+    with suppress(files.Busy, OSError):  # a read-only folder is not removed either
         mark = work / f"{IN_USE}{os.getpid()}"
         files.hold(mark, lambda text: None)
         atexit.register(files.release, mark)
 
 
 def user_cache() -> Path | None:
-    """Return the user's cache folder; None where it is unknown."""
+    """Return the user's cache folder; None = unknown."""
     with suppress(RuntimeError):  # there is no HOME, and the system does not know the user
         stated = os.environ.get("XDG_CACHE_HOME", "")
         return (Path(stated) if os.path.isabs(stated) else Path.home() / ".cache") / "bitymi-ns"

@@ -1,39 +1,38 @@
 """COLMAP models on disk: cameras, poses and points in COLMAP's frame, checked by file and entry.
 
-pycolmap's reader accepts truncated files, ends photograph names in text files at the first space, and reads no model
-without points. So files are parsed here; camera models and their geometry are pycolmap's (`capture/lens.py`).
+pycolmap's reader accepts truncated files, ends names in text files at the first space, and reads no model without
+points. So files are parsed here; pycolmap has the camera models (`capture/lens.py`).
 """
 
 import functools
 import math
 import os
 import struct
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from bitymi_ns.capture.camera import ColmapCamera
-from bitymi_ns.capture.points import color_bytes, ply_fault, read_points
+from bitymi_ns.capture.points import color_bytes, read_cloud
 from bitymi_ns.capture.recognise import image_count
 from bitymi_ns.capture.transforms import MAX_SIDE
-from bitymi_ns.capture.types import fail, parsing, warn
+from bitymi_ns.capture.types import ColmapCamera, fail, parsing, warn
 from bitymi_ns.reading import open_text, read_bytes
 from bitymi_ns.trust import listed
 
 FORMS = (".txt", ".bin")
 MOST_MODEL = 1 << 36  # bytes of a file of a model; 100 million points take a twentieth of it
-TINY = 1e-100  # length of a quaternion that can still be normalised
+TINY = 1e-100  # least length of a quaternion that can be normalised
 CAMERA_SENSOR = int(pycolmap.SensorType.CAMERA)
+T = TypeVar("T")
 
 
 class ModelImage(NamedTuple):
-    """Photograph: name, camera, world to camera as quaternion (wxyz) and translation, and the rig's frame that it is
-    part of; None = it stands alone."""
+    """Photograph: name, camera, world to camera as quaternion (wxyz) and translation, and its rig's frame; None = it
+    stands alone."""
 
     name: str
     camera_id: int
@@ -48,17 +47,13 @@ class Model(NamedTuple):
     cameras: dict[int, ColmapCamera]  # by number
     images: list[ModelImage]  # sorted by name
     xyz: npt.NDArray[np.float64]  # [N, 3] float64 points
-    rgb: npt.NDArray[np.uint8]  # [N, 3] uint8 colors; [0, 3] where they have none
-    without_colors: str = ""  # why they have none, in words that follow the name of the file; empty where they have
+    rgb: npt.NDArray[np.uint8]  # [N, 3] colors; [0, 3] without colors
+    without_colors: str = ""  # why they have none, in words that follow the file's name
 
 
 def read_model(folder: Path) -> Model:
-    """Read the model in a folder, binary or text; the text where both are there, as nerfstudio does, with a warning
-    where they differ. The last model is cached, as several commands of a run ask for it.
-
-    Raises:
-        CaptureError: it cannot be used; names file and entry.
-    """
+    """Read a model, in text as nerfstudio does if there are both forms; warn if they differ. Several commands of a run
+    read it: the last one is cached. Raises CaptureError: it cannot be used; names file and entry."""
     names = [f"{name}{form}" for name in ("cameras", "images", "frames", "points3D") for form in FORMS]
     files = [*(folder / name for name in names), folder / "points3D.ply"]
     stamps = tuple((file, file.stat().st_mtime_ns, file.stat().st_size) for file in files if file.is_file())
@@ -68,37 +63,28 @@ def read_model(folder: Path) -> Model:
 @functools.lru_cache(maxsize=1)
 def _read_model(folder: Path, stamps: tuple[Any, ...]) -> Model:
     path = _file(folder, "cameras")
-    with _naming_file(path):
-        cameras = dict(_cameras_text(path) if path.suffix == ".txt" else _cameras_binary(path))
-        _check_cameras(path, cameras)
+    cameras = _parsed(path, _cameras_text, _cameras_binary, dict)
+    _check_cameras(path, cameras)
     path = _file(folder, "images")
-    with _naming_file(path):
-        images = dict(_images_text(path) if path.suffix == ".txt" else _images_binary(path))
-        _check_images(path, images, cameras)
+    images = _parsed(path, _images_text, _images_binary, dict)
+    _check_images(path, images, cameras)
     path = path.with_stem("frames")
     if path.is_file():  # of COLMAP 4, whose images keep poses of their own
-        with _naming_file(path):
-            frames = dict(_frames_text(path) if path.suffix == ".txt" else _frames_binary(path))
+        frames = _parsed(path, _frames_text, _frames_binary, dict)
         images = {number: image._replace(frame=frames.get(number)) for number, image in images.items()}
     _warn_of_other_form(folder, cameras, len(images))
     path = _file(folder, "points3D")
     xyz, rgb, without_colors = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), ""
     if path.is_file():
-        with _naming_file(path):
-            xyz, rgb, without_colors = _points_text(path) if path.suffix == ".txt" else (*_points_binary(path), "")
-            finite = np.isfinite(xyz).all(1)
+        xyz, rgb, without_colors = _parsed(path, _points_text, _points_binary, tuple)
+        finite = np.isfinite(xyz).all(1)
         if not finite.all():
-            warn(
-                f"{path}: {np.sum(~finite):,} of {len(xyz):,} points, the first is point {np.argmin(finite) + 1}, are "
-                "not finite. They are left out."
-            )
+            first = f"the first is point {np.argmin(finite) + 1}"
+            warn(f"{path}: {np.sum(~finite):,} of {len(xyz):,} points, {first}, are not finite. They are left out.")
             xyz, rgb = xyz[finite], rgb[finite] if len(rgb) else rgb
     elif (cloud := folder / "points3D.ply").is_file():  # as programs leave it that have read the model
-        fault = ply_fault(cloud)
-        if fault is not None:
-            fail(f"the point cloud {cloud} {fault}. Copy it again, or move it away to have points triangulated.")
-        (xyz, rgb), without_colors = read_points(cloud)
-    # nerfstudio sorts paths, not text: so the same photographs are held out
+        (xyz, rgb), without_colors = read_cloud(cloud, "Copy it again, or move it away to have points triangulated.")
+    # nerfstudio sorts paths, not text: sort alike to hold the same photographs out
     return Model(cameras, sorted(images.values(), key=lambda image: Path(image.name)), xyz, rgb, without_colors)
 
 
@@ -106,75 +92,73 @@ forget_model = _read_model.cache_clear
 
 
 def _file(folder: Path, name: str) -> Path:
-    """Choose the text or binary file. All are of one form where one is complete: a single file of the other form is of
-    another time."""
+    """Choose the text or binary file, all of a form that is complete: a single file of the other form is of another
+    time."""
 
     def is_complete(form: str) -> bool:
         return all((folder / f"{each}{form}").is_file() for each in ("cameras", "images"))
 
-    preferred = sorted(FORMS, key=is_complete, reverse=True)  # the text first, of two that are complete or are not
+    preferred = sorted(FORMS, key=is_complete, reverse=True)  # else the text first
     return next((file for form in preferred if (file := folder / f"{name}{form}").is_file()), folder / f"{name}.bin")
 
 
 def _warn_of_other_form(folder: Path, cameras: dict[int, ColmapCamera], images: int) -> None:
-    """Warn where a binary model beside the text that is read differs from it."""
+    """Warn if a binary model beside the text that is read differs from it."""
     if _file(folder, "images").suffix != ".txt" or not (folder / "images.bin").is_file():
         return
     differences = []
-    count = image_count(folder)  # of the binary one, where that is there
+    count = image_count(folder)  # of the binary form, if there is one
     if count != images:
         differences.append(f"{images} images in text and {count} in binary form")
     path = folder / "cameras.bin"
-    if path.is_file():
-        with _naming_file(path):
-            if dict(_cameras_binary(path)) != cameras:
-                differences.append("other cameras in text than in binary form")
+    if path.is_file() and _parsed(path, _cameras_text, _cameras_binary, dict) != cameras:
+        differences.append("other cameras in text than in binary form")
     if differences:
-        warn(
-            f"{folder} holds two models: {' and '.join(differences)}. The text is read. To have the binary one read, "
-            "move cameras.txt, images.txt and points3D.txt away."
-        )
+        advice = "To have the binary one read, move cameras.txt, images.txt and points3D.txt away."
+        warn(f"{folder} holds two models: {' and '.join(differences)}. The text is read. {advice}")
 
 
-@contextmanager
-def _naming_file(path: Path) -> Iterator[None]:
-    """Report errors of parsing a file by its name."""
+def _parsed(
+    path: Path,
+    text: Callable[[Path], Iterable[Any]],
+    binary: Callable[[Path], Iterable[Any]],
+    collect: Callable[[Iterable[Any]], T],
+) -> T:
+    """Parse and collect the content of a file; report errors by its name."""
     if not os.path.lexists(path):
         fail(f"the COLMAP model lacks {path}. Copy the whole model: cameras, images and points3D.")
     hint = "It is cut off or damaged. " * (path.suffix == ".bin")
     hint += "Each image has two lines; the second, of its 2D points, may be empty. " * (path.name == "images.txt")
     with parsing(path, f"{hint}Copy the model again, or export it from COLMAP again."):
-        yield
+        return collect((text if path.suffix == ".txt" else binary)(path))
 
 
 @functools.cache
 def parameter_count(model: str) -> int | None:
-    """Number of parameters of a COLMAP camera model; None where COLMAP has no such model."""
+    """Count the parameters of a COLMAP camera model; None = COLMAP has no such model."""
     if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":
         return None
     return len(pycolmap.Camera.create_from_model_name(1, model, 1.0, 1, 1).params)
 
 
 def _check_cameras(path: Path, cameras: dict[int, ColmapCamera]) -> None:
-    """Fail at parameters that are not finite, or not as many as the camera model has."""
+    """Fail at sizes and parameters out of range, or not as many as the camera model has."""
     for number, camera in cameras.items():
         count = parameter_count(camera.model)
         if not all(1 <= side <= MAX_SIDE for side in camera.size) or not np.isfinite(camera.params).all():
             written = " ".join([*(str(side)[:20] for side in camera.size), *(f"{value:g}" for value in camera.params)])
+            line, what = _line_of(path, number), f"camera {number} ({camera.model} {written})"
             fail(
-                f"{path}{_line_of(path, number)}: camera {number} ({camera.model} {written}) cannot be used: its size "
-                f"has to be from 1 to {MAX_SIDE:,} pixels and all numbers finite. Correct it, or export the model from "
-                "COLMAP again."
+                f"{path}{line}: {what} cannot be used: its size has to be from 1 to {MAX_SIDE:,} pixels and all "
+                "numbers finite. Correct it, or export the model from COLMAP again."
             )
         if count is not None and len(camera.params) != count:
-            fail(
-                f"{path}: camera {number} has {len(camera.params)} parameters, but a {camera.model} has {count}. "
-                "Correct its line."
-            )
+            what = f"camera {number} has {len(camera.params)} parameters, but a {camera.model} has {count}"
+            fail(f"{path}: {what}. Correct its line.")
 
 
 def _check_images(path: Path, images: dict[int, ModelImage], cameras: dict[int, ColmapCamera]) -> None:
-    """Fail at images without a usable pose or camera, and at two images of one name."""
+    """Fail at images without usable pose or camera, and at two images of one name."""
     if not images:
         fail(f"{path} lists no images: COLMAP found no poses. Give another model with `--colmap-path`.")
     first: dict[str, int] = {}
@@ -190,14 +174,12 @@ def _check_images(path: Path, images: dict[int, ModelImage], cameras: dict[int, 
                 "rotation is zero. Correct its line or remove the image."
             )
         if first.setdefault(image.name, number) != number:
-            fail(
-                f"{path}: images {first[image.name]} and {number} are both of {image.name}. Correct the name of one of "
-                "them or remove it."
-            )
+            twice = f"images {first[image.name]} and {number} are both of {image.name}"
+            fail(f"{path}: {twice}. Correct the name of one of them or remove it.")
 
 
 def _line_of(path: Path, number: int) -> str:
-    """Line of a text file that states this camera or image, as ", line N"; empty for a binary file."""
+    """Find the line of a text file with this camera or image, as ", line N"; empty for a binary file."""
     if path.suffix != ".txt":
         return ""
     with open_text(path, errors="replace") as file:
@@ -206,7 +188,7 @@ def _line_of(path: Path, number: int) -> str:
 
 
 class _Binary:
-    """Sequential reader of a binary file that fails where it has less or more than it states."""
+    """Reads a binary file in sequence; fails if it has less or more than it states."""
 
     def __init__(self, path: Path) -> None:
         self.data, self.offset = read_bytes(path, MOST_MODEL), 0
@@ -251,7 +233,7 @@ def _images_binary(path: Path) -> Iterator[tuple[int, ModelImage]]:
 
 
 def _frames_binary(path: Path) -> Iterator[tuple[int, int]]:
-    """Image and frame of the images that the cameras of a rig took together."""
+    """Yield image and frame of the images that a rig's cameras took together."""
     file = _Binary(path)
     for _ in range(file.take("Q")[0]):
         frame, *_, count = file.take("II7dI")  # with rig and pose
@@ -262,7 +244,7 @@ def _frames_binary(path: Path) -> Iterator[tuple[int, int]]:
     file.end()
 
 
-def _points_binary(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
+def _points_binary(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8], str]:
     file = _Binary(path)
     starts = []
     for _ in range(file.take("Q")[0]):
@@ -271,7 +253,7 @@ def _points_binary(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.
         file.skip(8 * file.take("Q")[0])  # track
     file.end()
     rows = np.frombuffer(file.data, np.uint8)[np.array(starts, int)[:, None] + np.arange(8, 35)]
-    return rows[:, :24].copy().view("<f8").reshape(-1, 3), rows[:, 24:].copy()
+    return rows[:, :24].copy().view("<f8").reshape(-1, 3), rows[:, 24:].copy(), ""
 
 
 def _lines(path: Path) -> Iterator[str]:
@@ -290,7 +272,7 @@ def _cameras_text(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
 
 
 def _images_text(path: Path) -> Iterator[tuple[int, ModelImage]]:
-    """Parse images.txt, also where a program left out the second line of images."""
+    """Parse images.txt, in which programs may leave out the second line of an image."""
     number = None
     for line in _lines(path):
         if number is not None and _are_observations(line):
@@ -319,7 +301,7 @@ def _frames_text(path: Path) -> Iterator[tuple[int, int]]:
 
 
 def _are_observations(line: str) -> bool:
-    """Test for the second line of an image: triples of numbers, or nothing."""
+    """Test for an image's second line: triples of numbers, or nothing."""
     words = line.split()
     try:
         return len(words) % 3 == 0 and all(math.isfinite(float(word)) for word in words)
@@ -328,7 +310,7 @@ def _are_observations(line: str) -> bool:
 
 
 def _points_text(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8], str]:
-    """Parse points3D.txt: positions, colors, and why it has no colors."""
+    """Parse points3D.txt: positions, colors, and why there are no colors."""
     rows = [[float(word) for word in line.split(maxsplit=7)[1:7]] for line in _lines(path) if line]
     counts = {len(row) for row in rows}
     if not counts <= {3, 6} or len(counts) > 1:

@@ -1,4 +1,4 @@
-"""Photographs of a COLMAP model: find the image and mask files, and convert poses and points to nerfstudio's frame."""
+"""Photographs of a COLMAP model: find image and mask files, and convert poses and points to nerfstudio's frame."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -9,29 +9,27 @@ from typing import Literal
 import numpy as np
 import pycolmap
 
-from bitymi_ns.capture.camera import OPENCV_AXES, Photograph, Pose
 from bitymi_ns.capture.colmap_model import Model, ModelImage, read_model
 from bitymi_ns.capture.find_files import FileFinder, renamed_message
 from bitymi_ns.capture.masks import LEAVE_OUT, USUAL_FOLDERS, downscaled_masks, mask_folder, masks_named
 from bitymi_ns.capture.pictures import is_photograph, photographs_below, result_in
 from bitymi_ns.capture.points import Points
-from bitymi_ns.capture.types import CaptureError, SfmSettings, fail, say, warn
+from bitymi_ns.capture.recognise import Found
+from bitymi_ns.capture.types import OPENCV_AXES, CaptureError, Photograph, Pose, SfmSettings, fail, say, warn
 from bitymi_ns.trust import leads_inside, listed
 
-TO_NERFSTUDIO = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-"""[4, 4] COLMAP's world, in which up is about -y, to nerfstudio's with z up; nerfstudio's parser does the same."""
+TO_Z_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+"""[4, 4] COLMAP's world, up about -y, to nerfstudio's with z up, as nerfstudio's parser does."""
 
 
 @dataclass(frozen=True)
 class Origin:
     """Input of structure from motion, for a run that keeps its model."""
 
-    kind: Literal["photographs", "video"]  # of the input
+    kind: Literal["photographs", "video"]
     path: str  # folder that was searched for photographs, or the video, relative to the capture
-    # folder of the photographs, relative to the capture; None = those of the model are upright copies or frames, in a
-    # folder that can go
-    photographs: str | None
-    settings: SfmSettings | None = None  # of structure from motion; None = unknown
+    photographs: str | None  # their folder, relative to the capture; None = upright copies or frames, which may go
+    settings: SfmSettings | None = None  # None = unknown
 
 
 @dataclass(frozen=True)
@@ -39,15 +37,13 @@ class Source:
     """A COLMAP model and the photographs that belong to it."""
 
     folder: Path  # of the model
-    photographs: Path  # folder to which the names in the model are relative
+    photographs: Path  # folder to which names in the model are relative
     masks: Path | None = None  # folder of masks; None = none
-    downscale: int = 1  # the photographs are used smaller by this factor
-    # folder of copies that are that much smaller; None = photographs are downscaled as they are read
-    copies: Path | None = None
-    # photographs that the model lacks, with reasons where they are known
-    left_out: Mapping[str, str] = field(default_factory=dict)
+    downscale: int = 1  # factor by which photographs are reduced
+    copies: Path | None = None  # folder of reduced copies; None = reduce photographs on reading
+    left_out: Mapping[str, str] = field(default_factory=dict)  # photographs that the model lacks, and known reasons
     report: Path | None = None  # folder of the report on structure from motion; None = none
-    origin: Origin | None = None  # input of structure from motion; None = the capture came with the model
+    origin: Origin | None = None  # None = the capture came with the model
 
     @property
     def model(self) -> Model:
@@ -60,13 +56,13 @@ class Source:
         return self.copies or self.photographs
 
     def files(self) -> list[Path]:
-        """Find the files of the model's images; missing ones under the names that the model has for them."""
+        """Find the files of the model's images; missing ones under the model's names."""
         names = [image.name for image in self.model.images]
         finder = FileFinder(self.image_folder)
         return [path or finder.missing(name) for path, name in zip(finder.find_all(names), names, strict=True)]
 
     def describe(self) -> str:
-        """Describe it in a line for the user."""
+        """Describe the source in a line."""
         model = self.model
         used = {image.camera_id for image in model.images}
         kinds = Counter(model.cameras[number].model for number in used)
@@ -80,56 +76,36 @@ class Source:
         return text
 
 
-def find_source(
-    folder: Path,
-    capture: Path,
-    images_path: Path | None = None,
-    masks_path: Path | None = None,
-    downscale: int = 1,
-    need_photos: bool = True,
-) -> Source:
-    """Find a model's photographs and masks; photographs may be missing where they are not needed.
-
-    Args:
-        capture: folder to which the paths are relative, and below which photographs are searched; where it is that of
-            the model, the folders above it, too.
-        downscale: use photographs that are smaller by this factor.
-
-    Raises:
-        CaptureError: no folder has the model's photographs, or the masks are incomplete.
-    """
-    names = [image.name for image in read_model(folder).images]
-    photographs = _photo_folder(names, folder, capture, images_path, downscale, need_photos)
-    return make_source(folder, photographs, find_masks(photographs, capture, masks_path, downscale), downscale)
+def find_source(found: Found, images: Path | None, masks: Path | None, downscale: int, need_photos: bool) -> Source:
+    """Find photographs and masks of a COLMAP model, at stated paths in the capture, or below it."""
+    names = [image.name for image in read_model(found.path).images]
+    photographs = _find_folder(names, found.path, found.folder, images, downscale, need_photos)
+    masks = find_masks(photographs, found.folder, masks, downscale)
+    return make_source(found.path, photographs, masks, downscale, {})
 
 
 def make_source(
-    folder: Path,
-    photographs: Path,
-    masks: Path | None = None,
-    downscale: int = 1,
-    left_out: Mapping[str, str] | None = None,
+    folder: Path, photographs: Path, masks: Path | None, downscale: int, left_out: Mapping[str, str]
 ) -> Source:
-    """Make a source of known folders, with downscaled copies (`images_2`, `masks_2`) where these exist."""
+    """Make a source of known folders, with downscaled copies (`images_2`, `masks_2`) if there are any."""
     smaller = photographs.with_name(f"{photographs.name}_{downscale}")
     copies = smaller if downscale > 1 and smaller.is_dir() else None
     if masks is not None and downscale > 1 and (copies is not None or not masks.is_dir()):
         small = downscaled_masks(masks, downscale)
-        masks = small if small.is_dir() else masks  # which are downscaled as they are read
-    return Source(folder, photographs, masks, downscale, copies, dict(left_out or {}))
+        masks = small if small.is_dir() else masks  # reduced on reading
+    return Source(folder, photographs, masks, downscale, copies, dict(left_out))
 
 
-def _photo_folder(
+def _find_folder(
     names: Sequence[str], folder: Path, capture: Path, stated: Path | None, downscale: int, need_photos: bool
 ) -> Path:
-    """Find the folder that has the most of these photographs."""
+    """Find the folder with most of these photographs of a model, which may be missing unless needed: `stated`, or below
+    the capture; above it, too, if it is the model's `folder`. Raises CaptureError: none has any."""
     if stated is not None:
         if not need_photos or (capture / stated).is_dir() or (capture / f"{stated}_{downscale}").is_dir():
             return capture / stated
-        fail(
-            f"the folder of photographs {capture / stated} does not exist. Give it, seen from {capture}, with "
-            "--images-path, or leave that out to have it found."
-        )
+        advice = f"Give it, seen from {capture}, with --images-path, or leave that out to have it found."
+        fail(f"the folder of photographs {capture / stated} does not exist. {advice}")
     bases = [capture]
     if folder.is_relative_to(capture):
         bases += [path for path in folder.parents if path.is_relative_to(capture) and path != capture]
@@ -147,16 +123,15 @@ def _photo_folder(
     def exact_count(path: Path) -> int:
         return max((sum((each / name).is_file() for name in portable) for each in with_copies(path)), default=0)
 
-    def similar_count(path: Path) -> int:
-        found = (FileFinder(each).find_all(names) for each in with_copies(path))
-        return max((sum(path is not None for path in files) for files in found), default=0)
-
     best = max(folders, key=exact_count)  # the first of equals
     if not need_photos or exact_count(best) == len(names):
         return best
     # a folder above the capture may be the root of a disk, which is not searched
     searched = [each for each in folders if each.is_relative_to(capture) or each.name in USUAL_FOLDERS]
-    counts = {each: similar_count(each) for each in dict.fromkeys(searched)}
+    counts = {}
+    for each in dict.fromkeys(searched):
+        found = (FileFinder(one).find_all(names) for one in with_copies(each))
+        counts[each] = max((sum(path is not None for path in files) for files in found), default=0)
     other = max(counts, key=counts.__getitem__)
     if counts[other] > exact_count(best):
         return other
@@ -172,34 +147,19 @@ def _photo_folder(
 
 
 def find_masks(photographs: Path, capture: Path, stated: Path | None, downscale: int = 1) -> Path | None:
-    """Find the folder of masks, or the stated one relative to the capture; see `mask_folder`.
-
-    Raises:
-        CaptureError: the stated one does not exist.
-    """
+    """Find the folder of masks, or the stated one relative to the capture, which must exist; see `mask_folder`."""
     try:
         return mask_folder(photographs, capture, None if stated is None else capture / stated, downscale)
     except CaptureError as error:
         fail(f"{error}. Give it, seen from {capture}, with --masks-path.", error)
 
 
-def mask_files(source: Source) -> list[Path] | None:
-    """Find the masks of the model's images, by the names of the photographs; None without masks.
-
-    Raises:
-        CaptureError: some photographs have a mask, and others none.
-    """
-    if source.masks is None:
-        return None
-    return masks_named(source.masks, [_name_in(source.image_folder, path) for path in source.files()])
-
-
 def _name_in(folder: Path, path: Path) -> str:
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name
 
 
-def warn_of_left_out(source: Source) -> set[Path]:
-    """Report photographs that the model lacks, and those that have other names than it states. Returns all of these."""
+def warn_left_out(source: Source) -> set[Path]:
+    """Report photographs that the model lacks, and those with other names than it states; return them all."""
     files = source.files()
     other = renamed_message([image.name for image in source.model.images], files, source.image_folder)
     if other:
@@ -211,29 +171,23 @@ def warn_of_left_out(source: Source) -> set[Path]:
     unused = sorted((names | source.left_out.keys()) - used)
     if unused:
         named = [f"{name} ({source.left_out[name]})" if name in source.left_out else name for name in unused]
-        warn(
-            f"{len(unused)} of {len(used) + len(unused)} photographs have no pose in the model and are left out: "
-            f"{listed(named)}."
-        )
+        total = len(used) + len(unused)
+        warn(f"{len(unused)} of {total} photographs have no pose in the model and are left out: {listed(named)}.")
     return {*files, *(source.photographs / name for name in names)}
 
 
-def model_photographs(source: Source, need_photos: bool) -> list[Photograph]:
-    """Return the photographs of a model in the order of their names, with cameras and poses."""
+def photographs_of(source: Source, need_photos: bool) -> list[Photograph]:
+    """List the photographs of a model in the order of their names, with cameras and poses."""
     model, files = source.model, source.files()
-    masks = mask_files(source) if need_photos else None
-    return [
-        Photograph(
-            file=file,
-            camera=model.cameras[image.camera_id],
-            pose=TO_NERFSTUDIO @ _camera_to_world(image),
-            label=f"camera {image.camera_id} of {source.folder}",
-            mask=None if masks is None else masks[i],
-            downscaled=source.copies is not None,
-            frame=image.frame,
-        )
-        for i, (image, file) in enumerate(zip(model.images, files, strict=True))
-    ]
+    masks = None
+    if need_photos and source.masks is not None:
+        masks = masks_named(source.masks, [_name_in(source.image_folder, path) for path in files])
+    found = []
+    for i, (image, file) in enumerate(zip(model.images, files, strict=True)):
+        camera, pose = model.cameras[image.camera_id], TO_Z_UP @ _camera_to_world(image)
+        label, mask = f"camera {image.camera_id} of {source.folder}", None if masks is None else masks[i]
+        found.append(Photograph(file, camera, pose, label, mask, source.copies is not None, image.frame))
+    return found
 
 
 def model_points(model: Model, frame: Pose) -> Points:

@@ -1,4 +1,4 @@
-"""EXIF of photographs: camera, focal length, exposure, GPS position, time and gravity, as far as they are plausible."""
+"""Read EXIF of photographs: camera, focal length, exposure, GPS position, time and gravity, if plausible."""
 
 import math
 import struct
@@ -7,29 +7,28 @@ from dataclasses import dataclass
 
 from PIL import ExifTags, Image
 
-FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)  # millimetres; focal lengths "in 35 mm film" are relative to it
+FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)  # millimetres, of focal lengths "in 35 mm film"
 SENSOR_ASPECTS = (4 / 3, 3 / 2, 16 / 9, 5 / 4)  # aspect ratios of uncropped photographs
-SAME_ASPECT = 0.02  # relative difference of equal aspect ratios: sizes are rounded to blocks of pixels
-FOCAL_RANGE = (0.3, 15.0)  # plausible focal lengths, in units of the longer side
-STILL = 0.1  # tolerance of the length of an acceleration, in g, for a phone that is held still
+SAME_ASPECT = 0.02  # relative difference of aspect ratios by rounding to blocks of pixels
+FOCAL_RANGE = (0.3, 15.0)  # plausible focal lengths in longer sides
+STILL = 0.1  # tolerance of the acceleration of a phone held still, g
 
 
 @dataclass(frozen=True)
 class Exif:
     """EXIF of one photograph."""
 
-    camera: str = ""
-    """Make, model, lens and focal length; photographs with the same one and the same size share a camera."""
-    focal_length: float | None = None  # in pixels of the photograph; None where there is no plausible one
+    camera: str = ""  # Make, model, lens and focal length; photographs of equal ones and equal size share a camera.
+    focal_length: float | None = None  # pixels; None = none plausible
     doubt: str = ""  # why a stated focal length is not used
     position: tuple[float, float, float] | None = None  # latitude and longitude in degrees, altitude in metres
-    time: str = ""  # sortable time of the photograph; empty where unknown
+    time: str = ""  # sortable; empty = unknown
     up: tuple[float, float, float] | None = None
-    """Unit vector away from the ground, in the upright photograph's axes (x right, y down, z forward)."""
+    """Unit vector away from the ground, in axes of the upright photograph (x right, y down, z forward)."""
 
 
 def read_exif(image: Image.Image) -> Exif:
-    """Read the EXIF of an opened image whose rotation has not been applied yet; broken entries count as missing."""
+    """Read the EXIF of an opened image before it is turned upright; broken entries count as missing."""
     try:
         tags = image.getexif()
         detail = tags.get_ifd(ExifTags.IFD.Exif)
@@ -41,21 +40,14 @@ def read_exif(image: Image.Image) -> Exif:
     focal, doubt = focal_length(detail, image.size)
     fraction = str(detail.get(ExifTags.Base.SubsecTimeOriginal) or "").strip()
     time = str(detail.get(ExifTags.Base.DateTimeOriginal) or "").strip()
-    return Exif(
-        camera=" ".join(
-            [str(name).strip("\0 ") for name in names if name] + ([f"{millimetres:g} mm"] if millimetres else [])
-        ),
-        focal_length=focal,
-        doubt=doubt,
-        position=_position(gps),
-        time=f"{time}.{fraction}" if time and fraction else time,
-        up=_up(image, tags, detail),
-    )
+    time = f"{time}.{fraction}" if time and fraction else time
+    parts = [str(name).strip("\0 ") for name in names if name] + ([f"{millimetres:g} mm"] if millimetres else [])
+    return Exif(" ".join(parts), focal, doubt, _position(gps), time, _up(image, tags, detail))
 
 
 def focal_length(detail: Mapping[int, object], size: tuple[int, int]) -> tuple[float | None, str]:
-    """Compute the focal length in pixels from the Exif IFD and the stored image's width and height, and why a stated
-    one is not used."""
+    """Compute the focal length in pixels from the Exif IFD and the stored width and height, and why a stated one is not
+    used."""
     long, short = max(size), min(size)
     film = number(detail.get(ExifTags.Base.FocalLengthIn35mmFilm))
     millimetres = number(detail.get(ExifTags.Base.FocalLength))
@@ -82,7 +74,7 @@ def focal_length(detail: Mapping[int, object], size: tuple[int, int]) -> tuple[f
 
 
 def number(value: object) -> float | None:
-    """Convert to a positive finite number, or None: files hold rationals with a denominator of 0, and text."""
+    """Convert to a positive finite number, or None: files hold text and rationals with a denominator of 0."""
     try:
         found = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
@@ -95,7 +87,7 @@ EXPOSURE = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISO
 
 
 def exposure_exif(image: Image.Image) -> Image.Exif:
-    """Make EXIF data that hold the exposure of an opened image and nothing else: no orientation, no position."""
+    """Make EXIF of an opened image's exposure alone, without orientation and position."""
     kept = Image.Exif()
     try:
         detail = image.getexif().get_ifd(ExifTags.IFD.Exif)
@@ -107,8 +99,7 @@ def exposure_exif(image: Image.Image) -> Image.Exif:
 
 
 def exposure_settings(image: Image.Image) -> tuple[float | None, ...] | None:
-    """Read shutter time (seconds), f-number and ISO of an opened image; None where the time is not stated, or cannot be
-    read."""
+    """Read shutter time (seconds), f-number and ISO of an opened image; None without a time."""
     try:
         detail = image.getexif().get_ifd(ExifTags.IFD.Exif)
     except Exception:  # Pillow raises many kinds on broken EXIF
@@ -123,15 +114,15 @@ def exposure_settings(image: Image.Image) -> tuple[float | None, ...] | None:
 
 
 def exif_stops(seconds: float, f_number: float, iso: float) -> float:
-    """Compute log2 of the exposure by a photograph's settings: shutter time times ISO over the f-number's square."""
+    """Compute log2 of the exposure: shutter time times ISO over the square of the f-number."""
     return math.log2(seconds * iso / (f_number * f_number))
 
 
 def _up(
     image: Image.Image, tags: Mapping[int, object], detail: Mapping[int, object]
 ) -> tuple[float, float, float] | None:
-    """Up by a phone's accelerometer; None where there is none, where the phone was moved, or where the photograph is
-    shown in another orientation."""
+    """Find up by a phone's accelerometer; None = none stated, the phone moved, or the photograph is shown in another
+    orientation."""
     note = detail.get(ExifTags.Base.MakerNote)
     if not isinstance(note, bytes) or "front" in str(detail.get(ExifTags.Base.LensModel)).lower():
         return None
@@ -139,25 +130,23 @@ def _up(
     if found is None or not abs(math.hypot(*found) - 1) <= STILL:
         return None
     left, bottom, into = (value / math.hypot(*found) for value in found)
-    # the sensor's rows run from the top of the phone to its bottom, its columns from the right to the left
+    # the sensor's rows run from top to bottom of the phone, its columns from right to left
     turns = {1: (bottom, left), 3: (-bottom, -left), 6: (-left, bottom), 8: (left, -bottom)}
     # HEIC is turned as it is opened
     orientation = image.info.get("original_orientation") or tags.get(ExifTags.Base.Orientation, 1)
     if orientation not in turns:
         return None
     x, y = turns[orientation]
-    upright = y < 0 and abs(x) <= -y  # nearer to the top of the picture than to another side
+    upright = y < 0 and abs(x) <= -y  # nearest to the picture's top
     return (x, y, into) if upright or math.hypot(x, y) < 0.5 else None
 
 
 def apple_acceleration(note: bytes) -> tuple[float, float, float] | None:
-    """Parse AccelerationVector (tag 8) of Apple's maker note, in g.
+    """Parse AccelerationVector (tag 8) of Apple's maker note, in g: towards the left side of the phone as seen from its
+    front, its bottom, and into its face. Of a phone held still it points away from the ground.
 
-    Its components point to the left side of the phone as seen from its front, to its bottom, and into its face. When
-    the phone is held still the vector points away from the ground.
-
-    The note is an IFD of big-endian numbers after 14 bytes, "Apple iOS", its version and "MM"; offsets count
-    from its start.
+    The note has 14 bytes, "Apple iOS", its version and "MM", then an IFD of big-endian numbers; offsets count from its
+    start.
     """
     if not note.startswith(b"Apple iOS\0") or note[12:14] != b"MM":
         return None
@@ -175,7 +164,7 @@ def apple_acceleration(note: bytes) -> tuple[float, float, float] | None:
 
 
 def _position(gps: Mapping[int, object]) -> tuple[float, float, float] | None:
-    """Latitude, longitude and altitude; None without plausible latitude and longitude."""
+    """Read latitude, longitude and altitude; None unless the first two are plausible."""
     try:
         angles = []
         for tag, reference, limit in ((2, 1, 90), (4, 3, 180)):

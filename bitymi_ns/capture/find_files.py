@@ -1,98 +1,85 @@
-"""Find files by the names in a capture's metadata, also where these were written on another machine."""
+"""Find a capture's files by the names in its metadata, even names of another machine."""
 
 import difflib
 import os
 import re
 import unicodedata
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from bitymi_ns.capture.camera import Photograph
 from bitymi_ns.capture.pictures import PHOTOGRAPHS, passed_over, result_in
-from bitymi_ns.capture.types import MAP_FILES, MapFiles, fail, say, warn
+from bitymi_ns.capture.types import MAP_FILES, MapFiles, Photograph, fail, say, warn
 from bitymi_ns.trust import leads_inside, listed
 
-Parts = tuple[str, ...]  # folders and file of a name, folded to one case and one Unicode form
+Parts = tuple[str, ...]  # folders and file of a name, in one case and one Unicode form
 _DRIVE = re.compile(r"^[A-Za-z]:")
 
 
 def folded(name: str) -> Parts:
-    """Remove from a name what differs between machines: separators, case, Unicode form, `.` and a drive."""
+    """Remove what differs between machines from a name: separators, case, Unicode form, `.` and a drive."""
     portable = _DRIVE.sub("", name).replace("\\", "/")
     plain = unicodedata.normalize("NFC", os.path.normpath(portable)).casefold()
     return tuple(part for part in plain.split("/") if part not in ("", "."))
 
 
 def without_extension(parts: Parts) -> Parts:
-    """Remove the extension of an image from a folded name."""
+    """Remove an image's extension from a folded name."""
     stem, ending = os.path.splitext(parts[-1])
     return (*parts[:-1], stem if ending in PHOTOGRAPHS else parts[-1])
 
 
+@dataclass
 class FileFinder:
-    """Finds files below a folder by names that may differ in what machines and programs change.
+    """Finds files below a folder by names that machines and programs may have changed, if only one file fits.
 
-    In this order: the exact name; other separators, case, Unicode form or leading folders, as in absolute names of
-    another machine; another extension, or none. Only unambiguous files are found.
-
-    Args:
-        folder: to which the names are relative.
-        outside: names may lead out of the folder.
-        extensions: of the files, in lower case.
+    Tries, in order: the exact name; other separators, case, Unicode form or leading folders, as of absolute names;
+    another extension, or none.
     """
 
-    def __init__(self, folder: Path, outside: bool = False, extensions: tuple[str, ...] = PHOTOGRAPHS) -> None:
-        self.folder = folder
-        self.outside = outside
-        self.extensions = extensions
+    folder: Path  # to which names are relative
+    outside: bool = False  # allow names that lead out of it
+    extensions: tuple[str, ...] = PHOTOGRAPHS  # of the files, in lower case
 
     def find(self, name: str) -> Path | None:
-        """Find one file; None = there is none, or more than one."""
+        """Find a file; None = none, or more than one."""
         for exact in (name, name.replace("\\", "/")):
             if self._allowed(exact) and (self.folder / exact).is_file():
                 return self.folder / exact
         parts = folded(name)
         if not parts:
             return None
-        stems = (parts, without_extension(parts))  # the name lacks an extension, or has another one
+        stems = (parts, without_extension(parts))  # for names without extension, and with another one
         return self._match(parts, self._whole) or next(filter(None, (self._match(p, self._stems) for p in stems)), None)
 
     def find_all(self, names: Sequence[str]) -> list[Path | None]:
-        """Find the files of several names. A file that fits two of them is that of the exact name, or of none."""
+        """Find files of several names. A file that fits two names is that of the exact one, or of none."""
         found = [self.find(name) for name in names]
-        users: dict[Path, list[int]] = defaultdict(list)
-        for i, path in enumerate(found):
-            if path is not None:
-                users[path].append(i)
-        for path, numbers in users.items():
-            if len(numbers) > 1:
-                exact = [i for i in numbers if self.folder / names[i] == path]
-                for i in numbers:
-                    if len(exact) != 1 or i != exact[0]:
-                        found[i] = None
-        return found
+        exact = [self.folder / name == path for name, path in zip(names, found, strict=True)]
+        users, sure = Counter(found), Counter(path for path, same in zip(found, exact, strict=True) if same)
+        unique = [users[path] == 1 or (same and sure[path] == 1) for path, same in zip(found, exact, strict=True)]
+        return [path if alone else None for path, alone in zip(found, unique, strict=True)]
 
     def _allowed(self, name: str) -> bool:
         return self.outside or leads_inside(name)
 
     def missing(self, name: str) -> Path:
-        """Path to show for a file that was not found."""
+        """Return a path to show for a missing file."""
         if self._allowed(name):
             return self.folder / name
         parts = PurePosixPath(name.replace("\\", "/").replace("\0", "_")).parts
         return self.folder.joinpath(*("_" if part in ("/", "//", "..") else part for part in parts))
 
     def ambiguous(self, name: str) -> list[str]:
-        """Files that a name without extension may mean, where there are several."""
+        """List the files that a name without extension may mean, if there are several."""
         files = self._stems.get(without_extension(folded(name)), [])
         return [path.relative_to(self.folder).as_posix() for path in files] if len(files) > 1 else []
 
     def nearest(self, name: str) -> str:
-        """Describe a file with a similar name, as "but there is ..."; empty where there is none."""
+        """Describe a file of a similar name, as "but there is ..."; empty = none."""
         wanted = folded(name)[-1:]
         last = {parts[-1]: files[0] for parts, files in self._whole.items()}
         near = difflib.get_close_matches(wanted[0] if wanted else "", last, n=1, cutoff=0.8)
@@ -131,7 +118,7 @@ class FileFinder:
 
 
 def check_photographs_exist(source: Path, files: Iterable[Path]) -> None:
-    """Fail where photographs of a capture's file or folder are missing, with similar names of files that exist."""
+    """Fail if photographs of a capture's file or folder are missing, with similar names of existing files."""
     names = list(dict.fromkeys(files))
     missing = [file for file in names if not file.is_file()]
     if not missing:
@@ -144,8 +131,8 @@ def check_photographs_exist(source: Path, files: Iterable[Path]) -> None:
 
 
 def name_unused(folder: Path, used: Iterable[Path | None], downscale: int | None = None) -> None:
-    """Name the pictures of a capture that are not used. Those that are `used` may be replaced by copies that are
-    smaller by `downscale`."""
+    """Report pictures of a capture that are not used; the `used` ones may be replaced by copies that are smaller by
+    `downscale`."""
     named = frozenset(Path(os.path.normpath(path)) for path in used if path is not None)
     others = passed_over(Path(os.path.normpath(folder)), named)
     if downscale is not None:
@@ -164,8 +151,7 @@ def _hint(folder: Path, file: Path) -> str:
 
 
 def renamed_message(names: Sequence[str], files: Sequence[Path], folder: Path) -> str:
-    """Describe the files that were found under another name; empty where none was. Names without extension are usual,
-    and so are either separators."""
+    """Describe files found under other names; empty = none. Names without extension and either separator are usual."""
 
     def is_usual(name: str, file: Path) -> bool:
         plain = Path(os.path.normpath(folder / name.replace("\\", "/")))
@@ -180,7 +166,7 @@ def renamed_message(names: Sequence[str], files: Sequence[Path], folder: Path) -
 
 
 def report_files(path: Path, names: Sequence[str], files: Sequence[Path], masks: Sequence[Path | None]) -> None:
-    """Report files that have other names than stated, and those outside of the folder: results show them."""
+    """Report files with other names than stated, and those outside the folder: results show them."""
     other = renamed_message(names, files, path.parent)
     if other:
         say(f"{path}: {other}")
@@ -192,8 +178,7 @@ def report_files(path: Path, names: Sequence[str], files: Sequence[Path], masks:
 
 
 def find_photographs(path: Path, names: Sequence[str], need_photos: bool) -> list[Path]:
-    """Find the photographs of a file; missing ones keep the stated names. Fails where a name fits more than one
-    file."""
+    """Find the photographs of a file; missing ones keep their stated names. Fail if a name fits more than one file."""
     folder = path.parent
     finder = FileFinder(folder, outside=True)
     found = finder.find_all(names)
@@ -204,16 +189,14 @@ def find_photographs(path: Path, names: Sequence[str], need_photos: bool) -> lis
     for i, (name, file) in enumerate(zip(names, found, strict=True)):
         ambiguous = finder.ambiguous(name) if need_photos and file is None else []
         if ambiguous:
-            fail(
-                f"{path}: frame {i} is of {name}, but there are {listed(ambiguous)}. Write the ending of the right one."
-            )
+            fail(f"{path}: frame {i} is of {name}, but there are {listed(ambiguous)}. Write the right one's ending.")
     return [Path(os.path.normpath(file or folder / name)) for name, file in zip(names, found, strict=True)]
 
 
 def find_masks(
     folder: Path, names: Sequence[str | None], photographs: Sequence[Path], need_photos: bool
 ) -> list[Path | None]:
-    """Find the masks of these names, which may serve several photographs; missing ones keep the stated names."""
+    """Find masks, which photographs may share, by name; missing ones keep their stated names."""
     finder = FileFinder(folder, outside=True)
     found = {name: finder.find(name) if need_photos else None for name in dict.fromkeys(names) if name is not None}
     taken = set(photographs)
@@ -222,7 +205,7 @@ def find_masks(
 
 
 def find_maps(path: Path, frames: Sequence[dict[str, Any]], need_photos: bool) -> list[MapFiles]:
-    """Find the maps of depth and normals, with a warning on those that are missing."""
+    """Find maps of depth and normals; warn of missing ones."""
     finder = FileFinder(path.parent, outside=True, extensions=MAP_FILES)
     found: dict[str, list[Path | None]] = {}
     for key in ("depth_file_path", "normal_file_path"):
@@ -235,8 +218,8 @@ def find_maps(path: Path, frames: Sequence[dict[str, Any]], need_photos: bool) -
 
 
 def downscaled(photographs: list[Photograph], folder: Path, downscale: int) -> list[Photograph]:
-    """Replace photographs by their downscaled copies, where there are such, in `images_2` beside `images`, under the
-    same names or, as nerfstudio's tool writes them, without folders; else they are downscaled as they are read."""
+    """Replace photographs by downscaled copies, if there are any, in `images_2` beside `images`; their names may lack
+    folders, as nerfstudio's tool writes them."""
 
     def copies(file: Path) -> list[Path]:
         inside = file.relative_to(folder).parts if file.is_relative_to(folder) else (file.parent.name, file.name)
@@ -256,8 +239,7 @@ def downscaled(photographs: list[Photograph], folder: Path, downscale: int) -> l
     if lacking:
         fail(
             f"{len(lacking)} of {len(found)} images of the capture are missing:\n  {listed(lacking)}\nOthers have a "
-            f"copy that is {downscale} times smaller: make the missing ones, or move that folder away to have all "
-            "photographs reduced as they are read."
+            f"copy {downscale} times smaller: make the missing ones, or move that folder away to reduce all on reading."
         )
     if len(set(found)) < len(set(each.file for each in photographs)):
         twins = sorted({each.file.relative_to(folder).as_posix() for each, copy in zip(photographs, found, strict=True)

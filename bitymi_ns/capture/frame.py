@@ -1,4 +1,4 @@
-"""World frame of a model: z up by gravity, GPS or the cameras, and metric scale by GPS."""
+"""World frame of a model: z up by gravity, GPS or the cameras; metric scale by GPS."""
 
 import json
 import math
@@ -14,17 +14,14 @@ from bitymi_ns.reading import read_json
 
 EARTH = 6378137.0  # equatorial radius in metres, WGS 84
 FLATTENING = 1 / 298.257223563
-GPS_ERROR = 5.0  # error of a phone's GPS, metres
-LEAST_SPREAD = 4 * GPS_ERROR  # least spread of positions, metres, that determines the scale
-SAME_SHAPE = 0.5  # largest error of an accepted alignment, relative to the spread
-
-
-FILE = "frame.json"  # file of the frame, beside the report
+GPS_ERROR = 5.0  # of phones, metres
+LEAST_SPREAD = 4 * GPS_ERROR  # least spread of positions that determines the scale, metres
+SAME_SHAPE = 0.5  # largest error of an alignment, relative to the spread
+FILE = "frame.json"  # beside the report
 UP = (0.0, 0.0, 1.0)  # up in the world frame
 SOURCES = ("gps", "gravity", "cameras")
 SAME_UP = np.cos(np.radians(10.0))  # cosine of the largest angle between equal up directions
-STEEPEST = np.cos(np.radians(45.0))
-"""Cosine of the largest tilt of GPS positions against gravity; beyond it, gravity is ignored."""
+STEEPEST = np.cos(np.radians(45.0))  # cosine of the largest tilt of GPS positions against gravity; else ignore gravity
 
 
 @dataclass(frozen=True)
@@ -34,10 +31,10 @@ class WorldFrame:
     up: str  # source of up (+z), one of SOURCES
     metres_per_unit: float | None  # 1 with scale by GPS; None = unknown
     gps_origin: tuple[float, float, float] | None
-    """Latitude, longitude (degrees) and altitude (metres) of the world's origin, x east and y north there."""
-    gps_error: float | None  # median distance in metres between the cameras and their GPS positions
-    gps_positions: int  # number of photographs with a position
-    transform: list[list[float]]  # [3, 4] from COLMAP's world to this one, scale included
+    """Latitude, longitude (degrees) and altitude (metres) of the origin, x east and y north there."""
+    gps_error: float | None  # median distance between cameras and their GPS positions, metres
+    gps_positions: int  # photographs with a position
+    transform: list[list[float]]  # [3, 4] from COLMAP's world, with scale
 
 
 def write_frame(folder: Path, frame: WorldFrame) -> None:
@@ -46,7 +43,7 @@ def write_frame(folder: Path, frame: WorldFrame) -> None:
 
 
 def read_frame(folder: Path) -> WorldFrame | None:
-    """Read frame.json in a folder; None where there is none, or another program's."""
+    """Read frame.json in a folder; None = none, or another program's."""
     try:
         frame = WorldFrame(**read_json(folder / FILE))
     except (OSError, ValueError, TypeError):
@@ -60,7 +57,7 @@ def local_positions(
     gps: Mapping[str, tuple[float, float, float]],
 ) -> tuple[dict[str, list[float]], tuple[float, float, float] | None]:
     """Convert GPS positions (latitude, longitude and altitude by name) to east, north and up in metres from their
-    middle, and return that middle."""
+    middle; return that, too."""
     if not gps:
         return {}, None
     middle = np.median(np.array(list(gps.values())), axis=0)
@@ -69,15 +66,9 @@ def local_positions(
     w = 1 - eccentricity * np.sin(latitude) ** 2
     north = EARTH * (1 - eccentricity) / w**1.5
     east = EARTH / np.sqrt(w) * np.cos(latitude)
-    local = {
-        name: [
-            float(np.radians(lon - middle[1]) * east),
-            float(np.radians(lat - middle[0]) * north),
-            float(alt - middle[2]),
-        ]
-        for name, (lat, lon, alt) in gps.items()
-    }
-    return local, (float(middle[0]), float(middle[1]), float(middle[2]))
+    values = np.array(list(gps.values()))
+    local = np.column_stack([np.radians(values[:, 1::-1] - middle[1::-1]) * (east, north), values[:, 2] - middle[2]])
+    return dict(zip(gps, local.tolist(), strict=True)), tuple(middle.tolist())
 
 
 def move_to_world(
@@ -87,8 +78,8 @@ def move_to_world(
 ) -> WorldFrame:
     """Transform a model in place to a world with z up.
 
-    Up is that of the phones' accelerometers where most of them agree, else by GPS where that is enough, else by the
-    cameras. Scale and north are by GPS where that is enough.
+    Up is by accelerometers if most agree, else by GPS if that is enough, else by the cameras; scale and north are by
+    GPS if that is enough.
 
     Args:
         gps: latitude, longitude and altitude by name.
@@ -108,24 +99,22 @@ def move_to_world(
         model.transform(similarity)
         error = _gps_error(similarity, placed, positions)
         return WorldFrame(source, 1.0, origin, error, len(local), similarity.matrix().tolist())
-    similarity = _by_up(model, np.array(list(centers.values())), _of_cameras(model) if up is None else up)
+    similarity = _by_up(model, np.array(list(centers.values())), up)
     model.transform(similarity)
     source = "cameras" if up is None else "gravity"
     return WorldFrame(source, None, None, None, len(local), similarity.matrix().tolist())
 
 
 def _gps_error(similarity: pycolmap.Sim3d, centers: np.ndarray, positions: np.ndarray) -> float:
-    """Median distance in metres between cameras [n, 3], moved by a similarity, and their GPS positions [n, 3]."""
+    """Measure the median distance in metres between cameras [n, 3] after a similarity and their GPS positions [n,
+    3]."""
     return float(np.median(np.linalg.norm((similarity * centers) - positions, axis=1)))
 
 
 def _by_gravity(model: pycolmap.Reconstruction, ups: Mapping[str, tuple[float, float, float]]) -> np.ndarray | None:
-    """Mean up [3] in the model's world by accelerometers; None unless three or more, and most of them, agree."""
-    found = [
-        image.cam_from_world().rotation.matrix().T @ np.array(ups[image.name])
-        for image in model.images.values()
-        if image.has_pose and image.name in ups
-    ]
+    """Average up [3] by accelerometers in the model's world; None unless three or more, and most of them, agree."""
+    images = [image for image in model.images.values() if image.has_pose and image.name in ups]
+    found = [image.cam_from_world().rotation.matrix().T @ np.array(ups[image.name]) for image in images]
     if len(found) < 3:
         return None
     directions = np.array(found)
@@ -138,15 +127,15 @@ def _by_gravity(model: pycolmap.Reconstruction, ups: Mapping[str, tuple[float, f
 
 
 def _smallest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Smallest rotation [3, 3] from one unit vector to another, which is not its opposite."""
+    """Make the smallest rotation [3, 3] from one unit vector to another, not its opposite."""
     axis, cosine = np.cross(start, end), float(start @ end)
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     return np.eye(3) + cross + cross @ cross / (1 + cosine)
 
 
 def _by_gps(centers: np.ndarray, positions: np.ndarray) -> pycolmap.Sim3d | None:
-    """Align centers [n, 3] with positions [n, 3] in metres; None where positions are too few, too close together, on
-    one line, or of another shape."""
+    """Align centers [n, 3] with positions [n, 3] in metres; None if these are too few, too close together, on one line,
+    or of another shape."""
     if len(positions) < 3:
         return None
     spread = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False) / np.sqrt(len(positions))
@@ -163,18 +152,15 @@ def _by_gps(centers: np.ndarray, positions: np.ndarray) -> pycolmap.Sim3d | None
     return similarity if _gps_error(similarity, centers, positions) < SAME_SHAPE * spread[0] else None
 
 
-def _of_cameras(model: pycolmap.Reconstruction) -> np.ndarray:
-    """The cameras' mean up [3]."""
+def _by_up(model: pycolmap.Reconstruction, centers: np.ndarray, up: np.ndarray | None) -> pycolmap.Sim3d:
+    """Make the similarity that turns `up` (None = the cameras' mean) to z, and scales the cameras' middle to the origin
+    and their mean distance from it to 1."""
     turns = [image.cam_from_world().rotation.matrix() for image in model.images.values() if image.has_pose]
-    up = -np.mean([turn[1] for turn in turns], axis=0)
-    if np.linalg.norm(up) < 0.1:  # they look all ways, or are turned all ways
-        up = -turns[0][1]
-    return up / np.linalg.norm(up)
-
-
-def _by_up(model: pycolmap.Reconstruction, centers: np.ndarray, up: np.ndarray) -> pycolmap.Sim3d:
-    """Similarity that maps `up` to z, the middle of the cameras to the origin, and their mean distance from it to 1."""
-    turns = [image.cam_from_world().rotation.matrix() for image in model.images.values() if image.has_pose]
+    if up is None:
+        up = -np.mean([turn[1] for turn in turns], axis=0)
+        if np.linalg.norm(up) < 0.1:  # they are turned all ways
+            up = -turns[0][1]
+        up /= np.linalg.norm(up)
     side = np.mean([turn[0] for turn in turns], axis=0)
     side -= up * (up @ side)
     if np.linalg.norm(side) < 1e-3:

@@ -1,61 +1,67 @@
-"""Image files of a capture: photographs and masks by their bit depth, sizes and EXIF from headers, blank and duplicate
-photographs."""
+"""Image files of a capture: bit depth, sizes and EXIF from headers, blank and duplicate photographs."""
 
 import hashlib
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from PIL import EpsImagePlugin, Image
+from PIL import EpsImagePlugin, ExifTags, Image, ImageCms
 
 from bitymi_ns.capture.exif import exif_stops, exposure_settings
-from bitymi_ns.capture.photos import eight_bits, in_srgb
 from bitymi_ns.capture.pictures import open_picture
 from bitymi_ns.capture.types import fail, parsing, warn
 from bitymi_ns.trust import listed
 
 S, T = TypeVar("S"), TypeVar("T")
-ORIENTATION = 0x0112  # EXIF tag that asks viewers to turn a photograph; 1 = as it is stored
+MAX_PIXELS = 1_000_000_000  # most pixels of a photograph; phones take 200 million
 MAX_PIXELS = 1_000_000_000  # photographs with more pixels are refused; phones take some of 200 million
 THREADS = 4
-PROPORTIONS = 0.02  # relative difference of aspect ratios that counts as rounding
+PROPORTIONS = 0.02  # relative difference of aspect ratios by rounding
+FINGERPRINT_SIZE = 64  # pixels across and down that fingerprints compare
+EMPTY: dict[str, Callable[[npt.NDArray[np.uint8]], bool]] = {
+    "transparent everywhere": lambda image: image.shape[-1] == 4 and not image[..., 3].any(),
+    "of one color throughout": lambda image: bool((image == image[0, 0]).all()),
+}
+"""Photographs from which nothing can be learned."""
 FINGERPRINT_SIZE = 64  # pixels across, and down, by which photographs are compared
 
 
 def set_up_pillow() -> None:
-    """Raise Pillow's pixel limit from 179 million to MAX_PIXELS, and keep it, in nerfstudio's readers too, from running
-    Ghostscript on files that are PostScript whatever their name."""
+    """Raise Pillow's limit from 179 million pixels to MAX_PIXELS, and keep it, in nerfstudio's readers too, from
+    running Ghostscript on PostScript files of any name."""
     EpsImagePlugin.gs_binary = False
     Image.MAX_IMAGE_PIXELS = MAX_PIXELS // 2  # PIL refuses twice as many
 
 
 def in_threads(function: Callable[[S], T], items: Iterable[S]) -> list[T]:
-    """Apply a function that reads files to each item, in a few threads."""
+    """Apply a function that reads files to the items in a few threads."""
     with ThreadPoolExecutor(THREADS) as pool:
         return list(pool.map(function, items))
 
 
 def from_header(path: Path, read: Callable[[Image.Image], T], default: T) -> T:
-    """Apply `read` to an opened image whose pixels are not decoded; `default` for files that cannot be opened."""
+    """Apply `read` to an opened, undecoded image; `default` for unreadable files."""
     try:
         with open_picture(path) as image:
             return read(image)
-    except Exception:  # Pillow raises many kinds on broken files, and on broken EXIF
+    except Exception:  # Pillow raises many kinds on broken files and EXIF
         return default
 
 
 def image_size(path: Path) -> tuple[int, int] | None:
-    """Read width and height from the header; None for files that cannot be opened."""
+    """Read width and height from the header; None for unreadable files."""
     return from_header(path, lambda image: image.size, None)
 
 
 def file_has_transparency(path: Path) -> bool:
-    """Read from the header if the image has transparency; False for files that cannot be opened."""
+    """Test for transparency by the header; False for unreadable files."""
     return from_header(path, has_transparency, False)
 
 
@@ -65,43 +71,39 @@ def has_transparency(image: Image.Image) -> bool:
 
 
 def in_proportion(mask: tuple[int, int], photograph: tuple[int, int]) -> bool:
-    """Test if a mask (width, height) has the aspect ratio of its photograph, so that it can be resized."""
+    """Test if a mask (width, height) has its photograph's aspect ratio, to be resized to it."""
     return abs(mask[0] / mask[1] / (photograph[0] / photograph[1]) - 1.0) <= PROPORTIONS
 
 
 def orientation(path: Path) -> int:
-    """Read the EXIF orientation, 1 to 8; 1 where there is none."""
+    """Read the EXIF orientation, 1 to 8; 1 without one."""
 
     def read(image: Image.Image) -> int:
         if image.format == "PNG" and "exif" not in image.info:
-            return 1  # else PIL would decode the whole image in search of it
-        return image.getexif().get(ORIENTATION, 1)
+            return 1  # else PIL decodes the whole image in search of it
+        return image.getexif().get(ExifTags.Base.Orientation, 1)
 
     value = from_header(path, read, 1)
     return value if value in range(1, 9) else 1
 
 
 def exposure_stops(paths: Sequence[Path]) -> list[float]:
-    """Compute log2 of the exposure of photographs from shutter time, aperture and ISO in EXIF; NaN where unknown.
+    """Compute log2 of the exposure of photographs from shutter time, aperture and ISO in EXIF; NaN = unknown.
 
-    A lens without electronics writes no f-number, and some cameras no ISO: what no photograph has counts as equal for
-    all. Photographs that lack what most have cannot be compared with these, and are NaN.
+    Lenses without electronics write no f-number, some cameras no ISO: what most photographs lack counts as equal for
+    all. Photographs with other entries than most cannot be compared, and are NaN.
     """
     found = in_threads(lambda path: from_header(path, exposure_settings, None), paths)
-    kinds = Counter(tuple(value is not None for value in each) for each in found if each is not None)
-    if not kinds:
-        return [math.nan] * len(paths)
-    usual = kinds.most_common(1)[0][0]
+    kinds = [None if each is None else tuple(value is not None for value in each) for each in found]
+    usual = Counter(kind for kind in kinds if kind is not None).most_common(1)
     return [
-        math.nan
-        if each is None or tuple(value is not None for value in each) != usual
-        else exif_stops(*(value or 1.0 for value in each))
-        for each in found
+        exif_stops(*(value or 1.0 for value in each)) if usual and kind == usual[0][0] else math.nan
+        for each, kind in zip(found, kinds, strict=True)
     ]
 
 
 def check_sizes(paths: Sequence[Path]) -> None:
-    """Fail at photographs with more than MAX_PIXELS, by their headers."""
+    """Fail at photographs of more than MAX_PIXELS, by their headers."""
 
     def too_large(path: Path) -> bool:
         try:
@@ -110,7 +112,7 @@ def check_sizes(paths: Sequence[Path]) -> None:
         except Image.DecompressionBombError:
             return True
         except Exception:
-            return False  # other faults are reported where the file is read
+            return False  # reported where the file is read
 
     large = [path for path, refused in zip(paths, in_threads(too_large, paths), strict=True) if refused]
     if large:
@@ -118,27 +120,23 @@ def check_sizes(paths: Sequence[Path]) -> None:
 
 
 def _too_large(paths: Sequence[Path]) -> str:
-    return (
-        f"{listed(paths)} has more than {MAX_PIXELS:,} pixels. Make it smaller, and w, h, fl_x, fl_y, cx and cy of its "
-        "camera with it."
-    )
+    camera = "w, h, fl_x, fl_y, cx and cy of its camera"
+    return f"{listed(paths)} has more than {MAX_PIXELS:,} pixels. Make it smaller, and {camera} with it."
 
 
 def check_orientation(paths: Sequence[Path]) -> None:
-    """Warn of photographs with an EXIF orientation: they are used as they are stored."""
+    """Warn of photographs with an EXIF orientation, which is ignored."""
     turned = [path for path, value in zip(paths, in_threads(orientation, paths), strict=True) if value != 1]
     if turned:
         warn(
-            f"{listed(turned)} has an EXIF tag that asks viewers to turn the photograph. It is used as it is stored, "
-            "as COLMAP and nerfstudio do. If the pose was made from the turned picture, write the turn into the pixels "
-            "(`mogrify -auto-orient <photos>`)."
+            f"{listed(turned)} has an EXIF tag that asks viewers to turn the photograph. It is used as it is stored. "
+            "If the pose is that of the turned picture, turn the pixels (`mogrify -auto-orient <photos>`)."
         )
 
 
 def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[int, int] | None = None) -> Image.Image:
-    """Read a photograph as 8-bit sRGB, mode RGB or, where it has transparency, RGBA.
-
-    Deep grey images are scaled to 8 bits, where PIL would clip them to white.
+    """Read a photograph as 8-bit sRGB, mode RGB, or RGBA with transparency. Deep grey is scaled to 8 bits, which PIL
+    would clip to white.
 
     Args:
         stored: width and height that it must have; None = any.
@@ -165,8 +163,57 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
         fail(_too_large([path]), error)
 
 
+def eight_bits(image: Image.Image) -> Image.Image:
+    """Scale deep grey modes to 8 bits, with their EXIF orientation. Raises ValueError: their range is unknown."""
+    if not image.mode.startswith(("I", "F")):
+        return image
+    values = np.asarray(image, dtype=np.float64)
+    low, high = float(values.min()), float(values.max())
+    if image.mode.startswith("I;16") or image.format == "PNG":
+        whites = (65535.0,)
+    else:  # TIFF and the like, which do not say what white is
+        whites = (1.0, 255.0) if image.mode == "F" else (255.0, 65535.0)
+    white = next((white for white in whites if high <= white), None)
+    if white is None or not low >= 0.0:  # also NaN
+        raise ValueError(
+            f"its values lie between {low:g} and {high:g}, those of such a file should between 0 and {whites[-1]:g} "
+            f"(PIL's mode {image.mode}); save it with 8 or 16 bits per channel"
+        )
+    grey = Image.fromarray((values * (255.0 / white) + 0.5).astype(np.uint8))
+    turn = Image.Exif()
+    turn[ExifTags.Base.Orientation] = image.getexif().get(ExifTags.Base.Orientation, 1)
+    grey.info["exif"] = turn.tobytes()
+    return grey
+
+
+def in_srgb(image: Image.Image) -> Image.Image:
+    """Convert an image with a color profile (Display P3, Adobe RGB) to sRGB."""
+    profile = image.info.get("icc_profile")
+    convert = _to_srgb(profile) if profile and image.mode in ("RGB", "RGBA") else None
+    if convert is None:
+        return image
+    converted = convert.apply(image.convert("RGB"))
+    if image.mode == "RGBA":
+        converted.putalpha(image.getchannel("A"))
+    return converted
+
+
+@lru_cache(maxsize=8)
+def _to_srgb(profile: bytes) -> ImageCms.ImageCmsTransform | None:
+    """Make the transform of an RGB profile to sRGB; None = it changes next to nothing, or there is none."""
+    try:
+        source = ImageCms.ImageCmsProfile(BytesIO(profile))
+        convert = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), "RGB", "RGB")
+    except (ImageCms.PyCMSError, OSError):
+        return None
+    levels = np.array([0, 64, 128, 192, 255], np.uint8)
+    probe = np.stack(np.meshgrid(levels, levels, levels), -1).reshape(5, 25, 3)
+    changed = np.asarray(convert.apply(Image.fromarray(probe)), int)
+    return convert if np.abs(changed - probe).max() > 4 else None
+
+
 def pixels_of(image: Image.Image) -> npt.NDArray[np.uint8]:
-    """Convert an image to [H, W, 3], or to [H, W, 4] where some of it is transparent."""
+    """Convert an image to [H, W, 3], or [H, W, 4] if some of it is transparent."""
     pixels = np.array(image, np.uint8)
     opaque = pixels.shape[-1] == 4 and pixels[..., 3].min(initial=255) == 255
     return np.ascontiguousarray(pixels[..., :3]) if opaque else pixels
@@ -177,7 +224,7 @@ _WORDED = (FileNotFoundError, Image.DecompressionBombError)
 
 
 def wrong_size(path: Path, size: tuple[int, int], declared: tuple[int, int]) -> str:
-    """Message for an image whose `size` (width, height) is not the one `declared` by its camera."""
+    """Explain that an image's `size` (width, height) is not the one `declared` by its camera."""
     shown = f"{size[0]} x {size[1]} pixels, but its camera is for {declared[0]} x {declared[1]}"
     if size == declared[::-1] and orientation(path) >= 5:
         return (
@@ -185,14 +232,11 @@ def wrong_size(path: Path, size: tuple[int, int], declared: tuple[int, int]) -> 
             "and the camera and pose are for the turned picture. Write the turn into the pixels with "
             "`mogrify -auto-orient <photos>`, or swap w and h (and fl_x and fl_y, cx and cy) and turn the pose."
         )
-    return (
-        f"the image {path} has {shown}. Correct w and h (and fl_x, fl_y, cx, cy) in the capture, or resize the image."
-    )
+    return f"the image {path} has {shown}. Correct w, h, fl_x, fl_y, cx, cy in the capture, or resize the image."
 
 
 class ImageSummary(NamedTuple):
-    """Kept of a photograph once it has been read: why nothing can be learned from it ("" = something can), and a
-    fingerprint that is equal for equal pixels."""
+    """Why nothing can be learned from a photograph ("" = something can), and a fingerprint equal for equal pixels."""
 
     empty: str
     fingerprint: bytes
@@ -203,54 +247,33 @@ def summarize(image: npt.NDArray[np.uint8]) -> ImageSummary:
     height, width = image.shape[:2]
     sample = image[:: max(1, height // FINGERPRINT_SIZE), :: max(1, width // FINGERPRINT_SIZE)]
     fingerprint = hashlib.sha256(repr(image.shape).encode() + sample.tobytes()).digest()
-    empty = ""
-    if _transparent(sample) and _transparent(image):
-        empty = "transparent everywhere"
-    elif _plain(sample) and _plain(image):
-        empty = "of one color throughout"
+    empty = next((what for what, test in EMPTY.items() if test(sample) and test(image)), "")
     return ImageSummary(empty, fingerprint)
-
-
-def _transparent(image: npt.NDArray[np.uint8]) -> bool:
-    return image.shape[-1] == 4 and not image[..., 3].any()
-
-
-def _plain(image: npt.NDArray[np.uint8]) -> bool:
-    return bool((image == image[0, 0]).all())
 
 
 Pair = tuple[int, int]  # index of a training photograph, and of a held-out one
 
 
 def duplicate_files(train: Sequence[Path], held_out: Sequence[Path]) -> list[Pair]:
-    """Pairs of files with the same bytes. Only files of equal size are read."""
-    sizes = [[path.stat().st_size for path in paths] for paths in (train, held_out)]
-    shared = set(sizes[0]) & set(sizes[1])
-    contents = [
-        [_digest(path) if size in shared else path for path, size in zip(paths, of, strict=True)]
-        for paths, of in zip((train, held_out), sizes, strict=True)
-    ]
-    return duplicates(*contents)
+    """Pair files of the same bytes, reading only files of equal size."""
+    sizes = {path: path.stat().st_size for path in (*train, *held_out)}
+    shared = {sizes[path] for path in train} & {sizes[path] for path in held_out}
+    digest = {path: hashlib.sha256(path.read_bytes()).digest() for path, size in sizes.items() if size in shared}
+    return duplicates(*([digest.get(path) for path in paths] for paths in (train, held_out)))
 
 
 def duplicates(train: Sequence[Any], held_out: Sequence[Any]) -> list[Pair]:
-    """Pairs of equal items, each held-out one with the first of its equals; None equals nothing."""
+    """Pair equal items, each held-out one with its first equal; None equals nothing."""
     first: dict[Any, int] = {}
     for i, content in enumerate(train):
         first.setdefault(content, i)
     return [(first[content], j) for j, content in enumerate(held_out) if content is not None and content in first]
 
 
-def _digest(path: Path) -> bytes:
-    return hashlib.sha256(path.read_bytes()).digest()
-
-
 def warn_of_duplicates(pairs: Sequence[Pair], train: Sequence[Path], held_out: Sequence[Path]) -> None:
-    """Warn of held-out photographs that are trained on, unless all views are used for both on request."""
+    """Warn of held-out photographs that are trained on, unless all views serve for both."""
     if not pairs or list(train) == list(held_out):
         return
     named = listed([f"{held_out[j]} = {train[i]}" for i, j in pairs])
-    warn(
-        f"{len(pairs)} of {len(held_out)} held-out photographs are training photographs, too: {named}. Figures on them "
-        "say nothing about new views: remove the duplicates from the capture."
-    )
+    advice = "Figures on them say nothing about new views: remove the duplicates from the capture."
+    warn(f"{len(pairs)} of {len(held_out)} held-out photographs are training photographs, too: {named}. {advice}")

@@ -1,7 +1,6 @@
-"""Triangulation of points from photographs with known poses."""
+"""Triangulate points from photographs with known poses."""
 
 import os
-import shutil
 import warnings
 from collections import defaultdict
 from collections.abc import Sequence
@@ -9,24 +8,21 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
-from bitymi_ns.capture.cache import content_key, finished, replace_stale, work_folder
-from bitymi_ns.capture.camera import OPENCV_AXES, ColmapCamera, Photograph
+from bitymi_ns.capture.cache import content_key, made_once, replace_stale
 from bitymi_ns.capture.colmap_model import read_model
-from bitymi_ns.capture.images import image_size
-from bitymi_ns.capture.photos import check_names, eight_bits, in_srgb, is_plain
+from bitymi_ns.capture.images import eight_bits, image_size, in_srgb
+from bitymi_ns.capture.photos import check_names, is_plain
 from bitymi_ns.capture.pictures import open_picture
 from bitymi_ns.capture.points import Points
 from bitymi_ns.capture.prepare import colmap_mask, emptied
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
-from bitymi_ns.capture.types import CaptureError, say, warn
-from bitymi_ns.files import Tell, explained, write_file
+from bitymi_ns.capture.types import OPENCV_AXES, CaptureError, ColmapCamera, Photograph, say, warn
+from bitymi_ns.files import Tell
 from bitymi_ns.progress import Progress, no_progress, rich_progress
 
 MIRROR = np.diag([1.0, 1.0, -1.0])
-DONE = "points"  # file that is written when the model is whole
 
 
 @dataclass(frozen=True)
@@ -36,18 +32,18 @@ class KnownView:
     file: Path
     camera: ColmapCamera  # in pixels of the file
     world_to_camera: np.ndarray  # [3,4] rotation and translation, OpenCV axes (x right, y down, z forward)
-    mask: Path | None = None  # picture that is black where no point is to be found; see `masks.mask_pixels`
+    mask: Path | None = None  # black where no points are wanted; see `masks.mask_pixels`
 
 
 def triangulate(
     capture: Path, views: Sequence[KnownView], progress: Progress | None = None, tell: Tell = warnings.warn
 ) -> Path:
-    """Triangulate points from photographs whose cameras are known; the cameras stay as they are. Kept in the folder
-    `capture` and continued as by `find_poses`.
+    """Triangulate points from photographs with known cameras, which stay as they are; cache and continue in the folder
+    `capture` as `find_poses` does.
 
     Returns:
-        folder of a COLMAP model (cameras.bin, images.bin, points3D.bin) in the world of the given poses, in which the
-        photographs have their names as seen from the folder of the capture.
+        folder of a COLMAP model (cameras.bin, images.bin, points3D.bin) in the world of the poses, with names as seen
+        from the capture.
 
     Raises:
         CaptureError: too few points can be found; says what may be wrong.
@@ -64,28 +60,21 @@ def triangulate(
     inputs = list(zip(names, (view.file for view in views), strict=True))
     inputs += [(os.path.relpath(mask, capture), mask) for mask in masks]
     key = content_key(inputs, [(view.camera, np.asarray(view.world_to_camera).tolist()) for view in views])
-    done = finished(capture, key, DONE, "points")
-    if done is not None:  # several processes may read it
-        return done / MODEL
-    with work_folder(capture, key, tell, "points") as work:
-        if (work / DONE).is_file():
-            return work / MODEL
-        with explained(work, CaptureError):
-            process.run(_job(names, views, work), capture, progress or no_progress)
-            write_file(work / DONE, b"")
-            for name in ("links", "masks"):
-                shutil.rmtree(work / name, ignore_errors=True)
-            process.forget(work)
-            folder = Path(os.path.commonpath([os.path.abspath(view.file.parent) for view in views]))
-            replace_stale(work, folder, content_key(inputs, "contents"))
-        return work / MODEL
+    folder = Path(os.path.commonpath([os.path.abspath(view.file.parent) for view in views]))
+
+    def make(work: Path) -> None:
+        process.run(_job(names, views, work), capture, progress or no_progress)
+        process.forget(work, "links", "masks")
+        replace_stale(work, folder, content_key(inputs, "contents"))
+
+    return made_once(capture, key, "points", tell, make) / MODEL
 
 
 def triangulated(photographs: Sequence[Photograph], folder: Path, source: str) -> Points | None:
-    """Triangulate points from photographs with poses; None (with a warning) where that is not possible."""
+    """Triangulate points from photographs with poses; None (with a warning) if that fails."""
     middle = np.mean([photograph.pose[:3, 3] for photograph in photographs], axis=0)
     mirrored = [bool(np.linalg.det(photograph.pose[:3, :3]) < 0.0) for photograph in photographs]
-    mirror = MIRROR if all(mirrored) else np.eye(3)  # the photographs of a mirrored capture are not mirrored
+    mirror = MIRROR if all(mirrored) else np.eye(3)  # photographs of a mirrored capture are not mirrored
     views = []
     for photograph in photographs:
         camera = photograph.camera
@@ -114,7 +103,11 @@ def _job(stated: Sequence[str], views: Sequence[KnownView], work: Path) -> Job:
     names, poses = {}, {}
     for i, (name, view) in enumerate(zip(stated, views, strict=True)):
         suffix = view.file.suffix.lower()
-        converted = _converted(view.file)
+        try:
+            with open_picture(view.file) as image:
+                converted = None if is_plain(image, view.file) else in_srgb(eight_bits(image)).convert("RGB")
+        except Exception as error:
+            raise CaptureError(f"{view.file} cannot be read as a picture: save it again") from error
         plain = f"{i:06d}{suffix if converted is None else '.png'}"
         if converted is None:
             (links / plain).symlink_to(view.file.resolve())
@@ -125,23 +118,6 @@ def _job(stated: Sequence[str], views: Sequence[KnownView], work: Path) -> Job:
         poses[plain] = np.asarray(view.world_to_camera, float)[:3].tolist()
         if view.mask is not None and view.mask.is_file():
             colmap_mask(view.mask, view.file.name, view.camera.size).save(masks / f"{plain}.png")
-    return Job(
-        work=str(work.resolve()),
-        images=str(links.resolve()),
-        masks=str(masks.resolve()) if any(masks.iterdir()) else None,
-        cameras=[CameraGroup(camera, True, members) for camera, members in groups.items()],
-        order=list(names),
-        names=names,
-        sequence=False,
-        positions={},
-        poses=poses,
-    )
-
-
-def _converted(file: Path) -> Image.Image | None:
-    """Convert a photograph for COLMAP; None = COLMAP reads the file itself."""
-    try:
-        with open_picture(file) as image:
-            return None if is_plain(image, file) else in_srgb(eight_bits(image)).convert("RGB")
-    except Exception as error:
-        raise CaptureError(f"{file} cannot be read as a picture: save it again") from error
+    mask_folder = str(masks.resolve()) if any(masks.iterdir()) else None
+    cameras = [CameraGroup(camera, True, members) for camera, members in groups.items()]
+    return Job(str(work.resolve()), str(links.resolve()), mask_folder, cameras, list(names), names, poses=poses)

@@ -1,4 +1,4 @@
-"""Lenses: turn photographs of any COLMAP or nerfstudio camera model into pictures of pinhole cameras."""
+"""Lenses: resample photographs of any COLMAP or nerfstudio camera model to pinhole pictures."""
 
 from __future__ import annotations
 
@@ -12,21 +12,14 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import numpy.typing as npt
-import pycolmap
 from PIL import Image
 
-from bitymi_ns.capture.camera import ColmapCamera, Photograph, is_full_sphere
 from bitymi_ns.capture.images import image_size, in_proportion, in_threads, wrong_size
-from bitymi_ns.capture.types import fail, say, warn
+from bitymi_ns.capture.types import ColmapCamera, Photograph, fail, is_full_sphere, say, warn
 
-MAX_VIEW_ANGLE = 110.0
-"""Largest horizontal and vertical view angle of a pinhole picture, degrees. Wider pictures spend ever more pixels on
-ever less of the photograph: wider cameras become faces of a cube."""
-NODE_STEP = 4
-"""Pixels between the nodes at which the distortion is evaluated; linear interpolation between them is accurate to far
-less than a pixel."""
-EDGE_SAMPLES = 64
-"""Rays per picture edge for testing what the photograph shows."""
+MAX_VIEW_ANGLE = 110.0  # degrees, across and down; a wider pinhole picture wastes pixels: it becomes faces of a cube
+NODE_STEP = 4  # pixels between the nodes of the distortion; interpolating between them is far more exact than a pixel
+EDGE_SAMPLES = 64  # rays per picture edge for testing what the photograph shows
 FACES: dict[str, tuple[tuple[float, float, float], ...]] = {
     "front": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
     "right": ((0.0, 0.0, -1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)),
@@ -35,30 +28,20 @@ FACES: dict[str, tuple[tuple[float, float, float], ...]] = {
     "up": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
     "down": ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
 }
-"""Right, down and forward of each face in the axes of the whole camera (OpenCV); a face is 90 degrees wide and high."""
-MAX_ANGLE = math.radians(89.9)
-"""Largest angle to the axis; COLMAP's fisheye models end before 90 degrees."""
-NODES = 361
-"""Rays along a side of a face at which coverage is tested."""
-LEAST_SHARE = 0.05
-"""A face of which less is covered is left out: it would be a view as any other, for a strip at the edge."""
-ANGLES, AZIMUTHS = 360, 64
-"""Rays for testing where the distortion folds the picture."""
-SAMPLES = 2
-"""Samples of the photograph along and across a pixel of a face: where a photograph is denser than the face, as
-equirectangular ones at the poles, one sample would alias."""
-BAND = 256
-"""Rows of a face that are resampled together."""
-PAD = 2
-"""Columns of the other edge that continue a picture of all directions."""
-CACHED_MAPS = 4
-"""Lenses whose remapping tables are cached; 72 MB for 12 megapixels."""
-DOUBTFUL_AREA, ABSURD_AREA = 0.25, 0.05
-"""Share of a photograph's area that undistorting leaves, below which to warn or to fail."""
+"""Right, down and forward of each face in the photograph's camera axes (OpenCV); a face spans 90 x 90 degrees."""
+MAX_ANGLE = math.radians(89.9)  # largest angle to the axis; COLMAP's fisheye models end before 90 degrees
+NODES = 361  # rays along a side of a face at which coverage is tested
+LEAST_SHARE = 0.05  # drop faces with a smaller covered share: strips at the edge
+ANGLES, AZIMUTHS = 360, 64  # rays for testing where the distortion folds the picture
+SAMPLES = 2  # samples along a side of a face's pixel: one would alias where photographs are denser, as at their poles
+BAND = 256  # rows of a face that are resampled together
+PAD = 2  # columns of the other edge that continue a picture of all directions
+CACHED_MAPS = 4  # lenses whose remapping tables are cached; 72 MB for 12 megapixels
+DOUBTFUL_AREA, ABSURD_AREA = 0.25, 0.05  # warn or fail if undistorting leaves a smaller share of the photograph
 
 
 class Pinhole(NamedTuple):
-    """Pinhole camera in pixels, with (0, 0) at the upper left corner of the picture."""
+    """Pinhole camera in pixels, (0, 0) at the upper left corner of the picture."""
 
     fx: float
     fy: float
@@ -83,26 +66,19 @@ class Pinhole(NamedTuple):
 
 @dataclass(frozen=True)
 class Lens:
-    """Maps a photograph, or a face of the cube around a wide camera, to the picture of a pinhole camera.
+    """Resamples a photograph, or a face of the cube around a wide camera, to a pinhole picture."""
 
-    Attributes:
-        camera: of the photograph, in the size to which it is downscaled first.
-        stored: width and height of the image file.
-        pinhole: camera of the result.
-        face: of the cube; empty = the photograph is one picture.
-        whole: the photograph covers all of the result; else `coverage` is its mask.
-    """
-
-    camera: ColmapCamera
-    stored: tuple[int, int]
-    pinhole: Pinhole
-    face: str = ""
-    whole: bool = True
+    camera: ColmapCamera  # of the photograph, for the size to which it is downscaled first
+    stored: tuple[int, int]  # width and height of the image file
+    pinhole: Pinhole  # camera of the result
+    face: str = ""  # of the cube; empty = the photograph becomes one picture
+    whole: bool = True  # the photograph covers the whole result; else `coverage` is its mask
 
     @property
     def distorts(self) -> bool:
         """True if undistorting moves pixels."""
-        return bool(self.face) or _distorts(self.camera.colmap)
+        camera = self.camera.colmap  # pycolmap tests coefficients alone; fisheye models distort without any
+        return bool(self.face) or camera.is_perspective_fisheye() or not camera.is_undistorted()
 
     @property
     def turn(self) -> npt.NDArray[np.float64]:
@@ -120,11 +96,11 @@ class Lens:
         return covered(self.camera, self.face, self.pinhole.rays)
 
     def name(self, photograph: Path) -> Path:
-        """Name the view of a photograph: by it, and by the face of the cube where it is split."""
+        """Name the view of a photograph, with the face of the cube."""
         return photograph.with_stem(f"{photograph.stem}-{self.face}") if self.face else photograph
 
     def undistort(self, image: Image.Image) -> Image.Image:
-        """Undistort an 8-bit image of any mode, decoded at `stored` or less, but not below the size of `camera`."""
+        """Undistort an 8-bit image of any mode, decoded at a size between those of `stored` and `camera`."""
         if image.size != self.camera.size:
             image = image.resize(self.camera.size, Image.Resampling.BOX)
         if not self.distorts:
@@ -132,16 +108,15 @@ class Lens:
         return Image.fromarray(self._moved(np.asarray(image), cv2.INTER_LINEAR), image.mode)
 
     def undistort_mask(self, mask: Image.Image | None, path: Path | None) -> Image.Image:
-        """Undistort a mask by nearest neighbors, False where the photograph shows nothing. It may have another size
-        than the photograph, but not another aspect ratio; `path` is for the message. None = all of it counts."""
+        """Undistort a mask by nearest neighbors, False outside the photograph; None = everything counts. Its size may
+        differ from the photograph's, but not its aspect ratio; `path` is for the message."""
         if mask is None:
             return Image.fromarray(self.coverage)
         pixels = self.undistort_map(np.asarray(mask).astype(np.uint8), path)
         return Image.fromarray(pixels.astype(bool) & self.coverage)
 
     def undistort_map(self, values: npt.NDArray[Any], path: Path) -> npt.NDArray[Any]:
-        """Undistort uint8 or float32 values [H, W] or [H, W, C] by nearest neighbors. They may have another size than
-        the photograph, but not another aspect ratio; `path` is for the message."""
+        """Undistort uint8 or float32 values [H, W] or [H, W, C] by nearest neighbors; sizes as for masks."""
         size = (values.shape[1], values.shape[0])
         if not in_proportion(size, self.stored):
             fail(wrong_size(path, size, self.stored))
@@ -152,12 +127,30 @@ class Lens:
 
     def _moved(self, pixels: npt.NDArray[Any], interpolation: int) -> npt.NDArray[Any]:
         if self.face:
-            nearest = interpolation == cv2.INTER_NEAREST
-            return resample(pixels, self.camera, self.face, self.pinhole, nearest)
+            return self._resampled(pixels, interpolation == cv2.INTER_NEAREST)
         return cv2.remap(pixels, *_maps(self), interpolation, borderMode=cv2.BORDER_REPLICATE)
 
+    def _resampled(self, pixels: npt.NDArray[Any], nearest: bool) -> npt.NDArray[Any]:
+        """Resample a photograph of `camera`'s size to the face."""
+        to, lens = self.pinhole, self.camera.colmap
+        samples = 1 if nearest else SAMPLES
+        how = cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC  # linear blurs: 1 dB on a ray-traced room
+        pad = PAD if lens.is_spherical() else 0
+        if pad:
+            pixels = cv2.copyMakeBorder(pixels, 0, 0, pad, pad, cv2.BORDER_WRAP)
+        x = ((np.arange(to.width * samples) + 0.5) / samples - to.cx) / to.fx
+        bands = []
+        for start in range(0, to.height, BAND):
+            rows = min(BAND, to.height - start)
+            y = (start + (np.arange(rows * samples) + 0.5) / samples - to.cy) / to.fy
+            rays = np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), -1).reshape(-1, 3) @ FACES[self.face]
+            at = lens.img_from_cam(rays).astype(np.float32).reshape(len(y), len(x), 2) + np.float32([pad - 0.5, -0.5])
+            band = cv2.remap(pixels, at, None, how, borderMode=cv2.BORDER_REPLICATE)
+            bands.append(band if nearest else cv2.resize(band, (to.width, rows), interpolation=cv2.INTER_AREA))
+        return np.concatenate(bands)
+
     def downscaled(self, factor: float) -> Lens:
-        """Return the same lens for pictures scaled by `factor`."""
+        """Return the lens for pictures scaled by `factor`."""
         of = self.pinhole
         width, height = max(1, round(of.width * factor)), max(1, round(of.height * factor))
         x, y = width / of.width, height / of.height
@@ -167,14 +160,14 @@ class Lens:
 
 
 def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tuple[list[Lens], list[str]]:
-    """Choose the pinhole cameras for a camera: one, or for cameras of more than MAX_VIEW_ANGLE faces of a cube.
+    """Choose the pinhole picture of a camera, or faces of a cube if it is wider than MAX_VIEW_ANGLE.
 
     Args:
         colmap: for the size to which photographs are downscaled.
         stored: width and height of the image files, which may be larger.
 
     Returns:
-        the lenses, and messages on what becomes of the photographs.
+        the lenses, and messages on what photographs become.
 
     Raises:
         CaptureError: the camera cannot be used.
@@ -195,17 +188,16 @@ def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tupl
             "lengths have to be positive and all parameters finite. Correct it, or export the model from COLMAP again."
         )
     center = (camera.principal_point_x, camera.principal_point_y)
-    if not _distorts(camera):
-        pinhole = Pinhole(*focal, *center, width, height)
-        return [Lens(colmap, stored, pinhole)], []
+    lens = Lens(colmap, stored, Pinhole(*focal, *center, width, height))
+    if not lens.distorts:
+        return [lens], []
     left, right, top, bottom = _window(colmap)
     w, h = int((left + right) * focal[0]), int((top + bottom) * focal[1])
     share = w * h / (width * height)
     if share < ABSURD_AREA or min(w, h) < 1:
         fail(
             f"the lens distortion of {label} is absurd: with {model} {camera.params_to_string()} undistorting would "
-            f"leave {100.0 * share:.2g} % of the picture. Correct the numbers, or calibrate again with a simpler model "
-            "(SIMPLE_RADIAL)."
+            f"leave {100.0 * share:.2g} % of the picture. Correct it, or calibrate a simpler model (SIMPLE_RADIAL)."
         )
     if share < DOUBTFUL_AREA:
         warn(f"Undistorting leaves only {100.0 * share:.2g} % of {label}. The lens distortion may be wrong.")
@@ -219,23 +211,23 @@ def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tupl
             f"{label} is {model}: its photographs are used as pinhole pictures of {across:.0f} x {down:.0f} degrees "
             f"({w} x {h} pixels); what they show beyond is not used."
         )
-    return [Lens(colmap, stored, pinhole)], messages
+    return [replace(lens, pinhole=pinhole)], messages
 
 
 def make_lenses(photographs: Sequence[Photograph], downscale: int = 1, need_photos: bool = True) -> list[list[Lens]]:
-    """Make the lenses of each photograph, equal ones once; see `make_views`."""
+    """Make the lenses of each photograph, equal ones once; `need_photos`: check sizes of downscaled copies."""
     sizes = in_threads(lambda each: image_size(each.file) if each.downscaled and need_photos else None, photographs)
     made: dict[tuple[Any, ...], list[Lens]] = {}
     lenses, messages = [], []
     for photograph, size in zip(photographs, sizes, strict=True):
         camera = photograph.camera
         full = camera.size
-        small = full if downscale == 1 else (max(1, round(full[0] / downscale)), max(1, round(full[1] / downscale)))
+        small = (max(1, round(full[0] / downscale)), max(1, round(full[1] / downscale)))
         if size is not None and max(abs(size[0] - small[0]), abs(size[1] - small[1])) > 1:
+            there, file = f"{small[0]} x {small[1]}", photograph.file
             fail(
-                f"the image {photograph.file} has {size[0]} x {size[1]} pixels, but its camera is for {full[0]} x "
-                f"{full[1]}, of which 1/{downscale} is {small[0]} x {small[1]}. Make the folder "
-                f"{photograph.file.parent} again, or leave --downscale-factor out."
+                f"the image {file} has {size[0]} x {size[1]} pixels, but its camera is for {full[0]} x {full[1]}, "
+                f"of which 1/{downscale} is {there}. Make {file.parent} again, or leave --downscale-factor out."
             )
         used = size or small
         key = (camera, used, photograph.downscaled)
@@ -252,7 +244,7 @@ def make_lenses(photographs: Sequence[Photograph], downscale: int = 1, need_phot
 
 
 def _faces(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tuple[list[Lens], list[str]]:
-    """Lenses of the faces of the cube that a wide camera covers, with its focal length; see `lenses_of`."""
+    """Make lenses of the cube faces that a wide camera covers, with its focal length; see `lenses_of`."""
     camera = colmap.colmap
     around = colmap.width / (2.0 * math.pi)
     fx, fy = (around, around) if camera.is_spherical() else (camera.focal_length_x, camera.focal_length_y)
@@ -270,21 +262,14 @@ def _faces(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tuple[l
         u, v = w / (right - left), h / (bottom - top)
         lenses.append(Lens(colmap, stored, Pinhole(u, v, -left * u, -top * v, w, h), face, whole))
     named = ", ".join(f"{lens.face} {lens.pinhole.width} x {lens.pinhole.height}" for lens in lenses)
-    return lenses, [
-        f"{label} is {colmap.model}: each of its photographs becomes {len(lenses)} pinhole pictures ({named})."
-    ]
-
-
-def _distorts(camera: pycolmap.Camera) -> bool:
-    # pycolmap tests the coefficients alone, of which fisheye models need none
-    return camera.is_perspective_fisheye() or not camera.is_undistorted()
+    becomes = f"each of its photographs becomes {len(lenses)} pinhole pictures ({named})"
+    return lenses, [f"{label} is {colmap.model}: {becomes}."]
 
 
 def _window(camera: ColmapCamera) -> tuple[float, float, float, float]:
-    """Largest extent of the pinhole picture to the left, right, top and bottom of the axis, in focal lengths.
+    """Measure how far the pinhole picture extends to the left, right, top and bottom of the axis, in focal lengths.
 
-    It shows nothing that the photograph does not, see `covered`. Each side is maximized on its own, then all are scaled
-    until the corners fit, too.
+    Maximize each side alone, then scale all until the photograph covers the corners, too.
     """
     most = math.tan(math.radians(0.5 * MAX_VIEW_ANGLE))
     reach = np.zeros(4)
@@ -306,7 +291,7 @@ def _window(camera: ColmapCamera) -> tuple[float, float, float, float]:
 
 
 def _largest(fits: Callable[[float], bool]) -> float:
-    """Bisect for the largest number in [0, 1] that fits, where all smaller ones fit."""
+    """Bisect for the largest number in [0, 1] that fits; all smaller ones fit."""
     if fits(1.0):
         return 1.0
     low, high = 0.0, 1.0
@@ -318,7 +303,7 @@ def _largest(fits: Callable[[float], bool]) -> float:
 
 @lru_cache(maxsize=CACHED_MAPS)
 def _maps(lens: Lens) -> tuple[npt.NDArray[np.int16], npt.NDArray[np.uint16]]:
-    """Position in the photograph of each pixel of the result, as fixed-point maps for cv2.remap."""
+    """Compute fixed-point maps for cv2.remap: positions in the photograph of the result's pixels."""
     to = lens.pinhole
     x, y = (np.arange(0, size + NODE_STEP, NODE_STEP) + 0.5 for size in (to.width, to.height))
     rays = np.stack(np.meshgrid((x - to.cx) / to.fx, (y - to.cy) / to.fy), -1).reshape(-1, 2)
@@ -331,7 +316,7 @@ def _maps(lens: Lens) -> tuple[npt.NDArray[np.int16], npt.NDArray[np.uint16]]:
 
 
 def covered(camera: ColmapCamera, face: str, rays: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
-    """Test which rays [..., 3] of a face a photograph shows, where the model does not fold it."""
+    """Test which rays [..., 3] of a face the photograph shows without folds."""
     if camera.colmap.is_spherical():
         return np.ones(rays.shape[:-1], bool)
     directions = (rays @ FACES[face]).reshape(-1, 3)
@@ -344,7 +329,7 @@ def covered(camera: ColmapCamera, face: str, rays: npt.NDArray[np.float64]) -> n
 
 @lru_cache(maxsize=64)
 def _field(camera: ColmapCamera) -> float:
-    """Largest angle to the axis up to which pixels move outwards with it, radians."""
+    """Find the largest angle to the axis up to which pixels move outwards with it, radians."""
     lens = camera.colmap
     angles = np.linspace(0.0, MAX_ANGLE, ANGLES + 1)[1:]
     azimuths = np.linspace(0.0, 2.0 * np.pi, AZIMUTHS, endpoint=False)
@@ -354,35 +339,3 @@ def _field(camera: ColmapCamera) -> float:
     away = np.linalg.norm(pixels - (lens.principal_point_x, lens.principal_point_y), axis=-1)
     outwards = (np.diff(away, axis=0, prepend=0.0) > 0.0).all(1)
     return float(MAX_ANGLE if outwards.all() else angles[max(0, int(outwards.argmin()) - 1)])
-
-
-def resample(
-    pixels: npt.NDArray[np.uint8],
-    camera: ColmapCamera,
-    face: str,
-    pinhole: tuple[float, float, float, float, int, int],
-    nearest: bool = False,
-) -> npt.NDArray[np.uint8]:
-    """Resample a photograph [H, W] or [H, W, C], of the size that its wide camera is for, to a face of the cube.
-
-    Args:
-        pinhole: fx, fy, cx, cy, width and height of the result in pixels.
-        nearest: take the nearest pixel, for masks.
-    """
-    lens = camera.colmap
-    fx, fy, cx, cy, width, height = pinhole
-    samples = 1 if nearest else SAMPLES
-    pad = PAD if lens.is_spherical() else 0
-    if pad:
-        pixels = cv2.copyMakeBorder(pixels, 0, 0, pad, pad, cv2.BORDER_WRAP)
-    x = ((np.arange(width * samples) + 0.5) / samples - cx) / fx
-    bands = []
-    for start in range(0, height, BAND):
-        rows = min(BAND, height - start)
-        y = (start + (np.arange(rows * samples) + 0.5) / samples - cy) / fy
-        rays = np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), -1).reshape(-1, 3) @ FACES[face]
-        at = lens.img_from_cam(rays).astype(np.float32).reshape(len(y), len(x), 2) + np.float32([pad - 0.5, -0.5])
-        how = cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC  # linear blurs: 1 dB on a ray-traced room
-        band = cv2.remap(pixels, at, None, how, borderMode=cv2.BORDER_REPLICATE)
-        bands.append(band if samples == 1 else cv2.resize(band, (width, rows), interpolation=cv2.INTER_AREA))
-    return np.concatenate(bands)

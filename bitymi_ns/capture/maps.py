@@ -1,4 +1,4 @@
-"""Depth maps, their confidence, and normal maps in files, as programs and scanners write them."""
+"""Read depth maps, their confidence, and normal maps, as programs and scanners write them."""
 
 import math
 import os
@@ -22,21 +22,15 @@ from bitymi_ns.capture.types import MAP_FILES, MapFiles, fail, parsing, warn
 from bitymi_ns.ranges import spread
 from bitymi_ns.reading import open_regular
 
-MILLIMETER = 1e-3
-"""Metres of a unit of integer depth, where no other is stated: nerfstudio's convention."""
-MAPS = "maps"
-"""Metadata key of the `MapFiles` of each view."""
-COLOR_SAMPLES = 8
-"""Files of a scanner's depth that are tested for color pictures; all have to be."""
-MOST_LARGER = 8
-"""Sides of a map in those of its photograph, at most: photographs may be reduced copies."""
-MOST_NUMBERS = 1 << 28
-"""Numbers of a map, at most: those of 80 million normals, or 260 million depths."""
-FARTHEST = 65504.0
-"""Depth from which on a number stands for "no depth": the largest of half floats, below Blender's 1e10."""
+MILLIMETER = 1e-3  # metres per unit of integer depth unless stated: nerfstudio's convention
+MAPS = "maps"  # metadata key of the views' `MapFiles`
+COLOR_SAMPLES = 8  # files of a scanner's depth that are tested for color; all have to be color pictures
+MOST_LARGER = 8  # largest side of a map in sides of its photograph, which may be a reduced copy
+MOST_NUMBERS = 1 << 28  # most numbers of a map: 80 million normals, or 260 million depths
+FARTHEST = 65504.0  # depth from which on numbers mean "no depth": the largest half float, below Blender's 1e10
 
 Check = Callable[[tuple[int, ...]], None]
-"""Receives the shape that a header declares, and raises where it must not be read."""
+"""Receives a header's shape, and raises if it must not be read."""
 TIFFS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 EXR = b"v/1\x01"
 _PARSING = threading.Lock()  # ast.literal_eval, which numpy parses headers with, fails in threads of Python 3.11
@@ -45,7 +39,7 @@ Values = npt.NDArray[np.float32]
 
 
 def maps_called(folder: Path, depth: str, confidence: str) -> MapFiles:
-    """Find the depth and confidence of a photograph by their names in a folder, without endings."""
+    """Find depth and confidence by their names in a folder, without extensions."""
 
     def find(name: str) -> Path | None:
         files = (folder / f"{name}{ending}" for ending in MAP_FILES)
@@ -55,9 +49,8 @@ def maps_called(folder: Path, depth: str, confidence: str) -> MapFiles:
 
 
 def maps_beside(photographs: Sequence[Path]) -> list[MapFiles]:
-    """Find the depth and confidence of a scanner's photographs: files of their names in `depth` and `confidence` beside
-    their folder (Polycam, Record3D, ScanNet). A folder of color pictures is not used, with a warning."""
-
+    """Find depth and confidence of a scanner's photographs: files of their names in `depth` and `confidence` beside
+    their folder (Polycam, Record3D, ScanNet). Warn of a folder of color pictures, which is not used."""
     found = [maps_called(path.parent.parent, f"depth/{path.stem}", f"confidence/{path.stem}") for path in photographs]
     depths = [files.depth for files in found if files.depth is not None]
     if depths and all(_is_color(depths[i]) for i in spread(len(depths), COLOR_SAMPLES)):
@@ -67,14 +60,14 @@ def maps_beside(photographs: Sequence[Path]) -> list[MapFiles]:
 
 
 def _is_color(path: Path) -> bool:
-    """Test for an image of integers in channels that differ, which is no depth; a damaged one is none."""
+    """Test for an image of integers in differing channels, which is no depth."""
     if path.suffix.lower() not in (".png", ".tif", ".tiff"):
         return False
     try:
         if math.prod(image_shape(path)) > MOST_NUMBERS:
             return False
         values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    except Exception:  # of libraries on damaged files; what is wrong is said where it is read
+    except Exception:  # libraries on damaged files; reported when they are read
         return False
     return values is not None and values.ndim == 3 and values.dtype.kind in "iu" and _channels_differ(values)
 
@@ -84,12 +77,10 @@ def _channels_differ(values: npt.NDArray[np.generic]) -> bool:
 
 
 def read_depth(files: MapFiles, lens: Lens, unit: float | None = None) -> Values:
-    """Read camera z [H, W] for the pinhole picture of a photograph's lens; 0 = unknown. The map is resized to the
-    photograph and undistorted by nearest neighbors.
+    """Read camera z [H, W] for the pinhole picture of a lens, by nearest neighbors; 0 = unknown.
 
-    Integers count millimetres; 0 and the largest one are unknown. Floating-point numbers are metres; those that are not
-    finite, not above 0, or 65,504 and more are unknown. So is what has confidence 0. `unit` is another length of a unit
-    in metres.
+    Integers are millimetres, 0 and the largest one unknown. Floating-point numbers are metres; unknown unless finite,
+    above 0 and below 65,504. A confidence of 0 means unknown. `unit`: metres per unit instead.
 
     Raises:
         CaptureError: a file cannot be read, or has another shape than the photograph.
@@ -111,8 +102,8 @@ def read_depth(files: MapFiles, lens: Lens, unit: float | None = None) -> Values
 def read_normal(files: MapFiles, lens: Lens) -> Values:
     """Read normals [H, W, 3] for the pinhole picture of a lens, in its frame (OpenCV axes); 0 = unknown.
 
-    Files hold them in the camera frame of transforms.json (x right, y up, z back): floating-point numbers x, y, z, or
-    colors (n + 1) / 2, of which black is unknown.
+    Files hold them in the camera frame of transforms.json (x right, y up, z back): floating-point numbers, or colors
+    (n + 1) / 2 with black for unknown.
 
     Raises:
         CaptureError: a file cannot be read, or has another shape than the photograph.
@@ -132,8 +123,8 @@ _WITHOUT = "Write it again, or train without: `bitymi-data --depth off`."
 
 
 def _read(path: Path, photograph: tuple[int, int], alike: bool = True) -> npt.NDArray[np.generic]:
-    """Read an array [H, W] or [H, W, C]; color channels in the order red, green, blue. Its header is compared with the
-    width and height of the photograph before its numbers are read; `alike`: it must have the shape of that, too."""
+    """Read an array [H, W] or [H, W, C] of RGB order, after checking its header against the photograph's width and
+    height, and against its shape if `alike`."""
 
     def check(shape: tuple[int, ...]) -> None:
         if len(shape) not in (2, 3) or min(shape) < 1:
@@ -167,11 +158,8 @@ def _read(path: Path, photograph: tuple[int, int], alike: bool = True) -> npt.ND
 
 
 def read_array(path: Path, check: Check) -> npt.NDArray[np.generic]:
-    """Read a .npy file, or the first array of a .npz file, if `check` lets its shape pass.
-
-    Raises:
-        OSError, ValueError: it cannot be read, is no array of numbers, or ends before its last number.
-    """
+    """Read a .npy file, or the first array of a .npz file, if `check` passes. Raises OSError, ValueError: it cannot be
+    read, is no array of numbers, or is cut off."""
     with open_regular(path) as file:
         if path.suffix.lower() != ".npz":
             return _array(file, check)
@@ -201,11 +189,7 @@ def _whole(file: IO[bytes], count: int) -> bytes:
 
 
 def image_shape(path: Path) -> tuple[int, int]:
-    """Read height and width of an image that OpenCV may read, from its header.
-
-    Raises:
-        OSError, ValueError: it is no such image.
-    """
+    """Read height and width of an image for OpenCV from its header. Raises OSError, ValueError: it is none."""
     with open_regular(path) as file:
         start = file.read(16)
         if start.startswith(EXR):
@@ -221,7 +205,7 @@ def image_shape(path: Path) -> tuple[int, int]:
 
 
 def _exr_shape(file: IO[bytes]) -> tuple[int, int]:
-    """The data window, among the attributes: names and types that end with 0, sizes, and values."""
+    """Find the data window among the attributes: zero-terminated name and type, size, value."""
     size = os.fstat(file.fileno()).st_size
     while file.tell() < size:
         name, kind = _text(file), _text(file)

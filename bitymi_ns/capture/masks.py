@@ -1,5 +1,5 @@
-"""Masks of photographs: their folder, the mask file of a photograph, and the pixels that count. Structure from motion
-and training share these rules. Those that files of a capture name are checked before anything uses them."""
+"""Masks of photographs: their folder, the mask of a photograph, and the pixels that count, in structure from motion and
+in training; named masks are checked before use."""
 
 import os
 from collections.abc import Sequence
@@ -10,30 +10,27 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from bitymi_ns.capture.camera import Photograph
 from bitymi_ns.capture.images import has_transparency, image_size, in_proportion, in_threads, wrong_size
 from bitymi_ns.capture.photos import COPY
 from bitymi_ns.capture.pictures import DYNAMIC_MASK, PHOTOGRAPHS, open_picture
-from bitymi_ns.capture.types import fail, parsing, say
+from bitymi_ns.capture.types import Photograph, fail, parsing, say
 from bitymi_ns.trust import listed
 
 LEAVE_OUT = "`bitymi-data --use-masks False` leaves masks out"
-"""Says in messages how to do without the masks of a capture."""
+"""Remedy in messages on masks."""
 USUAL_FOLDERS = ("images", "input", "image", "photos", "photographs", "rgb", "color")
-"""Names of a capture's folder of photographs, the most usual first."""
+"""Usual folders of photographs, the most usual first."""
 LOSSY = {"JPEG", "MPO", "WEBP", "JPEG2000", "HEIF", "AVIF"}
-"""Lossy formats by Pillow's names, in which black may come back as almost black."""
+"""Lossy formats by Pillow's names: black may come back as almost black."""
 MIDDLE = 127  # threshold of lossy masks, of 255
 
 
 def mask_folder(photographs: Path, data: Path, stated: Path | None = None, downscale: int = 1) -> Path | None:
-    """Find the folder of a capture's masks: the stated one; else `masks` beside the folder of the photographs, in that
-    folder, or in that of the data, the first of them that is there. A folder of masks that are smaller by `downscale`,
-    as `masks_2`, counts, too.
+    """Find the folder of masks, or of reduced ones (`masks_2` for a `downscale` of 2): the stated one, else the first
+    `masks` beside the folder of photographs, in it, or in that of the data.
 
-    Beside a folder that is the data, or holds it, lie other things than the capture. There `masks` is used if the
-    folder has a usual name for the photographs of a capture: `bed/masks` for `bed/images`, but not `all/masks` for
-    `all/bed`.
+    Other things than the capture lie beside the folder of the data. There `masks` is used if the photographs' folder
+    has a usual name: `bed/masks` for `bed/images`, but not `all/masks` for `all/bed`.
 
     Raises:
         CaptureError: the stated one does not exist.
@@ -54,13 +51,12 @@ def _exists(masks: Path, downscale: int) -> bool:
 
 
 def downscaled_masks(masks: Path, downscale: int) -> Path:
-    """Folder of masks that are smaller by a factor."""
     return masks.with_name(f"{masks.name}_{downscale}")
 
 
 def mask_of(masks: Path, name: str) -> Path | None:
-    """Find the mask of a photograph: its name with .png appended, as COLMAP has it, or its stem with any image suffix,
-    as nerfstudio has it. An upright copy has the mask of its photograph."""
+    """Find the mask of a photograph: its name with .png appended (COLMAP), or its stem with any image suffix
+    (nerfstudio). An upright copy has its photograph's mask."""
     stem = str(PurePosixPath(name).with_suffix(""))
     endings = (".png", *PHOTOGRAPHS)
     candidates = [f"{name}.png", *(stem + ending for ending in endings), f"{name}.PNG"]
@@ -71,18 +67,17 @@ def mask_of(masks: Path, name: str) -> Path | None:
 
 
 def read_mask(path: Path) -> Image.Image:
-    """Read a mask as a 1-bit image, True where pixels count; see `mask_pixels`. In masks of instant-ngp's name it is
-    the others that count. Raises Pillow's errors."""
+    """Read a mask as a 1-bit image, True where pixels count; see `mask_pixels`. instant-ngp's are inverted. Raises
+    Pillow's errors."""
     with open_picture(path) as image:
         return Image.fromarray(mask_pixels(image) ^ path.name.startswith(DYNAMIC_MASK))
 
 
 def mask_pixels(image: Image.Image) -> npt.NDArray[np.bool_]:
-    """Threshold a mask to the pixels [H, W] that count: those that are not black, for lossy formats those with a
-    channel above MIDDLE. Transparent pixels do not count.
+    """Threshold a mask to the pixels [H, W] that count: opaque and not black, or above MIDDLE for lossy formats.
 
-    COLMAP and nerfstudio count all that is not black, as masks of zeros and ones or of class numbers need it. JPEG
-    compression ripples around an edge are a few levels above black, but do not reach MIDDLE.
+    Masks of zeros and ones or of class numbers need this, as COLMAP and nerfstudio do it. JPEG ripples around an edge
+    are a few levels above black, but stay below MIDDLE.
     """
     if image.mode.startswith(("I", "F")):
         result = np.asarray(image) != 0
@@ -95,11 +90,7 @@ def mask_pixels(image: Image.Image) -> npt.NDArray[np.bool_]:
 
 
 def checked_mask(path: Path) -> Image.Image:
-    """Read a mask, see `read_mask`.
-
-    Raises:
-        CaptureError: it is missing, or cannot be read.
-    """
+    """Read a mask, see `read_mask`. Raises CaptureError: it is missing, or cannot be read."""
     if not path.exists():
         fail(f"the mask {path} is missing")
     with parsing(f"the mask {path}", "Replace it, or remove the masks from the capture."):
@@ -107,12 +98,8 @@ def checked_mask(path: Path) -> Image.Image:
 
 
 def masks_named(masks: Path, names: Sequence[str], needed: bool = True) -> list[Path] | None:
-    """Find the masks of photographs by their names in a folder of masks; None = it has none of them, where none is
-    `needed`.
-
-    Raises:
-        CaptureError: some photographs have a mask, and others none.
-    """
+    """Find masks of photographs by their names in a folder; None = it has none, unless `needed`. Raises CaptureError:
+    only some photographs have a mask."""
     found = {name: mask_of(masks, name) for name in names}
     missing = [name for name, file in found.items() if file is None]
     if len(missing) == len(found) and not needed:
@@ -127,16 +114,9 @@ def masks_named(masks: Path, names: Sequence[str], needed: bool = True) -> list[
 
 
 def with_masks(photographs: Sequence[Photograph], capture: Path, base: Path | None = None) -> list[Photograph]:
-    """Give photographs without masks those that lie beside them, with a line that says so: instant-ngp's, of which
-    some may be missing, or those of a folder `masks`; see `mask_folder`.
-
-    Args:
-        capture: folder of the capture.
-        base: folder to which the names of masks are relative; None = the one that holds all photographs.
-
-    Raises:
-        CaptureError: the folder has masks of some photographs only.
-    """
+    """Give photographs the masks beside them, and report so: instant-ngp's, of which some may be missing, or those of a
+    folder `masks`; see `mask_folder`. `base`: folder to which names of masks are relative; None = that of all
+    photographs. Raises CaptureError: the folder has masks of some photographs only."""
     files = [each.file for each in photographs]
     dynamic = [file.with_name(f"{DYNAMIC_MASK}{file.stem}.png") for file in files]
     found: Sequence[Path | None] | None = [file if file.is_file() else None for file in dynamic]
@@ -156,16 +136,14 @@ def with_masks(photographs: Sequence[Photograph], capture: Path, base: Path | No
 
 
 def check_masks(photographs: Sequence[Photograph]) -> None:
-    """Fail where masks are missing or cannot be used, before time is spent on the photographs."""
+    """Fail if masks are missing or cannot be used, before time is spent on the photographs."""
     masked = {each.mask: each for each in photographs if each.mask is not None}
     missing = [mask for mask in masked if not mask.exists()]
     if missing:
-        fail(
-            f"{len(missing)} of {len(masked)} masks of the capture are missing: {listed(missing)}. Put them there, or "
-            f"correct their names; {LEAVE_OUT}."
-        )
-    sizes = in_threads(image_size, masked)
+        where = f"{len(missing)} of {len(masked)} masks of the capture are missing: {listed(missing)}"
+        fail(f"{where}. Put them there, or correct their names; {LEAVE_OUT}.")
+    sizes = in_threads(image_size, masked) if masked else []
     for (mask, photograph), known in zip(masked.items(), sizes, strict=True):
-        size = known or checked_mask(mask).size  # which says what is wrong with it
+        size = known or checked_mask(mask).size  # fails with the reason
         if not in_proportion(size, photograph.camera.size):
             fail(f"{wrong_size(mask, size, photograph.camera.size)} {LEAVE_OUT[0].upper()}{LEAVE_OUT[1:]}.")

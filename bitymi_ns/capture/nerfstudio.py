@@ -1,4 +1,4 @@
-"""Export of poses as a nerfstudio capture: photographs, transforms.json, point cloud, COLMAP model."""
+"""Export poses as a nerfstudio capture: photographs, transforms.json, point cloud, COLMAP model."""
 
 import json
 import shutil
@@ -14,13 +14,14 @@ from bitymi_ns.progress import Progress
 from bitymi_ns.trust import inside
 
 CLOUD = "sparse_pc.ply"
+SIZES = ("w", "h", "fl_x", "fl_y", "cx", "cy")
 
 
 def write_capture(poses: Poses, folder: Path, progress: Progress) -> None:
     """Write `images`, `sparse/0`, transforms.json, the point cloud and the report into a new or an empty folder.
 
-    Photographs are copied as they are, so their cameras are distorted; parsers undistort them on loading.
-    There is no applied_transform: COLMAP model, cameras and points share one world with z up.
+    Cameras are distorted like the copied photographs, which parsers undistort on loading. There is no
+    applied_transform: COLMAP model, cameras and points share one world with z up.
 
     Raises:
         OSError: it cannot be written.
@@ -48,8 +49,8 @@ def write_capture(poses: Poses, folder: Path, progress: Progress) -> None:
 
 
 def transforms(model: pycolmap.Reconstruction) -> dict[str, object]:
-    """Build transforms.json: camera to world with OpenGL axes (x right, y up, z backward), cameras with OpenCV
-    distortion, common entries at the top."""
+    """Build transforms.json: camera to world with OpenGL axes (x right, y up, z backward), OpenCV distortion, and
+    common entries at the top."""
     frames = []
     for image in sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name):
         pose = np.vstack([image.cam_from_world().inverse().matrix(), [0, 0, 0, 1]])
@@ -62,17 +63,10 @@ def transforms(model: pycolmap.Reconstruction) -> dict[str, object]:
 
 
 def intrinsics(camera: pycolmap.Camera) -> dict[str, object]:
-    """Return nerfstudio's entries of a camera, for COLMAP models up to OPENCV."""
+    """Convert a camera, of COLMAP models up to OPENCV, to nerfstudio's entries."""
     distortion = dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
     first = sum(len(part) for part in (camera.focal_length_idxs(), camera.principal_point_idxs()))
     distortion |= dict(zip(distortion, camera.params[first:].tolist(), strict=False))
-    return {
-        "camera_model": "OPENCV",
-        "w": camera.width,
-        "h": camera.height,
-        "fl_x": camera.focal_length_x,
-        "fl_y": camera.focal_length_y,
-        "cx": camera.principal_point_x,
-        "cy": camera.principal_point_y,
-        **distortion,
-    }
+    focal = (camera.focal_length_x, camera.focal_length_y)
+    sizes = (camera.width, camera.height, *focal, camera.principal_point_x, camera.principal_point_y)
+    return {"camera_model": "OPENCV", **dict(zip(SIZES, sizes, strict=True)), **distortion}

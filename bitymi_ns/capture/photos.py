@@ -1,7 +1,6 @@
 """Photographs for structure from motion: find them, and read size, EXIF, thumbnail and sharpness of each.
 
-360-degree (equirectangular) pictures are detected by metadata or content. An aspect ratio of 2 alone is no evidence:
-phones take such photographs, too.
+Metadata or content tell 360-degree (equirectangular) pictures; phones take other photographs with an aspect ratio of 2.
 """
 
 import os
@@ -9,42 +8,36 @@ import re
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from PIL import ExifTags, Image, ImageCms, ImageOps
+from PIL import ExifTags, Image, ImageOps
 
-from bitymi_ns.capture.camera import is_full_sphere
 from bitymi_ns.capture.exif import Exif, exposure_exif, read_exif
+from bitymi_ns.capture.images import eight_bits, in_srgb
 from bitymi_ns.capture.pictures import is_photograph, open_picture, photographs_below
-from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.capture.types import CaptureError, is_full_sphere
 from bitymi_ns.progress import Progress
-from bitymi_ns.reading import open_regular
+from bitymi_ns.reading import open_regular, why
 from bitymi_ns.trust import is_text
 
 PLAIN = {
     "JPEG": (".jpg", ".jpeg"), "PNG": (".png",), "BMP": (".bmp",), "TIFF": (".tif", ".tiff"),
 }  # fmt: skip
-"""Formats that COLMAP and nerfstudio read, with the extensions that they expect."""
-COPY = ".jpg"  # extension appended to the name of a photograph for its upright copy
-THUMB = 256  # longer side of the grey thumbnails for duplicate detection, pixels
-SHARPNESS_SIZE = 1024  # longer side at which sharpness is measured, pixels
-
-BLURRED = 0.5  # a photograph is blurred if its sharpness is below this share of the set's median
-DUPLICATE_SHIFT = 0.1
-"""Two photographs are duplicates if they differ by less than a shift by this many pixels of their thumbnails."""
-
+"""Formats and extensions that COLMAP and nerfstudio read."""
+COPY = ".jpg"  # appended to a photograph's name for its upright copy
+THUMB = 256  # longer side of grey thumbnails for duplicate detection, pixels
+SHARPNESS_SIZE = 1024  # longer side for measuring sharpness, pixels
+BLURRED = 0.5  # largest share of the median sharpness of a blurred photograph
+DUPLICATE_SHIFT = 0.1  # shift in pixels of thumbnails that explains the difference of duplicates
 HEADER = 1 << 17  # bytes at the start of a file that are searched for metadata
 SPHERICAL = re.compile(rb"GPano:ProjectionType|ProjectionType[^a-z]{1,8}(equirectangular|cylindrical)", re.IGNORECASE)
 """XMP entries of panoramas (Google Photo Sphere)."""
-ALIKE = 0.6  # correlation of the details of the left and right edge from which on they match
-SMOOTH = 15  # rows of the moving average that is subtracted to leave the detail
-DETAIL = 1.5  # least standard deviation of detail, grey levels: edges of a bare background always match
-POLE = 0.35
-"""Largest standard deviation of the first and last row, each one point of the sphere, relative to the picture's."""
+ALIKE = 0.6  # least correlation of the details of matching left and right edges
+SMOOTH = 15  # rows of the moving average that is subtracted to leave detail
+DETAIL = 1.5  # least standard deviation of detail, grey levels: bare edges always match
+POLE = 0.35  # largest standard deviation of the first and last row, points of the sphere, relative to the picture's
 
 
 @dataclass(frozen=True)
@@ -53,32 +46,29 @@ class Photo:
 
     name: str  # path relative to the folder, with slashes
     path: Path
-    width: int  # width of the upright image, as the height
+    width: int  # upright, as the height
     height: int
     exif: Exif
-    plain: bool  # True if it can be used as it is: upright, in a format that everything reads
+    plain: bool  # usable as it is: upright, in a format that everything reads
     thumb: np.ndarray  # [h,w] float32 grey levels, longer side THUMB
-    sharpness: float  # share of the fine detail in all detail; see `sharpness`
-    panorama: bool = False  # True for 360-degree pictures
+    sharpness: float  # see `sharpness`
+    panorama: bool = False  # a 360-degree picture
 
 
 def natural(name: str) -> list[tuple[int, int, str]]:
-    """Sort key with numbers by value: frame_2 before frame_10."""
+    """Make a sort key with numbers by value: frame_2 before frame_10."""
     return [(1, int(part), "") if part.isdecimal() else (0, 0, part.lower()) for part in re.split(r"(\d+)", name)]
 
 
 def photo_folder(source: Path) -> Path:
-    """Return the folder of the photographs of a capture: itself, or `images` in it."""
+    """Return the folder of a capture's photographs: itself, or its `images`."""
     images = source / "images"
     return images if images.is_dir() and not any(map(is_photograph, source.iterdir())) else source
 
 
 def find_photos(folder: Path) -> list[str]:
-    """List the photographs in and below a folder in natural order; see `photographs_below`.
-
-    Raises:
-        CaptureError: the folder is missing, or cannot be read.
-    """
+    """List the photographs in and below a folder in natural order; see `photographs_below`. Raises CaptureError: the
+    folder cannot be read."""
     try:
         os.listdir(folder)
         paths = list(photographs_below(folder))
@@ -88,27 +78,17 @@ def find_photos(folder: Path) -> list[str]:
 
 
 def check_names(folder: Path, names: Sequence[str]) -> None:
-    """Check that names are UTF-8, as COLMAP and JSON files need.
-
-    Raises:
-        CaptureError: the path to the folder, or a name in it, is not UTF-8.
-    """
+    """Check that names are UTF-8, as COLMAP and JSON need. Raises CaptureError: a name or the folder's path is not."""
     where = os.path.realpath(folder)
     wrong = [name for name in (where, *names) if not is_text(name)]
     if wrong:
         more = f" and of {len(wrong) - 1} more" if len(wrong) > 1 else ""
-        raise CaptureError(
-            f"in {where}, the name of {wrong[0]}{more} is not UTF-8: rename it (`convmv -r -f latin1 -t utf8 --notest "
-            "FOLDER` does so for names in an older encoding)"
-        )
+        advice = "rename it (`convmv -r -f latin1 -t utf8 --notest FOLDER` does so for names in an older encoding)"
+        raise CaptureError(f"in {where}, the name of {wrong[0]}{more} is not UTF-8: {advice}")
 
 
 def read_photos(folder: Path, names: list[str], progress: Progress) -> tuple[list[Photo], dict[str, str]]:
-    """Read all photographs in threads.
-
-    Returns:
-        those that can be read, and for each of the others why not.
-    """
+    """Read photographs in threads; return those that can be read, and why the others cannot."""
     photos: list[Photo] = []
     broken: dict[str, str] = {}
     with ThreadPoolExecutor() as pool:
@@ -128,22 +108,18 @@ def read_photos(folder: Path, names: list[str], progress: Progress) -> tuple[lis
 
 
 def read_photo(folder: Path, name: str) -> Photo:
-    """Read one photograph to its last byte.
-
-    Raises:
-        CaptureError: it cannot be read; the message leaves out its name.
-    """
+    """Read a photograph to its last byte. Raises CaptureError: it cannot be read; the message lacks its name."""
     path = folder / name
     try:
         with open_picture(path) as image:
             exif = read_exif(image)
-            orientation = image.getexif().get(0x0112, 1)
+            orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
             width, height = image.size[::-1] if orientation in (5, 6, 7, 8) else image.size
             mode, plain = image.mode, is_plain(image, path)
             if image.format == "JPEG":
-                image.draft("L", (SHARPNESS_SIZE, SHARPNESS_SIZE))  # decodes at a half, a quarter or an eighth
+                image.draft("L", (SHARPNESS_SIZE, SHARPNESS_SIZE))  # decode at a half, a quarter or an eighth
             grey = ImageOps.exif_transpose(eight_bits(image).convert("L"))
-            if image.format != "JPEG":  # Pillow turns TIFF by itself, so that its size is that of the upright picture
+            if image.format != "JPEG":  # Pillow turns TIFF by itself, and changes its size
                 width, height = grey.size
             frames = getattr(image, "n_frames", 1)
     except CaptureError:
@@ -151,7 +127,7 @@ def read_photo(folder: Path, name: str) -> Photo:
     except Image.DecompressionBombError as error:
         raise CaptureError("it has too many pixels to be a photograph") from error
     except Exception as error:  # decoders raise many kinds on broken files
-        raise CaptureError(f"it cannot be read ({_first_line(error)}): the file is damaged or not an image") from error
+        raise CaptureError(f"it cannot be read ({why(error)}): the file is damaged or not an image") from error
     if min(width, height) < 32:
         raise CaptureError(f"it is only {width} x {height} pixels")
     plain = orientation in (0, 1) and plain and frames == 1 and mode in ("L", "RGB", "RGBA", "P")
@@ -162,7 +138,7 @@ def read_photo(folder: Path, name: str) -> Photo:
 
 
 def has_panorama_metadata(path: Path) -> bool:
-    """Test the metadata of a file for a spherical or cylindrical projection."""
+    """Test a file's metadata for a spherical or cylindrical projection."""
     try:
         with open_regular(path) as file:
             return SPHERICAL.search(file.read(HEADER)) is not None
@@ -171,8 +147,8 @@ def has_panorama_metadata(path: Path) -> bool:
 
 
 def looks_panoramic(grey: npt.NDArray[np.float32]) -> bool:
-    """Test if left and right edge continue each other, and the first and last row are constant, in grey levels [h, w]
-    to 255 of the whole picture, reduced to some hundreds of pixels."""
+    """Test if left and right edge continue each other, and first and last row are constant, in grey levels [h, w] to
+    255 of a picture reduced to some hundreds of pixels."""
     height, width = grey.shape
     if height < 32 or not is_full_sphere(width, height):
         return False
@@ -186,66 +162,9 @@ def looks_panoramic(grey: npt.NDArray[np.float32]) -> bool:
     return bool(np.corrcoef(detail)[0, 1] > ALIKE)
 
 
-def eight_bits(image: Image.Image) -> Image.Image:
-    """Scale deep grey modes to 8 bits; EXIF orientation is kept.
-
-    Raises:
-        ValueError: its values have no known range.
-    """
-    if not image.mode.startswith(("I", "F")):
-        return image
-    values = np.asarray(image, dtype=np.float64)
-    low, high = float(values.min()), float(values.max())
-    if image.mode.startswith("I;16") or image.format == "PNG":
-        whites = (65535.0,)
-    else:  # TIFF and the like, which do not say what white is
-        whites = (1.0, 255.0) if image.mode == "F" else (255.0, 65535.0)
-    white = next((white for white in whites if high <= white), None)
-    if white is None or not low >= 0.0:  # also NaN
-        raise ValueError(
-            f"its values lie between {low:g} and {high:g}, those of such a file should between 0 and {whites[-1]:g} "
-            f"(PIL's mode {image.mode}); save it with 8 or 16 bits per channel"
-        )
-    grey = Image.fromarray((values * (255.0 / white) + 0.5).astype(np.uint8))
-    turn = Image.Exif()
-    turn[ExifTags.Base.Orientation] = image.getexif().get(ExifTags.Base.Orientation, 1)
-    grey.info["exif"] = turn.tobytes()
-    return grey
-
-
 def is_plain(image: Image.Image, path: Path) -> bool:
-    """Test if the opened file is in a format that everything reads, with the right extension."""
+    """Test for an opened file in a format that everything reads, with the right extension."""
     return path.suffix.lower() in PLAIN.get(image.format or "", ())
-
-
-def in_srgb(image: Image.Image) -> Image.Image:
-    """Convert an image with a color profile (Display P3 of phones, Adobe RGB of cameras) to sRGB."""
-    profile = image.info.get("icc_profile")
-    convert = _to_srgb(profile) if profile and image.mode in ("RGB", "RGBA") else None
-    if convert is None:
-        return image
-    converted = convert.apply(image.convert("RGB"))
-    if image.mode == "RGBA":
-        converted.putalpha(image.getchannel("A"))
-    return converted
-
-
-@lru_cache(maxsize=8)
-def _to_srgb(profile: bytes) -> ImageCms.ImageCmsTransform | None:
-    """Transform of an RGB profile to sRGB; None where it changes next to nothing, or there is none."""
-    try:
-        source = ImageCms.ImageCmsProfile(BytesIO(profile))
-        convert = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), "RGB", "RGB")
-    except (ImageCms.PyCMSError, OSError):
-        return None
-    levels = np.array([0, 64, 128, 192, 255], np.uint8)
-    probe = np.stack(np.meshgrid(levels, levels, levels), -1).reshape(5, 25, 3)
-    changed = np.asarray(convert.apply(Image.fromarray(probe)), int)
-    return convert if np.abs(changed - probe).max() > 4 else None
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def _reduced(image: Image.Image, size: int) -> Image.Image:
@@ -256,8 +175,7 @@ def _reduced(image: Image.Image, size: int) -> Image.Image:
 
 
 def sharpness(grey: np.ndarray) -> float:
-    """Root mean square of the Laplacian over that of the gradient of [h,w] float32: low where fine detail is
-    missing."""
+    """Divide the root mean squares of Laplacian and gradient of [h,w] float32: low without fine detail."""
     right, down = np.diff(grey, axis=1), np.diff(grey, axis=0)
     gradient = float(np.mean(right**2) + np.mean(down**2))
     laplacian = float(np.mean(np.diff(right, axis=1) ** 2) + np.mean(np.diff(down, axis=0) ** 2))
@@ -265,7 +183,7 @@ def sharpness(grey: np.ndarray) -> float:
 
 
 def upright(photo: Photo) -> Image.Image:
-    """Read the photograph as an upright 8-bit RGB image, with the EXIF data of its exposure in `info`."""
+    """Read a photograph as an upright 8-bit RGB image, with the EXIF of its exposure in `info`."""
     with open_picture(photo.path) as image:
         exposure = exposure_exif(image)
         picture = in_srgb(ImageOps.exif_transpose(eight_bits(image))).convert("RGB")
@@ -274,7 +192,7 @@ def upright(photo: Photo) -> Image.Image:
 
 
 def blurred(photos: Sequence[Photo]) -> list[str]:
-    """Find the names of photographs with much less fine detail than the median of the set."""
+    """List photographs with much less fine detail than the median."""
     if len(photos) < 3:
         return []
     middle = float(np.median([photo.sharpness for photo in photos]))
@@ -282,7 +200,7 @@ def blurred(photos: Sequence[Photo]) -> list[str]:
 
 
 def duplicates(photos: Sequence[Photo]) -> dict[str, str]:
-    """Map near-duplicates to the sharper photograph that they repeat, by name; see `shift`."""
+    """Map near-duplicates to the sharper photograph of the same picture, by name; see `shift`."""
     found: dict[str, str] = {}
     for shape in {photo.thumb.shape for photo in photos}:
         same = sorted((p for p in photos if p.thumb.shape == shape), key=lambda p: -p.sharpness)
@@ -290,7 +208,7 @@ def duplicates(photos: Sequence[Photo]) -> dict[str, str]:
         means = np.empty(0)
         for photo in same:
             level = float(photo.thumb.mean())
-            # a duplicate has almost the same mean, so few are compared pixel by pixel.
+            # a duplicate has almost the same mean: compare few pixel by pixel
             near = [kept[i] for i in np.flatnonzero(np.abs(means - level) < 2.0)]
             twin = next((other for other in near if shift(photo.thumb, other.thumb) < DUPLICATE_SHIFT), None)
             if twin is not None:
@@ -302,8 +220,8 @@ def duplicates(photos: Sequence[Photo]) -> dict[str, str]:
 
 
 def shift(first: np.ndarray, second: np.ndarray) -> float:
-    """Root mean square difference of two images [h,w] float32 over that of their gradient: the shift in pixels that
-    would explain it."""
+    """Divide the root mean squares of the difference of two images [h,w] and of their gradient: the shift in pixels
+    that explains it."""
     gradient = np.mean(np.diff(first, axis=0) ** 2) + np.mean(np.diff(first, axis=1) ** 2)
     difference = np.mean((first - second) ** 2)
     return float(np.sqrt(difference / gradient)) if gradient > 0 else (0.0 if difference == 0 else np.inf)

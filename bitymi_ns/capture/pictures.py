@@ -1,5 +1,5 @@
-"""Photographs among the pictures of a folder, and what the others are: results of this package and of nerfstudio,
-wherever they lie, and files of cameras and other programs that are not read."""
+"""Tell photographs from other pictures of a folder: results of this package and of nerfstudio, wherever they lie, maps,
+masks, and files of other programs that are not read."""
 
 import os
 import re
@@ -10,21 +10,21 @@ from pathlib import Path
 import pillow_heif
 from PIL import Image
 
-from bitymi_ns.reading import open_regular, read_bytes
+from bitymi_ns.reading import MOST_TEXT, open_regular
 
-pillow_heif.register_heif_opener()  # so that Pillow opens all of these, whoever asks it to
+pillow_heif.register_heif_opener()  # for all users of Pillow
 
 PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".avif", ".jp2")
 FORMATS_OF_PICTURES = (
     "JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "HEIF", "AVIF", "JPEG2000", "GIF", "PPM", "TGA"
 )  # fmt: skip
-"""Formats of photographs and masks by Pillow's names, whatever the file name. EPS, among others, is excluded: it is a
-program that Ghostscript runs."""
+"""Formats of photographs and masks by Pillow's names, whatever the file name; not EPS, a program that Ghostscript
+runs."""
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp")
 DYNAMIC_MASK = "dynamic_mask_"
-"""Begins the name of the mask that instant-ngp reads beside a photograph: all that is not black does not count."""
+"""Prefix of instant-ngp's masks beside photographs; black counts in them."""
 RENDERED = b"rendered by bitymi-ns"
-"""Comment in the pictures and films that ns-render writes of our scenes: frames are called as photographs are."""
+"""Comment in pictures and films of ns-render: frames are named as photographs are."""
 BUNDLE, RUN = "pictures of a bundle", "pictures of a training run"
 RESULT_FILES = {
     "bundle.json": (b'"bitymi-bundle"', BUNDLE),
@@ -32,33 +32,24 @@ RESULT_FILES = {
     "pictures.json": (b'"bitymi_pictures"', "pictures of `bitymi bench pictures`"),
     "transforms_eval.json": (b'[\n    {\n        "file_path"', "pictures beside cameras of ns-export"),
 }
-"""Files that mark a folder as a result: what stands in them, and what the pictures of the folder are."""
-HEAD = 1 << 20  # bytes of a file in which its mark stands
+"""Files that mark a folder as a result: their content, and what the folder's pictures are."""
+HEAD = 1 << 20  # bytes of a file that are searched for a mark
 _RENDERS = "renders of ns-render"
 _SPLIT_FOLDERS = {"train", "val", "test", "train+test"}
 _MAPS = {"accumulation", "beta", "overdraw", "expected_depth"}
-"""Folders that ns-render writes beside `rgb`, and captures do not have; and all that begin with raw- or gt-."""
+"""Folders that ns-render writes beside `rgb`, and captures lack; so are those that begin with raw- or gt-."""
 RAW = "raw data of a camera"
 UNREAD = {
     **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"), RAW),
-    ".jxl": "JPEG XL",
-    ".exr": "OpenEXR",
-    ".hdr": "Radiance HDR",
-    ".psd": "Photoshop",
-}
-"""Extensions of unread images, and their formats."""
+    ".jxl": "JPEG XL", ".exr": "OpenEXR", ".hdr": "Radiance HDR", ".psd": "Photoshop",
+}  # fmt: skip
+"""Formats of unread images by extension."""
 UNREAD_POSES = {
-    "poses_bounds.npy": "LLFF",
-    "cameras_sphere.npz": "NeuS",
-    "cameras.npz": "IDR",
-    "cameras.sfm": "Meshroom",
-    "sfm_data.json": "OpenMVG",
-    "reconstruction.json": "OpenSfM",
-    "bundle.out": "Bundler",
-    "bundle.rd.out": "Bundler",
-}
-"""Files of poses, in lower case, and the programs that write them."""
-METASHAPE = b"<camera "  # content of the XML file to which Metashape exports cameras, whatever its name
+    "poses_bounds.npy": "LLFF", "cameras_sphere.npz": "NeuS", "cameras.npz": "IDR", "cameras.sfm": "Meshroom",
+    "sfm_data.json": "OpenMVG", "reconstruction.json": "OpenSfM", "bundle.out": "Bundler", "bundle.rd.out": "Bundler",
+}  # fmt: skip
+"""Programs by their files of poses, in lower case."""
+METASHAPE = b"<camera "  # in the XML file of cameras that Metashape exports under any name
 OTHER_FOLDERS = {
     "mask": "masks", "masks": "masks", "depth": "depth maps", "depths": "depth maps", "depth_maps": "depth maps",
     "confidence": "confidence maps", "confidences": "confidence maps", "conf": "confidence maps",
@@ -68,18 +59,18 @@ OTHER_FOLDERS = {
     "segmentation": "segmentations", "segmentations": "segmentations", "semantic": "segmentations",
     "exports": "exports", "wandb": "pictures of a log", "planar_projections": "pictures made of panoramas",
 }  # fmt: skip
-"""Folders of a capture that hold no photographs, by their names in lower case, and what they hold."""
+"""Content of a capture's folders without photographs, by name in lower case."""
 OTHER_FILES = {
     r"thumb(nail)?(_\d+)?": "a thumbnail", r"material_0|textured_output": "a texture", r"dynamic_mask_.*":
     "a mask of instant-ngp", r"depth_\d+|.*[._-]depth": "a depth map", r"conf_\d+": "a confidence map",
 }  # fmt: skip
-"""Names files among photographs that are none: patterns of their names in lower case, without their endings."""
+"""Pictures that are no photographs, by patterns of their names in lower case, without extension."""
 
 
 def open_picture(file: Path) -> Image.Image:
-    """Open a photograph or mask with Pillow; raises Pillow's errors, and those of `open_regular`."""
+    """Open a photograph or mask with Pillow; raises errors of Pillow's and of `open_regular`."""
     open_regular(file).close()
-    Image.init()  # Pillow knows AVIF from a version on
+    Image.init()  # AVIF came with a later version of Pillow
     return Image.open(file, formats=[name for name in FORMATS_OF_PICTURES if name in Image.OPEN])
 
 
@@ -89,39 +80,40 @@ def is_photograph(path: Path) -> bool:
 
 
 def is_picture(path: Path) -> bool:
-    """Test for a file with the extension of a photograph that is not hidden."""
+    """Test for a file with a photograph's extension that is not hidden."""
     return path.suffix.lower() in PHOTOGRAPHS and not path.name.startswith(".") and path.is_file()
 
 
 def _no_photograph(path: Path) -> str:
-    """Describe an image that is no photograph, by its name; empty = a photograph."""
+    """Describe an image that is no photograph, by its name; empty for photographs."""
     matching = (what for pattern, what in OTHER_FILES.items() if re.fullmatch(pattern, path.stem.lower()))
     return next(matching, "")
 
 
 def no_photographs(folder: Path, beside: Collection[str] = ()) -> str:
-    """Describe the pictures in a folder that are no photographs, by its name, the names of folders `beside` it and the
-    results in it; empty = there may be photographs."""
-    known = "hidden" if folder.name.startswith(".") else OTHER_FOLDERS.get(folder.name.lower())
-    return known or _copies(folder.name, beside) or result_in(folder)
-
-
-def _copies(name: str, beside: Collection[str]) -> str:
-    """Describe the copies that a folder holds of images in a folder beside it, by its name; empty = none."""
+    """Describe the pictures of a folder without photographs, by its name, the names of folders `beside` it and the
+    results in it; empty = it may hold photographs."""
+    name = folder.name
+    if name.startswith("."):
+        return "hidden"
+    if known := OTHER_FOLDERS.get(name.lower()):
+        return known
     if f"corrected_{name}" in beside:
         return "raw copies of corrected pictures"
     original, _, factor = name.rpartition("_")
-    return "reduced copies" if factor in ("2", "4", "8", "16") and original in beside else ""
+    if factor in ("2", "4", "8", "16") and original in beside:
+        return "reduced copies"
+    return result_in(folder)
 
 
 def folders_in(folder: Path) -> list[Path]:
-    """List the folders in a folder that may hold photographs."""
+    """List the subfolders that may hold photographs."""
     names = [path.name for path in folder.iterdir() if path.is_dir()]
     return sorted(folder / name for name in names if not no_photographs(folder / name, names))
 
 
 def has_photographs(folder: Path, below: bool = False) -> bool:
-    """Test if photographs lie in a folder, or in or `below` it."""
+    """Test for photographs in a folder, or in or `below` it."""
     if not folder.is_dir():
         return False
     return any(True for _ in photographs_below(folder)) if below else any(map(is_photograph, folder.iterdir()))
@@ -135,30 +127,30 @@ def photographs_below(folder: Path) -> Iterator[Path]:
 
 
 def videos_in(folder: Path, rendered: bool = False) -> list[Path]:
-    """List the videos in a folder that are not hidden; `rendered`: the films that ns-render wrote instead."""
+    """List a folder's videos that are not hidden; `rendered`: films of ns-render instead."""
     names = (path for path in folder.iterdir() if path.suffix.lower() in VIDEOS and not path.name.startswith("."))
     return sorted(path for path in names if path.is_file() and is_rendered_film(path) is rendered)
 
 
 def _skipped(parent: Path, below: Collection[str]) -> dict[str, str]:
-    """Map the names of folders below a searched one to what is in them that is not searched; empty = it is. Captures
-    beside photographs have copies of these."""
+    """Map names of folders below a searched one to what they hold if they are not searched; empty = search them.
+    Captures beside photographs hold copies of these."""
     found = {name: no_photographs(parent / name, below) for name in sorted(below)}
-    captures = [name for name, what in found.items() if not what and is_capture(parent / name)]
+    marks = {name: parent / name / "transforms.json" for name, what in found.items() if not what}
+    captures = [name for name, file in marks.items() if holds(file, b'"transform_matrix"')]
     if captures and (has_photographs(parent) or has_photographs(parent / "images")):
         found |= dict.fromkeys(captures, "pictures of another capture")
     return found
 
 
 def passed_over(folder: Path, used: Collection[Path] | None = None) -> list[str]:
-    """Describe the pictures in and below a folder that are not read: those that `photographs_below` leaves out, and
-    with the files that are `used`, the other photographs in folders with these and one level below."""
+    """Describe the pictures in and below a folder that are not read: those that `photographs_below` leaves out; given
+    the `used` files, also other photographs in their folders and one level below."""
     found, holding = [], {above for path in used or () for above in path.parents}
     for parent, below, names in os.walk(folder):
         skipped = _skipped(Path(parent), below)
         for name, what in skipped.items():
-            count = 0 if what in ("", "hidden") else _pictures(Path(parent, name), used or ())
-            if count:
+            if what not in ("", "hidden") and (count := _pictures(Path(parent, name), used or ())):
                 found.append(f"{Path(parent, name).relative_to(folder)} ({count} {what})")
         searched = used is None or Path(parent) in holding  # a folder of captures may hold a whole disk
         below[:] = [name for name, what in skipped.items() if searched and not what]
@@ -185,19 +177,19 @@ def passed_over(folder: Path, used: Collection[Path] | None = None) -> list[str]
 
 
 def _pictures(folder: Path, used: Collection[Path]) -> int:
-    """Count the pictures in and below a folder that are not used."""
+    """Count the unused pictures in and below a folder."""
     walked = (Path(parent, name) for parent, _, names in os.walk(folder) for name in names)
     return sum(is_picture(path) and path not in used for path in walked)
 
 
 def result_in(folder: Path) -> str:
-    """Say of what result the pictures in a folder are, by the files in it; empty = of none."""
+    """Describe the result that a folder's pictures are of, by its files; empty = none."""
     try:
         names = sorted(os.listdir(folder))
-    except OSError:  # it may not be read, and need not be
+    except OSError:  # unreadable folders are allowed
         return ""
     for name, (mark, what) in RESULT_FILES.items():
-        if name in names and _holds(folder / name, mark):
+        if name in names and holds(folder / name, mark):
             return what
     if folder.name in _SPLIT_FOLDERS and any(name in _MAPS or name.startswith(("raw-", "gt-")) for name in names):
         return _RENDERS
@@ -206,62 +198,46 @@ def result_in(folder: Path) -> str:
         return ""
     if re.fullmatch(r"eval_img_\d{4,}\.png", pictures[-1]) and all(name.startswith("eval_") for name in pictures):
         return "renders of ns-eval"
-    return _RENDERS if _holds(folder / pictures[0], RENDERED, 1 << 10) else ""
-
-
-def is_capture(folder: Path) -> bool:
-    """Test for a capture as ns-process-data and `bitymi sfm` write it, with copies of the photographs."""
-    return _holds(folder / "transforms.json", b'"transform_matrix"')
+    return _RENDERS if holds(folder / pictures[0], RENDERED, 1 << 10) else ""
 
 
 def refusal(folder: Path) -> str:
-    """Say why a folder cannot be trained on, and what to do, where it is a bundle or a run; empty = it may be."""
+    """Say why a folder cannot be trained on, and what to do, if it is a bundle or a run; empty = it can."""
     what = result_in(folder) if folder.is_dir() else ""
     if what == BUNDLE:
-        return (
-            f"{folder} is a bundle, not a capture: give the folder of its photographs. `bitymi view {folder}` shows "
-            "the bundle."
-        )
+        bundle = f"{folder} is a bundle, not a capture: give the folder of its photographs."
+        return f"{bundle} `bitymi view {folder}` shows the bundle."
     if what == RUN:
-        return (
-            f"{folder} is a training run, not a capture: give the folder of its photographs, and --load-dir "
-            f"{folder}/nerfstudio_models to go on with the run."
-        )
+        advice = f"give the folder of its photographs, and --load-dir {folder}/nerfstudio_models to go on with the run."
+        return f"{folder} is a training run, not a capture: {advice}"
     return ""
 
 
 def is_rendered_film(path: Path) -> bool:
-    """Test for a film that ns-render wrote of a scene of ours."""
-    return _holds(path, RENDERED)
+    """Test for a film that ns-render wrote."""
+    return holds(path, RENDERED)
 
 
-def _holds(path: Path, mark: bytes, most: int = HEAD) -> bool:
+def holds(path: Path, mark: bytes, most: int = HEAD) -> bool:
+    """Test if the first bytes of a file hold `mark`; False for unreadable files."""
     try:
         with open_regular(path) as file:
-            return mark in file.read(most)
+            return mark in file.read(min(most, os.fstat(file.fileno()).st_size))
     except OSError:
         return False
 
 
 def poses_in(folder: Path) -> Iterator[tuple[Path, str]]:
-    """Yield files of poses in a folder, each with the program that wrote it."""
+    """Yield a folder's files of poses, each with its program."""
     for path in sorted(path for path in folder.iterdir() if path.is_file()):
         if path.name.lower() in UNREAD_POSES:
             yield path, UNREAD_POSES[path.name.lower()]
-        elif path.suffix.lower() == ".xml" and _is_metashapes(path):
+        elif path.suffix.lower() == ".xml" and holds(path, METASHAPE, MOST_TEXT):
             yield path, "Metashape"
 
 
-def _is_metashapes(path: Path) -> bool:
-    try:
-        return METASHAPE in read_bytes(path)
-    except OSError:  # it may not be read, and need not be
-        return False
-
-
 def pictures_among(names: Sequence[str], read: Sequence[str]) -> dict[str, int]:
-    """Count unread images of a folder by extension. Raw data beside a photograph of the same name in `read` do not
-    count."""
+    """Count a folder's unread images by extension, without raw data beside a photograph of the same name in `read`."""
     stems = {Path(name).stem.lower() for name in read}
     endings = [path.suffix.lower() for path in map(Path, names) if path.stem.lower() not in stems]
     return {ending: endings.count(ending) for ending in UNREAD if ending in endings}

@@ -1,8 +1,8 @@
-"""Point clouds: PLY files validated and read, colored by photographs where they have no colors, and projected into
-these to detect poses in another convention.
+"""Point clouds: validate and read PLY files, color points by photographs, and project them to detect poses in another
+convention.
 
-The PLY reader that nerfstudio uses returns uninitialized memory for points that the file lacks, and divides every color
-by 255, also those in [0, 1].
+nerfstudio's PLY reader returns uninitialized memory for missing points, and divides all colors by 255, even those in
+[0, 1].
 """
 
 import time
@@ -18,49 +18,39 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from bitymi_ns.capture.camera import OPENCV_AXES, Photograph, Pose
 from bitymi_ns.capture.images import read_image
-from bitymi_ns.capture.types import fail, say, warn
+from bitymi_ns.capture.types import OPENCV_AXES, Photograph, Pose, fail, say, warn
 from bitymi_ns.ply import PlyError, read_header, read_rows, rows_there, text_lines
 from bitymi_ns.ranges import spread
 
 VERTEX = "vertex"
 COLOR_NAMES = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
-"""Property names by which programs write colors."""
-MANY_POINTS = 500_000  # number of points from which on slow steps are announced and timed
+"""Names of color properties in PLY files."""
+MANY_POINTS = 500_000  # points from which on slow steps are announced and timed
 COLOR_VIEWS = 24  # photographs, spread over all, in which colors are looked up
 COLOR_CHUNK = 100_000  # points that are colored together
 GREY = 128
 CHECK_VIEWS = 8  # photographs, spread over all, into which points are projected to check conventions
 CHECK_POINTS = 2000
-CHECK_SIZE = 800  # pixels at least to which large JPEG files are downscaled as they are decoded for that check
+CHECK_SIZE = 800  # least longer side of JPEG files that are decoded for that check, pixels
 NOTHING, SOMETHING = 0.01, 0.1
-"""Share of the points that a picture shows by poses that are wrong, and by such as may be right."""
+"""Shares of the points in pictures by wrong poses, and by poses that may be right."""
 MANY_TIMES, MORE_ALIKE = 2.5, 0.05
-"""Poses that show so many times as many points, with a correlation of brightness that is so much higher, are the right
-ones. In three real captures the right ones show 70 to 76 % of the points with a correlation of 0.21 to 0.56, all others
-at most 24 % with 0.12."""
-ALIKE = 0.4
-"""With a correlation so much higher, poses are the right ones however few points they show: a room has points on all
-sides."""
+"""Factor of the points and difference of the correlation of brightness that tell right poses. In three real captures
+right ones show 70 to 76 % of the points with a correlation of 0.21 to 0.56, others at most 24 % with 0.12."""
+ALIKE = 0.4  # difference of the correlation that suffices alone: a room has points on all sides
 
 
 class Points(NamedTuple):
-    """Initial points: positions [N, 3] float64, and colors [N, 3] uint8, or [0, 3] where they have none."""
+    """Initial points: positions [N, 3] float64 and colors [N, 3] uint8, [0, 3] without colors."""
 
     xyz: npt.NDArray[np.float64]
     rgb: npt.NDArray[np.uint8]
 
 
 def read_points(path: Path) -> tuple[Points, str]:
-    """Read the points of a file in which `ply_fault` finds no fault.
-
-    Returns:
-        the points, and why they have no colors, in words that follow "points: "; empty where they have.
-
-    Raises:
-        PlyError: its points have lists, or stand behind some.
-    """
+    """Read the points of a file without `ply_fault`, and why they have no colors, in words that follow "points: ".
+    Raises PlyError: its points have lists, or follow some."""
     header = read_header(path)
     rows = read_rows(path, header, VERTEX)
     xyz = np.stack([rows[name] for name in "xyz"], -1).astype(np.float64)
@@ -75,8 +65,8 @@ def read_points(path: Path) -> tuple[Points, str]:
 
 
 def color_bytes(values: npt.NDArray[np.float64], floating: bool) -> tuple[npt.NDArray[np.uint8], str]:
-    """Convert colors [N, 3] to bytes by the smallest white (1, 255 or 65535) that bounds them, or to none [0, 3] and
-    why that cannot be done. `floating`: white may be 1."""
+    """Convert colors [N, 3] to bytes by the smallest white (1 if `floating`, 255, 65535) that bounds them, or to [0, 3]
+    and why that fails."""
     none = np.zeros((0, 3), np.uint8)
     if not len(values):
         return none, ""
@@ -89,7 +79,7 @@ def color_bytes(values: npt.NDArray[np.float64], floating: bool) -> tuple[npt.ND
 
 
 def ply_fault(path: Path) -> str | None:
-    """Describe why the file is no complete PLY file of points, in words that follow its name; None = it is one."""
+    """Describe why a file is no complete PLY file of points, in words that follow its name; None = it is."""
     try:
         header = read_header(path)
         points = header.elements.get(VERTEX)
@@ -109,9 +99,9 @@ def ply_fault(path: Path) -> str | None:
     return None if line is None else f"is damaged: {line}"
 
 
-@lru_cache(maxsize=2)  # a capture is checked twice before it is read, which takes seconds for large clouds
+@lru_cache(maxsize=2)  # captures are checked twice, which takes seconds for large clouds
 def _bad_line(path: Path, changed: int) -> str | None:
-    """Find the first line of a text file that is no point; None = none."""
+    """Find a text file's first line that is no point; None = none."""
     header = read_header(path)
     points = header.elements[VERTEX]
     if header.order or points.row is None or not points.count:
@@ -144,7 +134,7 @@ def _fits(word: str, kind: np.dtype) -> bool:
 
 @contextmanager
 def reporting_time(what: str, points: int) -> Iterator[None]:
-    """Announce a step on many points, and report the time that it took."""
+    """Announce and time a step on many points."""
     if points < MANY_POINTS:
         yield
         return
@@ -154,15 +144,12 @@ def reporting_time(what: str, points: int) -> Iterator[None]:
     say(f"{what} {points:,} points took {time.perf_counter() - start:.1f} s.")
 
 
-def read_cloud(path: Path, without: str) -> tuple[Points, str]:
-    """Read the points of a PLY file, see `read_points`; `without` says how to do without it.
-
-    Raises:
-        CaptureError: it is missing, or cannot be read.
-    """
+def read_cloud(path: Path, remedy: str) -> tuple[Points, str]:
+    """Read a PLY file, see `read_points`. Raises CaptureError: it is missing, or cannot be read; `remedy` says what to
+    do."""
     fault = ply_fault(path) if path.is_file() else "does not exist"
     if fault is not None:
-        fail(f"the point cloud {path} {fault}. Put it there again, or {without} to start from random points.")
+        fail(f"the point cloud {path} {fault}. {remedy}")
     try:
         return read_points(path)
     except PlyError as error:
@@ -170,8 +157,7 @@ def read_cloud(path: Path, without: str) -> tuple[Points, str]:
 
 
 def with_colors(points: Points, without: str, photographs: Sequence[Photograph], source: Path) -> Points:
-    """Color points in the frame of the photographs that have no colors, for the reason `without`; see
-    `color_points`."""
+    """Color points that have no colors, for the reason `without`, or black ones only; see `color_points`."""
     if not without and not points.rgb.any():
         without = "its own are all black"
     if not without or not len(points.xyz):
@@ -181,8 +167,8 @@ def with_colors(points: Points, without: str, photographs: Sequence[Photograph],
 
 
 def color_points(points: Points, photographs: Sequence[Photograph]) -> Points:
-    """Color each point by the median over the photographs it projects into; grey where there is none. A median is
-    robust to the photographs in which the point is occluded."""
+    """Color each point by its median over the photographs that it projects into, robust to those in which it is hidden;
+    grey without any."""
     chosen = [photographs[i] for i in spread(len(photographs), COLOR_VIEWS)]
     images = [np.asarray(read_image(photograph.file).convert("RGB")) for photograph in chosen]
     rgb = np.full((len(points.xyz), 3), GREY, np.uint8)
@@ -197,7 +183,7 @@ def color_points(points: Points, photographs: Sequence[Photograph]) -> Points:
 def sample_colors(
     xyz: npt.NDArray[np.float64], photograph: Photograph, image: npt.NDArray[np.uint8]
 ) -> npt.NDArray[np.float32]:
-    """Look up the colors [N, 3] of points [N, 3] in an image [H, W, 3]; NaN outside of it."""
+    """Look up colors [N, 3] of points [N, 3] in an image [H, W, 3]; NaN outside."""
     camera = photograph.camera
     colors = np.full((len(xyz), 3), np.nan, np.float32)
     local = (xyz - photograph.pose[:3, 3]) @ photograph.pose[:3, :3] * [1.0, -1.0, -1.0]
@@ -214,8 +200,11 @@ def sample_colors(
     return colors
 
 
+Conventions = dict[str, Callable[[Pose], Pose]]
+
+
 def _from_xyzw(pose: Pose) -> Pose:
-    """Camera to world of a COLMAP model with quaternions x, y, z, w that were read as w, x, y, z."""
+    """Convert a COLMAP pose whose quaternion x, y, z, w was read as w, x, y, z."""
     read = np.linalg.inv(pose @ OPENCV_AXES)
     meant = np.eye(4)  # SciPy's order is x, y, z, w
     meant[:3, :3] = Rotation.from_quat(Rotation.from_matrix(read[:3, :3]).as_quat()[[3, 0, 1, 2]]).as_matrix()
@@ -223,45 +212,37 @@ def _from_xyzw(pose: Pose) -> Pose:
     return np.linalg.inv(meant) @ OPENCV_AXES
 
 
-JSON_CONVENTIONS: dict[str, Callable[[Pose], Pose]] = {
-    "the cameras have OpenCV's axes (y down, z forward): negate the second and third column": lambda pose: (
-        pose @ OPENCV_AXES
-    ),
+JSON_POSES: Conventions = {
+    "the cameras have OpenCV's axes (y down, z forward): negate the second and third column": lambda c: c @ OPENCV_AXES,
     "they are world to camera: invert them": np.linalg.inv,
-    "they are world to camera with OpenCV's axes: invert them, then negate the second and third column": lambda pose: (
-        np.linalg.inv(pose) @ OPENCV_AXES
+    "they are world to camera with OpenCV's axes: invert them, then negate the second and third column": lambda c: (
+        np.linalg.inv(c) @ OPENCV_AXES
     ),
-    "they are left-handed, as Unity's: negate the third column": lambda pose: pose @ np.diag([1.0, 1.0, -1.0, 1.0]),
+    "they are left-handed, as Unity's: negate the third column": lambda c: c @ np.diag([1.0, 1.0, -1.0, 1.0]),
 }
-"""Other conventions of a matrix in a transforms.json, which should be camera to world with OpenGL axes, and the
-conversion of a pose that was read as such."""
-COLMAP_CONVENTIONS: dict[str, Callable[[Pose], Pose]] = {
+"""Conversions of poses in a transforms.json that was written in another convention than camera to world with OpenGL
+axes, by the remedy."""
+COLMAP_POSES: Conventions = {
     "the cameras have OpenGL's axes (y up, z backward)": lambda pose: pose @ OPENCV_AXES,
     "they are camera to world: invert them": lambda pose: OPENCV_AXES @ np.linalg.inv(pose) @ OPENCV_AXES,
     "they are camera to world with OpenGL's axes": lambda pose: OPENCV_AXES @ np.linalg.inv(pose),
     "the quaternions are in the order x, y, z, w: write w first": _from_xyzw,
 }
-"""The same for a COLMAP model, whose poses should be world to camera with OpenCV axes."""
+"""The same for COLMAP models, which should be world to camera with OpenCV axes."""
 
 
 class _Fit(NamedTuple):
-    """Share of the points that project into a picture, and correlation of their brightness with its; 0 without
-    colors."""
+    """Share of points that project into pictures, and correlation of their brightness; 0 without colors."""
 
     share: float
     correlation: float
 
 
 def check_conventions(
-    points: Points,
-    photographs: Sequence[Photograph],
-    conventions: dict[str, Callable[[Pose], Pose]],
-    source: str,
-    frame: Pose | None = None,
+    points: Points, photographs: Sequence[Photograph], conventions: Conventions, source: str, frame: Pose | None = None
 ) -> None:
-    """Warn where the points are not seen by the poses as they are read, but would be by another of these conventions.
-    `frame` [4, 4] is from the frame in which the poses were written to that of points and photographs; None = the
-    same."""
+    """Warn if the photographs do not show the points by their poses, but would by another of the `conventions`. `frame`
+    [4, 4] leads from the poses' frame to that of points and photographs; None = the same."""
     rgb = points.rgb if len(points.rgb) == len(points.xyz) else np.zeros((len(points.xyz), 3), np.uint8)
     kept = np.flatnonzero(np.isfinite(points.xyz).all(1))
     kept = kept[:: max(1, len(kept) // CHECK_POINTS)]
@@ -270,7 +251,11 @@ def check_conventions(
     back = np.eye(4) if frame is None else np.linalg.inv(frame)
     xyz = points.xyz[kept] @ back[:3, :3].T + back[:3, 3]
     chosen = [photographs[i] for i in spread(len(photographs), CHECK_VIEWS)]
-    images = [_small_image(photograph) for photograph in chosen]
+    images = []
+    for each in chosen:
+        scale = CHECK_SIZE / max(each.camera.size)
+        wanted = (round(each.camera.width * scale), round(each.camera.height * scale))
+        images.append(np.asarray(read_image(each.file, wanted=wanted).convert("RGB")))
 
     def fit(convention: Callable[[Pose], Pose]) -> _Fit:
         cameras = [replace(each, pose=convention(back @ each.pose)) for each in chosen]
@@ -295,10 +280,3 @@ def check_conventions(
             f"{source}: by its poses its points {what}; they would if the poses were written in another convention: "
             f"{best}. As they are, the scene will be wrong."
         )
-
-
-def _small_image(photograph: Photograph) -> npt.NDArray[np.uint8]:
-    camera = photograph.camera
-    scale = CHECK_SIZE / max(camera.width, camera.height)
-    wanted = (round(camera.width * scale), round(camera.height * scale)) if scale < 1.0 else None
-    return np.asarray(read_image(photograph.file, wanted=wanted).convert("RGB"))

@@ -1,4 +1,4 @@
-"""Checks of poses: rotations (or mirrored ones), positions that belong together, and points in their unit."""
+"""Check poses: rotations (or mirrored ones), positions that belong together, and points in their unit."""
 
 import os
 from collections.abc import Sequence
@@ -9,28 +9,25 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bitymi_ns.capture.camera import Photograph
-from bitymi_ns.capture.types import FrameOptions, fail, say, warn
+from bitymi_ns.capture.types import FrameOptions, Photograph, fail, say, warn
 from bitymi_ns.trust import listed
 
-EXACT = 1e-3  # matrices this close to a rotation are taken as they are: float32, or four written digits
-ROUNDED = 2e-2  # matrices this close to a rotation, up to a common factor, are meant to be one: two written digits
-FAR = 100.0  # distance relative to all the others from which a camera may be misplaced
-TOO_FAR = 1000.0  # relative distance beside which the other cameras shrink to one point
-FAR_FROM_ORIGIN = 100.0  # distance from the origin relative to that from their middle at which float32 blurs cameras
-OTHER_UNIT = 150.0
-"""Distance of points relative to that between cameras, or their extent as a part of the picture, in another unit."""
+EXACT = 1e-3  # error of rotations taken as they are: float32, or four written digits
+ROUNDED = 2e-2  # error of rounded rotations, up to a common factor: two written digits
+FAR = 100.0  # distance relative to the others' from which a camera may be misplaced
+TOO_FAR = 1000.0  # relative distance that shrinks the other cameras to one point
+FAR_FROM_ORIGIN = 100.0  # distance from the origin, relative to that from their middle, at which float32 blurs cameras
+OTHER_UNIT = 150.0  # ratio of points' and cameras' distances, or of picture and cloud, that tells another unit
 USUAL_SPREAD, MAX_SPREAD = 2.5, 25.0
-"""Median distance of cameras from their middle, in half sides of the scene box: of NeRF-Synthetic, and from which on a
-capture is taken to be in another unit."""
+"""Median distance of cameras from their middle in half sides of the scene box: NeRF-Synthetic's, and the largest in the
+format's unit."""
 
 
 def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source: str) -> npt.NDArray[np.float64]:
-    """Recover rotations from the 3 x 3 parts [N, 3, 3] of poses, camera to world; rows that need no change stay equal.
+    """Recover rotations from the 3 x 3 parts [N, 3, 3] of poses, camera to world; valid ones stay equal.
 
-    A factor common to a matrix is divided out, and rounding is undone by the nearest rotation. Mirrored rotations
-    (determinant -1) stay mirrored: captures may be mirrored as a whole. Names of the frames and `source` are for
-    messages.
+    Divide out each matrix's common factor, and undo rounding by the nearest rotation. Mirrored rotations (determinant
+    -1) stay mirrored, as whole captures may be. `names` of the frames and `source` are for messages.
 
     Raises:
         CaptureError: a matrix is not finite, zero or sheared.
@@ -43,16 +40,18 @@ def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source
     length = np.sqrt(np.square(unit).sum((1, 2)) / 3.0)
     scale, unit = largest * length, unit / length[:, None, None]
     error = np.abs(unit.transpose(0, 2, 1) @ unit - np.eye(3)).max((1, 2))
+
+    def named(wrong: npt.NDArray[np.bool_]) -> str:
+        return listed([names[i] for i in wrong.nonzero()[0]])
+
     for what, wrong in (
         ("is not finite", ~finite),
         ("is zero", finite & ~usable),
         ("is sheared or stretched: its columns are not at right angles and equally long", usable & (error > ROUNDED)),
     ):
         if wrong.any():
-            fail(
-                f"{source}: the 3 x 3 part of the pose of {listed([names[i] for i in wrong.nonzero()[0]])} is no "
-                f"rotation, it {what}. Correct the pose or remove the frame."
-            )
+            advice = "Correct the pose or remove the frame."
+            fail(f"{source}: the 3 x 3 part of the pose of {named(wrong)} is no rotation, it {what}. {advice}")
     scaled = np.abs(scale - 1.0) > EXACT
     result[scaled] = unit[scaled]
     rounded = error > EXACT
@@ -61,37 +60,28 @@ def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source
     if scaled.any():
         low, high = scale[scaled].min(), scale[scaled].max()
         factor = f"{low:.4g}" if high - low <= EXACT * high else f"{low:.4g} to {high:.4g}"
-        warn(
-            f"{source}: rotations are scaled by {factor} in the poses of "
-            f"{listed([names[i] for i in scaled.nonzero()[0]])}. The factor is divided out; positions stay as they are."
-        )
+        then = "The factor is divided out; positions stay as they are."
+        warn(f"{source}: rotations are scaled by {factor} in the poses of {named(scaled)}. {then}")
     only_rounded = rounded & ~scaled
     if only_rounded.any():
-        warn(
-            f"{source}: rotations are off by up to {error[only_rounded].max():.1g} in the poses of "
-            f"{listed([names[i] for i in only_rounded.nonzero()[0]])}. The nearest ones are used."
-        )
+        off = f"rotations are off by up to {error[only_rounded].max():.1g} in the poses of {named(only_rounded)}"
+        warn(f"{source}: {off}. The nearest ones are used.")
     return result
 
 
 def correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
-    """Fail at matrices that are no poses; recover rotations, see `rotations`. Frames are those of a
-    transforms.json, which are changed."""
+    """Check the poses of a transforms.json's frames, and replace them by rotations, see `rotations`."""
     names = [frame["file_path"] for frame in frames]
     poses = []
     for frame, name in zip(frames, names, strict=True):
         pose = as_matrix(frame["transform_matrix"])
         if pose is None:
-            fail(
-                f"{path}: the transform_matrix of {name} is not a matrix of 4 x 4 finite numbers. "
-                "Correct it or remove the frame."
-            )
+            what = f"the transform_matrix of {name} is not a matrix of 4 x 4 finite numbers"
+            fail(f"{path}: {what}. Correct it or remove the frame.")
         if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
             row = " ".join(f"{x:g}" for x in pose[3])
-            fail(
-                f"{path}: the last row of the transform_matrix of {name} is {row}, not 0 0 0 1. A matrix whose "
-                "position stands in its last row has to be transposed."
-            )
+            why = "A matrix whose position stands in its last row has to be transposed."
+            fail(f"{path}: the last row of the transform_matrix of {name} is {row}, not 0 0 0 1. {why}")
         poses.append(pose)
     matrices = np.stack(poses)
     matrices[:, :3, :3] = rotations(matrices[:, :3, :3], names, str(path))
@@ -100,21 +90,19 @@ def correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
 
 
 def check_repeated(path: Path, frames: list[dict[str, Any]]) -> None:
-    """Fail where one photograph has two poses."""
+    """Fail if a photograph has two poses."""
     first: dict[str, int] = {}
     for i, frame in enumerate(frames):
         name = os.path.normpath(frame["file_path"])
         before = first.setdefault(name, i)
         poses = [np.asarray(frames[j]["transform_matrix"]) for j in (before, i)]
         if before != i and not np.allclose(*poses, rtol=1e-5, atol=1e-5):
-            fail(
-                f"{path}: frames {before} and {i} (counted from 0) are both of {name}, but with different poses. "
-                "Correct the name of one of them or remove it."
-            )
+            twice = f"frames {before} and {i} (counted from 0) are both of {name}, but with different poses"
+            fail(f"{path}: {twice}. Correct the name of one of them or remove it.")
 
 
 def as_matrix(value: Any) -> np.ndarray | None:
-    """Convert 3 x 4 or 4 x 4 finite numbers to [4, 4]; None for anything else."""
+    """Convert 3 x 4 or 4 x 4 finite numbers to [4, 4]; else None."""
     try:
         matrix = np.asarray(value, dtype=np.float64)
     except (ValueError, TypeError, OverflowError):
@@ -125,7 +113,7 @@ def as_matrix(value: Any) -> np.ndarray | None:
 
 
 def warn_of_mirrored(rotations: npt.NDArray[np.float64], names: Sequence[object]) -> None:
-    """Warn of frames that are mirrored where the others are not; rotations [N, 3, 3], names for messages."""
+    """Warn of frames that are mirrored against the others; rotations [N, 3, 3], `names` for messages."""
     mirrored = np.linalg.det(rotations) < 0.0
     few = mirrored if 2 * mirrored.sum() <= len(mirrored) else ~mirrored
     if few.any():
@@ -136,15 +124,13 @@ def warn_of_mirrored(rotations: npt.NDArray[np.float64], names: Sequence[object]
 
 
 def check_spread(centers: npt.NDArray[np.float64], source: str) -> None:
-    """Fail where all cameras [N, 3] are at one place."""
+    """Fail if all cameras [N, 3] are at one place."""
     if not np.ptp(centers, axis=0).any():
-        fail(
-            f"{source}: all cameras are at one place. Depth cannot be learned: take photographs from different places."
-        )
+        fail(f"{source}: all cameras are at one place. Depth cannot be learned: photograph from different places.")
 
 
 def check_outliers(centers: npt.NDArray[np.float64], names: Sequence[object]) -> None:
-    """Fail or warn at single cameras that are far from all the others; centers [N, 3] finite, names for messages."""
+    """Fail or warn at single cameras far from all others; centers [N, 3] finite, `names` for messages."""
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     order = np.argsort(distances)
     sorted_distances = distances[order]
@@ -153,10 +139,8 @@ def check_outliers(centers: npt.NDArray[np.float64], names: Sequence[object]) ->
         near, far = sorted_distances[k - 1], sorted_distances[k]
         if near <= 0.0 or far < FAR * near:
             continue
-        message = (
-            f"the camera of {listed([names[i] for i in order[k:]])} is {far / near:,.0f} times as far from the middle "
-            "of the capture as the others."
-        )
+        away = f"{far / near:,.0f} times as far from the middle of the capture as the others"
+        message = f"the camera of {listed([names[i] for i in order[k:]])} is {away}."
         if far < TOO_FAR * near:
             warn(f"{message[0].upper()}{message[1:]} If that is a mistake, correct the pose or remove the frame.")
         else:
@@ -165,38 +149,35 @@ def check_outliers(centers: npt.NDArray[np.float64], names: Sequence[object]) ->
 
 
 def far_from_origin(centers: npt.NDArray[np.float64]) -> bool:
-    """Test if cameras [N, 3] are so far from the origin that float32 cannot tell their positions."""
+    """Test for cameras [N, 3] too far from the origin for float32."""
     middle = centers.mean(0)
     spread = np.linalg.norm(centers - middle, axis=1).max()
     return bool(0.0 < FAR_FROM_ORIGIN * spread < np.linalg.norm(middle))
 
 
 def fit_scale(frame: FrameOptions, photographs: Sequence[Photograph], source: str) -> FrameOptions:
-    """Reduce the scale of a capture whose cameras lie far outside of the scene box: in millimetres they would, and
-    random points would all fall on one spot of the pictures. `frame` is the format's default, without
-    auto_scale_poses."""
+    """Reduce the scale of a capture whose cameras lie far outside the scene box, as in millimetres: random points would
+    all be one spot of the pictures. `frame`: the format's default, without auto_scale_poses."""
     centers = np.stack([photograph.pose[:3, 3] for photograph in photographs])
     spread = float(np.median(np.linalg.norm(centers - centers.mean(0), axis=1)))
     ratio = spread * frame.scale_factor / frame.scene_scale
     if ratio <= MAX_SPREAD:
         return frame
     scale = frame.scale_factor * USUAL_SPREAD / ratio
-    say(
-        f"The cameras of {source} lie {spread:,.4g} units from their middle, where those of this format usually lie "
-        f"{USUAL_SPREAD * frame.scene_scale / frame.scale_factor:.2g}: the capture is scaled by {scale:.3g}. Bundles "
-        "state that."
-    )
+    usual = f"where those of this format usually lie {USUAL_SPREAD * frame.scene_scale / frame.scale_factor:.2g}"
+    more = f"the capture is scaled by {scale:.3g}. Bundles state that."
+    say(f"The cameras of {source} lie {spread:,.4g} units from their middle, {usual}: {more}")
     return replace(frame, scale_factor=scale)
 
 
 def check_point_unit(
     points: npt.NDArray[np.float64], centers: npt.NDArray[np.float64], widths: npt.NDArray[np.float64]
 ) -> None:
-    """Warn where the points [N, 3] seem to be in another unit than the camera positions [M, 3], finite; `widths` [M] of
-    the pictures are in focal lengths.
+    """Warn if points [N, 3] seem to be in another unit than finite camera positions [M, 3]; `widths` [M] of the
+    pictures in focal lengths.
 
-    Points are then far beyond the cameras, or all in a spot of the picture: both leave training next to nothing to
-    start from. Medians and percentiles are used because clouds and captures have outliers.
+    Such points are far beyond the cameras or a spot of the pictures, and training starts from next to nothing. Medians
+    and percentiles are robust to outliers.
     """
     points = points[:: max(1, len(points) // 100_000)]
     points = points[np.isfinite(points).all(1)]
@@ -214,10 +195,8 @@ def check_point_unit(
             f"{_rounded(away / apart)} times as far from the cameras as these are from their middle. {hint}"
         )
     elif 0.0 < spread < picture / OTHER_UNIT:
-        warn(
-            "The point cloud seems to be in another unit than the poses: half of its points lie in a spot that is "
-            f"1/{_rounded(picture / spread)} of a picture's width. {hint}"
-        )
+        what = f"half of its points lie in a spot that is 1/{_rounded(picture / spread)} of a picture's width. {hint}"
+        warn(f"The point cloud seems to be in another unit than the poses: {what}")
 
 
 def _rounded(ratio: float) -> str:

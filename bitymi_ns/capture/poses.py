@@ -1,8 +1,7 @@
-"""Structure from motion: camera poses of photographs or of the frames of a video."""
+"""Find camera poses of photographs or of a video's frames by structure from motion."""
 
 import json
 import os
-import shutil
 import statistics
 import time
 import warnings
@@ -15,7 +14,6 @@ import pycolmap
 from pydantic import TypeAdapter
 
 from bitymi_ns.capture.cache import content_key, replace_stale, work_folder
-from bitymi_ns.capture.camera import SPHERICAL_MODEL, ColmapCamera, is_full_sphere
 from bitymi_ns.capture.frame import local_positions, move_to_world, write_frame
 from bitymi_ns.capture.masks import mask_folder
 from bitymi_ns.capture.photos import Photo, blurred, check_names, duplicates, find_photos, photo_folder, read_photos
@@ -25,29 +23,27 @@ from bitymi_ns.capture.recognise import is_model
 from bitymi_ns.capture.report import write_report
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
-from bitymi_ns.capture.types import CaptureError, Poses, SfmOptions
-from bitymi_ns.capture.video import extract_frames
+from bitymi_ns.capture.types import SPHERICAL_MODEL, CaptureError, ColmapCamera, Poses, SfmOptions, is_full_sphere
+from bitymi_ns.capture.video import NO_MOTION, extract_frames
 from bitymi_ns.files import Tell, complete_folder, explained, write_file
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.reading import read_json
 
-GUESSED_FOCAL = 1.2  # initial focal length where it is unknown, in units of the longer side; COLMAP's own
-TELLING = 0.25  # share of 360-degree pictures among photographs of one size from which on all of them count as such
-LEAST = 3  # least number of photographs
-SPARSE = Path("sparse/0")  # path of the model in a result
+GUESSED_FOCAL = 1.2  # initial focal length if unknown, in longer sides; COLMAP's own
+TELLING = 0.25  # share of 360-degree pictures from which on all photographs of one size count as such
+LEAST = 3  # photographs
+SPARSE = Path("sparse/0")  # the model's path in a result
 
 
 def find_poses(
     source: Path, options: SfmOptions | None = None, progress: Progress | None = None, warn: Tell = warnings.warn
 ) -> Poses:
-    """Find the camera poses of photographs or of the frames of a video.
-
-    The result is cached beside the photographs, or in the user's cache folder if nothing can be written there. An
-    interrupted run continues.
+    """Find camera poses of photographs or of a video's frames; cache them beside the photographs, or in the user's
+    cache folder if nothing can be written there; continue an interrupted run.
 
     Args:
-        source: a folder of photographs, a folder that holds them in `images` (and masks in `masks`), or a video.
-        warn: called with the location of the result, if not beside writable photographs.
+        source: a folder of photographs, a folder with `images` (and `masks`), or a video.
+        warn: called with the location of the result if not beside writable photographs.
 
     Raises:
         CaptureError: no poses can be found; says what to photograph differently.
@@ -77,7 +73,7 @@ def find_poses(
 
 
 def _what(source: Path) -> tuple[Path, Path, list[str]]:
-    """Return the source, the folder of its photographs and their names; for a video no names."""
+    """Return the source, its folder of photographs and their names; for a video no names."""
     if source.suffix.lower() in VIDEOS and source.is_file():
         return source, source, []
     if not source.exists():
@@ -93,30 +89,25 @@ def _what(source: Path) -> tuple[Path, Path, list[str]]:
         return videos[0], videos[0], []
     if len(names) < LEAST:
         also = f" Of its {len(videos)} videos, name one." if videos and not names else ""
-        raise CaptureError(f"{folder} holds {_few(len(names))}.{also}")
-    below = os.path.commonpath([f"./{os.path.dirname(name)}" for name in names])  # as if that folder had been named
+        held = {0: "no photographs", 1: "one photograph"}.get(len(names), f"{len(names)} photographs")
+        raise CaptureError(
+            f"{folder} holds {held}: camera poses need at least {LEAST}, and a scene 20 to 200. Walk round it and take "
+            f"photographs of which each shares at least two thirds with the one before.{also}"
+        )
+    below = os.path.commonpath([f"./{os.path.dirname(name)}" for name in names])  # as if this folder were named
     return source, folder / below, [os.path.relpath(name, below) for name in names]
 
 
-def _few(count: int) -> str:
-    held = {0: "no photographs", 1: "one photograph"}.get(count, f"{count} photographs")
-    return (
-        f"{held}: camera poses need at least {LEAST}, and a scene 20 to 200. Walk round it and take photographs of "
-        "which each shares at least two thirds with the one before"
-    )
-
-
 def _finished(work: Path, folder: Path) -> Poses | None:
-    """Read the poses of an earlier run by poses.json, which marks a result as complete; None where there are none, or
-    they are damaged."""
+    """Read an earlier run's poses by poses.json, which marks complete results; None = none, or damaged ones."""
     result = work / "result"
     try:
         kept = read_json(result / "poses.json")
-        made = kept.pop("made")  # the photographs of the model are copies or frames in the work folder
+        made = kept.pop("made")  # photographs of the model are copies or frames in the work folder
         images = work / IMAGES if made else Path(os.path.abspath(folder))
         values = {**kept, "model": result / SPARSE, "images": images, "report": result}
         poses = TypeAdapter(Poses).validate_python(values)
-    except Exception:  # it is damaged, in whatever way
+    except Exception:  # damaged in any way
         return None
     whole = images.is_dir() and all(path.exists() for path in images.rglob("*")) if made else True
     return poses if whole and is_model(result / SPARSE) else None
@@ -127,12 +118,11 @@ def _find(
 ) -> Poses:
     begun = time.monotonic()
     seconds: dict[str, float] = {}
-    video = not names
+    given, video = len(names), not names
     if video:
         folder = extract_frames(source, work, options.frames, tell)
         names = find_photos(folder)
-        seconds["taking frames"] = time.monotonic() - begun
-    given = len(names)
+        given, seconds["taking frames"] = len(names), time.monotonic() - begun
     read = time.monotonic()
     photos, left_out = read_photos(folder, names, tell)
     photos = _with_panoramas(source, photos, left_out, options.camera_model == SPHERICAL_MODEL)
@@ -141,7 +131,14 @@ def _find(
     photos = [photo for photo in photos if photo.name not in twins]
     seconds["reading photographs"] = time.monotonic() - read
     if len(photos) < LEAST:
-        raise CaptureError(_too_few_left(source, folder, photos, left_out, twins, video))
+        if video:
+            raise CaptureError(f"{source} {NO_MOTION}")
+        some = "; ".join(f"{name}: {why}" for name, why in list(left_out.items())[:3])
+        some += f"; and {len(left_out) - 3} more" if len(left_out) > 3 else ""
+        use, then = "can be used", "copy or export them again"
+        if len(twins) >= len(left_out) - len(twins):
+            use, then = "differ", "take photographs from different places"
+        raise CaptureError(f"of the photographs in {folder}, only {len(photos)} {use} ({some}): {then}")
     photos = ordered(photos)
     started = time.monotonic()
     images, used = upright_photos(photos, folder, work, tell)
@@ -158,15 +155,13 @@ def _find(
 
 
 def _with_panoramas(source: Path, photos: list[Photo], left_out: dict[str, str], every: bool) -> list[Photo]:
-    """Mark 360-degree pictures, one that was not detected by others of its size, or `every` one. Panoramas of another
-    shape do not show all directions: they are left out, and it fails where they are the most."""
+    """Mark 360-degree pictures: detected ones, others of their size, or `every` one. Leave out panoramas of another
+    shape, which do not show all directions; fail if most are."""
     groups: dict[tuple[int, int], list[Photo]] = defaultdict(list)
     for photo in photos:
         groups[photo.width, photo.height].append(photo)
     panoramic = {size for size, of_size in groups.items() if sum(p.panorama for p in of_size) >= TELLING * len(of_size)}
-    photos = [
-        replace(photo, panorama=every or photo.panorama or (photo.width, photo.height) in panoramic) for photo in photos
-    ]
+    photos = [replace(p, panorama=every or p.panorama or (p.width, p.height) in panoramic) for p in photos]
     partial = [photo.name for photo in photos if photo.panorama and not is_full_sphere(photo.width, photo.height)]
     if len(partial) > len(photos) / 2:
         raise CaptureError(
@@ -177,31 +172,8 @@ def _with_panoramas(source: Path, photos: list[Photo], left_out: dict[str, str],
     return [photo for photo in photos if photo.name not in left_out]
 
 
-def _too_few_left(
-    source: Path,
-    folder: Path,
-    photos: Sequence[Photo],
-    left_out: Mapping[str, str],
-    twins: Mapping[str, str],
-    video: bool,
-) -> str:
-    if video:
-        return (
-            f"{source} shows no motion: its frames are all alike. Film while you walk slowly round the scene, and turn "
-            "the camera to keep it in view"
-        )
-    some = "; ".join(f"{name}: {why}" for name, why in list(left_out.items())[:3])
-    more = f"; and {len(left_out) - 3} more" if len(left_out) > 3 else ""
-    if len(twins) >= len(left_out) - len(twins):
-        return (
-            f"of the photographs in {folder}, only {len(photos)} differ ({some}{more}): take photographs from "
-            "different places"
-        )
-    return f"of the photographs in {folder}, only {len(photos)} can be used ({some}{more}). Copy or export them again"
-
-
 def ordered(photos: list[Photo]) -> list[Photo]:
-    """Sort by time, if all have one and not all the same; else keep the order by name."""
+    """Sort by time if all photographs have one and they differ; else keep the order by name."""
     times = {photo.exif.time for photo in photos}
     return sorted(photos, key=lambda photo: photo.exif.time) if "" not in times and len(times) > 1 else photos
 
@@ -215,9 +187,9 @@ def make_job(
     work: Path,
     sequence: bool,
 ) -> Job:
-    """Make the job for these photographs in their order, with links to them in the work folder under names without
-    spaces for COLMAP's lists. `images` is the folder of the upright photographs, `used` their names in it; neighbours
-    overlap in a `sequence`, as a video's frames do."""
+    """Make the job of these photographs in their order, linked in the work folder under names without spaces for
+    COLMAP's lists. `images`: folder of the upright photographs, `used` their names in it; neighbours overlap in a
+    `sequence`."""
     links, mask_files = emptied(work / "links"), emptied(work / "masks")
     plain = {photo.name: f"{i:06d}{Path(used[photo.name]).suffix.lower()}" for i, photo in enumerate(photos)}
     for photo in photos:
@@ -225,20 +197,15 @@ def make_job(
     if masks is not None:
         colmap_masks(photos, plain, masks, mask_files)
     positions, _ = local_positions({p.name: p.exif.position for p in photos if p.exif.position is not None})
+    cameras = [camera_group(members, [plain[p.name] for p in members], options) for members in by_camera(photos)]
+    mask_folder = None if masks is None else str(mask_files.resolve())
     return Job(
-        work=str(work.resolve()),
-        images=str(links.resolve()),
-        masks=None if masks is None else str(mask_files.resolve()),
-        cameras=[camera_group(members, [plain[p.name] for p in members], options) for members in by_camera(photos)],
-        order=[plain[photo.name] for photo in photos],
+        *(str(work.resolve()), str(links.resolve()), mask_folder, cameras, list(plain.values())),
         names={plain[photo.name]: used[photo.name] for photo in photos},
         sequence=sequence,
         positions={plain[name]: position for name, position in positions.items()},
-        matching=options.matching,
-        mapper=options.mapper,
         opencv_if_better=options.camera_model == "auto",
-        max_image_size=options.max_image_size,
-        max_features=options.max_features,
+        **{name: getattr(options, name) for name in ("matching", "mapper", "max_image_size", "max_features")},
     )
 
 
@@ -251,41 +218,31 @@ def by_camera(photos: Sequence[Photo]) -> list[list[Photo]]:
 
 
 def camera_group(photos: Sequence[Photo], names: list[str], options: SfmOptions) -> CameraGroup:
-    """Initial camera of these photographs."""
+    """Make the initial camera of these photographs."""
     width, height = photos[0].width, photos[0].height
     if photos[0].panorama:
         return CameraGroup(ColmapCamera(SPHERICAL_MODEL, width, height, (float(width), float(height))), True, names)
     stated = [photo.exif.focal_length for photo in photos]
     focal = options.focal_length or (statistics.median(stated) if all(stated) else None)
     model = "SIMPLE_RADIAL" if options.camera_model == "auto" else options.camera_model
-    camera = pycolmap.Camera.create_from_model_name(
-        0, model, focal or GUESSED_FOCAL * max(width, height), width, height
-    )
+    start = focal or GUESSED_FOCAL * max(width, height)
+    camera = pycolmap.Camera.create_from_model_name(0, model, start, width, height)
     return CameraGroup(ColmapCamera(model, width, height, tuple(camera.params.tolist())), focal is not None, names)
 
 
 def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence[Photo], job: Job) -> Poses:
-    """Move the model to its world frame and write it with its report; remove temporary files."""
+    """Move the model to its world frame, write it with its report, and remove temporary files."""
     model = pycolmap.Reconstruction(work / MODEL)
     by_used = {job.names[plain]: photo for plain, photo in zip(job.order, photos, strict=True)}
-    frame = move_to_world(
-        model,
-        {n: p.exif.position for n, p in by_used.items() if p.exif.position is not None},
-        {n: p.exif.up for n, p in by_used.items() if p.exif.up is not None},
-    )
+    gps = {name: photo.exif.position for name, photo in by_used.items() if photo.exif.position is not None}
+    ups = {name: photo.exif.up for name, photo in by_used.items() if photo.exif.up is not None}
+    frame = move_to_world(model, gps, ups)
     values |= {"up": frame.up, "metres_per_unit": frame.metres_per_unit, "gps_error": frame.gps_error}
     known = {job.names[plain] for group in job.cameras if group.prior for plain in group.names}
     stated = {image.camera_id for image in model.images.values() if image.name in known}  # a model's file has no priors
-    values["cameras"] = [
-        {
-            "model": c.model_name,
-            "width": c.width,
-            "height": c.height,
-            "params": c.params.tolist(),
-            "prior": c.camera_id in stated,
-        }
-        for c in model.cameras.values()
-    ]
+    names, cameras = ("model", "width", "height", "params", "prior"), model.cameras.values()
+    rows = ((c.model_name, c.width, c.height, c.params.tolist(), c.camera_id in stated) for c in cameras)
+    values["cameras"] = [dict(zip(names, row, strict=True)) for row in rows]
     kept = {each.name: values[each.name] for each in fields(Poses) if each.name in values}
     with complete_folder(work / "result") as result:
         sparse = result / SPARSE
@@ -294,9 +251,7 @@ def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence
         write_frame(result, frame)
         write_report(result, values, model)
         write_file(result / "poses.json", json.dumps({"made": images == work / IMAGES, **kept}).encode())
-    for name in ("links", "masks", MODEL):
-        shutil.rmtree(work / name, ignore_errors=True)
-    process.forget(work)
+    process.forget(work, "links", "masks", MODEL)
     found = _finished(work, images)
     assert found is not None
     return found

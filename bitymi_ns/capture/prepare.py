@@ -1,4 +1,4 @@
-"""Photographs and masks in forms that both COLMAP and nerfstudio read."""
+"""Prepare photographs and masks for both COLMAP and nerfstudio."""
 
 import os
 import shutil
@@ -7,22 +7,22 @@ from pathlib import Path
 
 from PIL import Image
 
-from bitymi_ns.capture.masks import in_proportion, mask_of, read_mask
+from bitymi_ns.capture.images import in_proportion
+from bitymi_ns.capture.masks import checked_mask, mask_of
 from bitymi_ns.capture.photos import COPY, Photo, upright
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import complete_folder
 from bitymi_ns.progress import Progress
 
 JPEG_QUALITY = 97
-IMAGES = "images"  # subfolder of the work folder for upright copies, or the frames of a video
+IMAGES = "images"  # subfolder of the work folder for upright copies, or a video's frames
 
 
 def upright_photos(
     photos: Sequence[Photo], folder: Path, work: Path, progress: Progress
 ) -> tuple[Path, dict[str, str]]:
-    """Return a folder in which every photograph is upright and in a format that everything reads, and the names in it
-    by photograph: `folder` itself where no photograph needs a copy, else `images` in the work folder, with links to the
-    others."""
+    """Make every photograph upright and readable by everything; return the folder, and the names in it by photograph:
+    `folder` itself if none needs a copy, else `images` in the work folder, with links to the others."""
     if all(photo.plain for photo in photos):
         return folder, {photo.name: photo.name for photo in photos}
     names = {photo.name: photo.name if photo.plain else photo.name + COPY for photo in photos}
@@ -44,35 +44,26 @@ def upright_photos(
 
 
 def emptied(folder: Path) -> Path:
-    """Make a folder, or remove what is in it."""
+    """Make an empty folder, or empty an existing one."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     return folder
 
 
 def colmap_masks(photos: Iterable[Photo], names: dict[str, str], masks: Path, target: Path) -> None:
-    """Write the masks as COLMAP reads them, grey PNGs of the size of the upright photographs, to `target`, by COLMAP's
-    `names` of the photographs. A photograph without a mask is used as a whole.
-
-    Raises:
-        CaptureError: a mask cannot be read, or has another aspect than its photograph, or there is none at all.
-    """
+    """Write masks for COLMAP to `target`, by its `names` of the photographs. A photograph without a mask counts whole.
+    Raises CaptureError: a mask cannot be read, or has another aspect ratio than its photograph, or there is none."""
     found = [(photo, path) for photo in photos if (path := mask_of(masks, photo.name)) is not None]
     if not found:
-        raise CaptureError(
-            f"no mask in {masks} belongs to a photograph: give them the photographs' names, as photo.png for "
-            "photo.jpg, or leave masks out (--use-masks False)"
-        )
+        advice = "give them the photographs' names, as photo.png for photo.jpg, or leave masks out (--use-masks False)"
+        raise CaptureError(f"no mask in {masks} belongs to a photograph: {advice}")
     for photo, path in found:
         colmap_mask(path, photo.name, (photo.width, photo.height)).save(target / f"{names[photo.name]}.png")
 
 
 def colmap_mask(path: Path, name: str, size: tuple[int, int]) -> Image.Image:
-    """Read the mask of a photograph, by its `name` and `size`, as COLMAP has it."""
-    try:
-        mask = read_mask(path)
-    except Exception as error:
-        raise CaptureError(f"the mask {path} cannot be read: save it again, or remove it") from error
+    """Read the mask of a photograph of this `name` and `size` for COLMAP: grey, of that size."""
+    mask = checked_mask(path)
     if not in_proportion(mask.size, size):
         raise CaptureError(
             f"the mask {path} has {mask.width} x {mask.height} pixels, its photograph {name} stands upright with "

@@ -1,69 +1,52 @@
 """Read a capture of any format: photographs with cameras, poses and masks, and points."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 
-from bitymi_ns.capture.camera import Photograph, Pose
 from bitymi_ns.capture.colmap_model import read_model
-from bitymi_ns.capture.colmap_views import (
-    TO_NERFSTUDIO,
-    Source,
-    find_source,
-    model_photographs,
-    model_points,
-    warn_of_left_out,
-)
+from bitymi_ns.capture.colmap_views import TO_Z_UP, Source, find_source, model_points, photographs_of, warn_left_out
 from bitymi_ns.capture.find_files import check_photographs_exist, name_unused
 from bitymi_ns.capture.frame import read_frame
 from bitymi_ns.capture.masks import check_masks, with_masks
-from bitymi_ns.capture.points import (
-    COLMAP_CONVENTIONS,
-    JSON_CONVENTIONS,
-    Points,
-    check_conventions,
-    read_cloud,
-    with_colors,
-)
+from bitymi_ns.capture.points import COLMAP_POSES, JSON_POSES, Points, check_conventions, read_cloud, with_colors
 from bitymi_ns.capture.pose_checks import fit_scale
-from bitymi_ns.capture.recognise import Format, Found, recognise
+from bitymi_ns.capture.recognise import Format, Found, is_model, recognise
 from bitymi_ns.capture.scanner_views import scanner_photographs
 from bitymi_ns.capture.sfm_poses import KeptPoses, find_sfm_source, kept_source, read_kept_poses
 from bitymi_ns.capture.splits import NameLists, SplitOptions, choose_split, list_files
-from bitymi_ns.capture.transforms import Transforms, applied_transform, check_number, colmap_points, read_transforms
-from bitymi_ns.capture.types import FrameOptions, Orientation, SfmSettings, fail, say, warn
+from bitymi_ns.capture.transforms import Transforms, check_number, read_transforms
+from bitymi_ns.capture.types import FrameOptions, Orientation, Photograph, Pose, SfmSettings, fail, say, warn
 from bitymi_ns.trust import listed
 
 Choice = Literal["auto", "triangulate", "random"]
-"""auto = those of the capture, triangulated ones where it has none; triangulate = in any case; random = in any case."""
-WITH_MODEL = ("colmap", "photographs", "video")  # formats that are read as a COLMAP model
+"""auto = the capture's points, else triangulated ones."""
+WITH_MODEL = ("colmap", "photographs", "video")  # formats read as a COLMAP model
 SCANNED = ("polycam", "record3d", "3d-scanner", "stray-scanner", "pose-files")  # with poses of scanners
+FRAMED = ("nerfstudio", *WITH_MODEL, *SCANNED)  # whose poses are oriented, centered and scaled
 OPTION_FORMATS: dict[str, tuple[str, ...]] = {
     "colmap_path": ("colmap",),
     "images_path": ("colmap",),
     "masks_path": ("colmap", "photographs"),
     "ply_path": ("blender",),
     "alpha_color": ("blender",),
-    "scene_scale": ("nerfstudio", *WITH_MODEL, *SCANNED),
-    "orientation_method": ("nerfstudio", *WITH_MODEL, *SCANNED),
-    "center_method": ("nerfstudio", *WITH_MODEL, *SCANNED),
-    "auto_scale_poses": ("nerfstudio", *WITH_MODEL, *SCANNED),
-    "scale_factor": ("nerfstudio", *WITH_MODEL, *SCANNED, "blender"),
+    **dict.fromkeys(("scene_scale", "orientation_method", "center_method", "auto_scale_poses"), FRAMED),
+    "scale_factor": (*FRAMED, "blender"),
     "eval_names": ("nerfstudio", "instant-ngp", *WITH_MODEL, *SCANNED),
     "sfm": ("photographs", "video"),
 }
-"""Formats that an option is for, where that is not all of them."""
+"""Formats of options that are not for all formats."""
 NGP_SCALE = 0.3333  # factor on positions of instant-ngp's captures, as in nerfstudio's reader
-BLENDER_SIDE = 1.5  # half the side of the box of a Blender data set, as in nerfstudio's reader
+BLENDER_SIDE = 1.5  # half the side of a Blender data set's box, as in nerfstudio's reader
 
 
 @dataclass
 class CaptureOptions(SplitOptions, FrameOptions):
-    """Options of the reading of a capture: path, format, files, points, frame and split."""
+    """Options of reading a capture: path, format, files, points, frame and split."""
 
     data: Path = Path()
     """Folder, or file: transforms.json or video."""
@@ -71,33 +54,23 @@ class CaptureOptions(SplitOptions, FrameOptions):
     """Format to read where there are several; auto = one with poses before one without."""
     downscale_factor: int | None = None
     """Use photographs that are smaller by this factor: those in images_2, images_4, ... where that folder exists."""
-    images_path: Path | None = None
-    """Folder of the photographs of a COLMAP model, relative to --data; None = find it."""
+    images_path: Path | None = None  # Folder of a COLMAP model's photographs, relative to --data; None = find it.
     masks_path: Path | None = None
     """Folder of masks for a COLMAP model or photographs, relative to --data; None = `masks` beside the photographs, in
     their folder or in that of the data."""
-    use_masks: bool = True
-    """Use the masks of the capture: those that it names, or those beside its photographs."""
-    colmap_path: Path | None = None
-    """Folder of the COLMAP model, relative to --data; None = find it."""
-    ply_path: Path | None = None
-    """Points of a Blender data set, a PLY file relative to --data; None = see --points."""
+    use_masks: bool = True  # Use the masks of the capture: those that it names, or those beside its photographs.
+    colmap_path: Path | None = None  # Folder of the COLMAP model, relative to --data; None = find it.
+    ply_path: Path | None = None  # Points of a Blender data set, a PLY file relative to --data; None = see --points.
     points: Choice = "auto"
-    """Points to start from: those of the capture, triangulated ones where it has none (auto); triangulated ones in any
-    case; or random ones."""
+    """Points to start from: those of the capture, else triangulated ones (auto); triangulated ones in any case; or
+    random ones."""
     sfm: SfmSettings = SfmSettings()  # noqa: RUF009 - it is frozen
     """Structure from motion for photographs and videos."""
-    poses: Path | None = None
-    """Folder of the poses that an existing run was trained with."""
+    poses: Path | None = None  # Folder of the poses that a run was trained with.
 
     def find(self) -> Found:
-        """Recognize what there is to read.
-
-        Raises:
-            CaptureError: nothing, or an option is for another format.
-        """
-        kept = self.kept()
-        data = Path(self.data)
+        """Recognize the capture. Raises CaptureError: there is none, or an option is for another format."""
+        kept, data = self.kept(), Path(self.data)
         found = recognise(data, self.format, self.colmap_path) if kept is None else kept.found(data)
         for name, formats in OPTION_FORMATS.items():
             default = getattr(type(self).__dataclass_fields__.get(name), "default", None)
@@ -109,14 +82,14 @@ class CaptureOptions(SplitOptions, FrameOptions):
         return found
 
     def kept(self) -> KeptPoses | None:
-        """Read the poses that the run was trained with; None = it keeps none."""
+        """Read the poses that a run was trained with; None = none."""
         return None if self.poses is None else read_kept_poses(Path(self.poses))
 
     def source(self, found: Found, need_photos: bool = True) -> Source:
-        """Find the COLMAP model and its photographs, by structure from motion for photographs without poses."""
+        """Find the COLMAP model and its photographs; photographs without poses go through structure from motion."""
         downscale, kept = self.downscale_factor or 1, self.kept()
         if found.format == "colmap":
-            source = find_source(found.path, found.folder, self.images_path, self.masks_path, downscale, need_photos)
+            source = find_source(found, self.images_path, self.masks_path, downscale, need_photos)
         elif kept is not None:
             source = kept_source(found, kept, self.masks_path, downscale, need_photos)
         else:
@@ -128,42 +101,28 @@ class CaptureOptions(SplitOptions, FrameOptions):
 
 @dataclass
 class Capture:
-    """A capture in the frame that its files state; up of a COLMAP model (-y) becomes z.
-
-    Attributes:
-        format: in which it was read.
-        source: names it in messages.
-        photographs: in the order of their names, Blender's train, val and test after one another.
-        points: to start from; None = random ones.
-        frame: orientation, centre and scale for training.
-        lists: its own lists of names for training and evaluation.
-        parts: numbers of the photographs to train on ("train") and of those held out ("val", "test").
-        downscale: photographs are used smaller by this factor.
-        applied, applied_scale: [4, 4] and scale that were applied to the capture before its files state it.
-        report: folder of the report on structure from motion; None = none.
-        model: found by structure from motion; None = the capture came with its poses.
-    """
+    """A capture in the frame that its files state; up of a COLMAP model (-y) becomes z."""
 
     format: Format
-    source: str
-    photographs: list[Photograph]
-    points: Points | None
+    source: str  # names it in messages
+    photographs: list[Photograph]  # in the order of their names, Blender's train, val and test after one another
+    points: Points | None  # to start from; None = random ones
     frame: FrameOptions
-    lists: NameLists = field(default_factory=dict)
-    parts: dict[str, Sequence[int]] = field(default_factory=dict)
-    downscale: int = 1
-    applied: Pose | None = None
+    lists: NameLists = field(default_factory=dict)  # its own lists for training and evaluation
+    parts: dict[str, Sequence[int]] = field(default_factory=dict)  # photographs of "train", and held out "val", "test"
+    downscale: int = 1  # factor by which photographs are reduced
+    applied: Pose | None = None  # [4, 4] that its files state as applied, and scale
     applied_scale: float = 1.0
-    report: Path | None = None
-    model: Source | None = None
+    report: Path | None = None  # folder of the report on structure from motion; None = none
+    model: Source | None = None  # found by structure from motion; None = the capture came with poses
 
 
 def read_capture(options: CaptureOptions, need_photos: bool = True, want_points: bool = True) -> Capture:
-    """Read a capture of any format, with checks of all that its files state.
+    """Read a capture of any format, and check all that its files state.
 
     Args:
-        need_photos: photographs have to be there; else their files are not opened.
-        want_points: a scene starts from the points: those without colors get some, and missing ones are triangulated.
+        need_photos: fail if photographs are missing; else their files are not opened.
+        want_points: a scene starts from the points: color them, and triangulate missing ones.
 
     Raises:
         CaptureError: it cannot be used; names the file and the entry, and says what to do.
@@ -186,28 +145,19 @@ class _Reader:
                 f"{found.folder} holds poses that cannot be read: {named}. Poses are computed from the photographs. "
                 "To have those used, export a COLMAP model, or convert them with `ns-process-data`."
             )
-        if found.format == "blender":
-            capture = self._blender()
-        else:
-            capture = self._with_poses()
+        readers = dict.fromkeys(WITH_MODEL, self._colmap) | dict.fromkeys(SCANNED, self._scanned)
+        capture = {**readers, "blender": self._blender}.get(found.format, self._transforms)()
+        if capture.report is None and read_frame(found.folder) is not None:
+            capture.report = found.folder
         there = [name for name in ("val", "test") if capture.parts.get(name)]
         if there:
             held_out = " and ".join(f"{len(capture.parts[name])} of transforms_{name}.json" for name in there)
             say(f"Held out for evaluation: {held_out}.")
             capture.parts |= {"val": capture.parts[there[0]], "test": capture.parts[there[-1]]}
         else:
-            names = [photograph.file for photograph in capture.photographs]
             split = choose_split(capture.photographs, capture.lists, self.options)
-            say(split.describe(names))
+            say(split.describe([photograph.file for photograph in capture.photographs]))
             capture.parts = {"train": split.train, "val": split.held_out, "test": split.held_out}
-        return capture
-
-    def _with_poses(self) -> Capture:
-        found = self.found
-        readers = dict.fromkeys(WITH_MODEL, self._colmap) | dict.fromkeys(SCANNED, self._scanned)
-        capture = readers.get(found.format, self._transforms)()
-        if capture.report is None and read_frame(found.folder) is not None:
-            capture.report = found.folder
         return capture
 
     @property
@@ -220,46 +170,43 @@ class _Reader:
 
     def _transforms(self) -> Capture:
         """Read a transforms.json."""
-        options, found, need_photos = self.options, self.found, self.need_photos
+        options, found = self.options, self.found
         read = self._read_transforms(found.path)
-        if need_photos:
-            check_photographs_exist(read.path, read.files)
-            check_masks(read.photographs)
+        if self.need_photos:
+            check_photographs_exist(read.path, [each.file for each in read.photographs])
+        photographs, source = read.photographs, str(found.path)
         meta, frame = read.meta, options
         if found.format == "instant-ngp":  # whose scale is that of its bounding box
             half = 0.5 * check_number(read.path, "aabb_scale", meta.get("aabb_scale", 1), "for all frames")
             if not 0.0 < half < math.inf:
                 fail(f"{read.path}: aabb_scale is {meta['aabb_scale']}, which is no positive number. Correct it.")
             frame = FrameOptions(NGP_SCALE, "none", "none", auto_scale_poses=False, scene_scale=half)
-            frame = fit_scale(frame, read.photographs, str(read.path))
+            frame = fit_scale(frame, photographs, source)
         elif "orientation_override" in meta:
             if meta["orientation_override"] not in get_args(Orientation):
                 allowed = ", ".join(get_args(Orientation))
                 fail(f"{read.path}: orientation_override is {meta['orientation_override']!r}, none of {allowed}.")
             frame = replace(frame, orientation_method=meta["orientation_override"])
             say(f"{read.path} asks for the orientation method {frame.orientation_method}.")
-        model = colmap_points(found.path)
-        applied = applied_transform(meta, found.folder)
-        what = f"{found.path} ({found.format}, {len(read.photographs)} photographs)"
-        own = None
-        if options.points == "auto":
-            if "ply_file_path" in meta:
-                hint = f"remove ply_file_path from {read.path}"
-                own = self._cloud(found.folder / meta["ply_file_path"], hint, read.photographs)
-            elif model is not None:
-                own = model_points(read_model(model), np.eye(4) if applied is None else applied)
-                own = self._colored(own, read_model(model).without_colors, read.photographs, model)
-                what += f", points of {model}"
-        self._report(what)
-        if need_photos:
-            name_unused(found.folder, read.named, options.downscale_factor)
-        if own is not None and need_photos and self.want_points:
-            check_conventions(own, read.photographs, JSON_CONVENTIONS, str(found.path))
-        source, scale = str(found.path), float(meta.get("applied_scale", 1.0))
-        points = self._points(own, read.photographs, source)
-        return Capture(
-            found.format, source, read.photographs, points, frame, read.lists, {}, self.downscale, applied, scale
-        )
+        earlier = found.folder / "colmap/sparse/0"  # in which nerfstudio's tool left points, before it stated either
+        applied, own = meta.get("applied_transform"), None
+        if applied is None and earlier.is_dir():
+            applied = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+        what, auto = f"{source} ({found.format}, {len(photographs)} photographs)", options.points == "auto"
+        model = read_model(earlier) if auto and "ply_file_path" not in meta and is_model(earlier) else None
+        if model is not None:
+            what += f", points of {earlier}"
+        self._check(what, photographs, read.named)
+        if auto and "ply_file_path" in meta:
+            hint = f"Put it there again, or remove ply_file_path from {read.path} to start from random points."
+            own = self._cloud(found.folder / meta["ply_file_path"], hint, photographs)
+        elif model is not None:
+            own = self._colored(model_points(model, applied), model.without_colors, photographs, earlier)
+        if own is not None and self.need_photos and self.want_points:
+            check_conventions(own, photographs, JSON_POSES, source)
+        scale = float(meta.get("applied_scale", 1.0))
+        points = self._points(own, photographs, source)
+        return Capture(found.format, source, photographs, points, frame, read.lists, {}, self.downscale, applied, scale)
 
     def _colmap(self) -> Capture:
         """Read a COLMAP model, and the lists of names beside it."""
@@ -268,20 +215,17 @@ class _Reader:
         model = source.model
         if need_photos and found.format == "colmap":
             check_photographs_exist(found.path, source.files())
-        self._report(source.describe())
-        named = warn_of_left_out(source) if need_photos else set()
-        photographs, where = model_photographs(source, need_photos), str(source.folder)
-        if need_photos:
-            check_masks(photographs)
-        if need_photos and found.format == "colmap":
-            name_unused(found.folder, {*named, *(each.mask for each in photographs)}, options.downscale_factor)
-        own = model_points(model, TO_NERFSTUDIO)
+        named = warn_left_out(source) if need_photos else set()
+        photographs, where = photographs_of(source, need_photos), str(source.folder)
+        masked = {*named, *(each.mask for each in photographs)} if found.format == "colmap" else None
+        self._check(source.describe(), photographs, masked)
+        own = model_points(model, TO_Z_UP)
         if need_photos and self.want_points and options.points == "auto":
             own = self._colored(own, model.without_colors, photographs, source.folder)
-            check_conventions(own, photographs, COLMAP_CONVENTIONS, where, TO_NERFSTUDIO)
+            check_conventions(own, photographs, COLMAP_POSES, where, TO_Z_UP)
         points, lists = self._points(own, photographs, where), list_files(found.folder)
         return Capture(
-            found.format, where, photographs, points, options, lists, {}, source.downscale, TO_NERFSTUDIO,
+            found.format, where, photographs, points, options, lists, {}, source.downscale, TO_Z_UP,
             report=source.report, model=None if source.origin is None else source,
         )  # fmt: skip
 
@@ -289,37 +233,37 @@ class _Reader:
         """Read the capture of a scanning program."""
         found = self.found
         photographs, source = scanner_photographs(found, self.need_photos), str(found.path)
-        self._report(f"{found.path} ({found.format}, {len(photographs)} photographs with their poses)")
-        if self.need_photos:
-            if self.options.use_masks:
-                photographs = with_masks(photographs, found.folder)
-            check_masks(photographs)
-            name_unused(found.folder, {file for each in photographs for file in (each.file, each.mask)})
+        if self.need_photos and self.options.use_masks:
+            photographs = with_masks(photographs, found.folder)
+        named = {file for each in photographs for file in (each.file, each.mask)}
+        self._check(f"{source} ({found.format}, {len(photographs)} photographs with their poses)", photographs, named)
         points = self._points(None, photographs, source)
         return Capture(found.format, source, photographs, points, self.options, downscale=self.downscale)
 
     def _blender(self) -> Capture:
-        """Read a Blender data set with its own split. Where one of its two files of held-out views is missing, or all
-        its photographs are, the other stands for it; where both are, it has no split."""
+        """Read a Blender data set with its own split. If one of its two files of held-out views is missing, or all its
+        photographs are, the other serves for it; if both are, there is no split."""
         options, found, need_photos = self.options, self.found, self.need_photos
         train = self._read_transforms(found.folder / "transforms_train.json")
         if need_photos:
-            check_photographs_exist(train.path, train.files)
+            check_photographs_exist(train.path, [each.file for each in train.photographs])
         parts: dict[str, list[Photograph]] = {"train": train.photographs}
         named = set(train.named)
         for name in ("val", "test"):
             if (found.path / f"transforms_{name}.json").is_file():
                 part = self._read_transforms(found.folder / f"transforms_{name}.json")
-                parts[name] = _existing(part) if need_photos else part.photographs
+                parts[name] = [each for each in part.photographs if not need_photos or each.file.is_file()]
+                if lacking := [each.file for each in part.photographs if each not in parts[name]]:
+                    what = str(len(lacking)) if parts[name] else "all"
+                    left = f"left out: {listed(lacking)}"
+                    warn(f"{part.path} lacks {what} of its {len(part.photographs)} photographs, {left}.")
                 named |= part.named
         source, every = str(train.path), [each for part in parts.values() for each in part]
-        self._report(f"{train.path} (blender, {len(train.photographs)} photographs)")
-        if need_photos:
-            check_masks(every)
-            name_unused(found.folder, named, options.downscale_factor)
+        self._check(f"{train.path} (blender, {len(train.photographs)} photographs)", every, named)
         own = None
         if options.ply_path is not None and options.points == "auto":
-            own = self._cloud(found.path / options.ply_path, "leave --ply-path out", train.photographs)
+            hint = "Put it there again, or leave --ply-path out to start from random points."
+            own = self._cloud(found.path / options.ply_path, hint, train.photographs)
         frame = FrameOptions(options.scale_factor, "none", "none", auto_scale_poses=False, scene_scale=BLENDER_SIDE)
         if options.scale_factor == 1.0:  # else the user has chosen it
             frame = fit_scale(frame, train.photographs, source)
@@ -330,22 +274,27 @@ class _Reader:
         points = self._points(own, train.photographs, source)
         return Capture(found.format, source, every, points, frame, parts=numbers, downscale=self.downscale)
 
-    def _report(self, what: str) -> None:
+    def _check(self, what: str, photographs: Sequence[Photograph], named: Iterable[Path | None] | None) -> None:
+        """Report what is read, check its masks, and report pictures beside the `named` ones (None = do not)."""
         text = f"Reading {what}. {self.found.how_to_choose()}"
         if self.found.format == "instant-ngp" and self.options.format == "auto":  # a guess: both use one name
             text = f"{text.rstrip()} If nerfstudio wrote it: `bitymi-data --format nerfstudio`."
         say(text.rstrip())
+        if self.need_photos:
+            check_masks(photographs)
+            if named is not None:
+                name_unused(self.found.folder, named, self.options.downscale_factor)
 
-    def _cloud(self, path: Path, without: str, photographs: Sequence[Photograph]) -> Points:
-        points, reason = read_cloud(path, without)
+    def _cloud(self, path: Path, remedy: str, photographs: Sequence[Photograph]) -> Points:
+        points, reason = read_cloud(path, remedy)
         return self._colored(points, reason, photographs, path)
 
     def _colored(self, points: Points, without: str, photographs: Sequence[Photograph], source: Path) -> Points:
         return with_colors(points, without, photographs, source) if self.want_points else points
 
     def _points(self, own: Points | None, photographs: Sequence[Photograph], source: str) -> Points | None:
-        """Choose the points to start from: the capture's `own`, or triangulated ones, which are kept in its folder;
-        None = random ones. `source` of the poses is for messages."""
+        """Choose the points to start from: the capture's `own`, else triangulated ones, which its folder caches; None =
+        random ones. `source` of the poses is for messages."""
         if self.options.points == "random":
             return None
         if own is not None and len(own.xyz) and self.options.points == "auto":
@@ -355,13 +304,3 @@ class _Reader:
         from bitymi_ns.capture.known_poses import triangulated  # slow to import, and seldom needed
 
         return triangulated(photographs, self.found.folder, source)
-
-
-def _existing(part: Transforms) -> list[Photograph]:
-    """Photographs of a file of held-out views that exist, with a warning on the others."""
-    there = [each for each in part.photographs if each.file.is_file()]
-    lacking = [each.file for each in part.photographs if not each.file.is_file()]
-    if lacking:
-        what = "all" if not there else str(len(lacking))
-        warn(f"{part.path} lacks {what} of its {len(part.photographs)} photographs, left out: {listed(lacking)}.")
-    return there

@@ -1,27 +1,15 @@
-"""Recognition of the format of a folder or file: a capture with poses, photographs, or a video."""
+"""Recognize the format of a folder or file: a capture with poses, photographs, or a video."""
 
 import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
-from bitymi_ns.capture.pictures import (
-    PHOTOGRAPHS,
-    UNREAD,
-    VIDEOS,
-    folders_in,
-    has_photographs,
-    no_photographs,
-    passed_over,
-    pictures_among,
-    poses_in,
-    refusal,
-    videos_in,
-)
+from bitymi_ns.capture import pictures
 from bitymi_ns.capture.types import fail
-from bitymi_ns.reading import open_regular, open_text, read_bytes, read_json
+from bitymi_ns.reading import MOST_TEXT, open_regular, open_text, read_json
 from bitymi_ns.trust import listed
 
 Format = Literal[
@@ -29,12 +17,12 @@ Format = Literal[
     "pose-files", "photographs", "video",
 ]  # fmt: skip
 
-MODELS = ("sparse/0", "colmap/sparse/0", "sparse")  # usual folders of a COLMAP model in a capture, the most usual first
+MODELS = ("sparse/0", "colmap/sparse/0", "sparse")  # usual folders of a COLMAP model, the most usual first
 NERFSTUDIOS_OWN = {"ply_file_path", "applied_transform", "camera_model", "orientation_override", "train_filenames"}
 """Entries of a transforms.json that only nerfstudio writes."""
 POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
-"""Folders of Polycam's images and their cameras, the better ones first."""
-STRAY = ("odometry.csv", "camera_matrix.csv", "rgb.mp4")  # files of Stray Scanner: poses, camera, video
+"""Polycam's folders of images and cameras, the better ones first."""
+STRAY = ("odometry.csv", "camera_matrix.csv", "rgb.mp4")  # Stray Scanner's poses, camera, video
 SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")  # files of a Blender data set
 INTRINSICS = {"fl_x", "fl_y", "cx", "cy", "w", "h"}
 
@@ -44,15 +32,15 @@ class Found:
     """Recognized capture."""
 
     format: Format  # to read it as
-    # nerfstudio, instant-ngp: the transforms.json; blender: the folder of its transforms_train.json; colmap: the folder
-    # of the model; photographs: the folder; video: the file
     path: Path
-    folder: Path  # of the capture, to which the names in its files are relative
-    others: tuple[tuple[Format, Path], ...] = ()  # other captures there that are not read, with their formats
-    unread: tuple[tuple[Path, str], ...] = ()  # files of poses that cannot be read, with the program that wrote each
+    """nerfstudio, instant-ngp: transforms.json; blender, photographs: the folder; colmap: that of the model; video: the
+    file."""
+    folder: Path  # of the capture, to which names in its files are relative
+    others: tuple[tuple[Format, Path], ...] = ()  # captures beside it that are not read
+    unread: tuple[tuple[Path, str], ...] = ()  # files of poses that cannot be read, with their programs
 
     def how_to_choose(self) -> str:
-        """Describe what is not read and how to read it; empty where there is nothing else."""
+        """Describe captures that are not read, and how to read them; empty if there are none."""
         if not self.others:
             return ""
         ways = []
@@ -67,15 +55,15 @@ class Found:
 
 
 def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path: Path | None = None) -> Found:
-    """Recognize what a path holds.
+    """Recognize the capture at a path.
 
     Args:
         data: a folder, or a file: transforms.json, a video, or a file of a COLMAP model.
         format: to search for; auto = any, files with poses before photographs without.
-        colmap_path: folder of a COLMAP model to read, relative to the capture.
+        colmap_path: folder of a COLMAP model, relative to the capture.
 
     Raises:
-        CaptureError: there is nothing of that format.
+        CaptureError: there is none of that format.
     """
     if not data.exists():
         fail(f"the capture {data} does not exist. Give a folder or a file with --data.")
@@ -83,7 +71,7 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
         if format not in ("auto", "colmap"):
             fail(f"--colmap-path is for COLMAP models: leave out --format {format}, or the path.")
         return _colmap_given(data, colmap_path)
-    if why := refusal(data):
+    if why := pictures.refusal(data):
         fail(why)
     folder = data if data.is_dir() else data.parent
     candidates = list(_in_folder(data) if data.is_dir() else _of_file(data))
@@ -92,32 +80,27 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
         within = _capture_within(data, format)
         if within is not None:
             return recognise(within, format)
-    if format == "instant-ngp" and not fitting:  # the user knows better than the entries of the file
-        fitting = [("instant-ngp", path) for found, path in candidates if found == "nerfstudio"]
-    elif format == "nerfstudio" and not fitting:
-        fitting = [("nerfstudio", path) for found, path in candidates if found == "instant-ngp"]
+    twins: dict[str, Format] = {"instant-ngp": "nerfstudio", "nerfstudio": "instant-ngp"}
+    if format in twins and not fitting:  # the user knows better than the entries of the file
+        fitting = [(format, path) for found, path in candidates if found == twins[format]]
     if not fitting:
         fail(_nothing(data, format, candidates))
     (chosen, path), *_ = fitting
-    # photographs lie beside every capture: they are another capture only beside a video
-    others = tuple(
-        each
-        for each in candidates
-        if each[1] != path
-        and (each[0] != "photographs" or chosen == "video")
-        and (chosen != "stray-scanner" or each[1].name != STRAY[2])
-    )
-    poses = tuple(poses_in(folder)) if chosen in ("photographs", "video") else ()
-    return Found(chosen, path, path if chosen == "blender" else folder, others, poses)
+    # photographs belong to the capture beside them, but not to a video
+    others = [each for each in candidates if each[1] != path and (each[0] != "photographs" or chosen == "video")]
+    if chosen == "stray-scanner":
+        others = [each for each in others if each[1].name != STRAY[2]]
+    poses = tuple(pictures.poses_in(folder)) if chosen in ("photographs", "video") else ()
+    return Found(chosen, path, path if chosen == "blender" else folder, tuple(others), poses)
 
 
 def _capture_within(folder: Path, format: Format | Literal["auto"]) -> Path | None:
-    """Find the one subfolder that is a capture with poses, as archives unpack to; None = none or several, or
-    photographs beside it."""
-    if has_photographs(folder):
+    """Find the only subfolder that is a capture with poses, as archives unpack to; None = none, several, or photographs
+    beside it."""
+    if pictures.has_photographs(folder):
         return None
     found = []
-    for path in sorted(path for path in folder.iterdir() if path.is_dir() and not no_photographs(path)):
+    for path in sorted(path for path in folder.iterdir() if path.is_dir() and not pictures.no_photographs(path)):
         candidates = [*_transforms_in(path), *_scanned(path)]
         if any(format in ("auto", each) for each, _ in candidates):
             found.append(path)
@@ -130,14 +113,14 @@ def _of_file(file: Path) -> Iterator[tuple[Format, Path]]:
         yield "blender", file.parent
     elif suffix == ".json":
         yield _kind_of(file), file
-    elif suffix in VIDEOS:
+    elif suffix in pictures.VIDEOS:
         yield "video", file
     elif file.stem in ("cameras", "images", "points3D") and is_model(file.parent):
         yield "colmap", file.parent
 
 
 def _in_folder(folder: Path) -> Iterator[tuple[Format, Path]]:
-    """Yield all captures in a folder, in order of preference."""
+    """Yield a folder's captures in order of preference."""
     yield from _transforms_in(folder)
     for model in models_in(folder):
         yield "colmap", folder / model
@@ -145,29 +128,21 @@ def _in_folder(folder: Path) -> Iterator[tuple[Format, Path]]:
     photographs = _photographs_in(folder)
     if photographs is not None:
         yield "photographs", photographs
-    yield from (("video", video) for video in videos_in(folder))
+    yield from (("video", video) for video in pictures.videos_in(folder))
 
 
 def _transforms_in(folder: Path) -> Iterator[tuple[Format, Path]]:
-    """Yield transforms.json and Blender's files; where there is neither, files of other names with the same content."""
+    """Yield transforms.json and Blender's files, else files of other names with the same content."""
     usual = folder / "transforms.json"
-    there, splits = (os.path.lexists(path) for path in (usual, folder / SPLITS[0]))  # what is no file is refused later
+    there, splits = (os.path.lexists(path) for path in (usual, folder / SPLITS[0]))  # anything but a file fails later
     if there:
         yield _kind_of(usual), usual
     if splits:
         yield "blender", folder
     elif not there:
         for path in sorted(folder.glob("*.json")):
-            if path.name not in SPLITS and _mentions(path, b'"transform_matrix"'):
+            if path.name not in SPLITS and pictures.holds(path, b'"transform_matrix"', MOST_TEXT):
                 yield _kind_of(path), path
-
-
-def _mentions(path: Path, word: bytes) -> bool:
-    """Test for a file that can be read and has a word in it."""
-    try:
-        return word in read_bytes(path)
-    except OSError:
-        return False
 
 
 def _scanned(folder: Path) -> Iterator[tuple[Format, Path]]:
@@ -176,11 +151,11 @@ def _scanned(folder: Path) -> Iterator[tuple[Format, Path]]:
     if any((keyframes / i).is_dir() and any((keyframes / c).glob("*.json")) for i, c in POLYCAM):
         yield "polycam", folder
     for name in ("metadata", "metadata.json"):
-        if _mentions(folder / name, b'"poses"'):
+        if pictures.holds(folder / name, b'"poses"', MOST_TEXT):
             yield "record3d", folder
             break
     first = min(folder.glob("frame_*.json"), default=None)
-    if first is not None and _mentions(first, b'"cameraPoseARFrame"'):
+    if first is not None and pictures.holds(first, b'"cameraPoseARFrame"', MOST_TEXT):
         yield "3d-scanner", folder
     if all((folder / name).is_file() for name in STRAY):
         yield "stray-scanner", folder
@@ -190,8 +165,8 @@ def _scanned(folder: Path) -> Iterator[tuple[Format, Path]]:
 
 
 def _kind_of(file: Path) -> Format:
-    """Tell a transforms.json of nerfstudio from one of instant-ngp. A file that cannot be read counts as nerfstudio's,
-    whose reader reports the error."""
+    """Tell nerfstudio's transforms.json from instant-ngp's. Unreadable files count as nerfstudio's: its reader reports
+    the error."""
     try:
         meta = read_json(file)
     except (OSError, ValueError):
@@ -212,15 +187,15 @@ def is_model(folder: Path) -> bool:
 
 
 def models_in(data: Path) -> list[Path]:
-    """List COLMAP models at most three levels below a folder, relative to it, the one to read first: in a usual folder,
-    and of models side by side, which COLMAP makes of photographs that it could not connect, that of most images."""
+    """List COLMAP models at most three levels below a folder, relative to it, the one to read first: in a usual folder;
+    of models side by side, which COLMAP makes of photographs that it cannot connect, that of most images."""
     found = {path.parent for depth in ("", "*/", "*/*/", "*/*/*/") for path in data.glob(f"{depth}cameras.*")}
     models = [path.relative_to(data) for path in found if is_model(path)]
     models = [model for model in models if not any(part.startswith(".") for part in model.parts)]
 
     def rank(model: Path) -> tuple[int, str, int, str]:
         usual = [Path(name) for name in MODELS]
-        first = model.with_name("0") if model.name.isdigit() else model  # it stands where that would
+        first = model.with_name("0") if model.name.isdigit() else model  # ranks where that would
         beside = usual.index(first) if first in usual else len(usual)
         return beside, str(model.parent), -image_count(data / model), str(model)
 
@@ -228,7 +203,7 @@ def models_in(data: Path) -> list[Path]:
 
 
 def image_count(model: Path) -> int:
-    """Read the number of images of a model; 0 where it states none."""
+    """Read a model's number of images; 0 if it states none."""
     try:
         if (model / "images.bin").is_file():
             with open_regular(model / "images.bin") as file:
@@ -240,19 +215,19 @@ def image_count(model: Path) -> int:
 
 
 def _photographs_in(folder: Path) -> Path | None:
-    """Choose the folder to search for photographs: this one where they lie in it or in its `images`, else the only
-    subfolder with photographs, else this one. None = none, or captures of their own."""
-    if has_photographs(folder) or has_photographs(folder / "images", below=True):
+    """Choose the folder to search for photographs: this one if it or its `images` holds some, or several
+    subfolders do; else the only subfolder that does. None = no photographs, or captures of their own."""
+    if pictures.has_photographs(folder) or pictures.has_photographs(folder / "images", below=True):
         return folder
-    holding = [path for path in folders_in(folder) if has_photographs(path, below=True)]
+    holding = [path for path in pictures.folders_in(folder) if pictures.has_photographs(path, below=True)]
     if not holding or captures_in(folder):
         return None
     return _photographs_in(holding[0]) if len(holding) == 1 else folder
 
 
 def captures_in(folder: Path) -> list[Path]:
-    """List subfolders that are captures of their own: several of them have `images` with photographs."""
-    found = [path for path in folders_in(folder) if has_photographs(path / "images", below=True)]
+    """List subfolders that are captures of their own: more than one has `images` with photographs."""
+    found = [path for path in pictures.folders_in(folder) if pictures.has_photographs(path / "images", below=True)]
     return found if len(found) > 1 else []
 
 
@@ -269,7 +244,7 @@ def _colmap_given(data: Path, colmap_path: Path) -> Found:
 
 
 def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> str:
-    """Message for a path that is no capture."""
+    """Explain why a path is no capture."""
     if format != "auto":
         held = ", ".join(f"{_seen_from(path, data)} ({found})" for found, path in candidates[:3])
         there = f" It holds {held}: leave --format out." if candidates else ""
@@ -279,11 +254,11 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
             return f"{data} is a bundle in one file, not a capture: give the folder of its photographs."
         if data.suffix.lower() in (".zip", ".tar", ".7z", ".gz", ".rar"):
             return f"{data} is an archive. Unpack it, and give the folder."
-        if data.suffix.lower() in PHOTOGRAPHS:
+        if data.suffix.lower() in pictures.PHOTOGRAPHS:
             return f"{data} is one photograph. A scene needs many: give the folder that holds them."
         return (
             f"{data} is no file that can be trained on. Give a folder of photographs, a video "
-            f"({', '.join(VIDEOS[:4])}, ...), a transforms.json, or the folder of a capture."
+            f"({', '.join(pictures.VIDEOS[:4])}, ...), a transforms.json, or the folder of a capture."
         )
     if not any(data.iterdir()):
         return f"the folder {data} is empty. Give a folder of photographs, a video, or a capture with poses."
@@ -292,14 +267,14 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
     several = captures_in(data)
     if several:
         hint = f" It holds {len(several)} captures: give one of them, as {several[0]}."
-    counts = pictures_among([path.name for path in data.rglob("*")], [])
+    counts = pictures.pictures_among([path.name for path in data.rglob("*")], [])
     if counts and not several:
         most = max(counts, key=counts.__getitem__)
-        hint = f" It holds {counts[most]} files {most} ({UNREAD[most]}): save them as JPEG or TIFF."
+        hint = f" It holds {counts[most]} files {most} ({pictures.UNREAD[most]}): save them as JPEG or TIFF."
     archive = next((path for path in sorted(data.iterdir()) if path.suffix.lower() in (".zip", ".tar", ".7z")), None)
     if archive is not None and not several:
         hint = f" Unpack {archive.name} first."
-    if not hint and (others := passed_over(data)):
+    if not hint and (others := pictures.passed_over(data)):
         hint = f" It holds what is not taken for photographs: {listed(others)}."
     return (
         f"{data} holds nothing to train on: no transforms.json, no transforms_train.json, no COLMAP model (sparse/0), "
@@ -309,6 +284,3 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
 
 def _seen_from(path: Path, folder: Path) -> str:
     return str(path.relative_to(folder)) if path != folder and path.is_relative_to(folder) else str(path)
-
-
-FORMATS: tuple[Format, ...] = get_args(Format)

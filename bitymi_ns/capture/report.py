@@ -1,4 +1,4 @@
-"""Report on structure from motion: errors, photographs left out and why, and a plot of cameras and points."""
+"""Report on structure from motion: errors, photographs left out and why, plot of cameras and points."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ import numpy as np
 from bitymi_ns.files import write_file
 from bitymi_ns.trust import printable
 
-if TYPE_CHECKING:  # those who read reports need not wait for it
+if TYPE_CHECKING:  # slow to import
     import pycolmap
 
 VALUES, PAGE, PICTURE = "report.json", "report.md", "cameras.png"
-FILES = (VALUES, PAGE, PICTURE, "frame.json")  # files of a report; the last one is written by frame.py
-MOST_POINTS = 20_000  # points in the plot; excess points are dropped at random
+FILES = (VALUES, PAGE, PICTURE, "frame.json")  # of a report; frame.py writes the last one
+MOST_POINTS = 20_000  # most points in the plot, drawn at random
 
 
 def write_report(folder: Path, values: Mapping[str, object], model: pycolmap.Reconstruction) -> None:
-    """Write the report without frame.json: `values` as report.json, and cameras and points of a model with z up."""
+    """Write the report without frame.json: `values`, a page, and a plot of a model with z up."""
     from matplotlib import style
 
     write_file(folder / VALUES, (json.dumps(values, indent=2, ensure_ascii=False) + "\n").encode())
     write_file(folder / PAGE, _page(values).encode())
-    with style.context("default"):  # and not as a matplotlibrc in the current folder says: it may ask for LaTeX
+    with style.context("default"):  # a matplotlibrc in the current folder may ask for LaTeX
         _draw(folder / PICTURE, model, values.get("metres_per_unit") is not None)
 
 
 def overview(values: Mapping[str, Any]) -> dict[str, str]:
-    """Statistics of report.json as texts; a dash stands for what is no number."""
+    """Format statistics of report.json; a dash stands for what is no number."""
     numbers = {key: value for key, value in values.items() if isinstance(value, (int, float))}
     stages = values["seconds"].items() if isinstance(values["seconds"], dict) else ()
     seconds = [f"{stage} {value:.1f}" for stage, value in stages if isinstance(value, (int, float))]
@@ -79,9 +79,9 @@ def _cell(text: object) -> str:
 
 
 def _frame_text(up: object, numbers: Mapping[str, float]) -> str:
-    """Describe the source of up and scale, from `up`, `metres_per_unit` and `gps_error`."""
+    """Describe the sources of up and scale, by `up`, `metres_per_unit` and `gps_error`."""
     metres, error = "metres_per_unit" in numbers, numbers.get("gps_error")
-    up = up or ("gps" if metres else "cameras")  # earlier reports do not say
+    up = up or ("gps" if metres else "cameras")  # earlier reports state none
     text = {"gps": "z up by GPS", "gravity": "z up by gravity"}.get(str(up), "z up by the cameras")
     if not metres:
         return f"{text}, scale not known"
@@ -101,7 +101,11 @@ def _draw(path: Path, model: pycolmap.Reconstruction, metres: bool) -> None:
     if len(points) > MOST_POINTS:
         some = np.random.default_rng(0).choice(len(points), MOST_POINTS, replace=False)
         points, colors = points[some], colors[some]
-    middle, reach = np.median(np.vstack([points, centers]), axis=0), _reach(points, centers)
+    middle = np.median(np.vstack([points, centers]), axis=0)
+    far = [np.abs(centers - middle).max()]
+    if len(points):  # all cameras and 90 % of the points
+        far.append(np.quantile(np.abs(points - middle).max(axis=1), 0.9))
+    reach = 1.1 * float(max(far)) or 1.0
     figure = Figure(figsize=(12, 6), dpi=100)
     FigureCanvasAgg(figure)
     for column, (up, title) in enumerate(((1, "from above"), (2, "from the side"))):
@@ -115,12 +119,3 @@ def _draw(path: Path, model: pycolmap.Reconstruction, metres: bool) -> None:
     data = io.BytesIO()
     figure.savefig(data, format="png")
     write_file(path, data.getvalue())
-
-
-def _reach(points: np.ndarray, centers: np.ndarray) -> float:
-    """Half the side of a square that holds the cameras and 90 % of the points."""
-    middle = np.median(np.vstack([points, centers]), axis=0)
-    far = [np.abs(centers - middle).max()] + (
-        [np.quantile(np.abs(points - middle).max(axis=1), 0.9)] if len(points) else []
-    )
-    return 1.1 * float(max(far)) or 1.0

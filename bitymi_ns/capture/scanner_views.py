@@ -1,5 +1,5 @@
-"""Photographs of scanning programs and RGB-D sets: Polycam's raw folder, Record3D's, 3D Scanner App's and Stray
-Scanner's, and folders of color images with a text file per pose (ScanNet, 7-Scenes)."""
+"""Read photographs with poses of Polycam, Record3D, 3D Scanner App and Stray Scanner, and of folders with a text file
+per pose (ScanNet, 7-Scenes)."""
 
 import csv
 from collections.abc import Callable, Sequence
@@ -8,29 +8,27 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
-from bitymi_ns.capture.camera import OPENCV_AXES, ColmapCamera, Photograph
 from bitymi_ns.capture.find_files import check_photographs_exist
-from bitymi_ns.capture.images import image_size
+from bitymi_ns.capture.images import image_size, in_proportion
 from bitymi_ns.capture.maps import MapFiles, maps_beside, maps_called
-from bitymi_ns.capture.masks import in_proportion
 from bitymi_ns.capture.photos import natural
 from bitymi_ns.capture.pictures import is_photograph
 from bitymi_ns.capture.pose_checks import rotations
 from bitymi_ns.capture.recognise import POLYCAM, STRAY, Found
 from bitymi_ns.capture.transforms import MAX_SIDE
-from bitymi_ns.capture.types import fail, parsing, warn
+from bitymi_ns.capture.types import OPENCV_AXES, ColmapCamera, Photograph, Pose, fail, parsing, warn
 from bitymi_ns.progress import rich_progress
 from bitymi_ns.reading import read_json, read_text
 from bitymi_ns.trust import listed
 
 
 class Row(NamedTuple):
-    """A photograph as a program states it."""
+    """Photograph as a program states it."""
 
     file: Path
-    pose: npt.NDArray[np.float64]  # [4, 4] in nerfstudio's axes
+    pose: Pose  # in nerfstudio's axes
     pinhole: tuple[float, ...]  # fx, fy, cx, cy
     size: tuple[int, int] | None = None  # that these are for; None = the file's
     maps: MapFiles | None = None  # None = those in folders beside that of the photographs
@@ -43,28 +41,24 @@ Y_UP = np.array([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0
 
 
 def scanner_photographs(found: Found, need_photos: bool) -> list[Photograph]:
-    """Read the photographs of a scanning program or RGB-D set, with cameras and poses, in the order of their names.
-
-    Raises:
-        CaptureError: a file is damaged, or photographs that are needed are missing.
-    """
+    """Read a capture's photographs, with cameras and poses, in the order of their names. Raises CaptureError: a file is
+    damaged, or photographs that are needed are missing."""
     readers: dict[str, Callable[[Path], list[Row]]] = {
         "polycam": _polycam, "record3d": _record3d, "pose-files": _pose_files,
         "3d-scanner": _scanner_app, "stray-scanner": _stray_scanner,
     }  # fmt: skip
-    rows = readers[found.format](found.path)
-    for path, pose, pinhole, stated, _ in rows:
-        if not np.isfinite([*pose.ravel(), *pinhole]).all() or not all(1 <= side <= MAX_SIDE for side in stated or ()):
-            fail(
-                f"{found.path}, read as {found.format}, is damaged: the pose or camera of {path.name} is not finite, "
-                f"or its picture has no pixels. {AGAIN}"
-            )
+    rows, what = readers[found.format](found.path), f"{found.path}, read as {found.format},"
+    for row in rows:
+        sides = row.size or ()
+        if not np.isfinite([*row.pose.ravel(), *row.pinhole]).all() or not all(1 <= side <= MAX_SIDE for side in sides):
+            bad = f"the pose or camera of {row.file.name} is not finite, or its picture has no pixels"
+            fail(f"{what} is damaged: {bad}. {AGAIN}")
     if len(rows) < 2:
-        fail(f"{found.path}, read as {found.format}, has {len(rows)} photographs with poses: a scene needs many.")
-    files = [path for path, *_ in rows]
+        fail(f"{what} has {len(rows)} photographs with poses: a scene needs many.")
+    files = [row.file for row in rows]
     if need_photos:
         check_photographs_exist(found.path, files)
-    parts = rotations(np.stack([pose[:3, :3] for _, pose, *_ in rows]), [file.name for file in files], str(found.path))
+    parts = rotations(np.stack([row.pose[:3, :3] for row in rows]), [file.name for file in files], str(found.path))
     result = []
     for (path, pose, pinhole, stated, own), rotation, beside in zip(rows, parts, maps_beside(files), strict=True):
         pose = pose.copy()
@@ -72,19 +66,17 @@ def scanner_photographs(found: Found, need_photos: bool) -> list[Photograph]:
         size = image_size(path) or stated or (1, 1)
         camera = ColmapCamera("PINHOLE", *(stated or size), pinhole)
         if not in_proportion(camera.size, size):
-            fail(
-                f"{path} has {size[0]} x {size[1]} pixels, but its camera is for {camera.width} x {camera.height}, "
-                "which is another shape. Export it again."
-            )
+            there, size_of = "{} x {}".format(*size), f"{camera.width} x {camera.height}, which is another shape"
+            fail(f"{path} has {there} pixels, but its camera is for {size_of}. Export it again.")
         result.append(Photograph(path, camera.rescaled(*size), pose, f"the camera of {path}", maps=own or beside))
     return result
 
 
 def _polycam(folder: Path) -> list[Row]:
-    """Read Polycam's cameras, the corrected ones and their images where there are such."""
+    """Read Polycam's cameras and images, the corrected ones if there are any."""
     keyframes = folder / "keyframes" if (folder / "keyframes").is_dir() else folder
     images, cameras = next((keyframes / i, keyframes / c) for i, c in POLYCAM if (keyframes / c).is_dir())
-    rows: list[Row] = []
+    rows = []
     for path in sorted(cameras.glob("*.json"), key=lambda path: natural(path.name)):
         with parsing(path, AGAIN):
             values = read_json(path)
@@ -92,17 +84,13 @@ def _polycam(folder: Path) -> list[Row]:
             pose[:3] = [[float(values[f"t_{i}{j}"]) for j in range(4)] for i in range(3)]
             size = (int(values["width"]), int(values["height"]))
             pinhole = tuple(float(values[name]) for name in ("fx", "fy", "cx", "cy"))
-        file = next(
-            (file for file in images.glob(f"{path.stem}.*") if is_photograph(file)), images / f"{path.stem}.jpg"
-        )
-        rows.append(Row(file, Y_UP @ pose, pinhole, size))
+        pictures = [*filter(is_photograph, images.glob(f"{path.stem}.*")), images / f"{path.stem}.jpg"]
+        rows.append(Row(pictures[0], Y_UP @ pose, pinhole, size))
     return rows
 
 
 def _record3d(folder: Path) -> list[Row]:
     """Read Record3D's metadata: one camera or one per image, and poses as quaternions xyzw and positions."""
-    from scipy.spatial.transform import Rotation  # slow to import
-
     path = folder / "metadata" if (folder / "metadata").is_file() else folder / "metadata.json"
     with parsing(path, AGAIN):
         values = read_json(path)
@@ -110,14 +98,11 @@ def _record3d(folder: Path) -> list[Row]:
         camera = (K[0], K[4], K[6], K[7])
         own: Sequence[Any] = values.get("perFrameIntrinsicCoeffs") or ()
         poses: Sequence[Any] = list(values["poses"])
-    images = next((folder / name for name in ("rgb", "rgbd", "images") if (folder / name).is_dir()), folder)
-    files = {file.stem: file for file in images.iterdir() if is_photograph(file)}
-    rows: list[Row] = []
+    files = _images(folder, "rgb", "rgbd", "images")
+    rows = []
     for i, each in enumerate(poses):
         with parsing(f"{path}: pose {i} (counted from 0)", AGAIN):
-            *quaternion, x, y, z = _numbers(each, 7)
-            pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = Rotation.from_quat(quaternion).as_matrix(), (x, y, z)
+            pose = _pose(_numbers(each, 7))
             pinhole = tuple(_numbers(own[i][:4], 4)) if i < len(own) else camera
         if str(i) in files:  # Record3D can export every n-th image
             rows.append(Row(files[str(i)], Y_UP @ pose, pinhole, size))
@@ -125,11 +110,11 @@ def _record3d(folder: Path) -> list[Row]:
 
 
 def _scanner_app(folder: Path) -> list[Row]:
-    """Read 3D Scanner App's frames: frame_00012.json with a matrix, camera to world, and the camera, both by rows;
-    beside it depth and confidence, and of some frames a picture."""
+    """Read 3D Scanner App's frames: frame_00012.json with camera to world and camera matrix, both by rows; beside it
+    depth and confidence, and of some frames a picture."""
     rows = []
     for path in sorted(folder.glob("frame_*.json"), key=lambda path: natural(path.name)):
-        picture = next((file for file in folder.glob(f"{path.stem}.*") if is_photograph(file)), None)
+        picture = next(filter(is_photograph, folder.glob(f"{path.stem}.*")), None)
         if picture is None:
             continue
         with parsing(path, AGAIN):
@@ -137,27 +122,22 @@ def _scanner_app(folder: Path) -> list[Row]:
             pose = np.array(_numbers(values["cameraPoseARFrame"], 16)).reshape(4, 4)
             fx, _, cx, _, fy, cy, *_ = _numbers(values["intrinsics"], 9)
         number = path.stem.removeprefix("frame_")
-        rows.append(
-            Row(picture, Y_UP @ pose, (fx, fy, cx, cy), maps=maps_called(folder, f"depth_{number}", f"conf_{number}"))
-        )
+        maps = maps_called(folder, f"depth_{number}", f"conf_{number}")
+        rows.append(Row(picture, Y_UP @ pose, (fx, fy, cx, cy), maps=maps))
     return rows
 
 
 def _stray_scanner(folder: Path) -> list[Row]:
-    """Read Stray Scanner's video, camera matrix and poses: positions and quaternions xyzw in ARKit's world, of cameras
-    with OpenCV axes. Frames that show much the same are left out."""
-    from scipy.spatial.transform import Rotation  # slow to import
-
-    from bitymi_ns.capture.video import frames_with_poses
+    """Read Stray Scanner's video, without frames that show much the same, camera matrix and poses: positions and
+    quaternions xyzw in ARKit's world, of cameras with OpenCV axes."""
+    from bitymi_ns.capture.video import frames_with_poses  # slow to import
 
     odometry, matrix, video = (folder / name for name in STRAY)
     with parsing(matrix, AGAIN):
         K = np.loadtxt(StringIO(read_text(matrix, MOST_POSE)), delimiter=",").reshape(3, 3)
     with parsing(odometry, AGAIN):
-        poses = [
-            {str(name).strip(): value for name, value in line.items()}
-            for line in csv.DictReader(StringIO(read_text(odometry)))
-        ]
+        lines = csv.DictReader(StringIO(read_text(odometry)))
+        poses = [{str(name).strip(): value for name, value in line.items()} for line in lines]
     with rich_progress() as progress:
         images = frames_with_poses(video, len(poses), progress, warn)
     rows = []
@@ -166,9 +146,7 @@ def _stray_scanner(folder: Path) -> list[Row]:
         if number >= len(poses):  # the app ended while it wrote
             continue
         with parsing(f"{odometry}: pose {number} (counted from 0)", AGAIN):
-            x, y, z, *quaternion = (float(poses[number][name]) for name in ("x", "y", "z", "qx", "qy", "qz", "qw"))
-            pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = Rotation.from_quat(quaternion).as_matrix(), (x, y, z)
+            pose = _pose([float(poses[number][name]) for name in ("qx", "qy", "qz", "qw", "x", "y", "z")])
             name = f"{int(poses[number]['frame']):06d}"
         maps = maps_called(folder, f"depth/{name}", f"confidence/{name}")
         rows.append(Row(file, Y_UP @ pose @ OPENCV_AXES, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), maps=maps))
@@ -178,29 +156,26 @@ def _stray_scanner(folder: Path) -> list[Row]:
 def _pose_files(folder: Path) -> list[Row]:
     """Read images in `color` or `rgb` and 4 x 4 matrices, camera to world with OpenCV axes, of the same names in
     `pose`; or both in one folder, as NAME.color.png and NAME.pose.txt. A matrix that is not finite means no pose."""
-    poses = folder / "pose" if (folder / "pose").is_dir() else folder
-    images = next((folder / name for name in ("color", "rgb", "images") if (folder / name).is_dir()), folder)
     pinhole = _intrinsics(folder)
-    files = {file.stem.removesuffix(".color"): file for file in images.iterdir() if is_photograph(file)}
-    rows: list[Row] = []
-    lost = []
+    files = {stem.removesuffix(".color"): file for stem, file in _images(folder, "color", "rgb", "images").items()}
+    poses, rows, lost = folder / "pose" if (folder / "pose").is_dir() else folder, [], []
     for path in sorted(poses.glob("*.txt"), key=lambda path: natural(path.name)):
         name = path.stem.removesuffix(".pose")
         if name not in files:
             continue
         with parsing(path, AGAIN):
             pose = np.loadtxt(StringIO(read_text(path, MOST_POSE))).reshape(4, 4)
-        if not np.isfinite(pose).all():
+        if np.isfinite(pose).all():
+            rows.append(Row(files[name], pose @ OPENCV_AXES, pinhole))
+        else:
             lost.append(name)
-            continue
-        rows.append(Row(files[name], pose @ OPENCV_AXES, pinhole))
     if lost:
         warn(f"{len(lost)} photographs of {folder} have no pose, and are left out: {listed(lost)}.")
     return rows
 
 
 def _intrinsics(folder: Path) -> tuple[float, ...]:
-    """Read fx, fy, cx, cy of all photographs from the first of the usual files: a matrix, or these four numbers."""
+    """Read fx, fy, cx, cy of all photographs from the first usual file: a matrix, or these four numbers."""
     names = ("intrinsic/intrinsic_color.txt", "intrinsics_color.txt", "intrinsic_color.txt", "intrinsics.txt",
              "intrinsic.txt", "camera-intrinsics.txt", "calibration.txt", "../camera-intrinsics.txt")  # fmt: skip
     path = next((folder / name for name in names if (folder / name).is_file()), None)
@@ -217,8 +192,21 @@ def _intrinsics(folder: Path) -> tuple[float, ...]:
         return fx, fy, cx, cy
 
 
+def _images(folder: Path, *names: str) -> dict[str, Path]:
+    """List photographs by stem in the first of these subfolders, or in the folder itself."""
+    images = next((folder / name for name in names if (folder / name).is_dir()), folder)
+    return {file.stem: file for file in images.iterdir() if is_photograph(file)}
+
+
+def _pose(values: Sequence[float]) -> Pose:
+    """Convert a quaternion xyzw and a position to [4, 4]."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_quat(values[:4]).as_matrix(), values[4:]
+    return pose
+
+
 def _numbers(values: Any, count: int) -> list[float]:
-    """Require so many numbers: fewer would be repeated, and more left out, silently."""
+    """Require this number of values: missing ones would be repeated, and further ones dropped silently."""
     numbers = [float(value) for value in values]
     if len(numbers) != count:
         raise ValueError(f"it has {len(numbers)} numbers, not {count}")

@@ -1,5 +1,5 @@
-"""Poses of photographs and videos by structure from motion, and the copy of them that a training run keeps: whatever
-becomes of the photographs, the run goes on with the poses it was trained with."""
+"""Poses of photographs and videos by structure from motion, and the copy that a training run keeps, so that it goes on
+with them whatever becomes of the photographs."""
 
 import json
 import os
@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from bitymi_ns.capture.cache import keep_work_folder
-from bitymi_ns.capture.colmap_model import Model
 from bitymi_ns.capture.colmap_views import Origin, Source, find_masks, make_source
 from bitymi_ns.capture.images import image_size, in_threads
 from bitymi_ns.capture.photos import photo_folder
@@ -24,28 +23,19 @@ from bitymi_ns.trust import Refused, leads_inside, listed
 MODEL = Path("sparse/0")
 IMAGES = "images"
 ORIGIN = "origin.json"
-"""File that states of what the model is. A folder without it holds no poses, but at most a report."""
+"""File of the model's `Origin`; a folder without it holds at most a report."""
 
 
 @dataclass(frozen=True)
 class KeptPoses:
     """Poses in the folder of a run."""
 
-    folder: Path  # it holds MODEL, the report, and IMAGES where those were made for the training
-    origin: Origin  # input of structure from motion; its photographs are IMAGES where it names no folder
+    folder: Path  # with MODEL, the report, and IMAGES if those were made for the training
+    origin: Origin  # its photographs are IMAGES if it names no folder
     left_out: Mapping[str, str] = field(default_factory=dict)  # photographs without a pose, and why
 
-    @property
-    def model(self) -> Path:
-        """Folder of the COLMAP model."""
-        return self.folder / MODEL
-
-    def images(self, capture: Path) -> Path:
-        """Folder to which the names in the model are relative, for a capture in this folder."""
-        return self.folder / IMAGES if self.origin.photographs is None else capture / self.origin.photographs
-
     def found(self, data: Path) -> Found:
-        """Return the capture at `data`, folder or file, whatever else lies beside it by now."""
+        """Return the capture at `data`, whatever else lies beside it by now."""
         folder = data if data.is_dir() else data.parent
         return Found(self.origin.kind, folder / self.origin.path, folder)
 
@@ -53,13 +43,9 @@ class KeptPoses:
 def find_sfm_source(
     found: Found, masks_path: Path | None, downscale: int, settings: SfmSettings, use_masks: bool = True
 ) -> Source:
-    """Run structure from motion on a folder of photographs or a video, or find the model of an earlier run. Photographs
-    are used smaller by `downscale`; `masks_path` is relative to the capture, None = find it.
-
-    Raises:
-        CaptureError: no poses can be found; says what to photograph differently.
-    """
-    from bitymi_ns.capture.poses import find_poses  # slow to import, and seldom needed
+    """Run structure from motion on photographs or a video, or find an earlier run's model. `masks_path` is relative to
+    the capture, None = find it. Raises CaptureError: no poses can be found; says what to photograph differently."""
+    from bitymi_ns.capture.poses import find_poses  # slow to import
     from bitymi_ns.progress import rich_progress
 
     masks = _masks(found, masks_path) if use_masks else None
@@ -81,7 +67,7 @@ def find_sfm_source(
         warn(poses.doubt)
     masks = _masks(found, masks_path, downscale)
     source = make_source(poses.model, poses.images, masks, downscale, poses.left_out)
-    made = poses.images.is_relative_to(poses.report.parent)  # upright copies and frames lie in the work folder
+    made = poses.images.is_relative_to(poses.report.parent)  # upright copies and frames are in the work folder
     photographs = None if made else os.path.relpath(poses.images, found.folder)
     assert found.format in ("photographs", "video")
     origin = Origin(found.format, os.path.relpath(found.path, found.folder), photographs, settings)
@@ -89,36 +75,45 @@ def find_sfm_source(
 
 
 def kept_source(found: Found, kept: KeptPoses, masks_path: Path | None, downscale: int, need_photos: bool) -> Source:
-    """Return the COLMAP model that a run was trained with; see `find_sfm_source`.
-
-    Raises:
-        CaptureError: photographs of the model that are needed are missing, or have another size than they had.
-    """
+    """Return the model that a run was trained with. Raises CaptureError: needed photographs of it are missing, or have
+    changed their size."""
     masks = _masks(found, masks_path, downscale)
-    source = make_source(kept.model, kept.images(found.folder), masks, downscale, kept.left_out)
+    photographs = kept.origin.photographs
+    images = kept.folder / IMAGES if photographs is None else found.folder / photographs
+    source = make_source(kept.folder / MODEL, images, masks, downscale, kept.left_out)
     if need_photos:
-        _check_photographs(source, kept.folder)
+        files = source.files()
+        missing = [file.readlink() if file.is_symlink() else file for file in files if not file.is_file()]
+        changed = []
+        sizes = in_threads(image_size, files) if source.copies is None else [None] * len(files)
+        for image, file, size in zip(source.model.images, files, sizes, strict=True):
+            camera = source.model.cameras[image.camera_id]
+            if size not in (None, camera.size):
+                changed.append(f"{file}: {size[0]} x {size[1]} pixels, {camera.width} x {camera.height} then")
+        what = [f"{len(missing)} are missing ({listed(missing)})"] if missing else []
+        what += [f"{len(changed)} have another size ({listed(changed)})"] if changed else []
+        if what:
+            fail(
+                f"of the {len(files)} photographs that the run was trained with, {' and '.join(what)}, so its poses in "
+                f"{kept.folder} cannot be used. Put these photographs back as they were, or train again."
+            )
     count = len(source.model.images)
     say(f"Poses of {count} photographs of {found.path} as the run was trained with them, of {kept.folder}.")
     return replace(source, report=kept.folder, origin=kept.origin)
 
 
 def _masks(found: Found, stated: Path | None, downscale: int = 1) -> Path | None:
-    """Folder of the masks, which upright copies of the photographs share; a video has none."""
+    """Find the folder of masks, which upright copies share; a video has none."""
     return None if found.format == "video" else find_masks(photo_folder(found.path), found.folder, stated, downscale)
 
 
 def has_kept_poses(folder: Path) -> bool:
-    """Test if a run keeps its poses in this folder; runs of earlier versions keep the report alone."""
+    """Test for poses kept in a run's folder; earlier versions kept the report alone."""
     return (folder / ORIGIN).is_file()
 
 
 def read_kept_poses(folder: Path) -> KeptPoses | None:
-    """Read the poses that a run keeps in this folder; None = none.
-
-    Raises:
-        CaptureError: ORIGIN cannot be read.
-    """
+    """Read the poses kept in a run's folder; None = none. Raises CaptureError: ORIGIN cannot be read."""
     path = folder / ORIGIN
     if not path.is_file():
         return None
@@ -126,7 +121,7 @@ def read_kept_poses(folder: Path) -> KeptPoses | None:
     with parsing(which, f"Put the folder {folder} back as it was, or train again."):
         values: dict[str, Any] = read_json(path)
         entries, left_out = dict(values["origin"]), dict(values["left_out"])
-        if entries.get("settings") is not None:  # runs of earlier versions do not state them
+        if entries.get("settings") is not None:  # earlier versions do not state them
             entries["settings"] = SfmSettings(**entries["settings"])
         origin = Origin(**entries)
         if origin.kind not in ("photographs", "video"):
@@ -135,8 +130,7 @@ def read_kept_poses(folder: Path) -> KeptPoses | None:
 
 
 def kept_settings(folder: Path, requested: SfmSettings) -> SfmSettings:
-    """Return the settings of the poses kept in a folder; warn of requested settings, other than defaults, that are not
-    used."""
+    """Return the settings of kept poses; warn of requested ones, other than defaults, that are not used."""
     kept = read_kept_poses(folder)
     settings = None if kept is None else kept.origin.settings
     unused = []
@@ -154,53 +148,21 @@ def kept_settings(folder: Path, requested: SfmSettings) -> SfmSettings:
 
 
 def write_kept_poses(folder: Path, source: Source, origin: Origin) -> None:
-    """Copy a model into an existing folder, with the photographs where those are copies or frames that can go.
-
-    Photographs are hard links where possible; symbolic links stay symbolic links.
-
-    Raises:
-        OSError: something cannot be written, or a name in the model leads out of its folder.
-    """
+    """Copy a model into an existing folder, with photographs that are copies or frames, as hard links where possible;
+    symbolic links stay. Raises OSError: something cannot be written, or a name in the model leads out of its folder."""
     copy_files(source.folder, folder / MODEL)
     if origin.photographs is None:
         for image in source.model.images:
             if not leads_inside(image.name):
                 raise Refused(f"{source.folder} names {image.name!r}, which leads out of its folder", folder)
-            _link(source.photographs / image.name, folder / IMAGES / image.name)
+            file, target = source.photographs / image.name, folder / IMAGES / image.name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if file.is_symlink():
+                target.symlink_to(os.path.realpath(file))
+                continue
+            try:
+                os.link(file, target)
+            except OSError:  # another disk, or a file system without links
+                shutil.copyfile(file, target)
     values = {"origin": asdict(origin), "left_out": dict(source.left_out)}
     (folder / ORIGIN).write_text(json.dumps(values, indent=2, ensure_ascii=False) + "\n", "utf8")
-
-
-def _link(file: Path, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if file.is_symlink():
-        target.symlink_to(os.path.realpath(file))
-        return
-    try:
-        os.link(file, target)
-    except OSError:  # another disk, or a file system without links
-        shutil.copyfile(file, target)
-
-
-def _check_photographs(source: Source, kept: Path) -> None:
-    """Fail where photographs of kept poses are missing, or have another size than their cameras."""
-    files = source.files()
-    missing = [file.readlink() if file.is_symlink() else file for file in files if not file.is_file()]
-    changed = [] if source.copies is not None else _other_sizes(source.model, files)
-    what = [f"{len(missing)} are missing ({listed(missing)})"] if missing else []
-    what += [f"{len(changed)} have another size ({listed(changed)})"] if changed else []
-    if what:
-        fail(
-            f"of the {len(files)} photographs that the run was trained with, {' and '.join(what)}, so its poses in "
-            f"{kept} cannot be used. Put these photographs back as they were, or train again."
-        )
-
-
-def _other_sizes(model: Model, files: list[Path]) -> list[str]:
-    """Photographs with another size than their cameras, with both sizes; unreadable ones do not count."""
-    changed = []
-    for image, file, size in zip(model.images, files, in_threads(image_size, files), strict=True):
-        camera = model.cameras[image.camera_id]
-        if size is not None and size != camera.size:
-            changed.append(f"{file}: {size[0]} x {size[1]} pixels, {camera.width} x {camera.height} then")
-    return changed

@@ -1,4 +1,4 @@
-"""Splits of a capture into training and held-out photographs: by rule, or by names."""
+"""Split a capture into training and held-out photographs: by rule, or by names."""
 
 import math
 import os
@@ -10,9 +10,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from bitymi_ns.capture.camera import Photograph
 from bitymi_ns.capture.find_files import folded, without_extension
-from bitymi_ns.capture.types import fail, parsing
+from bitymi_ns.capture.types import Photograph, fail, parsing
 from bitymi_ns.reading import read_text
 from bitymi_ns.trust import listed
 
@@ -25,12 +24,10 @@ class SplitOptions:
     """Photographs to hold out for evaluation."""
 
     eval_mode: Mode = "interval"
-    """Photographs to hold out: evenly spaced ones, those with eval in their names, every n-th, or none (all are used
-    for both)."""
-    eval_interval: int = 8
-    """Hold out every n-th photograph by name, with --eval-mode interval."""
-    train_split_fraction: float = 0.9
-    """Share of the photographs to train on, with --eval-mode fraction."""
+    """Photographs to hold out: evenly spaced ones, those with eval in their names, every n-th, or none (all serve for
+    both)."""
+    eval_interval: int = 8  # Hold out every n-th photograph by name, with --eval-mode interval.
+    train_split_fraction: float = 0.9  # Share of the photographs to train on, with --eval-mode fraction.
     eval_names: tuple[str, ...] = ()
     """Names of photographs to hold out, or a text file (.txt) with one per line; overrides --eval-mode."""
 
@@ -43,7 +40,7 @@ class Split(NamedTuple):
     rule: str
 
     def describe(self, names: Sequence[Path]) -> str:
-        """Describe the split of these photographs in a line."""
+        """Describe the split in a line."""
         if not self.held_out:
             return f"All {len(self.train)} photographs are trained on: none is held out for evaluation."
         if self.rule == "all":
@@ -53,26 +50,15 @@ class Split(NamedTuple):
 
 
 def of_members(split: Split, groups: Sequence[int]) -> Split:
-    """Split members as their groups are, by the number of the group of each: views by photographs, and photographs by
-    the frames of a rig."""
+    """Split members by the sides of their groups: views by photographs, photographs by frames of a rig."""
     sides = [set(side) for side in (split.train, split.held_out)]
     train, held_out = ([i for i, group in enumerate(groups) if group in side] for side in sides)
     return Split(train, held_out, split.rule)
 
 
-def ordinal(number: int) -> str:
-    """Format 1st, 2nd, 3rd, 4th and so on."""
-    suffix = "th" if number % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(number % 10, "th")
-    return f"{number}{suffix}"
-
-
 def choose_split(photographs: Sequence[Photograph], lists: NameLists, options: SplitOptions) -> Split:
-    """Split photographs by the stated names, else by the capture's lists, else by a rule; those that a rig took
-    together stay together.
-
-    Raises:
-        CaptureError: a name is that of no photograph, or of several.
-    """
+    """Split photographs by the stated names, else the capture's lists, else a rule; frames of a rig stay together.
+    Raises CaptureError: a name is that of no photograph, or of several."""
     names = [photograph.file for photograph in photographs]
     first: dict[object, int] = {}
     frames = [first.setdefault(i if each.frame is None else ("frame", each.frame), i)
@@ -91,10 +77,11 @@ def choose_split(photographs: Sequence[Photograph], lists: NameLists, options: S
 
 
 def by_mode(names: Sequence[Path], mode: Mode, interval: int, fraction: float) -> Split:
-    """Split photographs in this order by nerfstudio's rules."""
+    """Split photographs in this order by one of nerfstudio's rules."""
     indices = list(range(len(names)))
     if mode == "interval":
-        rule = f"every {ordinal(interval)} by name"
+        suffix = {1: "st", 2: "nd", 3: "rd"}.get(interval % 10 * (interval % 100 not in (11, 12, 13)), "th")
+        rule = f"every {interval}{suffix} by name"
         return Split([i for i in indices if i % interval], indices[::interval], rule)
     if mode == "all":
         return Split(indices, indices, "all")
@@ -106,28 +93,23 @@ def by_mode(names: Sequence[Path], mode: Mode, interval: int, fraction: float) -
     held_out = [i for i in indices if "train" not in names[i].name and "eval" in names[i].name]
     neither = [names[i].name for i in sorted(set(indices) - {*train, *held_out})]
     if neither:
-        fail(
-            f"--eval-mode filename: the names of photographs must contain train or eval, {listed(neither)} does not. "
-            "Use `--eval-names`, or another mode."
-        )
+        advice = "Use `--eval-names`, or another mode."
+        fail(f"--eval-mode filename: {listed(neither)} has neither train nor eval in its name. {advice}")
     return Split(train, held_out, "those with eval in their names")
 
 
 def by_names(names: Sequence[Path], wanted: Sequence[str], source: str) -> Split:
-    """Hold out the photographs of the wanted names, each with as many folders as make it unambiguous.
-
-    Raises:
-        CaptureError: one of them is the name of no photograph, or of several.
-    """
+    """Hold out photographs by names, each with as many folders as make it unambiguous. Raises CaptureError: one is the
+    name of no photograph, or of several."""
     held_out = set(find(names, wanted, source))
     return Split([i for i in range(len(names)) if i not in held_out], sorted(held_out), f"by {source}")
 
 
 def by_lists(names: Sequence[Path], lists: NameLists) -> Split:
-    """Split by the capture's own lists of names; names in "val" and "test" are held out."""
+    """Split by the capture's own lists; "val" and "test" are held out."""
     source = "the capture's own lists"
 
-    def indices(split: str) -> set[int]:  # downscaled photographs lie in another folder than the lists say
+    def indices(split: str) -> set[int]:  # downscaled photographs are in another folder than the lists state
         return set(find(names, lists.get(split, []), source, any_folder=True))
 
     held_out = indices("val") | indices("test")
@@ -136,8 +118,8 @@ def by_lists(names: Sequence[Path], lists: NameLists) -> Split:
 
 
 def find(names: Sequence[Path], wanted: Sequence[str], source: str, any_folder: bool = False) -> list[int]:
-    """Find the indices of photographs by names that may differ in case, Unicode form, or extension, and with
-    `any_folder` have leading folders that the photographs do not lie in; see `by_names`."""
+    """Find photographs by names that may differ in case, Unicode form, extension, and with `any_folder` leading
+    folders; see `by_names`."""
     forms: list[Callable[[str], tuple[str, ...]]] = [
         lambda name: PurePath(name.replace("\\", "/")).parts,
         folded,
@@ -163,22 +145,18 @@ def find(names: Sequence[Path], wanted: Sequence[str], source: str, any_folder: 
     for name in wanted:
         fitting = fit(name)
         if len(fitting) > 1:
-            fail(
-                f"{source}: {name} is the name of {len(fitting)} photographs, {listed([names[i] for i in fitting])}. "
-                "Give its folder, too."
-            )
+            several = f"{len(fitting)} photographs, {listed([names[i] for i in fitting])}"
+            fail(f"{source}: {name} is the name of {several}. Give its folder, too.")
         found += fitting
         unknown += [] if fitting else [name]
     if unknown:
-        fail(
-            f"{source}: {len(unknown)} of {len(wanted)} names are of no photograph of the capture: {listed(unknown)}. "
-            f"Its photographs are {listed([name.name for name in names])}."
-        )
+        which = f"{listed(unknown)}. Its photographs are {listed([name.name for name in names])}."
+        fail(f"{source}: {len(unknown)} of {len(wanted)} names are of no photograph of the capture: {which}")
     return found
 
 
 def read_names(names_or_file: Sequence[str]) -> tuple[str, ...]:
-    """Return the names, or those in a text file, one per line, where its name stands for them."""
+    """Return the names, or those in the text file that they name, one per line."""
     if len(names_or_file) != 1 or not names_or_file[0].lower().endswith((".txt", ".lst", ".list")):
         return tuple(names_or_file)
     path = Path(os.path.expanduser(names_or_file[0]))
@@ -191,7 +169,7 @@ def read_names(names_or_file: Sequence[str]) -> tuple[str, ...]:
 
 
 def list_files(folder: Path) -> NameLists:
-    """Read train_list.txt, test_list.txt and validation_list.txt, which nerfstudio's COLMAP parser knows."""
+    """Read train_list.txt, test_list.txt and validation_list.txt of nerfstudio's COLMAP parser."""
     lists = {}
     for split, name in (("train", "train"), ("val", "val"), ("val", "validation"), ("test", "test")):
         path = folder / f"{name}_list.txt"

@@ -1,25 +1,25 @@
 """Read the JSON files of captures: nerfstudio's transforms.json, instant-ngp's, and Blender's.
 
-The three differ in how they state a focal length and where photographs lie; every entry is read wherever it stands, in
-a frame before the top of the file. Entries that nothing reads are reported.
+They state focal lengths and names of photographs differently; each entry is read from the frame first, then from the
+top of the file. Unused entries are reported.
 """
 
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bitymi_ns.capture.camera import CAMERA_TYPES, SPHERICAL_MODEL, ColmapCamera, Photograph, colmap_distortion
 from bitymi_ns.capture.find_files import FileFinder, downscaled, find_maps, find_masks, find_photographs, report_files
 from bitymi_ns.capture.images import image_size
 from bitymi_ns.capture.masks import with_masks
 from bitymi_ns.capture.pose_checks import as_matrix, check_repeated, correct_poses
-from bitymi_ns.capture.recognise import SPLITS, is_model
+from bitymi_ns.capture.recognise import SPLITS
 from bitymi_ns.capture.splits import NameLists
-from bitymi_ns.capture.types import fail, parsing, say, warn
+from bitymi_ns.capture.types import SPHERICAL_MODEL, ColmapCamera, Photograph, fail, parsing, say, warn
 from bitymi_ns.reading import read_json
 from bitymi_ns.trust import listed
 
@@ -28,53 +28,47 @@ HOW_TO_CORRECT = "Correct it there (JSON has neither comments nor a comma behind
 INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
 FILE_KEYS = ("file_path", "mask_path", "depth_file_path", "normal_file_path")
 LATLONG = ("latlong", "is_latlong")
-"""Entries of instant-ngp's for pictures of all directions with latitude and longitude along their sides."""
+"""instant-ngp's entries for 360-degree pictures with latitude and longitude along their sides."""
+CAMERA_TYPES = {
+    **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), "PERSPECTIVE"),
+    "OPENCV_FISHEYE": "FISHEYE", "EQUIRECTANGULAR": "EQUIRECTANGULAR", "FISHEYE624": "FISHEYE624",
+    "OMNIDIRECTIONALSTEREO_L": "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R": "OMNIDIRECTIONALSTEREO_R",
+    "VR180_L": "VR180_L", "VR180_R": "VR180_R", "ORTHOPHOTO": "ORTHOPHOTO",
+}  # fmt: skip
+"""nerfstudio's camera types by camera_model; the last two lines cannot be trained on."""
 MAX_SIDE = 1 << 20  # largest plausible width or height of a picture, pixels
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 DISTORTION = (*COEFFICIENTS, "distortion_params")
 FOCALS = {"x": ("fl_x", "camera_angle_x", "x_fov"), "y": ("fl_y", "camera_angle_y", "y_fov")}
-"""Entries that state a focal length: in pixels, or by the view angle in radians, or in degrees."""
+"""Entries of a focal length: in pixels, or by the view angle in radians, or in degrees."""
 STATED_BY = {"fl_x": FOCALS["x"], "fl_y": (*FOCALS["y"], *FOCALS["x"][1:])}
-"""Entries that serve as another; an angle of one side is that of square pixels."""
-EQUAL_AREA = ("equirectangular", "is_equirectangular")
-"""Entries of instant-ngp's for pictures of all directions of which rows show equal areas."""
+"""Entries that serve as another; an angle of one side assumes square pixels."""
+EQUAL_AREA = ("equirectangular", "is_equirectangular")  # instant-ngp's entries for 360-degree rows of equal areas
 USED = {
     "frames", *FILE_KEYS, "transform_matrix", "camera_model", "is_fisheye", "fisheye", "ply_file_path",
     *LATLONG, *EQUAL_AREA, "applied_transform", "applied_scale", "orientation_override", "aabb_scale",
     *INTRINSICS, *DISTORTION, *FOCALS["x"], *FOCALS["y"],
 }  # fmt: skip
-IRRELEVANT = {"rotation", "sharpness", "colmap_im_id", "made_by"}
-"""Unused entries that are not reported: turntable step, sharpness, number in another file, program."""
-UNKNOWN_SIZE = 800
-"""Pixels along a side of a picture whose size is not stated and that is missing, where none is needed."""
+IRRELEVANT = {"rotation", "sharpness", "colmap_im_id", "made_by"}  # unused entries that are not reported
+UNKNOWN_SIZE = 800  # pixels along the sides of missing pictures of unstated size, where none are needed
 
 
 @dataclass(frozen=True)
 class Transforms:
     """JSON file of a capture."""
 
-    path: Path  # the file
-    meta: dict[str, Any]  # its content
+    path: Path
+    meta: dict[str, Any]  # content
     photographs: list[Photograph]  # sorted by file name
     lists: NameLists  # of names for training and evaluation
-    named: frozenset[Path]  # its pictures, masks and maps, before they are replaced by downscaled copies
-
-    @property
-    def files(self) -> list[Path]:
-        """Files of the photographs."""
-        return [photograph.file for photograph in self.photographs]
+    named: frozenset[Path]  # pictures, masks and maps, before downscaled copies replace them
 
 
 def read_transforms(
     path: Path, own_format: bool, downscale: int = 1, need_photos: bool = True, use_masks: bool = True
 ) -> Transforms:
-    """Read and check a JSON file, see `load_transforms`, and find its photographs, or copies that are smaller by
-    `downscale`, and masks, those beside the photographs where it names none; see `with_masks`. Photographs may be
-    missing where they are not needed.
-
-    Raises:
-        CaptureError: the file cannot be used, or lacks photographs.
-    """
+    """Read a JSON file, see `load_transforms`, and find its photographs, or copies smaller by `downscale`, its maps and
+    masks, see `with_masks`. Raises CaptureError: the file cannot be used, or lacks photographs that are needed."""
     meta = load_transforms(path, own_format)
     frames = meta["frames"]
     for holder in (meta, *frames):
@@ -84,7 +78,7 @@ def read_transforms(
                     f"{path}: {key} is set, by which instant-ngp means pictures whose rows show equal areas, which "
                     'cannot be read. For rows of equal angles write "camera_model": "EQUIRECTANGULAR" instead.'
                 )
-    lists = take_lists(meta)
+    lists = {split: meta.pop(f"{split}_filenames", None) for split in ("train", "val", "test")}
     names = [frame["file_path"] for frame in frames]
     files = find_photographs(path, names, need_photos)
     masks = find_masks(path.parent, [frame.get("mask_path") if use_masks else None for frame in frames], files,
@@ -98,7 +92,11 @@ def read_transforms(
         meta["ply_file_path"] = cloud if there is None else there.relative_to(path.parent).as_posix()
     if need_photos:
         report_files(path, names, files, masks)
-    _report_unused(path, meta, own_format)
+    known = {*USED, *IRRELEVANT} - ({"aabb_scale"} if own_format else set())
+    unused = [key for key in meta if key not in known]
+    unused += [f"{key} of frames" for key in dict.fromkeys(k for f in frames for k in f) if key not in known]
+    if unused:
+        say(f"Entries of {path} that are not used: {listed(unused, most=12)}.")
     made: dict[ColmapCamera, ColmapCamera] = {}
     photographs = []
     for frame, file, mask, beside in zip(frames, files, masks, maps, strict=True):
@@ -114,26 +112,14 @@ def read_transforms(
     if downscale > 1:
         photographs = downscaled(photographs, path.parent, downscale)
     named = frozenset(Path(os.path.normpath(file)) for file in used if file is not None)
-    return Transforms(path, meta, photographs, lists, named)
-
-
-def _report_unused(path: Path, meta: dict[str, Any], own_format: bool) -> None:
-    known = USED | IRRELEVANT
-    unused = [key for key in meta if key not in known]
-    unused += [f"{key} of frames" for key in dict.fromkeys(k for f in meta["frames"] for k in f) if key not in known]
-    if own_format and "aabb_scale" in meta:
-        unused.append("aabb_scale")
-    if unused:
-        say(f"Entries of {path} that are not used: {listed(unused, most=12)}.")
+    stated = {split: names for split, names in lists.items() if names is not None}
+    return Transforms(path, meta, photographs, stated, named)
 
 
 def load_transforms(path: Path, own_format: bool) -> dict[str, Any]:
-    """Load a file in any Unicode encoding, with or without byte order mark, and check its frames, poses and lists of
-    names; poses become rotations. nerfstudio's own format states each camera in full.
-
-    Raises:
-        CaptureError: the file cannot be used; names the frame.
-    """
+    """Load a file in any Unicode encoding, with or without byte order mark; check its frames, poses and lists of names,
+    and make poses rotations. nerfstudio's own format states each camera in full. Raises CaptureError: the file cannot
+    be used; names the frame."""
     if not os.path.lexists(path):
         fail(f"{path} does not exist, which this kind of capture needs. {HOW_TO_GET_ONE}")
     with parsing(path, HOW_TO_CORRECT if path.is_file() else HOW_TO_GET_ONE):
@@ -151,7 +137,7 @@ def load_transforms(path: Path, own_format: bool) -> dict[str, Any]:
 
 
 def _drop_nulls(meta: Any) -> None:
-    """Remove entries that are null, and empty names of masks and maps, which programs write for "none"."""
+    """Remove null entries and empty names of masks and maps, which programs write for "none"."""
     frames = meta.get("frames") if isinstance(meta, dict) else None
     for holder in [meta, *frames] if isinstance(frames, list) else [meta]:
         for key, value in list(holder.items()) if isinstance(holder, dict) else ():
@@ -160,7 +146,7 @@ def _drop_nulls(meta: Any) -> None:
 
 
 def _check_frames(path: Path, meta: Any, own_format: bool) -> None:
-    """Fail where there are no frames, or where one lacks an entry or has no name of a file."""
+    """Fail if there are no frames, or one lacks an entry or names no file."""
     frames = meta.get("frames") if isinstance(meta, dict) else None
     if isinstance(frames, dict):
         fail(f"{path}: frames is an object with names, not a list. Write its values as a list, in brackets.")
@@ -182,14 +168,12 @@ def _check_frames(path: Path, meta: Any, own_format: bool) -> None:
                 frame[key] = name.replace("\\", "/")
     without = [frame["file_path"] for frame in frames if "mask_path" not in frame]
     if 0 < len(without) < len(frames):
-        fail(
-            f"{path}: {listed(without)} has no mask_path, but other frames have one. Give every frame a mask (a white "
-            "picture lets all pixels count), or none."
-        )
+        advice = "Give every frame a mask (a white picture lets all pixels count), or none."
+        fail(f"{path}: {listed(without)} has no mask_path, but other frames have one. {advice}")
 
 
 def _check_intrinsics(path: Path, meta: dict[str, Any]) -> None:
-    """Fail where neither a frame nor the file states an entry of nerfstudio's cameras."""
+    """Fail if neither a frame nor the file states an entry of nerfstudio's cameras."""
     frames = meta["frames"]
     for key in INTRINSICS:
         keys = STATED_BY.get(key, (key,))
@@ -201,13 +185,12 @@ def _check_intrinsics(path: Path, meta: dict[str, Any]) -> None:
 
 
 def is_equirectangular(meta: dict[str, Any], frame: dict[str, Any]) -> bool:
-    """Test if a frame is a picture of all directions, which has no focal length: so stated in nerfstudio's words, or by
-    an entry of instant-ngp's."""
+    """Test for a 360-degree picture, which has no focal length."""
     return stated_model(meta, frame) == "EQUIRECTANGULAR"
 
 
 def stated_model(meta: dict[str, Any], frame: dict[str, Any]) -> Any:
-    """Return nerfstudio's name of the camera model of a frame, whose entries go before those of the file."""
+    """Return nerfstudio's name of a frame's camera model; entries of the frame go before those of the file."""
     for holder in (frame, meta):
         if "camera_model" in holder:
             return holder["camera_model"]
@@ -219,7 +202,7 @@ def stated_model(meta: dict[str, Any], frame: dict[str, Any]) -> Any:
 
 
 def _warn_of_contradictions(path: Path, meta: dict[str, Any]) -> None:
-    """Warn where frames state another camera than the file does for all; the frame's is used."""
+    """Warn if frames state another camera than the file does for all; the frame's is used."""
     differing: list[str] = []
     for group in (*((key,) for key in INTRINSICS), DISTORTION):
         common = {key: meta[key] for key in group if key in meta}
@@ -231,11 +214,8 @@ def _warn_of_contradictions(path: Path, meta: dict[str, Any]) -> None:
 
 
 def check_number(path: Path, key: str, value: Any, label: str) -> float | int:
-    """Convert an entry, which may be in quotes, to a number; `label` is for the message.
-
-    Raises:
-        CaptureError: it is no number, or for w and h no number of pixels.
-    """
+    """Convert an entry, also in quotes, to a number; `label` is for the message. Raises CaptureError: it is no number,
+    or for w and h no number of pixels."""
     try:
         number = float(None if isinstance(value, bool) else value)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
@@ -248,17 +228,14 @@ def check_number(path: Path, key: str, value: Any, label: str) -> float | int:
 
 
 def _check_applied(path: Path, meta: dict[str, Any]) -> None:
-    """Check the transform [3, 4] and the scale that were applied to the capture as a whole."""
+    """Check the transform [3, 4], made [4, 4] here, and the scale that were applied to the whole capture."""
     if "applied_transform" in meta:
         transform = as_matrix(meta["applied_transform"])
         singular = "maps the capture to a plane, a line or a point, which cannot be undone"
         if transform is None or abs(np.linalg.det(transform[:3, :3])) < 1e-12:
             fault = "is not a matrix of 3 x 4 finite numbers" if transform is None else singular
-            fail(
-                f"{path}: applied_transform {fault}. Correct it, or remove it: then exports are in the frame of this "
-                "file."
-            )
-        meta["applied_transform"] = transform[:3].tolist()
+            fail(f"{path}: applied_transform {fault}. Correct it, or remove it: then exports are in this file's frame.")
+        meta["applied_transform"] = transform
     if "applied_scale" in meta:
         scale = check_number(path, "applied_scale", meta["applied_scale"], "for all frames")
         if not 0.0 < scale < math.inf:
@@ -266,7 +243,7 @@ def _check_applied(path: Path, meta: dict[str, Any]) -> None:
 
 
 def _check_lists(path: Path, meta: dict[str, Any]) -> None:
-    """Check the lists of names for training and evaluation: all of them or none."""
+    """Check the lists of names for training and evaluation: all or none."""
     keys = [f"{split}_filenames" for split in ("train", "val", "test")]
     stated = [key for key in keys if key in meta]
     if not stated:
@@ -283,39 +260,12 @@ def _check_lists(path: Path, meta: dict[str, Any]) -> None:
         meta.setdefault(key, meta.get(other))
 
 
-def take_lists(meta: dict[str, Any]) -> NameLists:
-    """Remove the lists of names for training and evaluation from `meta` and return them."""
-    found = {split: meta.pop(f"{split}_filenames", None) for split in ("train", "val", "test")}
-    return {split: names for split, names in found.items() if names is not None}
-
-
-def colmap_points(path: Path) -> Path | None:
-    """Find the COLMAP model with the points of a transforms.json that names none, as earlier versions of nerfstudio's
-    tool left it; None = there is none."""
-    model = path.parent / "colmap/sparse/0"
-    if not is_model(model):
-        return None
-    try:
-        meta = read_json(path)
-    except (OSError, ValueError):
-        return None  # reported where it is read
-    return None if not isinstance(meta, dict) or meta.get("ply_file_path") is not None else model
-
-
-def applied_transform(meta: dict[str, Any], folder: Path) -> np.ndarray | None:
-    """Read [4, 4] that was applied to a nerfstudio capture before its file was written; None = unknown."""
-    rows = meta.get("applied_transform")
-    if rows is None and (folder / "colmap/sparse/0").is_dir():
-        rows = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]  # nerfstudio's tool applied it before it stated that
-    return None if rows is None else np.vstack([np.array(rows, float)[:3], [0.0, 0.0, 0.0, 1.0]])
-
-
 def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path) -> ColmapCamera:
-    """Convert the camera of a frame to COLMAP's terms."""
+    """Convert the camera of a frame to COLMAP's."""
     name = frame["file_path"]
 
     def value(*keys: str) -> tuple[str, float] | None:
-        """The first of these that the frame has, else the file."""
+        """Find the first of these keys in the frame, else in the file."""
         for holder, label in ((frame, f"of {name}"), (meta, "for all frames")):
             for key in keys:
                 if key in holder:
@@ -327,7 +277,7 @@ def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path)
         size = image_size(file)
         if size is not None:
             width, height = width or size[0], height or size[1]
-        else:  # reported where it is read; and what opens no photograph needs some size
+        else:  # reported when it is read; without photographs any size serves
             width, height = width or height or UNKNOWN_SIZE, height or width or UNKNOWN_SIZE
     if is_equirectangular(meta, frame):
         middle = (width / 2.0 if cx is None else cx, height / 2.0 if cy is None else cy)
@@ -344,10 +294,8 @@ def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path)
         if found is not None:
             focal[axis] = _focal_length(path, *found, sides[axis])
     if not focal:
-        fail(
-            f"{path} gives no focal length of {name}: neither fl_x nor camera_angle_x (radians) is in the frame or at "
-            "the top of the file. Add one of them."
-        )
+        where = "neither fl_x nor camera_angle_x (radians) is in the frame or at the top of the file"
+        fail(f"{path} gives no focal length of {name}: {where}. Add one of them.")
     fx, fy = focal.get("x", focal.get("y", 0.0)), focal.get("y", focal.get("x", 0.0))
     pinhole = (fx, fy, width / 2.0 if cx is None else cx, height / 2.0 if cy is None else cy)
     model, coefficients = _distortion(path, meta, frame)
@@ -355,7 +303,7 @@ def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path)
 
 
 def _focal_length(path: Path, key: str, value: float, side: float) -> float:
-    """Convert an entry of FOCALS to pixels; `side` of the picture in pixels."""
+    """Convert an entry of FOCALS to pixels; the picture's `side` is in pixels."""
     if key.startswith("fl_"):
         return value
     angle = math.radians(value) if key.endswith("fov") else value
@@ -370,10 +318,8 @@ def _distortion(path: Path, meta: dict[str, Any], frame: dict[str, Any]) -> tupl
     label = f"of {frame['file_path']}"
     model = stated_model(meta, frame)
     if not isinstance(model, str) or model not in CAMERA_TYPES:
-        fail(
-            f"{path}: the camera_model {model!r} {label} is unknown. nerfstudio knows "
-            f"{', '.join(CAMERA_TYPES)}; for undistorted photographs write PINHOLE."
-        )
+        advice = f"nerfstudio knows {', '.join(CAMERA_TYPES)}; for undistorted photographs write PINHOLE."
+        fail(f"{path}: the camera_model {model!r} {label} is unknown. {advice}")
     kind = CAMERA_TYPES[model]
     holder = frame if any(key in frame for key in DISTORTION) else meta
     stated = holder.get("distortion_params")
@@ -383,3 +329,44 @@ def _distortion(path: Path, meta: dict[str, Any], frame: dict[str, Any]) -> tupl
     else:
         values = [check_number(path, "distortion_params", each, label) for each in np.ravel(stated).tolist()]
     return colmap_distortion(kind, values, f"{label} in {path}")
+
+
+def colmap_distortion(kind: str, values: Sequence[float], label: str) -> tuple[str, tuple[float, ...]]:
+    """Convert nerfstudio's camera type, see CAMERA_TYPES, and its distortion_params to COLMAP's.
+
+    Args:
+        values: k1, k2, k3, k4, p1, p2; twelve of FISHEYE624.
+
+    Returns:
+        camera model with separate focal lengths, and its parameters after fx, fy, cx, cy (none if SPHERICAL_MODEL).
+
+    Raises:
+        CaptureError: COLMAP has no such camera.
+    """
+    if kind == "EQUIRECTANGULAR":
+        return SPHERICAL_MODEL, ()
+    if kind not in ("PERSPECTIVE", "FISHEYE", "FISHEYE624"):
+        fail(
+            f"the camera {label} cannot be used: it is neither a perspective, a fisheye nor an equirectangular camera, "
+            f"which are the kinds that can be trained on, but {kind}. Correct the capture."
+        )
+    counts, needs = {
+        "PERSPECTIVE": ((6,), "perspective cameras need six: k1, k2, k3, k4, p1, p2"),
+        "FISHEYE": ((4, 6), "fisheye cameras need four: k1, k2, k3, k4"),
+        "FISHEYE624": ((12,), "FISHEYE624 needs twelve"),
+    }[kind]
+    if len(values) not in counts:
+        fail(f"the camera {label} has {len(values)} distortion_params; {needs}. Correct the capture.")
+    if kind == "FISHEYE624":
+        return "RAD_TAN_THIN_PRISM_FISHEYE", tuple(values)
+    if kind == "FISHEYE":
+        return "OPENCV_FISHEYE", tuple(values[:4])
+    k1, k2, k3, k4, p1, p2 = values
+    if k4 != 0.0:
+        fail(
+            f"the camera {label} cannot be used: its k4 is {k4:g}, but perspective cameras have k1 to k3, p1, p2 only. "
+            "For a fisheye write camera_model OPENCV_FISHEYE; else undistort first (COLMAP's image_undistorter)."
+        )
+    if k3 != 0.0:
+        return "FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
+    return ("OPENCV", (k1, k2, p1, p2)) if any((k1, k2, p1, p2)) else ("PINHOLE", ())

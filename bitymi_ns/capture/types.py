@@ -1,75 +1,122 @@
-"""Reports of the package, `CaptureError` and a logger of its name; options of captures, and options and result of
-structure from motion."""
+"""Types of the package: `CaptureError`, photographs and cameras, options of captures and of structure from motion."""
 
 import logging
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NoReturn
+from typing import TYPE_CHECKING, Literal, NamedTuple, NoReturn
+
+import numpy as np
+import numpy.typing as npt
 
 from bitymi_ns.reading import reading
 
+if TYPE_CHECKING:
+    import pycolmap
+
+Pose = npt.NDArray[np.float64]
+OPENCV_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # [4, 4] between camera frames with OpenCV axes and with OpenGL's
+SPHERICAL_MODEL = "EQUIRECTANGULAR"  # COLMAP camera model of 360-degree pictures; its parameters are width and height
+ASPECT = 0.01  # rounding of the aspect ratio 2 of 360-degree pictures, relative
 Orientation = Literal["pca", "up", "vertical", "none"]
 
 CONTRADICTED = 0.1
-"""Share of contradicted matches above which poses are doubtful. Right poses of two real captures have 0.012 to 0.016;
-wrong ones of a room with a box whose faces are alike have 0.20 and 0.27."""
+"""Share of contradicted matches that makes poses doubtful: right poses of two real captures have 0.012 to 0.016, wrong
+ones of a room with a box of equal faces 0.20 and 0.27."""
 
 
 class CaptureError(ValueError):
-    """A capture, photographs or a video that cannot be used: what is wrong, in which file, and what to do."""
+    """Refuses a capture, photographs or a video: says what is wrong, in which file, and what to do."""
 
 
 _log = logging.getLogger("bitymi_ns.capture")
-say, warn = _log.info, _log.warning
-"""Report what is read, and what is missing, in one line each."""
+say, warn = _log.info, _log.warning  # report what is read, and what is missing, in one line each
 
 
 def fail(message: str, cause: BaseException | None = None) -> NoReturn:
-    """Raise CaptureError(message), remembering `cause` for debuggers."""
+    """Raise CaptureError(message) from `cause`."""
     raise CaptureError(message) from cause
 
 
 def parsing(
     what: object, advice: str = "", passing: tuple[type[BaseException], ...] = ()
 ) -> AbstractContextManager[None]:
-    """Turn whatever goes wrong in the block into a CaptureError, see `reading`."""
+    """Convert any exception in the block to a CaptureError; see `reading`."""
     return reading(what, fail, advice, (CaptureError, *passing))
 
 
-MAP_FILES = (".png", ".tif", ".tiff", ".npy", ".npz", ".exr")
-"""Extensions of depth and normal maps."""
+MAP_FILES = (".png", ".tif", ".tiff", ".npy", ".npz", ".exr")  # extensions of depth and normal maps
 
 
 @dataclass(frozen=True)
 class MapFiles:
-    """Files with what is known of a photograph's pixels beside their colors; None = none.
+    """Files of depth and normals beside a photograph; None = none."""
 
-    Attributes:
-        depth: of camera z, see `read_depth`.
-        confidence: of the depth, 0 = low, at most of the size of the depth.
-        normal: see `read_normal`.
-    """
+    depth: Path | None = None  # camera z, see `read_depth`
+    confidence: Path | None = None  # of the depth, 0 = low, at most of the size of the depth
+    normal: Path | None = None  # see `read_normal`
 
-    depth: Path | None = None
-    confidence: Path | None = None
-    normal: Path | None = None
+
+def is_full_sphere(width: float, height: float) -> bool:
+    """Test for the aspect ratio of a 360-degree picture, up to rounding."""
+    return abs(width / (2.0 * height) - 1.0) <= ASPECT + 1.0 / height
+
+
+class ColmapCamera(NamedTuple):
+    """Camera model of COLMAP, width and height of the pictures in pixels, and parameters in COLMAP's order."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, pixels."""
+        return self.width, self.height
+
+    @property
+    def colmap(self) -> "pycolmap.Camera":
+        """pycolmap's camera."""
+        import pycolmap  # slow, and not needed for options
+
+        return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
+
+    def rescaled(self, width: int, height: int) -> "ColmapCamera":
+        """Return the camera for the same pictures in another size."""
+        if (width, height) == self.size:
+            return self
+        if self.model == SPHERICAL_MODEL:
+            return self._replace(width=width, height=height, params=(float(width), float(height)))
+        camera = self.colmap
+        camera.rescale(width, height)
+        return self._replace(width=width, height=height, params=tuple(camera.params))
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A photograph with its camera."""
+
+    file: Path
+    camera: ColmapCamera  # in pixels before downscaling
+    pose: Pose  # [4, 4] float64, camera to world, OpenGL axes (camera: x right, y up, z backward)
+    label: str  # names the camera in messages
+    mask: Path | None = None
+    downscaled: bool = False  # `file` is a downscaled copy
+    frame: int | None = None  # shared by photographs that a rig took together; None = it stands alone
+    maps: MapFiles = MapFiles()
 
 
 @dataclass
 class FrameOptions:
     """Orientation, centering and scaling of a capture, as in nerfstudio's parsers."""
 
-    scale_factor: float = 1.0
-    """Factor on the positions of the cameras."""
-    orientation_method: Orientation = "up"
-    """Orientation of the capture: up = the cameras' mean up is z."""
+    scale_factor: float = 1.0  # Factor on the positions of the cameras.
+    orientation_method: Orientation = "up"  # Orientation of the capture: up = the cameras' mean up is z.
     center_method: Literal["poses", "focus", "none"] = "poses"
     """Origin: the middle of the cameras, or the point that they face."""
-    auto_scale_poses: bool = True
-    """Scale the capture so that the cameras fit into a box from -1 to 1."""
-    scene_scale: float = 1.0
-    """Half the side of the box of random points."""
+    auto_scale_poses: bool = True  # Scale the capture so that the cameras fit into a box from -1 to 1.
+    scene_scale: float = 1.0  # Half the side of the box of random points.
 
 
 @dataclass(frozen=True)
@@ -80,32 +127,26 @@ class SfmSettings:
     """Pairs to match: all (exhaustive), neighbors and similar photographs (sequential), or by number, order and GPS
     positions (auto)."""
     mapper: Literal["auto", "global", "incremental"] = "auto"
-    """Register all cameras at once, one after the other, or the former with the latter as fallback."""
+    """Register all cameras at once (global), one after the other (incremental), or fall back to that (auto)."""
     camera_model: Literal[
         "auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "EQUIRECTANGULAR"
     ] = "auto"
-    """Camera model of COLMAP; auto = SIMPLE_RADIAL, and OPENCV where that lowers the reprojection error, and
-    EQUIRECTANGULAR for pictures that are recognized as 360-degree ones."""
+    """Camera model of COLMAP; auto = SIMPLE_RADIAL, OPENCV if that lowers the reprojection error, and EQUIRECTANGULAR
+    for detected 360-degree pictures."""
     focal_length: float | None = None  # Focal length of all photographs in pixels; None = from EXIF or estimated.
-    max_image_size: int = 1600
-    """Detect features on photographs downscaled to this many pixels along their longer side. Cameras stay in pixels of
-    the photographs."""
+    max_image_size: int = 1600  # Detect features on photographs downscaled to this many pixels along the longer side.
     max_features: int = 8192  # Most features per photograph.
     frames: int | None = None  # Number of frames of a video; None = by camera motion.
 
 
 @dataclass(frozen=True)
 class SfmOptions(SfmSettings):
-    """Settings, and the folder of masks.
-
-    Raises:
-        CaptureError: one is out of its range.
-    """
+    """Settings, and the folder of masks. Raises CaptureError: one is out of its range."""
 
     masks: Path | None = None
-    """Folder of masks; features are found where they are not black. None = `masks` beside the photographs or in their
-    folder, if there is one."""
-    use_masks: bool = True  # Use masks; else a folder of them is ignored.
+    """Folder of masks; black pixels get no features. None = `masks` beside the photographs or in their folder, if
+    there is one."""
+    use_masks: bool = True  # Use masks; else ignore their folder.
 
     def __post_init__(self) -> None:
         least = {"max_image_size": 200, "max_features": 100, "frames": 3, "focal_length": 1}
@@ -120,10 +161,9 @@ class Poses:
     """Camera poses of a capture."""
 
     model: Path
-    """Folder of a COLMAP model (cameras.bin, images.bin, points3D.bin) in full-size pixels of `images`; cameras may be
-    distorted. Its world is that of `report`'s frame.json: up and metres, as far as they are known."""
-    images: Path
-    """Folder that the model's image names are relative to: that of the photographs, or of upright copies, or frames."""
+    """Folder of a COLMAP model (cameras.bin, images.bin, points3D.bin) in full-size pixels of `images`, distorted as
+    they are. frame.json in `report` states its up and metres, as far as they are known."""
+    images: Path  # Folder that image names are relative to: of the photographs, of upright copies or of frames.
     report: Path  # Folder with report.json, report.md, cameras.png and frame.json.
     left_out: dict[str, str]  # Photographs that have no pose, by name, and why.
     registered: int  # Number of photographs that have a pose.

@@ -1,4 +1,4 @@
-"""Frames of a video: the sharpest of each stretch of equal camera motion."""
+"""Frames of a video: the sharpest of each stretch of equal camera motion, tone mapped from high dynamic range."""
 
 import math
 import os
@@ -8,85 +8,75 @@ from pathlib import Path
 
 import av
 import numpy as np
+import numpy.typing as npt
 from PIL import Image
 
-from bitymi_ns.capture.cache import content_key, finished, work_folder
-from bitymi_ns.capture.hdr import is_hdr, tone_mapped
+from bitymi_ns.capture.cache import content_key, made_once
 from bitymi_ns.capture.photos import sharpness
 from bitymi_ns.capture.prepare import IMAGES, JPEG_QUALITY
 from bitymi_ns.capture.types import CaptureError
-from bitymi_ns.files import Tell, complete_folder, explained, write_file
+from bitymi_ns.files import Tell, complete_folder
 from bitymi_ns.progress import Progress
 from bitymi_ns.reading import open_regular
 
-DONE = "frames"  # file that is written when all frames are
 SMALL = 160  # longer side of frames for measuring motion, pixels
 FINE = 640  # longer side of frames for measuring sharpness, pixels
-STRIDE = 0.08  # motion between extracted frames, in units of the longer side: neighbors share about 90 %
-FEWEST, MOST = 20, 300  # number of frames of a video whose camera moves at all
-STILL = 0.02  # motion over the whole video, in units of the longer side, below which the camera stood still
-PER_SECOND = 15  # frames surveyed per second by their timestamps: phones film at a rate that varies with the light
+STRIDE = 0.08  # motion between extracted frames in longer sides: neighbors share about 90 %
+FEWEST, MOST = 20, 300  # frames of a video whose camera moves
+STILL = 0.02  # motion over a video in longer sides, below which the camera stood still
+PER_SECOND = 15  # frames surveyed per second by their timestamps: the rate of phones varies with the light
 TRUSTED = {
     "format_whitelist": "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpeg,mpegts,mpegvideo",
     "protocol_whitelist": "file",
 }
-"""FFmpeg options: a file of any name may be a list of other files and URLs, which would be read."""
-LEAST_SURVEYED = 60  # frames surveyed at least, where there are so many: all of a clip of a second or two
+"""FFmpeg options: a file of any name may be a list of files and URLs to read."""
+LEAST_SURVEYED = 60  # least number of surveyed frames: all of a clip of a second or two
+NO_MOTION = "shows no motion: its frames are all alike. Film while you walk slowly round the scene, with it in view"
+PQ, HLG = 16, 18  # transfer functions of high dynamic range, as ITU-T H.273 numbers them
+FULL_RANGE = 2
+WHITE = 203.0  # cd/m^2 of white paper in such films (ITU-R BT.2408), which becomes a screen's white
+HLG_PEAK, HLG_GAMMA = 1000.0, 1.2  # peak luminance and gamma of HLG's reference display (ITU-R BT.2100)
+KNEE = 0.8  # share of white up to which light is kept; brighter light is compressed to white
+LUMA = np.array([0.2627, 0.6780, 0.0593])  # luma coefficients of BT.2020
+TO_709 = np.array([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]])
+"""BT.2020's linear red, green and blue to those of BT.709 and sRGB."""
 
 
 def frames_with_poses(video: Path, poses: int, progress: Progress, tell: Tell) -> Path:
-    """Write the frames of a video whose camera is known, as they are stored; see `extract_frames`. They are kept beside
-    the video.
+    """Write the frames of a video with `poses` known poses beside it, as they are stored; see `extract_frames`. Raises
+    CaptureError: it cannot be read, or has another number of frames."""
 
-    Args:
-        poses: number of frames with a pose.
+    def extract(work: Path) -> None:
+        total = _pace(video)[2]
+        if abs(total - poses) > max(2, poses // 100):
+            raise CaptureError(
+                f"{video} has {total} frames, but {poses} poses: which belong together is unknown. Export the capture "
+                f"again, or have poses computed: `bitymi-data --data {video}`"
+            )
+        extract_frames(video, work, None, progress, upright=False)
 
-    Raises:
-        CaptureError: it cannot be read, or has another number of frames.
-    """
-    key = content_key([(video.name, video)], "frames")
-    done = finished(video.parent, key, DONE, "frames")
-    if done is not None:
-        return done / IMAGES
-    total = _pace(video)[2]
-    if abs(total - poses) > max(2, poses // 100):
-        raise CaptureError(
-            f"{video} has {total} frames, but {poses} poses: which belong together is unknown. Export the capture "
-            f"again, or have poses computed: `bitymi-data --data {video}`"
-        )
-    with work_folder(video.parent, key, tell, "frames") as work:
-        with explained(work, CaptureError):
-            extract_frames(video, work, None, progress, upright=False)
-            write_file(work / DONE, b"")
-        return work / IMAGES
+    return made_once(video.parent, content_key([(video.name, video)], "frames"), "frames", tell, extract) / IMAGES
 
 
 def extract_frames(video: Path, work: Path, count: int | None, progress: Progress, upright: bool = True) -> Path:
-    """Write `count` frames of a video, or one per STRIDE of motion, as JPEGs to the folder `images` in the work folder,
-    which is whole or not there: frame_000012.jpg is number 12, counted from 0. They are turned `upright`, or as they
-    are stored.
-
-    Raises:
-        CaptureError: it cannot be read, or nothing moves in it.
-    """
+    """Write `count` frames of a video, or one per STRIDE of motion, turned `upright` or as stored, as JPEGs to `images`
+    in the work folder, whole or not at all: frame_000012.jpg is number 12, counted from 0. Raises CaptureError: it
+    cannot be read, or nothing moves in it."""
     target = work / IMAGES
     if target.is_dir():
         return target
     seen, motion, sharp = _survey(video, progress)
     if len(seen) < 3:
-        raise CaptureError(
-            f"{video} holds {len(seen)} frames: film for at least ten seconds while you walk round the scene"
-        )
+        raise CaptureError(f"{video} holds {len(seen)} frames: film for at least ten seconds, walking round the scene")
     if motion[-1] < STILL:
-        raise CaptureError(
-            f"{video} shows no motion: its frames are all alike. Film while you walk slowly round the scene, and turn "
-            "the camera to keep it in view"
-        )
+        raise CaptureError(f"{video} {NO_MOTION}")
     wanted = count or int(np.clip(round(motion[-1] / STRIDE), FEWEST, MOST))
     chosen = choose(np.array(motion), np.array(sharp), wanted)
     numbers = {seen[i] for i in chosen}
     with complete_folder(target) as folder:
-        shape = _shape_of_pixels(video)
+        with _opened(video) as container:  # pixels of some camcorders and anamorphic lenses are not square
+            shape = float(_pictures(container).sample_aspect_ratio or 1.0)
+            shape = shape if 0.25 < shape < 4.0 else 1.0
         wanted_frames = islice((each for each in _frames(video) if each[0] in numbers), len(numbers))
         for written, (number, frame, turn) in enumerate(wanted_frames, 1):
             image = _upright(frame, turn if upright else 0, shape)
@@ -96,14 +86,14 @@ def extract_frames(video: Path, work: Path, count: int | None, progress: Progres
 
 
 def choose(motion: np.ndarray, sharp: np.ndarray, count: int) -> list[int]:
-    """Choose the sharpest frame of each of `count` stretches of equal motion, by motion from the start [n], not
-    decreasing, and sharpness [n]; stretches without a frame give none."""
+    """Choose the sharpest frame of each of `count` stretches of equal motion, by motion from the start [n] and
+    sharpness [n]."""
     stretch = np.minimum((motion / motion[-1] * count).astype(int), count - 1)
     return [int(i) for s in np.unique(stretch) for i in [np.flatnonzero(stretch == s)[sharp[stretch == s].argmax()]]]
 
 
 def _survey(video: Path, progress: Progress) -> tuple[list[int], list[float], list[float]]:
-    """Return the numbers of the surveyed frames, the motion up to each in units of the longer side, and sharpness."""
+    """Survey frames: their numbers, motion up to each in longer sides, and sharpness."""
     seen: list[int] = []
     motion: list[float] = []
     sharp: list[float] = []
@@ -112,10 +102,12 @@ def _survey(video: Path, progress: Progress) -> tuple[list[int], list[float], li
     gap, rate, total = _pace(video)
     for number, frame, _ in _frames(video):
         time = number / rate if frame.time is None else frame.time
-        if 0.0 <= time - last < gap:  # times that run backwards are no reason to pass over what follows
+        if 0.0 <= time - last < gap:  # times may run backwards
             continue
         last = time
-        small = frame.reformat(*_size(frame, FINE), format="gray8").to_ndarray().astype(np.float32)
+        scale = min(1.0, FINE / max(frame.width, frame.height))
+        size = (max(16, round(side * scale)) for side in (frame.width, frame.height))
+        small = frame.reformat(*size, format="gray8").to_ndarray().astype(np.float32)
         sharp.append(sharpness(small) * float(np.sqrt(np.mean(np.diff(small, axis=1) ** 2))))
         factor = max(1, round(max(small.shape) / SMALL))
         rows, columns = (side // factor * factor for side in small.shape)
@@ -129,8 +121,8 @@ def _survey(video: Path, progress: Progress) -> tuple[list[int], list[float], li
 
 
 def displacement(first: np.ndarray, second: np.ndarray) -> float:
-    """Measure the mean displacement of image blocks by phase correlation, in units of the longer side; blocks without
-    texture count as still."""
+    """Measure the mean displacement of image blocks by phase correlation, in longer sides; blocks without texture count
+    as still."""
     size = max(16, min(first.shape) // 3)
     window = np.outer(np.hanning(size), np.hanning(size))
     lengths = []
@@ -142,7 +134,7 @@ def displacement(first: np.ndarray, second: np.ndarray) -> float:
                 continue
             product = np.fft.rfft2((a - a.mean()) * window) * np.conj(np.fft.rfft2((b - b.mean()) * window))
             peak = np.fft.irfft2(product / np.maximum(np.abs(product), 1e-6), s=(size, size))
-            # a parabola through the peak and its neighbours finds shifts of less than a pixel.
+            # a parabola through the peak and its neighbours finds parts of a pixel
             at = np.array(np.unravel_index(peak.argmax(), peak.shape))
             shift = [_between(peak[:, at[1]], at[0]), _between(peak[at[0]], at[1])]
             shift = [s - size if s > size / 2 else s for s in shift]
@@ -151,14 +143,14 @@ def displacement(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def _between(line: np.ndarray, at: int) -> float:
-    """Position of the peak of a parabola through three values of a periodic line."""
+    """Locate the peak of a parabola through three values of a periodic line."""
     low, mid, high = line[at - 1], line[at], line[(at + 1) % len(line)]
     curve = low - 2 * mid + high
     return float(at + (0.5 * (low - high) / curve if curve < 0 else 0.0))
 
 
 def _pace(video: Path) -> tuple[float, float, int]:
-    """Return the least seconds between surveyed frames, the mean frame rate, and the approximate number of frames."""
+    """Return the least seconds between surveyed frames, mean frame rate, and approximate number of frames."""
     with _opened(video) as container:
         stream = _pictures(container)
         rate = float(stream.average_rate or 30)
@@ -183,12 +175,12 @@ def _opened(video: Path) -> av.container.InputContainer:
 
 
 def _pictures(container: av.container.InputContainer) -> av.VideoStream:
-    """Choose the video stream; in some files a cover picture is the first."""
+    """Choose the video stream, not a cover picture."""
     return container.streams.best("video") or container.streams.video[0]
 
 
 def _frames(video: Path) -> Iterator[tuple[int, av.VideoFrame, int]]:
-    """Yield number, frame and display rotation in degrees; a broken end is skipped."""
+    """Yield number, frame and display rotation in degrees; skip a broken end."""
     with _opened(video) as container:
         stream = _pictures(container)
         stream.thread_type = "AUTO"
@@ -204,22 +196,55 @@ def _frames(video: Path) -> Iterator[tuple[int, av.VideoFrame, int]]:
                 ) from error
 
 
-def _size(frame: av.VideoFrame, longer: int) -> tuple[int, int]:
-    scale = min(1.0, longer / max(frame.width, frame.height))
-    return max(16, round(frame.width * scale)), max(16, round(frame.height * scale))
-
-
-def _shape_of_pixels(video: Path) -> float:
-    """Return the pixel aspect ratio, which is not 1 for some camcorders and anamorphic lenses."""
-    with _opened(video) as container:
-        shape = float(_pictures(container).sample_aspect_ratio or 1.0)
-    return shape if 0.25 < shape < 4.0 else 1.0
-
-
 def _upright(frame: av.VideoFrame, turn: int, shape: float = 1.0) -> Image.Image:
-    """Rotate a frame upright by `turn` degrees counter-clockwise (ffmpeg's display matrix), with square pixels; `shape`
+    """Turn a frame upright by `turn` degrees counter-clockwise (ffmpeg's display matrix), with square pixels; `shape`
     is the pixel aspect ratio."""
-    image = tone_mapped(frame) if is_hdr(frame) else frame.to_image()
+    image = tone_mapped(frame) if getattr(frame, "color_trc", None) in (PQ, HLG) else frame.to_image()
     if shape != 1.0:  # cameras of COLMAP with one focal length have square pixels
         image = image.resize((round(image.width * shape), image.height), Image.Resampling.LANCZOS)
     return image.rotate(turn, expand=True) if turn % 360 else image
+
+
+def tone_mapped(frame: av.VideoFrame) -> Image.Image:
+    """Convert a high dynamic range frame to 8-bit sRGB, without which it is pale."""
+    signal = _signal(frame)
+    nits = pq_to_nits(signal) if frame.color_trc == PQ else hlg_to_nits(signal)
+    light = nits @ TO_709.T / WHITE
+    brightest = np.maximum(light.max(-1, keepdims=True), 1e-6)
+    rest = 1.0 - KNEE
+    beyond = KNEE + rest * (1.0 - np.exp(-np.maximum(brightest - KNEE, 0.0) / rest))
+    light = np.clip(light * np.where(brightest <= KNEE, 1.0, beyond / brightest), 0.0, 1.0)
+    srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
+    return Image.fromarray(np.uint8(srgb * 255.0 + 0.5))
+
+
+def pq_to_nits(signal: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Convert a PQ signal in [0, 1] to display light in cd/m^2 (ITU-R BT.2100)."""
+    m1, m2, c1, c2, c3 = 2610 / 16384, 2523 / 4096 * 128, 3424 / 4096, 2413 / 4096 * 32, 2392 / 4096 * 32
+    power = np.maximum(signal, 0.0) ** (1.0 / m2)
+    return 10_000.0 * (np.maximum(power - c1, 0.0) / (c2 - c3 * power)) ** (1.0 / m1)
+
+
+def hlg_to_nits(signal: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Convert an HLG signal [..., 3] in [0, 1] to display light in cd/m^2."""
+    a, b, c = 0.17883277, 0.28466892, 0.55991073
+    scene = np.where(signal <= 0.5, signal**2 / 3.0, (np.exp((signal - c) / a) + b) / 12.0)
+    luminance = np.maximum(scene @ LUMA, 1e-6)[..., None]
+    return HLG_PEAK * luminance ** (HLG_GAMMA - 1.0) * scene
+
+
+def _signal(frame: av.VideoFrame) -> npt.NDArray[np.float32]:
+    """Decode the non-linear RGB signal [h, w, 3] in [0, 1]."""
+    whole = frame.reformat(format="yuv444p16le")
+    planes = []
+    for plane in whole.planes:
+        rows = np.frombuffer(plane, np.uint16).reshape(plane.height, plane.line_size // 2)
+        planes.append(rows[:, : plane.width].astype(np.float32) / 65536.0)
+    if frame.color_range == FULL_RANGE:
+        y, cb, cr = planes[0], planes[1] - 0.5, planes[2] - 0.5
+    else:
+        y, cb, cr = ((p - low / 256.0) * 256.0 / span for p, low, span in
+                     zip(planes, (16, 128, 128), (219, 224, 224), strict=True))  # fmt: skip
+    red, blue = y + 2.0 * (1.0 - LUMA[0]) * cr, y + 2.0 * (1.0 - LUMA[2]) * cb
+    green = (y - LUMA[0] * red - LUMA[2] * blue) / LUMA[1]
+    return np.clip(np.stack([red, green, blue], -1), 0.0, 1.0).astype(np.float32)

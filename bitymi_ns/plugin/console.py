@@ -18,23 +18,18 @@ from bitymi_ns.trust import printable
 
 @contextmanager
 def step_bar(done: int, total: int) -> Iterator[Callable[[int], None]]:
-    """A progress bar below whatever else is printed; nothing where the output is not a terminal.
-
-    Returns:
-        What is to be called with the index of every finished step.
-    """
+    """Show a progress bar below other output in a terminal; yield a function of each finished step's index."""
     columns = (TextColumn("step"), MofNCompleteColumn(), BarColumn(), TimeRemainingColumn())
-    terminal = CONSOLE.is_terminal
-    with Progress(*columns, console=CONSOLE, refresh_per_second=2, transient=True, disable=not terminal) as bar:
+    hidden = not CONSOLE.is_terminal
+    with Progress(*columns, console=CONSOLE, refresh_per_second=2, transient=True, disable=hidden) as bar:
         task = bar.add_task("", completed=done, total=total)
         yield lambda step: bar.update(task, completed=step + 1)
 
 
 class InputError(SystemExit):
-    """Something about the input is wrong. Python prints the message to stderr and exits with status 1.
+    """Wrong input. Python prints the message to stderr and exits with status 1.
 
-    A SystemExit rather than an Exception: nerfstudio's commands have no error handling of their own, and a traceback
-    through them hides what the user can do about it.
+    nerfstudio's commands handle no errors: the traceback of an Exception through them would hide what the user can do.
     """
 
     def __init__(self, message: str) -> None:
@@ -45,23 +40,23 @@ class InputError(SystemExit):
 
 
 def fail(message: str, cause: BaseException | None = None) -> NoReturn:
-    """Raise InputError(message), remembering `cause` for debuggers."""
+    """Raise InputError(message) from `cause`."""
     raise InputError(message) from cause
 
 
 def say(message: str) -> None:
-    """Tell the user something, in one line however long it is; brackets in it are no markup."""
+    """Print one line, however long; brackets in it are no markup."""
     CONSOLE.print(escape(printable(message)), soft_wrap=True)
 
 
 def warn(message: str) -> None:
-    """Tell the user about something that goes on without what it should have had."""
+    """Print a warning."""
     CONSOLE.print(f"[bold yellow]{escape(printable(message))}", soft_wrap=True)
 
 
 @contextmanager
 def as_input_error() -> Iterator[None]:
-    """End with one line where a capture cannot be used; also a decorator."""
+    """Convert a CaptureError to an InputError; also a decorator."""
     try:
         yield
     except CaptureError as error:
@@ -69,7 +64,7 @@ def as_input_error() -> Iterator[None]:
 
 
 class _Console(logging.Handler):
-    """Prints what the reading of captures reports."""
+    """Prints reports on captures."""
 
     def emit(self, record: logging.LogRecord) -> None:
         (warn if record.levelno >= logging.WARNING else say)(record.getMessage())
@@ -80,4 +75,4 @@ _captures.addHandler(_Console())
 _captures.setLevel(logging.INFO)
 _captures.propagate = False
 
-warn_once = functools.cache(warn)  # the same message only once in a process
+warn_once = functools.cache(warn)  # each message once in a process

@@ -1,9 +1,6 @@
-"""Changes to nerfstudio's functions and to what they read; no other module makes any. nerfstudio's registry and
-subclasses serve for the rest.
-
-Each function says what it changes, for which command, what a user would lose without it, and what in nerfstudio would
-make it superfluous.
-"""
+"""Change nerfstudio's functions and what they read, which no other module does: its registry and subclasses serve for
+the rest. Each function states what it changes, for which commands, what is lost without it, and what would make it
+superfluous."""
 
 import atexit
 import os
@@ -33,8 +30,8 @@ from bitymi_ns.bundle.manifest import MANIFEST
 from bitymi_ns.bundle.parts import CONFIG, bundle_at
 from bitymi_ns.files import check_writable, explained
 from bitymi_ns.plugin.console import InputError, fail
-from bitymi_ns.plugin.data.bundle_cameras import BundleCamerasConfig, has_cameras
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
+from bitymi_ns.plugin.data.dataparser import BundleCamerasConfig, has_cameras
 from bitymi_ns.plugin.data.views import DATA
 from bitymi_ns.plugin.run import checkpoints, render
 from bitymi_ns.plugin.run.bundle_model import BakedModelConfig
@@ -52,27 +49,25 @@ REFUSED = {
     "ExportMarchingCubesMesh": f"ns-export marching-cubes needs a field of distances, which surfels have not. {_MESH}",
     "ExportGaussianSplat": f"ns-export gaussian-splat is for splatfacto. {_MESH}",
 }
-"""Classes of nerfstudio's scripts that cannot work on surfels, and what does instead."""
+"""Classes of nerfstudio's scripts that cannot work on surfels, and remedies."""
 REMARKS = re.compile(
     r"Saving config to|Saving checkpoints to"  # our summary of the run says where
     r"|Mixed precision is disabled|Auto image downscale factor of 1$"
     r"|\[NOTE\] Not running eval iterations"  # the training curve is of held-out views
     r"|\[bold yellow\]Disabled comet|disabled local writer"
 )
-"""Beginnings of the lines that are dropped. Everything else is shown: it may be about the capture."""
+"""Beginnings of dropped lines. All others are shown: they may be about the capture."""
 COMMAND, MESH_COMMAND = "bitymi-atlas", "bitymi-mesh"
 EXPORTER, VIEWER = "nerfstudio.scripts.exporter", "nerfstudio.scripts.viewer.run_viewer"
-LOOPBACK = "127.0.0.1"
-"""The address that only this machine can reach. nerfstudio's default, 0.0.0.0, is open to the network."""
+LOOPBACK = "127.0.0.1"  # reachable from this machine alone, unlike nerfstudio's default 0.0.0.0
 HOST_OPTION = "--viewer.websocket-host"
 
 
 def allow_numpy_scalars() -> None:
     """Let torch.load's safe mode read numpy's numbers.
 
-    Changes: torch's list of safe types. For: every command that loads a run of nerfstudio's own methods or of ours.
-    Without: checkpoints whose schedulers left such numbers do not load with torch 2.6 or later. Superfluous once
-    nerfstudio saves plain numbers.
+    Changes: torch's list of safe types. For: commands that load a run. Without: checkpoints whose schedulers left such
+    numbers do not load with torch 2.6 or later. Superfluous once nerfstudio saves plain numbers.
     """
     try:
         from numpy._core.multiarray import scalar
@@ -84,12 +79,10 @@ def allow_numpy_scalars() -> None:
 def extend_exporter(commands: Callable[[], Sequence[Any]]) -> None:
     """Add commands to ns-export.
 
-    Changes: `tyro` in the namespace of nerfstudio's script, which loads the plugin before it builds the union of its
-    commands: its `cli` gets the union with ours. tyro itself stays. For: ns-export. Without: `ns-export bitymi-atlas`
-    and `bitymi-mesh` are unknown. Superfluous once nerfstudio has a registry of exports.
-
-    Args:
-        commands: called with the first command line; what is wrong then leaves nerfstudio's own commands working.
+    Changes: `tyro` in the namespace of nerfstudio's script, which loads the plugin before it builds its commands'
+    union: `cli` gets the union with ours. For: ns-export. Without: `ns-export bitymi-atlas` and `bitymi-mesh` are
+    unknown. Superfluous once nerfstudio has a registry of exports. Errors of `commands`, called with the first command
+    line, leave nerfstudio's own commands working.
     """
     main = sys.modules.get("__main__")
     as_main = str(getattr(main, "__file__", "") or "").replace("\\", "/").endswith("nerfstudio/scripts/exporter.py")
@@ -110,7 +103,7 @@ def extend_exporter(commands: Callable[[], Sequence[Any]]) -> None:
 
 
 def _with_members(union: Any, more: Sequence[Any]) -> Any:
-    """The union with further members; markers around it are kept."""
+    """Add members to a union; keep markers around it."""
     if get_origin(union) is Annotated:
         inner, *markers = get_args(union)
         return Annotated[(_with_members(inner, more), *markers)]  # type: ignore[return-value]
@@ -119,25 +112,22 @@ def _with_members(union: Any, more: Sequence[Any]) -> Any:
 
 
 def refuse_without_config() -> None:
-    """Stop where nerfstudio is about to load, as its own YAML, a bundle that has none.
+    """Stop before nerfstudio loads a bundle without config.yml as YAML.
 
-    Changes: nothing; reads `sys.argv` as the plugin is loaded. For: every command with --load-config but
-    MESH_COMMAND, which reads such bundles. Without: a traceback of yaml's on binary data. Superfluous once nerfstudio
-    reports a config.yml that it cannot read.
+    Changes: nothing; reads `sys.argv` when the plugin is loaded. For: commands with --load-config but MESH_COMMAND,
+    which reads such bundles. Without: yaml's traceback on binary data. Superfluous once nerfstudio reports an
+    unreadable config.yml.
     """
     path = _given_config()
     bundle = None if path is None else bundle_at(path)
     if bundle is None or MESH_COMMAND in sys.argv[1:2]:
         return
     if bundle.is_file() or not (bundle / CONFIG).is_file():
-        fail(
-            f"{bundle} has no {CONFIG} for nerfstudio's commands: `bitymi unpack {bundle}` writes it as a folder with "
-            "one; give that."
-        )
+        fail(f"{bundle} has no {CONFIG} for nerfstudio's commands: give the folder of `bitymi unpack {bundle}`.")
 
 
 def _given_config() -> Path | None:
-    """The --load-config of this process's command line; None without."""
+    """Return --load-config of this process's command line; None without."""
     for i, argument in enumerate(sys.argv):
         name, _, value = argument.partition("=")
         if name in ("--load-config", "--load_config") and (value or i + 1 < len(sys.argv)):
@@ -146,13 +136,13 @@ def _given_config() -> Path | None:
 
 
 def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
-    """Find the folder of the checkpoints; for the configuration in a bundle, make a stand-in that satisfies nerfstudio.
+    """Find the folder of the checkpoints; for a bundle, make a stand-in that satisfies nerfstudio.
 
-    Changes: the answer of the trainer configuration's `get_checkpoint_dir`, which eval_setup asks before it builds the
-    pipeline; reads eval_setup's frame for the config.yml that it loads, and the calling script's for its options. For:
-    ns-eval, ns-render, ns-viewer, ns-export. Without: no bundle could be opened, no run or bundle that was moved or is
-    used from another folder, and commands that cannot work fail with tracebacks. Superfluous once eval_setup passes on
-    the path that it loads, and asks the method for its state.
+    Changes: the answer of the trainer configuration's `get_checkpoint_dir`, for which eval_setup asks before it builds
+    the pipeline; reads config.yml's path in eval_setup's frame, and options in the script's. For: ns-eval, ns-render,
+    ns-viewer, ns-export. Without: no bundle opens, nor a moved run or bundle or one used from another folder, and
+    commands that cannot work end in tracebacks. Superfluous once eval_setup passes on the path that it loads, and asks
+    the method for its state.
     """
     model, evaluated = config.pipeline.model, _folder_being_evaluated()
     if evaluated is not None:
@@ -164,16 +154,20 @@ def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
     if isinstance(model, BakedModelConfig):
         model.bundle = _find_bundle(model.bundle, evaluated)
         config.read_from = evaluated
-        _read_cameras_of(model.bundle, config.pipeline.datamanager)
+        datamanager = config.pipeline.datamanager
+        data = datamanager.data or getattr(datamanager.dataparser, "data", None)
+        if data is not None and not Path(data).exists() and has_cameras(model.bundle):  # its capture is gone
+            datamanager.dataparser = BundleCamerasConfig(data=model.bundle, capture=Path(data))
+            datamanager.data = model.bundle
         return _stub_checkpoint_dir(model.bundle)
     folder = usual()
     if evaluated is not None:
         if (evaluated / config.relative_model_dir).is_dir():
             folder, config.read_from = evaluated / config.relative_model_dir, evaluated
-        # in a resumed run the recorded step is that of the run it went on from
+        # a resumed run records the step it went on from
         if config.load_step is None or not checkpoints.path_of(folder, config.load_step).is_file():
             config.load_step = checkpoints.newest_step(folder)
-        # stop now if it cannot be used: nerfstudio's tools would report that with a traceback
+        # nerfstudio's tools would report a bad checkpoint with a traceback
         checkpoints.load(checkpoints.path_of(folder, config.load_step), model.scene)
         config.take_poses_of(evaluated)
     return folder
@@ -187,7 +181,7 @@ def _callers() -> Iterator[FrameType]:
 
 
 def _folder_being_evaluated() -> Path | None:
-    """The folder of the config.yml that nerfstudio's eval_setup is loading; else None."""
+    """Find the folder of the config.yml that nerfstudio's eval_setup is loading; else None."""
     for frame in _callers():
         if frame.f_code.co_name == "eval_setup" and isinstance(frame.f_locals.get("config_path"), Path):
             return frame.f_locals["config_path"].absolute().parent
@@ -195,7 +189,7 @@ def _folder_being_evaluated() -> Path | None:
 
 
 def _running_command() -> tuple[Any, dict[str, Any]] | None:
-    """The object of nerfstudio's script whose main function is loading a scene, and its module's namespace; or None."""
+    """Find the script object whose main function is loading a scene, and its module's namespace; else None."""
     for frame in _callers():
         command = frame.f_locals.get("self")
         if frame.f_code.co_name == "main" and type(command).__module__.startswith(("nerfstudio.scripts.", "__main__")):
@@ -204,7 +198,7 @@ def _running_command() -> tuple[Any, dict[str, Any]] | None:
 
 
 def _find_bundle(recorded: Path, evaluated: Path | None) -> Path:
-    """The folder of the bundle whose config.yml is being loaded."""
+    """Find the bundle whose config.yml is being loaded."""
     candidates = [] if evaluated is None else [evaluated]
     given = _given_config()
     candidates += [recorded] if given is None else [given.parent, recorded]
@@ -216,11 +210,8 @@ def _find_bundle(recorded: Path, evaluated: Path | None) -> Path:
 
 
 def _stub_checkpoint_dir(bundle: Path) -> Path:
-    """A temporary folder with an empty checkpoint, named after the bundle.
-
-    It is not kept in the bundle, so that a bundle holds no pickled data. Its path ends up in the results of ns-eval,
-    where `bitymi report` tells by it that they are those of a bundle.
-    """
+    """Make a temporary folder with an empty checkpoint, named after the bundle, in which no pickled data may lie; by
+    its path in results of ns-eval `bitymi report` tells a bundle."""
     scratch = Path(tempfile.mkdtemp(prefix="bitymi-bundle-"))
     atexit.register(shutil.rmtree, scratch, ignore_errors=True)
     folder = scratch / bundle.name / "nerfstudio_models"
@@ -230,19 +221,11 @@ def _stub_checkpoint_dir(bundle: Path) -> Path:
     return folder
 
 
-def _read_cameras_of(bundle: Path, datamanager: Any) -> None:
-    """Read the bundle's own cameras where its capture is gone."""
-    data = datamanager.data or getattr(datamanager.dataparser, "data", None)
-    if data is not None and not Path(data).exists() and has_cameras(bundle):
-        datamanager.dataparser = BundleCamerasConfig(data=bundle, capture=Path(data))
-        datamanager.data = bundle
-
-
 def refuse_others() -> None:
-    """Stop where the command that loads a scene cannot work on it, before it is loaded.
+    """Stop a command that cannot work on a scene before loading it.
 
-    Changes: nothing. For: the commands of ns-export that need rays. Without: they fail in their middle with tracebacks.
-    Superfluous once methods say which exports they support.
+    Changes: nothing. For: commands of ns-export that need rays. Without: they fail halfway with tracebacks. Superfluous
+    once methods state which exports they support.
     """
     found = _running_command()
     if found is not None and type(found[0]).__name__ in REFUSED:
@@ -250,10 +233,10 @@ def refuse_others() -> None:
 
 
 def moved_capture(datamanager: Any) -> None:
-    """Read the capture where the environment variable `DATA` says it is now, if it says anything.
+    """Read the capture at the environment variable `DATA`, if it is set.
 
     Changes: the recorded path. For: ns-eval, ns-render, ns-viewer, ns-export. Without: runs and bundles are lost with
-    the folder of their capture. Superfluous once these have an option --data.
+    their capture's folder. Superfluous once these have an option --data.
     """
     if not os.environ.get(DATA):
         return
@@ -264,11 +247,11 @@ def moved_capture(datamanager: Any) -> None:
 
 
 def adopt_viewer(config: Any) -> None:
-    """Have ns-viewer, where it is the command that loads `config`, show this scene by our rules.
+    """Have ns-viewer, if it loads `config`, show this scene by our rules.
 
     Changes: `_start_viewer` in nerfstudio's script, for this scene. For: ns-viewer. Without: the viewer is open to the
-    network, as its command line replaces the recorded host; Ctrl-C ends in a traceback; a bundle whose photographs are
-    gone cannot be shown. Superfluous once ns-viewer keeps recorded options, listens on this machine alone, and catches
+    network, as its command line replaces the recorded host; Ctrl-C ends in a traceback; bundles of lost photographs
+    cannot be shown. Superfluous once ns-viewer keeps recorded options, listens on this machine alone, and catches
     Ctrl-C.
     """
     for script in map(sys.modules.get, (VIEWER, "__main__")):
@@ -296,15 +279,12 @@ def _start_viewer(ours: Any, start: Callable[..., None], config: Any, *args: Any
 
 
 def adopt_render() -> None:
-    """Have ns-render or ns-eval, where it is the command that is about to load a scene of ours, write by our rules.
+    """Have ns-render or ns-eval, if about to load a scene of ours, write by our rules. Raises InputError: an option or
+    the camera path cannot be used.
 
-    Changes: functions in the namespace of the script that render and write, until it has rendered; the output path of
-    ns-eval. For: ns-render, ns-eval. Without: films need a program ffmpeg, spirals roll, principal points are ignored,
-    options are checked after the scene was loaded, and a full disk leaves half of a file. Superfluous once nerfstudio
-    does these itself.
-
-    Raises:
-        InputError: an option or the camera path cannot be used.
+    Changes: functions in the script's namespace that render and write, until it has rendered; ns-eval's output path.
+    For: ns-render, ns-eval. Without: films need a program ffmpeg, spirals roll, principal points are ignored, options
+    are checked after loading the scene, and a full disk leaves half a file. Superfluous once nerfstudio does these.
     """
     found = _running_command()
     if found is None:
@@ -347,11 +327,11 @@ def adopt_render() -> None:
 
 @contextmanager
 def filter_console() -> Iterator[None]:
-    """Drop REMARKS, the box in which the viewer's server states its address, and torch's warnings about nerfstudio's
-    code. Afterwards all is as before: other methods are not concerned.
+    """Drop REMARKS, the viewer server's box with its address, and torch's warnings about nerfstudio's code; restore all
+    afterwards.
 
     Changes: `print` and `log` of nerfstudio's console, and rich's `print`. For: ns-train. Without: the run's own lines
-    are lost among a screen of others, and a bracket in a path ends it. Superfluous once nerfstudio logs by levels.
+    are lost in a screen of others, and a bracket in a path ends it. Superfluous once nerfstudio logs by levels.
     """
 
     def remark(said: Any) -> bool:
@@ -380,7 +360,7 @@ def ignore_torch_warnings() -> Iterator[None]:
 
 @contextmanager
 def _dropping(owner: Any, name: str, dropped: Callable[[Any], bool], **always: Any) -> Iterator[None]:
-    """Have the function `name` of `owner` do nothing where `dropped` holds for its first argument."""
+    """Drop calls of `owner`'s function `name` by their first argument."""
     write = getattr(owner, name)
 
     def filtered(*said: Any, **options: Any) -> None:

@@ -1,6 +1,5 @@
-"""Entry points of nerfstudio's method registry (pyproject.toml), one name per method. nerfstudio loads them without any
-error handling, from every ns-* command, so nothing here raises: a method that cannot be set up is registered under its
-name and says why when it is used."""
+"""Entry points of nerfstudio's method registry (pyproject.toml). Every ns-* command loads them and handles no errors,
+so nothing here raises: a method that fails to load reports why when it is used."""
 
 import warnings
 from dataclasses import dataclass
@@ -15,10 +14,9 @@ from bitymi_ns import KernelsUnavailable
 
 @dataclass
 class UnavailableConfig(TrainerConfig):
-    """Stands in for a method that could not be set up: reports the reason as soon as it is used."""
+    """Stands in for a method that failed to load, and reports the reason when used."""
 
     reason: str = ""
-    """The reason that the method is not available."""
 
     def set_timestamp(self) -> None:
         raise SystemExit(f"{self.method_name} is not available: {self.reason}")
@@ -32,13 +30,12 @@ def _specification(name: str) -> MethodSpecification:
     except Exception as error:  # noqa: BLE001 - see the module's docstring
         reason = str(error) if isinstance(error, KernelsUnavailable) else f"{type(error).__name__}: {error}"
         warnings.warn(f"bitymi-ns: its methods are not available: {reason}", stacklevel=1)
-        return MethodSpecification(
-            config=UnavailableConfig(method_name=name, reason=reason), description=f"not available: {reason}"
-        )
+        config = UnavailableConfig(method_name=name, reason=reason)
+        return MethodSpecification(config=config, description=f"not available: {reason}")
 
 
 def _install() -> None:
-    """Change what does not pass through nerfstudio's registry; see `hooks`."""
+    """Make the changes that nerfstudio's registry has no place for; see `hooks`."""
     try:
         from bitymi_ns.plugin import hooks
         from bitymi_ns.plugin.run import torchrun

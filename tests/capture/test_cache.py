@@ -11,12 +11,11 @@ from PIL import Image
 
 from bitymi_ns import files
 from bitymi_ns.capture.cache import keep_work_folder
-from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.capture.known_poses import KnownView, triangulate
 from bitymi_ns.capture.poses import find_poses
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import Job
-from bitymi_ns.capture.types import CaptureError, SfmOptions
+from bitymi_ns.capture.types import CaptureError, ColmapCamera, SfmOptions
 
 
 @pytest.fixture

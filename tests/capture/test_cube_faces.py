@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.capture.lens import FACES, Lens, lenses_of
+from bitymi_ns.capture.types import ColmapCamera
 
 PANORAMA = ColmapCamera("EQUIRECTANGULAR", 256, 128, (256.0, 128.0))
 RADIUS = 100.0

@@ -7,9 +7,9 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.capture.sfm import features
 from bitymi_ns.capture.sfm.job import CameraGroup, Job
+from bitymi_ns.capture.types import ColmapCamera
 
 
 @pytest.fixture

@@ -7,8 +7,7 @@ import av
 import numpy as np
 import pytest
 
-from bitymi_ns.capture.hdr import HLG, HLG_PEAK, LUMA, PQ, TO_709, WHITE, hlg_to_nits, pq_to_nits
-from bitymi_ns.capture.video import _frames, _upright
+from bitymi_ns.capture.video import HLG, HLG_PEAK, LUMA, PQ, TO_709, WHITE, _frames, _upright, hlg_to_nits, pq_to_nits
 
 
 def scene() -> np.ndarray:

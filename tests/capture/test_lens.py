@@ -10,9 +10,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.capture.images import read_image
 from bitymi_ns.capture.lens import MAX_VIEW_ANGLE, Lens, lenses_of
+from bitymi_ns.capture.types import ColmapCamera
 from tests.captures import refused
 
 SIZE = (96, 72)

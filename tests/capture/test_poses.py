@@ -12,12 +12,11 @@ import pycolmap
 import pytest
 from PIL import ExifTags, Image
 
-from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.capture.exif import Exif
 from bitymi_ns.capture.known_poses import KnownView, triangulate
 from bitymi_ns.capture.photos import Photo
 from bitymi_ns.capture.poses import _finished, _what, by_camera, camera_group, find_poses, make_job, ordered
-from bitymi_ns.capture.types import CaptureError, SfmOptions, SfmSettings
+from bitymi_ns.capture.types import CaptureError, ColmapCamera, SfmOptions, SfmSettings
 from bitymi_ns.cli import main
 from bitymi_ns.sample.capture import View, render
 from bitymi_ns.sample.room import Room

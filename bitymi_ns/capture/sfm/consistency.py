@@ -1,4 +1,4 @@
-"""Consistency of a model: cameras that no points link to the others, and matches that contradict the poses."""
+"""Check a model: cameras that no points link to the others, and matches that contradict the poses."""
 
 from pathlib import Path
 
@@ -9,15 +9,13 @@ from scipy.sparse.csgraph import connected_components
 
 from bitymi_ns.capture.sfm.job import MAX_ERROR
 
-LINK = 15
-"""Points that two photographs see together, from which on they link each other; COLMAP's least number of inliers of a
-pair."""
+LINK = 15  # points seen together that link two photographs; COLMAP's least number of inliers of a pair
 
 
 def drop_unlinked(model: pycolmap.Reconstruction) -> None:
-    """Take the pose from cameras that points do not link to most of the others: their pose is arbitrary.
+    """Remove arbitrary poses: of cameras that points do not link to most others.
 
-    Mappers place them by directions between pairs, whose points the filters may have removed.
+    Mappers find them by directions between pairs, whose points the filters may have removed.
     """
     placed = [image for image in model.images.values() if image.has_pose]
     column = {image.image_id: i for i, image in enumerate(placed)}
@@ -35,21 +33,21 @@ def drop_unlinked(model: pycolmap.Reconstruction) -> None:
 
 
 def contradicted(model: pycolmap.Reconstruction, database: Path, pixel: float) -> float:
-    """Share of the verified matches of a database between placed photographs that their poses contradict: the rays pass
-    each other by more than `MAX_ERROR` pixels of `Job.pixel`, or meet behind a camera."""
+    """Compute the share of verified matches between placed photographs that poses contradict: the rays pass each other
+    by more than `MAX_ERROR` pixels of `Job.pixel`, or meet behind a camera."""
     placed = {i: image for i, image in model.images.items() if image.has_pose}
     total = against = 0
     with pycolmap.Database.open(database) as opened:
-        rays = {
-            i: np.asarray(image.camera.cam_ray_from_img(opened.read_keypoints(i)[:, :2].astype(np.float64)))
-            for i, image in placed.items()
-        }
+        pixels = {i: opened.read_keypoints(i)[:, :2].astype(np.float64) for i in placed}
+        rays = {i: np.asarray(image.camera.cam_ray_from_img(pixels[i])) for i, image in placed.items()}
         for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
             first, second = pycolmap.pair_id_to_image_pair(pair)
             matches = np.asarray(geometry.inlier_matches)
             if first not in placed or second not in placed or len(matches) < LINK:
                 continue
-            limit = MAX_ERROR * pixel / pixels_per_radian(placed[second].camera)
+            camera = placed[second].camera
+            focal = camera.width / (2.0 * np.pi) if camera.is_spherical() else camera.mean_focal_length()
+            limit = MAX_ERROR * pixel / focal  # angle in the middle of the picture
             a, b = (rays[i][column] for i, column in zip((first, second), matches.T, strict=True))
             move = placed[second].cam_from_world() * placed[first].cam_from_world().inverse()
             total += len(matches)
@@ -57,15 +55,9 @@ def contradicted(model: pycolmap.Reconstruction, database: Path, pixel: float) -
     return against / max(total, 1)
 
 
-def pixels_per_radian(camera: pycolmap.Camera) -> float:
-    """Pixels per radian in the middle of a picture."""
-    return camera.width / (2.0 * np.pi) if camera.is_spherical() else camera.mean_focal_length()
-
-
 def _rays_meet(a: np.ndarray, b: np.ndarray, move: pycolmap.Rigid3d, limit: float) -> np.ndarray:
-    """Test [n] which pairs of unit rays [n,3], each in the axes of its camera, meet in front of both cameras. `move` is
-    from the first camera to the second, `limit` the largest angle in radians between a ray and the plane of the other
-    one and both centres."""
+    """Test [n] which pairs of unit rays [n,3], in the axes of their cameras, meet in front of both. `move`: first
+    camera to second; `limit`: largest angle in radians between a ray and the plane of the other and both centres."""
     a, step = a @ move.rotation.matrix().T, move.translation
     normal = np.cross(np.broadcast_to(step, a.shape), a)
     off = np.abs((normal * b).sum(1)) / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)

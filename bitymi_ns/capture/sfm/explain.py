@@ -1,4 +1,4 @@
-"""Reasons why photographs have no pose, with advice on what to photograph differently."""
+"""Explain why photographs have no pose, and what to photograph differently."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -8,19 +8,16 @@ import numpy as np
 import pycolmap
 from scipy.cluster.hierarchy import DisjointSet
 
-from bitymi_ns.capture.camera import SPHERICAL_MODEL
 from bitymi_ns.capture.sfm.job import CameraGroup, Job, NoPoses
+from bitymi_ns.capture.types import SPHERICAL_MODEL
 
-FEW_FEATURES = 60  # a photograph with fewer features shows hardly any detail
-PARALLAX = 1.0  # degrees; if the rays to the points differ by less, the photographs were taken from one spot
-ROTATED = 2.0  # pixels of the features' images within which a turn alone explains a match
-MOST = 0.9
-"""Share of a pair's matches, and of the pairs, that a turn alone has to explain. Fewer are a far background, or
-neighbours that are almost at one place."""
+FEW_FEATURES = 60  # features of a photograph with hardly any detail
+PARALLAX = 1.0  # largest angle in degrees between rays to the points of photographs from one spot
+ROTATED = 2.0  # pixels of the images with features within which a turn alone explains a match
+MOST = 0.9  # least share of a pair's matches, and of the pairs, that a turn explains; fewer: a far background
 PAIRS_TRIED = 60
-TELLING = 30  # matches of a pair that are enough to tell a turn from a step
-GUESSES = (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0, 3.0)
-"""Focal lengths, in units of the longer side, that are tried where it is not known."""
+TELLING = 30  # least matches of a pair that tell a turn from a step
+GUESSES = (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0, 3.0)  # unknown focal lengths, in longer sides
 
 SHOOT = (
     "Walk round the scene and photograph it from many places, each photograph sharing at least two thirds of what it "
@@ -38,10 +35,10 @@ class ViewGraph:
     """Matches between photographs."""
 
     features: dict[str, int]  # per photograph
-    inliers: dict[tuple[str, str], int]  # matches per pair that fit a common geometry; pairs without are missing
+    inliers: dict[tuple[str, str], int]  # matches per pair that fit a common geometry
 
     def components(self) -> list[set[str]]:
-        """Connected sets of photographs, the largest first, without single photographs."""
+        """List connected sets of photographs, the largest first, without single ones."""
         sets = DisjointSet(self.features)
         for first, second in self.inliers:
             sets.merge(first, second)
@@ -62,7 +59,7 @@ def view_graph(database: Path) -> ViewGraph:
 
 
 def left_out(graph: ViewGraph, placed: set[str], title: dict[str, str]) -> dict[str, str]:
-    """Explain by name (`title`) why photographs have no pose; `placed` ones have."""
+    """Explain by name (`title`) why photographs other than the `placed` ones have no pose."""
     best: Counter[str] = Counter()
     with_placed: Counter[str] = Counter()
     for (first, second), count in graph.inliers.items():
@@ -87,7 +84,7 @@ def left_out(graph: ViewGraph, placed: set[str], title: dict[str, str]) -> dict[
 
 
 def why_none(job: Job, graph: ViewGraph) -> NoPoses:
-    """Explain why there is no model at all."""
+    """Explain why there is no model."""
     count = len(job.order)
     bare = sum(features < FEW_FEATURES for features in graph.features.values())
     if bare > count / 2:
@@ -99,14 +96,12 @@ def why_none(job: Job, graph: ViewGraph) -> NoPoses:
     if not parts or len(parts[0]) < max(3, 0.2 * count):
         together = f"at most {len(parts[0])} of {count} are connected" if parts else "no two of them show the same"
         return NoPoses(f"the photographs do not overlap: {together}. {SHOOT}")
-    return NoPoses(
-        f"{len(parts[0])} of {count} photographs overlap, but no poses explain what they show: the scene may have "
-        f"moved between them, or the camera hardly did. {SHOOT}"
-    )
+    why = f"the scene may have moved between them, or the camera hardly did. {SHOOT}"
+    return NoPoses(f"{len(parts[0])} of {count} photographs overlap, but no poses explain what they show: {why}")
 
 
 def parallax(model: pycolmap.Reconstruction) -> float:
-    """Median over the points of the widest angle between two rays to them, in degrees."""
+    """Compute the median over the points of the widest angle between two rays, in degrees."""
     centers = {image.image_id: image.projection_center() for image in model.images.values() if image.has_pose}
     ids = list(model.point3D_ids())
     angles = []
@@ -119,7 +114,7 @@ def parallax(model: pycolmap.Reconstruction) -> float:
 
 
 def only_turned(job: Job, database: Path) -> bool:
-    """Test if pure rotation explains most pairs: the matches fit K R K^-1 for some focal length."""
+    """Test if a turn explains most pairs: the matches fit K R K^-1 for some focal length."""
     groups = {name: group for group in job.cameras for name in group.names}
     with pycolmap.Database.open(database) as opened:
         images = {image.image_id: image for image in opened.read_all_images()}
@@ -127,14 +122,13 @@ def only_turned(job: Job, database: Path) -> bool:
         pairs, geometries = opened.read_two_view_geometries()
     counted = sorted(zip(pairs, geometries, strict=True), key=lambda item: -len(item[1].inlier_matches))
     counted = [item for item in counted if len(item[1].inlier_matches) >= TELLING]
-    tried = counted[:: max(1, len(counted) // PAIRS_TRIED)]  # wide pairs too: neighbours alone show little parallax
+    tried = counted[:: max(1, len(counted) // PAIRS_TRIED)]  # wide pairs too: neighbours show little parallax
     turned = 0
     for pair, geometry in tried:
         matches = np.asarray(geometry.inlier_matches)
         first, second = pycolmap.pair_id_to_image_pair(pair)
-        pair_of = [
-            (groups[images[i].name], points[i][column]) for i, column in zip((first, second), matches.T, strict=True)
-        ]
+        of_pair = zip((first, second), matches.T, strict=True)
+        pair_of = [(groups[images[i].name], points[i][column]) for i, column in of_pair]
         limit = ROTATED * max(1.0, max(pair_of[0][0].camera.size) / job.max_image_size)
         for guess in GUESSES[: 1 if all(each.prior for each, _ in pair_of) else None]:
             (a, focal), (b, _) = (_rays(*each, guess) for each in pair_of)
@@ -145,8 +139,8 @@ def only_turned(job: Job, database: Path) -> bool:
 
 
 def _rays(group: CameraGroup, points: np.ndarray, guess: float) -> tuple[np.ndarray, float]:
-    """Unit rays [n,3] of points [n,2] in pixels, and pixels per radian; `guess` of the focal length, in units of the
-    longer side, where it is not known."""
+    """Make unit rays [n,3] of points [n,2] in pixels, and pixels per radian; `guess` of an unknown focal length, in
+    longer sides."""
     camera = group.camera
     if camera.model == SPHERICAL_MODEL:
         return camera.colmap.cam_ray_from_img(points.astype(float)), camera.width / (2.0 * np.pi)
@@ -156,10 +150,9 @@ def _rays(group: CameraGroup, points: np.ndarray, guess: float) -> tuple[np.ndar
 
 
 def _turn_errors(a: np.ndarray, b: np.ndarray, focal: float) -> np.ndarray:
-    """Distances [n] in pixels between points and those that the best turn takes to them, of unit rays a, b [n, 3];
-    `focal` in pixels per radian."""
+    """Measure distances [n] in pixels of unit rays a, b [n, 3] after the best turn; `focal` in pixels per radian."""
     keep = np.ones(len(a), bool)
-    for _ in range(3):  # least squares, then without the worst half, in which the wrong matches are
+    for _ in range(3):  # least squares, then without the worst half, which has the wrong matches
         u, _, vt = np.linalg.svd(b[keep].T @ a[keep])
         turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
         distances = np.linalg.norm(a @ turn.T - b, axis=1) * focal

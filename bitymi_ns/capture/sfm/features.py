@@ -1,48 +1,36 @@
-"""SIFT features of all photographs, in COLMAP's database."""
+"""Find SIFT features of all photographs, in COLMAP's database."""
 
 from pathlib import Path
 
 import pycolmap
 
-from bitymi_ns.capture.camera import SPHERICAL_MODEL
 from bitymi_ns.capture.sfm.job import CameraGroup, Job, StageProgress
+from bitymi_ns.capture.types import SPHERICAL_MODEL
 
-SMALL = 1000
-"""Photographs whose longer side has fewer pixels are doubled before features are found; larger ones have enough."""
-
+SMALL = 1000  # double photographs with fewer pixels along the longer side; larger ones have enough features
 SPHERICAL_SCALE = 2
-"""Factor on these sizes for 360-degree pictures, whose details are small: with half as many features, their positions
-were wrong by a metre where perspective photographs were among them."""
+"""Factor on these sizes for 360-degree pictures, whose details are small: with half the features, their positions were
+wrong by a metre among perspective photographs."""
 
 
 def extract(job: Job, database: Path, tell: StageProgress) -> None:
-    """Find the features of the photographs that have none yet."""
+    """Find features of photographs without any yet."""
     total = len(job.order)
     tell("finding features", 0, total, counts="keypoints")
-    groups = list(zip(job.cameras, camera_ids(job, database), strict=True))
-    for group, camera_id in groups:  # which numbers the photographs, in an order that threads do not change
-        pycolmap.import_images(
-            database,
-            job.images,
-            image_names=group.names,
-            camera_mode=pycolmap.CameraMode.SINGLE,
-            options=_reader(job, group, camera_id),
-        )
-    for group, camera_id in groups:
-        pycolmap.extract_features(
-            database,
-            job.images,
-            image_names=group.names,
-            camera_mode=pycolmap.CameraMode.SINGLE,
-            reader_options=_reader(job, group, camera_id),
-            extraction_options=_extraction(job, group),
-            device=pycolmap.Device.cpu,
-        )
+    ids = zip(job.cameras, camera_ids(job, database), strict=True)
+    groups = [(group, _reader(job, group, camera_id)) for group, camera_id in ids]
+    single = {"camera_mode": pycolmap.CameraMode.SINGLE}
+    for group, reader in groups:  # number photographs in an order that threads do not change
+        pycolmap.import_images(database, job.images, image_names=group.names, options=reader, **single)
+    for group, reader in groups:
+        options = {"reader_options": reader, "extraction_options": _extraction(job, group), **single}
+        how = {"image_names": group.names, "device": pycolmap.Device.cpu}
+        pycolmap.extract_features(database, job.images, **how, **options)
     tell("finding features", total, total)
 
 
 def camera_ids(job: Job, database: Path) -> list[int]:
-    """The groups' cameras in the database; those that an earlier run has not come to are written."""
+    """Return the groups' cameras in the database; write those that an earlier run lacks."""
     with pycolmap.Database.open(database) as opened:
         for group in job.cameras[opened.num_cameras() :]:
             camera = group.camera.colmap

@@ -1,5 +1,5 @@
-"""Camera poses from compared photographs: all at once first, one after the other where that falls short, and the last
-bundle adjustment; points for photographs whose cameras are known."""
+"""Map compared photographs: all cameras at once, else one after the other, and a last bundle adjustment; or points for
+known cameras."""
 
 import copy
 import shutil
@@ -15,52 +15,42 @@ from bitymi_ns.capture.sfm.job import DATABASE, MAX_ERROR, Job, NoPoses, StagePr
 from bitymi_ns.capture.types import CONTRADICTED
 
 Mapper = Callable[[Job, Path, Path, StageProgress], dict[int, pycolmap.Reconstruction]]
-"""Maps the features and matches of a database with a folder for its files; returns connected components."""
-ENOUGH = 0.9
-"""The global mapper's poses are taken as they are if they are of this share of the connected photographs."""
-GOOD_ERROR = 1.0
-"""... and their reprojection error is below so many pixels of the photographs as features were found on them, and few
-matches contradict them."""
+"""Maps a database's features and matches, with a folder for files; returns connected components."""
+ENOUGH = 0.9  # share of the connected photographs in a global model that is good enough
+GOOD_ERROR = 1.0  # and its reprojection error, in pixels of the images with features, if few matches contradict it
 
-MIN_ANGLE = 1.5  # degrees between rays below which a point has no depth to be trusted; COLMAP's own limit
-GAIN = 0.03
-"""OPENCV replaces SIMPLE_RADIAL if it lowers the reprojection error by this share: its four terms are there to be
-misused by few observations."""
-OBSERVATIONS_PER_CAMERA = 2000  # a camera with fewer observations keeps the simple model
-LEAST_POINTS = 10  # fewer points are none to start from
+MIN_ANGLE = 1.5  # least angle between rays of a point with depth, degrees; COLMAP's own limit
+GAIN = 0.03  # least drop of the reprojection error by OPENCV: few observations may misuse its four terms
+OBSERVATIONS_PER_CAMERA = 2000  # least for OPENCV
+LEAST_POINTS = 10  # to start from
 
 
 def reconstruct(job: Job, database: Path, connected: int, tell: StageProgress) -> pycolmap.Reconstruction | None:
-    """The best model of the photographs, or None where there is none; `connected` of them are connected by verified
-    pairs."""
+    """Find the best model of the photographs; None = none. Verified pairs connect `connected` of them."""
     found = None
     if job.mapper in ("auto", "global"):
         found = _mapped(_global, job, database, tell)
-        if job.mapper == "global" or (found is not None and _satisfies(found, job, database, connected)):
+        if job.mapper == "global":
             return found
+        if found is not None and found.num_reg_images() >= ENOUGH * connected:
+            exact = found.compute_mean_reprojection_error() <= GOOD_ERROR * job.pixel
+            if exact and contradicted(found, database, job.pixel) <= CONTRADICTED:
+                return found
     return better(job, database, found, _mapped(_incremental, job, database, tell))
 
 
 def better(job: Job, database: Path, *models: pycolmap.Reconstruction | None) -> pycolmap.Reconstruction | None:
-    """The model with most cameras, of equals that which fewest matches contradict; None if there is none."""
+    """Choose the model with most cameras, of equals that which fewest matches contradict; None = none."""
     found = [model for model in models if model is not None]
     most = max((model.num_reg_images() for model in found), default=0)
     equal = [model for model in found if model.num_reg_images() == most]
-    if len(equal) < 2:  # no matches need to be read
+    if len(equal) < 2:
         return equal[0] if equal else None
     return min(equal, key=lambda model: contradicted(model, database, job.pixel))
 
 
-def _satisfies(model: pycolmap.Reconstruction, job: Job, database: Path, connected: int) -> bool:
-    return (
-        model.num_reg_images() >= ENOUGH * connected
-        and model.compute_mean_reprojection_error() <= GOOD_ERROR * job.pixel
-        and contradicted(model, database, job.pixel) <= CONTRADICTED
-    )
-
-
 def _mapped(mapper: Mapper, job: Job, database: Path, tell: StageProgress) -> pycolmap.Reconstruction | None:
-    """The largest component of a mapper's, refined, of the cameras that its points link."""
+    """Map, and refine the largest component's cameras that its points link."""
     with job.scratch() as folder:
         models = mapper(job, database, folder, tell)
     largest = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
@@ -80,9 +70,9 @@ def _global(job: Job, database: Path, folder: Path, tell: StageProgress) -> dict
     options.random_seed = 0
     options.num_threads = options.mapper.num_threads = job.threads
     options.mapper.bundle_adjustment.ceres.solver_options.num_threads = job.threads
-    copy = folder / "database.db"  # its focal lengths are changed, which the other mapper starts from
+    copy = folder / "database.db"  # whose focal lengths change, but not for the other mapper
     shutil.copyfile(database, copy)
-    calibration = pycolmap.ViewGraphCalibrationOptions()  # finds focal lengths, and finds out wrong ones from EXIF
+    calibration = pycolmap.ViewGraphCalibrationOptions()  # finds focal lengths, and wrong ones of EXIF
     calibration.random_seed = 0
     pycolmap.calibrate_view_graph(copy, calibration)
     models = pycolmap.global_mapping(copy, job.images, folder, options)
@@ -113,7 +103,7 @@ def _incremental(job: Job, database: Path, folder: Path, tell: StageProgress) ->
 
 
 def refined(model: pycolmap.Reconstruction, job: Job) -> pycolmap.Reconstruction:
-    """Drop what does not fit, adjust all cameras and points of a mapper's `model` in place, and drop again."""
+    """Drop bad observations, adjust all cameras and points of a `model` in place, and drop again."""
     _filter(model, job.pixel)
     if model.num_points3D() == 0:
         return model
@@ -150,11 +140,7 @@ def _filter(model: pycolmap.Reconstruction, pixel: float) -> None:
 
 
 def triangulate(job: Job, tell: StageProgress) -> pycolmap.Reconstruction:
-    """Triangulate points from a job's photographs with their poses as they are.
-
-    Raises:
-        NoPoses: the photographs do not show the same from the poses given.
-    """
+    """Triangulate points by a job's known poses. Raises NoPoses: the photographs do not show the same by them."""
     database = Path(job.work) / DATABASE
     features.extract(job, database, tell)
     pairs.match(job, database, tell)
@@ -174,7 +160,7 @@ def triangulate(job: Job, tell: StageProgress) -> pycolmap.Reconstruction:
             f"only {model.num_points3D()} points can be triangulated from the given poses: the poses may belong to "
             "other photographs, or be camera to world where world to camera is meant, or have other axes"
         )
-    # The poses are written back as given: the triangulation leaves them as they are, but for rounding.
+    # the triangulation changes poses by rounding
     for image in model.images.values():
         image.frame.rig_from_world = _pose(job.poses[image.name])
     return model
@@ -186,7 +172,7 @@ def _pose(matrix: list[list[float]]) -> pycolmap.Rigid3d:
 
 
 def _known(job: Job, database: Path) -> pycolmap.Reconstruction:
-    """A model of the cameras and poses, with the numbers that the database has for them."""
+    """Make a model of known cameras and poses, with the database's numbers."""
     model = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as opened:
         for camera in opened.read_all_cameras():

@@ -1,4 +1,4 @@
-"""Selection and matching of pairs of photographs."""
+"""Choose and match pairs of photographs."""
 
 from itertools import combinations
 from pathlib import Path
@@ -11,21 +11,20 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from bitymi_ns.capture.sfm.job import PAIRS, Job, StageProgress
 from bitymi_ns.files import write_file
 
-FEW = 30  # up to so many photographs are all compared with all
-WORTH_ALL = 150  # up to so many are compared with all where too few get a pose without
-NEIGHBOURS = 20  # photographs that each is compared with, by how alike they look, or by GPS
+FEW = 30  # most photographs that are all compared with all
+WORTH_ALL = 150  # most that are so if too few get a pose otherwise
+NEIGHBOURS = 20  # photographs that each is compared with, by likeness or by GPS
 COARSE_FEATURES = (256, 128)
-"""Features per photograph that decide how alike two look: the largest, because they are seen from afar and close by.
-The second number is for more than MANY photographs."""
+"""Largest features per photograph that decide on likeness, seen from afar and close by; of more than MANY photographs
+the second number."""
 MANY = 400
-COARSE_COSINE = 0.85
-"""Two features are alike if the cosine between their descriptors is above this, and each is the other's nearest."""
+COARSE_COSINE = 0.85  # least cosine between descriptors of like features, each the other's nearest
 SEQUENCE_NEIGHBOURS = 6
-SEQUENCE_SHARE = 0.8  # photographs are a sequence if so many neighbours in their order are among the most alike
+SEQUENCE_SHARE = 0.8  # least share of neighbours in order that are most alike, in a sequence
 
 
 def match(job: Job, database: Path, tell: StageProgress, every: bool = False) -> None:
-    """Choose pairs, or `every` one, and compare those that have not been compared yet."""
+    """Choose pairs, or `every` one, and compare those not compared yet."""
     listed = Path(job.work) / PAIRS
     if every or not listed.exists():
         pairs = list(combinations(range(len(job.order)), 2)) if every else choose(job, database, tell)
@@ -36,14 +35,13 @@ def match(job: Job, database: Path, tell: StageProgress, every: bool = False) ->
     tell("comparing photographs", 0, total, counts="two_view_geometries")
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
-    pycolmap.match_image_pairs(
-        database, pairing_options=options, verification_options=verification, device=pycolmap.Device.cpu
-    )
+    settings = {"pairing_options": options, "verification_options": verification}
+    pycolmap.match_image_pairs(database, **settings, device=pycolmap.Device.cpu)
     tell("comparing photographs", total, total)
 
 
 def choose(job: Job, database: Path, tell: StageProgress) -> list[tuple[int, int]]:
-    """Pairs of indices into `job.order`, the first index the smaller one."""
+    """Choose pairs of indices into `job.order`, the smaller one first."""
     count = len(job.order)
     if job.matching == "exhaustive" or (job.matching == "auto" and count <= FEW):
         return list(combinations(range(count), 2))
@@ -60,11 +58,7 @@ def choose(job: Job, database: Path, tell: StageProgress) -> list[tuple[int, int
 
 
 def likeness(job: Job, database: Path, tell: StageProgress) -> np.ndarray:
-    """Count the largest features that pairs of photographs share.
-
-    Returns:
-        [n,n] counts; 0 on the diagonal.
-    """
+    """Count the largest features [n,n] that pairs of photographs share; 0 on the diagonal."""
     count = len(job.order)
     size = COARSE_FEATURES[count > MANY]
     descriptors = np.zeros((count, size, 128), np.float32)
@@ -95,7 +89,7 @@ def likeness(job: Job, database: Path, tell: StageProgress) -> np.ndarray:
 
 
 def nearest(alike: np.ndarray, neighbours: int) -> set[tuple[int, int]]:
-    """For each photograph those most alike, and a tree of the best pairs, so that no part stands alone; `alike` [n,n]
+    """Pair each photograph with those most alike, and along a tree of the best pairs, which connects all; `alike` [n,n]
     is symmetric, 0 = nothing shared."""
     pairs = set()
     for i, row in enumerate(alike):
@@ -107,13 +101,13 @@ def nearest(alike: np.ndarray, neighbours: int) -> set[tuple[int, int]]:
 
 
 def sequence(count: int) -> set[tuple[int, int]]:
-    """Each photograph with those that follow it, and with some farther ones at distances of powers of two."""
+    """Pair each photograph with those that follow it, and with farther ones at powers of two."""
     steps = sorted({*range(1, SEQUENCE_NEIGHBOURS + 1), 8, 16})
     return {(i, i + step) for i in range(count) for step in steps if i + step < count}
 
 
 def is_sequence(alike: np.ndarray) -> bool:
-    """Test if neighbors in the order are as similar as any photographs."""
+    """Test if neighbors in order are most alike."""
     count = len(alike)
     rank = [(alike[i] > alike[i, i + 1]).sum() for i in range(count - 1) if alike[i, i + 1] > 0]
     return sum(r < NEIGHBOURS / 2 for r in rank) >= SEQUENCE_SHARE * (count - 1)

@@ -1,4 +1,4 @@
-"""COLMAP in a process of its own: Ctrl-C ends it at once, and where it aborts, which its library does, only it does."""
+"""Run COLMAP in a process of its own: Ctrl-C ends it at once, and only it ends where COLMAP aborts."""
 
 import json
 import os
@@ -18,28 +18,19 @@ from bitymi_ns.progress import Progress
 from bitymi_ns.trust import no_links, python_command
 
 LOG = "colmap.log"
-LITTLE_SPACE = 50_000_000  # bytes; where less is left, the disk is what stopped COLMAP
+LITTLE_SPACE = 50_000_000  # bytes free below which the disk has stopped COLMAP
 
 
 def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:
-    """Run a job to its end, and return what the worker found; `source` is for messages.
-
-    Raises:
-        CaptureError: there are no poses, or COLMAP ended otherwise.
-    """
+    """Run a job, and return what the worker found; `source` is for messages. Raises CaptureError: there are no poses,
+    or COLMAP ended otherwise."""
     work = Path(job.work)
     watching = ExitStack()
     with open(work / LOG, "wb", opener=no_links) as log:
-        process = subprocess.Popen(
-            python_command("bitymi_ns.capture.sfm.worker", "main"),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=log,
-            text=True,
-            encoding="utf8",
-            start_new_session=True,  # Ctrl-C comes to us, and we end it
-            env={**os.environ, "PYTHONUNBUFFERED": "1"},
-        )
+        streams = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": log}
+        how = {"text": True, "encoding": "utf8", "env": {**os.environ, "PYTHONUNBUFFERED": "1"}}
+        how["start_new_session"] = True  # Ctrl-C comes to this process alone
+        process = subprocess.Popen(python_command("bitymi_ns.capture.sfm.worker", "main"), **streams, **how)
         try:
             assert process.stdin is not None and process.stdout is not None
             process.stdin.write(job.text() + "\n")
@@ -67,9 +58,9 @@ def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:
 
 @contextmanager
 def _watched(database: Path, table: str, progress: Progress, stage: str, total: int) -> Iterator[None]:
-    """Tell how many rows a table of COLMAP's database has while COLMAP fills it.
+    """Report the rows of a table of COLMAP's database while COLMAP fills it.
 
-    From this process, because two copies of SQLite in one, COLMAP's and Python's, undo each other's locks on a file.
+    From this process: COLMAP's copy of SQLite and Python's in one process would undo each other's locks on a file.
     """
     ended = threading.Event()
 
@@ -87,7 +78,7 @@ def _watched(database: Path, table: str, progress: Progress, stage: str, total: 
 
 
 def rows(database: Path, table: str) -> int:
-    """Count the rows of a database table; 0 while it cannot be read. Not for a process in which COLMAP has it open."""
+    """Count the rows of a table; 0 if it cannot be read. Not in a process in which COLMAP has the database open."""
     try:
         connection = sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True, timeout=5)
         try:
@@ -98,11 +89,13 @@ def rows(database: Path, table: str) -> int:
         return 0
 
 
-def forget(work: Path) -> None:
-    """Remove what features and matches are kept in."""
+def forget(work: Path, *folders: str) -> None:
+    """Remove features and matches, and these folders."""
     for name in (DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm", PAIRS):
         with suppress(OSError):
             (work / name).unlink()
+    for name in folders:
+        shutil.rmtree(work / name, ignore_errors=True)
 
 
 def _why_ended(work: Path, source: Path, code: int) -> str:
@@ -110,21 +103,15 @@ def _why_ended(work: Path, source: Path, code: int) -> str:
     said = [line for line in log.splitlines() if line.strip() and not re.match(r"\*\*\* |PC: @| +@ ", line)]
     last = said[-1].split("] ", 1)[-1].strip() if said else ""
     free = shutil.disk_usage(work).free
-    full = any(
-        word in log
-        for word in ("disk is full", "No space left", "disk I/O error", "File too large", "readonly database")
-    )
+    signs = ("disk is full", "No space left", "disk I/O error", "File too large", "readonly database")
+    full = any(sign in log for sign in signs)
     if full or free < LITTLE_SPACE:
-        return (
-            f"{work} cannot be written: the disk or the quota is full ({size_text(free)} free on the disk). Free some "
-            "space, and start again: what is done is kept"
-        )
+        advice = "Free some space, and start again: what is done is kept"
+        return f"{work} cannot be written: the disk or the quota is full ({size_text(free)} free on the disk). {advice}"
     if "database disk image is malformed" in log:
         forget(work)
         return f"what was kept of an earlier run in {work} was damaged and has been removed: start again"
     if code in (-9, 137):
-        return (
-            f"the finding of poses of {source} was killed: the machine may have run out of memory. Start it again, it "
-            "goes on where it stopped; a smaller max_image_size needs less"
-        )
+        advice = "Start it again, it goes on where it stopped; a smaller max_image_size needs less"
+        return f"the finding of poses of {source} was killed: the machine may have run out of memory. {advice}"
     return f"COLMAP failed on {source}: {last or f'it ended with status {code}'}. All it said is in {work / LOG}"

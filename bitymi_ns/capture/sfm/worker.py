@@ -1,7 +1,7 @@
-"""The process that runs COLMAP, by `main`: a Job on stdin, lines of JSON on stdout.
+"""Run COLMAP in this process, by `main`: a Job on stdin, lines of JSON on stdout.
 
-A line is {"stage", "done", "total", "counts"}, or at the end {"result"} or {"failure"}. The process ends when its stdin
-does, so that nothing goes on after whoever started it was killed. What COLMAP and its libraries print goes to stderr.
+A line is {"stage", "done", "total", "counts"}, or at the end {"result"} or {"failure"}. The process ends with its
+stdin, so that nothing goes on after its parent was killed. Prints of COLMAP and its libraries go to stderr.
 """
 
 import json
@@ -18,12 +18,12 @@ from bitymi_ns.capture.sfm import consistency, explain, features, mapping, pairs
 from bitymi_ns.capture.sfm.job import DATABASE, MODEL, Job, NoPoses
 from bitymi_ns.files import complete_folder
 
-LEAST = 3  # fewer placed photographs are no capture
+LEAST = 3  # placed photographs of a capture
 _messages = sys.__stdout__  # the pipe of messages
 
 
 class Stages:
-    """Sends progress, and measures the seconds of every stage."""
+    """Sends progress, and times every stage."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -44,11 +44,7 @@ def send(**line: object) -> None:
 
 
 def find(job: Job, stages: Stages) -> tuple[pycolmap.Reconstruction, dict[str, object]]:
-    """Find the poses of a job's photographs; returns the model, and statistics.
-
-    Raises:
-        NoPoses: there are none.
-    """
+    """Find poses of a job's photographs; return the model and statistics. Raises NoPoses: there are none."""
     database = Path(job.work) / DATABASE
     features.extract(job, database, stages)
     pairs.match(job, database, stages)
@@ -89,10 +85,10 @@ def _mapped(job: Job, database: Path, stages: Stages) -> tuple[explain.ViewGraph
 
 
 def main() -> None:
-    """Run one job, and write its model under the names that people gave the photographs."""
+    """Run a job, and write its model under the photographs' own names."""
     global _messages
     _messages = os.fdopen(os.dup(1), "w", encoding="utf8")
-    os.dup2(2, 1)  # OpenBLAS prints warnings to stdout, among the messages
+    os.dup2(2, 1)  # OpenBLAS prints warnings to stdout
     job = Job.parse(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
     pycolmap.logging.minloglevel = 1  # warnings and errors

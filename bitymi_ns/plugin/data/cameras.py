@@ -1,5 +1,4 @@
-"""Conversion of nerfstudio's cameras to those of the renderer, checks of a capture's cameras, and depth and normal
-outputs for nerfstudio's tools."""
+"""Convert nerfstudio's cameras to the renderer's, check them, and convert depth and normals for nerfstudio's tools."""
 
 import math
 from collections.abc import Sequence
@@ -11,24 +10,21 @@ from torch import Tensor
 from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.scene.camera import Camera
 
-MAX_OFF_AXIS = 80  # largest angle between the optical axis and the middle of the picture, degrees
-USUAL_VIEW = (0.5, 150.0)  # view angles, degrees; outside, the focal length is doubtful
-POSSIBLE_VIEW = (0.01, 178.0)  # view angles, degrees; outside, the focal length is refused
+MAX_OFF_AXIS = 80  # largest angle between the optical axis and the picture's middle, degrees
+USUAL_VIEW = (0.5, 150.0)  # view angles of plausible focal lengths, degrees
+POSSIBLE_VIEW = (0.01, 178.0)  # view angles of accepted focal lengths, degrees
 
 
 def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Camera:
-    """Convert one nerfstudio camera, of shape () or (1,) (OpenGL axes: x right, y up, z backward), to world-to-camera
-    in OpenCV axes, on its device unless another is stated.
-
-    Raises:
-        InputError: it is not a perspective camera, or it has lens distortion.
-    """
+    """Convert a camera of nerfstudio's, of shape () or (1,) (OpenGL axes: x right, y up, z backward), to
+    world-to-camera in OpenCV axes, on its device unless stated. Raises InputError: it is no perspective camera, or has
+    distortion."""
     cameras = cameras.reshape((-1,))
     if cameras.shape[0] != 1:
         raise ValueError(f"expected one camera, found {cameras.shape[0]}")
     names = ("camera_type", "fx", "fy", "cx", "cy", "width", "height", "camera_to_worlds", "distortion_params")
     fields = (getattr(cameras, name) for name in names)
-    # one copy from the device: each waits for it
+    # one copy from the device: each waits
     row = torch.cat([field[0].detach().flatten().double() for field in fields if field is not None]).cpu()
     kind, fx, fy, cx, cy, width, height = row[:7].tolist()
     if int(kind) != CameraType.PERSPECTIVE.value:
@@ -48,13 +44,12 @@ def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Cam
 
 
 def to_cameras(cameras: Cameras, device: torch.device | str | None = None) -> list[Camera]:
-    """Convert each of nerfstudio's cameras [N]; see `to_camera`."""
+    """Convert nerfstudio's cameras [N]; see `to_camera`."""
     return [to_camera(cameras[i : i + 1], device) for i in range(len(cameras))]
 
 
 def check_cameras(cameras: Sequence[Cameras], names: Sequence[object]) -> None:
-    """Fail or warn at pinhole cameras, of the training and of the held-out views, that see nothing, or at focal lengths
-    that do not go with the picture size."""
+    """Fail or warn at pinhole cameras of both splits that see nothing, or whose focal length and size do not fit."""
 
     def column(name: str) -> Tensor:
         return torch.cat([getattr(some, name).flatten() for some in cameras]).double()
@@ -62,13 +57,10 @@ def check_cameras(cameras: Sequence[Cameras], names: Sequence[object]) -> None:
     fx, fy, cx, cy, width, height = (column(name) for name in ("fx", "fy", "cx", "cy", "width", "height"))
     poses = torch.cat([some.camera_to_worlds.flatten(1) for some in cameras])
     off_axis = torch.hypot((cx - 0.5 * width) / fx, (cy - 0.5 * height) / fy)
+    far = f"so far from the picture that this lies more than {MAX_OFF_AXIS} degrees off its axis"
     for what, wrong in (
         ("its pose is not finite", ~poses.isfinite().all(1)),
-        (
-            f"its principal point is so far from the picture that this lies more than {MAX_OFF_AXIS} degrees off its "
-            "axis",
-            off_axis > math.tan(math.radians(MAX_OFF_AXIS)),
-        ),
+        (f"its principal point is {far}", off_axis > math.tan(math.radians(MAX_OFF_AXIS))),
     ):
         if bool(wrong.any()):
             fail(f"the camera of {names[int(wrong.nonzero()[0])]} cannot be used: {what}. Correct the capture.")
@@ -91,15 +83,8 @@ def check_cameras(cameras: Sequence[Cameras], names: Sequence[object]) -> None:
 
 
 def ray_distance(depth: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
-    """Convert blended depth to the expected distance along each pixel's ray, nerfstudio's depth.
-
-    Args:
-        depth: [H, W, 1] sum of w z, camera z.
-        alpha: [H, W, 1] sum of w.
-
-    Returns:
-        [H, W, 1]; empty pixels get the largest distance in the picture.
-    """
+    """Convert blended depth [H, W, 1], the sum of w z over camera z, and alpha [H, W, 1], the sum of w, to the expected
+    distance [H, W, 1] along each pixel's ray, nerfstudio's depth; empty pixels get the picture's largest."""
     height, width = depth.shape[:2]
     x = (torch.arange(width, device=depth.device) + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
     y = (torch.arange(height, device=depth.device) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
@@ -109,9 +94,9 @@ def ray_distance(depth: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
 
 
 def normal_image(normal: Tensor, camera: Camera) -> Tensor:
-    """Convert blended camera-frame normals [H, W, 3] to colors of the world normal, (n + 1) / 2; 0 for none."""
+    """Convert blended camera-frame normals [H, W, 3] to colors (n + 1) / 2 of the world normal; 0 without any."""
     length = normal.norm(dim=-1, keepdim=True)
     unit = normal / length.clamp(min=1e-6)
-    # R^T n without a matrix product, which cuBLAS refuses where torch is asked for deterministic algorithms
+    # R^T n without a matrix product, which cuBLAS refuses to deterministic algorithms
     world = (unit[..., None] * camera.viewmat[:3, :3]).sum(-2)
     return torch.where(length > 1e-3, 0.5 * (world + 1.0), 0.0)

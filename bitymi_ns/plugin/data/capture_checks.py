@@ -1,4 +1,4 @@
-"""Checks of a capture before any time is spent on it, and errors of nerfstudio's loaders in plain words."""
+"""Check a capture before time is spent on it, and report errors of nerfstudio's loaders in plain words."""
 
 import math
 from collections.abc import Iterator
@@ -34,17 +34,15 @@ STOCK_FORMATS: dict[type[DataParserConfig], Format] = {
     BlenderDataParserConfig: "blender",
     ColmapDataParserConfig: "colmap",
 }
-"""nerfstudio's parsers whose captures `bitymi-data` reads."""
+"""nerfstudio's parsers that `bitymi-data` replaces."""
 STOCK_IGNORED = ("_target", "depths_path", "max_2D_matches_per_3D_point",
                  "downscale_rounding_mode", "load_3D_points")  # fmt: skip
-"""Options of these that do not change what is read here, or are translated."""
+"""Their options that change nothing here, or are translated."""
 
 
 def bitymi_parser(config: DataParserConfig) -> DataParserConfig:
-    """Translate one of nerfstudio's parsers to `bitymi-data`, which reads the same captures with more checks.
-
-    Parsers of other formats, and those with an option that `bitymi-data` lacks, are returned as they are.
-    """
+    """Translate nerfstudio's parsers to `bitymi-data`, which checks more, unless their format or an option lacks
+    there."""
     format = STOCK_FORMATS.get(type(config))
     if format is None:
         return config
@@ -66,19 +64,23 @@ def bitymi_parser(config: DataParserConfig) -> DataParserConfig:
 
 @as_input_error()
 def check_capture(config: FullImageDatamanagerConfig, read: bool = False, trains: bool = True) -> None:
-    """Check that there is a capture where the data manager's configuration points; parsers of nerfstudio are replaced
-    by `bitymi_parser`. With `read`, views with poses are read as well; they say nothing, as they will be read again.
-    `trains`: there is an option for the capture, see MOVED.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Check that there is a capture at the data manager's path; replace nerfstudio's parsers by `bitymi_parser`.
+    `read`: read views with poses, too, silently. `trains`: there is an option for the path. Raises InputError: there is
+    none."""
     config.dataparser = dataparser = bitymi_parser(config.dataparser)
     data = Path(config.data if config.data is not None else dataparser.data)
     if not data.exists():
         advice = f"Give its folder with --data. {HOW_TO_GET_ONE}" if trains else MOVED
         fail(f"the capture {data} does not exist. {advice}")
-    _check_options(dataparser)
+    mode = getattr(dataparser, "eval_mode", None)
+    for name, used, within, what in (
+        ("scale_factor", True, lambda value: 0.0 < value < math.inf, "above 0"),
+        ("downscale_factor", True, lambda value: value is None or value >= 1, "1 or more"),
+        ("train_split_fraction", mode == "fraction", lambda value: 0.0 < value <= 1.0, "above 0 and at most 1"),
+        ("eval_interval", mode == "interval", lambda value: value >= 1, "1 or more"),
+    ):
+        if used and hasattr(dataparser, name) and not within(value := getattr(dataparser, name)):
+            fail(f"--{name.replace('_', '-')} is {value}, but has to be {what}. Correct it, or leave it out.")
     if isinstance(dataparser, BitymiDataParserConfig):
         dataparser.data = data
         if read and dataparser.find().format not in ("photographs", "video"):
@@ -91,21 +93,8 @@ def check_capture(config: FullImageDatamanagerConfig, read: bool = False, trains
                 forget_model()
 
 
-def _check_options(dataparser: DataParserConfig) -> None:
-    """Fail at options out of their range, by their names on the command line."""
-    mode = getattr(dataparser, "eval_mode", None)
-    for name, used, within, what in (
-        ("scale_factor", True, lambda value: 0.0 < value < math.inf, "above 0"),
-        ("downscale_factor", True, lambda value: value is None or value >= 1, "1 or more"),
-        ("train_split_fraction", mode == "fraction", lambda value: 0.0 < value <= 1.0, "above 0 and at most 1"),
-        ("eval_interval", mode == "interval", lambda value: value >= 1, "1 or more"),
-    ):
-        if used and hasattr(dataparser, name) and not within(value := getattr(dataparser, name)):
-            fail(f"--{name.replace('_', '-')} is {value}, but has to be {what}. Correct it, or leave it out.")
-
-
 def declares_box(dataparser: DataParserConfig) -> bool:
-    """Test if the capture itself states the box that holds its scene; other parsers' boxes are defaults."""
+    """Test if the capture states the box of its scene; other parsers' boxes are defaults."""
     path = None
     if isinstance(dataparser, BitymiDataParserConfig):
         found = dataparser.find()
@@ -119,7 +108,8 @@ def declares_box(dataparser: DataParserConfig) -> bool:
 
 @contextmanager
 def reporting_input_errors(config: Any) -> Iterator[None]:
-    """Report errors of nerfstudio's loaders as one clear message."""
+    """Report errors of nerfstudio's loaders in one line."""
+    capture = f"the capture {config.data if config.data is not None else config.dataparser.data}"
     try:
         yield
     except ImportError as error:
@@ -128,19 +118,12 @@ def reporting_input_errors(config: Any) -> Iterator[None]:
             "install the system's package of it; if a module, install it with pip.",
             error,
         )
-    except Image.DecompressionBombError as error:  # nerfstudio opens a photograph before they are checked
-        fail(
-            f"the capture {_folder_of(config)} has a photograph of more than {MAX_PIXELS:,} pixels: make it smaller",
-            error,
-        )
-    except (CaptureError, NameError, AssertionError):  # says it all already, or is no fault of the capture
+    except Image.DecompressionBombError as error:  # nerfstudio opens photographs before they are checked
+        fail(f"{capture} has a photograph of more than {MAX_PIXELS:,} pixels: make it smaller", error)
+    except (CaptureError, NameError, AssertionError):  # clear already, or no fault of the capture
         raise
     except Exception as error:
         detail = why(error)
         if isinstance(error, UnidentifiedImageError):
             detail += ". Save the photographs as PNG or JPEG"
-        fail(f"the capture {_folder_of(config)} cannot be loaded: {detail}", error)
-
-
-def _folder_of(config: Any) -> Any:
-    return config.data if config.data is not None else config.dataparser.data
+        fail(f"{capture} cannot be loaded: {detail}", error)

@@ -1,4 +1,4 @@
-"""nerfstudio's full-image data manager with a resumable training order and views for multi-view scoring."""
+"""Full-image data manager with a resumable training order and views for multi-view scoring."""
 
 from __future__ import annotations
 
@@ -22,10 +22,9 @@ from bitymi_ns.capture import images
 from bitymi_ns.capture.find_files import check_photographs_exist
 from bitymi_ns.capture.pose_checks import check_outliers, check_point_unit, warn_of_mirrored
 from bitymi_ns.plugin.console import as_input_error, fail, listed, warn
-from bitymi_ns.plugin.data.bundle_cameras import BundleCamerasConfig
 from bitymi_ns.plugin.data.cameras import check_cameras, to_camera, to_cameras
 from bitymi_ns.plugin.data.capture_checks import check_capture, declares_box, reporting_input_errors
-from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig, reading_points
+from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig, BundleCamerasConfig, reading_points
 from bitymi_ns.plugin.data.dataset import BitymiDataset, CachedImages, drop_blank_views, photograph_bytes
 from bitymi_ns.plugin.data.depth import with_depth
 from bitymi_ns.plugin.data.views import LONGEST_SIDE, NO_PHOTOS, limit_size, with_lenses
@@ -36,13 +35,12 @@ from bitymi_ns.train.processes import Processes
 from bitymi_ns.train.views import MemoryBudget, OnDemand, View, spread, training_order
 
 ALPHA_SAMPLES = 8  # photographs that are searched for transparent pixels
-FEW_VIEWS = 10  # number of training views below which multi-view scores are unreliable
-
+FEW_VIEWS = 10  # training views below which multi-view scores are unreliable
 
 if TYPE_CHECKING:
     AnyDataParser = DataParserConfig
 else:
-    # bitymi-data for these methods alone: it needs this data manager, which undistorts by lenses
+    # bitymi-data for these methods alone: it needs their data manager, which undistorts by lenses
     AnyDataParser = tyro.conf.OmitSubcommandPrefixes[
         tyro.extras.subcommand_type_from_defaults(
             {
@@ -60,15 +58,14 @@ class BitymiDataManagerConfig(FullImageDatamanagerConfig):
     """Configuration of the data manager."""
 
     _target: type = field(default_factory=lambda: BitymiDataManager)
-    dataparser: AnyDataParser = field(default_factory=NerfstudioDataParserConfig)
-    """Parser of the capture."""
+    dataparser: AnyDataParser = field(default_factory=NerfstudioDataParserConfig)  # Parser of the capture.
     cache_images_type: Literal["uint8", "float32"] = "uint8"
     """Type of the images in memory; uint8 takes a quarter of the space."""
     longest_side: int = LONGEST_SIDE
-    """Downscale photographs with more pixels along a side to this as they are read; 0 = use them as they are."""
+    """Downscale photographs to this many pixels along a side as they are read; 0 = use them as they are."""
     train_cameras_sampling_seed: int = 42
     """Seed of the order of training views."""
-    # options of nerfstudio's other data managers, which nothing reads here, are left out of the help
+    # nerfstudio's options without effect here are left out of the help
     train_cameras_sampling_strategy: tyro.conf.Suppress[Literal["random", "fps"]] = "random"
     fps_reset_every: tyro.conf.Suppress[int] = 100
     eval_num_images_to_sample_from: tyro.conf.Suppress[int] = -1
@@ -82,62 +79,51 @@ class BitymiDataManagerConfig(FullImageDatamanagerConfig):
 class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
     """Full images and their cameras.
 
-    Attributes:
-        step_view: returns a training view by its index in the size that the current step trains on; full size unless a
-            run replaces it.
-
-    The view of a training step is a function of the seed and the step alone, so that a resumed run sees the views that
-    the uninterrupted one would have seen: each epoch of n steps is a permutation of the n views.
+    The view of a training step is a function of seed and step alone, so that resumed runs see the views of
+    uninterrupted ones: each epoch of n steps permutes the n views.
     """
 
     config: BitymiDataManagerConfig
 
     @as_input_error()
     def __init__(
-        self,
-        config: BitymiDataManagerConfig,
-        device: torch.device | str = "cpu",
-        test_mode: Literal["test", "val", "inference"] = "val",
-        world_size: int = 1,
-        local_rank: int = 0,
-        **kwargs: Any,
+        self, config: BitymiDataManagerConfig, test_mode: Literal["test", "val", "inference"] = "val", **kwargs: Any
     ) -> None:
+        # makes a training view by its index, at full size; a run replaces it by one for the size of its step
         self.step_view: Callable[[int], View] = lambda index: self.train_views[index]
         images.set_up_pillow()
         check_capture(config, trains=test_mode == "val")
         with reporting_input_errors(config), reading_points(test_mode == "val"):
-            super().__init__(config, device, test_mode, world_size, local_rank, **kwargs)
+            super().__init__(config, test_mode=test_mode, **kwargs)
         self._check_images(test_mode)
         if test_mode == "val":
             self._check_points()
-        outputs = self.train_dataparser_outputs
-        color = outputs.alpha_color
-        self.train_dataset.metadata["alpha_color"] = None if color is None else torch.as_tensor(color).float()
-        files = self.train_dataset.files
-        self.train_dataset.metadata["has_alpha"] = bool(files) and images.file_has_transparency(files[0])
-        # whether a run trains with a background; photographs may be missing where no run is trained
-        self.train_dataset.metadata["transparent"] = self._has_photos(test_mode) and any(
-            images.file_has_transparency(files[i]) and self.train_dataset.get_numpy_image(i).shape[-1] == 4
-            for i in spread(len(files), ALPHA_SAMPLES)
-        )
-        self.train_dataset.metadata["declares_box"] = declares_box(config.dataparser)
-        cameras = outputs.cameras
-        self.train_dataset.metadata["train_pixels"] = int((cameras.width.long() * cameras.height.long()).sum())
-        self.train_dataset.metadata["camera_centers"] = outputs.cameras.camera_to_worlds[..., :3, 3].reshape(-1, 3)
+        outputs, dataset = self.train_dataparser_outputs, self.train_dataset
+        cameras, color, files = outputs.cameras, outputs.alpha_color, dataset.files
+        dataset.metadata |= {
+            "alpha_color": None if color is None else torch.as_tensor(color).float(),
+            "has_alpha": bool(files) and images.file_has_transparency(files[0]),
+            # for a run with a background; photographs may be missing without training
+            "transparent": self._has_photos(test_mode)
+            and any(
+                images.file_has_transparency(files[i]) and dataset.get_numpy_image(i).shape[-1] == 4
+                for i in spread(len(files), ALPHA_SAMPLES)
+            ),
+            "declares_box": declares_box(config.dataparser),
+            "train_pixels": int((cameras.width.long() * cameras.height.long()).sum()),
+            "camera_centers": cameras.camera_to_worlds[..., :3, 3].reshape(-1, 3),
+        }
         points = outputs.metadata.get("points3D_xyz")
         if test_mode == "val" and points is not None and len(points):
-            seed = config.train_cameras_sampling_seed
-            # called where a scene starts with such points: it reads the photographs
-            self.train_dataset.metadata["background_points"] = partial(
-                background_points, points, self.train_views, seed
-            )
+            # called if a scene starts with these points: it reads the photographs
+            found = partial(background_points, points, self.train_views, config.train_cameras_sampling_seed)
+            dataset.metadata["background_points"] = found
 
     def _has_photos(self, test_mode: str) -> bool:
         return test_mode != "inference" and NO_PHOTOS not in self.train_dataparser_outputs.metadata
 
     def get_datapath(self) -> Path:
-        """Return the folder in which the viewer keeps camera paths: the capture, or that of the bundle where it is
-        gone."""
+        """Return the viewer's folder of camera paths: the capture's, or the bundle's if that is gone."""
         path = Path(super().get_datapath())
         return path.parent if isinstance(self.config.dataparser, BundleCamerasConfig) else path
 
@@ -146,7 +132,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         return BitymiDataset
 
     def sample_train_cameras(self) -> list[int]:
-        """Return the training views for nerfstudio's base class; their order comes from `train_index`."""
+        """Return the training views for nerfstudio's base class; `train_index` orders them."""
         if len(self.train_dataset) == 0:
             fail(
                 f"no image is left for training in {self.config.data}: all {len(self.eval_dataset)} are held out for "
@@ -155,7 +141,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         return list(range(len(self.train_dataset)))
 
     def _check_images(self, test_mode: str) -> None:
-        """Fail or warn before any time is spent on a capture from which no scene can be learned."""
+        """Fail or warn at captures from which no scene can be learned, before time is spent."""
         if not self._has_photos(test_mode):
             return
         count, datasets = len(self.train_dataset), (self.train_dataset, self.eval_dataset)
@@ -173,10 +159,8 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         self._duplicates = images.duplicate_files(*files)
         images.warn_of_duplicates(self._duplicates, train, held_out)
         if count == 1 and test_mode == "val":
-            fail(
-                f"only one training view in {self.config.data}. A scene cannot be learned from one image: take "
-                "photographs from more sides."
-            )
+            one = f"only one training view in {self.config.data}"
+            fail(f"{one}. A scene cannot be learned from one image: take photographs from more sides.")
         if count < FEW_VIEWS and test_mode == "val":
             warn(
                 f"Only {count} training views: all of them are used for multi-view scoring, and views "
@@ -184,7 +168,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
             )
 
     def _check_points(self) -> None:
-        """Warn where points have no colors, or are in another unit than the poses."""
+        """Warn if points have no colors, or another unit than the poses."""
         outputs = self.train_dataparser_outputs
         points = outputs.metadata.get("points3D_xyz")
         if points is None:
@@ -192,11 +176,8 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         if len(points) and not len(outputs.metadata["points3D_rgb"]):  # of a parser of nerfstudio
             warn("The points of the capture have no colors: they start grey.")
         cameras = outputs.cameras
-        check_point_unit(
-            points.double().numpy(),
-            cameras.camera_to_worlds[:, :, 3].double().numpy(),
-            (cameras.width / cameras.fx).flatten().double().numpy(),
-        )
+        centers, widths = cameras.camera_to_worlds[:, :, 3].double(), (cameras.width / cameras.fx).flatten().double()
+        check_point_unit(points.double().numpy(), centers.numpy(), widths.numpy())
 
     def create_train_dataset(self) -> BitymiDataset:
         self.train_dataparser_outputs = self._prepared(self.train_dataparser_outputs, "training")
@@ -207,7 +188,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         return BitymiDataset(dataparser_outputs=outputs, scale_factor=self.config.camera_res_scale_factor)
 
     def _prepared(self, outputs: DataparserOutputs, split: str) -> DataparserOutputs:
-        """Undistorted views of limited size without those that are masked out."""
+        """Undistort and limit the size of views; drop those that are masked out."""
         verbose = split == "training" and self.test_mode == "val"
         outputs = limit_size(with_lenses(outputs), self.config.longest_side, verbose)
         if verbose and isinstance(self.config.dataparser, BitymiDataParserConfig):
@@ -216,7 +197,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         return drop_blank_views(outputs, split) if self._has_photos(self.test_mode) else outputs
 
     def check_pictures(self) -> None:
-        """Fail or warn where photographs show nothing, or the same in both splits."""
+        """Fail or warn if photographs show nothing, or the same in both splits."""
         train, held_out = self.train_dataset, self.eval_dataset
         empty: dict[str, list[Path]] = {}
         for i, path in enumerate(train.image_filenames):
@@ -240,29 +221,29 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
     def _load_images(  # type: ignore[override]
         self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
     ) -> CachedImages:
-        """Cache a split in memory of the host; what of it lies on a card is a run's to decide (`DownscaledViews`)."""
+        """Cache a split in memory of the host; a run decides what is on a card (`DownscaledViews`)."""
         dataset = self.train_dataset if split == "train" else self.eval_dataset
         with reporting_input_errors(self.config):
             return CachedImages(dataset, self.config.cache_images_type, self._budget, f"Reading the {split} images")
 
     def get_train_rays_per_batch(self) -> int:
-        """Return the pixels of the first training view, without reading it."""
+        """Count the pixels of the first training view without reading it."""
         cameras = self.train_dataset.cameras
         return int(cameras.width[0]) * int(cameras.height[0])
 
     @property
     def fixed_indices_eval_dataloader(self) -> Sequence[tuple[Cameras, dict[str, Any]]]:  # type: ignore[override]
-        """Held-out views in turn, each read when it is asked for."""
+        """Held-out views in turn, read on demand."""
         return OnDemand(len(self.eval_dataset), self.eval_view)
 
     @property
     def eval_dataloader(self) -> SimpleNamespace:
-        """Serve ns-render spiral its first camera: that of a held-out view, or of training where there is none."""
+        """Serve ns-render spiral its first camera: of a held-out view, else of training."""
         cameras = (self.eval_dataset if len(self.eval_dataset) else self.train_dataset).cameras
         return SimpleNamespace(get_camera=lambda image_idx: (cameras[image_idx : image_idx + 1], {}))
 
     def train_index(self, step: int) -> int:
-        """Return the index of the training view of a step of this process."""
+        """Return the training view's index in a step of this process."""
         (number,) = Processes.joined().numbers(step)
         return training_order(len(self.train_dataset), self.config.train_cameras_sampling_seed, number)
 
@@ -274,7 +255,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
 
     @property
     def train_views(self) -> OnDemand[View]:
-        """Training views at full size, each read when it is asked for, with pictures in memory of the host."""
+        """Training views at full size, read on demand, with pictures in memory of the host."""
         return OnDemand(len(self.train_dataset), lambda i: self._view(self.train_dataset, i, self.cached_train[i]))
 
     @property
@@ -283,14 +264,8 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         return OnDemand(len(self.eval_dataset), lambda i: self._view(self.eval_dataset, i, self.cached_eval[i]))
 
     def move_cameras(self, motions: Tensor) -> Callable[[Camera], Camera] | None:
-        """Move the cameras of the training views to where a run has refined them.
-
-        Args:
-            motions: [V, 6] of `Poses`.
-
-        Returns:
-            What carries other cameras along; None, and nothing is moved, where the motions are of other photographs.
-        """
+        """Move the training views' cameras to where a run has refined them, by its motions [V, 6] of `Poses`; return
+        what carries other cameras along, or None if the motions are of other photographs."""
         cameras = self.train_dataset.cameras
         if len(motions) != len(cameras):
             return None
@@ -306,11 +281,11 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         return View(camera, batch["image"], batch.get("mask"), depth=batch.get("depth"), normal=batch.get("normal"))
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict[str, Any]]:
-        """Return the held-out views in turn, without drawing from a shared random generator."""
+        """Return the held-out views in turn, without a shared random generator."""
         return self.eval_view(step % len(self.eval_dataset))
 
     def train_view(self, index: int) -> tuple[Cameras, dict[str, Any]]:
-        """Return camera and batch of a training view; the order of training is not affected."""
+        """Return camera and batch of a training view without effect on the order."""
         data = self._batch(self.cached_train[index])
         camera = self.train_dataset.cameras[index : index + 1].to(self.device)
         camera.metadata = {**(camera.metadata or {}), "cam_idx": index}

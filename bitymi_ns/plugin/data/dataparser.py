@@ -1,5 +1,5 @@
-"""`bitymi-data`, the methods' default parser: reads a folder or file of any format as views, and splits these by one
-rule for all formats."""
+"""Parsers: `bitymi-data`, the methods' default, reads a folder or file of any format and splits its views by one rule;
+cameras of a bundle serve where the capture is gone."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,24 +9,31 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+import torch
 import tyro
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.utils.colors import get_color
 
+from bitymi_ns.bundle import BundleError
+from bitymi_ns.bundle.parts import CAMERAS
+from bitymi_ns.bundle.read import read_cameras, read_manifest
 from bitymi_ns.capture import splits
 from bitymi_ns.capture.colmap_views import Source
+from bitymi_ns.capture.lens import Pinhole
 from bitymi_ns.capture.read import CaptureOptions, read_capture
-from bitymi_ns.plugin.console import as_input_error
+from bitymi_ns.capture.types import OPENCV_AXES
+from bitymi_ns.plugin.console import as_input_error, fail
 from bitymi_ns.plugin.data.depth import DepthKind
-from bitymi_ns.plugin.data.views import make_views, select_views
+from bitymi_ns.plugin.data.views import NO_PHOTOS, Views, make_views, pinhole_cameras, select_views
+from bitymi_ns.trust import inside
 
 _want_points: ContextVar[bool] = ContextVar("want_points", default=False)
 
 
 @contextmanager
 def reading_points(wanted: bool) -> Iterator[None]:
-    """Read captures for a scene that starts from points, if `wanted`. Evaluation and the viewer spend no time on
-    them."""
+    """Read points of captures, if a scene that starts from them is `wanted`; evaluation and the viewer skip them."""
     token = _want_points.set(wanted)
     try:
         yield
@@ -43,33 +50,28 @@ class BitymiDataParserConfig(CaptureOptions, DataParserConfig):
     alpha_color: Literal["white", "black"] | None = "white"
     """Color behind the transparent pictures of a Blender data set; None = that of the method."""
     depth: DepthKind = "auto"
-    """Depth of the photographs, where the capture has it: metric, or relative (scale and shift fitted to the points),
-    as the points say (auto); off = neither depth nor normals are used."""
+    """Depth of the photographs: metric, or relative (scale and shift fitted to the points), as the points say (auto);
+    off = use neither depth nor normals."""
     depth_unit_scale_factor: float | None = None
     """Metres of a unit of depth; None = 0.001 for integers, 1 for floating-point numbers."""
     poses: tyro.conf.Suppress[Path | None] = None
-    """Folder of the poses that an existing run was trained with. Not in the help: set where its data are read."""
+    """Folder of the poses that a run was trained with; set where its data are read."""
 
     @as_input_error()
     def resolve_names(self) -> None:
-        """Replace the name of a file of names by its content, so that config.yml stands on its own."""
+        """Replace the name of a file of names by its content, so that config.yml needs no other file."""
         self.eval_names = splits.read_names(self.eval_names)
 
 
 class BitymiDataParser(DataParser):
-    """Views of a capture in any format.
-
-    Attributes:
-        downscale_factor: set by nerfstudio where photographs are not needed, so that none is opened; else None.
-        poses_report: folder of the report on structure from motion, once the views are read; None = none.
-        sfm_source: model by structure from motion, once the views are read; None = the capture came with its poses.
-    """
+    """Views of a capture in any format."""
 
     config: BitymiDataParserConfig
 
     def __init__(self, config: BitymiDataParserConfig) -> None:
         super().__init__(config)
-        self.downscale_factor: int | None = None
+        self.downscale_factor: int | None = None  # set by nerfstudio if photographs are not needed: none is opened then
+        # after reading: report on structure from motion, and its model; None = the capture came with poses
         self.poses_report: Path | None = None
         self.sfm_source: Source | None = None
 
@@ -89,3 +91,50 @@ class BitymiDataParser(DataParser):
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs: Any) -> DataparserOutputs:
         return self.outputs[split]
+
+
+@dataclass
+class BundleCamerasConfig(DataParserConfig):
+    """Cameras of a bundle."""
+
+    _target: type = field(default_factory=lambda: BundleCameras)
+    data: Path = Path()  # Folder of the bundle.
+    capture: Path = Path()  # Folder of the lost capture.
+
+
+class BundleCameras(DataParser):
+    """Views with a bundle's cameras and without photographs."""
+
+    config: BundleCamerasConfig
+    downscale_factor = None  # nerfstudio sets it where photographs are not needed
+
+    def _generate_dataparser_outputs(self, split: str = "train", **kwargs: Any) -> DataparserOutputs:
+        folder = Path(self.config.data)
+        try:
+            info, rows = read_manifest(folder), read_cameras(folder)
+            files = {row.name: inside(Path(self.config.capture), row.name) for row in rows}
+        except BundleError as error:
+            fail(str(error), error)
+        except ValueError as error:
+            fail(f"{folder}, {CAMERAS}: {error}.", error)
+        chosen = [row for row in rows if row.held_out == (split != "train")] or rows
+        poses, pinholes = [], []
+        for camera in (row.camera for row in chosen):
+            poses.append((torch.linalg.inv(camera.viewmat.double()) @ torch.from_numpy(OPENCV_AXES)).float())
+            K = camera.K.tolist()
+            pinholes.append(Pinhole(K[0][0], K[1][1], K[0][2], K[1][2], camera.width, camera.height))
+        return Views(
+            image_filenames=[files[row.name] for row in chosen],
+            cameras=pinhole_cameras(pinholes, torch.stack(poses)),
+            dataparser_scale=float(info.world.scale),
+            dataparser_transform=torch.tensor(np.asarray(info.world.transform, np.float64)[:3]),
+            metadata={NO_PHOTOS: True},
+        )
+
+
+def has_cameras(bundle: Path) -> bool:
+    """Test if a bundle states the cameras of its capture."""
+    try:
+        return bool(read_cameras(bundle))
+    except BundleError as error:
+        fail(str(error), error)

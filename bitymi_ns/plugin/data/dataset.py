@@ -1,4 +1,4 @@
-"""Dataset of a capture: undistorted images with alpha and masks, cached in memory up to a budget."""
+"""Dataset of a capture: undistorted images with alpha and masks, cached in memory within a budget."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -28,21 +28,14 @@ from bitymi_ns.plugin.data.views import MOVED, NO_PHOTOS, photograph_files, sele
 from bitymi_ns.train.views import MemoryBudget, nearest, over_background
 
 PHOTOGRAPH_BYTES = 1 << 28
-"""Memory for the images of a capture, training and held-out views together, where a step on the CPU takes far longer
-than reading one."""
+"""Memory for all images of a capture where a step is on the CPU, and takes far longer than reading one."""
 PREFETCH = 4  # images that are read together at the start
-RECENT = 2
-"""Images beyond the budget that stay cached until the next ones are read: one step asks for a view more than once."""
-POSE_STEP = 1e-4  # resolution to which poses are compared, in units of the scene
+RECENT = 2  # last images beyond the budget that stay cached: a step asks for a view more than once
+POSE_STEP = 1e-4  # resolution of compared poses, in units of the scene
 
 
 class BitymiDataset(InputDataset):
-    """nerfstudio's dataset with images undistorted by their lenses; images with transparent pixels stay [H, W, 4]: the
-    model composes them over a background.
-
-    Attributes:
-        gray_images: images whose photographs are gone are grey, for the viewer; else reading them fails.
-    """
+    """nerfstudio's dataset with images undistorted by lenses; the model composes transparent ones, [H, W, 4]."""
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
         c2w = dataparser_outputs.cameras.camera_to_worlds
@@ -50,8 +43,8 @@ class BitymiDataset(InputDataset):
         c2w[:, :3, :3] = torch.from_numpy(parts)
         super().__init__(dataparser_outputs, scale_factor)
         self._summaries: dict[int, ImageSummary] = {}
-        self.gray_images = False
-        self._read_shared = lru_cache(maxsize=RECENT)(read_image)  # the views of one photograph follow each other
+        self.gray_images = False  # show missing photographs grey, for the viewer; else fail
+        self._read_shared = lru_cache(maxsize=RECENT)(read_image)  # views of one photograph follow each other
 
     @property
     def files(self) -> list[Path]:
@@ -85,21 +78,21 @@ class BitymiDataset(InputDataset):
         return pixels
 
     def summary(self, image_idx: int) -> ImageSummary:
-        """Return the summary of an image, which is read for that if it has not been yet."""
+        """Return the summary of an image, reading it if necessary."""
         if image_idx not in self._summaries:
             self.get_numpy_image(image_idx)
         return self._summaries[image_idx]
 
     def get_image_float32(self, image_idx: int) -> Tensor:
-        """Read image [H, W, 3 or 4] in [0, 1]; alpha is not composed."""
+        """Read image [H, W, 3 or 4] in [0, 1], alpha not composed."""
         return torch.from_numpy(self.get_numpy_image(image_idx)).float() / 255.0
 
     def get_image_uint8(self, image_idx: int) -> Tensor:
-        """Read image [H, W, 3 or 4]; alpha is not composed."""
+        """Read image [H, W, 3 or 4], alpha not composed."""
         return torch.from_numpy(self.get_numpy_image(image_idx))
 
     def __getitem__(self, image_idx: int) -> dict[str, Any]:
-        """Return the batch for viewer and ns-render, which show images as they get them: alpha is composed."""
+        """Return the batch for viewer and ns-render, which need composed alpha."""
         data = self.get_data(image_idx)
         color = self._dataparser_outputs.alpha_color
         data["image"] = over_background(data["image"], None if color is None else torch.as_tensor(color).float())
@@ -107,8 +100,8 @@ class BitymiDataset(InputDataset):
 
     @as_input_error()
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
-        """Read the image; its mask [H, W, 1] bool where the capture has masks; in training depth [H, W], in units of
-        the scene, and normal [H, W, 3], both float16, where they are used."""
+        """Read an image, its mask [H, W, 1] bool if any, and in training its depth [H, W] in units of the scene and
+        normal [H, W, 3], both float16, if they are used."""
         read = self.get_image_float32 if image_type == "float32" else self.get_image_uint8
         data: dict[str, Any] = {"image_idx": image_idx, "image": read(image_idx)}
         masks = self._dataparser_outputs.mask_filenames
@@ -117,20 +110,21 @@ class BitymiDataset(InputDataset):
             mask = self._scaled(mask, Image.Resampling.NEAREST)
             data["mask"] = torch.from_numpy(np.array(mask, dtype=bool))[..., None]
             if self.mask_color:
-                data["image"] = _fill(data["image"], data["mask"], self.mask_color)
-        data.update(self._maps(image_idx, (data["image"].shape[1], data["image"].shape[0])))
+                fill, image = torch.tensor(self.mask_color), data["image"]
+                if not image.is_floating_point():
+                    fill = fill.mul(255.0).round().to(image.dtype)
+                colors = torch.where(data["mask"], image[..., :3], fill)
+                data["image"] = torch.cat([colors, image[..., 3:]], -1)
+        if fitted := self._dataparser_outputs.metadata.get(FITTED):
+            size = (data["image"].shape[1], data["image"].shape[0])
+            maps = fitted[image_idx].read(self._lens(image_idx))
+            data |= {name: nearest(torch.from_numpy(values), *size).half() for name, values in maps.items()}
         data.update(self.get_metadata(data))
         return data
 
-    def _maps(self, image_idx: int, size: tuple[int, int]) -> dict[str, Tensor]:
-        """Depth and normals of a view in a picture of `size`."""
-        fitted = self._dataparser_outputs.metadata.get(FITTED)
-        found = {} if fitted is None else fitted[image_idx].read(self._lens(image_idx))
-        return {name: nearest(torch.from_numpy(values), *size).half() for name, values in found.items()}
-
     @property
     def has_maps(self) -> bool:
-        """True where views have depth or normals that are used."""
+        """True if depth or normals of views are used."""
         fitted = self._dataparser_outputs.metadata.get(FITTED, ())
         return any(maps.fit is not None or maps.files.normal is not None for maps in fitted)
 
@@ -148,33 +142,22 @@ class BitymiDataset(InputDataset):
 
 
 def photograph_bytes(device: torch.device, processes: int = 1) -> int:
-    """Memory of the host for the images of a capture in one of the processes of a run. With cards half of what is
-    available for all: a step there takes less time than reading a photograph."""
+    """Return the memory of the host for a capture's images in one of a run's processes; with cards half of what is
+    available: a step there takes less time than reading a photograph."""
     if device.type == "cpu":
         return PHOTOGRAPH_BYTES
     return max(PHOTOGRAPH_BYTES, int(min(psutil.virtual_memory().available, memory_limit()) / (2 * processes)))
 
 
 def view_mask(outputs: DataparserOutputs, index: int) -> Image.Image:
-    """Read the mask of a view whose photograph has one, or does not cover it."""
+    """Read the mask of a view whose photograph has one, or does not cover the view."""
     path = None if outputs.mask_filenames is None else outputs.mask_filenames[index]
     return outputs.metadata["lenses"][index].undistort_mask(None if path is None else checked_mask(path), path)
 
 
-def _fill(image: Tensor, mask: Tensor, color: tuple[float, float, float]) -> Tensor:
-    """Set the colors of an image to `color`, in [0, 1], where the mask is False."""
-    fill = torch.tensor(color) if image.is_floating_point() else torch.tensor(color).mul(255.0).round().to(image.dtype)
-    return torch.cat([torch.where(mask, image[..., :3], fill), image[..., 3:]], -1)
-
-
 class CachedImages(Sequence):
-    """Batches of a dataset (image, mask, metadata): kept while the budget lasts, read at every use beyond it.
-
-    All are read once at the start, so that one that cannot be read is noticed then.
-
-    Args:
-        budget: shared with other datasets.
-    """
+    """Batches of a dataset (image, mask, metadata), kept within the budget, which datasets share, and read at every use
+    beyond it. Reads all at the start, to notice unreadable ones."""
 
     def __init__(
         self, dataset: BitymiDataset, image_type: Literal["uint8", "float32"], budget: MemoryBudget, description: str
@@ -202,11 +185,8 @@ class CachedImages(Sequence):
 
 
 def drop_blank_views(outputs: DataparserOutputs, split: str) -> DataparserOutputs:
-    """Leave out the views whose masks exclude every pixel; `split` is "training" or "held-out".
-
-    Raises:
-        InputError: no training view is left.
-    """
+    """Leave out fully masked views; `split` is "training" or "held-out". Raises InputError: no training view is
+    left."""
     masks = outputs.mask_filenames
     if not masks:
         return outputs
@@ -216,30 +196,23 @@ def drop_blank_views(outputs: DataparserOutputs, split: str) -> DataparserOutput
         return outputs
     named = listed([outputs.image_filenames[i] for i in blank])
     if split == "training" and len(blank) == len(masks):
-        fail(
-            f"the masks of all {len(masks)} {split} photographs exclude every pixel: {named}. Pixels count where the "
-            "mask is not black; if the masks are inverted, invert them."
-        )
-    warn(
-        f"The masks of {len(blank)} of {len(masks)} {split} photographs exclude every pixel: {named}. These views are "
-        "left out."
-    )
+        advice = "Pixels count where the mask is not black; if the masks are inverted, invert them."
+        fail(f"the masks of all {len(masks)} {split} photographs exclude every pixel: {named}. {advice}")
+    blank_of = f"{len(blank)} of {len(masks)} {split} photographs"
+    warn(f"The masks of {blank_of} exclude every pixel: {named}. These views are left out.")
     return select_views(outputs, [i for i in range(len(masks)) if i not in blank])
 
 
 def capture_fingerprint(dataset: BitymiDataset) -> dict[str, Any]:
-    """Summarize number, names and poses of the training views, the latter two as digests, for checkpoints."""
+    """Summarize the training views for checkpoints: number, and digests of names and poses."""
     poses = (dataset.cameras.camera_to_worlds / POSE_STEP).round().cpu().numpy()
     names = "\n".join(path.name for path in dataset.image_filenames)
-    return {
-        "views": len(dataset),
-        "names": hashlib.sha256(names.encode("utf8", "surrogateescape")).hexdigest(),
-        "poses": hashlib.sha256(poses.tobytes()).hexdigest(),
-    }
+    digests = {"names": names.encode("utf8", "surrogateescape"), "poses": poses.tobytes()}
+    return {"views": len(dataset), **{name: hashlib.sha256(data).hexdigest() for name, data in digests.items()}}
 
 
 def warn_of_other_capture(before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Warn where a resumed run reads another capture than it was trained on; both are fingerprints."""
+    """Warn if a resumed run reads another capture, by fingerprints."""
     if before["views"] != now["views"]:
         what = f"it had {before['views']} training photographs, this one has {now['views']}"
     elif before["names"] != now["names"]:

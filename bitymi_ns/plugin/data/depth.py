@@ -1,5 +1,4 @@
-"""Depth maps of the training photographs in the units of the scene, by what points and other photographs say of them,
-and initial points from them."""
+"""Fit depth maps of the training photographs to the scene, by points and other photographs, and make initial points."""
 
 from __future__ import annotations
 
@@ -22,36 +21,26 @@ from bitymi_ns.plugin.console import say, warn
 from bitymi_ns.train.views import spread
 
 DepthKind = Literal["auto", "metric", "relative", "off"]
-"""metric = one scale for all maps; relative = scale and shift of each map; auto = as the points say; off = not used."""
-FITTED = "fitted maps"
-"""Metadata key of the `FittedMaps` of each view."""
-SIDE = 320
-"""Longest side in pixels at which maps are compared with points and with each other."""
-TOLERANCE = 0.05
-"""Relative difference of two depths that are of one surface."""
-FEW_PAIRS = 20
-"""Points in a photograph from which scale and shift of its depth can be told."""
-AGREES = 0.25
-"""Share of the points that usable depth agrees with: many are hidden in the pictures that they project into."""
+"""metric = one scale for all maps; relative = scale and shift of each; auto = as the points say; off = unused."""
+FITTED = "fitted maps"  # metadata key of the views' `FittedMaps`
+SIDE = 320  # longest side of compared maps, pixels
+TOLERANCE = 0.05  # relative difference of depths of one surface
+FEW_PAIRS = 20  # least points in a photograph that tell scale and shift of its depth
+AGREES = 0.25  # least share of points that usable depth agrees with: many are hidden in pictures
 AGREE_MUTUALLY = 0.45
-"""Share of the pixels that another photograph confirms, of those that it confirms or sees through, where depth is
-usable. In the sample room 0.95; 0.57 with noise of 5 %; at most 0.39 in another unit, from 0.001 to 1,000 times."""
-BETTER = 0.15
-"""Share by which scale and shift of each map fit better where maps are not metric."""
-TRIALS = 200
-"""Pairs of points that scale and shift are computed from."""
-SEEN_BY = 16
-"""Photographs that a new point is compared with."""
-PIXELS_PER_POINT = 30
-"""Pixels of the training photographs per initial point."""
-MOST_POINTS = 200_000
-"""Initial points at most."""
+"""Least share of pixels that another photograph confirms, of those that it confirms or sees through, for usable depth.
+In the sample room 0.95; 0.57 with noise of 5 %; at most 0.39 in another unit, from 0.001 to 1,000 times."""
+BETTER = 0.15  # share of points by which scale and shift of each map have to fit better
+TRIALS = 200  # pairs of points for scale and shift
+SEEN_BY = 16  # photographs compared with a new point
+PIXELS_PER_POINT = 30  # of the training photographs per initial point
+MOST_POINTS = 200_000  # initial points
 
 Floats = npt.NDArray[np.float64]
 
 
 class DepthFit(NamedTuple):
-    """Camera z in units of the scene from the values of a map: scale value + shift, or its inverse."""
+    """Camera z in units of the scene from a map's values: scale value + shift, or its inverse."""
 
     scale: float
     shift: float = 0.0
@@ -66,20 +55,20 @@ class DepthFit(NamedTuple):
 
 
 class FittedMaps(NamedTuple):
-    """Maps of a view in units of the scene; fit None = its depth is not used."""
+    """Maps of a view in units of the scene; fit None = depth is unused."""
 
     files: MapFiles
     fit: DepthFit | None
     unit: float | None
 
     def read(self, lens: Lens) -> dict[str, Values]:
-        """Read depth [H, W] and normal [H, W, 3] of those that are used, see `View`."""
+        """Read depth [H, W] and normal [H, W, 3] if they are used, see `View`."""
         found = {} if self.fit is None else {"depth": self.fit.z(read_depth(self.files, lens, self.unit))}
         return found if self.files.normal is None else {**found, "normal": read_normal(self.files, lens)}
 
 
 class _Seen(NamedTuple):
-    """Map of a view, its camera and its pose: position, and rotation of OpenCV's camera axes to the world."""
+    """Map, camera and pose of a view: position, and rotation of OpenCV's camera axes to the world."""
 
     values: Values
     lens: Lens
@@ -91,19 +80,16 @@ class _Seen(NamedTuple):
         return self.lens.pinhole
 
     def fitted(self, fit: DepthFit) -> _Seen:
-        """The view with camera z in units of the scene in place of the values of the map."""
+        """Replace the map's values by camera z in units of the scene."""
         return self._replace(values=fit.z(self.values))
 
 
 def with_depth(
     outputs: DataparserOutputs, kind: DepthKind = "auto", unit: float | None = None, add_points: bool = True
 ) -> DataparserOutputs:
-    """Fit the depth maps of training views of limited size to the scene, and add points from them to those of the
-    capture: one for PIXELS_PER_POINT pixels. Metadata gets `FittedMaps` for each view, where depth is used at all.
-
-    Raises:
-        InputError: a map cannot be read, or has another shape than its photograph.
-    """
+    """Fit depth maps of training views of limited size to the scene, set `FittedMaps` in the metadata if depth is used,
+    and add points from them, one for PIXELS_PER_POINT pixels. Raises InputError: a map cannot be read, or has another
+    shape than its photograph."""
     maps: Sequence[MapFiles] = outputs.metadata.get(MAPS) or []
     if kind == "off" or not maps:
         return outputs
@@ -129,7 +115,7 @@ def with_depth(
 
 
 def _read_maps(outputs: DataparserOutputs, rows: Sequence[int], unit: float | None) -> list[_Seen]:
-    """Read the depth of views at small size."""
+    """Read depth of views at small size."""
     lenses, maps = outputs.metadata["lenses"], outputs.metadata[MAPS]
     small = {
         lens: lens.downscaled(min(1.0, SIDE / max(lens.pinhole.width, lens.pinhole.height)))
@@ -144,7 +130,7 @@ def _read_maps(outputs: DataparserOutputs, rows: Sequence[int], unit: float | No
 
 
 def _check_normals(outputs: DataparserOutputs, maps: Sequence[MapFiles]) -> None:
-    """Warn where normals are in another frame than that of the camera."""
+    """Warn of normals in another frame than the camera's."""
     rows = [i for i, files in enumerate(maps) if files.normal is not None]
     for i in [rows[k] for k in spread(len(rows), 8)]:
         lens: Lens = outputs.metadata["lenses"][i]
@@ -160,7 +146,7 @@ def _check_normals(outputs: DataparserOutputs, maps: Sequence[MapFiles]) -> None
 
 
 def _project(xyz: Floats, view: _Seen) -> tuple[npt.NDArray[np.intp], Floats, npt.NDArray[np.bool_]]:
-    """Pixel (flat index), camera z, and whether points [N, 3] are in the picture."""
+    """Project points [N, 3]: pixel (flat index), camera z, and whether they are in the picture."""
     to = view.camera
     local = (xyz - view.center) @ view.rotation
     front = local[:, 2] > 0.0
@@ -171,15 +157,15 @@ def _project(xyz: Floats, view: _Seen) -> tuple[npt.NDArray[np.intp], Floats, np
 
 
 def _unproject(pixels: npt.NDArray[np.intp], view: _Seen) -> Floats:
-    """World positions [N, 3] of pixels of a fitted view."""
+    """Compute world positions [N, 3] of pixels of a fitted view."""
     to, z = view.camera, view.values.ravel()[pixels]
     x, y = (pixels % to.width + 0.5 - to.cx) / to.fx, (pixels // to.width + 0.5 - to.cy) / to.fy
     return np.stack([x * z, y * z, z], -1) @ view.rotation.T + view.center
 
 
 def _fits(seen: Sequence[_Seen], xyz: Floats, kind: DepthKind, unit: float) -> list[DepthFit | None] | None:
-    """Fit each map to points [N, 3] of the scene, or take it as metric where there are none, with `unit` units of the
-    scene per metre; None = depth is of no use."""
+    """Fit each map to points [N, 3], or take it as metric without any, `unit` units per metre; None = depth is
+    unused."""
     if not any(each.values.any() for each in seen):
         warn("The depth maps have no valid pixel: depth is not used.")
         return None
@@ -212,10 +198,8 @@ def _fits(seen: Sequence[_Seen], xyz: Floats, kind: DepthKind, unit: float) -> l
     use_relative = kind == "relative" or (kind == "auto" and share > metric + BETTER)
     if (share if use_relative else metric) < AGREES:
         what = "with scale and shift fitted to each" if use_relative else "with one scale for all"
-        warn(
-            f"The depth maps agree with {max(share, metric):.0%} of the points in the pictures, {what}: depth is not "
-            "used. They may be of other photographs, or not of camera z."
-        )
+        then = "depth is not used. They may be of other photographs, or not of camera z."
+        warn(f"The depth maps agree with {max(share, metric):.0%} of the points in the pictures, {what}: {then}")
         return None
     if use_relative:
         inverse = any(fit is not None and fit.inverse for fit in relative)
@@ -231,7 +215,7 @@ def _fits(seen: Sequence[_Seen], xyz: Floats, kind: DepthKind, unit: float) -> l
 
 
 def _pairs(view: _Seen, xyz: Floats) -> tuple[Floats, Floats]:
-    """Values of a map, and camera z, of the points that project into it."""
+    """Pair values of a map with camera z of the points in its picture."""
     pixels, z, inside = _project(xyz, view)
     values = view.values.ravel()[pixels]
     kept = inside & (values > 0.0)
@@ -239,7 +223,7 @@ def _pairs(view: _Seen, xyz: Floats) -> tuple[Floats, Floats]:
 
 
 def _mode(ratios: Floats) -> float:
-    """The ratio that most lie near to: hidden points are farther than what hides them."""
+    """Find the most frequent ratio: hidden points are farther than what hides them."""
     logs = np.sort(np.log(ratios))
     width = np.searchsorted(logs, logs + 2 * TOLERANCE) - np.arange(len(logs))
     start = int(width.argmax())
@@ -247,7 +231,7 @@ def _mode(ratios: Floats) -> float:
 
 
 def _affine(values: Floats, z: Floats, inverse: bool) -> tuple[DepthFit | None, float]:
-    """Fit scale and shift of a map by the largest set of points that agree, and state their share."""
+    """Fit scale and shift of a map by the largest set of agreeing points; return their share, too."""
     if len(z) < FEW_PAIRS:
         return None, 0.0
     target = 1.0 / z if inverse else z
@@ -278,7 +262,7 @@ def _affine(values: Floats, z: Floats, inverse: bool) -> tuple[DepthFit | None, 
 
 
 def _agreement(seen: Sequence[_Seen]) -> float | None:
-    """Share of pixels that others see at the same depth, of those that they do not hide; None = too few are seen."""
+    """Compute the share of pixels that others see at the same depth, without those that they hide; None = too few."""
     rng = np.random.default_rng(0)
     counts = np.zeros(3, np.int64)
     for i in spread(len(seen), SEEN_BY):
@@ -290,8 +274,7 @@ def _agreement(seen: Sequence[_Seen]) -> float | None:
 
 
 def _votes(xyz: Floats, own: int, seen: Sequence[_Seen]) -> npt.NDArray[np.int64]:
-    """Count, [3, N], the other fitted views that see points [N, 3] on their surfaces, see through them, and hide
-    them."""
+    """Count [3, N] the other fitted views that agree with points [N, 3], see through them, and hide them."""
     votes = np.zeros((3, len(xyz)), np.int64)
     others = [j for j in range(len(seen)) if j != own]
     for j in (others[k] for k in spread(len(others), SEEN_BY)):
@@ -304,11 +287,8 @@ def _votes(xyz: Floats, own: int, seen: Sequence[_Seen]) -> npt.NDArray[np.int64
 
 
 def _new_points(seen: Sequence[_Seen], files: Sequence[Path], count: int) -> tuple[Floats, npt.NDArray[np.uint8]]:
-    """Points [N, 3] on what the maps show, with colors [N, 3], evenly sampled to at most `count`.
-
-    Points that more views see through than agree with are left out. A point is taken from one of the views that agree,
-    so that what many of them show gets no more points than the rest.
-    """
+    """Sample at most `count` points [N, 3] with colors [N, 3] evenly from the maps, weighted by one over the views that
+    show them; leave out points that more views see through than agree with."""
     if count < 1 or not seen:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     rng = np.random.default_rng(0)

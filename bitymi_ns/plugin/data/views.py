@@ -1,5 +1,4 @@
-"""Views of a capture for training: photographs with cameras and poses become pinhole pictures in nerfstudio's frame,
-those of wide cameras several."""
+"""Make training views of a capture: pinhole pictures in nerfstudio's frame, several of a wide camera's photograph."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -13,23 +12,23 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 
-from bitymi_ns.capture.camera import OPENCV_AXES, SPHERICAL_MODEL, ColmapCamera, Photograph, Pose, colmap_distortion
 from bitymi_ns.capture.lens import Lens, Pinhole, make_lenses
 from bitymi_ns.capture.maps import MAPS
 from bitymi_ns.capture.pose_checks import check_spread, far_from_origin
 from bitymi_ns.capture.read import Capture
-from bitymi_ns.capture.types import FrameOptions, MapFiles
+from bitymi_ns.capture.transforms import colmap_distortion
+from bitymi_ns.capture.types import OPENCV_AXES, SPHERICAL_MODEL, ColmapCamera, FrameOptions, MapFiles, Photograph, Pose
 from bitymi_ns.plugin.console import fail, listed, say
 
 DATA = "BITYMI_DATA"
-"""Environment variable: where a capture is now; most of nerfstudio's commands that read a run have no option for it."""
+"""Environment variable with a capture's location, for which most of nerfstudio's commands have no option."""
 MOVED = f"If it was moved, say where it is now: `{DATA}=/where/it/is` before the command."
-NO_PHOTOS = "without photographs"  # metadata key of views whose photographs are gone
-LONGEST_SIDE = 1600  # default longest side of a training photograph, pixels; as in papers on such captures
+NO_PHOTOS = "without photographs"  # metadata key of views of lost photographs
+LONGEST_SIDE = 1600  # default longest side of training photographs, pixels; as in papers on such captures
 
 
 class Views(DataparserOutputs):
-    """DataparserOutputs with a float64 dataparser_transform: a capture may lie millions of units from its origin."""
+    """DataparserOutputs with a float64 dataparser_transform: captures may lie millions of units from the origin."""
 
     def transform_poses_to_original_space(self, poses: torch.Tensor, *args: Any, **kwargs: Any) -> torch.Tensor:
         """Call nerfstudio's method in float64."""
@@ -37,15 +36,9 @@ class Views(DataparserOutputs):
 
 
 def make_views(capture: Capture, need_photos: bool = True) -> Views:
-    """Build the views of a capture, in the order of the photographs. metadata has for each view its `Lens` ("lenses"),
-    photograph ("files"), and the number of the photograph ("photographs"), which views of one share.
-
-    Args:
-        need_photos: open downscaled copies for their size; else they may be missing.
-
-    Raises:
-        CaptureError: a camera or a photograph cannot be used.
-    """
+    """Build a capture's views in the order of its photographs. Lists in metadata: `Lens` ("lenses"), photograph
+    ("files"), and its number ("photographs"), which views may share. `need_photos`: open downscaled copies for their
+    size; else they may be missing. Raises CaptureError: a camera or a photograph cannot be used."""
     photographs, frame, points, source = capture.photographs, capture.frame, capture.points, capture.source
     if len(photographs) == 1:
         fail(f"{source} has one image only. A scene cannot be learned from one view: add photographs.")
@@ -56,9 +49,9 @@ def make_views(capture: Capture, need_photos: bool = True) -> Views:
     transform, scale = training_frame(poses, frame, source)
     moved = transform @ poses
     moved[:, :3, 3] *= scale
-    lenses, of, moved = _split(parts, moved)
-    files = [photographs[i].file for i in of]
-    metadata: dict[str, Any] = {"lenses": lenses, "files": files, "photographs": of}
+    views = _split(parts, moved, [photograph.file for photograph in photographs])
+    metadata = views["metadata"]
+    lenses, of = metadata["lenses"], metadata["photographs"]
     maps = [MapFiles() if lens.face else photographs[i].maps for i, lens in zip(of, lenses, strict=True)]
     if any(each != MapFiles() for each in maps):
         metadata[MAPS] = maps
@@ -72,23 +65,26 @@ def make_views(capture: Capture, need_photos: bool = True) -> Views:
     masks = [photographs[i].mask for i in of]
     side = frame.scene_scale
     return Views(
-        image_filenames=[lens.name(file) for file, lens in zip(files, lenses, strict=True)],
-        cameras=pinhole_cameras([each.pinhole for each in lenses], torch.from_numpy(moved.astype(np.float32))),
+        **views,
         scene_box=SceneBox(aabb=torch.tensor([[-side] * 3, [side] * 3], dtype=torch.float32)),
         mask_filenames=masks if any(masks) else None,  # type: ignore[arg-type]  # some may have none
         dataparser_scale=scale * capture.applied_scale,
         dataparser_transform=torch.from_numpy(transform if capture.applied is None else transform @ capture.applied),
-        metadata=metadata,
     )
 
 
-def _split(parts: Sequence[Sequence[Lens]], poses: Pose) -> tuple[list[Lens], list[int], Pose]:
-    """Split photographs into the views of their lenses (`parts`, of each photograph), with poses [N, 3 or 4, 4] camera
-    to world in nerfstudio's axes. Returns lens, number of the photograph and pose of each view."""
+def _split(parts: Sequence[Sequence[Lens]], poses: Pose, photographs: Sequence[Path]) -> dict[str, Any]:
+    """Split photographs into views of their lenses (`parts`); poses [N, 3 or 4, 4] are camera to world in nerfstudio's
+    axes. Return names, cameras and metadata of the views' outputs."""
     lenses = [lens for some in parts for lens in some]
     of = [i for i, some in enumerate(parts) for _ in some]
     turns = np.stack([OPENCV_AXES @ lens.turn @ OPENCV_AXES for lens in lenses])
-    return lenses, of, poses[of] @ turns
+    files = [photographs[i] for i in of]
+    return {
+        "image_filenames": [lens.name(file) for file, lens in zip(files, lenses, strict=True)],
+        "cameras": pinhole_cameras([each.pinhole for each in lenses], torch.from_numpy(poses[of] @ turns).float()),
+        "metadata": {"lenses": lenses, "files": files, "photographs": of},
+    }
 
 
 def photograph_files(outputs: DataparserOutputs) -> list[Path]:
@@ -97,16 +93,15 @@ def photograph_files(outputs: DataparserOutputs) -> list[Path]:
 
 
 def training_frame(poses: Pose, frame: FrameOptions, source: str) -> tuple[Pose, float]:
-    """Compute the transform [3, 4] that orients and centers poses [N, 4, 4] camera to world, and the scale that follows
-    it.
+    """Compute the transform [3, 4] that orients and centers poses [N, 4, 4] camera to world, and the scale after it.
 
-    Both are nerfstudio's, but the capture is centered in float64 first: UTM or ECEF positions have seven digits before
-    the point, which is all that float32 has.
+    Center in float64 before nerfstudio's functions: UTM or ECEF positions have seven digits before the point, all of
+    float32's.
     """
     middle = poses[:, :3, 3].mean(0)
     local = poses.copy()
     local[:, :3, 3] -= middle
-    # the transform alone: for `pca`, nerfstudio 1.1.5 turns cameras that come out upside down, but two of them only
+    # not the poses: for `pca`, nerfstudio 1.1.5 turns upside-down cameras, but two of them only
     _, oriented = auto_orient_and_center_poses(
         torch.from_numpy(local.astype(np.float32)), frame.orientation_method, frame.center_method
     )
@@ -142,7 +137,7 @@ def pinhole_cameras(pinholes: Sequence[Pinhole], poses: torch.Tensor) -> Cameras
 
 
 def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
-    """Give the outputs of any nerfstudio parser lenses, and the lenses' pinhole cameras in place of distorted ones."""
+    """Give outputs of any nerfstudio parser lenses, and the lenses' pinhole cameras."""
     if "lenses" in outputs.metadata or NO_PHOTOS in outputs.metadata:
         return outputs
     cameras = outputs.cameras
@@ -160,28 +155,18 @@ def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
         size = (int(cameras.width[i]), int(cameras.height[i]))
         camera = ColmapCamera(model, *size, size if model == SPHERICAL_MODEL else (*pinhole, *coefficients))
         photographs.append(Photograph(file, camera, np.eye(4), f"the camera of {file}"))
-    lenses, of, poses = _split(make_lenses(photographs), cameras.camera_to_worlds.double().numpy())
-    outputs = select_views(outputs, of)
-    files = outputs.image_filenames
-    return dataclasses.replace(
-        outputs,
-        image_filenames=[lens.name(file) for file, lens in zip(files, lenses, strict=True)],
-        cameras=pinhole_cameras([lens.pinhole for lens in lenses], torch.from_numpy(poses).float()),
-        metadata={**outputs.metadata, "lenses": lenses, "files": files, "photographs": of},
-    )
+    views = _split(make_lenses(photographs), cameras.camera_to_worlds.double().numpy(), outputs.image_filenames)
+    outputs = select_views(outputs, views["metadata"]["photographs"])
+    views["metadata"] = {**outputs.metadata, **views["metadata"]}
+    return dataclasses.replace(outputs, **views)
 
 
 def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> DataparserOutputs:
-    """Downscale views with more than `longest` pixels along a side (0 = no limit), by their lenses.
-
-    Raises:
-        InputError: `longest` is negative.
-    """
+    """Downscale views of more than `longest` pixels along a side (0 = any) by their lenses. Raises InputError: it is
+    negative."""
     if longest < 0:
-        fail(
-            f"--pipeline.datamanager.longest-side is {longest}: give a number of pixels, or 0 to use photographs as "
-            "they are."
-        )
+        how = "give a number of pixels, or 0 to use photographs as they are"
+        fail(f"--pipeline.datamanager.longest-side is {longest}: {how}.")
     lenses: list[Lens] = outputs.metadata.get("lenses", [])
     sizes = [(lens.pinhole.width, lens.pinhole.height) for lens in lenses]
     large = [size for size in sizes if longest and max(size) > longest]
@@ -194,18 +179,14 @@ def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> Datap
         width, height = max(large, key=max)
         say(
             f"{len(large)} of {len(sizes)} training photographs have more than {longest} pixels along a side (up to "
-            f"{width} x {height}): they are reduced to that as they are read. --pipeline.datamanager.longest-side 0 "
-            "uses them as they are."
+            f"{width} x {height}): they are reduced. --pipeline.datamanager.longest-side 0 uses them as they are."
         )
-    return dataclasses.replace(
-        outputs,
-        cameras=pinhole_cameras([lens.pinhole for lens in lenses], outputs.cameras.camera_to_worlds),
-        metadata={**outputs.metadata, "lenses": lenses},
-    )
+    cameras = pinhole_cameras([lens.pinhole for lens in lenses], outputs.cameras.camera_to_worlds)
+    return dataclasses.replace(outputs, cameras=cameras, metadata={**outputs.metadata, "lenses": lenses})
 
 
 def select_views(outputs: DataparserOutputs, indices: Sequence[int]) -> DataparserOutputs:
-    """Return a subset of the views, with all that belongs to them."""
+    """Select views, with all that belongs to them."""
     count = len(outputs.image_filenames)
     masks = outputs.mask_filenames
     metadata = {

@@ -1,9 +1,8 @@
-"""`ns-export bitymi-atlas`: bake a trained scene into a bundle, and measure what the bake cost.
+"""`ns-export bitymi-atlas`: bake a trained scene into a bundle, and measure the loss.
 
-Also `python -m bitymi_ns.plugin.export.command`, should a future nerfstudio not take the command in.
+Also `python -m bitymi_ns.plugin.export.command`, should nerfstudio not take the command in.
 """
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from bitymi_ns import endings
 from bitymi_ns.bake import BakeOptions, Learning, TuneOptions, bake_and_learn, export, rich_progress
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bake.pipeline import FEWEST_PASSES
-from bitymi_ns.bundle import Bundle, BundleError, read_bundle
+from bitymi_ns.bundle import BundleError, read_bundle
 from bitymi_ns.bundle.bake_options import BundleFormat
 from bitymi_ns.bundle.manifest import MANIFEST, dump
 from bitymi_ns.bundle.parts import CONFIG
@@ -23,17 +22,12 @@ from bitymi_ns.files import reason, write_file
 from bitymi_ns.interchange import Frame, Kind, check_extras, extras_folder, summary_line, write_extras
 from bitymi_ns.plugin.console import INTERRUPTED, fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
-from bitymi_ns.plugin.export.cameras import camera_files
-from bitymi_ns.plugin.export.nerfstudio_config import bundle_config
 from bitymi_ns.plugin.export.summary import print_summary
-from bitymi_ns.plugin.export.target import bundle_version, check_room, reserve_bundle
-from bitymi_ns.plugin.export.trained import compare, load_trained, preview, world_of
+from bitymi_ns.plugin.export.target import bundle_config, bundle_version, check_room, reserve_bundle
+from bitymi_ns.plugin.export.trained import camera_files, compare, load_trained, preview, world_of
 from bitymi_ns.plugin.run.memory import state_export
-from bitymi_ns.plugin.run.model import BitymiModel
-from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.exposure import corrected
-from bitymi_ns.train.views import View
 
 _MUCH_SMALLER = 0.9
 MANIFEST_BYTES = 28_000  # upper estimate of bundle.json and config.yml
@@ -43,21 +37,19 @@ MANIFEST_BYTES = 28_000  # upper estimate of bundle.json and config.yml
 class CompactOptions:
     """Size and quality of a compact bundle."""
 
-    interchange: bool = False
-    """Write surfels.ply into a compact bundle, too, for other programs; those of other formats have it."""
+    interchange: bool = False  # Write surfels.ply into a compact bundle, too; those of other formats have it.
     compact_error: float = Compact.share
-    """Share by which compacting may raise the mean square error against the training photographs,
-    before the texels are tuned; less where texels would then be too coarse to learn. The bytes go where they save most
-    of it: to surfels, view colours or texels."""
+    """Share by which compacting may raise the mean square error against the training photographs before texels are
+    tuned, or less if texels were too coarse to learn; the bytes go to surfels, view colours or texels as they help."""
     target_mb: float | None = None
-    """Bytes of a compact bundle, in MB (10^6), in the place of compact_error: everything becomes as coarse as it
-    takes. Where fewer bytes show the photographs as well, to 0.01 dB, these are taken."""
+    """Bytes of a compact bundle, in MB (10^6), instead of compact_error: everything becomes as coarse as it takes, or
+    less if fewer bytes show the photographs as well, to 0.01 dB."""
     target_psnr: float | None = None
-    """PSNR in dB against the training photographs, before the texels are tuned, in the place of compact_error:
-    everything becomes as coarse as it may. Held-out views are shown less well than these."""
+    """PSNR in dB against the training photographs before texels are tuned, instead of compact_error: everything becomes
+    as coarse as it may. Held-out views reach less."""
 
     def check_compact(self, form: BundleFormat) -> None:
-        """Stop where an option is out of its range, or is for another format than that of the bundle."""
+        """Stop at options out of range, or for another format."""
         compact = form == "compact"
         for name in ("interchange", "compact_error", "target_mb", "target_psnr"):
             if not compact and getattr(self, name) != getattr(CompactOptions, name):
@@ -72,28 +64,20 @@ class CompactOptions:
             fail(f"--compact-error must lie between 0 and 1, not at {self.compact_error}")
 
     def state_size(self, written: int) -> None:
-        """Print a note where the bundle is much smaller than --target-mb."""
+        """Report a bundle much smaller than --target-mb."""
         if self.target_mb is not None and written < _MUCH_SMALLER * 1e6 * self.target_mb:
-            say(
-                f"{written / 1e6:.2f} MB suffice, of the {self.target_mb:g} MB that were asked for: with more, the "
-                "training photographs are shown no better by 0.01 dB."
-            )
+            more = "with more, the training photographs are shown no better by 0.01 dB."
+            say(f"{written / 1e6:.2f} MB suffice, of the {self.target_mb:g} MB that were asked for: {more}")
 
     def compact_of(self, beside: int) -> Compact:
-        """Make the options of the compact bake.
-
-        Args:
-            beside: bytes of other files, such as the preview.
-        """
+        """Make options of the compact bake; `beside`: bytes of other files, such as the preview."""
         most = None
         if self.target_mb is not None:
             beside += MANIFEST_BYTES + most_bytes(int(1e6 * self.target_mb))
             most = int(1e6 * self.target_mb) - beside
             if most < 1:
-                fail(
-                    f"a bundle of {self.target_mb} MB leaves no bytes for the scene, as other files take "
-                    f"{beside:,}: ask for more (--target-mb)"
-                )
+                others = f"as other files take {beside:,}: ask for more (--target-mb)"
+                fail(f"a bundle of {self.target_mb} MB leaves no bytes for the scene, {others}")
         return Compact(self.compact_error, most, self.target_psnr)
 
 
@@ -101,40 +85,35 @@ class CompactOptions:
 class ExportAtlas(BakeOptions, CompactOptions):
     """Bake a trained bitymi scene into a bundle: surfels, a compressed texture atlas and a manifest.
 
-    The bundle is written aside and renamed, opened again, and compared with the trained scene and with the photographs
-    on the held-out views.
+    Writes the bundle aside, renames and opens it, and compares it with the trained scene and the photographs on the
+    held-out views.
     """
 
     load_config: Path  # config.yml of a trained scene.
     output_dir: Path  # Folder of the bundle.
-    overwrite: bool = False  # Replace a bundle that is there already.
+    overwrite: bool = False  # Replace an existing bundle.
     exact: bool = False
-    """Keep everything: every tile at the Nyquist rate of the field, no cap by views, no surfel dropped as unseen, all
-    sites of the view colours, and texels as the field gives them, without fine-tuning."""
+    """Keep everything: tiles at the Nyquist rate of the field, not capped by views, unseen surfels, all sites of view
+    colours, and the field's texels without fine-tuning."""
     polish_steps: int | None = None
-    """Steps in which texels, geometry, opacities and view colours learn together against the training photographs,
-    without the network, before tiles and view colours are reduced; 0 = surfels stay as they were trained. Not given:
-    0 where texels learned in training already, and on a GPU, for which there are no kernels; else 300, or 4 for each
-    photograph where that is more."""
+    """Steps in which texels, geometry, opacities and view colours learn together from the training photographs, without
+    the network, before tiles and view colours are reduced; 0 = surfels stay as trained. Not given: 0 if texels learned
+    in training, and on a GPU, which lacks kernels for it; else 300, or 4 per photograph if more."""
     finetune_steps: int | None = None
-    """Steps of fine-tuning the texels alone, after that; 0 = none. Not given: 400 where nothing but a field has learned
-    yet, 100 after a polish, both with 120 further ones that see what is stored of the texels; 100 that do so where
-    texels learned in training."""
+    """Steps of fine-tuning texels alone, after that; 0 = none. Not given: 400 if only a field has learned yet, 100
+    after a polish, both with 120 more on texels as stored; 100 on these if texels learned in training."""
     finetune_memory: float = TuneOptions.cache_bytes / 1e9
-    """GB of memory in which the fine-tuning keeps views that it has traced; its time depends on it, its result does
-    not."""
-    compare: bool = True
-    """Render the held-out views from the bundle and from the trained scene and state the difference."""
+    """GB of memory for traced views in the fine-tuning; changes its time, not its result."""
+    compare: bool = True  # Render the held-out views from bundle and trained scene, and state the difference.
 
     extras: tuple[Kind, ...] = ()
-    """Also write the scene for other programs, into a folder beside the bundle with its name and .extras: gaussians (a
+    """Also write the scene for other programs, beside the bundle into a folder of its name and .extras: gaussians (a
     preview as Gaussian splats), surfels (with two scales), usd (OpenUSD's surflets), mesh (textured quads). `bitymi
     extras BUNDLE` does so later."""
     extras_frame: Frame = "scene"  # Frame of these files: the scene's, or the capture's own.
     check_room: bool = True
-    """Stop before the work where the disk may have too little room, by an estimate that can be many times too high."""
-    photographs: bool = False
-    """Put the held-out photographs into the bundle, so that a viewer can show them beside the renders."""
+    """Stop if the disk may have too little room, by an estimate that can be many times too high."""
+    photographs: bool = False  # Put the held-out photographs into the bundle, for viewers to show beside renders.
 
     def main(self) -> None:
         """Run the export."""
@@ -158,7 +137,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
             fail(str(error), error)
 
     def _options(self) -> BakeOptions:
-        """Options of the bake; stops where one is out of its range, before anything is loaded."""
+        """Make options of the bake; stop at one out of range, before loading anything."""
         options = BakeOptions(**{f.name: getattr(self, f.name) for f in fields(BakeOptions)})
         if self.exact:
             options = replace(options, tolerance=0.0, cap_by_views=False, drop_unseen=False)
@@ -175,14 +154,6 @@ class ExportAtlas(BakeOptions, CompactOptions):
         self.check_compact(options.bundle_format)
         return options
 
-    def _learning(self, model: BitymiModel, views: int, compact: Compact | None) -> Learning:
-        """Optimisation after the bake for so many training photographs."""
-        if self.exact:
-            return Learning()
-        kept = int(self.finetune_memory * 1e9)
-        steps = self.polish_steps, self.finetune_steps
-        return Learning.of_scene(model.scene, views, *steps, kept, model.train_config, compact)
-
     def _run(self, options: BakeOptions) -> None:
         config, pipeline = load_trained(self.load_config)
         model, datamanager = pipeline.model, pipeline.datamanager
@@ -192,15 +163,17 @@ class ExportAtlas(BakeOptions, CompactOptions):
         shown = preview(model, first, "JPEG" if compact else "PNG")
         cameras_of = camera_files(datamanager, views, self.photographs)
         beside = len(shown) + sum(map(len, cameras_of.values()))
-        learning = self._learning(model, len(views), self.compact_of(beside) if compact else None)
+        compacting = self.compact_of(beside) if compact else None
+        learning, memory = Learning(), int(self.finetune_memory * 1e9)
+        if not self.exact:
+            steps = (self.polish_steps, self.finetune_steps, memory)
+            learning = Learning.of_scene(model.scene, len(views), *steps, model.train_config, compacting)
         polish, tune, has_learned = learning.polish, learning.tune, isinstance(model.scene.field, TexelField)
         for name, options_of in (("polish", polish), ("finetune", None if polish or has_learned else tune)):
             if options_of is not None and options_of.steps < FEWEST_PASSES * len(views):
                 passes = options_of.steps / len(views)
-                say(
-                    f"The {name} has {options_of.steps:,} steps for {len(views):,} training photographs, {passes:.1f} "
-                    f"for each: more may gain (--{name}-steps)."
-                )
+                each = f"{len(views):,} training photographs, {passes:.1f} for each"
+                say(f"The {name} has {options_of.steps:,} steps for {each}: more may gain (--{name}-steps).")
         kept, learning_surfels = tune.cache_bytes if tune else 0, len(model.scene) if polish else 0
         state_export(model.scene, views, kept, learning_surfels, compact)
         try:
@@ -209,27 +182,20 @@ class ExportAtlas(BakeOptions, CompactOptions):
                 background = model.background.cpu()
                 photographs = datamanager.train_views
                 if polish or tune or learning.compact:
-                    photographs = corrected(
-                        photographs, model.resume_state.get("exposure"), datamanager.train_dataset.photographs
-                    )
-                baked = bake_and_learn(
-                    model.scene, views, photographs, background, options, learning, progress, held_out
-                )
+                    exposure = model.resume_state.get("exposure")
+                    photographs = corrected(photographs, exposure, datamanager.train_dataset.photographs)
+                learned = (options, learning, progress, held_out)
+                baked = bake_and_learn(model.scene, views, photographs, background, *learned)
         except (ValueError, RuntimeError) as error:
             fail(f"the scene cannot be baked: {error}", error)
         background = tuple(model.background.tolist())
-        export(
-            baked,
-            self.output_dir,
-            background=background,
-            world=world_of(datamanager),
-            statistics={"options": asdict(baked.options), "method": config.method_name},
-            extra_files={"preview.jpg" if compact else "preview.png": shown, **cameras_of},
-            loose_files={CONFIG: bundle_config(config, self.output_dir, background)},
-            overwrite=self.overwrite,
-            interchange=self.interchange,
-            first=first,
-        )
+        written = {
+            "statistics": {"options": asdict(baked.options), "method": config.method_name},
+            "extra_files": {"preview.jpg" if compact else "preview.png": shown, **cameras_of},
+            "loose_files": {CONFIG: bundle_config(config, self.output_dir, background)},
+        }
+        how = {"overwrite": self.overwrite, "interchange": self.interchange, "first": first, "background": background}
+        export(baked, self.output_dir, world=world_of(datamanager), **written, **how)
         bundle = read_bundle(self.output_dir)
         if self.compare and len(datamanager.eval_dataset):
             bundle.info.statistics.held_out = compare(model, datamanager, bundle.scene)
@@ -241,24 +207,13 @@ class ExportAtlas(BakeOptions, CompactOptions):
         print_summary(self.output_dir, bundle.info)
         self.state_size(download_bytes(self.output_dir, bundle.info))
         if self.extras:
-            self._write_extras(bundle, views, datamanager.eval_views)
-
-    def _write_extras(self, bundle: Bundle, cameras: Sequence[Camera], held_out: Sequence[View]) -> None:
-        """Beside the bundle, which is complete already; says what was written."""
-        folder = extras_folder(self.output_dir)
-        with rich_progress() as progress:
-            written = write_extras(
-                bundle,
-                folder,
-                self.extras,
-                frame=self.extras_frame,
-                cameras=[camera.to("cpu") for camera in cameras],
-                held_out=held_out if self.compare else (),
-                overwrite=self.overwrite,
-                progress=progress,
-            )
-        for each in written.values():
-            say(f"In {folder}: {summary_line(each)}")
+            folder = extras_folder(self.output_dir)
+            how = {"frame": self.extras_frame, "overwrite": self.overwrite}
+            how |= {"cameras": [camera.to("cpu") for camera in views], "held_out": held_out}
+            with rich_progress() as progress:
+                written = write_extras(bundle, folder, self.extras, progress=progress, **how)
+            for each in written.values():
+                say(f"In {folder}: {summary_line(each)}")
 
 
 def main() -> None:

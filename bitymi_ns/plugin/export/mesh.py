@@ -1,10 +1,11 @@
-"""`ns-export bitymi-mesh`: the surface of a trained scene or of a bundle as a triangle mesh."""
+"""`ns-export bitymi-mesh`: extract the surface of a trained scene or of a bundle as a triangle mesh."""
 
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -29,20 +30,19 @@ from bitymi_ns.ranges import check_ranges
 from bitymi_ns.scene.camera import Camera
 
 NAME = "mesh"
-MOST_VIEWS = 400  # training views that are fused at most, evenly spaced
+MOST_VIEWS = 400  # most fused training views, evenly spaced
 
 
-@dataclass(frozen=True)
-class Source:
-    """Scene that a mesh is made of."""
+class Source(NamedTuple):
+    """Scene that a mesh is made of, on the device that draws it."""
 
-    surfels: Mapping[str, Tensor]  # geometry by name, on the device where it is drawn
+    surfels: Mapping[str, Tensor]  # geometry by name
     render: Callable[[Camera], Tensor]  # [H, W, 3] colors of a view
-    cameras: Sequence[Camera]  # of the training views, on that device
-    near: float  # nearest depth that is drawn, camera z
+    cameras: Sequence[Camera]  # of the training views
+    near: float  # nearest drawn depth, camera z
     prefilter: Prefilter  # as in `ops.project`
-    world: WorldFrame  # how the scene lies in the capture
-    alpha: TexelAlpha | None  # opacities of the texels, on that device; None = opaque texels
+    world: WorldFrame  # of the scene in the capture
+    alpha: TexelAlpha | None  # opacities of the texels; None = opaque
 
 
 @dataclass(kw_only=True)
@@ -53,8 +53,8 @@ class ExportMesh(SurfaceOptions):
     output_dir: Path  # Folder of the mesh: mesh.ply, mesh.glb or mesh.obj.
     format: MeshFormat = "ply"  # Of the file. Those of other formats stay.
     frame: Frame = "capture"
-    """Frame of the vertices: the capture's own, with its unit of length, or the scene's, in which nerfstudio trains."""
-    overwrite: bool = False  # Replace a mesh that is there already.
+    """Frame of the vertices: the capture's, with its unit of length, or the scene's, in which nerfstudio trains."""
+    overwrite: bool = False  # Replace an existing mesh.
 
     def main(self) -> None:
         """Run the export."""
@@ -69,22 +69,21 @@ class ExportMesh(SurfaceOptions):
                 self._check_target(path)
                 bundle = bundle_at(self.load_config)
                 source = from_run(self.load_config) if bundle is None else from_bundle(bundle)
-                note = self._write(source, path)
+                say(f"{path}: {self._write(source, path)}")
         except BundleError as error:
             fail(str(error), error)
         except NoSurface as error:
             fail(f"{self.load_config}: {error}.", error)
         except OSError as error:
             fail(f"{path} cannot be written: {reason(error, path)} (--output-dir).", error)
-        say(f"{path}: {size_text(path.stat().st_size)}, in the {self.frame}'s frame" + (note and f"; {note}"))
 
     def _check_target(self, path: Path) -> None:
-        """Stop where the file is there and may not be replaced."""
+        """Stop if the file exists and may not be replaced."""
         if os.path.lexists(path) and not self.overwrite:
             fail(f"{path} is there already: choose another --output-dir, or add --overwrite True.")
 
     def _write(self, source: Source, path: Path) -> str:
-        """Write the mesh; returns what is to be said of its positions."""
+        """Write the mesh; return a summary."""
         to = to_capture(source.world) if self.frame == "capture" else None
         step = max(1, -(-len(source.cameras) // MOST_VIEWS))
         cameras = source.cameras[::step]
@@ -102,40 +101,30 @@ class ExportMesh(SurfaceOptions):
         say(f"{counts}, of {len(cameras)} views")
         if self.watertight and (left := mesh.open_edges()):
             warn(f"{left:,} edges could not be closed, so that the mesh is not watertight: try another --resolution.")
-        return note and note + (" (its node is moved there)" if self.format == "glb" else " (a comment of the file)")
+        where = " (its node is moved there)" if self.format == "glb" else " (a comment of the file)"
+        return f"{size_text(path.stat().st_size)}, in the {self.frame}'s frame" + (note and f"; {note}{where}")
 
 
 def from_run(load_config: Path) -> Source:
-    """The scene of a training run's last checkpoint."""
+    """Load the scene of a training run's last checkpoint."""
     _, pipeline = load_trained(load_config)
     model, datamanager = pipeline.model, pipeline.datamanager
     cameras = to_cameras(datamanager.train_dataset.cameras, model.device)
     scene = model.scene
     surfels = {name: value.detach() for name, value in scene.surfels.items()}
-    return Source(
-        surfels,
-        lambda camera: model.render(camera, model.background, maps=False).rgb,
-        cameras,
-        scene.near,
-        scene.config.prefilter,
-        WorldFrame.model_validate_json(json.dumps(plain(world_of(datamanager).described()))),
-        None if scene.field is None else scene.field.opacity(scene.config.weight_bound, learns=False),
-    )
+    world = WorldFrame.model_validate_json(json.dumps(plain(world_of(datamanager).described())))
+    alpha = None if scene.field is None else scene.field.opacity(scene.config.weight_bound, learns=False)
+    drawn = (cameras, scene.near, scene.config.prefilter, world, alpha)
+    return Source(surfels, lambda camera: model.render(camera, model.background, maps=False).rgb, *drawn)
 
 
 def from_bundle(folder: Path) -> Source:
-    """A bundle, a folder or one file, from the training cameras that it holds.
-
-    Raises:
-        BundleError: it cannot be read, or has no cameras.
-    """
+    """Load a bundle with its training cameras. Raises BundleError: it cannot be read, or has no cameras."""
     bundle = read_bundle(folder)
     scene = bundle.scene
     cameras = training_cameras(bundle) or [row.camera for row in bundle.cameras]
     if not cameras:
-        raise BundleError(
-            f"{folder} has no cameras ({CAMERAS}) to see the surface from: give the config.yml of the run that it was "
-            "made from"
-        )
+        advice = "give the config.yml of the run that it was made from"
+        raise BundleError(f"{folder} has no cameras ({CAMERAS}) to see the surface from: {advice}")
     drawn = (cameras, scene.near, scene.prefilter, bundle.info.world, texel_alpha(scene))
     return Source(scene.surfels, lambda camera: bundle.render(camera).rgb, *drawn)

@@ -1,4 +1,4 @@
-"""Summary table of an export."""
+"""Print the summary table of an export."""
 
 import shlex
 from pathlib import Path
@@ -16,12 +16,12 @@ from bitymi_ns.trust import printable
 
 
 def decibels(value: float | None) -> str:
-    """For the table; pictures that are equal have no finite PSNR, nor have those of which no pixel counts."""
+    """Format a PSNR; equal pictures, and those without pixels that count, have none."""
     return "no number" if value is None else f"{value:.2f} dB"
 
 
 def print_summary(folder: Path, info: Manifest) -> None:
-    """Print what was written, what was left out, and what it cost."""
+    """Print what was written, left out, and lost."""
     statistics = info.statistics
     surfels = statistics.surfels
     table = Table("", "", title=escape(printable(f"Bundle {folder}")), show_header=False)
@@ -57,15 +57,14 @@ def print_summary(folder: Path, info: Manifest) -> None:
         table.add_row("Bundle against trained scene", decibels(held_out.psnr_baked_against_neural))
         for name, form in (("Trained scene", "neural"), ("Bundle", "baked")):
             plain, fitted = (getattr(held_out, f"{kind}_{form}_against_photos") for kind in ("psnr", "fitted_psnr"))
-            table.add_row(
-                f"{name} against photographs", f"{decibels(plain)}, {decibels(fitted)} after a fit of the colours"
-            )
+            fit = f"{decibels(plain)}, {decibels(fitted)} after a fit of the colours"
+            table.add_row(f"{name} against photographs", fit)
     CONSOLE.print(table)
     say(f"Evaluate it with: ns-eval --load-config {shlex.quote(str(folder / 'config.yml'))}")
 
 
 def print_savings(table: Table, info: Manifest) -> None:
-    """Tiles, texels and bytes of the rule and of the bundle, and the error that the difference costs."""
+    """Add rows for tiles, texels and bytes of rule and bundle, and the error of the difference."""
     statistics, options = info.statistics, info.statistics.options
     texels = statistics.texels
     learned = [part.error_before for part in (statistics.polish, statistics.finetune) if part is not None]
@@ -94,7 +93,7 @@ def print_savings(table: Table, info: Manifest) -> None:
         table.add_row("As stored and seen", f"{certificate.within:,} of {count:,} surfels within the tolerance")
         worst = "no number" if certificate.worst is None else f"at most {certificate.worst:.2f} steps"
         table.add_row("", f"({certificate.tolerance:g} steps from {of[certificate.against]}; {worst})")
-    if error is None:  # the tiles hold what was learned, not the field
+    if error is None:  # tiles hold learned texels, not the field
         return
     tolerance = f"tolerance {error.tolerance:g}" if error.tolerance else "no tolerance"
     table.add_row("Error of a tile", percentiles_text(error.rms))

@@ -1,27 +1,30 @@
-"""Checks of the output folder before the work: writable, free, with enough disk space."""
+"""Output folder of an export: checks before the work, and config.yml for nerfstudio's tools."""
 
-from collections.abc import Iterator
+import copy
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
+
+import yaml
 
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.manifest import MANIFEST
+from bitymi_ns.bundle.parts import CONFIG as CONFIG
 from bitymi_ns.bundle.parts import check_target
 from bitymi_ns.codec.quantise import BYTES_PER_TEXEL
 from bitymi_ns.files import explained, free_bytes, reserved, size_text
 from bitymi_ns.plugin.console import InputError, fail, warn
+from bitymi_ns.plugin.run.bundle_model import BakedModelConfig
+from bitymi_ns.plugin.run.config import method_config
 
-SURFEL_BYTES = 60 * 4  # bytes of a surfel's parameters. A checkpoint holds them three times, with Adam's two moments.
-TYPICAL_SIDE = 32  # side of a texture tile in texels, estimated generously: within a tolerance most are far smaller
+SURFEL_BYTES = 60 * 4  # bytes of a surfel's parameters; checkpoints have them and Adam's two moments
+TYPICAL_SIDE = 32  # side of a tile in texels, generously: within a tolerance most are far smaller
 
 
 @contextmanager
 def reserve_bundle(folder: Path, overwrite: bool) -> Iterator[None]:
-    """Lock the folder of a bundle; stop where another process has it, or a bundle may not or cannot be written.
-
-    Raises:
-        BundleError: there is a bundle, or other files.
-    """
+    """Lock a bundle's folder; stop if it is in use or cannot be written. Raises BundleError: other files are there."""
     with ExitStack() as stack:
         with explained(folder, InputError, " (--output-dir)."):
             stack.enter_context(reserved(folder, warn))
@@ -30,27 +33,22 @@ def reserve_bundle(folder: Path, overwrite: bool) -> Iterator[None]:
 
 
 def check_room(folder: Path, load_config: Path, options: BakeOptions, exact: bool) -> None:
-    """Stop where there may be too little room for a bundle."""
+    """Stop if there may be too little room for a bundle."""
     needed, free = space_needed(load_config, options, exact), free_bytes(folder)
     if free < needed:
         beside = " beside the earlier one" if folder.exists() else ""
+        most = f"up to {size_text(needed)}{beside} (a generous estimate by the size of its checkpoint)"
         fail(
             f"there may be too little room for {folder}: {size_text(free)} are free, and a bundle of this scene may "
-            f"take up to {size_text(needed)}{beside} (a generous estimate by the size of its checkpoint). Free some "
-            "space, give an --output-dir on another disk, or try it all the same with --check-room False: if the disk "
-            "gets full, nothing is left behind."
+            f"take {most}. Free some space, give an --output-dir on another disk, or try --check-room False: if the "
+            "disk gets full, nothing is left behind."
         )
 
 
 def space_needed(load_config: Path, options: BakeOptions, exact: bool) -> int:
-    """A generous estimate of the bytes of a run's bundle.
+    """Estimate the most bytes of a run's bundle by its newest checkpoint; 0 without one.
 
-    It assumes that the newest checkpoint holds nothing but surfels, each with a tile of 32 x 32 texels, or with the
-    largest tile where everything is kept.
-
-    Args:
-        load_config: config.yml of the run; without a checkpoint beside it the estimate is 0.
-        exact: whether everything is kept.
+    It counts as surfels alone, each with a tile of TYPICAL_SIDE texels, or the largest tile if `exact`.
     """
     newest = max(load_config.parent.glob("*/step-*.ckpt"), default=None)
     surfels = newest.stat().st_size // (3 * SURFEL_BYTES) if newest is not None else 0
@@ -60,9 +58,28 @@ def space_needed(load_config: Path, options: BakeOptions, exact: bool) -> int:
 
 
 def bundle_version(folder: Path) -> tuple[int, int] | None:
-    """Identity of the bundle file in a folder, inode and time; None where there is none."""
+    """Return inode and time of a folder's bundle file; None without one."""
     try:
         found = (folder / MANIFEST).stat()
     except OSError:
         return None
     return found.st_ino, found.st_mtime_ns
+
+
+def bundle_config(config: Any, folder: Path, background: Sequence[float]) -> bytes:
+    """Make the config.yml with which nerfstudio's tools open a bundle; bundle.json does not vouch for it, as its data
+    path may have to be edited for moved photographs."""
+    config = copy.deepcopy(config)
+    config.pipeline.model = BakedModelConfig(bundle=folder.absolute(), background=tuple(background))  # type: ignore[arg-type]
+    config.load_dir = config.load_step = config.load_checkpoint = config.load_config = None
+    config.optimizers = {}
+    vars(config).pop("read_from", None)
+    return yaml.dump(config).encode("utf8")
+
+
+def config_without_run(folder: Path, background: Sequence[float]) -> bytes:
+    """Make the config.yml of a bundle without run, which uses its own cameras; `BITYMI_DATA` names a capture."""
+    config = method_config("bitymi").config
+    config.experiment_name = folder.name
+    config.pipeline.datamanager.data = folder.absolute() / "photographs"
+    return bundle_config(config, folder, background)

@@ -1,8 +1,9 @@
-"""A trained run as an export reads it: loading, previewing, and comparing with its bundle."""
+"""Load and preview a trained run, make its bundle's cameras.json, and compare both."""
 
 import copy
 import io
 import pickle
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,8 @@ from PIL import Image
 
 from bitymi_ns.bake.verify import check_field, check_view_color
 from bitymi_ns.bundle import Bundle, Check, check_world
-from bitymi_ns.bundle.parts import bundle_at
+from bitymi_ns.bundle.cameras import CapturedCamera, cameras_data
+from bitymi_ns.bundle.parts import CAMERAS, bundle_at
 from bitymi_ns.bundle.statistics import HeldOut
 from bitymi_ns.bundle.write import World
 from bitymi_ns.capture.frame import UP, read_frame
@@ -28,20 +30,19 @@ from bitymi_ns.scene.field import HashField
 from bitymi_ns.train.losses import fitted_psnr, psnr
 
 _PSNR_SLACK = 0.1  # dB
+MOST_PIXELS = 1600  # longer side of a photograph in a bundle
 
 
 def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
-    """Configuration and pipeline of a trained scene, at a step of which there is a checkpoint or at the last one."""
+    """Load configuration and pipeline of a trained scene, at the step of a checkpoint or the last one."""
 
     def choose(config: Any) -> Any:
         config.load_step = step
         return config
 
     if bundle_at(load_config) is not None:
-        fail(
-            f"{load_config} is that of a bundle, which is baked already. Give the config.yml of the training run that "
-            "it was made from."
-        )
+        what = f"{load_config} is that of a bundle, which is baked already"
+        fail(f"{what}. Give the config.yml of the training run that it was made from.")
     if not load_config.is_file():
         fail(f"there is no {load_config}. Give the config.yml of a trained scene (ns-train says where it is).")
     try:
@@ -50,19 +51,17 @@ def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
         fail(f"{load_config} is not the configuration of a trained scene: {error}", error)
     except (RuntimeError, EOFError, IndexError, AssertionError, OSError, ValueError, pickle.UnpicklingError) as error:
         detail = (str(error).strip().splitlines() or [""])[0]
-        if isinstance(error, AssertionError) and not detail:  # the host's word for another kind of file
+        if isinstance(error, AssertionError) and not detail:  # nerfstudio's report of another kind of file
             fail(f"{load_config} is not the configuration of a trained scene. ns-train says where it is.", error)
         fail(f"the checkpoint of {load_config} cannot be loaded: {detail or type(error).__name__}", error)
     if not isinstance(pipeline.model, BitymiModel):
-        fail(
-            f"{load_config} is a run of the method {config.method_name}, which cannot be baked; "
-            "give the config.yml of a bitymi training run"
-        )
+        what = f"{load_config} is a run of the method {config.method_name}, which cannot be baked"
+        fail(f"{what}; give the config.yml of a bitymi training run")
     return config, pipeline
 
 
 def world_of(datamanager: Any) -> World:
-    """Transform from the scene to the capture's frame, with up and metres where the poses come from our SfM."""
+    """Return the transform from scene to capture, with up and metres if our SfM found the poses."""
     outputs = datamanager.train_dataparser_outputs
     report = getattr(datamanager.dataparser, "poses_report", None)
     frame = None if report is None else read_frame(report)
@@ -72,17 +71,37 @@ def world_of(datamanager: Any) -> World:
 
 @torch.no_grad()
 def preview(model: BitymiModel, camera: Camera, format: str = "PNG") -> bytes:
-    """The trained scene as a camera sees it."""
-    rgb = model.render(camera, model.background, maps=False).rgb
-    buffer = io.BytesIO()
-    Image.fromarray(as_bytes(rgb).numpy()).save(buffer, format=format)
+    """Draw the trained scene for a camera."""
+    return _encoded(model.render(camera, model.background, maps=False).rgb, format)
+
+
+def camera_files(datamanager: Any, train: Sequence[Camera], photographs: bool) -> dict[str, bytes]:
+    """Make cameras.json, and if `photographs` the held-out ones as JPEG of at most `MOST_PIXELS` along a side."""
+    files: dict[str, bytes] = {}
+    names = [path.name for path in datamanager.train_dataset.image_filenames]
+    rows = [CapturedCamera.of(name, camera, False) for name, camera in zip(names, train, strict=True)]
+    for i, path in enumerate(datamanager.eval_dataset.image_filenames):
+        view = datamanager.eval_views[i]
+        photograph = f"photograph-{i + 1:04d}.jpg" if photographs else None
+        if photograph is not None:
+            files[photograph] = _encoded(view.target(torch.zeros(3), "cpu"), "JPEG", MOST_PIXELS, quality=88)
+        rows.append(CapturedCamera.of(path.name, view.camera, True, photograph))
+    return {CAMERAS: cameras_data(rows), **files}
+
+
+def _encoded(image: torch.Tensor, format: str, most: int | None = None, **options: Any) -> bytes:
+    """Encode an image [H, W, 3], of at most `most` pixels along a side."""
+    picture, buffer = Image.fromarray(as_bytes(image).numpy()), io.BytesIO()
+    if most is not None:
+        picture.thumbnail((most, most), Image.Resampling.LANCZOS)
+    picture.save(buffer, format=format, **options)
     return buffer.getvalue()
 
 
 @torch.no_grad()
 def compare(model: BitymiModel, datamanager: Any, scene: BakedScene) -> HeldOut:
-    """PSNR in dB over the held-out views: means of bundle, trained scene and photographs against each other, also after
-    the affine fit of each view's colours to its photograph; and the lowest of the bundle against the trained scene."""
+    """Average PSNR in dB over the held-out views: bundle, trained scene and photographs against each other, also after
+    the affine fit of each view's colours to its photograph; and the worst of the bundle against the trained scene."""
     rows = held_out_psnr(model, datamanager, scene, len(datamanager.eval_dataset))
     names = ("psnr_baked_against_neural", "psnr_neural_against_photos", "psnr_baked_against_photos")
     names += ("fitted_psnr_neural_against_photos", "fitted_psnr_baked_against_photos")
@@ -93,8 +112,8 @@ def compare(model: BitymiModel, datamanager: Any, scene: BakedScene) -> HeldOut:
 
 @torch.no_grad()
 def held_out_psnr(model: BitymiModel, datamanager: Any, scene: BakedScene, views: int) -> list[list[float]]:
-    """Rows of the first `views` held-out views: PSNR of bundle against trained scene, trained scene against photograph,
-    bundle against photograph, and the last two after the affine fit of the colours. All on the device of the model."""
+    """Compute PSNR of the first `views` held-out views on the model's device, a row each: bundle against trained scene,
+    trained scene against photograph, bundle against photograph, and these two after the affine fit of colours."""
     rows = []
     scene, background = scene.to(model.device), model.background
     for index in range(min(views, len(datamanager.eval_views))):
@@ -108,16 +127,20 @@ def held_out_psnr(model: BitymiModel, datamanager: Any, scene: BakedScene, views
 
 
 def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
-    """Check a bundle against the run it was baked from.
-
-    Args:
-        run: config.yml of the run, its folder, or one of its checkpoints.
-    """
+    """Check a bundle against its run, named by config.yml, folder or a checkpoint."""
     if views < 1:
         fail(f"--views must be at least 1, not {views}")
-    config, step = find_run(run)
+    step = None
+    if run.suffix == ".ckpt":
+        number = run.stem.removeprefix("step-")
+        if not run.is_file() or not number.isdecimal():
+            fail(f"there is no checkpoint {run}")
+        run, step = run.parent.parent / "config.yml", int(number)
+    elif run.is_dir():  # of the run or of its checkpoints
+        folders = [folder for folder in (run, run.parent) if (folder / "config.yml").is_file()]
+        run = (folders[0] if folders else run) / "config.yml"
     with CONSOLE.capture():  # nerfstudio reports at length what it loads
-        _, pipeline = load_trained(config, step)
+        _, pipeline = load_trained(run, step)
     model, datamanager = pipeline.model, pipeline.datamanager
     train = to_cameras(datamanager.train_dataset.cameras, "cpu")
     checks = [check_view_color(bundle, model.scene.surfels, train)]
@@ -132,15 +155,3 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
         detail += f"; against the photographs {photos:+.3f} dB"
         checks.append(Check("PSNR against the trained scene", stated is None or worst >= stated - _PSNR_SLACK, detail))
     return [*checks, check_world(bundle.info.world, world_of(datamanager))]
-
-
-def find_run(run: Path) -> tuple[Path, int | None]:
-    """The config.yml of a run named by it, by its folder or by a checkpoint, and the checkpoint's step."""
-    if run.suffix == ".ckpt":
-        step = run.stem.removeprefix("step-")
-        if not run.is_file() or not step.isdecimal():
-            fail(f"there is no checkpoint {run}")
-        return run.parent.parent / "config.yml", int(step)
-    if run.is_dir() and not (run / "config.yml").is_file() and (run.parent / "config.yml").is_file():
-        run = run.parent  # the folder of its checkpoints
-    return (run / "config.yml" if run.is_dir() else run), None

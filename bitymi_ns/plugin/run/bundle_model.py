@@ -23,7 +23,7 @@ from bitymi_ns.scene.baked_renderer import SceneRenderer
 from bitymi_ns.scene.camera import Camera
 
 RENDERER = "BITYMI_RENDERER"
-"""Environment variable that overrides `BakedModelConfig.renderer`, because ns-eval has no option for it."""
+"""Environment variable that overrides `BakedModelConfig.renderer`: ns-eval has no option for it."""
 
 
 @dataclass
@@ -31,24 +31,27 @@ class BakedModelConfig(SurfelModelConfig):
     """A scene baked into a bundle."""
 
     _target: type = field(default_factory=lambda: BakedModel)
-    bundle: Path = Path()
-    """Folder of the bundle when it was written; a bundle that was moved is found beside its config.yml."""
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Colour behind the scene."""
+    bundle: Path = Path()  # Folder of the bundle when written; a moved one is found beside its config.yml.
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Colour behind the scene.
     renderer: Literal["kernels", "fast", "webgpu"] = "kernels"
-    """kernels: on CUDA or the CPU; fast: the same, and a pixel ends where less than half of an 8-bit step of light is
-    left; webgpu: on graphics of any maker, which needs the package wgpu."""
+    """kernels: on CUDA or the CPU; fast: the same, but pixels end at less than half an 8-bit step of light; webgpu: on
+    graphics of any maker, by the package wgpu."""
 
 
 class BakedModel(SurfelModel):
-    """Renders from the files of a bundle alone: no network, no checkpoint."""
+    """Renders a bundle's files alone: no network, no checkpoint."""
 
     config: BakedModelConfig
 
     def populate_modules(self) -> None:
         super().populate_modules()
-        folder, renderer = Path(self.config.bundle), self._renderer_name()
+        folder, renderer = Path(self.config.bundle), os.environ.get(RENDERER) or self.config.renderer
+        if renderer not in ("kernels", "fast", "webgpu"):
+            fail(f"{RENDERER} must be kernels, fast or webgpu, not {renderer!r}")
         through_webgpu = renderer == "webgpu"
+        if through_webgpu:
+            with _webgpu_needed():
+                webgpu.device.device()
         on_card = kernel_device(self.kwargs.get("device", "cpu")).type == "cuda" and not through_webgpu
         try:
             bundle = read_bundle(folder, decode=not on_card)
@@ -64,16 +67,6 @@ class BakedModel(SurfelModel):
         if renderer == "fast":
             bundle.scene.transmittance_min = FAST
         self._renderer = SceneRenderer(bundle.scene)
-
-    def _renderer_name(self) -> str:
-        """The renderer of the options; stops where it is unknown, or WebGPU is not available."""
-        asked = os.environ.get(RENDERER) or self.config.renderer
-        if asked not in ("kernels", "fast", "webgpu"):
-            fail(f"{RENDERER} must be kernels, fast or webgpu, not {asked!r}")
-        if asked == "webgpu":
-            with _webgpu_needed():
-                webgpu.device.device()
-        return asked
 
     def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
         with _webgpu_needed():
@@ -97,7 +90,7 @@ class BakedModel(SurfelModel):
         return self
 
     def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
-        """Nothing to load: everything is in the bundle."""
+        """Load nothing: all is in the bundle."""
         return torch.nn.modules.module._IncompatibleKeys([], [])
 
 

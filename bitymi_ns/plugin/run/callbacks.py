@@ -1,9 +1,10 @@
-"""A training run inside nerfstudio's loop: what it calls before, in and after a step, and the curve of progress."""
+"""Run training inside nerfstudio's loop: before, in and after a step; append the curve of progress."""
 
 import errno
 import json
 import math
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -44,43 +45,36 @@ class TrainingRun:
         self.total: int = trainer.config.max_num_iterations
         self.first_step: int = trainer._start_step
         self._parameters = attributes.optimizers.parameters
-        train = self.datamanager.train_dataset.cameras
+        dataset, views, metadata = self.datamanager.train_dataset, self.datamanager.train_views, model.metadata
+        train, extent = dataset.cameras, scene_extent(metadata["camera_centers"], scene.surfels["means"])
         cameras = OnDemand(len(train), lambda i: to_camera(train[i : i + 1], "cpu"))
-        data = TrainingData(
-            self.datamanager.train_views,
-            scene_extent(model.metadata["camera_centers"], scene.surfels["means"]),
-            model.metadata["train_pixels"],
-            model.metadata["first_surfels"],
-            covered_share(self.datamanager.train_views),
-            exposure_stops(self.datamanager.train_dataset.files),
-            self.datamanager.train_dataset.photographs,
-            cameras,
-        )
+        counts = (metadata["train_pixels"], metadata["first_surfels"], covered_share(views))
+        data = TrainingData(views, extent, *counts, exposure_stops(dataset.files), dataset.photographs, cameras)
         optimizers, processes = attributes.optimizers.optimizers, trainer.processes
         self.training = Training(scene, data, optimizers, config, self.total, self._on_resize, warn, processes)
         attributes.optimizers.before_step = self.training.combine
-        self.capture = capture_fingerprint(self.datamanager.train_dataset)
+        self.capture = capture_fingerprint(dataset)
         self._random_state: Tensor | None = None
         if resume_state := model.resume_state:
             self.training.load_state_dict(resume_state)
             self._random_state = resume_state["random"]
             if "capture" in resume_state:  # checkpoints of earlier versions have none
                 warn_of_other_capture(resume_state["capture"], self.capture)
-        # after which the curve gets a point: evenly spaced, the last step included
+        # steps after which the curve gets a point: evenly spaced, with the last one
         self.curve_steps = {max(0, round(self.total * (i + 1) / curve_points) - 1) for i in range(curve_points)}
         resumed_from = trainer.config.load_dir or getattr(trainer.config.load_checkpoint, "parent", None)
         self.curve = TrainingCurve(
             trainer.base_dir / FILE, None if resumed_from is None else resumed_from.parent / FILE, self.first_step
         )
         self.names = {"experiment_name": trainer.config.experiment_name, "method_name": trainer.config.method_name}
-        self._held_back = False  # whether it was said that densification meets its bound
+        self._held_back = False  # densification has met its bound, and a warning said so
         for sentence in (
             *limits.other_options(model.recorded_options, config),
             *limits.recorded_rules(config),
             *limits.short_run(self.training.schedule, len(train), scene.config.texture == "hash", processes.views),
         ):
             say(sentence)
-        _ = self.datamanager.cached_train  # read the images now: loading is not training time
+        _ = self.datamanager.cached_train  # read images now: loading is not training time
         if self.curve_steps:
             _ = self.datamanager.cached_eval
         self.datamanager.check_pictures()
@@ -94,7 +88,7 @@ class TrainingRun:
         self.datamanager.step_view = self.training.view
 
     def _check_start(self) -> None:
-        """Stop, or warn, when views see nothing of what training starts from: no gradient would come from them."""
+        """Stop, or warn, if views see nothing of what training starts from: they would give no gradient."""
         dataset = self.datamanager.train_dataset
         cameras = [to_camera(dataset.cameras[i : i + 1]) for i in range(len(dataset))]
         blind = [dataset.image_filenames[i] for i in views_without_surfels(self.scene, cameras)]
@@ -105,10 +99,8 @@ class TrainingRun:
                 "look the other way (nerfstudio's axes are x right, y up, z back)."
             )
         if blind:
-            warn(
-                f"{listed(blind)} sees none of the points that training starts from: the pose may be wrong, or the "
-                "point cloud has no points there."
-            )
+            none = f"{listed(blind)} sees none of the points that training starts from"
+            warn(f"{none}: the pose may be wrong, or the point cloud has no points there.")
 
     def callbacks(self) -> list[TrainingCallback]:
         return [
@@ -117,13 +109,11 @@ class TrainingRun:
         ]
 
     def state(self) -> dict[str, Any]:
-        """Everything beside parameters and optimisers that decides how the run goes on."""
+        """Return all but parameters and optimisers that decides how the run goes on."""
         return {**self.training.state_dict(), "random": torch.get_rng_state(), "capture": self.capture}
 
-    # a step
-
     def before(self, step: int) -> None:
-        """Set the learning rates of the step."""
+        """Set the step's learning rates."""
         if self._random_state is not None:
             torch.set_rng_state(self._random_state)
             self._random_state = None
@@ -136,14 +126,14 @@ class TrainingRun:
             say(self.training.exposure.sentence)
 
     def losses(self, view: View) -> dict[str, Tensor]:
-        """Render the step's view and compare it with its photograph."""
+        """Compare a render of the step's view with its photograph."""
         try:
             return self.training.losses(view)[0]
         except ValueError as error:
             self._diverged(error)
 
     def after(self, step: int) -> None:
-        """Densify and prune; then, with the clock stopped, note how far the run has come."""
+        """Densify and prune; then stop the clock and note progress."""
         try:
             if step in self.curve_steps:
                 self.training.watch.finish(self.scene)
@@ -169,20 +159,15 @@ class TrainingRun:
     def _on_resize(self, name: str, parameter: Parameter) -> None:
         self._parameters[name] = [parameter]  # used by gradient clipping
 
-    # the curve
-
     def _add_point(self, step: int) -> None:
         views = self.datamanager.eval_views
         rows = evenly_spaced(len(views), 0 if step + 1 >= self.total else self._curve_views)
         refined = self.training.poses.refined and step + 1 >= self.total
         poses = self.training.poses if refined else None
         quality = evaluate(self.scene, OnDemand(len(rows), lambda i: views[rows[i]]), self.config, poses)
-        point = {
-            "step": step + 1,
-            "seconds": round(self.training.clock.seconds, 4),
-            "cpu_seconds": round(self.training.clock.cpu_seconds, 4),
-            "surfels": len(self.scene),
-        }
+        clock = self.training.clock
+        times = {"seconds": round(clock.seconds, 4), "cpu_seconds": round(clock.cpu_seconds, 4)}
+        point = {"step": step + 1, **times, "surfels": len(self.scene)}
         shown = ""
         if not math.isnan(quality.psnr):
             point |= {k: round(value, 4) for k, value in quality._asdict().items() if not math.isnan(value)}
@@ -192,43 +177,34 @@ class TrainingRun:
                 shown += f"{quality.refined_psnr:.2f} dB with their poses refined, "
             writer.put_scalar("Held-out PSNR", torch.tensor(quality.psnr), step)
         self.curve.add({**point, **self.names})
-        CONSOLE.print(
-            f"step {step + 1:6,d} of {self.total:,}: {shown}{point['surfels']:,} surfels, "
-            f"{self.training.clock.seconds:.0f} s of training"
-        )
+        more = f"{shown}{point['surfels']:,} surfels, {self.training.clock.seconds:.0f} s of training"
+        CONSOLE.print(f"step {step + 1:6,d} of {self.total:,}: {more}")
 
 
 FILE = "training_curve.jsonl"
 
 
 class TrainingCurve:
-    """Appends points to the file of a run; a resumed run keeps the points up to its checkpoint."""
+    """Appends points to a run's file; a resumed run keeps those up to its checkpoint."""
 
     def __init__(self, path: Path, resumed_from: Path | None = None, steps_done: int = 0) -> None:
         self.path = path
         source = resumed_from if resumed_from is not None else path if steps_done > 0 else None
         with explained(path, InputError, "."):
-            kept = _points_until(source, steps_done) if source is not None and source.is_file() else []
+            kept = []
+            for line in source.read_text("utf8").splitlines() if source is not None and source.is_file() else ():
+                with suppress(ValueError, KeyError, TypeError):  # cut off when the run was killed
+                    if json_of(line)["step"] <= steps_done:
+                        kept.append(line)
             write_file(path, "".join(line + "\n" for line in kept).encode("utf8"))
 
     def add(self, point: dict[str, Any]) -> None:
-        """Write one point, whole and at once. A full disk costs the point, not the run."""
+        """Write a point whole and at once; a full disk costs the point, not the run."""
         try:
             with open(self.path, "ab", buffering=0, opener=no_links) as file:
                 line, kept = f"{json.dumps(point)}\n".encode(), file.tell()
-                if file.write(line) < len(line):  # the next point must not follow half a one
+                if file.write(line) < len(line):  # no point may follow half a one
                     file.truncate(kept)
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
             warn(f"A point of the training curve {self.path} could not be written: {reason(error, self.path)}.")
-
-
-def _points_until(path: Path, steps: int) -> list[str]:
-    kept = []
-    for line in path.read_text("utf8").splitlines():
-        try:
-            if json_of(line)["step"] <= steps:
-                kept.append(line)
-        except (ValueError, KeyError, TypeError):
-            continue  # cut off when the run was killed
-    return kept

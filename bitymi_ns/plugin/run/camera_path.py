@@ -1,5 +1,4 @@
-"""Camera paths that `ns-render camera-path` reads: checked before the scene is loaded, and written again for
-nerfstudio, so that what it reads is what was checked."""
+"""Read and check camera paths of `ns-render camera-path` before loading the scene, and write them for nerfstudio."""
 
 import atexit
 import math
@@ -17,12 +16,12 @@ from bitymi_ns.ranges import first_problem
 from bitymi_ns.reading import read_json, reading
 
 MOST_PIXELS = 16_384  # along a side of a frame
-SLACK = 1e-3  # of a rotation that was stored with rounding
+SLACK = 1e-3  # rounding of a stored rotation
 HELP = "Record it in the viewer of the run or bundle, or write nerfstudio's format."
 
 
 def _pose(value: list[Any]) -> list[float]:
-    """The 16 numbers of a matrix [4, 4] by rows: a rotation and a position."""
+    """Check 16 numbers of a matrix [4, 4] by rows: a rotation and a position."""
     try:
         matrix = np.array(value, np.float64).reshape(4, 4)
     except (TypeError, ValueError, OverflowError):
@@ -45,7 +44,7 @@ class _Frame(BaseModel):
 
 
 class CameraPath(BaseModel):
-    """A camera path that can be rendered; entries of nerfstudio's format that mean nothing here are left out."""
+    """A camera path that can be rendered, without meaningless entries of nerfstudio's format."""
 
     render_width: _Side
     render_height: _Side
@@ -59,7 +58,7 @@ class CameraPath(BaseModel):
         return len(self.camera_path) / self.seconds
 
     def written(self) -> Path:
-        """Write the path to a file that lasts as long as this process."""
+        """Write the path to a file that lasts as long as the process."""
         folder = Path(tempfile.gettempdir())
         with explained(folder, InputError):
             folder = Path(tempfile.mkdtemp(prefix="bitymi-path-"))
@@ -70,11 +69,7 @@ class CameraPath(BaseModel):
 
 
 def read_camera_path(file: Path) -> CameraPath:
-    """Read and check a camera path; warn of what is ignored, or looks like a mistake.
-
-    Raises:
-        InputError: it cannot be rendered; names the file, the field and what is wrong with it.
-    """
+    """Read a camera path; warn of what is ignored or looks mistaken. Raises InputError: it cannot be rendered."""
     with reading(f"the camera path {file}", fail, f"{HELP} (--camera-path-filename)"):
         found = read_json(file)
     if isinstance(found, dict) and (found.get("seconds") == 0 or found.get("camera_path") == []):
@@ -93,8 +88,6 @@ def read_camera_path(file: Path) -> CameraPath:
         warn("Crop boxes are not supported: the whole scene is rendered.")
     widest = max(frame.fov for frame in path.camera_path)
     if widest < math.pi:
-        warn(
-            f"The fields of view of {file} are at most {widest:.3g} degrees. If radians were meant, fov has to be "
-            f"{math.degrees(widest):.3g}."
-        )
+        radians = f"If radians were meant, fov has to be {math.degrees(widest):.3g}."
+        warn(f"The fields of view of {file} are at most {widest:.3g} degrees. {radians}")
     return path

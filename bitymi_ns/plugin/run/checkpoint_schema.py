@@ -1,5 +1,5 @@
-"""Check what a checkpoint holds: names, kinds, shapes and types of its entries, the state of the optimisers included.
-Compiled code trusts sizes, so they are checked before anything else sees them."""
+"""Check a checkpoint's entries, the optimisers' included: names, kinds, shapes and types. Compiled code trusts sizes,
+so nothing else sees them before."""
 
 from __future__ import annotations
 
@@ -21,22 +21,20 @@ from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.strategy import STATISTICS
 from bitymi_ns.trust import json_of
 
-EXTRA_STATE = "_extra_state"  # torch's name for what a module saves beside its tensors
+EXTRA_STATE = "_extra_state"  # torch's name of a module's state beside tensors
 SCENE = "_model.scene."  # prefix of the scene's parameters
 SURFELS = f"{SCENE}surfels."
-LARGEST = (
-    1e15  # absolute value of a parameter that can still be drawn: its square is a float32, and so is a sum of them
-)
+LARGEST = 1e15  # absolute value of a drawable parameter: its square and sums of these are float32
 _GEOMETRY = dict(zip(GEOMETRY, ((3,), (4,), (2,), (), ()), strict=True))
 
 
 class Misfit(ValueError):
-    """An entry is not what it has to be; the message begins with its name."""
+    """An entry is wrong; the message begins with its name."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A value of a checkpoint, with its name."""
+    """Value of a checkpoint, with its name."""
 
     value: Any
     name: str = ""
@@ -45,7 +43,7 @@ class Entry:
         raise Misfit(f"{self.name} has to be {must}, not {_kind(self.value)}")
 
     def get(self, key: object) -> Entry | None:
-        """The entry of this key; None where there is none, or it is None."""
+        """Return an entry; None if it is missing or None."""
         value = self.table().get(key)
         return None if value is None else self._part(key, value)
 
@@ -64,7 +62,7 @@ class Entry:
         return self.value
 
     def parts(self) -> list[Entry]:
-        """All entries of a table."""
+        """List all entries of a table."""
         return [self._part(key, value) for key, value in self.table().items()]
 
     def text(self) -> str:
@@ -73,7 +71,7 @@ class Entry:
         return self.value
 
     def number(self, low: float = -math.inf, high: float = math.inf) -> float:
-        """A number, which may be infinite or NaN where no range is given."""
+        """Return a number, infinite or NaN only without a range."""
         if isinstance(self.value, bool) or not isinstance(self.value, (int, float)):
             self.refuse("a number")
         if not low <= self.value <= high and (low, high) != (-math.inf, math.inf):
@@ -86,20 +84,16 @@ class Entry:
         return int(self.number(low, MOST))
 
     def tensor(self, *shape: int | None, dtype: torch.dtype | None = torch.float32) -> Tensor:
-        """Numbers of this shape, of which None is any size, one after the other in memory.
-
-        Tensors in files may have strides with which they declare more than there is."""
+        """Return contiguous numbers of this shape, None = any size: strides in files may declare more than there is."""
         value = self.value
         plain = type(value) in (Tensor, Parameter) and value.layout == torch.strided and value.device.type == "cpu"
         fits = plain and dtype in (None, value.dtype) and value.is_contiguous()
-        if not fits or (dtype is not None and not _fits(value.shape, shape)):
+        if fits and dtype is not None:
+            fits = len(shape) == value.ndim and all(a in (None, b) for a, b in zip(shape, value.shape, strict=True))
+        if not fits:
             sizes = ", ".join("any" if size is None else str(size) for size in shape)
             self.refuse("numbers" if dtype is None else f"{_name(dtype)} [{sizes}]")
         return value
-
-
-def _fits(there: torch.Size, shape: tuple[int | None, ...]) -> bool:
-    return len(there) == len(shape) and all(want in (None, size) for size, want in zip(there, shape, strict=True))
 
 
 def _name(dtype: torch.dtype) -> str:
@@ -116,15 +110,9 @@ def _kind(value: Any) -> str:
 
 
 def check(state: Mapping[str, Any], scene: SceneConfig) -> list[str]:
-    """Check all entries of a checkpoint of a scene of this kind. Entries of later and earlier versions may be there or
-    not, where they can be done without.
-
-    Returns:
-        names of the entries that hold numbers that are not finite, or too large to be drawn.
-
-    Raises:
-        Misfit: an entry is missing, or not what it has to be.
-    """
+    """Check all entries of a checkpoint of a scene of this kind, without dispensable ones of other versions; return
+    names of those with numbers that are not finite, or too large to be drawn. Raises Misfit: an entry is missing or
+    wrong."""
     root = Entry(dict(state))
     root["step"].count()
     pipeline = root["pipeline"]
@@ -140,33 +128,27 @@ def check(state: Mapping[str, Any], scene: SceneConfig) -> list[str]:
         if (count := extra.get(name)) is not None:
             count.count(low)
     if (options := extra.get("train")) is not None:
-        _check_options(options)
+        try:
+            Entry(json_of(options.text()), options.name).table()
+        except ValueError as error:
+            raise Misfit(f"{options.name} has to be a table of options as JSON") from error
     if (run := extra.get("run")) is not None and run.table():
         _check_run(run, rows)
     for entry in (root["optimizers"], root.get("schedulers"), root.get("scalers")):
         if entry is not None:
             entry.table()
-    drawable = {name.removeprefix("_model."): _drawable(value) for name, value in parameters.items()}
+    drawable = {
+        name.removeprefix("_model."): (values.abs() <= LARGEST).reshape(len(values), -1).all(1)
+        for name, values in parameters.items()
+    }
     broken = [name for name, rows in drawable.items() if not bool(rows.all())]
     if not bool(torch.stack([drawable[f"scene.surfels.{name}"] for name in _GEOMETRY]).all(0).any()):
         raise Misfit(f"{broken[0]} holds numbers that are too large, or none, for every surfel")
     return broken
 
 
-def _check_options(options: Entry) -> None:
-    try:
-        Entry(json_of(options.text()), options.name).table()
-    except ValueError as error:
-        raise Misfit(f"{options.name} has to be a table of options as JSON") from error
-
-
-def _drawable(values: Tensor) -> Tensor:
-    """[N] rows whose numbers are finite and not too large."""
-    return (values.abs() <= LARGEST).reshape(len(values), -1).all(1)
-
-
 def _parameters(pipeline: Entry, scene: SceneConfig) -> dict[str, Tensor]:
-    """Check the parameters of a scene; by name."""
+    """Check a scene's parameters, and return them by name."""
     n = len(pipeline[f"{SURFELS}means"].tensor(None, 3))
     if n == 0:
         raise Misfit("it holds no surfels")
@@ -175,7 +157,12 @@ def _parameters(pipeline: Entry, scene: SceneConfig) -> dict[str, Tensor]:
     found = {
         f"{SURFELS}{name}": pipeline[f"{SURFELS}{name}"].tensor(n, *row) for name, row in (*_GEOMETRY.items(), *view)
     }
-    field = {name: pipeline[f"{SCENE}field.{name}"] for name in _field_names(pipeline, scene)}
+    names: tuple[str, ...] = ("field_table", "field_w1", "field_w2", "field_w3", "domain")
+    if scene.texture != "hash":
+        there = pipeline.table().keys()
+        names = ("texels", "size", "extent", "share") if f"{SCENE}field.texels" in there else ()
+        names += ("alpha",) if names and f"{SCENE}field.alpha" in there else ()
+    field = {name: pipeline[f"{SCENE}field.{name}"] for name in names}
     if "field_table" in field:
         table = field["field_table"].tensor(scene.levels, None, FEATURES)
         if table.shape[1] & (table.shape[1] - 1) or table.shape[1] == 0:
@@ -202,21 +189,8 @@ def _parameters(pipeline: Entry, scene: SceneConfig) -> dict[str, Tensor]:
     return found
 
 
-def _field_names(pipeline: Entry, scene: SceneConfig) -> tuple[str, ...]:
-    if scene.texture == "hash":
-        return "field_table", "field_w1", "field_w2", "field_w3", "domain"
-    if f"{SCENE}field.texels" not in pipeline.table():
-        return ()
-    alpha = ("alpha",) if f"{SCENE}field.alpha" in pipeline.table() else ()
-    return "texels", "size", "extent", "share", *alpha
-
-
 def check_optimizer(optimizer: Entry, parameters: Sequence[Tensor]) -> None:
-    """Check the state of Adam, or one of its kin, for these parameters.
-
-    Raises:
-        Misfit: an entry is missing, or not what it has to be.
-    """
+    """Check the state of Adam, or its kin, for these parameters. Raises Misfit: an entry is missing or wrong."""
     groups = optimizer["param_groups"]
     if not isinstance(groups.value, list) or len(groups.value) != 1:
         groups.refuse("a list of one group")
@@ -230,7 +204,7 @@ def check_optimizer(optimizer: Entry, parameters: Sequence[Tensor]) -> None:
             raise Misfit(f"{each.name} belongs to no parameter")
         for name in ("exp_avg", "exp_avg_sq"):
             each[name].tensor(*parameters[number].shape)
-        steps = each["step"]  # a plain number of sparse optimisers
+        steps = each["step"]  # a plain number in sparse optimisers
         steps.tensor() if isinstance(steps.value, Tensor) else steps.count()
         unknown = sorted(map(str, each.table().keys() - {"step", "exp_avg", "exp_avg_sq"}))
         if unknown:
@@ -238,12 +212,8 @@ def check_optimizer(optimizer: Entry, parameters: Sequence[Tensor]) -> None:
 
 
 def restore_optimizer(optimizer: Optimizer, saved: Entry) -> None:
-    """Check and load the state of an optimiser of one group. Of its options the learning rate alone is that of the
-    file: the others are those of this run.
-
-    Raises:
-        Misfit: see `check_optimizer`.
-    """
+    """Check and load the state of an optimiser of one group, with the file's learning rate and this run's other
+    options. Raises Misfit: see `check_optimizer`."""
     check_optimizer(saved, [parameter for group in optimizer.param_groups for parameter in group["params"]])
     groups = optimizer.state_dict()["param_groups"]
     groups[0]["lr"] = saved.value["param_groups"][0]["lr"]
@@ -251,7 +221,7 @@ def restore_optimizer(optimizer: Optimizer, saved: Entry) -> None:
 
 
 def _check_run(run: Entry, rows: int) -> None:
-    """Check the state of a run beside parameters and optimisers."""
+    """Check a run's state beside parameters and optimisers."""
     strategy = run["strategy"]
     first = strategy[STATISTICS[0]].tensor(None)
     if len(first) not in (0, rows):

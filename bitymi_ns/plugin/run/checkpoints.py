@@ -1,4 +1,4 @@
-"""Checkpoint files: written whole or not at all, read with errors that say what to do."""
+"""Checkpoint files: write them whole or not at all, and read them with errors that say what to do."""
 
 import dataclasses
 import os
@@ -17,43 +17,31 @@ from bitymi_ns.trust import json_of
 
 STATE_VERSION = 2
 MAY_DIFFER = ("near", "weight_bound", "rim", "texture_moves_surfels", "max_fragments")
-"""Scene options that may differ from those that a checkpoint was trained with: they do not decide what its parameters
-mean, only how they are drawn or learned."""
+"""Scene options that may differ from a checkpoint's: they change how parameters are drawn or learned alone."""
 
 
 def save(state: dict[str, Any], path: Path, scratch: Path) -> None:
-    """Write a checkpoint; a crash or a full disk leaves the previous ones as they were.
-
-    Args:
-        scratch: a folder of the same file system for the unfinished file; nerfstudio takes every name in the
-            checkpoint folder for a checkpoint.
-    """
+    """Write a checkpoint; a crash or a full disk leaves the previous ones as they were. The unfinished file lies in
+    `scratch`, of the same file system: nerfstudio takes any name in the folder for a checkpoint."""
     try:
         with complete_file(path, scratch) as file:
             torch.save(state, file)
     except (OSError, RuntimeError) as error:
+        # torch writes an archive's end after a failed write, and reports only that it does not fit
+        behind: BaseException | None = error
+        while behind is not None and not isinstance(behind, OSError):
+            behind = behind.__context__
         kept = sorted(p.name for p in path.parent.glob("*.ckpt"))
-        detail = reason(_of_the_system(error), path)
+        detail = reason(behind or OSError(0, "the disk took only a part of it"), path)
         then = f"Resume with --load-dir {path.parent} (from {kept[-1]}, which is intact)" if kept else "Train again"
         fail(f"the checkpoint {path} could not be written: {detail}.\n  {then}.", error)
 
 
-def _of_the_system(error: BaseException) -> OSError:
-    """The system's error behind that of torch, which writes an archive's end after a write that failed and reports only
-    that this does not fit."""
-    behind: BaseException | None = error
-    while behind is not None and not isinstance(behind, OSError):
-        behind = behind.__context__
-    return behind or OSError(0, "the disk took only a part of it")
-
-
 def newest_step(folder: Path) -> int:
-    """The largest step for which the folder holds a checkpoint."""
+    """Find the folder's largest step with a checkpoint."""
     if not folder.is_dir():
-        fail(
-            f"there is no checkpoint folder {folder}. "
-            "Give the nerfstudio_models folder of a run: --load-dir outputs/.../nerfstudio_models"
-        )
+        advice = "Give the nerfstudio_models folder of a run: --load-dir outputs/.../nerfstudio_models"
+        fail(f"there is no checkpoint folder {folder}. {advice}")
     steps = [int(p.stem[5:]) for p in folder.glob("step-*.ckpt") if p.stem[5:].isdigit()]
     deeper = next((p.parent for p in sorted(folder.glob("*/step-*.ckpt"))), None)
     if not steps and deeper is not None:
@@ -64,16 +52,14 @@ def newest_step(folder: Path) -> int:
 
 
 def path_of(folder: Path, step: int) -> Path:
-    """Path of the checkpoint of a step."""
+    """Return the path of a step's checkpoint."""
     return folder / f"step-{step:09d}.ckpt"
 
 
 def load(path: Path, scene: SceneConfig) -> dict[str, Any]:
-    """Read a checkpoint of a run whose scene is of this kind."""
+    """Read a checkpoint of a scene of this kind."""
     if path.is_dir():
-        fail(
-            f"{path} is a folder: give one of the files step-*.ckpt with --load-checkpoint, or a folder with --load-dir"
-        )
+        fail(f"{path} is a folder: give one of the files step-*.ckpt with --load-checkpoint, or --load-dir")
     if not path.is_file():
         fail(f"there is no checkpoint {path}")
     others = sorted(p.name for p in path.parent.glob("step-*.ckpt") if p != path)
@@ -90,22 +76,20 @@ def load(path: Path, scene: SceneConfig) -> dict[str, Any]:
     except Misfit as error:
         fail(f"the checkpoint {path} was altered, or is not of this method: {error}. {way_out}.", error)
     if broken:
-        warn(
-            f"The checkpoint {path} holds numbers that are not finite, or too large to be drawn, in {listed(broken)}: "
-            "expect holes, or black."
-        )
+        where = f"holds numbers that are not finite, or too large to be drawn, in {listed(broken)}"
+        warn(f"The checkpoint {path} {where}: expect holes, or black.")
     return state
 
 
 def _read(path: Path) -> Any:
-    """Read an archive of torch in its safe mode; ValueError where its sizes or its checksums are wrong."""
+    """Read an archive in torch's safe mode. Raises ValueError: its sizes or checksums are wrong."""
     with open_regular(path) as file:
         with zipfile.ZipFile(file) as archive:
             parts = archive.infolist()
             size = os.fstat(file.fileno()).st_size
             if sum(part.file_size for part in parts) > size or any(part.compress_type for part in parts):
                 raise ValueError("its parts are compressed, or larger than the file")
-            altered = archive.testzip()  # torch does not look at the checksums
+            altered = archive.testzip()  # torch ignores checksums
         if altered is not None:
             raise ValueError(f"the checksum of {altered} is wrong")
         file.seek(0)
@@ -113,7 +97,7 @@ def _read(path: Path) -> Any:
 
 
 def _check_kind(parameters: Any, scene: SceneConfig, path: Path) -> None:
-    """Stop when the parameters are those of another method, version or preset, which is no fault of the file."""
+    """Stop at parameters of another method, version or preset, in a sound file."""
     extra = parameters.get("_model." + EXTRA_STATE) if isinstance(parameters, dict) else None
     if not isinstance(extra, dict) or f"{SURFELS}means" not in parameters:
         fail(f"{path} is not a checkpoint of this method: it holds no surfels. Load it with the method it is from.")

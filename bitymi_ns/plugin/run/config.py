@@ -1,4 +1,4 @@
-"""nerfstudio configurations of the registered methods, made from the presets."""
+"""Make nerfstudio configurations of the registered methods from presets."""
 
 import os
 from dataclasses import dataclass, field, replace
@@ -28,7 +28,7 @@ from bitymi_ns.ranges import check_ranges
 from bitymi_ns.train.optimizers import BETAS, EPS, FIELD_BETAS
 from bitymi_ns.train.preset import load_preset
 
-SEEDS = 1 << 32  # end of the range of seeds that numpy takes
+SEEDS = 1 << 32  # end of numpy's range of seeds
 
 
 @dataclass
@@ -36,36 +36,26 @@ class BitymiTrainerConfig(TrainerConfig):
     """Configuration of a training run."""
 
     _target: type = field(default_factory=lambda: BitymiTrainer)
-    read_from = None  # folder of the config.yml that was loaded for evaluation; no field: config.yml is not to state it
+    read_from = None  # folder of a config.yml loaded for evaluation; no field, to stay out of config.yml
     vis: Literal[
-        "none",
-        "viewer",
-        "wandb",
-        "tensorboard",
-        "comet",
-        "viewer+wandb",
-        "viewer+tensorboard",
-        "viewer+comet",
+        "none", "viewer", "wandb", "tensorboard", "comet", "viewer+wandb", "viewer+tensorboard", "viewer+comet",
         "viewer_legacy",
-    ] = "viewer"
-    """Which visualizer to use; none = no viewer and no log but the training curve."""
+    ] = "viewer"  # fmt: skip
+    """Visualizer; none = no viewer, and no log but the training curve."""
     max_num_iterations: int | None = None
     """Length of the run in steps; schedules scale. Not given: --default-iterations; a resumed run: as before."""
-    default_iterations: int = 30_000
-    """Steps of a run on a GPU when --max-num-iterations is not given."""
+    default_iterations: int = 30_000  # Steps of a run on a GPU when --max-num-iterations is not given.
     default_iterations_cpu: int = 3_000
     """Steps of a run without a supported GPU when --max-num-iterations is not given."""
     steps_per_save: int | None = None
     """Number of steps between checkpoints; not given: see --default-saves."""
-    default_saves: int = 5
-    """Checkpoints written over a run when --steps-per-save is not given."""
-    prompt: tyro.conf.Suppress[str | None] = None
-    """Of nerfstudio's text-to-scene methods."""
+    default_saves: int = 5  # Checkpoints written over a run when --steps-per-save is not given.
+    prompt: tyro.conf.Suppress[str | None] = None  # Of nerfstudio's text-to-scene methods.
     optimizers: tyro.conf.Suppress[dict[str, Any]] = field(default_factory=dict)
-    """By parameter group. Not in the help: the rates come from --pipeline.model.train.lr."""
+    """By parameter group; the rates come from --pipeline.model.train.lr."""
 
     def __post_init__(self) -> None:
-        """Refuse a command line that names two captures: nerfstudio uses the first of them silently."""
+        """Refuse a command line with two captures: nerfstudio silently uses the first."""
         datamanager = self.pipeline.datamanager
         dataparser = getattr(datamanager, "dataparser", None)
         default = getattr(type(dataparser), "data", None)
@@ -81,10 +71,8 @@ class BitymiTrainerConfig(TrainerConfig):
             fail(f"a run is of one capture, and two are given: {named}. Leave out one of them.")
 
     def set_timestamp(self) -> None:
-        """Fix what depends on the moment and the machine. nerfstudio calls this before it writes config.yml.
-
-        What starts a run of several processes ends here, with them; those after the first take what that has fixed.
-        """
+        """Fix what depends on moment and machine, before nerfstudio writes config.yml. Start the processes of a run of
+        several, and end with them; those after the first take what the first has fixed."""
         if not torchrun.own().first:
             torchrun.join(self)
             return
@@ -104,10 +92,10 @@ class BitymiTrainerConfig(TrainerConfig):
         self._make_paths_absolute()
         self._take_poses_of_resumed()
         if self.load_dir is None and self.load_checkpoint is None:
-            self.resolve_length()  # a resumed run learns its length from the checkpoint
+            self.resolve_length()  # resumed runs take it from the checkpoint
 
     def _seed_by_machine(self) -> None:
-        """Have a --machine.seed that is not the default seed all that has a seed of its own and was not given one."""
+        """Seed all that has a seed of its own by --machine.seed, unless that or theirs is given."""
         seed, pipeline = self.machine.seed, self.pipeline
         if seed != MachineConfig().seed:
             for owner, name in ((pipeline.datamanager, "train_cameras_sampling_seed"), (pipeline.model.train, "seed")):
@@ -122,22 +110,20 @@ class BitymiTrainerConfig(TrainerConfig):
                 fail(f"an option is out of range (--pipeline.model.*): {error}", error)
         for name in ("mixed_precision", "use_grad_scaler"):
             if getattr(self, name):
+                option = f"--{name.replace('_', '-')} True"
                 fail(
-                    f"--{name.replace('_', '-')} True is not supported: it scales the loss, and with it the gradients "
-                    "by which texels move and surfels are densified. The kernels compute in single precision anyway; "
-                    "leave the option out"
+                    f"{option} is not supported: it scales the loss, and with it the gradients by which texels move "
+                    "and surfels are densified. The kernels compute in single precision anyway; leave the option out"
                 )
         asked, cards = self.machine.num_devices, torch.cuda.device_count()
         if self.machine.device_type == "cuda" and has_cuda_kernels() and asked > cards:
             fail(f"there are {cards} of {asked} GPUs that --machine.num-devices asks for")
 
     def print_to_terminal(self) -> None:
-        """Nothing: nerfstudio would print every option here, before anything is checked. All of them are in config.yml,
-        and `save_config` says what matters."""
+        """Print nothing: nerfstudio prints every option before checks; `save_config` reports what matters."""
 
     def save_config(self) -> None:
-        """Write config.yml and say in a few lines what is going to happen. This is the first that a run writes, so a
-        folder that cannot be used shows here. What can be checked before anything is written is checked now."""
+        """Check what can be checked before writing, write config.yml, the run's first file, and summarize the run."""
         if not torchrun.own().first:
             return
         check_capture(self.pipeline.datamanager, read=True)
@@ -152,7 +138,7 @@ class BitymiTrainerConfig(TrainerConfig):
         say(self.summary())
 
     def summary(self) -> str:
-        """Method, capture, length, device and output folder of the run, a line each."""
+        """Describe method, capture, length, device and output folder, a line each."""
         resumed = self.load_dir or self.load_checkpoint
         lines = {
             "method": self.method_name,
@@ -163,11 +149,7 @@ class BitymiTrainerConfig(TrainerConfig):
         return "\n".join(f"{name:8} {value}" for name, value in lines.items())
 
     def resolve_length(self, trained_for: int | None = None) -> None:
-        """Fill in the length of the run where it was not given.
-
-        Args:
-            trained_for: the length of the run that is resumed.
-        """
+        """Fill in a length that was not given; a resumed run was `trained_for` steps."""
         if self.max_num_iterations is None:
             default = self.default_iterations_cpu if self.machine.device_type == "cpu" else self.default_iterations
             self.max_num_iterations = trained_for or default
@@ -178,7 +160,7 @@ class BitymiTrainerConfig(TrainerConfig):
             self.steps_per_save = max(1, self.max_num_iterations // max(1, self.default_saves))
 
     def length(self) -> str:
-        """The number of steps and the device, with the reason where the run is shorter than on a GPU."""
+        """Describe steps and device, and why the run is shorter than on a GPU."""
         text = f"{self.max_num_iterations:,} steps on {self.machine.device_type}"
         if (count := torchrun.own().count) > 1:
             text += f", each on {count} views by as many processes"
@@ -189,7 +171,7 @@ class BitymiTrainerConfig(TrainerConfig):
         return text
 
     def _make_paths_absolute(self) -> None:
-        """So that the capture is found from any folder, also by the commands that read config.yml later."""
+        """Make paths absolute, for commands that read config.yml in any folder."""
         datamanager = self.pipeline.datamanager
         if datamanager.data is None:  # given to the dataparser; the experiment is named after this one
             datamanager.data = getattr(datamanager.dataparser, "data", None)
@@ -202,7 +184,7 @@ class BitymiTrainerConfig(TrainerConfig):
 
     @as_input_error()
     def _take_poses_of_resumed(self) -> None:
-        """Have a resumed run read the poses of the run that it goes on from; a new one finds its own."""
+        """Have a resumed run read the poses of its origin; a new one finds its own."""
         checkpoints_of = self.load_dir or (None if self.load_checkpoint is None else Path(self.load_checkpoint).parent)
         if checkpoints_of is not None:
             self.take_poses_of(Path(os.path.expanduser(checkpoints_of)).absolute().parent)
@@ -214,7 +196,7 @@ class BitymiTrainerConfig(TrainerConfig):
             self.pipeline.datamanager.dataparser.poses = None
 
     def take_poses_of(self, run: Path) -> None:
-        """Have the data read with the poses in this run's folder, where it keeps any."""
+        """Have the data read with poses that this run's folder keeps, if any."""
         dataparser = self.pipeline.datamanager.dataparser
         if isinstance(dataparser, BitymiDataParserConfig) and has_kept_poses(run / run_folder.POSES):
             dataparser.poses = run / run_folder.POSES
@@ -227,23 +209,20 @@ class BitymiTrainerConfig(TrainerConfig):
         return hooks.answer_checkpoint_dir(self, super().get_checkpoint_dir)
 
     def get_base_dir(self) -> Path:
-        """The folder of the run; of one that is evaluated, that of its config.yml, from whatever folder that is done
-        and wherever the run was moved."""
+        """Return the folder of the run; of an evaluated one that of its config.yml, wherever it was moved."""
         return super().get_base_dir() if self.read_from is None else self.read_from
 
 
 @dataclass
 class BitymiAdamConfig(OptimizerConfig):
-    """Adam; the learning rate is set at every step from the preset's schedule."""
+    """Adam; the preset's schedule sets the learning rate at every step."""
 
-    betas: tuple[float, float] = BETAS
-    """Decay of the running averages."""
-    fused: bool = True
-    """Update all entries of a tensor in one pass."""
+    betas: tuple[float, float] = BETAS  # Decay of the running averages.
+    fused: bool = True  # Update all entries of a tensor in one pass.
 
 
 def method_config(name: str) -> MethodSpecification:
-    """The registry entry of the preset `name`."""
+    """Make the registry entry of a preset."""
     preset = load_preset(name)
 
     def adam(group: str) -> BitymiAdamConfig:
@@ -252,9 +231,8 @@ def method_config(name: str) -> MethodSpecification:
     config = BitymiTrainerConfig(
         method_name=preset.name,
         machine=MachineConfig(device_type="cuda" if has_cuda_kernels() else "cpu"),
-        steps_per_eval_batch=0,
-        steps_per_eval_image=0,
-        steps_per_eval_all_images=0,  # the training curve has what these would measure, without its time
+        # the training curve measures what these would
+        **dict.fromkeys(("steps_per_eval_batch", "steps_per_eval_image", "steps_per_eval_all_images"), 0),
         mixed_precision=False,
         pipeline=BitymiPipelineConfig(
             datamanager=BitymiDataManagerConfig(dataparser=BitymiDataParserConfig()),
@@ -262,7 +240,7 @@ def method_config(name: str) -> MethodSpecification:
         ),
         # one optimiser per parameter group, no scheduler: the model sets the rates
         optimizers={group: {"optimizer": adam(group), "scheduler": None} for group in PARAMETER_GROUPS},
-        # instead of the table there is a progress bar; profiles of nerfstudio's functions say nothing about ours
+        # a progress bar replaces the table; profiles of nerfstudio's functions say nothing about ours
         logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False), profiler="none"),
         viewer=ViewerConfig(websocket_host=hooks.LOOPBACK, quit_on_train_completion=True),
     )

@@ -11,25 +11,19 @@ from bitymi_ns.plugin.console import warn_once
 
 
 def has_cuda_kernels() -> bool:
-    """True where there is a GPU and this installation has CUDA kernels; does not touch the GPU."""
+    """Test for a GPU and CUDA kernels in this installation without touching the GPU."""
     return torch.cuda.is_available() and importlib.util.find_spec("bitymi_ns._cuda") is not None
 
 
 def why_not_cuda(index: int | None = None) -> str | None:
-    """Explain why the kernels cannot run on a GPU, and what to do; None when they can.
-
-    Args:
-        index: of the GPU; None = the current one.
-    """
+    """Explain why the kernels cannot run on a GPU (`index`, or the current one), and what to do; None = they can."""
     if not torch.cuda.is_available():
         if torch.version.cuda is None:
             return f"torch {torch.__version__} is a build without CUDA"
         return "there is no NVIDIA GPU, or its driver is missing or too old for this torch"
     if importlib.util.find_spec("bitymi_ns._cuda") is None:
-        return (
-            "this installation has no CUDA kernels, because no nvcc was found when it was built: install the CUDA "
-            "toolkit (12 or 13), put its bin folder on PATH and install bitymi-ns again"
-        )
+        advice = "install the CUDA toolkit (12 or 13), put its bin folder on PATH and install bitymi-ns again"
+        return f"this installation has no CUDA kernels, because no nvcc was found when it was built: {advice}"
     try:
         kernels = importlib.import_module("bitymi_ns._cuda")
     except ImportError as error:
@@ -39,17 +33,16 @@ def why_not_cuda(index: int | None = None) -> str | None:
 
 @cache
 def _device_problem(kernels: ModuleType, index: int) -> str | None:
-    """The kernels' own trial on that GPU."""
+    """Have the kernels try that GPU."""
     return kernels.device_problem(index) or None
 
 
 def kernel_device(device: torch.device | str) -> torch.device:
-    """`device`, or the CPU where the kernels cannot run on it (nerfstudio's tools pick a GPU whenever they see one)."""
+    """Return the device, or the CPU if the kernels cannot run on it: nerfstudio's tools pick any GPU."""
     device = torch.device(device)
     if device.type != "cpu":
-        problem = (
-            why_not_cuda(device.index) if device.type == "cuda" else f"there are no kernels for the device '{device}'"
-        )
+        none = f"there are no kernels for the device '{device}'"
+        problem = why_not_cuda(device.index) if device.type == "cuda" else none
         if problem is None:
             return device
         warn_once(f"The scene stays on the CPU: {problem}.")

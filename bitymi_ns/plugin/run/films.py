@@ -1,4 +1,4 @@
-"""Films as H.264 in MP4, encoded by PyAV, and pictures as files, all of them written whole or not at all."""
+"""Write films as H.264 in MP4, by PyAV, and pictures, whole or not at all."""
 
 import gzip
 import io
@@ -21,7 +21,7 @@ from bitymi_ns.plugin.console import fail
 from bitymi_ns.scene.baked import as_bytes
 
 RATES = (0.01, 1000.0)  # frames per second of a film
-QUALITY = "18"  # constant rate factor of H.264, at which its loss is hardly visible
+QUALITY = "18"  # constant rate factor of H.264 with hardly visible loss
 ENDINGS = {"jpeg": ".jpg", "png": ".png"}
 FRAME = re.compile(r"\d{5}\.(jpg|png)")
 
@@ -31,17 +31,9 @@ Add = Callable[[np.ndarray], None]
 
 @contextmanager
 def film(path: Path, fps: float) -> Iterator[Add]:
-    """Open a film, which all browsers play: 8 bits, yuv420p of BT.709, with its index in front.
-
-    H.264 with halved colour needs even sizes: of odd ones the last row or column is left out.
-
-    Args:
-        path: of the film; an earlier one is replaced at the end.
-
-    Raises:
-        InputError: the frames are too small or too large for H.264.
-        OSError: it cannot be written.
-    """
+    """Open a film for all browsers: 8 bits, yuv420p of BT.709, index in front; it replaces an earlier one at the end.
+    H.264 with halved colour needs even sizes: odd ones lose the last row or column. Raises InputError: the frames are
+    too small or too large for H.264; OSError: it cannot be written."""
     import av
     from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
@@ -70,21 +62,13 @@ def film(path: Path, fps: float) -> Iterator[Add]:
         except av.FFmpegError as error:
             if isinstance(error, OSError) and error.errno:
                 raise OSError(error.errno, error.strerror) from error
-            fail(
-                f"{path}: H.264 cannot encode it ({error}). Choose another size, or --output-format images.",
-                error,
-            )
+            fail(f"{path}: H.264 cannot encode it ({error}). Choose another size, or --output-format images.", error)
 
 
 @contextmanager
 def frames(folder: Path, form: str, quality: int) -> Iterator[Add]:
-    """Open a folder of pictures 00000.jpg, 00001.jpg and so on, or .png. An existing folder that holds
-    only frames is replaced once all new ones are written.
-
-    Raises:
-        InputError: the folder holds anything else.
-        OSError: it cannot be written.
-    """
+    """Open a folder of pictures 00000.jpg, 00001.jpg and so on, or .png; it replaces a folder of frames at the end.
+    Raises InputError: the existing folder holds other files; OSError: it cannot be written."""
     count = 0
 
     def add(image: np.ndarray) -> None:
@@ -98,13 +82,13 @@ def frames(folder: Path, form: str, quality: int) -> Iterator[Add]:
 
 
 def check_frames(folder: Path) -> None:
-    """Stop where a folder holds anything but earlier frames, which would be lost."""
+    """Stop at a folder with files other than frames, which would be lost."""
     if folder.is_dir() and not all(FRAME.fullmatch(path.name) for path in folder.iterdir()):
         fail(f"the folder {folder} holds other files than frames and is not replaced: choose another --output-path.")
 
 
 def write_image(path: Path, image: np.ndarray, *, fmt: str, quality: int = 100) -> None:
-    """Write a picture [H, W, 3 or 4], float in [0, 1] or uint8, whole or not at all; stands for mediapy's function."""
+    """Write a picture [H, W, 3 or 4], float in [0, 1] or uint8, whole or not at all, as mediapy's function does."""
     if image.dtype != np.uint8:
         image = as_bytes(torch.from_numpy(image)).numpy()
     with complete_file(Path(path)) as file:
@@ -112,7 +96,7 @@ def write_image(path: Path, image: np.ndarray, *, fmt: str, quality: int = 100) 
 
 
 def _save(file: IO[bytes], image: np.ndarray, form: str, quality: int) -> None:
-    encoded = io.BytesIO()  # Pillow does not say why it cannot write to a file
+    encoded = io.BytesIO()  # Pillow hides why it cannot write to a file
     picture = Image.fromarray(image)
     if form == "jpeg":
         picture.save(encoded, form, quality=quality, comment=RENDERED)
@@ -124,7 +108,7 @@ def _save(file: IO[bytes], image: np.ndarray, form: str, quality: int) -> None:
 
 
 class WholeText(type(Path())):  # type: ignore[misc]
-    """A path to which text is written whole or not at all; stands for that of nerfstudio's ns-eval."""
+    """A path for ns-eval that writes text whole or not at all."""
 
     def write_text(self, data: str, encoding: str | None = None, *options: Any) -> int:
         write_file(Path(self), data.encode(encoding or "utf8"))
@@ -133,6 +117,6 @@ class WholeText(type(Path())):  # type: ignore[misc]
 
 @contextmanager
 def open_gzip(path: Path, mode: str) -> Iterator[IO[bytes]]:
-    """Open a compressed file for writing, whole or not at all; stands for gzip's function."""
+    """Open a compressed file for writing, whole or not at all, as gzip's function does."""
     with complete_file(Path(path)) as file, gzip.GzipFile(fileobj=file, mode="wb", mtime=0) as compressed:
         yield compressed  # type: ignore[misc]

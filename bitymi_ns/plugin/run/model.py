@@ -32,7 +32,7 @@ from bitymi_ns.train.poses import aligned, view_psnr
 from bitymi_ns.train.views import View, eval_background
 
 PARAMETER_GROUPS = (*GEOMETRY, *VIEW_PARAMETERS, "field_table", "field_mlp")
-"""Groups that an optimiser is configured for; a scene has those that its view colour and texture call for."""
+"""Groups with a configured optimiser; a scene has those of its view colour and texture."""
 
 
 @dataclass
@@ -40,39 +40,34 @@ class BitymiModelConfig(SurfelModelConfig):
     """Configuration of the model."""
 
     _target: type = field(default_factory=lambda: BitymiModel)
-    scene: SceneConfig = field(default_factory=SceneConfig)
-    """Representation of the scene."""
-    train: TrainConfig = field(default_factory=TrainConfig)
-    """Training options."""
-    steps: tyro.conf.Suppress[int | None] = None
-    """Length of the run, where one is going to be made."""
+    scene: SceneConfig = field(default_factory=SceneConfig)  # Representation of the scene.
+    train: TrainConfig = field(default_factory=TrainConfig)  # Training options.
+    steps: tyro.conf.Suppress[int | None] = None  # Length of a run to come.
     curve_points: int = 20
-    """Evaluations over a run, for the curve of quality against time (training_curve.jsonl); 0 = none."""
-    curve_views: int = 8
-    """Held-out views rendered for a point of that curve, all for the last one; 0 = all."""
+    """Evaluations over a run for the curve of quality against time (training_curve.jsonl); 0 = none."""
+    curve_views: int = 8  # Held-out views per point of that curve, all for the last one; 0 = all.
 
 
 def train_config_for(config: TrainConfig, alpha_color: Tensor | None, transparent: bool) -> TrainConfig:
-    """The training options with the colour that the capture states for its transparent images, if any: it is their
-    `alpha_color`, and stands for a `background` of one colour. Where none is transparent, also for auto."""
-    color = config.alpha_color if alpha_color is None else _name_of(alpha_color)
+    """Return training options with the colour that the capture states for transparent images, if any: as `alpha_color`,
+    and for a `background` of one colour, or auto without transparent images."""
+    color = config.alpha_color
+    if alpha_color is not None:
+        names: dict[float, Literal["black", "white"]] = {0.0: "black", 1.0: "white"}
+        values = alpha_color.unique().tolist()
+        if len(values) != 1 or values[0] not in names:
+            fail(f"the capture's alpha colour {alpha_color.tolist()} cannot be trained on; choose black or white")
+        color = names[values[0]]
     one = config.background in ("black", "white") and alpha_color is not None
     background = color if one or (config.background == "auto" and not transparent) else config.background
     return dataclasses.replace(config, background=background, alpha_color=color)
 
 
-def _name_of(alpha_color: Tensor) -> Literal["black", "white"]:
-    for name, value in (("black", 0.0), ("white", 1.0)):
-        if bool((alpha_color == value).all()):
-            return name  # type: ignore[return-value]
-    fail(f"the capture's alpha colour {alpha_color.tolist()} cannot be trained on; choose black or white")
-
-
 class BitymiModel(SurfelModel):
     """Textured Beta surfels.
 
-    The checkpoint holds, beside the parameters, everything that a resumed run needs to go on as if it had not been
-    interrupted: the state of the strategy, of the random generators and of the clocks.
+    Checkpoints hold, beside parameters, all that a resumed run needs to go on as if uninterrupted: the state of
+    strategy, random generators and clocks.
     """
 
     config: BitymiModelConfig
@@ -84,17 +79,14 @@ class BitymiModel(SurfelModel):
             self.config.train, self.metadata.get("alpha_color"), bool(self.metadata.get("transparent"))
         )
         points = self.kwargs.pop("seed_points", None)
-        self.scene = new_scene(
-            points, self.scene_box, self.config.scene, self.train_config, self.metadata, self.config.steps
-        )
-        self.metadata["first_surfels"] = len(self.scene)  # a checkpoint that is loaded may have another number
+        config, steps = self.config.scene, self.config.steps
+        self.scene = new_scene(points, self.scene_box, config, self.train_config, self.metadata, steps)
+        self.metadata["first_surfels"] = len(self.scene)  # checkpoints may have another number
         self.trained_for: int | None = None
         self.resume_state: dict[str, Any] = {}
-        self.recorded_options: str | None = None  # of the run that is resumed
+        self.recorded_options: str | None = None  # of a resumed run
         self._run: TrainingRun | None = None
         self.carry: Callable[[Camera], Camera] | None = None  # of a finished run that refined poses
-
-    # rendering
 
     @property
     def background(self) -> Tensor:
@@ -110,7 +102,7 @@ class BitymiModel(SurfelModel):
         return {"surfels": float(len(self.scene))}
 
     def get_outputs(self, ray_bundle: Any) -> dict[str, Any]:
-        """Loss terms of a training view, or pictures of cameras."""
+        """Return loss terms of a training view, or pictures of cameras."""
         if isinstance(ray_bundle, View):
             if self._run is None:
                 raise RuntimeError("losses exist in training only")
@@ -120,8 +112,8 @@ class BitymiModel(SurfelModel):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Judge a held-out view as it is posed; after a run that refined poses also with its pose carried along with
-        those of the photographs, and from where it fits the scene."""
+        """Judge a held-out view; after a run that refined poses also with its pose carried along with theirs, and from
+        where it fits the scene."""
         metrics, images = super().get_image_metrics_and_images(outputs, batch)
         camera = getattr(self, "_last_camera", None)
         if self.carry is not None and camera is not None:
@@ -130,8 +122,6 @@ class BitymiModel(SurfelModel):
             view = view._replace(camera=aligned(self.scene, view, self.background, self.train_config.loss.ssim_weight))
             metrics["refined_psnr"] = view_psnr(self.scene, view, self.background)
         return metrics, images
-
-    # training
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         groups = {name: [parameter] for name, parameter in self.scene.surfels.items()}
@@ -150,16 +140,14 @@ class BitymiModel(SurfelModel):
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: Any = None
     ) -> dict[str, Tensor]:
-        """Loss terms from `get_outputs`; of a held-out view (--steps-per-eval-batch) the photometric loss."""
+        """Return loss terms from `get_outputs`; the photometric loss of a held-out view (--steps-per-eval-batch)."""
         if "losses" in outputs:
             return outputs["losses"]
         target, mask = self.photograph(batch, outputs["rgb"])
         return {"photometric": photometric(outputs["rgb"], target, self.train_config.loss.ssim_weight, mask)}
 
-    # checkpoints
-
     def get_extra_state(self) -> dict[str, Any]:
-        """Tensors, numbers and text only, so that torch loads it in its safe mode."""
+        """Return tensors, numbers and text only, for torch's safe mode."""
         state: dict[str, Any] = {"version": STATE_VERSION, "scene": json.dumps(dataclasses.asdict(self.config.scene))}
         state["train"] = limits.recorded(self.train_config)
         state["near"], state["first_surfels"] = self.scene.near, self.metadata["first_surfels"]
@@ -175,21 +163,20 @@ class BitymiModel(SurfelModel):
         self.resume_state, self.recorded_options = state.get("run", {}), state.get("train")
         self.metadata["first_surfels"] = state.get("first_surfels", self.metadata["first_surfels"])
         if self.config.scene.near is None:
-            self.scene.near = state.get("near", 0.2)  # older checkpoints: what all scenes had
+            self.scene.near = state.get("near", 0.2)  # all scenes' value in older checkpoints
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """Load a checkpoint (`checkpoints.load` has checked that it belongs to this preset), whatever its number of
-        surfels."""
+        """Load a checkpoint of any number of surfels; `checkpoints.load` has checked that it fits this preset."""
         self.scene.make_room(state_dict, "scene.")
         for name, parameter in self.named_parameters():
             saved = state_dict.get(name)
             if saved is not None and saved.shape != parameter.shape:
-                # the same Parameter object: nerfstudio's optimisers hold it already
+                # nerfstudio's optimisers hold the Parameter object already
                 parameter.data = torch.zeros(saved.shape, dtype=parameter.dtype, device=parameter.device)
         return super().load_state_dict(state_dict, strict=True)
 
 
-FEW_POINTS = 50  # number of points below which much of a scene may have none near it
+FEW_POINTS = 50  # points below which much of a scene may have none near it
 
 
 def new_scene(
@@ -200,26 +187,25 @@ def new_scene(
     metadata: dict[str, Any],
     steps: int | None = None,
 ) -> Scene:
-    """Surfels at the capture's points, or at random in its box, and an empty texture field around them.
-
-    Args:
-        points: positions [N, 3] and colours [N, 3] (uint8, or empty when the cloud has none).
-        metadata: what the data manager says about the capture.
-        steps: length of the run that is going to be made.
-    """
+    """Make surfels at points (positions [N, 3], colours [N, 3] uint8 or empty), or at random in the capture's box, and
+    an empty texture field around them; `metadata` is the data manager's, `steps` the length of a run to come."""
     centers, pixels = metadata.get("camera_centers", torch.zeros(0, 3)), metadata.get("train_pixels", 0)
     if steps is not None:
         train = limit_first_surfels(train, steps, pixels, len(centers))
-    xyz, rgb = _points(points)
+    xyz, rgb = points or (torch.zeros(0, 3), torch.zeros(0, 3))
+    xyz, rgb = xyz.detach().reshape(-1, 3), rgb.detach()
+    if rgb.shape[:1] == xyz.shape[:1]:
+        rgb = rgb.float().reshape(-1, 3) / (255.0 if rgb.dtype == torch.uint8 else 1.0)
+    else:  # a cloud without colours
+        rgb = torch.full_like(xyz, 0.5, dtype=torch.float32)
+    xyz = xyz.float()
     find_background = metadata.get("background_points")
     declared = _corners(scene_box) if metadata.get("declares_box") else None
     box = None
     if not bool(torch.isfinite(xyz).all(1).any()):
         if len(xyz):
-            fail(
-                f"all {len(xyz)} points of the capture's point cloud are NaN or infinite. Make the cloud again, or "
-                "remove ply_file_path from transforms.json to start from random points."
-            )
+            advice = "Make the cloud again, or remove ply_file_path from transforms.json to start from random points."
+            fail(f"all {len(xyz)} points of the capture's point cloud are NaN or infinite. {advice}")
         box = None if scene_box is None else _corners(scene_box)
     with reporting_time("Making surfels of", len(xyz)):
         background = find_background() if find_background and train.background_points else None
@@ -233,31 +219,17 @@ def new_scene(
         say(f"{report.background:,} more surfels start where the photographs show no point.")
     usable = report.given - report.not_finite - report.duplicates
     if 0 < usable < FEW_POINTS:
-        warn(
-            f"The capture's point cloud has only {usable} different points to start from. If little appears, remove it "
-            "(ply_file_path in transforms.json) to start from random points."
-        )
+        advice = "If little appears, remove it (ply_file_path in transforms.json) to start from random points."
+        warn(f"The capture's point cloud has only {usable} different points to start from. {advice}")
     if report.not_finite:
         row = int(torch.nonzero(~torch.isfinite(xyz).all(1))[0])
-        warn(
-            f"{report.not_finite} of {report.given} points of the capture are NaN or infinite (the "
-            f"first is point {row}); they are left out."
-        )
+        what = f"{report.not_finite} of {report.given} points of the capture are NaN or infinite"
+        warn(f"{what} (the first is point {row}); they are left out.")
     return scene
 
 
-def _points(points: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:
-    if points is None:
-        return torch.zeros(0, 3), torch.zeros(0, 3)
-    xyz, rgb = points
-    xyz = xyz.detach().float().reshape(-1, 3)
-    if rgb.shape[:1] != xyz.shape[:1]:
-        return xyz, torch.full_like(xyz, 0.5)  # a cloud without colours
-    return xyz, rgb.detach().float().reshape(-1, 3) / (255.0 if rgb.dtype == torch.uint8 else 1.0)
-
-
 def _corners(scene_box: SceneBox) -> Tensor:
-    """[2, 3]: low and high corner."""
+    """Return low and high corner [2, 3]."""
     corners = scene_box.aabb.float().cpu().reshape(2, 3)
     low, high = corners
     if not bool(torch.isfinite(corners).all()) or not bool((high > low).all()):

@@ -1,7 +1,7 @@
-"""`ns-render` on our scenes: films and frames without a program ffmpeg, options checked before a scene is loaded.
+"""Render our scenes in `ns-render`: films and frames without a program ffmpeg, options checked before loading a scene.
 
-nerfstudio's script reads a camera path, or makes one of the capture's cameras, and hands it to a function that renders
-and writes. `hooks.adopt_render` puts functions of this module into the script.
+nerfstudio's script reads a camera path, or makes one of the capture's cameras, and calls a function that renders and
+writes. `hooks.adopt_render` replaces it by those of this module.
 """
 
 import math
@@ -27,11 +27,11 @@ from bitymi_ns.scene.baked import as_bytes
 from bitymi_ns.train.views import spread
 
 TRAJECTORIES = ("RenderCameraPath", "RenderInterpolated", "SpiralRender")
-"""Classes of nerfstudio's script that render along a path."""
+"""nerfstudio's script classes that render along a path."""
 OUTPUTS = ("rgb", "rgba", "accumulation", "depth", "normal", "beta", "overdraw")  # outputs of all our scenes
-WITHOUT_MAPS = {"rgb", "rgba", "accumulation"}  # outputs for which no maps need to be drawn
+WITHOUT_MAPS = {"rgb", "rgba", "accumulation"}  # outputs drawn without maps
 DEPTH_VIEWS, DEPTH_SIDE, DEPTH_SHARE = 16, 160, 0.01
-"""Depth colours of a film span the depths of so many frames of this size, without this share at either end."""
+"""Frames, their size, and the share left out at either end, for the range of a film's depth colours."""
 TURNS = 2  # of a spiral
 FAINT = 1 / 255  # accumulation of a pixel that shows nothing
 OPTION = " (--output-path)."
@@ -42,7 +42,7 @@ def _spiral_frames(command: Any) -> int:
 
 
 def target_of(command: Any) -> Path:
-    """The file or folder that a command writes: a film without an ending gets .mp4, folders nerfstudio's names."""
+    """Name the output: films without an extension get .mp4, folders nerfstudio's names."""
     path = Path(command.output_path)
     if not hasattr(command, "output_format"):
         return path / command.split
@@ -52,7 +52,7 @@ def target_of(command: Any) -> Path:
 
 
 def check_options(command: Any) -> None:
-    """Stop where options of a command cannot be used."""
+    """Stop at options that cannot be used."""
     as_film = getattr(command, "output_format", "images") == "video"
     for name, low, high in (
         ("downscale_factor", 1 / MOST_PIXELS, MOST_PIXELS),
@@ -91,9 +91,9 @@ def check_options(command: Any) -> None:
 
 
 def _check_outputs(command: Any, transparency: bool) -> None:
-    """Stop at outputs that cannot be written in the format."""
+    """Stop at outputs that the format cannot hold."""
     names = command.rendered_output_names
-    if names is None:  # of a dataset: all of them
+    if names is None:  # all of a dataset
         return
     dataset = not hasattr(command, "output_format")
     more = "; with raw- before it for raw values; gt-rgb" if dataset else ""
@@ -110,8 +110,7 @@ def _check_outputs(command: Any, transparency: bool) -> None:
 
 
 def interpolated(stock: Any, cameras: Cameras, **options: Any) -> Cameras:
-    """nerfstudio's path between cameras, in the size of the first one: nerfstudio takes the principal point for the
-    middle, and that of the first camera for all."""
+    """Make nerfstudio's path between cameras, in the first one's size and with all principal points interpolated."""
     if len(cameras) < 2:
         fail(
             f"a path leads from camera to camera, and there is {'only one' if len(cameras) else 'none'} to start from. "
@@ -119,7 +118,7 @@ def interpolated(stock: Any, cameras: Cameras, **options: Any) -> Cameras:
         )
     path = stock(cameras=cameras, **options)
     points = Cameras(cameras.camera_to_worlds, fx=cameras.cx, fy=cameras.cy, cx=cameras.cx, cy=cameras.cy)
-    along = stock(cameras=points, **options)  # the same way, with principal points for focal lengths
+    along = stock(cameras=points, **options)  # principal points for focal lengths
     path.cx, path.cy = along.fx, along.fy
     for name in ("width", "height"):
         setattr(path, name, torch.full_like(getattr(path, name), int(getattr(cameras, name)[0])))
@@ -127,8 +126,7 @@ def interpolated(stock: Any, cameras: Cameras, **options: Any) -> Cameras:
 
 
 def with_principal_points(path: Cameras, found: dict[str, Any]) -> Cameras:
-    """Give the cameras of a path the `principal_point` of their frames, parts of width and height, which our viewer
-    writes and nerfstudio ignores."""
+    """Give a path's cameras their frames' `principal_point`, shares of width and height, which nerfstudio ignores."""
     points = torch.tensor([frame["principal_point"] for frame in found["camera_path"]]).float()
     path.cx, path.cy = found["render_width"] * points[:, :1], found["render_height"] * points[:, 1:]
     return path
@@ -136,13 +134,9 @@ def with_principal_points(path: Cameras, found: dict[str, Any]) -> Cameras:
 
 @torch.no_grad()
 def spiral(model: SurfelModel, start: Cameras, steps: int, radius: float) -> Cameras:
-    """Cameras on a spiral around one, all turned to the point that the middle of its picture shows.
-
-    nerfstudio's own spiral takes the camera's axis in the world for the upward one in the camera, and rolls.
-
-    Args:
-        radius: of the spiral in units of the scene, along all axes of the camera.
-    """
+    """Make cameras on a spiral around one, turned to the point in the middle of its picture, `radius` units of the
+    scene along its axes; nerfstudio's rolls, as it takes the camera's axis in the world for the upward one in the
+    camera."""
     camera = to_camera(start, model.device).within(DEPTH_SIDE)
     outputs = model.outputs_of(camera, maps=True)
     y, x = camera.height // 3, camera.width // 3
@@ -163,11 +157,7 @@ def spiral(model: SurfelModel, start: Cameras, steps: int, radius: float) -> Cam
 
 @torch.no_grad()
 def write_trajectory(model: SurfelModel, cameras: Cameras, command: Any, seconds: float) -> None:
-    """Render a path of so many seconds, or a spiral around a camera, as a film or as frames, whole or not at all.
-
-    Raises:
-        InputError: the target cannot be written.
-    """
+    """Render a path, or a spiral, as a film or frames, whole or not at all. Raises InputError: it cannot be written."""
     if hasattr(command, "radius"):
         cameras = spiral(model, cameras, _spiral_frames(command), command.radius)
     fps = len(cameras) / seconds if hasattr(command, "camera_path_filename") else float(command.frame_rate)
@@ -199,17 +189,15 @@ def write_trajectory(model: SurfelModel, cameras: Cameras, command: Any, seconds
         what += f", {fps:.3g} per second, {size_text(target.stat().st_size)}"
     say(f"{target}: {what}; {time.monotonic() - started:.1f} s")
     if empty:
-        warn(
-            f"{empty} of {len(views)} frames show nothing of the scene: the cameras look past it, or the path was made "
-            "for another one."
-        )
+        nothing = f"{empty} of {len(views)} frames show nothing of the scene"
+        warn(f"{nothing}: the cameras look past it, or the path was made for another one.")
 
 
 def _picture(
     model: SurfelModel, camera: Any, names: Sequence[str], planes: dict[str, float], options: Any
 ) -> tuple[np.ndarray, bool]:
-    """Draw the outputs of a camera side by side, as nerfstudio colours them: [H, W, 3 or 4] uint8, and whether anything
-    of the scene is there."""
+    """Draw a camera's outputs side by side in nerfstudio's colours [H, W, 3 or 4] uint8, and whether the scene
+    shows."""
     outputs = model.outputs_of(camera, maps=not WITHOUT_MAPS.issuperset(names))
     outputs["rgba"] = model.get_rgba_image(outputs)
     parts = []
@@ -224,8 +212,7 @@ def _picture(
 
 
 def _depth_planes(model: SurfelModel, views: Sequence[Any], command: Any) -> dict[str, float]:
-    """Return the nearest and farthest depth of the colours: those of the options, else of the whole film, so that a
-    colour means the same in all frames."""
+    """Return the colours' nearest and farthest depth: the options', else the whole film's, to mean the same in it."""
     seen = []
     for i in spread(len(views), DEPTH_VIEWS):
         outputs = model.outputs_of(views[i].within(DEPTH_SIDE), maps=True)

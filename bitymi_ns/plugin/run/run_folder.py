@@ -1,4 +1,4 @@
-"""The folder of a training run: one process at a time trains into it, and it keeps how the poses were found."""
+"""Folder of a training run: one process at a time trains into it, and it keeps how poses were found."""
 
 import atexit
 import shutil
@@ -11,18 +11,13 @@ from bitymi_ns.capture.sfm_poses import write_kept_poses
 from bitymi_ns.plugin.console import InputError, fail, warn
 from bitymi_ns.trust import check_no_links
 
-LOCK = ".lock"  # name of the file that lies in a run folder while a process trains into it
-POSES = "poses"
-"""Folder in that of the run for the poses and the report on how they were found, where this package found them."""
+LOCK = ".lock"  # file of a training process
+POSES = "poses"  # subfolder of poses that this package found, and their report
 
 
 def take(folder: Path) -> None:
-    """Make the folder where it is missing and hold it until `leave` or the end of the process; remove what killed runs
-    left unfinished there.
-
-    Raises:
-        InputError: another process trains into it, or it cannot be written.
-    """
+    """Make the folder, hold it until `leave` or the end of the process, and remove unfinished files of killed runs.
+    Raises InputError: another process trains into it, or it cannot be written."""
     with files.explained(folder, InputError, " (--output-dir)."):
         folder.mkdir(parents=True, exist_ok=True)
         try:
@@ -35,7 +30,7 @@ def take(folder: Path) -> None:
 
 
 def check_unused(folder: Path, checkpoints: Path) -> None:
-    """Stop where a new run would mix with, and in time replace, the checkpoints of an earlier one."""
+    """Stop a new run that would mix with checkpoints of an earlier one, and replace them in time."""
     there = sorted(checkpoints.glob("step-*.ckpt"))
     if there:
         fail(
@@ -50,12 +45,7 @@ def leave(folder: Path) -> None:
 
 
 def keep_poses_report(folder: Path, report: Path | None, source: Source | None = None) -> None:
-    """Copy the poses that were found, and the report on how, to POSES, so that they stay when the photographs change.
-
-    Args:
-        report: folder of the report; None = the capture came with its poses.
-        source: the poses that were found; None = the capture came with them.
-    """
+    """Copy found poses and their report to POSES, to outlast the photographs; None = the capture came with poses."""
     there = [] if report is None else [report / name for name in FILES if (report / name).is_file()]
     origin = None if source is None else source.origin
     if origin is None and not there:
@@ -75,11 +65,7 @@ def keep_poses_report(folder: Path, report: Path | None, source: Source | None =
 
 
 def check_space(folder: Path, needed: int) -> None:
-    """Stop before the first step when there is no room for a single checkpoint.
-
-    Args:
-        needed: bytes of a checkpoint of the scene as it is now.
-    """
+    """Stop before the first step if a checkpoint of these bytes has no room."""
     free = files.free_bytes(folder)
     if free < needed:
         fail(

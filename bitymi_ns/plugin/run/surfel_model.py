@@ -1,10 +1,11 @@
-"""Base of the nerfstudio models of trained and baked scenes: outputs, metrics and images."""
+"""Base of nerfstudio models of trained and baked scenes: outputs, metrics and images."""
 
 from __future__ import annotations
 
 import threading
 from abc import abstractmethod
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
@@ -23,12 +24,12 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import as_float, downscale_image, downscale_mask, over_background
 
 OVERDRAW_SCALE = 64.0
-"""Blended surfels at a pixel at which colour maps of overdraw end: the same in every picture, so that runs compare."""
+"""Blended surfels per pixel at the end of overdraw's colour map, fixed to compare runs."""
 
 
 @dataclass
 class SurfelModelConfig(ModelConfig):
-    """Options of nerfstudio's models of rays, which mean nothing here, are left out of the help."""
+    """Base of options; nerfstudio's of models of rays, without meaning here, are left out of the help."""
 
     enable_collider: tyro.conf.Suppress[bool] = False
     collider_params: tyro.conf.Suppress[dict[str, float] | None] = None
@@ -40,45 +41,38 @@ class SurfelModelConfig(ModelConfig):
 class SurfelModel(Model):
     """Renders whole images from surfels."""
 
-    measure_time = True
-    """Include render_ms in the image metrics; off while training."""
+    measure_time = True  # include render_ms in the image metrics; off in training
 
     @abstractmethod
     def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
-        """A RenderOutput: rgb, alpha, beta, overdraw, and with maps also depth and normal."""
+        """Draw a RenderOutput: rgb, alpha, beta, overdraw, and with maps depth and normal."""
 
     @abstractmethod
     def sizes(self) -> dict[str, float]:
-        """Number of `surfels`, and other sizes that are reported with the image metrics."""
+        """Return the number of `surfels`, and other sizes for the image metrics."""
 
     @property
     @abstractmethod
     def background(self) -> Tensor:
-        """[3] colour behind the scene in evaluation."""
+        """Colour [3] behind the scene in evaluation."""
 
     def to(self, *args: Any, **kwargs: Any) -> SurfelModel:
-        """Move the model, except to a device that this installation has no kernels for: there it stays on the CPU.
-
-        nerfstudio's tools use a GPU whenever they see one.
-        """
+        """Move the model, except to a device without kernels here, as nerfstudio's tools use any GPU."""
         device, dtype, _, _ = torch._C._nn._parse_to(*args, **kwargs)
         if dtype is not None:
             raise ValueError("the scene is float32")
         return self if device is None else super().to(kernel_device(device))
 
     def get_outputs(self, ray_bundle: Any) -> dict[str, Any]:
-        """Render one of nerfstudio's cameras; see `outputs_of`."""
+        """Render nerfstudio's cameras; see `outputs_of`."""
         if not isinstance(ray_bundle, Cameras):
             raise TypeError("this model renders cameras, not bundles of rays")
         return self.outputs_of(to_camera(ray_bundle, self.device), maps=True)
 
     def outputs_of(self, camera: Camera, maps: bool) -> dict[str, Tensor]:
-        """Outputs that the viewer and ns-render offer, each [H, W, C] float32:
-
-        rgb, accumulation; with maps also depth = expected distance along the ray (not z), normal = world normal as
-        (n + 1) / 2 (0 where nothing is seen), beta = blended kernel exponent / 4, overdraw = surfels blended at the
-        pixel / OVERDRAW_SCALE (the tools' colour maps span 0 to 1).
-        """
+        """Draw the outputs of viewer and ns-render, each [H, W, C] float32: rgb, accumulation; with maps also depth =
+        expected distance along the ray (not z), normal = world normal as (n + 1) / 2 (0 for none), beta = blended
+        kernel exponent / 4, overdraw = surfels blended at the pixel / OVERDRAW_SCALE (colour maps span 0 to 1)."""
         output = self.render(camera, self.background, maps=maps)
         outputs = {"rgb": output.rgb.clamp(0.0, 1.0), "accumulation": output.alpha}
         if output.depth is not None:
@@ -93,11 +87,8 @@ class SurfelModel(Model):
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Render a camera; a crop box is not supported: a warning says so.
-
-        In a thread, which is one of the viewer's, a camera that cannot be rendered gives an empty picture: a refusal
-        would end the thread, and the viewer would show nothing any more.
-        """
+        """Render a camera; warn of a crop box, which is not supported. In the viewer's thread, which a refusal would
+        end for good, a camera that cannot be rendered gives an empty picture."""
         if obb_box is not None:
             warn_once("Crop boxes are not supported: the whole scene is rendered.")
         try:
@@ -107,17 +98,13 @@ class SurfelModel(Model):
             if threading.current_thread() is threading.main_thread():
                 raise
             warn_once(str(error))
-            return self._empty(int(camera.height.flatten()[0]), int(camera.width.flatten()[0]))
+            black = torch.zeros(int(camera.height.flatten()[0]), int(camera.width.flatten()[0]), 3, device=self.device)
+            one = dict.fromkeys(("accumulation", "depth", "beta", "overdraw"), black[..., :1])
+            return {"rgb": black + self.background.to(black), "normal": black, **one}
         return {name: value for name, value in outputs.items() if isinstance(value, Tensor)}
 
-    def _empty(self, height: int, width: int) -> dict[str, Tensor]:
-        """The outputs of `get_outputs` where nothing is seen."""
-        black = torch.zeros(height, width, 3, device=self.device)
-        one = dict.fromkeys(("accumulation", "depth", "beta", "overdraw"), black[..., :1])
-        return {"rgb": black + self.background.to(black), "normal": black, **one}
-
     def photograph(self, batch: dict[str, Any], rgb: Tensor) -> tuple[Tensor, Tensor | None]:
-        """[H, W, 3] the batch's photograph over the background, and [H, W, 1] its mask, at the size of a render."""
+        """Return the batch's photograph [H, W, 3] over the background, and its mask [H, W, 1], at a render's size."""
         height, width = rgb.shape[:2]
         target = downscale_image(as_float(batch["image"].to(rgb.device)), width, height)
         mask = batch.get("mask")
@@ -127,7 +114,7 @@ class SurfelModel(Model):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Quality of a held-out view, what it cost to draw, and photograph and render side by side."""
+        """Measure a held-out view's quality and cost, and show photograph and render side by side."""
         rgb = outputs["rgb"]
         height, width = rgb.shape[:2]
         target, mask = self.photograph(batch, rgb)
@@ -136,13 +123,12 @@ class SurfelModel(Model):
         metrics.update(self.sizes())
         camera = getattr(self, "_last_camera", None)
         if self.measure_time and camera is not None and (camera.width, camera.height) == (width, height):
-            metrics["render_ms"] = render_milliseconds(
-                lambda: self.render(camera, self.background, maps=False), self.device
-            )
+            draw = partial(self.render, camera, self.background, maps=False)
+            metrics["render_ms"] = render_milliseconds(draw, self.device)
         return metrics, {"img": torch.cat([target, rgb], dim=1)}
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
-        """[H, W, 4] with straight alpha, for `ns-render --rendered-output-names rgba`."""
+        """Return [H, W, 4] with straight alpha, for `ns-render --rendered-output-names rgba`."""
         alpha = outputs["accumulation"]
         rgb = (outputs[output_name] - (1.0 - alpha) * self.background.to(alpha)) / alpha.clamp(min=1e-6)
         return torch.cat([torch.where(alpha > 0, rgb, 0.0).clamp(0.0, 1.0), alpha], dim=-1)

@@ -1,4 +1,4 @@
-"""nerfstudio's trainer with exact resumption, crash-safe checkpoints and an orderly end on Ctrl-C."""
+"""Train in nerfstudio's loop with exact resumption, crash-safe checkpoints and an orderly end on Ctrl-C."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ AGAIN = 1.0  # seconds; signals within are one: a batch system's comes from it a
 
 
 class _StopAfterStep(Exception):
-    """Raised at the end of a training step after which the run is to stop."""
+    """Ends training after a step."""
 
 
 class TogetherOptimizers(Optimizers):
-    """nerfstudio's optimisers, one per parameter group, that step together: the same steps in less time."""
+    """nerfstudio's optimisers, one per parameter group, stepping together in less time."""
 
-    # called before each step, with all gradients there; returns the factors of `optimizers.step`
+    # called before each step with all gradients; returns the factors of `optimizers.step`
     before_step: Callable[[], Mapping[str, Tensor]] | None = None
 
     def zero_grad_some(self, param_groups: list[str]) -> None:
@@ -60,10 +60,8 @@ class TogetherOptimizers(Optimizers):
 
 
 class BitymiTrainer(Trainer):
-    """Trains to a given step in total, so that an interrupted and resumed run ends like an uninterrupted one.
-
-    In a run of several processes each has one, in step with the others; that of the first is as it would be alone.
-    """
+    """Trains to a total number of steps, so that interrupted and resumed runs end like uninterrupted ones; each process
+    of a run has one, in step."""
 
     def __init__(self, config: TrainerConfig, **alone: Any) -> None:
         here = torchrun.own("LOCAL_")  # nerfstudio, which has not started the process, takes it for the only one
@@ -80,12 +78,11 @@ class BitymiTrainer(Trainer):
             CONSOLE.print("[bold yellow]Interrupted before the first step; there is nothing to save.")
             raise SystemExit(INTERRUPTED) from None
         parser = self.pipeline.datamanager.dataparser
-        run_folder.keep_poses_report(
-            self.base_dir, getattr(parser, "poses_report", None), getattr(parser, "sfm_source", None)
-        )
+        found = (getattr(parser, name, None) for name in ("poses_report", "sfm_source"))
+        run_folder.keep_poses_report(self.base_dir, *found)
         for line in getattr(self.viewer_state, "viewer_info", []):
             CONSOLE.print(line, soft_wrap=True)
-        # after all other callbacks of a step: the state is then complete and can be saved
+        # last callback of a step: the complete state can be saved
         self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._end_of_step))
 
     def setup_optimizers(self) -> Optimizers:
@@ -121,7 +118,7 @@ class BitymiTrainer(Trainer):
             self.grad_scaler.load_state_dict(state["scalers"])
 
     def train(self) -> None:
-        """Train to step `max_num_iterations`. nerfstudio's loop would train that many steps more on a resumed run."""
+        """Train to step `max_num_iterations`; nerfstudio trains that many more in a resumed run."""
         orderly = False
         try:
             if self.processes.count > 1 and self.processes.first:
@@ -141,17 +138,15 @@ class BitymiTrainer(Trainer):
     def _train_to_the_end(self) -> None:
         total = self.config.max_num_iterations
         if self._start_step >= total:
-            warn(
-                f"Nothing to do: the checkpoint has {self._start_step:,} of {total:,} steps. For a longer run give a "
-                "larger --max-num-iterations."
-            )
+            done = f"the checkpoint has {self._start_step:,} of {total:,} steps"
+            warn(f"Nothing to do: {done}. For a longer run give a larger --max-num-iterations.")
             return
         if self.processes.first:  # of every parameter a checkpoint holds the value and Adam's two moments
             learned = [p.nbytes for p in self.pipeline.parameters() if p.requires_grad]
             run_folder.check_space(self.base_dir, 3 * sum(learned))
         if self._start_step > 0:
             say(f"{self.config.length()}, {total - self._start_step:,} of them left")
-        restore_handler = self._catch_interrupt()
+        previous = self._catch_interrupt()
         try:
             self.config.max_num_iterations = total - self._start_step
             with ignore_torch_warnings(), step_bar(self._start_step, total) as self._show_step:
@@ -164,14 +159,15 @@ class BitymiTrainer(Trainer):
                 self._report_interruption()
         finally:
             self.config.max_num_iterations = total
-            restore_handler()
+            for number, handler in previous.items():
+                signal.signal(number, handler)
 
-    def _catch_interrupt(self) -> Callable[[], None]:
-        """Let the first Ctrl-C, or a batch system's request to end, stop the run after the current step; returns what
-        undoes that."""
+    def _catch_interrupt(self) -> dict[int, Any]:
+        """Let the first Ctrl-C, or a batch system's request to end, stop the run after the current step; return the
+        previous handlers."""
         if threading.current_thread() is not threading.main_thread():
-            return lambda: None
-        previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+            return {}
+        previous: dict[int, Any] = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
         def on_interrupt(number: int, frame: Any) -> None:
             now, before = time.monotonic(), self._stop_requested
@@ -183,12 +179,7 @@ class BitymiTrainer(Trainer):
 
         for number in previous:
             signal.signal(number, on_interrupt)
-
-        def restore() -> None:
-            for number, handler in previous.items():
-                signal.signal(number, handler)
-
-        return restore
+        return previous
 
     def _report_interruption(self) -> None:
         saved = sorted(self.checkpoint_dir.glob("step-*.ckpt"))
@@ -201,7 +192,7 @@ class BitymiTrainer(Trainer):
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
-        """Write the checkpoint of a finished step; older ones are removed only after that."""
+        """Write a finished step's checkpoint, and only then remove older ones."""
         path = checkpoints.path_of(self.checkpoint_dir, step)
         pipeline = getattr(self.pipeline, "module", self.pipeline)
         state = {
@@ -214,15 +205,15 @@ class BitymiTrainer(Trainer):
         checkpoints.save(state, path, scratch=self.base_dir)
         if self.config.save_only_latest_checkpoint:
             for other in self.checkpoint_dir.glob("step-*.ckpt"):
-                if other.name < path.name:  # later ones are of a run that this one branched off from
+                if other.name < path.name:  # later ones are of a run that this one branched from
                     other.unlink(missing_ok=True)
 
 
 class BitymiPipeline(VanillaPipeline):
-    """Data manager and model, as nerfstudio pairs them."""
+    """nerfstudio's pair of data manager and model."""
 
     def __init__(self, *args: Any, world_size: int = 1, local_rank: int = 0, **kwargs: Any) -> None:
-        # as if alone: nerfstudio would wrap the model, to add gradients of parameters that keep their size
+        # one process: nerfstudio would wrap the model, to add gradients of parameters that keep their size
         super().__init__(*args, **kwargs)
         self.datamanager.world_size = world_size
 
@@ -237,11 +228,8 @@ class BitymiPipeline(VanillaPipeline):
             self.model.carry = self.datamanager.move_cameras(poses["motions"])
 
     def get_average_image_metrics(self, data_loader: Any, *args: Any, **kwargs: Any) -> dict[str, float]:
-        """Averages over images, without NaN, which JSON does not know.
-
-        The deviation of a single image is 0. A metric that an image has none of, because no pixel of it counts, is
-        left out.
-        """
+        """Average over images, without NaN, which JSON does not know, and metrics that images without counting pixels
+        lack; the deviation of a single image is 0."""
         if len(data_loader) == 0:
             fail("there is no held-out view to evaluate: none was held out, or their masks exclude every pixel")
         metrics = super().get_average_image_metrics(data_loader, *args, **kwargs)

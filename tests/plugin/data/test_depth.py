@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.capture.lens import lenses_of
 from bitymi_ns.capture.maps import MAPS, MapFiles, maps_beside, read_depth
+from bitymi_ns.capture.types import ColmapCamera
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.sample.capture import View, first_hits, generate
 from bitymi_ns.sample.room import Room

@@ -9,9 +9,9 @@ import torch
 from PIL import Image
 
 from bitymi_ns.capture import images
-from bitymi_ns.capture.camera import ColmapCamera
 from bitymi_ns.capture.images import read_image
 from bitymi_ns.capture.lens import lenses_of
+from bitymi_ns.capture.types import ColmapCamera
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from tests.captures import expect

@@ -43,11 +43,14 @@ export function quatOf({ right: r, down: d, forward: f }: Pose): Quat {
   return rows[largest].map((x) => k * x) as Quat;
 }
 
-export function poseOf(position: Vec3, [w, x, y, z]: Quat): Pose {
-  return {
-    position,
-    right: [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
-    down: [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
-    forward: [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
-  };
+// Converts a rotation to the axes of its frame.
+export const axesOf = ([w, x, y, z]: Quat): [Vec3, Vec3, Vec3] => [
+  [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
+  [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
+  [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
+];
+
+export function poseOf(position: Vec3, quat: Quat): Pose {
+  const [right, down, forward] = axesOf(quat);
+  return { position, right, down, forward };
 }

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-import torch
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from bitymi_ns.bundle import strict_json
@@ -140,8 +139,8 @@ class Notes(_Strict):
     def cropping(self) -> Crop:
         """Surfels to hide."""
         box, floor = (None, None) if self.crop is None else (self.crop.box, self.crop.floor)
-        plane = None if floor is None else (torch.tensor(floor.normal, dtype=torch.float64), floor.offset)
-        return Crop(None if box is None else _box(box), plane, tuple(map(_box, self.hidden)))
+        plane = None if floor is None else (tuple(floor.normal), floor.offset)
+        return Crop(None if box is None else _box(box), plane, tuple(map(_box, self.hidden)))  # type: ignore[arg-type]
 
 
 def _box(entry: OrientedBox) -> Box:
@@ -193,6 +192,19 @@ def read_notes(parts: Parts) -> tuple[bytes, Notes] | None:
     """
     data = notes_data(parts)
     return None if data is None else (data, parse_notes(data, str(parts.bundle / NOTES)))
+
+
+def crop_of(parts: Parts) -> Crop | None:
+    """Read the crop in a bundle's notes.json; None if it hides nothing. Raises as `read_notes`."""
+    found = read_notes(parts)
+    crop = Crop() if found is None else found[1].cropping
+    return None if crop == Crop() else crop
+
+
+def hides(bundle: str | Path) -> bool:
+    """Return True if a bundle's notes.json hides surfels. Raises as `read_notes`."""
+    with parts_of(bundle) as parts:
+        return crop_of(parts) is not None
 
 
 def notes_of(bundle: str | Path) -> bytes | None:

@@ -10,24 +10,34 @@ from torch import Tensor
 
 from bitymi_ns.ops.reference.project import rotation
 
+Vector = tuple[float, float, float]
+
+
+def _tensor(numbers: Sequence[float] | Sequence[Sequence[float]]) -> Tensor:
+    return torch.tensor(numbers, dtype=torch.float64)
+
 
 @dataclass(frozen=True)
 class Box:
     """Oriented box, faces included."""
 
-    center: Tensor  # [3] float64
-    half: Tensor  # [3] float64, half sides along the axes
-    axes: Tensor  # [3, 3] float64, orthonormal columns
+    center: Vector
+    half: Vector  # half sides along the axes
+    axes: tuple[Vector, Vector, Vector]  # rows of a rotation matrix, whose columns are the axes
 
     @classmethod
     def turned(cls, center: Sequence[float], half: Sequence[float], quat: Sequence[float]) -> Box:
         """Make a box whose axes are those of a rotation wxyz, of any length but zero."""
-        c, h, q = (torch.tensor(numbers, dtype=torch.float64) for numbers in (center, half, quat))
-        return cls(c, h, rotation(q[None])[0])
+        return cls.of(center, half, rotation(_tensor([quat]))[0].tolist())
+
+    @classmethod
+    def of(cls, center: Sequence[float], half: Sequence[float], axes: Sequence[Sequence[float]]) -> Box:
+        """Make a box of numbers in any sequences."""
+        return cls(tuple(center), tuple(half), tuple(map(tuple, axes)))  # type: ignore[arg-type]
 
     def contains(self, points: Tensor) -> Tensor:
         """Tell which of the points [N, 3] lie in the box, [N] bool."""
-        center, half, axes = (t.to(points.device) for t in (self.center, self.half, self.axes))
+        center, half, axes = (_tensor(numbers).to(points.device) for numbers in (self.center, self.half, self.axes))
         return (((points.double() - center) @ axes).abs() <= half).all(-1)
 
 
@@ -37,12 +47,12 @@ class Crop:
 
     Attributes:
         box: surfels outside are hidden; None: no box.
-        floor: normal [3] float64 and offset of a plane; surfels with normal . mean < offset are hidden.
+        floor: normal and offset of a plane; surfels with normal . mean < offset are hidden.
         hidden: surfels in these boxes are hidden.
     """
 
     box: Box | None = None
-    floor: tuple[Tensor, float] | None = None
+    floor: tuple[Vector, float] | None = None
     hidden: tuple[Box, ...] = ()
 
     def keeps(self, means: Tensor) -> Tensor:
@@ -52,7 +62,7 @@ class Crop:
             kept &= self.box.contains(means)
         if self.floor is not None:
             normal, offset = self.floor
-            kept &= means.double() @ normal.to(means.device) >= offset
+            kept &= means.double() @ _tensor(normal).to(means.device) >= offset
         for box in self.hidden:
             kept &= ~box.contains(means)
         return kept

@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 import torch
 
-from bitymi_ns.bundle import BundleError, check_files, check_target
+from bitymi_ns.bundle import BundleError, check_files, check_target, read_bundle
 from bitymi_ns.bundle.notes import notes_of, parse_notes
 from bitymi_ns.bundle.parts import NOTES_LIMIT
+from bitymi_ns.bundle.read import CropError
 from bitymi_ns.bundle.single import write_single
 from bitymi_ns.cli import main
 from tests.bundle.compact_scene import make_codes, write_compact
@@ -112,6 +113,26 @@ def test_surfels_are_hidden_by_their_centres() -> None:
 def test_what_is_no_such_file_is_refused(data: bytes) -> None:
     with pytest.raises(BundleError, match="^notes.json: "):
         parse_notes(data)
+
+
+def test_a_bundle_is_read_without_the_surfels_that_it_hides(folder: Path) -> None:
+    whole = read_bundle(folder)
+    with pytest.raises(CropError, match=r"notes\.json hides no surfels: save a crop"):
+        read_bundle(folder, crop=True)
+    means = whole.scene.surfels["means"]
+    offset = float(means[:, 2].median())
+    half = {"format": "bitymi-notes", "version": 2, "views": [], "notes": []}
+    half["crop"] = {"floor": {"normal": [0, 0, 1], "offset": offset}}
+    (folder / "notes.json").write_bytes(text(half))
+    some = read_bundle(folder, crop=True)
+    assert torch.equal(some.scene.surfels["means"], means[means[:, 2] >= offset]) and 0 < len(some) < len(whole) == 40
+    assert some.hidden == f"{40 - len(some)} of 40 surfels are hidden by notes.json" and whole.hidden == ""
+    write_single(folder, folder.with_suffix(".bitymi"))
+    assert len(read_bundle(folder.with_suffix(".bitymi"), crop=True)) == len(some)
+    half["crop"]["floor"]["offset"] = 1e6
+    (folder / "notes.json").write_bytes(text(half))
+    with pytest.raises(CropError, match="hides all surfels"):
+        read_bundle(folder, crop=True)
 
 
 def test_verify_checks_it(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,6 +20,7 @@ from bitymi_ns.plugin.data.cameras import normal_image, ray_distance, to_camera
 from bitymi_ns.plugin.run.device import kernel_device
 from bitymi_ns.plugin.run.metrics import image_metrics, render_milliseconds
 from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.crop import Box
 from bitymi_ns.train.views import as_float, downscale_image, downscale_mask, over_background
 
 OVERDRAW_SCALE = 64.0
@@ -37,11 +38,18 @@ class SurfelModelConfig(ModelConfig):
     prompt: tyro.conf.Suppress[str | None] = None
 
 
+def box_of(box: OrientedBox | None) -> Box | None:
+    """Convert nerfstudio's box, whose scale is its sides."""
+    return None if box is None else Box.of(box.T.tolist(), (box.S / 2).tolist(), box.R.tolist())
+
+
 class SurfelModel(Model):
     """Renders whole images from surfels."""
 
     measure_time = True
     """Include render_ms in the image metrics; off while training."""
+    crop_box: Box | None = None
+    """Box outside which surfels are hidden, by their centres."""
 
     @abstractmethod
     def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
@@ -55,6 +63,10 @@ class SurfelModel(Model):
     @abstractmethod
     def background(self) -> Tensor:
         """[3] colour behind the scene in evaluation."""
+
+    def crop_to(self, box: OrientedBox | None) -> None:
+        """Hide the surfels outside of nerfstudio's crop box, or none."""
+        self.crop_box = box_of(box)
 
     def to(self, *args: Any, **kwargs: Any) -> SurfelModel:
         """Move the model, except to a device that this installation has no kernels for: there it stays on the CPU.
@@ -93,13 +105,12 @@ class SurfelModel(Model):
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Render a camera; a crop box is not supported: a warning says so.
+        """Render a camera, with the surfels in the crop box alone if one is given.
 
         In a thread, which is one of the viewer's, a camera that cannot be rendered gives an empty picture: a refusal
         would end the thread, and the viewer would show nothing any more.
         """
-        if obb_box is not None:
-            warn_once("Crop boxes are not supported: the whole scene is rendered.")
+        self.crop_to(obb_box)
         try:
             self._last_camera = to_camera(camera, self.device)
             outputs = self.get_outputs(camera)

@@ -246,6 +246,7 @@ class Extras:
     """gaussians: gaussians.ply, in 3DGS's format; surfels: surfels.ply, the same with two scales (2DGS, Brush); usd:
     surfels.usdc, OpenUSD's surflets; mesh: mesh.glb, a textured quad per surfel."""
     frame: Literal["scene", "capture"] = "scene"  # Frame of the files: the scene's, or the capture's.
+    crop: Flag = False  # Leave out the surfels that notes.json hides; the files' PSNR is not measured then.
     output: Path | None = None  # Folder to write; not given: beside the bundle, with its name and .extras.
     overwrite: Flag = False  # Replace an existing folder of extras.
 
@@ -256,8 +257,9 @@ class Extras:
 
         output = self.output or interchange.extras_folder(self.bundle)
         interchange.check_extras(self.kinds, output, self.overwrite)
-        bundle = read_bundle(self.bundle)
-        cameras, held_out = interchange.training_cameras(bundle), interchange.read_held_out(self.bundle, bundle)
+        bundle = read_bundle(self.bundle, crop=self.crop)
+        cameras = interchange.training_cameras(bundle)
+        held_out = [] if self.crop else interchange.read_held_out(self.bundle, bundle)
         with rich_progress() as progress:
             written = interchange.write_extras(
                 bundle,
@@ -269,7 +271,7 @@ class Extras:
                 overwrite=self.overwrite,
                 progress=progress,
             )
-        say(f"Wrote {output}")
+        say(f"Wrote {output}" + (bundle.hidden and f"; {bundle.hidden}"))
         for each in written.values():
             say(interchange.summary_line(each))
         if not cameras:
@@ -293,6 +295,7 @@ class View:
         import webbrowser
 
         from bitymi_ns import view
+        from bitymi_ns.bundle.notes import hides
         from bitymi_ns.files import size_text
 
         if self.one_file and self.export is None:
@@ -303,6 +306,8 @@ class View:
             with explained(self.export, ValueError):
                 size = view.write_static(site, self.export, self.overwrite)
             say(f"Wrote {self.export}, {size_text(size)}: any web server can send it. Browsers ask for https then.")
+            if hides(self.bundle):
+                say("The page hides surfels as notes.json says. Its bundle still has all of them.")
             return
         server = view.serve(site, self.host, self.port)
         address = view.address_of(server)

@@ -26,7 +26,8 @@ from bitymi_ns.bundle.manifest import (
     parse,
     points_of,
 )
-from bitymi_ns.bundle.parts import CAMERAS, MANIFEST_LIMIT, MissingPart, Parts, instead_of, parts_of
+from bitymi_ns.bundle.notes import crop_of
+from bitymi_ns.bundle.parts import CAMERAS, MANIFEST_LIMIT, NOTES, MissingPart, Parts, instead_of, parts_of
 from bitymi_ns.bundle.sizes import HEAD, SCENE_FILES, check_head, check_memory, enough_memory
 from bitymi_ns.bundle.surfel_table import TERMS, from_columns
 from bitymi_ns.codec.bc7_encode import Profile, bc7_blocks
@@ -52,6 +53,10 @@ CONTENTS = SCENE_FILES | {CAMERAS}  # files used by `assemble`
 _CHUNK = 1 << 22
 
 
+class CropError(BundleError):
+    """A crop that cannot be applied."""
+
+
 @dataclass
 class Bundle:
     """A loaded bundle.
@@ -68,6 +73,12 @@ class Bundle:
 
     def __len__(self) -> int:
         return len(self.scene)
+
+    @property
+    def hidden(self) -> str:
+        """Statement of the surfels that were left out by a crop; empty if there are none."""
+        count = self.info.surfels.count
+        return f"{count - len(self):,} of {count:,} surfels are hidden by {NOTES}" if len(self) < count else ""
 
     def to(self, device: torch.device | str) -> Bundle:
         """Move the scene to a device."""
@@ -86,7 +97,7 @@ class Bundle:
         return self.scene.render(camera, background, maps)
 
 
-def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True) -> Bundle:
+def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True, crop: bool = False) -> Bundle:
     """Load a bundle.
 
     Args:
@@ -94,16 +105,29 @@ def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True) ->
         verify: compare every file with its SHA-256 (sizes are always compared).
         decode: decode a BC7 atlas to four bytes per texel; a CUDA device draws from the blocks alone. False also
             encodes large compact atlases (`LARGE_ATLAS`) to BC7, because they have no blocks.
+        crop: leave out the surfels that notes.json hides.
 
     Raises:
         BundleError: a file is missing, truncated, altered or malformed, a value is out of range, the version is too
             new, or memory is insufficient.
+        CropError: `crop`, and notes.json hides no surfels, or all.
     """
     with parts_of(folder) as parts:
         info = manifest_of(parts)
         with enough_memory(parts.bundle, info):
             files = {name: read_file(parts, info, name, verify, name in CONTENTS) for name in info.files}
-            return assemble(parts.bundle, info, files, decode)
+            bundle = assemble(parts.bundle, info, files, decode)
+        return _cropped(bundle, parts) if crop else bundle
+
+
+def _cropped(bundle: Bundle, parts: Parts) -> Bundle:
+    found, path = crop_of(parts), parts.bundle / NOTES
+    if found is None:
+        raise CropError(f"{path} hides no surfels: save a crop there with `bitymi view`, or do not ask for it")
+    kept = found.keeps(bundle.scene.surfels["means"])
+    if not kept.any():
+        raise CropError(f"{path} hides all surfels: correct its crop with `bitymi view`, or do not ask for it")
+    return replace(bundle, scene=bundle.scene.only(kept))
 
 
 def read_manifest(folder: str | Path) -> Manifest:

@@ -75,7 +75,7 @@ def _check_notes(parts: Parts) -> list[Check]:
         found = read_notes(parts)
     except BundleError as error:
         return [Check(NOTES, False, str(error))]
-    return [] if found is None else [Check(NOTES, True, f"{len(found[1].views)} views, {len(found[1].notes)} notes")]
+    return [] if found is None else [Check(NOTES, True, found[1].contents)]
 
 
 def _format_world(frame: WorldFrame) -> str:

@@ -305,6 +305,8 @@ def adopt_render() -> None:
     def render_trajectory(pipeline: Any, cameras: Any, seconds: float, **options: Any) -> None:
         script.update(stock)  # for another method in the same process
         if isinstance(pipeline.model, SurfelModel):
+            crop = options.get("crop_data")
+            pipeline.model.crop_to(None if crop is None else crop.obb)
             render.write_trajectory(pipeline.model, cameras, command, seconds)
         else:
             script["_render_trajectory_video"](pipeline, cameras, seconds=seconds, **options)

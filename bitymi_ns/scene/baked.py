@@ -129,6 +129,16 @@ class BakedScene:
         optional = {name: moved(getattr(self, name)) for name in ("extent", "mean_residual", "mean_alpha")}
         return replace(self, surfels=surfels, tiles=self.tiles.to(device), **optional)
 
+    def only(self, kept: Tensor) -> BakedScene:
+        """Leave out surfels, those for which `kept` [N] is False; texels and terms of view colours stay."""
+
+        def some(t: Tensor | None) -> Tensor | None:
+            return None if t is None else t[kept.to(t.device)]
+
+        surfels = {name: value if name == "view_terms" else some(value) for name, value in self.surfels.items()}
+        optional = {name: some(getattr(self, name)) for name in ("extent", "mean_residual", "mean_alpha")}
+        return replace(self, surfels=surfels, tiles=some(self.tiles), **optional)
+
     def __len__(self) -> int:
         return len(self.tiles)
 

@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
-from bitymi_ns.bundle import BundleError, check_files, check_target
+from bitymi_ns.bundle import BundleError, check_files, check_target, read_bundle
 from bitymi_ns.bundle.notes import notes_of, parse_notes
 from bitymi_ns.bundle.parts import NOTES_LIMIT
+from bitymi_ns.bundle.read import CropError
 from bitymi_ns.bundle.single import write_single
 from bitymi_ns.cli import main
 from tests.bundle.compact_scene import make_codes, write_compact
@@ -23,6 +25,10 @@ NOTES: dict[str, Any] = {
     "views": [{"name": "door", **CAMERA, "lens": LENS}, {"name": "Tür <b>", **CAMERA, "lens": LENS}],
     "notes": [{"text": "first line\nsecond", "position": [0.1, -2, 3]}],
 }
+
+
+CASES: dict[str, Any] = json.loads((Path(__file__).parents[2] / "web" / "test" / "notes.json").read_text("utf8"))
+"""A file of version 2, changes that are refused, and points with what a crop keeps; read by the page's tests, too."""
 
 
 def text(notes: Any = NOTES) -> bytes:
@@ -43,9 +49,9 @@ def test_views_and_notes_are_read() -> None:
     assert parse_notes(text({**NOTES, "views": [], "notes": []})).views == []
 
 
-def change(path: str, value: Any) -> bytes:
-    """Return the file with another value at a path."""
-    notes = copy.deepcopy(NOTES)
+def change(path: str, value: Any, file: Any = NOTES) -> bytes:
+    """Return a file with another value at a path."""
+    notes = copy.deepcopy(file)
     *keys, last = (int(key) if key.isdigit() else key for key in path.split("."))
     at: Any = notes
     for key in keys:
@@ -64,24 +70,69 @@ REFUSED = {
     "notes.0.html": ["<b>"],
     "views": [None, {}, [NOTES["views"][0]] * 201],
     "notes": [[NOTES["notes"][0]] * 501, [5]],
-    "version": [2, "1"],
+    "version": [3, "1", True],
     "format": ["bitymi-bundle"],
+    "unit": [CASES["file"]["unit"]],
 }
 
 
-@pytest.mark.parametrize("path", REFUSED)
-def test_an_entry_that_is_none_is_named_in_one_line(path: str) -> None:
-    for value in REFUSED[path]:
+@pytest.mark.parametrize(
+    ("file", "path", "values"),
+    [(NOTES, *each) for each in REFUSED.items()] + [(CASES["file"], *each) for each in CASES["refused"].items()],
+)
+def test_an_entry_that_is_none_is_named_in_one_line(file: Any, path: str, values: list[Any]) -> None:
+    for value in values:
         with pytest.raises(BundleError) as error:
-            parse_notes(change(path, value), "b/notes.json")
+            parse_notes(change(path, value, file), "b/notes.json")
         said = str(error.value)
         assert said.startswith(f"b/notes.json: {'.'.join(path.split('.')[:2])}") and "\n" not in said, said
+
+
+def test_version_2_has_measures_a_unit_and_a_crop() -> None:
+    found = parse_notes(text(CASES["file"]))
+    assert [measure.text for measure in found.measures] == ["Tür <b>", ""] and found.unit is not None
+    assert (found.unit.name, found.unit.per_world) == ("m", 2.5)
+    assert found.contents == "1 views, 1 notes, 2 measures, a crop, 1 hidden boxes"
+    for name, most in (("measures", 500), ("hidden", 200)):
+        entries = CASES["file"][name][:1]
+        parse_notes(change(name, entries * most, CASES["file"]))
+        with pytest.raises(BundleError, match=f"^notes.json: {name}"):
+            parse_notes(change(name, entries * (most + 1), CASES["file"]))
+    for name in ("measures", "unit", "crop", "hidden"):
+        parse_notes(text({key: value for key, value in CASES["file"].items() if key != name}))
+
+
+def test_surfels_are_hidden_by_their_centres() -> None:
+    found = parse_notes(text({**CASES["file"], **CASES["crop"]}))
+    points = torch.tensor(CASES["points"])
+    assert found.cropping.keeps(points).tolist() == [bool(kept) for kept in CASES["kept"]]
+    assert parse_notes(text()).cropping.keeps(points).all()
 
 
 @pytest.mark.parametrize("data", [b"", b"[]", b"{", b'{"format":1,"format":2}', text().replace(b"-3", b"NaN"), b"\xff"])
 def test_what_is_no_such_file_is_refused(data: bytes) -> None:
     with pytest.raises(BundleError, match="^notes.json: "):
         parse_notes(data)
+
+
+def test_a_bundle_is_read_without_the_surfels_that_it_hides(folder: Path) -> None:
+    whole = read_bundle(folder)
+    with pytest.raises(CropError, match=r"notes\.json hides no surfels: save a crop"):
+        read_bundle(folder, crop=True)
+    means = whole.scene.surfels["means"]
+    offset = float(means[:, 2].median())
+    half = {"format": "bitymi-notes", "version": 2, "views": [], "notes": []}
+    half["crop"] = {"floor": {"normal": [0, 0, 1], "offset": offset}}
+    (folder / "notes.json").write_bytes(text(half))
+    some = read_bundle(folder, crop=True)
+    assert torch.equal(some.scene.surfels["means"], means[means[:, 2] >= offset]) and 0 < len(some) < len(whole) == 40
+    assert some.hidden == f"{40 - len(some)} of 40 surfels are hidden by notes.json" and whole.hidden == ""
+    write_single(folder, folder.with_suffix(".bitymi"))
+    assert len(read_bundle(folder.with_suffix(".bitymi"), crop=True)) == len(some)
+    half["crop"]["floor"]["offset"] = 1e6
+    (folder / "notes.json").write_bytes(text(half))
+    with pytest.raises(CropError, match="hides all surfels"):
+        read_bundle(folder, crop=True)
 
 
 def test_verify_checks_it(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

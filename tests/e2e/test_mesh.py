@@ -1,5 +1,6 @@
 """`ns-export bitymi-mesh` on a run and on its bundle."""
 
+import json
 import re
 from pathlib import Path
 
@@ -47,6 +48,20 @@ def test_a_run_and_its_bundle_give_the_same_surface(trained: BitymiTrainerConfig
         assert len(shape.faces) == len(captured.triangles)
         assert shape.area == pytest.approx(captured.get_surface_area(), rel=1e-4)
     assert (folder / "mesh.ply").read_bytes() == before
+
+
+def test_a_mesh_of_a_crop_has_no_more(
+    copied: Path, trained: BitymiTrainerConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    low = float(read_bundle(copied).scene.surfels["means"][:, 2].median())
+    crop = {"floor": {"normal": [0, 0, 1], "offset": low}}
+    notes = {"format": "bitymi-notes", "version": 2, "views": [], "notes": [], "crop": crop}
+    (copied / "notes.json").write_text(json.dumps(notes))
+    whole, some = (mesh_of(copied / "config.yml", tmp_path / f"{crop}", frame="scene", crop=crop) for crop in (0, 1))
+    assert np.quantile(np.asarray(some.vertices)[:, 2], 0.05) > low - 0.1 > np.asarray(whole.vertices)[:, 2].min()
+    assert "surfels are hidden by notes.json" in capsys.readouterr().out
+    with pytest.raises(InputError, match="--crop is for bundles"):
+        mesh_of(trained.get_base_dir() / "config.yml", tmp_path / "run", crop=True)
 
 
 def test_a_closed_mesh_is_closed(bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -120,10 +120,7 @@ def test_commands_that_cannot_work_on_surfels(
 def test_a_refusal_ends_no_thread_of_the_viewer(bundle: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _, pipeline, _, _ = eval_setup(bundle / "config.yml")
     camera = pipeline.datamanager.eval_dataset.cameras[:1]
-    box = OrientedBox.from_params((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-    for _ in range(2):
-        seen = pipeline.model.get_outputs_for_camera(camera, obb_box=box)
-    assert capsys.readouterr().out.count("Crop boxes are not supported") == 1
+    seen = pipeline.model.get_outputs_for_camera(camera)
     camera.camera_type[:] = CameraType.EQUIRECTANGULAR.value
     with pytest.raises(InputError, match="equirectangular cannot be rendered"):
         pipeline.model.get_outputs_for_camera(camera)
@@ -131,6 +128,33 @@ def test_a_refusal_ends_no_thread_of_the_viewer(bundle: Path, capsys: pytest.Cap
         outputs = [thread.submit(pipeline.model.get_outputs_for_camera, camera).result() for _ in range(2)]
     assert {name: value.shape for name, value in outputs[1].items()} == {n: v.shape for n, v in seen.items()}
     assert capsys.readouterr().out.count("equirectangular cannot be rendered") == 1
+
+
+def test_a_crop_box_hides_surfels(bundle: Path, trained: BitymiTrainerConfig) -> None:
+    box = OrientedBox.from_params((0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.8, 0.8, 0.8))
+    for folder in (bundle, trained.get_base_dir()):
+        _, pipeline, _, _ = eval_setup(folder / "config.yml")
+        model, camera = pipeline.model, pipeline.datamanager.eval_dataset.cameras[:1]
+        whole, some, again, nothing = (
+            model.get_outputs_for_camera(camera, obb_box=each)["accumulation"]
+            for each in (None, box, None, OrientedBox.from_params((99.0, 0.0, 0.0), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)))
+        )
+        assert torch.equal(whole, again) and 0 < some.mean() < 0.9 * whole.mean() and not nothing.any()
+
+
+def test_a_bundle_is_drawn_with_its_crop(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("BITYMI_CROP", "True")
+    with pytest.raises(InputError, match=r"notes\.json hides no surfels: save a crop .* ask for it\.$"):
+        eval_setup(copied / "config.yml")
+    crop = {"box": {"center": [0, 0, 0], "half": [0.4, 0.4, 0.4], "quat": [1, 0, 0, 0]}}
+    notes = {"format": "bitymi-notes", "version": 2, "views": [], "notes": [], "crop": crop}
+    (copied / "notes.json").write_text(json.dumps(notes))
+    some = eval_setup(copied / "config.yml")[1].model.sizes()["surfels"]
+    monkeypatch.setenv("BITYMI_CROP", "False")
+    assert 0 < some < eval_setup(copied / "config.yml")[1].model.sizes()["surfels"]
+    monkeypatch.setenv("BITYMI_CROP", "yes")
+    with pytest.raises(InputError, match="BITYMI_CROP must be True or False, not 'yes'"):
+        eval_setup(copied / "config.yml")
 
 
 def test_photographs_through_a_lens_are_rendered(

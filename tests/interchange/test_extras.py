@@ -116,6 +116,25 @@ def test_a_bundle_on_its_own_is_written_by_the_command(
     assert {path.name for path in folder.iterdir()} == {"gaussians.ply", "extras.json"}
 
 
+def test_surfels_that_notes_hide_are_left_out_of_a_crop(
+    with_cameras: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    args = ["extras", str(with_cameras), "--crop", "--overwrite"]
+    assert cli.main(args) == 1 and "hides no surfels" in capsys.readouterr().err
+    assert not (tmp_path / "scene.extras").exists()
+    means = read_bundle(with_cameras).scene.surfels["means"]
+    notes = {"format": "bitymi-notes", "version": 2, "views": [], "notes": []}
+    floor = {"normal": [1, 0, 0], "offset": float(means[:, 0].median())}
+    (with_cameras / "notes.json").write_text(json.dumps({**notes, "crop": {"floor": floor}}))
+    assert cli.main(args) == 0
+    out = capsys.readouterr().out
+    left = means[means[:, 0] >= floor["offset"]]
+    assert f"{12 - len(left)} of 12 surfels are hidden" in out and " dB" not in out
+    assert torch.equal(positions(tmp_path / "scene.extras" / "gaussians.ply"), left)
+    assert cli.main(["view", str(with_cameras), "--export", str(tmp_path / "site")]) == 0
+    assert "The page hides surfels" in capsys.readouterr().out
+
+
 def test_cameras_and_photographs_are_read_from_folder_and_file(with_cameras: Path, tmp_path: Path) -> None:
     write_single(with_cameras, tmp_path / "scene.bitymi")
     for bundle in (with_cameras, tmp_path / "scene.bitymi"):

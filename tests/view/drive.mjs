@@ -66,6 +66,7 @@ const actionsOf = (context, page) => ({
     await page.mouse.move(...at);
     await page.mouse.wheel(0, by);
   },
+  double: ([at]) => page.mouse.dblclick(...at),
   drag: async ([from, to, button]) => {
     await page.mouse.move(...from);
     await page.mouse.down({ button });

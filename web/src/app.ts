@@ -5,9 +5,14 @@ import type { Depths, DrawOptions, Renderer } from './render/renderer';
 import type { Show } from './render/programs';
 import { Pace, type Screen } from './render/screen';
 import { download, element, onClick, press, pressed, typing } from './ui/dom';
+import { CropPanel } from './ui/crop_panel';
+import { MeasurePanel } from './ui/measure_panel';
+import { NotesFile } from './ui/notes_file';
 import { NotesPanel } from './ui/notes_panel';
 import { endPoster, notify, showError, stopped } from './ui/pages';
+import { bindPanels } from './ui/panels';
 import { PathPanel } from './ui/path_panel';
+import { Picker } from './ui/picker';
 import type { Stage } from './ui/stage';
 import { type CaptureCamera, commonTarget, parseCameras } from './view/cameras';
 import { Controls, type Mode } from './view/controls';
@@ -16,30 +21,27 @@ import { Flight } from './view/path';
 import { DEFAULT_LENS, type Lens, type Pose, View, moved } from './view/pose';
 import { type Shared, type Viewpoint, fromHash, toHash } from './view/share';
 import { extentOf, firstPose } from './view/start';
-import { length, subtract } from './view/vector';
+import { length, subtract, unit } from './view/vector';
 
 const MOVING_LAYERS = 4; // batches per frame while the camera moves, and at rest
 const STILL_LAYERS = 16;
 const STILL_AFTER = 250; // milliseconds
 
-// Side panels: button that opens it, button that closes it, section.
-const ASIDES = [
-  ['tools', 'close', 'aside'],
-  ['notes', 'close-notes', 'notes-panel'],
-] as const;
-
 const KEYS: Record<string, string> = {
   ...{ o: 'orbit', f: 'fly', h: 'home', ',': 'previous', '.': 'next', p: 'beside', t: 'texture', c: 'colors' },
   ...{ l: 'share', n: 'tools', m: 'notes', k: 'add-keyframe', v: 'play' },
+  ...{ r: 'measure', b: 'crop', g: 'full-screen', '?': 'show-help' },
 };
 
-const onPhone = (): boolean => matchMedia('(width <= 720px)').matches; // style.css
 const unsaved = (): void => notify('This view cannot be saved: there is not enough memory for it.');
 
 export class App implements Stage {
   private readonly controls: Controls;
   private readonly path: PathPanel;
+  private readonly picker: Picker;
   readonly notes: NotesPanel;
+  private readonly measures: MeasurePanel;
+  private readonly crop: CropPanel;
   private readonly cameras: CaptureCamera[];
   private readonly pace = new Pace();
   private readonly size: number;
@@ -79,7 +81,11 @@ export class App implements Stage {
     });
     this.lens = this.first.lens;
     this.path = new PathPanel(this, canvas);
-    this.notes = new NotesPanel(this, canvas, notes);
+    this.picker = new Picker(this, canvas);
+    const file = new NotesFile(notes);
+    this.notes = new NotesPanel(this, this.picker, file);
+    this.measures = new MeasurePanel(this, this.picker, file, info.metres);
+    this.crop = new CropPanel(this, this.picker, file, surfels, { middle, size, up: unit(up) });
     this.bind();
   }
 
@@ -125,6 +131,20 @@ export class App implements Stage {
 
   view(): View {
     return View.contain(this.controls.pose, this.lens, ...this.pixels());
+  }
+
+  hide(kept: Uint8Array | null): void {
+    this.renderer.scene.hide(kept);
+    this.changed();
+  }
+
+  // Makes the surface at a screen pixel the middle of the view, around which it turns.
+  private async turnAround(clientX: number, clientY: number): Promise<void> {
+    const target = this.picker.waits ? null : await this.picker.surface(clientX, clientY);
+    if (!target) return;
+    const { pose } = this.controls;
+    const away = length(subtract(target, pose.position));
+    this.fly({ pose: moved({ ...pose, position: target }, 0, 0, -away), lens: this.lens, target });
   }
 
   depths(view: View): Promise<Depths> {
@@ -213,6 +233,8 @@ export class App implements Stage {
       endPoster();
       this.path.drawn(view.pose);
       void this.notes.drawn(view, still);
+      this.measures.drawn(view);
+      this.crop.drawn(view);
       this.shown();
       if (!still && chosen === 'auto') this.pace.took(took);
       this.still = still && !this.dirty;
@@ -224,8 +246,10 @@ export class App implements Stage {
   }
 
   private report(milliseconds: number, scale: number): void {
-    const count = this.renderer.scene.count.toLocaleString('en');
-    const rest = this.renderer.scene.complete ? '' : ' · the texture is on its way';
+    const { scene } = this.renderer;
+    const [shown, all] = [scene.shown, scene.count].map((count) => count.toLocaleString('en'));
+    const count = shown === all ? all : `${shown} of ${all}`;
+    const rest = scene.complete ? '' : ' · the texture is on its way';
     element('status').textContent =
       `${milliseconds.toFixed(milliseconds < 10 ? 1 : 0)} ms · ${Math.round(100 * scale)} % · ${count} surfels${rest}`;
   }
@@ -244,31 +268,17 @@ export class App implements Stage {
     onClick('screenshot', () => void this.screenshot().catch(unsaved));
     onClick('share', () => void this.share());
     onClick('theme', () => this.turnTheme());
-    onClick('menu', () => this.open('panel', !element('panel').classList.contains('open')));
-    for (const [button, close, aside] of ASIDES) {
-      onClick(button, () => this.open(aside, element(aside).hidden));
-      onClick(close, () => {
-        this.open(aside, false);
-        this.canvas.focus();
-      });
-    }
+    bindPanels(this.canvas, () => {
+      this.picker.stop();
+      this.crop.choose(null);
+    });
+    this.canvas.addEventListener('dblclick', ({ clientX, clientY }) => void this.turnAround(clientX, clientY));
     element('resolution').addEventListener('change', () => this.changed());
     const show = element<HTMLSelectElement>('show');
     show.addEventListener('change', () => this.setShow(show.value as Show));
     element('camera').addEventListener('change', () => this.jump(this.chosen));
     addEventListener('keydown', (e) => this.shortcut(e));
     this.fillCameras();
-  }
-
-  // Opens or closes a panel; at most one side panel is open, on phones one panel of any kind.
-  private open(panel: 'panel' | (typeof ASIDES)[number][2], open: boolean): void {
-    element('panel').classList.toggle('open', panel === 'panel' && open);
-    element('menu').setAttribute('aria-expanded', String(panel === 'panel' && open));
-    for (const [button, , aside] of ASIDES) {
-      const stays = !element(aside).hidden && !(open && (panel !== 'panel' || onPhone()));
-      element(aside).hidden = panel === aside ? !open : !stays;
-      press(element(button), !element(aside).hidden);
-    }
   }
 
   private shortcut(e: KeyboardEvent): void {

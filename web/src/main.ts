@@ -15,7 +15,7 @@ import { SceneOnDevice } from './render/scene';
 import { screenOf } from './render/screen';
 import { element } from './ui/dom';
 import { notify, onError, showError, showPoster, showProgress, showScene } from './ui/pages';
-import { type Notes, parseNotes } from './view/notes';
+import { type Notes, noNotes, parseNotes } from './view/notes';
 import { fromHash } from './view/share';
 
 // Opens the bundle beside the page: the file in the address (?file=), the one named by an export, or a folder.
@@ -50,7 +50,7 @@ async function notesOf(from: Source, stated: boolean): Promise<Notes> {
   } catch (error) {
     notify(`notes.json cannot be used: ${error instanceof Error ? error.message : String(error)}`);
   }
-  return { views: [], notes: [] };
+  return noNotes();
 }
 
 // Loads the bundle, after the poster if that shows the first view.

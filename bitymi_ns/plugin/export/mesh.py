@@ -54,6 +54,7 @@ class ExportMesh(SurfaceOptions):
     format: MeshFormat = "ply"  # Of the file. Those of other formats stay.
     frame: Frame = "capture"
     """Frame of the vertices: the capture's, with its unit of length, or the scene's, in which nerfstudio trains."""
+    crop: bool = False  # Leave out the surfels that the bundle's notes.json hides.
     overwrite: bool = False  # Replace an existing mesh.
 
     def main(self) -> None:
@@ -68,7 +69,9 @@ class ExportMesh(SurfaceOptions):
             with reserved(path, warn):
                 self._check_target(path)
                 bundle = bundle_at(self.load_config)
-                source = from_run(self.load_config) if bundle is None else from_bundle(bundle)
+                if bundle is None and self.crop:
+                    fail(f"--crop is for bundles, whose notes.json has the crop: {self.load_config} is a run's.")
+                source = from_run(self.load_config) if bundle is None else from_bundle(bundle, self.crop)
                 say(f"{path}: {self._write(source, path)}")
         except BundleError as error:
             fail(str(error), error)
@@ -118,9 +121,12 @@ def from_run(load_config: Path) -> Source:
     return Source(surfels, lambda camera: model.render(camera, model.background, maps=False).rgb, *drawn)
 
 
-def from_bundle(folder: Path) -> Source:
-    """Load a bundle with its training cameras. Raises BundleError: it cannot be read, or has no cameras."""
-    bundle = read_bundle(folder)
+def from_bundle(folder: Path, crop: bool = False) -> Source:
+    """Load a bundle with its training cameras, cropped as by `read_bundle`. Raises BundleError: it cannot be read, or
+    has no cameras."""
+    bundle = read_bundle(folder, crop=crop)
+    if bundle.hidden:
+        say(f"{bundle.hidden}.")
     scene = bundle.scene
     cameras = training_cameras(bundle) or [row.camera for row in bundle.cameras]
     if not cameras:

@@ -10,20 +10,23 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from nerfstudio.data.scene_box import OrientedBox
 from torch import Tensor
 
 from bitymi_ns.bundle import REMEDY, BundleError, read_bundle
-from bitymi_ns.bundle.read import download_bytes
+from bitymi_ns.bundle.read import CropError, download_bytes
 from bitymi_ns.ops import webgpu
 from bitymi_ns.plugin.console import fail
 from bitymi_ns.plugin.run.device import kernel_device
-from bitymi_ns.plugin.run.surfel_model import SurfelModel, SurfelModelConfig
+from bitymi_ns.plugin.run.surfel_model import SurfelModel, SurfelModelConfig, box_of
 from bitymi_ns.scene.baked import FAST, BakedOutput
 from bitymi_ns.scene.baked_renderer import SceneRenderer
 from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.crop import Box
 
-RENDERER = "BITYMI_RENDERER"
-"""Environment variable that overrides `BakedModelConfig.renderer`: ns-eval has no option for it."""
+RENDERER, CROP = "BITYMI_RENDERER", "BITYMI_CROP"
+"""Environment variables that override `BakedModelConfig.renderer` and `crop`: ns-eval, ns-render and ns-viewer have no
+options for them."""
 
 
 @dataclass
@@ -36,6 +39,8 @@ class BakedModelConfig(SurfelModelConfig):
     renderer: Literal["kernels", "fast", "webgpu"] = "kernels"
     """kernels: on CUDA or the CPU; fast: the same, but pixels end at less than half an 8-bit step of light; webgpu: on
     graphics of any maker, by the package wgpu."""
+    crop: bool = False
+    """Leave out the surfels that the bundle's notes.json hides."""
 
 
 class BakedModel(SurfelModel):
@@ -54,9 +59,9 @@ class BakedModel(SurfelModel):
                 webgpu.device.device()
         on_card = kernel_device(self.kwargs.get("device", "cpu")).type == "cuda" and not through_webgpu
         try:
-            bundle = read_bundle(folder, decode=not on_card)
+            bundle = read_bundle(folder, decode=not on_card, crop=self._crops())
         except BundleError as error:
-            fail(f"{error}. {REMEDY}", error)
+            fail(f"{error}." if isinstance(error, CropError) else f"{error}. {REMEDY}", error)
         atlas = bundle.info.atlas
         self._sizes = {
             "surfels": float(len(bundle)),
@@ -66,7 +71,24 @@ class BakedModel(SurfelModel):
         bundle.scene.through_webgpu = through_webgpu
         if renderer == "fast":
             bundle.scene.transmittance_min = FAST
-        self._renderer = SceneRenderer(bundle.scene)
+        self._scene = bundle.scene
+        self._renderer = self._new_renderer(None)
+
+    def _crops(self) -> bool:
+        asked = os.environ.get(CROP) or str(self.config.crop)
+        if asked.lower() not in ("true", "false"):
+            fail(f"{CROP} must be True or False, not {asked!r}")
+        return asked.lower() == "true"
+
+    def crop_to(self, box: OrientedBox | None) -> None:
+        wanted = box_of(box)
+        if wanted != self.crop_box:
+            renderer = self._new_renderer(wanted)
+            self.crop_box, self._renderer = wanted, renderer  # in one line, as the viewer may interrupt after any
+
+    def _new_renderer(self, box: Box | None) -> SceneRenderer:
+        scene = self._scene
+        return SceneRenderer(scene if box is None else scene.only(box.contains(scene.surfels["means"])))
 
     def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
         with _webgpu_needed():
@@ -84,9 +106,9 @@ class BakedModel(SurfelModel):
 
     def to(self, *args: Any, **kwargs: Any) -> BakedModel:
         super().to(*args, **kwargs)
-        scene = self._renderer.scene
-        if scene.tiles.device != self.device and not scene.through_webgpu:
-            self._renderer = SceneRenderer(scene.to(self.device))
+        if self._scene.tiles.device != self.device and not self._scene.through_webgpu:
+            self._scene = self._scene.to(self.device)
+            self._renderer = self._new_renderer(self.crop_box)
         return self
 
     def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:

@@ -33,6 +33,7 @@ def _pose(value: list[Any]) -> list[float]:
 
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_Coordinate = Annotated[float, Field(allow_inf_nan=False)]
 _Share = Annotated[float, Field(ge=-1, le=2)]
 _Side = Annotated[int, Field(ge=1, le=MOST_PIXELS)]
 
@@ -43,6 +44,13 @@ class _Frame(BaseModel):
     principal_point: Annotated[list[_Share], Field(min_length=2, max_length=2)] = [0.5, 0.5]
 
 
+class _Crop(BaseModel):
+    crop_center: Annotated[list[_Coordinate], Field(min_length=3, max_length=3)]
+    crop_scale: Annotated[list[_Positive], Field(min_length=3, max_length=3)]
+    crop_rot: Annotated[list[_Coordinate], Field(min_length=3, max_length=3)] = [0.0, 0.0, 0.0]
+    crop_bg_color: dict[str, float] = {"r": 0.0, "g": 0.0, "b": 0.0}  # not drawn
+
+
 class CameraPath(BaseModel):
     """A camera path that can be rendered, without meaningless entries of nerfstudio's format."""
 
@@ -51,6 +59,7 @@ class CameraPath(BaseModel):
     seconds: _Positive
     camera_path: list[_Frame]
     camera_type: str = "perspective"
+    crop: _Crop | None = None
 
     @property
     def rate(self) -> float:
@@ -84,8 +93,6 @@ def read_camera_path(file: Path) -> CameraPath:
             f"the camera path {file} is for cameras of type {path.camera_type}: only perspective cameras can be "
             "rendered. Choose perspective in the viewer's render tab and save the path again."
         )
-    if found.get("crop") is not None:
-        warn("Crop boxes are not supported: the whole scene is rendered.")
     widest = max(frame.fov for frame in path.camera_path)
     if widest < math.pi:
         radians = f"If radians were meant, fov has to be {math.degrees(widest):.3g}."

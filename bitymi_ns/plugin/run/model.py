@@ -2,7 +2,8 @@
 
 import dataclasses
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -31,6 +32,7 @@ from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.poses import aligned, view_psnr
 from bitymi_ns.train.views import View, eval_background
 
+_NO_OPACITY = -1e4  # logit
 PARAMETER_GROUPS = (*GEOMETRY, *VIEW_PARAMETERS, "field_table", "field_mlp")
 """Groups with a configured optimiser; a scene has those of its view colour and texture."""
 
@@ -95,8 +97,23 @@ class BitymiModel(SurfelModel):
         return torch.zeros(3, device=self.device) if color is None else color
 
     def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
-        with torch.no_grad():
+        with torch.no_grad(), self._cropped():
             return self.scene.render(camera, background=background, field_mode="frozen", maps=maps)
+
+    @contextmanager
+    def _cropped(self) -> Iterator[None]:
+        """Set the opacity of surfels outside the crop box to 0 meanwhile: tiles of texels are counted by surfels, none
+        of which may be missing."""
+        if self.crop_box is None:
+            yield
+            return
+        logits = self.scene.surfels["opacity_logits"]
+        opacities = logits.data
+        logits.data = opacities.masked_fill(~self.crop_box.contains(self.scene.surfels["means"].data), _NO_OPACITY)
+        try:
+            yield
+        finally:
+            logits.data = opacities
 
     def sizes(self) -> dict[str, float]:
         return {"surfels": float(len(self.scene))}

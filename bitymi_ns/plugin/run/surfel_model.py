@@ -21,6 +21,7 @@ from bitymi_ns.plugin.data.cameras import normal_image, ray_distance, to_camera
 from bitymi_ns.plugin.run.device import kernel_device
 from bitymi_ns.plugin.run.metrics import image_metrics, render_milliseconds
 from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.crop import Box
 from bitymi_ns.train.views import as_float, downscale_image, downscale_mask, over_background
 
 OVERDRAW_SCALE = 64.0
@@ -38,10 +39,16 @@ class SurfelModelConfig(ModelConfig):
     prompt: tyro.conf.Suppress[str | None] = None
 
 
+def box_of(box: OrientedBox | None) -> Box | None:
+    """Convert nerfstudio's box, whose scale is its sides."""
+    return None if box is None else Box.of(box.T.tolist(), (box.S / 2).tolist(), box.R.tolist())
+
+
 class SurfelModel(Model):
     """Renders whole images from surfels."""
 
     measure_time = True  # include render_ms in the image metrics; off in training
+    crop_box: Box | None = None  # hides the surfels whose centres lie outside
 
     @abstractmethod
     def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
@@ -55,6 +62,10 @@ class SurfelModel(Model):
     @abstractmethod
     def background(self) -> Tensor:
         """Colour [3] behind the scene in evaluation."""
+
+    def crop_to(self, box: OrientedBox | None) -> None:
+        """Hide the surfels outside of nerfstudio's crop box, or none."""
+        self.crop_box = box_of(box)
 
     def to(self, *args: Any, **kwargs: Any) -> SurfelModel:
         """Move the model, except to a device without kernels here, as nerfstudio's tools use any GPU."""
@@ -87,10 +98,9 @@ class SurfelModel(Model):
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Render a camera; warn of a crop box, which is not supported. In the viewer's thread, which a refusal would
-        end for good, a camera that cannot be rendered gives an empty picture."""
-        if obb_box is not None:
-            warn_once("Crop boxes are not supported: the whole scene is rendered.")
+        """Render a camera, with only the surfels in the crop box if one is given. In the viewer's thread, which a
+        refusal would end for good, a camera that cannot be rendered gives an empty picture."""
+        self.crop_to(obb_box)
         try:
             self._last_camera = to_camera(camera, self.device)
             outputs = self.get_outputs(camera)

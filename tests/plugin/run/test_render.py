@@ -16,6 +16,7 @@ pytest.importorskip("nerfstudio")
 import av
 import torch
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.scripts import render
 from PIL import Image
 
@@ -25,7 +26,7 @@ from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.hooks import adopt_render
 from bitymi_ns.plugin.run.films import write_image
 from bitymi_ns.plugin.run.render import spiral
-from bitymi_ns.plugin.run.surfel_model import SurfelModel
+from bitymi_ns.plugin.run.surfel_model import SurfelModel, box_of
 from bitymi_ns.scene.camera import Camera
 
 DISTANCE = 3.0
@@ -115,6 +116,29 @@ def camera_path(tmp_path: Path) -> Callable[..., None]:
         render.RenderCameraPath(load_config=tmp_path / "config.yml", **options).main()
 
     return command
+
+
+def test_a_box_holds_the_points_that_nerfstudios_does() -> None:
+    random = torch.Generator().manual_seed(0)
+    points = 2 * torch.randn(2000, 3, generator=random)
+    theirs = OrientedBox.from_params((0.3, -0.2, 0.5), (0.4, -1.1, 2.0), (2.0, 3.0, 4.0))
+    inside = theirs.within(points)
+    assert 100 < int(inside.sum()) < 1900 and torch.equal(box_of(theirs).contains(points), inside)
+
+
+def test_the_crop_of_a_camera_path_is_the_models(wall: Wall, camera_path: Any) -> None:
+    crop = {"crop_center": [1, 2, 3], "crop_scale": [2, 4, 6.0], "crop_rot": [0, 0, math.pi / 2]}
+    camera_path({**path_of(1), "crop": {**crop, "crop_bg_color": {"r": 38, "g": 42, "b": 55}}})
+    assert wall.crop_box is not None and (wall.crop_box.center, wall.crop_box.half) == ((1, 2, 3), (1, 2, 3))
+    assert wall.crop_box.contains(torch.tensor([[1 + 1.9, 2 + 0.9, 3], [1 + 0.9, 2 + 1.9, 3]])).tolist() == [
+        True,
+        False,
+    ]
+    camera_path(path_of(1))
+    assert wall.crop_box is None
+    for wrong in ({"crop_scale": [0, 1, 1]}, {"crop_center": [1, 2]}, {"crop_rot": ["a", 0, 0]}):
+        with pytest.raises(InputError, match=f"path.json cannot be used: crop.{next(iter(wrong))}"):
+            camera_path({**path_of(1), "crop": {**crop, **wrong}})
 
 
 def decoded(path: Path) -> tuple[Any, list[np.ndarray]]:

@@ -52,6 +52,7 @@ export interface Manifest {
   background: Vec3;
   bounds: { min: Vec3; max: Vec3 };
   up: Vec3 | null;
+  metres: number | null; // per unit of the scene
   files: Map<string, { bytes: number; sha256: string }>;
 }
 
@@ -255,6 +256,7 @@ export function parseManifest(text: string): Manifest {
     background: render.point('background', 1),
     bounds: { min: bounds.point('min', 1e9), max: bounds.point('max', 1e9) },
     up: world?.has('up') ? world.point('up', 2) : null,
+    metres: world?.has('metres_per_unit') ? world.number('metres_per_unit', 1e-300, 1e12) : null,
     files,
   };
 }

@@ -2,7 +2,7 @@
 import { decodeBc7 } from '../bundle/bc7';
 import { type Pages, blockOf } from '../bundle/ktx2';
 import type { Manifest } from '../bundle/manifest';
-import type { Surfels } from '../bundle/surfels';
+import { SURFEL_WORDS, type Surfels, WORD } from '../bundle/surfels';
 import { tooLarge } from '../errors';
 import type { Graphics } from './device';
 import { type Programs, SORT_ENTRIES, type SortEntry } from './programs';
@@ -13,6 +13,7 @@ const BLOCK = 1024; // of sort.wgsl: keys per block, digits, rounds
 const DIGITS = 16;
 const ROUNDS = 8;
 const FRAME_BYTES = 160;
+const NO_OPACITY = -1e4; // logit
 
 type Resource = GPUBuffer | GPUTextureView | GPUSampler;
 
@@ -26,6 +27,7 @@ export function group(device: GPUDevice, layout: GPUBindGroupLayout, resources: 
 
 export class SceneOnDevice {
   readonly count: number;
+  shown: number; // surfels that are not hidden
   readonly frame: GPUBuffer;
   readonly visible: GPUBuffer;
   readonly draws: GPUBuffer;
@@ -41,6 +43,7 @@ export class SceneOnDevice {
   private readonly rounds: Record<SortEntry, GPUBindGroup>[] = [];
   private readonly sharing: GPUBindGroup;
   private readonly blocks: number;
+  private readonly stored: GPUBuffer;
 
   constructor(
     private readonly graphics: Graphics,
@@ -51,11 +54,11 @@ export class SceneOnDevice {
   ) {
     const { device } = graphics;
     this.device = device;
-    this.count = surfels.count;
+    this.count = this.shown = surfels.count;
     this.blocks = Math.ceil(Math.max(1, this.count) / BLOCK);
     const { STORAGE, UNIFORM, COPY_DST, INDIRECT } = GPUBufferUsage;
     const n = Math.max(1, this.count);
-    const stored = this.upload(surfels.words, STORAGE);
+    const stored = (this.stored = this.upload(surfels.words, STORAGE));
     const terms = this.upload(surfels.terms, STORAGE);
     const seen = this.empty(96 * n, STORAGE);
     const keys = [0, 1].map(() => this.empty(4 * n, STORAGE));
@@ -100,6 +103,16 @@ export class SceneOnDevice {
   // DETAIL_* of scene.wgsl.
   get detail(): number {
     return this.complete ? (this.surfels.means ? 2 : 1) : 0;
+  }
+
+  // Hides the surfels whose entry is 0, by an opacity that prepare.wgsl skips; null: shows all.
+  hide(kept: Uint8Array | null): void {
+    const words = kept ? this.surfels.words.slice() : this.surfels.words;
+    kept?.forEach((shown, i) => {
+      if (!shown) words[i * SURFEL_WORDS + WORD.opacity] = NO_OPACITY;
+    });
+    this.shown = kept ? kept.reduce((sum, shown) => sum + shown, 0) : this.count;
+    if (this.count) this.device.queue.writeBuffer(this.stored, 0, words as Float32Array<ArrayBuffer>);
   }
 
   // Sets texels that arrived later.

@@ -1,51 +1,38 @@
-// Saved views and notes: their lists, their file, and the markers of notes over the scene.
+// Saved views and notes: their lists, and the markers of notes over the scene.
 import { LONGEST_NAME, LONGEST_TEXT, MOST_NOTES, MOST_VIEWS, type Note, type Notes } from '../view/notes';
-import { cleared, notesText } from '../view/notes';
-import { View, moved } from '../view/pose';
+import { cleared } from '../view/notes';
+import { type View, moved } from '../view/pose';
 import { length, subtract } from '../view/vector';
-import { button, download, element, make, onClick, press, pressed } from './dom';
+import { button, element, make, onClick, press, pressed } from './dom';
+import type { NotesFile } from './notes_file';
 import { notify } from './pages';
+import type { Picker } from './picker';
 import type { Stage } from './stage';
 
-const STILL_HAND = 5; // pixels of pointer movement that still count as a click
 const BEHIND = 0.97; // share of a note's depth; nearer surfels hide it
 
 type Entry = Notes['views'][number] | Note;
 
 export class NotesPanel {
   private editing: Entry | null = null;
-  private saved = true;
-  private pressedAt = [0, 0];
   private readonly markers = new Map<Note, HTMLElement>();
 
   constructor(
     private readonly stage: Stage,
-    private readonly canvas: HTMLCanvasElement,
-    private readonly all: Notes,
+    private readonly picker: Picker,
+    private readonly file: NotesFile,
   ) {
     onClick('save-view', () => this.addView());
-    onClick('add-note', () => this.placing(!pressed(element('add-note'))));
+    onClick('add-note', () => this.add());
     onClick('show-notes', () => {
       press(element('show-notes'), !pressed(element('show-notes')));
       element('markers').hidden = !pressed(element('show-notes'));
     });
-    onClick('save-notes', () => {
-      download('notes.json', new Blob([notesText(all)], { type: 'application/json' }));
-      this.saved = true;
-      this.show();
-    });
-    canvas.addEventListener('pointerdown', ({ clientX, clientY }) => (this.pressedAt = [clientX, clientY]));
-    canvas.addEventListener('click', ({ clientX, clientY }) => {
-      const [x, y] = this.pressedAt;
-      if (pressed(element('add-note')) && Math.hypot(clientX - x, clientY - y) < STILL_HAND) {
-        this.placing(false);
-        void this.pin(clientX, clientY);
-      }
-    });
-    addEventListener('beforeunload', (e) => {
-      if (!this.saved) e.preventDefault();
-    });
     this.show();
+  }
+
+  private get all(): Notes {
+    return this.file.all;
   }
 
   get names(): string[] {
@@ -81,7 +68,7 @@ export class NotesPanel {
   }
 
   private changed(): void {
-    this.saved = false;
+    this.file.changed();
     this.show();
   }
 
@@ -100,31 +87,16 @@ export class NotesPanel {
     this.changed();
   }
 
-  private placing(on: boolean): void {
-    if (on && this.all.notes.length >= MOST_NOTES) {
+  private add(): void {
+    if (this.all.notes.length >= MOST_NOTES) {
       notify(`There are ${MOST_NOTES} notes, as many as there can be.`);
       return;
     }
-    press(element('add-note'), on);
-    this.canvas.classList.toggle('placing', on);
-  }
-
-  // Adds a note at the surface seen through a screen pixel.
-  private async pin(clientX: number, clientY: number): Promise<void> {
-    const [view, box] = [this.stage.view(), this.canvas.getBoundingClientRect()];
-    const x = ((clientX - box.left) / box.width) * view.width;
-    const y = ((clientY - box.top) / box.height) * view.height;
-    const pixel = new View(view.pose, view.fx, view.fy, view.cx - x + 0.5, view.cy - y + 0.5, 1, 1);
-    const [depth] = (await this.stage.depths(pixel)).depth;
-    if (!Number.isFinite(depth)) {
-      notify('The note needs a surface: there is none at that pixel.');
-      return;
-    }
-    const [right, down] = [((x - view.cx) / view.fx) * depth, ((y - view.cy) / view.fy) * depth];
-    const note = { text: '', position: moved(view.pose, right, down, depth).position };
-    this.all.notes.push(note);
-    this.editing = note;
-    this.show();
+    this.picker.toggle('add-note', (position) => {
+      this.editing = { text: '', position };
+      this.all.notes.push(this.editing);
+      this.show();
+    });
   }
 
   private goToNote({ position }: Note): void {
@@ -139,13 +111,11 @@ export class NotesPanel {
     const noteRows = notes.map((note) => this.row(notes, note, note.text, () => this.goToNote(note)));
     element('view-rows').replaceChildren(...viewRows);
     element('note-rows').replaceChildren(...noteRows);
-    element<HTMLButtonElement>('save-notes').disabled = !views.length && !notes.length && this.saved;
-    element('save-notes').classList.toggle('unsaved', !this.saved);
     this.markers.clear();
     for (const note of notes) {
       this.markers.set(note, make('div', { className: 'marker' }, make('span', { textContent: note.text })));
     }
-    element('markers').replaceChildren(...this.markers.values());
+    element('note-markers').replaceChildren(...this.markers.values());
     void this.drawn(this.stage.view(), true);
     document.querySelector<HTMLElement>('#notes-panel li :is(input, textarea)')?.focus();
   }

@@ -23,7 +23,8 @@ export function showError(error: unknown): void {
   element('page-text').textContent = message;
   element('page-advice').textContent = advice;
   element('page-progress').hidden = true;
-  for (const id of ['top', 'panel', 'menu', 'aside', 'notes-panel', 'markers']) element(id).hidden = true;
+  const parts = ['top', 'panel', 'menu', 'aside', 'notes-panel', 'measure-panel', 'crop-panel', 'markers'];
+  for (const id of parts) element(id).hidden = true;
   element('page').hidden = false;
   endPoster();
   document.documentElement.dataset.state = 'error';

@@ -9,6 +9,7 @@ export interface Stage {
   fly(to: Viewpoint): void; // animated, until the user moves the camera
   pixels(): [number, number]; // of the canvas
   view(): View; // on the canvas
+  hide(kept: Uint8Array | null): void; // surfels whose entry is 0; null: none
   depths(view: View): Promise<Depths>;
   fileName(ending: string): string;
 }

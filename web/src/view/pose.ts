@@ -19,6 +19,8 @@ export interface Lens {
   height: number;
 }
 
+const NEAR = 1e-3; // depth at which lines end, as a share of that of their farther end
+
 export class View implements Lens {
   constructor(
     readonly pose: Pose,
@@ -51,6 +53,22 @@ export class View implements Lens {
     const x = (this.fx * dot(from, this.pose.right)) / z + this.cx;
     const y = (this.fy * dot(from, this.pose.down)) / z + this.cy;
     return z > 0 && x >= 0 && x < this.width && y >= 0 && y < this.height ? [x, y, z] : null;
+  }
+  // Projects the part of a line in front of the camera: pixel coordinates of its ends; null if there is none.
+  segment(a: Vec3, b: Vec3): [number, number, number, number] | null {
+    const { position, right, down, forward } = this.pose;
+    const [p, q] = [a, b].map((at): Vec3 => {
+      const from = subtract(at, position);
+      return [dot(from, right), dot(from, down), dot(from, forward)];
+    });
+    const near = NEAR * Math.max(Math.abs(p[2]), Math.abs(q[2]));
+    if (Math.max(p[2], q[2]) < near || !near) return null;
+    const pixel = (end: Vec3, other: Vec3): [number, number] => {
+      const share = end[2] < near ? (near - end[2]) / (other[2] - end[2]) : 0;
+      const [x, y, z] = add(end, times(share, subtract(other, end)));
+      return [(this.fx * x) / z + this.cx, (this.fy * y) / z + this.cy];
+    };
+    return [...pixel(p, q), ...pixel(q, p)];
   }
   // Fits a lens into a screen, showing more on two sides.
   static contain(pose: Pose, lens: Lens, width: number, height: number): View {

@@ -1,7 +1,7 @@
 // Unit quaternions w, x, y, z, and their logarithms: rotation vectors of half the angle.
 import type { Vec3 } from '../bundle/manifest';
 import type { Pose } from './pose';
-import { length, times } from './vector';
+import { cross, length, times, unit } from './vector';
 
 export type Quat = [number, number, number, number];
 
@@ -43,11 +43,21 @@ export function quatOf({ right: r, down: d, forward: f }: Pose): Quat {
   return rows[largest].map((x) => k * x) as Quat;
 }
 
-export function poseOf(position: Vec3, [w, x, y, z]: Quat): Pose {
-  return {
-    position,
-    right: [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
-    down: [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
-    forward: [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
-  };
+// Converts a rotation to the axes of its frame.
+export const axesOf = ([w, x, y, z]: Quat): [Vec3, Vec3, Vec3] => [
+  [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
+  [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
+  [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
+];
+
+// Returns a rotation whose third axis points upwards.
+export function uprightQuat(up: Vec3): Quat {
+  const forward = unit(up);
+  const right = unit(cross(forward, Math.abs(forward[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0]));
+  return quatOf({ position: [0, 0, 0], right, down: cross(forward, right), forward });
+}
+
+export function poseOf(position: Vec3, quat: Quat): Pose {
+  const [right, down, forward] = axesOf(quat);
+  return { position, right, down, forward };
 }

@@ -27,10 +27,8 @@ def step_bar(done: int, total: int) -> Iterator[Callable[[int], None]]:
 
 
 class InputError(SystemExit):
-    """Wrong input. Python prints the message to stderr and exits with status 1.
-
-    nerfstudio's commands handle no errors: the traceback of an Exception through them would hide what the user can do.
-    """
+    """Wrong input. Python prints the message to stderr and exits with status 1. nerfstudio's commands handle no errors:
+    the traceback of an Exception through them would hide what the user can do."""
 
     def __init__(self, message: str) -> None:
         super().__init__(printable(f"bitymi: {message}"))

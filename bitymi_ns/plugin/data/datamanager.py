@@ -77,11 +77,8 @@ class BitymiDataManagerConfig(FullImageDatamanagerConfig):
 
 
 class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
-    """Full images and their cameras.
-
-    The view of a training step is a function of seed and step alone, so that resumed runs see the views of
-    uninterrupted ones: each epoch of n steps permutes the n views.
-    """
+    """Full images and their cameras. The view of a training step is a function of seed and step alone, so that resumed
+    runs see the views of uninterrupted ones: each epoch of n steps permutes the n views."""
 
     config: BitymiDataManagerConfig
 

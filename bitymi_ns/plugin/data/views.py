@@ -94,10 +94,8 @@ def photograph_files(outputs: DataparserOutputs) -> list[Path]:
 
 def training_frame(poses: Pose, frame: FrameOptions, source: str) -> tuple[Pose, float]:
     """Compute the transform [3, 4] that orients and centers poses [N, 4, 4] camera to world, and the scale after it.
-
     Center in float64 before nerfstudio's functions: UTM or ECEF positions have seven digits before the point, all of
-    float32's.
-    """
+    float32's."""
     middle = poses[:, :3, 3].mean(0)
     local = poses.copy()
     local[:, :3, 3] -= middle

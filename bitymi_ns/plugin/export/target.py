@@ -46,10 +46,8 @@ def check_room(folder: Path, load_config: Path, options: BakeOptions, exact: boo
 
 
 def space_needed(load_config: Path, options: BakeOptions, exact: bool) -> int:
-    """Estimate the most bytes of a run's bundle by its newest checkpoint; 0 without one.
-
-    It counts as surfels alone, each with a tile of TYPICAL_SIDE texels, or the largest tile if `exact`.
-    """
+    """Estimate the most bytes of a run's bundle by its newest checkpoint; 0 without one. It counts as surfels alone,
+    each with a tile of TYPICAL_SIDE texels, or the largest tile if `exact`."""
     newest = max(load_config.parent.glob("*/step-*.ckpt"), default=None)
     surfels = newest.stat().st_size // (3 * SURFEL_BYTES) if newest is not None else 0
     side = options.r_max if exact else min(options.r_max, TYPICAL_SIDE)

@@ -66,11 +66,8 @@ def train_config_for(config: TrainConfig, alpha_color: Tensor | None, transparen
 
 
 class BitymiModel(SurfelModel):
-    """Textured Beta surfels.
-
-    Checkpoints hold, beside parameters, all that a resumed run needs to go on as if uninterrupted: the state of
-    strategy, random generators and clocks.
-    """
+    """Textured Beta surfels. Checkpoints hold, beside parameters, all that a resumed run needs to go on as if
+    uninterrupted: the state of strategy, random generators and clocks."""
 
     config: BitymiModelConfig
 

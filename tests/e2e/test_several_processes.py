@@ -1,6 +1,7 @@
 """Runs of two processes on the CPU, by `--machine.num-devices 2` and torchrun: results, resuming, the loss of one."""
 
 import json
+import os
 import pickle
 import signal
 import socket
@@ -36,7 +37,10 @@ def started(config: BitymiTrainerConfig, by: tuple[str, ...] = ()) -> Run:
     file = config.output_dir.with_name(f"{config.timestamp}.pickle")
     file.write_bytes(pickle.dumps(config))
     command = [*by, sys.executable, "-c", TRAIN, str(file)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    threads = {"OMP_NUM_THREADS": "1" if by else "2"}  # one of each process, as torchrun does not divide them
+    return subprocess.Popen(
+        command, env={**os.environ, **threads}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
 
 
 def wait_for(file: Path, run: Run, lines: int = 0) -> None:

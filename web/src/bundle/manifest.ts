@@ -239,6 +239,7 @@ export function parseManifest(text: string): Manifest {
   const texture = root.has('atlas')
     ? atlas(root.part('atlas'), isCompact, coded, files.get('surfels.bin')?.bytes ?? 0)
     : null;
+  if (coded && !isCompact) throw new DamagedBundle('bundle.json: version 5 has surfels.bin.');
   if (!coded && Boolean(texture?.alphaScale) !== (major === 4)) {
     throw new DamagedBundle('bundle.json: atlas.alpha_scale must be stated in version 4, and in no earlier one.');
   }

@@ -123,7 +123,10 @@ def refuse_without_config() -> None:
     if bundle is None or MESH_COMMAND in sys.argv[1:2]:
         return
     if bundle.is_file() or not (bundle / CONFIG).is_file():
-        fail(f"{bundle} has no {CONFIG} for nerfstudio's commands: give the folder of `bitymi unpack {bundle}`.")
+        fail(
+            f"{bundle} has no {CONFIG} for nerfstudio's commands: `bitymi unpack {bundle}` writes it as a folder with "
+            "one; give that."
+        )
 
 
 def _given_config() -> Path | None:

@@ -49,7 +49,7 @@ Token split(int64_t x, int direct) {
 
 int tokens_of(int direct) { return 2 * ((1 << direct) + ((kIntegerBits - direct) << kFine)) - 1; }
 
-// What precedes a number in its column, as the index of a table.
+// Chooses a table by what precedes a number in its column.
 class Contexts {
  public:
   // order: 0 = one table. Of blocks, 1 = by the running mean of the magnitudes of the block's earlier coefficients, 2 =

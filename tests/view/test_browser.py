@@ -134,7 +134,7 @@ def test_a_damaged_compact_bundle_gets_a_page_that_says_so(name: str, tmp_path: 
     (bundle / name).write_bytes(data)
     amend(bundle, lambda info: info["files"][name].update(sha256=hashlib.sha256(data).hexdigest()))
     state, text = page_of(site_of(bundle))
-    assert state == "error" and "damaged" in text and "Zstandard frame" in text
+    assert state == "error" and "damaged" in text and "a column is damaged" in text
 
 
 def test_a_shared_link_brings_the_same_picture(bundle: Path, tmp_path: Path) -> None:

@@ -228,7 +228,7 @@ COLMAP_POSES: Conventions = {
     "they are camera to world with OpenGL's axes": lambda pose: OPENCV_AXES @ np.linalg.inv(pose),
     "the quaternions are in the order x, y, z, w: write w first": _from_xyzw,
 }
-"""The same for COLMAP models, which should be world to camera with OpenCV axes."""
+"""Conversions of poses of COLMAP models, which should be world to camera with OpenCV axes, by the remedy."""
 
 
 class _Fit(NamedTuple):

@@ -13,6 +13,7 @@ from bitymi_ns.ops.backend import load
 
 MOST_PLANES = 7  # bytes of an integer that a float64 holds exactly
 _WINDOW = 1 << 23
+Others = npt.NDArray[np.uint8] | None  # [rows] sums of the magnitudes of a row's earlier numbers
 _OTHERS = 2  # largest context from a row's earlier numbers
 
 
@@ -33,7 +34,9 @@ def compress(codes: npt.NDArray[np.integer]) -> Compressed:
     blocks = codes.shape[1] if codes.ndim == 3 else 0
     rows = math.prod(codes.shape[:-1])
     numbers = np.ascontiguousarray(codes.reshape(rows, codes.shape[-1]).T, dtype=np.int64)
-    others = _others(numbers) if blocks else [None] * len(numbers)
+    others: list[Others] = [None]
+    for number in numbers[:-1]:
+        others.append(_others(others[-1], number, blocks))
     module = load("_cpu")
     with ThreadPoolExecutor(module.num_threads()) as pool:
         parts = list(pool.map(lambda number, of: module.encode_integers(number, blocks, of), numbers, others))
@@ -49,23 +52,23 @@ def decompress(view: memoryview, rows: int, sizes: Sequence[int], blocks: int = 
     if sum(sizes) != len(view):
         raise StreamError(f"the numbers have {sum(sizes)} bytes, not {len(view)}")
     numbers, at, module = np.empty((len(sizes), rows), dtype=np.int64), 0, load("_cpu")
-    for k, size in enumerate(sizes):
-        of = _others(numbers[: k + 1])[k] if blocks else None
+    others: Others = None
+    for number, size in zip(numbers, sizes, strict=True):
         try:
-            module.decode_integers(bytes(view[at : at + size]), numbers[k], blocks, of)
+            module.decode_integers(bytes(view[at : at + size]), number, blocks, others)
         except module.DamagedStream as error:
             raise StreamError(f"a column is damaged ({error})") from error
+        others = _others(others, number, blocks)
         at += size
     return numbers.T
 
 
-def _others(numbers: npt.NDArray[np.int64]) -> list[npt.NDArray[np.uint8] | None]:
-    """Sum the magnitudes of the numbers [n, rows] before each, at most `_OTHERS`; None for the first."""
-    found: list[npt.NDArray[np.uint8] | None] = [None]
-    for number in numbers[:-1]:
-        least = np.clip(np.abs(number), 0, _OTHERS).astype(np.uint8)
-        found.append(least if found[-1] is None else np.minimum(found[-1] + least, _OTHERS).astype(np.uint8))
-    return found
+def _others(before: Others, number: npt.NDArray[np.int64], blocks: int) -> Others:
+    """Add the magnitudes of a number [rows] to those before it, at most `_OTHERS`; None for plain rows."""
+    if not blocks:
+        return None
+    least = np.clip(np.abs(number), 0, _OTHERS).astype(np.uint8)
+    return least if before is None else np.minimum(before + least, _OTHERS).astype(np.uint8)
 
 
 def decompress_planes(

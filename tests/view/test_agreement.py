@@ -87,7 +87,7 @@ def numbers(data: bytes) -> Damage:
     return damage
 
 
-def places(rows: int, first: int = 0) -> bytes:
+def positions(rows: int, first: int = 0) -> bytes:
     """Encode differences of positions."""
     return compress(np.array([first, *range(rows - 1)])[:, None]).data
 
@@ -119,11 +119,11 @@ TABLE: list[tuple[str, str, Damage, bool]] = [
     ("a frame that holds what it declares", "planes", frame(STORED), True),
     ("a frame that holds more", "planes", frame(STORED + 5), False),
     ("a frame that holds less", "planes", frame(STORED - 5), False),
-    ("a column of other numbers", "compact", numbers(places(COUNT)), True),
-    ("a column of more rows", "compact", numbers(places(COUNT + 5)), False),
-    ("a column of fewer rows", "compact", numbers(places(COUNT - 5)), False),
-    ("a column that descends", "compact", numbers(places(COUNT, -5)), False),
-    ("a column that a byte follows", "compact", numbers(places(COUNT) + b"\0"), False),
+    ("a column of other numbers", "compact", numbers(positions(COUNT)), True),
+    ("a column of more rows", "compact", numbers(positions(COUNT + 5)), False),
+    ("a column of fewer rows", "compact", numbers(positions(COUNT - 5)), False),
+    ("a column that descends", "compact", numbers(positions(COUNT, -5)), False),
+    ("a column that a byte follows", "compact", numbers(positions(COUNT) + b"\0"), False),
     ("a column without bytes", "compact", numbers(b""), False),
     ("a column with a long head", "compact", numbers(b"\xff" * 40), False),
 ]

@@ -1,4 +1,4 @@
-"""What starts a run of several processes, and its end. Whole runs: tests/e2e/test_several_processes.py."""
+"""Start and end runs of several processes. Whole runs: tests/e2e/test_several_processes.py."""
 
 import pytest
 

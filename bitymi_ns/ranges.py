@@ -1,11 +1,13 @@
 """Ranges of options as types of their fields, validation errors of such data, and samples of a range."""
 
+import re
 from dataclasses import asdict
 from typing import Annotated, Any
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 MOST = 10**9  # largest value of a count or a weight
+_MOST_PROBLEMS = 3  # per message
 Share = Annotated[float, Field(ge=0, le=1)]
 PositiveShare = Annotated[float, Field(gt=0, le=1)]
 NonNegative = Annotated[float, Field(ge=0, le=MOST)]
@@ -19,6 +21,30 @@ def first_problem(error: ValidationError) -> tuple[str, str]:
     """Return the location of the first validation error, joined by dots, and its message."""
     first = error.errors(include_url=False, include_input=False)[0]
     return ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
+
+
+def describe_problems(error: ValidationError) -> str:
+    """Describe the first three validation errors in one line: location, expected, found."""
+    found = error.errors(include_url=False, include_context=False)
+    more = len(found) - _MOST_PROBLEMS
+    return "; ".join(map(_problem, found[:_MOST_PROBLEMS])) + (f" (and {more} more)" if more > 0 else "")
+
+
+def _problem(detail: Any) -> str:
+    path = ".".join(str(part) if re.fullmatch(r"[\w.-]+", str(part)) else short(part) for part in detail["loc"])
+    what = "is missing" if detail["type"] == "missing" else re.sub(r"^\w+ should", "must", detail["msg"])
+    if what.startswith("must") and not isinstance(detail["input"], BaseModel) and detail["type"] != "too_long":
+        what += f", not {short(detail['input'])}"
+    return f"{path} {what}".strip()
+
+
+def short(value: Any) -> str:
+    """Represent a value in at most 60 characters."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # an integer with too many digits
+        text = f"a {type(value).__name__}"
+    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def check_ranges(options: Any) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import torch
-from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 from torch import Tensor
 
@@ -21,6 +21,7 @@ from bitymi_ns.codec.limits import ALPHA_SCALE, EXTENTS, LIMITS, RESIDUAL_LIMIT
 from bitymi_ns.codec.streams import MOST_PLANES
 from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, SUPPORT, TRANSMITTANCE_MIN
 from bitymi_ns.ops.view_kinds import Kind
+from bitymi_ns.ranges import describe_problems, short
 
 FORMAT = "bitymi-bundle"
 COMPACT_VERSION = (5, 0)  # entropy-coded columns; the newest version that is read
@@ -33,7 +34,6 @@ COMPACT_SURFELS, TEXELS = "surfels.bin", "texels.bin"
 POSTER = "poster.webp"  # optional picture of a viewer's first view: `bundle.poster`
 ACTIVATIONS = {"opacity": "sigmoid", "scale": "exp", "beta": "4 * sigmoid", "rotation": "wxyz, unit"}
 UNIT_LENGTH = 1e-3  # tolerance of a unit vector's length
-_MOST_PROBLEMS = 3  # per message
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
@@ -48,7 +48,7 @@ def check_file_name(name: str, source: str) -> None:
         BundleError: it is not; names `source`.
     """
     if not _is_file_name(name):
-        raise BundleError(f"{source}: {_short(name)} cannot be the name of a file of the bundle")
+        raise BundleError(f"{source}: {short(name)} cannot be the name of a file of the bundle")
 
 
 def _is_file_name(name: str) -> bool:
@@ -293,7 +293,7 @@ class Manifest(Part):
     def _files_fit(self) -> Manifest:
         for name in self.files:
             if not _is_file_name(name):
-                raise PydanticCustomError("files", "files: {name} cannot be the name of a file", {"name": _short(name)})
+                raise PydanticCustomError("files", "files: {name} cannot be the name of a file", {"name": short(name)})
         if self.surfels.file not in self.files:
             raise PydanticCustomError("files", f"files must list {self.surfels.file}")
         atlas = None if self.atlas is None else self.atlas.file
@@ -336,7 +336,7 @@ def describe(info: Mapping[str, Any]) -> Manifest:
     try:
         return Manifest.model_validate_json(strict_json.canonical(strict_json.plain(info)))
     except ValidationError as error:
-        raise BundleError(f"the bundle cannot be described: {_problems(error)}") from error
+        raise BundleError(f"the bundle cannot be described: {describe_problems(error)}") from error
 
 
 def dump(manifest: Manifest) -> bytes:
@@ -372,7 +372,7 @@ def parse(data: bytes, source: str = MANIFEST) -> Manifest:
     try:
         manifest = Manifest.model_validate_json(text)
     except ValidationError as error:
-        raise BundleError(f"{source}: {_problems(error)}") from error
+        raise BundleError(f"{source}: {describe_problems(error)}") from error
     if stated is None and version[1] >= _DIGEST_SINCE.get(version[0], 0):
         raise BundleError(f"{source}: digest is missing{_ON_PURPOSE.format(found)}")
     if stated is not None and stated != found:
@@ -387,33 +387,10 @@ _ON_PURPOSE = '; if you have edited it on purpose, set "digest" to "{}"'
 def _version(version: Any, source: str) -> tuple[int, int]:
     found = re.fullmatch(r"([0-9]{1,6})\.([0-9]{1,6})", version) if isinstance(version, str) else None
     if found is None:
-        raise BundleError(f"{source}: version must look like 1.0, not {_short(version)}")
+        raise BundleError(f"{source}: version must look like 1.0, not {short(version)}")
     if int(found[1]) > COMPACT_VERSION[0]:
         raise BundleError(
             f"{source} has version {found[0]}, this program reads up to {COMPACT_VERSION[0]}.x: update bitymi-ns to "
             "open it"
         )
     return int(found[1]), int(found[2])
-
-
-def _problems(error: ValidationError) -> str:
-    """Describe the first three errors in one line: path in the JSON, expected, found."""
-    found = error.errors(include_url=False, include_context=False)
-    more = len(found) - _MOST_PROBLEMS
-    return "; ".join(map(_problem, found[:_MOST_PROBLEMS])) + (f" (and {more} more)" if more > 0 else "")
-
-
-def _problem(detail: Any) -> str:
-    path = ".".join(str(part) if re.fullmatch(r"[\w.-]+", str(part)) else _short(part) for part in detail["loc"])
-    what = "is missing" if detail["type"] == "missing" else re.sub(r"^\w+ should", "must", detail["msg"])
-    if what.startswith("must") and not isinstance(detail["input"], BaseModel) and detail["type"] != "too_long":
-        what += f", not {_short(detail['input'])}"
-    return f"{path} {what}".strip()
-
-
-def _short(value: Any) -> str:
-    try:
-        text = repr(value)
-    except (ValueError, RecursionError):  # an integer with too many digits
-        text = f"a {type(value).__name__}"
-    return text if len(text) <= 60 else text[:57] + "..."

@@ -391,11 +391,8 @@ def test_scenes_of_other_methods_are_rendered_as_before(
     loaded = render.eval_setup
     camera_path()  # as if one of ours had been loaded before
     assert stock == []
-
-    def eval_setup(*_: Any, **__: Any) -> tuple:
-        return None, SimpleNamespace(model="splatfacto", device="cpu"), None, 0
-
-    monkeypatch.setattr(render, "eval_setup", eval_setup)
+    other = SimpleNamespace(model="splatfacto", device="cpu")
+    monkeypatch.setattr(render, "eval_setup", lambda *_, **__: (None, other, None, 0))
     camera_path()
     assert stock == ["checked", "splatfacto"]
     monkeypatch.setattr(render, "eval_setup", loaded)

@@ -111,7 +111,7 @@ def run_seed(capture: "Capture", seed: int, calibration: Calibration) -> dict[st
     """Measure the figures of one scene and seed."""
     import torch
 
-    from bitymi_ns.bake import BakeOptions, Learning, TuneOptions, bake_and_learn, export
+    from bitymi_ns.bake import BakeOptions, RefineOptions, TuneOptions, bake, export
     from bitymi_ns.bundle import read_bundle
     from bitymi_ns.plugin.run.lpips import LpipsUnavailable, lpips
     from bitymi_ns.scene.config import SceneConfig
@@ -129,9 +129,9 @@ def run_seed(capture: "Capture", seed: int, calibration: Calibration) -> dict[st
     trained, fragments, *_ = evaluate(scene, capture.views, config)
 
     def make() -> Any:
-        learning = Learning(tune=TuneOptions.of_learned(SETTINGS["tuning"]), train=config)
+        refine = RefineOptions(tune=TuneOptions.of_learned(SETTINGS["tuning"]), train=config)
         calibrate = calibration.every(10)
-        return bake_and_learn(scene, cameras, capture.train, background, BakeOptions(format="bc7"), learning, calibrate)
+        return bake(scene, cameras, capture.train, background, BakeOptions(format="bc7"), refine, calibrate)
 
     baked, baking = calibration.timed(make)
     with tempfile.TemporaryDirectory() as folder:

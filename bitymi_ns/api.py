@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake import BakeOptions, Learning, bake_and_learn, export
+from bitymi_ns.bake import BakeOptions, RefineOptions, bake, export
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bundle import Bundle, check_target, read_bundle
 from bitymi_ns.bundle.cameras import CapturedCamera, cameras_data
@@ -237,9 +237,9 @@ def bake_scene(
     options.check()
     check_target(folder, overwrite)
     compact = Compact() if options.bundle_format == "compact" else None
-    learning = Learning.of_scene(scene, len(views), compact=compact)
+    refine = RefineOptions.for_scene(scene, len(views), compact=compact)
     cameras = [view.camera for view in views]
-    baked = bake_and_learn(scene, cameras, views, background, options, learning)
+    baked = bake(scene, cameras, views, background, options, refine)
     listed = cameras_data(CapturedCamera.of(f"{i:04d}", camera, False) for i, camera in enumerate(cameras))
     where = {"first": cameras[0], "extra_files": {CAMERAS: listed}, "overwrite": overwrite}
     export(baked, folder, background=background.tolist(), **where)

@@ -8,8 +8,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.baked import Baked, joined
 from bitymi_ns.bake.precision import PER_BIT, Pictures, column_noise
+from bitymi_ns.bake.state import BakeState, joined
 from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bake.tuning_views import TexelList
 from bitymi_ns.bundle.statistics import Rounding, ViewColorError
@@ -70,7 +70,7 @@ class Compact:
 class RatePoint:
     """A point of the rate-distortion curve."""
 
-    baked: Baked  # with the surfels that are kept, and their codes; its texels are as they were
+    baked: BakeState  # with the surfels that are kept, and their codes; its texels are as they were
     coding: TexelCodeOptions  # of the texels
     texels: TexelCodes | None  # codes of its texels; None without
     error: float  # mean square error against the training photographs
@@ -90,7 +90,7 @@ class Coder:
 
     def __init__(
         self,
-        baked: Baked,
+        baked: BakeState,
         views: Sequence[View],
         background: Tensor,
         options: Compact,
@@ -169,13 +169,13 @@ class Coder:
 
 
 def compacted(
-    baked: Baked,
+    baked: BakeState,
     views: Sequence[View],
     background: Tensor,
     options: Compact | None = None,
     progress: Progress = no_progress,
     device: torch.device = _CPU,
-) -> tuple[Baked, TexelCodeOptions]:
+) -> tuple[BakeState, TexelCodeOptions]:
     """Round the surfels of a bake to the values of a compact bundle, in its order, and choose the coding of its texels,
     for `tune.tune_atlas` or `with_coded_texels`.
 
@@ -191,7 +191,7 @@ def compacted(
     return choose(Coder(baked, views, background, options, progress, device), options, progress)
 
 
-def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> tuple[Baked, TexelCodeOptions]:
+def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> tuple[BakeState, TexelCodeOptions]:
     """Do what `compacted` does with a coder whose options differ at most in what decides lambda."""
     if options.most_bytes is not None:
         enough = coder.allowed(ENOUGH) if coder.measured else -math.inf
@@ -226,7 +226,7 @@ def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> 
         coding = replace(coding, most_bytes=most, fill=binds)
     mse = max(0.0, found.error - coder.error) if coder.measured else None
     rounding = Rounding(mse=mse, steps=dict(baked.codes.surfels.steps))
-    statistics = baked.statistics.but(rounding=rounding, error=None, certificate=None, view_color=_thinned(baked))
+    statistics = baked.statistics.replace(rounding=rounding, error=None, certificate=None, view_color=_thinned(baked))
     return replace(baked, statistics=statistics), coding
 
 
@@ -255,7 +255,7 @@ def _search(
     return found[min(found) if low is None else low], found[max(found) if high is None else high]
 
 
-def with_coded_texels(baked: Baked, options: TexelCodeOptions | None = None) -> Baked:
+def with_coded_texels(baked: BakeState, options: TexelCodeOptions | None = None) -> BakeState:
     """A bake with rounded surfels whose texels, all of which count the same, are coded as well."""
     assert baked.codes is not None
     if not baked.textured:
@@ -266,14 +266,14 @@ def with_coded_texels(baked: Baked, options: TexelCodeOptions | None = None) -> 
     return baked.with_texel_codes(coded, texels)
 
 
-def _thinned(baked: Baked) -> ViewColorError | None:
+def _thinned(baked: BakeState) -> ViewColorError | None:
     """Statistics of the view colours with the terms that are left; the error stays that of their reduction."""
     stated, surfels = baked.statistics.view_color, baked.scene.surfels
     if stated is None:
         return None
     terms = surfels["view_terms"]
-    return stated.but(
-        sites=stated.sites.but(after=len(baked.rows) + len(terms)),
+    return stated.replace(
+        sites=stated.sites.replace(after=len(baked.rows) + len(terms)),
         one_color=int((surfels["view_span"][:, 1] == 0).sum()),
-        bytes=stated.bytes and stated.bytes.but(after=4 * (4 * len(baked.rows) + terms.numel())),
+        bytes=stated.bytes and stated.bytes.replace(after=4 * (4 * len(baked.rows) + terms.numel())),
     )

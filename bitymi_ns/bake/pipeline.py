@@ -9,11 +9,11 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.baked import BakeableScene, Baked, joined
 from bitymi_ns.bake.compact import Compact, compacted, with_coded_texels
-from bitymi_ns.bake.field.bake import bake
+from bitymi_ns.bake.field.bake import bake_field
 from bitymi_ns.bake.field.polish import PolishOptions, polish_scene
 from bitymi_ns.bake.inputs import BakeInput, device_of, drawable, photo_resolution, visible
+from bitymi_ns.bake.state import BakeableScene, BakeState, joined
 from bitymi_ns.bake.tile_errors import certified
 from bitymi_ns.bake.tiles import Tiles, reduced_tiles
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
@@ -28,8 +28,8 @@ from bitymi_ns.train.views import View
 
 
 @torch.no_grad()
-def trained_texels(scene: BakeableScene, options: BakeOptions) -> Baked:
-    """Bake a scene whose texels were trained: all of its tiles and view colours, and all drawable surfels; `reduced`
+def trained_texels(scene: BakeableScene, options: BakeOptions) -> BakeState:
+    """Bake a scene whose texels were trained: all of its tiles, view colours and drawable surfels; `prune_and_resample`
     then drops what the options say.
 
     Args:
@@ -51,7 +51,7 @@ def trained_texels(scene: BakeableScene, options: BakeOptions) -> Baked:
     if field.alpha is not None:
         texels = joined(texels, field.alpha.detach().float())
     tiles = Tiles(torch.where(bare[:, None], 0, field.size), field.extent.float(), texels)
-    baked = Baked.of(scene, surfels, rows, tiles, options)
+    baked = BakeState.of(scene, surfels, rows, tiles, options)
     statistics = Statistics(
         surfels=KeptSurfels(
             trained=len(scene.surfels["means"]), kept=len(rows), left_out=left_out, without_tile=int(bare.sum())
@@ -62,7 +62,7 @@ def trained_texels(scene: BakeableScene, options: BakeOptions) -> Baked:
 
 
 @torch.no_grad()
-def reduced(baked: Baked, cameras: Sequence[Camera], progress: Progress = no_progress) -> Baked:
+def prune_and_resample(baked: BakeState, cameras: Sequence[Camera], progress: Progress = no_progress) -> BakeState:
     """Reduce tiles and view colours of a bake whose texels or surfels were trained, as its options say.
 
     Left out and counted are surfels that cannot be drawn or stored, or that no view blends. The atlas is not encoded.
@@ -83,7 +83,7 @@ def reduced(baked: Baked, cameras: Sequence[Camera], progress: Progress = no_pro
     inputs = BakeInput(surfels, cameras, scene.near, scene.weight_bound, scene.prefilter, alpha=alpha)
     inputs, seen = visible(inputs, options, progress)
     if seen is not None:
-        gone = gone.but(unseen=int((~seen).sum()))
+        gone = gone.replace(unseen=int((~seen).sum()))
         kept[rows] = seen.cpu()
     if not bool(kept.any()):
         raise ValueError("no surfel is left to bake")
@@ -97,15 +97,15 @@ def reduced(baked: Baked, cameras: Sequence[Camera], progress: Progress = no_pro
     result.scene.photographed = photo_resolution(inputs)
     counts = baked.statistics.surfels
     assert counts is not None and counts.left_out is not None
-    left_out = counts.left_out.but(**{name: (getattr(counts.left_out, name) or 0) + n for name, n in gone if n})
-    statistics = baked.statistics.but(
-        surfels=counts.but(
+    left_out = counts.left_out.replace(**{name: (getattr(counts.left_out, name) or 0) + n for name, n in gone if n})
+    statistics = baked.statistics.replace(
+        surfels=counts.replace(
             kept=len(result.rows), left_out=left_out, without_tile=int((result.packing.tiles[:, 3] == 0).sum())
         ),
         view_color=view_color,
     )
     if statistics.texels is not None:
-        statistics = statistics.but(texels=statistics.texels.but(kept=result.packing.texels))
+        statistics = statistics.replace(texels=statistics.texels.replace(kept=result.packing.texels))
     return replace(result, statistics=statistics)
 
 
@@ -115,7 +115,7 @@ STEPS_AFTER_LEARNING = 100
 
 
 @dataclass(frozen=True)
-class Learning:
+class RefineOptions:
     """Optimisation after the training, against the photographs."""
 
     polish: PolishOptions | None = None  # of texels and surfels together; None = none
@@ -124,7 +124,7 @@ class Learning:
     compact: Compact | None = None  # rounding for a compact bundle, before the texels are tuned alone; None = none
 
     @classmethod
-    def of_scene(
+    def for_scene(
         cls,
         scene: BakeableScene,
         views: int,
@@ -133,7 +133,7 @@ class Learning:
         cache_bytes: int = TuneOptions.cache_bytes,
         train: TrainConfig | None = None,
         compact: Compact | None = None,
-    ) -> Learning:
+    ) -> RefineOptions:
         """Choose the steps by what the scene's texture has learned from.
 
         Args:
@@ -157,16 +157,16 @@ class Learning:
         return cls(polish, tune, train, compact)
 
 
-def bake_and_learn(
+def bake(
     scene: BakeableScene,
     cameras: Sequence[Camera],
     photographs: Sequence[View],
     background: Tensor,
     options: BakeOptions,
-    learning: Learning,
+    refine: RefineOptions,
     progress: Progress = no_progress,
     held_out: Sequence[View] = (),
-) -> Baked:
+) -> BakeState:
     """Bake a trained scene, optimise it against the photographs, and encode it for a bundle.
 
     Stages: tiles of the trained texels, or of the field; polish of texels and surfels (field only); reduction of tiles
@@ -181,20 +181,20 @@ def bake_and_learn(
     Raises:
         ValueError: no surfel is left, an option is out of range, or the atlas would be too large.
     """
-    tune, coding, device = learning.tune, None, device_of(cameras)
-    form = "compact" if learning.compact is not None else options.format
+    tune, coding, device = refine.tune, None, device_of(cameras)
+    form = "compact" if refine.compact is not None else options.format
     options = replace(options, format=replace(options, format=form).texel_format)  # as bundle.json states it
-    polish, trained = learning.polish, isinstance(scene.field, TexelField)
+    polish, trained = refine.polish, isinstance(scene.field, TexelField)
     if trained:
         baked = trained_texels(scene, options)
     else:
-        baked = bake(scene, cameras, options, progress, None if polish is None else polish.pixels_per_texel)
+        baked = bake_field(scene, cameras, options, progress, None if polish is None else polish.pixels_per_texel)
     if polish is not None and baked.textured:
-        baked = polish_scene(baked, photographs, background, polish, learning.train, progress, held_out, device)
+        baked = polish_scene(baked, photographs, background, polish, refine.train, progress, held_out, device)
     if polish is not None or trained:
-        baked = reduced(baked, cameras, progress)
-    if learning.compact is not None:
-        baked, coding = compacted(baked, photographs, background, learning.compact, progress, device)
+        baked = prune_and_resample(baked, cameras, progress)
+    if refine.compact is not None:
+        baked, coding = compacted(baked, photographs, background, refine.compact, progress, device)
     if tune is not None and baked.textured:
         baked = tune_atlas(baked, photographs, background, tune, progress, held_out, coding, device)
     if baked.codes is not None and baked.codes.texels is None:

@@ -8,8 +8,8 @@ from itertools import chain
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.baked import Baked
-from bitymi_ns.bake.tiles import Shown, weighted_rms, weights
+from bitymi_ns.bake.state import BakeState
+from bitymi_ns.bake.tiles import TileVisibility, weighted_rms, weights
 from bitymi_ns.bundle.sketch import sketches_text
 from bitymi_ns.bundle.statistics import Certificate
 from bitymi_ns.codec.pages import first_texels, listed_texels, listed_tiles
@@ -28,7 +28,9 @@ def seen_rms(difference: Tensor, weight: Tensor, cells: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def listed_errors(difference: Tensor, sizes: Tensor, shown: Shown, chunk: int = 1 << 18) -> tuple[Tensor, Tensor]:
+def listed_errors(
+    difference: Tensor, sizes: Tensor, shown: TileVisibility, chunk: int = 1 << 18
+) -> tuple[Tensor, Tensor]:
     """Differences of texels as the closest training view shows them.
 
     Args:
@@ -66,7 +68,7 @@ def closest_pixels(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], ext
     return max_projected_extent(*at, cameras, extent, near) / (2.0 * extent)
 
 
-def cells_per_pixel(shown: Shown, rows: Tensor, size: tuple[int, int]) -> Tensor:
+def cells_per_pixel(shown: TileVisibility, rows: Tensor, size: tuple[int, int]) -> Tensor:
     """[n, 2] cells of a grid of (u, v) cells over the tiles `rows` that a pixel of the closest view covers along u and
     v, from 1 to the side of the grid; 1 where that is not known."""
     extent = shown.extent[rows]
@@ -100,7 +102,7 @@ def _windows(count: int, width: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def certified(baked: Baked, cameras: Sequence[Camera]) -> Baked:
+def certified(baked: BakeState, cameras: Sequence[Camera]) -> BakeState:
     """Certificate of a bake: measure the error of the stored residual colours against those before quantisation, as
     training views see it, and state it in the statistics; alphas are not covered. A bake that has a certificate
     already, against the field, or no texels, or no tolerance, is returned as it is.
@@ -115,10 +117,10 @@ def certified(baked: Baked, cameras: Sequence[Camera]) -> Baked:
     before = (baked.texels if baked.uncoded is None else baked.uncoded)[:, :3]
     pixels = closest_pixels(scene.surfels, cameras, options.extent, scene.near) if cameras else None
     opacity, beta = kernel_parameters(scene.surfels, baked.in_front)
-    shown = Shown(opacity, beta, baked.extent, scene.weight_bound, pixels=pixels)
+    shown = TileVisibility(opacity, beta, baked.extent, scene.weight_bound, pixels=pixels)
     errors, seen = listed_errors(stored - before, baked.sizes, shown)
     rms = STEPS * float((stored - before).double().square().mean().sqrt())
-    certificate = Certificate.of(errors[seen], options.tolerance, "texels").but(
+    certificate = Certificate.of(errors[seen], options.tolerance, "texels").replace(
         texel_rms=round(rms, 4), marks=sketches_text(before, stored)
     )
-    return replace(baked, statistics=baked.statistics.but(certificate=certificate))
+    return replace(baked, statistics=baked.statistics.replace(certificate=certificate))

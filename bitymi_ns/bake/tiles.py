@@ -32,7 +32,7 @@ class Tiles:
 
 
 @dataclass
-class Shown:
+class TileVisibility:
     """Largest visible part and weight of N tiles."""
 
     opacity: Tensor  # [N] largest blending weight of the surfel's centre
@@ -74,7 +74,7 @@ def grid(count: tuple[int, int], extent: Tensor) -> tuple[Tensor, Tensor]:
     return u[:, None, :].expand(-1, count[1], -1), v[:, :, None].expand(-1, -1, count[0])
 
 
-def weights(shown: Shown, rows: Tensor, count: tuple[int, int]) -> Tensor:
+def weights(shown: TileVisibility, rows: Tensor, count: tuple[int, int]) -> Tensor:
     """[n, count_v, count_u] largest blending weight of a fragment at the points of `grid`; 0 without residual."""
     u, v = grid(count, shown.extent[rows])
     rest = 1.0 - (u.square() + v.square()) / SUPPORT**2
@@ -93,7 +93,7 @@ def weighted_rms(difference: Tensor, weight: Tensor) -> Tensor:
     return STEPS * (square / count).sqrt()
 
 
-def tile_values(texels: Tensor, sizes: Tensor, shown: Shown, chunk: int) -> Iterator[TileValues]:
+def tile_values(texels: Tensor, sizes: Tensor, shown: TileVisibility, chunk: int) -> Iterator[TileValues]:
     """Texels of the tiles, in chunks of tiles of one size.
 
     Args:
@@ -158,7 +158,7 @@ class Reduced:
     parts: list[tuple[Tensor, Tensor]] = field(default_factory=list)
     nonfinite: int = 0  # number of points at which the field was not finite (taken as 0 there)
 
-    def tiles(self, shown: Shown, extent: float) -> Tiles:
+    def tiles(self, shown: TileVisibility, extent: float) -> Tiles:
         """The tiles, in their list; those of which nothing is shown have a half side `extent`."""
         first = first_texels(self.sizes)
         texels = self.constant.repeat_interleave(self.sizes.long().clamp(min=1).prod(dim=1), dim=0)
@@ -171,7 +171,7 @@ class Reduced:
 @torch.no_grad()
 def reduce_tiles(
     wanted: Iterable[TileValues],
-    shown: Shown,
+    shown: TileVisibility,
     tolerance: float,
     r_min: int = 4,
     progress: Progress = no_progress,
@@ -255,7 +255,7 @@ def reduced_tiles(tiles: Tiles, inputs: BakeInput, options: BakeOptions, progres
     """
     opacity, beta = kernel_parameters(inputs.surfels, inputs.transmittance)
     device, channels = opacity.device, tiles.texels.shape[1]
-    shown = Shown(opacity, beta, tiles.extent.to(device), inputs.weight_bound)
+    shown = TileVisibility(opacity, beta, tiles.extent.to(device), inputs.weight_bound)
     parts = tile_values(tiles.texels.to(device), tiles.sizes.to(device), shown, options.chunk)
     smaller = reduce_tiles(parts, shown, options.tolerance, options.r_min, progress, channels)
     bare = tiles.sizes[:, 0] == 0

@@ -10,8 +10,8 @@ import torch
 from pydantic import NonNegativeInt
 from torch import Tensor
 
-from bitymi_ns.bake.baked import Baked, encoded_texels
 from bitymi_ns.bake.early_stopping import FEWEST_VIEWS, EarlyStopping, gain, validation_split
+from bitymi_ns.bake.state import BakeState, encoded_texels
 from bitymi_ns.bake.tuning_views import TexelList, TuningViews
 from bitymi_ns.bundle.statistics import FineTuning
 from bitymi_ns.codec.pages import first_texels, listed_texels
@@ -70,7 +70,7 @@ class Cosines:
 class Pages:
     """An atlas in the format of the bake's options, in the range of values of the texels that come first."""
 
-    def __init__(self, baked: Baked) -> None:
+    def __init__(self, baked: BakeState) -> None:
         self._baked, self._range = baked, None
 
     def first(self, texels: Tensor) -> Coded:
@@ -128,7 +128,7 @@ class TuneOptions(TexelSteps):
 
 
 def tune_atlas(
-    baked: Baked,
+    baked: BakeState,
     views: Sequence[View],
     background: Tensor,
     options: TuneOptions | None = None,
@@ -136,7 +136,7 @@ def tune_atlas(
     eval_views: Sequence[View] = (),
     coding: TexelCodeOptions | None = None,
     device: torch.device | str = "cpu",
-) -> Baked:
+) -> BakeState:
     """Fine-tune the texels of a bake against its training photographs, 0.8 L1 + 0.2 (1 - SSIM).
 
     A step moves texel t by t <- t - rate g / (m + prior). Here g is the gradient of one view's loss, as a sum over
@@ -162,7 +162,7 @@ def tune_atlas(
     options = options or TuneOptions()
     options.check()
     if len(views) < (FEWEST_VIEWS if options.val_every else 1):
-        return replace(baked, statistics=baked.statistics.but(finetune=FineTuning(steps=0, views=len(views))))
+        return replace(baked, statistics=baked.statistics.replace(finetune=FineTuning(steps=0, views=len(views))))
     started, cpu_started = time.perf_counter(), time.process_time()
     texels = TexelList(baked, device)
     budget = MemoryBudget(options.cache_bytes)
@@ -181,7 +181,7 @@ def tune_atlas(
     untuned = held_out.psnr(coder.first(texels.values.cpu()).texels) if eval_views else None
     coded = _coded(tuned, validation, share, stopping.best, coder, options, progress)
     spent = time.perf_counter() - started, time.process_time() - cpu_started
-    statistics = stopping.statistics(len(tuned), len(validation), *spent).but(
+    statistics = stopping.statistics(len(tuned), len(validation), *spent).replace(
         steps=stopping.done + options.coded_steps,
         steps_asked=options.steps + options.coded_steps,
         error_before=baked.statistics.error,
@@ -191,7 +191,7 @@ def tune_atlas(
         result = baked.with_texel_codes(coded.stored, coded.listed)
     else:
         result = baked.with_texels(coded.listed).with_atlas(coded.stored)
-    return replace(result, statistics=result.statistics.but(finetune=statistics))
+    return replace(result, statistics=result.statistics.replace(finetune=statistics))
 
 
 def _descend(

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.baked import Baked
 from bitymi_ns.bake.early_stopping import evaluate
+from bitymi_ns.bake.state import BakeState
 from bitymi_ns.ops import (
     Fragments,
     Projection,
@@ -37,7 +37,7 @@ class TexelList:
         alpha: opacities of the texels on the device, which stand still; None = opaque texels.
     """
 
-    def __init__(self, baked: Baked, device: torch.device | str = "cpu") -> None:
+    def __init__(self, baked: BakeState, device: torch.device | str = "cpu") -> None:
         """
         Args:
             baked: with an atlas.

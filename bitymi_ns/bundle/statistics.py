@@ -28,7 +28,7 @@ class Part(BaseModel):
         given = self.model_fields_set
         return {key: value for key, value in serialize(self).items() if value is not None or key in given}
 
-    def but(self: _P, **changes: Any) -> _P:
+    def replace(self: _P, **changes: Any) -> _P:
         """Copy with other values; None removes a field."""
         return type(self)(**{name: value for name, value in {**dict(self), **changes}.items() if value is not None})
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bitymi_ns.bake import BakeOptions, export
 from bitymi_ns.bake.compact import Compact
-from bitymi_ns.bake.pipeline import Learning, bake_and_learn, reduced, trained_texels
+from bitymi_ns.bake.pipeline import RefineOptions, bake, prune_and_resample, trained_texels
 from bitymi_ns.bake.tune import TuneOptions
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.bundle.verify import check_files
@@ -51,7 +51,7 @@ def test_bakes_show_what_was_trained(trained) -> None:
     torch.testing.assert_close(rgb(baked.unquantised(), camera), want, rtol=1e-5, atol=1e-5)
     opaque = replace(baked.unquantised(), alpha_scale=0.0, mean_alpha=None)
     assert psnr(rgb(opaque, camera), want) < 25  # alpha decides the picture
-    smaller = reduced(baked, [camera])
+    smaller = prune_and_resample(baked, [camera])
     assert psnr(rgb(smaller.unquantised(), camera), want) > 45
     assert psnr(rgb(smaller.encoded().stored(), camera), want) > 35
 
@@ -62,7 +62,7 @@ def test_a_compact_bundle_keeps_the_alphas_that_its_colours_were_tuned_over(trai
     views = [View(camera, want)]
     tune = replace(TuneOptions.of_learned(20), coded_every=5)
     compact = Compact(share=0.5, views=1)
-    baked = bake_and_learn(scene, [camera], views, torch.zeros(3), BakeOptions(), Learning(tune=tune, compact=compact))
+    baked = bake(scene, [camera], views, torch.zeros(3), BakeOptions(), RefineOptions(tune=tune, compact=compact))
     assert torch.equal(baked.codes.texels.alphas(), baked.alpha_codes.alphas())
     folder = export(baked, tmp_path / "b")
     bundle, checks = check_files(folder)

@@ -11,10 +11,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bitymi_ns.bake import Baked, BakeOptions, Learning, TuneOptions, bake, bake_and_learn, export
+from bitymi_ns.bake import BakeOptions, BakeState, RefineOptions, TuneOptions, bake, bake_field, export
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bake.tile_errors import averaged, cells_per_pixel, certified, closest_pixels, listed_errors
-from bitymi_ns.bake.tiles import Shown
+from bitymi_ns.bake.tiles import TileVisibility
 from bitymi_ns.bake.verify import check_field
 from bitymi_ns.bundle import check_files
 from bitymi_ns.bundle.sketch import SIZE, estimated_rms, sketch, sketches_of, sketches_text
@@ -60,7 +60,7 @@ def test_a_pixel_averages_what_it_covers(size: tuple[int, int], shares: tuple[fl
 
 def test_a_pixel_covers_from_one_cell_to_the_whole_tile() -> None:
     pixels = torch.tensor([[10.0, 1.0], [0.0, 0.25]])
-    shown = Shown(torch.ones(2), torch.ones(2), torch.tensor([1.0, 2.0]), 0.0, pixels=pixels)
+    shown = TileVisibility(torch.ones(2), torch.ones(2), torch.tensor([1.0, 2.0]), 0.0, pixels=pixels)
     cells = cells_per_pixel(shown, torch.arange(2), (8, 16))
     assert cells.tolist() == [[1.0, 8.0], [8.0, 16.0]]
     values = torch.rand(2, 3, 16, 8)
@@ -83,7 +83,7 @@ def test_the_counts_are_true(seed: int, size: float) -> None:
     sizes = torch.tensor([SIDES[i] for i in torch.randint(len(SIDES), (9,), generator=generator).tolist()])
     extent, opacity, beta = (torch.rand(9, generator=generator) for _ in range(3))
     pixels = 20 * torch.rand(9, 2, generator=generator)
-    shown = Shown(opacity, 4 * beta, 0.2 + 2.8 * extent, 0.3, pixels=pixels)
+    shown = TileVisibility(opacity, 4 * beta, 0.2 + 2.8 * extent, 0.3, pixels=pixels)
     area = sizes.clamp(min=1).prod(1)
     difference = size * torch.randn(int(area.sum()), 3, generator=generator)
     errors, seen = listed_errors(difference, sizes, shown, chunk=40)
@@ -137,21 +137,21 @@ EXPECTED = [-667.0, -141.0, -296.0, -144.0]
 
 
 @pytest.fixture(scope="module")
-def truth(scene) -> Baked:
+def truth(scene) -> BakeState:
     return waving(scene(60))
 
 
 @pytest.fixture(scope="module", params=[True, False], ids=["compact", "pages"])
-def tuned(scene, truth: Baked, request: pytest.FixtureRequest) -> Baked:
+def tuned(scene, truth: BakeState, request: pytest.FixtureRequest) -> BakeState:
     compact, made, views = request.param, scene(60), photographs(truth)
     made.surfels["log_scales"] += 1.5
     made.surfels["opacity_logits"] += 1.0
-    learning = Learning(tune=TuneOptions(steps=2, coded_steps=10), compact=Compact() if compact else None)
+    refine = RefineOptions(tune=TuneOptions(steps=2, coded_steps=10), compact=Compact() if compact else None)
     at = ([view.camera for view in views], views, BACKGROUND)
-    return bake_and_learn(made, *at, BakeOptions(format="uint8"), learning)
+    return bake(made, *at, BakeOptions(format="uint8"), refine)
 
 
-def test_texels_that_were_altered_fail_behind_a_good_hash(tuned: Baked, truth: Baked, tmp_path: Path) -> None:
+def test_texels_that_were_altered_fail_behind_a_good_hash(tuned: BakeState, truth: BakeState, tmp_path: Path) -> None:
     baked = tuned
     stated = baked.statistics.certificate
     cameras = [view.camera for view in photographs(truth)]
@@ -166,7 +166,7 @@ def test_texels_that_were_altered_fail_behind_a_good_hash(tuned: Baked, truth: B
         codes = baked.codes.texels
         other = replace(codes, coefficients=[3 * each for each in codes.coefficients])
         coded = baked.with_texel_codes(other, baked.uncoded)
-        export(replace(coded, statistics=coded.statistics.but(certificate=stated)), tmp_path / "c")
+        export(replace(coded, statistics=coded.statistics.replace(certificate=stated)), tmp_path / "c")
     else:
         export(baked, tmp_path / "c")
         data = bytearray((tmp_path / "c" / "atlas.ktx2").read_bytes())
@@ -178,7 +178,7 @@ def test_texels_that_were_altered_fail_behind_a_good_hash(tuned: Baked, truth: B
     assert "not those that were measured" in failed[0].detail
 
 
-def test_counts_that_contradict_each_other_fail(tuned: Baked, tmp_path: Path) -> None:
+def test_counts_that_contradict_each_other_fail(tuned: BakeState, tmp_path: Path) -> None:
     export(tuned, tmp_path / "b")
     amend(tmp_path / "b", lambda info: info["statistics"]["certificate"].update(beyond=0, worst=2.0))
     assert [check.name for check in check_files(tmp_path / "b")[1] if not check.ok] == ["certificate"]
@@ -187,7 +187,7 @@ def test_counts_that_contradict_each_other_fail(tuned: Baked, tmp_path: Path) ->
 def test_a_bake_of_the_field_is_held_against_it_as_seen(scene, camera, tmp_path: Path) -> None:
     made, views = scene(40), [camera(6.0), camera(40.0)]
     options = BakeOptions(format="uint8", tolerance=0.3)
-    baked = certified(bake(made, views, options), views)
+    baked = certified(bake_field(made, views, options), views)
     stated, error = baked.statistics.certificate, baked.statistics.error
     assert stated.against == "field" and stated.marks is None
     assert stated.worst <= error.rms.p100 + 1e-4 and stated.within > 0
@@ -199,4 +199,4 @@ def test_a_bake_of_the_field_is_held_against_it_as_seen(scene, camera, tmp_path:
     amend(tmp_path / "b", lambda info: info["statistics"]["certificate"].update(worst=worst / 2 - 0.05))
     bundle, _ = check_files(tmp_path / "b")
     assert bundle is not None and not check_field(bundle, made.field, views).ok
-    assert bake(made, views, replace(options, tolerance=0.0)).statistics.certificate is None
+    assert bake_field(made, views, replace(options, tolerance=0.0)).statistics.certificate is None

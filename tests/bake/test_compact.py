@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from bitymi_ns.bake import Baked, TuneOptions, compact, export, tune_atlas
+from bitymi_ns.bake import BakeState, TuneOptions, compact, export, tune_atlas
 from bitymi_ns.bake.compact import (
     ENOUGH,
     MAX_LAMBDA,
@@ -27,36 +27,36 @@ from tests.bake.test_tune import BACKGROUND, photographs, render, waving
 
 
 @pytest.fixture(scope="module")
-def truth(scene) -> Baked:
+def truth(scene) -> BakeState:
     """The scene in the photographs."""
     return waving(scene(60))
 
 
 @pytest.fixture(scope="module")
-def views(truth: Baked) -> list[View]:
+def views(truth: BakeState) -> list[View]:
     """Photographs of `truth`, darker by 0.01, for a nonzero error."""
     return [View(view.camera, (view.image - 0.01).clamp(0, 1)) for view in photographs(truth)]
 
 
 @pytest.fixture(scope="module")
-def rounded(truth: Baked, views: list[View]) -> Baked:
+def rounded(truth: BakeState, views: list[View]) -> BakeState:
     return compacted(truth, views, BACKGROUND, Compact(share=0.05))[0]
 
 
-def error(a: Baked, b: Baked, views: list[View]) -> float:
+def error(a: BakeState, b: BakeState, views: list[View]) -> float:
     """Compute the mean squared difference of renders."""
     pictures = [(render(a, view.camera), render(b, view.camera)) for view in views]
     return sum(float((x.clamp(0, 1) - y.clamp(0, 1)).square().mean()) for x, y in pictures) / len(pictures)
 
 
-def from_photographs(baked: Baked, views: list[View]) -> float:
+def from_photographs(baked: BakeState, views: list[View]) -> float:
     """Compute the mean squared difference from the photographs."""
     pictures = [(render(baked, view.camera).clamp(0, 1), view.image) for view in views]
     return sum(float((x - y).square().mean()) for x, y in pictures) / len(pictures)
 
 
 def test_it_costs_what_it_may_and_what_costs_less_takes_more_bytes(
-    truth: Baked, views: list[View], monkeypatch: pytest.MonkeyPatch
+    truth: BakeState, views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(compact, "MAX_LAMBDA", math.inf)  # the share alone decides
     sizes = []
@@ -70,7 +70,7 @@ def test_it_costs_what_it_may_and_what_costs_less_takes_more_bytes(
     assert sizes[1] < 0.9 * sizes[0]
 
 
-def test_a_large_error_of_the_bake_does_not_hide_that_of_rounding(truth: Baked, views: list[View]) -> None:
+def test_a_large_error_of_the_bake_does_not_hide_that_of_rounding(truth: BakeState, views: list[View]) -> None:
     dark = [View(view.camera, view.image / 2) for view in views]
     capped, coding = compacted(truth, dark, BACKGROUND, Compact(share=0.9))
     assert coding.step == pytest.approx(255 * math.sqrt(TEXEL_SHARE * 12 * MAX_LAMBDA / PER_BIT))
@@ -79,7 +79,7 @@ def test_a_large_error_of_the_bake_does_not_hide_that_of_rounding(truth: Baked, 
     assert wider.step > coding.step and asked.codes.surfels.nbytes() < capped.codes.surfels.nbytes()
 
 
-def test_the_pictures_are_as_good_as_is_asked_for(truth: Baked, views: list[View]) -> None:
+def test_the_pictures_are_as_good_as_is_asked_for(truth: BakeState, views: list[View]) -> None:
     coder = Coder(truth, views, BACKGROUND, Compact())
     sizes = []
     for loss in (0.1, 1.0):
@@ -91,7 +91,7 @@ def test_the_pictures_are_as_good_as_is_asked_for(truth: Baked, views: list[View
         compacted(truth, views, BACKGROUND, Compact(psnr=coder.psnr + 1))
 
 
-def test_surfels_and_texels_fit_into_the_bytes_there_are(truth: Baked, views: list[View], tmp_path: Path) -> None:
+def test_surfels_and_texels_fit_into_the_bytes_there_are(truth: BakeState, views: list[View], tmp_path: Path) -> None:
     free, coding = compacted(truth, views, BACKGROUND, Compact(share=0.02))
     most = (free.codes.surfels.nbytes() + with_coded_texels(free, coding).codes.texels.nbytes()) * 7 // 10
     fitted, coding = compacted(truth, views, BACKGROUND, Compact(most_bytes=most))
@@ -107,7 +107,7 @@ def test_surfels_and_texels_fit_into_the_bytes_there_are(truth: Baked, views: li
         compacted(truth, views, BACKGROUND, Compact(most_bytes=300))
 
 
-def test_bytes_that_buy_nothing_are_not_spent(truth: Baked, views: list[View]) -> None:
+def test_bytes_that_buy_nothing_are_not_spent(truth: BakeState, views: list[View]) -> None:
     coder = Coder(truth, views, BACKGROUND, Compact(views=len(views)))
     kept, coding = choose(coder, Compact(most_bytes=10**9))
     assert kept.statistics.rounding.mse <= 1.001 * ENOUGH * coder.error
@@ -116,19 +116,21 @@ def test_bytes_that_buy_nothing_are_not_spent(truth: Baked, views: list[View]) -
     assert coding.most_bytes == 10**9 - kept.codes.surfels.nbytes()
 
 
-def test_without_views_the_reference_steps_are_taken(truth: Baked) -> None:
+def test_without_views_the_reference_steps_are_taken(truth: BakeState) -> None:
     plain, _ = compacted(truth, [], BACKGROUND)
     assert plain.statistics.rounding.mse is None
     assert len(plain.rows) == len(truth.rows) and len(plain.scene.surfels["view_terms"]) > 0
 
 
-def test_texels_learn_through_their_coding_and_are_what_is_stored(rounded: Baked, views: list[View], tmp_path) -> None:
+def test_texels_learn_through_their_coding_and_are_what_is_stored(
+    rounded: BakeState, views: list[View], tmp_path
+) -> None:
     options = TuneOptions(steps=8, coded_steps=40, coded_every=5, val_every=4)
     coarse = TexelCodeOptions(step=30.0)
     still = tune_atlas(rounded, views, BACKGROUND, replace(options, coded_steps=0), coding=coarse)
     tuned = tune_atlas(rounded, views, BACKGROUND, options, coding=coarse)
 
-    def against_photographs(baked: Baked) -> float:
+    def against_photographs(baked: BakeState) -> float:
         return sum(float((render(baked, v.camera).clamp(0, 1) - v.image).square().mean()) for v in views)
 
     assert against_photographs(tuned) <= against_photographs(still)

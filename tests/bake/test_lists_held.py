@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from bitymi_ns.bake import BakeOptions, bake
+from bitymi_ns.bake import BakeOptions, bake_field
 from bitymi_ns.bake.tuning_views import TexelList, TuningViews
 from bitymi_ns.ops import Fragments, trace_cpu
 from bitymi_ns.ops import bands as bands_module
@@ -46,7 +46,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
 def test_of_a_bake(scene, made: list[int], most: int, monkeypatch: pytest.MonkeyPatch) -> None:
     large = scene(60)
     large.surfels["log_scales"] += 1.5
-    baked = bake(large, options=BakeOptions(format="fp16", r_max=8))
+    baked = bake_field(large, options=BakeOptions(format="fp16", r_max=8))
     monkeypatch.setattr(trace_cpu, "MOST", most)
     views = cameras()[:3]
     visibility(large.surfels, views, 0.2)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from bitymi_ns.bake import bake
+from bitymi_ns.bake import bake_field
 from bitymi_ns.bake.inputs import POINTS, BakeInput, photo_resolution
 from bitymi_ns.scene.sampling import size_of
 from bitymi_ns.scene.visibility import Visibility
@@ -39,7 +39,7 @@ def test_points_are_drawn_evenly() -> None:
 
 def test_a_baked_scene_knows_it(scene) -> None:
     camera = make_camera()
-    baked = bake(scene(60), [camera]).scene
+    baked = bake_field(scene(60), [camera]).scene
     assert size_of(baked.photographed, camera) == pytest.approx(1.0, rel=0.3)
     assert size_of(baked.photographed, camera.scaled(0.5)) == pytest.approx(0.5, rel=0.3)
-    assert bake(scene(60)).scene.photographed is None
+    assert bake_field(scene(60)).scene.photographed is None

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bake import BakeOptions, bake, export, rich_progress
+from bitymi_ns.bake import BakeOptions, bake_field, export, rich_progress
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.train.init import tangents
 
@@ -24,7 +24,7 @@ def test_the_bundle_gives_the_field_back_between_texels(scene, tmp_path, format,
     """Bilinear samples inside the tiles match the analytic field."""
     made = scene(60)
     made.field.voxel = 0.02  # well below the wavelength, to exclude interpolation error
-    export(bake(made, options=BakeOptions(format=format, tolerance=0)), tmp_path / "b")
+    export(bake_field(made, options=BakeOptions(format=format, tolerance=0)), tmp_path / "b")
     bundle = read_bundle(tmp_path / "b")
     scales = bundle.scene.surfels["log_scales"].exp()
     axes = tangents(bundle.scene.surfels["quats"]) * scales[:, None]
@@ -47,7 +47,7 @@ def test_what_cannot_be_drawn_is_left_out_and_counted(scene, tmp_path):
     made.surfels["sv_rgb"][10, 3, 1] = float("inf")
     made.surfels["sv_rgb"][11, 0, 0] = 1e4  # beyond a bundle's limit
     made.surfels["means"][12, 2] = -1e12
-    baked = bake(made)
+    baked = bake_field(made)
     assert baked.statistics.surfels.model_dump() == {
         "trained": 100,
         "kept": 87,
@@ -62,26 +62,26 @@ def test_what_cannot_be_drawn_is_left_out_and_counted(scene, tmp_path):
     assert info.render.near == 0.25 and info.atlas.extent == 3.0
     made.surfels["opacity_logits"][:] = -20.0
     with pytest.raises(ValueError, match="no surfel is left.*'transparent': 9"):
-        bake(made)
+        bake_field(made)
 
 
 def test_views_cap_the_tiles_and_say_what_that_saved(scene, camera):
     made = scene(80)
     rule = BakeOptions(tolerance=0, drop_unseen=False)
-    free = bake(made, [camera()], replace(rule, cap_by_views=False)).statistics.texels
-    capped = bake(made, [camera()], rule).statistics.texels
+    free = bake_field(made, [camera()], replace(rule, cap_by_views=False)).statistics.texels
+    capped = bake_field(made, [camera()], rule).statistics.texels
     assert free.nyquist == free.after_cap_by_views == free.kept == capped.nyquist
     assert capped.after_cap_by_views == capped.kept < free.nyquist / 2
-    assert bake(made, [], rule).statistics.texels == free  # no views, no cap
+    assert bake_field(made, [], rule).statistics.texels == free  # no views, no cap
 
 
 def test_the_papers_rule_has_one_voxel_size_and_wider_tiles(scene):
     made = scene(60)
     made.field.voxel_size = lambda x: (0.02 * (1 + x.square().sum(-1, keepdim=True))).expand(-1, 2)
     rule = BakeOptions(tolerance=0, drop_unseen=False, cap_by_views=False, r_max=1024)
-    local = bake(made, [], rule).statistics.texels
-    finest = bake(made, [], replace(rule, local_voxel=False)).statistics.texels
-    paper = bake(made, [], replace(rule, local_voxel=False, extent=4.0)).statistics.texels
+    local = bake_field(made, [], rule).statistics.texels
+    finest = bake_field(made, [], replace(rule, local_voxel=False)).statistics.texels
+    paper = bake_field(made, [], replace(rule, local_voxel=False, extent=4.0)).statistics.texels
     assert local.kept < finest.kept < paper.kept
     assert paper.kept == paper.nyquist == paper.paper == finest.paper == local.paper
 
@@ -90,20 +90,20 @@ def test_unseen_surfels_get_the_smallest_tile_or_are_dropped(scene, camera):
     made = scene(50)
     made.surfels["means"] *= 0.3
     made.surfels["means"][::2, 2] -= 100.0  # behind the camera
-    kept = bake(made, [camera()], BakeOptions(drop_unseen=False, tolerance=0))
+    kept = bake_field(made, [camera()], BakeOptions(drop_unseen=False, tolerance=0))
     assert (kept.packing.tiles[::2, 3:] == 4).all() and len(kept.rows) == 50
     # surfels that no view sees are treated as unoccluded
-    within = bake(made, [camera()], BakeOptions(drop_unseen=False))
+    within = bake_field(made, [camera()], BakeOptions(drop_unseen=False))
     assert within.packing.tiles[::2].any() and within.packing.tiles[::2, 3:].max() == 4
     assert (within.scene.surfels["view_span"][::2, 1] > 0).any()
-    dropped = bake(made, [camera()])
+    dropped = bake_field(made, [camera()])
     assert dropped.rows.tolist() == list(range(1, 50, 2))
     assert dropped.statistics.surfels.left_out.unseen == 25
     assert dropped.statistics.texels.paper == within.statistics.texels.paper  # the paper's rule counts them
 
 
 def test_a_scene_without_texture_has_no_atlas(scene, tmp_path):
-    baked = bake(scene(20, field=None, kind="sh"))
+    baked = bake_field(scene(20, field=None, kind="sh"))
     assert baked.atlas is None and not baked.textured and not baked.packing.tiles.any()
     export(baked, tmp_path / "b")
     loaded = read_bundle(tmp_path / "b")
@@ -114,10 +114,10 @@ def test_a_scene_without_texture_has_no_atlas(scene, tmp_path):
 
 def test_fine_tuned_texels_are_encoded_anew(scene, capsys):
     with rich_progress() as progress:
-        baked = bake(scene(30), progress=progress)
+        baked = bake_field(scene(30), progress=progress)
     out = capsys.readouterr().out
     assert "choosing the tiles" in out and "measuring the error" in out and "encoding the atlas" in out
-    again = bake(scene(30))  # the layout does not depend on the run
+    again = bake_field(scene(30))  # the layout does not depend on the run
     np.testing.assert_array_equal(again.packing.tiles, baked.packing.tiles)
     assert again.atlas.payload == baked.atlas.payload and again.atlas.range == baked.atlas.range
     tuned = baked.with_texels(baked.texels + 1.0).encoded()
@@ -133,9 +133,9 @@ def test_fine_tuned_texels_are_encoded_anew(scene, capsys):
 def test_the_field_may_state_its_centre_for_anisotropic_voxels(scene):
     made = scene(60)
     made.field.voxel_size = lambda x: torch.tensor([0.4, 0.05]).expand(len(x), 2)
-    isotropic = bake(made).statistics.texels.nyquist
+    isotropic = bake_field(made).statistics.texels.nyquist
     made.field.geometry = SimpleNamespace(mid=(0.0, 0.0, 0.0))
-    assert bake(made).statistics.texels.nyquist < isotropic
+    assert bake_field(made).statistics.texels.nyquist < isotropic
 
 
 @pytest.mark.parametrize(
@@ -155,4 +155,4 @@ def test_the_field_may_state_its_centre_for_anisotropic_voxels(scene):
 )
 def test_options_out_of_range_are_refused(scene, options, reason):
     with pytest.raises(ValueError, match=reason):
-        bake(scene(5), options=options)
+        bake_field(scene(5), options=options)

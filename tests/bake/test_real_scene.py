@@ -5,7 +5,7 @@ import torch
 
 pytest.importorskip("bitymi_ns._cpu")
 
-from bitymi_ns.bake import BakeOptions, bake, export
+from bitymi_ns.bake import BakeOptions, bake_field, export
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.ops import VIEW_COLORS
 from bitymi_ns.ops.reference.render import texel
@@ -29,7 +29,7 @@ def real_scene(surfels, count=80, kind="sv", min_resolution=8):
 @pytest.mark.parametrize("kind", list(VIEW_COLORS))
 def test_every_view_colour_reaches_the_bundle(surfels, camera, tmp_path, kind):
     scene = real_scene(surfels, kind=kind)
-    export(bake(scene, [camera()], BakeOptions(tolerance=0.0)), tmp_path / "b")
+    export(bake_field(scene, [camera()], BakeOptions(tolerance=0.0)), tmp_path / "b")
     bundle = read_bundle(tmp_path / "b")
     assert set(bundle.scene.surfels) == set(scene.surfels) and set(VIEW_COLORS[kind].names) < set(scene.surfels)
     Scene(scene.config, bundle.scene.surfels, None)  # the parameters fit a scene again
@@ -37,7 +37,7 @@ def test_every_view_colour_reaches_the_bundle(surfels, camera, tmp_path, kind):
 
 def test_tiles_at_the_nyquist_rate_hold_the_field(surfels, tmp_path):
     scene = real_scene(surfels)
-    baked = bake(scene, options=BakeOptions(format="fp16", tolerance=0))
+    baked = bake_field(scene, options=BakeOptions(format="fp16", tolerance=0))
     export(baked, tmp_path / "b")
     bundle = read_bundle(tmp_path / "b")
     scales = bundle.scene.surfels["log_scales"].exp()
@@ -59,4 +59,4 @@ def test_tiles_shrink_in_the_contracted_background(surfels):
         near.surfels["means"].mul_(0.2)
         far.surfels["means"].copy_(torch.nn.functional.normalize(far.surfels["means"], dim=1) * 20.0)
     rule = BakeOptions(tolerance=0)
-    assert bake(far, options=rule).packing.texels < 0.3 * bake(near, options=rule).packing.texels
+    assert bake_field(far, options=rule).packing.texels < 0.3 * bake_field(near, options=rule).packing.texels

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from bitymi_ns.bake import BakeOptions, bake
+from bitymi_ns.bake import BakeOptions, bake_field
 from bitymi_ns.bake.field.plan import make_plan, references
 from bitymi_ns.bake.inputs import BakeInput
 from bitymi_ns.bake.tiles import fit, interpolation
@@ -70,7 +70,7 @@ def test_a_constant_residual_needs_no_tile(discs):
     made, _ = discs(PlaneField(torch.tensor([1.0, 0.0, 0.0]), 0.0))
     flat = type("Flat", (PlaneField,), {"__call__": lambda self, x: torch.full((len(x), 3), 0.25)})
     made.field = flat(torch.zeros(3), 0.0)
-    baked = bake(made, options=OPTIONS)
+    baked = bake_field(made, options=OPTIONS)
     assert baked.atlas is None and not baked.packing.tiles.any()
     torch.testing.assert_close(baked.mean_residual, torch.full((8, 3), 0.25))
     assert baked.statistics.error.rms.p100 == 0 and baked.statistics.surfels.without_tile == 8
@@ -80,7 +80,7 @@ def test_a_constant_residual_needs_no_tile(discs):
 def test_detail_along_one_axis_refines_that_axis_alone(discs, axis):
     made, axes = discs()
     made.field = PlaneField(axes[:, axis], 30.0)
-    sizes = bake(made, options=OPTIONS).packing.tiles[:, 3:]
+    sizes = bake_field(made, options=OPTIONS).packing.tiles[:, 3:]
     assert (sizes[:, 1 - axis] == 4).all() and (sizes[:, axis] >= 16).all()
 
 
@@ -89,13 +89,13 @@ def test_the_error_stays_below_the_tolerance_and_the_next_smaller_grid_does_not(
     made.field = PlaneField(axes[:, 0] + 0.3 * axes[:, 1], 25.0)
     sizes = {}
     for tolerance in (0.1, 0.5, 2.0, 20.0):
-        baked = bake(made, options=replace(OPTIONS, tolerance=tolerance))
+        baked = bake_field(made, options=replace(OPTIONS, tolerance=tolerance))
         assert baked.statistics.error.rms.p100 <= tolerance + 0.02  # half floats
         sizes[tolerance] = baked.packing.texels
     assert sizes[0.1] > sizes[0.5] > sizes[2.0] > sizes[20.0] == 0
-    exact = bake(made, options=replace(OPTIONS, tolerance=0.0))
+    exact = bake_field(made, options=replace(OPTIONS, tolerance=0.0))
     assert exact.statistics.texels.kept == exact.statistics.texels.nyquist and exact.extent.tolist() == [3.0] * 8
-    near, far = (bake(made, [camera(d)], replace(OPTIONS, drop_unseen=False)) for d in (1.0, 60.0))
+    near, far = (bake_field(made, [camera(d)], replace(OPTIONS, drop_unseen=False)) for d in (1.0, 60.0))
     assert far.packing.texels < near.packing.texels  # views that see less allow less
 
 
@@ -104,7 +104,7 @@ def test_the_error_is_the_one_that_independent_points_show(discs):
     error between them is a little larger."""
     made, axes = discs()
     made.field = PlaneField(axes[:, 0], 25.0)
-    baked = bake(made, options=replace(OPTIONS, tolerance=1.0))
+    baked = bake_field(made, options=replace(OPTIONS, tolerance=1.0))
     r_u, r_v = baked.sizes[0].tolist()
     tile = baked.texels[: r_u * r_v].view(r_v, r_u, 3)
     extent = float(baked.extent[0])
@@ -127,7 +127,7 @@ def test_texels_out_of_sight_do_not_widen_the_range(discs):
         return torch.where(inside, 0.2 * torch.sin(60 * x), 1000.0)
 
     made.field = type("Wild", (PlaneField,), {"__call__": wild_outside})(torch.zeros(3), 0.0)
-    assert bake(made, options=OPTIONS).texels.abs().max() < 0.5
+    assert bake_field(made, options=OPTIONS).texels.abs().max() < 0.5
 
 
 def test_what_is_hidden_counts_less(discs):

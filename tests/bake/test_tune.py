@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake import Baked, BakeOptions, TuneOptions, bake, tune_atlas
+from bitymi_ns.bake import BakeOptions, BakeState, TuneOptions, bake_field, tune_atlas
 from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bake.tuning_views import TexelList, TuningView, TuningViews
 from bitymi_ns.codec.pages import listed_texels
@@ -34,16 +34,16 @@ def cameras() -> list[Camera]:
     return views
 
 
-def render(baked: Baked, camera: Camera) -> Tensor:
+def render(baked: BakeState, camera: Camera) -> Tensor:
     return baked.unquantised().render(camera, BACKGROUND).rgb
 
 
-def waving(made: Any, **options: Any) -> Baked:
+def waving(made: Any, **options: Any) -> BakeState:
     """Bake large surfels with a waving residual; the first one's is constant, the last is unseen."""
     made.surfels["log_scales"] += 1.5
     made.surfels["opacity_logits"] += 1.0
     made.surfels["means"][59] = torch.tensor([0.0, 100.0, 0.0])
-    baked = bake(made, options=BakeOptions(format="fp16", r_max=8), **options)
+    baked = bake_field(made, options=BakeOptions(format="fp16", r_max=8), **options)
     baked.scene.weight_bound = 0.02
     area, sizes = int(baked.sizes[0].prod()), baked.sizes.clone()
     sizes[0] = 0
@@ -51,37 +51,37 @@ def waving(made: Any, **options: Any) -> Baked:
     return baked.with_tiles(Tiles(sizes, baked.extent, texels))
 
 
-def tuning_views(baked: Baked, views: list[View], budget: int = 1 << 30) -> TuningViews:
+def tuning_views(baked: BakeState, views: list[View], budget: int = 1 << 30) -> TuningViews:
     return TuningViews(TexelList(baked), views, BACKGROUND, MemoryBudget(budget))
 
 
-def texels_of(baked: Baked) -> Tensor:
+def texels_of(baked: BakeState) -> Tensor:
     return TexelList(baked).values
 
 
-def photographs(truth: Baked) -> list[View]:
+def photographs(truth: BakeState) -> list[View]:
     return [View(camera, render(truth, camera).clamp(0.0, 1.0)) for camera in cameras()]
 
 
 @pytest.fixture(scope="module")
-def truth(scene) -> Baked:
+def truth(scene) -> BakeState:
     """The scene in the photographs."""
     return waving(scene(60))
 
 
 @pytest.fixture(scope="module")
-def views(truth: Baked) -> list[View]:
+def views(truth: BakeState) -> list[View]:
     return photographs(truth)
 
 
 @pytest.fixture(scope="module")
-def wrong(truth: Baked) -> Baked:
+def wrong(truth: BakeState) -> BakeState:
     """`truth` with a constant residual."""
     grey = truth.with_constants(torch.full_like(truth.mean_residual, 0.1))
     return grey.with_texels(torch.full_like(truth.texels, 0.1))
 
 
-def test_tuning_finds_what_the_photographs_show(truth: Baked, wrong: Baked, views: list[View]) -> None:
+def test_tuning_finds_what_the_photographs_show(truth: BakeState, wrong: BakeState, views: list[View]) -> None:
     tuned = tune_atlas(wrong, views[:10], BACKGROUND, OPTIONS, eval_views=views[10:])
     statistics = tuned.statistics.finetune
     assert statistics.views == 7 and statistics.held_in_views == 3
@@ -97,7 +97,7 @@ def test_tuning_finds_what_the_photographs_show(truth: Baked, wrong: Baked, view
 
 
 @pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
-def test_its_pictures_are_the_renderers(truth: Baked, prefilter: str) -> None:
+def test_its_pictures_are_the_renderers(truth: BakeState, prefilter: str) -> None:
     baked = replace(truth, scene=replace(truth.scene, prefilter=prefilter))
     for camera in cameras()[:2]:
         want = render(baked, camera)
@@ -106,7 +106,7 @@ def test_its_pictures_are_the_renderers(truth: Baked, prefilter: str) -> None:
         torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-5)
 
 
-def test_texels_that_no_view_sees_stay_and_the_hardly_seen_hardly_move(wrong: Baked, views: list[View]) -> None:
+def test_texels_that_no_view_sees_stay_and_the_hardly_seen_hardly_move(wrong: BakeState, views: list[View]) -> None:
     scene = TexelList(wrong)
     seen = scene.coverage([v for i, v in enumerate(views) if i % 4])[:, 0]
     tuned = texels_of(tune_atlas(wrong, views, BACKGROUND, OPTIONS))
@@ -118,7 +118,7 @@ def test_texels_that_no_view_sees_stay_and_the_hardly_seen_hardly_move(wrong: Ba
     assert moved[few].mean() < 0.2 * moved[many].mean()
 
 
-def test_coverage_of_several_views_is_their_sum(wrong: Baked, views: list[View]) -> None:
+def test_coverage_of_several_views_is_their_sum(wrong: BakeState, views: list[View]) -> None:
     texels = TexelList(wrong)
     both = texels.coverage(views[:5])
     torch.testing.assert_close(both, sum(texels.coverage([view]) for view in views[:5]))
@@ -131,7 +131,7 @@ def test_coverage_of_several_views_is_their_sum(wrong: Baked, views: list[View])
 
 @pytest.mark.parametrize("patience", [2, 99])
 def test_it_gives_up_without_a_gain_and_its_progress_ends_with_it(
-    wrong: Baked, views: list[View], patience: int
+    wrong: BakeState, views: list[View], patience: int
 ) -> None:
     told: list[tuple[int, int]] = []
 
@@ -159,7 +159,7 @@ def test_it_gives_up_without_a_gain_and_its_progress_ends_with_it(
 
 @pytest.mark.parametrize("coded", [False, True])
 def test_the_texels_kept_are_those_of_the_best_evaluation(
-    wrong: Baked, views: list[View], monkeypatch: pytest.MonkeyPatch, coded: bool
+    wrong: BakeState, views: list[View], monkeypatch: pytest.MonkeyPatch, coded: bool
 ) -> None:
     """A run that gains, then loses, as its rate rises instead of falling."""
     seen: list[tuple[float, Tensor]] = []
@@ -188,14 +188,14 @@ def test_the_texels_kept_are_those_of_the_best_evaluation(
     torch.testing.assert_close(kept, seen[best][1], rtol=0, atol=0)
 
 
-def test_memory_for_the_views_does_not_change_the_result(wrong: Baked, views: list[View]) -> None:
+def test_memory_for_the_views_does_not_change_the_result(wrong: BakeState, views: list[View]) -> None:
     few = replace(OPTIONS, steps=8)
     results = [tune_atlas(wrong, views, BACKGROUND, replace(few, cache_bytes=b)) for b in (0, 200_000, 1 << 30)]
     assert all(torch.equal(r.texels, results[0].texels) for r in results)
 
 
 def test_a_view_with_many_fragments_is_traced_in_bands(
-    wrong: Baked, views: list[View], monkeypatch: pytest.MonkeyPatch
+    wrong: BakeState, views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def learned() -> tuple[TuningView, Tensor]:
         drawn, texels = tuning_views(wrong, views[:1]), texels_of(wrong)
@@ -211,7 +211,7 @@ def test_a_view_with_many_fragments_is_traced_in_bands(
     assert not torch.equal(texels, texels_of(wrong))
 
 
-def test_masked_pixels_and_alpha(wrong: Baked, views: list[View]) -> None:
+def test_masked_pixels_and_alpha(wrong: BakeState, views: list[View]) -> None:
     few = replace(OPTIONS, steps=12)
     mask = torch.ones(40, 48, 1, dtype=torch.bool)
     mask[:, :24] = False
@@ -226,7 +226,7 @@ def test_masked_pixels_and_alpha(wrong: Baked, views: list[View]) -> None:
     assert torch.equal(*same)
 
 
-def with_exposures(truth: Baked, views: list[View]) -> list[View]:
+def with_exposures(truth: BakeState, views: list[View]) -> list[View]:
     exposed = []
     for view, log in zip(views, torch.linspace(-0.4, 0.4, len(views)), strict=True):
         alpha = truth.unquantised().render(view.camera, BACKGROUND).alpha
@@ -235,7 +235,7 @@ def with_exposures(truth: Baked, views: list[View]) -> list[View]:
     return exposed
 
 
-def test_exposures_are_not_tuned_into_the_texels(truth: Baked, wrong: Baked, views: list[View]) -> None:
+def test_exposures_are_not_tuned_into_the_texels(truth: BakeState, wrong: BakeState, views: list[View]) -> None:
     exposed = with_exposures(truth, views)
     assert tuning_views(truth, exposed).psnr(texels_of(truth)) > 55  # background and all
     blind = [view._replace(correction=None) for view in exposed]
@@ -246,28 +246,28 @@ def test_exposures_are_not_tuned_into_the_texels(truth: Baked, wrong: Baked, vie
     assert after["known"] > after["unknown"] + 1.0
 
 
-def test_too_few_views_leave_the_atlas_alone(scene, wrong: Baked, views: list[View]) -> None:
+def test_too_few_views_leave_the_atlas_alone(scene, wrong: BakeState, views: list[View]) -> None:
     same = tune_atlas(wrong, views[:3], BACKGROUND)
     assert same.texels is wrong.texels and same.statistics.finetune.model_dump() == {"steps": 0, "views": 3}
     with pytest.raises(ValueError, match="without texture"):
-        tune_atlas(bake(scene(20, field=None)), views, BACKGROUND)
+        tune_atlas(bake_field(scene(20, field=None)), views, BACKGROUND)
 
 
 @pytest.mark.parametrize("bad", [{"steps": -1}, {"val_every": 1}, {"rate": 0.0}, {"prior": -1.0}, {"ssim_weight": 2}])
-def test_options_out_of_range_are_refused(wrong: Baked, views: list[View], bad: dict[str, float]) -> None:
+def test_options_out_of_range_are_refused(wrong: BakeState, views: list[View], bad: dict[str, float]) -> None:
     tune = partial(tune_atlas, wrong, views, BACKGROUND)
     with pytest.raises(ValueError, match=next(iter(bad))):
         tune(replace(TuneOptions(), **bad))
 
 
-def error(baked: Baked, views: list[View]) -> float:
+def error(baked: BakeState, views: list[View]) -> float:
     """Compute the mean squared error of the stored scene."""
     scene = baked.stored()
     return fmean(float((scene.render(v.camera, BACKGROUND).rgb - v.image).square().mean()) for v in views)
 
 
 @pytest.mark.parametrize("format", ["bc7", "uint8"])
-def test_the_last_steps_see_what_is_stored(truth: Baked, views: list[View], format: str) -> None:
+def test_the_last_steps_see_what_is_stored(truth: BakeState, views: list[View], format: str) -> None:
     """With texels that BC7 blocks cannot hold, the render of the stored ones improves, with or without validation
     views."""
     options = replace(truth.options, format=format)
@@ -286,7 +286,7 @@ def test_the_last_steps_see_what_is_stored(truth: Baked, views: list[View], form
     assert few.atlas is not None and few.statistics.finetune.psnr_held_in is None
 
 
-def test_texels_that_have_learned_stay_when_nothing_is_left_to_learn(truth: Baked) -> None:
+def test_texels_that_have_learned_stay_when_nothing_is_left_to_learn(truth: BakeState) -> None:
     """Fine-tuning towards photographs of the scene itself does not drift."""
     scene = replace(truth, options=replace(truth.options, format="fp16"))
     views = photographs(scene)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional as F
 
-from bitymi_ns.bake import BakeOptions, bake, export
+from bitymi_ns.bake import BakeOptions, bake_field, export
 from bitymi_ns.bake.directions import BETWEEN, SPHERE, view_directions
 from bitymi_ns.bake.verify import check_view_color
 from bitymi_ns.bake.view_colors import ColorChoices, centers_of, color_choices, view_color_errors
@@ -126,7 +126,7 @@ def test_without_room_all_sites_are_kept_and_nothing_changes(surfels):
 def test_a_bundle_holds_the_lean_colours_and_verify_measures_them(scene, camera, tmp_path, kind):
     made, cameras = scene(60, None, kind), [camera(3.0), camera(4.0)]
     options = BakeOptions(format="uint8", tolerance=2.0)
-    baked = bake(made, cameras, options)
+    baked = bake_field(made, cameras, options)
     export(baked, tmp_path / "b", statistics={"options": vars(options)})
     bundle, checks = check_files(tmp_path / "b")
     assert all(check.ok for check in checks) and bundle.scene.view_color == kind
@@ -138,7 +138,7 @@ def test_a_bundle_holds_the_lean_colours_and_verify_measures_them(scene, camera,
     assert stated["one_color"] == int((bundle.scene.surfels["view_span"][:, 1] == 0).sum())
     check = check_view_color(bundle, made.surfels, cameras)
     assert check.ok and "stated" in check.detail
-    full = bake(made, cameras, BakeOptions(format="uint8", tolerance=0.0))
+    full = bake_field(made, cameras, BakeOptions(format="uint8", tolerance=0.0))
     assert full.statistics.view_color is None and set(full.scene.surfels) == set(made.surfels)
     export(full, tmp_path / "full")
     whole = read_bundle(tmp_path / "full")
@@ -152,7 +152,7 @@ def test_a_bundle_holds_the_lean_colours_and_verify_measures_them(scene, camera,
 
 def test_altered_colours_are_found(scene, camera, tmp_path):
     made, cameras = scene(60), [camera(3.0)]
-    export(bake(made, cameras, BakeOptions(format="uint8")), tmp_path / "b")
+    export(bake_field(made, cameras, BakeOptions(format="uint8")), tmp_path / "b")
     bundle = read_bundle(tmp_path / "b")
     bundle.scene.surfels["view_base"][bundle.scene.surfels["opacity_logits"].argmax()] += 0.3
     assert not check_view_color(bundle, made.surfels, cameras).ok
@@ -162,7 +162,7 @@ def test_altered_colours_are_found(scene, camera, tmp_path):
 
 def test_without_views_the_bound_holds_all_around(scene):
     made = scene(40)
-    baked = bake(made, options=BakeOptions(tolerance=3.0))
+    baked = bake_field(made, options=BakeOptions(tolerance=3.0))
     opacity = baked.scene.surfels["opacity_logits"].sigmoid().clamp(max=0.99)
     none = torch.zeros(0, 40, dtype=torch.bool), torch.zeros(0, 3, dtype=torch.float64)
     full = {name: value[baked.rows] for name, value in made.surfels.items()}

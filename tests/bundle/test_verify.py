@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bitymi_ns.bake import BakeOptions, bake, export
+from bitymi_ns.bake import BakeOptions, bake_field, export
 from bitymi_ns.bake.verify import check_field, check_view_color
 from bitymi_ns.bundle import check_files
 from bitymi_ns.cli import main
@@ -16,7 +16,7 @@ from tests.bundle.damage import amend, change_columns
 def made(scene, camera, tmp_path):
     trained, views = scene(60), [camera(3.0)]
     options = BakeOptions(format="uint8", tolerance=0.2)
-    export(bake(trained, views, options), tmp_path / "b", statistics={"options": vars(options)})
+    export(bake_field(trained, views, options), tmp_path / "b", statistics={"options": vars(options)})
     return tmp_path / "b", trained, views
 
 
@@ -41,7 +41,7 @@ def test_the_error_that_a_bundle_states_is_found_again(scene, camera, tmp_path, 
     trained, views = scene(60), [camera(6.0), camera(8.0)]
     trained.surfels["means"][::3, 2] -= 100.0  # behind the cameras
     options = BakeOptions(format="fp16", tolerance=tolerance, drop_unseen=drop)
-    baked = bake(trained, views, options)
+    baked = bake_field(trained, views, options)
     export(baked, tmp_path / "b", statistics={"options": vars(options)})
     bundle, _ = check_files(tmp_path / "b")
     assert check_field(bundle, trained.field, views).ok
@@ -55,7 +55,7 @@ def test_percentiles_count_surfels_that_show_a_residual(scene):
         each.surfels["opacity_logits"][::2] = -4.5  # never reach the weight bound
     few.surfels = {name: value[1::2] for name, value in few.surfels.items()}
     options = BakeOptions(format="fp16", drop_unseen=False)
-    errors = [bake(each, [], options).statistics.error.rms for each in (made, few)]
+    errors = [bake_field(each, [], options).statistics.error.rms for each in (made, few)]
     assert errors[0] == errors[1] and errors[0].p50 > 0
 
 
@@ -104,7 +104,7 @@ def test_texels_that_do_not_hold_the_field_are_found_behind_a_good_hash(made):
 
 def test_changed_texels_make_no_statement_about_the_field(scene, tmp_path):
     trained = scene(30)
-    baked = bake(trained)
+    baked = bake_field(trained)
     export(baked.with_texels(baked.texels + 0.1), tmp_path / "b")
     bundle, checks = check_files(tmp_path / "b")
     assert all(check.ok for check in checks)

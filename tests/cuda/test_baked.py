@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake import bake, export
+from bitymi_ns.bake import bake_field, export
 from bitymi_ns.bundle import read as bundle_read
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.bundle.bake_options import BakeOptions
@@ -171,7 +171,7 @@ def test_other_numbers_of_sites_and_coefficients(kind: str, trim: dict[str, int]
 def test_bundles(format: str, device: torch.device, cpu, tmp_path) -> None:
     with cpu():
         made = real_scene(make_surfels, count=60)
-        export(bake(made, options=BakeOptions(format=format)), tmp_path / "b")
+        export(bake_field(made, options=BakeOptions(format=format)), tmp_path / "b")
         bundle = read_bundle(tmp_path / "b")
         undecoded = read_bundle(tmp_path / "b", decode=False)
     assert check(bundle.scene, front(48, 40), device, cpu) < most(device, 3e-3, TEXEL + FLIP)

@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager
 import pytest
 import torch
 
-from bitymi_ns.bake import Baked, BakeOptions, Learning, PolishOptions, TuneOptions, bake_and_learn
+from bitymi_ns.bake import BakeOptions, BakeState, PolishOptions, RefineOptions, TuneOptions, bake
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.ops import backend
 from bitymi_ns.ops.backend import cuda_backend
@@ -45,13 +45,13 @@ def trained() -> tuple[Scene, list[View]]:
     return trainer.scene, [*views, *views]
 
 
-def exported(scene: Scene, views: list[View], device: torch.device, learning: Learning) -> Baked:
+def exported(scene: Scene, views: list[View], device: torch.device, refine: RefineOptions) -> BakeState:
     cameras = [view.camera.to(device) for view in views]
     options = BakeOptions(tolerance=0.75, format="uint8")
-    return bake_and_learn(scene.to(device), cameras, views, BACKGROUND, options, learning)
+    return bake(scene.to(device), cameras, views, BACKGROUND, options, refine)
 
 
-def db(baked: Baked, views: list[View]) -> float:
+def db(baked: BakeState, views: list[View]) -> float:
     """Compute the PSNR against the photographs, masked."""
     errors = [(baked.stored().render(v.camera, BACKGROUND).rgb - v.image).square() for v in views]
     return -10 * float(torch.stack([e.mean() for e in errors]).mean().log10())
@@ -63,13 +63,13 @@ def test_texels_are_tuned_as_on_the_cpu(
 ) -> None:
     with cpu():
         scene, views = trained()
-    learning = Learning(tune=TuneOptions.of_learned(12), compact=compact)
+    refine = RefineOptions(tune=TuneOptions.of_learned(12), compact=compact)
     learned_on.clear()
-    got = exported(scene, views, device, learning)
+    got = exported(scene, views, device, refine)
     assert learned_on == {True}
     with cpu():
-        want = exported(scene.to(HERE), views, HERE, learning)
-        plain = exported(scene, views, HERE, Learning(compact=compact))
+        want = exported(scene.to(HERE), views, HERE, refine)
+        plain = exported(scene, views, HERE, RefineOptions(compact=compact))
         mine, cpus, untuned = (db(each, views) for each in (got, want, plain))
     assert got.statistics.finetune.steps == want.statistics.finetune.steps == 12
     assert all(value.device == HERE for value in got.scene.surfels.values())
@@ -83,14 +83,14 @@ def test_texels_and_surfels_are_polished_as_on_the_cpu(
 ) -> None:
     with cpu():
         scene, views = trained()
-    learning = Learning(
+    refine = RefineOptions(
         polish=PolishOptions(steps=6, val_every=2), tune=TuneOptions(steps=6, coded_steps=4), train=TrainConfig()
     )
     learned_on.clear()
-    got = exported(scene, views, device, learning)
+    got = exported(scene, views, device, refine)
     assert learned_on == {True}
     with cpu():
-        want = exported(scene.to(HERE), views, HERE, learning)
+        want = exported(scene.to(HERE), views, HERE, refine)
         mine, cpus = (db(each, views) for each in (got, want))
     assert got.statistics.polish.steps == want.statistics.polish.steps and got.statistics.finetune.steps > 4
     assert abs(mine - cpus) < 0.1

@@ -7,8 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake import reduced
-from bitymi_ns.bake.pipeline import trained_texels
+from bitymi_ns.bake.pipeline import prune_and_resample, trained_texels
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.ops import Bands
 from bitymi_ns.scene import Camera, Scene, SceneConfig
@@ -152,9 +151,9 @@ def test_what_is_left_out_of_a_bake_is_that_of_the_cpu(device: torch.device, cpu
         trainer.advance()
     baked, cameras = trained_texels(trainer.scene, BakeOptions(tolerance=4.0)), [v.camera for v in scene_and_views()[1]]
 
-    got = reduced(baked, [camera.to(device) for camera in cameras])
+    got = prune_and_resample(baked, [camera.to(device) for camera in cameras])
     with cpu():
-        want = reduced(baked, cameras)
+        want = prune_and_resample(baked, cameras)
     assert len(want.rows) > 5 and want.packing.texels < baked.packing.texels
     torch.testing.assert_close(got.rows, want.rows)
     torch.testing.assert_close(torch.from_numpy(got.packing.tiles), torch.from_numpy(want.packing.tiles))

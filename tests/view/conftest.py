@@ -10,9 +10,9 @@ import pytest
 import torch
 from PIL import Image
 
-from bitymi_ns.bake import Baked, bake, export
-from bitymi_ns.bake.baked import joined
+from bitymi_ns.bake import BakeState, bake_field, export
 from bitymi_ns.bake.compact import compacted, with_coded_texels
+from bitymi_ns.bake.state import joined
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.codec.pages import tile_means
 from bitymi_ns.scene import Camera
@@ -28,7 +28,7 @@ def view() -> Camera:
     return front(WIDTH, HEIGHT, 3.0)
 
 
-def with_alpha(baked: Baked) -> Baked:
+def with_alpha(baked: BakeState) -> BakeState:
     """Add random alphas from 0 to 2 to a bake."""
     random = torch.Generator().manual_seed(0)
     texels = joined(baked.texels, 2 * torch.rand(len(baked.texels), generator=random))
@@ -46,12 +46,12 @@ def baked_scene(
     larger: float,
     alpha: bool,
     options: tuple[tuple[str, object], ...],
-) -> Baked:
+) -> BakeState:
     """Bake the test scene; `compact`: version 3; `seen`: photographed by the camera, so that views adapt to their size;
     `larger`: added to the log scales; `alpha`: with alpha texels."""
     made = real_scene(make_surfels, count=count, kind=kind)
     made.surfels["log_scales"] += larger
-    baked = bake(made, [view()] if seen else [], options=BakeOptions(format=format, **dict(options)))
+    baked = bake_field(made, [view()] if seen else [], options=BakeOptions(format=format, **dict(options)))
     baked = with_alpha(baked) if alpha else baked
     return with_coded_texels(*compacted(baked, [], torch.zeros(3))) if compact else baked
 

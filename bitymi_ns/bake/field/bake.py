@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import torch
 
-from bitymi_ns.bake.baked import BakeableScene, Baked, atlas_cost, encoded_texels
 from bitymi_ns.bake.field.errors import tile_errors
 from bitymi_ns.bake.field.lean_field import lean_field
 from bitymi_ns.bake.field.plan import Field, Plan, make_plan, paper_texels, references
 from bitymi_ns.bake.inputs import BakeInput, drawable, photo_resolution, visible
+from bitymi_ns.bake.state import BakeableScene, BakeState, atlas_cost, encoded_texels
 from bitymi_ns.bake.tiles import Reduced, Tiles, reduce_tiles
 from bitymi_ns.bake.view_colors import reduce_view_colors
 from bitymi_ns.bundle.bake_options import BakeOptions
@@ -25,13 +25,13 @@ from bitymi_ns.scene.tile_sizes import coarsened
 
 
 @torch.no_grad()
-def bake(
+def bake_field(
     scene: BakeableScene,
     cameras: Sequence[Camera] = (),
     options: BakeOptions | None = None,
     progress: Progress | None = None,
     pixels_per_texel: float | None = None,
-) -> Baked:
+) -> BakeState:
     """Bake a scene's residual field into an atlas (paper, section Texture Baking).
 
     Left out and counted are surfels that can never be drawn (opacity below 1/255), rows that are not finite or beyond
@@ -55,7 +55,7 @@ def bake(
     candidates = BakeInput(surfels, cameras, scene.near, scene.config.weight_bound, scene.config.prefilter)
     inputs, seen = visible(candidates, options, progress)
     if seen is not None:
-        left_out, rows = left_out.but(unseen=int((~seen).sum())), rows[seen]
+        left_out, rows = left_out.replace(unseen=int((~seen).sum())), rows[seen]
     trained = len(scene.surfels["means"])
     if len(rows) == 0:
         raise ValueError(f"no surfel is left to bake of {trained}: left out {left_out.model_dump()}")
@@ -72,9 +72,9 @@ def bake(
         surfels, colors, view_color = reduce_view_colors(inputs, options, progress)
     else:
         surfels, colors, view_color = dict(inputs.surfels), None, None
-    baked = Baked.of(scene, surfels, rows, tiles, options)
+    baked = BakeState.of(scene, surfels, rows, tiles, options)
     baked.scene.photographed = photo_resolution(inputs)
-    statistics = statistics.but(view_color=view_color, seconds=round(time.perf_counter() - started, 3))
+    statistics = statistics.replace(view_color=view_color, seconds=round(time.perf_counter() - started, 3))
     in_front = None if inputs.transmittance is None else inputs.transmittance.cpu()
     return replace(baked, atlas=atlas, statistics=statistics, in_front=in_front, colors=colors)
 
@@ -104,7 +104,7 @@ def _textured(
         tiles = _fine_tiles(field, plan, options, progress)
     packing, counts = pack(tiles.sizes, options.page_width, options.page_rows), plan.texels
     if pixels_per_texel is not None:
-        counts = counts.but(polished=packing.texels)
+        counts = counts.replace(polished=packing.texels)
     else:
         stored = tiles.texels
         if packing.texels:
@@ -115,9 +115,9 @@ def _textured(
     return (
         tiles,
         atlas,
-        statistics.but(
-            surfels=statistics.surfels.but(without_tile=int((packing.tiles[:, 3] == 0).sum())),
-            texels=counts.but(paper=paper, kept=packing.texels, not_finite=tiles.nonfinite),
+        statistics.replace(
+            surfels=statistics.surfels.replace(without_tile=int((packing.tiles[:, 3] == 0).sum())),
+            texels=counts.replace(paper=paper, kept=packing.texels, not_finite=tiles.nonfinite),
             field=levels,
             atlas=None if atlas is None else atlas_cost(packing, atlas),
             error=errors and errors.summary(options.tolerance),

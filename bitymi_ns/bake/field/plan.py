@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bitymi_ns.bake.inputs import BakeInput
 from bitymi_ns.bake.tile_errors import closest_pixels
-from bitymi_ns.bake.tiles import Shown, TileValues, fitted, grid, weights
+from bitymi_ns.bake.tiles import TileValues, TileVisibility, fitted, grid, weights
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.statistics import KeptTexels
 from bitymi_ns.scene.tile_sizes import kernel_parameters, nyquist_resolution, visible_extent, voxel_along_axes
@@ -33,7 +33,7 @@ class Field(Protocol):
 
 
 @dataclass
-class Plan(Shown):
+class Plan(TileVisibility):
     """Extents and grids of N tiles, before the field is evaluated."""
 
     means: Tensor  # [N, 3] world positions

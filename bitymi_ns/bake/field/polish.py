@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.baked import Baked
 from bitymi_ns.bake.early_stopping import FEWEST_VIEWS, EarlyStopping, evaluate, gain, validation_split
+from bitymi_ns.bake.state import BakeState
 from bitymi_ns.bake.tune import TuneOptions
 from bitymi_ns.bake.tuning_views import TexelList
 from bitymi_ns.bundle.statistics import FineTuning
@@ -49,7 +49,7 @@ class _Polish:
 
     def __init__(
         self,
-        baked: Baked,
+        baked: BakeState,
         views: Sequence[View],
         background: Tensor,
         options: PolishOptions,
@@ -122,7 +122,7 @@ class _Polish:
 
 
 def polish_scene(
-    baked: Baked,
+    baked: BakeState,
     views: Sequence[View],
     background: Tensor,
     options: PolishOptions | None = None,
@@ -130,7 +130,7 @@ def polish_scene(
     progress: Progress = no_progress,
     eval_views: Sequence[View] = (),
     device: torch.device | str = "cpu",
-) -> Baked:
+) -> BakeState:
     """Optimise texels and surfels of a bake together against its training photographs, 0.8 L1 + 0.2 (1 - SSIM).
 
     Surfels move by Adam, texels as in `tune_atlas`, with the coverage of the bake. Surfels keep their tiles with their
@@ -158,7 +158,7 @@ def polish_scene(
     if "view_terms" in baked.scene.surfels:
         raise ValueError("the view colours are reduced already: polish a bake that was made with pixels_per_texel")
     if len(views) < FEWEST_VIEWS:
-        return replace(baked, statistics=baked.statistics.but(polish=FineTuning(steps=0, views=len(views))))
+        return replace(baked, statistics=baked.statistics.replace(polish=FineTuning(steps=0, views=len(views))))
     started, cpu_started = time.perf_counter(), time.process_time()
     validation, trained = validation_split(views, options.val_every)
     run = _Polish(baked, views, background, options, train or TrainConfig(), device)
@@ -166,12 +166,12 @@ def polish_scene(
     stopping = _optimise(run, trained, validation, progress)
     run.scene.load_state_dict(stopping.best)
     spent = time.perf_counter() - started, time.process_time() - cpu_started
-    statistics = stopping.statistics(len(trained), len(validation), *spent).but(
+    statistics = stopping.statistics(len(trained), len(validation), *spent).replace(
         error_before=baked.statistics.error, psnr_held_out=gain(before, run.psnr(eval_views)) if eval_views else None
     )
     texels = run.field.texels.detach()
     result = baked.with_texels(texels).with_surfels(dict(run.scene.surfels))
-    return replace(result, statistics=result.statistics.but(polish=statistics))
+    return replace(result, statistics=result.statistics.replace(polish=statistics))
 
 
 def _optimise(

@@ -9,7 +9,7 @@ from pathlib import Path
 import tyro
 
 from bitymi_ns import endings
-from bitymi_ns.bake import BakeOptions, Learning, TuneOptions, bake_and_learn, export, rich_progress
+from bitymi_ns.bake import BakeOptions, RefineOptions, TuneOptions, bake, export, rich_progress
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bake.pipeline import FEWEST_PASSES
 from bitymi_ns.bundle import BundleError, read_bundle
@@ -164,11 +164,11 @@ class ExportAtlas(BakeOptions, CompactOptions):
         cameras_of = camera_files(datamanager, views, self.photographs)
         beside = len(shown) + sum(map(len, cameras_of.values()))
         compacting = self.compact_of(beside) if compact else None
-        learning, memory = Learning(), int(self.finetune_memory * 1e9)
+        refine, memory = RefineOptions(), int(self.finetune_memory * 1e9)
         if not self.exact:
             steps = (self.polish_steps, self.finetune_steps, memory)
-            learning = Learning.of_scene(model.scene, len(views), *steps, model.train_config, compacting)
-        polish, tune, has_learned = learning.polish, learning.tune, isinstance(model.scene.field, TexelField)
+            refine = RefineOptions.for_scene(model.scene, len(views), *steps, model.train_config, compacting)
+        polish, tune, has_learned = refine.polish, refine.tune, isinstance(model.scene.field, TexelField)
         for name, options_of in (("polish", polish), ("finetune", None if polish or has_learned else tune)):
             if options_of is not None and options_of.steps < FEWEST_PASSES * len(views):
                 passes = options_of.steps / len(views)
@@ -181,11 +181,11 @@ class ExportAtlas(BakeOptions, CompactOptions):
                 held_out = datamanager.eval_views if self.compare else ()
                 background = model.background.cpu()
                 photographs = datamanager.train_views
-                if polish or tune or learning.compact:
+                if polish or tune or refine.compact:
                     exposure = model.resume_state.get("exposure")
                     photographs = corrected(photographs, exposure, datamanager.train_dataset.photographs)
-                learned = (options, learning, progress, held_out)
-                baked = bake_and_learn(model.scene, views, photographs, background, *learned)
+                learned = (options, refine, progress, held_out)
+                baked = bake(model.scene, views, photographs, background, *learned)
         except (ValueError, RuntimeError) as error:
             fail(f"the scene cannot be baked: {error}", error)
         background = tuple(model.background.tolist())

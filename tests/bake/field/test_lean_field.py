@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from bitymi_ns.bake import BakeOptions, bake, export
+from bitymi_ns.bake import BakeOptions, bake_field, export
 from bitymi_ns.bake.field.lean_field import lean_field, level_changes
 from bitymi_ns.bake.verify import check_field
 from bitymi_ns.bundle import check_files
@@ -46,14 +46,14 @@ def test_a_bake_of_fewer_levels_is_the_same_and_is_verified(surfels, camera, tmp
     scene = real_scene(surfels, 40)
     scene.field.field_table.data[3] = 0
     options = BakeOptions(format="uint8", r_max=16)
-    baked = bake(scene, [camera()], options)
+    baked = bake_field(scene, [camera()], options)
     assert baked.statistics.field.kept == (0, 3)
     export(baked, tmp_path / "b", statistics={"options": vars(options)})
     bundle, checks = check_files(tmp_path / "b")
     assert all(check.ok for check in checks) and check_field(bundle, scene.field, [camera()]).ok
     smaller = real_scene(surfels, 40)
     smaller.field = scene.field.only(0, 3)
-    again = bake(smaller, [camera()], options)
+    again = bake_field(smaller, [camera()], options)
     assert torch.equal(again.texels, baked.texels)
-    exact = bake(scene, [camera()], BakeOptions(format="uint8", r_max=16, tolerance=0.0))
+    exact = bake_field(scene, [camera()], BakeOptions(format="uint8", r_max=16, tolerance=0.0))
     assert exact.statistics.field is None

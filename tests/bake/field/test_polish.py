@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake import (
-    Baked,
     BakeOptions,
+    BakeState,
     PolishOptions,
     TuneOptions,
-    bake,
+    bake_field,
     polish_scene,
-    reduced,
+    prune_and_resample,
     tune_atlas,
 )
 from bitymi_ns.bake.field import polish as polish_module
@@ -28,18 +28,18 @@ OPTIONS = PolishOptions(steps=40, rate=0.3, share=1.0, val_every=4)
 
 
 @pytest.fixture(scope="module")
-def truth(scene) -> Baked:
+def truth(scene) -> BakeState:
     """The scene in the photographs, with full view colours."""
     return waving(scene(60), pixels_per_texel=0.5)
 
 
 @pytest.fixture(scope="module")
-def views(truth: Baked) -> list[View]:
+def views(truth: BakeState) -> list[View]:
     return photographs(truth)
 
 
 @pytest.fixture(scope="module")
-def wrong(truth: Baked) -> Baked:
+def wrong(truth: BakeState) -> BakeState:
     """`truth` with a constant residual, surfels shifted and fainter."""
     g = torch.Generator().manual_seed(0)
     surfels = {name: value.clone() for name, value in truth.scene.surfels.items()}
@@ -49,13 +49,13 @@ def wrong(truth: Baked) -> Baked:
     return grey.with_texels(torch.full_like(truth.texels, 0.1)).with_surfels(surfels)
 
 
-def db(baked: Baked, views: list[View]) -> float:
+def db(baked: BakeState, views: list[View]) -> float:
     """Compute the mean PSNR before quantisation."""
     errors = [(render(baked, v.camera).clamp(0, 1) - v.image).square().mean() for v in views]
     return float(torch.stack(errors).log10().mean() * -10)
 
 
-def test_everything_learns_and_the_gain_is_what_is_stated(wrong: Baked, views: list[View]) -> None:
+def test_everything_learns_and_the_gain_is_what_is_stated(wrong: BakeState, views: list[View]) -> None:
     polished = polish_scene(wrong, views[:10], BACKGROUND, OPTIONS, eval_views=views[10:])
     tuned = tune_atlas(wrong, views[:10], BACKGROUND, TuneOptions(steps=40, rate=0.3, val_every=4, coded_steps=0))
     told = polished.statistics.polish
@@ -72,10 +72,10 @@ def test_everything_learns_and_the_gain_is_what_is_stated(wrong: Baked, views: l
     assert (wrong.texels == 0.1).all() and wrong.statistics.polish is None  # the bake itself is as it was
 
 
-def test_view_colours_are_reduced_afterwards_and_can_be_tuned(wrong: Baked, views: list[View]) -> None:
+def test_view_colours_are_reduced_afterwards_and_can_be_tuned(wrong: BakeState, views: list[View]) -> None:
     polished = polish_scene(wrong, views[:10], BACKGROUND, OPTIONS)
     polished.scene.surfels["opacity_logits"][5] = -9.0  # no longer drawn
-    lean = reduced(polished, [v.camera for v in views[:10]])
+    lean = prune_and_resample(polished, [v.camera for v in views[:10]])
     assert "view_terms" in lean.scene.surfels and lean.statistics.view_color.error.p100 <= 0.76
     left = lean.statistics.surfels
     assert (left.kept, left.left_out.transparent, left.left_out.unseen) == (58, 1, 1)
@@ -89,10 +89,10 @@ def test_view_colours_are_reduced_afterwards_and_can_be_tuned(wrong: Baked, view
 
 def test_a_bake_whose_surfels_did_not_change_is_nearly_that_of_one_go(scene, views: list[View]) -> None:
     made, seen, options = scene(60), [v.camera for v in views], BakeOptions(format="fp16")
-    once, later = (bake(made, seen, options, pixels_per_texel=each) for each in (None, 1e-3))
+    once, later = (bake_field(made, seen, options, pixels_per_texel=each) for each in (None, 1e-3))
     assert later.atlas is None and later.statistics.error is None
     assert (later.packing.tiles[:, 3:] >= once.packing.tiles[:, 3:]).all()
-    later = reduced(later, seen)
+    later = prune_and_resample(later, seen)
     assert all(torch.equal(later.scene.surfels[name], value) for name, value in once.scene.surfels.items())
     assert later.statistics.view_color == once.statistics.view_color
     assert later.packing.texels < 1.2 * once.packing.texels  # what the tolerance asks for, of the fitted field
@@ -103,11 +103,11 @@ def test_a_bake_whose_surfels_did_not_change_is_nearly_that_of_one_go(scene, vie
 
 def test_tiles_are_as_fine_as_the_views_see(scene, views: list[View]) -> None:
     made, seen = scene(60), [v.camera for v in views]
-    sizes = [bake(made, seen, pixels_per_texel=each).packing.tiles[:, 3:].prod(1) for each in (0.05, 2.0, 1e6)]
+    sizes = [bake_field(made, seen, pixels_per_texel=each).packing.tiles[:, 3:].prod(1) for each in (0.05, 2.0, 1e6)]
     assert (sizes[0] >= sizes[1]).all() and sizes[0].sum() > 2 * sizes[1].sum() and (sizes[2] <= 16).all()
 
 
-def test_some_of_the_surfels_keep_their_texels(truth: Baked) -> None:
+def test_some_of_the_surfels_keep_their_texels(truth: BakeState) -> None:
     kept = torch.arange(60) % 3 > 0
     some = truth.only(kept)
     gone = dict(truth.scene.surfels)
@@ -118,7 +118,7 @@ def test_some_of_the_surfels_keep_their_texels(truth: Baked) -> None:
     assert truth.only(torch.ones(60, dtype=torch.bool)) is truth
 
 
-def test_the_best_state_is_kept(truth: Baked, wrong: Baked, views: list[View]) -> None:
+def test_the_best_state_is_kept(truth: BakeState, wrong: BakeState, views: list[View]) -> None:
     wild = replace(OPTIONS, rate=30.0, share=40.0, patience=2)
     perfect = [View(v.camera, render(wrong, v.camera)) for v in views]
     progress: list[tuple[int, int]] = []
@@ -132,7 +132,7 @@ def test_the_best_state_is_kept(truth: Baked, wrong: Baked, views: list[View]) -
 
 
 def test_steps_that_are_not_finite_are_survived(
-    wrong: Baked, views: list[View], monkeypatch: pytest.MonkeyPatch
+    wrong: BakeState, views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real, calls = polish_module.photometric, []
 
@@ -150,7 +150,7 @@ def test_steps_that_are_not_finite_are_survived(
     torch.testing.assert_close(given_up.texels, wrong.texels, rtol=0, atol=0)
 
 
-def test_masks_and_exposures(truth: Baked, wrong: Baked, views: list[View]) -> None:
+def test_masks_and_exposures(truth: BakeState, wrong: BakeState, views: list[View]) -> None:
     mask = torch.ones(40, 48, 1, dtype=torch.bool)
     mask[:, :24] = False
     spoilt = [View(v.camera, torch.where(mask, v.image, float("nan")), mask) for v in views]
@@ -167,7 +167,7 @@ def test_masks_and_exposures(truth: Baked, wrong: Baked, views: list[View]) -> N
     "bad", [{"steps": 0}, {"val_every": 1}, {"rate": 0.0}, {"share": 0.0}, {"pixels_per_texel": 0.0}]
 )
 def test_options_out_of_range_are_refused_and_too_few_views_change_nothing(
-    wrong: Baked, views: list[View], bad: dict[str, float]
+    wrong: BakeState, views: list[View], bad: dict[str, float]
 ) -> None:
     with pytest.raises(ValueError, match=next(iter(bad))):
         partial(polish_scene, wrong, views, BACKGROUND)(replace(PolishOptions(), **bad))

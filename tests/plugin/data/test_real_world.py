@@ -82,7 +82,7 @@ def test_heights_and_distances_are_those_of_the_world(
     np.testing.assert_allclose(spans, np.linalg.norm(known - known[0], axis=1), atol=1e-4)
     assert check_world(world, world_of(manager)).ok
     for wrong in ({"up": (0.0, 0.6, 0.8)}, {"metres_per_unit": 1.01 * world.metres_per_unit}, {"scale": 7.0}):
-        assert not check_world(world.but(**wrong), world_of(manager)).ok
+        assert not check_world(world.replace(**wrong), world_of(manager)).ok
 
 
 def test_up_without_a_scale(capture: Path, tmp_path: Path, surfels: Any) -> None:

@@ -12,7 +12,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from bitymi_ns.bake import BakeOptions
-from bitymi_ns.bake.baked import Baked
+from bitymi_ns.bake.state import BakeState
 from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bake.tuning_views import TexelList, TuningViews
 from bitymi_ns.ops.backend import emulated_cuda
@@ -230,7 +230,7 @@ def test_lists_of_an_export_take_what_is_stated_on_a_card(monkeypatch: pytest.Mo
         surfels=surfels, near=0.2, config=SimpleNamespace(weight_bound=bound, prefilter="low_pass")
     )
     tiles = Tiles(torch.full((count, 2), 4), torch.full((count,), 3.0), torch.zeros(16 * count, 3))
-    baked = Baked.of(stands, surfels, torch.arange(count), tiles, BakeOptions(format="fp16"))
+    baked = BakeState.of(stands, surfels, torch.arange(count), tiles, BakeOptions(format="fp16"))
     view = View(camera, torch.zeros(size, size, 3))
     monkeypatch.setattr("bitymi_ns.scene.visibility.PART", 1 << 12)  # large views have many parts
     taken = []

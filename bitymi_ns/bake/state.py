@@ -39,7 +39,7 @@ class BakeableScene(Protocol):
 
 
 @dataclass
-class Baked:
+class BakeState:
     """A baked scene, before it is written."""
 
     # the surfels that are kept, N of them on the CPU, without an atlas; their view colours are lean
@@ -68,7 +68,7 @@ class Baked:
     @classmethod
     def of(
         cls, scene: BakeableScene, surfels: Mapping[str, Tensor], rows: Tensor, tiles: Tiles, options: BakeOptions
-    ) -> Baked:
+    ) -> BakeState:
         """A bake of surfels, rows [N] of a scene, and their tiles, not encoded yet.
 
         Raises:
@@ -106,7 +106,7 @@ class Baked:
         """True where any surfel has a tile."""
         return self.packing.texels > 0
 
-    def with_constants(self, constants: Tensor) -> Baked:
+    def with_constants(self, constants: Tensor) -> BakeState:
         """Copy with other means [N, C], or [N, 3] to keep those of alpha."""
         return replace(self, scene=with_means(self.scene, constants))
 
@@ -141,19 +141,19 @@ class Baked:
         scaled = {"offset": atlas.range.offset, "scale": atlas.range.scale, "alpha_scale": atlas.alpha_scale}
         return replace(self.scene, atlas=pages, **scaled)
 
-    def with_surfels(self, surfels: Mapping[str, Tensor]) -> Baked:
+    def with_surfels(self, surfels: Mapping[str, Tensor]) -> BakeState:
         """Copy with other parameters of its N surfels, and the same tiles."""
         given = {name: value.detach().cpu().contiguous() for name, value in surfels.items()}
         return replace(self, scene=replace(self.scene, surfels=given))
 
-    def with_tiles(self, tiles: Tiles) -> Baked:
+    def with_tiles(self, tiles: Tiles) -> BakeState:
         """Copy with other tiles of its N surfels, packed, not encoded yet."""
         packing = pack(tiles.sizes, self.options.page_width, self.options.page_rows)
         scene = replace(self.scene, tiles=torch.from_numpy(packing.tiles), extent=tiles.extent)
         scene = with_means(scene, tile_means(tiles.texels, tiles.sizes))
         return replace(self, scene=scene, packing=packing, texels=tiles.texels, atlas=None, coverage=None)
 
-    def only(self, kept: Tensor) -> Baked:
+    def only(self, kept: Tensor) -> BakeState:
         """Copy with the surfels of the mask `kept` [N] and their tiles, packed again, not encoded yet."""
         if bool(kept.all()):
             return self
@@ -163,27 +163,27 @@ class Baked:
         some = replace(self, scene=replace(self.scene, surfels=surfels), rows=self.rows[kept], in_front=in_front)
         return some.with_tiles(Tiles(self.sizes[kept], self.extent[kept], self.texels[listed]))
 
-    def with_texels(self, texels: Tensor) -> Baked:
+    def with_texels(self, texels: Tensor) -> BakeState:
         """Copy with other texels [T, C], or [T, 3] to keep the alphas, not encoded yet."""
         texels = self.cut(texels.detach().float().cpu()) if texels.shape[-1] == 3 else texels.detach().float().cpu()
         if not self.textured or texels.shape != self.texels.shape:
             raise ValueError(f"texels of shape {tuple(texels.shape)} do not fit the bake")
         # no error: the field is no longer what the texels are meant to hold
-        statistics = self.statistics.but(atlas=None, error=None, certificate=None)
+        statistics = self.statistics.replace(atlas=None, error=None, certificate=None)
         means = tile_means(texels, self.sizes)
         return replace(self.with_constants(means), texels=texels.contiguous(), atlas=None, statistics=statistics)
 
-    def encoded(self, progress: Progress = no_progress) -> Baked:
+    def encoded(self, progress: Progress = no_progress) -> BakeState:
         """Copy with its texels quantised and encoded, where that is not done."""
         if not self.textured or self.atlas is not None:
             return self
         return self.with_atlas(encoded_texels(self.texels, self.packing, self.options, progress))
 
-    def with_atlas(self, atlas: EncodedAtlas) -> Baked:
+    def with_atlas(self, atlas: EncodedAtlas) -> BakeState:
         """Copy with an encoded atlas."""
-        return replace(self, atlas=atlas, statistics=self.statistics.but(atlas=atlas_cost(self.packing, atlas)))
+        return replace(self, atlas=atlas, statistics=self.statistics.replace(atlas=atlas_cost(self.packing, atlas)))
 
-    def with_texel_codes(self, codes: TexelCodes, uncoded: Tensor) -> Baked:
+    def with_texel_codes(self, codes: TexelCodes, uncoded: Tensor) -> BakeState:
         """Copy with the residual colours of the codes of its tiles, which were made of `uncoded` [T, 3]."""
         assert self.codes is not None
         alphas, options = codes.alphas(), replace(self.options, format="uint8")
@@ -193,14 +193,14 @@ class Baked:
             self.with_constants(codes.constants),
             texels=texels,
             atlas=atlas,
-            statistics=self.statistics.but(atlas=atlas_cost(self.packing, atlas), error=None, certificate=None),
+            statistics=self.statistics.replace(atlas=atlas_cost(self.packing, atlas), error=None, certificate=None),
             uncoded=uncoded,
             codes=replace(self.codes, texels=codes, residual=codes.residual, residual_step=codes.residual_step),
         )
 
 
 def export(
-    baked: Baked,
+    baked: BakeState,
     folder: str | Path,
     *,
     background: Sequence[float] = (0.0, 0.0, 0.0),

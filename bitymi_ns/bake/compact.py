@@ -59,7 +59,7 @@ class Compact:
     views: int = 8
 
     def check(self) -> None:
-        """Refuse values that make no sense."""
+        """Check the values."""
         if not 0 < self.share < 1 or self.views < 1:
             raise ValueError(f"the share of the error must lie between 0 and 1, not at {self.share}")
         if self.most_bytes is not None and self.psnr is not None:
@@ -125,17 +125,17 @@ class Coder:
         return self._pictures.views > 0
 
     def allowed(self, share: float) -> float:
-        """The mean square error against the photographs, where so much of that of the bake may be added."""
+        """Compute the allowed mean square error: (1 + share) x that of the bake."""
         return self.error + max(LEAST_ERROR, share * self.error)
 
     def _view_colors(self, lmbda: float) -> dict[str, Tensor]:
-        """The view colours at a lambda; none where they were not reduced, or there is nothing to measure with."""
+        """Choose the view colours at a lambda; none if they were not reduced or there are no views."""
         return self._baked.colors.at(lmbda) if self._baked.colors is not None and self.measured else {}
 
     @torch.no_grad()
     def at(self, lmbda: float) -> RatePoint:
-        """Point of the curve at a lambda: squared error per bit, colours from 0 to 1, summed over the pixels and
-        channels of all views."""
+        """Round and code everything at a lambda: squared error per bit, colours from 0 to 1, summed over the pixels
+        and channels of all views."""
         baked = self._baked
         surfels = {**baked.scene.surfels, **self._view_colors(lmbda)}
         steps = self._noise.steps(lmbda / self._numbers if self.measured else 0.0)
@@ -192,7 +192,7 @@ def compacted(
 
 
 def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> tuple[BakeState, TexelCodeOptions]:
-    """Do what `compacted` does with a coder whose options differ at most in what decides lambda."""
+    """Search lambda and code as `compacted`, with a coder made for the same views."""
     if options.most_bytes is not None:
         enough = coder.allowed(ENOUGH) if coder.measured else -math.inf
         most = 0.97 * options.most_bytes
@@ -233,9 +233,10 @@ def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> 
 def _search(
     coder: Coder, excess: Callable[[RatePoint], float], progress: Progress, most: float = math.inf
 ) -> tuple[RatePoint, RatePoint]:
-    """Bisect lambda up to `most`: points of the largest whose excess is at most 1, and of the smallest whose excess is
-    larger, within a tenth. An excess that is finite and above 0 gives the next lambda, as nearly proportional.
-    Where there is no point of a kind, the nearest that was tried stands for it."""
+    """Bisect lambda up to `most`, to a tenth: the last passing point (excess at most 1) and the first failing one.
+
+    An excess that is finite and above 0 gives the next lambda, as nearly proportional. Without a point of a kind,
+    returns the nearest that was tried."""
     low, high, found = None, None, {}
     lmbda = min(START, most)
     for step in range(_SEARCH):
@@ -256,7 +257,7 @@ def _search(
 
 
 def with_coded_texels(baked: BakeState, options: TexelCodeOptions | None = None) -> BakeState:
-    """A bake with rounded surfels whose texels, all of which count the same, are coded as well."""
+    """Code the texels of a bake with rounded surfels, all with the same weight."""
     assert baked.codes is not None
     if not baked.textured:
         return baked
@@ -267,7 +268,7 @@ def with_coded_texels(baked: BakeState, options: TexelCodeOptions | None = None)
 
 
 def _thinned(baked: BakeState) -> ViewColorError | None:
-    """Statistics of the view colours with the terms that are left; the error stays that of their reduction."""
+    """Update the statistics of the view colours to the terms that are left; the error stays that of their reduction."""
     stated, surfels = baked.statistics.view_color, baked.scene.surfels
     if stated is None:
         return None

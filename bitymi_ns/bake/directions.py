@@ -26,13 +26,13 @@ class Directions:
     view: Tensor  # [n, views] int64, view of each of these columns
 
     def subset(self, values: Tensor, most: int) -> Tensor:
-        """Columns of `values` [n, D, ...]: an even choice of at most `most` views, and every other one of the rest."""
+        """Select columns of `values` [n, D, ...]: at most `most` views, evenly, and every other one of the rest."""
         stride = -(-self.views // most) if self.views else 1
         return torch.cat([values[:, : self.views : stride], values[:, self.views :: 2]], dim=1)
 
 
 def view_directions(means: Tensor, seen: Tensor, centers: Tensor) -> Iterator[Directions]:
-    """The directions of all surfels, in chunks of surfels that about equally many views see.
+    """Yield the directions of all surfels, in chunks of surfels that about equally many views see.
 
     Beside those of the views that see a surfel there are BETWEEN others: random points of the triangles of three such
     views, a quarter larger, with the same random numbers for every surfel. A surfel that no view sees has SPHERE

@@ -40,11 +40,11 @@ class EarlyStopping(Generic[S]):
         self.best, self.curve, self.done = first, [] if math.isnan(psnr) else [(0, psnr)], 0
 
     def due(self, done: int) -> bool:
-        """True where the validation views are evaluated after so many steps."""
+        """True if the validation views are evaluated after this step."""
         return done % self._every == 0 or done == self._steps
 
     def update(self, done: int, psnr: float, state: Callable[[], S]) -> bool:
-        """Record an evaluation after so many steps.
+        """Record an evaluation after a step.
 
         Args:
             psnr: of the views, dB; NaN without any.
@@ -65,7 +65,7 @@ class EarlyStopping(Generic[S]):
         return not all(p < highest for _, p in self.curve[-self._patience :])
 
     def statistics(self, views: int, validation_views: int, seconds: float, cpu_seconds: float) -> FineTuning:
-        """Statistics of the optimisation."""
+        """Collect the statistics of the optimisation."""
         best_step, best = max(self.curve, key=lambda point: point[1], default=(self.done, math.nan))
         return FineTuning(
             views=views,
@@ -83,7 +83,7 @@ class EarlyStopping(Generic[S]):
 def evaluate(
     pictures: Iterable[tuple[Tensor, Tensor, Tensor | None]], count: int, progress: Progress = no_progress
 ) -> float:
-    """Mean dB over the views of which any pixel counts.
+    """Average the PSNR, dB, over views with an unmasked pixel.
 
     Args:
         pictures: rendering and photograph [H, W, 3] of every view, and the mask of the pixels that count; made one by
@@ -97,13 +97,12 @@ def evaluate(
 
 
 def gain(before: float, after: float) -> Gain:
-    """`Gain` of two PSNRs, dB."""
+    """Compare two PSNRs, dB."""
     return Gain(before=round(before, 4), after=round(after, 4))
 
 
 def validation_split(views: Sequence[View], every: int) -> tuple[Sequence[View], Sequence[View]]:
-    """The validation views, every `every`-th or with 0 none, and those that are trained on; each is read when it is
-    asked for."""
+    """Split into validation views, every `every`-th (0: none), and training views; each is read on access."""
     rows = range(len(views))
     parts = [i for i in rows if every and i % every == 0], [i for i in rows if not every or i % every]
     held, trained = (OnDemand(len(part), lambda i, part=part: views[part[i]]) for part in parts)

@@ -40,7 +40,7 @@ class BakeInput:
         return None if self.views is None else self.views.in_front
 
     def of(self, rows: Tensor) -> BakeInput:
-        """Inputs of some of the surfels."""
+        """Select surfels by rows or a mask."""
         surfels = {name: value[rows] for name, value in self.surfels.items()}
         rows = torch.nonzero(rows).squeeze(1) if rows.dtype == torch.bool else rows
         alpha, views = (None if part is None else part.of(rows) for part in (self.alpha, self.views))
@@ -55,12 +55,12 @@ class BakeInput:
 
 
 def device_of(cameras: Sequence[Camera]) -> torch.device:
-    """Device of the cameras; the CPU without any."""
+    """Return the device of the cameras; the CPU without any."""
     return cameras[0].viewmat.device if cameras else torch.device("cpu")
 
 
 def drawable(surfels: Mapping[str, Tensor]) -> tuple[Tensor, LeftOut]:
-    """Rows [N] int64 that can be drawn and stored, and the counts of those left out, by reason."""
+    """Find the rows [N] int64 that can be drawn and stored; count those left out, by reason."""
     finite = torch.stack([torch.isfinite(value).flatten(1).all(1) for value in _as_rows(surfels)]).all(0)
     scales = surfels["log_scales"].exp()
     finite &= torch.isfinite(scales).all(1) & (scales > 0).all(1)
@@ -77,12 +77,12 @@ def drawable(surfels: Mapping[str, Tensor]) -> tuple[Tensor, LeftOut]:
 
 
 def _as_rows(surfels: Mapping[str, Tensor]) -> list[Tensor]:
-    """Every parameter with at least two dimensions."""
+    """Give every parameter at least two dimensions."""
     return [value.detach() if value.dim() > 1 else value.detach()[:, None] for value in surfels.values()]
 
 
 def photo_resolution(inputs: BakeInput) -> Tensor | None:
-    """Resolution of the photographs at points of the scene (`scene/sampling.py`).
+    """Sample the resolution of the photographs at points of the scene (`scene/sampling.py`).
 
     Returns:
         [P, 4] float32 on the CPU: positions of surfels, evenly chosen from those that views show, and the geometric
@@ -112,8 +112,8 @@ def photo_resolution(inputs: BakeInput) -> Tensor | None:
 def visible(
     inputs: BakeInput, options: BakeOptions, progress: Progress = no_progress
 ) -> tuple[BakeInput, Tensor | None]:
-    """The inputs with their visibility, without the surfels that no view blends where the options drop them; and the
-    mask [N] bool of those that stay, None = all."""
+    """Add the visibility and, if the options say so, drop the surfels that no view blends; also returns the mask [N]
+    bool of those that stay, None = all."""
     inputs = inputs.with_visibility(options, progress)
     if inputs.views is None or not options.drop_unseen:
         return inputs, None

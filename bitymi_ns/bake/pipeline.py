@@ -63,7 +63,7 @@ def trained_texels(scene: BakeableScene, options: BakeOptions) -> BakeState:
 
 @torch.no_grad()
 def prune_and_resample(baked: BakeState, cameras: Sequence[Camera], progress: Progress = no_progress) -> BakeState:
-    """Reduce tiles and view colours of a bake whose texels or surfels were trained, as its options say.
+    """Drop surfels that no view shows, and reduce tiles and view colours, as the options of a bake say.
 
     Left out and counted are surfels that cannot be drawn or stored, or that no view blends. The atlas is not encoded.
 
@@ -134,7 +134,7 @@ class RefineOptions:
         train: TrainConfig | None = None,
         compact: Compact | None = None,
     ) -> RefineOptions:
-        """Choose the steps by what the scene's texture has learned from.
+        """Choose the steps by the kind of the scene's texture.
 
         Args:
             scene: trained, with its texture as texels, as a field, or without texture.

@@ -45,19 +45,19 @@ class Pictures:
         self.numbers = sum(counts)
 
     def of(self, scene: BakedScene) -> list[Tensor]:
-        """[H, W, 3] each, as the photographs show them."""
+        """Draw the views [H, W, 3] with the exposure of their photographs."""
         scene = scene.to(self._device)
         drawn = [(view, scene.render(view.camera, self._background)) for view in self._views]
         return [view.shown(d.rgb, d.alpha, self._background).clamp(0.0, 1.0) for view, d in drawn]
 
     def square(self, pictures: Sequence[Tensor], than: Sequence[Tensor] | None = None) -> float:
-        """Mean square difference from other pictures; None = from the photographs."""
+        """Average the square difference from other pictures; None: from the photographs."""
         pairs = zip(pictures, self._targets if than is None else than, self._masks, strict=True)
         squares = [_square(*pair) for pair in pairs]
         return sum(squares) / max(1, len(squares))
 
     def psnr(self, pictures: Sequence[Tensor]) -> float:
-        """Mean dB of the views of which any pixel counts, against the photographs."""
+        """Average the PSNR, dB, over views with an unmasked pixel, against the photographs."""
         pairs = zip(pictures, self._targets, self._masks, strict=True)
         found = [psnr(a, b, m) for a, b, m in pairs if m is None or bool(m.any())]
         return sum(found) / max(1, len(found))
@@ -71,7 +71,7 @@ class ColumnNoise:
     counts: Mapping[str, int]  # numbers of the column
 
     def steps(self, lmbda: float) -> dict[str, float]:
-        """Steps at which a further bit for each number of a column saves lambda.
+        """Choose the steps at which a further bit for each number of a column saves lambda.
 
         A column whose step is s adds D s^2 to the mean square error, and halving s takes a bit per number.
 
@@ -115,7 +115,7 @@ def column_noise(
 
 
 def _column(scene: BakedScene, codes: SurfelCodes, rounded: Mapping[str, Tensor], column: str) -> dict[str, Tensor]:
-    """The parameter of a column with the rounded numbers of the column."""
+    """Replace a column's numbers in its parameter by the rounded ones."""
     if column not in ("term_shape", "term_color"):
         name = PARAMETERS.get(column, column)
         return {name: rounded[name]}
@@ -125,7 +125,7 @@ def _column(scene: BakedScene, codes: SurfelCodes, rounded: Mapping[str, Tensor]
 
 
 def _step(name: str, error: float, noise: float) -> float:
-    """The step that adds this error."""
+    """Compute the step that adds this error."""
     wanted = math.sqrt(error / noise) / REFERENCE[name] if noise > 0 else WIDEST
     return REFERENCE[name] * min(WIDEST, max(NARROWEST, wanted))
 

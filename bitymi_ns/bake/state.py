@@ -69,7 +69,7 @@ class BakeState:
     def of(
         cls, scene: BakeableScene, surfels: Mapping[str, Tensor], rows: Tensor, tiles: Tiles, options: BakeOptions
     ) -> BakeState:
-        """A bake of surfels, rows [N] of a scene, and their tiles, not encoded yet.
+        """Start from surfels, rows [N] of a scene, and their tiles, not encoded yet.
 
         Raises:
             ValueError: the atlas would be too large.
@@ -107,7 +107,7 @@ class BakeState:
         return self.packing.texels > 0
 
     def with_constants(self, constants: Tensor) -> BakeState:
-        """Copy with other means [N, C], or [N, 3] to keep those of alpha."""
+        """Replace the means by [N, C], or by [N, 3] to keep those of alpha."""
         return replace(self, scene=with_means(self.scene, constants))
 
     @cached_property
@@ -119,11 +119,11 @@ class BakeState:
         return TexelAlpha(tiles, self.texels[:, 3].contiguous(), self.scene.weight_bound)
 
     def cut(self, colors: Tensor) -> Tensor:
-        """[T, C] texels of residual colours [T, 3], with the alphas of the bake where it has such."""
+        """Append the alphas of the bake, if any, to residual colours [T, 3]: [T, C]."""
         return colors if self.alpha is None else joined(colors, self.alpha.values)
 
     def unquantised(self) -> BakedScene:
-        """The scene with its texels as 32-bit floats."""
+        """Make a renderable scene with texels as 32-bit floats."""
         if not self.textured:
             return self.scene
         pages = paged_texels(self.texels, self.packing)
@@ -132,7 +132,7 @@ class BakeState:
         return replace(self.scene, atlas=torch.cat([pages, torch.ones_like(pages[..., :1])], -1))
 
     def stored(self) -> BakedScene:
-        """The scene with its texels as a bundle has them."""
+        """Make a renderable scene with texels as stored in the bundle."""
         if self.atlas is None:
             return self.scene
         atlas = self.atlas
@@ -142,19 +142,19 @@ class BakeState:
         return replace(self.scene, atlas=pages, **scaled)
 
     def with_surfels(self, surfels: Mapping[str, Tensor]) -> BakeState:
-        """Copy with other parameters of its N surfels, and the same tiles."""
+        """Replace the parameters of the N surfels; their tiles stay."""
         given = {name: value.detach().cpu().contiguous() for name, value in surfels.items()}
         return replace(self, scene=replace(self.scene, surfels=given))
 
     def with_tiles(self, tiles: Tiles) -> BakeState:
-        """Copy with other tiles of its N surfels, packed, not encoded yet."""
+        """Replace the tiles of the N surfels and lay them out; they are not encoded yet."""
         packing = pack(tiles.sizes, self.options.page_width, self.options.page_rows)
         scene = replace(self.scene, tiles=torch.from_numpy(packing.tiles), extent=tiles.extent)
         scene = with_means(scene, tile_means(tiles.texels, tiles.sizes))
         return replace(self, scene=scene, packing=packing, texels=tiles.texels, atlas=None, coverage=None)
 
     def only(self, kept: Tensor) -> BakeState:
-        """Copy with the surfels of the mask `kept` [N] and their tiles, packed again, not encoded yet."""
+        """Keep the surfels of a mask [N] and their tiles, laid out again, not encoded yet."""
         if bool(kept.all()):
             return self
         surfels = {name: value[kept] for name, value in self.scene.surfels.items()}
@@ -164,7 +164,7 @@ class BakeState:
         return some.with_tiles(Tiles(self.sizes[kept], self.extent[kept], self.texels[listed]))
 
     def with_texels(self, texels: Tensor) -> BakeState:
-        """Copy with other texels [T, C], or [T, 3] to keep the alphas, not encoded yet."""
+        """Replace the texels by [T, C], or by [T, 3] to keep the alphas; they are not encoded yet."""
         texels = self.cut(texels.detach().float().cpu()) if texels.shape[-1] == 3 else texels.detach().float().cpu()
         if not self.textured or texels.shape != self.texels.shape:
             raise ValueError(f"texels of shape {tuple(texels.shape)} do not fit the bake")
@@ -174,17 +174,17 @@ class BakeState:
         return replace(self.with_constants(means), texels=texels.contiguous(), atlas=None, statistics=statistics)
 
     def encoded(self, progress: Progress = no_progress) -> BakeState:
-        """Copy with its texels quantised and encoded, where that is not done."""
+        """Quantise and encode the texels, unless that is done."""
         if not self.textured or self.atlas is not None:
             return self
         return self.with_atlas(encoded_texels(self.texels, self.packing, self.options, progress))
 
     def with_atlas(self, atlas: EncodedAtlas) -> BakeState:
-        """Copy with an encoded atlas."""
+        """Set the encoded atlas."""
         return replace(self, atlas=atlas, statistics=self.statistics.replace(atlas=atlas_cost(self.packing, atlas)))
 
     def with_texel_codes(self, codes: TexelCodes, uncoded: Tensor) -> BakeState:
-        """Copy with the residual colours of the codes of its tiles, which were made of `uncoded` [T, 3]."""
+        """Replace the residual colours by those decoded from codes of `uncoded` [T, 3]."""
         assert self.codes is not None
         alphas, options = codes.alphas(), replace(self.options, format="uint8")
         texels = codes.texels() if alphas is None else joined(codes.texels(), alphas)
@@ -208,7 +208,7 @@ def export(
     first: Camera | None = None,
     **options: Any,
 ) -> Path:
-    """Write a baked scene, encoded where it is not yet, as a bundle; errors are those of `write_bundle`.
+    """Encode a baked scene, unless that is done, and write a bundle; errors are those of `write_bundle`.
 
     Args:
         background: colour behind the surfels.
@@ -230,12 +230,12 @@ def export(
 
 
 def joined(colors: Tensor, alphas: Tensor) -> Tensor:
-    """[n, 4] texels of residual colours [n, 3] and alphas [n]."""
+    """Join residual colours [n, 3] and alphas [n] to texels [n, 4]."""
     return torch.cat([colors, alphas[:, None]], 1)
 
 
 def with_means(scene: BakedScene, constants: Tensor) -> BakedScene:
-    """The scene with other means of its tiles, [N, 3] or with alpha [N, 4]."""
+    """Replace the means of a scene's tiles by [N, 3] or, with alpha, [N, 4]."""
     if constants.shape[1] == 3:
         return replace(scene, mean_residual=constants)
     return replace(scene, mean_residual=constants[:, :3].contiguous(), mean_alpha=constants[:, 3].contiguous())
@@ -248,7 +248,7 @@ def encoded_texels(
     progress: Progress = no_progress,
     value_range: Range | None = None,
 ) -> EncodedAtlas:
-    """Texels [T, C] in pages, as the options say, and in a range of values that they choose where none is stated."""
+    """Encode texels [T, C] in pages as the options say; the range of values is chosen if it is None."""
     if options.texel_format != "fp16" and value_range is None:
         sizes = torch.from_numpy(packing.tiles[:, 3:]).long()
         of_tiles = (sizes[:, 0] > 0).repeat_interleave(sizes.clamp(min=1).prod(dim=1))
@@ -258,7 +258,7 @@ def encoded_texels(
 
 
 def atlas_cost(packing: Packing, atlas: EncodedAtlas) -> AtlasCost:
-    """Bytes and quantisation error of an encoded atlas."""
+    """Collect the bytes and the quantisation error of an encoded atlas."""
     return AtlasCost(
         bytes=atlas.nbytes,
         pages=(packing.layers, packing.height, packing.width),

@@ -22,8 +22,7 @@ _CONSTANT = (8, 8)  # grid on which the weight of a surfel without a tile is eva
 
 
 def seen_rms(difference: Tensor, weight: Tensor, cells: Tensor) -> Tensor:
-    """`weighted_rms` of what a view can see: difference times weight is averaged over its pixels first, of `cells`
-    [n, 2]."""
+    """Compute `weighted_rms` as a view sees it: difference x weight, averaged over pixels of `cells` [n, 2] first."""
     return weighted_rms(averaged(difference * weight[:, None], cells), (weight > 0).float())
 
 
@@ -31,7 +30,7 @@ def seen_rms(difference: Tensor, weight: Tensor, cells: Tensor) -> Tensor:
 def listed_errors(
     difference: Tensor, sizes: Tensor, shown: TileVisibility, chunk: int = 1 << 18
 ) -> tuple[Tensor, Tensor]:
-    """Differences of texels as the closest training view shows them.
+    """Measure differences of texels as the closest training view shows them.
 
     Args:
         difference: [T, 3] in the order of `ops.TexelTiles`: a surfel without a tile has one.
@@ -56,7 +55,7 @@ def listed_errors(
 
 
 def closest_pixels(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], extent: float, near: float) -> Tensor:
-    """Pixels that a scale unit of every surfel takes along u and v in the view that shows it largest: [N, 2]; 0 where
+    """Count the pixels of a scale unit of every surfel along u and v in the view that shows it largest: [N, 2]; 0 where
     no view shows it.
 
     Args:
@@ -69,8 +68,8 @@ def closest_pixels(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], ext
 
 
 def cells_per_pixel(shown: TileVisibility, rows: Tensor, size: tuple[int, int]) -> Tensor:
-    """[n, 2] cells of a grid of (u, v) cells over the tiles `rows` that a pixel of the closest view covers along u and
-    v, from 1 to the side of the grid; 1 where that is not known."""
+    """Count the cells [n, 2] of a grid over the tiles `rows` that a pixel of the closest view covers along u and v,
+    from 1 to the side of the grid; 1 if unknown."""
     extent = shown.extent[rows]
     sides = torch.tensor(size, dtype=torch.float32, device=extent.device).expand(len(extent), 2)
     if shown.pixels is None:
@@ -80,7 +79,7 @@ def cells_per_pixel(shown: TileVisibility, rows: Tensor, size: tuple[int, int]) 
 
 
 def averaged(values: Tensor, cells: Tensor) -> Tensor:
-    """Means of values over rectangles about every cell: [n, c, v, u] of the same.
+    """Average values [n, c, v, u] over rectangles about every cell.
 
     A rectangle that would reach beyond the grid is moved into it. One of a single cell leaves its value.
 
@@ -94,7 +93,7 @@ def averaged(values: Tensor, cells: Tensor) -> Tensor:
 
 
 def _windows(count: int, width: Tensor) -> Tensor:
-    """[n, count, count] the share of every cell in the window of each, of widths [n]."""
+    """Compute the share [n, count, count] of every cell in the window of each, of widths [n]."""
     edge, half = torch.arange(count, device=width.device, dtype=torch.float32), width[:, None] / 2
     center = torch.minimum(torch.maximum(edge + 0.5, half), count - half)  # [n, count]
     low, high = (center - half)[:, :, None], (center + half)[:, :, None]
@@ -103,7 +102,7 @@ def _windows(count: int, width: Tensor) -> Tensor:
 
 @torch.no_grad()
 def certified(baked: BakeState, cameras: Sequence[Camera]) -> BakeState:
-    """Certificate of a bake: measure the error of the stored residual colours against those before quantisation, as
+    """Certify a bake: measure the error of the stored residual colours against those before quantisation, as
     training views see it, and state it in the statistics; alphas are not covered. A bake that has a certificate
     already, against the field, or no texels, or no tolerance, is returned as it is.
 

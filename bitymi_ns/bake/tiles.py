@@ -56,7 +56,7 @@ class TileValues:
 
 
 def texel_centers(count: int, extent: Tensor) -> Tensor:
-    """Surfel coordinates of texel centres along one axis: (i + 0.5) / count * 2 extent - extent.
+    """Compute surfel coordinates of texel centres along one axis: (i + 0.5) / count * 2 extent - extent.
 
     Args:
         count: texels along the axis.
@@ -69,13 +69,13 @@ def texel_centers(count: int, extent: Tensor) -> Tensor:
 
 
 def grid(count: tuple[int, int], extent: Tensor) -> tuple[Tensor, Tensor]:
-    """Surfel coordinates u, v [n, count_v, count_u] of the cell centres of tiles of half sides [n]."""
+    """Compute surfel coordinates u, v [n, count_v, count_u] of the cell centres of tiles of half sides [n]."""
     u, v = (texel_centers(c, extent[:, None]) for c in count)
     return u[:, None, :].expand(-1, count[1], -1), v[:, :, None].expand(-1, -1, count[0])
 
 
 def weights(shown: TileVisibility, rows: Tensor, count: tuple[int, int]) -> Tensor:
-    """[n, count_v, count_u] largest blending weight of a fragment at the points of `grid`; 0 without residual."""
+    """Compute the largest blending weight [n, count_v, count_u] at the points of `grid`; 0 without residual."""
     u, v = grid(count, shown.extent[rows])
     rest = 1.0 - (u.square() + v.square()) / SUPPORT**2
     weight = shown.opacity[rows, None, None] * rest.clamp(min=1e-12) ** shown.beta[rows, None, None]
@@ -83,7 +83,7 @@ def weights(shown: TileVisibility, rows: Tensor, count: tuple[int, int]) -> Tens
 
 
 def weighted_rms(difference: Tensor, weight: Tensor) -> Tensor:
-    """Root mean square of difference [n, C, v, u] times weight [n, v, u] where that is not 0, in 8-bit steps: [n].
+    """Compute the root mean square of difference [n, C, v, u] times weight [n, v, u] where not 0, 8-bit steps: [n].
     Alpha, the fourth of four channels, counts by `ALPHA_CONTRAST`."""
     count = 3 * (weight > 0).flatten(1).sum(1).clamp(min=1)
     squares = difference[:, :3].square().sum(1)
@@ -94,7 +94,7 @@ def weighted_rms(difference: Tensor, weight: Tensor) -> Tensor:
 
 
 def tile_values(texels: Tensor, sizes: Tensor, shown: TileVisibility, chunk: int) -> Iterator[TileValues]:
-    """Texels of the tiles, in chunks of tiles of one size.
+    """Yield the texels in chunks of tiles of one size.
 
     Args:
         texels: [T, C] in the order of `ops.TexelTiles`, on the device of `shown`.
@@ -111,7 +111,7 @@ _FORESIGHT = 1.1  # how much larger than the tolerance the predicted error of a 
 
 @lru_cache(maxsize=64)
 def interpolation(probes: int, texels: int) -> Tensor:
-    """Values at evenly spaced probes (cell centres) from a tile's texels along one axis: [probes, texels] float32.
+    """Build the matrix [probes, texels] float32 from a tile's texels to evenly spaced probes along one axis.
 
     Linear between texel centres and constant beyond the outer ones, as the renderers fetch them.
     """
@@ -126,18 +126,18 @@ def interpolation(probes: int, texels: int) -> Tensor:
 
 @lru_cache(maxsize=64)
 def fit(probes: int, texels: int) -> Tensor:
-    """[texels, probes] float32: the texels whose interpolation is nearest to values at the probes, least squares."""
+    """Build the least-squares matrix [texels, probes] float32 from values at the probes to texels."""
     return torch.linalg.pinv(interpolation(probes, texels).double()).float()
 
 
 def along_axes(x: Tensor, along_u: Tensor, along_v: Tensor) -> Tensor:
-    """along_v x along_u^T of every channel: [n, C, V, U] with [u, U], [v, V] -> [n, C, v, u]."""
+    """Compute along_v x along_u^T per channel: [n, C, V, U] with [u, U], [v, V] -> [n, C, v, u]."""
     y = (x @ along_u.T).transpose(2, 3)  # one product of matrices each
     return (y.contiguous() @ along_v.T).transpose(2, 3).contiguous()
 
 
 def fitted(values: Tensor, size: tuple[int, int]) -> Tensor:
-    """Tiles [n, C, v, u] on another grid (u, v), by least squares."""
+    """Fit tiles [n, C, v, u] on another grid (u, v), by least squares."""
     u, v = values.shape[3], values.shape[2]
     return along_axes(values, fit(u, size[0]).to(values), fit(v, size[1]).to(values))
 
@@ -150,7 +150,7 @@ def read_at(texels: Tensor, size: tuple[int, int]) -> Tensor:
 
 @dataclass
 class Reduced:
-    """The grids that were chosen, and their texels."""
+    """Chosen grids, and their texels."""
 
     sizes: Tensor  # [N, 2] int32 (r_u, r_v), 0 for a surfel without a tile
     constant: Tensor  # [N, C] the residual, and alpha where C = 4, of the surfels without a tile
@@ -159,7 +159,7 @@ class Reduced:
     nonfinite: int = 0  # number of points at which the field was not finite (taken as 0 there)
 
     def tiles(self, shown: TileVisibility, extent: float) -> Tiles:
-        """The tiles, in their list; those of which nothing is shown have a half side `extent`."""
+        """Assemble the tiles in their order; `extent` is the half side of those that show nothing."""
         first = first_texels(self.sizes)
         texels = self.constant.repeat_interleave(self.sizes.long().clamp(min=1).prod(dim=1), dim=0)
         for rows, values in self.parts:
@@ -209,14 +209,14 @@ def reduce_tiles(
 
 
 def _constant(part: TileValues, tolerance: float) -> tuple[Tensor, Tensor]:
-    """The constant nearest to the tile, [n, C], and whether it is near enough, [n] bool."""
+    """Find the nearest constant [n, C], and if it is within the tolerance [n] bool."""
     square = part.weight.square()[:, None]
     constant = (part.values * square).sum((2, 3)) / square.sum((2, 3)).clamp(min=1e-12)
     return constant, weighted_rms(part.values - constant[:, :, None, None], part.weight) <= tolerance
 
 
 def _grids(part: TileValues, rows: Tensor, tolerance: float, r_min: int) -> list[tuple[tuple[int, int], Tensor]]:
-    """The smallest grid of each of `rows` (of `part`): pairs of size and rows.
+    """Find the smallest grid of each of `rows` (of `part`): pairs of size and rows.
 
     The errors of coarsening along u alone and along v alone, added in squares, predict that of both. Only grids that
     are promising by that are tried.

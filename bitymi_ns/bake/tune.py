@@ -58,7 +58,7 @@ class Cosines:
         return self._coded(texels, codes)
 
     def last(self, coded: Coded) -> Coded:
-        """Final coding of the best texels."""
+        """Code the best texels."""
         if self._most is None or coded.stored.nbytes() <= self._most:
             return coded
         return self._coded(coded.listed, self._coder.fit(coded.texels, self._most, rounds=1))
@@ -101,8 +101,8 @@ class TuneOptions(TexelSteps):
     steps: Count = 400  # Steps, before the texels are stored; each stopping at one training view.
     ssim_weight: Share = 0.2  # Share of 1 - SSIM in the loss; the rest is L1.
     val_every: Count = 8
-    """Every so-many-th training view is a validation view; the texels that show these best are kept. 0 = none, and the
-    last texels are kept: where they have learned from all views already, these tell nothing."""
+    """Spacing of the validation views; the texels that show these best are kept. 0: none, and the last texels are kept,
+    as for texels that have learned from all views."""
     checks: PositiveCount = 16  # Evaluations of the validation views over the run.
     patience: PositiveCount = 6  # Evaluations without a gain after which the run ends.
     cache_bytes: NonNegativeInt = 1_000_000_000
@@ -110,18 +110,18 @@ class TuneOptions(TexelSteps):
     fit is traced again whenever it is needed."""
     seed: int = 0  # Of the order of the views.
     coded_steps: Count = 120
-    """Further steps, which see what is stored of the texels: blocks of BC7, say, or the codes of a compact bundle."""
+    """Further steps, which draw the texels as stored: blocks of BC7, or the codes of a compact bundle."""
     coded_every: PositiveCount = 10  # Steps between codings of the texels.
     coded_rate: float = 0.02  # Their rate at the start.
 
     @classmethod
     def of_learned(cls, steps: int, cache_bytes: int = cache_bytes) -> TuneOptions:
-        """For texels that have learned in training, from all views: these go on teaching them, and all steps see what
-        is stored. With half of the rate it takes twice the steps."""
+        """Options for trained texels: all views train, and all steps draw what is stored. Half the rate takes twice the
+        steps."""
         return cls(steps=0, coded_steps=steps, coded_rate=2 * cls.rate, val_every=0, cache_bytes=cache_bytes)
 
     def check(self) -> None:
-        """Refuse values that make no sense."""
+        """Check the values."""
         check_ranges(self)
         if self.val_every == 1:
             raise ValueError("val_every must not be 1: no view would be left to learn from")

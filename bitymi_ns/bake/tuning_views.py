@@ -59,8 +59,8 @@ class TexelList:
         return project(*geometry, camera.to(self.device), self.scene.near, self.scene.prefilter, alpha=self.alpha)
 
     def coverage(self, views: Sequence[View], progress: Progress = no_progress) -> Tensor:
-        """Coverage of every texel, in pixels that count: [T, 2], the sums over views and fragments of the blending
-        weight, and of its square, times the bilinear weight; 0 where no view sees it."""
+        """Measure every texel's coverage in unmasked pixels: [T, 2], the sums over views and fragments of the blending
+        weight, and of its square, times the bilinear weight."""
         totals = torch.zeros_like(self.values), torch.zeros_like(self.values)
         for done, view in enumerate(views, start=1):
             lists = fitting_lists(self.projection(view.camera))
@@ -87,7 +87,7 @@ class TuningView:
 
     @property
     def nbytes(self) -> int:
-        """Memory that it takes."""
+        """Count the bytes in memory."""
         arrays = (self.base, self.rest, self.target, self.mask, self.alpha, *self.lists)
         return sum(array.nbytes for array in arrays if array is not None)
 
@@ -122,7 +122,7 @@ class TuningViews(Sequence[TuningView]):
     @torch.no_grad()
     def _traced(self, view: View) -> TuningView:
         scene, projection = self._texels.scene, self._texels.projection(view.camera)
-        # Only the map of beta, which nobody asks for, needs a view's own projection: any will do, and one is kept.
+        # Only the unused beta map needs a view's own projection: one is kept for all.
         self._projection = self._projection or projection
         p, camera = scene.surfels, projection.camera
         base = view_color(scene.view_color, p, p["means"], camera.exact_center, projection.visible)
@@ -146,7 +146,7 @@ class TuningViews(Sequence[TuningView]):
         )
 
     def _chosen(self, projection: Projection, base: Tensor) -> Iterator[tuple[Tensor, Fragments]]:
-        """Band by band the image [h * W, 5] of all fragments, and the fragments that show a texel."""
+        """Yield, per band, the image [h * W, 5] of all fragments, and the fragments that show a texel."""
         for fragments in fitting_lists(projection):
             image = blended_image(fragments, projection, base)
             chosen = select(fragments, fragments.weight >= self._texels.scene.weight_bound)
@@ -154,7 +154,7 @@ class TuningViews(Sequence[TuningView]):
             yield image, chosen
 
     def picture(self, view: TuningView, texels: Tensor, descent: TexelDescent | None = None) -> Tensor:
-        """[H, W, 3] what the photograph would show of these texels, by its correction.
+        """Draw texels with the exposure of the photograph: [H, W, 3].
 
         Args:
             view: of this sequence.
@@ -186,7 +186,7 @@ class TuningViews(Sequence[TuningView]):
 
     @torch.no_grad()
     def psnr(self, texels: Tensor, progress: Progress = no_progress) -> float:
-        """Mean dB over the views of which any pixel counts."""
+        """Average the PSNR, dB, over views with an unmasked pixel."""
         texels = texels.to(self._texels.device)
         pictures = ((self.picture(view, texels), view.target, view.mask) for view in self)
         return evaluate(pictures, len(self), progress)

@@ -99,6 +99,6 @@ def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Seq
 
 
 def _keys(surfels: Mapping[str, Tensor]) -> list[bytes]:
-    """The numbers of every surfel that a bundle holds bit for bit."""
+    """Select the numbers per surfel that a bundle holds bit for bit."""
     parts = [surfels["means"], surfels["log_scales"], surfels["opacity_logits"][:, None], surfels["beta_raw"][:, None]]
     return [row.tobytes() for row in torch.cat(parts, dim=1).numpy()]

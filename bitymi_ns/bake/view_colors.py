@@ -42,7 +42,7 @@ class ColorChoices:
     choices: Sequence[tuple[Tensor, Tensor, Tensor]]
 
     def at(self, lmbda: float | None = None) -> dict[str, Tensor]:
-        """Lean view colours of the least error + lambda bits.
+        """Choose the lean view colours of the least error + lambda x bits.
 
         Args:
             lmbda: squared error per bit, colours from 0 to 1; None = those within the tolerance.
@@ -62,7 +62,7 @@ class ColorChoices:
 
 
 def choice_bytes(kind: str, surfels: int, views: int, most: int) -> int:
-    """Memory of `color_choices`, bytes.
+    """Estimate the memory of `color_choices`, bytes.
 
     Args:
         most: lean terms of a surfel.
@@ -74,7 +74,7 @@ def choice_bytes(kind: str, surfels: int, views: int, most: int) -> int:
 
 
 def shown_at(kind: str, params: Mapping[str, Tensor], directions: Tensor) -> Tensor:
-    """max(f_view + 0.5, 0), the colour that is blended, by the renderers' own kernels: [n, D, 3].
+    """Evaluate the blended colour max(f_view + 0.5, 0) by the renderers' kernels: [n, D, 3].
 
     Args:
         kind: a name of `ops.VIEW_COLORS`.
@@ -87,7 +87,7 @@ def shown_at(kind: str, params: Mapping[str, Tensor], directions: Tensor) -> Ten
 
 
 def centers_of(cameras: Sequence[Camera], like: Tensor) -> Tensor:
-    """[V, 3] float64 centres of the cameras on the device of `like`."""
+    """Stack the camera centres [V, 3] float64 on the device of `like`."""
     centers = [camera.exact_center.double().cpu() for camera in cameras]
     return torch.stack(centers).to(like.device) if centers else torch.zeros(0, 3, dtype=torch.float64)
 
@@ -178,7 +178,7 @@ def color_choices(
 
 
 def _weights(at: Directions, weights: Tensor) -> Tensor:
-    """[n, D] how much an error at each direction counts, of the weights [V, n] of the views."""
+    """Weight an error at each direction, [n, D], by the weights [V, n] of the views."""
     of_views = weights.T.gather(1, at.view) * at.valid[:, : at.views]
     rest = at.valid.shape[1] - at.views
     between = (1 - VIEW_SHARE) * of_views.sum(1, keepdim=True) / max(1, rest)
@@ -186,7 +186,7 @@ def _weights(at: Directions, weights: Tensor) -> Tensor:
 
 
 def _blind(means: Tensor, weights: Tensor, centers: Tensor, near: float) -> tuple[Tensor, Tensor]:
-    """Directions [n, BLIND, 3] from the nearest views that do not show a surfel, and how much each counts: by what the
+    """Find directions [n, BLIND, 3] from the nearest views that do not show a surfel, and their weights: by what the
     views that do show would show from there, by the square of the distance; none from where there is no such view.
     `means` [n, 3], `weights` [V, n] of the views, `centers` [V, 3] float64."""
     offset = means.double()[:, None] - centers.to(means.device)  # [n, V, 3]
@@ -198,8 +198,8 @@ def _blind(means: Tensor, weights: Tensor, centers: Tensor, near: float) -> tupl
 
 
 def _one_color(target: Tensor, valid: Tensor, weight: Tensor, allowed: Tensor) -> Tensor:
-    """[n, 3] the middle of the extremes of colours [n, D, 3] where it is within `allowed` [n] 8-bit steps, else their
-    mean."""
+    """Choose the middle [n, 3] of the extremes of colours [n, D, 3] if it is within `allowed` [n] 8-bit steps, else
+    their mean."""
     low = target.masked_fill(~valid[..., None], torch.inf).amin(1)
     high = target.masked_fill(~valid[..., None], -torch.inf).amax(1)
     weight = weight + LEAST_WEIGHT
@@ -217,8 +217,8 @@ def view_color_errors(
     centers: Tensor,
     opacity: Tensor,
 ) -> Tensor:
-    """Largest error of every surfel's view colour over the directions of `view_directions`, times its largest blending
-    weight, in 8-bit steps: [N].
+    """Measure the largest error of every surfel's view colour over the directions of `view_directions`, times its
+    largest blending weight, in 8-bit steps: [N].
 
     Args:
         full, lean: parameters of N surfels as they were trained, and their lean ones.
@@ -237,8 +237,8 @@ def view_color_errors(
 def reduce_view_colors(
     inputs: BakeInput, options: BakeOptions, progress: Progress = no_progress
 ) -> tuple[dict[str, Tensor], ColorChoices | None, ViewColorError | None]:
-    """Surfels with the view colours that the tolerance keeps, the choices of fewer terms, and the error; without a
-    tolerance all of the view colours."""
+    """Reduce the view colours within the tolerance: the surfels, the choices of fewer terms, and the error. A tolerance
+    of 0 keeps all."""
     surfels, tolerance = dict(inputs.surfels), options.tolerance
     if tolerance == 0:
         return surfels, None, None
@@ -271,12 +271,12 @@ loosely instead of diverging."""
 
 
 def site_weights(vectors: Tensor, directions: Tensor) -> Tensor:
-    """softmax_k(v_k . d): [n, D, K] from [n, K, 3] and [n, D, 3]."""
+    """Compute softmax_k(v_k . d): [n, D, K] from [n, K, 3] and [n, D, 3]."""
     return torch.softmax(directions @ vectors.transpose(1, 2), dim=2)
 
 
 def least_needed(vectors: Tensor, rgb: Tensor, directions: Tensor, weight: Tensor) -> list[Tensor]:
-    """Sites in the order in which they can be done without.
+    """Rank the sites by how little their removal changes the colour.
 
     Without site k the colour changes by w_k / (1 - w_k) (c - rgb_k); the site goes for which the weighted sum of its
     squares is least.
@@ -307,7 +307,7 @@ def least_needed(vectors: Tensor, rgb: Tensor, directions: Tensor, weight: Tenso
 def fewer_sites(
     at: Directions, weight: Tensor, vectors: Tensor, rgb: Tensor
 ) -> Callable[[int, Tensor], tuple[Tensor, Tensor]]:
-    """Fit the sites that are hardest to do without to the colour of all, by Levenberg-Marquardt.
+    """Fit the most needed sites to the colour of all, by Levenberg-Marquardt.
 
     Args:
         weight: [n, D'] of those that `Directions.subset` leaves.

@@ -88,7 +88,7 @@ def _textured(
     pixels_per_texel: float | None,
     progress: Progress,
 ) -> tuple[Tiles, EncodedAtlas | None, Statistics]:
-    """Tiles of a scene with a field, the atlas where any surfel needs one, and the statistics of both."""
+    """Make the tiles of a scene with a field, the atlas if any surfel needs one, and the statistics of both."""
     levels, atlas, errors = None, None, None
     reduces = pixels_per_texel is None and options.tolerance > 0
     if reduces and isinstance(field, HashField):
@@ -127,7 +127,7 @@ def _textured(
 
 
 def _fine_tiles(field: Field, plan: Plan, options: BakeOptions, progress: Progress) -> Tiles:
-    """Tiles of the plan's limits, one for every surfel of which any view shows a residual."""
+    """Make tiles of the plan's limits for every surfel whose residual is visible."""
     reduced, done = Reduced(torch.zeros(len(plan), 2, dtype=torch.int32), torch.zeros(len(plan), 3)), 0
     for part in references(field, plan, options.chunk):
         reduced.sizes[part.rows.cpu()] = torch.tensor(part.size, dtype=torch.int32)

@@ -24,7 +24,7 @@ class TileErrors:
     shown: Tensor  # [N] bool, whether any fragment of the surfel gets a residual; the errors are 0 elsewhere
 
     def summary(self, tolerance: float) -> TileError:
-        """Percentiles over the surfels that get a residual at all, and the tolerance that was asked for."""
+        """Compute percentiles over the surfels with a residual."""
         unit = "8-bit steps, weighted by the blending weight; stored atlas against field"
         rms, largest = (
             Percentiles.of(values[self.shown] if self.shown.any() else torch.zeros(1))
@@ -33,7 +33,7 @@ class TileErrors:
         return TileError(tolerance=tolerance, unit=unit, rms=rms, largest=largest)
 
     def certificate(self, tolerance: float) -> Certificate | None:
-        """Certificate of these surfels; None without a tolerance."""
+        """Certify these surfels; None without a tolerance."""
         return Certificate.of(self.seen[self.shown], tolerance, "field") if tolerance else None
 
 

@@ -26,7 +26,7 @@ def level_changes(
     transmittance: Tensor | None = None,
     weight_bound: float = 0.0,
 ) -> Tensor:
-    """Change of every surfel's residual when the features of some levels are 0, in 8-bit steps.
+    """Measure every surfel's change of residual without some levels, 8-bit steps.
 
     Root mean square over points of the kernel's support (even over the disc, the same for every surfel) and the
     channels, of the change times the largest blending weight there: the measure of the tiles' tolerance. Points whose

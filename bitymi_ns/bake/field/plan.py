@@ -48,7 +48,7 @@ class Plan(TileVisibility):
 
 
 def make_plan(inputs: BakeInput, field: Field, options: BakeOptions, whole: bool = False) -> Plan:
-    """Extents and grids of all tiles.
+    """Plan the extents and grids of all tiles.
 
     Args:
         inputs: surfels that are all finite and drawable, and the training views, for the cap and the weights.
@@ -89,7 +89,7 @@ def make_plan(inputs: BakeInput, field: Field, options: BakeOptions, whole: bool
 
 
 def paper_texels(surfels: Mapping[str, Tensor], field: Field, options: BakeOptions) -> int:
-    """Number of texels by the paper's rule: the smallest voxel size everywhere, and tiles of extent 4.
+    """Count the texels by the paper's rule: the smallest voxel size everywhere, and tiles of extent 4.
 
     Args:
         surfels: means [N, 3], log_scales [N, 2] of all surfels that can be drawn.
@@ -101,7 +101,7 @@ def paper_texels(surfels: Mapping[str, Tensor], field: Field, options: BakeOptio
 
 
 def _texels(sizes: Tensor) -> int:
-    """Texels of all tiles of sizes [N, 2]."""
+    """Count the texels of tiles of sizes [N, 2]."""
     return int(sizes.long().prod(1).sum())
 
 

@@ -40,8 +40,7 @@ class PolishOptions(TuneOptions):
     """Rates of the surfels, as a share of those of a training run of as many steps; they fall to 0 as a cosine."""
     checks: PositiveCount = 10
     pixels_per_texel: Positive = 0.25
-    """A tile starts with at most a texel for so many pixels that its surfel makes up of the view that shows most of
-    it."""
+    """A tile starts with at most one texel per this number of pixels in the view that shows most of its surfel."""
 
 
 class _Polish:
@@ -75,13 +74,13 @@ class _Polish:
         self.train, self.factor = train, 1.0
 
     def shown(self, view: View, background: Tensor | None) -> Tensor:
-        """[H, W, 3] the scene as a view's photograph shows it, over a colour [3]."""
+        """Draw a view with the exposure of its photograph over a colour [3]: [H, W, 3]."""
         output = self.scene.render(view.camera, background)
         return view.shown(output.rgb, output.alpha, background)
 
     @torch.no_grad()
     def psnr(self, views: Sequence[View], progress: Progress = no_progress) -> float:
-        """Mean dB over the views of which any pixel counts."""
+        """Average the PSNR, dB, over views with an unmasked pixel."""
         pictures = (
             (self.shown(view, self.background), view.target(self.background, self.device), view.mask)
             for view in (view.to(self.device) for view in views)
@@ -89,7 +88,7 @@ class _Polish:
         return evaluate(pictures, len(views), progress)
 
     def step(self, number: int, view: View, share: Tensor) -> bool:
-        """A step on one view; False = it is not finite, and was not done."""
+        """Step on one view; returns False, without a step, if it is not finite."""
         options, view = self.options, view.to(self.device)
         for name, optimizer in self.optimizers.items():
             set_rate(optimizer, self.factor * falling(self.schedule.lr(name, 0), number, options.steps))
@@ -111,7 +110,7 @@ class _Polish:
         return True
 
     def state(self) -> dict[str, Any]:
-        """Copy of the parameters."""
+        """Copy the parameters."""
         return {name: value.detach().clone() for name, value in self.scene.state_dict().items()}
 
     def go_back(self, state: dict[str, Any]) -> None:
@@ -177,7 +176,7 @@ def polish_scene(
 def _optimise(
     run: _Polish, views: Sequence[View], validation: Sequence[View], progress: Progress
 ) -> EarlyStopping[dict[str, Any]]:
-    """The state that shows the validation views best, and the evaluations."""
+    """Find the state that shows the validation views best; also returns the evaluations."""
     options = run.options
     before = run.psnr(validation, progress)
     stopping = EarlyStopping(options.steps, options.checks, options.patience, before, run.state())

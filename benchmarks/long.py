@@ -27,6 +27,7 @@ from zlib import crc32
 import torch
 import yaml
 from common import arguments_of, number, page, publish, say, table
+from matplotlib.figure import Figure
 from plain_capture import Capture, load_capture
 from torch import Tensor
 
@@ -37,6 +38,7 @@ from bitymi_ns.measure.bench.cells import FILE, Cells, identity, provenance, wit
 from bitymi_ns.measure.machine import commit
 from bitymi_ns.ops import ssim
 from bitymi_ns.plugin.run.metrics import lpips_metrics
+from bitymi_ns.scene import Scene
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.init import scene_for_views
@@ -82,12 +84,14 @@ class Run:
     bake: bool
     align: bool
     device: str
-    keep: Path | None = None  # folder to keep the bundle in
+    megabytes: tuple[float, ...] = ()  # sizes of further bundles
+    keep: Path | None = None  # folder to keep the bundles in
 
     @property
     def key(self) -> dict[str, Any]:
-        names = ("steps", "reduction", "seed", "photographs", "bake", "align")
-        settings = {name: getattr(self, name) for name in names} | {"device": device_name(self.device)}
+        names = ("steps", "reduction", "seed", "photographs", "bake", "align", "megabytes")
+        settings = {name: getattr(self, name) for name in names if name != "megabytes" or self.megabytes}
+        settings |= {"device": device_name(self.device)}
         return {**settings, "data": Path(self.data).resolve().name, "settings": self.row, "commit": commit()}
 
 
@@ -212,19 +216,31 @@ def measure(run: Run) -> dict[str, Any]:
         found["peak_megabytes"] = torch.cuda.max_memory_allocated(device) / 1e6
     if run.bake:
         say(f"PSNR {found['psnr']:.2f} dB, {len(scene):,} surfels; baking")
-        with tempfile.TemporaryDirectory() as folder:
-            bundle = (run.keep or Path(folder)) / f"{'-'.join(shlex.split(run.row))}-{run.steps}-{run.seed}"
-            start = time.perf_counter()
-            poses = trainer.training.poses
-            views = [view._replace(camera=poses.of(i, view.camera)) for i, view in enumerate(capture.train)]
-            bake_scene(scene, views, bundle, background=background, overwrite=True)
-            found["bake_seconds"] = time.perf_counter() - start
-            found["kilobytes"] = sum(path.stat().st_size for path in bundle.iterdir()) / 1e3
-            baked = read_bundle(bundle).scene.to(device)
-            drawn = (baked.render(view.camera.to(device), background).rgb for view in capture.held_out)
-            figures = means([quality(*pair) for pair in zip(drawn, targets, strict=True)])
-            found |= {f"baked_{name}": value for name, value in figures.items()}
+        poses = trainer.training.poses
+        views = [view._replace(camera=poses.of(i, view.camera)) for i, view in enumerate(capture.train)]
+        default, *others = (
+            bundle(run, scene, views, capture.held_out, background, size) for size in (None, *run.megabytes)
+        )
+        found |= {"bake_seconds": default["seconds"], "kilobytes": default["kilobytes"]}
+        found |= {f"baked_{name}": default[name] for name in ("psnr", "ssim", "lpips")}
+        found["curve"] = sorted([default, *others], key=lambda point: point["kilobytes"])
     return found
+
+
+def bundle(
+    run: Run, scene: Scene, views: Sequence[View], held_out: Sequence[View], background: Tensor, megabytes: float | None
+) -> dict[str, float]:
+    """Bake a bundle and compare it with the held-out photographs."""
+    name = f"{'-'.join(shlex.split(run.row))}-{run.steps}-{run.seed}"
+    with tempfile.TemporaryDirectory() as folder:
+        path = (run.keep or Path(folder)) / (name if megabytes is None else f"{name}-{megabytes:g}MB")
+        start = time.perf_counter()
+        bake_scene(scene, views, path, background=background, overwrite=True, target_mb=megabytes)
+        found = {"seconds": time.perf_counter() - start}
+        found["kilobytes"] = sum(file.stat().st_size for file in path.iterdir()) / 1e3
+        baked = read_bundle(path).scene.to(background.device)
+    pairs = ((baked.render(v.camera.to(background.device), background).rgb, v) for v in held_out)
+    return found | means([quality(rgb, view.target(background, background.device)) for rgb, view in pairs])
 
 
 def tables(runs: Sequence[Run], cells: Cells) -> str:
@@ -249,10 +265,29 @@ def tables(runs: Sequence[Run], cells: Cells) -> str:
     return "\n\n".join(parts)
 
 
+def draw_curves(runs: Sequence[Run], cells: Cells) -> Figure:
+    """Plot PSNR and LPIPS of the bundles of every run against their bytes; dashes: before the bake."""
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    for axes, name, label in zip(figure.subplots(1, 2), ("psnr", "lpips"), ("PSNR (dB)", "LPIPS"), strict=True):
+        for i, run in enumerate(runs):
+            value, color = cells.get(run.key)["value"], f"C{i}"
+            points = value["curve"]
+            title = f"{Path(run.data).name}, {run.steps:,} steps, {value.get('width')} x {value.get('height')}"
+            axes.plot(*zip(*((p["kilobytes"] / 1e3, p[name]) for p in points), strict=True), "o-", label=title)
+            axes.axhline(value[name], color=color, linestyle="--", linewidth=0.8)
+        axes.set(xlabel="MB, all files", ylabel=label, xscale="log")
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter("{x:g}")
+        axes.grid(alpha=0.3, which="both")
+    axes.legend()
+    return figure
+
+
 def main() -> None:
     arguments = read_arguments()
     torch.set_num_threads(1)
-    rest = (arguments.bake or arguments.keep is not None, arguments.align, arguments.device, arguments.keep)
+    baked = arguments.bake or arguments.keep is not None or bool(arguments.megabytes)
+    rest = (baked, arguments.align, arguments.device, tuple(arguments.megabytes), arguments.keep)
     runs = [
         Run(str(data), row, *(int(x) for x in run.split("/")), seed, arguments.photographs, *rest)
         for data, run, row, seed in itertools.product(arguments.data, arguments.runs, arguments.rows, arguments.seeds)
@@ -273,6 +308,8 @@ def main() -> None:
             say(", ".join(f"{name} {value[of]:.4g}" for name, (of, _) in COLUMNS.items() if of in value))
     cells.refresh()
     publish(page("Long and short runs", tables(runs, cells)), arguments.output)
+    if arguments.plot is not None:
+        draw_curves(runs, cells).savefig(arguments.plot, dpi=110)
 
 
 def read_arguments() -> Namespace:
@@ -284,6 +321,8 @@ def read_arguments() -> Namespace:
     parser.add_argument("--photographs", type=int, default=0, help="train on so many photographs only; 0 = all")
     parser.add_argument("--bake", action="store_true", help="also bake: bytes, and quality of the bundle")
     parser.add_argument("--keep", type=Path, help="bake, and keep the bundles in this folder")
+    parser.add_argument("--megabytes", nargs="+", type=float, default=[], help="bake bundles of these sizes, too")
+    parser.add_argument("--plot", type=Path, help="plot quality against the sizes of the bundles, a PNG file")
     parser.add_argument("--align", action="store_true", help="align held-out poses of rows without refinement, too")
     parser.add_argument("--device", default="cpu", help="cpu or cuda (%(default)s)")
     parser.add_argument("--work", type=Path, default=Path("outputs/long"), help="folder of the finished runs")

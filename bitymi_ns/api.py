@@ -210,6 +210,7 @@ def bake_scene(
     background: Tensor | None = None,
     overwrite: bool = False,
     options: BakeOptions | None = None,
+    target_mb: float | None = None,
 ) -> Bundle:
     """Bake a trained scene to a bundle, as `ns-export bitymi-atlas` does, and read it back.
 
@@ -221,6 +222,7 @@ def bake_scene(
         overwrite: replace an existing bundle.
         options: format of the bundle (compact, bc7, uint8 or fp16), tolerance, tiles and others, see `BakeOptions`;
             None: its defaults, a compact bundle.
+        target_mb: limit of all files of a compact bundle, in MB (10^6 bytes); None: the default precision.
 
     Returns:
         The bundle as read from the folder, with the cameras of the views.
@@ -236,11 +238,15 @@ def bake_scene(
     options = options or BakeOptions()
     options.check()
     check_target(folder, overwrite)
-    compact = Compact() if options.bundle_format == "compact" else None
-    refine = RefineOptions.for_scene(scene, len(views), compact=compact)
     cameras = [view.camera for view in views]
-    baked = bake(scene, cameras, views, background, options, refine)
     listed = cameras_data(CapturedCamera.of(f"{i:04d}", camera, False) for i, camera in enumerate(cameras))
+    compact = Compact() if options.bundle_format == "compact" else None
+    if target_mb is not None:
+        if compact is None:
+            raise ValueError(f"target_mb is for compact bundles, and this one's format is {options.bundle_format}")
+        compact = compact.fitting(target_mb, len(listed))
+    refine = RefineOptions.for_scene(scene, len(views), compact=compact)
+    baked = bake(scene, cameras, views, background, options, refine)
     where = {"first": cameras[0], "extra_files": {CAMERAS: listed}, "overwrite": overwrite}
     export(baked, folder, background=background.tolist(), **where)
     return read_bundle(folder)

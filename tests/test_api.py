@@ -222,6 +222,14 @@ def test_bundles_of_every_format_with_their_cameras(room: Path, tmp_path: Path) 
         assert options is None or options.format in (None, baked.info.atlas.format)
         assert len(baked.cameras) == len(views) and not any(row.held_out for row in baked.cameras)
         assert all(torch.equal(row.camera.K, v.camera.K) for row, v in zip(baked.cameras, views, strict=True))
+    bitymi_ns.bake_scene(scene, views, tmp_path / "small", target_mb=0.05)
+    assert sum(path.stat().st_size for path in (tmp_path / "small").iterdir()) <= 50_000
+    for most, options, message in (
+        (0.05, BakeOptions(format="bc7"), "target_mb is for compact bundles, and this one's format is bc7"),
+        (0.01, None, "a bundle of 0.01 MB leaves no bytes for the scene"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            bitymi_ns.bake_scene(scene, views, tmp_path / "smaller", options=options, target_mb=most)
     for options, message in (
         (BakeOptions(format="webp"), "no format 'webp': choose among compact, bc7, uint8, fp16"),
         (BakeOptions(format="compact", tolerance=0.0), "compact bundle needs a tolerance"),

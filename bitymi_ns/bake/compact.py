@@ -12,6 +12,7 @@ from bitymi_ns.bake.precision import PER_BIT, Pictures, column_noise
 from bitymi_ns.bake.state import BakeState, joined
 from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bake.tuning_views import TexelList
+from bitymi_ns.bundle.poster import most_bytes as poster_bytes
 from bitymi_ns.bundle.statistics import Rounding, ViewColorError
 from bitymi_ns.codec import streams
 from bitymi_ns.codec.surfel_codes import code_surfels
@@ -34,6 +35,7 @@ TEXEL_SHARE = 0.5  # lambda of the texels, which are tuned after it, as a share 
 ENOUGH = 0.002
 """Share of the error (0.009 dB) that may be added even where a size is asked for: finer is not worth bytes."""
 LEAST_ERROR = 1e-7  # mean square error that is always allowed, of colours from 0 to 1: 70 dB
+MANIFEST_BYTES = 28_000  # upper estimate of bundle.json and config.yml
 LEAST_TEXEL_BYTES = 1000  # that are left for the texels where a size is asked for
 _SEARCH = 7
 _CPU = torch.device("cpu")
@@ -57,6 +59,19 @@ class Compact:
     most_bytes: int | None = None
     psnr: float | None = None
     views: int = 8
+
+    def fitting(self, megabytes: float, beside: int) -> "Compact":
+        """Limit all files to `megabytes` (10^6 bytes), of which others than surfels, texels, poster, bundle.json and
+        config.yml take `beside` bytes.
+
+        Raises:
+            ValueError: nothing is left for surfels and texels.
+        """
+        size = int(1e6 * megabytes)
+        beside += MANIFEST_BYTES + poster_bytes(size)
+        if size <= beside:
+            raise ValueError(f"a bundle of {megabytes:g} MB leaves no bytes for the scene: other files take {beside:,}")
+        return replace(self, most_bytes=size - beside)
 
     def check(self) -> None:
         """Check the values."""

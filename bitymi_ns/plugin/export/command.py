@@ -16,7 +16,6 @@ from bitymi_ns.bundle import BundleError, read_bundle
 from bitymi_ns.bundle.bake_options import BundleFormat
 from bitymi_ns.bundle.manifest import MANIFEST, dump
 from bitymi_ns.bundle.parts import CONFIG
-from bitymi_ns.bundle.poster import most_bytes
 from bitymi_ns.bundle.read import download_bytes
 from bitymi_ns.files import reason, write_file
 from bitymi_ns.interchange import Frame, Kind, check_extras, extras_folder, summary_line, write_extras
@@ -30,7 +29,6 @@ from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.exposure import corrected
 
 _MUCH_SMALLER = 0.9
-MANIFEST_BYTES = 28_000  # upper estimate of bundle.json and config.yml
 
 
 @dataclass(kw_only=True)
@@ -71,14 +69,11 @@ class CompactOptions:
 
     def compact_of(self, beside: int) -> Compact:
         """Make options of the compact bake; `beside`: bytes of other files, such as the preview."""
-        most = None
-        if self.target_mb is not None:
-            beside += MANIFEST_BYTES + most_bytes(int(1e6 * self.target_mb))
-            most = int(1e6 * self.target_mb) - beside
-            if most < 1:
-                others = f"as other files take {beside:,}: ask for more (--target-mb)"
-                fail(f"a bundle of {self.target_mb} MB leaves no bytes for the scene, {others}")
-        return Compact(self.compact_error, most, self.target_psnr)
+        compact = Compact(self.compact_error, psnr=self.target_psnr)
+        try:
+            return compact if self.target_mb is None else compact.fitting(self.target_mb, beside)
+        except ValueError as error:
+            fail(f"{error}; ask for more (--target-mb)", error)
 
 
 @dataclass(kw_only=True)

@@ -36,7 +36,6 @@ ENOUGH = 0.002
 """Share of the error (0.009 dB) that may be added even where a size is asked for: finer is not worth bytes."""
 LEAST_ERROR = 1e-7  # mean square error that is always allowed, of colours from 0 to 1: 70 dB
 MANIFEST_BYTES = 28_000  # upper estimate of bundle.json and config.yml
-LEAST_TEXEL_BYTES = 1000  # that are left for the texels where a size is asked for
 _SEARCH = 7
 _CPU = torch.device("cpu")
 
@@ -215,10 +214,10 @@ def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> 
             coder, lambda point: 0.0 if point.bytes > most or point.error <= enough else math.inf, progress
         )
         found = more if more.bytes <= most else less
-        if found.baked.codes.surfels.nbytes() + LEAST_TEXEL_BYTES > options.most_bytes:
+        if found.bytes > options.most_bytes:
             raise ValueError(
-                f"{options.most_bytes:,} bytes are too few for {len(found.baked.rows):,} surfels, which take "
-                f"{found.baked.codes.surfels.nbytes():,}: ask for more, or train with fewer surfels"
+                f"{options.most_bytes:,} bytes are too few for {len(found.baked.rows):,} surfels, which take at least "
+                f"{found.bytes:,} with their texels: ask for more, or train with fewer surfels"
             )
     elif not coder.measured:
         found = coder.at(START)

@@ -3,6 +3,8 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -105,6 +107,15 @@ def test_surfels_and_texels_fit_into_the_bytes_there_are(truth: BakeState, views
         assert (0.93 if fill else 0.5) * most < size <= most
     with pytest.raises(ValueError, match="are too few for 60 surfels"):
         compacted(truth, views, BACKGROUND, Compact(most_bytes=300))
+
+
+def test_a_size_that_the_coarsest_texels_exceed_is_refused() -> None:
+    surfels = SimpleNamespace(nbytes=lambda: 1000)
+    baked = SimpleNamespace(rows=range(60), codes=SimpleNamespace(surfels=surfels))
+    point = SimpleNamespace(bytes=5000, error=0.1, baked=baked, coding=None)
+    coder: Any = SimpleNamespace(measured=True, allowed=lambda share: 0.01, at=lambda lmbda: point)
+    with pytest.raises(ValueError, match=r"3,000 bytes are too few for 60 surfels, which take at least 5,000"):
+        choose(coder, Compact(most_bytes=3000))
 
 
 def test_bytes_that_buy_nothing_are_not_spent(truth: BakeState, views: list[View]) -> None:

@@ -8,6 +8,8 @@ const MOST_BITS = 52; // of a magnitude
 const MOST_THRESHOLDS = 7;
 const ORDERS = 3; // kinds of contexts
 const LEVEL_BOUNDS = [3, 7, 13, 21, 32, 56, 96]; // of 16 times the running mean of magnitudes
+// Context of a running mean up to the last bound.
+const LEVELS = Uint8Array.from({ length: 97 }, (_, mean) => 1 + LEVEL_BOUNDS.filter((bound) => mean >= bound).length);
 const OTHERS = 3; // values of `others`
 
 class Bytes {
@@ -42,29 +44,27 @@ class Bytes {
   }
 }
 
-// By slot: its token, the token's frequency, and the slot's index among the token's.
+// By slot: its token, and 2^12 times the token's frequency, plus the slot's index among the token's.
 interface Table {
   tokens: Uint16Array;
-  frequencies: Uint16Array;
-  offsets: Uint16Array;
+  steps: Uint32Array;
 }
 
 function readTable(bytes: Bytes, most: number): Table | null {
   const count = bytes.number(most);
-  const [tokens, frequencies, offsets] = [0, 1, 2].map(() => new Uint16Array(count ? TOTAL : 0));
+  const [tokens, steps] = [new Uint16Array(count ? TOTAL : 0), new Uint32Array(count ? TOTAL : 0)];
   let first = 0;
   for (let token = 0; token < count; token++) {
     const frequency = bytes.number(TOTAL);
     const zeros = frequency ? 0 : bytes.number(most);
     if (first + frequency > TOTAL || token + zeros >= count) throw new Error('a table is too long');
     tokens.fill(token, first, first + frequency);
-    frequencies.fill(frequency, first, first + frequency);
-    for (let k = 0; k < frequency; k++) offsets[first + k] = k;
+    for (let k = 0; k < frequency; k++) steps[first + k] = frequency * TOTAL + k;
     first += frequency;
     token += zeros;
   }
   if (count && first !== TOTAL) throw new Error('a table is incomplete');
-  return count ? { tokens, frequencies, offsets } : null;
+  return count ? { tokens, steps } : null;
 }
 
 // Decodes a number of every row of a column into `codes`. blocks: rows are coefficients of so many blocks, 0 = they are
@@ -107,8 +107,7 @@ export function decodeIntegers(
     let context = 0;
     if (order && blocks) {
       if (i >= blocks) {
-        const mean = means[block];
-        for (context = 1; context < 8 && mean >= LEVEL_BOUNDS[context - 1];) context++;
+        context = LEVELS[Math.min(means[block], LEVELS.length - 1)];
       }
       if (order === 2) context = OTHERS * context + others![i];
     } else if (order) {
@@ -119,7 +118,8 @@ export function decodeIntegers(
     if (!table) throw new Error('a table is missing');
     const slot = state & (TOTAL - 1);
     const token = table.tokens[slot];
-    state = table.frequencies[slot] * (state >>> PRECISION) + table.offsets[slot];
+    const step = table.steps[slot];
+    state = (step >>> PRECISION) * (state >>> PRECISION) + (step & (TOTAL - 1));
     while (state < LOWEST) {
       if (at === coded.length) throw new Error('it ends early');
       state = (state << 8) | coded[at++];

@@ -78,7 +78,8 @@ def _view(source: tuple[Photograph, Lens]) -> View:
     mask = None if photograph.mask is None else checked_mask(photograph.mask)
     whole = mask is None and lens.whole
     counts = None if whole else torch.from_numpy(np.array(lens.undistort_mask(mask, photograph.mask)))
-    return View(Camera(viewmat, K, to.width, to.height), torch.from_numpy(pixels_of(image)), counts)
+    camera = Camera(viewmat, K, to.width, to.height)
+    return View(camera, torch.from_numpy(pixels_of(image)), counts, file=photograph.file)
 
 
 def rasterize(
@@ -215,7 +216,7 @@ def bake_scene(
 
     Args:
         scene: of `train_scene`, with any texture.
-        views: the training photographs, on which texels are fine-tuned.
+        views: the training photographs, on which texels are fine-tuned, with their `correction` if any.
         folder: of the bundle, complete or absent.
         background: [3] color behind the scene; None: black.
         overwrite: replace an existing bundle.
@@ -240,7 +241,7 @@ def bake_scene(
     learning = Learning.of_scene(scene, len(views), compact=compact)
     cameras = [view.camera for view in views]
     baked = bake_and_learn(scene, cameras, views, background, options, learning)
-    listed = cameras_data(CapturedCamera.of(f"{i:04d}", camera, False) for i, camera in enumerate(cameras))
-    where = {"first": cameras[0], "extra_files": {CAMERAS: listed}, "overwrite": overwrite}
+    rows = [CapturedCamera.of(f"{i:04d}", v.camera, False, correction=v.correction) for i, v in enumerate(views)]
+    where = {"first": cameras[0], "extra_files": {CAMERAS: cameras_data(rows)}, "overwrite": overwrite}
     export(baked, folder, background=background.tolist(), **where)
     return read_bundle(folder)

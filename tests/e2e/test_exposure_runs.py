@@ -11,10 +11,12 @@ from nerfstudio.scripts import train as ns_train
 from PIL import Image
 
 from bitymi_ns.bake import pipeline
+from bitymi_ns.bundle.parts import CAMERAS
 from bitymi_ns.plugin.export.command import ExportAtlas
 from bitymi_ns.plugin.run.callbacks import FILE
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from bitymi_ns.sample import generate
+from tests.e2e.exports import evaluate
 from tests.e2e.runs import checkpoint, different
 
 Start = Callable[..., BitymiTrainerConfig]
@@ -22,9 +24,9 @@ Start = Callable[..., BitymiTrainerConfig]
 
 @pytest.fixture
 def uneven(tmp_path: Path) -> Path:
-    """The room with every other photograph darkened to 0.7."""
+    """The room with the second half of the photographs darkened to 0.7."""
     folder = generate(tmp_path / "uneven", views=12, width=48, height=36, seed=0, points=200)
-    for path in sorted((folder / "images").iterdir())[::2]:
+    for path in sorted((folder / "images").iterdir())[6:]:
         Image.open(path).point(lambda value: round(0.7 * value)).save(path)
     return folder
 
@@ -43,7 +45,7 @@ def test_a_resumed_run_goes_on_with_its_corrections(
     assert table.shape == (10, 3) and table.abs().max() > 0.02
     torch.testing.assert_close(table.mean(0), torch.zeros(3), atol=1e-6, rtol=0)
     last = json.loads((whole.get_base_dir() / FILE).read_text().splitlines()[-1])
-    assert last["fitted_psnr"] > last["psnr"]
+    assert last["fitted_psnr"] > last["psnr"] and last["exposed_psnr"] > last["psnr"]
 
     resumed = start(data=uneven, name="resumed")
     resumed.pipeline.model.train.exposure = "gain"
@@ -67,3 +69,15 @@ def test_a_resumed_run_goes_on_with_its_corrections(
     assert held_out["fitted_psnr_neural_against_photos"] > held_out["psnr_neural_against_photos"]
     assert held_out["fitted_psnr_baked_against_photos"] > held_out["psnr_baked_against_photos"]
     assert "after a fit of the colours" in " ".join(capsys.readouterr().out.split())
+
+    # of the held-out photographs, the first has one neighbour
+    rows = json.loads((tmp_path / "bundle" / CAMERAS).read_text())["cameras"]
+    found = torch.tensor([row["correction"] for row in rows]).log()
+    expected = torch.cat([table, table[:1], 0.5 * (table[6:7] + table[7:8])])
+    torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
+    of_run, of_bundle = (
+        evaluate(folder / "config.yml", tmp_path / "results.json")
+        for folder in (whole.get_base_dir(), tmp_path / "bundle")
+    )
+    assert of_run["exposed_psnr"] == pytest.approx(last["exposed_psnr"], abs=0.01)
+    assert of_bundle["exposed_psnr"] > of_bundle["psnr"] and of_bundle["exposed_ssim"] > 0

@@ -8,7 +8,7 @@ from bitymi_ns.capture.order import Neighbours
 
 FILES = [
     *("a/IMG_9.JPG", "a/IMG_10.jpg", "a/img_14.jpg", "b/IMG_11.jpg", "a/0002_left.png", "a/0004_left.png"),
-    *("a/0002_right.png", "a/20260101_115958.jpg", "a/20260101_120000.jpg", "a/20260102_000000.jpg", "a/door.jpg"),
+    *("a/0002_right.png", "a/20260101_120000.jpg", "a/20260101_120004.jpg", "a/20260102_000000.jpg", "a/door.jpg"),
 ]
 
 
@@ -23,7 +23,7 @@ FILES = [
         ("b/IMG_1.jpg", (3, 3, 0.0)),
         ("a/0003_left.png", (4, 5, 0.5)),  # not between the cameras of a rig
         ("a/0003_right.png", (6, 6, 0.0)),
-        ("a/20260101_115959.jpg", (7, 8, 0.5)),
+        ("a/20260101_120001.jpg", (7, 8, 0.25)),
         ("a/20260101_235959.jpg", (8, 9, 0.0)),  # by the first number that differs
         ("a/door.jpg", (10, 10, 0.0)),
         ("a/hall.jpg", None),

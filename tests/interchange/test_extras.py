@@ -172,7 +172,7 @@ ROW = b"""{"cameras": [{"name": "a", "held_out": true, "width": 8, "height": 6, 
         (b'{"cameras": [{"name": "a", "held_out": true, "width": 0}]}', "width"),
         (ROW % b"[1, 1, 1, 1]", "cameras.0.correction: .*must be 3 or 12 numbers, not 4"),
         (ROW % b"[1, 1, NaN]", "NaN"),
-        (ROW % b"[1, 1, 1e999]", "correction.2"),
+        (ROW % b"[1, 1, 1e999]", "1e999 is not a finite number"),
         (ROW % b"[1, 1, 2e9]", "correction.2"),
     ],
 )

@@ -102,6 +102,7 @@ CURVE_COLUMNS = (
     Column("Seconds", "seconds", significant),
     Column("CPU seconds", "cpu_seconds", significant),
     Column("Last PSNR", "psnr", "{:.2f}".format),
+    Column("Last PSNR exposed", "exposed_psnr", "{:.2f}".format),
     Column("Last PSNR fitted", "fitted_psnr", "{:.2f}".format),
     Column("Points", "surfels", count),
     Column("Fragments", "fragments", count),

@@ -2,8 +2,8 @@
 
 A photograph maps the scene's colour c to gain c, with a gain per channel, or to matrix c + offset. Corrections are
 relative to the mean photograph: after every step log gains and other entries are shifted to sum to zero over the
-photographs, so that they do not tint the scene, and are not part of it: a free camera shows the mean exposure, one of a
-photograph that was not trained on what `Exposure.at` interpolates.
+photographs, so that they do not tint the scene. They are not part of the scene: a free camera shows the mean exposure, and
+`Exposure.at` interpolates that of a held-out photograph.
 
 Gains are initialised from the colours of the sparse points. In logarithms, observation = point + photograph, solved by
 alternating medians (median polish), which are robust to highlights, occluders and wrong points. Points occluded by

@@ -2,7 +2,7 @@
 
 A photograph maps the scene's colour c to gain c, with a gain per channel, or to matrix c + offset. Corrections are
 relative to the mean photograph: after every step log gains and other entries are shifted to sum to zero over the
-photographs, so that they do not tint the scene. They are not part of the scene: a free camera shows the mean exposure, and
+photographs, so that they do not tint the scene. They are not part of the scene: a free camera shows the mean exposure;
 `Exposure.at` interpolates that of a held-out photograph.
 
 Gains are initialised from the colours of the sparse points. In logarithms, observation = point + photograph, solved by

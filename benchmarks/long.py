@@ -40,17 +40,19 @@ from bitymi_ns.ops import ssim
 from bitymi_ns.plugin.run.metrics import lpips_metrics
 from bitymi_ns.scene import Scene
 from bitymi_ns.train.evaluate import evaluate
+from bitymi_ns.train.exposure import corrected
 from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.init import scene_for_views
 from bitymi_ns.train.losses import fitted_psnr, photometric, psnr
 from bitymi_ns.train.preset import Loader, Preset, load_preset
-from bitymi_ns.train.views import View, eval_background, spread
+from bitymi_ns.train.views import View, eval_background, shown, spread
 
 RUNS = ("10000/4", "1500/2", "300/1")
 WATCHED, EVERY, WATCH = 8, 30, 300
 """Number of training views whose loss is monitored when the texel stage begins, interval in steps, and duration."""
 COLUMNS = {
     "PSNR": ("psnr", 2),
+    "exposed": ("exposed_psnr", 2),
     "fitted": ("fitted_psnr", 2),
     "carried": ("carried_psnr", 2),
     "refined": ("refined_psnr", 2),
@@ -189,21 +191,24 @@ def measure(run: Run) -> dict[str, Any]:
     )
     trainer = Trainer(scene, capture.train, preset.train, run.steps)
     watch, clock, before = TexelWatch(trainer, capture.train), trainer.training.clock, math.nan
-    shown = {run.steps * i // 20 for i in range(1, 20)}
+    told = {run.steps * i // 20 for i in range(1, 20)}
     while trainer.step < run.steps:
         if trainer.step == trainer.training.schedule.texels_start:
             before = evaluate(scene, capture.held_out, preset.train).psnr
         watch.note()
         trainer.advance()
-        if trainer.step in shown:
+        if trainer.step in told:
             say(f"step {trainer.step:,}: loss {trainer.loss:.4f}, {len(scene):,} surfels, {clock.cpu_seconds:.0f} s")
     background = eval_background(preset.train, device)
     targets = [view.target(background, device) for view in capture.held_out]
-    rows = []
+    rows, exposure = [], trainer.training.exposure
     for view, target in zip(capture.held_out, targets, strict=True):
         with torch.no_grad():
             output = scene.render(view.camera.to(device), background, "frozen")
         rows.append(quality(output.rgb, target) | {"fragments": len(output.fragments) / (target.numel() / 3)})
+        if exposure.table is not None:
+            rgb = shown(output.rgb, exposure.at(view.file), output.alpha, background)
+            rows[-1]["exposed_psnr"] = psnr(rgb.clamp(0.0, 1.0), target)
     found = means(rows) | watch.figures()
     if run.align or trainer.training.poses.refined:
         judged = evaluate(scene, capture.held_out, preset.train, trainer.training.poses)
@@ -218,6 +223,7 @@ def measure(run: Run) -> dict[str, Any]:
         say(f"PSNR {found['psnr']:.2f} dB, {len(scene):,} surfels; baking")
         poses = trainer.training.poses
         views = [view._replace(camera=poses.of(i, view.camera)) for i, view in enumerate(capture.train)]
+        views = corrected(views, exposure.state_dict(), [view.file for view in views])
         default, *others = (
             bundle(run, scene, views, capture.held_out, background, size) for size in (None, *run.megabytes)
         )

@@ -78,7 +78,8 @@ def _view(source: tuple[Photograph, Lens]) -> View:
     mask = None if photograph.mask is None else checked_mask(photograph.mask)
     whole = mask is None and lens.whole
     counts = None if whole else torch.from_numpy(np.array(lens.undistort_mask(mask, photograph.mask)))
-    return View(Camera(viewmat, K, to.width, to.height), torch.from_numpy(pixels_of(image)), counts)
+    camera = Camera(viewmat, K, to.width, to.height)
+    return View(camera, torch.from_numpy(pixels_of(image)), counts, file=photograph.file)
 
 
 def rasterize(
@@ -216,7 +217,7 @@ def bake_scene(
 
     Args:
         scene: of `train_scene`, with any texture.
-        views: the training photographs, on which texels are fine-tuned.
+        views: the training photographs, on which texels are fine-tuned, with their `correction` if any.
         folder: of the bundle, complete or absent.
         background: [3] color behind the scene; None: black.
         overwrite: replace an existing bundle.
@@ -239,7 +240,8 @@ def bake_scene(
     options.check()
     check_target(folder, overwrite)
     cameras = [view.camera for view in views]
-    listed = cameras_data(CapturedCamera.of(f"{i:04d}", camera, False) for i, camera in enumerate(cameras))
+    rows = [CapturedCamera.of(f"{i:04d}", v.camera, False, correction=v.correction) for i, v in enumerate(views)]
+    listed = cameras_data(rows)
     compact = Compact() if options.bundle_format == "compact" else None
     if target_mb is not None:
         if compact is None:

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Annotated
 
 import torch
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, Field, ValidationError
+from torch import Tensor
 
 from bitymi_ns.bundle import strict_json
 from bitymi_ns.bundle.manifest import BundleError
@@ -19,6 +20,12 @@ _Size = Annotated[int, Field(ge=1, le=1 << 20)]
 _Length = Annotated[float, Field(gt=0, le=1e9)]
 
 
+def _gains_or_rows(numbers: list[float]) -> list[float]:
+    if len(numbers) not in (3, 12):
+        raise ValueError(f"must be 3 or 12 numbers, not {len(numbers)}")
+    return numbers
+
+
 class CapturedCamera(BaseModel):
     """A camera of the capture.
 
@@ -28,6 +35,8 @@ class CapturedCamera(BaseModel):
         width, height, fx, fy, cx, cy: of the photograph, in pixels.
         viewmat: [16] world to camera by rows, OpenCV axes.
         photograph: file of the bundle with the photograph, possibly reduced; None if it has none.
+        correction: of the scene's colours, not of the background, to the photograph's: 3 gains, or 12 numbers, matrix
+            and offset [3, 4] by rows; None: mean exposure.
     """
 
     name: str
@@ -40,15 +49,27 @@ class CapturedCamera(BaseModel):
     cy: _Number
     viewmat: Annotated[list[_Number], Field(min_length=16, max_length=16)]
     photograph: str | None = None
+    correction: Annotated[list[_Number], AfterValidator(_gains_or_rows)] | None = None
 
     @classmethod
-    def of(cls, name: str, camera: Camera, held_out: bool, photograph: str | None = None) -> "CapturedCamera":
+    def of(
+        cls, name: str, camera: Camera, held_out: bool, photograph: str | None = None, correction: Tensor | None = None
+    ) -> "CapturedCamera":
         """Describe a camera."""
         (fx, _, cx), (_, fy, cy), _ = camera.K.cpu().tolist()
         size = {"width": camera.width, "height": camera.height}
         viewmat = camera.viewmat.cpu().flatten().tolist()
         of_lens = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
-        return cls(name=name, held_out=held_out, **size, **of_lens, viewmat=viewmat, photograph=photograph)
+        of_photograph = {"photograph": photograph, "correction": None}
+        if correction is not None:
+            of_photograph["correction"] = correction.cpu().flatten().tolist()
+        return cls(name=name, held_out=held_out, **size, **of_lens, viewmat=viewmat, **of_photograph)
+
+    @property
+    def exposure(self) -> Tensor | None:
+        """Convert the correction to gains [3] or matrix and offset [3, 4]."""
+        found = None if self.correction is None else torch.tensor(self.correction)
+        return found if found is None or len(found) == 3 else found.view(3, 4)
 
     @property
     def camera(self) -> Camera:

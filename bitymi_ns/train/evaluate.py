@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 
 from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.exposure import Exposure
 from bitymi_ns.train.losses import fitted_psnr, mean_psnr, psnr
 from bitymi_ns.train.poses import Poses, aligned, view_psnr
-from bitymi_ns.train.views import View, eval_background
+from bitymi_ns.train.views import View, eval_background, shown
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
@@ -25,6 +26,7 @@ class Quality(NamedTuple):
     fitted_psnr: float  # dB after an affine fit of each view's colours (`losses.color_fitted`), over the same views
     carried_psnr: float = math.nan  # dB with poses corrected as those of the nearest photographs
     refined_psnr: float = math.nan  # dB with poses aligned to the scene
+    exposed_psnr: float = math.nan  # dB with exposures interpolated from the training photographs' (`Exposure.at`)
 
 
 def evenly_spaced(count: int, most: int) -> list[int]:
@@ -34,22 +36,32 @@ def evenly_spaced(count: int, most: int) -> list[int]:
 
 
 @torch.no_grad()
-def evaluate(scene: Scene, views: Sequence[View], config: TrainConfig, poses: Poses | None = None) -> Quality:
+def evaluate(
+    scene: Scene,
+    views: Sequence[View],
+    config: TrainConfig,
+    poses: Poses | None = None,
+    exposure: Exposure | None = None,
+) -> Quality:
     """Compare renders of a scene with photographs, over the evaluation background.
 
     Args:
         views: at full size; each is read once.
         poses: of a run that refined them: views are also evaluated with the corrections of the nearest photographs,
             and with poses then aligned to the scene.
+        exposure: of the run: if it corrects photographs, views are also evaluated with its corrections.
     """
     device = scene.surfels["means"].device
     background = eval_background(config, device)
-    values, fitted, along, refined, fragments = [], [], [], [], []
+    values, fitted, along, refined, exposed, fragments = [], [], [], [], [], []
     for view in (view.to(device) for view in views):
         output = scene.render(view.camera, background=background, field_mode="frozen")
         rgb, target = output.rgb.clamp(0.0, 1.0), view.target(background, device)
         values.append(psnr(rgb, target, view.mask))
         fitted.append(fitted_psnr(rgb, target, view.mask))
+        if exposure is not None and exposure.table is not None and view.file is not None:
+            rgb = shown(output.rgb, exposure.at(view.file), output.alpha, background)
+            exposed.append(psnr(rgb.clamp(0.0, 1.0), target, view.mask))
         fragments.append(len(output.fragments))
         del output  # frees its fragments before the next view is rendered
         if poses is not None:
@@ -58,4 +70,4 @@ def evaluate(scene: Scene, views: Sequence[View], config: TrainConfig, poses: Po
             view = view._replace(camera=aligned(scene, view, background, config.loss.ssim_weight))
             refined.append(view_psnr(scene, view, background))
     mean_fragments = sum(fragments) / len(fragments) if fragments else math.nan
-    return Quality(mean_psnr(values), mean_fragments, *(mean_psnr(each) for each in (fitted, along, refined)))
+    return Quality(mean_psnr(values), mean_fragments, *(mean_psnr(each) for each in (fitted, along, refined, exposed)))

@@ -2,7 +2,8 @@
 
 A photograph maps the scene's colour c to gain c, with a gain per channel, or to matrix c + offset. Corrections are
 relative to the mean photograph: after every step log gains and other entries are shifted to sum to zero over the
-photographs, so that they do not tint the scene. They are not part of the scene: held-out views and bundles have none.
+photographs, so that they do not tint the scene. They are not part of the scene: a free camera shows the mean exposure;
+`Exposure.at` interpolates that of a held-out photograph.
 
 Gains are initialised from the colours of the sparse points. In logarithms, observation = point + photograph, solved by
 alternating medians (median polish), which are robust to highlights, occluders and wrong points. Points occluded by
@@ -12,6 +13,7 @@ others in a photograph are ignored there.
 import copy
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -20,6 +22,7 @@ from torch.nn import Parameter
 from torch.nn.functional import embedding, max_pool2d
 from torch.optim import SparseAdam
 
+from bitymi_ns.capture.order import Neighbours
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.config import ExposureKind
 from bitymi_ns.train.optimizers import set_rate
@@ -58,20 +61,22 @@ class Exposure:
     """
 
     def __init__(
-        self, kind: ExposureKind, exif: Sequence[float] | None = None, photographs: Sequence[int] | None = None
+        self, kind: ExposureKind, exif: Sequence[float] | None = None, files: Sequence[Path] | None = None
     ) -> None:
         """
         Args:
             exif: log2 exposure of each training view (`exif_stops`), NaN: unknown; None: unknown for every view.
-            photographs: index of each view's photograph; views of one photograph share its correction. None: one view
-                per photograph.
+            files: photograph of each training view; views of one photograph share its correction. None: one view per
+                photograph, and `at` knows none.
         """
         self.kind: ExposureKind = kind
         self.table: Parameter | None = None
         self.decided = kind == "off"
         self.reason = ""
         self._exif = exif
-        self._photographs = photographs
+        rows = {file: row for row, file in enumerate(dict.fromkeys(files or ()))}
+        self._photographs = None if files is None else [rows[file] for file in files]
+        self._neighbours = Neighbours(list(rows))
         self._optimizer: SparseAdam | None = None
 
     def start(self, points: Tensor, views: Sequence[View], near: float) -> None:
@@ -146,12 +151,17 @@ class Exposure:
         if self.table is None:
             return None
         number = number if self._photographs is None else self._photographs[number]
-        row = embedding(torch.full((), number, device=self.table.device), self.table, sparse=True)
-        if row.numel() == 3:
-            return row.exp()
-        gains = torch.zeros(12, dtype=torch.bool, device=row.device)
-        gains[_diagonal(row)] = True
-        return torch.where(gains, torch.where(gains, row, 0.0).exp(), row).view(3, 4)
+        return _correction(embedding(torch.full((), number, device=self.table.device), self.table, sparse=True))
+
+    @torch.no_grad()
+    def at(self, file: Path | None) -> Tensor | None:
+        """Return the correction of a photograph of the capture, as `of` does: its own, or interpolated between training
+        photographs (`Neighbours`) as log gains and other entries. None: mean exposure."""
+        found = None if file is None else self._neighbours.of(file)
+        if self.table is None or found is None:
+            return None
+        before, after, share = found
+        return _correction(torch.lerp(self.table[before], self.table[after], share))
 
     @torch.no_grad()
     def average(self, processes: Processes) -> None:
@@ -223,29 +233,34 @@ class Exposure:
         self._optimizer.load_state_dict({"state": moments, "param_groups": groups})
 
 
+def restored(state: Mapping[str, Any] | None, views: int, files: Sequence[Path] | None = None) -> Exposure:
+    """Restore the corrections of a finished run for its number of views; none if they were of more or fewer."""
+    exposure = Exposure("off" if state is None else state["kind"], files=files)
+    exposure.load_state_dict(state, views)
+    return exposure
+
+
 def corrected(
-    views: Sequence[View], state: Mapping[str, Any] | None, photographs: Sequence[int] | None = None
+    views: Sequence[View], state: Mapping[str, Any] | None, files: Sequence[Path] | None = None
 ) -> Sequence[View]:
     """Add the final corrections of a run to its training views.
 
     Args:
         views: of the run, at full size.
-        state: of its `Exposure`; None: no corrections.
-        photographs: as in `Exposure`.
+        state, files: of its `Exposure`; state None: no corrections.
 
     Raises:
         ValueError: the number of photographs differs from the run's.
     """
     if state is None or state["table"] is None:
         return views
-    exposure = Exposure(state["kind"], photographs=photographs)
-    count = exposure.count(len(views))
-    if len(state["table"]) != count:
+    exposure = restored(state, len(views), files)
+    if exposure.table is None:
+        count = exposure.count(len(views))
         raise ValueError(
             f"training learned the exposure of {len(state['table'])} photographs, and now there are {count}: restore "
             "the capture, or leave the texels as they are baked (--finetune-steps 0)"
         )
-    exposure.load_state_dict(state, len(views))
     with torch.no_grad():
         found = [exposure.of(i) for i in range(len(views))]
     return OnDemand(len(views), lambda i: views[i]._replace(correction=found[i]))
@@ -258,6 +273,15 @@ def settled(table: Tensor) -> Tensor:
     table = torch.maximum(torch.minimum(table.detach().nan_to_num(0.0), limit), -limit)
     table = table - table.mean(0)
     return table / (table.abs().amax(0) / limit).clamp(min=1.0)
+
+
+def _correction(row: Tensor) -> Tensor:
+    """Convert a row of the table to gains [3], or matrix and offset [3, 4]."""
+    if row.numel() == 3:
+        return row.exp()
+    gains = torch.zeros(12, dtype=torch.bool, device=row.device)
+    gains[_diagonal(row)] = True
+    return torch.where(gains, torch.where(gains, row, 0.0).exp(), row).view(3, 4)
 
 
 def _diagonal(table: Tensor) -> slice:

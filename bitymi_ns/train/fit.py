@@ -39,6 +39,8 @@ class LogEntry:
     """PSNR in dB with poses moved along with the training poses (`poses.carried`); NaN before the last step and in
     runs without pose refinement."""
     refined_psnr: float = math.nan  # PSNR in dB with poses aligned to the finished scene; NaN likewise.
+    exposed_psnr: float = math.nan
+    """PSNR in dB with exposures interpolated from those of the training photographs; NaN if these are not corrected."""
 
 
 @dataclass
@@ -80,7 +82,9 @@ class Trainer:
         self.scene, self.config = scene, config
         self.optimizers = make_optimizers(scene)
         pixels = sum(view.camera.width * view.camera.height for view in views)
-        data = TrainingData(views, extent, pixels, len(scene), covered_share(views))
+        files = [view.file for view in views if view.file is not None]
+        named = files if len(files) == len(views) else None
+        data = TrainingData(views, extent, pixels, len(scene), covered_share(views), files=named)
         self.training = Training(scene, data, self.optimizers, config, max_steps, processes=processes)
         self.step = 0
         self._views = len(views)
@@ -133,9 +137,10 @@ def fit(
         if trainer.step in due:
             trainer.training.watch.finish(scene)
             poses = trainer.training.poses if trainer.step == max_steps else None
-            found = evaluate(scene, eval_views, config, poses if poses and poses.refined else None)
+            poses = poses if poses and poses.refined else None
+            found = evaluate(scene, eval_views, config, poses, trainer.training.exposure)
             times, loss = (clock.seconds, clock.cpu_seconds), trainer.loss
-            figures = (found.psnr, found.fitted_psnr, found.carried_psnr, found.refined_psnr)
+            figures = (found.psnr, found.fitted_psnr, found.carried_psnr, found.refined_psnr, found.exposed_psnr)
             log.entries.append(LogEntry(trainer.step, *times, len(scene), found.fragments, loss, *figures))
         if callback is not None:
             callback(trainer, terms, output, report)

@@ -109,7 +109,7 @@ class Training:
         pixels = data.covered * data.image_pixels / max(1, len(data.views))
         self.schedule = Schedule(config, max_steps, data.extent, textured, pixels)
         self.strategy = Strategy(self.schedule, on_resize, data.image_pixels, data.first_surfels, processes)
-        self.exposure = Exposure(config.exposure, data.exif_stops, data.photographs)
+        self.exposure = Exposure(config.exposure, data.exif_stops, data.files)
         cameras = [view.camera for view in data.views] if data.cameras is None else data.cameras
         self.poses = Poses(self.schedule, cameras)
         self.guard = RollbackGuard(scene, optimizers, self.strategy, self.exposure, self.poses, announce)

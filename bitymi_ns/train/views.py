@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 
 import torch
@@ -32,6 +33,7 @@ class View(NamedTuple):
         normal: [H, W, 3] float, surface normals in the camera frame (OpenCV axes, facing the camera), 0 or NaN where
             unknown; None: unknown everywhere.
         counted: number of True pixels of `mask`; None: not known.
+        file: of the photograph; None: not known.
     """
 
     camera: Camera
@@ -41,6 +43,7 @@ class View(NamedTuple):
     depth: Tensor | None = None
     normal: Tensor | None = None
     counted: int | None = None
+    file: Path | None = None
 
     @property
     def nbytes(self) -> int:
@@ -72,7 +75,7 @@ class TrainingData:
         first_surfels: initial number of surfels, also in a resumed run.
         covered: share of opaque, unmasked pixels (`covered_share`).
         exif_stops: log2 exposure of each view (`capture.exif.exif_stops`), NaN: unknown; None: unknown for every view.
-        photographs: index of each view's photograph; None: one view per photograph.
+        files: photograph of each view, which views may share; None: one view per photograph.
         cameras: of the views; None: taken from the views, which may read the photographs for it.
     """
 
@@ -82,7 +85,7 @@ class TrainingData:
     first_surfels: int
     covered: float = 1.0
     exif_stops: Sequence[float] | None = None
-    photographs: Sequence[int] | None = None
+    files: Sequence[Path] | None = None
     cameras: Sequence[Camera] | None = None
 
 

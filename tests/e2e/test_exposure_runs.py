@@ -11,10 +11,12 @@ from nerfstudio.scripts import train as ns_train
 from PIL import Image
 
 from bitymi_ns.bake import pipeline
+from bitymi_ns.bundle.parts import CAMERAS
 from bitymi_ns.plugin.export.command import ExportAtlas
 from bitymi_ns.plugin.run.callbacks import FILE
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from bitymi_ns.sample import generate
+from tests.e2e.exports import evaluate
 from tests.e2e.runs import checkpoint, different
 
 Start = Callable[..., BitymiTrainerConfig]
@@ -32,9 +34,10 @@ def uneven(tmp_path: Path) -> Path:
 def test_a_resumed_run_goes_on_with_its_corrections(
     uneven: Path, start: Start, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    whole = start(data=uneven, name="whole")
+    whole, resumed = (start(data=uneven, name=name) for name in ("whole", "resumed"))
     whole.save_only_latest_checkpoint = False
-    whole.pipeline.model.train.exposure = "gain"
+    for config in (whole, resumed):
+        config.pipeline.model.train.exposure, config.pipeline.model.train.lr.exposure = "gain", (0.05, 0.02)
     ns_train.main(whole)
     said = " ".join(capsys.readouterr().out.split())
     assert "The exposure of each photograph is learned" in said and "as asked for" in said
@@ -44,9 +47,9 @@ def test_a_resumed_run_goes_on_with_its_corrections(
     torch.testing.assert_close(table.mean(0), torch.zeros(3), atol=1e-6, rtol=0)
     last = json.loads((whole.get_base_dir() / FILE).read_text().splitlines()[-1])
     assert last["fitted_psnr"] > last["psnr"]
+    wrong = last["psnr"] - last["exposed_psnr"]  # the neighbours of dark photographs are bright
+    assert wrong > 0.3
 
-    resumed = start(data=uneven, name="resumed")
-    resumed.pipeline.model.train.exposure = "gain"
     resumed.load_dir, resumed.load_step = whole.get_checkpoint_dir(), 20
     ns_train.main(resumed)
     assert different(checkpoint(whole, 59), checkpoint(resumed, 59)) == []
@@ -67,3 +70,16 @@ def test_a_resumed_run_goes_on_with_its_corrections(
     assert held_out["fitted_psnr_neural_against_photos"] > held_out["psnr_neural_against_photos"]
     assert held_out["fitted_psnr_baked_against_photos"] > held_out["psnr_baked_against_photos"]
     assert "after a fit of the colours" in " ".join(capsys.readouterr().out.split())
+
+    # of the held-out photographs, the first has one neighbour
+    rows = json.loads((tmp_path / "bundle" / CAMERAS).read_text())["cameras"]
+    found = torch.tensor([row["correction"] for row in rows]).log()
+    expected = torch.cat([table, table[:1], 0.5 * (table[6:7] + table[7:8])])
+    torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
+    of_run, of_bundle = (
+        evaluate(folder / "config.yml", tmp_path / "results.json")
+        for folder in (whole.get_base_dir(), tmp_path / "bundle")
+    )
+    assert of_run["exposed_psnr"] == pytest.approx(last["exposed_psnr"], abs=0.01)
+    assert of_bundle["psnr"] - of_bundle["exposed_psnr"] == pytest.approx(wrong, abs=0.1)
+    assert of_bundle["exposed_ssim"] < of_bundle["ssim"]

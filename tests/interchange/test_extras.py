@@ -157,6 +157,10 @@ def test_a_photograph_that_is_a_program_is_refused(surfels, tmp_path: Path) -> N
         read_held_out(tmp_path / "b", read_bundle(tmp_path / "b"))
 
 
+ROW = b"""{"cameras": [{"name": "a", "held_out": true, "width": 8, "height": 6, "fx": 5, "fy": 5, "cx": 4, "cy": 3,
+"viewmat": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], "correction": %s}]}"""
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -166,6 +170,10 @@ def test_a_photograph_that_is_a_program_is_refused(surfels, tmp_path: Path) -> N
         (b'{"cameras": [' + b"[]," * 90_000 + b"[]]}", "cameras.0: "),
         (b'{"cameras": [{"name": "a"}]}', "held_out"),
         (b'{"cameras": [{"name": "a", "held_out": true, "width": 0}]}', "width"),
+        (ROW % b"[1, 1, 1, 1]", "cameras.0.correction: .*must be 3 or 12 numbers, not 4"),
+        (ROW % b"[1, 1, NaN]", "NaN"),
+        (ROW % b"[1, 1, 1e999]", "1e999 is not a finite number"),
+        (ROW % b"[1, 1, 2e9]", "correction.2"),
     ],
 )
 def test_a_damaged_list_of_cameras_is_refused(surfels, tmp_path: Path, text: bytes, message: str) -> None:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import pytest
 import torch
@@ -13,8 +14,8 @@ from bitymi_ns.capture.exif import exif_stops
 from bitymi_ns.train import exposure as module
 from bitymi_ns.train.config import DensifyConfig, LearningRates, TrainConfig
 from bitymi_ns.train.evaluate import evaluate
-from bitymi_ns.train.exposure import LIMIT, OTHER_LIMIT, Exposure, ExposureGains, corrected, seeds, settled
-from bitymi_ns.train.fit import Trainer
+from bitymi_ns.train.exposure import LIMIT, OTHER_LIMIT, Exposure, ExposureGains, corrected, restored, seeds, settled
+from bitymi_ns.train.fit import Trainer, fit
 from bitymi_ns.train.score import multi_view_scores
 from bitymi_ns.train.views import View, shown
 
@@ -172,6 +173,31 @@ def test_off_and_auto_on_even_photographs_are_the_same_run(make_scene, views) ->
         assert torch.equal(a, b)
 
 
+# of other photographs
+
+
+@pytest.mark.parametrize("kind", ["gain", "affine"])
+def test_between_photographs_log_gains_and_other_entries_are_interpolated(kind: str) -> None:
+    """Two views of the first photograph share its correction."""
+    files = [Path(f"images/{name}.png") for name in ("1", "1", "5")]
+    table = torch.tensor([[0.3] * 3, [-0.3] * 3])
+    if kind == "affine":
+        table = torch.cat([torch.arange(12.0)[None] / 100, -torch.arange(12.0)[None] / 100])
+    state = {"kind": kind, "decided": True, "finding": "", "table": table, "optimizer": {"state": {}}}
+    exposure = restored(state, 3, files)
+    for number, row in (("0", table[0]), ("1", table[0]), ("2", 0.5 * table[0]), ("5", table[1]), ("9", table[1])):
+        expected = row.exp() if kind == "gain" else row.view(3, 4).clone()
+        if kind == "affine":
+            expected[range(3), range(3)] = expected[range(3), range(3)].exp()
+        found = exposure.at(Path(f"images/{number}.png"))
+        torch.testing.assert_close(found, expected)
+        assert not found.requires_grad
+    torch.testing.assert_close(exposure.at(files[2]), exposure.of(2).detach())
+    assert exposure.at(Path("others/2.png")) is None and exposure.at(None) is None
+    for others in (restored(state, 4, [*files, Path("images/7.png")]), restored(None, 3, files)):
+        assert others.table is None and others.at(files[0]) is None
+
+
 # in training
 
 
@@ -190,6 +216,24 @@ def test_training_learns_the_exposures(make_scene, views, uneven) -> None:
         torch.testing.assert_close(logs, torch.tensor([0.3, -0.2, 0.1, -0.3, 0.25, -0.15]), atol=0.1, rtol=0)
         assert results[kind].fitted_psnr > results["off"].fitted_psnr + 0.5
         assert results[kind].psnr > results["off"].psnr - 0.1
+
+
+def test_held_out_photographs_are_judged_with_the_exposure_of_their_neighbours(make_scene, views) -> None:
+    """The first three photographs are bright, the last three dark."""
+    logs = torch.tensor([0.3, 0.3, 0.3, -0.3, -0.3, -0.3])
+    named = [
+        v._replace(image=(v.image * g.exp()).clamp(0, 1), file=Path(f"{i}.png"))
+        for i, (v, g) in enumerate(zip(views, logs, strict=True))
+    ]
+    options = {"lr": LearningRates(exposure=(0.02, 0.005)), "resolution_schedule": 0}
+    train, held_out = [named[i] for i in (0, 1, 3, 5)], [named[2], named[4]]
+    (last,) = fit(make_scene(every=2), train, held_out, config("gain", **options), 100).entries
+    assert last.exposed_psnr > last.psnr
+    unnamed = [view._replace(file=None) for view in held_out]
+    (last,) = fit(make_scene(every=2), train, unnamed, config("gain", **options), 2).entries
+    assert math.isnan(last.exposed_psnr)
+    (last,) = fit(make_scene(every=2), train, held_out, config("off", **options), 2).entries
+    assert math.isnan(last.exposed_psnr)
 
 
 def test_scores_are_of_the_corrected_image(make_scene, views) -> None:

@@ -14,7 +14,7 @@ import { bindPanels } from './ui/panels';
 import { PathPanel } from './ui/path_panel';
 import { Picker } from './ui/picker';
 import type { Stage } from './ui/stage';
-import { type CaptureCamera, commonTarget, parseCameras } from './view/cameras';
+import { type CaptureCamera, commonTarget, correctionAt, parseCameras } from './view/cameras';
 import { Controls, type Mode } from './view/controls';
 import type { Notes } from './view/notes';
 import { Flight } from './view/path';
@@ -29,7 +29,7 @@ const STILL_AFTER = 250; // milliseconds
 
 const KEYS: Record<string, string> = {
   ...{ o: 'orbit', f: 'fly', h: 'home', ',': 'previous', '.': 'next', p: 'beside', t: 'texture', c: 'colors' },
-  ...{ l: 'share', n: 'tools', m: 'notes', k: 'add-keyframe', v: 'play' },
+  ...{ i: 'exposure', l: 'share', n: 'tools', m: 'notes', k: 'add-keyframe', v: 'play' },
   ...{ r: 'measure', b: 'crop', g: 'full-screen', '?': 'show-help' },
 };
 
@@ -182,10 +182,17 @@ export class App implements Stage {
       residuals: pressed(element('texture')),
       held: this.held,
       background: this.bundle.info.background,
+      correction: this.correction,
       layers: still ? STILL_LAYERS : MOVING_LAYERS,
       fine: still,
       farthest: length(subtract(this.controls.pose.position, this.first.target)) + 1.5 * this.size,
     };
+  }
+
+  // Correction at the camera of a photograph: a path, which may pass one, has the mean exposure.
+  private get correction(): number[] | null {
+    const shows = this.show === 'color' && pressed(element('exposure')) && !this.path.plays;
+    return shows ? correctionAt(this.cameras, this.controls.pose) : null;
   }
 
   private tick(now: number): void {
@@ -262,6 +269,7 @@ export class App implements Stage {
     onClick('next', () => this.jump(this.chosen + 1));
     onClick('beside', () => this.toggleBeside());
     onClick('texture', () => this.toggle('texture'));
+    onClick('exposure', () => this.toggle('exposure'));
     onClick('colors', () => {
       this.held = this.toggle('colors') ? null : this.controls.pose.position;
     });
@@ -322,6 +330,7 @@ export class App implements Stage {
 
   private fillCameras(): void {
     element('cameras').hidden = !this.cameras.length;
+    element('exposure').hidden = !this.cameras.some((camera) => camera.correction);
     element('beside').hidden = !this.cameras.some((camera) => camera.photograph);
     const list = element<HTMLSelectElement>('camera');
     this.cameras.forEach((camera, k) =>

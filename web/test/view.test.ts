@@ -1,8 +1,8 @@
 import { describe, expect, it } from 'vitest';
 import type { Vec3 } from '../src/bundle/manifest';
-import { commonTarget, parseCameras } from '../src/view/cameras';
+import { commonTarget, correctionAt, parseCameras } from '../src/view/cameras';
 import { Pace } from '../src/render/screen';
-import { DEFAULT_LENS, View, look, lookAt, orbit } from '../src/view/pose';
+import { DEFAULT_LENS, View, look, lookAt, moved, orbit, rolled } from '../src/view/pose';
 import { fromHash, toHash } from '../src/view/share';
 import { firstPose } from '../src/view/start';
 import { partOf, samplingOf, sizeOf } from '../src/view/size';
@@ -75,6 +75,22 @@ describe('the capture', () => {
     expect(camera.heldOut).toBe(true);
     expect(parseCameras('{')).toEqual([]);
     expect(parseCameras('{"cameras": 3}')).toEqual([]);
+  });
+  it('has the exposures of photographs, for their cameras alone', () => {
+    const affine = [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12];
+    const given = [[2, 3, 4], affine, [1, 2], [1, 2, '3'], [1, 2, null], undefined];
+    const rows = given.map((correction, k) => ({
+      ...row,
+      correction,
+      viewmat: row.viewmat.map((x, i) => (i === 3 ? -k : x)),
+    }));
+    const cameras = parseCameras(JSON.stringify({ cameras: rows }));
+    const gains = [...[2, 0, 0, 0], ...[0, 3, 0, 0], ...[0, 0, 4, 0]];
+    expect(cameras.map((camera) => camera.correction)).toEqual([gains, affine, null, null, null, null]);
+    const at = cameras[1].pose;
+    const linked = fromHash(toHash({ pose: at, lens: DEFAULT_LENS, target: UP, show: 'color', residuals: true }))!.pose;
+    const poses = [at, linked, moved(at, 1e-3, 0, 0), rolled(at, 0.01), cameras[2].pose];
+    expect(poses.map((each) => correctionAt(cameras, each))).toEqual([affine, affine, null, null, null]);
   });
   it('does not reach out of the bundle', () => {
     const photograph = (name: string): string | null =>

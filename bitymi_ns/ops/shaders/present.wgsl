@@ -8,6 +8,7 @@ struct Screen {
   pixels: vec2f,  // size of the view
   first: vec2u,  // top left pixel of the part that was rendered; nothing covers the others
   samples: u32,  // per pixel and axis
+  correction: array<vec4f, 3>,  // rows of [matrix | offset] of colours, as train.views.shown
 }
 
 @group(0) @binding(0) var<uniform> screen: Screen;
@@ -59,6 +60,11 @@ fn present(@builtin(position) position: vec4f) -> @location(0) vec4f {
       return vec4f(mix(screen.background.rgb, normal * 0.5 + 0.5, covered), 1.0);
     }
     case SHOW_OVERDRAW: { return vec4f(ramp(s.r / screen.most), 1.0); }
-    default: { return vec4f(s.rgb + s.a * screen.background.rgb, 1.0); }
+    default: {
+      let seen = vec4f(s.rgb, covered);
+      let rows = screen.correction;
+      let corrected = vec3f(dot(rows[0], seen), dot(rows[1], seen), dot(rows[2], seen));
+      return vec4f(corrected + s.a * screen.background.rgb, 1.0);
+    }
   }
 }

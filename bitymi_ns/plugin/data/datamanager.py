@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -30,6 +30,7 @@ from bitymi_ns.plugin.data.depth import with_depth
 from bitymi_ns.plugin.data.views import LONGEST_SIDE, NO_PHOTOS, limit_size, with_lenses
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.background_points import background_points
+from bitymi_ns.train.exposure import restored
 from bitymi_ns.train.poses import carried, cross_matrix
 from bitymi_ns.train.processes import Processes
 from bitymi_ns.train.views import MemoryBudget, OnDemand, View, spread, training_order
@@ -273,9 +274,17 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         cameras.camera_to_worlds = poses.to(cameras.camera_to_worlds)
         return lambda camera: carried(camera, given, motions)
 
+    def corrections(self, state: Mapping[str, Any] | None) -> list[list[Tensor | None]]:
+        """Return the colour corrections of the training and of the held-out views (`Exposure.at`), by the state of a
+        run's `Exposure`."""
+        files = self.train_dataset.files
+        exposure = restored(state, len(files), files)
+        return [[exposure.at(file) for file in dataset.files] for dataset in (self.train_dataset, self.eval_dataset)]
+
     def _view(self, dataset: BitymiDataset, index: int, batch: dict[str, Any]) -> View:
         camera = to_camera(dataset.cameras[index : index + 1], self.device)
-        return View(camera, batch["image"], batch.get("mask"), depth=batch.get("depth"), normal=batch.get("normal"))
+        maps = {name: batch.get(name) for name in ("mask", "depth", "normal")}
+        return View(camera, batch["image"], **maps, file=dataset.files[index])
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict[str, Any]]:
         """Return the held-out views in turn, without a shared random generator."""

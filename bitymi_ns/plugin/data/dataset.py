@@ -51,12 +51,6 @@ class BitymiDataset(InputDataset):
         """Photograph of each view."""
         return photograph_files(self._dataparser_outputs)
 
-    @property
-    def photographs(self) -> list[int]:
-        """Number of the photograph of each view, from 0 on."""
-        numbers = {file: i for i, file in enumerate(dict.fromkeys(self.files))}
-        return [numbers[file] for file in self.files]
-
     @as_input_error()
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
         """Read image [H, W, 3 or 4]."""

@@ -156,7 +156,8 @@ class ExportAtlas(BakeOptions, CompactOptions):
         compact = options.bundle_format == "compact"
         first = datamanager.eval_views[0].camera if len(datamanager.eval_dataset) else views[0]
         shown = preview(model, first, "JPEG" if compact else "PNG")
-        cameras_of = camera_files(datamanager, views, self.photographs)
+        exposure = model.resume_state.get("exposure")
+        cameras_of = camera_files(datamanager, views, self.photographs, exposure)
         beside = len(shown) + sum(map(len, cameras_of.values()))
         compacting = self.compact_of(beside) if compact else None
         refine, memory = RefineOptions(), int(self.finetune_memory * 1e9)
@@ -177,8 +178,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
                 background = model.background.cpu()
                 photographs = datamanager.train_views
                 if polish or tune or refine.compact:
-                    exposure = model.resume_state.get("exposure")
-                    photographs = corrected(photographs, exposure, datamanager.train_dataset.photographs)
+                    photographs = corrected(photographs, exposure, datamanager.train_dataset.files)
                 learned = (options, refine, progress, held_out)
                 baked = bake(model.scene, views, photographs, background, *learned)
         except (ValueError, RuntimeError) as error:

@@ -75,17 +75,20 @@ def preview(model: BitymiModel, camera: Camera, format: str = "PNG") -> bytes:
     return _encoded(model.render(camera, model.background, maps=False).rgb, format)
 
 
-def camera_files(datamanager: Any, train: Sequence[Camera], photographs: bool) -> dict[str, bytes]:
-    """Make cameras.json, and if `photographs` the held-out ones as JPEG of at most `MOST_PIXELS` along a side."""
+def camera_files(datamanager: Any, train: Sequence[Camera], photographs: bool, exposure: Any) -> dict[str, bytes]:
+    """Make cameras.json, with corrections by the state of the run's `Exposure` (None: none), and if `photographs` the
+    held-out ones as JPEG of at most `MOST_PIXELS` along a side."""
     files: dict[str, bytes] = {}
     names = [path.name for path in datamanager.train_dataset.image_filenames]
-    rows = [CapturedCamera.of(name, camera, False) for name, camera in zip(names, train, strict=True)]
+    trained, held_out = datamanager.corrections(exposure)
+    given = zip(names, train, trained, strict=True)
+    rows = [CapturedCamera.of(name, camera, False, correction=of_camera) for name, camera, of_camera in given]
     for i, path in enumerate(datamanager.eval_dataset.image_filenames):
         view = datamanager.eval_views[i]
         photograph = f"photograph-{i + 1:04d}.jpg" if photographs else None
         if photograph is not None:
             files[photograph] = _encoded(view.target(torch.zeros(3), "cpu"), "JPEG", MOST_PIXELS, quality=88)
-        rows.append(CapturedCamera.of(path.name, view.camera, True, photograph))
+        rows.append(CapturedCamera.of(path.name, view.camera, True, photograph, held_out[i]))
     return {CAMERAS: cameras_data(rows), **files}
 
 

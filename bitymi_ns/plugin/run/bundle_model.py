@@ -73,6 +73,7 @@ class BakedModel(SurfelModel):
             bundle.scene.transmittance_min = FAST
         self._scene = bundle.scene
         self._renderer = self._new_renderer(None)
+        self.corrections = [(row.camera, row.exposure) for row in bundle.cameras if row.correction is not None]
 
     def _crops(self) -> bool:
         asked = os.environ.get(CROP) or str(self.config.crop)

@@ -49,7 +49,7 @@ class TrainingRun:
         train, extent = dataset.cameras, scene_extent(metadata["camera_centers"], scene.surfels["means"])
         cameras = OnDemand(len(train), lambda i: to_camera(train[i : i + 1], "cpu"))
         counts = (metadata["train_pixels"], metadata["first_surfels"], covered_share(views))
-        data = TrainingData(views, extent, *counts, exposure_stops(dataset.files), dataset.photographs, cameras)
+        data = TrainingData(views, extent, *counts, exposure_stops(dataset.files), dataset.files, cameras)
         optimizers, processes = attributes.optimizers.optimizers, trainer.processes
         self.training = Training(scene, data, optimizers, config, self.total, self._on_resize, warn, processes)
         attributes.optimizers.before_step = self.training.combine
@@ -163,8 +163,8 @@ class TrainingRun:
         views = self.datamanager.eval_views
         rows = evenly_spaced(len(views), 0 if step + 1 >= self.total else self._curve_views)
         refined = self.training.poses.refined and step + 1 >= self.total
-        poses = self.training.poses if refined else None
-        quality = evaluate(self.scene, OnDemand(len(rows), lambda i: views[rows[i]]), self.config, poses)
+        poses, exposure = self.training.poses if refined else None, self.training.exposure
+        quality = evaluate(self.scene, OnDemand(len(rows), lambda i: views[rows[i]]), self.config, poses, exposure)
         clock = self.training.clock
         times = {"seconds": round(clock.seconds, 4), "cpu_seconds": round(clock.cpu_seconds, 4)}
         point = {"step": step + 1, **times, "surfels": len(self.scene)}
@@ -172,6 +172,8 @@ class TrainingRun:
         if not math.isnan(quality.psnr):
             point |= {k: round(value, 4) for k, value in quality._asdict().items() if not math.isnan(value)}
             shown = f"{quality.psnr:6.2f} dB held out, "
+            if exposure.table is not None:
+                shown += f"{quality.exposed_psnr:.2f} dB with exposures between those of their neighbours, "
             if refined:
                 shown += f"{quality.carried_psnr:.2f} dB with their poses carried along, "
                 shown += f"{quality.refined_psnr:.2f} dB with their poses refined, "

@@ -16,10 +16,13 @@ LPIPS = {"lpips": "alex", "lpips_vgg": "vgg"}
 _lpips_missing: list[str] = []
 
 
-def image_metrics(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> dict[str, float]:
+def image_metrics(
+    image: Tensor, reference: Tensor, mask: Tensor | None = None, exposed: Tensor | None = None
+) -> dict[str, float]:
     """Measure psnr, ssim, flip (if its package is installed), lpips and lpips_vgg (if their weights can be had) of
-    images [H, W, 3] in [0, 1], and fitted_psnr, fitted_ssim and fitted_lpips of the `color_fitted` image. Pixels that a
-    mask [H, W, 1] excludes are equal in both for every metric and left out of both PSNR and the fit."""
+    images [H, W, 3] in [0, 1]; fitted_psnr, fitted_ssim and fitted_lpips of the `color_fitted` image, and exposed_psnr
+    and so on of an image `exposed` as the photograph. Pixels that a mask [H, W, 1] excludes are equal in all for every
+    metric and left out of PSNR and fit."""
     image, reference = image.detach().float().clamp(0.0, 1.0), reference.detach().float().clamp(0.0, 1.0)
     if mask is not None:
         mask = mask.to(image.device).bool().reshape(*image.shape[:2], 1)
@@ -27,9 +30,13 @@ def image_metrics(image: Tensor, reference: Tensor, mask: Tensor | None = None) 
     result = _similarity(image, reference, mask, tuple(LPIPS))
     if (found := flip(image, reference)) is not None:
         result["flip"] = found
-    fitted = color_fitted(image, reference, mask)
-    fitted = fitted if mask is None else fitted * mask
-    return result | {f"fitted_{k}": v for k, v in _similarity(fitted, reference, mask, ("lpips",)).items()}
+    others = {"fitted": color_fitted(image, reference, mask)}
+    if exposed is not None:
+        others["exposed"] = exposed.detach().float().clamp(0.0, 1.0)
+    for name, other in others.items():
+        other = other if mask is None else other * mask
+        result |= {f"{name}_{k}": v for k, v in _similarity(other, reference, mask, ("lpips",)).items()}
+    return result
 
 
 def _similarity(image: Tensor, reference: Tensor, mask: Tensor | None, distances: Sequence[str]) -> dict[str, float]:

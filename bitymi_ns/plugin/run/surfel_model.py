@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -18,11 +19,12 @@ from torch.nn import Parameter
 
 from bitymi_ns.plugin.console import InputError, warn_once
 from bitymi_ns.plugin.data.cameras import normal_image, ray_distance, to_camera
+from bitymi_ns.plugin.data.dataset import POSE_STEP
 from bitymi_ns.plugin.run.device import kernel_device
 from bitymi_ns.plugin.run.metrics import image_metrics, render_milliseconds
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.crop import Box
-from bitymi_ns.train.views import as_float, downscale_image, downscale_mask, over_background
+from bitymi_ns.train.views import as_float, downscale_image, downscale_mask, over_background, shown
 
 OVERDRAW_SCALE = 64.0
 """Blended surfels per pixel at the end of overdraw's colour map, fixed to compare runs."""
@@ -49,6 +51,8 @@ class SurfelModel(Model):
 
     measure_time = True  # include render_ms in the image metrics; off in training
     crop_box: Box | None = None  # hides the surfels whose centres lie outside
+    corrections: Sequence[tuple[Camera, Tensor | None]] = ()
+    """Cameras of the capture's photographs with their colour corrections; empty if the run made none."""
 
     @abstractmethod
     def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
@@ -128,14 +132,28 @@ class SurfelModel(Model):
         rgb = outputs["rgb"]
         height, width = rgb.shape[:2]
         target, mask = self.photograph(batch, rgb)
-        metrics = image_metrics(rgb, target, mask)
+        camera = getattr(self, "_last_camera", None)
+        drawn_here = camera is not None and (camera.width, camera.height) == (width, height)
+        exposed = self._exposed(camera) if drawn_here and self.corrections else None
+        metrics = image_metrics(rgb, target, mask, exposed)
         metrics["fragments_per_pixel"] = float(outputs["overdraw"].mean()) * OVERDRAW_SCALE
         metrics.update(self.sizes())
-        camera = getattr(self, "_last_camera", None)
-        if self.measure_time and camera is not None and (camera.width, camera.height) == (width, height):
+        if self.measure_time and drawn_here:
             draw = partial(self.render, camera, self.background, maps=False)
             metrics["render_ms"] = render_milliseconds(draw, self.device)
         return metrics, {"img": torch.cat([target, rgb], dim=1)}
+
+    def _exposed(self, camera: Camera) -> Tensor:
+        """Draw a camera [H, W, 3] with the correction of its photograph; with none, if it is not of the capture."""
+
+        def apart(other: Camera) -> float:
+            return float((other.viewmat.cpu() - camera.viewmat.cpu()).abs().max())
+
+        nearest, correction = min(self.corrections, key=lambda each: apart(each[0]))
+        if correction is not None:
+            correction = correction.to(self.device) if apart(nearest) <= POSE_STEP else None
+        drawn = self.render(camera, self.background, maps=False)
+        return shown(drawn.rgb, correction, drawn.alpha, self.background)
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Return [H, W, 4] with straight alpha, for `ns-render --rendered-output-names rgba`."""

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from bitymi_ns import files
 from bitymi_ns.plugin.console import INTERRUPTED, fail, say, step_bar, warn
+from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.hooks import filter_console, ignore_torch_warnings
 from bitymi_ns.plugin.run import checkpoints, run_folder, torchrun
 from bitymi_ns.plugin.run.checkpoint_schema import Entry, restore_optimizer
@@ -223,9 +224,14 @@ class BitymiPipeline(VanillaPipeline):
             super().load_pipeline(loaded_state, step)
         except (RuntimeError, LookupError, TypeError, AttributeError) as error:  # torch's list of what does not fit
             fail(f"the checkpoint of step {step} does not fit this scene. {error}", error)
-        poses = self.model.resume_state.get("poses") if isinstance(self.model, BitymiModel) else None
-        if self.test_mode != "val" and poses is not None and poses["motions"] is not None:  # a run moves them itself
+        if self.test_mode == "val" or not isinstance(self.model, BitymiModel):  # a run has its own
+            return
+        state, held_out = self.model.resume_state, to_cameras(self.datamanager.eval_dataset.cameras, "cpu")
+        if (poses := state.get("poses")) is not None and poses["motions"] is not None:
             self.model.carry = self.datamanager.move_cameras(poses["motions"])
+        _, found = self.datamanager.corrections(state.get("exposure"))
+        if any(correction is not None for correction in found):
+            self.model.corrections = list(zip(held_out, found, strict=True))
 
     def get_average_image_metrics(self, data_loader: Any, *args: Any, **kwargs: Any) -> dict[str, float]:
         """Average over images, without NaN, which JSON does not know, and metrics that images without counting pixels

@@ -11,6 +11,7 @@ export interface DrawOptions {
   residuals: boolean;
   held: Vec3 | null; // viewpoint of view colours; null: the camera
   background: Vec3;
+  correction: number[] | null; // of colours, before the background: matrix and offset [3, 4] by rows
   layers: number; // batches: draw.wgsl
   fine: boolean; // single precision, if the device can blend it
   farthest: number; // upper end of the depth map
@@ -42,7 +43,8 @@ export interface Depths {
 }
 
 const MOST_PIXELS = 1 << 22; // in a target
-const SCREEN_BYTES = 64; // of present.wgsl's uniforms
+const SCREEN_BYTES = 112; // of present.wgsl's uniforms
+const UNCHANGED = [...[1, 0, 0, 0], ...[0, 1, 0, 0], ...[0, 0, 1, 0]];
 const MOST_OVERDRAW = 64; // upper end of the overdraw map
 
 export class Renderer {
@@ -159,6 +161,7 @@ export class Renderer {
     u[6] = SHOW[options.show];
     f.set([options.show === 'overdraw' ? MOST_OVERDRAW : options.farthest, width, height], 7);
     u.set([part[0], part[1], target.samples], 10);
+    f.set(options.correction ?? UNCHANGED, 16);
     device.queue.writeBuffer(this.screen, 0, data);
     const bound = group(device, pipeline.getBindGroupLayout(0), [this.screen, target.sums.createView(), this.smooth]);
     const work = encoder.beginRenderPass({

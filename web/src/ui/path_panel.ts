@@ -77,6 +77,10 @@ export class PathPanel {
     void film?.end().then((data) => download(this.stage.fileName('webm'), data));
   }
 
+  get plays(): boolean {
+    return this.playing !== null;
+  }
+
   get filming(): boolean {
     return this.playing?.record === true;
   }

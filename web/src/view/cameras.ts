@@ -1,7 +1,7 @@
 // Cameras of the capture, from the optional cameras.json.
 import type { Vec3 } from '../bundle/manifest';
 import type { Lens, Pose } from './pose';
-import { add, dot, subtract, times } from './vector';
+import { add, dot, length, subtract, times } from './vector';
 
 export interface CaptureCamera {
   name: string;
@@ -9,12 +9,20 @@ export interface CaptureCamera {
   pose: Pose;
   lens: Lens;
   photograph: string | null; // file in the bundle
+  correction: number[] | null; // of the scene's colours to the photograph's: matrix and offset [3, 4] by rows
 }
 
 const FILE = /^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$/;
 const MOST = 100_000;
+const SAME = 1e-6; // difference of equal poses, relative
 
 const isNumber = (x: unknown): x is number => typeof x === 'number' && Number.isFinite(x);
+
+function correctionOf(found: unknown): number[] | null {
+  if (!Array.isArray(found) || !found.every(isNumber)) return null;
+  if (found.length === 3) return found.flatMap((gain, c) => [0, 1, 2, 3].map((k) => (k === c ? gain : 0)));
+  return found.length === 12 ? found : null;
+}
 
 function camera(row: unknown): CaptureCamera | null {
   if (typeof row !== 'object' || row === null) return null;
@@ -33,6 +41,7 @@ function camera(row: unknown): CaptureCamera | null {
     pose: { position: times(-1, back), right, down, forward },
     lens,
     photograph,
+    correction: correctionOf(r.correction),
   };
 }
 
@@ -49,6 +58,15 @@ export function parseCameras(text: string): CaptureCamera[] {
     .slice(0, MOST)
     .map(camera)
     .filter((found) => found !== null);
+}
+
+// Returns the correction of the camera that has a pose; null: none has, or it has none.
+export function correctionAt(cameras: CaptureCamera[], pose: Pose): number[] | null {
+  const same = (a: Vec3, b: Vec3): boolean => length(subtract(a, b)) < SAME * (1 + length(b));
+  const found = cameras.find(
+    ({ pose: p }) => same(pose.position, p.position) && same(pose.right, p.right) && same(pose.forward, p.forward),
+  );
+  return found?.correction ?? null;
 }
 
 // Computes the point nearest to all optical axes by least squares; null if they are parallel.

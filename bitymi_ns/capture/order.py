@@ -1,0 +1,40 @@
+"""Order of a capture's photographs by their names."""
+
+from bisect import bisect_left
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+
+from bitymi_ns.capture.photos import natural
+
+Position = tuple[int, ...]
+
+
+class Neighbours:
+    """Finds the photographs before and after another one in its sequence: those of its folder whose names differ in
+    numbers alone, as several cameras may write to one folder."""
+
+    def __init__(self, files: Sequence[Path]) -> None:
+        found = defaultdict(list)
+        for index, file in enumerate(files):
+            sequence, position = _numbered(file)
+            found[sequence].append((position, index))
+        self._sequences = {sequence: sorted(members) for sequence, members in found.items()}
+
+    def of(self, file: Path) -> tuple[int, int, float] | None:
+        """Return the indices of the photographs before and after a file, and how far it is between them by the first
+        number that differs, 0 to 1; beyond an end twice that photograph. None: its sequence has none."""
+        sequence, position = _numbered(file)
+        members = self._sequences.get(sequence)
+        if members is None:
+            return None
+        after = bisect_left(members, (position,))
+        (low, first), (high, last) = members[max(after - 1, 0)], members[min(after, len(members) - 1)]
+        share = next(((at - a) / (b - a) for a, at, b in zip(low, position, high, strict=True) if a != b), 0.0)
+        return first, last, share
+
+
+def _numbered(file: Path) -> tuple[tuple[str, ...], Position]:
+    """Split a path into what a sequence has in common, and the numbers in its name."""
+    parts = natural(file.stem)
+    return (str(file.parent), *(text for kind, _, text in parts if not kind)), tuple(n for kind, n, _ in parts if kind)

@@ -20,6 +20,7 @@ from bitymi_ns.measure.report.records import ReportError
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.reading import open_regular
 from tests.captures import edit, edit_frames, expect, load_any
+from tests.measure.report.conftest import cell, figures, write_lines
 from tests.plugin.data.test_scanner_views import polycam, record3d, scannet
 
 
@@ -256,5 +257,8 @@ def test_names_in_a_report_that_no_file_can_have(tmp_path: Path) -> None:
     value = {"bitymi_pictures": 1, "scene": "a", "method": "b", "captions": {"final": "x"}, "views": [view]}
     (tmp_path / "pictures.json").write_text(json.dumps(value))
     assert build([tmp_path / "pictures.json"], tmp_path / "report").is_file()  # like without a picture
+    named = [cell("train", {"curve": "a" * 300}), cell("pictures", {"folder": "a" * 300})]
+    cells = write_lines(tmp_path / "cells.jsonl", [*named, cell("eval", figures(25.0, 30.0))])
+    assert build([cells], tmp_path / "cells").is_file()
     with pytest.raises(OSError, match="no file can have this name"):
         open_regular(tmp_path / "a\0")

@@ -1,5 +1,5 @@
-"""Reader of PLY files, binary or text: header, and the rows of an element. plyfile is not used: it is under the GPL,
-and allocates memory for as many rows of text as a header claims."""
+"""Reader of PLY files, binary or text: header, and the rows of an element; writer of points. plyfile is not used: it is
+under the GPL, and allocates memory for as many rows of text as a header claims."""
 
 import re
 import warnings
@@ -167,3 +167,13 @@ def text_lines(path: Path, header: Header, name: str) -> Iterator[tuple[int, str
     with TextIOWrapper(open_regular(path), encoding="latin-1", newline="\n") as file:
         filled = ((number, line) for number, line in enumerate(file, 1) if number > header.lines and line.strip())
         yield from islice(filled, header.ahead(name), None)
+
+
+def write_cloud(path: Path, points: npt.NDArray, colors: npt.NDArray) -> None:
+    """Write points [n, 3] with colors [n, 3] as binary little-endian PLY."""
+    rows = np.empty(len(points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    rows["xyz"], rows["rgb"] = points, colors
+    names = ["float x", "float y", "float z", "uchar red", "uchar green", "uchar blue"]
+    properties = "".join(f"property {name}\n" for name in names)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
+    path.write_bytes(header.encode("ascii") + rows.tobytes())

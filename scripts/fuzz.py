@@ -122,6 +122,8 @@ def fuzz(name: str, seconds: int, folder: Path, work: Path) -> None:
                 (folder / file).write_bytes(data)
                 print(f"FOUND {file}: {error}"[:300], file=sys.stderr, flush=True)
 
+    for seed in target.seeds:
+        one(seed)  # late imports would count as a hang
     corpus = work / "corpus"
     corpus.mkdir()
     for k, seed in enumerate(target.seeds):

@@ -34,6 +34,7 @@ from bitymi_ns.ply import PlyError
 from bitymi_ns.sample import generate
 from bitymi_ns.scene.config import SceneConfig
 from tests.captures import as_binary, colmap_model
+from tests.measure.report.conftest import POSES, cell
 from tests.plugin.run.test_checkpoints import moved, state
 
 CUT = b"\n--8<--\n"  # separates the files of an input
@@ -214,14 +215,12 @@ def report(work: Path) -> Target:
     evaluation = {"experiment_name": "a", "method_name": "bitymi", "checkpoint": "a/b/c.ckpt", "results": results}
     point = {"step": 10, "seconds": 1.0, "cpu_seconds": 2.0, "surfels": 10, "fragments": 5, "psnr": 20.0}
     point |= {"scene": "a", "method": "bitymi"}
-    made = {"command": "x", "seconds": 1.0, "version": "1", "commit": "a"}
-    key = {"scene": "a", "method": "bitymi", "seed": 0, "kind": "eval", "form": "run", "options": []}
-    cell = {"key": key, "value": evaluation, "made": made}
-    poses = {"registered": 3, "given": 4, "reprojection_error": 0.5, "track_length": 3.0, "left_out": {}, "seconds": {}}
-    poses |= {"contradicted": 0.0, "cameras": [], "up": "gravity", "metres_per_unit": 1.0, "gps_error": None}
+    train = cell("train", {"seconds": 1.0, "steps": 10, "curve": "named/curve.jsonl"})
+    cells = [train, cell("eval", evaluation), cell("export", {"bytes": 9}, "bc7"), cell("eval", evaluation, "bc7")]
+    cells.append(cell("pictures", {"folder": "named"}))
     pictures = {"bitymi_pictures": 1, "scene": "a", "method": "b", "captions": {"final": "x"}}
     pictures |= {"views": [{"view": 0, "rank": 1, "of": 2, "metrics": {"psnr": 1.0}, "files": {"final": "a.png"}}]}
-    seeds = {"eval.json": [evaluation], "curve.jsonl": [point, point], "cells.jsonl": [cell], "report.json": [poses]}
+    seeds = {"eval.json": [evaluation], "curve.jsonl": [point, point], "cells.jsonl": cells, "report.json": [POSES]}
     seeds["pictures.json"] = [pictures]
     Image.new("RGB", (4, 4)).save(work / "a.png")
     names = list(seeds)
@@ -236,7 +235,10 @@ def report(work: Path) -> Target:
             path.unlink()
 
     starts = [next(bytes([b]) for b in range(256) if b % len(names) == k) for k in range(len(names))]
-    lines = ["\n".join(map(json.dumps, seeds[name])).encode() for name in names]
+    lines = ["".join(f"{json.dumps(line)}\n" for line in seeds[name]).encode() for name in names]
+    (work / "named").mkdir()
+    for name, line in zip(names, lines, strict=True):
+        (work / "named" / name).write_bytes(line)
     return Target(run, [CUT.join(pair) for pair in zip(starts, lines, strict=True)], (ReportError,), True)
 
 

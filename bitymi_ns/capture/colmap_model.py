@@ -4,6 +4,7 @@ pycolmap's reader accepts truncated files, ends names in text files at the first
 points. So files are parsed here; pycolmap has the camera models (`capture/lens.py`).
 """
 
+import errno
 import functools
 import math
 import os
@@ -89,6 +90,23 @@ def _read_model(folder: Path, stamps: tuple[Any, ...]) -> Model:
 
 
 forget_model = _read_model.cache_clear
+
+
+def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
+    """Write a model in binary form. Raises OSError: it is not whole. COLMAP ignores failed writes, hence its files are
+    read again, not by COLMAP, whose reader does not end on some that are cut off."""
+    readers = {
+        "cameras": _cameras_binary,
+        "images": _images_binary,
+        "frames": _frames_binary,
+        "points3D": _points_binary,
+    }
+    try:
+        model.write_binary(folder)
+        for name, read in readers.items():
+            tuple(read(folder / f"{name}.bin"))
+    except (ValueError, struct.error, OSError) as error:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder)) from error
 
 
 def _file(folder: Path, name: str) -> Path:

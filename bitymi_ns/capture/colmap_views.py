@@ -1,5 +1,6 @@
 """Photographs of a COLMAP model: find image and mask files, and convert poses and points to nerfstudio's frame."""
 
+import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -121,7 +122,7 @@ def _find_folder(
     portable = [name for name in names if leads_inside(name)]
 
     def exact_count(path: Path) -> int:
-        return max((sum((each / name).is_file() for name in portable) for each in with_copies(path)), default=0)
+        return max((sum(os.path.isfile(each / name) for name in portable) for each in with_copies(path)), default=0)
 
     best = max(folders, key=exact_count)  # the first of equals
     if not need_photos or exact_count(best) == len(names):

@@ -47,7 +47,7 @@ class FileFinder:
     def find(self, name: str) -> Path | None:
         """Find a file; None = none, or more than one."""
         for exact in (name, name.replace("\\", "/")):
-            if self._allowed(exact) and (self.folder / exact).is_file():
+            if self._allowed(exact) and os.path.isfile(self.folder / exact):
                 return self.folder / exact
         parts = folded(name)
         if not parts:
@@ -117,10 +117,11 @@ class FileFinder:
             yield from (Path(folder, name) for name in files if name.lower().endswith(self.extensions))
 
 
+# os.path.isfile, unlike Path.is_file, also takes names that are too long for this system, or extended to be so.
 def check_photographs_exist(source: Path, files: Iterable[Path]) -> None:
     """Fail if photographs of a capture's file or folder are missing, with similar names of existing files."""
     names = list(dict.fromkeys(files))
-    missing = [file for file in names if not file.is_file()]
+    missing = [file for file in names if not os.path.isfile(file)]
     if not missing:
         return
     some = "\n  ".join(f"{file}{_hint(source.parent, file)}" for file in missing[:3])
@@ -142,11 +143,11 @@ def name_unused(folder: Path, used: Iterable[Path | None], downscale: int | None
 
 
 def _hint(folder: Path, file: Path) -> str:
-    if file.is_symlink():
+    if os.path.islink(file):
         return " (a link to nothing)"
-    if file.exists():
+    if os.path.exists(file):
         return " (not a file)"
-    near = FileFinder(file.parent if file.parent.is_dir() else folder).nearest(file.name)
+    near = FileFinder(file.parent if os.path.isdir(file.parent) else folder).nearest(file.name)
     return f" ({near})" if near else ""
 
 
@@ -172,7 +173,7 @@ def report_files(path: Path, names: Sequence[str], files: Sequence[Path], masks:
         say(f"{path}: {other}")
     folder = os.path.normpath(path.parent)
     pictures = dict.fromkeys(Path(os.path.normpath(file)) for file in (*files, *masks) if file is not None)
-    outside = [file for file in pictures if not file.is_relative_to(folder) and file.is_file()]
+    outside = [file for file in pictures if not file.is_relative_to(folder) and os.path.isfile(file)]
     if outside:
         warn(f"{path} names pictures outside of its folder, which are read there: {listed(outside)}.")
 
@@ -230,9 +231,9 @@ def downscaled(photographs: list[Photograph], folder: Path, downscale: int) -> l
 
     def mask_copy(mask: Path | None) -> Path | None:
         small = None if mask is None else folder / f"masks_{downscale}" / mask.name
-        return small if small is not None and small.is_file() else mask
+        return small if small is not None and os.path.isfile(small) else mask
 
-    found = [next((copy for copy in copies(each.file) if copy.is_file()), None) for each in photographs]
+    found = [next((copy for copy in copies(each.file) if os.path.isfile(copy)), None) for each in photographs]
     if not any(found):
         return photographs
     lacking = [copies(each.file)[0] for each, copy in zip(photographs, found, strict=True) if copy is None]

@@ -49,14 +49,14 @@ def triangulate(
         CaptureError: too few points can be found; says what may be wrong.
         KeyboardInterrupt: Ctrl-C; what is done is kept.
     """
-    missing = [view.file for view in views if not view.file.is_file()]
+    missing = [view.file for view in views if not os.path.isfile(view.file)]
     if missing:
         raise CaptureError(f"{missing[0]} is missing ({len(missing)} of {len(views)}): put the photographs there")
     if len(views) < 2:
         raise CaptureError(f"{capture}: points need at least two photographs with poses, these are {len(views)}")
     names = [os.path.relpath(view.file, capture) for view in views]
     check_names(capture, names)
-    masks = [view.mask for view in views if view.mask is not None and view.mask.is_file()]
+    masks = [view.mask for view in views if view.mask is not None and os.path.isfile(view.mask)]
     inputs = list(zip(names, (view.file for view in views), strict=True))
     inputs += [(os.path.relpath(mask, capture), mask) for mask in masks]
     key = content_key(inputs, [(view.camera, np.asarray(view.world_to_camera).tolist()) for view in views])
@@ -116,7 +116,7 @@ def _job(stated: Sequence[str], views: Sequence[KnownView], work: Path) -> Job:
         groups[view.camera].append(plain)
         names[plain] = name
         poses[plain] = np.asarray(view.world_to_camera, float)[:3].tolist()
-        if view.mask is not None and view.mask.is_file():
+        if view.mask is not None and os.path.isfile(view.mask):
             colmap_mask(view.mask, view.file.name, view.camera.size).save(masks / f"{plain}.png")
     mask_folder = str(masks.resolve()) if any(masks.iterdir()) else None
     cameras = [CameraGroup(camera, True, members) for camera, members in groups.items()]

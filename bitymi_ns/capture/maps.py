@@ -43,7 +43,7 @@ def maps_called(folder: Path, depth: str, confidence: str) -> MapFiles:
 
     def find(name: str) -> Path | None:
         files = (folder / f"{name}{ending}" for ending in MAP_FILES)
-        return next((file for file in files if file.is_file()), None)
+        return next((file for file in files if os.path.isfile(file)), None)
 
     return MapFiles(find(depth), find(confidence))
 

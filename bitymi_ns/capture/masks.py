@@ -61,7 +61,7 @@ def mask_of(masks: Path, name: str) -> Path | None:
     endings = (".png", *PHOTOGRAPHS)
     candidates = [f"{name}.png", *(stem + ending for ending in endings), f"{name}.PNG"]
     candidates += [stem + ending.upper() for ending in endings]
-    found = next((masks / c for c in candidates if (masks / c).is_file()), None)
+    found = next((masks / c for c in candidates if os.path.isfile(masks / c)), None)
     is_copy = found is None and name.endswith(COPY) and stem.lower().endswith(PHOTOGRAPHS)
     return mask_of(masks, stem) if is_copy else found
 
@@ -119,7 +119,7 @@ def with_masks(photographs: Sequence[Photograph], capture: Path, base: Path | No
     photographs. Raises CaptureError: the folder has masks of some photographs only."""
     files = [each.file for each in photographs]
     dynamic = [file.with_name(f"{DYNAMIC_MASK}{file.stem}.png") for file in files]
-    found: Sequence[Path | None] | None = [file if file.is_file() else None for file in dynamic]
+    found: Sequence[Path | None] | None = [file if os.path.isfile(file) else None for file in dynamic]
     if any(found):
         count = sum(file is not None for file in found)
         said = f"{count} masks {DYNAMIC_MASK}*.png beside {len(files)} photographs are used, of which black counts"
@@ -138,7 +138,7 @@ def with_masks(photographs: Sequence[Photograph], capture: Path, base: Path | No
 def check_masks(photographs: Sequence[Photograph]) -> None:
     """Fail if masks are missing or cannot be used, before time is spent on the photographs."""
     masked = {each.mask: each for each in photographs if each.mask is not None}
-    missing = [mask for mask in masked if not mask.exists()]
+    missing = [mask for mask in masked if not os.path.exists(mask)]
     if missing:
         where = f"{len(missing)} of {len(masked)} masks of the capture are missing: {listed(missing)}"
         fail(f"{where}. Put them there, or correct their names; {LEAVE_OUT}.")

@@ -10,6 +10,7 @@ import pycolmap
 from bitymi_ns.capture.report import FILES
 from bitymi_ns.capture.types import Poses
 from bitymi_ns.files import complete_folder, copy_files
+from bitymi_ns.ply import write_cloud
 from bitymi_ns.progress import Progress
 from bitymi_ns.trust import inside
 
@@ -42,7 +43,9 @@ def write_capture(poses: Poses, folder: Path, progress: Progress) -> None:
             shutil.copyfile(poses.images / name, target)
         progress("copying photographs", len(names), len(names))
         copy_files(poses.model, new / "sparse" / "0")
-        model.export_PLY(new / CLOUD)
+        points = model.points3D.values()
+        xyz, rgb = (np.reshape([getattr(point, name) for point in points], (-1, 3)) for name in ("xyz", "color"))
+        write_cloud(new / CLOUD, xyz, rgb)  # COLMAP's own writer does not notice a full disk
         (new / "transforms.json").write_text(json.dumps(transforms(model), indent=2, ensure_ascii=False) + "\n", "utf8")
         for name in FILES:
             shutil.copyfile(poses.report / name, new / name)

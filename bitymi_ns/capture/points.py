@@ -5,6 +5,7 @@ nerfstudio's PLY reader returns uninitialized memory for missing points, and div
 [0, 1].
 """
 
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -147,7 +148,7 @@ def reporting_time(what: str, points: int) -> Iterator[None]:
 def read_cloud(path: Path, remedy: str) -> tuple[Points, str]:
     """Read a PLY file, see `read_points`. Raises CaptureError: it is missing, or cannot be read; `remedy` says what to
     do."""
-    fault = ply_fault(path) if path.is_file() else "does not exist"
+    fault = ply_fault(path) if os.path.isfile(path) else "does not exist"
     if fault is not None:
         fail(f"the point cloud {path} {fault}. {remedy}")
     try:

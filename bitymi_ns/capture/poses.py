@@ -14,6 +14,7 @@ import pycolmap
 from pydantic import TypeAdapter
 
 from bitymi_ns.capture.cache import content_key, replace_stale, work_folder
+from bitymi_ns.capture.colmap_model import write_model
 from bitymi_ns.capture.frame import local_positions, move_to_world, write_frame
 from bitymi_ns.capture.masks import mask_folder
 from bitymi_ns.capture.photos import Photo, blurred, check_names, duplicates, find_photos, photo_folder, read_photos
@@ -247,7 +248,7 @@ def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence
     with complete_folder(work / "result") as result:
         sparse = result / SPARSE
         sparse.mkdir(parents=True)
-        model.write_binary(sparse)
+        write_model(model, sparse)
         write_frame(result, frame)
         write_report(result, values, model)
         write_file(result / "poses.json", json.dumps({"made": images == work / IMAGES, **kept}).encode())

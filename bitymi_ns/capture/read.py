@@ -1,6 +1,7 @@
 """Read a capture of any format: photographs with cameras, poses and masks, and points."""
 
 import math
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -252,7 +253,7 @@ class _Reader:
         for name in ("val", "test"):
             if (found.path / f"transforms_{name}.json").is_file():
                 part = self._read_transforms(found.folder / f"transforms_{name}.json")
-                parts[name] = [each for each in part.photographs if not need_photos or each.file.is_file()]
+                parts[name] = [each for each in part.photographs if not need_photos or os.path.isfile(each.file)]
                 if lacking := [each.file for each in part.photographs if each not in parts[name]]:
                     what = str(len(lacking)) if parts[name] else "all"
                     left = f"left out: {listed(lacking)}"

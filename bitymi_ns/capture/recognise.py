@@ -183,7 +183,7 @@ def _kind_of(file: Path) -> Format:
 
 def is_model(folder: Path) -> bool:
     """Test for the cameras of a COLMAP model."""
-    return any((folder / name).is_file() for name in ("cameras.bin", "cameras.txt"))
+    return any(os.path.isfile(folder / name) for name in ("cameras.bin", "cameras.txt"))
 
 
 def models_in(data: Path) -> list[Path]:
@@ -236,7 +236,7 @@ def _colmap_given(data: Path, colmap_path: Path) -> Found:
     model = folder / colmap_path
     if is_model(model):
         return Found("colmap", model, folder)
-    what = "has no cameras.bin or cameras.txt" if model.is_dir() else "does not exist"
+    what = "has no cameras.bin or cameras.txt" if os.path.isdir(model) else "does not exist"
     there = models_in(folder)
     if not there:
         fail(f"the COLMAP model {model} {what}, and there is none in other folders of {folder}.")

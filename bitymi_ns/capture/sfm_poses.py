@@ -83,7 +83,7 @@ def kept_source(found: Found, kept: KeptPoses, masks_path: Path | None, downscal
     source = make_source(kept.folder / MODEL, images, masks, downscale, kept.left_out)
     if need_photos:
         files = source.files()
-        missing = [file.readlink() if file.is_symlink() else file for file in files if not file.is_file()]
+        missing = [file.readlink() if file.is_symlink() else file for file in files if not os.path.isfile(file)]
         changed = []
         sizes = in_threads(image_size, files) if source.copies is None else [None] * len(files)
         for image, file, size in zip(source.model.images, files, sizes, strict=True):

@@ -13,7 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from bitymi_ns.capture.find_files import FileFinder, downscaled, find_maps, find_masks, find_photographs, report_files
+from bitymi_ns.capture.find_files import (
+    FileFinder,
+    downscaled,
+    find_maps,
+    find_masks,
+    find_photographs,
+    folded,
+    report_files,
+)
 from bitymi_ns.capture.images import image_size
 from bitymi_ns.capture.masks import with_masks
 from bitymi_ns.capture.pose_checks import as_matrix, check_repeated, correct_poses
@@ -87,7 +95,7 @@ def read_transforms(
     cloud = meta.get("ply_file_path")
     if cloud is not None and (not isinstance(cloud, str) or not cloud):
         fail(f"{path}: ply_file_path is {cloud!r}, not the name of a file. Correct it or remove it.")
-    if cloud and not (path.parent / cloud).is_file():
+    if cloud and not os.path.isfile(path.parent / cloud):
         there = FileFinder(path.parent, extensions=(".ply",)).find(cloud)
         meta["ply_file_path"] = cloud if there is None else there.relative_to(path.parent).as_posix()
     if need_photos:
@@ -162,9 +170,9 @@ def _check_frames(path: Path, meta: Any, own_format: bool) -> None:
             fail(f"{path}: frame {i} (counted from 0) has no {' and no '.join(lacking)}. Add that or remove the frame.")
         for key in FILE_KEYS:
             name = frame.get(key, "none")
-            if not isinstance(name, str) or not name:
+            if not isinstance(name, str) or folded(name)[-1:] in ((), ("..",)):  # of the folder itself or above
                 fail(f"{path}: the {key} of frame {i} is {name!r}, not the name of a file")
-            if key in frame and os.sep == "/" and not (path.parent / name).exists():
+            if key in frame and os.sep == "/" and not os.path.exists(path.parent / name):
                 frame[key] = name.replace("\\", "/")
     without = [frame["file_path"] for frame in frames if "mask_path" not in frame]
     if 0 < len(without) < len(frames):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image as PILImage
 
 from bitymi_ns.files import complete_folder
+from bitymi_ns.ply import write_cloud
 from bitymi_ns.progress import no_progress, rich_progress
 from bitymi_ns.reading import read_json
 from bitymi_ns.sample.room import Hits, Room
@@ -107,16 +108,6 @@ def sparse_points(
     return np.concatenate(points), np.concatenate(colors)
 
 
-def write_ply(path: Path, points: NDArray[np.float32], colors: NDArray[np.uint8]) -> None:
-    """Write points [n, 3] with colors [n, 3] as binary little-endian PLY."""
-    rows = np.empty(len(points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    rows["xyz"], rows["rgb"] = points, colors
-    names = ["float x", "float y", "float z", "uchar red", "uchar green", "uchar blue"]
-    properties = "".join(f"property {name}\n" for name in names)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
-    path.write_bytes(header.encode("ascii") + rows.tobytes())
-
-
 def generate(
     output_dir: Path,
     views: int = 60,
@@ -192,7 +183,7 @@ def _write(folder: Path, views: int, width: int, height: int, seed: int, points:
             except BaseException:  # also Ctrl-C: do not wait for pending frames
                 pool.shutdown(cancel_futures=True)
                 raise
-    write_ply(folder / CLOUD, *sparse_points(room, path, images, points, seed))
+    write_cloud(folder / CLOUD, *sparse_points(room, path, images, points, seed))
     meta = {
         "made_by": MADE_BY,
         "camera_model": "OPENCV",

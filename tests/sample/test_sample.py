@@ -162,7 +162,7 @@ def test_interrupted_stops_soon_and_leaves_nothing(tmp_path: Path, monkeypatch: 
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
-        patch.setattr("bitymi_ns.sample.capture.write_ply", full_disk)
+        patch.setattr("bitymi_ns.sample.capture.write_cloud", full_disk)
         generate(tmp_path / "room", views=1, width=16, height=12)
     assert not list(tmp_path.iterdir())
     calls = []

@@ -90,7 +90,8 @@ def replaced(rng: random.Random, info: dict[str, Any], files: dict[str, bytes]) 
     codes = [rng.randrange(-reach, reach) for _ in range(rows)]
     data = compress(np.array(codes, dtype=np.int64).reshape(rows, 1)).data
     if rng.random() < 0.2:
-        data = rng.randbytes(rng.choice((1, size, size + 1, 1000)))
+        length = rng.choice((1, size, size + 1, 1000))  # misstated before, perhaps
+        data = rng.randbytes(max(0, min(length, 1000)))
     files[name] = files[name][:at] + data + files[name][at + size :]
     sizes[index] = len(data)
 

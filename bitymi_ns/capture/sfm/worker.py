@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from bitymi_ns.capture.colmap_model import write_model
 from bitymi_ns.capture.sfm import consistency, explain, features, mapping, pairs
 from bitymi_ns.capture.sfm.job import DATABASE, MODEL, Job, NoPoses
 from bitymi_ns.files import complete_folder
@@ -99,7 +100,7 @@ def main() -> None:
         for image in model.images.values():
             image.name = job.names[image.name]
         with complete_folder(Path(job.work) / MODEL) as folder:
-            model.write_binary(folder)
+            write_model(model, folder)
         stages("writing", 1, 1)
         send(result={**result, "seconds": {k: v for k, v in stages.seconds.items() if k != "starting"}})
     except NoPoses as failure:

@@ -178,12 +178,12 @@ def _add_run(trained: Evaluation, suffix: str, cells: dict[tuple[str, str], dict
                 group = f"{trained.method}, {bundle}" if bundle else trained.method
                 own = {"baked": bool(bundle), "label": group + suffix, "group": group}
                 records.evaluations.append(replace(trained, results=results, **own))
-            elif kind == "pictures" and (listed := folder / value["folder"] / PICTURES).is_file():
+            elif kind == "pictures" and os.path.isfile(listed := folder / value["folder"] / PICTURES):
                 records.worst |= picture_files(listed, trained.label)
         except (KeyError, TypeError, AttributeError) as error:
             raise ReportError(f"{trained.source}: the {kind} cell of {trained.method} lacks {error}.") from error
     curve = folder / str(train["curve"]) if train.get("curve") else None
-    if curve is not None and curve.is_file():
+    if curve is not None and os.path.isfile(curve):
         _, curves, notes = read_jsonl(curve)
         records.curves += [replace(c, scene=trained.scene, label=trained.label, run=trained.run) for c in curves]
         records.notes += notes

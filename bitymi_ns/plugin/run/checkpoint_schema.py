@@ -195,7 +195,9 @@ def check_optimizer(optimizer: Entry, parameters: Sequence[Tensor]) -> None:
     if not isinstance(groups.value, list) or len(groups.value) != 1:
         groups.refuse("a list of one group")
     group = Entry(groups.value[0], f"{groups.name}.0")
-    if group["params"].value != list(range(len(parameters))):
+    numbers = group["params"].value
+    plain = isinstance(numbers, list) and all(isinstance(each, int) for each in numbers)  # tensors compare otherwise
+    if not plain or numbers != list(range(len(parameters))):
         group["params"].refuse(f"the numbers of {len(parameters)} parameters")
     group["lr"].number(0.0, MOST)
     for number, value in optimizer["state"].table().items():

@@ -1,12 +1,13 @@
 """COLMAP models as other programs and editors write them."""
 
+import resource
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
 
-from bitymi_ns.capture.colmap_model import read_model
+from bitymi_ns.capture.colmap_model import read_model, write_model
 from tests.captures import as_binary, expect, held_out, images_of, load_any, printed, refused
 
 
@@ -94,6 +95,21 @@ def test_a_single_file_in_text_is_of_another_model(project: Path) -> None:
     as_binary(folder)
     (folder / "cameras.txt").write_text("1 PINHOLE 48 36 20 20 24 18\n")
     assert read_model(folder).cameras[1].params[0] == 40.0
+
+
+@pytest.mark.parametrize("size", [100, 1000, 20_000])
+def test_a_model_that_is_not_written_whole(tmp_path: Path, size: int) -> None:
+    pycolmap.set_random_seed(0)
+    model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_frames_per_rig=9, num_points3D=50))
+    write_model(model, tmp_path)
+    assert len(read_model(tmp_path).images) == len(model.images)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        with pytest.raises(OSError, match="No space left"):
+            write_model(model, tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 @pytest.mark.parametrize("form", ["txt", "bin"])

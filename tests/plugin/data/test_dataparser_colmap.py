@@ -157,6 +157,17 @@ def test_photographs_that_the_model_lacks_are_named(project: Path, capsys: pytes
     )
 
 
+def test_a_name_as_long_as_the_system_allows(project: Path) -> None:
+    path, name, model = images_of(project)[0], "a" * 251 + ".png", project / "sparse/0/images.txt"
+    path.rename(path.with_name(name))
+    model.write_text(model.read_text().replace(path.name, name))
+    save_masks(project, 255)
+    assert "mask" in load_any(project).cached_train[0]
+    model.write_text(model.read_text().replace(name, f"a{name}"))
+    with expect(r"1 of 12 photographs of .* are missing:\s+.*/aaaa"):
+        load_any(project)
+
+
 def test_photographs_of_the_model_that_are_not_there(project: Path) -> None:
     images_of(project)[3].unlink()
     with expect(r"1 of 12 photographs of .* are missing:\s+.*frame_00004.png"):

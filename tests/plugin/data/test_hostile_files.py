@@ -13,19 +13,21 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from bitymi_ns.capture.exif import Exif, exposure_exif, exposure_settings, read_exif
 from bitymi_ns.capture.images import exposure_stops
 from bitymi_ns.measure.report.page import build
 from bitymi_ns.measure.report.records import ReportError
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.reading import open_regular
 from tests.captures import edit, edit_frames, expect, load_any
+from tests.measure.report.conftest import cell, figures, write_lines
 from tests.plugin.data.test_scanner_views import polycam, record3d, scannet
 
 
 @pytest.fixture(autouse=True)
 def no_hang() -> Iterator[None]:
     def stop(*_: Any) -> None:
-        raise TimeoutError("it waits for ever")
+        pytest.fail("it waits for ever")  # not an Exception, which readers turn into a message
 
     before = signal.signal(signal.SIGALRM, stop)
     signal.alarm(60)
@@ -230,6 +232,8 @@ def test_exif_that_breaks_pillow_counts_as_none(tmp_path: Path) -> None:
     for path in paths:
         Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(path, exif=exif)
     assert np.isnan(exposure_stops(paths)).all()
+    with Image.open(paths[0]) as image:
+        assert read_exif(image) == Exif() and exposure_settings(image) is None and not dict(exposure_exif(image))
 
 
 @pytest.mark.parametrize("ending", ["png", "jpg", "webp", "tif"])
@@ -253,5 +257,8 @@ def test_names_in_a_report_that_no_file_can_have(tmp_path: Path) -> None:
     value = {"bitymi_pictures": 1, "scene": "a", "method": "b", "captions": {"final": "x"}, "views": [view]}
     (tmp_path / "pictures.json").write_text(json.dumps(value))
     assert build([tmp_path / "pictures.json"], tmp_path / "report").is_file()  # like without a picture
+    named = [cell("train", {"curve": "a" * 300}), cell("pictures", {"folder": "a" * 300})]
+    cells = write_lines(tmp_path / "cells.jsonl", [*named, cell("eval", figures(25.0, 30.0))])
+    assert build([cells], tmp_path / "cells").is_file()
     with pytest.raises(OSError, match="no file can have this name"):
         open_regular(tmp_path / "a\0")

@@ -48,6 +48,14 @@ def test_names_do_not_control_the_terminal(capsys: pytest.CaptureFixture[str]) -
     assert str(InputError("\x1b]0;x\x07")) == "bitymi: \\x1b]0;x\\x07"
 
 
+def test_a_name_as_long_as_the_system_allows(capture: Path) -> None:
+    path = images_of(capture)[0]
+    named = path.rename(path.with_name("a" * 251 + ".png"))
+    edit(capture, lambda meta: meta["frames"][0].update(file_path=f"images/{named.name}"))
+    save_masks(capture, 255)
+    assert "mask" in load(capture).cached_train[0]
+
+
 def test_a_frame_with_a_camera_of_its_own(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     edit(capture, lambda meta: meta["frames"][5].update(w=meta["w"], fl_x=meta["fl_x"]))
     load(capture)
@@ -104,6 +112,16 @@ def set_value(key: str, value: Any) -> Any:
         (lambda meta: meta["frames"][3]["transform_matrix"][0].__setitem__(3, math.nan), "_00004.png is not a matrix"),
         (set_value("ply_file_path", 7), "ply_file_path is 7, not the name of a file"),
         (lambda meta: meta["frames"][2].update(file_path=7), "the file_path of frame 2 is 7, not the name of a file"),
+        (
+            lambda meta: meta["frames"][2].update(file_path="a/.."),
+            "file_path of frame 2 is 'a/..', not the name of a file",
+        ),
+        (
+            lambda meta: meta["frames"][2].update(mask_path="\\\\"),
+            r"mask_path of frame 2 is '.*', not the name of a file",
+        ),
+        (lambda meta: meta["frames"][2].update(file_path="a" * 300), r"1 of 12 photographs .* missing:\s+.*/aaa"),
+        (set_value("ply_file_path", "a" * 300), "the point cloud .*/aaa.* does not exist"),
         (lambda meta: meta["frames"][2].update(h="tall"), "h of images/frame_00003.png is 'tall', which is no number"),
         (
             lambda meta: [f.update(w=meta["w"]) for f in meta["frames"][1:]] and meta.pop("w"),

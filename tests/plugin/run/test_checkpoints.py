@@ -309,6 +309,10 @@ def test_an_archive_that_declares_more_than_it_holds_is_not_read(saved: Path) ->
         (lambda saved: saved.update(state=[1]), "state has to be a table"),
         (lambda saved: saved["param_groups"][0].update(lr="fast"), "param_groups.0.lr has to be a number"),
         (lambda saved: saved["param_groups"][0].update(params=[0, 1]), "params has to be the numbers of 1 parameters"),
+        (
+            lambda saved: saved["param_groups"][0].update(params=[torch.zeros(2)]),
+            "params has to be the numbers of 1 par",
+        ),
         (lambda saved: saved.pop("param_groups"), "param_groups is missing"),
     ],
 )

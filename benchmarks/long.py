@@ -45,7 +45,7 @@ from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.init import scene_for_views
 from bitymi_ns.train.losses import fitted_psnr, photometric, psnr
 from bitymi_ns.train.preset import Loader, Preset, load_preset
-from bitymi_ns.train.views import View, eval_background, shown, spread
+from bitymi_ns.train.views import View, eval_background, spread
 
 RUNS = ("10000/4", "1500/2", "300/1")
 WATCHED, EVERY, WATCH = 8, 30, 300
@@ -191,28 +191,26 @@ def measure(run: Run) -> dict[str, Any]:
     )
     trainer = Trainer(scene, capture.train, preset.train, run.steps)
     watch, clock, before = TexelWatch(trainer, capture.train), trainer.training.clock, math.nan
-    told = {run.steps * i // 20 for i in range(1, 20)}
+    shown = {run.steps * i // 20 for i in range(1, 20)}
     while trainer.step < run.steps:
         if trainer.step == trainer.training.schedule.texels_start:
             before = evaluate(scene, capture.held_out, preset.train).psnr
         watch.note()
         trainer.advance()
-        if trainer.step in told:
+        if trainer.step in shown:
             say(f"step {trainer.step:,}: loss {trainer.loss:.4f}, {len(scene):,} surfels, {clock.cpu_seconds:.0f} s")
     background = eval_background(preset.train, device)
     targets = [view.target(background, device) for view in capture.held_out]
-    rows, exposure = [], trainer.training.exposure
+    rows, poses, exposure = [], trainer.training.poses, trainer.training.exposure
     for view, target in zip(capture.held_out, targets, strict=True):
         with torch.no_grad():
             output = scene.render(view.camera.to(device), background, "frozen")
         rows.append(quality(output.rgb, target) | {"fragments": len(output.fragments) / (target.numel() / 3)})
-        if exposure.table is not None:
-            rgb = shown(output.rgb, exposure.at(view.file), output.alpha, background)
-            rows[-1]["exposed_psnr"] = psnr(rgb.clamp(0.0, 1.0), target)
     found = means(rows) | watch.figures()
-    if run.align or trainer.training.poses.refined:
-        judged = evaluate(scene, capture.held_out, preset.train, trainer.training.poses)
-        found |= {"carried_psnr": judged.carried_psnr, "refined_psnr": judged.refined_psnr}
+    aligned = run.align or poses.refined
+    if aligned or exposure.table is not None:
+        judged = evaluate(scene, capture.held_out, preset.train, poses if aligned else None, exposure)
+        found |= {name: getattr(judged, name) for name in ("carried_psnr", "refined_psnr", "exposed_psnr")}
     found |= {"before_texels": before, "surfels": len(scene), "rollbacks": trainer.training.guard.rollbacks}
     camera = capture.train[0].camera
     found |= {"cpu_seconds": clock.cpu_seconds, "seconds": clock.seconds}
@@ -221,7 +219,6 @@ def measure(run: Run) -> dict[str, Any]:
         found["peak_megabytes"] = torch.cuda.max_memory_allocated(device) / 1e6
     if run.bake:
         say(f"PSNR {found['psnr']:.2f} dB, {len(scene):,} surfels; baking")
-        poses = trainer.training.poses
         views = [view._replace(camera=poses.of(i, view.camera)) for i, view in enumerate(capture.train)]
         views = corrected(views, exposure.state_dict(), [view.file for view in views])
         default, *others = (
@@ -234,19 +231,24 @@ def measure(run: Run) -> dict[str, Any]:
 
 
 def bundle(
-    run: Run, scene: Scene, views: Sequence[View], held_out: Sequence[View], background: Tensor, megabytes: float | None
+    run: Run,
+    scene: Scene,
+    views: Sequence[View],
+    held_out: Sequence[View],
+    background: Tensor | None,
+    megabytes: float | None,
 ) -> dict[str, float]:
     """Bake a bundle and compare it with the held-out photographs."""
-    name = f"{'-'.join(shlex.split(run.row))}-{run.steps}-{run.seed}"
+    name, device = f"{'-'.join(shlex.split(run.row))}-{run.steps}-{run.seed}", torch.device(run.device)
     with tempfile.TemporaryDirectory() as folder:
         path = (run.keep or Path(folder)) / (name if megabytes is None else f"{name}-{megabytes:g}MB")
         start = time.perf_counter()
         bake_scene(scene, views, path, background=background, overwrite=True, target_mb=megabytes)
         found = {"seconds": time.perf_counter() - start}
         found["kilobytes"] = sum(file.stat().st_size for file in path.iterdir()) / 1e3
-        baked = read_bundle(path).scene.to(background.device)
-    pairs = ((baked.render(v.camera.to(background.device), background).rgb, v) for v in held_out)
-    return found | means([quality(rgb, view.target(background, background.device)) for rgb, view in pairs])
+        baked = read_bundle(path).scene.to(device)
+    pairs = ((baked.render(v.camera.to(device), background).rgb, v.target(background, device)) for v in held_out)
+    return found | means([quality(*pair) for pair in pairs])
 
 
 def tables(runs: Sequence[Run], cells: Cells) -> str:
@@ -292,7 +294,7 @@ def draw_curves(runs: Sequence[Run], cells: Cells) -> Figure:
 def main() -> None:
     arguments = read_arguments()
     torch.set_num_threads(1)
-    baked = arguments.bake or arguments.keep is not None or bool(arguments.megabytes)
+    baked = arguments.bake or arguments.keep is not None or bool(arguments.megabytes) or arguments.plot is not None
     rest = (baked, arguments.align, arguments.device, tuple(arguments.megabytes), arguments.keep)
     runs = [
         Run(str(data), row, *(int(x) for x in run.split("/")), seed, arguments.photographs, *rest)

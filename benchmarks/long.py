@@ -50,6 +50,8 @@ from bitymi_ns.train.views import View, eval_background, spread
 RUNS = ("10000/4", "1500/2", "300/1")
 WATCHED, EVERY, WATCH = 8, 30, 300
 """Number of training views whose loss is monitored when the texel stage begins, interval in steps, and duration."""
+WATCHED_PSNR = {0: "before_texels", WATCH: "after_texels"}
+"""Steps since the texel stage began at which held-out views are evaluated, and the figure's name."""
 COLUMNS = {
     "PSNR": ("psnr", 2),
     "exposed": ("exposed_psnr", 2),
@@ -59,6 +61,7 @@ COLUMNS = {
     "SSIM": ("ssim", 4),
     "LPIPS": ("lpips", 4),
     "before texels": ("before_texels", 2),
+    "300 later": ("after_texels", 2),
     "loss, peak": ("peak", 2),
     "back after": ("back_after", 0),
     "rollbacks": ("rollbacks", 0),
@@ -190,11 +193,13 @@ def measure(run: Run) -> dict[str, Any]:
         device
     )
     trainer = Trainer(scene, capture.train, preset.train, run.steps)
-    watch, clock, before = TexelWatch(trainer, capture.train), trainer.training.clock, math.nan
+    watch, clock = TexelWatch(trainer, capture.train), trainer.training.clock
+    watched = {trainer.training.schedule.texels_start + wait: name for wait, name in WATCHED_PSNR.items()}
+    texels: dict[str, float] = {}
     shown = {run.steps * i // 20 for i in range(1, 20)}
     while trainer.step < run.steps:
-        if trainer.step == trainer.training.schedule.texels_start:
-            before = evaluate(scene, capture.held_out, preset.train).psnr
+        if (name := watched.get(trainer.step)) is not None:
+            texels[name] = evaluate(scene, capture.held_out, preset.train).psnr
         watch.note()
         trainer.advance()
         if trainer.step in shown:
@@ -211,7 +216,7 @@ def measure(run: Run) -> dict[str, Any]:
     if aligned or exposure.table is not None:
         judged = evaluate(scene, capture.held_out, preset.train, poses if aligned else None, exposure)
         found |= {name: getattr(judged, name) for name in ("carried_psnr", "refined_psnr", "exposed_psnr")}
-    found |= {"before_texels": before, "surfels": len(scene), "rollbacks": trainer.training.guard.rollbacks}
+    found |= texels | {"surfels": len(scene), "rollbacks": trainer.training.guard.rollbacks}
     camera = capture.train[0].camera
     found |= {"cpu_seconds": clock.cpu_seconds, "seconds": clock.seconds}
     found |= {"width": camera.width, "height": camera.height}

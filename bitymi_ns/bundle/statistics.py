@@ -177,6 +177,9 @@ class Rounding(Part):
     mse: Measured = None
     """Mean squared error in the training views before texels were tuned, colours in [0, 1]."""
     steps: dict[str, NotNegative] = {}  # by column, as in `surfel_codes.REFERENCE`
+    alternatives: Annotated[list[tuple[NotNegative, Decibels]], Field(max_length=16)] | None = None
+    """Other precisions: bytes as a multiple of the chosen ones, and change of the PSNR of the training views, dB, both
+    before texels were tuned."""
 
 
 class FineTuning(Part):

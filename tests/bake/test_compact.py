@@ -121,6 +121,8 @@ def test_a_size_that_the_coarsest_texels_exceed_is_refused() -> None:
 def test_bytes_that_buy_nothing_are_not_spent(truth: BakeState, views: list[View]) -> None:
     coder = Coder(truth, views, BACKGROUND, Compact(views=len(views)))
     kept, coding = choose(coder, Compact(most_bytes=10**9))
+    fewer, more = kept.statistics.rounding.alternatives
+    assert fewer[0] < 0.8 and more[0] > 1.2 and fewer[1] < more[1]
     assert kept.statistics.rounding.mse <= 1.001 * ENOUGH * coder.error
     size = kept.codes.surfels.nbytes() + with_coded_texels(kept, coding).codes.texels.nbytes()
     assert size < 0.8 * coder.at(START / 1000).bytes
@@ -129,7 +131,7 @@ def test_bytes_that_buy_nothing_are_not_spent(truth: BakeState, views: list[View
 
 def test_without_views_the_reference_steps_are_taken(truth: BakeState) -> None:
     plain, _ = compacted(truth, [], BACKGROUND)
-    assert plain.statistics.rounding.mse is None
+    assert plain.statistics.rounding.mse is None and plain.statistics.rounding.alternatives is None
     assert len(plain.rows) == len(truth.rows) and len(plain.scene.surfels["view_terms"]) > 0
 
 

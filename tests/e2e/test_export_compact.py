@@ -19,6 +19,7 @@ def test_it_is_the_default_smaller_and_shows_the_same(
     run_export(trained, folder, format=None, tolerance=TOLERANCE, finetune_steps=30, interchange=True)
     out = " ".join(capsys.readouterr().out.split())
     assert "MB dct" in out and "per surfel" in out and "surfels within the tolerance" in out
+    assert "with --target-mb, about" in out
     assert {path.name for path in folder.iterdir()} == {
         "bundle.json", "surfels.bin", "texels.bin", "surfels.ply", "config.yml", "preview.jpg", "cameras.json",
         "poster.webp",

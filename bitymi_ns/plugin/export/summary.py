@@ -50,7 +50,13 @@ def print_summary(folder: Path, info: Manifest) -> None:
     for name, learned in (("Polish", statistics.polish), ("Fine-tuning", statistics.finetune)):
         if learned is not None:
             print_tuning(table, name, learned)
-    table.add_row("Files", f"{sum(entry.bytes for entry in info.files.values()) / 1e6:.2f} MB in total")
+    size = sum(entry.bytes for entry in info.files.values()) / 1e6
+    table.add_row("Files", f"{size:.2f} MB in total")
+    others = statistics.rounding and statistics.rounding.alternatives
+    if others:
+        found = (f"{size * ratio:.2g} MB {gain:+.2f} dB" for ratio, gain in others if gain is not None)
+        table.add_row("... with --target-mb, about", ", ".join(found))
+        table.add_row("", "(training photographs, before fine-tuning, which makes the differences smaller)")
     held_out = statistics.held_out
     if held_out is not None:
         table.add_row("Held-out views", f"{held_out.views}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,9 +34,9 @@ def write_report(folder: Path, values: Mapping[str, object], model: pycolmap.Rec
 
 def overview(values: Mapping[str, Any]) -> dict[str, str]:
     """Format statistics of report.json; a dash stands for what is no number."""
-    numbers = {key: value for key, value in values.items() if isinstance(value, (int, float))}
+    numbers = {key: value for key, value in values.items() if _is_number(value)}
     stages = values["seconds"].items() if isinstance(values["seconds"], dict) else ()
-    seconds = [f"{stage} {value:.1f}" for stage, value in stages if isinstance(value, (int, float))]
+    seconds = [f"{stage} {value:.1f}" for stage, value in stages if _is_number(value)]
 
     def text(key: str, form: str) -> str:
         return form.format(numbers[key]) if key in numbers else "–"
@@ -50,6 +51,11 @@ def overview(values: Mapping[str, Any]) -> dict[str, str]:
         "Up, scale": _frame_text(values.get("up"), numbers),
         "Seconds": ", ".join(seconds),
     }
+
+
+def _is_number(value: object) -> bool:
+    """Test for a finite number; JSON's integers have no bound, and formats convert them to float."""
+    return isinstance(value, (int, float)) and abs(value) <= sys.float_info.max
 
 
 def _page(values: Mapping[str, Any]) -> str:

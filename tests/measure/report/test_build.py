@@ -151,8 +151,13 @@ def test_foreign_page_is_not_replaced(eval_json, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "changes",
-    [{name: None for name in POSES}, {name: [1] for name in POSES}, {name: {"a": {}} for name in POSES}],
-    ids=["null", "lists", "objects"],
+    [
+        {name: None for name in POSES},
+        {name: [1] for name in POSES},
+        {name: {"a": {}} for name in POSES},
+        {**dict.fromkeys(POSES, 10**400), "seconds": {"a": 10**400}},
+    ],
+    ids=["null", "lists", "objects", "huge"],
 )
 def test_poses_with_values_of_any_type(changes: dict[str, Any], tmp_path: Path) -> None:
     file = write_poses(tmp_path / "poses", **changes)

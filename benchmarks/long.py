@@ -54,7 +54,7 @@ WATCHED_PSNR = {0: "before_texels", WATCH: "after_texels"}
 """Steps since the texel stage began at which held-out views are evaluated, and the figure's name."""
 COLUMNS = {
     "PSNR": ("psnr", 2),
-    "exposed": ("exposed_psnr", 2),
+    "mean exposure": ("mean_exposure_psnr", 2),
     "fitted": ("fitted_psnr", 2),
     "carried": ("carried_psnr", 2),
     "refined": ("refined_psnr", 2),
@@ -199,23 +199,25 @@ def measure(run: Run) -> dict[str, Any]:
     shown = {run.steps * i // 20 for i in range(1, 20)}
     while trainer.step < run.steps:
         if (name := watched.get(trainer.step)) is not None:
-            texels[name] = evaluate(scene, capture.held_out, preset.train).psnr
+            found = evaluate(scene, capture.held_out, preset.train, exposure=trainer.training.exposure)
+            texels[name] = found.psnr
         watch.note()
         trainer.advance()
         if trainer.step in shown:
             say(f"step {trainer.step:,}: loss {trainer.loss:.4f}, {len(scene):,} surfels, {clock.cpu_seconds:.0f} s")
     background = eval_background(preset.train, device)
-    targets = [view.target(background, device) for view in capture.held_out]
     rows, poses, exposure = [], trainer.training.poses, trainer.training.exposure
-    for view, target in zip(capture.held_out, targets, strict=True):
+    held_out = [view._replace(correction=exposure.at(view.file)) for view in capture.held_out]
+    for view in held_out:
         with torch.no_grad():
             output = scene.render(view.camera.to(device), background, "frozen")
-        rows.append(quality(output.rgb, target) | {"fragments": len(output.fragments) / (target.numel() / 3)})
+        target, rgb = view.target(background, device), view.shown(output.rgb, output.alpha, background)
+        rows.append(quality(rgb, target) | {"fragments": len(output.fragments) / (target.numel() / 3)})
     found = means(rows) | watch.figures()
     aligned = run.align or poses.refined
     if aligned or exposure.table is not None:
         judged = evaluate(scene, capture.held_out, preset.train, poses if aligned else None, exposure)
-        found |= {name: getattr(judged, name) for name in ("carried_psnr", "refined_psnr", "exposed_psnr")}
+        found |= {name: getattr(judged, name) for name in ("carried_psnr", "refined_psnr", "mean_exposure_psnr")}
     found |= texels | {"surfels": len(scene), "rollbacks": trainer.training.guard.rollbacks}
     camera = capture.train[0].camera
     found |= {"cpu_seconds": clock.cpu_seconds, "seconds": clock.seconds}
@@ -226,9 +228,7 @@ def measure(run: Run) -> dict[str, Any]:
         say(f"PSNR {found['psnr']:.2f} dB, {len(scene):,} surfels; baking")
         views = [view._replace(camera=poses.of(i, view.camera)) for i, view in enumerate(capture.train)]
         views = corrected(views, exposure.state_dict(), [view.file for view in views])
-        default, *others = (
-            bundle(run, scene, views, capture.held_out, background, size) for size in (None, *run.megabytes)
-        )
+        default, *others = (bundle(run, scene, views, held_out, background, size) for size in (None, *run.megabytes))
         found |= {"bake_seconds": default["seconds"], "kilobytes": default["kilobytes"]}
         found |= {f"baked_{name}": default[name] for name in ("psnr", "ssim", "lpips")}
         found["curve"] = sorted([default, *others], key=lambda point: point["kilobytes"])
@@ -252,8 +252,12 @@ def bundle(
         found = {"seconds": time.perf_counter() - start}
         found["kilobytes"] = sum(file.stat().st_size for file in path.iterdir()) / 1e3
         baked = read_bundle(path).scene.to(device)
-    pairs = ((baked.render(v.camera.to(device), background).rgb, v.target(background, device)) for v in held_out)
-    return found | means([quality(*pair) for pair in pairs])
+    rows = []
+    for view in held_out:
+        drawn = baked.render(view.camera.to(device), background)
+        rgb = view.shown(drawn.rgb, drawn.alpha, background)
+        rows.append(quality(rgb, view.target(background, device)))
+    return found | means(rows)
 
 
 def tables(runs: Sequence[Run], cells: Cells) -> str:

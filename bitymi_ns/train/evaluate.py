@@ -12,7 +12,7 @@ from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.exposure import Exposure
 from bitymi_ns.train.losses import fitted_psnr, mean_psnr, psnr
 from bitymi_ns.train.poses import Poses, aligned, view_psnr
-from bitymi_ns.train.views import View, eval_background, shown
+from bitymi_ns.train.views import View, eval_background
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 class Quality(NamedTuple):
     """Means over views; NaN without views."""
 
-    psnr: float  # dB, over the views with unmasked pixels
+    psnr: float  # dB, over the views with unmasked pixels, with interpolated exposures (`Exposure.at`)
     fragments: float  # blended fragments per view
     fitted_psnr: float  # dB after an affine fit of each view's colours (`losses.color_fitted`), over the same views
     carried_psnr: float = math.nan  # dB with poses corrected as those of the nearest photographs
     refined_psnr: float = math.nan  # dB with poses aligned to the scene
-    exposed_psnr: float = math.nan  # dB with exposures interpolated from the training photographs' (`Exposure.at`)
+    mean_exposure_psnr: float = math.nan  # dB with the mean exposure, where the run corrects photographs
 
 
 def evenly_spaced(count: int, most: int) -> list[int]:
@@ -49,19 +49,21 @@ def evaluate(
         views: at full size; each is read once.
         poses: of a run that refined them: views are also evaluated with the corrections of the nearest photographs,
             and with poses then aligned to the scene.
-        exposure: of the run: if it corrects photographs, views are also evaluated with its corrections.
+        exposure: of the run: if it corrects photographs, views get corrections interpolated from theirs.
     """
     device = scene.surfels["means"].device
     background = eval_background(config, device)
-    values, fitted, along, refined, exposed, fragments = [], [], [], [], [], []
+    values, fitted, along, refined, uncorrected, fragments = [], [], [], [], [], []
+    corrects = exposure is not None and exposure.table is not None
     for view in (view.to(device) for view in views):
         output = scene.render(view.camera, background=background, field_mode="frozen")
-        rgb, target = output.rgb.clamp(0.0, 1.0), view.target(background, device)
+        target = view.target(background, device)
+        if exposure is not None and corrects:
+            uncorrected.append(psnr(output.rgb.clamp(0.0, 1.0), target, view.mask))
+            view = view._replace(correction=exposure.at(view.file))
+        rgb = view.shown(output.rgb, output.alpha, background).clamp(0.0, 1.0)
         values.append(psnr(rgb, target, view.mask))
         fitted.append(fitted_psnr(rgb, target, view.mask))
-        if exposure is not None and exposure.table is not None and view.file is not None:
-            rgb = shown(output.rgb, exposure.at(view.file), output.alpha, background)
-            exposed.append(psnr(rgb.clamp(0.0, 1.0), target, view.mask))
         fragments.append(len(output.fragments))
         del output  # frees its fragments before the next view is rendered
         if poses is not None:
@@ -70,4 +72,5 @@ def evaluate(
             view = view._replace(camera=aligned(scene, view, background, config.loss.ssim_weight))
             refined.append(view_psnr(scene, view, background))
     mean_fragments = sum(fragments) / len(fragments) if fragments else math.nan
-    return Quality(mean_psnr(values), mean_fragments, *(mean_psnr(each) for each in (fitted, along, refined, exposed)))
+    means = (mean_psnr(each) for each in (fitted, along, refined, uncorrected))
+    return Quality(mean_psnr(values), mean_fragments, *means)

@@ -39,8 +39,9 @@ class LogEntry:
     """PSNR in dB with poses moved along with the training poses (`poses.carried`); NaN before the last step and in
     runs without pose refinement."""
     refined_psnr: float = math.nan  # PSNR in dB with poses aligned to the finished scene; NaN likewise.
-    exposed_psnr: float = math.nan
-    """PSNR in dB with exposures interpolated from those of the training photographs; NaN if these are not corrected."""
+    mean_exposure_psnr: float = math.nan
+    """PSNR in dB without the exposures that `psnr` interpolates between the training photographs'; NaN if these are not
+    corrected."""
 
 
 @dataclass
@@ -140,7 +141,7 @@ def fit(
             poses = poses if poses and poses.refined else None
             found = evaluate(scene, eval_views, config, poses, trainer.training.exposure)
             times, loss = (clock.seconds, clock.cpu_seconds), trainer.loss
-            figures = (found.psnr, found.fitted_psnr, found.carried_psnr, found.refined_psnr, found.exposed_psnr)
+            figures = (found.psnr, found.fitted_psnr, found.carried_psnr, found.refined_psnr, found.mean_exposure_psnr)
             log.entries.append(LogEntry(trainer.step, *times, len(scene), found.fragments, loss, *figures))
         if callback is not None:
             callback(trainer, terms, output, report)

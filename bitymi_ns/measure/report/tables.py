@@ -79,7 +79,7 @@ COLUMNS = (
     Column("LPIPS", "lpips", "{:.3f}".format, "down"),
     Column("LPIPS (VGG)", "lpips_vgg", "{:.3f}".format, "down"),
     Column("FLIP", "flip", "{:.3f}".format, "down"),
-    Column("PSNR exposed", "exposed_psnr", "{:.2f}".format, "up"),
+    Column("PSNR, mean exposure", "mean_exposure_psnr", "{:.2f}".format, "up"),
     Column("PSNR fitted", "fitted_psnr", "{:.2f}".format, "up"),
     Column("SSIM fitted", "fitted_ssim", "{:.3f}".format, "up"),
     Column("LPIPS fitted", "fitted_lpips", "{:.3f}".format, "down"),
@@ -102,7 +102,7 @@ CURVE_COLUMNS = (
     Column("Seconds", "seconds", significant),
     Column("CPU seconds", "cpu_seconds", significant),
     Column("Last PSNR", "psnr", "{:.2f}".format),
-    Column("Last PSNR exposed", "exposed_psnr", "{:.2f}".format),
+    Column("Last PSNR, mean exposure", "mean_exposure_psnr", "{:.2f}".format),
     Column("Last PSNR fitted", "fitted_psnr", "{:.2f}".format),
     Column("Points", "surfels", count),
     Column("Fragments", "fragments", count),
@@ -113,8 +113,8 @@ NOTES = (
     "ms: rendering alone, warmed up; FPS = 1000 / ms (the fps of ns-eval also times metrics and files, so it is not "
     "shown). 1 MB = 10⁶ bytes. ΔPSNR: baked minus trained, in dB. ± seeds: standard deviation of the PSNR over seeds. "
     "Fitted: each half of a view after the affine map of its colours that fits the other half to the photograph, so "
-    "that exposure and white balance do not count. Exposed: with exposures between those of the neighbouring "
-    "photographs. Bold: best of its scene."
+    "that exposure and white balance do not count. Mean exposure: without the exposure between those of the "
+    "neighbouring photographs that the others have. Bold: best of its scene."
 )
 
 

@@ -281,6 +281,11 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         exposure = restored(state, len(files), files)
         return [[exposure.at(file) for file in dataset.files] for dataset in (self.train_dataset, self.eval_dataset)]
 
+    def corrected_eval_views(self, state: Mapping[str, Any] | None) -> OnDemand[View]:
+        """Held-out views with their corrections, by the state of a run's `Exposure`."""
+        views, (_, found) = self.eval_views, self.corrections(state)
+        return OnDemand(len(views), lambda i: views[i]._replace(correction=found[i]))
+
     def _view(self, dataset: BitymiDataset, index: int, batch: dict[str, Any]) -> View:
         camera = to_camera(dataset.cameras[index : index + 1], self.device)
         maps = {name: batch.get(name) for name in ("mask", "depth", "normal")}

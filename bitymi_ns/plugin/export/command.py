@@ -174,7 +174,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
         state_export(model.scene, views, kept, learning_surfels, compact)
         try:
             with rich_progress() as progress:
-                held_out = datamanager.eval_views if self.compare else ()
+                held_out = datamanager.corrected_eval_views(exposure) if self.compare else ()
                 background = model.background.cpu()
                 photographs = datamanager.train_views
                 if polish or tune or refine.compact:

@@ -104,7 +104,8 @@ def _encoded(image: torch.Tensor, format: str, most: int | None = None, **option
 @torch.no_grad()
 def compare(model: BitymiModel, datamanager: Any, scene: BakedScene) -> HeldOut:
     """Average PSNR in dB over the held-out views: bundle, trained scene and photographs against each other, also after
-    the affine fit of each view's colours to its photograph; and the worst of the bundle against the trained scene."""
+    the affine fit of each view's colours to its photograph; and the worst of the bundle against the trained scene. The
+    run's exposures are interpolated."""
     rows = held_out_psnr(model, datamanager, scene, len(datamanager.eval_dataset))
     names = ("psnr_baked_against_neural", "psnr_neural_against_photos", "psnr_baked_against_photos")
     names += ("fitted_psnr_neural_against_photos", "fitted_psnr_baked_against_photos")
@@ -119,10 +120,10 @@ def held_out_psnr(model: BitymiModel, datamanager: Any, scene: BakedScene, views
     trained scene against photograph, bundle against photograph, and these two after the affine fit of colours."""
     rows = []
     scene, background = scene.to(model.device), model.background
-    for index in range(min(views, len(datamanager.eval_views))):
-        view = datamanager.eval_views[index].to(model.device)
-        neural = model.render(view.camera, background, maps=False).rgb.clamp(0.0, 1.0)
-        baked = scene.render(view.camera, background).rgb.clamp(0.0, 1.0)
+    held_out = datamanager.corrected_eval_views(model.resume_state.get("exposure"))
+    for view in (held_out[index].to(model.device) for index in range(min(views, len(held_out)))):
+        drawn = model.render(view.camera, background, maps=False), scene.render(view.camera, background)
+        neural, baked = (view.shown(each.rgb, each.alpha, background).clamp(0.0, 1.0) for each in drawn)
         photo = view.target(background, model.device)
         of_photo = [measure(rgb, photo, view.mask) for measure in (psnr, fitted_psnr) for rgb in (neural, baked)]
         rows.append([psnr(baked, neural, view.mask), *of_photo])

@@ -173,7 +173,7 @@ class TrainingRun:
             point |= {k: round(value, 4) for k, value in quality._asdict().items() if not math.isnan(value)}
             shown = f"{quality.psnr:6.2f} dB held out, "
             if exposure.table is not None:
-                shown += f"{quality.exposed_psnr:.2f} dB with exposures between those of their neighbours, "
+                shown += f"{quality.mean_exposure_psnr:.2f} dB with the mean exposure, "
             if refined:
                 shown += f"{quality.carried_psnr:.2f} dB with their poses carried along, "
                 shown += f"{quality.refined_psnr:.2f} dB with their poses refined, "

@@ -17,12 +17,12 @@ _lpips_missing: list[str] = []
 
 
 def image_metrics(
-    image: Tensor, reference: Tensor, mask: Tensor | None = None, exposed: Tensor | None = None
+    image: Tensor, reference: Tensor, mask: Tensor | None = None, mean_exposure: Tensor | None = None
 ) -> dict[str, float]:
     """Measure psnr, ssim, flip (if its package is installed), lpips and lpips_vgg (if their weights can be had) of
-    images [H, W, 3] in [0, 1]; fitted_psnr, fitted_ssim and fitted_lpips of the `color_fitted` image, and exposed_psnr
-    and so on of an image `exposed` as the photograph. Pixels that a mask [H, W, 1] excludes are equal in all for every
-    metric and left out of PSNR and fit."""
+    images [H, W, 3] in [0, 1]; fitted_psnr, fitted_ssim and fitted_lpips of the `color_fitted` image; and
+    mean_exposure_psnr and so on of the image without correction, if one is given. Pixels that a mask [H, W, 1] excludes
+    are equal in all for every metric and left out of PSNR and fit."""
     image, reference = image.detach().float().clamp(0.0, 1.0), reference.detach().float().clamp(0.0, 1.0)
     if mask is not None:
         mask = mask.to(image.device).bool().reshape(*image.shape[:2], 1)
@@ -31,8 +31,8 @@ def image_metrics(
     if (found := flip(image, reference)) is not None:
         result["flip"] = found
     others = {"fitted": color_fitted(image, reference, mask)}
-    if exposed is not None:
-        others["exposed"] = exposed.detach().float().clamp(0.0, 1.0)
+    if mean_exposure is not None:
+        others["mean_exposure"] = mean_exposure.detach().float().clamp(0.0, 1.0)
     for name, other in others.items():
         other = other if mask is None else other * mask
         result |= {f"{name}_{k}": v for k, v in _similarity(other, reference, mask, ("lpips",)).items()}

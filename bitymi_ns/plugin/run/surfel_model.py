@@ -134,8 +134,11 @@ class SurfelModel(Model):
         target, mask = self.photograph(batch, rgb)
         camera = getattr(self, "_last_camera", None)
         drawn_here = camera is not None and (camera.width, camera.height) == (width, height)
-        exposed = self._exposed(camera) if drawn_here and self.corrections else None
-        metrics = image_metrics(rgb, target, mask, exposed)
+        if drawn_here and self.corrections:
+            rgb, drawn = self._exposed(camera), rgb
+            metrics = image_metrics(rgb, target, mask, drawn)
+        else:
+            metrics = image_metrics(rgb, target, mask)
         metrics["fragments_per_pixel"] = float(outputs["overdraw"].mean()) * OVERDRAW_SCALE
         metrics.update(self.sizes())
         if self.measure_time and drawn_here:

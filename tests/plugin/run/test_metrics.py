@@ -52,9 +52,9 @@ def test_quality_is_stated_as_it_is_and_after_a_fit_of_the_colours(monkeypatch: 
     spoilt = torch.where(mask, darker, 1.0)
     assert metrics.image_metrics(spoilt, reference, mask)["fitted_psnr"] > 50
     assert metrics.image_metrics(spoilt, reference)["fitted_psnr"] < 30
-    assert not any(name.startswith("exposed") for name in result)
-    result = metrics.image_metrics(spoilt, reference, mask, torch.where(mask, (darker - 0.02) / 0.7, 1.0))
-    assert result["exposed_psnr"] > 50 and result["exposed_ssim"] > 0.99 and result["psnr"] < 20
+    assert not any(name.startswith("mean_exposure") for name in result)
+    result = metrics.image_metrics(torch.where(mask, (darker - 0.02) / 0.7, 1.0), reference, mask, spoilt)
+    assert result["psnr"] > 50 and result["ssim"] > 0.99 and result["mean_exposure_psnr"] < 20
 
 
 def test_the_lpips_whose_weights_are_there_is_stated(

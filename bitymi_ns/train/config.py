@@ -201,7 +201,7 @@ class TrainConfig:
     """Maximum number of initial surfels added where photographs show no point, as a share of the others; 0 = none."""
     random_points: PositiveCount = 20_000
     """Random surfels in the scene box if the capture has no sparse points."""
-    exposure: ExposureKind = "off"
+    exposure: ExposureKind = "auto"
     """Exposure and white balance of each photograph: gain = a learned factor per channel, affine = a learned 3 x 4
     matrix, off = no correction, auto = gain if the photographs' differences are explained by gains."""
     refine_poses: RefinePoses = "off"

@@ -46,7 +46,10 @@ SWEEPS = 10  # passes of the median polish
 DARKEST, BRIGHTEST = 0.03, 0.97  # range of channels used: beyond it noise, rounding and clipping dominate
 FEWEST_PHOTOGRAPHS = 3  # minimum number of photographs that show a point
 CELL = 2.0  # side of the cells of the occlusion test, in mean distances of the points in the image
-HIDDEN = 1.05  # a point is occluded if another in its cell or a neighbouring cell is nearer by this factor
+HIDDEN = 0.05
+"""A point is occluded if another in its cell or a neighbouring cell is nearer by this share of that one's depth, or of
+twice the range of depths in the view if that is less: through a long lens, front and back of an object differ by less
+than a share of their depth."""
 FEWEST_TESTED = 1000  # minimum number of observations to test gains on the other half of the points
 
 
@@ -218,6 +221,9 @@ class Exposure:
         if state is None:
             self.decided = self.kind in ("off", "auto")
             return
+        if self.kind == "auto" and state["kind"] == "off":  # the earlier default: corrections cannot begin midway
+            self.decided, self.reason = True, "as in the run that is resumed"
+            return
         table = state["table"]
         if state["kind"] != self.kind or (table is not None and len(table) != self.count(count)):
             return
@@ -348,7 +354,10 @@ def _log_colors(view: View, points: Tensor, count: int, near: float) -> Tensor:
     nearest = torch.full((rows * columns,), math.inf, device=z.device)
     nearest = nearest.scatter_reduce(0, cell[inside], z[inside], "amin").view(1, 1, rows, columns)
     around = -max_pool2d(-nearest, 3, stride=1, padding=1).flatten()
-    shown = inside & (z <= HIDDEN * around[cell])
+    depths = z[inside].sort().values
+    most = len(depths) - 1
+    spread = depths[int(0.99 * most)] - depths[int(0.01 * most)] if most >= 0 else z.new_zeros(())
+    shown = inside & (z <= around[cell] + HIDDEN * torch.minimum(around[cell], 2.0 * spread))
 
     color = as_float(_pixels(view.image, camera, x[:count], y[:count]))
     shown = shown[:count].to(color.device)

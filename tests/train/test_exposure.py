@@ -14,10 +14,22 @@ from bitymi_ns.capture.exif import exif_stops
 from bitymi_ns.train import exposure as module
 from bitymi_ns.train.config import DensifyConfig, LearningRates, TrainConfig
 from bitymi_ns.train.evaluate import evaluate
-from bitymi_ns.train.exposure import LIMIT, OTHER_LIMIT, Exposure, ExposureGains, corrected, restored, seeds, settled
+from bitymi_ns.train.exposure import (
+    EXPLAINED,
+    LIMIT,
+    OTHER_LIMIT,
+    Exposure,
+    ExposureGains,
+    corrected,
+    estimate_gains,
+    restored,
+    seeds,
+    settled,
+)
 from bitymi_ns.train.fit import Trainer, fit
 from bitymi_ns.train.score import multi_view_scores
 from bitymi_ns.train.views import View, shown
+from tests.train.test_step_sizes import fine
 
 DENSIFY = DensifyConfig(max_surfels=250, min_interval=1, min_reset_interval=1, pixels_per_surfel=0)
 
@@ -218,6 +230,16 @@ def test_training_learns_the_exposures(make_scene, views, uneven) -> None:
         assert results[kind].psnr > results["off"].psnr - 0.1
 
 
+def test_the_far_side_of_an_object_through_a_long_lens_is_hidden(views, ball) -> None:
+    """Its colours, compared with those of the near side, would be differences of exposure."""
+    xyz, rgb = ball
+    for by in (1.0, 30.0):
+        here, *_ = fine(views, by, (xyz, rgb))
+        found = estimate_gains(xyz, here, 0.01)
+        assert math.isnan(found.explained) or found.explained < EXPLAINED
+        assert float(found.log_gains.abs().max()) < 0.05
+
+
 def test_held_out_photographs_are_judged_with_the_exposure_of_their_neighbours(make_scene, views) -> None:
     """The first three photographs are bright, the last three dark."""
     logs = torch.tensor([0.3, 0.3, 0.3, -0.3, -0.3, -0.3])
@@ -263,6 +285,9 @@ def test_states_of_earlier_versions_other_options_and_other_photographs(make_sce
     assert off.decided and off.table is None
     asked = Exposure("gain")
     asked.load_state_dict(None, 6)
+    resumed = Exposure("auto")
+    resumed.load_state_dict(Exposure("off").state_dict(), 6)
+    assert resumed.decided and resumed.table is None
     assert not asked.decided
 
 

@@ -54,7 +54,7 @@ def test_a_resumed_run_names_the_options_that_differ() -> None:
     assert limits.other_options(record, TrainConfig()) == [] and limits.other_options(None, TrainConfig()) == []
     other = TrainConfig(densify=DensifyConfig(max_surfels=800), exposure="gain")
     (sentence,) = limits.other_options(record, other)
-    assert "densify.max-surfels 800 (was 0)" in sentence and "exposure gain (was off)" in sentence
+    assert "densify.max-surfels 800 (was 0)" in sentence and "exposure gain (was auto)" in sentence
     assert "quats" not in sentence
 
 

@@ -166,7 +166,7 @@ def polish_scene(
     run.scene.load_state_dict(stopping.best)
     spent = time.perf_counter() - started, time.process_time() - cpu_started
     statistics = stopping.statistics(len(trained), len(validation), *spent).replace(
-        error_before=baked.statistics.error, psnr_held_out=gain(before, run.psnr(eval_views)) if eval_views else None
+        psnr_held_out=gain(before, run.psnr(eval_views)) if eval_views else None
     )
     texels = run.field.texels.detach()
     result = baked.with_texels(texels).with_surfels(dict(run.scene.surfels))

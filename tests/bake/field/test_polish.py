@@ -19,7 +19,7 @@ from bitymi_ns.bake import (
     prune_and_resample,
     tune_atlas,
 )
-from bitymi_ns.bake.field import polish as polish_module
+from bitymi_ns.train import losses
 from bitymi_ns.train.config import GuardConfig
 from bitymi_ns.train.views import View
 from tests.bake.test_tune import BACKGROUND, cameras, photographs, render, waving, with_exposures
@@ -134,17 +134,17 @@ def test_the_best_state_is_kept(truth: BakeState, wrong: BakeState, views: list[
 def test_steps_that_are_not_finite_are_survived(
     wrong: BakeState, views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real, calls = polish_module.photometric, []
+    real, calls = losses.photometric, []
 
     def sometimes(*arguments: Any) -> Tensor:
         calls.append(1)
         return real(*arguments) * (math.nan if len(calls) in (5, 6) else 1.0)
 
-    monkeypatch.setattr(polish_module, "photometric", sometimes)
+    monkeypatch.setattr(losses, "photometric", sometimes)
     told = polish_scene(wrong, views, BACKGROUND, OPTIONS)
     assert told.statistics.polish.steps == 40 and told.texels.isfinite().all()
     assert told.statistics.polish.psnr_held_in.after > told.statistics.polish.psnr_held_in.before + 1
-    monkeypatch.setattr(polish_module, "photometric", lambda *a: real(*a) * math.nan)
+    monkeypatch.setattr(losses, "photometric", lambda *a: real(*a) * math.nan)
     given_up = polish_scene(wrong, views, BACKGROUND, OPTIONS)
     assert given_up.statistics.polish.steps == GuardConfig().rollbacks and given_up.statistics.polish.best_step == 0
     torch.testing.assert_close(given_up.texels, wrong.texels, rtol=0, atol=0)

@@ -61,8 +61,8 @@ def field_tiles(
         baked: without tiles.
         field: on the device of the cameras.
         cameras: training views, for the cap on tile sizes and for what they see.
-        pixels_per_texel: a tile gets at most a texel for so many pixels that its surfel makes up of the view that shows
-            most of it; None = as many as field and views resolve.
+        pixels_per_texel: a tile gets at most one texel per this number of pixels that its surfel fills in the view that
+            shows most of it; None = as many as field and views resolve.
 
     Raises:
         ValueError: no surfel is left, or the atlas would be too large.

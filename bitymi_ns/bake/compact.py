@@ -243,7 +243,7 @@ def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> 
         coding = replace(coding, most_bytes=most, fill=binds)
     mse = max(0.0, found.error - coder.error) if coder.measured else None
     rounding = Rounding(mse=mse, steps=dict(baked.codes.surfels.steps), alternatives=_alternatives(coder, found))
-    statistics = baked.statistics.replace(rounding=rounding, error=None, certificate=None, view_color=_thinned(baked))
+    statistics = baked.statistics.replace(rounding=rounding, certificate=None, view_color=_thinned(baked))
     return replace(baked, statistics=statistics), coding
 
 

@@ -1,4 +1,4 @@
-"""Inputs of the bake: the drawable surfels, the training cameras, and what these see."""
+"""Inputs of the bake: the surfels, the training cameras, and what these see."""
 
 from __future__ import annotations
 
@@ -9,11 +9,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bundle.bake_options import BakeOptions
-from bitymi_ns.bundle.statistics import LeftOut
-from bitymi_ns.codec.limits import within
 from bitymi_ns.ops import Prefilter, TexelAlpha
-from bitymi_ns.ops.constants import ALPHA_MIN
-from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.visibility import Visibility, visibility
@@ -59,28 +55,6 @@ def device_of(cameras: Sequence[Camera]) -> torch.device:
     return cameras[0].viewmat.device if cameras else torch.device("cpu")
 
 
-def drawable(surfels: Mapping[str, Tensor]) -> tuple[Tensor, LeftOut]:
-    """Find the rows [N] int64 that can be drawn and stored; count those left out, by reason."""
-    finite = torch.stack([torch.isfinite(value).flatten(1).all(1) for value in _as_rows(surfels)]).all(0)
-    scales = surfels["log_scales"].exp()
-    finite &= torch.isfinite(scales).all(1) & (scales > 0).all(1)
-    turned = surfels["quats"].norm(dim=1)
-    finite &= torch.isfinite(turned) & (turned > 1e-12)
-    storable = finite & within(surfels, kind_of(surfels))
-    transparent = storable & (surfels["opacity_logits"].sigmoid() < ALPHA_MIN)
-    kept = torch.nonzero(storable & ~transparent).squeeze(1)
-    return kept, LeftOut(
-        not_finite=int((~finite).sum()),
-        beyond_limits=int((finite & ~storable).sum()),
-        transparent=int(transparent.sum()),
-    )
-
-
-def _as_rows(surfels: Mapping[str, Tensor]) -> list[Tensor]:
-    """Give every parameter at least two dimensions."""
-    return [value.detach() if value.dim() > 1 else value.detach()[:, None] for value in surfels.values()]
-
-
 def photo_resolution(inputs: BakeInput) -> Tensor | None:
     """Sample the resolution of the photographs at points of the scene (`scene/sampling.py`).
 
@@ -107,15 +81,3 @@ def photo_resolution(inputs: BakeInput) -> Tensor | None:
     count = min(POINTS, len(rows))
     rows = rows[(torch.arange(count) * len(rows)) // count]
     return torch.cat([means[rows], (logs[rows] / views[rows]).exp()[:, None]], 1).float()
-
-
-def visible(
-    inputs: BakeInput, options: BakeOptions, progress: Progress = no_progress
-) -> tuple[BakeInput, Tensor | None]:
-    """Add the visibility and, if the options say so, drop the surfels that no view blends; also returns the mask [N]
-    bool of those that stay, None = all."""
-    inputs = inputs.with_visibility(options, progress)
-    if inputs.views is None or not options.drop_unseen:
-        return inputs, None
-    seen = inputs.views.transmittance > 0
-    return inputs.of(seen), seen

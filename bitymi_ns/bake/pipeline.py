@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.compact import Compact, compacted, with_coded_texels
-from bitymi_ns.bake.field.bake import bake_field
 from bitymi_ns.bake.field.polish import PolishOptions, polish_scene
-from bitymi_ns.bake.inputs import BakeInput, device_of, drawable, photo_resolution, visible
+from bitymi_ns.bake.field.tiles import field_tiles
+from bitymi_ns.bake.inputs import device_of, photo_resolution
+from bitymi_ns.bake.left_out import drawable, drop_unseen
 from bitymi_ns.bake.state import BakeableScene, BakeState, joined
 from bitymi_ns.bake.tile_errors import certified
 from bitymi_ns.bake.tiles import Tiles, reduced_tiles
@@ -30,35 +31,39 @@ from bitymi_ns.train.views import View
 @torch.no_grad()
 def trained_texels(scene: BakeableScene, options: BakeOptions) -> BakeState:
     """Bake a scene whose texels were trained: all of its tiles, view colours and drawable surfels; `prune_and_resample`
-    then drops what the options say.
-
-    Args:
-        scene: with a `TexelField`.
+    then drops what the options say. Of a scene without texels no surfel has a tile.
 
     Raises:
         ValueError: no surfel is left, an option is out of range, or the atlas would be too large.
     """
     options.check()
     rows, left_out = drawable(scene.surfels)
+    trained = len(scene.surfels["means"])
     if len(rows) == 0:
-        raise ValueError(f"no surfel is left to bake of {len(scene.surfels['means'])}: left out {left_out}")
+        raise ValueError(f"no surfel is left to bake of {trained}: left out {left_out.model_dump()}")
     surfels = {name: value.detach()[rows].float().cpu() for name, value in scene.surfels.items()}
-    assert isinstance(scene.field, TexelField)
-    field, rows = copy.deepcopy(scene.field).cpu(), rows.cpu()
+    rows, count, texels = rows.cpu(), len(rows), None
+    if isinstance(scene.field, TexelField):
+        tiles = _tiles_of(scene.field, rows)
+    else:
+        sizes = torch.zeros(count, 2, dtype=torch.int32)
+        tiles = Tiles(sizes, torch.full((count,), options.extent), torch.zeros(count, 3))
+    baked = BakeState.of(scene, surfels, rows, tiles, options)
+    if isinstance(scene.field, TexelField):
+        texels = KeptTexels(learned=baked.packing.texels)
+    counts = KeptSurfels(trained=trained, kept=count, left_out=left_out)
+    return replace(baked, statistics=Statistics(surfels=counts).replace(texels=texels))
+
+
+def _tiles_of(field: TexelField, rows: Tensor) -> Tiles:
+    """Copy the tiles of the surfels `rows` to the CPU."""
+    field = copy.deepcopy(field).cpu()
     field.keep(rows)
     bare = field.size.long().prod(1) == 1  # their one texel is their constant
     texels = field.texels.detach().float()
     if field.alpha is not None:
         texels = joined(texels, field.alpha.detach().float())
-    tiles = Tiles(torch.where(bare[:, None], 0, field.size), field.extent.float(), texels)
-    baked = BakeState.of(scene, surfels, rows, tiles, options)
-    statistics = Statistics(
-        surfels=KeptSurfels(
-            trained=len(scene.surfels["means"]), kept=len(rows), left_out=left_out, without_tile=int(bare.sum())
-        ),
-        texels=KeptTexels(learned=baked.packing.texels, kept=baked.packing.texels),
-    )
-    return replace(baked, statistics=statistics)
+    return Tiles(torch.where(bare[:, None], 0, field.size), field.extent.float(), texels)
 
 
 @torch.no_grad()
@@ -68,42 +73,24 @@ def prune_and_resample(baked: BakeState, cameras: Sequence[Camera], progress: Pr
     Left out and counted are surfels that cannot be drawn or stored, or that no view blends. The atlas is not encoded.
 
     Args:
-        baked: of `trained_texels`, or made with `pixels_per_texel`.
+        baked: of `trained_texels` or `field_tiles`.
         cameras: training views; their device does the work.
 
     Raises:
         ValueError: no surfel is left.
     """
-    rows, gone = drawable(baked.scene.surfels)
-    kept = torch.zeros(len(baked.rows), dtype=torch.bool)
-    kept[rows] = True
-    scene, options, device = baked.scene, baked.options, device_of(cameras)
-    surfels = {name: value[rows].to(device) for name, value in scene.surfels.items()}
-    alpha = None if baked.alpha is None else baked.alpha.of(rows).to(device)
-    inputs = BakeInput(surfels, cameras, scene.near, scene.weight_bound, scene.prefilter, alpha=alpha)
-    inputs, seen = visible(inputs, options, progress)
-    if seen is not None:
-        gone = gone.replace(unseen=int((~seen).sum()))
-        kept[rows] = seen.cpu()
-    if not bool(kept.any()):
-        raise ValueError("no surfel is left to bake")
-    surfels, colors, view_color = reduce_view_colors(inputs, options, progress)
-    result = baked.only(kept)
-    if options.tolerance > 0 and result.textured:
+    result, inputs = drop_unseen(baked, cameras, progress)
+    surfels, colors, view_color = reduce_view_colors(inputs, baked.options, progress)
+    if baked.options.tolerance > 0 and result.textured:
         tiles = Tiles(result.sizes, result.extent, result.texels)
-        result = result.with_tiles(reduced_tiles(tiles, inputs, options, progress))
+        result = result.with_tiles(reduced_tiles(tiles, inputs, baked.options, progress))
     in_front = None if inputs.transmittance is None else inputs.transmittance.cpu()
     result = replace(result.with_surfels(surfels), in_front=in_front, colors=colors)
     result.scene.photographed = photo_resolution(inputs)
-    counts = baked.statistics.surfels
-    assert counts is not None and counts.left_out is not None
-    left_out = counts.left_out.replace(**{name: (getattr(counts.left_out, name) or 0) + n for name, n in gone if n})
-    statistics = baked.statistics.replace(
-        surfels=counts.replace(
-            kept=len(result.rows), left_out=left_out, without_tile=int((result.packing.tiles[:, 3] == 0).sum())
-        ),
-        view_color=view_color,
-    )
+    statistics = result.statistics
+    assert statistics.surfels is not None
+    bare = int((result.packing.tiles[:, 3] == 0).sum())
+    statistics = statistics.replace(surfels=statistics.surfels.replace(without_tile=bare), view_color=view_color)
     if statistics.texels is not None:
         statistics = statistics.replace(texels=statistics.texels.replace(kept=result.packing.texels))
     return replace(result, statistics=statistics)
@@ -184,15 +171,12 @@ def bake(
     tune, coding, device = refine.tune, None, device_of(cameras)
     form = "compact" if refine.compact is not None else options.format
     options = replace(options, format=replace(options, format=form).texel_format)  # as bundle.json states it
-    polish, trained = refine.polish, isinstance(scene.field, TexelField)
-    if trained:
-        baked = trained_texels(scene, options)
-    else:
-        baked = bake_field(scene, cameras, options, progress, None if polish is None else polish.pixels_per_texel)
+    polish, baked = refine.polish, trained_texels(scene, options)
+    if scene.field is not None and not isinstance(scene.field, TexelField):
+        baked = field_tiles(baked, scene.field, cameras, polish and polish.pixels_per_texel, progress)
     if polish is not None and baked.textured:
         baked = polish_scene(baked, photographs, background, polish, refine.train, progress, held_out, device)
-    if polish is not None or trained:
-        baked = prune_and_resample(baked, cameras, progress)
+    baked = prune_and_resample(baked, cameras, progress)
     if refine.compact is not None:
         baked, coding = compacted(baked, photographs, background, refine.compact, progress, device)
     if tune is not None and baked.textured:
@@ -200,3 +184,18 @@ def bake(
     if baked.codes is not None and baked.codes.texels is None:
         baked = with_coded_texels(baked, coding)
     return certified(baked.encoded(progress), [camera.to("cpu") for camera in cameras])
+
+
+def bake_field(
+    scene: BakeableScene,
+    cameras: Sequence[Camera] = (),
+    options: BakeOptions | None = None,
+    progress: Progress | None = None,
+    pixels_per_texel: float | None = None,
+) -> BakeState:
+    """Bake a scene as it is, without photographs; with `pixels_per_texel` only the tiles of its field, for a polish."""
+    options, progress = options or BakeOptions(), progress or no_progress
+    options.check()
+    if pixels_per_texel is not None:
+        return field_tiles(trained_texels(scene, options), scene.field, cameras, pixels_per_texel, progress)
+    return bake(scene, cameras, (), torch.zeros(3), options, RefineOptions(), progress)

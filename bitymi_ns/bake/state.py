@@ -168,8 +168,7 @@ class BakeState:
         texels = self.cut(texels.detach().float().cpu()) if texels.shape[-1] == 3 else texels.detach().float().cpu()
         if not self.textured or texels.shape != self.texels.shape:
             raise ValueError(f"texels of shape {tuple(texels.shape)} do not fit the bake")
-        # no error: the field is no longer what the texels are meant to hold
-        statistics = self.statistics.replace(atlas=None, error=None, certificate=None)
+        statistics = self.statistics.replace(atlas=None, certificate=None)
         means = tile_means(texels, self.sizes)
         return replace(self.with_constants(means), texels=texels.contiguous(), atlas=None, statistics=statistics)
 
@@ -193,7 +192,7 @@ class BakeState:
             self.with_constants(codes.constants),
             texels=texels,
             atlas=atlas,
-            statistics=self.statistics.replace(atlas=atlas_cost(self.packing, atlas), error=None, certificate=None),
+            statistics=self.statistics.replace(atlas=atlas_cost(self.packing, atlas), certificate=None),
             uncoded=uncoded,
             codes=replace(self.codes, texels=codes, residual=codes.residual, residual_step=codes.residual_step),
         )

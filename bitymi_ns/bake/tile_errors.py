@@ -103,14 +103,14 @@ def _windows(count: int, width: Tensor) -> Tensor:
 @torch.no_grad()
 def certified(baked: BakeState, cameras: Sequence[Camera]) -> BakeState:
     """Certify a bake: measure the error of the stored residual colours against those before quantisation, as
-    training views see it, and state it in the statistics; alphas are not covered. A bake that has a certificate
-    already, against the field, or no texels, or no tolerance, is returned as it is.
+    training views see it, and state it in the statistics; alphas are not covered. A bake without texels, or without
+    a tolerance, is returned as it is.
 
     Args:
         baked: encoded, on the CPU.
     """
     scene, options = baked.scene, baked.options
-    if baked.atlas is None or options.tolerance == 0 or baked.statistics.certificate:
+    if baked.atlas is None or options.tolerance == 0:
         return baked
     stored = listed_texels(torch.from_numpy(baked.atlas.decoded()[..., :3]), baked.packing, baked.mean_residual)
     before = (baked.texels if baked.uncoded is None else baked.uncoded)[:, :3]
@@ -119,7 +119,7 @@ def certified(baked: BakeState, cameras: Sequence[Camera]) -> BakeState:
     shown = TileVisibility(opacity, beta, baked.extent, scene.weight_bound, pixels=pixels)
     errors, seen = listed_errors(stored - before, baked.sizes, shown)
     rms = STEPS * float((stored - before).double().square().mean().sqrt())
-    certificate = Certificate.of(errors[seen], options.tolerance, "texels").replace(
+    certificate = Certificate.of(errors[seen], options.tolerance).replace(
         texel_rms=round(rms, 4), marks=sketches_text(before, stored)
     )
     return replace(baked, statistics=baked.statistics.replace(certificate=certificate))

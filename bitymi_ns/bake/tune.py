@@ -184,7 +184,6 @@ def tune_atlas(
     statistics = stopping.statistics(len(tuned), len(validation), *spent).replace(
         steps=stopping.done + options.coded_steps,
         steps_asked=options.steps + options.coded_steps,
-        error_before=baked.statistics.error,
         psnr_held_out=None if untuned is None else gain(untuned, held_out.psnr(coded.texels)),
     )
     if isinstance(coded.stored, TexelCodes):

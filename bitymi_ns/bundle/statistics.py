@@ -62,20 +62,11 @@ class Percentiles(Part):
         return cls(**{f"p{p}": value if value <= _LARGEST else None for p, value in found.items()})
 
 
-class TileError(Part):
-    """Error of the stored tiles against the field, 8-bit steps."""
-
-    tolerance: NotNegative
-    unit: str | None = None
-    rms: Percentiles
-    largest: Percentiles
-
-
 class Certificate(Part):
     """Numbers of surfels whose stored residual is within the tolerance as seen by the closest training view: weighted
     by blending weight, averaged per pixel, root mean square over the tile; alphas are ignored."""
 
-    against: Literal["field", "texels"]  # reference: the field, or the trained texels before quantisation
+    against: Literal["field", "texels"]  # reference: texels before quantisation; earlier: the field
     tolerance: NotNegative
     within: Whole
     beyond: Whole
@@ -86,11 +77,11 @@ class Certificate(Part):
     """Count sketches of 2 x 128 sums, before quantisation and as stored (`sketch.sketches_text`)."""
 
     @classmethod
-    def of(cls, errors: Tensor, tolerance: float, against: Literal["field", "texels"]) -> Certificate:
+    def of(cls, errors: Tensor, tolerance: float) -> Certificate:
         """Certify errors [n], 8-bit steps."""
         within = int((errors <= tolerance).sum())
         worst = float(errors.amax()) if len(errors) else 0.0
-        return cls(against=against, tolerance=tolerance, within=within, beyond=len(errors) - within, worst=worst)
+        return cls(against="texels", tolerance=tolerance, within=within, beyond=len(errors) - within, worst=worst)
 
 
 class LeftOut(Part):
@@ -103,7 +94,7 @@ class LeftOut(Part):
 
 
 class KeptSurfels(Part):
-    """Numbers of surfels; `without_tile` for a scene with a field."""
+    """Numbers of surfels."""
 
     trained: Whole | None = None
     kept: Whole | None = None
@@ -121,18 +112,7 @@ class KeptTexels(Part):
     polished: Count | None = None  # texels before the polish
     learned: Count | None = None  # texels that were trained
     kept: Count | None = None
-    not_finite: Count | None = None  # points where the field was not finite
-
-
-class FieldLevels(Part):
-    """Evaluated levels of the field, and the change of a residual without each, 8-bit steps."""
-
-    unit: str | None = None
-    levels: Whole | None = None
-    kept: tuple[Whole, Annotated[int, Field(ge=1, le=64)]]  # first level and number of levels
-    change_of_each: Annotated[list[Measured], Field(max_length=64)] | None = None
-    change: Measured = None  # change without all dropped levels
-    tolerance: NotNegative | None = None
+    not_finite: Count | None = None  # texels where the field was not finite
 
 
 class AtlasCost(Part):
@@ -196,7 +176,6 @@ class FineTuning(Part):
     """Step and PSNR over the validation views, dB."""
     seconds: NotNegative | None = None
     cpu_seconds: NotNegative | None = None
-    error_before: TileError | None = None  # error of the texels as baked from the field
 
 
 class HeldOut(Part):
@@ -216,15 +195,12 @@ class Statistics(Part):
 
     surfels: KeptSurfels | None = None
     texels: KeptTexels | None = None
-    error: TileError | None = None  # None: no texture, or texels changed after the bake
     certificate: Certificate | None = None  # None: no texture, or no tolerance
     view_color: ViewColorError | None = None  # None: view colours unchanged
-    field: FieldLevels | None = None
     atlas: AtlasCost | None = None
     polish: FineTuning | None = None
     rounding: Rounding | None = None
     finetune: FineTuning | None = None
-    seconds: NotNegative | None = None  # of the bake, without fine-tuning
     options: BakeOptions | None = None
     method: str | None = None
     held_out: HeldOut | None = None

@@ -174,10 +174,7 @@ def _check_counts(bundle: Bundle) -> Check:
     for name, value in stated.items():
         if value is not None and value != found[name]:
             return Check("statistics", False, f"{name}: {value:,} stated, {found[name]:,} found")
-    error = statistics.error
     detail = "agree with the files"
-    if error is not None:
-        detail += f"; error of a tile at most {steps_text(error.rms.p100)} steps, tolerance {error.tolerance:g}"
     if lean is not None:
-        detail += f"; of a view colour at most {steps_text(lean.error.p100)}, tolerance {lean.tolerance:g}"
+        detail += f"; error of a view colour at most {steps_text(lean.error.p100)} steps, tolerance {lean.tolerance:g}"
     return Check("statistics", True, detail)

@@ -93,27 +93,6 @@ class HashField(ResidualField):
         self.register_buffer("domain", torch.tensor([*mid, half, float(contract)], dtype=torch.float64))
         self._geometry: tuple[Tensor, int, FieldGeometry] | None = None
 
-    @torch.no_grad()
-    def only(self, first: int, count: int) -> HashField:
-        """Copy the field with only the levels first ... first + count - 1, as if the features of all others were 0. Its
-        voxel size is that of its finest level.
-
-        Raises:
-            ValueError: the field has no such levels.
-        """
-        if not (0 <= first and 1 <= count and first + count <= self.levels):
-            raise ValueError(f"a field of {self.levels} levels has none from {first} to {first + count - 1}")
-        config = SceneConfig(levels=count, min_resolution=self.min_resolution << first)
-        *mid, half, contract = self.domain.tolist()
-        size = self.field_table.shape[1].bit_length() - 1
-        part = HashField(config, tuple(mid), half, bool(contract), size).to(self.field_table)
-        rows = slice(first * FEATURES, (first + count) * FEATURES)
-        own = (self.field_table[first : first + count], self.field_w1[rows], self.field_w2, self.field_w3)
-        for to, value in zip(part.weights, own, strict=True):
-            to.copy_(value)
-        part.domain = self.domain.clone()
-        return part
-
     @property
     def geometry(self) -> FieldGeometry:
         """Geometry of the grid. Cached, to avoid a synchronisation in every step."""

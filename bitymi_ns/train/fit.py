@@ -79,13 +79,13 @@ class Trainer:
         """
         if not views:
             raise ValueError("there is nothing to train on: no views")
-        extent = scene_extent(torch.stack([view.camera.center for view in views]), scene.surfels["means"])
+        cameras, files = zip(*((view.camera, view.file) for view in views), strict=True)  # reads photographs once
+        extent = scene_extent(torch.stack([camera.center for camera in cameras]), scene.surfels["means"])
         self.scene, self.config = scene, config
         self.optimizers = make_optimizers(scene)
-        pixels = sum(view.camera.width * view.camera.height for view in views)
-        files = [view.file for view in views if view.file is not None]
-        named = files if len(files) == len(views) else None
-        data = TrainingData(views, extent, pixels, len(scene), covered_share(views), files=named)
+        pixels = sum(camera.width * camera.height for camera in cameras)
+        named = None if None in files else files
+        data = TrainingData(views, extent, pixels, len(scene), covered_share(views), files=named, cameras=cameras)
         self.training = Training(scene, data, self.optimizers, config, max_steps, processes=processes)
         self.step = 0
         self._views = len(views)

@@ -26,20 +26,21 @@ from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.step_sizes import StepSizes
 from bitymi_ns.train.strategy import Strategy
 from bitymi_ns.train.texels import LearningTexels
-from bitymi_ns.train.views import DownscaledViews, TrainingData, View, step_background
+from bitymi_ns.train.views import DownscaledViews, TrainingData, View, background_changes, step_background
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import RenderOutput, Scene
 
 
 def view_losses(
-    scene: Scene, view: View, schedule: Schedule, step: int, watch: LossWatch
+    scene: Scene, view: View, schedule: Schedule, step: int, watch: LossWatch, background: Tensor | None = None
 ) -> tuple[dict[str, Tensor], RenderOutput]:
     """Render a training view and compare it with its photograph.
 
     Args:
         view: on the scene's device, with its image at its camera's size.
         schedule, step: decide which parts of the scene are trained.
+        background: [3] colour behind the scene where it is the same in all steps; None: that of the options.
 
     Returns:
         The weighted loss terms (their sum is the objective) and the rendered view.
@@ -49,7 +50,8 @@ def view_losses(
     """
     config = schedule.config
     device = scene.surfels["means"].device
-    background = step_background(config, view, step, device)
+    if background is None or background_changes(config, view):
+        background = step_background(config, view, step, device)
     output = scene.render(
         view.camera,
         background=background,
@@ -80,6 +82,7 @@ class Training:
         exposure: colour corrections of the training photographs; decided when the first step begins.
         poses: pose corrections of the training photographs.
         clock: time spent between `begin` and `finish`.
+        background: [3] colour behind the scene where it is the same in all steps; None: that of the options.
     """
 
     def __init__(
@@ -117,6 +120,7 @@ class Training:
         self.watch = LossWatch()
         self.step_sizes = StepSizes(self.schedule, cameras)
         self.clock = Stopwatch()
+        self.background: Tensor | None = None
         self.step = 0
         self._full_size = data.views
         self._outputs: list[RenderOutput] = []
@@ -171,7 +175,7 @@ class Training:
             self.texels.prepare(self.step, view, self.guard.factor)
             diverged: TrainingDiverged | None = None
             try:
-                terms, output = view_losses(self.scene, view, self.schedule, self.step, self.watch)
+                terms, output = view_losses(self.scene, view, self.schedule, self.step, self.watch, self.background)
             except TrainingDiverged as error:
                 diverged = error
             problem = self.processes.problem(None if diverged is None else str(diverged))

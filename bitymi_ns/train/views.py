@@ -228,7 +228,7 @@ class DownscaledViews:
     Args:
         views: at full size.
         device: of the images returned.
-        correction: returns the current correction of a view by its index; None: no corrections.
+        correction: returns the current correction of a view by its index; None: the view's own.
         pose: returns a view's camera, by its index, with the current pose; None: poses are fixed.
         resident_bytes: budget on a CUDA device; None: `photograph_budget`.
     """
@@ -262,7 +262,8 @@ class DownscaledViews:
         view = self._at(index, factor)
         if self._pose is not None:
             view = view._replace(camera=self._pose(index, view.camera))
-        return view if self._correction is None else view._replace(correction=self._correction(index))
+        correction = None if self._correction is None else self._correction(index)
+        return view if correction is None else view._replace(correction=correction)
 
     def _at(self, index: int, factor: float) -> View:
         if factor != self._factor:

@@ -116,7 +116,7 @@ def test_fine_tuned_texels_are_encoded_anew(scene, capsys):
     with rich_progress() as progress:
         baked = bake_field(scene(30), progress=progress)
     out = capsys.readouterr().out
-    assert "choosing the tiles" in out and "measuring the error" in out and "encoding the atlas" in out
+    assert "choosing the tiles" in out and "evaluating texels" in out and "encoding the atlas" in out
     again = bake_field(scene(30))  # the layout does not depend on the run
     np.testing.assert_array_equal(again.packing.tiles, baked.packing.tiles)
     assert again.atlas.payload == baked.atlas.payload and again.atlas.range == baked.atlas.range
@@ -124,7 +124,7 @@ def test_fine_tuned_texels_are_encoded_anew(scene, capsys):
     tiled = torch.from_numpy(baked.packing.tiles[:, 3:4] > 0)
     assert tiled.any() and not tiled.all()
     torch.testing.assert_close(tuned.mean_residual, baked.mean_residual + 1.0)
-    assert baked.statistics.error is not None and tuned.statistics.error is None
+    assert baked.statistics.certificate is not None and tuned.statistics.certificate is None
     assert tuned.atlas.range.offset == pytest.approx(baked.atlas.range.offset + 1.0, abs=1e-4)
     with pytest.raises(ValueError, match="do not fit"):
         baked.with_texels(baked.texels[:4])

@@ -95,7 +95,7 @@ def test_versions(surfels, tmp_path):
         (lambda i: i["bounds"].update(min=[0, 0, 1e300]), "bounds.min.2 must be"),
         (lambda i: i.update(statistics=[1, 2]), r"statistics must be an object, not \[1, 2\]"),
         (lambda i: i["statistics"].update(options={"r_max": "wide"}), "statistics.options.r_max must be a valid"),
-        (lambda i: i["statistics"].update(error=3), "statistics.error must be an object, not 3"),
+        (lambda i: i["statistics"].update(certificate=3), "statistics.certificate must be an object, not 3"),
         (lambda i: i.update(generator="\ud800"), "hex escape"),
     ],
 )

@@ -124,6 +124,18 @@ def test_images_with_alpha_and_bytes_and_masks(make_scene, views):
     assert math.isfinite(evaluate(scene, [View(camera, rgba, mask)], config)[0])
 
 
+def test_the_colour_behind_the_scene_may_be_given(make_scene, views):
+    scene, color = make_scene(texture=False), torch.tensor([0.2, 0.4, 0.6])
+    scene.surfels["means"].data[:, 2] -= 1e3  # nothing is seen
+    camera = views[0].camera
+    for kind in ("black", "random"):
+        schedule = Schedule(TrainConfig(background=kind), 100)
+        for channels in (3, 4):
+            view = View(camera, torch.zeros(48, 48, channels))
+            shown = view_losses(scene, view, schedule, 0, LossWatch(), color)[1].rgb[0, 0]
+            assert torch.equal(shown, color) == (kind == "black")
+
+
 def test_views_that_see_nothing_and_runs_of_one_step(make_scene, views):
     scene = make_scene()
     away = views[0].camera.viewmat.clone()

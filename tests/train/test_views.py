@@ -44,6 +44,13 @@ def test_the_pixels_that_count_are_counted_once_at_each_size(monkeypatch: pytest
             assert views.at(0, factor).counted == count
 
 
+def test_photographs_keep_their_own_correction_where_the_run_finds_none() -> None:
+    camera, own, found = Camera(torch.eye(4), torch.eye(3), 12, 8), torch.full((3,), 0.5), torch.full((3,), 2.0)
+    view = View(camera, torch.rand(8, 12, 3), correction=own)
+    views = DownscaledViews([view, view], correction=lambda index: found if index else None)
+    assert views.at(0, 0.5).correction is own and views.at(1, 0.5).correction is found
+
+
 def test_background():
     image, color = torch.tensor([[[1.0, 1.0, 1.0, 0.25]]]), torch.tensor([0.2, 0.4, 0.9])
     torch.testing.assert_close(over_background(image, color)[0, 0], 0.25 + 0.75 * color)

@@ -1,10 +1,9 @@
-"""Polish of a bake: texels, geometry, opacities and view colours are optimised together, without the network."""
+"""Polish of a bake: a training run of its texels and surfels together, without the network and densification."""
 
 import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,18 +13,15 @@ from bitymi_ns.bake.state import BakeState
 from bitymi_ns.bake.tune import TuneOptions
 from bitymi_ns.bake.tuning_views import TexelList
 from bitymi_ns.bundle.statistics import FineTuning
-from bitymi_ns.ops import TexelDescent
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.ranges import Positive, PositiveCount
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import Scene
-from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.init import scene_extent
-from bitymi_ns.train.losses import numbers, photometric
-from bitymi_ns.train.optimizers import forget_gradients, set_rate, step, surfel_optimizers
-from bitymi_ns.train.schedules import Schedule, falling
-from bitymi_ns.train.views import View, background_changes, step_background, training_order
+from bitymi_ns.train.config import DensifyConfig, GuardConfig, LossConfig, TexelConfig, TrainConfig
+from bitymi_ns.train.divergence import TrainingDiverged
+from bitymi_ns.train.fit import Trainer
+from bitymi_ns.train.views import View
 
 MEANS = (1.6e-4, 1.6e-6)
 """Rates of the positions in shares of the extent, as polishing was measured with: steps in pixels have not been."""
@@ -43,81 +39,55 @@ class PolishOptions(TuneOptions):
     """A tile starts with at most one texel per this number of pixels in the view that shows most of its surfel."""
 
 
-class _Polish:
-    """One polish, step by step."""
+def _polish_run(
+    baked: BakeState,
+    views: Sequence[View],
+    background: Tensor,
+    options: PolishOptions,
+    train: TrainConfig,
+    device: torch.device | str,
+    progress: Progress,
+) -> Trainer:
+    """Begin a training run that is all texel stage, without what changes the number of surfels."""
+    texels = TexelList(baked, device)
+    drawn, tiles = texels.scene, texels.tiles
+    share = 1.0 / (texels.coverage(views, progress)[:, 0] + options.prior)
+    config = SceneConfig(
+        texture="texels",
+        view_color=drawn.view_color,  # type: ignore[arg-type]
+        weight_bound=drawn.weight_bound,
+        prefilter=drawn.prefilter,  # type: ignore[arg-type]
+    )
+    scene = Scene(config, drawn.surfels, TexelField(tiles.size, tiles.extent, texels.values, share), near=drawn.near)
+    train = replace(
+        train,
+        loss=LossConfig(ssim_weight=options.ssim_weight, falloff_weight=0.0, depth_weight=0.0, normal_weight=0.0),
+        densify=DensifyConfig(final_prune_steps=()),
+        lr=replace(train.lr, means=MEANS),
+        guard=GuardConfig(rollbacks=0),  # the guard may drop surfels; here the best state is restored
+        texels=TexelConfig(start=0, rate=options.rate, travel=0.0, surfel_rates=options.share),
+        num_downscales=0,
+        exposure="off",
+        refine_poses="off",
+        seed=options.seed,
+    )
+    run = Trainer(scene, views, train, options.steps)
+    run.training.background = background.to(device)
+    return run
 
-    def __init__(
-        self,
-        baked: BakeState,
-        views: Sequence[View],
-        background: Tensor,
-        options: PolishOptions,
-        train: TrainConfig,
-        device: torch.device | str,
-    ) -> None:
-        self.texels, self.device = TexelList(baked, device), device
-        drawn = self.texels.scene
-        config = SceneConfig(
-            view_color=drawn.view_color,  # type: ignore[arg-type]
-            weight_bound=drawn.weight_bound,
-            prefilter=drawn.prefilter,  # type: ignore[arg-type]
-        )
-        tiles = self.texels.tiles
-        self.field = TexelField(tiles.size, tiles.extent, self.texels.values)
-        self.scene = Scene(config, drawn.surfels, self.field, near=drawn.near)
-        self.options, self.background = options, background.to(device)
-        centers = torch.stack([view.camera.center.to(device) for view in views])
-        extent = scene_extent(centers, drawn.surfels["means"])
-        rates = replace(train.lr, means=MEANS).times(options.share)
-        self.schedule = Schedule(replace(train, lr=rates), options.steps, extent)
-        self.optimizers = surfel_optimizers(self.scene)
-        self.train, self.factor = train, 1.0
 
-    def shown(self, view: View, background: Tensor | None) -> Tensor:
-        """Draw a view with the exposure of its photograph over a colour [3]: [H, W, 3]."""
-        output = self.scene.render(view.camera, background)
-        return view.shown(output.rgb, output.alpha, background)
-
-    @torch.no_grad()
-    def psnr(self, views: Sequence[View], progress: Progress = no_progress) -> float:
-        """Average the PSNR, dB, over views with an unmasked pixel."""
-        pictures = (
-            (self.shown(view, self.background), view.target(self.background, self.device), view.mask)
-            for view in (view.to(self.device) for view in views)
-        )
-        return evaluate(pictures, len(views), progress)
-
-    def step(self, number: int, view: View, share: Tensor) -> bool:
-        """Step on one view; returns False, without a step, if it is not finite."""
-        options, view = self.options, view.to(self.device)
-        for name, optimizer in self.optimizers.items():
-            set_rate(optimizer, self.factor * falling(self.schedule.lr(name, 0), number, options.steps))
-        forget_gradients(self.optimizers.values())
-        background = self.background
-        if background_changes(self.train, view):
-            background = step_background(self.train, view, number, self.device)
-        mask, target = view.mask, view.target(background, self.device)
-        # the loss is a mean, the step wants a sum
-        rate = self.factor * falling(options.rate, number, options.steps) * numbers(target, mask)
-        self.field.descent = TexelDescent(share, rate)
-        loss = photometric(self.shown(view, background), target, options.ssim_weight, mask)
-        if not math.isfinite(float(loss.detach())):
-            return False
-        if not loss.requires_grad:  # nothing of the scene is in the view
-            return True
-        loss.backward()
-        step(self.optimizers, {})
-        return True
-
-    def state(self) -> dict[str, Any]:
-        """Copy the parameters."""
-        return {name: value.detach().clone() for name, value in self.scene.state_dict().items()}
-
-    def go_back(self, state: dict[str, Any]) -> None:
-        """Restore an earlier state, with slower steps from here on."""
-        self.scene.load_state_dict(state)
-        self.optimizers = surfel_optimizers(self.scene)
-        self.factor *= self.train.guard.rates
+@torch.no_grad()
+def _psnr(run: Trainer, views: Sequence[View], progress: Progress = no_progress) -> float:
+    """Average the PSNR, dB, over views with an unmasked pixel."""
+    background = run.training.background
+    assert background is not None
+    moved = (view.to(background.device) for view in views)
+    drawn = ((view, run.scene.render(view.camera, background)) for view in moved)
+    pictures = (
+        (view.shown(output.rgb, output.alpha, background), view.target(background, background.device), view.mask)
+        for view, output in drawn
+    )
+    return evaluate(pictures, len(views), progress)
 
 
 def polish_scene(
@@ -146,7 +116,7 @@ def polish_scene(
         eval_views: views of which the gain is stated; they decide nothing.
 
     Returns:
-        a new bake with `statistics.polish`, to be `reduced`; `baked` itself without change where there are fewer than 4
+        a new bake with `statistics.polish`; `baked` itself without change where there are fewer than 4
         views.
 
     Raises:
@@ -160,35 +130,44 @@ def polish_scene(
         return replace(baked, statistics=baked.statistics.replace(polish=FineTuning(steps=0, views=len(views))))
     started, cpu_started = time.perf_counter(), time.process_time()
     validation, trained = validation_split(views, options.val_every)
-    run = _Polish(baked, views, background, options, train or TrainConfig(), device)
-    before = run.psnr(eval_views) if eval_views else math.nan
-    stopping = _optimise(run, trained, validation, progress)
+    train = train or TrainConfig()
+    run = _polish_run(baked, trained, background, options, train, device, progress)
+    before = _psnr(run, eval_views) if eval_views else math.nan
+    stopping = _optimise(run, validation, options, train.guard, progress)
     run.scene.load_state_dict(stopping.best)
     spent = time.perf_counter() - started, time.process_time() - cpu_started
     statistics = stopping.statistics(len(trained), len(validation), *spent).replace(
-        error_before=baked.statistics.error, psnr_held_out=gain(before, run.psnr(eval_views)) if eval_views else None
+        psnr_held_out=gain(before, _psnr(run, eval_views)) if eval_views else None
     )
-    texels = run.field.texels.detach()
-    result = baked.with_texels(texels).with_surfels(dict(run.scene.surfels))
+    result = baked.with_texels(run.scene.field.texels.detach()).with_surfels(dict(run.scene.surfels))
     return replace(result, statistics=result.statistics.replace(polish=statistics))
 
 
 def _optimise(
-    run: _Polish, views: Sequence[View], validation: Sequence[View], progress: Progress
-) -> EarlyStopping[dict[str, Any]]:
+    run: Trainer, validation: Sequence[View], options: PolishOptions, guard: GuardConfig, progress: Progress
+) -> EarlyStopping[dict[str, Tensor]]:
     """Find the state that shows the validation views best; also returns the evaluations."""
-    options = run.options
-    before = run.psnr(validation, progress)
-    stopping = EarlyStopping(options.steps, options.checks, options.patience, before, run.state())
-    share, attempts = 1.0 / (run.texels.coverage(views, progress)[:, 0] + options.prior), 0  # [T]
+
+    def state() -> dict[str, Tensor]:
+        return {name: value.detach().clone() for name, value in run.scene.state_dict().items()}
+
+    before, failures = _psnr(run, validation, progress), 0
+    stopping = EarlyStopping(options.steps, options.checks, options.patience, before, state())
     for number in range(options.steps):
-        view = views[training_order(len(views), options.seed, number)]
-        if not run.step(number, view, share):
-            attempts += 1
-            run.go_back(stopping.best)
-        more = attempts < run.train.guard.rollbacks
-        if not more or stopping.due(number + 1):
-            more = stopping.update(number + 1, run.psnr(validation), run.state) and more
+        run.step, due = number, stopping.due(number + 1)
+        try:
+            run.advance()
+            if due:
+                run.training.watch.finish(run.scene)
+        except TrainingDiverged:
+            run.scene.load_state_dict(stopping.best)
+            for optimizer in run.optimizers.values():
+                optimizer.state.clear()
+            run.training.guard.factor *= guard.rates
+            failures += 1
+        more = failures < guard.rollbacks
+        if not more or due:
+            more = stopping.update(number + 1, _psnr(run, validation), state) and more
         progress("polishing", number + 1, options.steps if more else number + 1)
         if not more:
             break

@@ -30,11 +30,6 @@ def print_summary(folder: Path, info: Manifest) -> None:
     table.add_row("Left out", ", ".join(f"{v:,} {k.replace('_', ' ')}" for k, v in left_out.items()) or "nothing")
     if statistics.texels is not None:
         print_savings(table, info)
-    levels = statistics.field
-    if levels is not None:
-        alone = ", ".join(f"{change:.2f}" for change in levels.change_of_each)
-        table.add_row("Levels of the field", f"{levels.levels} -> {levels.kept[1]}")
-        table.add_row("", f"(each alone changes a surfel by up to {alone} steps; tolerance {levels.tolerance:g})")
     print_view_color(table, info)
     atlas = statistics.atlas
     if atlas is None:
@@ -70,11 +65,9 @@ def print_summary(folder: Path, info: Manifest) -> None:
 
 
 def print_savings(table: Table, info: Manifest) -> None:
-    """Add rows for tiles, texels and bytes of rule and bundle, and the error of the difference."""
+    """Add rows for tiles, texels and bytes of rule and bundle, and the error of coding."""
     statistics, options = info.statistics, info.statistics.options
     texels = statistics.texels
-    learned = [part.error_before for part in (statistics.polish, statistics.finetune) if part is not None]
-    error = statistics.error or next((each for each in learned if each is not None), None)
     kept, count = texels.kept, info.surfels.count
     table.add_row("Tiles", f"{statistics.surfels.trained:,} -> {count - statistics.surfels.without_tile:,}")
     if texels.paper is not None:
@@ -95,16 +88,10 @@ def print_savings(table: Table, info: Manifest) -> None:
     table.add_row("Atlas bytes", f"{rule:,} -> {stored:,} ({100 * stored / max(1, rule):.1f} %)")
     certificate = statistics.certificate
     if certificate is not None:
-        count, of = certificate.within + certificate.beyond, {"field": "the field", "texels": "the learned colours"}
+        count = certificate.within + certificate.beyond
         table.add_row("As stored and seen", f"{certificate.within:,} of {count:,} surfels within the tolerance")
         worst = "no number" if certificate.worst is None else f"at most {certificate.worst:.2f} steps"
-        table.add_row("", f"({certificate.tolerance:g} steps from {of[certificate.against]}; {worst})")
-    if error is None:  # tiles hold learned texels, not the field
-        return
-    tolerance = f"tolerance {error.tolerance:g}" if error.tolerance else "no tolerance"
-    table.add_row("Error of a tile", percentiles_text(error.rms))
-    when = "before the texels learned" if statistics.error is None else "as stored"
-    table.add_row("", f"({tolerance}; weighted root mean square against the field, {when})")
+        table.add_row("", f"({certificate.tolerance:g} steps from the colours before coding; {worst})")
 
 
 def print_view_color(table: Table, info: Manifest) -> None:

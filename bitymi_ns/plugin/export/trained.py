@@ -1,6 +1,5 @@
 """Load and preview a trained run, make its bundle's cameras.json, and compare both."""
 
-import copy
 import io
 import pickle
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
-from bitymi_ns.bake.verify import check_field, check_view_color
+from bitymi_ns.bake.verify import check_view_color
 from bitymi_ns.bundle import Bundle, Check, check_world
 from bitymi_ns.bundle.cameras import CapturedCamera, cameras_data
 from bitymi_ns.bundle.parts import CAMERAS, bundle_at
@@ -26,7 +25,6 @@ from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.run.model import BitymiModel
 from bitymi_ns.scene.baked import BakedScene, as_bytes
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.scene.field import HashField
 from bitymi_ns.train.losses import fitted_psnr, psnr
 
 _PSNR_SLACK = 0.1  # dB
@@ -148,8 +146,6 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
     model, datamanager = pipeline.model, pipeline.datamanager
     train = to_cameras(datamanager.train_dataset.cameras, "cpu")
     checks = [check_view_color(bundle, model.scene.surfels, train)]
-    if isinstance(model.scene.field, HashField):
-        checks.append(check_field(bundle, copy.deepcopy(model.scene.field).cpu(), train))
     if len(datamanager.eval_dataset):
         rows = held_out_psnr(model, datamanager, bundle.scene, views)
         worst, photos = min(row[0] for row in rows), sum(row[2] - row[1] for row in rows) / len(rows)

@@ -1,0 +1,141 @@
+"""Tiles of a residual field (paper, section Texture Baking): a grid for every surfel, with the field at its texels."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake.inputs import BakeInput, device_of
+from bitymi_ns.bake.left_out import drop_unseen
+from bitymi_ns.bake.state import BakeState
+from bitymi_ns.bake.tile_errors import closest_pixels
+from bitymi_ns.bake.tiles import Tiles, grid
+from bitymi_ns.bundle.bake_options import BakeOptions
+from bitymi_ns.bundle.statistics import KeptTexels
+from bitymi_ns.codec.pages import listed_tiles
+from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.tile_sizes import (
+    coarsened,
+    kernel_parameters,
+    nyquist_resolution,
+    visible_extent,
+    voxel_along_axes,
+)
+from bitymi_ns.train.init import tangents
+
+PAPER_EXTENT = 4.0  # e of the paper's rule
+
+
+class Field(Protocol):
+    """The part of the residual field that the bake uses.
+
+    A field that also has `geometry.mid`, the centre of its contraction, gets tiles that follow the direction in which
+    its voxels are stretched; without it the smaller voxel edge holds for both axes.
+    """
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """[M, 3] world positions to [M, 3] residual colours."""
+
+    def voxel_size(self, x: Tensor) -> Tensor:
+        """[M, 3] world positions to [M, 2] finest voxel edges (radial, tangential), world units."""
+
+
+@torch.no_grad()
+def field_tiles(
+    baked: BakeState,
+    field: Field,
+    cameras: Sequence[Camera],
+    pixels_per_texel: float | None = None,
+    progress: Progress = no_progress,
+) -> BakeState:
+    """Give the surfels of a bake tiles with the values of a field at the texel centres; surfels that no view blends are
+    left out. `pipeline.prune_and_resample` then drops what the options say, as of trained texels.
+
+    With a tolerance a tile covers the disc in which fragments reach the weight bound. Beyond it nothing is seen: the
+    field is read at the nearest point of the disc, so values stay smooth and within the range of what is seen.
+
+    Args:
+        baked: without tiles.
+        field: on the device of the cameras.
+        cameras: training views, for the cap on tile sizes and for what they see.
+        pixels_per_texel: a tile gets at most one texel per this number of pixels that its surfel fills in the view that
+            shows most of it; None = as many as field and views resolve.
+
+    Raises:
+        ValueError: no surfel is left, or the atlas would be too large.
+    """
+    options, paper = baked.options, _paper_texels(baked, field, device_of(cameras))
+    baked, inputs = drop_unseen(baked, cameras, progress)
+    sizes, extent, counts = grids(inputs, field, options, pixels_per_texel)
+    edges = tangents(inputs.surfels["quats"]) * inputs.surfels["log_scales"].exp()[:, None, :]
+    texels = torch.zeros(int(sizes.long().clamp(min=1).prod(1).sum()), 3)
+    done, tiled = 0, int((sizes[:, 0] > 0).sum())
+    for size, rows, index in listed_tiles(sizes, options.chunk):
+        u, v = grid(size, extent[rows])
+        if options.tolerance > 0:
+            inward = (extent[rows, None, None] / torch.hypot(u, v).clamp(min=1e-12)).clamp(max=1.0)
+            u, v = u * inward, v * inward
+        uv = torch.stack([u, v], dim=-1).flatten(1, 2)  # [n, r_v r_u, 2]
+        x = inputs.surfels["means"][rows, None] + uv @ edges[rows].transpose(1, 2)
+        texels[index.cpu()] = field(x.reshape(-1, 3)).float().view(*index.shape, 3).cpu()
+        done += len(rows)
+        progress("evaluating texels", done, tiled)
+    bad = ~torch.isfinite(texels).all(1)
+    texels[bad] = 0.0
+    extent = torch.where(extent > 0, extent, options.extent)
+    baked = baked.with_tiles(Tiles(sizes.cpu(), extent.cpu(), texels))
+    polished = None if pixels_per_texel is None else baked.packing.texels
+    counts = counts.replace(paper=paper, polished=polished, kept=baked.packing.texels, not_finite=int(bad.sum()))
+    return replace(baked, statistics=baked.statistics.replace(texels=counts))
+
+
+def grids(
+    inputs: BakeInput, field: Field, options: BakeOptions, pixels_per_texel: float | None
+) -> tuple[Tensor, Tensor, KeptTexels]:
+    """Choose the finest grids of use: sides [N, 2] int32, (0, 0) = none, and half sides [N]; also counts the texels by
+    each rule."""
+    surfels = inputs.surfels
+    means, scales, axes = surfels["means"], surfels["log_scales"].exp(), tangents(surfels["quats"])
+    opacity, beta = kernel_parameters(surfels, inputs.transmittance)
+    extent = torch.full_like(opacity, options.extent)
+    if options.tolerance > 0:
+        extent = torch.minimum(extent, visible_extent(opacity, beta, inputs.weight_bound))
+    voxel = torch.cat([field.voxel_size(part) for part in means.split(options.chunk)])
+    geometry = getattr(field, "geometry", None)
+    center = None if geometry is None else torch.tensor(geometry.mid, dtype=torch.float32)
+    delta = voxel_along_axes(voxel, axes, means, center) if options.local_voxel else voxel.amin().expand(scales.shape)
+    pixels = None
+    if inputs.cameras and options.cap_by_views:
+        pixels = closest_pixels(surfels, inputs.cameras, options.extent, inputs.near)
+
+    def sides(reach: Tensor, pixels: Tensor | None) -> Tensor:
+        most = None if pixels is None else 2.0 * reach * pixels
+        return nyquist_resolution(scales * reach, delta, 1.0, options.r_min, options.r_max, most)
+
+    whole = torch.full_like(extent[:, None], options.extent)
+    sizes = sides(extent[:, None], pixels)
+    counts = KeptTexels(
+        nyquist=_texels(sides(whole, None)),
+        after_cap_by_views=_texels(sides(whole, pixels)),
+        within_visible_part=_texels(sizes),
+    )
+    if pixels_per_texel is not None and inputs.views is not None:
+        sizes = coarsened(sizes, inputs.views.pixels / pixels_per_texel, options.r_min)
+    return torch.where(extent[:, None] > 0, sizes, 0), extent, counts
+
+
+def _paper_texels(baked: BakeState, field: Field, device: torch.device) -> int:
+    """Count the texels by the paper's rule: the smallest voxel size everywhere, and tiles of extent 4."""
+    options = baked.options
+    means, scales = (baked.scene.surfels[name].to(device) for name in ("means", "log_scales"))
+    finest = torch.stack([field.voxel_size(part).amin() for part in means.split(options.chunk)]).amin()
+    rates = (scales.exp(), finest.expand(scales.shape), PAPER_EXTENT)
+    return _texels(nyquist_resolution(*rates, options.r_min, options.r_max))
+
+
+def _texels(sizes: Tensor) -> int:
+    """Count the texels of tiles of sizes [N, 2]."""
+    return int(sizes.long().prod(1).sum())

@@ -1,0 +1,67 @@
+"""Surfels that a bake leaves out: those that cannot be drawn or stored, and those that no view blends."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from bitymi_ns.bake.inputs import BakeInput, device_of
+from bitymi_ns.bake.state import BakeState
+from bitymi_ns.bundle.statistics import LeftOut
+from bitymi_ns.codec.limits import within
+from bitymi_ns.ops.constants import ALPHA_MIN
+from bitymi_ns.ops.view_kinds import kind_of
+from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.scene.camera import Camera
+
+
+def drawable(surfels: Mapping[str, Tensor]) -> tuple[Tensor, LeftOut]:
+    """Find the rows [N] int64 that can be drawn and stored; count those left out, by reason."""
+    finite = torch.stack([torch.isfinite(value).flatten(1).all(1) for value in _as_rows(surfels)]).all(0)
+    scales = surfels["log_scales"].exp()
+    finite &= torch.isfinite(scales).all(1) & (scales > 0).all(1)
+    turned = surfels["quats"].norm(dim=1)
+    finite &= torch.isfinite(turned) & (turned > 1e-12)
+    storable = finite & within(surfels, kind_of(surfels))
+    transparent = storable & (surfels["opacity_logits"].sigmoid() < ALPHA_MIN)
+    kept = torch.nonzero(storable & ~transparent).squeeze(1)
+    return kept, LeftOut(
+        not_finite=int((~finite).sum()),
+        beyond_limits=int((finite & ~storable).sum()),
+        transparent=int(transparent.sum()),
+    )
+
+
+def _as_rows(surfels: Mapping[str, Tensor]) -> list[Tensor]:
+    """Give every parameter at least two dimensions."""
+    return [value.detach() if value.dim() > 1 else value.detach()[:, None] for value in surfels.values()]
+
+
+def drop_unseen(
+    baked: BakeState, cameras: Sequence[Camera], progress: Progress = no_progress
+) -> tuple[BakeState, BakeInput]:
+    """Leave out, and count, the surfels that cannot be drawn or stored and, if the options say so, those that no view
+    blends; also returns the others with what the views see of them, on the device of the cameras.
+
+    Raises:
+        ValueError: no surfel is left.
+    """
+    scene, device = baked.scene, device_of(cameras)
+    rows, gone = drawable(scene.surfels)
+    surfels = {name: value[rows].to(device) for name, value in scene.surfels.items()}
+    alpha = None if baked.alpha is None else baked.alpha.of(rows).to(device)
+    inputs = BakeInput(surfels, cameras, scene.near, scene.weight_bound, scene.prefilter, alpha=alpha)
+    inputs = inputs.with_visibility(baked.options, progress)
+    if inputs.views is not None and baked.options.drop_unseen:
+        seen = inputs.views.transmittance > 0
+        inputs, rows, gone = inputs.of(seen), rows[seen.cpu()], gone.replace(unseen=int((~seen).sum()))
+    if len(rows) == 0:
+        raise ValueError("no surfel is left to bake")
+    kept = torch.zeros(len(baked.rows), dtype=torch.bool)
+    kept[rows] = True
+    counts = baked.statistics.surfels
+    assert counts is not None and counts.left_out is not None
+    left_out = counts.left_out.replace(**{name: (getattr(counts.left_out, name) or 0) + n for name, n in gone if n})
+    statistics = baked.statistics.replace(surfels=counts.replace(kept=len(rows), left_out=left_out))
+    return replace(baked.only(kept), statistics=statistics), inputs

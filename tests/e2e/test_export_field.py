@@ -54,7 +54,9 @@ def test_exact_keeps_everything_and_a_tolerance_states_what_it_saves(
     assert "Atlas bytes" in printed and "all of it is kept" in printed
     assert "view_color" not in exact and default["view_color"]["tolerance"] == TOLERANCE
     assert default["view_color"]["sites"]["after"] < default["view_color"]["sites"]["before"]
-    assert default["certificate"]["tolerance"] == TOLERANCE and default["certificate"]["within"] > 0
+    certificate = default["certificate"]
+    assert certificate["tolerance"] == TOLERANCE and 0 < certificate["worst"] < 1
+    assert certificate["within"] + certificate["beyond"] == default["surfels"]["kept"]
 
 
 def test_verify_compares_a_bundle_with_its_run(

@@ -137,10 +137,10 @@ class Exposure:
 
     @property
     def sentence(self) -> str:
-        """Message for the console: the decision and its reason."""
+        """Message for the console: corrections and their reason; empty without corrections."""
         gains = self.log_gains
         if gains is None:
-            return f"Photographs are taken as they are exposed: {self.reason or 'as asked for'}."
+            return ""
         spread = f"{math.expm1(float(gains.std(correction=0))):.0%}"
         return f"The exposure of each photograph is learned, they differ by {spread}: {self.reason}."
 

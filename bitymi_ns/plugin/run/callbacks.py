@@ -122,8 +122,8 @@ class TrainingRun:
         if self.scene.field is not field:
             assert isinstance(self.scene.field, TexelField)
             say(f"From step {step} on every surfel has its own texels, {len(self.scene.field.texels):,} in all.")
-        if undecided:
-            say(self.training.exposure.sentence)
+        if undecided and (sentence := self.training.exposure.sentence):
+            say(sentence)
 
     def losses(self, view: View) -> dict[str, Tensor]:
         """Compare a render of the step's view with its photograph."""

@@ -21,14 +21,15 @@ def test_held_out_views_are_compared_on_the_device_of_the_model() -> None:
 
     def render(image: torch.Tensor, camera: Camera) -> SimpleNamespace:
         drawn_on.append(camera.K.device)
-        return SimpleNamespace(rgb=image.to(CARD))
+        return SimpleNamespace(rgb=image.to(CARD), alpha=None)
 
     moved = SimpleNamespace(render=lambda camera, background: render(baked, camera))
     scene = SimpleNamespace(to=lambda device: moved if device == CARD else None)
     with noted_reads() as reads:
-        model = SimpleNamespace(device=CARD, background=torch.zeros(3).to(CARD))
+        model = SimpleNamespace(device=CARD, background=torch.zeros(3).to(CARD), resume_state={})
         model.render = lambda camera, background, maps: render(neural, camera)
-        (row,) = held_out_psnr(model, SimpleNamespace(eval_views=[view]), scene, 5)  # type: ignore[arg-type]
+        capture = SimpleNamespace(corrected_eval_views=lambda state: [view])
+        (row,) = held_out_psnr(model, capture, scene, 5)  # type: ignore[arg-type]
         assert drawn_on == [CARD, CARD] and max(reads) == 56
     want = [psnr(baked, neural, mask), psnr(neural, photo, mask), psnr(baked, photo, mask)]
     want += [fitted_psnr(neural, photo, mask), fitted_psnr(baked, photo, mask)]

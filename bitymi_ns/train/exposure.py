@@ -48,8 +48,7 @@ FEWEST_PHOTOGRAPHS = 3  # minimum number of photographs that show a point
 CELL = 2.0  # side of the cells of the occlusion test, in mean distances of the points in the image
 HIDDEN = 0.05
 """A point is occluded if another in its cell or a neighbouring cell is nearer by this share of that one's depth, or of
-twice the range of depths in the view if that is less: through a long lens, front and back of an object differ by less
-than a share of their depth."""
+twice the range of depths in the view if that is less, as through a long lens."""
 FEWEST_TESTED = 1000  # minimum number of observations to test gains on the other half of the points
 
 
@@ -214,15 +213,12 @@ class Exposure:
         """Restore what `state_dict` returned. Ignores state saved with another option or number of photographs.
 
         Args:
-            state: None: a checkpoint from before there were corrections; `auto` then makes none.
+            state: None: a checkpoint from before there were corrections; `auto` then makes none, nor after `off`.
             count: number of training views.
             device: of the corrections; None: that of `state`.
         """
-        if state is None:
+        if state is None or (self.kind == "auto" and state["kind"] == "off"):  # corrections do not begin midway
             self.decided = self.kind in ("off", "auto")
-            return
-        if self.kind == "auto" and state["kind"] == "off":  # the earlier default: corrections cannot begin midway
-            self.decided, self.reason = True, "as in the run that is resumed"
             return
         table = state["table"]
         if state["kind"] != self.kind or (table is not None and len(table) != self.count(count)):
@@ -354,9 +350,8 @@ def _log_colors(view: View, points: Tensor, count: int, near: float) -> Tensor:
     nearest = torch.full((rows * columns,), math.inf, device=z.device)
     nearest = nearest.scatter_reduce(0, cell[inside], z[inside], "amin").view(1, 1, rows, columns)
     around = -max_pool2d(-nearest, 3, stride=1, padding=1).flatten()
-    depths = z[inside].sort().values
-    most = len(depths) - 1
-    spread = depths[int(0.99 * most)] - depths[int(0.01 * most)] if most >= 0 else z.new_zeros(())
+    depths = z[inside].sort().values if bool(inside.any()) else z.new_zeros(1)
+    spread = depths[int(0.99 * (len(depths) - 1))] - depths[int(0.01 * (len(depths) - 1))]
     shown = inside & (z <= around[cell] + HIDDEN * torch.minimum(around[cell], 2.0 * spread))
 
     color = as_float(_pixels(view.image, camera, x[:count], y[:count]))
@@ -382,9 +377,7 @@ def _pixels(image: Tensor, camera: Camera, x: Tensor, y: Tensor) -> Tensor:
 def _log_gains(logs: Tensor) -> Tensor:
     """Compute log gains [V, 3] by median polish, mean 0 per channel; 0 for photographs without points."""
     gains = torch.zeros(len(logs), 3)
-    if logs.shape[1] == 0:
-        return gains
-    for _ in range(SWEEPS):
+    for _ in range(SWEEPS if logs.shape[1] > 0 else 0):
         colors = _median(logs - gains[:, None], 0)
         gains = _median(logs - colors, 1).nan_to_num(0.0)
         gains -= gains.mean(0)

@@ -3,11 +3,12 @@ leave their folder, JSON depth is limited, text is escaped, and Python runs no m
 
 import errno
 import json
+import math
 import os
 import re
 import stat
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -189,6 +190,21 @@ def leads_inside(name: str) -> bool:
     """Return True if a relative name stays inside its folder."""
     path = PurePosixPath(name)
     return bool(path.parts) and not path.is_absolute() and ".." not in path.parts and "\0" not in name
+
+
+def finite_numbers(values: Mapping[str, Any]) -> dict[str, float]:
+    """Select the finite numbers of a JSON object, as floats."""
+    numbers = {}
+    for key, value in values.items():
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            continue
+        try:
+            number = float(value)
+        except OverflowError:  # an integer beyond the range of a double
+            continue
+        if math.isfinite(number):
+            numbers[key] = number
+    return numbers
 
 
 def json_of(data: str | bytes) -> Any:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bitymi_ns.files import write_file
-from bitymi_ns.trust import printable
+from bitymi_ns.trust import finite_numbers, printable
 
 if TYPE_CHECKING:  # slow to import
     import pycolmap
@@ -34,9 +33,9 @@ def write_report(folder: Path, values: Mapping[str, object], model: pycolmap.Rec
 
 def overview(values: Mapping[str, Any]) -> dict[str, str]:
     """Format statistics of report.json; a dash stands for what is no number."""
-    numbers = {key: value for key, value in values.items() if _is_number(value)}
-    stages = values["seconds"].items() if isinstance(values["seconds"], dict) else ()
-    seconds = [f"{stage} {value:.1f}" for stage, value in stages if _is_number(value)]
+    numbers = {key: values[key] for key in finite_numbers(values)}  # integers stay integers
+    stages = finite_numbers(values["seconds"]) if isinstance(values["seconds"], dict) else {}
+    seconds = [f"{stage} {value:.1f}" for stage, value in stages.items()]
 
     def text(key: str, form: str) -> str:
         return form.format(numbers[key]) if key in numbers else "–"
@@ -51,11 +50,6 @@ def overview(values: Mapping[str, Any]) -> dict[str, str]:
         "Up, scale": _frame_text(values.get("up"), numbers),
         "Seconds": ", ".join(seconds),
     }
-
-
-def _is_number(value: object) -> bool:
-    """Test for a finite number; JSON's integers have no bound, and formats convert them to float."""
-    return isinstance(value, (int, float)) and abs(value) <= sys.float_info.max
 
 
 def _page(values: Mapping[str, Any]) -> str:

@@ -54,13 +54,13 @@ def evaluate(
     device = scene.surfels["means"].device
     background = eval_background(config, device)
     values, fitted, along, refined, uncorrected, fragments = [], [], [], [], [], []
-    corrects = exposure is not None and exposure.table is not None
+    corrections = None if exposure is None or exposure.table is None else exposure
     for view in (view.to(device) for view in views):
         output = scene.render(view.camera, background=background, field_mode="frozen")
         target = view.target(background, device)
-        if exposure is not None and corrects:
+        if corrections is not None:
             uncorrected.append(psnr(output.rgb.clamp(0.0, 1.0), target, view.mask))
-            view = view._replace(correction=exposure.at(view.file))
+            view = view._replace(correction=corrections.at(view.file))
         rgb = view.shown(output.rgb, output.alpha, background).clamp(0.0, 1.0)
         values.append(psnr(rgb, target, view.mask))
         fitted.append(fitted_psnr(rgb, target, view.mask))

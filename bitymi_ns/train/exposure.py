@@ -46,9 +46,7 @@ SWEEPS = 10  # passes of the median polish
 DARKEST, BRIGHTEST = 0.03, 0.97  # range of channels used: beyond it noise, rounding and clipping dominate
 FEWEST_PHOTOGRAPHS = 3  # minimum number of photographs that show a point
 CELL = 2.0  # side of the cells of the occlusion test, in mean distances of the points in the image
-HIDDEN = 0.05
-"""A point is occluded if another in its cell or a neighbouring cell is nearer by this share of that one's depth, or of
-twice the range of depths in the view if that is less, as through a long lens."""
+HIDDEN = 0.05  # an occluding point is nearer by this share of its depth, or of twice the view's depth range if less
 FEWEST_TESTED = 1000  # minimum number of observations to test gains on the other half of the points
 
 
@@ -377,7 +375,9 @@ def _pixels(image: Tensor, camera: Camera, x: Tensor, y: Tensor) -> Tensor:
 def _log_gains(logs: Tensor) -> Tensor:
     """Compute log gains [V, 3] by median polish, mean 0 per channel; 0 for photographs without points."""
     gains = torch.zeros(len(logs), 3)
-    for _ in range(SWEEPS if logs.shape[1] > 0 else 0):
+    if logs.shape[1] == 0:
+        return gains
+    for _ in range(SWEEPS):
         colors = _median(logs - gains[:, None], 0)
         gains = _median(logs - colors, 1).nan_to_num(0.0)
         gains -= gains.mean(0)

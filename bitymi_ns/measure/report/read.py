@@ -19,13 +19,12 @@ from bitymi_ns.measure.report.records import (
     ReportError,
     curve_from,
     evaluation_from,
-    finite_numbers,
     link,
 )
 from bitymi_ns.measure.report.tables import COLUMNS
 from bitymi_ns.reading import read_text as text_of
 from bitymi_ns.reading import reading
-from bitymi_ns.trust import json_of
+from bitymi_ns.trust import finite_numbers, json_of
 
 PICTURES = "pictures.json"
 MAX_BYTES = 64 << 20  # larger files are no evaluation

@@ -1,12 +1,12 @@
 """Records of a report and the links between them: evaluations, training curves, worst views, estimated poses."""
 
-import math
 import re
 import statistics
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+
+from bitymi_ns.trust import finite_numbers
 
 _BUNDLE = re.compile(r"(?<![a-z])(bundle|baked)(?![a-z])")
 _BUNDLE_SUFFIX = re.compile(r"[-_]?(bundle|baked)$")
@@ -70,21 +70,6 @@ class Records:
     poses: dict[Path, dict[str, Any]] = field(default_factory=dict)
     machines: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-
-
-def finite_numbers(values: Mapping[str, Any]) -> dict[str, float]:
-    """Select the finite numbers of a JSON object, as floats."""
-    numbers = {}
-    for key, value in values.items():
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            continue
-        try:
-            number = float(value)
-        except OverflowError:  # an integer beyond the range of a double
-            continue
-        if math.isfinite(number):
-            numbers[key] = number
-    return numbers
 
 
 def is_bundle_name(name: str) -> bool:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import chain
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -278,35 +279,39 @@ class TexelCoder:
 
     def _coefficients(self, texels: Tensor, means: Tensor, step: float, rounds: int) -> list[Tensor]:
         """Compute int32 [coefficients, B, C] per block size, from texels [T, C] and tile means [N, C]."""
-        of_tile, steps = means[self._sizes[:, 0] > 0], _steps(step, self.grades)
-        sparse_cosines = backend.load("_cpu").sparse_cosines_f32  # codes do not depend on the renderer's device
-        options = {
-            "values": texels.contiguous(), "weights": self._weights, "mean": of_tile.contiguous(), "step": steps,
-            "mix": _CHANNELS[texels.shape[1]], "channels": texels.shape[1], "rounds": rounds, "shrink": SHRINK,
-        }  # fmt: skip
         coefficients = []
+        shared = _shared(means, self._sizes, _steps(step, self.grades))
+        values = {"values": texels.contiguous(), "weights": self._weights, "rounds": rounds, "shrink": SHRINK}
         for blocks in self._blocks:
-            width, height = blocks.size
-            codes = torch.empty(height * width, len(blocks.tile), texels.shape[1], dtype=torch.int32)
-            order = torch.tensor([k_v * width + k_u for k_v, k_u in blocks.order])
-            sparse_cosines(
-                **options, codes=codes, rows=blocks.texels, tile=blocks.tile, order=order,
-                height=height, width=width, down=_cosines(height), across=_cosines(width),
-            )  # fmt: skip
+            codes = torch.empty(len(blocks.order), len(blocks.tile), texels.shape[1], dtype=torch.int32)
+            backend.load("_cpu").sparse_cosines_f32(**shared, **_block_arguments(blocks), **values, codes=codes)
             coefficients.append(codes)
         return coefficients
 
 
 def _decode(means: Tensor, coefficients: Sequence[Tensor], sizes: Tensor, steps: Tensor) -> Tensor:
     """Decode texels [T, C] from means [N, C] and coefficients of tiles of sizes [N, 2] and steps [tiles]."""
-    texels, of_tile = means.repeat_interleave(sizes.clamp(min=1).prod(dim=1), dim=0), means[sizes[:, 0] > 0]
-    for blocks, values in zip(blocks_of(sizes), coefficients, strict=True):
-        texels_of, count, width = values.shape
-        channels = values.view(texels_of, -1).T.float() @ _basis(blocks)  # [B C, texels]: one product
-        channels = channels.view(count, width, -1).transpose(1, 2) * steps[blocks.tile, None, None]
-        found = channels @ _CHANNELS[width] + of_tile[blocks.tile, None, :]
-        texels[blocks.texels.reshape(-1)] = found.reshape(-1, width)
+    texels = means.repeat_interleave(sizes.clamp(min=1).prod(dim=1), dim=0)
+    shared = _shared(means, sizes, steps)
+    for blocks, codes in zip(blocks_of(sizes), coefficients, strict=True):
+        backend.load("_cpu").decode_cosines_f32(**shared, **_block_arguments(blocks), codes=codes, values=texels)
     return texels
+
+
+def _shared(means: Tensor, sizes: Tensor, steps: Tensor) -> dict[str, Any]:
+    """Build the arguments of csrc/ops/cosine.h for all blocks. The kernels run on the CPU: codes do not depend on the
+    renderer's device."""
+    channels = means.shape[1]
+    of_tiles = means[sizes[:, 0] > 0].contiguous()
+    return {"mean": of_tiles, "step": steps, "mix": _CHANNELS[channels], "channels": channels}
+
+
+def _block_arguments(blocks: Blocks) -> dict[str, Any]:
+    """Build the kernels' arguments for the blocks of one size."""
+    width, height = blocks.size
+    order = torch.tensor([k_v * width + k_u for k_v, k_u in blocks.order])
+    cosines = {"down": _cosines(height), "across": _cosines(width)}
+    return {**cosines, "rows": blocks.texels, "tile": blocks.tile, "order": order, "height": height, "width": width}
 
 
 def _round_to_bytes(alpha: Tensor) -> Tensor:
@@ -325,11 +330,3 @@ def _cosines(count: int) -> Tensor:
     rows = np.cos(math.pi * (i + 0.5) * k / count) * math.sqrt(2.0 / count)
     rows[0] /= math.sqrt(2.0)
     return torch.from_numpy(rows.astype(np.float32))
-
-
-def _basis(blocks: Blocks) -> Tensor:
-    """Compute the basis [coefficients, texels] of a block, in coefficient order."""
-    b_u, b_v = blocks.size
-    v, u = _cosines(b_v), _cosines(b_u)
-    rows, columns = (list(each) for each in zip(*blocks.order, strict=True))
-    return (v[rows][:, :, None] * u[columns][:, None, :]).reshape(len(rows), b_v * b_u)

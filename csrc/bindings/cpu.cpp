@@ -139,6 +139,7 @@ template <class S> void bind_operations(nb::module_& m) {
   bind_tracer<S>(m);
   bind_operation(m, name("baked_forward"), &baked_forward<S>);
   bind_operation(m, name("sparse_cosines"), &sparse_cosines<S>);
+  bind_operation(m, name("decode_cosines"), &decode_cosines<S>);
   bind_operation(m, name("fit_sites"), &fit_sites<S>);
 }
 }  // namespace

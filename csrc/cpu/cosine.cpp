@@ -1,4 +1,4 @@
-// Sparse cosine coefficients of texel blocks: a lane per block and channel.
+// Cosine transform of texel blocks: a lane per block and channel to coefficients, a lane per block back.
 #include "ops/cosine.h"
 
 #include "cpu/kernels.h"
@@ -8,6 +8,22 @@ namespace bt {
 
 namespace {
 constexpr int kArea = kCosines * kCosines;
+
+template <class S> void product(const S* matrix, int n, bool back, const Lanes<S>* from, Lanes<S>* to, int apart) {
+  const int by_row = back ? 1 : n, by_column = back ? n : 1;
+  for (int k = 0; k < n; ++k) {
+    Lanes<S> sum = Lanes<S>(matrix[k * by_row]) * from[0];
+    for (int i = 1; i < n; ++i) sum += Lanes<S>(matrix[k * by_row + i * by_column]) * from[i * apart];
+    to[k * apart] = sum;
+  }
+}
+
+// Transforms a block along u, then along v; `back`: with the transposed matrices.
+template <class S> void transform(const CosineBlocks<S>& a, const Lanes<S>* from, Lanes<S>* to, bool back) {
+  Lanes<S> half[kArea];
+  for (int v = 0; v < a.height; ++v) product(a.across, a.width, back, from + v * a.width, half + v * a.width, 1);
+  for (int u = 0; u < a.width; ++u) product(a.down, a.height, back, half + u, to + u, a.width);
+}
 
 template <class S> class BlockLanes {
   using P = Lanes<S>;
@@ -19,11 +35,11 @@ template <class S> class BlockLanes {
   void run(int64_t first) {
     const int count = int(std::min<int64_t>(kLanes, a_.blocks * a_.channels - first));
     gather(first, count);
-    transform(target_, value_, false);
+    transform(a_, target_, value_, false);
     for (int round = 0; round < a_.rounds; ++round) {
-      transform(value_, texel_, true);
+      transform(a_, value_, texel_, true);
       for (int i = 0; i < area_; ++i) texel_[i] = pull_[i] * (target_[i] - texel_[i]);
-      transform(texel_, change_, false);
+      transform(a_, texel_, change_, false);
       value_[0] = value_[0] + change_[0];
       for (int i = 1; i < area_; ++i) value_[i] = shrunk(value_[i] + change_[i]);
     }
@@ -60,26 +76,40 @@ template <class S> class BlockLanes {
     const P rest = max_(max_(x, -x) - threshold_, P(S(0)));
     return select(x < P(S(0)), -rest, rest);
   }
-  // Transforms along u, then along v; `back`: with the transposed matrices.
-  void transform(const P* from, P* to, bool back) {
-    const int h = a_.height, w = a_.width;
-    for (int v = 0; v < h; ++v) product(a_.across, w, back, from + v * w, half_ + v * w, 1);
-    for (int u = 0; u < w; ++u) product(a_.down, h, back, half_ + u, to + u, w);
-  }
-  static void product(const S* matrix, int n, bool back, const P* from, P* to, int apart) {
-    const int by_row = back ? 1 : n, by_column = back ? n : 1;
-    for (int k = 0; k < n; ++k) {
-      P sum = P(matrix[k * by_row]) * from[0];
-      for (int i = 1; i < n; ++i) sum += P(matrix[k * by_row + i * by_column]) * from[i * apart];
-      to[k * apart] = sum;
-    }
-  }
 
   const SparseCosines<S>& a_;
   const int area_;
   P step_, threshold_;
-  P target_[kArea], pull_[kArea], value_[kArea], texel_[kArea], change_[kArea], half_[kArea];
+  P target_[kArea], pull_[kArea], value_[kArea], texel_[kArea], change_[kArea];
 };
+
+// Decodes consecutive blocks from `first` on, up to the number of lanes.
+template <class S> void decode(const DecodeCosines<S>& a, int64_t first) {
+  using P = Lanes<S>;
+  const int count = int(std::min<int64_t>(kLanes, a.blocks - first)), area = a.height * a.width;
+  alignas(64) S lanes[kLanes];
+  P value[kArea], channel[kMostChannels][kArea];
+  for (int c = 0; c < a.channels; ++c) {
+    for (int k = 0; k < area; ++k) {
+      const int32_t* from = a.codes + (k * a.blocks + first) * a.channels + c;
+      for (int lane = 0; lane < kLanes; ++lane) lanes[lane] = S(from[std::min(lane, count - 1) * a.channels]);
+      value[a.order[k]] = load(lanes);
+    }
+    transform(a, value, channel[c], true);
+  }
+  for (int lane = 0; lane < kLanes; ++lane) lanes[lane] = a.step[a.tile[first + std::min(lane, count - 1)]];
+  const P step = load(lanes);
+  for (int i = 0; i < area; ++i)
+    for (int c = 0; c < a.channels; ++c) {
+      P sum(S(0));
+      for (int from = 0; from < a.channels; ++from) sum += P(a.mix[from * a.channels + c]) * channel[from][i];
+      store(lanes, sum * step);
+      for (int lane = 0; lane < count; ++lane) {
+        const int64_t block = first + lane;
+        a.values[a.rows[block * area + i] * a.channels + c] = lanes[lane] + a.mean[a.tile[block] * a.channels + c];
+      }
+    }
+}
 }  // namespace
 
 template <class S> void sparse_cosines(const SparseCosines<S>& a) {
@@ -91,5 +121,13 @@ template <class S> void sparse_cosines(const SparseCosines<S>& a) {
 }
 template void sparse_cosines(const SparseCosines<float>&);
 template void sparse_cosines(const SparseCosines<double>&);
+
+template <class S> void decode_cosines(const DecodeCosines<S>& a) {
+  parallel_parts((a.blocks + kLanes - 1) / kLanes, 8, [&](int, int64_t begin, int64_t end) {
+    for (int64_t group = begin; group < end; ++group) decode(a, group * kLanes);
+  });
+}
+template void decode_cosines(const DecodeCosines<float>&);
+template void decode_cosines(const DecodeCosines<double>&);
 
 }  // namespace bt

@@ -27,6 +27,7 @@ void set_num_threads(int n);
 template <class S> void project_forward(const ProjectForward<S>& a);
 template <class S> void project_backward(const ProjectBackward<S>& a);
 template <class S> void sparse_cosines(const SparseCosines<S>& a);
+template <class S> void decode_cosines(const DecodeCosines<S>& a);
 template <class S> void fit_sites(const FitSites<S>& a);
 
 // Visible surfels per tile, front to back, and the squared radii of each surfel's level set in scale units, and of its

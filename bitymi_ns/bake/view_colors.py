@@ -296,7 +296,7 @@ def least_needed(vectors: Tensor, rgb: Tensor, directions: Tensor, weight: Tenso
     for size in range(count - 1, 0, -1):
         w = torch.softmax(logits.masked_fill(~alive[:, None], -torch.inf), dim=2)  # [n, D, K]
         c = w @ rgb
-        square = (rgb[:, None] - c[:, :, None]).square().sum(3)  # [n, D, K]
+        square = torch.cdist(c, rgb, compute_mode="donot_use_mm_for_euclid_dist").square()  # [n, D, K]
         cost = ((w / (1 - w).clamp(min=1e-6)).square() * square * weight[..., None]).sum(1)
         gone = cost.masked_fill(~alive, torch.inf).argmin(1, keepdim=True)
         alive = alive.scatter(1, gone, False)

@@ -66,18 +66,20 @@ def photo_resolution(inputs: BakeInput) -> Tensor | None:
     """
     if not inputs.cameras:
         return None
-    means = inputs.surfels["means"].double().cpu()
-    logs, views = torch.zeros(len(means), dtype=torch.float64), torch.zeros(len(means), dtype=torch.float64)
-    for i, camera in enumerate(inputs.cameras):
-        _, _, z, inside = camera.to("cpu").project(means, inputs.near)
-        shown = inside if inputs.views is None else (z > inputs.near) & inputs.views.seen[i].cpu()
-        K = camera.K.double().cpu()
-        rate = torch.sqrt(K[0, 0] * K[1, 1]) / z.clamp(min=inputs.near)
-        logs += torch.where(shown, rate.log(), 0.0)
-        views += shown
-    rows = views.nonzero().flatten()
+    means = inputs.surfels["means"]
+    if inputs.views is None:
+        seen = torch.stack([camera.to(means.device).project(means, inputs.near)[3] for camera in inputs.cameras])
+    else:
+        seen = inputs.views.seen
+    rows = seen.any(0).nonzero().flatten()
     if not len(rows):
         return None
     count = min(POINTS, len(rows))
-    rows = rows[(torch.arange(count) * len(rows)) // count]
-    return torch.cat([means[rows], (logs[rows] / views[rows]).exp()[:, None]], 1).float()
+    rows = rows[(torch.arange(count, device=rows.device) * len(rows)) // count]
+    means, seen = means[rows].double().cpu(), seen[:, rows].cpu()
+    logs = torch.zeros(count, dtype=torch.float64)
+    for camera, shown in zip(inputs.cameras, seen, strict=True):
+        z = camera.to("cpu").project(means, inputs.near)[2]
+        K = camera.K.double().cpu()
+        logs += torch.where(shown, (torch.sqrt(K[0, 0] * K[1, 1]) / z.clamp(min=inputs.near)).log(), 0.0)
+    return torch.cat([means, (logs / seen.sum(0)).exp()[:, None]], 1).float()

@@ -21,6 +21,10 @@ LONGEST_NAME, LONGEST_TEXT, LONGEST_UNIT = 80, 1000, 12
 FARTHEST = 1e9
 
 
+class NotesError(BundleError):
+    """A notes.json that is refused, or a crop that cannot be applied; the rest of the bundle is as it should be."""
+
+
 def _printable(text: str) -> str:
     if any(ord(c) < 32 and c != "\n" or 0x7F <= ord(c) < 0xA0 or 0xD800 <= ord(c) < 0xE000 for c in text):
         raise ValueError("must not have control characters")
@@ -151,15 +155,15 @@ def parse_notes(data: bytes, source: str = NOTES) -> Notes:
     """Parse notes.json.
 
     Raises:
-        BundleError: names the source, the entry and the fault.
+        NotesError: names the source, the entry and the fault.
     """
     try:
         given = strict_json.loads(data)
         stated = given.get("version") if isinstance(given, dict) else None
         if isinstance(stated, int) and stated > NEWEST:
-            raise BundleError(f"{source}: version {stated} is newer than {NEWEST}: update bitymi-ns to read it")
+            raise NotesError(f"{source}: version {stated} is newer than {NEWEST}: update bitymi-ns to read it")
         found = Notes.model_validate(given)
-    except BundleError:
+    except NotesError:
         raise
     except ValidationError as error:
         where, what = first_problem(error)
@@ -180,8 +184,8 @@ def parse_notes(data: bytes, source: str = NOTES) -> Notes:
     return found
 
 
-def _refusal(source: str, what: str) -> BundleError:
-    return BundleError(f"{source}: {what}. Correct the file, or remove it")
+def _refusal(source: str, what: str) -> NotesError:
+    return NotesError(f"{source}: {what}. Correct the file, or remove it")
 
 
 def read_notes(parts: Parts) -> tuple[bytes, Notes] | None:

@@ -26,7 +26,7 @@ from bitymi_ns.bundle.manifest import (
     parse,
     points_of,
 )
-from bitymi_ns.bundle.notes import crop_of
+from bitymi_ns.bundle.notes import NotesError, crop_of
 from bitymi_ns.bundle.parts import CAMERAS, MANIFEST_LIMIT, NOTES, MissingPart, Parts, instead_of, parts_of
 from bitymi_ns.bundle.sizes import HEAD, SCENE_FILES, check_head, check_memory, enough_memory
 from bitymi_ns.bundle.surfel_table import TERMS, from_columns
@@ -51,10 +51,6 @@ atlases fit any device, and encoding costs time and some quality of texels that 
 LOAD_PROFILE: Profile = "veryfast"  # of this encoding: the next faster profile loses more than twice as much
 CONTENTS = SCENE_FILES | {CAMERAS}  # files used by `assemble`
 _CHUNK = 1 << 22
-
-
-class CropError(BundleError):
-    """A crop that cannot be applied."""
 
 
 @dataclass
@@ -110,7 +106,7 @@ def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True, cr
     Raises:
         BundleError: a file is missing, truncated, altered or malformed, a value is out of range, the version is too
             new, or memory is insufficient.
-        CropError: `crop`, and notes.json hides no surfels, or all.
+        NotesError: `crop`, and notes.json is refused or hides no surfels, or all.
     """
     with parts_of(folder) as parts:
         info = manifest_of(parts)
@@ -123,10 +119,10 @@ def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True, cr
 def _cropped(bundle: Bundle, parts: Parts) -> Bundle:
     found, path = crop_of(parts), parts.bundle / NOTES
     if found is None:
-        raise CropError(f"{path} hides no surfels: save a crop there with `bitymi view`, or do not ask for it")
+        raise NotesError(f"{path} hides no surfels: save a crop there with `bitymi view`, or do not ask for it")
     kept = found.keeps(bundle.scene.surfels["means"])
     if not kept.any():
-        raise CropError(f"{path} hides all surfels: correct its crop with `bitymi view`, or do not ask for it")
+        raise NotesError(f"{path} hides all surfels: correct its crop with `bitymi view`, or do not ask for it")
     return replace(bundle, scene=bundle.scene.only(kept))
 
 

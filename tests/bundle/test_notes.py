@@ -11,9 +11,8 @@ import pytest
 import torch
 
 from bitymi_ns.bundle import BundleError, check_files, check_target, read_bundle
-from bitymi_ns.bundle.notes import notes_of, parse_notes
+from bitymi_ns.bundle.notes import NotesError, notes_of, parse_notes
 from bitymi_ns.bundle.parts import NOTES_LIMIT
-from bitymi_ns.bundle.read import CropError
 from bitymi_ns.bundle.single import write_single
 from bitymi_ns.cli import main
 from tests.bundle.compact_scene import make_codes, write_compact
@@ -117,7 +116,7 @@ def test_what_is_no_such_file_is_refused(data: bytes) -> None:
 
 def test_a_bundle_is_read_without_the_surfels_that_it_hides(folder: Path) -> None:
     whole = read_bundle(folder)
-    with pytest.raises(CropError, match=r"notes\.json hides no surfels: save a crop"):
+    with pytest.raises(NotesError, match=r"notes\.json hides no surfels: save a crop"):
         read_bundle(folder, crop=True)
     means = whole.scene.surfels["means"]
     offset = float(means[:, 2].median())
@@ -131,7 +130,7 @@ def test_a_bundle_is_read_without_the_surfels_that_it_hides(folder: Path) -> Non
     assert len(read_bundle(folder.with_suffix(".bitymi"), crop=True)) == len(some)
     half["crop"]["floor"]["offset"] = 1e6
     (folder / "notes.json").write_bytes(text(half))
-    with pytest.raises(CropError, match="hides all surfels"):
+    with pytest.raises(NotesError, match="hides all surfels"):
         read_bundle(folder, crop=True)
 
 
@@ -143,7 +142,8 @@ def test_verify_checks_it(folder: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert bundle is not None and [check.name for check in checks_now if not check.ok] == ["notes.json"]
     for command in (["verify"], ["pack"], ["view", "--export", str(folder.parent / "site")]):
         assert main([command[0], str(folder), *command[1:]]) == 1
-        assert "notes.0.position.2" in "".join(capsys.readouterr())
+        said = "".join(capsys.readouterr())
+        assert "notes.0.position.2" in said and "or remove it" in said and "export the scene again" not in said
     assert sorted(path.name for path in folder.parent.iterdir()) == ["b"]
 
 

@@ -148,6 +148,9 @@ def test_a_bundle_is_drawn_with_its_crop(copied: Path, monkeypatch: pytest.Monke
         eval_setup(copied / "config.yml")
     crop = {"box": {"center": [0, 0, 0], "half": [0.4, 0.4, 0.4], "quat": [1, 0, 0, 0]}}
     notes = {"format": "bitymi-notes", "version": 2, "views": [], "notes": [], "crop": crop}
+    (copied / "notes.json").write_text(json.dumps({**notes, "version": 3}))
+    with pytest.raises(InputError, match=r"version 3 is newer than 2: update bitymi-ns to read it\.$"):
+        eval_setup(copied / "config.yml")
     (copied / "notes.json").write_text(json.dumps(notes))
     some = eval_setup(copied / "config.yml")[1].model.sizes()["surfels"]
     monkeypatch.setenv("BITYMI_CROP", "False")

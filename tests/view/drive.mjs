@@ -73,8 +73,8 @@ const actionsOf = (context, page) => ({
     await page.mouse.move(...to, { steps: 4 });
     await page.mouse.up({ button });
   },
-  // fingers, one or more
-  fingers: async ([from, to]) => {
+  // fingers, one or more, which rest for some milliseconds before they are lifted
+  fingers: async ([from, to, rest]) => {
     const session = await context.newCDPSession(page);
     const send = (type, points) =>
       session.send('Input.dispatchTouchEvent', { type, touchPoints: points.map(([x, y], id) => ({ x, y, id })) });
@@ -82,6 +82,7 @@ const actionsOf = (context, page) => ({
     for (let k = 1; k <= 4; k++) {
       await send('touchMove', from.map((p, i) => p.map((v, c) => v + ((to[i][c] - v) * k) / 4)));
     }
+    await page.waitForTimeout(rest ?? 0);
     await send('touchEnd', []);
   },
   save: async ([selector, path]) => saved(page, page.evaluate(press, selector), path),

@@ -125,6 +125,59 @@ def test_panels_and_help_fit_the_screen(cropped: tuple[Path, str, str], phone: b
     assert all(page[number] for number in fits) and page[closed] is False
 
 
+def test_a_resting_finger_measures(solid: Path) -> None:
+    page, dots = Steps(), "document.querySelector('.ends').getAttribute('d').split('M').length - 1"
+    hint = "document.getElementById('measure-hint').textContent"
+    first, second = (130, 390), (215, 390)
+    page.do(["press", "#measure"], ["press", "#add-measure"])
+    before = page.ask(hint)
+    page.do(["fingers", [first, (300, 300)], [first, (300, 300)]])  # no click
+    page.do(["fingers", [first], [first], 900], ["until", f"{dots} === 1"])  # shown without a new frame
+    half = page.ask(hint)
+    page.do(["fingers", [second], [second]], ["until", f"{LABELS}.includes('units')"])
+    after = page.ask(f"[{hint}, {dots}].join()")
+    page.run(solid, viewport=PHONE, touch=True)
+    assert [page[number] for number in (before, half, after)] == [
+        "Click the first surface.",
+        "Click the other surface.",
+        ",2",
+    ]
+
+
+def test_keys_end_what_they_should(solid: Path) -> None:
+    page = Steps()
+    pressed = "[...document.querySelectorAll('[aria-pressed=true]')].map((e) => e.id).join()"
+    page.do(["press", "#measure"], ["press", "#add-measure"], ["click", "#canvas"])
+    page.do(["until", "document.querySelector('.ends').getAttribute('d')"], ["key", "Escape"], ["settle"])
+    cancelled = page.ask(f"document.querySelector('.ends').getAttribute('d') + {pressed}")
+    page.do(["key", "Escape"])
+    closed = page.ask(pressed)
+    page.do(["press", "#measure"], ["press", "#add-measure"], click(FIRST))
+    page.do(["until", "document.querySelector('.ends').getAttribute('d')"], click(SECOND))
+    page.do(["until", f"{LABELS}.includes('units')"], ["click", "#known"], ["key", "3"], ["key", "Enter"])
+    length = page.ask(LABELS)
+    page.do(["press", "#crop"], ["press", "#crop-box"], ["press", "#undo"])
+    undone = page.ask(f"document.getElementById('crop-hint').textContent + {pressed}")
+    page.do(["press", "#notes"], ["click", "#view-name"], ["key", "a"], ["key", "Enter"])
+    view = page.ask("document.getElementById('view-rows').textContent")
+    page.run(solid)
+    assert "measure" in page[cancelled] and "add-measure" not in page[cancelled]
+    assert not page[cancelled].startswith("M") and "measure" not in page[closed]
+    assert page[length] == "3 m" and page[view].startswith("a")
+    assert page[undone].startswith("Hidden surfels stay") and "crop-box" not in page[undone]
+
+
+def test_the_controls_can_be_hidden(solid: Path) -> None:
+    page = Steps()
+    shown = "['#panel', '#top', '#menu'].map((id) => Number(document.querySelector(id).offsetWidth > 0)).join('')"
+    seen = [page.ask(shown)]
+    for step in (["click", "#hide-panel"], ["click", "#menu"], ["key", "u"], ["key", "u"], ["key", "n"]):
+        page.do(step)
+        seen.append(page.ask(shown))
+    page.run(solid)
+    assert [page[number] for number in seen] == ["110", "001", "110", "001", "110", "110"]
+
+
 def test_a_double_click_turns_around_a_surface(solid: Path) -> None:
     page = Steps()
     page.do(["double", FIRST], ["until", "document.documentElement.dataset.frame === 'moving'"], ["settle"])

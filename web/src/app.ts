@@ -4,7 +4,7 @@ import type { Vec3 } from './bundle/manifest';
 import type { Depths, DrawOptions, Renderer } from './render/renderer';
 import type { Show } from './render/programs';
 import { Pace, type Screen } from './render/screen';
-import { download, element, onClick, press, pressed, typing } from './ui/dom';
+import { download, element, onClick, press, pressed, writing } from './ui/dom';
 import { CropPanel } from './ui/crop_panel';
 import { MeasurePanel } from './ui/measure_panel';
 import { NotesFile } from './ui/notes_file';
@@ -30,7 +30,7 @@ const STILL_AFTER = 250; // milliseconds
 const KEYS: Record<string, string> = {
   ...{ o: 'orbit', f: 'fly', h: 'home', ',': 'previous', '.': 'next', p: 'beside', t: 'texture', c: 'colors' },
   ...{ i: 'exposure', l: 'share', n: 'tools', m: 'notes', k: 'add-keyframe', v: 'play' },
-  ...{ r: 'measure', b: 'crop', g: 'full-screen', '?': 'show-help' },
+  ...{ r: 'measure', b: 'crop', g: 'full-screen', u: 'menu', '?': 'show-help' },
 };
 
 const unsaved = (): void => notify('This view cannot be saved: there is not enough memory for it.');
@@ -275,11 +275,7 @@ export class App implements Stage {
     });
     onClick('screenshot', () => void this.screenshot().catch(unsaved));
     onClick('share', () => void this.share());
-    onClick('theme', () => this.turnTheme());
-    bindPanels(this.canvas, () => {
-      this.picker.stop();
-      this.crop.choose(null);
-    });
+    bindPanels(this.canvas, () => this.endPicking());
     this.canvas.addEventListener('dblclick', ({ clientX, clientY }) => void this.turnAround(clientX, clientY));
     element('resolution').addEventListener('change', () => this.changed());
     const show = element<HTMLSelectElement>('show');
@@ -289,13 +285,25 @@ export class App implements Stage {
     this.fillCameras();
   }
 
+  private endPicking(): void {
+    this.picker.stop();
+    this.crop.choose(null);
+    this.changed();
+  }
+
+  private cancel(): void {
+    if (this.picker.waits) this.endPicking();
+    else document.querySelector<HTMLElement>('.aside:not([hidden]) .close')?.click();
+  }
+
   private shortcut(e: KeyboardEvent): void {
-    if (typing(e.target)) return;
+    if (writing(e.target)) return;
     if ((e.ctrlKey || e.metaKey) && e.code === 'KeyS') {
       e.preventDefault();
       void this.screenshot().catch(unsaved);
     }
     if (e.ctrlKey || e.metaKey || e.altKey) return;
+    if (e.key === 'Escape' && !element<HTMLDialogElement>('help').open) this.cancel();
     const id = KEYS[e.key] as string | undefined;
     if (id && !element(id).hidden) element(id).click();
   }
@@ -366,14 +374,6 @@ export class App implements Stage {
     const found = photograph ? this.bundle.photograph(photograph) : null;
     this.photograph = found;
     found?.then((address) => this.photograph === found && (image.src = address), showError);
-  }
-
-  private turnTheme(): void {
-    const root = document.documentElement;
-    const next = { '': 'light', light: 'dark', dark: '' }[root.dataset.theme ?? ''] ?? '';
-    if (next) root.dataset.theme = next;
-    else delete root.dataset.theme;
-    element('theme').textContent = next ? `Theme: ${next}` : 'Theme';
   }
 
   private async screenshot(): Promise<void> {

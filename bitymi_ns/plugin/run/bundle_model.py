@@ -14,7 +14,8 @@ from nerfstudio.data.scene_box import OrientedBox
 from torch import Tensor
 
 from bitymi_ns.bundle import REMEDY, BundleError, read_bundle
-from bitymi_ns.bundle.read import CropError, download_bytes
+from bitymi_ns.bundle.notes import NotesError
+from bitymi_ns.bundle.read import download_bytes
 from bitymi_ns.ops import webgpu
 from bitymi_ns.plugin.console import fail
 from bitymi_ns.plugin.run.device import kernel_device
@@ -61,7 +62,7 @@ class BakedModel(SurfelModel):
         try:
             bundle = read_bundle(folder, decode=not on_card, crop=self._crops())
         except BundleError as error:
-            fail(f"{error}." if isinstance(error, CropError) else f"{error}. {REMEDY}", error)
+            fail(f"{error}." if isinstance(error, NotesError) else f"{error}. {REMEDY}", error)
         atlas = bundle.info.atlas
         self._sizes = {
             "surfels": float(len(bundle)),

@@ -6,7 +6,7 @@ import { MOST_HIDDEN } from '../view/notes';
 import type { View } from '../view/pose';
 import { axesOf, exponential, product, uprightQuat } from '../view/rotation';
 import { add, dot, subtract, times } from '../view/vector';
-import { button, element, make, onClick, press, pressed, typing } from './dom';
+import { button, element, make, onClick, press, pressed, writing } from './dom';
 import { Lines, edgesOf } from './lines';
 import type { NotesFile } from './notes_file';
 import { notify } from './pages';
@@ -60,9 +60,7 @@ export class CropPanel {
       this.apply();
     });
     addEventListener('keydown', (e) => {
-      const range = e.target instanceof HTMLInputElement && e.target.type === 'range';
-      if (e.key !== 'z' || !(e.ctrlKey || e.metaKey) || element('crop-panel').hidden) return;
-      if (typing(e.target) && !range) return;
+      if (e.key !== 'z' || !(e.ctrlKey || e.metaKey) || element('crop-panel').hidden || writing(e.target)) return;
       e.preventDefault();
       this.undo();
     });
@@ -247,6 +245,7 @@ export class CropPanel {
 
   private show(): void {
     const { crop, hidden } = this.all;
+    if (this.mode === 'box' && !crop.box) this.mode = null; // undone
     for (const mode of MODES) press(element(`crop-${mode}`), this.mode === mode);
     element('faces').hidden = !this.box;
     element('floor-row').hidden = this.mode !== 'floor' || !crop.floor;

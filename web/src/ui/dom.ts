@@ -31,6 +31,10 @@ export const button = (
 export const typing = (target: EventTarget | null): boolean =>
   [HTMLSelectElement, HTMLInputElement, HTMLTextAreaElement].some((kind) => target instanceof kind);
 
+// As `typing`, but not for sliders, which take the arrows alone.
+export const writing = (target: EventTarget | null): boolean =>
+  typing(target) && !(target instanceof HTMLInputElement && target.type === 'range');
+
 // Offers a file for download.
 export function download(name: string, data: Blob): void {
   const link = make('a', { href: URL.createObjectURL(data), download: name });

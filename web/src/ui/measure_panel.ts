@@ -3,7 +3,7 @@ import type { Vec3 } from '../bundle/manifest';
 import { LONGEST_NAME, LONGEST_UNIT, MOST_MEASURES, type Measure, type Unit, cleared } from '../view/notes';
 import type { View } from '../view/pose';
 import { add, length, subtract, times } from '../view/vector';
-import { button, element, make, onClick, pressed } from './dom';
+import { button, element, make, onClick, pressed, writing } from './dom';
 import { type Line, Lines } from './lines';
 import type { NotesFile } from './notes_file';
 import { notify } from './pages';
@@ -35,6 +35,9 @@ export class MeasurePanel {
   ) {
     onClick('add-measure', () => this.toggle());
     onClick('set-unit', () => this.setUnit());
+    element('known-row').addEventListener('keydown', (e) => {
+      if (e.key === 'Enter' && writing(e.target)) this.setUnit();
+    });
     onClick('reset-unit', () => {
       this.file.all.unit = null;
       this.changed();
@@ -47,7 +50,9 @@ export class MeasurePanel {
   drawn(view: View): void {
     const { measures } = this.file.all;
     const dots = measures.flatMap(({ points }): Vec3[] => points);
-    if (this.first && pressed(element('add-measure'))) dots.push(this.first);
+    const waits = pressed(element('add-measure'));
+    if (this.first && waits) dots.push(this.first);
+    element('measure-hint').textContent = waits ? `Click the ${this.first ? 'other' : 'first'} surface.` : '';
     this.lines.draw(
       view,
       measures.map(({ points }): Line => points),
@@ -76,14 +81,15 @@ export class MeasurePanel {
     }
     this.picker.toggle('add-measure', (from) => {
       this.first = from;
-      this.redraw();
       this.picker.start('add-measure', (to) => {
         this.first = null;
-        if (!length(subtract(from, to))) return;
-        this.chosen = { points: [from, to], text: '' };
-        this.file.all.measures.push(this.chosen);
-        this.changed();
+        if (length(subtract(from, to))) {
+          this.chosen = { points: [from, to], text: '' };
+          this.file.all.measures.push(this.chosen);
+          this.changed();
+        } else this.redraw();
       });
+      this.redraw();
     });
     this.redraw();
   }

@@ -23,6 +23,9 @@ export class NotesPanel {
     private readonly file: NotesFile,
   ) {
     onClick('save-view', () => this.addView());
+    element('view-name').addEventListener('keydown', ({ key }) => {
+      if (key === 'Enter') this.addView();
+    });
     onClick('add-note', () => this.add());
     onClick('show-notes', () => {
       press(element('show-notes'), !pressed(element('show-notes')));

@@ -1,4 +1,4 @@
-// Opening and closing of panels, help and full screen.
+// Opening and closing of panels, help and full screen; the theme.
 import { element, onClick, press } from './dom';
 
 // Side panels: button that opens it, button that closes it, section.
@@ -11,10 +11,13 @@ const ASIDES = [
 
 const onPhone = (): boolean => matchMedia('(width <= 720px)').matches; // style.css
 
+const isOpen = (): boolean => element('panel').classList.contains('open');
+
 // Opens or closes a panel; at most one side panel is open, on phones one panel of any kind.
 function open(panel: 'panel' | (typeof ASIDES)[number][2], opened: boolean): void {
-  element('panel').classList.toggle('open', panel === 'panel' && opened);
-  element('menu').setAttribute('aria-expanded', String(panel === 'panel' && opened));
+  const controls = panel === 'panel' ? opened : isOpen() && !(opened && onPhone());
+  element('panel').classList.toggle('open', controls);
+  element('menu').setAttribute('aria-expanded', String(controls));
   for (const [button, , aside] of ASIDES) {
     const stays = !element(aside).hidden && !(opened && (panel !== 'panel' || onPhone()));
     element(aside).hidden = panel === aside ? !opened : !stays;
@@ -22,9 +25,18 @@ function open(panel: 'panel' | (typeof ASIDES)[number][2], opened: boolean): voi
   }
 }
 
+function turnTheme(): void {
+  const root = document.documentElement;
+  const next = { '': 'light', light: 'dark', dark: '' }[root.dataset.theme ?? ''] ?? '';
+  if (next) root.dataset.theme = next;
+  else delete root.dataset.theme;
+  element('theme').textContent = next ? `Theme: ${next}` : 'Theme';
+}
+
 // Binds the buttons; `changed` is called when a panel has opened or closed.
 export function bindPanels(canvas: HTMLElement, changed: () => void): void {
-  onClick('menu', () => open('panel', !element('panel').classList.contains('open')));
+  open('panel', !onPhone());
+  for (const button of ['menu', 'hide-panel']) onClick(button, () => open('panel', !isOpen()));
   for (const [button, close, aside] of ASIDES) {
     onClick(button, () => {
       open(aside, element(aside).hidden);
@@ -36,6 +48,7 @@ export function bindPanels(canvas: HTMLElement, changed: () => void): void {
       changed();
     });
   }
+  onClick('theme', turnTheme);
   const help = element<HTMLDialogElement>('help');
   onClick('show-help', () => (help.open ? help.close() : help.showModal()));
   onClick('close-help', () => help.close());

@@ -6,20 +6,26 @@ import { notify } from './pages';
 import type { Stage } from './stage';
 
 const STILL_HAND = 5; // pixels of pointer movement that still count as a click
+const STILL_FINGER = 15;
 
 export class Picker {
-  private pressedAt = [0, 0];
+  private pressedAt: [number, number] | null = null; // null: with several fingers
   private wanted: { button: string; run: (point: Vec3) => void } | null = null;
 
   constructor(
     private readonly stage: Stage,
     private readonly canvas: HTMLCanvasElement,
   ) {
-    canvas.addEventListener('pointerdown', ({ clientX, clientY }) => (this.pressedAt = [clientX, clientY]));
-    canvas.addEventListener('click', ({ clientX, clientY }) => {
-      const [x, y] = this.pressedAt;
-      const { wanted } = this;
-      if (!wanted || Math.hypot(clientX - x, clientY - y) >= STILL_HAND) return;
+    canvas.addEventListener('pointerdown', ({ isPrimary, button, clientX, clientY }) => {
+      this.pressedAt = isPrimary && button === 0 ? [clientX, clientY] : null;
+    });
+    // not `click`, which a finger that rests for long does not give
+    canvas.addEventListener('pointerup', ({ clientX, clientY, pointerType }) => {
+      const { wanted, pressedAt } = this;
+      this.pressedAt = null;
+      if (!wanted || !pressedAt) return;
+      const apart = Math.hypot(clientX - pressedAt[0], clientY - pressedAt[1]);
+      if (apart >= (pointerType === 'touch' ? STILL_FINGER : STILL_HAND)) return;
       void this.surface(clientX, clientY).then((point) => {
         if (wanted !== this.wanted) return; // an earlier click was taken
         if (!point) {

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from .backend import dense, kernel
+from .backend import kernel
 from .blend import backward_memory
 from .constants import GEOM, IMAGE_CHANNELS
 from .texel import TexelTiles
@@ -28,42 +28,29 @@ def add_texel_coverage(
         mask: [H, W] or [H, W, 1] bool, True for pixels that count; None: all.
         bound: fragments of smaller weight are ignored.
         total: [T, 3] of the tiles' dtype, dense, equal columns, added to.
-        squares: [T, 3], added to: the same sum with squared blending weights; None: skip.
+        squares: [T], added to: the same sum with squared blending weights; None: skip.
     """
     like, top = tiles.extent, 0
-    share = like.new_ones(tiles.count)
     mask = None if mask is None else mask.to(like.device).reshape(-1)
+    # a step of length -1 for colours with no clamped channel
+    step = {"texels": total, "moved": total, "squares": squares, "share": like.new_ones(tiles.count), "rate": -1.0}
     for fragments in lists:
-        pixels = fragments.width * fragments.height
+        pixels, surfels = fragments.width * fragments.height, fragments.surfels
         counts = like.new_ones(pixels) if mask is None else mask[top : top + pixels].to(like.dtype)
-        weight = dense(fragments.weight, like)
-        _add(fragments, weight, tiles, counts, bound, total, share)
-        if squares is not None:
-            _add(fragments, weight.square(), tiles, counts, bound * bound, squares, share)
+        base, geom = like.new_zeros(surfels, 3), like.new_zeros(surfels, GEOM)
+        kernel("blend_backward", total)(
+            **fragments.arrays,
+            **tiles.arrays,
+            **step,
+            **backward_memory(fragments, False, len(total)),
+            **fragments.view,
+            maps=False,
+            bound=bound,
+            base=base,
+            geom=geom,
+            dimage=torch.nn.functional.pad(counts[:, None].expand(-1, 3), (0, IMAGE_CHANNELS - 3)),
+            dgeom=torch.empty_like(geom),
+            dbase=torch.empty_like(base),
+        )
         top += pixels
-        del fragments, weight  # before the next list is made
-
-
-def _add(
-    fragments: Fragments, weight: Tensor, tiles: TexelTiles, counts: Tensor, bound: float, total: Tensor, share: Tensor
-) -> None:
-    """Accumulate one list with these weights and counts per pixel [H * W], as a texel step of length -1 with `share`
-    [T] of 1 for colours with no clamped channel."""
-    surfels = fragments.surfels
-    base, geom = total.new_zeros(surfels, 3), total.new_zeros(surfels, GEOM)
-    dimage = torch.nn.functional.pad(counts[:, None].expand(-1, 3), (0, IMAGE_CHANNELS - 3))
-    step = {"texels": total, "moved": total, "share": share, "rate": -1.0}
-    kernel("blend_backward", total)(
-        **{**fragments.arrays, "weight": weight},
-        **tiles.arrays,
-        **step,
-        **backward_memory(fragments, False, len(total)),
-        **fragments.view,
-        maps=False,
-        bound=bound,
-        base=base,
-        geom=geom,
-        dimage=dimage,
-        dgeom=torch.empty_like(geom),
-        dbase=torch.empty_like(base),
-    )
+        del fragments  # before the next list is made

@@ -76,7 +76,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
 template <class S> struct Gradients {
   S *weight, *uv, *depth, *residual, *partial;
   S* texels;  // sums, unless exact
-  bool sums_texels;
+  bool sums_texels, squares;
 };
 
 // Source of residual colours: none, texels, or one listed per fragment.
@@ -159,7 +159,7 @@ __global__ void __launch_bounds__(kTileThreads, resident<S, kMaps, kResidual>())
         if (out.uv) out.uv[i] = dot(dcolor, slopes.u), out.uv[f.total + i] = dot(dcolor, slopes.v);
       }
       if (kTexels && out.sums_texels) {
-        const S d[3] = {dcolor.x, dcolor.y, dcolor.z};
+        const S d[4] = {dcolor.x, dcolor.y, dcolor.z, out.squares ? w * dcolor.x : S(0)};
         add_to_corners(textured ? patch.first + corners.at[0] : int64_t(-1), corners, d, int(threadIdx.x) % kWarp,
                        texel_sums);
       }
@@ -184,7 +184,8 @@ template <class S> struct StoreSurfelGradient {
 template <class S, bool kMaps, Residual kResidual, bool kExact>
 void run_backward(const BlendBackward<S, Pairs>& a, const ExactSums& exact, Stream stream) {
   const Pairs& p = a.of.fragments.layout;
-  const Gradients<S> out = {a.dweight, a.duv, a.ddepth, a.dresidual, a.partial, a.work.sums, a.moved != nullptr};
+  const Gradients<S> out = {a.dweight, a.duv,       a.ddepth,           a.dresidual,
+                            a.partial, a.work.sums, a.moved != nullptr, a.squares != nullptr};
   if (p.pairs)
     BT_LAUNCH((backward_kernel<S, kMaps, kResidual, kExact>), dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream,
               a.of, a.dimage, out, exact);
@@ -192,7 +193,8 @@ void run_backward(const BlendBackward<S, Pairs>& a, const ExactSums& exact, Stre
   sum_slots<blend_sums(kMaps)>(p, static_cast<const S*>(a.partial),
                                StoreSurfelGradient<S>{a.of.table.base, a.dgeom, a.dbase}, stream);
   if (a.moved)
-    each_shown_texel(p, a.of.table, MoveTexel<S, kExact>{a.work.sums, exact, a.share, a.rate, a.moved}, stream);
+    each_shown_texel(p, a.of.table, MoveTexel<S, kExact>{a.work.sums, exact, a.share, a.rate, a.moved, a.squares},
+                     stream);
 }
 }  // namespace
 

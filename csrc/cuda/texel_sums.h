@@ -1,5 +1,5 @@
-// Gradient sums of texels over fragments, and their use. Four numbers per texel, the last that of alpha or 0, for one
-// vector reduction per texel (warp.h); or integers, for order-independent sums.
+// Gradient sums of texels over fragments, and their use. Four numbers per texel, the last that of alpha or of squares,
+// or 0, for one vector reduction per texel (warp.h); or integers, for order-independent sums.
 #pragma once
 
 #include "cuda/exact_sums.h"
@@ -64,12 +64,13 @@ template <class S, bool kExact> struct MoveTexel {
   ExactSums exact;
   const S* share;
   S rate;
-  S* moved;
+  S *moved, *squares;
   __device__ void operator()(int64_t t) const {
     const Adder<S, kExact> of = adder<kExact>(sums, exact);
     const Vec3<S> g = {of.sum(4 * t), of.sum(4 * t + 1), of.sum(4 * t + 2)};
     if (g.x != S(0) || g.y != S(0) || g.z != S(0))
       store3(moved + 3 * t, texel_step(load3(moved + 3 * t), g, rate, share[t]));
+    if (squares) squares[t] = texel_step(squares[t], of.sum(4 * t + 3), rate, share[t]);
   }
 };
 

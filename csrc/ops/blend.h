@@ -45,12 +45,13 @@ constexpr int blend_sums(bool maps) { return maps ? 8 : 4; }
 
 // Writes ddepth [F] (maps only), dgeom [n, kGeom] (beta and normal columns), dbase [n, 3] and, unless null, dweight
 // [F], duv [2, F] and dresidual [F, 3]. Texel t of `moved` [texels, 3], which may be the texels that are read, moves by
-// -rate share[t] times its gradient. partial [pairs, blend_sums] and work are working memory.
+// -rate share[t] times its gradient; number t of `squares` [texels], unless null, likewise by the gradient of the first
+// channel, whose fragments count once more by their weight. partial [pairs, blend_sums] and work are working memory.
 template <class S, class Layout> struct BlendBackward {
   BlendedSurfels<S, Layout> of;
   const S *dimage, *share;
   S rate;
-  S *partial, *dweight, *duv, *ddepth, *dgeom, *dbase, *dresidual, *moved;
+  S *partial, *dweight, *duv, *ddepth, *dgeom, *dbase, *dresidual, *moved, *squares;
   TexelWork<S> work;
 
   template <class R> void fields(R& r) {
@@ -65,11 +66,13 @@ template <class S, class Layout> struct BlendBackward {
     r.maybe("dresidual", dresidual, 3 * total);
     if (dresidual && !of.residual) r.refuse("there is no residual of fragments");
     r.maybe("moved", moved, 3 * of.table.texels);
+    r.maybe("squares", squares, of.table.texels);
     r.maybe("share", share, of.table.texels);
     r.number("rate", rate);
     r.work("partial", partial, of.fragments.layout.pairs * blend_sums(of.maps));
     work.fields(r, moved ? of.table.texels : 0);
     if (moved && !share) r.refuse("texels move by a share of each");
+    if (squares && !moved) r.refuse("squares are summed where texels move");
   }
 };
 

@@ -53,7 +53,8 @@ template <class S> struct TexelPatch {
     return shaded(view, texel_mix(t, at.weight));
   }
 };
-// Working memory of the backward pass on CUDA: gradient sums of texels, rows of four, the last 0.
+// Working memory of the backward pass on CUDA: gradient sums of texels, rows of four, the last that of the
+// squares of BlendBackward, or 0.
 template <class S> struct TexelWork {
   S* sums;         // [texels, 4]
   int64_t* exact;  // null, or order-independent sums instead of `sums`: [exact_size(...)]

@@ -212,10 +212,10 @@ def check_coverage(case: Case, masked: bool) -> None:
         weighed = replace(f, weight=f.weight.pow(power))
         image = case.image(torch.zeros_like(case.base), texels, weighed, bound=0.05**power)
         want.append(1 + torch.autograd.grad((image * counts).sum(), texels)[0])  # 1: initial value
-    got = [torch.ones_like(case.texels) for _ in want]
-    ops.add_texel_coverage([f], case.tiles, mask, 0.05, *got)
+    total, squares = torch.ones_like(case.texels), torch.ones_like(case.texels[:, 0])
+    ops.add_texel_coverage([f], case.tiles, mask, 0.05, total, squares)
     assert want[0].max() > 2
-    for mine, theirs in zip(got, want, strict=True):
+    for mine, theirs in zip((total, squares[:, None].expand(-1, 3)), want, strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-11, atol=1e-11)
 
 

@@ -139,9 +139,8 @@ def _check_range(name: str, values: Tensor, low: float, high: float) -> None:
     wrong = ~((values >= low) & (values <= high))
     if bool(wrong.any()):
         row = tuple(wrong.nonzero()[0].tolist())
-        least = "above 0" if 0.0 < low else f"from {low:g}"
-        most = "finite" if high > BETA_MAX else f"to {high:g}"
-        raise ValueError(f"{name} have to be {least} and {most}: {name}{list(row)} is {values[row].item():g}")
+        limits = "above 0 and finite" if 0.0 < low else f"from {low:g} to {high:g}"
+        raise ValueError(f"{name} have to be {limits}: {name}{list(row)} is {values[row].item():g}")
 
 
 def _logit(share: Tensor) -> Tensor:

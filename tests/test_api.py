@@ -127,10 +127,10 @@ def test_the_ends_of_the_ranges_have_values_and_gradients_of_the_float64_referen
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("opacities", 2.0, r"opacities have to be from 0 and to 1: opacities\[0\] is 2"),
+        ("opacities", 2.0, r"opacities have to be from 0 to 1: opacities\[0\] is 2"),
         ("opacities", -0.1, "opacities have to be"),
         ("opacities", float("nan"), "opacities have to be .* is nan"),
-        ("betas", 4.5, r"betas have to be from 0 and to 4: betas\[0\] is 4.5"),
+        ("betas", 4.5, r"betas have to be from 0 to 4: betas\[0\] is 4.5"),
         ("scales", -1.0, r"scales have to be above 0 and finite: scales\[0, 0\] is -1"),
         ("scales", 0.0, "scales have to be above 0"),
         ("scales", float("inf"), "scales have to be above 0 and finite"),

@@ -26,6 +26,7 @@ from bitymi_ns.trust import listed
 
 FORMS = (".txt", ".bin")
 MOST_MODEL = 1 << 36  # bytes of a file of a model; 100 million points take a twentieth of it
+PROBE = 1 << 20  # bytes by which a disk shows that it is full
 TINY = 1e-100  # least length of a quaternion that can be normalised
 CAMERA_SENSOR = int(pycolmap.SensorType.CAMERA)
 T = TypeVar("T")
@@ -96,17 +97,23 @@ def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
     """Write a model in binary form. Raises OSError: it is not whole. COLMAP ignores failed writes, hence its files are
     read again, not by COLMAP, whose reader does not end on some that are cut off."""
     readers = {
+        "rigs": _rigs_binary,
         "cameras": _cameras_binary,
-        "images": _images_binary,
         "frames": _frames_binary,
+        "images": _images_binary,
         "points3D": _points_binary,
     }
     try:
         model.write_binary(folder)
         for name, read in readers.items():
             tuple(read(folder / f"{name}.bin"))
-    except (ValueError, struct.error, OSError) as error:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder)) from error
+    except (ValueError, struct.error) as error:
+        for name in readers:  # the reason is lost: writing more has the system state it
+            with open(folder / f"{name}.bin", "ab") as file:
+                file.write(bytes(PROBE))
+                file.flush()
+                os.fsync(file.fileno())
+        raise OSError(errno.EIO, os.strerror(errno.EIO), str(folder)) from error  # a failure that has passed
 
 
 def _file(folder: Path, name: str) -> Path:
@@ -247,6 +254,17 @@ def _images_binary(path: Path) -> Iterator[tuple[int, ModelImage]]:
         number, *pose, camera = file.take("I7dI")
         yield number, ModelImage(file.name(), camera, np.array(pose[:4]), np.array(pose[4:]))
         file.skip(24 * file.take("Q")[0])  # 2D points
+    file.end()
+
+
+def _rigs_binary(path: Path) -> Iterator[int]:
+    file = _Binary(path)
+    for _ in range(file.take("Q")[0]):
+        number, sensors = file.take("II")
+        file.skip(8 * (sensors > 0))  # the reference sensor
+        for _ in range(sensors - 1):
+            file.skip(56 * file.take("iIB")[-1])  # a pose, if it has one
+        yield number
     file.end()
 
 

@@ -33,6 +33,7 @@ Check = Callable[[tuple[int, ...]], None]
 """Receives a header's shape, and raises if it must not be read."""
 TIFFS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 EXR = b"v/1\x01"
+cv2.setLogLevel(0)  # a damaged map is one message, without OpenCV's own lines
 _PARSING = threading.Lock()  # ast.literal_eval, which numpy parses headers with, fails in threads of Python 3.11
 
 Values = npt.NDArray[np.float32]

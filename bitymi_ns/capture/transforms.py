@@ -177,7 +177,7 @@ def _check_frames(path: Path, meta: Any, own_format: bool) -> None:
     without = [frame["file_path"] for frame in frames if "mask_path" not in frame]
     if 0 < len(without) < len(frames):
         advice = "Give every frame a mask (a white picture lets all pixels count), or none."
-        fail(f"{path}: {listed(without)} has no mask_path, but other frames have one. {advice}")
+        fail(f"{path}: no mask_path for {listed(without)}, but other frames have one. {advice}")
 
 
 def _check_intrinsics(path: Path, meta: dict[str, Any]) -> None:

@@ -7,7 +7,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -109,21 +110,38 @@ def test_a_read_only_folder_is_no_hindrance(copied: Copy, tmp_path: Path, monkey
     assert not (folder / ".bitymi").exists()
 
 
-def test_what_libraries_print_is_no_message(tmp_path: Path) -> None:
-    code = """if True:
-        import os
+@contextmanager
+def worker_that_finds(tmp_path: Path, found: str) -> Iterator[subprocess.Popen[str]]:
+    """Start the process of COLMAP with a job that finds this."""
+    code = f"""if True:
+        import os, resource, pycolmap
         from bitymi_ns.capture.sfm import worker
         def find(job, stages):
-            os.write(1, b"BLAS : Bad memory unallocation!\\n")
-            raise worker.NoPoses("nothing")
+            {found}
         worker.find = find
         worker.main()"""
     job = Job(str(tmp_path), str(tmp_path), None, [], [], {}, False, {})
     with subprocess.Popen(
         [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as worker:
-        assert worker.stdin is not None and worker.stdout is not None and worker.stderr is not None
+        assert worker.stdin is not None
         worker.stdin.write(job.text() + "\n")
         worker.stdin.flush()
+        yield worker
+
+
+def test_what_libraries_print_is_no_message(tmp_path: Path) -> None:
+    found = 'os.write(1, b"BLAS : Bad memory unallocation!\\n"); raise worker.NoPoses("nothing")'
+    with worker_that_finds(tmp_path, found) as worker:
+        assert worker.stdout is not None and worker.stderr is not None
         assert json.loads(worker.stdout.readline()) == {"failure": "nothing"}
         assert "BLAS" in worker.stderr.read()
+
+
+def test_a_model_that_cannot_be_written_has_its_reason(tmp_path: Path) -> None:
+    found = "resource.setrlimit(resource.RLIMIT_FSIZE, (7, 7)); return pycolmap.Reconstruction(), {}"
+    with worker_that_finds(tmp_path, found) as worker:
+        assert worker.stdout is not None
+        lines = [json.loads(line) for line in worker.stdout]
+    why = f"{tmp_path / 'model'} cannot be written: the file would be larger than this system allows (see `ulimit -f`)"
+    assert lines[-1] == {"failure": f"{why}. Start again then: what is done is kept."}

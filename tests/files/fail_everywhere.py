@@ -28,10 +28,11 @@ from nerfstudio.scripts import train as ns_train
 from nerfstudio.scripts.eval import ComputePSNR
 
 from bitymi_ns import cli, endings
+from bitymi_ns.capture.colmap_model import write_model
 from bitymi_ns.capture.nerfstudio import write_capture
 from bitymi_ns.capture.report import FILES
 from bitymi_ns.capture.types import Poses
-from bitymi_ns.files import explained
+from bitymi_ns.files import complete_folder, explained
 from bitymi_ns.measure.pictures import draw_worst
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export.command import ExportAtlas
@@ -52,7 +53,7 @@ CASES = [
 ]
 SOME = 2  # accesses tried per case by default
 SLOW = ("sample", "bundle", "mesh", "maps", "pictures", "eval")  # one access only
-QUICK = ("pack", "report", "capture", "checkpoint", "curve")  # every access
+QUICK = ("pack", "report", "capture", "model", "checkpoint", "curve")  # every access
 GOLDEN = 0.618  # spacing of the tried accesses, as a share of all
 
 Contents = dict[str, bytes | None]
@@ -215,13 +216,13 @@ def writers(work: Path) -> dict[str, Callable[[Path], Write]]:
 
     models = [work / f"model-{version}" for version in range(2)]
     for version, folder in enumerate(models):
-        model = pycolmap.Reconstruction()
-        model.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 50.0 + version, 48, 36))
+        made = pycolmap.Reconstruction()
+        made.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 50.0 + version, 48, 36))
         for k, path in enumerate(sorted((room / "images").iterdir())):
             image = pycolmap.Image(path.name, np.zeros((0, 2)), 1, k + 1)
-            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+            made.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
         folder.mkdir()
-        model.write_binary(folder)
+        made.write_binary(folder)
         for name in FILES:
             (folder / name).write_text(f"report {version}")
 
@@ -230,6 +231,12 @@ def writers(work: Path) -> dict[str, Callable[[Path], Write]]:
         shutil.rmtree(place / "a", ignore_errors=True)  # a capture never replaces files
         with explained(place / "a", InputError):
             write_capture(found, place / "a", lambda *told: None)
+
+    found = [pycolmap.Reconstruction(folder) for folder in models]
+
+    def model(place: Path, version: int) -> None:
+        with explained(place / "a", InputError), complete_folder(place / "a") as new:
+            write_model(found[version], new)
 
     def begin(place: Path, version: int) -> None:
         begun = small_run(room, place, name="begun")
@@ -264,6 +271,7 @@ def writers(work: Path) -> dict[str, Callable[[Path], Write]]:
         "maps": lambda p: partial(dataset, p),
         "pictures": lambda p: lambda v: draw_worst(run, p / "a", 1 + v),
         "capture": lambda p: partial(capture, p),
+        "model": lambda p: partial(model, p),
         "checkpoint": lambda p: partial(checkpoint, p),
         "curve": lambda p: partial(curve, p),
         "begin": lambda p: partial(begin, p),

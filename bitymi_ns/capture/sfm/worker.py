@@ -17,7 +17,7 @@ import pycolmap
 from bitymi_ns.capture.colmap_model import write_model
 from bitymi_ns.capture.sfm import consistency, explain, features, mapping, pairs
 from bitymi_ns.capture.sfm.job import DATABASE, MODEL, Job, NoPoses
-from bitymi_ns.files import complete_folder
+from bitymi_ns.files import complete_folder, explained
 
 LEAST = 3  # placed photographs of a capture
 _messages = sys.__stdout__  # the pipe of messages
@@ -99,7 +99,8 @@ def main() -> None:
         model, result = (mapping.triangulate(job, stages), {}) if job.poses else find(job, stages)
         for image in model.images.values():
             image.name = job.names[image.name]
-        with complete_folder(Path(job.work) / MODEL) as folder:
+        path = Path(job.work) / MODEL
+        with explained(path, NoPoses, ". Start again then: what is done is kept."), complete_folder(path) as folder:
             write_model(model, folder)
         stages("writing", 1, 1)
         send(result={**result, "seconds": {k: v for k, v in stages.seconds.items() if k != "starting"}})

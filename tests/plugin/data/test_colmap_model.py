@@ -2,6 +2,7 @@
 
 import resource
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -97,19 +98,42 @@ def test_a_single_file_in_text_is_of_another_model(project: Path) -> None:
     assert read_model(folder).cameras[1].params[0] == 40.0
 
 
-@pytest.mark.parametrize("size", [100, 1000, 20_000])
-def test_a_model_that_is_not_written_whole(tmp_path: Path, size: int) -> None:
+@pytest.fixture
+def synthetic() -> pycolmap.Reconstruction:
     pycolmap.set_random_seed(0)
-    model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_frames_per_rig=9, num_points3D=50))
-    write_model(model, tmp_path)
-    assert len(read_model(tmp_path).images) == len(model.images)
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=2, num_cameras_per_rig=2, num_frames_per_rig=9, num_points3D=50)
+    return pycolmap.synthesize_dataset(options)
+
+
+@pytest.mark.parametrize("size", [100, 1000, 20_000])
+def test_a_model_that_is_not_written_whole(tmp_path: Path, size: int, synthetic: pycolmap.Reconstruction) -> None:
+    write_model(synthetic, tmp_path)
+    assert len(read_model(tmp_path).images) == len(synthetic.images)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
     try:
-        with pytest.raises(OSError, match="No space left"):
-            write_model(model, tmp_path)
+        with pytest.raises(OSError, match="File too large"):
+            write_model(synthetic, tmp_path)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.parametrize("name", ["rigs", "cameras", "frames", "images", "points3D"])
+def test_each_file_of_a_model_is_checked_and_the_true_reason_named(
+    tmp_path: Path, name: str, synthetic: pycolmap.Reconstruction
+) -> None:
+    (tmp_path / f"{name}.bin").mkdir()
+    with pytest.raises(IsADirectoryError):
+        write_model(synthetic, tmp_path)
+    (tmp_path / f"{name}.bin").rmdir()
+
+    def loses_its_last_byte(folder: Path) -> None:
+        synthetic.write_binary(folder)
+        path = folder / f"{name}.bin"
+        path.write_bytes(path.read_bytes()[:-1])
+
+    with pytest.raises(OSError, match="Input/output error"):
+        write_model(SimpleNamespace(write_binary=loses_its_last_byte), tmp_path)
 
 
 @pytest.mark.parametrize("form", ["txt", "bin"])

@@ -229,6 +229,22 @@ def test_headers_are_compared_with_the_photograph_before_numbers_are_read(tmp_pa
         read_depth(MapFiles(tmp_path / "depth.npy", confidence=tmp_path / name), LENS)
 
 
+@pytest.mark.parametrize("ending", [".exr", ".tif"])
+def test_a_damaged_map_is_one_message(tmp_path, ending, capfd) -> None:
+    """OpenCV prints lines of its own by default. Found by scripts/fuzz.py."""
+    os.environ["OPENCV_IO_ENABLE_OPENEXR"] = "1"
+    file = tmp_path / f"a{ending}"
+    assert cv2.imwrite(str(file), np.ones((64, 64), np.float32))
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2 :] = bytes(len(data) - len(data) // 2)
+    file.write_bytes(data)
+    if ending == ".exr":
+        file.write_bytes(data.replace(b"compression", b"compressiom"))
+    with refused(f"a{ending} cannot be read"):
+        read_depth(MapFiles(file), LENS)
+    assert capfd.readouterr().err == ""
+
+
 @pytest.mark.parametrize("name", ["a.npy", "a.npz", "a.png", "a.exr"])
 def test_maps_that_are_no_files(tmp_path, name) -> None:
     with refused(f"{name} cannot be read: it does not exist"):

@@ -118,7 +118,7 @@ def test_masks_without_a_pixel(capture: Path, capsys: pytest.CaptureFixture[str]
     with expect("the masks of all 10 training photographs exclude every pixel.*if the masks are inverted"):
         load(capture)
     edit(capture, lambda meta: meta["frames"][5].pop("mask_path"))
-    with expect("images/frame_00006.png has no mask_path, but other frames have one"):
+    with expect("no mask_path for images/frame_00006.png, but other frames have one"):
         load(capture)
 
 

@@ -9,6 +9,7 @@ to 60 minutes on one CPU core, or one to two on a GPU (--device cuda). Several c
 runs. Rounding alone moves PSNR by 0.1 dB: give --seeds."""
 
 import contextlib
+import csv
 import functools
 import itertools
 import math
@@ -27,7 +28,9 @@ from zlib import crc32
 import torch
 import yaml
 from common import arguments_of, number, page, publish, say, table
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 from plain_capture import Capture, load_capture
 from torch import Tensor
 
@@ -282,8 +285,14 @@ def tables(runs: Sequence[Run], cells: Cells) -> str:
     return "\n\n".join(parts)
 
 
+PUBLISHED = Path(__file__).with_name("published.csv")
+"""Figures per scene that authors publish in their repositories, or in the survey 3dgs.zip, of their own files and
+pictures."""
+
+
 def draw_curves(runs: Sequence[Run], cells: Cells) -> Figure:
-    """Plot PSNR and LPIPS of the bundles of every run against their bytes; dashes: before the bake."""
+    """Plot PSNR and LPIPS of the bundles of every run against their bytes; dashes: before the bake; crosses: PSNR that
+    others publish of the same scenes."""
     figure = Figure(figsize=(10, 4), layout="constrained")
     for axes, name, label in zip(figure.subplots(1, 2), ("psnr", "lpips"), ("PSNR (dB)", "LPIPS"), strict=True):
         for i, run in enumerate(runs):
@@ -292,12 +301,28 @@ def draw_curves(runs: Sequence[Run], cells: Cells) -> Figure:
             title = f"{Path(run.data).name}, {run.steps:,} steps, {value.get('width')} x {value.get('height')}"
             axes.plot(*zip(*((p["kilobytes"] / 1e3, p[name]) for p in points), strict=True), "o-", label=title)
             axes.axhline(value[name], color=color, linestyle="--", linewidth=0.8)
+            if name == "psnr":
+                draw_published(axes, Path(run.data).name, color)
         axes.set(xlabel="MB, all files", ylabel=label, xscale="log")
         axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))
         axes.xaxis.set_minor_formatter("{x:g}")
+        axes.margins(x=0.2)
         axes.grid(alpha=0.3, which="both")
     axes.legend()
     return figure
+
+
+def draw_published(axes: Axes, scene: str, color: str) -> None:
+    """Plot what `PUBLISHED` states of a scene, a cross and a name each."""
+    with open(PUBLISHED, newline="", encoding="utf8") as file:
+        rows = [row for row in csv.DictReader(file) if row["scene"] == scene]
+    for row in rows:
+        at = (int(row["bytes"]) / 1e6, float(row["psnr"]))
+        axes.plot(*at, "x", color=color)
+        axes.annotate(f" {row['program']}", at, fontsize=6, va="center")
+    if rows:
+        axes.text(0.98, 0.02, f"crosses: published, {rows[0]['pictures']}", ha="right", transform=axes.transAxes)
 
 
 def main() -> None:

@@ -19,7 +19,7 @@ import sys
 import tempfile
 import time
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -301,28 +301,29 @@ def draw_curves(runs: Sequence[Run], cells: Cells) -> Figure:
             title = f"{Path(run.data).name}, {run.steps:,} steps, {value.get('width')} x {value.get('height')}"
             axes.plot(*zip(*((p["kilobytes"] / 1e3, p[name]) for p in points), strict=True), "o-", label=title)
             axes.axhline(value[name], color=color, linestyle="--", linewidth=0.8)
-            if name == "psnr":
-                draw_published(axes, Path(run.data).name, color)
         axes.set(xlabel="MB, all files", ylabel=label, xscale="log")
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))
         axes.xaxis.set_minor_formatter("{x:g}")
         axes.margins(x=0.2)
         axes.grid(alpha=0.3, which="both")
+        if name == "psnr":
+            draw_published(axes, {Path(run.data).name for run in runs})
     axes.legend()
     return figure
 
 
-def draw_published(axes: Axes, scene: str, color: str) -> None:
-    """Plot what `PUBLISHED` states of a scene, a cross and a name each."""
+def draw_published(axes: Axes, scenes: Set[str]) -> None:
+    """Plot what `PUBLISHED` states of these scenes, a cross and a name each."""
     with open(PUBLISHED, newline="", encoding="utf8") as file:
-        rows = [row for row in csv.DictReader(file) if row["scene"] == scene]
+        rows = [row for row in csv.DictReader(file) if row["scene"] in scenes]
     for row in rows:
         at = (int(row["bytes"]) / 1e6, float(row["psnr"]))
-        axes.plot(*at, "x", color=color)
+        axes.plot(*at, "kx")
         axes.annotate(f" {row['program']}", at, fontsize=6, va="center")
-    if rows:
-        axes.text(0.98, 0.02, f"crosses: published, {rows[0]['pictures']}", ha="right", transform=axes.transAxes)
+    sizes = dict.fromkeys(f"{row['scene']} {row['pictures']}" for row in rows)
+    if sizes:
+        axes.text(0.98, 0.02, f"crosses: published, {', '.join(sizes)}", ha="right", transform=axes.transAxes)
 
 
 def main() -> None:

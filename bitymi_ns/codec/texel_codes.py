@@ -283,7 +283,7 @@ class TexelCoder:
         shared = _shared(means, self._sizes, _steps(step, self.grades))
         values = {"values": texels.contiguous(), "weights": self._weights, "rounds": rounds, "shrink": SHRINK}
         for blocks in self._blocks:
-            codes = torch.empty(len(blocks.order), len(blocks.tile), texels.shape[1], dtype=torch.int32)
+            codes = torch.empty(math.prod(blocks.size), len(blocks.tile), texels.shape[1], dtype=torch.int32)
             backend.load("_cpu").sparse_cosines_f32(**shared, **_block_arguments(blocks), **values, codes=codes)
             coefficients.append(codes)
         return coefficients

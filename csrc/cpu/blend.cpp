@@ -163,17 +163,17 @@ void run_backward(const Backward<S>& a, const BlockPicture<S, kChannels<kMaps>>&
       for (int k = 0; k < 3; ++k) sums.normal[k] += weight * d[6 + k];
     }
     const uint32_t textured = surfel.textured(block);
-    S rgb[3][kLanes], squares[kLanes] = {};
+    S rgb[3][kLanes], last[kLanes];
     if ((textured && rows) || a.dresidual)
       for (int k = 0; k < 3; ++k) store(rgb[k], dcolors[k]);
-    if (a.squares) store(squares, weight * dcolors[0]);
+    if (textured && rows) store(last, a.squares ? weight * dcolors[0] : zero);
     if (S* to = a.dresidual ? a.dresidual + 3 * at : nullptr)
       for (uint32_t lanes = part.lanes; lanes; lanes &= lanes - 1)
         for (int k = 0; k < 3; ++k) *to++ = rgb[k][__builtin_ctz(lanes)];
     const int number = surfel.number(block);
     if (rows)
       each_lane(textured, [&](int lane) {
-        const Four<S> dcolor(Vec3<S>{rgb[0][lane], rgb[1][lane], rgb[2][lane]}, squares[lane]);
+        const Four<S> dcolor(Vec3<S>{rgb[0][lane], rgb[1][lane], rgb[2][lane]}, last[lane]);
         surfel.few().add_gradient(number + lane, dcolor, rows);
       });
     if (!a.duv) return;

@@ -153,13 +153,15 @@ def function(name: str, device: torch.device) -> Callable[..., Any]:
 
     def on_stream(**arguments: Any) -> Any:
         with on_device(device):
-            return compiled(**arguments, stream=_stream(device))
+            return compiled(**arguments, stream=stream_of(device))
 
     return on_stream
 
 
-def _stream(device: torch.device) -> int:
-    """Return torch's current stream of a CUDA device as a raw handle."""
+def stream_of(device: torch.device) -> int:
+    """Return torch's current stream of a CUDA device as a raw handle; 0 for the emulator."""
+    if device.type != "cuda":
+        return 0
     raw = getattr(torch._C, "_cuda_getCurrentRawStream", None)  # 0.5 us; constructing a Stream takes ten
     if raw is None or device.index is None:
         return torch.cuda.current_stream(device).cuda_stream

@@ -3,57 +3,86 @@
 In torch they are about fifty small operations, whose launches take the host longer than the GPU takes to run them.
 """
 
+from dataclasses import dataclass
+from typing import Any
+
 import torch
 from torch import Tensor
 
-from .backend import dense, kernel, module, on_same_device, require
+from .backend import dense, kernel, on_same_device, require, workspace
 from .constants import IMAGE_CHANNELS
 from .project import Projection
-from .ssim import similarity
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A photograph to compare a picture with, and the weights of the losses.
+
+    Attributes:
+        target: [H, W, 3].
+        mask: [H, W] or [H, W, 1] bool, True for pixels that count; None: all.
+        background: [3] colour behind the picture; None: black, or the picture contains it.
+        ssim_weight: w of (1 - w) L1 + w (1 - SSIM).
+        falloff_weight: weight of the mean of omega beta, omega = exp(-gamma e).
+        gamma: decay of omega with the error e, the sum of absolute differences over rgb.
+    """
+
+    target: Tensor
+    mask: Tensor | None
+    background: Tensor | None
+    ssim_weight: float
+    falloff_weight: float
+    gamma: float
+
+    def check(self, like: Tensor, size: tuple[int, ...]) -> None:
+        """Raise a ValueError if the shapes do not fit a picture of height and width `size`, or a device is not that of
+        `like`."""
+        if tuple(self.target.shape) != (*size, 3):
+            raise ValueError(f"the picture is {list(size)} and the photograph {list(self.target.shape)}")
+        on_same_device(like, target=self.target)
+        if self.mask is not None:
+            on_same_device(like, mask=self.mask)
+            if self.mask.dtype != torch.bool or self.mask.numel() != size[0] * size[1]:
+                mask = f"{list(self.mask.shape)} {self.mask.dtype}"
+                raise ValueError(f"the picture is {list(size)}, its mask {mask}, not bool")
+
+    def arguments(self, like: Tensor, correction: Tensor | None = None) -> dict[str, Any]:
+        """Build the kernels' arguments for a picture (`Picture` of csrc/cuda/training.h).
+
+        Args:
+            like: of the picture's dtype and device.
+            correction: of the photograph, [3] or [3, 4], see `train.views.View`; None: none.
+        """
+        return {
+            "target": dense(self.target, like),
+            "mask": None if self.mask is None else self.mask.reshape(-1).contiguous().view(torch.uint8),
+            "background": None if self.background is None else dense(self.background, like),
+            "correction": None if correction is None else dense(correction, like),
+            "corrected": 0 if correction is None else correction.numel(),
+            "share": self.ssim_weight,
+            "weight": self.falloff_weight,
+            "gamma": self.gamma,
+        }
 
 
 class _PictureLosses(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, image, target, mask, share, weight, gamma):
-        pixels, wanted, rgb, flat = dense(image, image), dense(target, image), image[..., :3].detach(), None
-        if mask is not None:  # masked-out pixels are made equal in both pictures
-            flat, counts = mask.reshape(-1).contiguous().view(torch.uint8), mask.reshape(*image.shape[:2], 1)
-            rgb, wanted = torch.where(counts, rgb, 0.0), torch.where(counts, wanted, 0.0)
-        alike, dalike = similarity(rgb, wanted, ctx.needs_input_grad[0])
-        photometric, falloff, counted = (image.new_empty(()) for _ in range(3))
-        sums = torch.empty(module(image.device).LOSS_SUMS, dtype=torch.float64, device=image.device)
-        ctx.arguments = {"gamma": gamma, "share": share, "weight": weight}
-        kernel("picture_loss", image)(
-            image=pixels,
-            target=wanted,
-            mask=flat,
-            similarity=alike,
-            sums=sums,
-            photometric=photometric,
-            falloff=falloff,
-            counted=counted,
-            **ctx.arguments,
-        )
-        ctx.save_for_backward(pixels, wanted, flat, counted)
-        ctx.dalike = dalike
+    def forward(ctx, image, photograph):
+        pixels, size = dense(image, image), {"height": image.shape[0], "width": image.shape[1]}
+        photometric, falloff = image.new_empty(2).unbind()
+        memory = workspace("picture_loss", image, **size)
+        ctx.arguments = {**photograph.arguments(pixels), **size, "image": pixels, "picture_work": memory}
+        kernel("picture_loss", image)(**ctx.arguments, photometric=photometric, falloff=falloff)
         return photometric, falloff
 
     @staticmethod
     def backward(ctx, dphotometric, dfalloff):
-        image, target, mask, counted = ctx.saved_tensors
+        image = ctx.arguments["image"]
         dimage = torch.empty_like(image)
         kernel("picture_loss_backward", image)(
-            image=image,
-            target=target,
-            mask=mask,
-            counted=counted,
-            dsimilarity=ctx.dalike,
-            dphotometric=dense(dphotometric, image),
-            dfalloff=dense(dfalloff, image),
-            dimage=dimage,
-            **ctx.arguments,
+            **ctx.arguments, dphotometric=dense(dphotometric, image), dfalloff=dense(dfalloff, image), dimage=dimage
         )
-        return dimage, None, None, None, None, None
+        return dimage, None
 
 
 def picture_losses(
@@ -79,14 +108,11 @@ def picture_losses(
         RuntimeError: the tensors are not on a CUDA device.
     """
     require("picture_losses", "cuda", image.device, "call `train.losses.objective`")
-    if image.dim() != 3 or image.shape[-1] != IMAGE_CHANNELS or tuple(target.shape) != (*image.shape[:2], 3):
-        raise ValueError(f"the picture is {list(image.shape)} and the photograph {list(target.shape)}")
-    on_same_device(image, target=target)
-    if mask is not None:
-        on_same_device(image, mask=mask)
-        if mask.dtype != torch.bool or mask.numel() != image.shape[0] * image.shape[1]:
-            raise ValueError(f"the picture is {list(image.shape)}, its mask {list(mask.shape)} {mask.dtype}, not bool")
-    return _PictureLosses.apply(image, target, mask, ssim_weight, falloff_weight, gamma)
+    if image.dim() != 3 or image.shape[-1] != IMAGE_CHANNELS:
+        raise ValueError(f"the picture is {list(image.shape)}, not [H, W, {IMAGE_CHANNELS}]")
+    photograph = Photograph(target, mask, None, ssim_weight, falloff_weight, gamma)
+    photograph.check(image, tuple(image.shape[:2]))
+    return _PictureLosses.apply(image, photograph)
 
 
 @torch.no_grad()

@@ -182,6 +182,24 @@ def rigid_gradient(means: Tensor, quats: Tensor, dmeans: Tensor, dquats: Tensor,
     return gradient.to(viewmat)
 
 
+def checked_geometry(
+    means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: Tensor, beta_raw: Tensor, camera: Camera
+) -> tuple[Tensor, ...]:
+    """Check the arguments of `project`; returns the surfels' in order.
+
+    Raises:
+        ValueError: shapes or devices do not match, or the camera has skew.
+    """
+    n = means.shape[0]
+    shapes = {"means": (means, (n, 3)), "quats": (quats, (n, 4)), "log_scales": (log_scales, (n, 2))}
+    shapes |= {"opacity_logits": (opacity_logits, (n,)), "beta_raw": (beta_raw, (n,))}
+    check_shapes(**shapes)
+    on_same_device(means, **{name: tensor for name, (tensor, _) in shapes.items()})
+    if camera.skewed:
+        raise ValueError("cameras with skew (K[0, 1] != 0) are not supported: undistort the images first")
+    return means, quats, log_scales, opacity_logits, beta_raw
+
+
 def project(
     means: Tensor,
     quats: Tensor,
@@ -217,13 +235,6 @@ def project(
     """
     if photo_pixel != 1.0 and (cuda_backend(means.device) or (torch.is_grad_enabled() and means.requires_grad)):
         raise ValueError("surfels are resized on the CPU and without gradients alone")
-    n = means.shape[0]
-    shapes = {"means": (means, (n, 3)), "quats": (quats, (n, 4)), "log_scales": (log_scales, (n, 2))}
-    shapes |= {"opacity_logits": (opacity_logits, (n,)), "beta_raw": (beta_raw, (n,))}
-    check_shapes(**shapes)
-    on_same_device(means, **{name: tensor for name, (tensor, _) in shapes.items()})
-    if camera.skewed:
-        raise ValueError("cameras with skew (K[0, 1] != 0) are not supported: undistort the images first")
-    geometry = (means, quats, log_scales, opacity_logits, beta_raw)
+    geometry = checked_geometry(means, quats, log_scales, opacity_logits, beta_raw, camera)
     geom, frames, radii, broken = _Project.apply(camera, near, prefilter, photo_pixel, camera.viewmat, *geometry)
     return Projection(geom, frames, radii, camera, near, prefilter, broken, photo_pixel, alpha=alpha)

@@ -12,7 +12,7 @@ from torch import Tensor
 from .backend import function, kernel, module, on_device, require, workspace
 from .constants import TILE
 from .fragment_list import Layout, TooManyFragments, empty_ids, empty_list
-from .project import Projection
+from .project import Camera, Projection
 
 NUMBERS = 24
 """Numbers per fragment in a training step: 7 in the list, 3 of its residual, 8 of gradients; the rest is slack."""
@@ -59,6 +59,15 @@ def _longs(like: Tensor, count: int) -> Tensor:
     return torch.empty(count, dtype=torch.int64, device=like.device)
 
 
+def check_pair_count(pairs: int, camera: Camera) -> None:
+    """Raise a RuntimeError if a view has 2^31 pairs of surfel and tile or more."""
+    if pairs >= 2**31:
+        raise RuntimeError(
+            f"the view has {pairs:,} pairs of surfel and tile, not below 2^31: the surfels are far too large for an "
+            f"image of {camera.width} x {camera.height} pixels"
+        )
+
+
 def tile_lists(geom: Tensor, projection: Projection) -> Bins:
     """List the pairs of surfel and tile of a view; waits once for their number.
 
@@ -71,11 +80,7 @@ def tile_lists(geom: Tensor, projection: Projection) -> Bins:
     ranks = {"order": _ints(geom, n), "slot_start": _longs(geom, n + 1)}
     kernel("bin_count", geom)(**view, **ranks, workspace=workspace("bin_count", geom, n=n))
     pairs = int(ranks["slot_start"][-1])
-    if pairs >= 2**31:
-        raise RuntimeError(
-            f"the view has {pairs:,} pairs of surfel and tile, not below 2^31: the surfels are far too large for an "
-            f"image of {camera.width} x {camera.height} pixels"
-        )
+    check_pair_count(pairs, camera)
     lists = {"slot": _ints(geom, pairs), "surfel": _ints(geom, pairs), "tile_pairs": _longs(geom, tiles + 1)}
     lists["differing"] = _ints(geom, 1)
     space = workspace("bin_fill", geom, pairs=pairs, width=camera.width, height=camera.height)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -29,7 +29,9 @@ from bitymi_ns.ops import (
     view_color,
 )
 from bitymi_ns.ops.constants import IMAGE_CHANNELS
+from bitymi_ns.ops.picture_cuda import Photograph
 from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.training_view import ComparedView, training_view
 
 from .camera import Camera
 from .config import SceneConfig
@@ -180,14 +182,13 @@ class Scene(nn.Module):
         projection = project(*(p[name] for name in GEOMETRY), camera, self.near, self.config.prefilter)
         field = None if field_mode == "off" else self.field
         learns, bound = field_mode == "train", self.config.weight_bound
+        texture = None if maps or overdraw_half is not None else self._unlisted_texture(field_mode)
         if self.field is not None:
             projection.alpha = self.field.opacity(bound, learns)
         base = self.base_color(projection)
-        if not maps and overdraw_half is None and not self.config.max_fragments and can_rasterize(base.device):
-            texture = {} if field is None else field.texture(bound, learns)
-            if texture is not None and (field is not None or projection.alpha is None):
-                image, marks = rasterize_image(projection, base, **texture, rim=self.config.rim)
-                return RenderOutput.of_image(image, projection, marks, background, maps)
+        if texture is not None:
+            image, marks = rasterize_image(projection, base, **texture, rim=self.config.rim)
+            return RenderOutput.of_image(image, projection, marks, background, maps)
         read: Tensor | None = None
 
         def draw(part: Projection, most: int | None) -> tuple[Tensor, Fragments]:
@@ -205,6 +206,34 @@ class Scene(nn.Module):
                 read = field.snapshot()
             image, fragments = self._draw_in_bands(projection, draw, error)
         return RenderOutput.of_image(image, projection, fragments, background, maps, overdraw_half is not None)
+
+    def _unlisted_texture(self, field_mode: Literal["train", "frozen", "off"]) -> dict[str, Any] | None:
+        """Return the texels' keywords of `rasterize_image`; None if views need fragment lists."""
+        if self.config.max_fragments or not can_rasterize(self.surfels["means"].device):
+            return None
+        if self.field is None or field_mode == "off":
+            return None if isinstance(self.field, TexelField) and self.field.alpha is not None else {}
+        return self.field.texture(self.config.weight_bound, field_mode == "train")
+
+    def compare(
+        self,
+        camera: Camera,
+        photograph: Photograph,
+        correction: Tensor | None = None,
+        field_mode: Literal["train", "frozen"] = "train",
+    ) -> ComparedView | None:
+        """Draw a view and compare it with its photograph, see `ops.training_view`; None if views need fragment lists.
+
+        Args:
+            correction: of the photograph, [3] or [3, 4], see `train.views.View`.
+            field_mode: as in `render`.
+        """
+        texture = self._unlisted_texture(field_mode)
+        if texture is None:
+            return None
+        alpha = None if self.field is None else self.field.opacity(self.config.weight_bound, field_mode == "train")
+        view = {"near": self.near, "prefilter": self.config.prefilter, "rim": self.config.rim, "alpha": alpha}
+        return training_view(self.config.view_color, self.surfels, camera, photograph, correction, **texture, **view)
 
     def _draw_in_bands(
         self,

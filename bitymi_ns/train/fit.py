@@ -20,6 +20,7 @@ from bitymi_ns.train.step import Training
 from bitymi_ns.train.views import TrainingData, View, covered_share, training_order
 
 if TYPE_CHECKING:
+    from bitymi_ns.ops.training_view import ComparedView
     from bitymi_ns.scene.scene import RenderOutput, Scene
 
 
@@ -91,7 +92,7 @@ class Trainer:
         self._views = len(views)
         self._terms: list[Tensor] = []
 
-    def advance(self) -> tuple[dict[str, Tensor], RenderOutput, dict[str, float]]:
+    def advance(self) -> tuple[dict[str, Tensor], RenderOutput | ComparedView, dict[str, float]]:
         """Do one step; return the loss terms and render of its (last) view, and the strategy's report."""
         self.training.begin(self.step)
         forget_gradients(self.optimizers.values())
@@ -118,7 +119,7 @@ def fit(
     eval_views: Sequence[View],
     config: TrainConfig,
     max_steps: int,
-    callback: Callable[[Trainer, dict[str, Tensor], RenderOutput, dict[str, float]], None] | None = None,
+    callback: Callable[[Trainer, dict[str, Tensor], RenderOutput | ComparedView, dict[str, float]], None] | None = None,
     eval_steps: Sequence[int] = (),
 ) -> TrainLog:
     """Train a scene in place.

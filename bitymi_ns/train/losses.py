@@ -46,12 +46,7 @@ def objective(
         `depth` and `normal` if used and their weights are not 0.
     """
     image = output.image
-    if (
-        image is not None
-        and config.ssim_weight > 0.0
-        and min(image.shape[:2]) >= SSIM_WINDOW
-        and cuda_backend(image.device)
-    ):
+    if image is not None and fused_losses(config, image):
         both = picture_losses(image, target, config.ssim_weight, config.falloff_weight, config.falloff_gamma, mask)
         return dict(zip(("photometric", "falloff"), both[: 1 + (config.falloff_weight > 0.0)], strict=False))
     terms = {"photometric": photometric(output.rgb, target, config.ssim_weight, mask)}
@@ -68,6 +63,11 @@ def objective(
         weight = config.normal_weight * config.geometry_interval
         terms["normal"] = weight * normal_error(output.normal, output.alpha, normal, mask)
     return terms
+
+
+def fused_losses(config: LossConfig, image: Tensor) -> bool:
+    """Return True if kernels compute the losses of an image [H, W, C]."""
+    return config.ssim_weight > 0.0 and min(image.shape[:2]) >= SSIM_WINDOW and cuda_backend(image.device)
 
 
 def numbers(image: Tensor, mask: Tensor | None, counted: int | None = None) -> int:

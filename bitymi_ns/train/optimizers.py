@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, MutableMapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
 
+from bitymi_ns.ops.backend import cuda_backend, dense, kernel_class, on_device, stream_of
 from bitymi_ns.scene.field import HashField
 
 if TYPE_CHECKING:
@@ -45,80 +46,117 @@ PLAIN = {"fused": True, "weight_decay": 0.0, "amsgrad": False, "maximize": False
 """Options of the Adam groups that `step` fuses."""
 
 
-def step(optimizers: Mapping[str, Optimizer], factors: Mapping[str, Tensor]) -> None:
-    """Step all optimisers, bit-identical to calling each `step`, and scale the updates of single rows.
+class _Row(NamedTuple):
+    """A parameter of a fused Adam optimiser, with its state and options."""
 
-    Each Adam.step costs 100-200 us of Python, ten times the GPU work. Fused Adam optimisers are therefore stepped here
-    together: one addition for all step counters, and one call per learning rate.
+    parameter: Tensor
+    gradient: Tensor
+    mean: Tensor
+    square: Tensor
+    step: Tensor
+    rate: float
+    betas: tuple[float, float]
+    eps: float
+    factors: Tensor | None  # [N], of the rows' updates
+
+
+@torch.no_grad()
+def step(optimizers: Mapping[str, Optimizer], factors: Mapping[str, Tensor]) -> None:
+    """Step all optimisers like calling each `step`, and scale the updates of single rows.
+
+    Each Adam.step costs 100-200 us of Python, ten times the GPU work. Fused Adam optimisers are therefore stepped
+    together: on the CPU by one call per learning rate, bit-identical to each `step`, on CUDA devices by one kernel.
 
     Args:
         optimizers: by parameter group.
         factors: row factors [N] of the updates of parameters [N, ...], by parameter group.
     """
-    scaled = [
-        (parameter, parameter.detach().clone(), factors[name].view(-1, *[1] * (parameter.ndim - 1)))
-        for name, optimizer in optimizers.items()
-        if name in factors
-        for parameter in optimizer.param_groups[0]["params"]
-    ]
-    _step_together(optimizers.values())
-    with torch.no_grad():
-        for parameter, before, factor in scaled:
-            torch.lerp(before, parameter, factor, out=parameter)
-
-
-def _step_together(optimizers: Iterable[Optimizer]) -> None:
-    batches: dict[tuple[Any, ...], list[list[torch.Tensor]]] = {}
-    counters: list[torch.Tensor] = []
-    for optimizer in optimizers:
-        found = [_fusable(optimizer, group) for group in optimizer.param_groups]
-        if any(rows is None for rows in found):
+    rows: list[_Row] = []
+    for name, optimizer in optimizers.items():
+        found = _fusable(optimizer, factors.get(name))
+        if found is None:
+            before = [p.detach().clone() for p in optimizer.param_groups[0]["params"] if name in factors]
             optimizer.step()
-            continue
-        for group, rows in zip(optimizer.param_groups, found, strict=True):
-            for row in rows or ():
-                key = (row[0].device, row[0].dtype, group["lr"], *group["betas"], group["eps"])
-                batches.setdefault(key, []).append(row)
-                counters.append(row[-1])
-    if not counters:
-        return
-    with torch.no_grad():
-        torch._foreach_add_(counters, 1.0)
-        for (_, _, rate, first, second, eps), rows in batches.items():
-            parameters, gradients, means, squares, steps = (list(column) for column in zip(*rows, strict=True))
-            torch._fused_adam_(
-                parameters,
-                gradients,
-                means,
-                squares,
-                [],
-                steps,
-                lr=rate,
-                beta1=first,
-                beta2=second,
-                weight_decay=0.0,
-                eps=eps,
-                amsgrad=False,
-                maximize=False,
-            )
+            for parameter, values in zip(optimizer.param_groups[0]["params"], before, strict=False):
+                _scale_update(parameter, values, factors[name])
+        else:
+            rows += found
+    if rows and cuda_backend(rows[0].parameter.device):
+        _step_by_kernel(rows)
+    elif rows:
+        _step_by_torch(rows)
 
 
-def _fusable(optimizer: Optimizer, group: dict[str, Any]) -> list[list[torch.Tensor]] | None:
-    """List parameter, gradient, both moments and step counter of each parameter with a gradient; None if the optimiser
-    must step itself, because it is no plain fused Adam or has no state yet."""
-    if type(optimizer) is not Adam or any(group.get(name) != value for name, value in PLAIN.items()):
-        return None
-    if not isinstance(group["lr"], float):
+def _scale_update(parameter: Tensor, before: Tensor, factors: Tensor) -> None:
+    torch.lerp(before, parameter, factors.view(-1, *[1] * (parameter.ndim - 1)), out=parameter)
+
+
+def _step_by_kernel(rows: Sequence[_Row]) -> None:
+    device = rows[0].parameter.device
+    arguments = [
+        {
+            "parameter": row.parameter.detach(),
+            "gradient": dense(row.gradient, row.parameter),
+            "mean": row.mean,
+            "square": row.square,
+            "step": row.step,
+            "width": row.parameter[0].numel() if row.factors is not None and len(row.parameter) else 1,
+            "factors": row.factors,
+            "rate": row.rate,
+            "beta1": row.betas[0],
+            "beta2": row.betas[1],
+            "eps": row.eps,
+        }
+        for row in rows
+    ]
+    with on_device(device):
+        kernel_class("adam", rows[0].parameter)(arguments, stream=stream_of(device))
+
+
+def _step_by_torch(rows: Sequence[_Row]) -> None:
+    scaled = [(row.parameter, row.parameter.detach().clone(), row.factors) for row in rows if row.factors is not None]
+    batches: dict[tuple[Any, ...], list[_Row]] = {}
+    for row in rows:
+        batches.setdefault((row.parameter.dtype, row.rate, *row.betas, row.eps), []).append(row)
+    torch._foreach_add_([row.step for row in rows], 1.0)
+    for (_, rate, first, second, eps), batch in batches.items():
+        torch._fused_adam_(
+            [row.parameter for row in batch],
+            [row.gradient for row in batch],
+            [row.mean for row in batch],
+            [row.square for row in batch],
+            [],
+            [row.step for row in batch],
+            lr=rate,
+            beta1=first,
+            beta2=second,
+            weight_decay=0.0,
+            eps=eps,
+            amsgrad=False,
+            maximize=False,
+        )
+    for parameter, before, row_factors in scaled:
+        _scale_update(parameter, before, row_factors)
+
+
+def _fusable(optimizer: Optimizer, factors: Tensor | None) -> list[_Row] | None:
+    """List the parameters with a gradient; None if the optimiser must step itself, because it is no plain fused Adam or
+    has no state yet."""
+    if type(optimizer) is not Adam:
         return None
     found = []
-    for parameter in group["params"]:
-        gradient = parameter.grad
-        if gradient is None:
-            continue
-        state = optimizer.state.get(parameter)
-        if not state or gradient.is_sparse or state["step"].device != parameter.device:
+    for group in optimizer.param_groups:
+        if any(group.get(name) != value for name, value in PLAIN.items()) or not isinstance(group["lr"], float):
             return None
-        found.append([parameter, gradient, state["exp_avg"], state["exp_avg_sq"], state["step"]])
+        for parameter in group["params"]:
+            gradient = parameter.grad
+            if gradient is None:
+                continue
+            state = optimizer.state.get(parameter)
+            if not state or gradient.is_sparse or state["step"].device != parameter.device:
+                return None
+            moments = (state["exp_avg"], state["exp_avg_sq"], state["step"])
+            found.append(_Row(parameter, gradient, *moments, group["lr"], group["betas"], group["eps"], factors))
     return found
 
 

@@ -7,17 +7,18 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
 from bitymi_ns.ops.backend import give_back_memory
+from bitymi_ns.ops.picture_cuda import Photograph
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.divergence import LossWatch, TrainingDiverged
 from bitymi_ns.train.exposure import Exposure
-from bitymi_ns.train.losses import objective
+from bitymi_ns.train.losses import fused_losses, objective
 from bitymi_ns.train.optimizers import ResizeHook, set_rate
 from bitymi_ns.train.poses import Poses
 from bitymi_ns.train.processes import ALONE, Processes
@@ -29,12 +30,14 @@ from bitymi_ns.train.texels import LearningTexels
 from bitymi_ns.train.views import DownscaledViews, TrainingData, View, background_changes, step_background
 
 if TYPE_CHECKING:
+    from bitymi_ns.ops.project import Projection
+    from bitymi_ns.ops.training_view import ComparedView
     from bitymi_ns.scene.scene import RenderOutput, Scene
 
 
 def view_losses(
     scene: Scene, view: View, schedule: Schedule, step: int, watch: LossWatch, background: Tensor | None = None
-) -> tuple[dict[str, Tensor], RenderOutput]:
+) -> tuple[dict[str, Tensor], RenderOutput | ComparedView]:
     """Render a training view and compare it with its photograph.
 
     Args:
@@ -43,28 +46,38 @@ def view_losses(
         background: [3] colour behind the scene where it is the same in all steps; None: that of the options.
 
     Returns:
-        The weighted loss terms (their sum is the objective) and the rendered view.
+        The weighted loss terms (their sum is the objective) and the rendered view, on CUDA devices without its picture
+        where one function does all.
 
     Raises:
         TrainingDiverged: the loss is not finite.
     """
-    config = schedule.config
+    config, loss = schedule.config, schedule.config.loss
     device = scene.surfels["means"].device
     if background is None or background_changes(config, view):
         background = step_background(config, view, step, device)
-    output = scene.render(
-        view.camera,
-        background=background,
-        field_mode="train" if schedule.field_trains(step) else "frozen",
-        maps=(view.depth is not None or view.normal is not None) and schedule.geometry_counts(step),
-        overdraw_half=config.loss.overdraw_half if schedule.overdraw_counts(step) else None,
-    )
+    target = view.target(background, device)
+    field_mode: Literal["train", "frozen"] = "train" if schedule.field_trains(step) else "frozen"
+    maps = (view.depth is not None or view.normal is not None) and schedule.geometry_counts(step)
+    overdraw_half = loss.overdraw_half if schedule.overdraw_counts(step) else None
+    compared: ComparedView | None = None
+    if not maps and overdraw_half is None and fused_losses(loss, target):
+        weights = (loss.ssim_weight, loss.falloff_weight, loss.falloff_gamma)
+        photograph = Photograph(target, view.mask, background, *weights)
+        compared = scene.compare(view.camera, photograph, view.correction, field_mode)
+    if compared is not None:
+        terms = {"photometric": compared.photometric}
+        if loss.falloff_weight > 0.0:
+            terms["falloff"] = compared.falloff
+        watch.note(scene, step, terms)
+        return terms, compared
+    output = scene.render(view.camera, background, field_mode, maps, overdraw_half)
     shown = output
     if view.correction is not None:
         rgb = view.shown(output.rgb, output.alpha, background)
         image = None if output.image is None else torch.cat([rgb, output.image[..., 3:]], -1)
         shown = replace(output, rgb=rgb, image=image)
-    terms = objective(shown, view.target(background, device), config.loss, view.mask, view.depth, view.normal)
+    terms = objective(shown, target, loss, view.mask, view.depth, view.normal)
     watch.note(scene, step, terms)
     return terms, output
 
@@ -123,7 +136,7 @@ class Training:
         self.background: Tensor | None = None
         self.step = 0
         self._full_size = data.views
-        self._outputs: list[RenderOutput] = []
+        self._projections: list[Projection] = []
         self._photometric: list[Tensor] = []
         self._synchronised = processes.count == 1
 
@@ -165,7 +178,7 @@ class Training:
         for name, optimizer in self.optimizers.items():
             set_rate(optimizer, self.guard.factor * self.step_sizes.rate(name, self.step))
 
-    def losses(self, view: View) -> tuple[dict[str, Tensor], RenderOutput]:
+    def losses(self, view: View) -> tuple[dict[str, Tensor], RenderOutput | ComparedView]:
         """Compute `view_losses`. If a loss is not finite, the guard repairs the scene and the view is rendered again.
 
         Raises:
@@ -180,7 +193,7 @@ class Training:
                 diverged = error
             problem = self.processes.problem(None if diverged is None else str(diverged))
             if problem is None:
-                self._outputs.append(output)
+                self._projections.append(output.projection)
                 self._photometric.append(terms["photometric"].detach())
                 return terms, output
             self.watch.forget()
@@ -215,16 +228,15 @@ class Training:
         Raises:
             TrainingDiverged: the limit of rollbacks is reached, or rollbacks are disabled.
         """
-        step, outputs, photometric = self.step, self._outputs, self._photometric
-        assert outputs, "a step is finished after its losses"
-        self._outputs, self._photometric = [], []
+        step, projections, photometric = self.step, self._projections, self._photometric
+        assert projections, "a step is finished after its losses"
+        self._projections, self._photometric = [], []
         self.exposure.step(self.guard.factor * self.schedule.lr("exposure", step))
         pixels = self.guard.factor * self.schedule.pose_pixels(step)
-        self.poses.step([output.projection for output in outputs], pixels, self.processes)
+        self.poses.step(projections, pixels, self.processes)
         if not self.schedule.densification_over(step):
-            self.strategy.accumulate(*outputs)
-        loss, broken = self._reduce_over_views(photometric, [output.projection.broken for output in outputs])
-        del outputs  # frees their fragments before the strategy renders its own views
+            self.strategy.accumulate(*projections)
+        loss, broken = self._reduce_over_views(photometric, [projection.broken for projection in projections])
         factor = self.schedule.resolution_factor(step)
         try:
             report = self.strategy.step(

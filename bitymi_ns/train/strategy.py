@@ -36,7 +36,8 @@ from bitymi_ns.train.score import multi_view_scores, removal_errors
 from bitymi_ns.train.views import View
 
 if TYPE_CHECKING:
-    from bitymi_ns.scene.scene import RenderOutput, Scene
+    from bitymi_ns.ops.project import Projection
+    from bitymi_ns.scene.scene import Scene
 
 DrawViews = Callable[[int, torch.Generator], Sequence[View]]
 """(k, CPU generator) -> k different training views, or all if there are fewer."""
@@ -97,14 +98,14 @@ class Strategy:
         self.statistics = torch.stack([state[name].detach().float() for name in STATISTICS])
         self.generator.set_state(state["generator"].cpu().to(torch.uint8))
 
-    def accumulate(self, *outputs: RenderOutput) -> None:
+    def accumulate(self, *projections: Projection) -> None:
         """Add the statistics of a step's training views, over all processes; call it after the backward passes."""
         if self.processes.views == 1:
-            self._note(*outputs)
+            self._note(*projections)
             return
         before, self.statistics = self.statistics, torch.zeros(len(STATISTICS), 0)
-        for output in outputs:
-            self._note(output)
+        for projection in projections:
+            self._note(projection)
         self.processes.sum(self.statistics[:3])
         self.processes.maximum(self.statistics[3])
         if before.shape[1] > 0:
@@ -113,9 +114,8 @@ class Strategy:
             self.statistics[3] = torch.maximum(before[3], self.statistics[3])
 
     @torch.no_grad()
-    def _note(self, output: RenderOutput) -> None:
+    def _note(self, projection: Projection) -> None:
         """Add the statistics of one training view."""
-        projection = output.projection
         n, device = len(projection.radii), projection.radii.device
         if self.statistics.shape[1] == 0:
             self.statistics = torch.zeros(len(STATISTICS), n, device=device)
@@ -123,7 +123,7 @@ class Strategy:
             raise ValueError(f"the strategy follows {self.statistics.shape[1]} surfels, but {n} were rendered")
         self.statistics = self.statistics.to(device)
         grad_sum, abs_grad_sum, visible_count, max_radius = self.statistics
-        height, width = output.rgb.shape[:2]
+        height, width = projection.camera.height, projection.camera.width
         if cuda_backend(device):
             note_centers(projection, width, height, grad_sum, abs_grad_sum, visible_count, max_radius)
             return

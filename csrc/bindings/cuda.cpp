@@ -7,6 +7,7 @@
 #include "cuda/baked.h"
 #include "cuda/kernels.h"
 #include "cuda/training.h"
+#include "cuda/training_view.h"
 
 namespace bt::cuda {
 namespace {
@@ -37,6 +38,35 @@ void bind_operation(nb::module_& m, const std::string& name, void (*run)(const A
   });
 }
 
+// Arguments of a call of their own, as all arguments of one dictionary.
+template <class S> void bind_adam(nb::module_& m, const std::string& name) {
+  m.def(
+      name.c_str(),
+      [name](const nb::list& parameters, uint64_t stream) {
+        std::vector<AdamRow<S>> rows;
+        for (nb::handle each : parameters) {
+          Reader r(name, nb::cast<nb::kwargs>(each), kCard);
+          rows.push_back(read<AdamRow<S>>(r));
+        }
+        adam(rows.data(), int(rows.size()), reinterpret_cast<Stream>(uintptr_t(stream)));
+      },
+      "parameters"_a, "stream"_a = 0, "Steps Adam on parameters, a dictionary of arguments for each.");
+}
+template <class S> void bind_training_view(nb::module_& m) {
+  const auto name = [](const char* base) { return std::string(base) + kSuffix<S>; };
+  bind_class<TrainingView<S>>(m, name("TrainingView"), kCard, "A training view (csrc/cuda/training_view.h).")
+      .def(
+          "count",
+          [](const Held<TrainingView<S>>& view, uint64_t stream) {
+            const nb::gil_scoped_release others_run;
+            return count_view<S>(view, reinterpret_cast<Stream>(uintptr_t(stream)));
+          },
+          "stream"_a = 0, "Project the surfels; wait for the number of pairs and return it.");
+  bind_operation(m, name("draw_view"), &draw_view<S>);
+  bind_operation(m, name("differentiate_view"), &differentiate_view<S>);
+  m.def(name("training_view_workspace").c_str(), &training_view_workspace<S>, "n"_a, "width"_a, "height"_a);
+}
+
 template <class S> void bind_operations(nb::module_& m) {
   const auto name = [](const char* base) { return std::string(base) + kSuffix<S>; };
   bind_class<FieldArrays<S>>(m, name("Field"), kCard, "The parameters of a residual field.");
@@ -52,10 +82,13 @@ template <class S> void bind_operations(nb::module_& m) {
   bind_operation(m, name("picture_loss"), &picture_loss<S>);
   bind_operation(m, name("picture_loss_backward"), &picture_loss_backward<S>);
   bind_operation(m, name("note_centers"), &note_centers<S>);
+  bind_adam<S>(m, name("adam"));
+  bind_training_view<S>(m);
   // bytes of working memory
   m.def(name("bin_count_workspace").c_str(), &bin_count_workspace<S>, "n"_a);
   m.def(name("bin_fill_workspace").c_str(), &bin_fill_workspace, "pairs"_a, "width"_a, "height"_a);
   m.def(name("trace_mark_workspace").c_str(), &trace_mark_workspace, "pairs"_a);
+  m.def(name("picture_loss_workspace").c_str(), &picture_workspace<S>, "height"_a, "width"_a);
   m.def(name("ssim_workspace").c_str(), &ssim_workspace<S>, "height"_a, "width"_a, "channels"_a, "gradient"_a);
 }
 
@@ -107,7 +140,7 @@ void bind_all(nb::module_& m) {
   bind_baked(m);
   m.attr("TILE_WARPS") = kTileWarps;
   m.attr("TRACE_SUMS") = kTraceSums;
-  m.attr("LOSS_SUMS") = kLossSums * kMostSums;
+  m.def("training_pairs_workspace", &training_pairs_workspace, "pairs"_a, "width"_a, "height"_a, "alpha"_a, "wide"_a);
   m.attr("MLP_WORK") = int64_t(kMostBlocks) * kMlpWeights;
   m.def("exact_size", &exact_size, "entries"_a, "Numbers of exact_work, int64.");
 }
@@ -119,6 +152,9 @@ NB_MODULE(_emulated, m) {
   m.doc() = "The CUDA kernels, thread by thread on the host: for tests.";
   m.def("set_seed", &bt::emulator::set_seed, nanobind::arg("seed"),
         "Seed of the order in which blocks and their threads take turns.");
+  m.def("set_idle", &bt::emulator::set_idle, nanobind::arg("idle"),
+        "Make launches return at once: for timing the host.");
+  m.def("launches", &bt::emulator::launches, "Kernels launched so far.");
   m.def("stale_numbers", &bt::emulator::stale_numbers, "Threads that read another block's values in shared memory.");
   m.def("open_barrier", &bt::emulator::open_barrier, "A kernel whose threads wait for one that does not come.");
   m.def("read_float4", &bt::emulator::read_float4, nanobind::arg("offset"), "A kernel that may read misaligned.");

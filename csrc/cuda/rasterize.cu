@@ -297,7 +297,7 @@ template <class S> void rasterize_backward(const RasterizeBackward<S>& a, Stream
   sum_slots<Held<S>::kColors>(p, static_cast<const S*>(a.color_partial), StoreColorGradient<S>{a.table.base, a.dbase},
                               stream);
   if (a.texel_sums) {
-    const MoveTexel<S, false> color = {a.texel_sums, {}, a.share, a.rate, a.moved};
+    const MoveTexel<S, false> color = {a.texel_sums, {}, a.share, a.rate, a.moved, nullptr};
     each_shown_texel(p, a.table, PutTexel<S>{color, a.dtexel_alpha}, stream);
   }
 }

@@ -1,7 +1,8 @@
-// Losses and densification statistics of a training step; see training.h.
+// Losses, densification statistics and Adam of a training step; see training.h.
 #include <cmath>
 
 #include "core/common.h"
+#include "cuda/kernels.h"
 #include "cuda/training.h"
 #include "cuda/warp.h"
 
@@ -9,80 +10,162 @@ namespace bt::cuda {
 
 namespace {
 constexpr int kThreads = 256;
+constexpr int kMostSums = 1024, kLossSums = 3;  // blocks; of l1, right and count
 
 template <class S> BT_HD S sign_(S x) {
   return x > S(0) ? S(1) : x < S(0) ? S(-1) : x;  // keeps 0 and NaN
 }
 
+template <class S> BT_HD bool counts(const Picture<S>& p, int64_t i) { return !p.mask || p.mask[i]; }
+
+// Working memory of the forward and the backward pass.
+template <class S> struct PictureSpace {
+  static constexpr int kCorrected = 12;  // most numbers of a correction
+  double *loss_sums, *correction_sums;   // [kMostSums, kLossSums], [kMostSums, kCorrected]
+  S *similarity, *counted;               // [1]
+  S *shown, *wanted, *dsimilarity;       // [pixels, 3]
+  Workspace ssim;
+  PictureSpace(Arena& arena, int height, int width) {
+    const int64_t pixels = int64_t(height) * width, bytes = ssim_workspace<S>(height, width, 3, true);
+    loss_sums = arena.take<double>(kMostSums * kLossSums);
+    correction_sums = arena.take<double>(kMostSums * kCorrected);
+    similarity = arena.take<S>(1), counted = arena.take<S>(1);
+    shown = arena.take<S>(3 * pixels), wanted = arena.take<S>(3 * pixels), dsimilarity = arena.take<S>(3 * pixels);
+    ssim = {arena.take<char>(bytes), bytes};
+  }
+};
+template <class S> PictureSpace<S> picture_space(const Picture<S>& p) {
+  Arena arena(p.workspace.of(picture_workspace<S>(p.height, p.width)));
+  return PictureSpace<S>(arena, p.height, p.width);
+}
+
+// Applies the correction and adds the background; masked-out pixels are made equal in both pictures.
+template <class S> __global__ void __launch_bounds__(kThreads) show_kernel(Picture<S> p, PictureSpace<S> to) {
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i >= p.pixels()) return;
+  const S *from = p.image + i * kImageChannels, alpha = from[3];
+  const bool counting = counts(p, i);
+  for (int k = 0; k < 3; ++k) {
+    S value = from[k];
+    if (p.corrected == 3) value *= p.correction[k];
+    if (p.corrected == 12) {
+      const S* row = p.correction + 4 * k;
+      value = from[0] * row[0] + from[1] * row[1] + from[2] * row[2] + alpha * row[3];
+    }
+    if (p.background) value += (S(1) - alpha) * p.background[k];
+    to.shown[3 * i + k] = counting ? value : S(0);
+    to.wanted[3 * i + k] = counting ? p.target[3 * i + k] : S(0);
+  }
+}
+
 template <class S> struct Error {
   S d[3], l1, omega;
 };
-template <class S> BT_HD Error<S> error_at(const Picture<S>& p, int64_t i) {
+template <class S> BT_HD Error<S> error_at(const PictureSpace<S>& of, S gamma, int64_t i) {
   Error<S> e;
   e.l1 = S(0);
   for (int k = 0; k < 3; ++k) {
-    e.d[k] = p.image[i * kImageChannels + k] - p.target[3 * i + k];
+    e.d[k] = of.shown[3 * i + k] - of.wanted[3 * i + k];
     e.l1 += e.d[k] < S(0) ? -e.d[k] : e.d[k];
   }
-  e.omega = S(exp(-p.gamma * e.l1));
+  e.omega = S(exp(-gamma * e.l1));
   return e;
 }
 
 // Sums over the block, to thread 0.
-__device__ void add_up(double (&own)[kLossSums], double (*total)[kThreads]) {
-  for (int k = 0; k < kLossSums; ++k) own[k] = block_sum<kThreads>(own[k], total[k]);
+template <int kSums> __device__ void add_up(double (&own)[kSums], double (*total)[kThreads]) {
+  BT_UNROLL
+  for (int k = 0; k < kSums; ++k) own[k] = block_sum<kThreads>(own[k], total[k]);
 }
 
-template <class S> BT_HD bool counts(const Picture<S>& p, int64_t i) { return !p.mask || p.mask[i]; }
-
-template <class S> __global__ void __launch_bounds__(kThreads) sums_kernel(Picture<S> p, double* sums) {
+template <class S> __global__ void __launch_bounds__(kThreads) sums_kernel(Picture<S> p, PictureSpace<S> of) {
   __shared__ double total[kLossSums][kThreads];
   double own[kLossSums] = {};
   const int64_t step = int64_t(gridDim.x) * kThreads;
-  for (int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x; i < p.pixels; i += step) {
+  for (int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x; i < p.pixels(); i += step) {
     if (!counts(p, i)) continue;
-    const Error<S> e = error_at(p, i);
+    const Error<S> e = error_at(of, p.gamma, i);
     own[0] += double(e.l1), own[1] += double(e.omega * p.image[i * kImageChannels + 4]), own[2] += 1;
   }
   add_up(own, total);
   if (threadIdx.x) return;
-  for (int k = 0; k < kLossSums; ++k) sums[kLossSums * blockIdx.x + k] = own[k];
+  for (int k = 0; k < kLossSums; ++k) of.loss_sums[kLossSums * blockIdx.x + k] = own[k];
 }
 
 template <class S>
 __global__ void __launch_bounds__(kThreads)
-    loss_kernel(int blocks, const double* __restrict__ sums, S share, S weight, const S* __restrict__ similarity,
-                S* photometric, S* falloff, S* counted) {
+    loss_kernel(int blocks, Picture<S> p, PictureSpace<S> of, S* photometric, S* falloff) {
   __shared__ double total[kLossSums][kThreads];
   double own[kLossSums] = {};
   for (int i = int(threadIdx.x); i < blocks; i += kThreads)
-    for (int k = 0; k < kLossSums; ++k) own[k] += sums[kLossSums * i + k];
+    for (int k = 0; k < kLossSums; ++k) own[k] += of.loss_sums[kLossSums * i + k];
   add_up(own, total);
   if (threadIdx.x) return;
   const double count = own[2] > 1 ? own[2] : 1;
   const S l1 = S(own[0] / (3.0 * count)), right = S(own[1] / count);
-  *counted = S(count);
-  *photometric = (S(1) - share) * l1 + share * (S(1) - *similarity);
-  *falloff = weight * right;
+  *of.counted = S(count);
+  *photometric = (S(1) - p.share) * l1 + p.share * (S(1) - *of.similarity);
+  *falloff = p.weight * right;
 }
 
-template <class S>
+template <class S, bool kCorrected>
 __global__ void __launch_bounds__(kThreads)
-    gradient_kernel(Picture<S> p, S share, S weight, const S* __restrict__ dsimilarity,
-                    const S* __restrict__ dphotometric, const S* __restrict__ dfalloff, const S* __restrict__ counted,
-                    S* __restrict__ dimage) {
-  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i >= p.pixels) return;
-  S* to = dimage + i * kImageChannels;
-  if (!counts(p, i)) {
-    for (int k = 0; k < kImageChannels; ++k) to[k] = S(0);
-    return;
+    gradient_kernel(Picture<S> p, PictureSpace<S> of, const S* __restrict__ dphotometric,
+                    const S* __restrict__ dfalloff, S* __restrict__ dimage) {
+  constexpr int kSums = kCorrected ? PictureSpace<S>::kCorrected : 1;
+  double own[kSums] = {};
+  const S l1 = *dphotometric * (S(1) - p.share) / (S(3) * *of.counted), similar = *dphotometric * p.share;
+  const S right = *dfalloff * p.weight / *of.counted;
+  const int64_t step = int64_t(gridDim.x) * kThreads;
+  for (int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x; i < p.pixels(); i += step) {
+    S* to = dimage + i * kImageChannels;
+    if (!counts(p, i)) {
+      for (int k = 0; k < kImageChannels; ++k) to[k] = S(0);
+      continue;
+    }
+    const Error<S> e = error_at(of, p.gamma, i);
+    const S* from = p.image + i * kImageChannels;
+    S d[3], dalpha = S(0);
+    BT_UNROLL
+    for (int k = 0; k < 3; ++k) {
+      d[k] = l1 * sign_(e.d[k]) - similar * of.dsimilarity[3 * i + k];
+      if (p.background) dalpha -= d[k] * p.background[k];
+    }
+    BT_UNROLL
+    for (int k = 0; k < 3; ++k) {
+      S dk = d[k];
+      if constexpr (kCorrected) {
+        if (p.corrected == 3) {
+          own[k] += double(dk * from[k]), dk *= p.correction[k];
+        } else {
+          BT_UNROLL
+          for (int j = 0; j < 4; ++j) own[4 * k + j] += double(d[k] * from[j]);
+          dalpha += d[k] * p.correction[4 * k + 3];
+          dk = d[0] * p.correction[k] + d[1] * p.correction[4 + k] + d[2] * p.correction[8 + k];
+        }
+      }
+      to[k] = dk;
+    }
+    to[3] = dalpha;
+    to[4] = right * e.omega;
   }
-  const Error<S> e = error_at(p, i);
-  const S l1 = *dphotometric * (S(1) - share) / (S(3) * *counted), similar = *dphotometric * share;
-  for (int k = 0; k < 3; ++k) to[k] = l1 * sign_(e.d[k]) - similar * dsimilarity[3 * i + k];
-  to[3] = S(0);
-  to[4] = *dfalloff * weight / *counted * e.omega;
+  if constexpr (kCorrected) {
+    __shared__ double total[kSums][kThreads];
+    add_up(own, total);
+    if (threadIdx.x == 0)
+      for (int k = 0; k < kSums; ++k) of.correction_sums[kSums * blockIdx.x + k] = own[k];
+  }
+}
+template <class S>
+__global__ void __launch_bounds__(kThreads) correction_kernel(int blocks, int corrected, const double* sums, S* to) {
+  constexpr int kSums = PictureSpace<S>::kCorrected;
+  __shared__ double total[kSums][kThreads];
+  double own[kSums] = {};
+  for (int i = int(threadIdx.x); i < blocks; i += kThreads)
+    for (int k = 0; k < kSums; ++k) own[k] += sums[kSums * i + k];
+  add_up(own, total);
+  if (threadIdx.x == 0)
+    for (int k = 0; k < corrected; ++k) to[k] = S(own[k]);
 }
 
 template <class S> BT_HD float length_(S x, S y) {
@@ -103,27 +186,88 @@ template <class S> __global__ void __launch_bounds__(kThreads) note_kernel(NoteC
 }
 
 dim3 blocks_for(int64_t n) { return dim3(unsigned(ceil_div(n, kThreads))); }
+int sum_blocks(int64_t n) { return int(min_(ceil_div(n, kThreads), int64_t(kMostSums))); }
+
+// Parameters of one launch; each has the blocks from first_block on.
+constexpr int kAdamEach = 4;  // numbers per thread
+template <class S> struct AdamRows {
+  AdamRow<S> rows[kAdamRows];
+  unsigned first_block[kAdamRows];
+  int count;
+};
+template <class S> __global__ void __launch_bounds__(kThreads) count_kernel(AdamRows<S> a) {
+  if (int(threadIdx.x) < a.count) *a.rows[threadIdx.x].step += 1.0f;
+}
+template <class S> __global__ void __launch_bounds__(kThreads) adam_kernel(AdamRows<S> a) {
+  int of = a.count - 1;
+  while (blockIdx.x < a.first_block[of]) --of;
+  const AdamRow<S>& r = a.rows[of];
+  const double step = double(*r.step);
+  const S rate = S(r.rate / (1.0 - pow(r.beta1, step))), root = S(1.0 / sqrt(1.0 - pow(r.beta2, step)));
+  const S keep1 = S(1.0 - r.beta1), keep2 = S(1.0 - r.beta2), beta2 = S(r.beta2), eps = S(r.eps);
+  const int64_t first = int64_t(blockIdx.x - a.first_block[of]) * (kThreads * kAdamEach) + threadIdx.x;
+  BT_UNROLL
+  for (int k = 0; k < kAdamEach; ++k) {
+    const int64_t i = first + k * kThreads;
+    if (i >= r.count) return;
+    const S g = r.gradient[i], m = r.mean[i] + keep1 * (g - r.mean[i]), v = beta2 * r.square[i] + keep2 * g * g;
+    r.mean[i] = m, r.square[i] = v;
+    const S moved = rate * m / (S(sqrt(v)) * root + eps);
+    r.parameter[i] -= r.factors ? r.factors[i / r.width] * moved : moved;
+  }
+}
 }  // namespace
 
+template <class S> int64_t picture_workspace(int height, int width) {
+  Arena arena(nullptr);
+  const PictureSpace<S> space(arena, height, width);
+  return arena.used();
+}
+
 template <class S> void picture_loss(const PictureLoss<S>& a, Stream stream) {
-  const int64_t wanted = ceil_div(a.picture.pixels, kThreads);
-  const int blocks = int(wanted < kMostSums ? wanted : kMostSums);
-  if (blocks) BT_LAUNCH(sums_kernel<S>, dim3(unsigned(blocks)), dim3(kThreads), 0, stream, a.picture, a.sums);
-  BT_LAUNCH(loss_kernel<S>, dim3(1), dim3(kThreads), 0, stream, blocks, a.sums, a.share, a.weight, a.similarity,
-            a.photometric, a.falloff, a.counted);
+  const Picture<S>& p = a.picture;
+  const PictureSpace<S> space = picture_space(p);
+  if (p.pixels()) BT_LAUNCH(show_kernel<S>, blocks_for(p.pixels()), dim3(kThreads), 0, stream, p, space);
+  ssim(Ssim<S>{p.height, p.width, 3, space.shown, space.wanted, space.similarity, space.dsimilarity, space.ssim},
+       stream);
+  const int blocks = sum_blocks(p.pixels());
+  if (blocks) BT_LAUNCH(sums_kernel<S>, dim3(unsigned(blocks)), dim3(kThreads), 0, stream, p, space);
+  BT_LAUNCH(loss_kernel<S>, dim3(1), dim3(kThreads), 0, stream, blocks, p, space, a.photometric, a.falloff);
 }
 
 template <class S> void picture_loss_backward(const PictureLossBackward<S>& a, Stream stream) {
-  if (!a.picture.pixels) return;
-  BT_LAUNCH(gradient_kernel<S>, blocks_for(a.picture.pixels), dim3(kThreads), 0, stream, a.picture, a.share, a.weight,
-            a.dsimilarity, a.dphotometric, a.dfalloff, a.counted, a.dimage);
+  const Picture<S>& p = a.picture;
+  const PictureSpace<S> space = picture_space(p);
+  const int blocks = sum_blocks(p.pixels());
+  const auto run = p.corrected ? gradient_kernel<S, true> : gradient_kernel<S, false>;
+  if (blocks)
+    BT_LAUNCH(run, dim3(unsigned(blocks)), dim3(kThreads), 0, stream, p, space, a.dphotometric, a.dfalloff, a.dimage);
+  if (a.dcorrection)
+    BT_LAUNCH(correction_kernel<S>, dim3(1), dim3(kThreads), 0, stream, blocks, p.corrected, space.correction_sums,
+              a.dcorrection);
 }
 
 template <class S> void note_centers(const NoteCenters<S>& a, Stream stream) {
   if (a.n) BT_LAUNCH(note_kernel<S>, blocks_for(a.n), dim3(kThreads), 0, stream, a);
 }
 
+template <class S> void adam(const AdamRow<S>* rows, int count, Stream stream) {
+  for (int from = 0; from < count; from += kAdamRows) {
+    AdamRows<S> a = {};
+    a.count = min_(count - from, kAdamRows);
+    unsigned blocks = 0;
+    for (int i = 0; i < a.count; ++i) {
+      a.rows[i] = rows[from + i], a.first_block[i] = blocks;
+      blocks += unsigned(ceil_div(a.rows[i].count, kThreads * kAdamEach));
+    }
+    BT_LAUNCH(count_kernel<S>, dim3(1), dim3(kThreads), 0, stream, a);
+    if (blocks) BT_LAUNCH(adam_kernel<S>, dim3(blocks), dim3(kThreads), 0, stream, a);
+  }
+}
+
 #define BT_INSTANTIATE(S)                                                     \
+  template int64_t picture_workspace<S>(int, int);                            \
+  template void adam(const AdamRow<S>*, int, Stream);                         \
   template void picture_loss(const PictureLoss<S>&, Stream);                  \
   template void picture_loss_backward(const PictureLossBackward<S>&, Stream); \
   template void note_centers(const NoteCenters<S>&, Stream);

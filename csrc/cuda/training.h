@@ -1,5 +1,5 @@
-// Losses and statistics of a training step, for all surfels and pixels at once; torch would need about fifty small
-// operations, whose launches take longer than the operations.
+// Losses, statistics and Adam of a training step, for all surfels and pixels at once; torch would need about fifty
+// small operations, whose launches take longer than the operations.
 #pragma once
 
 #include "core/blend.h"
@@ -8,57 +8,64 @@
 
 namespace bt::cuda {
 
-// image [pixels, kImageChannels]: rgb, alpha and beta; target [pixels, 3]; mask [pixels], 0 for pixels that do not
-// count, null: all count. The losses of `train.losses.objective`: l1 is the mean of |rgb - target|, right that of omega
-// beta, omega = exp(-gamma e), e = |rgb - target| summed over rgb.
+// A rendered picture: image [height, width, kImageChannels] of rgb over black, alpha and beta; its photograph target
+// [height, width, 3]; mask [height, width], 0 for pixels that do not count, null: all count. background [3] is the
+// colour behind the scene, null: black. correction maps the scene's colour to the photograph's, see
+// `train.views.View`: gains [3] or matrix and offset [3, 4]; null: none. The losses are those of
+// `train.losses.objective`: l1 is the mean of |shown - target|, right that of omega beta, omega = exp(-gamma e),
+// e = |shown - target| summed over rgb. The forward pass leaves in `workspace` what the backward pass reads.
 template <class S> struct Picture {
-  int64_t pixels;
-  const S *image, *target;
+  int height, width, corrected;  // numbers of the correction: 0, 3 or 12
+  const S *image, *target, *background, *correction;
   const uint8_t* mask;
-  S gamma;
+  S gamma, share, weight;
+  Workspace workspace;
 
+  BT_HD int64_t pixels() const { return int64_t(height) * width; }
   template <class R> void fields(R& r) {
-    r.rows("image", image, pixels, kImageChannels);
-    r.array("target", target, 3 * pixels);
-    r.maybe("mask", mask, pixels);
-    r.numbers("gamma", gamma);
+    r.array("image", image, pixels() * kImageChannels);
+    compared(r);
+    r.memory("picture_work", workspace);
+  }
+  // All but the image and working memory.
+  template <class R> void compared(R& r) {
+    r.array("target", target, 3 * pixels());
+    r.maybe("mask", mask, pixels());
+    r.maybe("background", background, 3);
+    r.number("corrected", corrected);
+    if (corrected != 0 && corrected != 3 && corrected != 12) r.refuse("a correction has 3 or 12 numbers");
+    r.maybe("correction", correction, corrected);
+    if (!corrected != !correction) r.refuse("the correction's numbers are missing");
+    r.numbers("gamma", gamma, "share", share, "weight", weight);
   }
 };
+template <class S> int64_t picture_workspace(int height, int width);
 
-// Writes photometric = (1 - share) l1 + share (1 - similarity), falloff = weight right, and counted, the number of
-// pixels that count, at least 1; [1] each. sums is working memory.
-constexpr int kMostSums = 1024, kLossSums = 3;  // blocks; of l1, right and count
+// Writes photometric = (1 - share) l1 + share (1 - similarity) and falloff = weight right; [1] each.
 template <class S> struct PictureLoss {
   Picture<S> picture;
-  S share, weight;
-  const S* similarity;  // [1]
-  double* sums;         // [kMostSums, kLossSums]
-  S *photometric, *falloff, *counted;
+  S *photometric, *falloff;
 
   template <class R> void fields(R& r) {
+    r.numbers("height", picture.height, "width", picture.width);
     picture.fields(r);
-    r.numbers("share", share, "weight", weight);
-    r.array("similarity", similarity, 1);
-    r.array("sums", sums, kLossSums * kMostSums);
-    r.arrays(1, "photometric", photometric, "falloff", falloff, "counted", counted);
+    r.arrays(1, "photometric", photometric, "falloff", falloff);
   }
 };
 template <class S> void picture_loss(const PictureLoss<S>& a, Stream stream);
 
-// Writes dimage from the gradients of both losses [1] and that of the similarity with respect to rgb [pixels, 3]; omega
-// is a constant.
+// Writes dimage, and dcorrection unless null, from the gradients of both losses [1]; omega is a constant.
 template <class S> struct PictureLossBackward {
   Picture<S> picture;
-  S share, weight;
-  const S *dsimilarity, *dphotometric, *dfalloff, *counted;
-  S* dimage;
+  const S *dphotometric, *dfalloff;
+  S *dimage, *dcorrection;
 
   template <class R> void fields(R& r) {
+    r.numbers("height", picture.height, "width", picture.width);
     picture.fields(r);
-    r.numbers("share", share, "weight", weight);
-    r.array("dsimilarity", dsimilarity, 3 * picture.pixels);
-    r.arrays(1, "dphotometric", dphotometric, "dfalloff", dfalloff, "counted", counted);
-    r.array("dimage", dimage, picture.pixels * kImageChannels);
+    r.arrays(1, "dphotometric", dphotometric, "dfalloff", dfalloff);
+    r.array("dimage", dimage, picture.pixels() * kImageChannels);
+    r.maybe("dcorrection", dcorrection, picture.corrected);
   }
 };
 template <class S> void picture_loss_backward(const PictureLossBackward<S>& a, Stream stream);
@@ -80,5 +87,28 @@ template <class S> struct NoteCenters {
   }
 };
 template <class S> void note_centers(const NoteCenters<S>& a, Stream stream);
+
+// A parameter of `count` numbers in rows of `width`, and Adam's state of it. The update of a row is multiplied by its
+// factor; null: 1. step [1] is the number of steps done.
+template <class S> struct AdamRow {
+  S *parameter, *mean, *square;
+  float* step;
+  const S *gradient, *factors;
+  int64_t count, width;
+  double rate, beta1, beta2, eps;
+
+  template <class R> void fields(R& r) {
+    r.rows("parameter", parameter, count, 1);
+    r.arrays(count, "mean", mean, "square", square, "gradient", gradient);
+    r.array("step", step, 1);
+    r.number("width", width);
+    if (width < 1 || count % width) r.refuse("the parameter's rows have another width");
+    r.maybe("factors", factors, count / width);
+    r.numbers("rate", rate, "beta1", beta1, "beta2", beta2, "eps", eps);
+  }
+};
+// Steps Adam on all rows of all parameters in one launch per kAdamRows of them.
+constexpr int kAdamRows = 16;
+template <class S> void adam(const AdamRow<S>* rows, int count, Stream stream);
 
 }  // namespace bt::cuda

@@ -18,10 +18,14 @@ template <class S> struct TexelTiles {
   const S* values;       // [texels, 3]
 
   template <class R> void fields(R& r) {
+    tiles(r);
+    r.array("base", base, 3 * n);
+  }
+  // All but the view colours.
+  template <class R> void tiles(R& r) {
     r.rows("first", first, n, 1);
     r.array("size", size, 2 * n);
     r.array("extent", extent, n);
-    r.array("base", base, 3 * n);
     r.rows("texels", values, texels, 3);
   }
 };

@@ -62,8 +62,9 @@ class Bench:
             mean2d_grad=pixels[0],
             mean2d_absgrad=pixels[1],
             radii=torch.as_tensor(radius, dtype=torch.float32).expand(n)[:, None].expand(n, 2),
+            camera=SimpleNamespace(width=200, height=100),
         )
-        self.strategy.accumulate(SimpleNamespace(projection=projection, rgb=torch.zeros(100, 200, 3)))
+        self.strategy.accumulate(projection)
 
     def step(self, at):
         return self.strategy.step(at, self.scene, self.optimizers, self.views)

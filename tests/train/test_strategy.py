@@ -57,8 +57,9 @@ def test_statistics_are_means_over_the_views_that_saw_a_surfel(bench):
     projection = SimpleNamespace(
         visible=torch.tensor([True]), radii=torch.ones(1, 2),
         mean2d_grad=torch.tensor([[3.0, 4.0]]), mean2d_absgrad=torch.tensor([[6.0, 8.0]]),
+        camera=SimpleNamespace(width=20, height=10),
     )  # fmt: skip
-    b.strategy.accumulate(SimpleNamespace(projection=projection, rgb=torch.zeros(10, 20, 3)))
+    b.strategy.accumulate(projection)
     assert statistics(b)["grad_sum"].item() == pytest.approx(math.hypot(30, 20))
     assert statistics(b)["abs_grad_sum"].item() == pytest.approx(math.hypot(60, 40))
 

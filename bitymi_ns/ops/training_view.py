@@ -1,0 +1,193 @@
+"""A training view with its losses by CUDA kernels, as one differentiable function (csrc/cuda/training_view.h).
+
+The results are those of `project`, `view_color`, `rasterize_image`, `train.views.shown` and
+`train.losses.objective`. Called one by one, these take the host several times as long as the GPU.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from .backend import dense, kernel, kernel_class, module, on_device, require, stream_of, workspace
+from .blend import checked_texels
+from .constants import FRAME, GEOM
+from .picture_cuda import Photograph
+from .project import GEOMETRY, Camera, Prefilter, Projection, checked_geometry, rigid_gradient
+from .texel import TexelAlpha, TexelDescent, TexelTiles, gradient_or_step
+from .trace_cuda import check_pair_count
+from .view_color import check_view_color, lettered
+from .view_kinds import entry_of
+
+
+@dataclass(frozen=True)
+class ComparedView:
+    """A drawn view, compared with its photograph.
+
+    Attributes:
+        photometric, falloff: the weighted losses, scalars.
+        projection: projected surfels.
+    """
+
+    photometric: Tensor
+    falloff: Tensor
+    projection: Projection
+
+
+@dataclass
+class _Drawing:
+    """Arguments of `_TrainingView` without gradients, and the projection that it makes."""
+
+    camera: Camera
+    photograph: Photograph
+    kind: str
+    near: float
+    prefilter: Prefilter
+    rim: float
+    tiles: TexelTiles
+    bound: float
+    moves: bool
+    descent: TexelDescent | None
+    projection: Projection | None = None
+
+
+class _TrainingView(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, drawing, viewmat, center, correction, texels, alpha, *surfels):
+        camera, means = drawing.camera, dense(surfels[0], surfels[0])
+        n, device, entry = len(means), means.device, entry_of(drawing.kind)
+        geometry, colors = surfels[: len(GEOMETRY)], [dense(t, means) for t in surfels[len(GEOMETRY) :]]
+        inputs = {name: dense(t, means) for name, t in zip(GEOMETRY, geometry, strict=True)}
+        textured = {**drawing.tiles.arrays, "texels": dense(texels, means)}
+        if alpha is not None:
+            textured |= {"texel_alpha": dense(alpha, means), "alpha_bound": drawing.bound}
+        size = {"width": camera.width, "height": camera.height}
+        geom, frames, radii = (means.new_empty(n, k) for k in (GEOM, FRAME, 2))
+        broken = torch.empty(1, dtype=torch.int32, device=device)
+        photometric, falloff = means.new_empty(2).unbind()
+        view = kernel_class("TrainingView", means)(
+            **inputs,
+            **lettered(colors),
+            **textured,
+            **drawing.photograph.arguments(means, correction),
+            **size,
+            viewmat=dense(viewmat, means),
+            K=dense(camera.K, means),
+            center=dense(center, center.double()).to(device),
+            near=drawing.near,
+            rim=drawing.rim,
+            bound=drawing.bound,
+            moves=int(drawing.moves),
+            prefilter=drawing.prefilter,
+            kind=drawing.kind,
+            terms=entry.terms(dict(zip(entry.names, colors, strict=True))),
+            geom=geom,
+            frames=frames,
+            radii=radii,
+            broken=broken,
+            photometric=photometric,
+            falloff=falloff,
+            memory=workspace("training_view", means, n=n, **size),
+        )
+        with on_device(device):
+            pairs = view.count(stream=stream_of(device))
+            check_pair_count(pairs, camera)
+            wide = means.dtype == torch.float64
+            needed = module(device).training_pairs_workspace(pairs, **size, alpha=alpha is not None, wide=wide)
+        ctx.drawn = {"view": view, "pairs": pairs}
+        ctx.drawn["pair_memory"] = torch.empty(needed, dtype=torch.uint8, device=device)
+        kernel("draw_view", means)(**ctx.drawn)
+        ctx.save_for_backward(viewmat, correction, texels, alpha, *inputs.values(), *colors)
+        drawing.projection = Projection(geom, frames, radii, camera, drawing.near, drawing.prefilter, broken)
+        ctx.drawing = drawing
+        return photometric, falloff
+
+    @staticmethod
+    def backward(ctx, dphotometric, dfalloff):
+        viewmat, correction, texels, alpha, *surfels = ctx.saved_tensors
+        moves_camera, _, corrects, has_texels, has_alpha = ctx.needs_input_grad[1:6]
+        means, gradients = surfels[0], [torch.empty_like(t) for t in surfels]
+        geometry, colors = gradients[: len(GEOMETRY)], gradients[len(GEOMETRY) :]
+        dtexels, step = gradient_or_step(texels, has_texels, ctx.drawing.descent)
+        dalpha = torch.empty_like(alpha) if has_alpha else None
+        if "moved" in step or dalpha is not None:
+            step["texel_work"] = means.new_empty(4 * len(texels))
+        dcorrection = means.new_empty(correction.shape) if corrects else None
+        dgeom, absgrad = means.new_empty(len(means), GEOM), means.new_empty(len(means), 2)
+        dmeans_color = torch.empty_like(means)
+        kernel("differentiate_view", means)(
+            **ctx.drawn,
+            **step,
+            **{f"d{name}": gradient for name, gradient in zip(GEOMETRY, geometry, strict=True)},
+            **lettered(colors, "d"),
+            dphotometric=dense(dphotometric, means),
+            dfalloff=dense(dfalloff, means),
+            dtexel_alpha=dalpha,
+            dcorrection=dcorrection,
+            dgeom=dgeom,
+            absgrad=absgrad,
+            dmeans_color=dmeans_color,
+        )
+        ctx.drawing.projection.take_mean2d(dgeom[:, :2], absgrad)
+        dviewmat = dcenter = None
+        if moves_camera:
+            dviewmat = rigid_gradient(means, surfels[1], geometry[0], geometry[1], viewmat)
+            dcenter = -dmeans_color.sum(0, dtype=torch.float64)
+        geometry[0] += dmeans_color
+        return None, dviewmat, dcenter, dcorrection, dtexels, dalpha, *gradients
+
+
+def training_view(
+    kind: str,
+    surfels: Mapping[str, Tensor],
+    camera: Camera,
+    photograph: Photograph,
+    correction: Tensor | None = None,
+    texels: Tensor | None = None,
+    tiles: TexelTiles | None = None,
+    bound: float = 0.0,
+    move_surfels: bool = True,
+    descent: TexelDescent | None = None,
+    alpha: TexelAlpha | None = None,
+    near: float = 0.2,
+    prefilter: Prefilter = "low_pass",
+    rim: float = 1e-3,
+) -> ComparedView:
+    """Draw a view over the photograph's background, as the photograph is exposed, and compare both.
+
+    Differentiable in the surfels, the camera's pose (see `project`), the correction, texels and alpha texels. The
+    backward pass fills `mean2d_grad` and `mean2d_absgrad` of the projection. Only sums over texels depend on the
+    thread order.
+
+    Args:
+        kind: of the view colours, see `view_color`.
+        surfels: parameters by name: `GEOMETRY` and those of the view colours.
+        photograph: of the camera's size, at least as large as a window of SSIM.
+        correction: of the photograph, [3] or [3, 4], see `train.views.View`; None: none.
+        texels, tiles, bound, move_surfels, descent: as in `blended_image`.
+        alpha: alpha texels, of the same tiles; None: opaque.
+        camera, near, prefilter: as in `project`.
+        rim: as in `trace`.
+
+    Raises:
+        RuntimeError: 2^31 pairs of surfel and tile or more, or not a CUDA device.
+        ValueError: as `project`, `view_color`, `picture_losses` and `blended_image`.
+    """
+    require("training_view", "cuda", surfels["means"].device, "call `Scene.render` and `train.losses.objective`")
+    geometry = checked_geometry(*(surfels[name] for name in GEOMETRY), camera)
+    means = geometry[0]
+    check_view_color(kind, surfels, len(means))
+    photograph.check(means, (camera.height, camera.width))
+    texels, tiles, moves, descent = checked_texels(means, len(means), means, texels, tiles, move_surfels, descent)
+    if alpha is not None and alpha.tiles.first is not tiles.first:
+        raise ValueError("the alphas of texels lie in other tiles than their colours")
+    surfel_inputs = (*geometry, *entry_of(kind).of(surfels))
+    if descent is not None and not means.requires_grad:
+        surfel_inputs = (means.detach().requires_grad_(), *surfel_inputs[1:])  # see `rasterize_image`
+    drawing = _Drawing(camera, photograph, kind, near, prefilter, rim, tiles, bound, moves, descent)
+    values = None if alpha is None else alpha.values
+    losses = _TrainingView.apply(
+        drawing, camera.viewmat, camera.exact_center, correction, texels, values, *surfel_inputs
+    )
+    return ComparedView(*losses, drawing.projection)

@@ -1,0 +1,157 @@
+// The calls of training_view.h.
+#include "cuda/training_view.h"
+
+namespace bt::cuda {
+
+namespace {
+constexpr int kThreads = 256;
+
+// Arrays that last from the first call of a view to the last.
+template <class S> struct ViewSpace {
+  S *base, *dbase;                    // [n, 3]
+  uint8_t* active;                    // [n]
+  int32_t* order;                     // [n]
+  int64_t* slot_start;                // [n + 1]
+  S *image, *dimage, *transmittance;  // [pixels, kImageChannels], [pixels]
+  Workspace count, picture;
+  ViewSpace(Arena& arena, int64_t n, int width, int height) {
+    const int64_t pixels = int64_t(width) * height;
+    base = arena.take<S>(3 * n), dbase = arena.take<S>(3 * n);
+    active = arena.take<uint8_t>(n), order = arena.take<int32_t>(n), slot_start = arena.take<int64_t>(n + 1);
+    image = arena.take<S>(kImageChannels * pixels), dimage = arena.take<S>(kImageChannels * pixels);
+    transmittance = arena.take<S>(pixels);
+    count.bytes = bin_count_workspace<S>(n), count.at = arena.take<char>(count.bytes);
+    picture.bytes = picture_workspace<S>(height, width), picture.at = arena.take<char>(picture.bytes);
+  }
+};
+template <class S> struct PairSpace {
+  int32_t *slot, *surfel, *differing;  // [pairs], [pairs], [1]
+  int64_t* tile_pairs;                 // [tiles + 1]
+  uint32_t *masks, *cuts;              // [kTileWarps, pairs]; cuts is null without alpha texels
+  S *partial, *color_partial;          // [pairs, kTraceSums], [pairs, 4]
+  Workspace fill;
+  PairSpace(Arena& arena, int64_t pairs, int width, int height, bool alpha) {
+    slot = arena.take<int32_t>(pairs), surfel = arena.take<int32_t>(pairs), differing = arena.take<int32_t>(1);
+    tile_pairs = arena.take<int64_t>(tiles_of(width, height) + 1);
+    masks = arena.take<uint32_t>(kTileWarps * pairs);
+    cuts = alpha ? arena.take<uint32_t>(kTileWarps * pairs) : nullptr;
+    partial = arena.take<S>(kTraceSums * pairs), color_partial = arena.take<S>(4 * pairs);
+    fill.bytes = bin_fill_workspace(pairs, width, height), fill.at = arena.take<char>(fill.bytes);
+  }
+};
+
+// A view with its arrays.
+template <class S> struct Spaces {
+  TrainingView<S> v;
+  ViewSpace<S> of;
+
+  explicit Spaces(const TrainingView<S>& view) : v(view), of(cut(view)) {
+    v.table.base = of.base, v.picture.image = of.image, v.picture.workspace = of.picture;
+  }
+  PairSpace<S> pairs(const DrawView<S>& drawn) const {
+    const bool alpha = v.alpha.values;
+    const int64_t bytes = training_pairs_workspace(drawn.pairs, v.width, v.height, alpha, sizeof(S) == 8);
+    Arena arena(drawn.pair_memory.of(bytes));
+    return PairSpace<S>(arena, drawn.pairs, v.width, v.height, alpha);
+  }
+  View<S> view() const { return {v.surfels.n, v.geom, v.radii, v.width, v.height, v.near, v.prefilter, S(1)}; }
+  Directions<S> directions() const { return {v.surfels.n, v.surfels.means, v.center, of.active}; }
+
+ private:
+  static ViewSpace<S> cut(const TrainingView<S>& v) {
+    Arena arena(v.memory.of(training_view_workspace<S>(v.surfels.n, v.width, v.height)));
+    return ViewSpace<S>(arena, v.surfels.n, v.width, v.height);
+  }
+};
+
+template <class S>
+__global__ void __launch_bounds__(kThreads) active_kernel(int64_t n, const S* radii, uint8_t* active) {
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i < n) active[i] = radii[2 * i] > S(0);
+}
+
+// Reads one number from the device, after all that is enqueued.
+int64_t read_number(const int64_t* at, Stream stream) {
+#if defined(__CUDACC__)
+  int64_t value;
+  check(cudaMemcpyAsync(&value, at, sizeof value, cudaMemcpyDeviceToHost, static_cast<cudaStream_t>(stream)), "read");
+  check(cudaStreamSynchronize(static_cast<cudaStream_t>(stream)), "wait for the number of pairs");
+  return value;
+#else
+  (void)stream;
+  return *at;
+#endif
+}
+}  // namespace
+
+template <class S> int64_t training_view_workspace(int64_t n, int width, int height) {
+  Arena arena(nullptr);
+  const ViewSpace<S> space(arena, n, width, height);
+  return arena.used();
+}
+int64_t training_pairs_workspace(int64_t pairs, int width, int height, bool alpha, bool wide) {
+  Arena arena(nullptr);
+  if (wide)
+    PairSpace<double>(arena, pairs, width, height, alpha);
+  else
+    PairSpace<float>(arena, pairs, width, height, alpha);
+  return arena.used();
+}
+
+template <class S> int64_t count_view(const TrainingView<S>& a, Stream stream) {
+  const Spaces<S> s(a);
+  const int64_t n = a.surfels.n;
+  fill_zero(a.broken, 1, stream);
+  project_forward(ProjectForward<S>{a.surfels, a.viewmat, a.K, a.width, a.height, a.near, a.prefilter, S(1), a.geom,
+                                    a.frames, a.radii, a.broken},
+                  stream);
+  if (n)
+    BT_LAUNCH(active_kernel<S>, dim3(unsigned(ceil_div(n, kThreads))), dim3(kThreads), 0, stream, n, a.radii,
+              s.of.active);
+  ViewColorForward<S> colors = {};
+  colors.to = s.directions(), colors.colors.whole = a.colors, colors.out = s.of.base;
+  view_color_forward(colors, stream);
+  bin_count(BinCount<S>{s.view(), s.of.order, s.of.slot_start, s.of.count}, stream);
+  return read_number(s.of.slot_start + n, stream);
+}
+
+template <class S> void draw_view(const DrawView<S>& a, Stream stream) {
+  const Spaces<S> s(*a.view);
+  const PairSpace<S> p = s.pairs(a);
+  bin_fill(
+      BinFill<S>{s.view(), s.of.order, s.of.slot_start, a.pairs, p.slot, p.surfel, p.tile_pairs, p.differing, p.fill},
+      stream);
+  rasterize_forward(RasterizeForward<S>{s.view(), s.v.alpha, s.v.table, s.v.bound, a.pairs, p.surfel, p.tile_pairs,
+                                        p.masks, p.cuts, s.of.image, s.of.transmittance},
+                    stream);
+  picture_loss(PictureLoss<S>{s.v.picture, s.v.photometric, s.v.falloff}, stream);
+}
+
+template <class S> void differentiate_view(const DifferentiateView<S>& a, Stream stream) {
+  const Spaces<S> s(*a.drawn.view);
+  const PairSpace<S> p = s.pairs(a.drawn);
+  const TrainingView<S>& v = s.v;
+  picture_loss_backward(PictureLossBackward<S>{v.picture, a.dphotometric, a.dfalloff, s.of.dimage, a.dcorrection},
+                        stream);
+  const Pairs layout = {v.width, v.height, v.surfels.n,  a.drawn.pairs, p.surfel,        p.slot,
+                        p.masks, nullptr,  p.tile_pairs, s.of.order,    s.of.slot_start, -1};
+  RasterizeBackward<S> r = {};
+  r.view = s.view(), r.rim = v.rim, r.alpha = v.alpha, r.table = v.table, r.bound = v.bound, r.layout = layout;
+  r.cuts = p.cuts, r.transmittance = s.of.transmittance, r.dimage = s.of.dimage;
+  r.share = a.share, r.rate = a.rate, r.moves = v.moves;
+  r.partial = p.partial, r.color_partial = p.color_partial, r.texel_sums = a.texel_sums;
+  r.dgeom = a.dgeom, r.absgrad = a.absgrad, r.dbase = s.of.dbase, r.moved = a.moved, r.dtexel_alpha = a.dtexel_alpha;
+  rasterize_backward(r, stream);
+  view_color_backward(ViewColorBackward<S>{s.directions(), v.colors, s.of.dbase, a.dcolors, a.dmeans_color}, stream);
+  project_backward(ProjectBackward<S>{v.surfels, v.viewmat, v.K, v.geom, a.dgeom, nullptr, a.out}, stream);
+}
+
+#define BT_INSTANTIATE(S)                                         \
+  template int64_t training_view_workspace<S>(int64_t, int, int); \
+  template int64_t count_view(const TrainingView<S>&, Stream);    \
+  template void draw_view(const DrawView<S>&, Stream);            \
+  template void differentiate_view(const DifferentiateView<S>&, Stream);
+BT_INSTANTIATE(float)
+BT_INSTANTIATE(double)
+
+}  // namespace bt::cuda

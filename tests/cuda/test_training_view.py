@@ -1,0 +1,161 @@
+"""A training view by one function on CUDA, against the CPU's renders and losses."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from bitymi_ns import ops
+from bitymi_ns.ops.picture_cuda import Photograph
+from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.texel import TexelDescent
+from bitymi_ns.ops.training_view import ComparedView, training_view
+from bitymi_ns.ops.view_kinds import VIEW_COLORS
+from bitymi_ns.scene import Camera, Scene, SceneConfig
+from bitymi_ns.scene.field import TexelField
+from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.divergence import LossWatch
+from bitymi_ns.train.schedules import Schedule
+from bitymi_ns.train.step import view_losses
+from bitymi_ns.train.views import View
+from tests.ops.golden import SceneCase, random_scene
+
+WIDTH, HEIGHT = 37, 21
+CORRECTIONS = {
+    "none": None,
+    "gains": [1.2, 0.8, 1.1],
+    "affine": [[1.1, 0.1, 0.0, 0.02], [0.0, 0.9, -0.1, 0.0], [0.05, 0.0, 1.0, -0.03]],
+}
+
+
+def scene_of(case: SceneCase, kind: str, texture: str, prefilter: str) -> Scene:
+    """Build a float64 scene with view colours of a kind and tiles of random texels."""
+    g = torch.Generator().manual_seed(4)
+    n = len(case.params["means"])
+    config = SceneConfig(view_color=kind, weight_bound=0.02, near=0.2, prefilter=prefilter)
+    colors = VIEW_COLORS[kind].first_values(torch.rand(n, 3, generator=g) - 0.5, config, g)
+    colors = {name: value + 0.3 * torch.randn(value.shape, generator=g) for name, value in colors.items()}
+    params = {name: value.double() for name, value in ({name: case.params[name] for name in GEOMETRY} | colors).items()}
+    field = None
+    if texture != "none":
+        size = torch.randint(1, 6, (n, 2), generator=g)
+        count = int(size.prod(1).sum())
+        texels, share = 0.2 * torch.randn(count, 3, generator=g), torch.rand(count, generator=g).double()
+        alphas = 0.5 + torch.rand(count, generator=g).double() if texture == "alpha" else None
+        field = TexelField(size, 1.0 + torch.rand(n, generator=g).double(), texels.double(), share, alphas)
+        if texture == "moved":
+            field.descent = TexelDescent(field.share, 0.7)
+    return Scene(config, params, field)
+
+
+def compared(
+    device: torch.device,
+    kind: str = "sv",
+    texture: str = "none",
+    correction: str = "none",
+    masked: bool = False,
+    background: str = "black",
+    prefilter: str = "low_pass",
+) -> dict[str, Tensor]:
+    """Compute the losses of a view, their gradients, texels after it and the statistics of the projection."""
+    case = random_scene(30, 5, WIDTH, HEIGHT)
+    scene = scene_of(case, kind, texture, prefilter).to(device)
+    if texture == "moved":
+        scene.field.descent = TexelDescent(scene.field.share, 0.7)
+    g = torch.Generator().manual_seed(7)
+    photo = torch.rand(HEIGHT, WIDTH, 3, generator=g).double().to(device)
+    mask = (torch.rand(HEIGHT, WIDTH, generator=g) < 0.7).to(device) if masked else None
+    if mask is not None:
+        photo[~mask] = math.nan
+    values = CORRECTIONS[correction]
+    gains = None if values is None else torch.tensor(values, dtype=torch.float64, device=device).requires_grad_()
+    pose = case.viewmat.double().to(device).requires_grad_()
+    camera = Camera(case.viewmat.double(), case.K.double(), WIDTH, HEIGHT).to(device).posed(pose)
+    config = TrainConfig(background=background, freeze_after=0, freeze_every=2, freeze_min_updates=1)
+    schedule = Schedule(config, 100)
+    step = 1 if texture == "frozen" else 2
+    terms, output = view_losses(scene, View(camera, photo, mask, gains), schedule, step, LossWatch())
+    (2.0 * terms["photometric"] + 3.0 * terms["falloff"]).backward()
+    assert isinstance(output, ComparedView) == ops.can_rasterize(device)
+    found = {f"gradient of {name}": p.grad for name, p in scene.named_parameters() if p.grad is not None}
+    found |= dict(terms) | {"gradient of the pose": pose.grad}
+    if gains is not None:
+        found["gradient of the correction"] = gains.grad
+    if scene.field is not None:
+        found["texels"] = scene.field.texels
+    found |= {name: getattr(output.projection, name) for name in ("mean2d_grad", "mean2d_absgrad", "visible", "broken")}
+    return {name: value.detach().cpu().double() for name, value in found.items()}
+
+
+CASES = [
+    *({"kind": kind} for kind in VIEW_COLORS),
+    *({"texture": texture} for texture in ("texels", "moved", "alpha", "frozen")),
+    *({"correction": correction, "background": "white"} for correction in ("gains", "affine")),
+    {"correction": "affine", "masked": True, "texture": "moved", "background": "random"},
+    {"masked": True, "prefilter": "pixel", "texture": "alpha", "correction": "gains"},
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: "-".join(f"{value}" for value in case.values()))
+def test_losses_and_gradients_equal_those_of_the_cpu(case: dict[str, Any], device: torch.device, cpu) -> None:
+    got = compared(device, **case)
+    with cpu():
+        want = compared(torch.device("cpu"), **case)
+    assert got.keys() == want.keys() and ("gradient of field.texels" in want) == (
+        case.get("texture") in ("texels", "alpha")
+    )
+    for name, value in want.items():
+        assert (got[name] - value).abs().max() <= 1e-9 * value.abs().max(), name
+
+
+def test_single_precision_is_near(device: torch.device, cpu, monkeypatch: pytest.MonkeyPatch) -> None:
+    def single() -> Tensor:
+        scene = scene_of(random_scene(30, 5, WIDTH, HEIGHT), "sv", "texels", "low_pass").float().to(device)
+        case = random_scene(30, 5, WIDTH, HEIGHT)
+        camera = Camera(case.viewmat.float(), case.K.float(), WIDTH, HEIGHT).to(device)
+        photo = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(7)).to(device)
+        terms, _ = view_losses(scene, View(camera, photo), Schedule(TrainConfig(), 100), 0, LossWatch())
+        sum(terms.values()).backward()
+        return torch.cat([p.grad.flatten().cpu() for p in scene.parameters()])
+
+    got = single()
+    monkeypatch.setattr(Scene, "compare", lambda *_: None)
+    assert (got - single()).abs().max() < 1e-5 * got.abs().max()
+
+
+def test_a_view_without_surfels_or_texels_in_it(device: torch.device) -> None:
+    case = random_scene(5, 5, WIDTH, HEIGHT)
+    scene = scene_of(case, "sv", "texels", "low_pass").to(device)
+    with torch.no_grad():
+        scene.surfels["means"] -= 1e6 * case.viewmat[2, :3].double().to(device)  # behind the camera
+    camera = Camera(case.viewmat.double(), case.K.double(), WIDTH, HEIGHT).to(device)
+    photo = torch.rand(HEIGHT, WIDTH, 3).double().to(device)
+    terms, output = view_losses(scene, View(camera, photo), Schedule(TrainConfig(), 100), 0, LossWatch())
+    sum(terms.values()).backward()
+    assert terms["photometric"] > 0 and all(p.grad.isfinite().all() for p in scene.parameters())
+    assert not output.projection.mean2d_absgrad.any()
+
+
+def test_wrong_arguments_are_named(device: torch.device) -> None:
+    case = random_scene(5, 5, WIDTH, HEIGHT)
+    scene = scene_of(case, "sv", "alpha", "low_pass").to(device)
+    camera = Camera(case.viewmat.double(), case.K.double(), WIDTH, HEIGHT).to(device)
+    photo = torch.rand(HEIGHT, WIDTH, 3).double().to(device)
+
+    def call(target: Tensor = photo, correction: Tensor | None = None, **options: Any) -> None:
+        photograph = Photograph(target, None, None, 0.2, 0.5, 4.0)
+        training_view("sv", scene.surfels, camera, photograph, correction, **options)
+
+    with pytest.raises(ValueError, match="the photograph"):
+        call(photo[1:])
+    with pytest.raises(ValueError, match="3 or 12 numbers"):
+        call(correction=photo.new_ones(4))
+    texture, alpha = scene.field.texture(0.0, True), scene.field.opacity(0.0, True)
+    others = replace(alpha.tiles, first=alpha.tiles.first.clone())
+    with pytest.raises(ValueError, match="other tiles"):
+        call(alpha=replace(alpha, tiles=others), **texture)
+    with pytest.raises(ValueError, match="view_colour|view colour"):
+        training_view("none", scene.surfels, camera, Photograph(photo, None, None, 0.2, 0.5, 4.0))

@@ -10,7 +10,6 @@ alternating medians (median polish), which are robust to highlights, occluders a
 others in a photograph are ignored there.
 """
 
-import copy
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,15 +17,13 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn import Parameter
-from torch.nn.functional import embedding, max_pool2d
-from torch.optim import SparseAdam
+from torch.nn.functional import max_pool2d
 
 from bitymi_ns.capture.order import Neighbours
+from bitymi_ns.ops.backend import dense, kernel
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.config import ExposureKind
-from bitymi_ns.train.optimizers import set_rate
-from bitymi_ns.train.processes import Processes
+from bitymi_ns.train.processes import ALONE, Processes
 from bitymi_ns.train.views import OnDemand, View, as_float
 
 LIMIT = 2.0  # largest log gain: 7.4 times as bright, about 6 stops in gamma-encoded colours
@@ -36,6 +33,7 @@ EXPLAINED = 0.1
 EXIF_SPREAD = 0.03  # without enough points, `auto` corrects photographs if their EXIF gains deviate by this (0.1 stop)
 PRIOR_POINTS = 20  # weight of the EXIF prior (mean exposure if unknown), in points
 BETAS = (0.9, 0.99)  # Adam's betas: a photograph is used once per epoch, so averages must be short
+EPS = 1e-8  # Adam's epsilon
 ENCODING = 2.2  # gamma of encoded colours
 
 # comparison at the points
@@ -70,14 +68,17 @@ class Exposure:
                 photograph, and `at` knows none.
         """
         self.kind: ExposureKind = kind
-        self.table: Parameter | None = None
+        self.table: Tensor | None = None
         self.decided = kind == "off"
         self.reason = ""
         self._exif = exif
         rows = {file: row for row, file in enumerate(dict.fromkeys(files or ()))}
         self._photographs = None if files is None else [rows[file] for file in files]
         self._neighbours = Neighbours(list(rows))
-        self._optimizer: SparseAdam | None = None
+        # Adam's moments [V, ...] and number of steps; photographs that a step does not use keep their moments
+        self._moments: tuple[Tensor, Tensor] | None = None
+        self._steps = 0
+        self._learning: list[tuple[int, Tensor]] = []
 
     def start(self, points: Tensor, views: Sequence[View], near: float) -> None:
         """Decide whether to correct photographs, and initialise the corrections.
@@ -128,9 +129,8 @@ class Exposure:
     def _begin(self, log_gains: Tensor, affine: bool) -> None:
         first = log_gains.new_zeros(len(log_gains), 12 if affine else 3)
         first[:, _diagonal(first)] = log_gains
-        self.table = Parameter(settled(first))
-        # sparse: photographs that a step does not use keep their moments
-        self._optimizer = SparseAdam([self.table], betas=BETAS)
+        self.table = settled(first)
+        self._moments, self._steps = (torch.zeros_like(self.table), torch.zeros_like(self.table)), 0
 
     @property
     def sentence(self) -> str:
@@ -144,14 +144,26 @@ class Exposure:
     @property
     def log_gains(self) -> Tensor | None:
         """Log gains [V, 3]; None: no corrections."""
-        return None if self.table is None else self.table.detach()[:, _diagonal(self.table)]
+        return None if self.table is None else self.table[:, _diagonal(self.table)]
+
+    def begin(self) -> None:
+        """Discard corrections that `learning` returned in an unfinished step."""
+        self._learning = []
 
     def of(self, number: int) -> Tensor | None:
         """Return the correction of a training view: [3] gains, or [3, 4] matrix and offset; None: no correction."""
-        if self.table is None:
-            return None
-        number = number if self._photographs is None else self._photographs[number]
-        return _correction(embedding(torch.full((), number, device=self.table.device), self.table, sparse=True))
+        return None if self.table is None else _correction(self.table[self._row(number)])
+
+    def learning(self, number: int, correction: Tensor | None) -> Tensor | None:
+        """Return the correction of a training view for a step, from `of`, as a leaf that gets a gradient."""
+        if correction is None or self.table is None:
+            return correction
+        leaf = correction.detach().requires_grad_()
+        self._learning.append((self._row(number), leaf))
+        return leaf
+
+    def _row(self, number: int) -> int:
+        return number if self._photographs is None else self._photographs[number]
 
     @torch.no_grad()
     def at(self, file: Path | None) -> Tensor | None:
@@ -164,36 +176,52 @@ class Exposure:
         return _correction(torch.lerp(self.table[before], self.table[after], share))
 
     @torch.no_grad()
-    def average(self, processes: Processes) -> None:
-        """Average the gradients over all views of the step."""
-        if self.table is None:
-            return
-        rows = self.table.new_zeros(len(self.table), self.table.shape[1] + 1)
-        if self.table.grad is not None:
-            own = self.table.grad.coalesce()
-            rows[own.indices()[0]] = torch.cat([own.values(), own.values().new_ones(len(own.values()), 1)], 1)
-        processes.sum(rows)
-        shown = rows[:, -1].nonzero().flatten()
-        if len(shown) > 0:
-            values = rows[shown, :-1] / processes.views
-            sizes = self.table.shape
-            self.table.grad = torch.sparse_coo_tensor(shown[None], values, sizes, check_invariants=False)
-
-    def step(self, rate: float) -> None:
-        """Update the corrections by their gradients, and clear these.
+    def step(self, rate: float, processes: Processes = ALONE) -> None:
+        """Update the corrections that `learning` returned by their gradients.
 
         Args:
             rate: learning rate of log gains and other entries.
+            processes: of the run, whose views the step averages over.
         """
-        if self.table is None or self._optimizer is None or self.table.grad is None:
+        learning, self._learning = self._learning, []
+        if self.table is None or self._moments is None:
             return
-        self.table.grad = self.table.grad.coalesce()
-        self.table.grad.values().nan_to_num_(0.0, 0.0, 0.0)
-        set_rate(self._optimizer, rate)
-        self._optimizer.step()
-        self._optimizer.zero_grad(set_to_none=True)
-        with torch.no_grad():
-            self.table.copy_(settled(self.table))
+        rows = [(row, leaf.grad.flatten()) for row, leaf in learning if leaf.grad is not None]
+        if processes.views > 1:
+            rows = self._averaged(rows, processes)
+        if not rows:
+            return
+        self._steps += 1
+        mean, square = self._moments
+        for number, (row, gradient) in enumerate(rows):
+            kernel("learn_exposure", self.table)(
+                table=self.table,
+                mean=mean,
+                square=square,
+                gradient=dense(gradient, self.table),
+                photographs=len(self.table),
+                width=self.table.shape[1],
+                number=row,
+                settle=int(number + 1 == len(rows)),
+                rate=rate,
+                beta1=BETAS[0],
+                beta2=BETAS[1],
+                eps=EPS,
+                step=self._steps,
+                limit=LIMIT,
+                other_limit=OTHER_LIMIT,
+            )
+
+    def _averaged(self, rows: Sequence[tuple[int, Tensor]], processes: Processes) -> list[tuple[int, Tensor]]:
+        """Average gradients, by row of the table, over all views of the step."""
+        assert self.table is not None
+        sums = self.table.new_zeros(len(self.table), self.table.shape[1] + 1)  # and the number of views
+        for row, gradient in rows:
+            sums[row, :-1] += gradient
+            sums[row, -1] += 1.0
+        processes.sum(sums)
+        seen = sums[:, -1].nonzero().flatten().tolist()
+        return [(row, sums[row, :-1] / processes.views) for row in seen]
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state for a resumed run: tensors, numbers and strings only."""
@@ -201,9 +229,17 @@ class Exposure:
             "kind": self.kind,
             "decided": self.decided,
             "finding": self.reason,
-            "table": None if self.table is None else self.table.detach().clone(),
-            "optimizer": None if self._optimizer is None else copy.deepcopy(self._optimizer.state_dict()),
+            "table": None if self.table is None else self.table.clone(),
+            "optimizer": self._optimizer_state(),
         }
+
+    def _optimizer_state(self) -> dict[str, Any] | None:
+        """Return Adam's state in the form of torch's optimisers."""
+        if self._moments is None:
+            return None
+        mean, square = (moment.clone() for moment in self._moments)
+        state = {0: {"step": self._steps, "exp_avg": mean, "exp_avg_sq": square}} if self._steps else {}
+        return {"state": state, "param_groups": [{"lr": 0.0, "betas": BETAS, "eps": EPS, "params": [0]}]}
 
     def load_state_dict(
         self, state: Mapping[str, Any] | None, count: int, device: torch.device | str | None = None
@@ -223,14 +259,16 @@ class Exposure:
             return
         self.decided, self.reason = bool(state["decided"]), str(state["finding"])
         if table is None:
-            self.table = self._optimizer = None
+            self.table = self._moments = None
             return
         self._begin(table[:, _diagonal(table)].to(device or table.device), table.shape[1] > 3)
-        assert self.table is not None and self._optimizer is not None
-        self.table.data.copy_(table)
-        groups = self._optimizer.state_dict()["param_groups"]  # with this run's options
-        moments = copy.deepcopy(state["optimizer"]["state"])
-        self._optimizer.load_state_dict({"state": moments, "param_groups": groups})
+        assert self.table is not None and self._moments is not None
+        self.table.copy_(table)
+        saved = state["optimizer"]["state"].get(0)
+        if saved is not None:
+            self._steps = int(saved["step"])
+            for moment, name in zip(self._moments, ("exp_avg", "exp_avg_sq"), strict=True):
+                moment.copy_(saved[name].to_dense())
 
 
 def restored(state: Mapping[str, Any] | None, views: int, files: Sequence[Path] | None = None) -> Exposure:

@@ -95,7 +95,7 @@ def _step_by_kernel(rows: Sequence[_Row]) -> None:
     device = rows[0].parameter.device
     arguments = [
         {
-            "parameter": row.parameter.detach(),
+            "parameter": row.parameter,
             "gradient": dense(row.gradient, row.parameter),
             "mean": row.mean,
             "square": row.square,

@@ -148,7 +148,8 @@ class Training:
     def view(self, index: int) -> View:
         """Return training view `index` on the device, at the resolution and pose of the current step."""
         view = self.views.at(index, self.schedule.resolution_factor(self.step))
-        return view._replace(camera=self.poses.learning(index, view.camera, self.step))
+        correction = self.exposure.learning(index, view.correction)
+        return view._replace(camera=self.poses.learning(index, view.camera, self.step), correction=correction)
 
     def begin(self, step: int) -> None:
         """Start the clock and set the learning rates of a step."""
@@ -157,6 +158,7 @@ class Training:
         self.clock.start()
         self.step = step
         self.poses.begin()
+        self.exposure.begin()
         if not self.exposure.decided:
             self.exposure.start(self.scene.surfels["means"], self._full_size, self.scene.near)
         if not self._synchronised:
@@ -215,7 +217,6 @@ class Training:
             learned = [parameter for group in groups for parameter in group["params"]]
             self.processes.average_gradients(learned, len(self.scene))
             self.texels.average()
-            self.exposure.average(self.processes)
         self.texels.step()
         return self.step_sizes.factors()
 
@@ -231,7 +232,7 @@ class Training:
         step, projections, photometric = self.step, self._projections, self._photometric
         assert projections, "a step is finished after its losses"
         self._projections, self._photometric = [], []
-        self.exposure.step(self.guard.factor * self.schedule.lr("exposure", step))
+        self.exposure.step(self.guard.factor * self.schedule.lr("exposure", step), self.processes)
         pixels = self.guard.factor * self.schedule.pose_pixels(step)
         self.poses.step(projections, pixels, self.processes)
         if not self.schedule.densification_over(step):

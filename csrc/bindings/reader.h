@@ -341,5 +341,6 @@ template <class S> constexpr const char* kSuffix = sizeof(S) == 4 ? "_f32" : "_f
   each(view_color_backward)   \
   each(field_forward)         \
   each(field_backward)        \
+  each(learn_exposure)        \
   each(ssim)
 // clang-format on

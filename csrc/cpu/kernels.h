@@ -156,6 +156,7 @@ template <class S> void field_backward(const FieldBackward<S>& a);
 
 template <class S> void blend_forward(const BlendForward<S, TileBlocks>& a);
 template <class S> void blend_backward(const BlendBackward<S, TileBlocks>& a);
+template <class S> void learn_exposure(const LearnExposure<S>& a);
 template <class S> void ssim(const Ssim<S>& a);
 
 // An atlas in the renderer's form: every surfel's tile contiguous, row by row. On pages each row of a tile would cost a

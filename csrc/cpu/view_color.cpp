@@ -1,6 +1,7 @@
-// View colours of surfels.
+// View colours of surfels, and corrections of photographs.
 #include "core/view_color.h"
 
+#include <algorithm>
 #include <stdexcept>
 #include <string>
 
@@ -138,7 +139,24 @@ template <class S> void view_color_backward(const ViewColorBackward<S>& a) {
   });
 }
 
+template <class S> void learn_exposure(const LearnExposure<S>& a) {
+  for (int column = 0; column < a.width; ++column) {
+    a.move(column);
+    if (!a.settle) continue;
+    const S limit = a.limit_of(column);
+    const auto entry = [&](int64_t i) -> S& { return a.table[i * a.width + column]; };
+    double sum = 0;
+    for (int64_t i = 0; i < a.photographs; ++i) sum += double(entry(i) = limited_entry(entry(i), limit));
+    const S mean = S(sum / double(a.photographs));
+    S largest = S(0);
+    for (int64_t i = 0; i < a.photographs; ++i) largest = std::max(largest, abs_(entry(i) -= mean));
+    const S over = std::max(largest / limit, S(1));
+    for (int64_t i = 0; i < a.photographs; ++i) entry(i) /= over;
+  }
+}
+
 #define BT_INSTANTIATE(S)                                       \
+  template void learn_exposure(const LearnExposure<S>&);        \
   template void view_color_forward(const ViewColorForward<S>&); \
   template void view_color_backward(const ViewColorBackward<S>&);
 BT_INSTANTIATE(float)

@@ -213,6 +213,8 @@ template <class S> void view_color_backward(const ViewColorBackward<S>& a, Strea
 template <class S> int64_t ssim_workspace(int height, int width, int channels, bool gradient);
 template <class S> void ssim(const Ssim<S>& a, Stream stream);
 
+template <class S> void learn_exposure(const LearnExposure<S>& a, Stream stream);
+
 template <class S> void field_forward(const FieldForward<S>& a, Stream stream);
 template <class S> void field_backward(const FieldBackward<S>& a, Stream stream);
 

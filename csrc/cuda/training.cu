@@ -1,6 +1,7 @@
 // Losses, densification statistics and Adam of a training step; see training.h.
 #include <cmath>
 
+#include "core/adam.h"
 #include "core/common.h"
 #include "cuda/kernels.h"
 #include "cuda/training.h"
@@ -202,18 +203,46 @@ template <class S> __global__ void __launch_bounds__(kThreads) adam_kernel(AdamR
   int of = a.count - 1;
   while (blockIdx.x < a.first_block[of]) --of;
   const AdamRow<S>& r = a.rows[of];
-  const double step = double(*r.step);
-  const S rate = S(r.rate / (1.0 - pow(r.beta1, step))), root = S(1.0 / sqrt(1.0 - pow(r.beta2, step)));
-  const S keep1 = S(1.0 - r.beta1), keep2 = S(1.0 - r.beta2), beta2 = S(r.beta2), eps = S(r.eps);
+  const AdamRates<S> rates = adam_rates<S>(r.rate, r.beta1, r.beta2, r.eps, double(*r.step));
   const int64_t first = int64_t(blockIdx.x - a.first_block[of]) * (kThreads * kAdamEach) + threadIdx.x;
   BT_UNROLL
   for (int k = 0; k < kAdamEach; ++k) {
     const int64_t i = first + k * kThreads;
     if (i >= r.count) return;
-    const S g = r.gradient[i], m = r.mean[i] + keep1 * (g - r.mean[i]), v = beta2 * r.square[i] + keep2 * g * g;
-    r.mean[i] = m, r.square[i] = v;
-    const S moved = rate * m / (S(sqrt(v)) * root + eps);
-    r.parameter[i] -= r.factors ? r.factors[i / r.width] * moved : moved;
+    const S moved = adam_step(rates, r.gradient[i], r.mean[i], r.square[i]);
+    r.parameter[i] += r.factors ? r.factors[i / r.width] * moved : moved;
+  }
+}
+
+// One block: first the row, then column after column of the table.
+template <class S> __global__ void __launch_bounds__(kThreads) exposure_kernel(LearnExposure<S> a) {
+  __shared__ double shared[kThreads];
+  const int thread = int(threadIdx.x);
+  if (thread < a.width) a.move(thread);
+  for (int column = 0; a.settle && column < a.width; ++column) {
+    __syncthreads();
+    const S limit = a.limit_of(column);
+    double sum = 0;
+    for (int64_t i = thread; i < a.photographs; i += kThreads)
+      sum += double(limited_entry(a.table[i * a.width + column], limit));
+    block_sum<kThreads>(sum, shared);
+    __syncthreads();
+    const S mean = S(shared[0] / double(a.photographs));
+    S largest = S(0);
+    for (int64_t i = thread; i < a.photographs; i += kThreads)
+      largest = max_(largest, abs_(limited_entry(a.table[i * a.width + column], limit) - mean));
+    __syncthreads();
+    shared[thread] = double(largest);
+    for (int half = kThreads / 2; half; half /= 2) {
+      __syncthreads();
+      if (thread < half) shared[thread] = max_(shared[thread], shared[thread + half]);
+    }
+    __syncthreads();
+    const S over = max_(S(shared[0]) / limit, S(1));
+    for (int64_t i = thread; i < a.photographs; i += kThreads) {
+      S& entry = a.table[i * a.width + column];
+      entry = (limited_entry(entry, limit) - mean) / over;
+    }
   }
 }
 }  // namespace
@@ -265,8 +294,13 @@ template <class S> void adam(const AdamRow<S>* rows, int count, Stream stream) {
   }
 }
 
+template <class S> void learn_exposure(const LearnExposure<S>& a, Stream stream) {
+  BT_LAUNCH(exposure_kernel<S>, dim3(1), dim3(kThreads), 0, stream, a);
+}
+
 #define BT_INSTANTIATE(S)                                                     \
   template int64_t picture_workspace<S>(int, int);                            \
+  template void learn_exposure(const LearnExposure<S>&, Stream);              \
   template void adam(const AdamRow<S>*, int, Stream);                         \
   template void picture_loss(const PictureLoss<S>&, Stream);                  \
   template void picture_loss_backward(const PictureLossBackward<S>&, Stream); \

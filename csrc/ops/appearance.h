@@ -1,6 +1,7 @@
 // Arguments of view colours and SSIM.
 #pragma once
 
+#include "core/adam.h"
 #include "core/view_color.h"
 #include "ops/arguments.h"
 
@@ -46,6 +47,35 @@ template <class S> struct ViewColorBackward {
     dcolors.kind = colors.kind, dcolors.terms = colors.terms;
     dcolors.arrays(r, to.n, "da", "db", "dc");
     r.array("dmeans", dmeans, 3 * to.n);
+  }
+};
+
+// Corrections of photographs, table [photographs, width] with Adam's state of them: steps on row `number` by the
+// gradient [width] of its correction, in which log gains are gains, and unless settle is 0, makes all rows admissible
+// as `train.exposure.settled`.
+template <class S> struct LearnExposure {
+  int64_t photographs, number;
+  int width, settle;
+  S *table, *mean, *square;
+  const S* gradient;
+  double rate, beta1, beta2, eps, step;
+  S limit, other_limit;  // of log gains and other entries
+
+  template <class R> void fields(R& r) {
+    r.numbers("photographs", photographs, "width", width, "number", number, "settle", settle);
+    if ((width != 3 && width != 12) || number < 0 || number >= photographs) r.refuse("there is no such correction");
+    r.arrays(photographs * width, "table", table, "mean", mean, "square", square);
+    r.array("gradient", gradient, width);
+    r.numbers("rate", rate, "beta1", beta1, "beta2", beta2, "eps", eps, "step", step);
+    r.numbers("limit", limit, "other_limit", other_limit);
+  }
+  BT_HD S limit_of(int column) const { return is_log_gain(width, column) ? limit : other_limit; }
+  // Steps on one entry of the row.
+  BT_HD void move(int column) const {
+    const int64_t at = number * width + column;
+    const S value = gradient[column], chained = is_log_gain(width, column) ? value * S(exp(table[at])) : value;
+    const AdamRates<S> rates = adam_rates<S>(rate, beta1, beta2, eps, step);
+    table[at] += adam_step(rates, chained - chained == S(0) ? chained : S(0), mean[at], square[at]);
   }
 };
 

@@ -1,0 +1,115 @@
+"""Print what a training step costs the host on CUDA: time, kernels, torch operations and waits, without a card.
+
+The emulator's kernels return at once and memory is cleared, so the time is that of Python, torch and the bindings; a
+card's launches and allocator add to it. `wait`: operations of torch that read from the device; the emulated device is
+the CPU, where losses are checked in every step, on a card every few.
+
+    python benchmarks/host.py [--exposure gain]
+"""
+
+import argparse
+import statistics
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import ModuleType
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from bitymi_ns.ops.backend import emulated_cuda, load
+from bitymi_ns.scene import Camera, SceneConfig
+from bitymi_ns.train.config import DensifyConfig, TexelConfig, TrainConfig
+from bitymi_ns.train.fit import Trainer
+from bitymi_ns.train.init import scene_for_views
+from bitymi_ns.train.views import View
+
+STEPS, TEXELS, MEASURED, COUNTED = 30_000, 600, 400, 20  # steps of the run, before texels, timed and counted
+READS = ("local_scalar_dense", "nonzero")
+VIEWED = ("detach", "view", "select", "slice", "unbind", "alias", "expand", "as_strided", "squeeze")  # launch nothing
+
+
+class Counted(TorchDispatchMode):
+    """Counts torch's operations by name."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: list[str] = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.names.append(func.overloadpacket.__name__)
+        return func(*args, **(kwargs or {}))
+
+    def per_step(self, names: tuple[str, ...]) -> float:
+        return sum(name.lstrip("_").startswith(names) for name in self.names) / COUNTED
+
+
+@contextmanager
+def idle(emulator: ModuleType) -> Iterator[None]:
+    """Make kernels return at once; new memory is cleared, so that counts that nobody wrote are 0."""
+    replaced = [(torch, "empty", torch.zeros), (torch, "empty_like", torch.zeros_like)]
+    replaced.append((Tensor, "new_empty", Tensor.new_zeros))
+    kept = [(where, name, getattr(where, name)) for where, name, _ in replaced]
+    emulator.set_idle(True)
+    try:
+        for where, name, value in replaced:
+            setattr(where, name, value)
+        yield
+    finally:
+        emulator.set_idle(False)
+        for where, name, value in kept:
+            setattr(where, name, value)
+
+
+def row(run: Trainer, emulator: ModuleType, stage: str) -> str:
+    """Measure steps of a run and return a row of the table."""
+    launched = emulator.launches()
+    with Counted() as counted:
+        for _ in range(COUNTED):
+            run.advance()
+    kernels = (emulator.launches() - launched) / COUNTED
+    times = []
+    for _ in range(MEASURED):
+        started = time.thread_time()
+        run.advance()
+        times.append(1e3 * (time.thread_time() - started))
+    viewed, waits = counted.per_step(VIEWED), counted.per_step(READS)
+    other = len(counted.names) / COUNTED - viewed - waits
+    figures = (f"{kernels:.0f}", f"{other:.0f}", f"{viewed:.0f}", f"{waits:.0f}")
+    return f"| {stage} | {statistics.median(times):.2f} | {min(times):.2f} | {' | '.join(figures)} |"
+
+
+def trainer(exposure: str) -> Trainer:
+    """Make a run of few surfels, whose texels start at once."""
+    g = torch.Generator().manual_seed(0)
+    points, colors = torch.rand(40, 3, generator=g) - 0.5, torch.rand(40, 3, generator=g)
+    viewmat, K = torch.eye(4), torch.tensor([[24.0, 0, 12], [0, 24, 12], [0, 0, 1]])
+    viewmat[2, 3] = 2.0
+    views = [View(Camera(viewmat, K, 24, 24), torch.rand(24, 24, 3, generator=g)) for _ in range(8)]
+    still = DensifyConfig(min_interval=STEPS, min_surfels=40, max_surfels=40)
+    config = TrainConfig(exposure=exposure, resolution_schedule=0, densify=still, texels=TexelConfig(start=TEXELS))
+    scene = scene_for_views(views, points, colors, SceneConfig(texture="texels"), config, STEPS)
+    return Trainer(scene, views, config, STEPS)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--exposure", default="off", choices=("off", "gain", "affine"))
+    exposure = parser.parse_args().exposure
+    torch.set_num_threads(1)
+    emulator = load("_emulated")
+    with emulated_cuda():
+        run = trainer(exposure)
+        print("| stage | ms of CPU time, median | least | kernels | other operations | views, detached | waits |")
+        print("|---|---:|---:|---:|---:|---:|---:|")
+        for stage, first in (("surfels", 0), ("texels", TEXELS)):
+            run.step = first
+            for _ in range(2):  # creates optimisers' states and tiles
+                run.advance()
+            with idle(emulator):
+                print(row(run, emulator, stage))
+
+
+if __name__ == "__main__":
+    main()

@@ -71,16 +71,23 @@ class _PictureLosses(torch.autograd.Function):
         pixels, size = dense(image, image), {"height": image.shape[0], "width": image.shape[1]}
         photometric, falloff = image.new_empty(2).unbind()
         memory = workspace("picture_loss", image, **size)
-        ctx.arguments = {**photograph.arguments(pixels), **size, "image": pixels, "picture_work": memory}
-        kernel("picture_loss", image)(**ctx.arguments, photometric=photometric, falloff=falloff)
+        ctx.arguments = {**photograph.arguments(pixels), **size}
+        written = {"photometric": photometric, "falloff": falloff, "picture_work": memory}
+        kernel("picture_loss", image)(**ctx.arguments, **written, image=pixels)
+        ctx.save_for_backward(pixels, memory)
         return photometric, falloff
 
     @staticmethod
     def backward(ctx, dphotometric, dfalloff):
-        image = ctx.arguments["image"]
+        image, memory = ctx.saved_tensors
         dimage = torch.empty_like(image)
         kernel("picture_loss_backward", image)(
-            **ctx.arguments, dphotometric=dense(dphotometric, image), dfalloff=dense(dfalloff, image), dimage=dimage
+            **ctx.arguments,
+            image=image,
+            picture_work=memory,
+            dphotometric=dense(dphotometric, image),
+            dfalloff=dense(dfalloff, image),
+            dimage=dimage,
         )
         return dimage, None
 

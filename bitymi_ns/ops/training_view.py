@@ -57,8 +57,8 @@ class _TrainingView(torch.autograd.Function):
     def forward(ctx, drawing, viewmat, center, correction, texels, alpha, *surfels):
         camera, means = drawing.camera, dense(surfels[0], surfels[0])
         n, device, entry = len(means), means.device, entry_of(drawing.kind)
-        geometry, colors = surfels[: len(GEOMETRY)], [dense(t, means) for t in surfels[len(GEOMETRY) :]]
-        inputs = {name: dense(t, means) for name, t in zip(GEOMETRY, geometry, strict=True)}
+        inputs = {name: dense(t, means) for name, t in zip(GEOMETRY, surfels, strict=False)}
+        colors = [dense(t, means) for t in surfels[len(GEOMETRY) :]]
         textured = {**drawing.tiles.arrays, "texels": dense(texels, means)}
         if alpha is not None:
             textured |= {"texel_alpha": dense(alpha, means), "alpha_bound": drawing.bound}
@@ -106,6 +106,8 @@ class _TrainingView(torch.autograd.Function):
     @staticmethod
     def backward(ctx, dphotometric, dfalloff):
         viewmat, correction, texels, alpha, *surfels = ctx.saved_tensors
+        drawn = ctx.drawn
+        del ctx.drawn  # frees its memory, as losses may outlive the step
         moves_camera, _, corrects, has_texels, has_alpha = ctx.needs_input_grad[1:6]
         means, gradients = surfels[0], [torch.empty_like(t) for t in surfels]
         geometry, colors = gradients[: len(GEOMETRY)], gradients[len(GEOMETRY) :]
@@ -117,7 +119,7 @@ class _TrainingView(torch.autograd.Function):
         dgeom, absgrad = means.new_empty(len(means), GEOM), means.new_empty(len(means), 2)
         dmeans_color = torch.empty_like(means)
         kernel("differentiate_view", means)(
-            **ctx.drawn,
+            **drawn,
             **step,
             **{f"d{name}": gradient for name, gradient in zip(GEOMETRY, geometry, strict=True)},
             **lettered(colors, "d"),

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import cached_property
 
 from bitymi_ns.ops.view_kinds import VIEW_PARAMETERS
 from bitymi_ns.ranges import check_ranges
@@ -71,7 +72,7 @@ class Schedule:
         """Number of steps of the texel stage."""
         return self.max_steps - self.texels_start
 
-    @property
+    @cached_property
     def short_run_gain(self) -> float:
         """Factor of the surfels' learning rates, above 1 in runs of fewer than 30,000 steps.
 

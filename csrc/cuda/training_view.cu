@@ -35,8 +35,10 @@ template <class S> struct PairSpace {
     tile_pairs = arena.take<int64_t>(tiles_of(width, height) + 1);
     masks = arena.take<uint32_t>(kTileWarps * pairs);
     cuts = alpha ? arena.take<uint32_t>(kTileWarps * pairs) : nullptr;
-    partial = arena.take<S>(kTraceSums * pairs), color_partial = arena.take<S>(4 * pairs);
-    fill.bytes = bin_fill_workspace(pairs, width, height), fill.at = arena.take<char>(fill.bytes);
+    fill.bytes = bin_fill_workspace(pairs, width, height);
+    partial = arena.take<S>(max_(kTraceSums * pairs, ceil_div(fill.bytes, int64_t(sizeof(S)))));
+    fill.at = partial;  // lists are sorted before sums are written
+    color_partial = arena.take<S>(4 * pairs);
   }
 };
 

@@ -1,0 +1,51 @@
+"""A run and its bundle of an earlier version, as users have them: they go on in this one."""
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from nerfstudio.scripts import train as ns_train
+
+from bitymi_ns.cli import main
+from tests.e2e.exports import evaluate, run_export
+from tests.e2e.runs import checkpoint, config_of
+
+STORED = Path(__file__).parent / "stored"
+"""Written by commit f4259ca8: 80 steps of `ns-train bitymi` on eight views of the sample room, with
+`--pipeline.model.train.exposure gain --pipeline.model.train.refine-poses on`, `ns-export bitymi-atlas`, and what
+`ns-eval` said of both, in dB."""
+TRAINED, REFINED, BUNDLE = 19.774, 19.779, 19.112
+
+
+@pytest.fixture
+def stored(tmp_path: Path) -> Path:
+    """Copy capture, run and bundle, with the folder that config.yml names."""
+    folder = Path(shutil.copytree(STORED, tmp_path / "stored"))
+    for config in folder.rglob("config.yml"):
+        config.write_text(re.sub(r"- /\n *- stored\n", f"- {folder}\n", config.read_text()))
+    return folder
+
+
+def test_the_run_is_evaluated_resumed_and_exported(stored: Path, tmp_path: Path) -> None:
+    run = stored / "outputs" / "stored" / "bitymi" / "run"
+    found = evaluate(run / "config.yml", tmp_path / "run.json")
+    assert found["refined_psnr"] == pytest.approx(REFINED, abs=0.02)
+    config = config_of(run)
+    run_export(config, tmp_path / "bundle", format="compact", finetune_steps=2)
+    assert evaluate(tmp_path / "bundle" / "config.yml", tmp_path / "new.json")["psnr"] > BUNDLE - 0.3
+    config.load_dir, config.max_num_iterations, config.timestamp = run / "nerfstudio_models", 90, "resumed"
+    ns_train.main(config)
+    before, after = checkpoint(config_of(run), 79), checkpoint(config, 89)
+    names = [name for name in before["pipeline"] if isinstance(before["pipeline"][name], torch.Tensor)]
+    assert names == [name for name in after["pipeline"] if isinstance(after["pipeline"][name], torch.Tensor)]
+    runs = [state["pipeline"]["_model._extra_state"]["run"] for state in (before, after)]
+    assert [int(each["exposure"]["optimizer"]["state"][0]["step"]) for each in runs] == [80, 90]
+    assert not torch.equal(*(each["poses"]["motions"] for each in runs))
+
+
+def test_the_bundle_is_shown_and_verified(stored: Path, tmp_path: Path) -> None:
+    found = evaluate(stored / "bundle" / "config.yml", tmp_path / "bundle.json")
+    assert found["psnr"] == pytest.approx(BUNDLE, abs=0.02)
+    assert main(["verify", str(stored / "bundle")]) == 0

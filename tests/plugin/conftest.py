@@ -10,7 +10,7 @@ pytest.importorskip("nerfstudio")
 
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.sample import generate
-from tests.captures import colmap_model
+from tests.formats import colmap
 
 
 @pytest.fixture(autouse=True)
@@ -39,7 +39,5 @@ def capture(original: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def project(capture: Path) -> Path:
     """The room as a COLMAP project, with a text model in sparse/0."""
-    colmap_model(capture, capture / "sparse/0")
-    for name in ("transforms.json", "sparse_pc.ply"):
-        (capture / name).unlink()
+    colmap(capture)
     return capture

@@ -23,7 +23,7 @@ from typing import Any
 
 import torch
 from harness import Arguments, means, say, table
-from scenes import Capture, load_capture
+from scenes import SplitCapture, load_capture
 
 from bitymi_ns.bake import BakeOptions, RefineOptions, TuneOptions, bake, export
 from bitymi_ns.bundle import read_bundle
@@ -124,7 +124,7 @@ class Calibration:
         return result, seconds / statistics.median(self.seconds)
 
 
-def run_seed(capture: Capture, seed: int, calibration: Calibration) -> dict[str, float]:
+def run_seed(capture: SplitCapture, seed: int, calibration: Calibration) -> dict[str, float]:
     """Measure the figures of one scene and seed."""
     config, background = TrainConfig(seed=seed), torch.zeros(3)
     cameras = [view.camera for view in capture.train]

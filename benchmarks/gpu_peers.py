@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 from harness import Arguments, Options, Rows, device_milliseconds, image_quality, means, number, publish, say
-from scenes import Capture, load_capture
+from scenes import SplitCapture, load_capture
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -90,7 +90,7 @@ def load() -> tuple[Any, str]:
     return gsplat, ""
 
 
-def first_gaussians(capture: Capture, most: int, extent: float) -> dict[str, Tensor]:
+def first_gaussians(capture: SplitCapture, most: int, extent: float) -> dict[str, Tensor]:
     """Initialise means, scales (logarithms), quats, opacities (logits), sh0 [N, 1, 3], shN [N, 15, 3] from points."""
     chosen = torch.randperm(len(capture.points), generator=torch.Generator().manual_seed(0))[:most]
     points, colours = capture.points[chosen], capture.colours[chosen]
@@ -118,7 +118,7 @@ def activated(p: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def train(
-    gsplat: Any, capture: Capture, most: int, steps: int, device: torch.device
+    gsplat: Any, capture: SplitCapture, most: int, steps: int, device: torch.device
 ) -> tuple[dict[str, Tensor], float]:
     """Train Gaussians on a capture with gsplat's MCMC strategy, which refines in the first 25/30 of the steps.
 
@@ -171,7 +171,7 @@ def picture(image: Tensor) -> Tensor:
 
 
 def row(
-    name: str, count: int, took: float | None, draws: Callable[[], Frames], capture: Capture, times: Times
+    name: str, count: int, took: float | None, draws: Callable[[], Frames], capture: SplitCapture, times: Times
 ) -> list[str]:
     """Measure the row of a renderer: primitives, seconds of training (None: not trained here), quality on the held-out
     views, and median milliseconds of a frame, averaged over cameras, by image size."""

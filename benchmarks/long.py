@@ -31,7 +31,7 @@ from harness import Arguments, image_quality, means, number, publish, say, table
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
-from scenes import Capture, load_capture
+from scenes import SplitCapture, load_capture
 from torch import Tensor
 
 from bitymi_ns import bake_scene
@@ -81,7 +81,7 @@ COLUMNS = {
 
 
 @dataclass(frozen=True)
-class Run:
+class LongRun:
     """One training run."""
 
     data: str
@@ -178,13 +178,13 @@ class TexelWatch:
 load = functools.lru_cache(maxsize=1)(load_capture)
 
 
-def cut(capture: Capture, photographs: int) -> Capture:
+def cut(capture: SplitCapture, photographs: int) -> SplitCapture:
     """Keep at most `photographs` training photographs (0 = all), evenly spaced; held-out ones do not change."""
     kept = spread(len(capture.train), photographs or len(capture.train))
     return replace(capture, train=[capture.train[i] for i in kept])
 
 
-def measure(run: Run) -> dict[str, Any]:
+def measure(run: LongRun) -> dict[str, Any]:
     """Train, evaluate and, if requested, bake a run."""
     preset = preset_of(run.row)
     preset.train.seed = run.seed
@@ -241,7 +241,7 @@ def measure(run: Run) -> dict[str, Any]:
 
 
 def bundle(
-    run: Run,
+    run: LongRun,
     scene: Scene,
     views: Sequence[View],
     held_out: Sequence[View],
@@ -260,7 +260,7 @@ def bundle(
     return found | quality(lambda camera: baked.render(camera.to(device), background), held_out, background)
 
 
-def tables(runs: Sequence[Run], cells: Cells) -> str:
+def tables(runs: Sequence[LongRun], cells: Cells) -> str:
     """Format a table per capture and kind of run: a line per row, means over seeds, standard deviation of the PSNR."""
     parts = []
     for group, members in itertools.groupby(runs, lambda run: (run.data, run.steps, run.reduction)):
@@ -287,7 +287,7 @@ PUBLISHED = Path(__file__).with_name("published.csv")
 pictures."""
 
 
-def draw_curves(runs: Sequence[Run], cells: Cells) -> Figure:
+def draw_curves(runs: Sequence[LongRun], cells: Cells) -> Figure:
     """Plot PSNR and LPIPS of the bundles of every run against their bytes; dashes: before the bake; crosses: PSNR that
     others publish of the same scenes."""
     figure = Figure(figsize=(10, 4), layout="constrained")
@@ -329,7 +329,7 @@ def main() -> None:
     baked = arguments.bake or arguments.keep is not None or bool(arguments.megabytes) or arguments.plot is not None
     rest = (baked, arguments.align, arguments.device, tuple(arguments.megabytes), arguments.keep)
     runs = [
-        Run(str(data), row, *(int(x) for x in run.split("/")), seed, arguments.photographs, *rest)
+        LongRun(str(data), row, *(int(x) for x in run.split("/")), seed, arguments.photographs, *rest)
         for data, run, row, seed in itertools.product(arguments.data, arguments.runs, arguments.rows, arguments.seeds)
     ]
     for row in arguments.rows:

@@ -149,7 +149,7 @@ def around(bundle: Bundle, width: int, height: int) -> list[Camera]:
 
 
 @dataclass
-class Capture:
+class SplitCapture:
     """A capture for training."""
 
     train: list[View]
@@ -164,7 +164,7 @@ class Capture:
         return [*self.train, *self.held_out]
 
 
-def load_capture(path: Path, downscale: int = 1) -> Capture:
+def load_capture(path: Path, downscale: int = 1) -> SplitCapture:
     """Read a capture, translated and scaled as in nerfstudio: the mean of the cameras is the origin, and their largest
     coordinate is 1. The orientation is kept.
 
@@ -190,4 +190,4 @@ def load_capture(path: Path, downscale: int = 1) -> Capture:
         return view._replace(camera=replace(view.camera, viewmat=viewmat.float()))
 
     points = ((points.double() - middle) * scale).float()
-    return Capture(list(map(moved, train)), list(map(moved, held_out)), points, colours, blender)
+    return SplitCapture(list(map(moved, train)), list(map(moved, held_out)), points, colours, blender)

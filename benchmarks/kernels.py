@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Compare each CPU kernel with the machine's ceilings, on a scene like a trained one (`harness.trained_like`).
+"""Compare each CPU kernel with the machine's ceilings, on a scene like a trained one (`scenes.trained_like`).
 
 The baked scene has a uint8 atlas with a tile per surfel, at one texel per pixel. Kernels are called through
 `bitymi_ns.ops`, as in training and rendering; median of --runs after two warm-up runs.

@@ -20,17 +20,13 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from common import arguments_of, number, page, publish, say, table
+from harness import Arguments, number, publish, say, table
 
 from bitymi_ns.measure.bench.process import CommandFailed, run_measured
 
 STAND_INS = ("IPython", "av", "fpsample", "gsplat", "open3d", "pathos", "pillow_heif", "plotly", "pymeshlab")
 STAND_INS += ("rawpy", "tensorly", "xatlas", "yourdfpy")
-IGNORED = (
-    "IPython.get_ipython",
-    "pillow_heif.register_heif_opener",
-    "tensorly.set_backend",
-)  # called at import time
+IGNORED = ("IPython.get_ipython", "pillow_heif.register_heif_opener", "tensorly.set_backend")  # called at import time
 
 SITE = '''"""Stand-ins, not the packages of these names: an attribute is a class, and to make one of it an error."""
 
@@ -208,11 +204,11 @@ def main() -> int:
     if sys.argv[1:2] == ["--waits"]:
         waits(sys.argv[2:])
         return 0
-    parser = arguments_of(__doc__)
+    parser = Arguments(__doc__)
     parser.add_argument("data", type=Path, help="folder of an undistorted capture with transforms.json")
     parser.add_argument("--steps", type=int, default=3000, help="length of the run (%(default)s)")
     parser.add_argument("--folder", type=Path, required=True, help="of runs, bundle and log; emptied first")
-    parser.add_argument("--output", type=Path, help="also write the Markdown to this file")
+    parser.add_output()
     parser.add_argument("--options", nargs="...", default=[], help="of ns-train, at the end")
     arguments = parser.parse_args()
     folder, capture = arguments.folder.resolve(), arguments.data.resolve()
@@ -224,7 +220,7 @@ def main() -> int:
         notes = [f"Stand-ins for {', '.join(STAND_INS)}."]
         for per_step in re.findall(r"waits per step: ([\d.]+)", logs):
             notes.append(f"Waits of the host for the card per step, nerfstudio's own included: {per_step}.")
-        publish(page(title, tables(folder, commands), notes), arguments.output)
+        publish(title, tables(folder, commands), notes, arguments.output)
 
     commands = Commands(folder, stand_in(folder / "stand-ins"), write)
     all_commands(capture, folder, arguments.steps, arguments.options, commands)

@@ -5,7 +5,6 @@ Training is chaotic: rounding alone moves one seed's PSNR by up to 0.13 dB, so t
 is compared. CPU seconds are divided by those of a calibration run in between, so that a busy or slower machine gives
 the same figures. `--accept` writes the figures to the baseline, benchmarks/gate.json."""
 
-import argparse
 import itertools
 import json
 import math
@@ -20,10 +19,24 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from plain_capture import Capture
+import torch
+from harness import Arguments, means, say, table
+from scenes import SplitCapture, load_capture
+
+from bitymi_ns.bake import BakeOptions, RefineOptions, TuneOptions, bake, export
+from bitymi_ns.bundle import read_bundle
+from bitymi_ns.files import write_file
+from bitymi_ns.measure.machine import processor
+from bitymi_ns.plugin.run import lpips
+from bitymi_ns.sample import generate
+from bitymi_ns.scene.config import SceneConfig
+from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.evaluate import evaluate
+from bitymi_ns.train.fit import fit
+from bitymi_ns.train.init import scene_for_views
+from bitymi_ns.train.losses import psnr
 
 BASELINE = Path(__file__).with_suffix(".json")
 THREADS = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
@@ -72,8 +85,6 @@ class Calibration:
     gather alone varies twice as much as training does when other programs share the caches."""
 
     def __init__(self) -> None:
-        import torch
-
         generator = torch.Generator().manual_seed(0)
         self._matrix = torch.randn(640, 640, generator=generator)
         self._keys = torch.rand(400_000, generator=generator)
@@ -113,20 +124,8 @@ class Calibration:
         return result, seconds / statistics.median(self.seconds)
 
 
-def run_seed(capture: "Capture", seed: int, calibration: Calibration) -> dict[str, float]:
+def run_seed(capture: SplitCapture, seed: int, calibration: Calibration) -> dict[str, float]:
     """Measure the figures of one scene and seed."""
-    import torch
-
-    from bitymi_ns.bake import BakeOptions, RefineOptions, TuneOptions, bake, export
-    from bitymi_ns.bundle import read_bundle
-    from bitymi_ns.plugin.run.lpips import LpipsUnavailable, lpips
-    from bitymi_ns.scene.config import SceneConfig
-    from bitymi_ns.train.config import TrainConfig
-    from bitymi_ns.train.evaluate import evaluate
-    from bitymi_ns.train.fit import fit
-    from bitymi_ns.train.init import scene_for_views
-    from bitymi_ns.train.losses import psnr
-
     config, background = TrainConfig(seed=seed), torch.zeros(3)
     cameras = [view.camera for view in capture.train]
     scene = scene_for_views(capture.train, capture.points, capture.colours, SceneConfig(texture="texels"), config)
@@ -152,8 +151,8 @@ def run_seed(capture: "Capture", seed: int, calibration: Calibration) -> dict[st
         pair = image.rgb.clamp(0.0, 1.0), view.target(background, "cpu")
         quality.append(psnr(*pair))
         try:
-            distances.append(lpips(*pair, "alex"))
-        except LpipsUnavailable:  # reported by `main`
+            distances.append(lpips.lpips(*pair, "alex"))
+        except lpips.LpipsUnavailable:  # reported by `main`
             distances.append(math.nan)
     return {
         "psnr_trained": trained,
@@ -170,20 +169,16 @@ def run_seed(capture: "Capture", seed: int, calibration: Calibration) -> dict[st
 
 def run_job(data: Path, downscale: int) -> dict[str, float]:
     """Measure the figures of one scene in this process: means over the seeds (the least of times), and peak memory."""
-    import torch
-    from plain_capture import load_capture
-
     torch.set_num_threads(int(THREADS["OMP_NUM_THREADS"]))
     calibration = Calibration()
     capture = load_capture(data, downscale=downscale)
     seeds = [run_seed(capture, seed, calibration) for seed in range(SETTINGS["seeds"])]
-    means = {key: statistics.fmean(figures[key] for figures in seeds) for key in seeds[0]}
     # other programs only ever add time
-    means |= {key: min(figures[key] for figures in seeds) for key, limit in LIMITS.items() if limit.timed}
-    means["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    means["psnr_spread"] = statistics.pstdev(figures["psnr_trained"] for figures in seeds)
-    means["calibration_seconds"] = statistics.median(calibration.seconds)
-    return means
+    found = means(seeds) | {key: min(f[key] for f in seeds) for key, limit in LIMITS.items() if limit.timed}
+    found["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    found["psnr_spread"] = statistics.pstdev(figures["psnr_trained"] for figures in seeds)
+    found["calibration_seconds"] = statistics.median(calibration.seconds)
+    return found
 
 
 def in_a_process(data: Path, downscale: int) -> dict[str, float]:
@@ -226,10 +221,6 @@ def quicker(found: Scenes, again: Scenes) -> Scenes:
 
 def measure(capture: Path | None) -> Scenes:
     """Measure the room at 160 x 120, and a capture at half its size."""
-    from common import say
-
-    from bitymi_ns.sample import generate
-
     found = {}
     with tempfile.TemporaryDirectory() as folder:
         say("gate: the room")
@@ -243,17 +234,11 @@ def measure(capture: Path | None) -> Scenes:
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Arguments(__doc__)
     parser.add_argument("--capture", type=Path, help="an undistorted capture to run at half its size beside the room")
     parser.add_argument("--accept", action="store_true", help="make the figures the new baseline")
     parser.add_argument("--baseline", type=Path, default=BASELINE, help="the file to compare with, or to write")
     options = parser.parse_args()
-    from common import say, table
-
-    from bitymi_ns.files import write_file
-    from bitymi_ns.measure.machine import processor
-    from bitymi_ns.plugin.run import lpips
-
     try:
         lpips.load("alex")
     except lpips.LpipsUnavailable as error:

@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """Time frames of baked scenes on a GPU (medians after a warm-up) and print a table.
 
-Scenes: those of `harness.textured`, and bundles (--bundles) with three cameras around their centre. "list" and "draw"
+Scenes: those of `scenes.textured`, and bundles (--bundles) with three cameras around their centre. "list" and "draw"
 are the two stages of a frame, "frame" is both launched by the host, "graph" the same as a CUDA graph, "packed" that
 with 8 bits per channel instead of floats, "waited for" includes synchronising after each frame. "ends at 1/512" is the
 packed graph with pixels that end at that transmittance instead of 1e-4.
@@ -19,8 +19,8 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from common import arguments_of, number, page, publish, say, table
-from harness import Options, around, attempt, failures, milliseconds, textured, with_launches
+from harness import Arguments, Options, Rows, device_milliseconds, image_size, number, publish, say, seconds
+from scenes import around, textured
 
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.ops.backend import emulated_cuda
@@ -29,6 +29,7 @@ from bitymi_ns.scene.baked import FAST, BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from bitymi_ns.scene.camera import Camera
 
+SIZES = ((1297, 840), (1920, 1080), (3840, 2160))
 TIMED = ("list", "draw", "frame", "graph", "packed", "waited for", "early")
 """Timings of `measured`, in the order of the columns from "list ms" on."""
 HEADER = (
@@ -55,8 +56,8 @@ def measured(scene: BakedScene, cameras: Sequence[Camera], options: Options) -> 
             "graph": recorded.run, "packed": packed.run, "early": early.run,
         }  # fmt: skip
         for name, run in cases.items():
-            sums[name] += milliseconds(run, options)
-        sums["waited for"] += with_launches(packed.run, options)
+            sums[name] += device_milliseconds(run, options)
+        sums["waited for"] += 1e3 * seconds(packed.run, options)[0]
     return {key: value / len(cameras) for key, value in sums.items()}
 
 
@@ -108,35 +109,31 @@ def card(device: torch.device) -> list[str]:
 
 def main() -> int:
     """Command line."""
-    parser = arguments_of(__doc__)
+    parser = Arguments(__doc__)
     parser.add_argument("--surfels", nargs="*", type=int, default=[50_000, 150_000, 500_000], help="of the scenes")
-    parser.add_argument(
-        "--sizes", nargs="+", default=["1297x840", "1920x1080", "3840x2160"], metavar="WxH", help="(%(default)s)"
-    )
+    parser.add_argument("--sizes", nargs="+", type=image_size, default=SIZES, metavar="WxH", help="(%(default)s)")
     parser.add_argument("--bundles", nargs="+", type=Path, default=[], help="baked scenes to draw as well")
     parser.add_argument("--warm-up", type=int, default=10)
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--emulated", action="store_true", help="try the script without a card")
-    parser.add_argument("--output", type=Path, help="also write the Markdown to this file")
+    parser.add_output()
     arguments = parser.parse_args()
-    if not (arguments.emulated or torch.cuda.is_available()):
-        parser.error("no CUDA device was found (or torch is a CPU build); --emulated tries the script without")
-    surfels, sizes = arguments.surfels, [tuple(int(part) for part in size.split("x")) for size in arguments.sizes]
-    options = Options(torch.device("cuda"), arguments.warm_up, arguments.runs)
     if arguments.emulated:
         surfels, sizes, options = [60], [(40, 24)], Options(torch.device("cpu"), 0, 1)
+    else:
+        surfels, sizes = arguments.surfels, arguments.sizes
+        options = Options(parser.device(), arguments.warm_up, arguments.runs)
     notes = [
         *card(options.device),
         f"Times: medians of about {options.runs} calls after {options.warm_up}, queued so that the host does not hold "
         "the device up, unless a column says otherwise.",
     ]
-    rows = []
+    rows = Rows(HEADER)
     with emulated_cuda() if arguments.emulated else nullcontext():
         for width, height in sizes:
             for make, each in [(synthetic, n) for n in surfels] + [(bundled, folder) for folder in arguments.bundles]:
-                rows.append(attempt(f"{each}, {width} x {height}", partial(make, each, width, height, options)))
-    text = table(HEADER, list(filter(None, rows))) + failures()
-    publish(page("Frames of baked scenes", text, notes), arguments.output)
+                rows.add(f"{each}, {width} x {height}", partial(make, each, width, height, options))
+    publish("Frames of baked scenes", str(rows), notes, arguments.output)
     return 0
 
 

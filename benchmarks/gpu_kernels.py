@@ -10,12 +10,16 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from common import arguments_of
-from harness import around, photo_loss, textured, trained_like, training_step, with_texels
+from harness import Arguments, image_size, table
+from scenes import around, textured, trained_like, with_texels
+from torch import Tensor
+from torch.nn.functional import l1_loss
 
 from bitymi_ns import ops
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.scene.baked_renderer import BakedRenderer
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.scene import Scene
 
 
 def baked(n: int, width: int, height: int, device: torch.device) -> Callable[[], object]:
@@ -40,19 +44,32 @@ def images(n: int, width: int, height: int, device: torch.device) -> Callable[[]
     return lambda: scene.render_views([camera], None, ops.baked.IMAGES)
 
 
+def training_step(scene: Scene, camera: Camera, parameters: list[Tensor]) -> Callable[[], object]:
+    """Prepare a training step: render, loss 0.8 L1 + 0.2 (1 - SSIM), backward and Adam on the parameters."""
+    # learning rate 0: the work of a step without changing the scene
+    optimizer = torch.optim.Adam(parameters, lr=0.0, fused=True)
+    photo = torch.rand(camera.height, camera.width, 3, device=parameters[0].device)
+
+    def run() -> None:
+        optimizer.zero_grad(set_to_none=True)
+        rgb = scene.render(camera, field_mode="train").rgb
+        (0.8 * l1_loss(rgb, photo) + 0.2 * (1 - ops.ssim(rgb, photo))).backward()
+        optimizer.step()
+
+    return run
+
+
 def training(n: int, width: int, height: int, device: torch.device) -> Callable[[], object]:
     """Prepare a training step: field, SSIM, Adam."""
     scene, camera = trained_like(n, width, height, device)
-    loss = photo_loss(torch.rand(height, width, 3, device=device))
-    return training_step(lambda: scene.render(camera, field_mode="train").rgb, loss, list(scene.parameters()))
+    return training_step(scene, camera, list(scene.parameters()))
 
 
 def texels(n: int, width: int, height: int, device: torch.device, most: int = 0) -> Callable[[], object]:
     """Prepare a training step with texels: SSIM, Adam of the surfels. `most`: limit of a fragment list, 0 = none."""
     scene, camera = with_texels(n, width, height, device)
     scene.config.max_fragments = most
-    loss = photo_loss(torch.rand(height, width, 3, device=device))
-    return training_step(lambda: scene.render(camera, field_mode="train").rgb, loss, list(scene.surfels.parameters()))
+    return training_step(scene, camera, list(scene.surfels.parameters()))
 
 
 def exact(n: int, width: int, height: int, device: torch.device) -> Callable[[], object]:
@@ -74,23 +91,20 @@ SECTIONS |= {"listed": partial(texels, most=1 << 30), "deterministic": exact}
 
 def main() -> int:
     """Command line."""
-    parser = arguments_of(__doc__)
+    parser = Arguments(__doc__)
     parser.add_argument("--surfels", type=int, default=300)
-    parser.add_argument("--size", default="96x64", metavar="WxH", help="image size (%(default)s)")
+    parser.add_argument("--size", type=image_size, default="96x64", metavar="WxH", help="image size (%(default)s)")
     parser.add_argument("--sections", nargs="*", choices=list(SECTIONS), default=list(SECTIONS))
     parser.add_argument("--bundles", nargs="+", type=Path, default=[], help="draw these as well")
     parser.add_argument("--times", type=int, default=0, metavar="RUNS", help="time by kernel over so many runs")
     arguments = parser.parse_args()
-    if not torch.cuda.is_available():
-        parser.error("no CUDA device was found (or torch is a CPU build)")
+    device = parser.device()
     if not arguments.sections and not arguments.bundles:
         parser.error("there is nothing to run: no section and no bundle is named")
-    width, height = (int(part) for part in arguments.size.split("x"))
-    device = torch.device("cuda")
     made = {name: partial(SECTIONS[name], arguments.surfels) for name in arguments.sections}
     made |= {folder.name: partial(bundled, folder) for folder in arguments.bundles}
     for name, make in made.items():
-        run = make(width, height, device)
+        run = make(*arguments.size, device)
         if arguments.times:
             print_times(name, run, arguments.times)
         else:
@@ -113,9 +127,9 @@ def print_times(name: str, run: Callable[[], object], runs: int) -> None:
     kernels = [e for e in profile.key_averages() if e.device_type == torch.autograd.DeviceType.CUDA]
     total = sum(e.self_device_time_total for e in kernels) / runs
     print(f"\n#### {name}: {total:.0f} us on the device per run, {sum(e.count for e in kernels) / runs:.0f} kernels\n")
-    print("| kernel | per run | us per run |\n|---|---:|---:|")
-    for e in sorted(kernels, key=lambda e: -e.self_device_time_total)[:45]:
-        print(f"| `{e.key[:90]}` | {e.count / runs:.1f} | {e.self_device_time_total / runs:.1f} |")
+    longest = sorted(kernels, key=lambda e: -e.self_device_time_total)[:45]
+    rows = [(f"`{e.key[:90]}`", f"{e.count / runs:.1f}", f"{e.self_device_time_total / runs:.1f}") for e in longest]
+    print(table(("kernel", "per run", "us per run"), rows))
 
 
 if __name__ == "__main__":

@@ -14,9 +14,8 @@ from statistics import fmean
 from typing import Any
 
 import torch
-from common import arguments_of, number, page, publish, say, table
-from harness import Options, attempt, failures, milliseconds, quality
-from plain_capture import Capture, load_capture
+from harness import Arguments, Options, Rows, device_milliseconds, image_quality, means, number, publish, say
+from scenes import SplitCapture, load_capture
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -33,6 +32,8 @@ RATES = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0
 
 CAMERAS = 6  # held-out cameras to time
 RUNS = 50  # frames per camera
+Times = dict[int, list[Camera]]
+"""Multiple of the photographs' size -> cameras to time."""
 Frames = Callable[[Camera], Callable[[], Tensor]]
 """Camera -> function that renders its view: [H, W, 3], or [H, W, 1] int32 with 8 bits per channel."""
 
@@ -89,7 +90,7 @@ def load() -> tuple[Any, str]:
     return gsplat, ""
 
 
-def first_gaussians(capture: Capture, most: int, extent: float) -> dict[str, Tensor]:
+def first_gaussians(capture: SplitCapture, most: int, extent: float) -> dict[str, Tensor]:
     """Initialise means, scales (logarithms), quats, opacities (logits), sh0 [N, 1, 3], shN [N, 15, 3] from points."""
     chosen = torch.randperm(len(capture.points), generator=torch.Generator().manual_seed(0))[:most]
     points, colours = capture.points[chosen], capture.colours[chosen]
@@ -117,7 +118,7 @@ def activated(p: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def train(
-    gsplat: Any, capture: Capture, most: int, steps: int, device: torch.device
+    gsplat: Any, capture: SplitCapture, most: int, steps: int, device: torch.device
 ) -> tuple[dict[str, Tensor], float]:
     """Train Gaussians on a capture with gsplat's MCMC strategy, which refines in the first 25/30 of the steps.
 
@@ -170,33 +171,36 @@ def picture(image: Tensor) -> Tensor:
 
 
 def row(
-    name: str, count: int, seconds: float | None, make: Frames, capture: Capture, times: dict[int, list[Camera]]
+    name: str, count: int, took: float | None, draws: Callable[[], Frames], capture: SplitCapture, times: Times
 ) -> list[str]:
     """Measure the row of a renderer: primitives, seconds of training (None: not trained here), quality on the held-out
     views, and median milliseconds of a frame, averaged over cameras, by image size."""
-    device = torch.device("cuda")
-    good = quality(lambda camera: picture(make(camera)()), capture.held_out, device)
+    device, make = next(iter(times.values()))[0].viewmat.device, draws()
+    good = means(
+        [
+            image_quality(picture(make(view.camera)()), view.target(None, device), view.mask)
+            for view in (view.to(device) for view in capture.held_out)
+        ]
+    )
     options = Options(device, 5, RUNS)
-    frames = [fmean(milliseconds(make(camera), options) for camera in cameras) for cameras in times.values()]
-    say(f"{name}, {count:,}: {good[0]:.2f} dB, {', '.join(f'{ms:.3f} ms' for ms in frames)}")
-    cells = [name, number(count, 0), number(seconds, 0), number(good[0]), number(good[1]), number(good[2], 3)]
-    return [*cells, *(number(ms, 3) for ms in frames)]
+    frames = [fmean(device_milliseconds(make(camera), options) for camera in cameras) for cameras in times.values()]
+    say(f"{name}, {count:,}: {good['psnr']:.2f} dB, {', '.join(f'{ms:.3f} ms' for ms in frames)}")
+    cells = [name, number(count, 0), number(took, 0), number(good["psnr"]), number(good["fitted_psnr"])]
+    return [*cells, number(good["ssim"], 3), *(number(ms, 3) for ms in frames)]
 
 
 def main() -> int:
     """Command line."""
-    parser = arguments_of(__doc__)
+    parser = Arguments(__doc__)
     parser.add_argument("data", type=Path, help="folder of an undistorted capture with transforms.json")
     parser.add_argument("--train", nargs="+", type=int, metavar="COUNT", help="train so many Gaussians, draw nothing")
     parser.add_argument("--steps", type=int, default=20_000, help="of training Gaussians (%(default)s)")
     parser.add_argument("--gaussians", type=Path, required=True, help="folder of the trained Gaussians")
     parser.add_argument("--bundles", nargs="*", type=Path, default=[], help="baked scenes of the same capture")
     parser.add_argument("--times", nargs="+", type=int, default=[1, 2], help="sizes, of the photographs' (%(default)s)")
-    parser.add_argument("--output", type=Path, help="also write the Markdown to this file, after each row")
+    parser.add_output()
     arguments = parser.parse_args()
-    if not torch.cuda.is_available():
-        parser.error("no CUDA device was found (or torch is a CPU build)")
-    device = torch.device("cuda")
+    device = parser.device()
     capture = load_capture(arguments.data.expanduser())
     gsplat, why = load()
     if arguments.train:
@@ -220,17 +224,12 @@ def main() -> int:
         count = len(g["means"])
         made.append(("gsplat rasterization", count, seconds, partial(rasterized, gsplat, g)))
         made.append(("gsplat inference renderer", count, seconds, partial(inferred, g)))
-    rows: list[list[str]] = []
+    rows = Rows(header)
     notes = [f"Device: {torch.cuda.get_device_name(device)}.", *filter(None, [why])]
     about = f"{len(capture.train)} photographs of {camera.width} x {camera.height}; {len(capture.held_out)} held out."
-    for *named, make in made:
-
-        def measured(named: list = named, make: Callable[[], Frames] = make) -> list[str]:
-            return row(*named, make(), capture, times)
-
-        rows += filter(None, [attempt(f"{named[0]}, {named[1]:,}", measured)])
-        text = f"{about}\n\n{table(header, rows)}{failures()}"
-        publish(page(f"Equal quality: {arguments.data.name}", text, notes), arguments.output)
+    for name, count, took, make in made:
+        rows.add(f"{name}, {count:,}", partial(row, name, count, took, make, capture, times))
+        publish(f"Equal quality: {arguments.data.name}", f"{about}\n\n{rows}", notes, arguments.output)
     return 0
 
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Compare each CPU kernel with the machine's ceilings, on a scene like a trained one (`harness.trained_like`).
+"""Compare each CPU kernel with the machine's ceilings, on a scene like a trained one (`scenes.trained_like`).
 
 The baked scene has a uint8 atlas with a tile per surfel, at one texel per pixel. Kernels are called through
 `bitymi_ns.ops`, as in training and rendering; median of --runs after two warm-up runs.
@@ -20,24 +20,23 @@ weight bound), b pairs of surfel and tile (r with a fragment), K sites, L levels
 
 import math
 import os
-import statistics
 import sys
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch loads OpenMP
 
 import torch
-from common import arguments_of, number, page, publish, say, table
-from harness import LOG2_TABLE, SITES, backward, textured, trained_like, without_graph
+from harness import Arguments, Options, number, publish, say, seconds, table
+from scenes import LOG2_TABLE, SITES, textured, trained_like
+from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.ops.trace_cpu import tracers
 
+CPU = torch.device("cpu")
 WARM_UP = 2
 LEVELS = 4
 TILE_SIDE = 8
@@ -48,17 +47,10 @@ HEADER = (
 Case = tuple[str, Callable[[], object], float, float, float]  # kernel, call, operations, bytes and loads
 
 
-def timed(run: Callable[[], object], runs: int) -> tuple[float, float]:
-    """Measure the median wall-clock and CPU seconds."""
-    for _ in range(WARM_UP):
-        run()
-    times = []
-    for _ in range(runs):
-        a, b = time.perf_counter(), time.process_time()
-        run()
-        times.append((time.perf_counter() - a, time.process_time() - b))
-    wall, cpu = map(statistics.median, zip(*times, strict=True))
-    return wall, cpu
+def back(outputs: Tensor, inputs: Sequence[Tensor]) -> Callable[[], object]:
+    """Prepare a backward pass on a retained graph, with fixed random gradients."""
+    gradients = torch.randn_like(outputs)
+    return lambda: torch.autograd.grad(outputs, inputs, gradients, retain_graph=True)
 
 
 def pairs(projection: ops.Projection) -> int:
@@ -71,8 +63,8 @@ def pairs(projection: ops.Projection) -> int:
 
 def cases(n: int, width: int, height: int) -> tuple[str, list[Case]]:
     """Describe a scene's counts, and list its kernels with their work; backward passes run on a retained graph."""
-    scene, camera = trained_like(n, width, height, torch.device("cpu"))
-    baked, _ = textured(n, width, height, torch.device("cpu"))
+    scene, camera = trained_like(n, width, height, CPU)
+    baked, _ = textured(n, width, height, CPU)
     q, field, bound = scene.surfels, scene.field, scene.config.weight_bound
     assert field is not None
     geometry = (q["means"], q["quats"], q["log_scales"], q["opacity_logits"], q["beta_raw"])
@@ -86,7 +78,7 @@ def cases(n: int, width: int, height: int) -> tuple[str, list[Case]]:
     leaf = base.detach().requires_grad_()  # leaves, so that each backward pass runs one kernel
     frames = projection.frames.detach()
 
-    def residual(weights: tuple[torch.Tensor, ...]) -> torch.Tensor:
+    def residual(weights: tuple[Tensor, ...]) -> Tensor:
         return ops.fragment_residual(fragments, frames, field.geometry, weights, bound)
 
     weights = field.weights
@@ -102,7 +94,7 @@ def cases(n: int, width: int, height: int) -> tuple[str, list[Case]]:
     tiles = ops.TexelTiles.of_sizes(side, projection.geom.new_full((n,), SUPPORT))
     texels = (torch.rand(tiles.count, 3) - 0.5).requires_grad_()
 
-    def blend(*textures: Any, residual: torch.Tensor | None = None) -> torch.Tensor:
+    def blend(*textures: Any, residual: Tensor | None = None) -> Tensor:
         return ops.blended_image(alone, at, leaf, *textures, bound=bound, residual=residual)
 
     view = tuple(q[name] for name in ops.VIEW_COLORS["sv"].names)
@@ -119,7 +111,7 @@ def cases(n: int, width: int, height: int) -> tuple[str, list[Case]]:
         f"{v:,} visible, {f:,} fragments ({f / p:.1f} per pixel), {100 * t / f:.0f} % of them textured, {b:,} pairs of "
         f"surfel and tile ({r:,} with a fragment)"
     )
-    back = backward
+    without_graph = torch.no_grad()
     return counts, [
         ("project", without_graph(project), ops_project, bytes_project, 0),
         ("project backward", back(projection.geom, geometry), 350 * n, 260 * n, 0),
@@ -158,7 +150,7 @@ def cases(n: int, width: int, height: int) -> tuple[str, list[Case]]:
 
 def main() -> int:
     """Command line."""
-    parser = arguments_of(__doc__)
+    parser = Arguments(__doc__)
     parser.add_argument("--surfels", nargs="+", type=int, default=[5_000, 20_000], help="sizes of the scene")
     parser.add_argument("--width", type=int, default=270)
     parser.add_argument("--height", type=int, default=480)
@@ -166,7 +158,7 @@ def main() -> int:
     parser.add_argument("--gflops", type=float, default=546.0, help="fp32 FMA ceiling, GFLOP/s (%(default)s)")
     parser.add_argument("--gbytes", type=float, default=77.0, help="memory triad, GB/s (%(default)s)")
     parser.add_argument("--mloads", type=float, default=2050.0, help="random loads in 8 MiB, M/s (%(default)s)")
-    parser.add_argument("--output", type=Path, help="also write the Markdown to this file")
+    parser.add_output()
     options = parser.parse_args()
     ceilings = (options.gflops * 1e9, options.gbytes * 1e9, options.mloads * 1e6)
     parts, load = [], os.getloadavg()[0]
@@ -174,12 +166,12 @@ def main() -> int:
         counts, kernels = cases(n, options.width, options.height)
         rows = []
         for name, run, *work in kernels:
-            seconds, cpu = timed(run, options.runs)
-            say(f"{n:,} surfels, {name}: {1e3 * seconds:.2f} ms")
-            rates = [amount / seconds for amount in work]
+            wall, cpu = seconds(run, Options(CPU, WARM_UP, options.runs))
+            say(f"{n:,} surfels, {name}: {1e3 * wall:.2f} ms")
+            rates = [amount / wall for amount in work]
             shares = [rate / ceiling for rate, ceiling in zip(rates, ceilings, strict=True)]
             limit = ("arithmetic", "bandwidth", "loads")[shares.index(max(shares))]
-            row = [name, limit, number(1e3 * seconds), number(1e3 * cpu), *(number(a / 1e6, 1) for a in work)]
+            row = [name, limit, number(1e3 * wall), number(1e3 * cpu), *(number(a / 1e6, 1) for a in work)]
             row += [number(rates[0] / 1e9, 1), number(rates[1] / 1e9, 1), number(rates[2] / 1e6, 0)]
             row += [f"{100 * share:.0f} %" for share in shares]
             if not work[2]:
@@ -194,7 +186,7 @@ def main() -> int:
         f"Load average at the start: {load:.1f}. Other work on the machine spoils ms and shares, CPU ms hardly.",
         "Operations and bytes are counted by the formulas of this script.",
     ]
-    publish(page("CPU kernels", "\n\n".join(parts), notes), options.output)
+    publish("CPU kernels", "\n\n".join(parts), notes, options.output)
     return 0
 
 

@@ -19,7 +19,7 @@ import sys
 import tempfile
 import time
 from argparse import Namespace
-from collections.abc import Sequence, Set
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,11 +27,11 @@ from zlib import crc32
 
 import torch
 import yaml
-from common import arguments_of, number, page, publish, say, table
+from harness import Arguments, image_quality, means, number, publish, say, table
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
-from plain_capture import Capture, load_capture
+from scenes import SplitCapture, load_capture
 from torch import Tensor
 
 from bitymi_ns import bake_scene
@@ -39,14 +39,15 @@ from bitymi_ns.bundle import read_bundle
 from bitymi_ns.files import Busy, Lock
 from bitymi_ns.measure.bench.cells import FILE, Cells, identity, provenance, without_nan
 from bitymi_ns.measure.machine import commit
-from bitymi_ns.ops import ssim
 from bitymi_ns.plugin.run.metrics import lpips_metrics
 from bitymi_ns.scene import Scene
+from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.scene import RenderOutput
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.exposure import corrected
 from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.init import scene_for_views
-from bitymi_ns.train.losses import fitted_psnr, photometric, psnr
+from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.preset import Loader, Preset, load_preset
 from bitymi_ns.train.views import View, eval_background, spread
 
@@ -80,7 +81,7 @@ COLUMNS = {
 
 
 @dataclass(frozen=True)
-class Run:
+class LongRun:
     """One training run."""
 
     data: str
@@ -131,16 +132,15 @@ def preset_of(row: str) -> Preset:
     return preset
 
 
-def quality(rgb: Tensor, target: Tensor) -> dict[str, float]:
-    """Compare a render with a photograph, both [H, W, 3]."""
-    rgb = rgb.clamp(0.0, 1.0)
-    found = {"psnr": psnr(rgb, target), "fitted_psnr": fitted_psnr(rgb, target), "ssim": float(ssim(rgb, target))}
-    return found | lpips_metrics(rgb, target, ("lpips",))
-
-
-def means(rows: Sequence[dict[str, float]]) -> dict[str, float]:
-    """Average figures over views."""
-    return {name: statistics.fmean(row[name] for row in rows) for name in rows[0]}
+def quality(draw: Callable[[Camera], Any], views: Sequence[View], background: Tensor | None) -> dict[str, float]:
+    """Compare renders with photographs: means over views on the device of `draw`."""
+    rows = []
+    for view in views:
+        with torch.no_grad():
+            drawn = draw(view.camera)
+        rgb, target = view.shown(drawn.rgb, drawn.alpha, background), view.target(background, drawn.rgb.device)
+        rows.append(image_quality(rgb, target) | lpips_metrics(rgb.clamp(0.0, 1.0), target, ("lpips",)))
+    return means(rows)
 
 
 class TexelWatch:
@@ -178,13 +178,13 @@ class TexelWatch:
 load = functools.lru_cache(maxsize=1)(load_capture)
 
 
-def cut(capture: Capture, photographs: int) -> Capture:
+def cut(capture: SplitCapture, photographs: int) -> SplitCapture:
     """Keep at most `photographs` training photographs (0 = all), evenly spaced; held-out ones do not change."""
     kept = spread(len(capture.train), photographs or len(capture.train))
     return replace(capture, train=[capture.train[i] for i in kept])
 
 
-def measure(run: Run) -> dict[str, Any]:
+def measure(run: LongRun) -> dict[str, Any]:
     """Train, evaluate and, if requested, bake a run."""
     preset = preset_of(run.row)
     preset.train.seed = run.seed
@@ -209,14 +209,16 @@ def measure(run: Run) -> dict[str, Any]:
         if trainer.step in shown:
             say(f"step {trainer.step:,}: loss {trainer.loss:.4f}, {len(scene):,} surfels, {clock.cpu_seconds:.0f} s")
     background = eval_background(preset.train, device)
-    rows, poses, exposure = [], trainer.training.poses, trainer.training.exposure
+    poses, exposure = trainer.training.poses, trainer.training.exposure
     held_out = [view._replace(correction=exposure.at(view.file)) for view in capture.held_out]
-    for view in held_out:
-        with torch.no_grad():
-            output = scene.render(view.camera.to(device), background, "frozen")
-        target, rgb = view.target(background, device), view.shown(output.rgb, output.alpha, background)
-        rows.append(quality(rgb, target) | {"fragments": len(output.fragments) / (target.numel() / 3)})
-    found = means(rows) | watch.figures()
+    fragments = []
+
+    def draw(camera: Camera) -> RenderOutput:
+        output = scene.render(camera.to(device), background, "frozen")
+        fragments.append(len(output.fragments) / (camera.width * camera.height))
+        return output
+
+    found = quality(draw, held_out, background) | {"fragments": statistics.fmean(fragments)} | watch.figures()
     aligned = run.align or poses.refined
     if aligned or exposure.table is not None:
         judged = evaluate(scene, capture.held_out, preset.train, poses if aligned else None, exposure)
@@ -239,7 +241,7 @@ def measure(run: Run) -> dict[str, Any]:
 
 
 def bundle(
-    run: Run,
+    run: LongRun,
     scene: Scene,
     views: Sequence[View],
     held_out: Sequence[View],
@@ -255,15 +257,10 @@ def bundle(
         found = {"seconds": time.perf_counter() - start}
         found["kilobytes"] = sum(file.stat().st_size for file in path.iterdir()) / 1e3
         baked = read_bundle(path).scene.to(device)
-    rows = []
-    for view in held_out:
-        drawn = baked.render(view.camera.to(device), background)
-        rgb = view.shown(drawn.rgb, drawn.alpha, background)
-        rows.append(quality(rgb, view.target(background, device)))
-    return found | means(rows)
+    return found | quality(lambda camera: baked.render(camera.to(device), background), held_out, background)
 
 
-def tables(runs: Sequence[Run], cells: Cells) -> str:
+def tables(runs: Sequence[LongRun], cells: Cells) -> str:
     """Format a table per capture and kind of run: a line per row, means over seeds, standard deviation of the PSNR."""
     parts = []
     for group, members in itertools.groupby(runs, lambda run: (run.data, run.steps, run.reduction)):
@@ -290,7 +287,7 @@ PUBLISHED = Path(__file__).with_name("published.csv")
 pictures."""
 
 
-def draw_curves(runs: Sequence[Run], cells: Cells) -> Figure:
+def draw_curves(runs: Sequence[LongRun], cells: Cells) -> Figure:
     """Plot PSNR and LPIPS of the bundles of every run against their bytes; dashes: before the bake; crosses: PSNR that
     others publish of the same scenes."""
     figure = Figure(figsize=(10, 4), layout="constrained")
@@ -332,7 +329,7 @@ def main() -> None:
     baked = arguments.bake or arguments.keep is not None or bool(arguments.megabytes) or arguments.plot is not None
     rest = (baked, arguments.align, arguments.device, tuple(arguments.megabytes), arguments.keep)
     runs = [
-        Run(str(data), row, *(int(x) for x in run.split("/")), seed, arguments.photographs, *rest)
+        LongRun(str(data), row, *(int(x) for x in run.split("/")), seed, arguments.photographs, *rest)
         for data, run, row, seed in itertools.product(arguments.data, arguments.runs, arguments.rows, arguments.seeds)
     ]
     for row in arguments.rows:
@@ -350,13 +347,13 @@ def main() -> None:
             cells.add(run.key, without_nan(value), provenance(sys.argv, time.perf_counter() - start))
             say(", ".join(f"{name} {value[of]:.4g}" for name, (of, _) in COLUMNS.items() if of in value))
     cells.refresh()
-    publish(page("Long and short runs", tables(runs, cells)), arguments.output)
+    publish("Long and short runs", tables(runs, cells), (), arguments.output)
     if arguments.plot is not None:
         draw_curves(runs, cells).savefig(arguments.plot, dpi=110)
 
 
 def read_arguments() -> Namespace:
-    parser = arguments_of(__doc__)
+    parser = Arguments(__doc__)
     parser.add_argument("data", nargs="+", type=Path, help="folders with a transforms.json, or such files")
     parser.add_argument("--rows", nargs="+", default=["bitymi"], help="a method each, and its settings: PATH=VALUE ...")
     parser.add_argument("--runs", nargs="+", default=list(RUNS), help="STEPS/REDUCTION each")
@@ -369,7 +366,7 @@ def read_arguments() -> Namespace:
     parser.add_argument("--align", action="store_true", help="align held-out poses of rows without refinement, too")
     parser.add_argument("--device", default="cpu", help="cpu or cuda (%(default)s)")
     parser.add_argument("--work", type=Path, default=Path("outputs/long"), help="folder of the finished runs")
-    parser.add_argument("--output", type=Path, help="file for the tables")
+    parser.add_output()
     return parser.parse_args()
 
 

@@ -13,7 +13,7 @@ import tyro
 
 from bitymi_ns import KernelsUnavailable, endings
 from bitymi_ns.capture.types import SfmOptions
-from bitymi_ns.files import explained
+from bitymi_ns.files import write_errors_as
 from bitymi_ns.measure.bench.cli import BenchRun
 from bitymi_ns.trust import listed, printable
 
@@ -43,7 +43,7 @@ class Sample:
         from bitymi_ns import sample
 
         options = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "output_dir"}
-        with explained(self.output_dir, ValueError):
+        with write_errors_as(self.output_dir, ValueError):
             folder = sample.generate(self.output_dir, **options, progress=True)
         say(f"Wrote {self.views} images and {self.points} points to {folder}")
 
@@ -68,7 +68,7 @@ class Sfm:
         with rich_progress() as progress:
             poses = find_poses(self.source, self.options, progress, lambda text: say(text, sys.stderr))
             if self.output is not None:
-                with explained(self.output, ValueError):
+                with write_errors_as(self.output, ValueError):
                     write_capture(poses, self.output, progress)
         for name, why in poses.left_out.items():
             say(f"left out: {name}: {why}")
@@ -109,7 +109,7 @@ class Stability:
 
         if why := missing(BACKENDS[self.backend]):
             raise ValueError(f"the backend '{self.backend}' cannot be used here: {why}")
-        with explained(self.output, ValueError):
+        with write_errors_as(self.output, ValueError):
             rows = page.write(self.output, BACKENDS[self.backend], lambda text: say(text, sys.stderr))
         worse = [row.label for row in rows if "**" in row.verdict]
         say(f"Wrote {self.output}: {len(rows)} scenes, {len(worse)} of them beyond what float32 inputs allow")
@@ -213,7 +213,7 @@ class Pack:
             raise ValueError(f"{output} is there already: choose another path (--output), or add --overwrite")
         if output.exists() and not is_single(output):
             raise ValueError(f"{output} is no bundle and is not replaced: choose another path (--output)")
-        with explained(output, ValueError):
+        with write_errors_as(output, ValueError):
             written = write_single(bundle, output)
         _say_left_out(written.left_out)
         say(f"Wrote {output}, {size_text(written.bytes)}; the surfels are in its first {size_text(written.first)}.")
@@ -233,7 +233,7 @@ class Unpack:
 
         folder = self.output or self.bundle.with_name(self.bundle.name.removesuffix(SUFFIX))
         config = config_without_run(folder, read_manifest(self.bundle).render.background)
-        with explained(folder, ValueError):
+        with write_errors_as(folder, ValueError):
             _say_left_out(write_folder(self.bundle, folder, {CONFIG: config}))
         say(f"Wrote {folder}: give {folder / CONFIG} to nerfstudio's commands.")
 
@@ -280,7 +280,7 @@ class Extras:
 
 
 @dataclass
-class View:
+class ViewBundle:
     """Show a bundle in the browser, or export it with its page to a folder for any web server."""
 
     bundle: tyro.conf.Positional[Path]  # Folder of the bundle, or its one file.
@@ -304,7 +304,7 @@ class View:
         site = view.single_site(self.bundle) if self.one_file else view.site_of(self.bundle)
         _say_left_out(site.left_out)
         if self.export is not None:
-            with explained(self.export, ValueError):
+            with write_errors_as(self.export, ValueError):
                 size = view.write_static(site, self.export, self.overwrite)
             say(f"Wrote {self.export}, {size_text(size)}: any web server can send it. Browsers ask for https then.")
             if hides(self.bundle):
@@ -335,7 +335,7 @@ Command = (
     | Annotated[Pack, tyro.conf.subcommand(name="pack")]
     | Annotated[Unpack, tyro.conf.subcommand(name="unpack")]
     | Annotated[Extras, tyro.conf.subcommand(name="extras")]
-    | Annotated[View, tyro.conf.subcommand(name="view")]
+    | Annotated[ViewBundle, tyro.conf.subcommand(name="view")]
 )
 
 

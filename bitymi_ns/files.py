@@ -67,7 +67,7 @@ def reason(error: OSError, path: Path) -> str:
 
 
 @contextmanager
-def explained(path: Path, kind: type[BaseException], then: str = "") -> Iterator[None]:
+def write_errors_as(path: Path, kind: type[BaseException], then: str = "") -> Iterator[None]:
     """Convert OSErrors in the block to exceptions of type `kind` that explain why `path` cannot be written; `then` is
     appended to the message."""
     try:

@@ -8,7 +8,7 @@ import os
 import re
 import stat
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -142,7 +142,7 @@ def check_no_links(paths: Iterable[Path]) -> None:
             raise Refused(f"{path} is a link, which is not followed: remove it", path)
 
 
-def strangers(folder: Path, made: Iterable[str]) -> list[str]:
+def foreign_files(folder: Path, made: Iterable[str]) -> list[str]:
     """List files and folders in a folder, relative to it, that its writer did not create.
 
     Args:
@@ -163,16 +163,35 @@ def strangers(folder: Path, made: Iterable[str]) -> list[str]:
     return sorted(found)
 
 
-def keep(folder: Path, made: Iterable[str]) -> None:
-    """Check that a folder holds only the files `made`, so that it can be replaced without loss.
+def check_replaceable(
+    folder: Path,
+    what: str,
+    made: Iterable[str] | None,
+    overwrite: bool,
+    refuse: Callable[[str], Exception],
+    option: str = "--overwrite",
+) -> None:
+    """Check that a folder is missing or empty, or holds an earlier result alone, which may be replaced.
 
-    Raises:
-        Refused: it holds other files.
+    Args:
+        what: names such a result, as "a bundle".
+        made: names of all files of the result in the folder, read after the other checks; None: it has none.
+        overwrite: an earlier result may be replaced.
+        refuse: makes the exception to raise.
+        option: lets an earlier result be replaced.
     """
-    others = strangers(folder, made)
-    if others:
+    if not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir())):
+        return
+    if not folder.is_dir():
+        kind = "a link to nothing" if folder.is_symlink() and not folder.exists() else "not a folder"
+        raise refuse(f"{folder} is {kind}: choose another folder")
+    if made is None:
+        raise refuse(f"{folder} is not {what} and is not replaced: choose another folder")
+    if not overwrite:
+        raise refuse(f"{folder} is there already: choose another folder, or add {option}")
+    if others := foreign_files(folder, made):
         lost = f"{folder} also holds {listed(others)}, which would be lost"
-        raise Refused(f"{lost}: move that away, or choose another folder", folder)
+        raise refuse(f"{lost}: move that away, or choose another folder")
 
 
 def inside(folder: Path, name: str) -> Path:

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from bitymi_ns.capture.types import CaptureError, Poses
+from bitymi_ns.capture.types import CaptureError, FoundPoses
 
 
 def load(data: Path, device: Any = "cpu", **options: Any) -> Any:
@@ -97,10 +97,10 @@ def printed(capsys: pytest.CaptureFixture[str]) -> str:
     return " ".join(capsys.readouterr().out.split())
 
 
-def found_poses(model: Path, images: Path, report: Path, **changes: Any) -> Poses:
+def found_poses(model: Path, images: Path, report: Path, **changes: Any) -> FoundPoses:
     """Make poses of twelve photographs, as pose estimation returns them; one was left out."""
     found = dict(left_out={"frame_00099.png": "blurred"}, registered=12, given=13, reprojection_error=0.5)
-    return Poses(model, images, report, **{**found, "track_length": 3.0, "seconds": {}, **changes})
+    return FoundPoses(model, images, report, **{**found, "track_length": 3.0, "seconds": {}, **changes})
 
 
 def colmap_model(capture: Path, folder: Path, scale: float = 1.0) -> None:

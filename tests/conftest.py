@@ -5,6 +5,7 @@ import importlib.util
 import inspect
 import os
 import sys
+from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -56,6 +57,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Run the slow files first when workers share the tests."""
     if hasattr(config, "workerinput"):
         items.sort(key=lambda item: item.path.parent.name not in FIRST)
+
+
+@pytest.fixture(scope="session")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A ray-traced room as a capture: 12 views of 48 x 36 pixels with 200 points. Not to be changed."""
+    from bitymi_ns.sample import generate
+
+    return generate(tmp_path_factory.mktemp("captures") / "room", views=12, width=48, height=36, seed=0, points=200)
 
 
 def pytest_collection_finish() -> None:

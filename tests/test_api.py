@@ -248,7 +248,7 @@ def test_a_bundle_of_an_earlier_version_is_replaced(room: Path, tmp_path: Path) 
     del info.files["cameras.json"]
     (tmp_path / "bundle" / "bundle.json").write_bytes(dump(info))
     assert bitymi_ns.read_bundle(tmp_path / "bundle").cameras == []
-    with pytest.raises(BundleError, match="is a bundle already"):
+    with pytest.raises(BundleError, match="is there already"):
         bitymi_ns.bake_scene(scene, views, tmp_path / "bundle")
     assert bitymi_ns.bake_scene(scene, views, tmp_path / "bundle", overwrite=True).cameras
     (tmp_path / "bundle" / "letter.txt").write_text("dear")

@@ -68,15 +68,15 @@ def dead_links(page: Path) -> list[str]:
 
 
 def owners(paths: list[Path]) -> dict[str, set[str]]:
-    """Map names of modules, packages and classes (lower case, without a final Config) to the names they define: so
-    `scene.rim` is an option of `SceneConfig`, and `ops.trace` a function."""
+    """Map names of modules, packages and classes (lower case, without a final Config or Entry) to the names they
+    define: so `scene.rim` is an option of `SceneConfig`, and `ops.trace` a function."""
     found: dict[str, set[str]] = defaultdict(set)
     for path in paths:
         tree = ast.parse(path.read_text("utf8"))
         module = {path.stem, path.parent.name, path.parent.parent.name}
         bodies = [(module, tree.body)]
         bodies += [
-            ({*module, node.name, node.name.removesuffix("Config")}, node.body)
+            ({*module, node.name, re.sub("(Config|Entry)$", "", node.name)}, node.body)
             for node in ast.walk(tree)
             if isinstance(node, ast.ClassDef)
         ]

@@ -16,13 +16,13 @@ from bitymi_ns.capture.cache import content_key, home, keep_work_folder, user_ca
 from bitymi_ns.capture.nerfstudio import write_capture
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import Job
-from bitymi_ns.capture.types import CaptureError, Poses
+from bitymi_ns.capture.types import CaptureError, FoundPoses
 from bitymi_ns.files import reason
 from bitymi_ns.measure.bench.cells import Cells
 from bitymi_ns.measure.bench.process import BenchError, run_measured
 from bitymi_ns.plugin.run.callbacks import TrainingCurve
 from bitymi_ns.plugin.run.run_folder import keep_poses_report
-from bitymi_ns.trust import Refused, inside, is_own, json_of, keep, no_links, own_folder, printable
+from bitymi_ns.trust import Refused, check_replaceable, inside, is_own, json_of, no_links, own_folder, printable
 
 
 @pytest.fixture
@@ -262,7 +262,7 @@ def test_a_model_whose_names_lead_elsewhere_is_not_written(victim: Path, tmp_pat
     model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
     (tmp_path / "model").mkdir()
     model.write_binary(tmp_path / "model")
-    poses = Poses(tmp_path / "model", tmp_path / "a/b", tmp_path, {}, 1, 1, 0.1, 3.0, {})
+    poses = FoundPoses(tmp_path / "model", tmp_path / "a/b", tmp_path, {}, 1, 1, 0.1, 3.0, {})
     with pytest.raises(ValueError, match="leads elsewhere"):
         write_capture(poses, tmp_path / "out", lambda *told: None)
     assert victim.read_text() == "precious" and not (tmp_path / "out").exists()
@@ -285,18 +285,18 @@ def test_what_was_not_made_is_named_and_stays(tmp_path: Path, name: str, named: 
         (tmp_path / each).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / each).touch()
     (tmp_path / "images/.b.png.unfinished").touch()  # as after a kill
-    keep(tmp_path, made)
+    check_replaceable(tmp_path, "a result", made, True, ValueError)
     if name.startswith("a.png"):
         (tmp_path / "a.png").unlink()
     (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).mkdir() if name.endswith("/") else (tmp_path / name).touch()
-    with pytest.raises(Refused, match=re.escape(f"also holds {named.split(', ')[0]}")):
-        keep(tmp_path, made)
+    with pytest.raises(ValueError, match=re.escape(f"also holds {named.split(', ')[0]}")):
+        check_replaceable(tmp_path, "a result", made, True, ValueError)
     (tmp_path / "new").mkdir()  # links with generated names
     (tmp_path / "new/a.png").symlink_to(tmp_path)
     (tmp_path / "new/images").symlink_to(tmp_path)
-    with pytest.raises(Refused, match="holds a.png, images, which"):
-        keep(tmp_path / "new", ["a.png", "images/b.png"])
+    with pytest.raises(ValueError, match="holds a.png, images, which"):
+        check_replaceable(tmp_path / "new", "a result", ["a.png", "images/b.png"], True, ValueError)
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "[" * 400 + "]" * 400, '{"a":' * 101 + "1" + "}" * 101])

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bitymi_ns.bundle.manifest import COMPACT_SURFELS, Atlas, Column, Surfels
+from bitymi_ns.bundle.manifest import COMPACT_SURFELS, AtlasEntry, ColumnEntry, Surfels
 from bitymi_ns.codec import streams
 from bitymi_ns.codec.packing import Packing, pack
 from bitymi_ns.codec.streams import StreamError
@@ -86,7 +86,7 @@ def _compressed(columns: Mapping[str, Codes], steps: Mapping[str, float]) -> tup
     return entries, b"".join(c.data for c in found.values())
 
 
-def _decompressed(data: memoryview, rows: int, column: Column, blocks: int = 0) -> Codes:
+def _decompressed(data: memoryview, rows: int, column: ColumnEntry, blocks: int = 0) -> Codes:
     """Decompress a column of any version."""
     if column.bytes is not None:
         return streams.decompress(data, rows, column.bytes, blocks)
@@ -95,7 +95,7 @@ def _decompressed(data: memoryview, rows: int, column: Column, blocks: int = 0) 
 
 
 def decode_texels(
-    info: Atlas, sizes: Tensor, residual: Codes, residual_step: float, data: memoryview, alpha: Codes | None = None
+    info: AtlasEntry, sizes: Tensor, residual: Codes, residual_step: float, data: memoryview, alpha: Codes | None = None
 ) -> TexelCodes:
     """Decode texels.bin.
 
@@ -135,7 +135,7 @@ def decode_texels(
     return TexelCodes(sizes, info.step, residual, residual_step, torch.from_numpy(grades), colors, coded)
 
 
-def packing_of(info: Atlas, sizes: Tensor) -> Packing:
+def packing_of(info: AtlasEntry, sizes: Tensor) -> Packing:
     """Pack the tiles; the packing follows from their sizes.
 
     Raises:
@@ -162,7 +162,7 @@ def check_surfels_size(info: Surfels, size: int) -> None:
         raise StreamError(f"{info.count} surfels with {info.terms} terms cannot be in {size} bytes")
 
 
-def check_texels_size(info: Atlas, size: int, surfels: int) -> None:
+def check_texels_size(info: AtlasEntry, size: int, surfels: int) -> None:
     """Check the size of texels.bin against bundle.json before reading; surfels.bin has `surfels` bytes.
 
     Raises:
@@ -186,7 +186,7 @@ def _surfel_columns(kind: str, has_alpha: bool) -> tuple[list[str], dict[str, in
 
 
 def _check_columns(
-    columns: Sequence[Column], names: Sequence[str], numbers: dict[str, int], stepped: Sequence[str]
+    columns: Sequence[ColumnEntry], names: Sequence[str], numbers: dict[str, int], stepped: Sequence[str]
 ) -> dict[str, float]:
     found = [column.name for column in columns]
     if found != list(names):
@@ -223,14 +223,14 @@ def _check_codes(name: str, codes: Codes, info: Surfels) -> None:
             raise StreamError("the view colours do not have the terms that bundle.json counts")
 
 
-def _parts(data: memoryview, columns: Sequence[Column]) -> Iterator[memoryview]:
+def _parts(data: memoryview, columns: Sequence[ColumnEntry]) -> Iterator[memoryview]:
     at = 0
     for column in columns:
         yield data[at : at + column.size]
         at += column.size
 
 
-def _check_size(columns: Sequence[Column], size: int) -> None:
+def _check_size(columns: Sequence[ColumnEntry], size: int) -> None:
     stated = sum(column.size for column in columns)
     if stated != size:
         raise StreamError(f"truncated or too long: the columns need {stated} bytes, the file has {size}")

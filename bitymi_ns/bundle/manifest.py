@@ -110,7 +110,7 @@ Point = tuple[Coordinate, Coordinate, Coordinate]
 Row = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 
 
-class Column(Part):
+class ColumnEntry(Part):
     """An integer column: `bytes` of `streams.compress`, or, before version 5, `low` and `planes` of
     `streams.decompress_planes`."""
 
@@ -127,7 +127,7 @@ class Column(Part):
     ) = None
 
     @model_validator(mode="after")
-    def _is_of_one_kind(self) -> Column:
+    def _is_of_one_kind(self) -> ColumnEntry:
         of_planes = self.low is not None and self.planes is not None and len(self.low) == len(self.planes)
         if of_planes == (self.bytes is not None):
             raise PydanticCustomError("column", "a column needs bytes, or as many numbers in low as in planes")
@@ -158,7 +158,7 @@ class Surfels(Part):
     file: Literal["surfels.ply", "surfels.bin"] = SURFELS
     count: Whole
     frame: PositionFrame | None = None
-    columns: Annotated[list[Column], Field(max_length=64)] | None = None  # of surfels.bin, in order
+    columns: Annotated[list[ColumnEntry], Field(max_length=64)] | None = None  # of surfels.bin, in order
     view_color: Kind
     kernel: str = "min(alpha_max, opacity * max((1 - (u^2 + v^2) / support^2)+ ^ beta, exp(-low_pass * d^2)))"
     support: _only(SUPPORT) = SUPPORT  # type: ignore[valid-type]
@@ -169,7 +169,7 @@ class Surfels(Part):
     view_terms: str | None = None  # formula of a lean view colour
 
 
-class Atlas(Part):
+class AtlasEntry(Part):
     """Contents of atlas.ktx2: residual = offset + scale * value, value = stored / 255 for bc7 and uint8; or of
     texels.bin (format dct), whose texels are rounded to 8 bits of that range."""
 
@@ -180,7 +180,7 @@ class Atlas(Part):
     page_width: Side | None = None
     page_rows: Side | None = None
     """Arguments of `codec.packing.pack`, which gives the packing from the tile sizes."""
-    columns: Annotated[list[Column], Field(max_length=64)] | None = None  # of texels.bin, in order
+    columns: Annotated[list[ColumnEntry], Field(max_length=64)] | None = None  # of texels.bin, in order
     width: Side
     height: Side
     layers: Side
@@ -198,13 +198,13 @@ class Atlas(Part):
     psnr: Decibels = None
 
     @model_validator(mode="after")
-    def _half_floats_are_residuals(self) -> Atlas:
+    def _half_floats_are_residuals(self) -> AtlasEntry:
         if self.format == "fp16" and (self.offset, self.scale) != (0.0, 1.0):
             raise PydanticCustomError("range", "must have offset 0 and scale 1, as its format is fp16")
         return self
 
     @model_validator(mode="after")
-    def _alphas_are_drawn(self) -> Atlas:
+    def _alphas_are_drawn(self) -> AtlasEntry:
         scale = 1.0 if self.format == "fp16" else ALPHA_SCALE
         if self.alpha_scale not in (None, scale):
             raise PydanticCustomError(
@@ -215,7 +215,7 @@ class Atlas(Part):
         return self
 
     @model_validator(mode="after")
-    def _file_fits(self) -> Atlas:
+    def _file_fits(self) -> AtlasEntry:
         parts = (self.texels, self.step, self.page_width, self.page_rows, self.columns)
         coded = self.format == "dct"
         if coded != (self.file == TEXELS) or (coded and None in parts):
@@ -223,7 +223,7 @@ class Atlas(Part):
         return self
 
 
-class Render(Part):
+class RenderEntry(Part):
     """Constants of the renderers."""
 
     alpha_max: _only(ALPHA_MAX) = ALPHA_MAX  # type: ignore[valid-type]
@@ -239,7 +239,7 @@ class Render(Part):
     background: tuple[Share, Share, Share]
 
 
-class WorldFrame(Part):
+class WorldEntry(Part):
     """Transform from the capture's frame, x_scene = scale * (transform @ [x_capture, 1]), and the scene's up vector and
     metric scale if known: since versions 1.3 and 2.2."""
 
@@ -251,7 +251,7 @@ class WorldFrame(Part):
     metres_per_unit: Positive | None = None  # length of a unit of the scene
 
     @model_validator(mode="after")
-    def _up_is_a_direction(self) -> WorldFrame:
+    def _up_is_a_direction(self) -> WorldEntry:
         if (self.up is None) != (self.up_from is None):
             raise PydanticCustomError("up", "must have up and up_from, or neither")
         if self.up is not None and not abs(math.hypot(*self.up) - 1) <= UNIT_LENGTH:
@@ -280,10 +280,10 @@ class Manifest(Part):
     version: Annotated[str, Field(pattern=r"^[0-9]{1,6}\.[0-9]{1,6}$")]
     generator: str = "an unnamed program"
     surfels: Surfels
-    atlas: Atlas | None
+    atlas: AtlasEntry | None
     color_bias: _only(COLOR_BIAS) = COLOR_BIAS  # type: ignore[valid-type]
-    render: Render
-    world: WorldFrame
+    render: RenderEntry
+    world: WorldEntry
     bounds: Bounds
     statistics: Statistics
     files: Annotated[dict[str, FileEntry], Field(max_length=1 << 14)]

@@ -148,7 +148,7 @@ class Notes(_Strict):
 
 
 def _box(entry: OrientedBox) -> Box:
-    return Box.turned(entry.center, entry.half, entry.quat)
+    return Box.rotated(entry.center, entry.half, entry.quat)
 
 
 def parse_notes(data: bytes, source: str = NOTES) -> Notes:

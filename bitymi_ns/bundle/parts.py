@@ -21,7 +21,7 @@ from bitymi_ns.bundle.manifest import (
     Manifest,
     dump,
 )
-from bitymi_ns.trust import Refused, json_of, keep
+from bitymi_ns.trust import check_replaceable, json_of
 
 MANIFEST_LIMIT = 4 << 20  # largest bundle.json, bytes
 DIRECTORY_LIMIT = 4 << 20  # largest ZIP directory of a bundle in one file, bytes
@@ -48,7 +48,7 @@ def left_out(info: Manifest) -> list[str]:
     return [name for name in info.files if not is_known(name)]
 
 
-def passed_on(info: Manifest, data: bytes) -> bytes:
+def public_manifest(info: Manifest, data: bytes) -> bytes:
     """Return bundle.json for a copy: `data`, or a version without the files that are left out."""
     if not left_out(info):
         return data
@@ -240,25 +240,15 @@ def check_target(folder: str | Path, overwrite: bool = False) -> None:
             that cannot be carried over.
     """
     folder = Path(folder)
-    if not os.path.lexists(folder):
-        return
-    if not folder.is_dir():
-        what = "a link to nothing" if folder.is_symlink() and not folder.exists() else "not a folder"
-        raise BundleError(f"{folder} is {what}; choose another folder")
-    if not any(folder.iterdir()):
-        return
-    if not (folder / MANIFEST).is_file():
-        raise BundleError(
-            f"{folder} is not a bundle (it has no {MANIFEST}) and is not overwritten; choose another folder"
-        )
-    if not overwrite:
-        raise BundleError(f"{folder} is a bundle already; choose another folder, or replace it (--overwrite True)")
+    made = _replaced(folder) if (folder / MANIFEST).is_file() else None
+    check_replaceable(folder, f"a bundle (it has no {MANIFEST})", made, overwrite, BundleError, "--overwrite True")
+
+
+def _replaced(folder: Path) -> Iterator[str]:
+    """Yield the files of a bundle, and its notes.json, which must be readable to be carried over."""
     with parts_of(folder) as parts:
-        notes_data(parts)  # carried over to the new bundle
-    try:
-        keep(folder, [*files_of(folder), NOTES])
-    except Refused as error:
-        raise BundleError(str(error)) from error
+        notes_data(parts)
+    yield from (*files_of(folder), NOTES)
 
 
 def files_of(folder: Path) -> list[str]:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from bitymi_ns.bundle.manifest import ATLAS, COMPACT_SURFELS, MANIFEST, POSTER, SURFELS, TEXELS, BundleError, Manifest
 from bitymi_ns.bundle.notes import read_notes
-from bitymi_ns.bundle.parts import MANIFEST_LIMIT, NOTES, Parts, is_known, left_out, parts_of, passed_on
+from bitymi_ns.bundle.parts import MANIFEST_LIMIT, NOTES, Parts, is_known, left_out, parts_of, public_manifest
 from bitymi_ns.bundle.read import manifest_of, read_file, read_manifest
 from bitymi_ns.bundle.sizes import enough_memory, machine_memory
 from bitymi_ns.files import complete_folder, size_text, write_file
@@ -22,7 +22,7 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 
 
 @dataclass(frozen=True)
-class Written:
+class SingleFile:
     """Sizes of a written file, in bytes."""
 
     first: int  # from the start to the end of the surfels
@@ -30,7 +30,7 @@ class Written:
     left_out: list[str]  # files listed in bundle.json that are not of the format and were not written
 
 
-def write_single(bundle: str | Path, path: str | Path) -> Written:
+def write_single(bundle: str | Path, path: str | Path) -> SingleFile:
     """Write a bundle to one file, atomically: the files of the format that bundle.json lists, and notes.json.
 
     Nothing is deflated, sizes precede the parts, and bundle.json comes first: the beginning of the file tells where
@@ -62,7 +62,7 @@ def is_single(path: Path) -> bool:
     return path.is_file()
 
 
-def joined(bundle: str | Path) -> tuple[bytes, Written]:
+def joined(bundle: str | Path) -> tuple[bytes, SingleFile]:
     """Build the contents of `write_single`'s file; returns and raises as it does."""
     first, buffer = 0, io.BytesIO()
     with parts_of(bundle, inside=True) as parts:
@@ -78,7 +78,7 @@ def joined(bundle: str | Path) -> tuple[bytes, Written]:
                     first = buffer.tell()
         with enough_memory(parts.bundle, info):
             whole = buffer.getvalue()
-    return whole, Written(first, len(whole), left_out(info))
+    return whole, SingleFile(first, len(whole), left_out(info))
 
 
 def write_folder(bundle: str | Path, folder: Path, beside: Mapping[str, bytes]) -> list[str]:
@@ -117,7 +117,7 @@ def _names(info: Manifest) -> list[str]:
 
 def _contents(parts: Parts, info: Manifest) -> Iterator[tuple[str, bytes | bytearray]]:
     """Yield name and bytes of each file to copy, bundle.json first, each compared with its hash."""
-    yield MANIFEST, passed_on(info, parts.read(MANIFEST, MANIFEST_LIMIT))
+    yield MANIFEST, public_manifest(info, parts.read(MANIFEST, MANIFEST_LIMIT))
     for name in _names(info):
         yield name, read_file(parts, info, name)
     if (notes := read_notes(parts)) is not None:

@@ -122,7 +122,7 @@ def _bounded(columns: Mapping[str, npt.NDArray], name: str, low: float, high: fl
     return values
 
 
-def first_problem(surfels: Mapping[str, Tensor], kind: str) -> str | None:
+def first_fault(surfels: Mapping[str, Tensor], kind: str) -> str | None:
     """Describe the first number beyond its limit (`limits.LIMITS`), by column and row of surfels.ply; None if none.
 
     Args:
@@ -143,7 +143,7 @@ def first_problem(surfels: Mapping[str, Tensor], kind: str) -> str | None:
 
 
 def _check_limits(surfels: Mapping[str, Tensor], kind: str) -> None:
-    problem = first_problem(surfels, kind)
+    problem = first_fault(surfels, kind)
     if problem is not None:
         raise PlyError(problem)
 

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bitymi_ns.bundle.manifest import MANIFEST, BundleError, WorldFrame
+from bitymi_ns.bundle.manifest import MANIFEST, BundleError, WorldEntry
 from bitymi_ns.bundle.notes import read_notes
 from bitymi_ns.bundle.parts import NOTES, Parts, parts_of
 from bitymi_ns.bundle.read import CONTENTS, Bundle, assemble, manifest_of, read_file
@@ -78,13 +78,13 @@ def _check_notes(parts: Parts) -> list[Check]:
     return [] if found is None else [Check(NOTES, True, found[1].contents)]
 
 
-def _format_world(frame: WorldFrame) -> str:
+def _format_world(frame: WorldEntry) -> str:
     """Format up vector and metres per unit, if stated."""
     text = "" if frame.up is None else f", up ({', '.join(f'{x:.3f}' for x in frame.up)}) by {frame.up_from}"
     return text + ("" if frame.metres_per_unit is None else f", {frame.metres_per_unit:.4g} m per unit")
 
 
-def check_world(stated: WorldFrame, world: World) -> Check:
+def check_world(stated: WorldEntry, world: World) -> Check:
     """Compare the frame in bundle.json with that of the training run.
 
     Args:

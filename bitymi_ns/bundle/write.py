@@ -35,7 +35,7 @@ from bitymi_ns.bundle.manifest import (
 )
 from bitymi_ns.bundle.parts import NOTES, check_target, notes_data, parts_of
 from bitymi_ns.bundle.poster import Pixels, encode_poster, most_bytes
-from bitymi_ns.bundle.surfel_table import EXTENT_COLUMN, TERMS, first_problem, term_columns, to_columns
+from bitymi_ns.bundle.surfel_table import EXTENT_COLUMN, TERMS, first_fault, term_columns, to_columns
 from bitymi_ns.codec.limits import ALPHA_LIMIT
 from bitymi_ns.codec.quantise import EncodedAtlas
 from bitymi_ns.codec.texel_codes import SceneCodes
@@ -59,7 +59,7 @@ class World:
     metres_per_unit: float | None = None  # length of a unit of the capture frame; None: unknown
 
     def described(self) -> dict[str, Any]:
-        """Convert to `manifest.WorldFrame`, with up and length in the scene frame."""
+        """Convert to `manifest.WorldEntry`, with up and length in the scene frame."""
         transform = np.asarray(self.transform, dtype=np.float64)[:3]
         frame: dict[str, Any] = {"transform": transform, "scale": float(self.scale)}
         if self.up is not None:
@@ -254,7 +254,7 @@ def _check_surfels(scene: BakedScene) -> None:
         if not finite.all():
             raise BundleError(f"{name} is not finite in row {int(torch.nonzero(~finite)[0])}")
     stored = dict(surfels) if mean_residual is None else {**surfels, "mean_residual": mean_residual}
-    problem = first_problem(stored, kind)
+    problem = first_fault(stored, kind)
     if problem is not None:
         raise BundleError(problem)
     turned = surfels["quats"].norm(dim=1) > 1e-12

@@ -84,7 +84,7 @@ def made_once(photographs: Path, key: str, kind: Kind, tell: Tell, make: Callabl
                     return folder
     with work_folder(photographs, key, tell, kind) as work:
         if not (work / kind).is_file():
-            with files.explained(work, CaptureError):
+            with files.write_errors_as(work, CaptureError):
                 make(work)
                 write_file(work / kind, b"")
     return work

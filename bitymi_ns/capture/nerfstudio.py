@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 
 from bitymi_ns.capture.report import FILES
-from bitymi_ns.capture.types import Poses
+from bitymi_ns.capture.types import FoundPoses
 from bitymi_ns.files import complete_folder, copy_files
 from bitymi_ns.ply import write_cloud
 from bitymi_ns.progress import Progress
@@ -18,7 +18,7 @@ CLOUD = "sparse_pc.ply"
 SIZES = ("w", "h", "fl_x", "fl_y", "cx", "cy")
 
 
-def write_capture(poses: Poses, folder: Path, progress: Progress) -> None:
+def write_capture(poses: FoundPoses, folder: Path, progress: Progress) -> None:
     """Write `images`, `sparse/0`, transforms.json, the point cloud and the report into a new or an empty folder.
 
     Cameras are distorted like the copied photographs, which parsers undistort on loading. There is no

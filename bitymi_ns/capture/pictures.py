@@ -11,6 +11,7 @@ import pillow_heif
 from PIL import Image
 
 from bitymi_ns.reading import MOST_TEXT, open_regular
+from bitymi_ns.trust import listed
 
 pillow_heif.register_heif_opener()  # for all users of Pillow
 
@@ -151,7 +152,7 @@ def passed_over(folder: Path, used: Collection[Path] | None = None) -> list[str]
         skipped = _skipped(Path(parent), below)
         for name, what in skipped.items():
             if what not in ("", "hidden") and (count := _pictures(Path(parent, name), used or ())):
-                found.append(f"{Path(parent, name).relative_to(folder)} ({count} {what})")
+                found.append(f"{Path(parent, name).relative_to(folder)} ({what}: {count})")
         searched = used is None or Path(parent) in holding  # a folder of captures may hold a whole disk
         below[:] = [name for name, what in skipped.items() if searched and not what]
         read, unnamed = [name for name in names if is_picture(Path(parent, name))], []
@@ -164,11 +165,9 @@ def passed_over(folder: Path, used: Collection[Path] | None = None) -> list[str]
             elif used is not None:
                 unnamed.append(path.name)
         for what, paths in alike.items():
-            more = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
-            found.append(f"{paths[0]}{more} ({what})")
+            found.append(f"{listed(paths, most=1)} ({what})")
         if unnamed:
-            few = ", ".join(unnamed[:2]) + (", ..." if len(unnamed) > 2 else "")
-            found.append(f"{len(unnamed)} pictures of {parent} that nothing names ({few})")
+            found.append(f"pictures of {parent} that nothing names ({listed(unnamed, most=2)})")
         films = videos_in(Path(parent), rendered=True)
         found += [f"{film.relative_to(folder)} (a film of ns-render)" for film in films]
         for ending, count in pictures_among(names, read).items():

@@ -24,9 +24,9 @@ from bitymi_ns.capture.recognise import is_model
 from bitymi_ns.capture.report import write_report
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
-from bitymi_ns.capture.types import SPHERICAL_MODEL, CaptureError, ColmapCamera, Poses, SfmOptions, is_full_sphere
+from bitymi_ns.capture.types import SPHERICAL_MODEL, CaptureError, ColmapCamera, FoundPoses, SfmOptions, is_full_sphere
 from bitymi_ns.capture.video import NO_MOTION, extract_frames
-from bitymi_ns.files import Tell, complete_folder, explained, write_file
+from bitymi_ns.files import Tell, complete_folder, write_errors_as, write_file
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.reading import read_json
 
@@ -38,7 +38,7 @@ SPARSE = Path("sparse/0")  # the model's path in a result
 
 def find_poses(
     source: Path, options: SfmOptions | None = None, progress: Progress | None = None, warn: Tell = warnings.warn
-) -> Poses:
+) -> FoundPoses:
     """Find camera poses of photographs or of a video's frames; cache them beside the photographs, or in the user's
     cache folder if nothing can be written there; continue an interrupted run.
 
@@ -67,7 +67,7 @@ def find_poses(
         finished = _finished(work, folder)
         if finished is not None:
             return finished
-        with explained(work, CaptureError):
+        with write_errors_as(work, CaptureError):
             found = _find(source, folder, names, masks, options, work, tell)
             replace_stale(work, folder, content_key(inputs, "contents"))
             return found
@@ -99,7 +99,7 @@ def _what(source: Path) -> tuple[Path, Path, list[str]]:
     return source, folder / below, [os.path.relpath(name, below) for name in names]
 
 
-def _finished(work: Path, folder: Path) -> Poses | None:
+def _finished(work: Path, folder: Path) -> FoundPoses | None:
     """Read an earlier run's poses by poses.json, which marks complete results; None = none, or damaged ones."""
     result = work / "result"
     try:
@@ -107,7 +107,7 @@ def _finished(work: Path, folder: Path) -> Poses | None:
         made = kept.pop("made")  # photographs of the model are copies or frames in the work folder
         images = work / IMAGES if made else Path(os.path.abspath(folder))
         values = {**kept, "model": result / SPARSE, "images": images, "report": result}
-        poses = TypeAdapter(Poses).validate_python(values)
+        poses = TypeAdapter(FoundPoses).validate_python(values)
     except Exception:  # damaged in any way
         return None
     whole = images.is_dir() and all(path.exists() for path in images.rglob("*")) if made else True
@@ -116,7 +116,7 @@ def _finished(work: Path, folder: Path) -> Poses | None:
 
 def _find(
     source: Path, folder: Path, names: list[str], masks: Path | None, options: SfmOptions, work: Path, tell: Progress
-) -> Poses:
+) -> FoundPoses:
     begun = time.monotonic()
     seconds: dict[str, float] = {}
     given, video = len(names), not names
@@ -231,7 +231,7 @@ def camera_group(photos: Sequence[Photo], names: list[str], options: SfmOptions)
     return CameraGroup(ColmapCamera(model, width, height, tuple(camera.params.tolist())), focal is not None, names)
 
 
-def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence[Photo], job: Job) -> Poses:
+def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence[Photo], job: Job) -> FoundPoses:
     """Move the model to its world frame, write it with its report, and remove temporary files."""
     model = pycolmap.Reconstruction(work / MODEL)
     by_used = {job.names[plain]: photo for plain, photo in zip(job.order, photos, strict=True)}
@@ -244,7 +244,7 @@ def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence
     names, cameras = ("model", "width", "height", "params", "prior"), model.cameras.values()
     rows = ((c.model_name, c.width, c.height, c.params.tolist(), c.camera_id in stated) for c in cameras)
     values["cameras"] = [dict(zip(names, row, strict=True)) for row in rows]
-    kept = {each.name: values[each.name] for each in fields(Poses) if each.name in values}
+    kept = {each.name: values[each.name] for each in fields(FoundPoses) if each.name in values}
     with complete_folder(work / "result") as result:
         sparse = result / SPARSE
         sparse.mkdir(parents=True)

@@ -24,7 +24,7 @@ from bitymi_ns.reading import read_json, read_text
 from bitymi_ns.trust import listed
 
 
-class Row(NamedTuple):
+class ScannedPhotograph(NamedTuple):
     """Photograph as a program states it."""
 
     file: Path
@@ -43,7 +43,7 @@ Y_UP = np.array([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0
 def scanner_photographs(found: Found, need_photos: bool) -> list[Photograph]:
     """Read a capture's photographs, with cameras and poses, in the order of their names. Raises CaptureError: a file is
     damaged, or photographs that are needed are missing."""
-    readers: dict[str, Callable[[Path], list[Row]]] = {
+    readers: dict[str, Callable[[Path], list[ScannedPhotograph]]] = {
         "polycam": _polycam, "record3d": _record3d, "pose-files": _pose_files,
         "3d-scanner": _scanner_app, "stray-scanner": _stray_scanner,
     }  # fmt: skip
@@ -72,7 +72,7 @@ def scanner_photographs(found: Found, need_photos: bool) -> list[Photograph]:
     return result
 
 
-def _polycam(folder: Path) -> list[Row]:
+def _polycam(folder: Path) -> list[ScannedPhotograph]:
     """Read Polycam's cameras and images, the corrected ones if there are any."""
     keyframes = folder / "keyframes" if (folder / "keyframes").is_dir() else folder
     images, cameras = next((keyframes / i, keyframes / c) for i, c in POLYCAM if (keyframes / c).is_dir())
@@ -85,11 +85,11 @@ def _polycam(folder: Path) -> list[Row]:
             size = (int(values["width"]), int(values["height"]))
             pinhole = tuple(float(values[name]) for name in ("fx", "fy", "cx", "cy"))
         pictures = [*filter(is_photograph, images.glob(f"{path.stem}.*")), images / f"{path.stem}.jpg"]
-        rows.append(Row(pictures[0], Y_UP @ pose, pinhole, size))
+        rows.append(ScannedPhotograph(pictures[0], Y_UP @ pose, pinhole, size))
     return rows
 
 
-def _record3d(folder: Path) -> list[Row]:
+def _record3d(folder: Path) -> list[ScannedPhotograph]:
     """Read Record3D's metadata: one camera or one per image, and poses as quaternions xyzw and positions."""
     path = folder / "metadata" if (folder / "metadata").is_file() else folder / "metadata.json"
     with parsing(path, AGAIN):
@@ -105,11 +105,11 @@ def _record3d(folder: Path) -> list[Row]:
             pose = _pose(_numbers(each, 7))
             pinhole = tuple(_numbers(own[i][:4], 4)) if i < len(own) else camera
         if str(i) in files:  # Record3D can export every n-th image
-            rows.append(Row(files[str(i)], Y_UP @ pose, pinhole, size))
+            rows.append(ScannedPhotograph(files[str(i)], Y_UP @ pose, pinhole, size))
     return rows
 
 
-def _scanner_app(folder: Path) -> list[Row]:
+def _scanner_app(folder: Path) -> list[ScannedPhotograph]:
     """Read 3D Scanner App's frames: frame_00012.json with camera to world and camera matrix, both by rows; beside it
     depth and confidence, and of some frames a picture."""
     rows = []
@@ -123,11 +123,11 @@ def _scanner_app(folder: Path) -> list[Row]:
             fx, _, cx, _, fy, cy, *_ = _numbers(values["intrinsics"], 9)
         number = path.stem.removeprefix("frame_")
         maps = maps_called(folder, f"depth_{number}", f"conf_{number}")
-        rows.append(Row(picture, Y_UP @ pose, (fx, fy, cx, cy), maps=maps))
+        rows.append(ScannedPhotograph(picture, Y_UP @ pose, (fx, fy, cx, cy), maps=maps))
     return rows
 
 
-def _stray_scanner(folder: Path) -> list[Row]:
+def _stray_scanner(folder: Path) -> list[ScannedPhotograph]:
     """Read Stray Scanner's video, without frames that show much the same, camera matrix and poses: positions and
     quaternions xyzw in ARKit's world, of cameras with OpenCV axes."""
     from bitymi_ns.capture.video import frames_with_poses  # slow to import
@@ -149,11 +149,11 @@ def _stray_scanner(folder: Path) -> list[Row]:
             pose = _pose([float(poses[number][name]) for name in ("qx", "qy", "qz", "qw", "x", "y", "z")])
             name = f"{int(poses[number]['frame']):06d}"
         maps = maps_called(folder, f"depth/{name}", f"confidence/{name}")
-        rows.append(Row(file, Y_UP @ pose @ OPENCV_AXES, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), maps=maps))
+        rows.append(ScannedPhotograph(file, Y_UP @ pose @ OPENCV_AXES, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), maps=maps))
     return rows
 
 
-def _pose_files(folder: Path) -> list[Row]:
+def _pose_files(folder: Path) -> list[ScannedPhotograph]:
     """Read images in `color` or `rgb` and 4 x 4 matrices, camera to world with OpenCV axes, of the same names in
     `pose`; or both in one folder, as NAME.color.png and NAME.pose.txt. A matrix that is not finite means no pose."""
     pinhole = _intrinsics(folder)
@@ -166,7 +166,7 @@ def _pose_files(folder: Path) -> list[Row]:
         with parsing(path, AGAIN):
             pose = np.loadtxt(StringIO(read_text(path, MOST_POSE))).reshape(4, 4)
         if np.isfinite(pose).all():
-            rows.append(Row(files[name], pose @ OPENCV_AXES, pinhole))
+            rows.append(ScannedPhotograph(files[name], pose @ OPENCV_AXES, pinhole))
         else:
             lost.append(name)
     if lost:

@@ -157,7 +157,7 @@ class SfmOptions(SfmSettings):
 
 
 @dataclass(frozen=True)
-class Poses:
+class FoundPoses:
     """Camera poses of a capture."""
 
     model: Path

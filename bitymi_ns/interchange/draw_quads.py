@@ -44,7 +44,7 @@ def draw_quads(quads: Quads, camera: Camera, background: Tensor | None = None, n
 
 
 @dataclass(frozen=True)
-class Hits:
+class QuadHits:
     """Nearest quads at pixel centres; empty pixels are omitted."""
 
     pixel: Tensor  # [F] y * width + x
@@ -54,7 +54,7 @@ class Hits:
 
 
 @torch.no_grad()
-def nearest(quads: Quads, camera: Camera, near: float) -> Hits:
+def nearest(quads: Quads, camera: Camera, near: float) -> QuadHits:
     """Find the nearest quad at each pixel; see `draw_quads`."""
     K, viewmat = camera.K.double(), camera.viewmat.double()
     corners = quads.corners.double() @ viewmat[:3, :3].T + viewmat[:3, 3]  # [Q, 4, 3]
@@ -89,7 +89,7 @@ def nearest(quads: Quads, camera: Camera, near: float) -> Hits:
         met = met[first]
         quad[pixel[met]], uv[pixel[met]], color[pixel[met]] = rows[own[met]], at[first], texel[first, :3]
     pixel = torch.nonzero(quad >= 0).squeeze(1)
-    return Hits(pixel, quad[pixel], uv[pixel], color[pixel])
+    return QuadHits(pixel, quad[pixel], uv[pixel], color[pixel])
 
 
 def _boxes(corners: Tensor, K: Tensor, near: float, width: int, height: int) -> tuple[Tensor, Tensor, Tensor]:

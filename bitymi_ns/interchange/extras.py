@@ -1,7 +1,6 @@
 """Extras of a bundle, for other programs: Gaussians, flat Gaussians, OpenUSD surflets, and a textured mesh."""
 
 import json
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache, partial
@@ -14,7 +13,7 @@ from torch import Tensor
 from bitymi_ns.bake.view_colors import centers_of
 from bitymi_ns.bundle import Bundle, BundleError
 from bitymi_ns.codec.pages import texel_alpha
-from bitymi_ns.files import complete_folder, explained
+from bitymi_ns.files import complete_folder, write_errors_as
 from bitymi_ns.interchange.draw_quads import draw_quads
 from bitymi_ns.interchange.frame import to_capture, up_of
 from bitymi_ns.interchange.gaussians import Gaussians, gaussians_of, write_gaussians
@@ -30,7 +29,7 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.visibility import visibility
 from bitymi_ns.train.losses import mean_psnr, psnr
 from bitymi_ns.train.views import View, at_size, spread
-from bitymi_ns.trust import Refused, keep
+from bitymi_ns.trust import check_replaceable
 
 Kind = Literal["gaussians", "surfels", "usd", "mesh"]
 Frame = Literal["scene", "capture"]
@@ -51,7 +50,7 @@ COLORED_VIEWS, MEASURED_VIEWS = 64, 4
 
 
 @dataclass(frozen=True)
-class Written:
+class ExtraFile:
     """A written file and its quality."""
 
     file: str  # name
@@ -82,18 +81,10 @@ def check_extras(kinds: Sequence[str], folder: Path, overwrite: bool) -> None:
         raise BundleError(f"{what}: choose among {', '.join(FILES)}")
     if "usd" in kinds:
         check_usd()
-    if not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir())):
-        return
-    if not (folder / SUMMARY).is_file():
-        raise BundleError(f"{folder} holds something other than extras and is not overwritten: choose another folder")
-    if not overwrite:
-        lost = [file for kind, file in FILES.items() if kind not in kinds and (folder / file).exists()]
-        also = f", which also removes {', '.join(lost)} unless you ask for all kinds" if lost else ""
-        raise BundleError(f"{folder} is there already: choose another folder, or add --overwrite{also}")
-    try:
-        keep(folder, [SUMMARY, *FILES.values()])
-    except Refused as error:
-        raise BundleError(str(error)) from error
+    lost = [file for kind, file in FILES.items() if kind not in kinds and (folder / file).exists()]
+    also = f", which also removes {', '.join(lost)} unless you ask for all kinds" if lost else ""
+    made = [SUMMARY, *FILES.values()] if (folder / SUMMARY).is_file() else None
+    check_replaceable(folder, "a folder of extras", made, overwrite, BundleError, f"--overwrite{also}")
 
 
 def write_extras(
@@ -106,7 +97,7 @@ def write_extras(
     held_out: Sequence[View] = (),
     overwrite: bool = False,
     progress: Progress = no_progress,
-) -> dict[str, Written]:
+) -> dict[str, ExtraFile]:
     """Write a folder with a file per kind and extras.json, which states their PSNR on held-out photographs. The folder
     is complete or absent.
 
@@ -169,20 +160,20 @@ def write_extras(
         path.write_bytes(quads_glb(quads if to is None else quads.moved(to), place))
         return count, _psnr(lambda camera: draw_quads(quads, camera, background, scene.near), views, background)
 
-    written: dict[str, Written] = {}
+    written: dict[str, ExtraFile] = {}
     replaceable = partial(check_extras, kinds, folder, overwrite)
-    with explained(folder, BundleError, ". Nothing was left behind"), complete_folder(folder, replaceable) as new:
+    with write_errors_as(folder, BundleError, ". Nothing was left behind"), complete_folder(folder, replaceable) as new:
         for kind in dict.fromkeys(kinds):
             path = new / FILES[kind]
             count, value = write(kind, path)
-            written[kind] = Written(path.name, path.stat().st_size, count, value, base, len(views), note)
+            written[kind] = ExtraFile(path.name, path.stat().st_size, count, value, base, len(views), note)
         summary = {"frame": frame, "training_views": len(cameras)}
         summary |= {kind: asdict(each) for kind, each in written.items()}
         (new / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", "utf8")
     return written
 
 
-def summary_line(written: Written) -> str:
+def summary_line(written: ExtraFile) -> str:
     """Summarise a written file in one line."""
     line = f"{written.file}: {written.count:,}, {written.bytes / 1e6:.2f} MB" + (written.note and f"; {written.note}")
     if written.psnr is None or written.psnr_bundle is None:

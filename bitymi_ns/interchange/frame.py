@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from bitymi_ns.bundle.manifest import BundleError, WorldFrame
+from bitymi_ns.bundle.manifest import BundleError, WorldEntry
 
 FARTHEST = 1_000.0
 """Distance, in scene units (cameras in [-1, 1]), beyond which positions get an origin: float32 is off by 1/30,000."""
@@ -45,7 +45,7 @@ class Similarity:
         return torch.from_numpy(Rotation.from_matrix(new).as_quat()[:, [3, 0, 1, 2]])
 
 
-def to_capture(place: WorldFrame) -> Similarity:
+def to_capture(place: WorldEntry) -> Similarity:
     """Invert x_scene = scale * (transform @ [x_capture, 1]).
 
     Raises:
@@ -70,7 +70,7 @@ def to_capture(place: WorldFrame) -> Similarity:
     return Similarity(turn.T, scale, shift - origin, origin)
 
 
-def up_of(place: WorldFrame, to: Similarity | None) -> Tensor:
+def up_of(place: WorldEntry, to: Similarity | None) -> Tensor:
     """Compute the up direction [3] in the scene's frame, or the nearest axis of another frame, so that a rotation to +y
     only permutes the coordinates of that frame."""
     up = torch.tensor(place.up or _UP, dtype=torch.float64)

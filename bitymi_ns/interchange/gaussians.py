@@ -57,7 +57,7 @@ class Gaussians:
 
     def moved(self, to: Similarity) -> Gaussians:
         """Transform to another frame."""
-        coefficients = harmonics.turned(to.turn.T) @ self.harmonics.double()
+        coefficients = harmonics.rotation_of(to.turn.T) @ self.harmonics.double()
         return replace(
             self,
             means=to.points(self.means),

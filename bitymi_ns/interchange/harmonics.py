@@ -27,7 +27,7 @@ def basis(directions: Tensor) -> Tensor:
     return _monomials(directions) @ _from_monomials().to(directions)
 
 
-def turned(matrix: Tensor) -> Tensor:
+def rotation_of(matrix: Tensor) -> Tensor:
     """Compute the matrix that rotates coefficients to another frame.
 
     Args:
@@ -35,7 +35,7 @@ def turned(matrix: Tensor) -> Tensor:
             are allowed.
 
     Returns:
-        [16, 16] float64; a colour of coefficients c in the old frame has the coefficients turned @ c in the new one.
+        [16, 16] float64; a colour of coefficients c in the old frame has the coefficients result @ c in the new one.
         Exact, because rotations do not mix degrees.
     """
     directions = fibonacci_sphere(_SAMPLES).double()

@@ -28,7 +28,7 @@ from rich.panel import Panel
 from bitymi_ns import endings
 from bitymi_ns.bundle.manifest import MANIFEST
 from bitymi_ns.bundle.parts import CONFIG, bundle_at
-from bitymi_ns.files import check_writable, explained
+from bitymi_ns.files import check_writable, write_errors_as
 from bitymi_ns.plugin.console import InputError, fail
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.data.dataparser import BundleCamerasConfig, has_cameras
@@ -151,8 +151,8 @@ def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
     if evaluated is not None:
         endings.install()
         refuse_others()
-        adopt_viewer(config)
-        adopt_render()
+        patch_viewer(config)
+        patch_render()
         moved_capture(config.pipeline.datamanager)
     if isinstance(model, BakedModelConfig):
         model.bundle = _find_bundle(model.bundle, evaluated)
@@ -249,7 +249,7 @@ def moved_capture(datamanager: Any) -> None:
     datamanager.data = datamanager.dataparser.data = folder
 
 
-def adopt_viewer(config: Any) -> None:
+def patch_viewer(config: Any) -> None:
     """Have ns-viewer, if it loads `config`, show this scene by our rules.
 
     Changes: `_start_viewer` in nerfstudio's script, for this scene. For: ns-viewer. Without: the viewer is open to the
@@ -281,7 +281,7 @@ def _start_viewer(ours: Any, start: Callable[..., None], config: Any, *args: Any
         CONSOLE.print("\nThe viewer has ended.")
 
 
-def adopt_render() -> None:
+def patch_render() -> None:
     """Have ns-render or ns-eval, if about to load a scene of ours, write by our rules. Raises InputError: an option or
     the camera path cannot be used.
 
@@ -298,7 +298,7 @@ def adopt_render() -> None:
         render.check_options(command)
     if kind == "ComputePSNR":
         command.output_path = WholeText(command.output_path)
-        with explained(command.output_path, InputError, render.OPTION):
+        with write_errors_as(command.output_path, InputError, render.OPTION):
             check_writable(command.output_path)
     if kind == "DatasetRender":
         script["media"], script["gzip"] = SimpleNamespace(write_image=write_image), SimpleNamespace(open=open_gzip)

@@ -16,8 +16,8 @@ from bitymi_ns.files import complete_folder
 from bitymi_ns.ply import write_cloud
 from bitymi_ns.progress import no_progress, rich_progress
 from bitymi_ns.reading import read_json
-from bitymi_ns.sample.room import Hits, Room
-from bitymi_ns.trust import keep
+from bitymi_ns.sample.room import RayHits, Room
+from bitymi_ns.trust import check_replaceable
 
 FOCAL = 0.80  # focal length in image widths
 TARGET = np.array([0.0, 0.0, 0.72])
@@ -27,7 +27,7 @@ MADE_BY = "bitymi sample"  # marks transforms.json: only folders with this mark 
 
 
 @dataclass(frozen=True)
-class View:
+class RoomView:
     """One pinhole camera: camera-to-world [4, 4] with OpenGL axes (x right, y up, z backward), pixel intrinsics."""
 
     camera_to_world: NDArray[np.float64]
@@ -57,7 +57,7 @@ def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np
     return matrix
 
 
-def camera_path(views: int, width: int, height: int, seed: int) -> list[View]:
+def camera_path(views: int, width: int, height: int, seed: int) -> list[RoomView]:
     """Generate two orbits around the objects at varying heights, with random offsets of the cameras' targets."""
     rng = np.random.default_rng([seed, 1])
     path = []
@@ -68,11 +68,11 @@ def camera_path(views: int, width: int, height: int, seed: int) -> list[View]:
         eye = np.array([2.25 * reach * np.cos(angle), 1.75 * reach * np.sin(angle), 0.0])
         eye[2] = (0.75 if s < 0.5 else 1.55) + 0.30 * np.sin(5 * 2 * np.pi * s)
         target = TARGET + rng.uniform(-0.25, 0.25, 3)
-        path.append(View(look_at(eye, target), FOCAL * width, width, height))
+        path.append(RoomView(look_at(eye, target), FOCAL * width, width, height))
     return path
 
 
-def render(room: Room, view: View, supersample: int = 3) -> NDArray[np.uint8]:
+def render(room: Room, view: RoomView, supersample: int = 3) -> NDArray[np.uint8]:
     """Render a view with antialiasing: [H, W, 3]."""
     origin, directions = view.rays(supersample)
     o = tuple(np.float32(a) for a in origin)
@@ -85,7 +85,7 @@ def render(room: Room, view: View, supersample: int = 3) -> NDArray[np.uint8]:
     return (color * 255 + 0.5).astype(np.uint8)
 
 
-def first_hits(room: Room, view: View, pixels: NDArray[np.int64]) -> tuple[NDArray[np.float32], Hits]:
+def first_hits(room: Room, view: RoomView, pixels: NDArray[np.int64]) -> tuple[NDArray[np.float32], RayHits]:
     """Trace the centres of pixels, flat indices [n]: world points [n, 3], and the hits."""
     origin, directions = view.rays()
     flat = directions.reshape(-1, 3)[pixels]
@@ -95,7 +95,7 @@ def first_hits(room: Room, view: View, pixels: NDArray[np.int64]) -> tuple[NDArr
 
 
 def sparse_points(
-    room: Room, views: list[View], images: list[NDArray[np.uint8]], count: int, seed: int
+    room: Room, views: list[RoomView], images: list[NDArray[np.uint8]], count: int, seed: int
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Sample exact surface points [count, 3] and their pixels' colors [count, 3], evenly over all views."""
     rng = np.random.default_rng([seed, 2])
@@ -127,7 +127,6 @@ def generate(
     Raises:
         ValueError: an argument is too small.
         FileExistsError: the folder already holds files that are not a sample, or `overwrite` is False.
-        Refused: an earlier sample's folder also holds other files, which would be lost.
     """
     limits = {"views": (views, 1), "width": (width, 8), "height": (height, 8), "points": (points, 0), "seed": (seed, 0)}
     for name, (value, least) in limits.items():
@@ -136,15 +135,8 @@ def generate(
     output_dir = Path(output_dir).absolute()
 
     def check() -> None:
-        if output_dir.exists() and not output_dir.is_dir():
-            raise FileExistsError(f"{output_dir} is a file; choose another output folder")
-        if not output_dir.exists() or not any(output_dir.iterdir()):
-            return
-        if not overwrite:
-            raise FileExistsError(f"{output_dir} already holds files; choose another folder or pass --overwrite")
-        if not _is_sample(output_dir):
-            raise FileExistsError(f"{output_dir} is not a sample capture and is not replaced; choose another folder")
-        keep(output_dir, _files_of(output_dir))
+        made = _files_of(output_dir) if _is_sample(output_dir) else None
+        check_replaceable(output_dir, "a sample capture", made, overwrite, FileExistsError)
 
     with complete_folder(output_dir, check) as new:
         _write(new, views, width, height, seed, points, progress)
@@ -154,7 +146,7 @@ def generate(
 def _is_sample(folder: Path) -> bool:
     try:
         return read_json(folder / CAPTURE).get("made_by") == MADE_BY
-    except (FileNotFoundError, ValueError, AttributeError):
+    except (FileNotFoundError, NotADirectoryError, ValueError, AttributeError):
         return False
 
 

@@ -26,7 +26,7 @@ class Box:
     axes: tuple[Vector, Vector, Vector]  # rows of a rotation matrix, whose columns are the axes
 
     @classmethod
-    def turned(cls, center: Sequence[float], half: Sequence[float], quat: Sequence[float]) -> Box:
+    def rotated(cls, center: Sequence[float], half: Sequence[float], quat: Sequence[float]) -> Box:
         """Make a box whose axes are those of a rotation wxyz, of any length but zero."""
         return cls.of(center, half, rotation(_tensor([quat]))[0].tolist())
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -14,11 +14,20 @@ from pathlib import Path
 
 from bitymi_ns.bundle.manifest import MANIFEST, BundleError, Manifest
 from bitymi_ns.bundle.notes import notes_of
-from bitymi_ns.bundle.parts import MANIFEST_LIMIT, NOTES, MissingPart, files_of, is_known, left_out, parts_of, passed_on
+from bitymi_ns.bundle.parts import (
+    MANIFEST_LIMIT,
+    NOTES,
+    MissingPart,
+    files_of,
+    is_known,
+    left_out,
+    parts_of,
+    public_manifest,
+)
 from bitymi_ns.bundle.read import manifest_of, read_file, read_manifest
 from bitymi_ns.bundle.single import joined
 from bitymi_ns.files import complete_folder
-from bitymi_ns.trust import Refused, keep
+from bitymi_ns.trust import check_replaceable
 
 TYPES = {
     ".html": "text/html; charset=utf-8",
@@ -164,7 +173,7 @@ class Shown:
         as_of = self.stamp()
         with parts_of(self._bundle, inside=True) as parts:
             self.info: Manifest = manifest_of(parts)
-            self._manifest = passed_on(self.info, parts.read(MANIFEST, MANIFEST_LIMIT))
+            self._manifest = public_manifest(self.info, parts.read(MANIFEST, MANIFEST_LIMIT))
         self._as_of = as_of
 
     @property
@@ -215,21 +224,13 @@ def write_static(site: Site, folder: Path, overwrite: bool = False) -> int:
     """
 
     def check() -> None:
-        if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
-            return
-        bundles = (folder / "bundle" / "bundle.json", folder / SINGLE)
-        ours = (folder / "index.html").is_file() and any(bundle.is_file() for bundle in bundles)
-        if not ours:
-            raise PageError(f"{folder} holds something other than an exported page: choose another folder")
-        if not overwrite:
-            raise PageError(f"{folder} is there already: choose another folder, or add --overwrite")
-        made = {*site.paths, *page_files(), "view.json", SINGLE}
-        if (folder / BUNDLE / MANIFEST).is_file():
-            made |= {f"{BUNDLE}{name}" for name in files_of(folder / BUNDLE)}
-        try:
-            keep(folder, made)
-        except Refused as error:
-            raise PageError(str(error)) from error
+        has_folder = (folder / BUNDLE / MANIFEST).is_file()
+        ours = (folder / "index.html").is_file() and (has_folder or (folder / SINGLE).is_file())
+        check_replaceable(folder, "an exported page", made(has_folder) if ours else None, overwrite, PageError)
+
+    def made(has_folder: bool) -> Iterator[str]:
+        yield from {*site.paths, *page_files(), "view.json", SINGLE}
+        yield from (f"{BUNDLE}{name}" for name in (files_of(folder / BUNDLE) if has_folder else ()))
 
     with complete_folder(folder, check) as new:
         for path in site.paths:

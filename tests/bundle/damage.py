@@ -6,25 +6,26 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from bitymi_ns.bundle import ply, strict_json
+import numpy as np
+
+from bitymi_ns.bundle import ktx2, ply, strict_json
 from bitymi_ns.codec.streams import compress, decompress
 
 
 def signed(info: Mapping[str, Any], files: Mapping[str, bytes] | None = None) -> bytes:
     """Serialise bundle.json with its digest, and with the sizes and hashes of `files` if given."""
     info = {key: value for key, value in info.items() if key != "digest"}
-    if files is not None:
-        names = info["files"]
-        info["files"] = {
-            name: {"bytes": len(files[name]), "sha256": hashlib.sha256(files[name]).hexdigest()} for name in names
-        }
+    for name, data in (files or {}).items():
+        if name in info["files"]:
+            stated = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+            info["files"] = {**info["files"], name: stated}
     return json.dumps({**info, "digest": strict_json.digest(info)}).encode()
 
 
 def amend(folder: Path, change: Callable[[dict[str, Any]], object] = lambda info: None) -> None:
     """Apply change(bundle.json) and write it with current hashes and digest."""
     info = json.loads((folder / "bundle.json").read_text())
-    files = {name: (folder / name).read_bytes() for name in info["files"]}
+    files = {name: (folder / name).read_bytes() for name in info["files"] if (folder / name).exists()}
     info = json.loads(signed(info, files))
     change(info)
     (folder / "bundle.json").write_bytes(signed(info))
@@ -45,6 +46,15 @@ def recode(folder: Path, name: str, change: Callable[..., object], rows: int) ->
                 column["bytes"] = found.sizes
             at += size
     (folder / "bundle.json").write_text(json.dumps(info))
+    amend(folder)
+
+
+def change_texel(folder: Path, channel: int, value: float) -> None:
+    """Set a channel of the texel (5, 3) of an atlas in half floats, with valid hash and digest."""
+    image = ktx2.parse_ktx2((folder / "atlas.ktx2").read_bytes())
+    layer = np.frombuffer(bytes(image.payload[0]), "<f2").reshape(image.height, image.width, 4).copy()
+    layer[3, 5, channel] = value
+    ktx2.write_ktx2(folder / "atlas.ktx2", [layer.tobytes()], "fp16", image.width, image.height, "test")
     amend(folder)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from bitymi_ns.bundle import check_files, strict_json
-from bitymi_ns.bundle.manifest import Atlas, BundleError, describe, dump, parse
+from bitymi_ns.bundle.manifest import AtlasEntry, BundleError, describe, dump, parse
 from bitymi_ns.bundle.single import write_single
 from bitymi_ns.codec.limits import BRIGHTEST, COLOR_LIMIT, RESIDUAL_LIMIT
 from bitymi_ns.ops.view_color import MAX_TERMS
@@ -111,9 +111,9 @@ def test_the_limits_keep_colours_below_the_stated_bound():
     harmonics = COLOR_LIMIT * 16 * (16 / 12.57) ** 0.5  # the squares of the basis add up to 16 / 4 pi
     residual = 3 * RESIDUAL_LIMIT  # the largest offset and the largest scale
     atlas = {"format": "bc7", "width": 4, "height": 4, "layers": 1, "offset": RESIDUAL_LIMIT}
-    Atlas.model_validate({**atlas, "scale": 2 * RESIDUAL_LIMIT})
+    AtlasEntry.model_validate({**atlas, "scale": 2 * RESIDUAL_LIMIT})
     with pytest.raises(ValueError):
-        Atlas.model_validate({**atlas, "scale": 2.01 * RESIDUAL_LIMIT})
+        AtlasEntry.model_validate({**atlas, "scale": 2.01 * RESIDUAL_LIMIT})
     assert max(lobes, harmonics) + 0.5 + residual + 1.0 < BRIGHTEST
 
 

@@ -19,7 +19,7 @@ from bitymi_ns.bundle.parts import parts_of
 from bitymi_ns.cli import main
 from tests.bake.scenes import write
 from tests.bundle import made
-from tests.bundle.damage import amend, change_columns, signed
+from tests.bundle.damage import change_columns, change_texel, signed
 
 COUNT = 6
 
@@ -176,11 +176,7 @@ def test_values_beyond_their_limits_are_refused_by_column_and_row(
 
 def test_alphas_that_are_missing_or_out_of_range_are_refused(surfels, tmp_path):
     folder = make(surfels, tmp_path / "b", format="fp16", alpha=True)
-    image = ktx2.parse_ktx2((folder / "atlas.ktx2").read_bytes())
-    layer = np.frombuffer(bytes(image.payload[0]), "<f2").reshape(image.height, image.width, 4).copy()
-    layer[3, 5, 3] = -0.5
-    ktx2.write_ktx2(folder / "atlas.ktx2", [layer.tobytes()], "fp16", image.width, image.height, "test")
-    amend(folder)
+    change_texel(folder, 3, -0.5)
     with pytest.raises(BundleError, match=r"atlas.ktx2: the alpha of the texel \(5, 3\) of layer 0 is not from 0 to 2"):
         read_bundle(folder)
     change_columns(folder, lambda columns: columns.pop("alpha"))
@@ -190,11 +186,7 @@ def test_alphas_that_are_missing_or_out_of_range_are_refused(surfels, tmp_path):
 
 def test_rotations_that_are_not_unit_and_texels_beyond_their_limit_are_refused(surfels, tmp_path):
     folder = make(surfels, tmp_path / "b", format="fp16")
-    image = ktx2.parse_ktx2((folder / "atlas.ktx2").read_bytes())
-    layer = np.frombuffer(bytes(image.payload[0]), "<f2").reshape(image.height, image.width, 4).copy()
-    layer[3, 5, 1] = 300
-    ktx2.write_ktx2(folder / "atlas.ktx2", [layer.tobytes()], "fp16", image.width, image.height, "test")
-    amend(folder)
+    change_texel(folder, 1, 300)
     with pytest.raises(BundleError, match=r"atlas.ktx2: the texel \(5, 3\) of layer 0 is not from -256 to 256"):
         read_bundle(folder)
     change_columns(folder, lambda columns: columns["rot_0"].__setitem__(4, 1.5))

@@ -133,7 +133,7 @@ def test_an_existing_folder_is_refused_unless_it_is_a_bundle_to_overwrite(surfel
     target = tmp_path / "b"
     target.mkdir()
     make(surfels, target)  # an empty folder is no loss
-    with pytest.raises(BundleError, match="is a bundle already"):
+    with pytest.raises(BundleError, match="is there already: .* or add --overwrite True"):
         make(surfels, target, "sh")
     assert read_bundle(target).scene.view_color == "sv"
     make(surfels, target, "sh", overwrite=True)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bitymi_ns.sample.capture import View, camera_path, render
+from bitymi_ns.sample.capture import RoomView, camera_path, render
 from bitymi_ns.sample.room import Room
 
 SIZE = (288, 216)
@@ -17,12 +17,12 @@ COUNT = 8
 
 
 @pytest.fixture(scope="session")
-def views() -> list[View]:
+def views() -> list[RoomView]:
     return camera_path(60, *SIZE, seed=0)[:COUNT]
 
 
 @pytest.fixture(scope="session")
-def pictures(views: list[View]) -> list[np.ndarray]:
+def pictures(views: list[RoomView]) -> list[np.ndarray]:
     room = Room(0)
     return [render(room, view, supersample=2) for view in views]
 

@@ -63,9 +63,9 @@ def test_results_beside_photographs_are_named_and_not_read(photographs: Path) ->
     assert (found.format, found.path) == ("photographs", photographs)
     assert find_photos(photographs) == ["a.jpg", "b.jpg", "c.jpg"]
     named = passed_over(photographs)
-    assert sum(int(each.rpartition("(")[2].split()[0]) for each in named) == len(RESULTS)
+    assert sum(int(each.rpartition(": ")[2].rstrip(")")) for each in named) == len(RESULTS)
     for name, what in RESULTS.items():
-        assert any(each.startswith(name.split("/")[0]) and each.endswith(f"{what})") for each in named), name
+        assert any(each.startswith(name.split("/")[0]) and f"({what}: " in each for each in named), name
 
 
 def test_files_of_these_names_that_are_something_else(tmp_path: Path) -> None:
@@ -101,7 +101,7 @@ def test_a_folder_of_results_alone_says_what_it_holds(photographs: Path) -> None
     (photographs / "processed/transforms.json").unlink()
     for path in (photographs / "processed").rglob("*.jpg"):
         path.unlink()
-    with pytest.raises(CaptureError, match=r"not taken for photographs: compared \(1 renders of ns-eval\)"):
+    with pytest.raises(CaptureError, match=r"not taken for photographs: compared \(renders of ns-eval: 1\)"):
         recognise(photographs)
 
 

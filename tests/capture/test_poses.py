@@ -18,7 +18,7 @@ from bitymi_ns.capture.photos import Photo
 from bitymi_ns.capture.poses import _finished, _what, by_camera, camera_group, find_poses, make_job, ordered
 from bitymi_ns.capture.types import CaptureError, ColmapCamera, SfmOptions, SfmSettings
 from bitymi_ns.cli import main
-from bitymi_ns.sample.capture import View, render
+from bitymi_ns.sample.capture import RoomView, render
 from bitymi_ns.sample.room import Room
 from tests.capture.test_exif import apple_note
 
@@ -128,11 +128,11 @@ def never(step: str, done: int, total: int) -> None:
     raise AssertionError("work was begun")
 
 
-def known_centers(views: list[View]) -> np.ndarray:
+def known_centers(views: list[RoomView]) -> np.ndarray:
     return np.array([view.camera_to_world[:3, 3] for view in views])
 
 
-def test_the_poses_are_those_the_photographs_were_taken_from(capture: Path, views: list[View]) -> None:
+def test_the_poses_are_those_the_photographs_were_taken_from(capture: Path, views: list[RoomView]) -> None:
     poses = find_poses(capture)
     assert poses.given == 11 and poses.registered == 8
     assert poses.reprojection_error < 1.0 and poses.track_length > 2
@@ -167,7 +167,7 @@ def test_the_report_says_what_was_found_and_what_was_left_out(capture: Path, mon
 
 
 def test_a_capture_of_nerfstudio_is_written(
-    capture: Path, tmp_path: Path, views: list[View], capsys: pytest.CaptureFixture
+    capture: Path, tmp_path: Path, views: list[RoomView], capsys: pytest.CaptureFixture
 ) -> None:
     assert main(["sfm", str(capture), "--output", str(tmp_path / "out")]) == 0
     printed = capsys.readouterr().out
@@ -185,7 +185,7 @@ def test_a_capture_of_nerfstudio_is_written(
     assert "exists already" in capsys.readouterr().err
 
 
-def test_points_are_triangulated_for_known_poses(arc: Path, views: list[View], copied: Copy) -> None:
+def test_points_are_triangulated_for_known_poses(arc: Path, views: list[RoomView], copied: Copy) -> None:
     folder = copied("known")
     known = []
     for i, view in enumerate(views):
@@ -236,13 +236,13 @@ def test_photographs_that_give_no_poses(arc: Path, tmp_path: Path) -> None:
         find_poses(tmp_path / "none")
 
 
-def test_photographs_from_one_spot(tmp_path: Path, views: list[View]) -> None:
+def test_photographs_from_one_spot(tmp_path: Path, views: list[RoomView]) -> None:
     room = Room(0)
     for i, angle in enumerate(np.radians([-20, -12, -4, 4, 12, 20])):
         turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
         pose = views[0].camera_to_world.copy()
         pose[:3, :3] = turn @ pose[:3, :3]
-        view = View(pose, views[0].focal, views[0].width, views[0].height)
+        view = RoomView(pose, views[0].focal, views[0].width, views[0].height)
         Image.fromarray(render(room, view, supersample=2)).save(tmp_path / f"{i}.png")
     with pytest.raises(CaptureError, match="were taken from one spot"):
         find_poses(tmp_path)
@@ -319,7 +319,7 @@ def test_photographs_are_in_the_order_of_their_times() -> None:
     assert [each.name for each in ordered(same)] == ["x", "c", "b"], "as they are where all times are the same"
 
 
-def test_heic_photographs(tmp_path: Path, pictures: list[np.ndarray], views: list[View]) -> None:
+def test_heic_photographs(tmp_path: Path, pictures: list[np.ndarray], views: list[RoomView]) -> None:
     """HEIC files as phones take them: rotated, with lens, time and gravity in EXIF."""
     folder = tmp_path / "phone"
     folder.mkdir()

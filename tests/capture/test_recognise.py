@@ -212,7 +212,7 @@ def test_pictures_that_are_no_photographs_are_named(tmp_path: Path) -> None:
     for name in ("rgb/1.jpg", "depth/1.png", "depth/2.png", "sub/Masks/1.png", "thumbnail.jpg", ".hidden/masks/1.png"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         Image.new("RGB", (8, 8)).save(tmp_path / name)
-    assert passed_over(tmp_path) == ["depth (2 depth maps)", "thumbnail.jpg (a thumbnail)", "sub/Masks (1 masks)"]
+    assert passed_over(tmp_path) == ["depth (depth maps: 2)", "thumbnail.jpg (a thumbnail)", "sub/Masks (masks: 1)"]
     for folder in ("outputs/room/bitymi", "renders", "@eaDir/a.jpg"):
         photograph(tmp_path / folder, "SYNOPHOTO_THUMB_XL.jpg")
     assert find_photos(tmp_path) == ["rgb/1.jpg"]

@@ -12,18 +12,9 @@ pytest.importorskip("nerfstudio")
 from nerfstudio.scripts import train as ns_train
 
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig, method_config
-from bitymi_ns.sample import generate
 from tests.e2e.exports import TOLERANCE, run_export
 
 STEPS = 60
-
-
-@pytest.fixture(scope="session")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Twelve views of 48 x 36 pixels with 200 points."""
-    folder = tmp_path_factory.mktemp("captures") / "room"
-    generate(folder, views=12, width=48, height=36, seed=0, points=200)
-    return folder
 
 
 def small_run(data: Path, output: Path, name: str = "run", method: str = "bitymi") -> BitymiTrainerConfig:

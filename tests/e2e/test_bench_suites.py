@@ -9,7 +9,7 @@ from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils.eval_utils import eval_setup
 
 from bitymi_ns.measure.bench.engine import CURVE, config_of, train_command
-from bitymi_ns.measure.bench.matrix import Row, Run, standard_scenes
+from bitymi_ns.measure.bench.matrix import MethodSpec, Run, standard_scenes
 from bitymi_ns.measure.report.read import read_jsonl
 from tests.captures import colmap_model
 
@@ -36,7 +36,7 @@ def train(work: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_scene_of_mipnerf360(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     colmap_scene(room, tmp_path / "360" / "bonsai")
     (scene,) = standard_scenes("mipnerf360", tmp_path / "360", ["bonsai"])
-    run = Run(scene, Row("small", "bitymi", SMALL), seed=3, steps=2)
+    run = Run(scene, MethodSpec("small", "bitymi", SMALL), seed=3, steps=2)
     path = train(tmp_path / "work", run, monkeypatch)
     _, (curve,), _ = read_jsonl(path.with_name(CURVE))
     assert curve.scene == "bonsai"

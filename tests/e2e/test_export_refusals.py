@@ -20,7 +20,7 @@ from tests.e2e.runs import rewrite
 
 def test_an_existing_bundle_is_replaced_only_on_request(trained: BitymiTrainerConfig, copied: Path) -> None:
     before = (copied / "bundle.json").read_bytes()
-    with pytest.raises(InputError, match="is a bundle already.*--overwrite True"):
+    with pytest.raises(InputError, match="is there already.*--overwrite True"):
         run_export(trained, copied)
     assert (copied / "bundle.json").read_bytes() == before
     run_export(trained, copied, overwrite=True, r_max=8, compare=False, finetune_steps=0)

@@ -1,6 +1,7 @@
 """Exposure corrections through nerfstudio's entry points: checkpoints, export, messages."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,6 @@ from bitymi_ns.bundle.parts import CAMERAS
 from bitymi_ns.plugin.export.command import ExportAtlas
 from bitymi_ns.plugin.run.callbacks import FILE
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
-from bitymi_ns.sample import generate
 from tests.e2e.exports import evaluate
 from tests.e2e.runs import checkpoint, different
 
@@ -23,9 +23,9 @@ Start = Callable[..., BitymiTrainerConfig]
 
 
 @pytest.fixture
-def uneven(tmp_path: Path) -> Path:
+def uneven(room: Path, tmp_path: Path) -> Path:
     """The room with every other photograph darkened to 0.7."""
-    folder = generate(tmp_path / "uneven", views=12, width=48, height=36, seed=0, points=200)
+    folder = Path(shutil.copytree(room, tmp_path / "uneven"))
     for path in sorted((folder / "images").iterdir())[::2]:
         Image.open(path).point(lambda value: round(0.7 * value)).save(path)
     return folder

@@ -1,6 +1,7 @@
 """Refined poses through nerfstudio's entry points: checkpoints, resume, the bundle's cameras, ns-eval."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +13,6 @@ from bitymi_ns.bundle.parts import CAMERAS
 from bitymi_ns.plugin.export.trained import load_trained
 from bitymi_ns.plugin.run.callbacks import FILE
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
-from bitymi_ns.sample import generate
 from bitymi_ns.train.poses import moved
 from tests.e2e.exports import TOLERANCE, evaluate, run_export
 from tests.e2e.runs import checkpoint, different
@@ -21,9 +21,9 @@ Start = Callable[..., BitymiTrainerConfig]
 
 
 @pytest.fixture
-def askew(tmp_path: Path) -> Path:
+def askew(room: Path, tmp_path: Path) -> Path:
     """The room with poses that are a pixel off."""
-    folder = generate(tmp_path / "askew", views=12, width=48, height=36, seed=0, points=200)
+    folder = Path(shutil.copytree(room, tmp_path / "askew"))
     file, generator = folder / "transforms.json", torch.Generator().manual_seed(0)
     meta = json.loads(file.read_text())
     for frame in meta["frames"]:

@@ -31,8 +31,8 @@ from bitymi_ns import cli, endings
 from bitymi_ns.capture.colmap_model import write_model
 from bitymi_ns.capture.nerfstudio import write_capture
 from bitymi_ns.capture.report import FILES
-from bitymi_ns.capture.types import Poses
-from bitymi_ns.files import complete_folder, explained
+from bitymi_ns.capture.types import FoundPoses
+from bitymi_ns.files import complete_folder, write_errors_as
 from bitymi_ns.measure.pictures import draw_worst
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export.command import ExportAtlas
@@ -227,15 +227,15 @@ def writers(work: Path) -> dict[str, Callable[[Path], Write]]:
             (folder / name).write_text(f"report {version}")
 
     def capture(place: Path, version: int) -> None:
-        found = Poses(models[version], room / "images", models[version], {}, 10, 10, 0.1, 3.0, {})
+        found = FoundPoses(models[version], room / "images", models[version], {}, 10, 10, 0.1, 3.0, {})
         shutil.rmtree(place / "a", ignore_errors=True)  # a capture never replaces files
-        with explained(place / "a", InputError):
+        with write_errors_as(place / "a", InputError):
             write_capture(found, place / "a", lambda *told: None)
 
     found = [pycolmap.Reconstruction(folder) for folder in models]
 
     def model(place: Path, version: int) -> None:
-        with explained(place / "a", InputError), complete_folder(place / "a") as new:
+        with write_errors_as(place / "a", InputError), complete_folder(place / "a") as new:
             write_model(found[version], new)
 
     def begin(place: Path, version: int) -> None:

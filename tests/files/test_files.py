@@ -135,7 +135,7 @@ def a_loop(folder: Path) -> Path:
 )
 def test_what_cannot_be_written_is_explained(tmp_path: Path, place: Callable[[Path], Path], why: str) -> None:
     target = place(tmp_path)
-    with pytest.raises(ValueError, match=f"cannot be written: .*({why})"), files.explained(target, ValueError):
+    with pytest.raises(ValueError, match=f"cannot be written: .*({why})"), files.write_errors_as(target, ValueError):
         files.check_writable(target)
 
 
@@ -155,13 +155,13 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def test_a_read_only_and_a_full_disk(small_disk: Path) -> None:
     files.write_file(small_disk / "f", b"old")
     with pytest.raises(ValueError, match="the disk is full: free some space"):
-        with files.explained(small_disk / "f", ValueError):
+        with files.write_errors_as(small_disk / "f", ValueError):
             files.write_file(small_disk / "f", bytes(2 << 20))
     assert names(small_disk) == ["f"] and (small_disk / "f").read_bytes() == b"old"
     assert 0 < files.free_bytes(small_disk / "a" / "b") < 1 << 20
     subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
     with pytest.raises(ValueError, match="the file system is read-only: write to another one"):
-        with files.explained(small_disk / "b", ValueError):
+        with files.write_errors_as(small_disk / "b", ValueError):
             files.check_writable(small_disk / "b")
 
 

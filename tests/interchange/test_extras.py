@@ -194,7 +194,7 @@ def test_what_cannot_be_written_is_refused_before_the_work(bundle: Bundle, tmp_p
         write_extras(bundle, tmp_path / "out", [])
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
-    with pytest.raises(BundleError, match="other than extras"):
+    with pytest.raises(BundleError, match="is not a folder of extras and is not replaced"):
         write_extras(bundle, tmp_path / "mine", overwrite=True)
     (tmp_path / "mine" / "extras.json").write_text("{}")
     with pytest.raises(BundleError, match="also holds letter.txt, which would be lost"):

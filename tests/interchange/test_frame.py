@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from bitymi_ns.bundle import BundleError
-from bitymi_ns.bundle.manifest import WorldFrame
+from bitymi_ns.bundle.manifest import WorldEntry
 from bitymi_ns.interchange.frame import to_capture, up_of
 from bitymi_ns.interchange.gaussians import gaussians_of
 from bitymi_ns.ops.reference.view_color import sh_basis
@@ -17,10 +17,10 @@ from tests.interchange.conftest import TURN
 from tests.interchange.test_surfel_colors import baked
 
 
-def place(matrix: torch.Tensor, scale: float) -> WorldFrame:
+def place(matrix: torch.Tensor, scale: float) -> WorldEntry:
     shift = torch.tensor([[0.5], [-2.0], [7.0]], dtype=torch.float64)
     transform = torch.cat([matrix, shift], 1).tolist()
-    return WorldFrame.model_validate_json(json.dumps({"transform": transform, "scale": scale}))
+    return WorldEntry.model_validate_json(json.dumps({"transform": transform, "scale": scale}))
 
 
 def covariance(g) -> torch.Tensor:

@@ -21,7 +21,7 @@ def test_the_basis_is_that_of_the_reference() -> None:
 def test_coefficients_turn_exactly_also_into_a_mirrored_frame() -> None:
     c, d = torch.randn(harmonics.TERMS, 3, dtype=torch.float64), directions(200)
     for matrix in (TURN, -TURN, torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))):
-        new = harmonics.turned(matrix) @ c
+        new = harmonics.rotation_of(matrix) @ c
         assert torch.allclose(sh_basis(3, d) @ new, sh_basis(3, d @ matrix.T) @ c, rtol=0, atol=1e-11)
-        back = harmonics.turned(matrix.T) @ new
+        back = harmonics.rotation_of(matrix.T) @ new
         assert torch.allclose(back, c, rtol=0, atol=1e-11)

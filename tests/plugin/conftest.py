@@ -9,8 +9,7 @@ import pytest
 pytest.importorskip("nerfstudio")
 
 from bitymi_ns.capture.types import CaptureError
-from bitymi_ns.sample import generate
-from tests.captures import colmap_model
+from tests.formats import colmap
 
 
 @pytest.fixture(autouse=True)
@@ -23,23 +22,13 @@ def no_triangulation(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bitymi_ns.capture.known_poses.triangulate", triangulate)
 
 
-@pytest.fixture(scope="session")
-def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A ray-traced room: 12 views of 48 x 36 pixels with 200 points. Not to be changed."""
-    folder = tmp_path_factory.mktemp("captures") / "room"
-    generate(folder, views=12, width=48, height=36, seed=0, points=200)
-    return folder
-
-
 @pytest.fixture
-def capture(original: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(original, tmp_path / "room"))
+def capture(room: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(room, tmp_path / "room"))
 
 
 @pytest.fixture
 def project(capture: Path) -> Path:
     """The room as a COLMAP project, with a text model in sparse/0."""
-    colmap_model(capture, capture / "sparse/0")
-    for name in ("transforms.json", "sparse_pc.ply"):
-        (capture / name).unlink()
+    colmap(capture)
     return capture

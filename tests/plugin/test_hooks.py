@@ -73,7 +73,7 @@ def view(monkeypatch: pytest.MonkeyPatch, config: Any, arguments: list[str], our
 
     def load(*_: Any, **__: Any) -> tuple:
         if ours:
-            hooks.adopt_viewer(config)
+            hooks.patch_viewer(config)
         return config, SimpleNamespace(), None, 0
 
     arguments = ["--load-config", "config.yml", *arguments]
@@ -109,7 +109,7 @@ def test_ns_viewer_listens_where_it_is_told(
 def test_scenes_of_other_methods_are_shown_as_before(hosts: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(KeyboardInterrupt):
         view(monkeypatch, method_config("bitymi").config, [], ours=False)
-    hooks.adopt_viewer(method_config("bitymi").config)  # as if one of ours had been loaded before
+    hooks.patch_viewer(method_config("bitymi").config)  # as if one of ours had been loaded before
     with pytest.raises(KeyboardInterrupt):
         view(monkeypatch, method_config("bitymi").config, [], ours=False)
     assert hosts == ["0.0.0.0", "0.0.0.0"]
@@ -117,7 +117,7 @@ def test_scenes_of_other_methods_are_shown_as_before(hosts: list[str], monkeypat
 
 def test_whatever_loads_a_run_adopts_the_viewer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     adopted = []
-    monkeypatch.setattr("bitymi_ns.plugin.hooks.adopt_viewer", adopted.append)
+    monkeypatch.setattr("bitymi_ns.plugin.hooks.patch_viewer", adopted.append)
     config = method_config("bitymi").config
     config.output_dir, config.experiment_name = tmp_path, "room"
     config.get_checkpoint_dir()

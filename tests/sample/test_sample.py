@@ -134,14 +134,16 @@ def test_same_seed_same_capture(tmp_path: Path) -> None:
 
 def test_refuses_to_replace_what_is_there(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("precious")
-    with pytest.raises(FileExistsError, match="--overwrite"):
+    with pytest.raises(FileExistsError, match="is not a sample capture and is not replaced"):
         generate(tmp_path, views=1)
-    with pytest.raises(FileExistsError, match="is a file"):
+    with pytest.raises(FileExistsError, match="is not a folder"):
         generate(tmp_path / "mine.txt", views=1)
     with pytest.raises(FileExistsError, match="is not a sample capture and is not replaced"):
         generate(tmp_path, views=1, width=16, height=12, overwrite=True)
     assert (tmp_path / "mine.txt").read_text() == "precious"
     folder = generate(tmp_path / "room", views=1, width=16, height=12, points=0)
+    with pytest.raises(FileExistsError, match="is there already: .*--overwrite"):
+        generate(folder, views=2, width=16, height=12, points=5)
     generate(folder, views=2, width=16, height=12, points=5, overwrite=True)
     assert len(list((folder / "images").iterdir())) == 2
     (folder / "images/mine.png").touch()

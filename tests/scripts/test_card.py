@@ -1,18 +1,14 @@
 """Files and commands for a bare machine with a GPU."""
 
-import importlib
 import json
 import os
 import re
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
-
-import pytest
-
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
 USE = """
 import open3d.geometry
@@ -28,20 +24,15 @@ except RuntimeError as error:
 """
 
 
-@pytest.fixture
-def card(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(BENCHMARKS)
-    return importlib.import_module("card_nerfstudio")
-
-
-def test_stand_ins_are_imported_and_their_use_is_an_error(card: ModuleType, tmp_path: Path) -> None:
-    environment = card.stand_in(tmp_path)
+def test_stand_ins_are_imported_and_their_use_is_an_error(load: Callable[[str], ModuleType], tmp_path: Path) -> None:
+    environment = load("card_nerfstudio").stand_in(tmp_path)
     done = subprocess.run([sys.executable, "-c", USE], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "open3d.io.read_point_cloud is a stand-in: the package is not on this machine"
 
 
-def test_commands_are_tabled_with_what_they_left(card: ModuleType, tmp_path: Path) -> None:
+def test_commands_are_tabled_with_what_they_left(load: Callable[[str], ModuleType], tmp_path: Path) -> None:
     written: list[int] = []
+    card = load("card_nerfstudio")
     environment = card.stand_in(tmp_path / "stand-ins")
     commands = card.Commands(tmp_path, environment, lambda: written.append(len(commands.rows)))
     assert commands.run(sys.executable, "-c", "x = bytearray(200_000_000)")
@@ -53,17 +44,15 @@ def test_commands_are_tabled_with_what_they_left(card: ModuleType, tmp_path: Pat
     assert "| baked | 28.15 |  | 0.080 |  |" in text and "| failed |  |" in text
 
 
-def test_wheels_are_parted_by_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(BENCHMARKS)
+def test_wheels_are_parted_by_size(load: Callable[[str], ModuleType], tmp_path: Path) -> None:
     for name, size in {"a": 30, "b": 20, "c": 15, "d": 5, "e": 50}.items():
         (tmp_path / name).write_bytes(bytes(size))
-    parts = importlib.import_module("card").parts(tmp_path, 45)
+    parts = load("card").parts(tmp_path, 45)
     assert [[file.name for file in part] for part in parts] == [["e"], ["a", "c"], ["b", "d"]]
 
 
-def test_the_table_of_a_run_says_why_a_command_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(BENCHMARKS)
-    card = importlib.import_module("card")
+def test_the_table_of_a_run_says_why_a_command_failed(load: Callable[[str], ModuleType], tmp_path: Path) -> None:
+    card = load("card")
     failing = [sys.executable, "-c", "import sys; print('first'); sys.exit('no card | none')"]
     step = card.Step("both", [failing, [sys.executable, "-c", "print('well')"]], 60)
     line = card.run_step(step, tmp_path, dict(os.environ), tmp_path, time.monotonic() + 60)

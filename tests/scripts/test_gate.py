@@ -1,29 +1,24 @@
 """The gate: what passes and what fails."""
 
-import importlib.util
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pytest
 
-FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
+
+@pytest.fixture
+def gate(load: Callable[[str], ModuleType]) -> ModuleType:
+    return load("gate")
+
+
 GOOD = {
     "psnr_trained": 20.0, "psnr_baked": 21.0, "lpips_baked": 0.1, "bundle_bytes": 1000.0, "surfels": 100.0,
     "fragments_per_pixel": 10.0, "peak_mb": 500.0, "train": 80.0, "bake": 40.0, "frame": 0.5,
 }  # fmt: skip
-
-
-@pytest.fixture
-def gate(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(FOLDER))
-    spec = importlib.util.spec_from_file_location("gate", FOLDER / "gate.py")
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "gate", module)
-    spec.loader.exec_module(module)
-    return module
 
 
 def run(gate: ModuleType, monkeypatch: pytest.MonkeyPatch, baseline: Path, *measured: Any, accept: bool = False) -> int:

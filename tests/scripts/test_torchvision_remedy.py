@@ -1,23 +1,18 @@
 """The torchvision remedy: its files, and that nerfstudio's torchvision imports work with it."""
 
-import importlib.util
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pytest
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "torchvision_remedy.py"
-
 
 @pytest.fixture
-def remedy() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("torchvision_remedy", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def remedy(load: Callable[[str], ModuleType]) -> ModuleType:
+    return load("torchvision_remedy")
 
 
 def python(code: str, *path: Path) -> subprocess.CompletedProcess[str]:

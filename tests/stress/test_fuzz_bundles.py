@@ -17,14 +17,10 @@ from bitymi_ns.bundle import BundleError, check_files, read_bundle
 from bitymi_ns.bundle.manifest import parse
 from bitymi_ns.bundle.ply import parse_ply, write_ply
 from bitymi_ns.codec.limits import BRIGHTEST
-from bitymi_ns.codec.packing import pack
-from bitymi_ns.codec.quantise import Range, encode
 from bitymi_ns.measure.stability.scenes import random_scene
-from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene import Camera
-from tests.bake.scenes import write
-from tests.bundle.damage import signed
-from tests.ops.test_view_color import lean_parameters
+from tests.bundle.damage import amend, signed
+from tests.bundle.made import make
 
 MORE = int(os.environ.get("BITYMI_FUZZ", "1"))
 EXAMPLES = 60 * MORE
@@ -34,16 +30,12 @@ N, SIDE = 12, 16
 
 @pytest.fixture(scope="module", params=FORMATS)
 def bundle(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    params = {key: value.float() for key, value in random_scene(N, 0).params.items()}
-    packing = pack([[8, 4]] * N)
-    texels = np.random.default_rng(0).random((packing.layers, packing.height, packing.width, 3)).astype(np.float32)
-    lean = request.param == "lean"
-    if lean:
-        params = {key: value for key, value in params.items() if key not in VIEW_COLORS["sv"].names}
-        params |= lean_parameters("sv", N, torch.float32)
-    atlas = encode(texels, packing, "uint8" if lean else request.param, Range(-0.5, 2.0, "test"))
+    def surfels(count: int, kind: str) -> dict[str, torch.Tensor]:
+        return {key: value.float() for key, value in random_scene(count, 0).params.items()}
+
     folder = tmp_path_factory.mktemp("bundles") / request.param
-    write(folder, params, packing.tiles, atlas, kind="sv")
+    lean = request.param == "lean"
+    make(surfels, folder, format="uint8" if lean else request.param, count=N, lean=lean)
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
@@ -92,8 +84,7 @@ def test_bit_flips(bundle: dict[str, bytes], name: str, tmp_path: Path) -> None:
         assert not opened or same(data) == same(bundle[name])
         if name != "bundle.json":
             load_and_draw(folder, verify=False)
-            spoiled = {**bundle, name: bytes(data)}
-            (folder / "bundle.json").write_bytes(signed(json.loads(bundle["bundle.json"]), spoiled))
+            amend(folder)
             load_and_draw(folder, verify=True)
             (folder / "bundle.json").write_bytes(bundle["bundle.json"])
 
@@ -109,7 +100,7 @@ def test_truncation_and_growth(bundle: dict[str, bytes], name: str, tmp_path: Pa
         # JSON may be followed by white space only
         assert not load_and_draw(folder, verify=False) or (name == "bundle.json" and data.strip() == whole.strip())
         if name != "bundle.json":
-            (folder / "bundle.json").write_bytes(signed(json.loads(bundle["bundle.json"]), {**bundle, name: data}))
+            amend(folder)
             load_and_draw(folder, verify=True)
             (folder / "bundle.json").write_bytes(bundle["bundle.json"])
 
@@ -195,6 +186,5 @@ def test_columns_of_extreme_values(bundle: dict[str, bytes], tmp_path: Path) -> 
             folder = put(tmp_path / "b", bundle)
             every = {**elements, element: spoiled}
             write_ply(folder / "surfels.ply", every.pop("vertex"), more=every)
-            files = {**bundle, "surfels.ply": (folder / "surfels.ply").read_bytes()}
-            (folder / "bundle.json").write_bytes(signed(json.loads(bundle["bundle.json"]), files))
+            amend(folder)
             load_and_draw(folder, verify=True)

@@ -1,7 +1,5 @@
 """The poster on the page: shown before the surfels, aligned with the first picture, removed with it."""
 
-import hashlib
-import json
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,7 +14,7 @@ from bitymi_ns.bundle import read_bundle
 from bitymi_ns.bundle.manifest import POSTER
 from bitymi_ns.bundle.single import write_single
 from bitymi_ns.view import Site, single_site, site_of, write_static
-from tests.bundle.damage import signed
+from tests.bundle.damage import amend
 from tests.view.browser import Outcome, drive, plain_server, served
 from tests.view.conftest import HEIGHT, WIDTH, view, write
 from tests.view.test_browser import MEAN, difference
@@ -118,9 +116,7 @@ def test_a_damaged_poster_is_not_shown_and_the_scene_is(damage: str, tmp_path: P
     else:  # with a valid hash
         data = data[:23] + bytes(3) + data[26:]  # the start code
         path.write_bytes(data)
-        info = json.loads((bundle / "bundle.json").read_text())
-        info["files"][POSTER] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
-        (bundle / "bundle.json").write_bytes(signed(info))
+        amend(bundle)
     watch = (
         "window.seen = false; new MutationObserver(() => {"
         "const poster = document.getElementById('poster'); if (poster && !poster.hidden) window.seen = true;"
@@ -133,9 +129,7 @@ def test_a_damaged_poster_is_not_shown_and_the_scene_is(damage: str, tmp_path: P
     assert found.results[3] == "ready" and found.results[4] is False
     if damage != "missing":  # the browser logs a 404
         assert not found.problems
-    info = json.loads((bundle / "bundle.json").read_text())
-    del info["files"][POSTER]
-    (bundle / "bundle.json").write_bytes(signed(info))
+    amend(bundle, lambda info: info["files"].pop(POSTER))
     assert difference(tmp_path / "p.png", bundle)[0] < MEAN
 
 

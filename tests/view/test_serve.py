@@ -208,7 +208,7 @@ def test_an_exported_page_is_complete_and_replaces_only_its_like(bundle: Path, t
     other = tmp_path / "other"
     other.mkdir()
     (other / "precious").write_text("x")
-    with pytest.raises(PageError, match="something other"):
+    with pytest.raises(PageError, match="is not an exported page and is not replaced"):
         write_static(site_of(bundle), other, overwrite=True)
     assert (other / "precious").read_text() == "x"
 

@@ -17,7 +17,7 @@ import pycolmap
 from bitymi_ns.capture.colmap_model import write_model
 from bitymi_ns.capture.sfm import consistency, explain, features, mapping, pairs
 from bitymi_ns.capture.sfm.job import DATABASE, MODEL, Job, NoPoses
-from bitymi_ns.files import complete_folder, explained
+from bitymi_ns.files import complete_folder, write_errors_as
 
 LEAST = 3  # placed photographs of a capture
 _messages = sys.__stdout__  # the pipe of messages
@@ -100,7 +100,10 @@ def main() -> None:
         for image in model.images.values():
             image.name = job.names[image.name]
         path = Path(job.work) / MODEL
-        with explained(path, NoPoses, ". Start again then: what is done is kept."), complete_folder(path) as folder:
+        with (
+            write_errors_as(path, NoPoses, ". Start again then: what is done is kept."),
+            complete_folder(path) as folder,
+        ):
             write_model(model, folder)
         stages("writing", 1, 1)
         send(result={**result, "seconds": {k: v for k, v in stages.seconds.items() if k != "starting"}})

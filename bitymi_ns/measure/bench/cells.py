@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from bitymi_ns.files import explained
+from bitymi_ns.files import write_errors_as
 from bitymi_ns.measure.bench.process import BenchError
 from bitymi_ns.measure.machine import commit, machine, versions
 from bitymi_ns.reading import read_bytes
@@ -84,7 +84,7 @@ class Cells:
         """
         cell = {"key": key, "value": value, "made": origin}
         line = json.dumps(cell, allow_nan=False).encode("utf8") + b"\n"
-        with explained(self.path, BenchError, ", with --work"):
+        with write_errors_as(self.path, BenchError, ", with --work"):
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with open(self.path, "a+b", opener=no_links) as file:
                 fcntl.flock(file, fcntl.LOCK_EX)

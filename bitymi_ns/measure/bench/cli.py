@@ -10,15 +10,15 @@ from typing import get_args
 
 import tyro
 
-from bitymi_ns.files import check_writable, explained, write_file
+from bitymi_ns.files import check_writable, write_errors_as, write_file
 from bitymi_ns.measure import markdown
 from bitymi_ns.measure.bench.cells import FILE, Cells
 from bitymi_ns.measure.bench.engine import run_chains
 from bitymi_ns.measure.bench.matrix import (
-    Bundle,
+    BundleSpec,
     Format,
     Matrix,
-    Row,
+    MethodSpec,
     SceneSpec,
     local_scenes,
     read_plan,
@@ -74,15 +74,15 @@ class BenchRun:
         if self.pictures < 0:
             raise BenchError("--pictures must not be negative")
         if self.plan is None:
-            rows, bundles = [Row(name, name) for name in self.methods], None
+            rows, bundles = [MethodSpec(name, name) for name in self.methods], None
         else:
             rows, bundles = read_plan(self.plan)
         extra = tuple(shlex.split(self.extra))
         if not rows:
             raise BenchError("nothing to run: give --methods or --plan")
-        rows = [Row(row.name, row.method, (*row.options, *extra)) for row in rows]
+        rows = [MethodSpec(row.name, row.method, (*row.options, *extra)) for row in rows]
         if bundles is None:
-            bundles = [Bundle(name, ("--format", name)) for name in dict.fromkeys(self.formats)]
+            bundles = [BundleSpec(name, ("--format", name)) for name in dict.fromkeys(self.formats)]
         return Matrix(self._scenes(), rows, self.seeds, self.steps, bundles, self.pictures)
 
     def run(self) -> int:
@@ -90,7 +90,7 @@ class BenchRun:
         matrix, work = self.matrix(), Path(os.path.expanduser(self.work)).resolve()
         cells = Cells(work / FILE)
         if self.output is not None:
-            with explained(self.output, BenchError):
+            with write_errors_as(self.output, BenchError):
                 check_writable(self.output)
         try:
             failures = run_chains(work, matrix.chains())
@@ -105,7 +105,7 @@ class BenchRun:
         text = results_page(f"Benchmark: {self.plan or self.suite}", matrix, cells, failures)
         print(printable(text))
         if self.output is not None:
-            with explained(self.output, BenchError):
+            with write_errors_as(self.output, BenchError):
                 write_file(self.output, text.encode("utf8"))
         if len(cells):
             print(printable(f"Cells: {cells.path}. A page of it: bitymi report {cells.path}"), file=sys.stderr)

@@ -9,15 +9,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from bitymi_ns.files import Busy, Lock, explained
+from bitymi_ns.files import Busy, Lock, write_errors_as
 from bitymi_ns.measure.bench.cells import FILE, Cells, provenance, without_nan
-from bitymi_ns.measure.bench.matrix import Run, Stage
+from bitymi_ns.measure.bench.matrix import CellSpec, Run
 from bitymi_ns.measure.bench.process import BenchError, CommandFailed, run_measured, say, tool
 from bitymi_ns.measure.report.read import PICTURES, read_jsonl
 from bitymi_ns.trust import json_of
 
 CURVE = "training_curve.jsonl"
-Chain = Sequence[Stage]  # the cells of one run; each may depend on those before it
+Chain = Sequence[CellSpec]  # the cells of one run; each may depend on those before it
 
 
 def config_of(work: Path, run: Run) -> Path:
@@ -25,7 +25,7 @@ def config_of(work: Path, run: Run) -> Path:
     return work / "runs" / run.folder / "config.yml"
 
 
-def output_of(work: Path, stage: Stage) -> Path:
+def output_of(work: Path, stage: CellSpec) -> Path:
     """Return the output path of a cell: a folder, or the file of an evaluation."""
     run = stage.run.folder
     return {
@@ -52,7 +52,7 @@ def train_command(work: Path, run: Run) -> list[str]:
     return [*command, *filter(None, [parser]), "--data", str(run.scene.data), *options]
 
 
-def stage_command(work: Path, stage: Stage) -> list[str]:
+def stage_command(work: Path, stage: CellSpec) -> list[str]:
     """Build the command line of a cell."""
     if stage.kind == "train":
         return train_command(work, stage.run)
@@ -69,7 +69,7 @@ def stage_command(work: Path, stage: Stage) -> list[str]:
     return [*command, "--output-dir", output, "--views", str(stage.count)]
 
 
-def read_result(work: Path, stage: Stage) -> dict[str, Any]:
+def read_result(work: Path, stage: CellSpec) -> dict[str, Any]:
     """Read the figures of a finished command.
 
     train: `steps`, `seconds` and `cpu_seconds` of the training steps only (no loading, evaluation or saving),
@@ -87,7 +87,7 @@ def read_result(work: Path, stage: Stage) -> dict[str, Any]:
     return without_nan(figures if stage.kind == "eval" else {**figures, "folder": output_of(Path(), stage).as_posix()})
 
 
-def _train(folder: Path, stage: Stage) -> dict[str, Any]:
+def _train(folder: Path, stage: CellSpec) -> dict[str, Any]:
     if not stage.run.row.ours:
         return {}
     _, curves, _ = read_jsonl(folder / CURVE)
@@ -97,7 +97,7 @@ def _train(folder: Path, stage: Stage) -> dict[str, Any]:
     return {"steps": curves[0].last("step"), **figures, "curve": f"runs/{stage.run.folder}/{CURVE}"}
 
 
-def _export(folder: Path, stage: Stage) -> dict[str, Any]:
+def _export(folder: Path, stage: CellSpec) -> dict[str, Any]:
     from bitymi_ns.bundle.read import download_bytes, read_manifest  # imports torch, not needed for other methods
 
     info = read_manifest(folder)
@@ -110,27 +110,27 @@ def _export(folder: Path, stage: Stage) -> dict[str, Any]:
     }
 
 
-def _evaluation(file: Path, stage: Stage) -> dict[str, Any]:
+def _evaluation(file: Path, stage: CellSpec) -> dict[str, Any]:
     results = json_of(file.read_text("utf8"))["results"]
     if not isinstance(results, dict) or "psnr" not in results:
         raise ValueError("no psnr in it")
     return {"results": results}
 
 
-def _pictures(folder: Path, stage: Stage) -> dict[str, Any]:
+def _pictures(folder: Path, stage: CellSpec) -> dict[str, Any]:
     return {"views": len(json_of((folder / PICTURES).read_text("utf8"))["views"])}
 
 
-def _needs(stage: Stage, other: Stage) -> bool:
+def _needs(stage: CellSpec, other: CellSpec) -> bool:
     """Return True if `stage` depends on `other`, of the same run."""
     if other.kind == "train":
         return stage.kind != "train"
     return other.kind == "export" and stage.kind == "eval" and stage.bundle == other.bundle
 
 
-def missing(chain: Chain, cells: Cells) -> list[Stage]:
+def missing(chain: Chain, cells: Cells) -> list[CellSpec]:
     """List the cells of a run to execute: those not finished, and those that depend on these."""
-    pending: list[Stage] = []
+    pending: list[CellSpec] = []
     for stage in chain:
         if cells.get(stage.key) is None or any(_needs(stage, other) for other in pending):
             pending.append(stage)
@@ -145,7 +145,7 @@ def locked(work: Path, run: Run) -> Iterator[Lock]:
         CommandFailed: another process holds the lock.
     """
     path = work / "locks" / f"{run.folder.replace('/', '--')}.lock"
-    with explained(work, BenchError, ", with --work"):
+    with write_errors_as(work, BenchError, ", with --work"):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             lock = Lock(path, say)
@@ -155,7 +155,7 @@ def locked(work: Path, run: Run) -> Iterator[Lock]:
         yield lock
 
 
-def _run_stage(work: Path, stage: Stage, cells: Cells, lock: Lock) -> None:
+def _run_stage(work: Path, stage: CellSpec, cells: Cells, lock: Lock) -> None:
     command, output = stage_command(work, stage), output_of(work, stage)
     if stage.kind == "eval":  # the folder also holds other evaluations
         output.parent.mkdir(parents=True, exist_ok=True)
@@ -167,10 +167,10 @@ def _run_stage(work: Path, stage: Stage, cells: Cells, lock: Lock) -> None:
     cells.add(stage.key, value, provenance(command, time.perf_counter() - start))
 
 
-def _run_chain(work: Path, chain: Chain, cells: Cells, announce: Callable[[Stage], None]) -> list[str]:
+def _run_chain(work: Path, chain: Chain, cells: Cells, announce: Callable[[CellSpec], None]) -> list[str]:
     """Execute the missing cells of a run, except those that depend on a failed one; return a message per failure."""
     failures: list[str] = []
-    broken: list[Stage] = []
+    broken: list[CellSpec] = []
     with locked(work, chain[0].run) as lock:
         cells.refresh()
         for stage in missing(chain, cells):
@@ -206,7 +206,7 @@ def run_chains(work: Path, chains: Sequence[Chain]) -> list[str]:
     if done:
         say(f"{done} of {total} cells are finished already")
 
-    def announce(stage: Stage) -> None:
+    def announce(stage: CellSpec) -> None:
         left = [other for chain in chains for other in missing(chain, cells)]
         say(f"{stage} ({total - len(left) + 1} of {total}{time_left(left, cells)})")
 
@@ -221,7 +221,7 @@ def run_chains(work: Path, chains: Sequence[Chain]) -> list[str]:
     return failures
 
 
-def time_left(stages: Iterable[Stage], cells: Cells) -> str:
+def time_left(stages: Iterable[CellSpec], cells: Cells) -> str:
     """Estimate the remaining time from the mean of finished cells of the same kind, scene and number of steps, or else
     of the same kind; empty if a kind has none."""
     known: dict[tuple, list[float]] = {}

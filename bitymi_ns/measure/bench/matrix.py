@@ -31,7 +31,7 @@ class SceneSpec:
 
 
 @dataclass(frozen=True)
-class Row:
+class MethodSpec:
     """A method with further options of ns-train."""
 
     name: str
@@ -45,7 +45,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Bundle:
+class BundleSpec:
     """Named options of `ns-export bitymi-atlas`."""
 
     name: str
@@ -57,7 +57,7 @@ class Run:
     """A training run: scene, row, seed (None: the method's own) and number of steps (None: the method's own)."""
 
     scene: SceneSpec
-    row: Row
+    row: MethodSpec
     seed: int | None = None
     steps: int | None = None
 
@@ -95,12 +95,12 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Stage:
+class CellSpec:
     """A cell of the matrix."""
 
     run: Run
     kind: Kind
-    bundle: Bundle | None = None
+    bundle: BundleSpec | None = None
     count: int = 0  # pictures: number of views
 
     @property
@@ -128,28 +128,28 @@ class Matrix:
     """Matrix of runs: each row is trained on each scene with each seed, then baked to each bundle."""
 
     scenes: Sequence[SceneSpec]
-    rows: Sequence[Row]
+    rows: Sequence[MethodSpec]
     seeds: Sequence[int] = ()  # empty: once, with the method's own seed
     steps: int | None = None  # length of a run; None: the method's own for this machine
-    bundles: Sequence[Bundle] = field(default_factory=tuple)
+    bundles: Sequence[BundleSpec] = field(default_factory=tuple)
     pictures: int = 0  # number of worst held-out views to draw with their decomposition
 
     def runs(self) -> list[Run]:
         seeds = list(self.seeds) or [None]
         return [Run(s, r, seed, self.steps) for s in self.scenes for r in self.rows for seed in seeds]
 
-    def stages(self, run: Run) -> list[Stage]:
+    def stages(self, run: Run) -> list[CellSpec]:
         """List the cells of a run in the order of their dependencies."""
-        stages = [Stage(run, "train"), Stage(run, "eval")]
+        stages = [CellSpec(run, "train"), CellSpec(run, "eval")]
         if not run.row.ours:
             return stages
         for bundle in self.bundles:
-            stages += [Stage(run, "export", bundle), Stage(run, "eval", bundle)]
+            stages += [CellSpec(run, "export", bundle), CellSpec(run, "eval", bundle)]
         if self.pictures:
-            stages.append(Stage(run, "pictures", count=self.pictures))
+            stages.append(CellSpec(run, "pictures", count=self.pictures))
         return stages
 
-    def chains(self) -> list[list[Stage]]:
+    def chains(self) -> list[list[CellSpec]]:
         return [self.stages(run) for run in self.runs()]
 
 
@@ -249,7 +249,7 @@ class _Plan(BaseModel):
     bundles: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._+-]*$")], Words] | None = None
 
 
-def read_plan(name: str) -> tuple[list[Row], list[Bundle] | None]:
+def read_plan(name: str) -> tuple[list[MethodSpec], list[BundleSpec] | None]:
     """Read a plan by name, or from a YAML file.
 
     Returns:
@@ -280,7 +280,7 @@ def read_plan(name: str) -> tuple[list[Row], list[Bundle] | None]:
             inside(Path("runs"), row.method)
         except ValueError as error:
             raise BenchError(f"plan {name}, row {title}: {error}") from error
-        rows.append(Row(str(title), row.method, tuple(map(str, row.options))))
+        rows.append(MethodSpec(str(title), row.method, tuple(map(str, row.options))))
     if plan.bundles is None:
         return rows, None
-    return rows, [Bundle(title, tuple(map(str, options))) for title, options in plan.bundles.items()]
+    return rows, [BundleSpec(title, tuple(map(str, options))) for title, options in plan.bundles.items()]

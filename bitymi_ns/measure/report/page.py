@@ -8,7 +8,7 @@ from typing import Any
 
 from bitymi_ns import __version__
 from bitymi_ns.capture.report import PICTURE
-from bitymi_ns.files import check_writable, explained, write_file
+from bitymi_ns.files import check_writable, write_errors_as, write_file
 from bitymi_ns.measure.markdown import rendered
 from bitymi_ns.measure.report.pictures import ERROR_CAPTION, compare_views, encode_files, worst_views
 from bitymi_ns.measure.report.plots import Plot, draw_plots
@@ -93,10 +93,10 @@ def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report"
         ReportError: an input is missing or broken, nothing usable was found, or the report cannot be written.
     """
     output_dir = Path(os.path.expanduser(output_dir)).absolute()
-    with explained(output_dir, ReportError):
+    with write_errors_as(output_dir, ReportError):
         _check_output(output_dir)
         check_writable(output_dir)
     text = to_page(compose(collect(list(inputs), output_dir), title))
-    with explained(output_dir, ReportError):
+    with write_errors_as(output_dir, ReportError):
         write_file(output_dir / PAGE, text.encode("utf8"))
     return output_dir / PAGE

@@ -87,7 +87,7 @@ def cases(way: Way = PLAIN) -> list[Case]:
 
 
 @dataclass(frozen=True)
-class Row:
+class SceneErrors:
     """Errors measured on one scene."""
 
     label: str
@@ -127,19 +127,21 @@ class Row:
         return "**loses figures**"
 
 
-def measure_row(label: str, scene: SceneCase, backend: Backend, near: float = 0.2, way: Way = PLAIN) -> Row:
+def measure_row(label: str, scene: SceneCase, backend: Backend, near: float = 0.2, way: Way = PLAIN) -> SceneErrors:
     """Measure one scene in float32, float64 and, if it is small enough, extended precision."""
     size = scene.width * scene.height * len(scene.params["means"])
     trust = against_extended(scene, near=near) if way is PLAIN and size <= EXTENDED_SIZE else None
     double = measure(scene, backend, torch.float64, near, way)
-    return Row(label, measure(scene, backend, torch.float32, near, way), double, trust)
+    return SceneErrors(label, measure(scene, backend, torch.float32, near, way), double, trust)
 
 
-def write(path: Path, backend: Backend = BACKENDS["cpu"], progress: Callable[[str], None] | None = None) -> list[Row]:
+def write(
+    path: Path, backend: Backend = BACKENDS["cpu"], progress: Callable[[str], None] | None = None
+) -> list[SceneErrors]:
     """Measure all cases and sweeps, write the page and its plot `<stem>.png`, and return the rows."""
     report_progress = progress or (lambda text: None)
     check_writable(path)
-    named: dict[str, list[Row]] = {}
+    named: dict[str, list[SceneErrors]] = {}
     for way in (PLAIN, *WAYS):
         named[way.name] = []
         for case in cases(way):
@@ -147,7 +149,7 @@ def write(path: Path, backend: Backend = BACKENDS["cpu"], progress: Callable[[st
             row = measure_row(case.name.replace("_", " "), case.scene, backend, way=way)
             if way is PLAIN or row.single.drawn:
                 named[way.name].append(row)
-    swept: dict[str, list[Row]] = {}
+    swept: dict[str, list[SceneErrors]] = {}
     for sweep in SWEEPS:
         report_progress(f"sweep {sweep.name}")
         swept[sweep.name] = [
@@ -159,7 +161,9 @@ def write(path: Path, backend: Backend = BACKENDS["cpu"], progress: Callable[[st
     return [row for rows in (*named.values(), *swept.values()) for row in rows]
 
 
-def _page(backend: Backend, named: dict[str, list[Row]], swept: dict[str, list[Row]], picture: str) -> str:
+def _page(
+    backend: Backend, named: dict[str, list[SceneErrors]], swept: dict[str, list[SceneErrors]], picture: str
+) -> str:
     return rendered(
         "stability.md.j2",
         backend=backend.name,
@@ -181,7 +185,7 @@ CASES = ("case", "forward", "inputs", "gradient", "inputs", "worst in", "flipped
 SWEPT = ("kind", "values", "forward", "inputs", "gradient", "inputs", "float64", "reference", "not accurate at")
 
 
-def _cases(rows: Sequence[Row]) -> str:
+def _cases(rows: Sequence[SceneErrors]) -> str:
     """Format a table of one line per scene."""
     lines = []
     for row in rows:
@@ -192,7 +196,7 @@ def _cases(rows: Sequence[Row]) -> str:
     return markdown.table(CASES, lines, (0, 5, len(CASES) - 1))
 
 
-def _inexact(rows: Sequence[Row]) -> str:
+def _inexact(rows: Sequence[SceneErrors]) -> str:
     """Summarise the accurate cases with their largest errors, then format a line for each other case."""
     accurate = [row for row in rows if row.verdict == "accurate"]
     images, gradients = (max((row.errors[i] for row in accurate), default=0.0) for i in (0, 2))
@@ -201,7 +205,7 @@ def _inexact(rows: Sequence[Row]) -> str:
     return f"{count} {_short(gradients)}." + (f" The others:\n\n{_cases(others)}" if others else "")
 
 
-def _verdicts(rows: Sequence[Row]) -> str:
+def _verdicts(rows: Sequence[SceneErrors]) -> str:
     """Count rows by verdict, without those that draw nothing; "loses figures" is listed even if 0."""
     counts = Counter(row.verdict.strip("*") for row in rows if row.single.drawn)
     return ", ".join(
@@ -209,7 +213,7 @@ def _verdicts(rows: Sequence[Row]) -> str:
     )
 
 
-def _sweeps(swept: Mapping[str, Sequence[Row]]) -> str:
+def _sweeps(swept: Mapping[str, Sequence[SceneErrors]]) -> str:
     """Format a line for each sweep: the largest errors, and the values whose verdict is not "accurate"."""
     lines = []
     for sweep in SWEEPS:
@@ -239,7 +243,7 @@ LOWEST = 1e-17
 
 
 @matplotlib.style.context("default")  # overrides a matplotlibrc in the current folder
-def _plot(swept: dict[str, list[Row]]) -> bytes:
+def _plot(swept: dict[str, list[SceneErrors]]) -> bytes:
     figure = Figure(figsize=(13, 6.4), layout="constrained")
     FigureCanvasAgg(figure)
     for axes, sweep in zip(figure.subplots(2, 4, sharey=True).flat, SWEEPS, strict=True):
@@ -251,7 +255,7 @@ def _plot(swept: dict[str, list[Row]]) -> bytes:
     return buffer.getvalue()
 
 
-def _panel(axes: Axes, sweep: Sweep, rows: Sequence[Row]) -> None:
+def _panel(axes: Axes, sweep: Sweep, rows: Sequence[SceneErrors]) -> None:
     x = sweep.values
     columns = zip(*((*row.errors, row.double.forward, row.double.gradient) for row in rows), strict=True)
     for (label, color, style), values in zip(LINES, columns, strict=True):

@@ -12,17 +12,17 @@ from torch import Tensor
 
 from bitymi_ns import endings
 from bitymi_ns.bundle import BundleError, read_bundle
-from bitymi_ns.bundle.manifest import WorldFrame
+from bitymi_ns.bundle.manifest import WorldEntry
 from bitymi_ns.bundle.parts import CAMERAS, bundle_at
 from bitymi_ns.bundle.strict_json import plain
 from bitymi_ns.codec.pages import texel_alpha
-from bitymi_ns.files import reason, reserved, size_text, write_file
+from bitymi_ns.files import reserved, size_text, write_errors_as, write_file
 from bitymi_ns.interchange import Frame, training_cameras
 from bitymi_ns.interchange.frame import to_capture, up_of
 from bitymi_ns.interchange.surface import NoSurface, SurfaceOptions, extract_surface
 from bitymi_ns.interchange.surface_files import MeshFormat, mesh_bytes
 from bitymi_ns.ops import Prefilter, TexelAlpha
-from bitymi_ns.plugin.console import fail, say, warn
+from bitymi_ns.plugin.console import InputError, fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.export.trained import load_trained, world_of
 from bitymi_ns.progress import rich_progress
@@ -33,7 +33,7 @@ NAME = "mesh"
 MOST_VIEWS = 400  # most fused training views, evenly spaced
 
 
-class Source(NamedTuple):
+class MeshScene(NamedTuple):
     """Scene that a mesh is made of, on the device that draws it."""
 
     surfels: Mapping[str, Tensor]  # geometry by name
@@ -41,7 +41,7 @@ class Source(NamedTuple):
     cameras: Sequence[Camera]  # of the training views
     near: float  # nearest drawn depth, camera z
     prefilter: Prefilter  # as in `ops.project`
-    world: WorldFrame  # of the scene in the capture
+    world: WorldEntry  # of the scene in the capture
     alpha: TexelAlpha | None  # opacities of the texels; None = opaque
 
 
@@ -66,7 +66,7 @@ class ExportMesh(SurfaceOptions):
         except ValueError as error:
             fail(f"--{error}.", error)
         try:
-            with reserved(path, warn):
+            with write_errors_as(path, InputError, " (--output-dir)."), reserved(path, warn):
                 self._check_target(path)
                 bundle = bundle_at(self.load_config)
                 if bundle is None and self.crop:
@@ -77,15 +77,13 @@ class ExportMesh(SurfaceOptions):
             fail(str(error), error)
         except NoSurface as error:
             fail(f"{self.load_config}: {error}.", error)
-        except OSError as error:
-            fail(f"{path} cannot be written: {reason(error, path)} (--output-dir).", error)
 
     def _check_target(self, path: Path) -> None:
         """Stop if the file exists and may not be replaced."""
         if os.path.lexists(path) and not self.overwrite:
             fail(f"{path} is there already: choose another --output-dir, or add --overwrite True.")
 
-    def _write(self, source: Source, path: Path) -> str:
+    def _write(self, source: MeshScene, path: Path) -> str:
         """Write the mesh; return a summary."""
         to = to_capture(source.world) if self.frame == "capture" else None
         step = max(1, -(-len(source.cameras) // MOST_VIEWS))
@@ -108,20 +106,20 @@ class ExportMesh(SurfaceOptions):
         return f"{size_text(path.stat().st_size)}, in the {self.frame}'s frame" + (note and f"; {note}{where}")
 
 
-def from_run(load_config: Path) -> Source:
+def from_run(load_config: Path) -> MeshScene:
     """Load the scene of a training run's last checkpoint."""
     _, pipeline = load_trained(load_config)
     model, datamanager = pipeline.model, pipeline.datamanager
     cameras = to_cameras(datamanager.train_dataset.cameras, model.device)
     scene = model.scene
     surfels = {name: value.detach() for name, value in scene.surfels.items()}
-    world = WorldFrame.model_validate_json(json.dumps(plain(world_of(datamanager).described())))
+    world = WorldEntry.model_validate_json(json.dumps(plain(world_of(datamanager).described())))
     alpha = None if scene.field is None else scene.field.opacity(scene.config.weight_bound, learns=False)
     drawn = (cameras, scene.near, scene.config.prefilter, world, alpha)
-    return Source(surfels, lambda camera: model.render(camera, model.background, maps=False).rgb, *drawn)
+    return MeshScene(surfels, lambda camera: model.render(camera, model.background, maps=False).rgb, *drawn)
 
 
-def from_bundle(folder: Path, crop: bool = False) -> Source:
+def from_bundle(folder: Path, crop: bool = False) -> MeshScene:
     """Load a bundle with its training cameras, cropped as by `read_bundle`. Raises BundleError: it cannot be read, or
     has no cameras."""
     bundle = read_bundle(folder, crop=crop)
@@ -133,4 +131,4 @@ def from_bundle(folder: Path, crop: bool = False) -> Source:
         advice = "give the config.yml of the run that it was made from"
         raise BundleError(f"{folder} has no cameras ({CAMERAS}) to see the surface from: {advice}")
     drawn = (cameras, scene.near, scene.prefilter, bundle.info.world, texel_alpha(scene))
-    return Source(scene.surfels, lambda camera: bundle.render(camera).rgb, *drawn)
+    return MeshScene(scene.surfels, lambda camera: bundle.render(camera).rgb, *drawn)

@@ -13,7 +13,7 @@ from bitymi_ns.bundle.manifest import MANIFEST
 from bitymi_ns.bundle.parts import CONFIG as CONFIG
 from bitymi_ns.bundle.parts import check_target
 from bitymi_ns.codec.quantise import BYTES_PER_TEXEL
-from bitymi_ns.files import explained, free_bytes, reserved, size_text
+from bitymi_ns.files import free_bytes, reserved, size_text, write_errors_as
 from bitymi_ns.plugin.console import InputError, fail, warn
 from bitymi_ns.plugin.run.bundle_model import BakedModelConfig
 from bitymi_ns.plugin.run.config import method_config
@@ -26,7 +26,7 @@ TYPICAL_SIDE = 32  # side of a tile in texels, generously: within a tolerance mo
 def reserve_bundle(folder: Path, overwrite: bool) -> Iterator[None]:
     """Lock a bundle's folder; stop if it is in use or cannot be written. Raises BundleError: other files are there."""
     with ExitStack() as stack:
-        with explained(folder, InputError, " (--output-dir)."):
+        with write_errors_as(folder, InputError, " (--output-dir)."):
             stack.enter_context(reserved(folder, warn))
             check_target(folder, overwrite)
         yield

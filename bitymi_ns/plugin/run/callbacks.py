@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from bitymi_ns.capture.images import exposure_stops
-from bitymi_ns.files import explained, reason, write_file
+from bitymi_ns.files import reason, write_errors_as, write_file
 from bitymi_ns.plugin.console import InputError, fail, listed, say, warn
 from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.plugin.data.dataset import capture_fingerprint, warn_of_other_capture
@@ -192,7 +192,7 @@ class TrainingCurve:
     def __init__(self, path: Path, resumed_from: Path | None = None, steps_done: int = 0) -> None:
         self.path = path
         source = resumed_from if resumed_from is not None else path if steps_done > 0 else None
-        with explained(path, InputError, "."):
+        with write_errors_as(path, InputError, "."):
             kept = []
             for line in source.read_text("utf8").splitlines() if source is not None and source.is_file() else ():
                 with suppress(ValueError, KeyError, TypeError):  # cut off when the run was killed

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
-from bitymi_ns.files import explained
+from bitymi_ns.files import write_errors_as
 from bitymi_ns.plugin.console import InputError, fail, warn
 from bitymi_ns.ranges import first_problem
 from bitymi_ns.reading import read_json, reading
@@ -69,7 +69,7 @@ class CameraPath(BaseModel):
     def written(self) -> Path:
         """Write the path to a file that lasts as long as the process."""
         folder = Path(tempfile.gettempdir())
-        with explained(folder, InputError):
+        with write_errors_as(folder, InputError):
             folder = Path(tempfile.mkdtemp(prefix="bitymi-path-"))
             atexit.register(shutil.rmtree, folder, ignore_errors=True)
             file = folder / "camera_path.json"

@@ -14,7 +14,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from bitymi_ns.capture.sfm_poses import has_kept_poses, kept_settings
-from bitymi_ns.files import explained, write_file
+from bitymi_ns.files import write_errors_as, write_file
 from bitymi_ns.plugin import hooks
 from bitymi_ns.plugin.console import InputError, as_input_error, fail, say, warn
 from bitymi_ns.plugin.data.capture_checks import check_capture
@@ -131,7 +131,7 @@ class BitymiTrainerConfig(TrainerConfig):
         if self.load_dir is None and self.load_checkpoint is None:
             run_folder.check_unused(folder, self.get_checkpoint_dir())
         run_folder.take(folder)
-        with explained(folder, InputError, " (--output-dir)."):
+        with write_errors_as(folder, InputError, " (--output-dir)."):
             write_file(folder / "config.yml", yaml.dump(self).encode("utf8"))
         # what follows in nerfstudio would start the processes its own way, see `torchrun`
         self.machine = replace(self.machine, num_machines=1, num_devices=1)

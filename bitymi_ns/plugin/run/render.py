@@ -1,7 +1,7 @@
 """Render our scenes in `ns-render`: films and frames without a program ffmpeg, options checked before loading a scene.
 
 nerfstudio's script reads a camera path, or makes one of the capture's cameras, and calls a function that renders and
-writes. `hooks.adopt_render` replaces it by those of this module.
+writes. `hooks.patch_render` replaces it by those of this module.
 """
 
 import math
@@ -16,7 +16,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils import colormaps
 from torch import Tensor
 
-from bitymi_ns.files import check_writable, explained, size_text
+from bitymi_ns.files import check_writable, size_text, write_errors_as
 from bitymi_ns.plugin.console import INTERRUPTED, InputError, fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.plugin.run.camera_path import MOST_PIXELS, read_camera_path
@@ -75,7 +75,7 @@ def check_options(command: Any) -> None:
     path = target_of(command)
     if as_film and path.suffix.lower() != ".mp4":
         fail(f"films are MP4: --output-path must end in .mp4, {path} does not. Frames: --output-format images.")
-    with explained(path, InputError, OPTION):
+    with write_errors_as(path, InputError, OPTION):
         check_writable(path)
     if as_film and path.is_dir():
         fail(f"{path} is a folder: choose another --output-path.")
@@ -173,7 +173,7 @@ def write_trajectory(model: SurfelModel, cameras: Cameras, command: Any, seconds
     planes = _depth_planes(model, views, command) if "depth" in names else {}
     empty = 0
     try:
-        with explained(target, InputError, OPTION):
+        with write_errors_as(target, InputError, OPTION):
             output = frames(target, command.image_format, command.jpeg_quality) if images else film(target, fps)
             with output as add, rich_progress() as progress:
                 for i, camera in enumerate(views):

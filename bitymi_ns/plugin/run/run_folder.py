@@ -18,7 +18,7 @@ POSES = "poses"  # subfolder of poses that this package found, and their report
 def take(folder: Path) -> None:
     """Make the folder, hold it until `leave` or the end of the process, and remove unfinished files of killed runs.
     Raises InputError: another process trains into it, or it cannot be written."""
-    with files.explained(folder, InputError, " (--output-dir)."):
+    with files.write_errors_as(folder, InputError, " (--output-dir)."):
         folder.mkdir(parents=True, exist_ok=True)
         try:
             files.hold(folder / LOCK, warn)

@@ -12,7 +12,7 @@ import pytest
 from bitymi_ns.bundle import World
 from bitymi_ns.bundle.manifest import describe, dump
 from bitymi_ns.codec.quantise import Format
-from bitymi_ns.measure.bench.matrix import Bundle, Matrix, Row, SceneSpec
+from bitymi_ns.measure.bench.matrix import BundleSpec, Matrix, MethodSpec, SceneSpec
 
 FAKE = """#!{python} -SE
 import json, os, pathlib, sys, time
@@ -144,5 +144,5 @@ def capture(tmp_path: Path) -> Callable[[str], Path]:
 def matrix(capture: Callable[[str], Path]) -> Matrix:
     """Two captures, two seeds, one format, with pictures: 20 cells."""
     scenes = [SceneSpec(name, capture(name)) for name in ("fox", "lego")]
-    bundles = [Bundle("bc7", ("--format", "bc7"))]
-    return Matrix(scenes, [Row("bitymi", "bitymi")], (0, 1), 100, bundles, pictures=1)
+    bundles = [BundleSpec("bc7", ("--format", "bc7"))]
+    return Matrix(scenes, [MethodSpec("bitymi", "bitymi")], (0, 1), 100, bundles, pictures=1)

@@ -13,7 +13,7 @@ from bitymi_ns.files import Lock
 from bitymi_ns.measure.bench import engine
 from bitymi_ns.measure.bench.cells import Cells, identity
 from bitymi_ns.measure.bench.engine import run_chains, time_left
-from bitymi_ns.measure.bench.matrix import Matrix, Row, Stage
+from bitymi_ns.measure.bench.matrix import CellSpec, Matrix, MethodSpec
 from bitymi_ns.measure.bench.process import BenchError, CommandFailed, run_measured, tool
 
 
@@ -54,7 +54,7 @@ def test_commands_are_the_stock_ones_with_all_settings(fakes, matrix: Matrix, tm
 def test_finished_cells_are_skipped(fakes, matrix: Matrix, tmp_path: Path) -> None:
     run_chains(tmp_path / "work", matrix.chains())
     fakes.calls()
-    renamed = Matrix(matrix.scenes, [Row("another name", "bitymi")], (0, 1), 100, matrix.bundles, 1)
+    renamed = Matrix(matrix.scenes, [MethodSpec("another name", "bitymi")], (0, 1), 100, matrix.bundles, 1)
     assert run_chains(tmp_path / "work", matrix.chains()) == run_chains(tmp_path / "work", renamed.chains()) == []
     assert fakes.calls() == []
 
@@ -154,7 +154,7 @@ def test_a_command_that_leaves_nothing_is_a_failure(fakes, matrix: Matrix, tmp_p
 
 
 def test_methods_of_others_are_trained_and_evaluated_only(fakes, matrix: Matrix, tmp_path: Path) -> None:
-    other = Matrix(matrix.scenes[:1], [Row("splatfacto", "splatfacto")], (), 100, matrix.bundles, 1)
+    other = Matrix(matrix.scenes[:1], [MethodSpec("splatfacto", "splatfacto")], (), 100, matrix.bundles, 1)
     assert run_chains(tmp_path / "work", other.chains()) == []
     assert [call.split()[0] for call in fakes.calls()] == ["ns-train", "ns-eval"]
     (cell, _) = lines(tmp_path / "work")
@@ -202,15 +202,15 @@ def test_places_that_cannot_be_written_are_found_first(
 def test_runs_of_different_settings_have_different_folders(matrix: Matrix) -> None:
     runs = matrix.runs()
     assert len({run.folder for run in runs}) == 4
-    assert Cells(Path("/nowhere/cells.jsonl")).get(Stage(runs[0], "train").key) is None
+    assert Cells(Path("/nowhere/cells.jsonl")).get(CellSpec(runs[0], "train").key) is None
 
 
 def test_the_time_left_is_that_of_the_cells_most_alike(matrix: Matrix, tmp_path: Path) -> None:
     cells = Cells(tmp_path / "cells.jsonl")
     fox, _, lego, _ = matrix.runs()
-    assert time_left([Stage(fox, "train")], cells) == ""
-    cells.add(Stage(lego, "train").key, {}, {"seconds": 600.0})
-    assert time_left([Stage(fox, "train")], cells) == ", about 10 min left"
-    cells.add(Stage(fox, "train").key, {}, {"seconds": 1800.0})
-    assert time_left([Stage(fox, "train")] * 4, cells) == ", about 2.0 h left"
-    assert time_left([Stage(fox, "train"), Stage(fox, "eval")], cells) == ""
+    assert time_left([CellSpec(fox, "train")], cells) == ""
+    cells.add(CellSpec(lego, "train").key, {}, {"seconds": 600.0})
+    assert time_left([CellSpec(fox, "train")], cells) == ", about 10 min left"
+    cells.add(CellSpec(fox, "train").key, {}, {"seconds": 1800.0})
+    assert time_left([CellSpec(fox, "train")] * 4, cells) == ", about 2.0 h left"
+    assert time_left([CellSpec(fox, "train"), CellSpec(fox, "eval")], cells) == ""

@@ -8,7 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bitymi_ns.capture.points import read_points
-from tests.captures import colmap_model, edit_frames, load_any, printed, write_cloud
+from tests.captures import edit_frames, load_any, printed, write_cloud
+from tests.formats import colmap
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 Pose = np.ndarray
@@ -18,13 +19,10 @@ WRONG = "As they are, the scene will be wrong."
 @pytest.fixture
 def model(capture: Path) -> Path:
     """images.txt of the room as a COLMAP model with 200 points."""
-    folder = capture / "sparse/0"
-    colmap_model(capture, folder)
     points = read_points(capture / "sparse_pc.ply")[0]
+    folder = colmap(capture)
     rows = [" ".join(map(str, [i, *xyz, *rgb, 0.5])) for i, (xyz, rgb) in enumerate(zip(*points, strict=True), 1)]
     (folder / "points3D.txt").write_text("\n".join(rows))
-    for name in ("transforms.json", "sparse_pc.ply"):
-        (capture / name).unlink()
     return folder / "images.txt"
 
 

@@ -18,7 +18,7 @@ from bitymi_ns.capture.lens import lenses_of
 from bitymi_ns.capture.maps import MAPS, MapFiles, maps_beside, read_depth
 from bitymi_ns.capture.types import ColmapCamera
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
-from bitymi_ns.sample.capture import View, first_hits, generate
+from bitymi_ns.sample.capture import RoomView, first_hits, generate
 from bitymi_ns.sample.room import Room
 from tests.captures import expect, load, refused
 
@@ -33,7 +33,7 @@ def room(tmp_path_factory) -> tuple[Path, list[np.ndarray]]:
     depths = []
     for frame in meta["frames"]:
         pose = np.array(frame["transform_matrix"])
-        points, _ = first_hits(model, View(pose, meta["fl_x"], WIDTH, HEIGHT), np.arange(WIDTH * HEIGHT))
+        points, _ = first_hits(model, RoomView(pose, meta["fl_x"], WIDTH, HEIGHT), np.arange(WIDTH * HEIGHT))
         depths.append(((pose[:3, 3] - points) @ pose[:3, 2]).reshape(HEIGHT, WIDTH))
     return folder, depths
 

@@ -16,7 +16,8 @@ from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.sample.capture import camera_path, render
 from bitymi_ns.sample.room import Room
 from tests.captures import edit, edit_frames, load_any, printed, write_cloud
-from tests.plugin.data.test_true_captures import ALL, blender, colmap, move
+from tests.formats import PHOTOGRAPHS, blender, colmap
+from tests.plugin.data.test_true_captures import move
 
 SIZE = (200, 150)
 TRIANGULATE = known_poses.triangulate  # before fixtures patch it
@@ -27,9 +28,9 @@ def arc(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Six photographs along an arc, with poses and without points."""
     folder = tmp_path_factory.mktemp("arc")
     (folder / "images").mkdir()
-    frames = []
+    room, frames = Room(0), []
     for i, view in enumerate(camera_path(60, *SIZE, seed=0)[:6]):
-        Image.fromarray(render(Room(0), view, supersample=2)).save(folder / f"images/{i}.png")
+        Image.fromarray(render(room, view, supersample=2)).save(folder / f"images/{i}.png")
         pose = np.vstack([view.camera_to_world[:3], [0, 0, 0, 1]]).tolist()
         frames.append({"file_path": f"images/{i}.png", "transform_matrix": pose})
     camera = {"w": SIZE[0], "h": SIZE[1], "fl_x": view.focal, "fl_y": view.focal, "cx": SIZE[0] / 2, "cy": SIZE[1] / 2}
@@ -104,7 +105,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[list[known_poses.KnownView]]:
     return calls
 
 
-@pytest.mark.parametrize("form", ALL)
+@pytest.mark.parametrize("form", PHOTOGRAPHS)
 def test_every_format_without_points(capture: Path, form: Any, asked: list[Any]) -> None:
     place = form(capture)
     if form is colmap:
@@ -121,7 +122,7 @@ def test_every_format_without_points(capture: Path, form: Any, asked: list[Any])
     assert len(asked) == 1
 
 
-@pytest.mark.parametrize("form", ALL)
+@pytest.mark.parametrize("form", PHOTOGRAPHS)
 def test_triangulated_points_instead_of_those_of_the_capture(capture: Path, form: Any, asked: list[Any]) -> None:
     place = form(capture)
     move(place, np.zeros(3))

@@ -12,7 +12,6 @@ from PIL import Image
 
 from tests.captures import (
     add_masks,
-    colmap_model,
     edit,
     edit_frames,
     expect,
@@ -21,8 +20,7 @@ from tests.captures import (
     printed,
     save_masks,
 )
-from tests.plugin.data.test_scanner_views import polycam
-from tests.plugin.data.test_true_captures import instant_ngp, nerfstudio
+from tests.formats import colmap, instant_ngp, nerfstudio, polycam
 
 LEFT = np.uint8(np.arange(48) < 24)[None].repeat(36, 0) * 255
 
@@ -40,14 +38,8 @@ def blender(capture: Path) -> Path:
     return capture
 
 
-def colmap(capture: Path) -> Path:
-    colmap_model(capture, capture / "sparse/0")
-    (capture / "transforms.json").unlink()
-    return capture
-
-
 def scanned(capture: Path) -> Path:
-    folder = polycam(capture, capture.parent / "scan")
+    folder = polycam(capture)
     if (capture / "masks").is_dir():
         shutil.copytree(capture / "masks", folder / "keyframes/masks")
         for i, path in enumerate(sorted((folder / "keyframes/masks").iterdir())):
@@ -61,12 +53,13 @@ def test_a_folder_of_masks_beside_the_photographs(
 ) -> None:
     save_masks(capture, LEFT)
     place = form(capture)
+    place = capture if form is colmap else place
     mask = load_any(place).cached_train[0]["mask"]
     assert mask[:, :24].all() and not mask[:, 24:].any()
     assert "`bitymi-data --use-masks False` leaves masks out" in (text := printed(capsys)) and "masks" in text
     assert "Not taken for photographs" not in text or "masks (" not in text
     assert "mask" not in load_any(place, use_masks=False).cached_train[0]
-    assert "masks (12 masks)" in printed(capsys)
+    assert "masks (masks: 12)" in printed(capsys)
 
 
 @pytest.mark.parametrize("form", [nerfstudio, instant_ngp])
@@ -96,7 +89,7 @@ def test_a_folder_with_some_of_the_masks_or_of_something_else(
         path.unlink()
     next((capture / "masks").iterdir()).rename(capture / "masks/mask.png")  # ns-process-data's name for a common mask
     assert "mask" not in load_any(capture).cached_train[0]
-    assert "Not taken for photographs" in (text := printed(capsys)) and "masks (1 masks)" in text
+    assert "Not taken for photographs" in (text := printed(capsys)) and "masks (masks: 1)" in text
 
 
 def test_masks_are_checked_before_points_are_triangulated(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -122,6 +115,7 @@ def test_pictures_that_nothing_names_are_named(
     capture: Path, form: Callable[[Path], Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     place = form(capture)
+    place = capture if form is colmap else place
     folder = next(path for path in (capture / "images", capture / "train") if path.is_dir())
     for name in ("extra.png", "deeper/other.png"):
         (folder / name).parent.mkdir(exist_ok=True)
@@ -133,7 +127,7 @@ def test_pictures_that_nothing_names_are_named(
         Image.new("RGB", (8, 8)).save(capture / name)
     load_any(place)
     text = printed(capsys)
-    for part in ("depth (1 depth maps)", "scene (1 pictures of a bundle)", "/notes that nothing names (board.png)"):
+    for part in ("depth (depth maps: 1)", "scene (pictures of a bundle: 1)", "/notes that nothing names (board.png)"):
         assert part in text, part
     assert ("are left out: extra.png" if form is colmap else "that nothing names (extra.png)") in text
     assert "deeper that nothing names (other.png)" in text
@@ -145,4 +139,4 @@ def test_pictures_that_nothing_names_are_named(
         load_any(place, downscale_factor=2)
         assert "images_2" not in printed(capsys)
         load_any(place)
-        assert "images_2 (13 reduced copies)" in printed(capsys)
+        assert "images_2 (reduced copies: 13)" in printed(capsys)

@@ -50,20 +50,6 @@ def test_scaled_rotations_give_the_cameras_of_clean_ones(
     assert ("in the poses of images/frame_00004.png. The" in message) == (only is not None)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda part: part + 0.3 * part[:, [1, 0, 2]] * [1, 0, 0], "is sheared or stretched"),
-        (lambda part: part * [1, 1, 1.1], "is sheared or stretched"),
-        (lambda part: 0 * part, "is zero"),
-    ],
-)
-def test_what_is_no_rotation_is_refused_by_name(capture: Path, change: Any, message: str) -> None:
-    change_poses(capture, change, only=3)
-    with expect(f"transforms.json: the 3 x 3 part of the pose of images/frame_00004.png is no rotation, it {message}"):
-        load(capture)
-
-
 def test_rounded_matrices_are_taken(capsys: pytest.CaptureFixture[str]) -> None:
     exact = Rotation.random(50, random_state=0).as_matrix()
     names = list(range(50))

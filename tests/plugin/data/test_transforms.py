@@ -1,6 +1,5 @@
 """Entries of transforms.json beside the poses, valid and invalid."""
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -75,84 +74,6 @@ def test_a_frame_with_a_camera_of_its_own(capture: Path, capsys: pytest.CaptureF
     assert len(manager.cached_train) == 10
 
 
-def set_value(key: str, value: Any) -> Any:
-    return lambda meta: meta.update({key: value})
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (set_value("camera_model", "BANANA"), "camera_model 'BANANA' of .*_00001.png is unknown.*write PINHOLE"),
-        (set_value("applied_transform", [[1, 0], [0, 1]]), "applied_transform is not a matrix of 3 x 4 finite numbers"),
-        (set_value("applied_scale", 0), "applied_scale is 0.0, which is no positive number"),
-        (set_value("w", "48px"), "w for all frames is '48px', which is no number"),
-        (set_value("w", 48.5), "w for all frames is 48.5, which is no number of pixels"),
-        (set_value("w", 1e30), r"w for all frames is 1e\+30, which is no number of pixels"),
-        (set_value("fl_x", True), "fl_x for all frames is True, which is no number"),
-        (set_value("fl_x", 1e9), r"focal length of .*frame_00002.png.* 1e\+09 pixels \(fl_x\).*not in millimetres"),
-        (set_value("fl_y", 0.1), r"focal length of .*frame_00002.png.* 0.1 pixels \(fl_y\).*span 179 degrees"),
-        (set_value("test_filenames", "a.png"), "test_filenames is 'a.png', not a list of names"),
-        (set_value("train_filenames", []), "has train_filenames, but a split needs .*val_filenames.*remove the lists"),
-        (set_value("test_filenames", []), "has test_filenames, but a split needs train_filenames and val_filenames"),
-        (set_value("cx", None), "gives no cx for images/frame_00001.png"),
-        (set_value("k1", [0.1]), r"k1 of images/frame_00001.png is \[0.1\], which is no number"),
-        (set_value("cx", 5e5), "frame_00002.png cannot be used: its principal point is so far .* 80 degrees off"),
-        (set_value("k4", 0.1), "camera of images/frame_00001.png .*cannot be used: its k4 is 0.1.*image_undistorter"),
-        (set_value("distortion_params", [0.1, 0.0]), "has 2 distortion_params; perspective cameras need six"),
-        (set_value("camera_model", "EQUIRECTANGULAR"), "EQUIRECTANGULAR, but .*: pictures of all .* are twice as wide"),
-        (set_value("camera_model", "ORTHOPHOTO"), "neither a perspective, a fisheye nor an equirectangular camera"),
-        (set_value("fl_x", -30.0), "camera of images/frame_00001.png .* cannot be used: its size and focal"),
-        (set_value("fl_y", float("inf")), "cannot be used: its size and focal lengths have to be positive and all"),
-        (set_value("cx", float("nan")), "cannot be used: .* all parameters finite"),
-        (set_value("w", 0), "w for all frames is 0, which is no number of pixels"),
-        (lambda meta: meta["frames"].clear(), "lists no frames"),
-        (lambda meta: meta.pop("fl_x"), "gives no fl_x for images/frame_00001.png, .* and 9 more: .*Add it once"),
-        (set_value("ply_file_path", "gone.ply"), "point cloud .*gone.ply does not exist.*remove ply_file_path"),
-        (lambda meta: meta["frames"][3].update(transform_matrix="here"), "frame_00004.png is not a matrix of 4 x 4"),
-        (lambda meta: meta["frames"][3]["transform_matrix"][0].__setitem__(3, math.nan), "_00004.png is not a matrix"),
-        (set_value("ply_file_path", 7), "ply_file_path is 7, not the name of a file"),
-        (lambda meta: meta["frames"][2].update(file_path=7), "the file_path of frame 2 is 7, not the name of a file"),
-        (
-            lambda meta: meta["frames"][2].update(file_path="a/.."),
-            "file_path of frame 2 is 'a/..', not the name of a file",
-        ),
-        (
-            lambda meta: meta["frames"][2].update(mask_path="\\\\"),
-            r"mask_path of frame 2 is '.*', not the name of a file",
-        ),
-        (lambda meta: meta["frames"][2].update(file_path="a" * 300), r"1 of 12 photographs .* missing:\s+.*/aaa"),
-        (set_value("ply_file_path", "a" * 300), "the point cloud .*/aaa.* does not exist"),
-        (lambda meta: meta["frames"][2].update(h="tall"), "h of images/frame_00003.png is 'tall', which is no number"),
-        (
-            lambda meta: [f.update(w=meta["w"]) for f in meta["frames"][1:]] and meta.pop("w"),
-            "gives no w for images/frame_00001.png: .*at the top of the file, or to each frame",
-        ),
-        (
-            lambda meta: meta["frames"][5].update(file_path="./" + meta["frames"][3]["file_path"]),
-            r"frames 3 and 5 \(counted from 0\) are both of images/frame_00004.png, but with different poses",
-        ),
-        (
-            set_value("applied_transform", [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0]]),
-            "transforms.json: applied_transform maps the capture to a plane, .*remove it: then exports are",
-        ),
-        (
-            lambda meta: [f.update(mask_path=f"/home/me/masks/{f['file_path']}") for f in meta["frames"]],
-            "12 of 12 masks .* are missing: /home/me/masks/images/frame_",
-        ),
-        (lambda meta: meta["frames"].insert(1, {"file_path": "a.png"}), "frame 1 .* has no transform_matrix. Add that"),
-        (lambda meta: meta["frames"].__setitem__(1, None), "frame 1 .* has no file_path and no transform_matrix"),
-        (
-            lambda meta: meta.update(frames=dict(enumerate(meta["frames"]))),
-            "frames is an object with names, not a list",
-        ),
-    ],
-)
-def test_entries_that_cannot_be_used_are_named(capture: Path, change: Any, message: str) -> None:
-    edit(capture, change)
-    with expect(message):
-        load(capture)
-
-
 def test_numbers_in_quotes(capture: Path) -> None:
     edit(capture, lambda meta: meta.update(w="48.0", h=36.0, fl_x=str(meta["fl_x"])))
     assert len(load(capture).cached_train) == 10
@@ -189,14 +110,6 @@ def test_null_is_what_a_capture_does_not_have(capture: Path) -> None:
         assert len(manager.train_dataset) == 10 and "mask" not in manager.train_dataset.get_data(0)
     edit(capture, lambda meta: meta.update(ply_file_path=None))
     assert "points3D_xyz" not in load_any(capture).train_dataset.metadata
-
-
-@pytest.mark.parametrize("change", [lambda text: f"// by hand\n{text}", lambda text: f"{text.rstrip()[:-1]},}}"])
-def test_what_is_no_json_is_to_be_corrected(capture: Path, change: Any) -> None:
-    path = capture / "transforms.json"
-    path.write_text(change(path.read_text("utf8")), "utf8")
-    with expect(r"transforms.json cannot be read: Expecting .*line \d+ .*Correct it there \(JSON has neither comments"):
-        load_any(capture)
 
 
 @pytest.mark.parametrize("name", ["points\\Cloud.ply", "/home/me/room/points/cloud.ply", "C:\\room\\CLOUD.PLY"])

@@ -16,46 +16,10 @@ from scipy.spatial.transform import Rotation
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.export.trained import world_of
-from tests.captures import (
-    colmap_model,
-    edit,
-    edit_frames,
-    expect,
-    images_of,
-    load_any,
-    printed,
-    write_cloud,
-)
+from tests.captures import edit, edit_frames, expect, images_of, load_any, printed, write_cloud
+from tests.formats import JSON, PHOTOGRAPHS, blender, instant_ngp
 
 UTM = np.array([500123.0, 4649876.0, 312.0])
-
-
-# formats: each makes the room a capture of one, with the same photographs and poses
-
-
-def nerfstudio(capture: Path) -> Path:
-    return capture / "transforms.json"
-
-
-def instant_ngp(capture: Path) -> Path:
-    edit(capture, lambda meta: (meta.pop("ply_file_path"), meta.pop("camera_model"), meta.update(aabb_scale=4)))
-    return capture / "transforms.json"
-
-
-def blender(capture: Path) -> Path:
-    (capture / "transforms.json").rename(capture / "transforms_train.json")
-    edit(capture / "transforms_train.json", lambda meta: meta.pop("ply_file_path"))
-    return capture / "transforms_train.json"
-
-
-def colmap(capture: Path) -> Path:
-    colmap_model(capture, capture / "sparse/0")
-    (capture / "transforms.json").unlink()
-    return capture / "sparse/0"
-
-
-JSON = [nerfstudio, instant_ngp, blender]
-ALL = [*JSON, colmap]
 
 
 def poses_of(manager: BitymiDataManager) -> np.ndarray:
@@ -92,7 +56,7 @@ def move(place: Path, shift: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("centred", ["poses", "none"])
-@pytest.mark.parametrize("form", ALL)
+@pytest.mark.parametrize("form", PHOTOGRAPHS)
 def test_coordinates_of_a_map(
     capture: Path, form: Callable[[Path], Path], centred: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -234,7 +198,7 @@ NAMES = {
 
 
 @pytest.mark.parametrize("difference", NAMES)
-@pytest.mark.parametrize("form", ALL)
+@pytest.mark.parametrize("form", PHOTOGRAPHS)
 def test_names_of_another_machine_or_program(
     capture: Path, form: Callable[[Path], Path], difference: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -250,19 +214,13 @@ def test_names_of_another_machine_or_program(
     assert told is (difference not in ("backslashes", "no ending"))
 
 
-@pytest.mark.parametrize("form", ALL)
+@pytest.mark.parametrize("form", PHOTOGRAPHS)
 def test_a_name_that_is_nearly_there(capture: Path, form: Callable[[Path], Path]) -> None:
     place = form(capture)
     for path in images_of(capture):
         path.rename(path.with_name(path.name.replace("frame_", "fr\u0430me_")))  # a Cyrillic letter
     with expect(r"(?s)but there is \S*fr\u0430me_\d+.png, '\S*fr\\u0430me_\d+.png', instead of '\S*frame_\d+.png'"):
         load_any(place)
-
-
-def test_one_file_is_not_taken_for_two_photographs(capture: Path) -> None:
-    edit(capture, lambda meta: meta["frames"][3].update(file_path="images/FRAME_00003.png"))
-    with expect(r"(?s)1 of 12 photographs of .* are missing:\s+\S*images/FRAME_00003.png"):
-        load_any(capture)
 
 
 def test_names_of_a_model_that_lead_elsewhere_are_those_of_photographs_in_the_capture(
@@ -314,7 +272,7 @@ def test_points_of_a_model_that_are_no_numbers(project: Path, capsys: pytest.Cap
     assert f"{path}: 1 of 3 points, the first is point 3, are not finite" in printed(capsys)
 
 
-@pytest.mark.parametrize("form", ALL)
+@pytest.mark.parametrize("form", PHOTOGRAPHS)
 def test_reduced_as_they_are_read(capture: Path, form: Callable[[Path], Path]) -> None:
     """`--downscale-factor` without a folder of reduced copies is the same for every format."""
     manager = load_any(form(capture), downscale_factor=2)
@@ -322,7 +280,7 @@ def test_reduced_as_they_are_read(capture: Path, form: Callable[[Path], Path]) -
     assert int(manager.train_dataset.cameras.width[0]) == 24
 
 
-@pytest.mark.parametrize("form", ALL)
+@pytest.mark.parametrize("form", PHOTOGRAPHS)
 def test_what_needs_no_photographs_opens_none(capture: Path, form: Callable[[Path], Path]) -> None:
     form(capture)
     for path in images_of(capture):

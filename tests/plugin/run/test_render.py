@@ -23,7 +23,7 @@ from PIL import Image
 from bitymi_ns.capture.pictures import is_rendered_film, result_in
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
-from bitymi_ns.plugin.hooks import adopt_render
+from bitymi_ns.plugin.hooks import patch_render
 from bitymi_ns.plugin.run.films import write_image
 from bitymi_ns.plugin.run.render import spiral
 from bitymi_ns.plugin.run.surfel_model import SurfelModel, box_of
@@ -65,7 +65,7 @@ def wall(monkeypatch: pytest.MonkeyPatch) -> Wall:
         monkeypatch.setattr(render, name, getattr(render, name))
 
     def eval_setup(*_: Any, **__: Any) -> tuple:
-        adopt_render()
+        patch_render()
         manager = BitymiDataManager.__new__(BitymiDataManager)
         torch.nn.Module.__init__(manager)
         manager.eval_dataset = HeldOut()

@@ -1,0 +1,246 @@
+"""A defect of a capture ends in one line that names it: a table of formats and defects."""
+
+import json
+import math
+import shutil
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.captures import as_binary, edit, expect, load_any
+from tests.formats import colmap, instant_ngp, nerfstudio, polycam, record3d, scanner_app, scannet, stray_scanner
+
+HUGE = 10**400
+Change = Callable[[Path], Any]
+"""Damages a file of a capture, or its folder."""
+
+
+def entries(**values: Any) -> Change:
+    """Set entries of a JSON file."""
+    return lambda path: edit(path, lambda meta: meta.update(values))
+
+
+def entry(change: Callable[[dict[str, Any]], Any]) -> Change:
+    """Change a JSON file."""
+    return lambda path: edit(path, change)
+
+
+def frame(i: int, **values: Any) -> Change:
+    """Set entries of a frame."""
+    return lambda path: edit(path, lambda meta: meta["frames"][i].update(values))
+
+
+def pose(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    """Change the 3 x 3 part of the fourth pose."""
+
+    def apply(meta: dict[str, Any]) -> None:
+        for row, new in zip(meta["frames"][3]["transform_matrix"], change(np.eye(3)).tolist(), strict=False):
+            row[:3] = new
+
+    return entry(apply)
+
+
+def content(data: bytes | str) -> Change:
+    """Replace a file."""
+    return lambda path: path.write_bytes(data if isinstance(data, bytes) else data.encode())
+
+
+def text(old: str, new: str) -> Change:
+    """Replace text wherever it stands."""
+
+    def apply(path: Path) -> None:
+        whole = path.read_text("utf8")
+        assert old in whole
+        path.write_text(whole.replace(old, new), "utf8")
+
+    return apply
+
+
+def line(number: int, change: Callable[[list[str]], list[str]]) -> Change:
+    """Change the words of a line, counted from 0."""
+
+    def apply(path: Path) -> None:
+        lines = path.read_text("utf8").split("\n")
+        lines[number] = " ".join(change(lines[number].split()))
+        path.write_text("\n".join(lines), "utf8")
+
+    return apply
+
+
+def binary(name: str, change: Callable[[bytes], bytes]) -> Change:
+    """Change a file of a model in its binary form."""
+
+    def apply(model: Path) -> None:
+        as_binary(model)
+        (model / name).write_bytes(change((model / name).read_bytes()))
+
+    return apply
+
+
+def without(name: str) -> Change:
+    """Remove a file or a folder."""
+    return lambda folder: shutil.rmtree(folder / name) if (folder / name).is_dir() else (folder / name).unlink()
+
+
+def box_of_ngp(path: Path, value: Any) -> None:
+    edit(path, lambda meta: (meta.pop("applied_transform", None), meta.update(aabb_scale=value)))
+
+
+def camera_of(meta: dict[str, Any], key: str) -> None:
+    """Move an entry from the top to all frames but the first."""
+    for one in meta["frames"][1:]:
+        one[key] = meta[key]
+    del meta[key]
+
+
+TRANSFORMS: list[tuple[Change, str]] = [
+    (entries(camera_model="BANANA"), "camera_model 'BANANA' of .*_00001.png is unknown.*write PINHOLE"),
+    (entries(applied_transform=[[1, 0], [0, 1]]), "applied_transform is not a matrix of 3 x 4 finite numbers"),
+    (entries(applied_transform=[[HUGE] * 4] * 3), "applied_transform is not a matrix"),
+    (entries(applied_transform=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0]]),
+     "transforms.json: applied_transform maps the capture to a plane, .*remove it: then exports are"),
+    (entries(applied_scale=0), "applied_scale is 0.0, which is no positive number"),
+    (entries(orientation_override=["up"]), "orientation_override is .'up'., none of pca, up"),
+    (entries(w="48px"), "w for all frames is '48px', which is no number"),
+    (entries(w=48.5), "w for all frames is 48.5, which is no number of pixels"),
+    (entries(w=1e30), r"w for all frames is 1e\+30, which is no number of pixels"),
+    (entries(w=0), "w for all frames is 0, which is no number of pixels"),
+    (entry(partial(camera_of, key="w")),
+     "gives no w for images/frame_00001.png: .*at the top of the file, or to each frame"),
+    (frame(2, h="tall"), "h of images/frame_00003.png is 'tall', which is no number"),
+    (entries(fl_x=True), "fl_x for all frames is True, which is no number"),
+    (entries(fl_x=1e9), r"focal length of .*frame_00002.png.* 1e\+09 pixels \(fl_x\).*not in millimetres"),
+    (entries(fl_x=-30.0), "camera of images/frame_00001.png .* cannot be used: its size and focal"),
+    (entry(lambda meta: meta.pop("fl_x")), "gives no fl_x for images/frame_00001.png, .* and 9 more: .*Add it once"),
+    (entries(fl_y=0.1), r"focal length of .*frame_00002.png.* 0.1 pixels \(fl_y\).*span 179 degrees"),
+    (entries(fl_y=float("inf")), "cannot be used: its size and focal lengths have to be positive and all"),
+    (entries(cx=None), "gives no cx for images/frame_00001.png"),
+    (entries(cx=5e5), "frame_00002.png cannot be used: its principal point is so far .* 80 degrees off"),
+    (entries(cx=float("nan")), "cannot be used: .* all parameters finite"),
+    (entries(k1=[0.1]), r"k1 of images/frame_00001.png is \[0.1\], which is no number"),
+    (entries(k4=0.1), "camera of images/frame_00001.png .*cannot be used: its k4 is 0.1.*image_undistorter"),
+    (entries(distortion_params=[0.1, 0.0]), "has 2 distortion_params; perspective cameras need six"),
+    (entries(camera_model="EQUIRECTANGULAR"), "EQUIRECTANGULAR, but .*: pictures of all .* are twice as wide"),
+    (entries(camera_model="ORTHOPHOTO"), "neither a perspective, a fisheye nor an equirectangular camera"),
+    (frame(3, camera_model=["PINHOLE"]), "camera_model .'PINHOLE'. of images/frame_00004.png is unknown"),
+    (frame(3, distortion_params=[[1, 2], [3]]),
+     "camera of images/frame_00004.png in .* cannot be read: setting an array"),
+    (entries(test_filenames="a.png"), "test_filenames is 'a.png', not a list of names"),
+    (entries(train_filenames=[]), "has train_filenames, but a split needs .*val_filenames.*remove the lists"),
+    (entries(test_filenames=[]), "has test_filenames, but a split needs train_filenames and val_filenames"),
+    (entries(frames=[]), "lists no frames"),
+    (entry(lambda meta: meta.update(frames=dict(enumerate(meta["frames"])))),
+     "frames is an object with names, not a list"),
+    (entry(lambda meta: meta["frames"].insert(1, {"file_path": "a.png"})),
+     "frame 1 .* has no transform_matrix. Add that"),
+    (entry(lambda meta: meta["frames"].__setitem__(1, None)), "frame 1 .* has no file_path and no transform_matrix"),
+    (frame(3, transform_matrix="here"), "frame_00004.png is not a matrix of 4 x 4"),
+    (frame(3, transform_matrix=[[HUGE] * 4] * 4), "transform_matrix of images/frame_00004.png is not a matrix"),
+    (frame(3, transform_matrix=[[1e200, 0, 0, 0], [0, 1e-200, 0, 0], [0, 0, 1e200, 0]]),
+     "pose of images/frame_00004.png is no rotation, it is sheared"),
+    (entry(lambda meta: meta["frames"][3]["transform_matrix"][0].__setitem__(3, math.nan)),
+     "frame_00004.png is not a matrix"),
+    *((pose(change), f"transforms.json: the 3 x 3 part of the pose of images/frame_00004.png is no rotation, it {why}")
+      for change, why in ((lambda part: part + 0.3 * part[:, [1, 0, 2]] * [1, 0, 0], "is sheared or stretched"),
+                          (lambda part: part * [1, 1, 1.1], "is sheared or stretched"),
+                          (lambda part: 0 * part, "is zero"))),
+    (entries(ply_file_path="gone.ply"), "point cloud .*gone.ply does not exist.*remove ply_file_path"),
+    (entries(ply_file_path=7), "ply_file_path is 7, not the name of a file"),
+    (entries(ply_file_path="a" * 300), "the point cloud .*/aaa.* does not exist"),
+    (frame(2, file_path=7), "the file_path of frame 2 is 7, not the name of a file"),
+    (frame(2, file_path="a/.."), "file_path of frame 2 is 'a/..', not the name of a file"),
+    (frame(2, file_path="a" * 300), r"1 of 12 photographs .* missing:\s+.*/aaa"),
+    (frame(3, file_path="images/FRAME_00003.png"),
+     r"(?s)1 of 12 photographs of .* are missing:\s+\S*images/FRAME_00003.png"),
+    (frame(5, file_path="./images/frame_00004.png"),
+     r"frames 3 and 5 \(counted from 0\) are both of images/frame_00004.png, but with different poses"),
+    (frame(2, mask_path="\\\\"), r"mask_path of frame 2 is '.*', not the name of a file"),
+    (entry(lambda meta: [f.update(mask_path=f"/home/me/masks/{f['file_path']}") for f in meta["frames"]]),
+     "12 of 12 masks .* are missing: /home/me/masks/images/frame_"),
+]  # fmt: skip
+NOT_JSON = r"transforms.json cannot be read: Expecting .*line \d+ .*Correct it there \(JSON has neither comments"
+IMAGES = "images.txt cannot be read: "
+MODEL: list[tuple[str, Change, str]] = [
+    ("cameras.txt", text(" 40 40 24 18", " 40"), "cameras.txt: camera 1 has 1 parameters, but a PINHOLE has 4"),
+    ("cameras.txt", text("PINHOLE", "PINHALE"), "cameras.txt cannot be read: COLMAP has no camera model PINHALE"),
+    ("cameras.txt", text("1 PIN", "7 PIN"), r"image 1 \(frame_00001.png\) was taken by camera 1, .* only 7"),
+    ("cameras.txt", text("PINHOLE 48 36 40 40 24 18", "EQUIRECTANGULAR 48 36 48 36"), "EQUIR.*, but .*twice as wide"),
+    ("cameras.txt", text("40 40 24", "nan 40 24"), "camera 1 .* has to be from 1 to 1,048,576 pixels and all"),
+    ("cameras.txt", text("48 36", f"{2**62} 36"), "camera 1 .* its size has to be from 1 to 1,048,576 pixels"),
+    ("cameras.txt", text("48 36", f"{HUGE} 36"), "camera 1 .* its size has to be from 1 to"),
+    ("cameras.txt", text("1 PINHOLE 48 36 40 40 24 18", "# a\n1 PINHOLE 48 36 40 40 24 inf"),
+     r"line 2: camera 1 \(PINHOLE .* inf\) cannot be used"),
+    ("images.txt", text("_00002.png\n\n", "_00002.png\n1 2 3 4\n"), IMAGES + ".*Each image has two"),
+    ("images.txt", text("frame_00002", "frame_00001"), "images 1 and 2 are both of frame_00001.png"),
+    ("images.txt", text("1 frame_00001.png", f"{HUGE} frame_00001.png"), "frame_00001.png. was taken by camera"),
+    *(("images.txt", line(6, lambda words, pose=pose: [words[0], pose, *words[8:]]),
+       r"the pose of image 4 \(frame_00004.png\) is not finite, or its rotation is zero")
+      for pose in ("nan 0 0 0 0 0 0", "0 0 0 0 1 2 3", "1 0 0 0 0 inf 0")),
+    ("images.txt", line(0, lambda words: [words[0], *(repr(float(w) * 1e-300) for w in words[1:5]), *words[5:]]),
+     "line 1: the pose of image 1 .* is not finite, or its rotation is zero"),
+    *(("images.txt", line(0, lambda words, cut=cut: [*words[:cut], *words[8:]]),
+       IMAGES + f"image 1 has {cut - 1} numbers for its pose instead of 7") for cut in (3, 5, 6, 7)),
+    ("points3D.txt", text("200", "red"), "points3D.txt cannot be read: .*red"),
+    ("points3D.txt", content("1 0 0 0.5 200 10 10\n2 0.1 0 0.5\n"),
+     "points3D.txt cannot be read: .*three coordinates and three colors"),
+    ("frames.txt", content("1 1 1 0 0 0\n"), "frames.txt cannot be read: the line of frame 1 is cut off"),
+    *(("", binary(name, change), f"{name} cannot be read: .*It is cut off or damaged")
+      for name in ("cameras.bin", "images.bin", "points3D.bin")
+      for change in (lambda data: data[:-5], lambda data: data + b"more")),
+]  # fmt: skip
+CAMERA = "keyframes/corrected_cameras/3.json"
+LARGE = "3.json cannot be read: a number in it is too large"
+SCAN: list[tuple[Any, str, Change, str]] = [
+    (polycam, CAMERA, entry(lambda meta: meta.pop("t_01")), "3.json cannot be read: the entry 't_01' is missing"),
+    (polycam, CAMERA, entries(t_01=float("nan")), "the pose or camera of 3.png is not finite"),
+    (polycam, CAMERA, entries(width=0), "its picture has no pixels"),
+    (polycam, CAMERA, entries(width=2**62), "or its picture has no pixels"),
+    (polycam, CAMERA, entries(width=float("inf")), LARGE),
+    (polycam, CAMERA, entries(t_01=HUGE), LARGE),
+    (polycam, CAMERA, entries(t_01=[[]] * 3), "3.json cannot be read: float"),
+    (polycam, CAMERA, content("[" * 100_000), "3.json cannot be read: it is nested too deeply"),
+    (polycam, "keyframes", without("corrected_images/5.png"), r"1 of 12 photographs of .* are missing:\s+.*images/5"),
+    (scannet, "", without("intrinsic"), "has poses, but no file with the camera .* `bitymi-data --format photographs`"),
+    *((record3d, "metadata", entry(lambda meta, pose=pose: meta["poses"].__setitem__(3, pose)), message)
+      for pose, message in (([0, 0, 0, 1, 0.1], "pose 3 .* it has 5 numbers, not 7"),
+                            ([HUGE] * 7, "pose 3 .*: a number in it is too large"),
+                            ([0] * 7, "metadata: pose 3 .counted from 0. cannot be read"))),
+    (record3d, "metadata", entries(perFrameIntrinsicCoeffs=[[1.0, 2.0]] * 20), "pose 0 .* it has 2 numbers, not 4"),
+    (record3d, "metadata", entries(K=[1.0]), "metadata cannot be read: list index out of range"),
+    (record3d, "rgb/2.png", lambda path: Image.new("RGB", (36, 48)).save(path),
+     "2.png has 36 x 48 pixels, but its camera is for 96 x 72, which is another shape"),
+    (partial(stray_scanner, rows=30), "", lambda folder: None, "has 12 frames, but 30 poses: .*--data .*rgb.mp4"),
+    (stray_scanner, "odometry.csv", text("qw", "w"),
+     "odometry.csv: pose 0 .* cannot be read: the entry 'qw' is missing"),
+    (stray_scanner, "odometry.csv", text("0.1, 000001", "0.1, one"),
+     "odometry.csv: pose 1 .* cannot be read: invalid literal"),
+    (stray_scanner, "camera_matrix.csv", content("1, 2\n"), "camera_matrix.csv cannot be read"),
+    (scanner_app, "frame_00010.json", content(json.dumps({"intrinsics": [1] * 9})),
+     "frame_00010.json cannot be read: the entry 'cameraPoseARFrame' is missing"),
+    (scanner_app, "frame_00010.json", entries(cameraPoseARFrame=[1.0] * 12), "it has 12 numbers, not 16"),
+]  # fmt: skip
+DEFECTS: list[tuple[Callable[[Path], Path], str, Change, str]] = [
+    *((nerfstudio, "", change, message) for change, message in TRANSFORMS),
+    (nerfstudio, "", lambda path: path.write_text(f"// by hand\n{path.read_text()}"), NOT_JSON),
+    (nerfstudio, "", lambda path: path.write_text(f"{path.read_text().rstrip()[:-1]},}}"), NOT_JSON),
+    *((instant_ngp, "", partial(box_of_ngp, value=value), "transforms.json: aabb_scale")
+      for value in (0, -1, float("inf"), HUGE, "wide", [])),
+    *((colmap, file, change, message) for file, change, message in MODEL),
+    *SCAN,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("form", "file", "change", "message"), DEFECTS)
+def test_a_defect_is_named(
+    capture: Path, form: Callable[[Path], Path], file: str, change: Change, message: str
+) -> None:
+    place = form(capture)
+    change(place / file if file else place)
+    options = {"format": {nerfstudio: "nerfstudio", instant_ngp: "instant-ngp"}.get(form, "auto")}
+    with expect(message):
+        load_any(capture if place.is_relative_to(capture) else place, **options)

@@ -23,7 +23,7 @@ from bitymi_ns.ops import (
 from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.train.losses import numbers, photometric
+from bitymi_ns.train.losses import count_values, photometric
 from bitymi_ns.train.views import MemoryBudget, View, shown
 
 
@@ -181,7 +181,7 @@ class TuningViews(Sequence[TuningView]):
         if read is None:
             read = texels if len(view.lists) == 1 else texels.clone()  # a band must not read what another has moved
         # the loss is a mean, the step wants a sum
-        descent = TexelDescent(share, rate * numbers(view.target, view.mask), texels)
+        descent = TexelDescent(share, rate * count_values(view.target, view.mask), texels)
         photometric(self.picture(view, read, descent), view.target, ssim_weight, view.mask).backward()
 
     @torch.no_grad()

@@ -17,7 +17,7 @@ from bitymi_ns.interchange.quads import fetch_texels
 from bitymi_ns.ops.constants import ALPHA_MAX, SUPPORT
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.tile_sizes import kernel_parameters
-from bitymi_ns.train.init import tangents, turned
+from bitymi_ns.train.init import rotate_in_plane, tangents
 
 FLAT_LOG_SCALE = -16.0
 """Log of the Gaussians' third scale, in the scene's frame, whose cameras lie within a unit of the origin."""
@@ -90,7 +90,7 @@ def gaussians_of(scene: BakedScene, coefficients: Tensor) -> Gaussians:
         spread = tangent.exp()
         values, axes = torch.linalg.eigh(spread[:, :, None] * covariance * spread[:, None])
         tangent = 0.5 * values.clamp(min=torch.finfo(torch.float64).tiny).log()
-        quats = turned(quats, torch.atan2(axes[:, 1, 0], axes[:, 0, 0]).float())
+        quats = rotate_in_plane(quats, torch.atan2(axes[:, 1, 0], axes[:, 0, 0]).float())
         opacity = (opacity * strength).clamp(LEAST_OPACITY, ALPHA_MAX)
     return Gaussians(
         means,

@@ -133,7 +133,7 @@ class Scene(nn.Module):
     def __len__(self) -> int:
         return self.surfels["means"].shape[0]
 
-    def make_room(self, state: Mapping[str, Tensor], prefix: str = "") -> None:
+    def resize_for_state(self, state: Mapping[str, Tensor], prefix: str = "") -> None:
         """Resize surfel parameters and texels for a state that is loaded next.
 
         Args:

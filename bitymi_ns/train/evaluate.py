@@ -29,12 +29,6 @@ class Quality(NamedTuple):
     mean_exposure_psnr: float = math.nan  # dB with the mean exposure, where the run corrects photographs
 
 
-def evenly_spaced(count: int, most: int) -> list[int]:
-    """List up to `most` (0: all) evenly spaced indices below `count`, including the first and the last."""
-    used = count if most <= 0 else min(count, most)
-    return sorted({round(i * (count - 1) / max(1, used - 1)) for i in range(used)})
-
-
 @torch.no_grad()
 def evaluate(
     scene: Scene,

@@ -96,7 +96,7 @@ class Trainer:
         """Do one step; return the loss terms and render of its (last) view, and the strategy's report."""
         self.training.begin(self.step)
         forget_gradients(self.optimizers.values())
-        for number in self.training.processes.numbers(self.step):
+        for number in self.training.processes.view_numbers(self.step):
             view = self.training.view(training_order(self._views, self.config.seed, number))
             terms, output = self.training.losses(view)
             learning = [term for term in terms.values() if term.requires_grad]

@@ -204,10 +204,10 @@ def _orientation(to_camera: Tensor, generator: torch.Generator) -> Tensor:
     fallback = torch.nn.functional.normalize(torch.randn(n, 3, generator=generator), dim=-1)
     distance = to_camera.norm(dim=-1, keepdim=True)
     normals = torch.where(distance > 1e-12, to_camera / distance.clamp(min=1e-12), fallback)
-    return facing(normals, angles)
+    return quat_from_normal(normals, angles)
 
 
-def facing(normals: Tensor, angles: Tensor) -> Tensor:
+def quat_from_normal(normals: Tensor, angles: Tensor) -> Tensor:
     """Compute unit quaternions [N, 4] that rotate about z by an angle and then take the z axis to a normal.
 
     Args:
@@ -219,10 +219,10 @@ def facing(normals: Tensor, angles: Tensor) -> Tensor:
     tilt = torch.stack([1.0 + z, -y, x, zero], -1)  # shortest rotation from (0, 0, 1); vanishes at -z
     flip = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=tilt.dtype, device=tilt.device)
     tilt = torch.where((tilt.norm(dim=-1) < 1e-4)[:, None], flip, tilt)
-    return turned(tilt / tilt.norm(dim=-1, keepdim=True), angles)
+    return rotate_in_plane(tilt / tilt.norm(dim=-1, keepdim=True), angles)
 
 
-def turned(quats: Tensor, angles: Tensor) -> Tensor:
+def rotate_in_plane(quats: Tensor, angles: Tensor) -> Tensor:
     """Rotate surfels in their planes: quaternions [N, 4] by angles [N] in radians, from first to second tangent."""
     w, x, y, z = quats.unbind(-1)
     cos, sin = torch.cos(angles / 2), torch.sin(angles / 2)

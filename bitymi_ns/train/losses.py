@@ -70,7 +70,7 @@ def fused_losses(config: LossConfig, image: Tensor) -> bool:
     return config.ssim_weight > 0.0 and min(image.shape[:2]) >= SSIM_WINDOW and cuda_backend(image.device)
 
 
-def numbers(image: Tensor, mask: Tensor | None, counted: int | None = None) -> int:
+def count_values(image: Tensor, mask: Tensor | None, counted: int | None = None) -> int:
     """Count the unmasked colour values of an image [H, W, C]; `counted`: number of unmasked pixels, if known."""
     if mask is None:
         return 3 * image.shape[0] * image.shape[1]

@@ -51,7 +51,7 @@ class Processes:
         """Number of views per step over all processes."""
         return self.count * self.each
 
-    def numbers(self, step: int) -> range:
+    def view_numbers(self, step: int) -> range:
         """Compute the positions in the training order of this process's views in a step."""
         start = step * self.views + self.rank * self.each
         return range(start, start + self.each)
@@ -62,7 +62,7 @@ class Processes:
         """Return True if the condition holds in any process."""
         return bool(self._largest([int(condition)])[0])
 
-    def problem(self, own: str | None) -> str | None:
+    def first_error(self, own: str | None) -> str | None:
         """Return the first problem reported by any process, by rank; None if there is none."""
         if self.count == 1 or not self.any(own is not None):
             return own
@@ -89,7 +89,7 @@ class Processes:
             dist.broadcast_object_list(box, src=0, device=torch.device("cpu"))
         return state if self.first else torch.load(io.BytesIO(box[0]), map_location=device, weights_only=True)
 
-    def like_first(self, tensors: Iterable[Tensor]) -> None:
+    def broadcast_(self, tensors: Iterable[Tensor]) -> None:
         """Broadcast tensors from rank 0, in place."""
         if self.count == 1:
             return

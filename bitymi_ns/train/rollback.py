@@ -289,7 +289,7 @@ class RollbackGuard:
         none = torch.zeros(0, dtype=torch.int64, device=surfels["means"].device)
         replace_rows(surfels, self.optimizers, none, rows, self.strategy.on_resize)
         if isinstance(self.scene.field, TexelField):
-            self.scene.make_room(state["scene"])
+            self.scene.resize_for_state(state["scene"])
         self.scene.load_state_dict(state["scene"])
         self.scene.zero_grad(set_to_none=True)
         for name, optimizer in self.optimizers.items():

@@ -154,7 +154,7 @@ class Training:
     def begin(self, step: int) -> None:
         """Start the clock and set the learning rates of a step."""
         if not self._synchronised:  # before the clock starts: waiting for other processes is no training time
-            self.processes.like_first(self.scene.state_dict().values())
+            self.processes.broadcast_(self.scene.state_dict().values())
         self.clock.start()
         self.step = step
         self.poses.begin()
@@ -193,7 +193,7 @@ class Training:
                 terms, output = view_losses(self.scene, view, self.schedule, self.step, self.watch, self.background)
             except TrainingDiverged as error:
                 diverged = error
-            problem = self.processes.problem(None if diverged is None else str(diverged))
+            problem = self.processes.first_error(None if diverged is None else str(diverged))
             if problem is None:
                 self._projections.append(output.projection)
                 self._photometric.append(terms["photometric"].detach())

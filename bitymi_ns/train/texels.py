@@ -21,7 +21,7 @@ from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.tile_sizes import coarsened, kernel_parameters, max_projected_extent, seen_sides, visible_extent
 from bitymi_ns.scene.visibility import Visibility, visibility
 from bitymi_ns.train.init import tangents
-from bitymi_ns.train.losses import numbers
+from bitymi_ns.train.losses import count_values
 from bitymi_ns.train.processes import Processes
 from bitymi_ns.train.views import OnDemand, at_size, spread
 
@@ -78,7 +78,7 @@ class LearningTexels:
         if not isinstance(field, TexelField):
             return
         # the loss is a mean, but a texel's step is defined by the sum
-        values = numbers(view.image, view.mask, view.counted)
+        values = count_values(view.image, view.mask, view.counted)
         rate = factor * self.schedule.texel_rate(step, self._views) * values
         for handle in self._rates:
             handle.remove()

@@ -46,7 +46,7 @@ def state_of(trainer: Trainer) -> dict[str, Any]:
 
 def resume(trainer: Trainer, state: dict[str, Any]) -> None:
     """Restore `state_of`; the run has the same options, views and length."""
-    trainer.scene.make_room(state["scene"])
+    trainer.scene.resize_for_state(state["scene"])
     trainer.scene.load_state_dict(state["scene"])
     for name, optimizer in trainer.optimizers.items():
         optimizer.load_state_dict(copy.deepcopy(state["optimizers"][name]))

@@ -9,9 +9,9 @@ from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import DensifyConfig, TrainConfig
 from bitymi_ns.train.init import (
-    facing,
     limit_first_surfels,
     neighbour_distance,
+    quat_from_normal,
     scene_extent,
     surfels_from_points,
     tangents,
@@ -63,7 +63,7 @@ def test_discs_face_the_nearest_camera(cloud):
 
 def test_facing_down_and_zero_quaternions():
     normals = torch.tensor([[0.0, 0, -1], [0, 0, 1], [1, 0, 0], [1e-6, 0, -1]])
-    u, v = tangents(facing(normals, torch.tensor([0.3, 0.4, 0.5, 0.6]))).unbind(-1)
+    u, v = tangents(quat_from_normal(normals, torch.tensor([0.3, 0.4, 0.5, 0.6]))).unbind(-1)
     torch.testing.assert_close(torch.linalg.cross(u, v), normals, atol=2e-6, rtol=0)
     u, v = tangents(torch.zeros(1, 4)).unbind(-1)
     assert u.tolist() == [[1, 0, 0]] and v.tolist() == [[0, 1, 0]]

@@ -114,9 +114,9 @@ def test_sums_that_are_lost_do_not_abort_the_process_as_it_ends(tmp_path):
 
 
 def test_views_are_dealt_out_in_the_order_of_training():
-    dealt = [[*Processes(rank, 3, 2).numbers(step)] for step in range(2) for rank in range(3)]
+    dealt = [[*Processes(rank, 3, 2).view_numbers(step)] for step in range(2) for rank in range(3)]
     assert [number for numbers in dealt for number in numbers] == list(range(12))
-    assert [*ALONE.numbers(7)] == [7] and ALONE == Processes.joined()
+    assert [*ALONE.view_numbers(7)] == [7] and ALONE == Processes.joined()
 
 
 def test_one_process_alone_asks_nobody():
@@ -125,7 +125,7 @@ def test_one_process_alone_asks_nobody():
     ALONE.sum(parameter.grad)
     ALONE.average_gradients([parameter, torch.nn.Parameter(value)], 5)
     assert torch.equal(parameter.grad, value)
-    assert ALONE.problem(None) is None and ALONE.problem("it broke") == "it broke"
+    assert ALONE.first_error(None) is None and ALONE.first_error("it broke") == "it broke"
     assert ALONE.from_first("anything", "cpu") == "anything" and ALONE.mean(0.1) == 0.1
     two = Processes(each=2)
     two.average_gradients([parameter], 5)

@@ -50,7 +50,7 @@ def test_statistics_are_means_over_the_views_that_saw_a_surfel(bench):
     torch.testing.assert_close(statistics(b)["grad_sum"], torch.tensor([2e-4, 2e-4, 4e-4, 1e-4]))
     assert statistics(b)["visible_count"].tolist() == [2, 1, 2, 2]
     assert statistics(b)["max_radius"].tolist() == [9, 3, 9, 3]
-    b.scene.make_room({"surfels.means": torch.zeros(7, 3)})
+    b.scene.resize_for_state({"surfels.means": torch.zeros(7, 3)})
     with pytest.raises(ValueError, match="4 surfels, but 7"):
         b.see()
     b = bench(1)  # pixels become NDC with the size of the image

@@ -242,7 +242,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
 
     def train_index(self, step: int) -> int:
         """Return the training view's index in a step of this process."""
-        (number,) = Processes.joined().numbers(step)
+        (number,) = Processes.joined().view_numbers(step)
         return training_order(len(self.train_dataset), self.config.train_cameras_sampling_seed, number)
 
     def next_train(self, step: int) -> tuple[View, dict[str, Any]]:  # type: ignore[override]

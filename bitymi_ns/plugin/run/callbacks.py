@@ -21,9 +21,10 @@ from bitymi_ns.plugin.console import InputError, fail, listed, say, warn
 from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.plugin.data.dataset import capture_fingerprint, warn_of_other_capture
 from bitymi_ns.plugin.run.memory import state_training
+from bitymi_ns.ranges import spread
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train import limits
-from bitymi_ns.train.evaluate import evaluate, evenly_spaced
+from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.init import scene_extent, views_without_surfels
 from bitymi_ns.train.step import Training
 from bitymi_ns.train.views import OnDemand, TrainingData, View, covered_share
@@ -161,7 +162,8 @@ class TrainingRun:
 
     def _add_point(self, step: int) -> None:
         views = self.datamanager.eval_views
-        rows = evenly_spaced(len(views), 0 if step + 1 >= self.total else self._curve_views)
+        most = 0 if step + 1 >= self.total else self._curve_views
+        rows = spread(len(views), most or len(views))
         refined = self.training.poses.refined and step + 1 >= self.total
         poses, exposure = self.training.poses if refined else None, self.training.exposure
         quality = evaluate(self.scene, OnDemand(len(rows), lambda i: views[rows[i]]), self.config, poses, exposure)

@@ -181,7 +181,7 @@ class BitymiModel(SurfelModel):
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
         """Load a checkpoint of any number of surfels; `checkpoints.load` has checked that it fits this preset."""
-        self.scene.make_room(state_dict, "scene.")
+        self.scene.resize_for_state(state_dict, "scene.")
         for name, parameter in self.named_parameters():
             saved = state_dict.get(name)
             if saved is not None and saved.shape != parameter.shape:

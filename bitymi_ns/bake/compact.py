@@ -180,7 +180,7 @@ class Coder:
             rounded = replace(rounded, alpha_codes=coded)
         shown = rounded
         if coded is not None:
-            shown = replace(rounded, texels=rounded.cut(coded.texels())).with_constants(coded.constants)
+            shown = replace(rounded, texels=rounded.cut(coded.texels_of(coder.blocks))).with_constants(coded.constants)
         drawn = self._pictures.of(shown.unquantised())
         return RatePoint(lmbda, rounded, coding, coded, self._pictures.square(drawn), self._pictures.psnr(drawn))
 

@@ -64,7 +64,7 @@ class Cosines:
         return self._coded(coded.listed, self._coder.fit(coded.texels, self._most, rounds=1))
 
     def _coded(self, texels: Tensor, codes: TexelCodes) -> Coded:
-        return Coded(texels.clone(), codes.texels(), codes)
+        return Coded(texels.clone(), codes.texels_of(self._coder.blocks), codes)
 
 
 class Pages:

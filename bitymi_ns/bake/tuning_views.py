@@ -61,12 +61,12 @@ class TexelList:
     def coverage(self, views: Sequence[View], progress: Progress = no_progress) -> Tensor:
         """Measure every texel's coverage in unmasked pixels: [T, 2], the sums over views and fragments of the blending
         weight, and of its square, times the bilinear weight."""
-        total, squares = torch.zeros_like(self.values), torch.zeros_like(self.values[:, 0])
+        covered = self.values.new_zeros(len(self.values), 2)
         for done, view in enumerate(views, start=1):
-            lists = fitting_lists(self.projection(view.camera))
-            add_texel_coverage(lists, self.tiles, view.mask, self.scene.weight_bound, total, squares)
+            projection = self.projection(view.camera)
+            add_texel_coverage(projection, self.tiles, view.mask, self.scene.weight_bound, covered)
             progress("tracing the training views", done, len(views))
-        return torch.stack([total[:, 0], squares], 1)
+        return covered
 
 
 LEAST_KEPT = 1 / 8

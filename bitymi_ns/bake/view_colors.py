@@ -165,9 +165,9 @@ def color_choices(
             for number in range(2, vectors.shape[1]):
                 if len(rest):
                     base, terms = fit(number, rest)
-                    weights = site_weights(F.pad(terms[..., :3], (0, 0, 1, 0)), at.unit[rest])
-                    color = view_base(weights @ torch.cat([base[:, None], terms[..., 3:]], dim=1))
-                    rest = rest_of(rest, base, terms, color)
+                    vectors_of = F.pad(terms[..., :3], (0, 0, 1, 0))
+                    color = site_colors(vectors_of, torch.cat([base[:, None], terms[..., 3:]], dim=1), at.unit[rest])
+                    rest = rest_of(rest, base, terms, view_base(color))
             own = colors[:, 0], torch.cat([vectors[:, 1:] - vectors[:, :1], colors[:, 1:]], dim=2)
         rows = at.rows[rest]
         error[rows, most], largest[rows] = 0.0, 0.0
@@ -270,38 +270,10 @@ OUTSIDE, OUTSIDE_WEIGHT = 12, 0.05
 loosely instead of diverging."""
 
 
-def site_weights(vectors: Tensor, directions: Tensor) -> Tensor:
-    """Compute softmax_k(v_k . d): [n, D, K] from [n, K, 3] and [n, D, 3]."""
-    return torch.softmax(directions @ vectors.transpose(1, 2), dim=2)
-
-
-def least_needed(vectors: Tensor, rgb: Tensor, directions: Tensor, weight: Tensor) -> list[Tensor]:
-    """Rank the sites by how little their removal changes the colour.
-
-    Without site k the colour changes by w_k / (1 - w_k) (c - rgb_k); the site goes for which the weighted sum of its
-    squares is least.
-
-    Args:
-        vectors, rgb: [n, K, 3].
-        directions: [n, D, 3].
-        weight: [n, D] how much a direction counts.
-
-    Returns:
-        for every number of sites from 1 to K - 1 the sites that are left, [n, number] int64.
-    """
-    n, count = vectors.shape[:2]
-    alive = torch.ones(n, count, dtype=torch.bool, device=vectors.device)
-    logits = directions @ vectors.transpose(1, 2)
-    left: list[Tensor] = []
-    for size in range(count - 1, 0, -1):
-        w = torch.softmax(logits.masked_fill(~alive[:, None], -torch.inf), dim=2)  # [n, D, K]
-        c = w @ rgb
-        square = torch.cdist(c, rgb, compute_mode="donot_use_mm_for_euclid_dist").square()  # [n, D, K]
-        cost = ((w / (1 - w).clamp(min=1e-6)).square() * square * weight[..., None]).sum(1)
-        gone = cost.masked_fill(~alive, torch.inf).argmin(1, keepdim=True)
-        alive = alive.scatter(1, gone, False)
-        left.insert(0, alive.to(torch.uint8).topk(size, dim=1).indices)
-    return left
+def site_colors(vectors: Tensor, rgb: Tensor, directions: Tensor) -> Tensor:
+    """Compute sum_k softmax_k(v_k . d) rgb_k: [n, D, 3] from [n, K, 3] twice, and [n, D, 3]."""
+    weights = torch.softmax(vectors @ directions.transpose(1, 2), dim=1)  # far slower along a last axis of few numbers
+    return weights.transpose(1, 2) @ rgb
 
 
 def fewer_sites(
@@ -319,15 +291,19 @@ def fewer_sites(
     outside = fibonacci_sphere(OUTSIDE).to(vectors).expand(len(vectors), -1, -1)
     unit = torch.cat([at.subset(at.unit, FIT_VIEWS), outside], dim=1)
     weight = F.pad(weight, (0, OUTSIDE), value=OUTSIDE_WEIGHT)
-    left = least_needed(vectors, rgb, unit, weight)
-    samples = torch.cat([unit, site_weights(vectors, unit) @ rgb, weight[..., None]], dim=2)
+    cpu, order = backend.load("_cpu"), torch.empty(vectors.shape[:2], dtype=torch.int64)  # whatever the device is
+    given = {"vectors": vectors.cpu().contiguous(), "colors": rgb.cpu().contiguous(), "order": order}
+    counts = {"sites": vectors.shape[1], "directions": unit.shape[1]}
+    cpu.rank_sites_f32(**given, **counts, samples=torch.cat([unit, weight[..., None]], dim=2).cpu())
+    order = order.to(vectors.device)
+    samples = torch.cat([unit, site_colors(vectors, rgb, unit), weight[..., None]], dim=2)
 
     def fit(number: int, rows: Tensor) -> tuple[Tensor, Tensor]:
-        kept = left[number - 1][rows, :, None].expand(-1, -1, 3)
+        kept = order[rows, :number, None].expand(-1, -1, 3)
         v, r = vectors[rows].gather(1, kept), rgb[rows].gather(1, kept)
         found = {"vectors": (v[:, 1:] - v[:, :1]).cpu().contiguous(), "colors": r.cpu()}
         counts = {"sites": number, "directions": samples.shape[1], "rounds": FIT_STEPS}
-        backend.load("_cpu").fit_sites_f32(**found, **counts, samples=samples[rows].cpu())  # whatever the device is
+        cpu.fit_sites_f32(**found, **counts, samples=samples[rows].cpu())
         v, r = (value.to(rgb.device) for value in found.values())
         return r[:, 0], torch.cat([v, r[:, 1:]], dim=2)
 

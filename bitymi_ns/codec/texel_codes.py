@@ -109,7 +109,8 @@ class AlphaCodes:
 
     def values(self, sizes: Tensor, grades: Tensor) -> Tensor:
         """Decode the alphas [T] float32 of tiles of sizes [N, 2] and grades [tiles]: bytes / 128, as drawn."""
-        found = _decode(self.means[:, None], self.coefficients, sizes, _steps(self.step, grades))
+        steps = _steps(self.step, grades)
+        found = _decode(self.means[:, None], self.coefficients, blocks_of(sizes), sizes, steps)
         return _round_to_bytes(found[:, 0]) / ALPHA_ONE
 
 
@@ -154,7 +155,11 @@ class TexelCodes:
 
     def texels(self) -> Tensor:
         """Decode the residual colours [T, 3], in the order of `TexelTiles`."""
-        return _decode(self.constants, self.coefficients, self.sizes, _steps(self.step, self.grades))
+        return self.texels_of(blocks_of(self.sizes))
+
+    def texels_of(self, blocks: Sequence[Blocks]) -> Tensor:
+        """Decode as `texels`, given the tiles' blocks."""
+        return _decode(self.constants, self.coefficients, blocks, self.sizes, _steps(self.step, self.grades))
 
     def alphas(self) -> Tensor | None:
         """Decode the alphas [T], in the same order; None if opaque."""
@@ -219,7 +224,7 @@ class TexelCoder:
         options.check()
         self._sizes, self._weights = sizes.long(), weights + LEAST_WEIGHT
         self._step = options.step / 255
-        self._blocks = blocks_of(self._sizes)
+        self.blocks = blocks_of(self._sizes)
         tiled = self._sizes[:, 0] > 0
         area = self._sizes.clamp(min=1).prod(dim=1)
         self._owner = torch.repeat_interleave(torch.arange(len(area)), area)
@@ -282,19 +287,21 @@ class TexelCoder:
         coefficients = []
         shared = _shared(means, self._sizes, _steps(step, self.grades))
         values = {"values": texels.contiguous(), "weights": self._weights, "rounds": rounds, "shrink": SHRINK}
-        for blocks in self._blocks:
+        for blocks in self.blocks:
             codes = torch.empty(math.prod(blocks.size), len(blocks.tile), texels.shape[1], dtype=torch.int32)
             backend.load("_cpu").sparse_cosines_f32(**shared, **_block_arguments(blocks), **values, codes=codes)
             coefficients.append(codes)
         return coefficients
 
 
-def _decode(means: Tensor, coefficients: Sequence[Tensor], sizes: Tensor, steps: Tensor) -> Tensor:
+def _decode(
+    means: Tensor, coefficients: Sequence[Tensor], blocks: Sequence[Blocks], sizes: Tensor, steps: Tensor
+) -> Tensor:
     """Decode texels [T, C] from means [N, C] and coefficients of tiles of sizes [N, 2] and steps [tiles]."""
     texels = means.repeat_interleave(sizes.clamp(min=1).prod(dim=1), dim=0)
     shared = _shared(means, sizes, steps)
-    for blocks, codes in zip(blocks_of(sizes), coefficients, strict=True):
-        backend.load("_cpu").decode_cosines_f32(**shared, **_block_arguments(blocks), codes=codes, values=texels)
+    for of, codes in zip(blocks, coefficients, strict=True):
+        backend.load("_cpu").decode_cosines_f32(**shared, **_block_arguments(of), codes=codes, values=texels)
     return texels
 
 

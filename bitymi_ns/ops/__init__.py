@@ -6,7 +6,7 @@ Functions take float32 or float64 tensors and dispatch on device and dtype. `bak
 
 from .bands import Bands, band, by_bands, fitting_lists, refused
 from .blend import blended_image, composite, soft_overdraw
-from .coverage import add_texel_coverage
+from .coverage import add_texel_coverage, surfel_coverage
 from .field import FieldGeometry, field, fragment_residual
 from .fragment_list import TooManyFragments
 from .project import Prefilter, Projection, project
@@ -45,6 +45,7 @@ __all__ = [
     "select",
     "soft_overdraw",
     "ssim",
+    "surfel_coverage",
     "trace",
     "view_color",
 ]

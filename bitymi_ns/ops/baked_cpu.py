@@ -1,27 +1,21 @@
 """Rendering of baked scenes with the CPU kernels, without a fragment list."""
 
-import functools
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from .backend import Pool, kernel, module, require
+from .backend import kernel, module, require
 from .baked_scene import BakedScene, check_images, common_size, residual, tile_levels
 from .constants import BAKED_CHANNELS, MAP_CHANNELS
 from .project import GEOMETRY, Camera, project
+from .trace_cpu import tile_lists
 from .view_color import view_color
 
 ON_CUDA = "move the scene to the CPU, or draw with `baked.draw`"
 CHANNELS = {"rgb": slice(0, 3), "alpha": slice(3, 4), "beta": slice(4, 5), "depth": slice(5, 6), "normal": slice(6, 9)}
 """Channels of a frame by image; without maps only the first two."""
-
-
-@functools.cache
-def _bins() -> Pool[Any]:
-    """Return reusable memory for the tile lists of frames."""
-    return Pool(module(torch.device("cpu")).Bins)
 
 
 def gather(atlas: Tensor | None, tiles: Tensor) -> Any:
@@ -78,7 +72,7 @@ def frame(scene: BakedScene, camera: Camera, maps: bool, photo_pixel: float = 1.
     levels = {}
     if atlas is not None and photo_pixel < 1.0:
         levels = scene.cache.coarser(lambda: coarser(atlas, tiles, scene.alpha_scale > 0))
-    with _bins().borrow() as bins:
+    with tile_lists().borrow() as bins:
         kernel("baked_forward", geom)(
             **projection.view(geom),
             **texture,

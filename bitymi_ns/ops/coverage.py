@@ -1,56 +1,108 @@
-"""Coverage of texels: the pixels of a view that each texel accounts for, which weight its step."""
+"""Coverage: what a view shows of its surfels, and of their texels.
 
-from collections.abc import Iterable
+On the CPU fragments are summed as they are found; on a CUDA device they are listed first."""
+
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from .backend import kernel
+from .backend import cuda_backend, kernel
+from .bands import fitting_lists
 from .blend import backward_memory
 from .constants import GEOM, IMAGE_CHANNELS
+from .project import Projection
 from .texel import TexelTiles
 from .trace import Fragments
+from .trace_cpu import tile_lists
+
+PART = 1 << 20  # fragments of a list summed at a time
 
 
+@torch.no_grad()
+def surfel_coverage(projection: Projection, bound: float) -> Tensor:
+    """Measure what a view shows of its surfels.
+
+    Returns:
+        [N, 3]: the largest transmittance in front of a blended fragment, the sum of the blending weights from `bound`
+        on, and the sum of all squared blending weights, in pixels; 0 for surfels that are not blended.
+    """
+    geom = projection.geom.detach()
+    shown = geom.new_zeros(len(geom), 3)
+    if not cuda_backend(geom.device):
+        _sum_fragments("surfel_coverage", projection, bound, shown=shown)
+        return shown
+    largest, weights, squares = shown.unbind(1)
+    for fragments in fitting_lists(projection):
+        lists = (fragments.surfel, fragments.weight, fragments.sigma)
+        for surfel, weight, sigma in zip(*(values.split(PART) for values in lists), strict=True):
+            rows = surfel.long()
+            largest.scatter_reduce_(0, rows, weight / sigma.abs(), "amax")  # sigma's sign is the low-pass branch
+            weights.index_add_(0, rows, torch.where(weight >= bound, weight, 0.0).to(shown.dtype))
+            squares.index_add_(0, rows, weight.square())
+        del fragments, lists, surfel, weight, sigma  # frees memory before the next list
+    return shown
+
+
+@torch.no_grad()
 def add_texel_coverage(
-    lists: Iterable[Fragments],
-    tiles: TexelTiles,
-    mask: Tensor | None,
-    bound: float,
-    total: Tensor,
-    squares: Tensor | None = None,
+    projection: Projection, tiles: TexelTiles, mask: Tensor | None, bound: float, covered: Tensor
 ) -> None:
-    """Add the coverage of each texel in a view, in pixels: sum over fragments of blending weight times bilinear weight.
+    """Add the coverage of each texel in a view, in pixels.
 
     Args:
-        lists: fragments of an H x W view from top to bottom, as from `fitting_lists`.
+        projection: of an H x W view.
         tiles: of the T texels.
         mask: [H, W] or [H, W, 1] bool, True for pixels that count; None: all.
         bound: fragments of smaller weight are ignored.
-        total: [T, 3] of the tiles' dtype, dense, equal columns, added to.
-        squares: [T], added to: the same sum with squared blending weights; None: skip.
+        covered: [T, 2] of the tiles' dtype, dense, added to: the sums over fragments of blending weight, and of squared
+            blending weight, times bilinear weight.
     """
-    like, top = tiles.extent, 0
-    mask = None if mask is None else mask.to(like.device).reshape(-1)
-    # a step of length -1 for colours with no clamped channel
-    step = {"texels": total, "moved": total, "squares": squares, "share": like.new_ones(tiles.count), "rate": -1.0}
-    for fragments in lists:
-        pixels, surfels = fragments.width * fragments.height, fragments.surfels
-        counts = like.new_ones(pixels) if mask is None else mask[top : top + pixels].to(like.dtype)
-        base, geom = like.new_zeros(surfels, 3), like.new_zeros(surfels, GEOM)
-        kernel("blend_backward", total)(
-            **fragments.arrays,
-            **tiles.arrays,
-            **step,
-            **backward_memory(fragments, False, len(total)),
-            **fragments.view,
-            maps=False,
-            bound=bound,
-            base=base,
-            geom=geom,
-            dimage=torch.nn.functional.pad(counts[:, None].expand(-1, 3), (0, IMAGE_CHANNELS - 3)),
-            dgeom=torch.empty_like(geom),
-            dbase=torch.empty_like(base),
-        )
+    counts = None if mask is None else mask.to(covered.device).reshape(-1)
+    if not cuda_backend(covered.device):
+        flat = {} if counts is None else {"mask": counts.view(torch.uint8).contiguous()}
+        of_tiles = {f"covered_{name}": value for name, value in tiles.arrays.items()}
+        _sum_fragments("texel_coverage", projection, bound, covered=covered, **of_tiles, **flat)
+        return
+    top, total, squares = 0, covered.new_zeros(len(covered), 3), covered.new_zeros(len(covered))
+    for fragments in fitting_lists(projection):
+        pixels = fragments.width * fragments.height
+        _add_of_list(fragments, tiles, None if counts is None else counts[top : top + pixels], bound, total, squares)
         top += pixels
         del fragments  # before the next list is made
+    covered += torch.stack([total[:, 0], squares], 1)
+
+
+def _sum_fragments(name: str, projection: Projection, bound: float, **arguments: Any) -> None:
+    """Call a CPU kernel that finds the fragments of a view."""
+    geom = projection.geom.detach()
+    with tile_lists().borrow() as bins:
+        kernel(name, geom)(**projection.view(geom), **projection.alpha_arrays, bound=bound, bins=bins, **arguments)
+
+
+def _add_of_list(
+    fragments: Fragments, tiles: TexelTiles, mask: Tensor | None, bound: float, total: Tensor, squares: Tensor
+) -> None:
+    """Add the coverage of a list's fragments on a CUDA device to total [T, 3], of equal columns, and squares [T]: a
+    step of length -1 for colours with no clamped channel."""
+    like, surfels, pixels = tiles.extent, fragments.surfels, fragments.width * fragments.height
+    counts = like.new_ones(pixels) if mask is None else mask.to(like.dtype)
+    base, geom = like.new_zeros(surfels, 3), like.new_zeros(surfels, GEOM)
+    kernel("blend_backward", total)(
+        **fragments.arrays,
+        **tiles.arrays,
+        **backward_memory(fragments, False, len(total)),
+        **fragments.view,
+        texels=total,
+        moved=total,
+        squares=squares,
+        share=like.new_ones(tiles.count),
+        rate=-1.0,
+        maps=False,
+        bound=bound,
+        base=base,
+        geom=geom,
+        dimage=torch.nn.functional.pad(counts[:, None].expand(-1, 3), (0, IMAGE_CHANNELS - 3)),
+        dgeom=torch.empty_like(geom),
+        dbase=torch.empty_like(base),
+    )

@@ -177,11 +177,8 @@ def select(fragments: Fragments, keep: Tensor) -> Fragments:
     check_shapes(keep=(keep, fragments.weight.shape))
     by = trace_cuda if cuda_backend(keep.device) else trace_cpu
     width, height = fragments.width, fragments.height
-    layout = by.select(fragments.layout, keep.contiguous().view(torch.uint8), width, height)
-    rows = torch.nonzero(keep).squeeze(1)
-    weight, depth, sigma = (t.detach()[rows] for t in (fragments.weight, fragments.depth, fragments.sigma))
-    uv = fragments.uv.detach()[:, rows].contiguous()
-    return Fragments(weight, uv, depth, sigma, width, height, layout, fragments.surfels)
+    layout, found = by.select(fragments.layout, fragments._numbers, keep, width, height)
+    return Fragments(**found, width=width, height=height, layout=layout, surfels=fragments.surfels)
 
 
 def masked_counts(fragments: Fragments, mask: Tensor, n: int) -> Tensor:

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .backend import Pool, function, kernel_class, module, require
+from .backend import Pool, function, kernel, kernel_class, module, require
 from .fragment_list import Layout, TooManyFragments, empty_ids, empty_list
 from .project import Projection
 
@@ -20,6 +20,12 @@ _pool = functools.cache(Pool)
 def tracers(like: Tensor) -> Pool[Any]:
     """Return reusable tracers for tensors like `like`, which keep their memory between views."""
     return _pool(kernel_class("Trace", like))
+
+
+@functools.cache
+def tile_lists() -> Pool[Any]:
+    """Return reusable memory for the tile lists of views whose fragments are not listed."""
+    return Pool(module(torch.device("cpu")).Bins)
 
 
 def find_fragments(geom: Tensor, projection: Projection, most: int | None = None) -> tuple[Layout, dict[str, Tensor]]:
@@ -48,18 +54,23 @@ def find_fragments(geom: Tensor, projection: Projection, most: int | None = None
     return _layout(arrays, projection.camera.width, projection.camera.height), found
 
 
-def select(layout: Layout, keep: Tensor, width: int, height: int) -> Layout:
-    """Build the layout of the selected fragments.
+def select(
+    layout: Layout, numbers: dict[str, Tensor], keep: Tensor, width: int, height: int
+) -> tuple[Layout, dict[str, Tensor]]:
+    """Select fragments: their layout, and their numbers.
 
     Args:
-        layout: of a list of F fragments.
-        keep: [F] uint8.
+        layout, numbers: of a list of F fragments.
+        keep: [F] bool.
         width, height: of the image, pixels.
     """
+    found = empty_list(numbers["weight"], int(keep.sum()))
     arrays = _empty_layout(len(layout.arrays["tile_start"]) - 1, len(layout.arrays["blocks"]))
-    function("select_fragments", keep.device)(layout=layout.handle, keep=keep, **arrays)
+    kept = {f"kept_{name}": values for name, values in found.items()}
+    flags = keep.contiguous().view(torch.uint8)
+    kernel("select_fragments", numbers["weight"])(layout=layout.handle, keep=flags, **numbers, **kept, **arrays)
     arrays["blocks"] = arrays["blocks"][: int(arrays["block_start"][-1])].clone()
-    return _layout(arrays, width, height)
+    return _layout(arrays, width, height), found
 
 
 def _empty_layout(tiles: int, blocks: int) -> dict[str, Tensor]:

@@ -176,19 +176,23 @@ def find_fragments(geom: Tensor, projection: Projection, most: int | None = None
     return layout, fill(geom, projection, layout)
 
 
-def select(layout: Layout, keep: Tensor, width: int, height: int) -> Layout:
-    """Build the layout of the selected fragments.
+def select(
+    layout: Layout, numbers: dict[str, Tensor], keep: Tensor, width: int, height: int
+) -> tuple[Layout, dict[str, Tensor]]:
+    """Select fragments: their layout, and their numbers.
 
     Args:
-        layout: of a list of F fragments.
-        keep: [F] uint8.
+        layout, numbers: of a list of F fragments.
+        keep: [F] bool.
         width, height: of the image, pixels.
     """
     masks, counts = torch.empty_like(layout.arrays["masks"]), torch.empty_like(layout.arrays["offsets"][1:])
-    function("select_fragments", keep.device)(layout=layout.handle, keep=keep, masks=masks, counts=counts)
+    flags = keep.contiguous().view(torch.uint8)
+    function("select_fragments", keep.device)(layout=layout.handle, keep=flags, masks=masks, counts=counts)
     offsets, rows = torch.nn.functional.pad(counts.cumsum(0), (1, 0)), keep.nonzero().squeeze(1)
     ids = {name: value[rows] for name, value in layout.ids().items()}
-    return layout_of(layout.arrays | {"masks": masks, "offsets": offsets}, width, height, ids)
+    found = {name: value[..., rows].contiguous() for name, value in numbers.items()}
+    return layout_of(layout.arrays | {"masks": masks, "offsets": offsets}, width, height, ids), found
 
 
 def backward_memory(geom: Tensor, layout: Layout, texel_alpha: Tensor | None) -> dict[str, Tensor]:

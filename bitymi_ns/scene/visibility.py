@@ -8,11 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops import Prefilter, TexelAlpha, fitting_lists, project
+from bitymi_ns.ops import Prefilter, TexelAlpha, project, surfel_coverage
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
-
-PART = 1 << 20  # fragments processed at a time: temporaries then fit in memory that the process already has
 
 
 @dataclass(frozen=True)
@@ -68,20 +66,12 @@ def visibility(
     """
     means = surfels["means"]
     geometry = [surfels[name] for name in ("quats", "log_scales", "opacity_logits", "beta_raw")]
-    largest = means.new_zeros(len(means))
-    pixels = torch.zeros_like(largest)
+    largest, pixels = means.new_zeros(2, len(means))
     squares = torch.zeros(len(cameras), len(means), dtype=torch.bfloat16, device=means.device)
     for done, camera in enumerate(cameras, start=1):
-        here, square = torch.zeros_like(pixels), torch.zeros_like(pixels)
         projection = project(means, *geometry, camera.to(means.device), near, prefilter, alpha=alpha)
-        for fragments in fitting_lists(projection):
-            lists = (fragments.surfel, fragments.weight, fragments.sigma)
-            for surfel, weight, sigma in zip(*(values.split(PART) for values in lists), strict=True):
-                rows = surfel.long()
-                largest.scatter_reduce_(0, rows, weight / sigma.abs(), "amax")  # sigma's sign is the low-pass branch
-                here.index_add_(0, rows, torch.where(weight >= weight_bound, weight, 0.0).to(here.dtype))
-                square.index_add_(0, rows, weight.square().to(square.dtype))
-            del fragments, lists, surfel, weight, sigma  # frees memory before the next list
-        pixels, squares[done - 1] = torch.maximum(pixels, here), square
+        shown = surfel_coverage(projection, weight_bound)
+        largest, pixels = torch.maximum(largest, shown[:, 0]), torch.maximum(pixels, shown[:, 1])
+        squares[done - 1] = shown[:, 2]
         progress("looking through the training views", done, len(cameras))
     return Visibility(largest, pixels, squares)

@@ -13,7 +13,7 @@ from torch.nn import Parameter
 from torch.utils.hooks import RemovableHandle
 
 from bitymi_ns.codec.limits import ALPHA_LIMIT
-from bitymi_ns.ops import TexelDescent, add_texel_coverage, fitting_lists, project
+from bitymi_ns.ops import TexelDescent, add_texel_coverage, project
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.scene.camera import Camera
@@ -235,10 +235,10 @@ def tiles_as_seen(
 @torch.no_grad()
 def coverage(scene: Scene, field: TexelField, views: Sequence[View]) -> Tensor:
     """Sum blending weight times bilinear weight of each texel, [T] pixels, over unmasked fragments and views."""
-    total = torch.zeros_like(field.texels)
+    covered = field.texels.new_zeros(len(field.texels), 2)
     for view in views:
         geometry = (scene.surfels[name].detach() for name in GEOMETRY)
-        camera = view.camera.to(total.device)
+        camera = view.camera.to(covered.device)
         projection = project(*geometry, camera, scene.near, scene.config.prefilter)
-        add_texel_coverage(fitting_lists(projection), field.tiles, view.mask, scene.config.weight_bound, total)
-    return total[:, 0]
+        add_texel_coverage(projection, field.tiles, view.mask, scene.config.weight_bound, covered)
+    return covered[:, 0]

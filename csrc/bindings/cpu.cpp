@@ -138,8 +138,12 @@ template <class S> void bind_operations(nb::module_& m) {
 #undef BT_BIND
   bind_tracer<S>(m);
   bind_operation(m, name("baked_forward"), &baked_forward<S>);
+  bind_operation(m, name("select_fragments"), &select_fragments<S>);
+  bind_operation(m, name("surfel_coverage"), &surfel_coverage<S>);
+  bind_operation(m, name("texel_coverage"), &texel_coverage<S>);
   bind_operation(m, name("sparse_cosines"), &sparse_cosines<S>);
   bind_operation(m, name("decode_cosines"), &decode_cosines<S>);
+  bind_operation(m, name("rank_sites"), &rank_sites<S>);
   bind_operation(m, name("fit_sites"), &fit_sites<S>);
 }
 }  // namespace
@@ -166,7 +170,6 @@ NB_MODULE(BITYMI_MODULE, m) {
   bind_entropy(m);
   bind_operation(m, "masked_counts", &masked_counts);
   bind_operation(m, "list_ids", &list_ids);
-  bind_operation(m, "select_fragments", &select_fragments);
   m.attr("SUPPORT") = kSupport, m.attr("ALPHA_MAX") = kAlphaMax, m.attr("ALPHA_MIN") = kAlphaMin;
   m.attr("TRANSMITTANCE_MIN") = kTransmittanceMin, m.attr("BETA_MAX") = kBetaMax, m.attr("TILE") = kTile;
   m.attr("GEOM") = int(kGeom), m.attr("FRAME") = kFrame;

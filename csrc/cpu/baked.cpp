@@ -73,6 +73,42 @@ template <class S, int channels> inline TexelPairs<S, channels> texel_pairs(cons
   return t;
 }
 
+#if defined(__AVX2__)
+// Interpolates along v between the texels at 16 offsets and those `down` below, and likewise their right neighbours.
+template <int channels>
+inline TexelPairs<float, channels> pairs_along_v(const float* patch, const int32_t* at, int64_t down, Lanes<float> fy) {
+  alignas(64) float below[kLanes];
+  store(below, fy);
+  __m256 half[2 * channels][2];  // left, then right
+  for (int h = 0; h < 2; ++h) {
+    const auto pair = [&](int lane) {  // four numbers on the left, four on the right
+      const float* p = patch + 4 * int64_t(at[8 * h + lane]);
+      const Oct<float> top = (Oct<float>)_mm256_loadu_ps(p), bottom = (Oct<float>)_mm256_loadu_ps(p + down);
+      return (__m256)(top + below[8 * h + lane] * (bottom - top));
+    };
+    __m256 left[4], right[4];  // of two lanes, four lanes apart
+    for (int lane = 0; lane < 4; ++lane) {
+      const __m256 a = pair(lane), b = pair(lane + 4);
+      left[lane] = _mm256_permute2f128_ps(a, b, 0x20), right[lane] = _mm256_permute2f128_ps(a, b, 0x31);
+    }
+    const auto columns = [&](const __m256* rows, int first) {
+      const __m256 a = _mm256_unpacklo_ps(rows[0], rows[1]), b = _mm256_unpacklo_ps(rows[2], rows[3]);
+      const __m256 c = _mm256_unpackhi_ps(rows[0], rows[1]), d = _mm256_unpackhi_ps(rows[2], rows[3]);
+      half[first][h] = _mm256_shuffle_ps(a, b, 0x44), half[first + 1][h] = _mm256_shuffle_ps(a, b, 0xee);
+      half[first + 2][h] = _mm256_shuffle_ps(c, d, 0x44);
+      if constexpr (channels == 4) half[first + 3][h] = _mm256_shuffle_ps(c, d, 0xee);
+    };
+    columns(left, 0), columns(right, channels);
+  }
+  TexelPairs<float, channels> t;
+  for (int c = 0; c < channels; ++c) {
+    t.left.of[c] = joined(half[c][0], half[c][1]);
+    t.right.of[c] = joined(half[channels + c][0], half[channels + c][1]);
+  }
+  return t;
+}
+#endif
+
 // Interpolates stored values bilinearly at the lanes' positions in a tile. Positions are clamped to the outer texel
 // centres; in a tile's last column and row the neighbour has weight 0 and may be any texel.
 template <class S, int channels, class T>
@@ -81,13 +117,22 @@ inline Texels<S, channels> bilinear(const T* patch, int columns, Lanes<S> x, Lan
   const P x0 = floor_(x), y0 = floor_(y), fx = x - x0, fy = y - y0;
   int32_t at[kLanes];
   store_integers(at, y0 * P(S(columns)) + x0);  // exact: a tile has fewer than 2^24 texels
-  const auto top = texel_pairs<S, channels>(patch, at), bottom = texel_pairs<S, channels>(patch + 4 * columns, at);
-  Texels<S, channels> t;
-  for (int c = 0; c < channels; ++c) {
-    const P left = top.left.of[c] + fy * (bottom.left.of[c] - top.left.of[c]);
-    const P right = top.right.of[c] + fy * (bottom.right.of[c] - top.right.of[c]);
-    t.of[c] = left + fx * (right - left);
+  TexelPairs<S, channels> pairs;
+#if defined(__AVX2__)
+  if constexpr (std::is_same_v<S, float> && std::is_same_v<T, float>) {
+    pairs = pairs_along_v<channels>(patch, at, 4 * int64_t(columns), fy);
+  } else
+#endif
+  {
+    pairs = texel_pairs<S, channels>(patch, at);
+    const auto bottom = texel_pairs<S, channels>(patch + 4 * columns, at);
+    for (int c = 0; c < channels; ++c) {
+      pairs.left.of[c] += fy * (bottom.left.of[c] - pairs.left.of[c]);
+      pairs.right.of[c] += fy * (bottom.right.of[c] - pairs.right.of[c]);
+    }
   }
+  Texels<S, channels> t;
+  for (int c = 0; c < channels; ++c) t.of[c] = pairs.left.of[c] + fx * (pairs.right.of[c] - pairs.left.of[c]);
   return t;
 }
 }  // namespace

@@ -163,17 +163,16 @@ void run_backward(const Backward<S>& a, const BlockPicture<S, kChannels<kMaps>>&
       for (int k = 0; k < 3; ++k) sums.normal[k] += weight * d[6 + k];
     }
     const uint32_t textured = surfel.textured(block);
-    S rgb[3][kLanes], last[kLanes];
+    S rgb[3][kLanes];
     if ((textured && rows) || a.dresidual)
       for (int k = 0; k < 3; ++k) store(rgb[k], dcolors[k]);
-    if (textured && rows) store(last, a.squares ? weight * dcolors[0] : zero);
     if (S* to = a.dresidual ? a.dresidual + 3 * at : nullptr)
       for (uint32_t lanes = part.lanes; lanes; lanes &= lanes - 1)
         for (int k = 0; k < 3; ++k) *to++ = rgb[k][__builtin_ctz(lanes)];
     const int number = surfel.number(block);
     if (rows)
       each_lane(textured, [&](int lane) {
-        const Four<S> dcolor(Vec3<S>{rgb[0][lane], rgb[1][lane], rgb[2][lane]}, last[lane]);
+        const Four<S> dcolor(Vec3<S>{rgb[0][lane], rgb[1][lane], rgb[2][lane]}, S(0));
         surfel.few().add_gradient(number + lane, dcolor, rows);
       });
     if (!a.duv) return;
@@ -282,13 +281,6 @@ template <class S> void move_texels(const S* rows, int64_t count, S rate, const 
   }
   for (; t < count; ++t) store3(texels + 3 * t, texel_step(load3(texels + 3 * t), load3(rows + 4 * t), rate, share[t]));
 }
-// Moves the squares of a surfel's texels by the last numbers of their rows, which become 0.
-template <class S> void move_squares(S* rows, int64_t count, S rate, const S* share, S* squares) {
-  for (int64_t t = 0; t < count; ++t) {
-    squares[t] = texel_step(squares[t], rows[4 * t + 3], rate, share[t]);
-    rows[4 * t + 3] = S(0);
-  }
-}
 // Surfel by surfel: each thread adds to its own surfels' texels. Also used without learning texels, so that gradients
 // of surfels stay the same.
 template <bool kMaps, class S>
@@ -308,7 +300,6 @@ void backward_by_surfel(const Backward<S>& a, const BlockPicture<S, kChannels<kM
       run_backward<kMaps>(a, dimage, surfel, moves ? own.data() : nullptr, sums);
     }
     surfel_backward(a, id, total<kMaps>(sums));
-    if (moves && a.squares) move_squares(own.data(), area, a.rate, a.share + patch.first, a.squares + patch.first);
     if (moves) move_texels(own.data(), area, a.rate, a.share + patch.first, a.moved + 3 * patch.first);
   });
 }

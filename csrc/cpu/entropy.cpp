@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <optional>
 #include <vector>
 
 namespace bt {
@@ -13,6 +14,7 @@ constexpr uint32_t kTotal = 1u << kPrecision;
 constexpr uint32_t kLowest = 1u << 23;  // rANS states are from here to below 256 times as much
 constexpr int kFine = 2;                // bits of a token after the leading one
 constexpr int kDirect[] = {2, 7};       // magnitudes below 2^this are tokens of their own: choices of the encoder
+constexpr int kFinest = 7;              // the largest of them, whose tokens imply those of the others
 constexpr int kMostDirect = 8;
 constexpr int kMostThresholds = 7;
 constexpr int kOrders = 3;  // kinds of contexts
@@ -21,11 +23,7 @@ constexpr int kOthers = 3;  // values of `others`
 constexpr int kMostContexts = (1 + kLevels) * kOthers;
 constexpr int kLevelBounds[kLevels - 1] = {3, 7, 13, 21, 32, 56, 96};  // of 16 times their running mean
 
-int bit_length(uint64_t x) {
-  int n = 0;
-  for (; x; x >>= 1) ++n;
-  return n;
-}
+int bit_length(uint64_t x) { return x ? 64 - __builtin_clzll(x) : 0; }
 
 // A number as a token and the lower `count` bits of its magnitude.
 struct Token {
@@ -45,6 +43,18 @@ Token split(int64_t x, int direct) {
   }
   const uint64_t mask = (uint64_t(1) << count) - 1;
   return {int(2 * kind) - (x < 0), count, magnitude & mask};
+}
+
+// Returns the bits that follow a token.
+int bits_after(int token, int direct) {
+  const int kind = (token + 1) / 2, above = kind - (1 << direct);
+  return above < 0 ? 0 : (above >> kFine) + direct - kFine;
+}
+// Returns the token for `direct` of the magnitudes with a token for kFinest.
+int coarser(int token, int direct) {
+  const int kind = (token + 1) / 2, above = kind - (1 << kFinest), sign = token & 1;
+  if (above < 0) return split(sign ? -kind : kind, direct).token;
+  return token + 2 * ((1 << direct) + ((kFinest - direct) << kFine) - (1 << kFinest));
 }
 
 int tokens_of(int direct) { return 2 * ((1 << direct) + ((kIntegerBits - direct) << kFine)) - 1; }
@@ -127,34 +137,74 @@ void put_table(std::string& to, const std::vector<uint32_t>& table) {
   }
 }
 
-// Coding with a choice of `direct` and `order`; keeps the bits it takes.
+using Counts = std::vector<std::vector<uint32_t>>;  // of tokens, by context
+
+// Occurrences of each token for kFinest in the contexts of an order.
+struct Occurrences {
+  int order;
+  std::vector<int64_t> thresholds;
+  Counts counts;
+};
+
+std::vector<int64_t> thresholds_of(const IntegerColumn& column, const int64_t* values, int64_t centre, int order) {
+  Contexts contexts(column, order, {});
+  std::vector<int64_t> sums(column.rows), found;
+  for (int64_t i = 0; i < column.rows; ++i) sums[i] = contexts.sum(), contexts.note(values[i] - centre);
+  std::sort(sums.begin(), sums.end());
+  for (double share : {0.1, 0.25, 0.5, 0.75, 0.9}) found.push_back(sums[size_t(share * double(sums.size()))]);
+  found.erase(std::unique(found.begin(), found.end()), found.end());
+  return found;
+}
+
+Occurrences count(const IntegerColumn& column, const int64_t* values, int64_t centre, int order) {
+  Occurrences found = {order, {}, {}};
+  if (order && !column.blocks) found.thresholds = thresholds_of(column, values, centre, order);
+  Contexts contexts(column, order, found.thresholds);
+  found.counts.assign(contexts.count(), std::vector<uint32_t>(tokens_of(kFinest)));
+  for (int64_t i = 0; i < column.rows; ++i) {
+    const int64_t x = values[i] - centre;
+    ++found.counts[contexts.at(i)][split(x, kFinest).token];
+    contexts.note(x);
+  }
+  return found;
+}
+// Counts in all orders. Of blocks, contexts of an order are unions of those of the next.
+std::vector<Occurrences> count_all(const IntegerColumn& column, const int64_t* values, int64_t centre) {
+  std::vector<Occurrences> found(column.blocks && !column.others ? 2 : kOrders);
+  for (int order = int(found.size()) - 1; order >= 0; --order) {
+    if (!column.blocks || order + 1 == int(found.size())) {
+      found[order] = count(column, values, centre, order);
+      continue;
+    }
+    const Counts& finer = found[order + 1].counts;
+    const size_t together = order ? kOthers : finer.size();
+    Counts counts(finer.size() / together, std::vector<uint32_t>(tokens_of(kFinest)));
+    for (size_t k = 0; k < finer.size(); ++k)
+      for (size_t t = 0; t < finer[k].size(); ++t) counts[k / together][t] += finer[k][t];
+    found[order] = {order, {}, std::move(counts)};
+  }
+  return found;
+}
+
+// Coding with a choice of `direct` and the order of `of`; keeps the bits it takes.
 class Attempt {
  public:
-  Attempt(const IntegerColumn& column, const int64_t* values, int64_t centre, int direct, int order)
-      : direct_(direct), order_(order), centre_(centre) {
-    if (order && !column.blocks) find_thresholds(column, values);
-    Contexts contexts(column, order, thresholds_);
-    counts_.assign(contexts.count(), std::vector<uint32_t>(tokens_of(direct)));
-    tokens_.resize(column.rows), contexts_.resize(column.rows);
-    for (int64_t i = 0; i < column.rows; ++i) {
-      const int64_t x = values[i] - centre;
-      const Token token = split(x, direct);
-      const int context = contexts.at(i);
-      contexts.note(x);
-      ++counts_[context][token.token];
-      tokens_[i] = uint16_t(token.token), contexts_[i] = uint8_t(context), bits_ += token.count;
-    }
-    for (const auto& counts : counts_) {
-      tables_.push_back(counts);
+  Attempt(const IntegerColumn& column, int64_t centre, int direct, const Occurrences& of)
+      : direct_(direct), order_(of.order), centre_(centre), thresholds_(of.thresholds) {
+    for (const auto& finest : of.counts) {
+      std::vector<uint32_t> counts(tokens_of(direct));
+      for (size_t t = 0; t < finest.size(); ++t)
+        if (finest[t]) counts[coarser(int(t), direct)] += finest[t];
       uint64_t sum = 0;
-      for (uint32_t n : counts) sum += n;
-      if (sum) tables_.back() = normalised(counts);
+      for (size_t t = 0; t < counts.size(); ++t)
+        sum += counts[t], bits_ += double(uint64_t(counts[t]) * bits_after(int(t), direct));
+      tables_.push_back(sum ? normalised(counts) : counts);
       for (size_t t = 0; t < counts.size(); ++t)
         if (counts[t]) bits_ += counts[t] * (kPrecision - std::log2(double(tables_.back()[t])));
     }
     put_signed(head_, centre);
-    head_ += char(direct), head_ += char(order);
-    if (order && !column.blocks) {
+    head_ += char(direct), head_ += char(order_);
+    if (order_ && !column.blocks) {
       put(head_, thresholds_.size());
       for (int64_t threshold : thresholds_) put_signed(head_, threshold);
     }
@@ -163,50 +213,45 @@ class Attempt {
   }
   double bits() const { return bits_; }
 
-  std::string encode(const int64_t* values) const {
+  std::string encode(const IntegerColumn& column, const int64_t* values) const {
     std::vector<std::vector<uint32_t>> starts = tables_;
     for (auto& start : starts) {
       uint32_t sum = 0;
       for (uint32_t& f : start) std::swap(f, sum), sum += f;
     }
+    std::vector<uint16_t> tokens(column.rows);
+    std::vector<uint8_t> contexts(column.rows);
     std::string coded, plain;
+    Contexts of(column, order_, thresholds_);
+    uint64_t held = 0;
+    int count = 0;
+    for (int64_t i = 0; i < column.rows; ++i) {
+      const int64_t x = values[i] - centre_;
+      const Token token = split(x, direct_);
+      tokens[i] = uint16_t(token.token), contexts[i] = uint8_t(of.at(i));
+      of.note(x);
+      held |= token.bits << count, count += token.count;
+      for (; count >= 8; count -= 8, held >>= 8) plain += char(held);
+    }
+    if (count) plain += char(held);
     uint32_t state = kLowest;
-    for (size_t i = tokens_.size(); i-- > 0;) {  // the decoder gets the last number first
-      const uint32_t frequency = tables_[contexts_[i]][tokens_[i]], start = starts[contexts_[i]][tokens_[i]];
+    for (size_t i = tokens.size(); i-- > 0;) {  // the decoder gets the last number first
+      const uint32_t frequency = tables_[contexts[i]][tokens[i]], start = starts[contexts[i]][tokens[i]];
       for (; state >= ((kLowest >> kPrecision) << 8) * uint64_t(frequency); state >>= 8) coded += char(state);
       state = (state / frequency << kPrecision) + state % frequency + start;
     }
     for (int k = 0; k < 4; ++k, state >>= 8) coded += char(state);
     std::reverse(coded.begin(), coded.end());
-    uint64_t held = 0;
-    int count = 0;
-    for (size_t i = 0; i < tokens_.size(); ++i) {
-      const Token token = split(values[i] - centre_, direct_);
-      held |= token.bits << count, count += token.count;
-      for (; count >= 8; count -= 8, held >>= 8) plain += char(held);
-    }
-    if (count) plain += char(held);
     std::string found = head_;
     put(found, coded.size());
     return found + coded + plain;
   }
 
  private:
-  void find_thresholds(const IntegerColumn& column, const int64_t* values) {
-    Contexts contexts(column, order_, {});
-    std::vector<int64_t> sums(column.rows);
-    for (int64_t i = 0; i < column.rows; ++i) sums[i] = contexts.sum(), contexts.note(values[i] - centre_);
-    std::sort(sums.begin(), sums.end());
-    for (double share : {0.1, 0.25, 0.5, 0.75, 0.9}) thresholds_.push_back(sums[size_t(share * double(sums.size()))]);
-    thresholds_.erase(std::unique(thresholds_.begin(), thresholds_.end()), thresholds_.end());
-  }
-
   int direct_, order_;
   int64_t centre_;
   std::vector<int64_t> thresholds_;
-  std::vector<std::vector<uint32_t>> counts_, tables_;  // per context
-  std::vector<uint16_t> tokens_;
-  std::vector<uint8_t> contexts_;
+  std::vector<std::vector<uint32_t>> tables_;  // per context
   std::string head_;
   double bits_ = 0;
 };
@@ -275,14 +320,14 @@ std::string encode_integers(const IntegerColumn& column, const int64_t* values) 
   std::vector<int64_t> sorted(values, values + column.rows);
   std::nth_element(sorted.begin(), sorted.begin() + column.rows / 2, sorted.end());
   const int64_t centre = column.blocks ? 0 : sorted[size_t(column.rows / 2)];
-  std::string best;
-  double least = INFINITY;
+  const std::vector<Occurrences> orders = count_all(column, values, centre);
+  std::optional<Attempt> best;
   for (int direct : kDirect)
-    for (int order = 0; order < (column.blocks && !column.others ? 2 : kOrders); ++order) {
-      const Attempt attempt(column, values, centre, direct, order);
-      if (attempt.bits() < least) least = attempt.bits(), best = attempt.encode(values);
+    for (const Occurrences& of : orders) {
+      Attempt attempt(column, centre, direct, of);
+      if (!best || attempt.bits() < best->bits()) best.emplace(std::move(attempt));
     }
-  return best;
+  return best->encode(column, values);
 }
 
 void decode_integers(const IntegerColumn& column, const uint8_t* data, size_t size, int64_t* values) {

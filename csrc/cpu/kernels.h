@@ -29,6 +29,7 @@ template <class S> void project_backward(const ProjectBackward<S>& a);
 template <class S> void sparse_cosines(const SparseCosines<S>& a);
 template <class S> void decode_cosines(const DecodeCosines<S>& a);
 template <class S> void fit_sites(const FitSites<S>& a);
+template <class S> void rank_sites(const RankSites<S>& a);
 
 // Visible surfels per tile, front to back, and the squared radii of each surfel's level set in scale units, and of its
 // low pass in pixels, 0 where the kernel covers that.
@@ -80,6 +81,54 @@ template <class S> struct Trace {
   Bins bins;
   FoundFragments<S> list;
 };
+// Adds what a view shows of its surfels: rows of `shown` are the largest transmittance of a blended fragment, and the
+// sums of the blending weights from `bound` on, and of all squared blending weights. `bins` is working memory.
+template <class S> struct SurfelCoverage {
+  View<S> view;
+  AlphaTiles<S> alpha;
+  S bound;
+  Bins* bins;
+  S* shown;  // [n, 3]
+
+  template <class R> void fields(R& r) {
+    view.fields(r);
+    alpha.fields(r, view.n);
+    r.number("bound", bound);
+    r.object("bins", bins);
+    r.array("shown", shown, 3 * view.n);
+  }
+};
+template <class S> void surfel_coverage(const SurfelCoverage<S>& a);
+
+// Adds what a view shows of the texels of tiles as in TexelTiles: rows of `covered` are the sums over fragments from
+// the weight `bound` on, at pixels with mask [height, width] not 0, of blending weight times bilinear weight, and of
+// squared blending weight times bilinear weight. `bins` is working memory.
+template <class S> struct TexelCoverage {
+  View<S> view;
+  AlphaTiles<S> alpha;
+  S bound;
+  Bins* bins;
+  const int64_t* first;
+  const int32_t* size;
+  const S* extent;
+  const uint8_t* mask;  // null: all pixels count
+  int64_t texels;
+  S* covered;  // [texels, 2]
+
+  template <class R> void fields(R& r) {
+    view.fields(r);
+    alpha.fields(r, view.n);
+    r.number("bound", bound);
+    r.object("bins", bins);
+    r.array("covered_first", first, view.n);
+    r.array("covered_size", size, 2 * view.n);
+    r.array("covered_extent", extent, view.n);
+    r.maybe("mask", mask, int64_t(view.width) * view.height);
+    r.rows("covered", covered, texels, 2);
+  }
+};
+template <class S> void texel_coverage(const TexelCoverage<S>& a);
+
 // More fragments than `most` (0 = no limit) are only counted.
 template <class S> struct TraceForward {
   View<S> view;
@@ -127,22 +176,29 @@ struct ListedIds {
 };
 void list_ids(const ListedIds& a);
 
-// Selects the fragments with keep [F] not 0. Writes tile_start, block_start, and as many rows of blocks as the last
-// block_start.
-struct SelectBlocks {
+// Selects the fragments with keep [F] not 0. Writes their numbers, tile_start, block_start, and as many rows of blocks
+// as the last block_start.
+template <class S> struct SelectBlocks {
   TileBlocks layout;
   const uint8_t* keep;
+  FragmentArrays<S> from, out;
   int64_t *tile_start, *block_start;
   int32_t* blocks;
 
   template <class R> void fields(R& r) {
     take(r, "layout", layout);
-    r.array("keep", keep, layout.fragments);
+    from.fields(r, false);
+    if (from.total != layout.fragments) r.refuse("the layout does not belong to these fragments");
+    r.array("keep", keep, from.total);
+    r.rows("kept_weight", out.weight, out.total, 1);
+    r.array("kept_uv", out.uv, 2 * out.total);
+    r.arrays(out.total, "kept_depth", out.depth, "kept_sigma", out.sigma);
     r.arrays(layout.tiles + 1, "tile_start", tile_start, "block_start", block_start);
     r.array("blocks", blocks, 2 * layout.count);
   }
 };
-void select_fragments(const SelectBlocks& a);
+// Throws std::invalid_argument where `out` has no room for exactly these fragments.
+template <class S> void select_fragments(const SelectBlocks<S>& a);
 
 template <class S> void trace_backward(const TraceBackward<S, TileBlocks>& a);
 void masked_counts(const MaskedCounts<TileBlocks>& a);

@@ -5,6 +5,7 @@
 #include "core/visibility.h"
 #include "cpu/blocks.h"
 #include "cpu/kernels.h"
+#include "cpu/texel_alpha.h"
 
 namespace bt {
 
@@ -112,5 +113,30 @@ template <class S> struct TileState {
     return {box & r.support, box & r.centre};
   }
 };
+
+// Visits the surfels that a tile may show, front to back, while a pixel is open: fn(surfel, blend), where blend(take)
+// blends the surfel with its alpha texels; `take` as in TileState::blend.
+template <class Kernel, bool kAll, class S, class F>
+void each_surfel(const View<S>& view, const AlphaTiles<S>& alpha, const Bins& bins, int64_t tile, F&& fn) {
+  using P = Lanes<S>;
+  TileState<S> state(int(tile % bins.tiles_x), int(tile / bins.tiles_x), view.width, view.height);
+  const int64_t end = bins.start[tile + 1];
+  for (int64_t k = bins.start[tile]; k < end && state.open_blocks; ++k) {
+    if (k + kAhead < end) prefetch(view, bins, bins.surfels[k + kAhead]);
+    const int32_t id = bins.surfels[k];
+    if (!alpha.values) {
+      fn(id, [&](auto&& take) { state.template blend<Kernel, kAll>(view, bins, id, take); });
+      continue;
+    }
+    if (k + 2 * kAhead < end) {
+      prefetch_tile<S>(alpha, bins.surfels[k + 2 * kAhead]);
+      prefetch_texels<S>(alpha, bins.surfels[k + kAhead], nullptr);
+    }
+    const auto cut_by = [&](Fragment<P>& f, const typename P::M& covered, const P& transmittance) {
+      cut(alpha, id, covered, transmittance, f);
+    };
+    fn(id, [&](auto&& take) { state.template blend<Kernel, kAll>(view, bins, id, take, S(1), cut_by); });
+  }
+}
 
 }  // namespace bt

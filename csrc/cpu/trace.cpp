@@ -6,7 +6,6 @@
 #include "core/kernel.h"
 #include "cpu/kernels.h"
 #include "cpu/simd.h"
-#include "cpu/texel_alpha.h"
 #include "cpu/threads.h"
 #include "cpu/tile_state.h"
 
@@ -24,7 +23,6 @@ template <class Kernel, class S>
 void trace_forward(const View<S>& view, const AlphaTiles<S>& alpha, int64_t most, Trace<S>& to) {
   using P = Lanes<S>;
   using Chunk = typename FoundFragments<S>::Chunk;
-  const int width = view.width, height = view.height;
   const Bins& bins = to.bins;
   FoundFragments<S>& list = to.list;
   static_assert(kTileMost < Chunk::kSize, "a tile fits a chunk");
@@ -51,12 +49,8 @@ void trace_forward(const View<S>& view, const AlphaTiles<S>& alpha, int64_t most
     Chunk& a = own[at_chunk];
     const int64_t from = a.used, from_block = a.used_blocks;
     int64_t count = 0, blocks = 0;
-    const int tx = int(tile % bins.tiles_x), ty = int(tile / bins.tiles_x);
-    TileState<S> state(tx, ty, width, height);
-    for (int64_t k = bins.start[tile]; k < bins.start[tile + 1] && state.open_blocks; ++k) {
-      if (k + kAhead < bins.start[tile + 1]) prefetch(view, bins, bins.surfels[k + kAhead]);
-      const int32_t id = bins.surfels[k];
-      const auto take = [&](int block, const typename P::M& taken, const Fragment<P>& f, P weight) {
+    each_surfel<Kernel, true>(view, alpha, bins, tile, [&](int32_t id, auto&& blend) {
+      blend([&](int block, const typename P::M& taken, const Fragment<P>& f, P weight) {
         const BlockPart part(bits(taken), block, id);
         if (keep) {
           const int64_t at = from + count;
@@ -68,20 +62,8 @@ void trace_forward(const View<S>& view, const AlphaTiles<S>& alpha, int64_t most
           compress(&a.sigma[at], listed_sigma(f), part.lanes);
         }
         count += part.count();
-      };
-      if (!alpha.values) {
-        state.template blend<Kernel, true>(view, bins, id, take);
-        continue;
-      }
-      if (k + 2 * kAhead < bins.start[tile + 1]) {
-        prefetch_tile<S>(alpha, bins.surfels[k + 2 * kAhead]);
-        prefetch_texels<S>(alpha, bins.surfels[k + kAhead], nullptr);
-      }
-      state.template blend<Kernel, true>(view, bins, id, take, S(1),
-                                         [&](Fragment<P>& f, const typename P::M& covered, const P& transmittance) {
-                                           cut(alpha, id, covered, transmittance, f);
-                                         });
-    }
+      });
+    });
     if (keep) a.used += count, a.used_blocks += blocks;
     found.fetch_add(count, std::memory_order_relaxed);
     list.pieces[tile] = {thread, at_chunk, from, count, from_block, blocks};
@@ -265,19 +247,27 @@ void list_ids(const ListedIds& a) {
   });
 }
 
-void select_fragments(const SelectBlocks& a) {
-  int64_t fragments = 0, blocks = 0;
-  const uint8_t* keep = a.keep;
+template <class S> void select_fragments(const SelectBlocks<S>& a) {
+  const int64_t from = a.from.total, total = a.out.total;
+  if (std::count_if(a.keep, a.keep + from, [](uint8_t keep) { return keep != 0; }) != total)
+    throw std::invalid_argument("the selection has another number of fragments");
+  int64_t fragments = 0, blocks = 0, at = 0;
   for (int64_t tile = 0; tile < a.layout.tiles; ++tile) {
     a.tile_start[tile] = fragments, a.block_start[tile] = blocks;
     for (int64_t k = a.layout.block_start[tile]; k < a.layout.block_start[tile + 1]; ++k) {
       const BlockPart part(a.layout, k);
+      const int64_t first = at;
       uint32_t kept = 0;
-      for (uint32_t lanes = part.lanes; lanes; lanes &= lanes - 1)
-        if (*keep++) kept |= lanes & -lanes;
+      each_lane(part.lanes, [&](int lane) { kept |= uint32_t(a.keep[at++] != 0) << lane; });
       if (!kept) continue;
       const BlockPart left(kept, part.block, part.surfel);
       left.write(a.blocks + 2 * blocks++);
+      const auto move = [&](const S* numbers, S* to, int64_t size) {
+        compress_until(to + size, to + fragments, expand(numbers + first, part.lanes), kept);
+      };
+      move(a.from.weight, a.out.weight, total), move(a.from.depth, a.out.depth, total);
+      move(a.from.sigma, a.out.sigma, total), move(a.from.uv, a.out.uv, total);
+      move(a.from.uv + from, a.out.uv + total, total);
       fragments += left.count();
     }
   }
@@ -301,6 +291,7 @@ void masked_counts(const MaskedCounts<TileBlocks>& a) {
 
 #define BT_INSTANTIATE(S)                                         \
   template void trace_forward(const TraceForward<S>&, Trace<S>&); \
+  template void select_fragments(const SelectBlocks<S>&);         \
   template void trace_copy(const TraceCopy<S>&, Trace<S>&);       \
   template void trace_backward(const TraceBackward<S, TileBlocks>&);
 BT_INSTANTIATE(float)

@@ -1,4 +1,4 @@
-// Fit of Spherical Voronoi colours by Levenberg-Marquardt: a lane for every surfel.
+// Fit of Spherical Voronoi colours by Levenberg-Marquardt, and ranking of their sites: a lane for every surfel.
 #include "ops/voronoi.h"
 
 #include "cpu/kernels.h"
@@ -31,6 +31,15 @@ template <class P> void solve_back(const P* l, int n, P* x) {
   for (int i = n; i-- > 0;) {
     for (int k = i + 1; k < n; ++k) x[i] -= l[pair(k, i)] * x[k];
     x[i] = x[i] * l[pair(i, i)];
+  }
+}
+
+// Loads `width` numbers of `count` surfels; lanes beyond repeat the last one.
+template <class S> void gather(const S* from, int64_t first, int count, int width, Lanes<S>* to) {
+  alignas(64) S lanes[kLanes];
+  for (int i = 0; i < width; ++i) {
+    for (int lane = 0; lane < kLanes; ++lane) lanes[lane] = from[(first + std::min(lane, count - 1)) * width + i];
+    to[i] = load(lanes);
   }
 }
 
@@ -74,10 +83,6 @@ template <class S> class SiteLanes {
     P v[3 * kMaxTerms], c[3 * kMaxTerms];  // vectors of the sites from the second on; colours of all
   };
 
-  static void gather(const S* from, int64_t first, int count, int width, P* to) {
-    for (int i = 0; i < width; ++i)
-      for (int lane = 0; lane < kLanes; ++lane) to[i].set(lane, from[(first + std::min(lane, count - 1)) * width + i]);
-  }
   static void scatter(const P* from, int64_t first, int count, int width, S* to) {
     for (int i = 0; i < width; ++i)
       for (int lane = 0; lane < count; ++lane) to[(first + lane) * width + i] = from[i][lane];
@@ -183,6 +188,56 @@ template <class S> class SiteLanes {
   std::vector<P> samples_, vv_, cc_, vc_;
   Fit now_, next_, step_;  // colours of the step by channel
 };
+
+// Ranks the sites of surfels from `first` on: as many as there are lanes, or fewer at the end.
+template <class S> void rank_lanes(const RankSites<S>& a, int64_t first, std::vector<Lanes<S>>& logits) {
+  using P = Lanes<S>;
+  const int count = int(std::min<int64_t>(kLanes, a.n - first)), sites = a.sites;
+  const P zero = P(S(0)), least = P(S(1e-6));
+  P vectors[3 * kMaxTerms], colors[3 * kMaxTerms], gone[kMaxTerms], w[kMaxTerms], cost[kMaxTerms];
+  gather(a.vectors, first, count, 3 * sites, vectors), gather(a.colors, first, count, 3 * sites, colors);
+  std::fill(gone, gone + sites, zero);
+  std::vector<P> samples(4 * a.directions);
+  gather(a.samples, first, count, 4 * a.directions, samples.data());
+  logits.resize(a.directions * sites);
+  for (int s = 0; s < a.directions; ++s)
+    for (int k = 0; k < sites; ++k) {
+      const P *d = &samples[4 * s], *v = vectors + 3 * k;
+      logits[s * sites + k] = d[0] * v[0] + d[1] * v[1] + d[2] * v[2];
+    }
+  P left = P(S(sites * (sites - 1) / 2));  // sum of the numbers of the sites that are left
+  const auto put = [&](int place, const P& site) {
+    for (int lane = 0; lane < count; ++lane) a.order[(first + lane) * sites + place] = int64_t(site[lane]);
+  };
+  for (int place = sites - 1; place > 0; --place) {
+    std::fill(cost, cost + sites, zero);
+    for (int s = 0; s < a.directions; ++s) {
+      const P* logit = &logits[s * sites];
+      P top = logit[0] + gone[0], sum = zero, c[3] = {zero, zero, zero};
+      for (int k = 1; k < sites; ++k) top = max_(top, logit[k] + gone[k]);
+      for (int k = 0; k < sites; ++k) w[k] = exp_(logit[k] + gone[k] - top), sum += w[k];
+      const P share = P(S(1)) / sum;
+      for (int k = 0; k < sites; ++k) {
+        w[k] = w[k] * share;
+        for (int i = 0; i < 3; ++i) c[i] += w[k] * colors[3 * k + i];
+      }
+      for (int k = 0; k < sites; ++k) {
+        const P by = w[k] / max_(P(S(1)) - w[k], least);
+        const P r = c[0] - colors[3 * k], g = c[1] - colors[3 * k + 1], b = c[2] - colors[3 * k + 2];
+        cost[k] += samples[4 * s + 3] * (by * by) * (r * r + g * g + b * b);
+      }
+    }
+    P found = P(S(-1)), lowest = zero;
+    for (int k = 0; k < sites; ++k) {  // the first of the least, or the last that is no number
+      const auto lower = (gone[k] >= zero) & (not_(found >= zero) | not_(cost[k] >= lowest));
+      found = select(lower, P(S(k)), found), lowest = select(lower, cost[k], lowest);
+    }
+    for (int k = 0; k < sites; ++k) gone[k] = select((found >= P(S(k))) & (P(S(k)) >= found), P(S(-1e30)), gone[k]);
+    left -= found;
+    put(place, found);
+  }
+  put(0, left);
+}
 }  // namespace
 
 template <class S> void fit_sites(const FitSites<S>& a) {
@@ -192,6 +247,14 @@ template <class S> void fit_sites(const FitSites<S>& a) {
     for (int64_t group = begin; group < end; ++group) lanes.run(group * kLanes);
   });
 }
+template <class S> void rank_sites(const RankSites<S>& a) {
+  parallel_parts((a.n + kLanes - 1) / kLanes, 1, [&](int, int64_t begin, int64_t end) {
+    std::vector<Lanes<S>> logits;
+    for (int64_t group = begin; group < end; ++group) rank_lanes(a, group * kLanes, logits);
+  });
+}
+template void rank_sites(const RankSites<float>&);
+template void rank_sites(const RankSites<double>&);
 template void fit_sites(const FitSites<float>&);
 template void fit_sites(const FitSites<double>&);
 

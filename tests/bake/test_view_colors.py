@@ -282,3 +282,39 @@ def test_the_fit_is_that_of_the_definition(dtype, sites: int) -> None:
     for got, want in zip(found.values(), exact, strict=True):
         near = torch.isclose(got.double(), want, *((1e-6, 1e-7) if dtype == torch.float64 else (2e-2, 2e-3)))
         assert near.double().mean() > (0.999 if dtype == torch.float64 else 0.97)
+
+
+def order_by_definition(vectors: torch.Tensor, rgb: torch.Tensor, directions: torch.Tensor, weight: torch.Tensor):
+    """Remove site after site, each time that without which the colour changes least: [n, K], the first removed last."""
+    n, count = vectors.shape[:2]
+    alive, gone = torch.ones(n, count, dtype=torch.bool), []
+    for _ in range(count - 1):
+        w = torch.softmax((directions @ vectors.transpose(1, 2)).masked_fill(~alive[:, None], -torch.inf), dim=2)
+        change = (w / (1 - w))[..., None] * ((w @ rgb)[:, :, None] - rgb[:, None])
+        cost = (change.square().sum(3) * weight[..., None]).sum(1)
+        gone.insert(0, cost.masked_fill(~alive, torch.inf).argmin(1, keepdim=True))
+        alive = alive.scatter(1, gone[0], False)
+    return torch.cat([alive.long().argmax(1, keepdim=True), *gone], 1)
+
+
+@pytest.mark.parametrize("sites", [1, 2, 7])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_sites_are_ranked_as_defined(dtype, sites: int) -> None:
+    g, n, count = torch.Generator().manual_seed(sites), 37, 20
+    vectors, rgb = (torch.randn(n, sites, 3, generator=g, dtype=torch.float64) for _ in range(2))
+    directions = F.normalize(torch.randn(n, count, 3, generator=g), dim=2).double()
+    weight = torch.rand(n, count, generator=g).double()
+    order = torch.empty(n, sites, dtype=torch.int64)
+    given = {"vectors": vectors.to(dtype), "colors": rgb.to(dtype), "sites": sites, "directions": count}
+    samples = torch.cat([directions, weight[..., None]], 2).to(dtype)
+    backend.kernel("rank_sites", samples)(**given, samples=samples, order=order)
+    same = (order == order_by_definition(vectors, rgb, directions, weight)).all(1)
+    assert same.double().mean() > (0.999 if dtype == torch.float64 else 0.97)
+
+
+def test_colours_that_are_no_numbers_are_ranked_too() -> None:
+    vectors, samples = torch.zeros(3, 4, 3), torch.ones(3, 2, 4)
+    rgb, order = torch.full((3, 4, 3), torch.nan), torch.empty(3, 4, dtype=torch.int64)
+    given = {"vectors": vectors, "colors": rgb, "samples": samples, "sites": 4, "directions": 2}
+    backend.kernel("rank_sites", samples)(**given, order=order)
+    assert order.sort(1).values.tolist() == [[0, 1, 2, 3]] * 3

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from tests.ops.test_kernels import relative
-from tests.ops.test_texel import Case, check_coverage, check_parts, one_surfel
+from tests.ops.test_texel import Case, check_coverage, check_parts, check_surfel_coverage, one_surfel
 
 Context = Callable[[], AbstractContextManager[None]]
 
@@ -63,6 +63,10 @@ def test_a_part_of_the_fragments_gives_its_part_of_the_image(device: torch.devic
 @pytest.mark.parametrize("masked", [False, True])
 def test_coverage(masked: bool, device: torch.device) -> None:
     check_coverage(Case(device=device), masked)
+
+
+def test_coverage_of_surfels(device: torch.device) -> None:
+    check_surfel_coverage(Case(device=device))
 
 
 def test_tensors_of_another_device_are_refused(device: torch.device) -> None:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from bitymi_ns import ops
+from bitymi_ns.ops import backend
 from bitymi_ns.ops.backend import cuda_backend
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
@@ -212,13 +213,44 @@ def check_coverage(case: Case, masked: bool) -> None:
         weighed = replace(f, weight=f.weight.pow(power))
         image = case.image(torch.zeros_like(case.base), texels, weighed, bound=0.05**power)
         want.append(1 + torch.autograd.grad((image * counts).sum(), texels)[0])  # 1: initial value
-    total, squares = torch.ones_like(case.texels), torch.ones_like(case.texels[:, 0])
-    ops.add_texel_coverage([f], case.tiles, mask, 0.05, total, squares)
+    covered = torch.ones_like(case.texels[:, :2])
+    ops.add_texel_coverage(case.projection, case.tiles, mask, 0.05, covered)
     assert want[0].max() > 2
-    for mine, theirs in zip((total, squares[:, None].expand(-1, 3)), want, strict=True):
-        torch.testing.assert_close(mine, theirs, rtol=1e-11, atol=1e-11)
+    for mine, theirs in zip(covered.unbind(1), want, strict=True):
+        torch.testing.assert_close(mine[:, None].expand(-1, 3), theirs, rtol=1e-11, atol=1e-11)
+
+
+def check_surfel_coverage(case: Case, bound: float = 0.05) -> None:
+    """Compare coverage with sums over the listed fragments."""
+    f, shown = case.fragments, ops.surfel_coverage(case.projection, bound)
+    for i, (largest, weights, squares) in enumerate(shown.tolist()):
+        weight, sigma = f.weight[f.surfel == i], f.sigma[f.surfel == i]
+        assert largest == pytest.approx(float((weight / sigma.abs()).max()) if len(weight) else 0.0, rel=1e-11)
+        assert weights == pytest.approx(float(weight[weight >= bound].sum()), rel=1e-11)
+        assert squares == pytest.approx(float(weight.square().sum()), rel=1e-11)
+    assert (shown > 0).any(0).all() and not shown.all()
 
 
 @pytest.mark.parametrize("masked", [False, True])
 def test_coverage(masked: bool) -> None:
     check_coverage(Case(), masked)
+
+
+def test_coverage_of_surfels() -> None:
+    check_surfel_coverage(Case())
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_coverage_in_single_precision(threads: int) -> None:
+    single, double = Case(200, torch.float32, width=150, height=90), Case(200, width=150, height=90)
+    found = []
+    backend.module(torch.device("cpu")).set_num_threads(threads)
+    for case in (single, double):
+        covered = torch.zeros_like(case.texels[:, :2])
+        ops.add_texel_coverage(case.projection, case.tiles, None, 0.0, covered)
+        found.append((covered.double(), ops.surfel_coverage(case.projection, 0.0).double()))
+    backend.module(torch.device("cpu")).set_num_threads(0)
+    for mine, exact in zip(*found, strict=True):
+        near = torch.isclose(mine, exact, rtol=1e-4, atol=1e-4)  # a fragment may fall on the other side of a limit
+        assert near.double().mean() > 0.99
+        torch.testing.assert_close(mine.sum(0), exact.sum(0), rtol=1e-4, atol=1e-4)

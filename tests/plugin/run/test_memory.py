@@ -232,7 +232,7 @@ def test_lists_of_an_export_take_what_is_stated_on_a_card(monkeypatch: pytest.Mo
     tiles = Tiles(torch.full((count, 2), 4), torch.full((count,), 3.0), torch.zeros(16 * count, 3))
     baked = BakeState.of(stands, surfels, torch.arange(count), tiles, BakeOptions(format="fp16"))
     view = View(camera, torch.zeros(size, size, 3))
-    monkeypatch.setattr("bitymi_ns.scene.visibility.PART", 1 << 12)  # large views have many parts
+    monkeypatch.setattr("bitymi_ns.ops.coverage.PART", 1 << 12)  # large views have many parts
     taken = []
     with emulated_cuda(seed=1):
         for use in (

@@ -48,8 +48,8 @@ export class ColumnReader {
   // Reads the next column: an array of `rows` codes per number. blocks: of which they are coefficients, 0 = of none.
   read<T extends Codes>(rows: number, make: (rows: number) => T, blocks = 0): T[] {
     const { bytes, low, planes } = this.columns[this.next++];
-    const others = blocks && bytes && bytes.length > 1 ? new Uint8Array(rows) : null;
-    if (bytes) return bytes.map((size, k) => this.decode(size, make(rows), blocks, k ? others : null, others));
+    const sums = blocks && bytes && bytes.length > 1 ? new Uint8Array(rows) : null;
+    if (bytes) return bytes.map((size, number) => this.decode(size, make(rows), blocks, sums, number));
     return low.map((least, k) => {
       const codes = make(rows).fill(least) as T;
       planes[k].forEach((size, plane) => {
@@ -62,23 +62,14 @@ export class ColumnReader {
     });
   }
 
-  // Decodes a number with the contexts of the earlier ones, and adds its own to `sums`.
-  private decode<T extends Codes>(
-    size: number,
-    codes: T,
-    blocks: number,
-    others: Uint8Array | null,
-    sums: Uint8Array | null,
-  ): T {
+  // Decodes a number, as decodeIntegers.
+  private decode<T extends Codes>(size: number, codes: T, blocks: number, sums: Uint8Array | null, number: number): T {
     try {
-      decodeIntegers(this.data.subarray(this.at, this.at + size), codes, blocks, others);
+      decodeIntegers(this.data.subarray(this.at, this.at + size), codes, blocks, sums, number);
     } catch (error) {
       throw new DamagedBundle(`${this.file}: a column is damaged: ${error instanceof Error ? error.message : error}.`);
     }
     this.at += size;
-    if (sums) {
-      for (let i = 0; i < codes.length; i++) if (codes[i]) sums[i] = sums[i] || codes[i] ** 2 > 1 ? 2 : 1;
-    }
     return codes;
   }
 }

@@ -8,9 +8,12 @@ const MOST_BITS = 52; // of a magnitude
 const MOST_THRESHOLDS = 7;
 const ORDERS = 3; // kinds of contexts
 const LEVEL_BOUNDS = [3, 7, 13, 21, 32, 56, 96]; // of 16 times the running mean of magnitudes
-// Context of a running mean up to the last bound.
-const LEVELS = Uint8Array.from({ length: 97 }, (_, mean) => 1 + LEVEL_BOUNDS.filter((bound) => mean >= bound).length);
-const OTHERS = 3; // values of `others`
+const MOST_MAGNITUDE = 255; // in a running mean
+// Context of a running mean.
+const LEVELS = Uint8Array.from({ length: 16 * MOST_MAGNITUDE + 16 }, (_, mean) => {
+  return 1 + LEVEL_BOUNDS.filter((bound) => mean >= bound).length;
+});
+const MOST_OTHERS = 2; // of the sums of earlier numbers
 
 class Bytes {
   private at = 0;
@@ -44,36 +47,41 @@ class Bytes {
   }
 }
 
-// By slot: its token, and 2^12 times the token's frequency, plus the slot's index among the token's.
-interface Table {
+// Tables of all contexts, TOTAL slots each. By slot: its token, and TOTAL times the token's frequency, plus the slot's
+// index among the token's; 0 in a context without table.
+interface Tables {
   tokens: Uint16Array;
-  steps: Uint32Array;
+  steps: Int32Array;
 }
 
-function readTable(bytes: Bytes, most: number): Table | null {
-  const count = bytes.number(most);
-  const [tokens, steps] = [new Uint16Array(count ? TOTAL : 0), new Uint32Array(count ? TOTAL : 0)];
-  let first = 0;
-  for (let token = 0; token < count; token++) {
-    const frequency = bytes.number(TOTAL);
-    const zeros = frequency ? 0 : bytes.number(most);
-    if (first + frequency > TOTAL || token + zeros >= count) throw new Error('a table is too long');
-    tokens.fill(token, first, first + frequency);
-    for (let k = 0; k < frequency; k++) steps[first + k] = frequency * TOTAL + k;
-    first += frequency;
-    token += zeros;
+function readTables(bytes: Bytes, contexts: number, most: number): Tables {
+  const [tokens, steps] = [new Uint16Array(contexts * TOTAL), new Int32Array(contexts * TOTAL)];
+  for (let context = 0, first = 0; context < contexts; context++, first = context * TOTAL) {
+    const end = first + TOTAL;
+    const count = bytes.number(most);
+    for (let token = 0; token < count; token++) {
+      const frequency = bytes.number(TOTAL);
+      const zeros = frequency ? 0 : bytes.number(most);
+      if (first + frequency > end || token + zeros >= count) throw new Error('a table is too long');
+      tokens.fill(token, first, first + frequency);
+      for (let k = 0; k < frequency; k++) steps[first + k] = frequency * TOTAL + k;
+      first += frequency;
+      token += zeros;
+    }
+    if (count && first !== end) throw new Error('a table is incomplete');
   }
-  if (count && first !== TOTAL) throw new Error('a table is incomplete');
-  return count ? { tokens, steps } : null;
+  return { tokens, steps };
 }
 
 // Decodes a number of every row of a column into `codes`. blocks: rows are coefficients of so many blocks, 0 = they are
-// plain; others: sums of the magnitudes of the rows' earlier numbers, at most 2, null before the first.
+// plain; sums: of the magnitudes of the rows' numbers, at most 2, to which these are added; null = not wanted; number:
+// how many came before.
 export function decodeIntegers(
   data: Uint8Array,
   codes: Float64Array | Int32Array,
   blocks: number,
-  others: Uint8Array | null,
+  sums: Uint8Array | null,
+  number: number,
 ): void {
   const bytes = new Bytes(data);
   const rows = codes.length;
@@ -84,16 +92,16 @@ export function decodeIntegers(
   const centre = bytes.signed();
   const [direct, order] = [bytes.byte(), bytes.byte()];
   if (direct < FINE || direct > MOST_DIRECT || order >= ORDERS) throw new Error('its head is of no kind');
-  if (order === 2 && blocks && !others) throw new Error('its head is of no kind');
+  if (order === 2 && blocks && !(sums && number)) throw new Error('its head is of no kind');
   const thresholds: number[] = [];
   if (order && !blocks) {
     for (let k = bytes.number(MOST_THRESHOLDS); k; k--) thresholds.push(bytes.signed());
     if (thresholds.some((x, k) => k && x < thresholds[k - 1])) throw new Error('its thresholds do not ascend');
   }
-  const inBlocks = (LEVEL_BOUNDS.length + 2) * (order === 2 ? OTHERS : 1);
+  const inBlocks = (LEVEL_BOUNDS.length + 2) * (order === 2 ? MOST_OTHERS + 1 : 1);
   const contexts = !order ? 1 : blocks ? inBlocks : thresholds.length + 1;
   const most = 2 * (2 ** direct + (MOST_BITS - direct) * 2 ** FINE) - 1;
-  const tables = Array.from({ length: contexts }, () => readTable(bytes, most));
+  const { tokens, steps } = readTables(bytes, contexts, most);
   const coded = bytes.rest(bytes.number(data.length));
   if (coded.length < 4) throw new Error('it ends early');
   let state = coded.subarray(0, 4).reduce((sum, byte) => sum * 256 + byte, 0);
@@ -103,23 +111,21 @@ export function decodeIntegers(
   let [held, count] = [0, 0]; // plain bits that are read, and not used
   const means = new Int32Array(order ? blocks : 0);
   let [before, earlier, block] = [0, 0, 0];
+  const inOrder = order > 0 && blocks > 0;
   for (let i = 0; i < rows; i++) {
     let context = 0;
-    if (order && blocks) {
-      if (i >= blocks) {
-        context = LEVELS[Math.min(means[block], LEVELS.length - 1)];
-      }
-      if (order === 2) context = OTHERS * context + others![i];
+    if (inOrder) {
+      if (i >= blocks) context = LEVELS[means[block]];
+      if (order === 2) context = (MOST_OTHERS + 1) * context + sums![i];
     } else if (order) {
       const sum = before + (order === 2 ? earlier : 0);
       while (context < thresholds.length && thresholds[context] < sum) context++;
     }
-    const table = tables[context];
-    if (!table) throw new Error('a table is missing');
-    const slot = state & (TOTAL - 1);
-    const token = table.tokens[slot];
-    const step = table.steps[slot];
-    state = (step >>> PRECISION) * (state >>> PRECISION) + (step & (TOTAL - 1));
+    const slot = context * TOTAL + (state & (TOTAL - 1));
+    const token = tokens[slot];
+    const step = steps[slot];
+    if (!step) throw new Error('a table is missing');
+    state = Math.imul(step >> PRECISION, state >> PRECISION) + (step & (TOTAL - 1));
     while (state < LOWEST) {
       if (at === coded.length) throw new Error('it ends early');
       state = (state << 8) | coded[at++];
@@ -143,8 +149,9 @@ export function decodeIntegers(
       }
     }
     const x = token & 1 ? -magnitude : magnitude;
-    if (blocks && order) {
-      means[block] += 4 * (magnitude < 255 ? magnitude : 255) - (means[block] >> 2);
+    if (sums && magnitude) sums[i] = Math.min(MOST_OTHERS, sums[i] + Math.min(MOST_OTHERS, magnitude));
+    if (inOrder) {
+      means[block] += 4 * Math.min(MOST_MAGNITUDE, magnitude) - (means[block] >> 2);
       if (++block === blocks) block = 0;
     } else {
       earlier = before;

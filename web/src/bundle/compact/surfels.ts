@@ -62,11 +62,11 @@ function thirds(key: number): number {
 }
 
 // Colours from columns green, red - green, blue - green, starting at column `at`, row i.
-const red = (of: Float64Array[], at: number, i: number): number => of[at + 1][i] + of[at][i];
-const green = (of: Float64Array[], at: number, i: number): number => of[at][i];
-const blue = (of: Float64Array[], at: number, i: number): number => of[at + 2][i] + of[at][i];
 function color(to: Float32Array, first: number, of: Float64Array[], at: number, i: number, step: number): void {
-  [red, green, blue].forEach((channel, c) => (to[first + c] = within(step * channel(of, at, i), MOST.color)));
+  const green = of[at][i];
+  to[first] = within(step * (of[at + 1][i] + green), MOST.color);
+  to[first + 1] = within(step * green, MOST.color);
+  to[first + 2] = within(step * (of[at + 2][i] + green), MOST.color);
 }
 
 class Decoder {
@@ -153,31 +153,34 @@ class Decoder {
   }
 
   private shapes(): void {
-    const step = (name: string): number => this.step(name);
+    const of = ['log_scales', 'opacity', 'beta', 'residual', 'view_base'].map((name) => this.step(name));
+    const [ofScale, ofOpacity, ofBeta, ofResidual, ofBase] = of;
     const [scales, [opacity], [beta]] = ['log_scales', 'opacity', 'beta'].map((name) => this.column(name));
     const [residual, base] = [this.column('residual'), this.column('view_base')];
     for (let i = 0, to = 0; i < this.count; i++, to += SURFEL_WORDS) {
       for (let c = 0; c < 2; c++) {
-        this.words[to + WORD.logScale + c] = within(step('log_scales') * scales[c][i], MOST.logScale);
+        this.words[to + WORD.logScale + c] = within(ofScale * scales[c][i], MOST.logScale);
       }
-      this.words[to + WORD.opacity] = logit(step('opacity') * opacity[i], ALPHA_MIN);
-      this.words[to + WORD.beta] = logit(step('beta') * beta[i], SHARE);
-      color(this.words, to + WORD.residual, residual, 0, i, step('residual'));
-      color(this.words, to + WORD.base, base, 0, i, step('view_base'));
+      this.words[to + WORD.opacity] = logit(ofOpacity * opacity[i], ALPHA_MIN);
+      this.words[to + WORD.beta] = logit(ofBeta * beta[i], SHARE);
+      color(this.words, to + WORD.residual, residual, 0, i, ofResidual);
+      color(this.words, to + WORD.base, base, 0, i, ofBase);
     }
   }
 
   private tiles(): void {
     const [[size], [extent]] = [this.column('size'), this.column('extent')];
     const [u, v] = [new Uint16Array(this.count), new Uint16Array(this.count)];
+    const step = this.step('extent');
     const good = (exponent: number): boolean => exponent >= LEAST_EXPONENT && exponent <= MOST_EXPONENT;
     for (let i = 0, tile = 0, to = WORD.extent; i < this.count; i++, to += SURFEL_WORDS) {
       this.words[to] = EXTENT;
       if (size[i] === 0) continue;
-      const exponents = [Math.floor(size[i] / 16), size[i] % 16];
-      if (!exponents.every(good)) this.refuse('a tile has a side that is not a power of two from 4 to 4096');
-      [u[i], v[i]] = exponents.map((exponent) => 1 << exponent);
-      this.words[to] = clip(this.step('extent') * extent[tile++], ...EXTENTS);
+      const [of_u, of_v] = [Math.floor(size[i] / 16), size[i] % 16];
+      if (!good(of_u) || !good(of_v)) this.refuse('a tile has a side that is not a power of two from 4 to 4096');
+      u[i] = 1 << of_u;
+      v[i] = 1 << of_v;
+      this.words[to] = clip(step * extent[tile++], ...EXTENTS);
     }
     const atlas = this.info.atlas;
     if (!atlas?.coded) {
@@ -217,7 +220,7 @@ class Decoder {
     const out = new Float32Array(this.terms * width);
     const [shapeStep, colorStep] = [this.step('term_shape'), this.step('term_color')];
     for (let i = 0, to = 0; i < this.terms; i++, to += width) {
-      limits.forEach((limit, k) => (out[to + at + k] = within(sinh(shapeStep * shape[k][i]), limit)));
+      for (let k = 0; k < limits.length; k++) out[to + at + k] = within(sinh(shapeStep * shape[k][i]), limits[k]);
       for (let c = 0; c < colors.length; c += 3) color(out, to + colored + c, colors, c, i, colorStep);
     }
     return out;

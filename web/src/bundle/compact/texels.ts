@@ -30,37 +30,65 @@ function tilesOf(surfels: Surfels): Tile[] {
   return tiles;
 }
 
-// Returns C(k, i, count) for all frequencies k and positions i.
-function cosines(count: number): number[][] {
-  return Array.from({ length: count }, (_, k) =>
-    Array.from({ length: count }, (_, i) => {
-      return Math.sqrt((k ? 2 : 1) / count) * Math.cos((Math.PI * (i + 0.5) * k) / count);
-    }),
-  );
+// The inverse cosine transform of blocks of u x v texels.
+interface Transform {
+  u: number;
+  v: number;
+  across: Float64Array; // [u, u], frequency by position
+  down: Float64Array; // [v, v]
+  // by coefficient in stored order: first number of its frequency along v in a row of u, and along u in `across`
+  row: Int32Array;
+  wave: Int32Array;
 }
 
-// Returns the contribution of each coefficient to a block's texels, a row per coefficient in stored order.
-function wavesOf(u: number, v: number): Float64Array[] {
-  const [across, down] = [cosines(u), cosines(v)];
+// Returns C(k, i, count) for all frequencies k and positions i.
+const cosines = (count: number): Float64Array =>
+  Float64Array.from({ length: count * count }, (_, at) => {
+    const [k, i] = [Math.floor(at / count), at % count];
+    return Math.sqrt((k ? 2 : 1) / count) * Math.cos((Math.PI * (i + 0.5) * k) / count);
+  });
+
+function transformOf(u: number, v: number): Transform {
   const order: [number, number][] = [];
   for (let k_v = 0; k_v < v; k_v++) for (let k_u = 0; k_u < u; k_u++) order.push([k_v, k_u]);
   order.sort((a, b) => a[0] * u + a[1] * v - (b[0] * u + b[1] * v) || a[0] - b[0] || a[1] - b[1]);
-  return order.map(([k_v, k_u]) =>
-    Float64Array.from({ length: u * v }, (_, t) => {
-      return down[k_v][Math.floor(t / u)] * across[k_u][t % u];
-    }),
-  );
+  const [row, wave] = [0, 1].map((axis) => Int32Array.from(order, (k) => k[axis] * u));
+  return { u, v, across: cosines(u), down: cosines(v), row, wave };
 }
 
-// Computes a channel of a block's texels from every `stride`-th number from `first` on.
-function inverse(values: Int32Array, first: number, stride: number, waves: Float64Array[], texels: Float64Array): void {
-  const count = waves.length;
-  for (let t = 0; t < count; t++) texels[t] = 0;
+const half = new Float64Array(BLOCK * BLOCK); // of `inverse`, transformed along u
+
+// Computes a channel of a block's texels from every `stride`-th number from `first` on. Sides are multiples of four.
+function inverse(values: Int32Array, first: number, stride: number, of: Transform, texels: Float64Array): void {
+  const { u, v, across, down, row, wave } = of;
+  const count = u * v;
+  half.fill(0);
   for (let f = 0, from = first; f < count; f++, from += stride) {
     const value = values[from];
-    if (value === 0) continue; // most are 0
-    const wave = waves[f];
-    for (let t = 0; t < count; t++) texels[t] += value * wave[t];
+    if (value === 0) continue;
+    const end = wave[f] + u;
+    for (let to = row[f], by = wave[f]; by < end; to += 4, by += 4) {
+      half[to] += value * across[by];
+      half[to + 1] += value * across[by + 1];
+      half[to + 2] += value * across[by + 2];
+      half[to + 3] += value * across[by + 3];
+    }
+  }
+  for (let t = 0, at = 0; t < count; t += u, at++) {
+    for (let i = 0; i < u; i += 4) {
+      let [a, b, c, d] = [0, 0, 0, 0];
+      for (let from = i, by = at; from < count; from += u, by += v) {
+        const weight = down[by];
+        a += weight * half[from];
+        b += weight * half[from + 1];
+        c += weight * half[from + 2];
+        d += weight * half[from + 3];
+      }
+      texels[t + i] = a;
+      texels[t + i + 1] = b;
+      texels[t + i + 2] = c;
+      texels[t + i + 3] = d;
+    }
   }
 }
 
@@ -109,8 +137,8 @@ class Painter {
     this.tiles.forEach((tile, number) => {
       if (Math.min(tile.u, BLOCK) !== u || Math.min(tile.v, BLOCK) !== v) return;
       const row = tile.surfel * SURFEL_WORDS;
-      const [x, y, word] = [WORD.tile, WORD.tile + 1, WORD.layer].map((at) => this.numbers[row + at]);
-      const first = (layerIn(word) * height + y) * width + x;
+      const line = layerIn(this.numbers[row + WORD.layer]) * height + this.numbers[row + WORD.tile + 1];
+      const first = line * width + this.numbers[row + WORD.tile];
       for (let at_v = 0; at_v < tile.v; at_v += v) {
         for (let at_u = 0; at_u < tile.u; at_u += u) visit(number, row, block++, first + at_v * width + at_u);
       }
@@ -125,18 +153,23 @@ class Painter {
   // Writes the residual colours of blocks from coefficients [channel][frequency * blocks + block].
   colors(of: Blocks, coefficients: Int32Array[], steps: Float64Array): void {
     const { u, v } = of;
-    const [waves, offsets] = [wavesOf(u, v), this.offsets(of)];
+    const [transform, offsets] = [transformOf(u, v), this.offsets(of)];
     const [p0, p1, p2] = this.sums;
+    const [c0, c1, c2] = coefficients;
+    const [blocks, words] = [of.texels / (u * v), this.surfels.words];
+    const [toGrey, toTilt, toBend] = [3, 2, 6].map((squares) => 1 / Math.sqrt(squares));
     this.each(of, (tile, row, block, first) => {
-      const [red, green, blue] = this.surfels.words.subarray(row + WORD.residual, row + WORD.residual + 3);
-      const [a, b, c] = [steps[tile] / Math.sqrt(3), steps[tile] / Math.sqrt(2), steps[tile] / Math.sqrt(6)];
-      for (let channel = 0; channel < 3; channel++) {
-        inverse(coefficients[channel], block, of.texels / (u * v), waves, this.sums[channel]);
-      }
-      for (let t = 0; t < u * v; t++) {
-        const grey = a * p0[t];
-        const tilt = b * p1[t];
-        const bend = c * p2[t];
+      const red = words[row + WORD.residual];
+      const green = words[row + WORD.residual + 1];
+      const blue = words[row + WORD.residual + 2];
+      const step = steps[tile];
+      inverse(c0, block, blocks, transform, p0);
+      inverse(c1, block, blocks, transform, p1);
+      inverse(c2, block, blocks, transform, p2);
+      for (let t = 0; t < offsets.length; t++) {
+        const grey = step * toGrey * p0[t];
+        const tilt = step * toTilt * p1[t];
+        const bend = step * toBend * p2[t];
         this.pages[first + offsets[t]] = this.code(
           red + grey + tilt + bend,
           green + grey - 2 * bend,
@@ -149,12 +182,12 @@ class Painter {
   // Writes the alphas of blocks, after their colours.
   alphas(of: Blocks, [coefficients]: Int32Array[], steps: Float64Array): void {
     const { u, v } = of;
-    const [waves, offsets] = [wavesOf(u, v), this.offsets(of)];
+    const [transform, offsets] = [transformOf(u, v), this.offsets(of)];
     const [sums] = this.sums;
     const perByte = 255 / this.atlas.alphaScale;
     this.each(of, (tile, row, block, first) => {
       const mean = alphaIn(this.numbers[row + WORD.layer]);
-      inverse(coefficients, block, of.texels / (u * v), waves, sums);
+      inverse(coefficients, block, of.texels / (u * v), transform, sums);
       for (let t = 0; t < u * v; t++) {
         const to = first + offsets[t];
         const byte = byteOf((mean + steps[tile] * sums[t]) * perByte);

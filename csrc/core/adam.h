@@ -11,8 +11,7 @@ namespace bt {
 template <class S> struct AdamRates {
   S rate, root, beta2, keep1, keep2, eps;
 };
-template <class S>
-BT_HD AdamRates<S> adam_rates(double rate, double beta1, double beta2, double eps, double step) {
+template <class S> BT_HD AdamRates<S> adam_rates(double rate, double beta1, double beta2, double eps, double step) {
   return {S(rate / (1.0 - pow(beta1, step))),
           S(1.0 / sqrt(1.0 - pow(beta2, step))),
           S(beta2),

@@ -7,12 +7,14 @@ whose use is an error, also on machines that have the packages, so that a run sh
 """
 
 import contextlib
+import itertools
 import json
 import os
 import re
 import runpy
 import shlex
 import shutil
+import statistics
 import subprocess
 import sys
 import threading
@@ -140,7 +142,8 @@ WAITS_STEPS = 60  # length of the run in which synchronisations are counted
 
 
 def waits(words: Sequence[str]) -> None:
-    """Train in this process and print the GPU synchronisations per step in the second half of the run."""
+    """Train in this process and print torch's GPU synchronisations in the median step of the second half of the run,
+    which has no point of the curve. The compiled module waits once more, for the number of pairs."""
     import torch
 
     from bitymi_ns.train.step import Training
@@ -158,8 +161,8 @@ def waits(words: Sequence[str]) -> None:
         warnings.filterwarnings("always", ".*synchronizing")
         torch.cuda.set_sync_debug_mode("warn")
         runpy.run_module("nerfstudio.scripts.train", run_name="__main__")
-    half = len(counted) // 2
-    print(f"waits per step: {(counted[-1] - counted[half]) / (len(counted) - 1 - half):.1f}")
+    late = counted[len(counted) // 2 :]
+    print(f"waits per step: {statistics.median(b - a for a, b in itertools.pairwise(late)):.1f}")
 
 
 def all_commands(capture: Path, folder: Path, steps: int, options: Sequence[str], commands: Commands) -> None:

@@ -1,7 +1,8 @@
 """Trained scene to bundle contents: tiles, view colours, fine-tuning, coding; `field`: of the paper's field."""
 
 from bitymi_ns.bake.field.polish import PolishOptions, polish_scene
-from bitymi_ns.bake.pipeline import RefineOptions, bake, bake_field, prune_and_resample
+from bitymi_ns.bake.pipeline import RefineOptions, bake, bake_field
+from bitymi_ns.bake.prune import prune_and_resample
 from bitymi_ns.bake.state import BakeState, export
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
 from bitymi_ns.bundle.bake_options import BakeOptions

@@ -12,13 +12,12 @@ from torch import Tensor
 from bitymi_ns.bake.compact import Compact, compacted, with_coded_texels
 from bitymi_ns.bake.field.polish import PolishOptions, polish_scene
 from bitymi_ns.bake.field.tiles import field_tiles
-from bitymi_ns.bake.inputs import device_of, photo_resolution
-from bitymi_ns.bake.left_out import drawable, drop_unseen
+from bitymi_ns.bake.inputs import device_of
+from bitymi_ns.bake.prune import drawable, prune_and_resample
 from bitymi_ns.bake.state import BakeableScene, BakeState, joined
 from bitymi_ns.bake.tile_errors import certified
-from bitymi_ns.bake.tiles import Tiles, reduced_tiles
+from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
-from bitymi_ns.bake.view_colors import reduce_view_colors
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.statistics import KeptSurfels, KeptTexels, Statistics
 from bitymi_ns.progress import Progress, no_progress
@@ -64,36 +63,6 @@ def _tiles_of(field: TexelField, rows: Tensor) -> Tiles:
     if field.alpha is not None:
         texels = joined(texels, field.alpha.detach().float())
     return Tiles(torch.where(bare[:, None], 0, field.size), field.extent.float(), texels)
-
-
-@torch.no_grad()
-def prune_and_resample(baked: BakeState, cameras: Sequence[Camera], progress: Progress = no_progress) -> BakeState:
-    """Drop surfels that no view shows, and reduce tiles and view colours, as the options of a bake say.
-
-    Left out and counted are surfels that cannot be drawn or stored, or that no view blends. The atlas is not encoded.
-
-    Args:
-        baked: of `trained_texels` or `field_tiles`.
-        cameras: training views; their device does the work.
-
-    Raises:
-        ValueError: no surfel is left.
-    """
-    result, inputs = drop_unseen(baked, cameras, progress)
-    surfels, colors, view_color = reduce_view_colors(inputs, baked.options, progress)
-    if baked.options.tolerance > 0 and result.textured:
-        tiles = Tiles(result.sizes, result.extent, result.texels)
-        result = result.with_tiles(reduced_tiles(tiles, inputs, baked.options, progress))
-    in_front = None if inputs.transmittance is None else inputs.transmittance.cpu()
-    result = replace(result.with_surfels(surfels), in_front=in_front, colors=colors)
-    result.scene.photographed = photo_resolution(inputs)
-    statistics = result.statistics
-    assert statistics.surfels is not None
-    bare = int((result.packing.tiles[:, 3] == 0).sum())
-    statistics = statistics.replace(surfels=statistics.surfels.replace(without_tile=bare), view_color=view_color)
-    if statistics.texels is not None:
-        statistics = statistics.replace(texels=statistics.texels.replace(kept=result.packing.texels))
-    return replace(result, statistics=statistics)
 
 
 FEWEST_PASSES = 4  # steps of polish or fine-tuning per photograph; more may gain where there are fewer

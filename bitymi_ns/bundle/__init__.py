@@ -4,7 +4,8 @@ from bitymi_ns.bundle.manifest import BundleError
 from bitymi_ns.bundle.parts import check_target
 from bitymi_ns.bundle.read import REMEDY, Bundle, read_bundle
 from bitymi_ns.bundle.verify import Check, check_files, check_world
-from bitymi_ns.bundle.write import World, write_bundle
+from bitymi_ns.bundle.world import World
+from bitymi_ns.bundle.write import write_bundle
 
 __all__ = [
     "REMEDY",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import binascii
 import json
-import math
 import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from bitymi_ns.bundle import strict_json
 from bitymi_ns.bundle.statistics import Decibels, Part, Share, Statistics, Whole
+from bitymi_ns.bundle.world import Coordinate, WorldEntry
 from bitymi_ns.codec.limits import ALPHA_SCALE, EXTENTS, LIMITS, RESIDUAL_LIMIT
 from bitymi_ns.codec.streams import MOST_PLANES
 from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, SUPPORT, TRANSMITTANCE_MIN
@@ -33,7 +33,6 @@ SURFELS, ATLAS, MANIFEST = "surfels.ply", "atlas.ktx2", "bundle.json"
 COMPACT_SURFELS, TEXELS = "surfels.bin", "texels.bin"
 POSTER = "poster.webp"  # optional picture of a viewer's first view: `bundle.poster`
 ACTIVATIONS = {"opacity": "sigmoid", "scale": "exp", "beta": "4 * sigmoid", "rotation": "wxyz, unit"}
-UNIT_LENGTH = 1e-3  # tolerance of a unit vector's length
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
@@ -101,13 +100,9 @@ def _points(text: str) -> str:
 _MOST_POINTS = 4096
 _RATES = (1e-12, 1e12)  # pixels per unit of length
 
-Positive = Annotated[float, Field(gt=0, le=1e12)]
 Side = Annotated[int, Field(ge=1, le=1 << 20)]
-Coordinate = Annotated[float, Field(ge=-LIMITS["means"][0], le=LIMITS["means"][0])]
-Cosine = Annotated[float, Field(ge=-2, le=2)]
 Bent = Annotated[float, Field(ge=-100, le=100)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
-Row = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 
 
 class ColumnEntry(Part):
@@ -237,26 +232,6 @@ class RenderEntry(Part):
     """Points of the scene with the pixels per unit of length of their photographs (`points_text`): since versions 1.4
     and 2.3."""
     background: tuple[Share, Share, Share]
-
-
-class WorldEntry(Part):
-    """Transform from the capture's frame, x_scene = scale * (transform @ [x_capture, 1]), and the scene's up vector and
-    metric scale if known: since versions 1.3 and 2.2."""
-
-    transform: tuple[Row, Row, Row]
-    scale: Positive
-    up: tuple[Cosine, Cosine, Cosine] | None = None  # unit vector away from the ground, scene frame
-    up_from: Annotated[str, Field(pattern=r"^[a-z][a-z_-]{0,39}$")] | None = None
-    """Source of `up`: gps, gravity, or cameras (upright as a rule)."""
-    metres_per_unit: Positive | None = None  # length of a unit of the scene
-
-    @model_validator(mode="after")
-    def _up_is_a_direction(self) -> WorldEntry:
-        if (self.up is None) != (self.up_from is None):
-            raise PydanticCustomError("up", "must have up and up_from, or neither")
-        if self.up is not None and not abs(math.hypot(*self.up) - 1) <= UNIT_LENGTH:
-            raise PydanticCustomError("up", "up must have the length 1")
-        return self
 
 
 class Bounds(Part):

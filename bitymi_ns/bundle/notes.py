@@ -8,8 +8,9 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from bitymi_ns.bundle import strict_json
-from bitymi_ns.bundle.manifest import UNIT_LENGTH, BundleError
+from bitymi_ns.bundle.manifest import BundleError
 from bitymi_ns.bundle.parts import NOTES, Parts, notes_data, parts_of
+from bitymi_ns.bundle.world import UNIT_LENGTH
 from bitymi_ns.ranges import first_problem
 from bitymi_ns.scene.crop import Box, Crop
 

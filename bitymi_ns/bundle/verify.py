@@ -7,13 +7,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bitymi_ns.bundle.manifest import MANIFEST, BundleError, WorldEntry
+from bitymi_ns.bundle.manifest import MANIFEST, BundleError
 from bitymi_ns.bundle.notes import read_notes
 from bitymi_ns.bundle.parts import NOTES, Parts, parts_of
 from bitymi_ns.bundle.read import CONTENTS, Bundle, assemble, manifest_of, read_file
 from bitymi_ns.bundle.sizes import enough_memory
 from bitymi_ns.bundle.sketch import estimated_rms, sketch, sketches_of
-from bitymi_ns.bundle.write import World
+from bitymi_ns.bundle.world import World, WorldEntry
 from bitymi_ns.codec.pages import scene_texels
 from bitymi_ns.codec.quantise import STEPS
 

@@ -5,12 +5,9 @@ from __future__ import annotations
 import errno
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 import torch
 
 from bitymi_ns import __version__
@@ -36,6 +33,7 @@ from bitymi_ns.bundle.manifest import (
 from bitymi_ns.bundle.parts import NOTES, check_target, notes_data, parts_of
 from bitymi_ns.bundle.poster import Pixels, encode_poster, most_bytes
 from bitymi_ns.bundle.surfel_table import EXTENT_COLUMN, TERMS, first_fault, term_columns, to_columns
+from bitymi_ns.bundle.world import World
 from bitymi_ns.codec.limits import ALPHA_LIMIT
 from bitymi_ns.codec.quantise import EncodedAtlas
 from bitymi_ns.codec.texel_codes import SceneCodes
@@ -46,29 +44,6 @@ from bitymi_ns.scene.baked import BakedScene
 
 GENERATOR = f"bitymi-ns {__version__}"
 _CHUNK = 1 << 22
-
-
-@dataclass(frozen=True)
-class World:
-    """Frame of the scene: transform from the capture, x_scene = scale * (transform @ [x_capture, 1]), up, metres."""
-
-    transform: npt.ArrayLike = field(default_factory=lambda: np.eye(4)[:3])  # [3, 4] (the dataparser's)
-    scale: float = 1.0  # the dataparser's
-    up: npt.ArrayLike | None = None  # [3] direction away from the ground, capture frame; None: unknown
-    up_from: str = ""  # source of `up`, one word
-    metres_per_unit: float | None = None  # length of a unit of the capture frame; None: unknown
-
-    def described(self) -> dict[str, Any]:
-        """Convert to `manifest.WorldEntry`, with up and length in the scene frame."""
-        transform = np.asarray(self.transform, dtype=np.float64)[:3]
-        frame: dict[str, Any] = {"transform": transform, "scale": float(self.scale)}
-        if self.up is not None:
-            up = transform[:, :3] @ np.asarray(self.up, dtype=np.float64)
-            frame |= {"up": up / np.linalg.norm(up), "up_from": self.up_from}
-        if self.metres_per_unit is not None:
-            stretch = abs(float(np.linalg.det(transform[:, :3]))) ** (1 / 3) * float(self.scale)
-            frame["metres_per_unit"] = float(self.metres_per_unit) / stretch
-        return frame
 
 
 def write_bundle(

@@ -8,7 +8,8 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from bitymi_ns.bundle.manifest import BundleError, WorldEntry
+from bitymi_ns.bundle.manifest import BundleError
+from bitymi_ns.bundle.world import WorldEntry
 
 FARTHEST = 1_000.0
 """Distance, in scene units (cameras in [-1, 1]), beyond which positions get an origin: float32 is off by 1/30,000."""

@@ -6,9 +6,9 @@ Functions take float32 or float64 tensors and dispatch on device and dtype. `bak
 
 from .bands import Bands, band, by_bands, fitting_lists, refused
 from .blend import blended_image, composite, soft_overdraw
+from .capacity import TooManyFragments
 from .coverage import add_texel_coverage, surfel_coverage
 from .field import FieldGeometry, field, fragment_residual
-from .fragment_list import TooManyFragments
 from .project import Prefilter, Projection, project
 from .rasterize_cuda import Marks, can_rasterize, rasterize_image
 from .ssim import ssim

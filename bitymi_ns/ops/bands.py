@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from .backend import cuda_backend
+from .capacity import TooManyFragments
 from .constants import TILE
-from .fragment_list import TooManyFragments
 from .project import Projection
 from .trace import Fragments, masked_counts, trace
 

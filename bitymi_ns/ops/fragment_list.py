@@ -6,26 +6,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .project import Projection
-
-
-class TooManyFragments(RuntimeError):
-    """A view with more fragments than allowed.
-
-    Args:
-        count, most: number of fragments, and its limit; also attributes.
-        ids: whether surfel and pixel are stored too: 8 bytes beside 5 numbers of geom's dtype.
-    """
-
-    def __init__(self, geom: Tensor, projection: Projection, count: int, most: int, ids: bool) -> None:
-        size, pixels = 5 * geom.element_size() + 8 * ids, projection.camera.width * projection.camera.height
-        super().__init__(
-            f"the view has {count:,} fragments, {count / pixels:.0f} per pixel; their list needs "
-            f"{count * size / 2**30:.2f} GiB, and there is room for {most:,}: render a smaller image or use fewer "
-            "surfels"
-        )
-        self.count, self.most = count, most
-
 
 def empty_list(geom: Tensor, count: int) -> dict[str, Tensor]:
     """Allocate the numbers of `count` fragments by name."""

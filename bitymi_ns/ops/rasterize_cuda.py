@@ -12,13 +12,14 @@ from torch import Tensor
 
 from .backend import cuda_backend, dense, kernel, module, require
 from .bands import fitting_lists
+from .bin_cuda import tile_lists
 from .blend import checked_texels
 from .constants import IMAGE_CHANNELS
 from .fragment_list import Layout
 from .project import Projection
 from .texel import TexelDescent, TexelTiles, gradient_or_step
 from .trace import Fragments, counted
-from .trace_cuda import layout_of, tile_lists
+from .trace_cuda import layout_of
 
 
 def can_rasterize(device: torch.device) -> bool:

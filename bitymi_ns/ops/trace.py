@@ -11,8 +11,9 @@ from torch import Tensor
 
 from . import trace_cpu, trace_cuda
 from .backend import check_shapes, cuda_backend, dense, function, kernel, on_same_device
+from .capacity import TooManyFragments
 from .constants import GEOM
-from .fragment_list import Layout, TooManyFragments
+from .fragment_list import Layout
 from .project import Projection
 
 __all__ = ["Fragments", "TooManyFragments", "masked_counts", "select", "trace"]

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from .backend import Pool, function, kernel, kernel_class, module, require
-from .fragment_list import Layout, TooManyFragments, empty_ids, empty_list
+from .capacity import TooManyFragments
+from .fragment_list import Layout, empty_ids, empty_list
 from .project import Projection
 
 MOST = 1 << 25

@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from .backend import dense, kernel, kernel_class, module, on_device, require, stream_of, workspace
+from .bin_cuda import check_pair_count
 from .blend import checked_texels
 from .constants import FRAME, GEOM
 from .picture_cuda import Photograph
 from .project import GEOMETRY, Camera, Prefilter, Projection, checked_geometry, rigid_gradient
 from .texel import TexelAlpha, TexelDescent, TexelTiles, gradient_or_step
-from .trace_cuda import check_pair_count
 from .view_color import check_view_color, lettered
 from .view_kinds import entry_of
 

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from bitymi_ns.bake import BakeOptions, export
 from bitymi_ns.bake.compact import Compact
-from bitymi_ns.bake.pipeline import RefineOptions, bake, prune_and_resample, trained_texels
+from bitymi_ns.bake.pipeline import RefineOptions, bake, trained_texels
+from bitymi_ns.bake.prune import prune_and_resample
 from bitymi_ns.bake.tune import TuneOptions
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.bundle.verify import check_files

@@ -7,7 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.pipeline import prune_and_resample, trained_texels
+from bitymi_ns.bake.pipeline import trained_texels
+from bitymi_ns.bake.prune import prune_and_resample
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.ops import Bands
 from bitymi_ns.scene import Camera, Scene, SceneConfig

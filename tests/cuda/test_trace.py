@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns import ops
-from bitymi_ns.ops import trace_cuda
+from bitymi_ns.ops import bin_cuda, capacity, trace_cuda
 from bitymi_ns.ops.backend import emulated_cuda, kernel, workspace
 from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color
@@ -209,7 +209,7 @@ def test_lists_that_differ_from_the_counts_stay_in_their_slots(fewer: str, devic
     projection = ops.project(*values_of(case, device=device), large)  # rows for both
     geom, views = projection.geom, [projection, replace(projection, camera=small)]
     counted, listed = views if fewer == "listed" else reversed(views)
-    bins, want = trace_cuda.tile_lists(geom, counted), trace_cuda.tile_lists(geom, listed)
+    bins, want = bin_cuda.tile_lists(geom, counted), bin_cuda.tile_lists(geom, listed)
     assert int(bins.differing) == int(want.differing) == 0
     size = {"pairs": len(bins.slot), "width": listed.camera.width, "height": listed.camera.height}
     kernel("bin_fill", geom)(**listed.view(geom), **vars(bins), workspace=workspace("bin_fill", geom, **size))
@@ -316,20 +316,20 @@ def test_discs_across_the_camera_plane_are_listed_where_they_show(
 def test_free_memory_is_looked_up_for_longer_lists_and_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
     card = SimpleNamespace(device=torch.device("cuda", 7), element_size=lambda: 4)
     view = SimpleNamespace(camera=SimpleNamespace(width=10, height=10))
-    capacities = iter([3 * trace_cuda.FEW, 4 * trace_cuda.FEW, trace_cuda.FEW])
+    capacities = iter([3 * capacity.FEW, 4 * capacity.FEW, capacity.FEW])
     asked = []
-    monkeypatch.setattr(trace_cuda, "_rooms", {})
-    monkeypatch.setattr(trace_cuda, "fragment_capacity", lambda geom: asked.append(1) or next(capacities))
-    few = trace_cuda.FEW
+    monkeypatch.setattr(capacity, "_rooms", {})
+    monkeypatch.setattr(capacity, "fragment_capacity", lambda geom: asked.append(1) or next(capacities))
+    few = capacity.FEW
     for count in (few, 2 * few, 2 * few - 1, few + 1):
-        trace_cuda.check_capacity(card, view, count, 0)
+        capacity.check_capacity(card, view, count, 0)
     assert len(asked) == 1
-    trace_cuda.check_capacity(card, view, 3 * few + 1, 0)  # the longest yet, and free memory has grown
+    capacity.check_capacity(card, view, 3 * few + 1, 0)  # the longest yet, and free memory has grown
     assert len(asked) == 2
-    for _ in range(trace_cuda.LISTS_PER_CHECK - 1):
-        trace_cuda.check_capacity(card, view, 2 * few, 0)
+    for _ in range(capacity.LISTS_PER_CHECK - 1):
+        capacity.check_capacity(card, view, 2 * few, 0)
     with pytest.raises(ops.TooManyFragments, match=f"there is room for {few:,}"):
-        trace_cuda.check_capacity(card, view, 2 * few, 0)
+        capacity.check_capacity(card, view, 2 * few, 0)
     assert len(asked) == 3
 
 

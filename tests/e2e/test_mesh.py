@@ -11,7 +11,7 @@ import trimesh
 
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.bundle.manifest import dump
-from bitymi_ns.bundle.write import World
+from bitymi_ns.bundle.world import World
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export.mesh import ExportMesh
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig

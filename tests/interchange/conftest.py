@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from bitymi_ns.bundle import Bundle, read_bundle
-from bitymi_ns.bundle.write import World
+from bitymi_ns.bundle.world import World
 from tests.bake.conftest import camera, scene, surfels
 from tests.bundle.made import make
 

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from bitymi_ns.bundle import BundleError
-from bitymi_ns.bundle.manifest import WorldEntry
+from bitymi_ns.bundle.world import WorldEntry
 from bitymi_ns.interchange.frame import to_capture, up_of
 from bitymi_ns.interchange.gaussians import gaussians_of
 from bitymi_ns.ops.reference.view_color import sh_basis

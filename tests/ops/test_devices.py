@@ -18,7 +18,7 @@ def test_the_tracers_refuse_each_others_tensors() -> None:
     case = random_scene(5, 1, width=24, height=20)
     _, projection = traced(case, [case.params[name] for name in SURFEL_KEYS])
     geom = projection.geom.detach()
-    with pytest.raises(RuntimeError, match=r"trace_cuda.tile_lists runs on a CUDA device only, .* call `trace`"):
+    with pytest.raises(RuntimeError, match=r"bin_cuda.tile_lists runs on a CUDA device only, .* call `trace`"):
         trace_cuda.find_fragments(geom, projection)
     with emulated_cuda():
         with pytest.raises(RuntimeError, match=r"trace_cpu.find_fragments runs on the CPU only, .* call `trace`"):

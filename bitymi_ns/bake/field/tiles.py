@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.inputs import BakeInput, device_of
-from bitymi_ns.bake.left_out import drop_unseen
+from bitymi_ns.bake.prune import drop_unseen
 from bitymi_ns.bake.state import BakeState
 from bitymi_ns.bake.tile_errors import closest_pixels
 from bitymi_ns.bake.tiles import Tiles, grid
@@ -52,7 +52,7 @@ def field_tiles(
     progress: Progress = no_progress,
 ) -> BakeState:
     """Give the surfels of a bake tiles with the values of a field at the texel centres; surfels that no view blends are
-    left out. `pipeline.prune_and_resample` then drops what the options say, as of trained texels.
+    left out. `prune.prune_and_resample` then drops what the options say, as of trained texels.
 
     With a tolerance a tile covers the disc in which fragments reach the weight bound. Beyond it nothing is seen: the
     field is read at the nearest point of the disc, so values stay smooth and within the range of what is seen.

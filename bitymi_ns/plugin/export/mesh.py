@@ -12,9 +12,9 @@ from torch import Tensor
 
 from bitymi_ns import endings
 from bitymi_ns.bundle import BundleError, read_bundle
-from bitymi_ns.bundle.manifest import WorldEntry
 from bitymi_ns.bundle.parts import CAMERAS, bundle_at
 from bitymi_ns.bundle.strict_json import plain
+from bitymi_ns.bundle.world import WorldEntry
 from bitymi_ns.codec.pages import texel_alpha
 from bitymi_ns.files import reserved, size_text, write_errors_as, write_file
 from bitymi_ns.interchange import Frame, training_cameras

@@ -18,7 +18,7 @@ from bitymi_ns.bundle import Bundle, Check, check_world
 from bitymi_ns.bundle.cameras import CapturedCamera, cameras_data
 from bitymi_ns.bundle.parts import CAMERAS, bundle_at
 from bitymi_ns.bundle.statistics import HeldOut
-from bitymi_ns.bundle.write import World
+from bitymi_ns.bundle.world import World
 from bitymi_ns.capture.frame import UP, read_frame
 from bitymi_ns.plugin.console import fail
 from bitymi_ns.plugin.data.cameras import to_cameras

@@ -11,9 +11,9 @@ from bitymi_ns.bake.tuning_views import LEAST_KEPT
 from bitymi_ns.bake.view_colors import choice_bytes
 from bitymi_ns.bundle.sizes import memory_limit
 from bitymi_ns.ops import can_rasterize, project
+from bitymi_ns.ops.capacity import NUMBERS, free_memory
 from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.trace_cpu import MOST, count
-from bitymi_ns.ops.trace_cuda import NUMBERS, free_memory
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.plugin.console import say, warn
 from bitymi_ns.plugin.data.dataset import PHOTOGRAPH_BYTES

@@ -1,4 +1,4 @@
-"""Surfels that a bake leaves out: those that cannot be drawn or stored, and those that no view blends."""
+"""Reduction of a bake: surfels that are not drawn, stored or seen, tiles, and terms of view colours."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -6,8 +6,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.inputs import BakeInput, device_of
+from bitymi_ns.bake.inputs import BakeInput, device_of, photo_resolution
 from bitymi_ns.bake.state import BakeState
+from bitymi_ns.bake.tiles import Tiles, reduced_tiles
+from bitymi_ns.bake.view_colors import reduce_view_colors
 from bitymi_ns.bundle.statistics import LeftOut
 from bitymi_ns.codec.limits import within
 from bitymi_ns.ops.constants import ALPHA_MIN
@@ -65,3 +67,33 @@ def drop_unseen(
     left_out = counts.left_out.replace(**{name: (getattr(counts.left_out, name) or 0) + n for name, n in gone if n})
     statistics = baked.statistics.replace(surfels=counts.replace(kept=len(rows), left_out=left_out))
     return replace(baked.only(kept), statistics=statistics), inputs
+
+
+@torch.no_grad()
+def prune_and_resample(baked: BakeState, cameras: Sequence[Camera], progress: Progress = no_progress) -> BakeState:
+    """Drop surfels that no view shows, and reduce tiles and view colours, as the options of a bake say.
+
+    Left out and counted are surfels that cannot be drawn or stored, or that no view blends. The atlas is not encoded.
+
+    Args:
+        baked: of `trained_texels` or `field_tiles`.
+        cameras: training views; their device does the work.
+
+    Raises:
+        ValueError: no surfel is left.
+    """
+    result, inputs = drop_unseen(baked, cameras, progress)
+    surfels, colors, view_color = reduce_view_colors(inputs, baked.options, progress)
+    if baked.options.tolerance > 0 and result.textured:
+        tiles = Tiles(result.sizes, result.extent, result.texels)
+        result = result.with_tiles(reduced_tiles(tiles, inputs, baked.options, progress))
+    in_front = None if inputs.transmittance is None else inputs.transmittance.cpu()
+    result = replace(result.with_surfels(surfels), in_front=in_front, colors=colors)
+    result.scene.photographed = photo_resolution(inputs)
+    statistics = result.statistics
+    assert statistics.surfels is not None
+    bare = int((result.packing.tiles[:, 3] == 0).sum())
+    statistics = statistics.replace(surfels=statistics.surfels.replace(without_tile=bare), view_color=view_color)
+    if statistics.texels is not None:
+        statistics = statistics.replace(texels=statistics.texels.replace(kept=result.packing.texels))
+    return replace(result, statistics=statistics)

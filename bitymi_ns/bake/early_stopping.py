@@ -20,8 +20,7 @@ class EarlyStopping(Generic[S]):
     """Best state by the PSNR of validation views.
 
     Attributes:
-        best: the state with the highest PSNR, the first one where none was better; the last one without validation
-            views.
+        best: the state with the highest PSNR, `first` included; the last one without validation views.
         curve: (step, dB over the validation views) of every evaluation.
         done: steps before the last evaluation.
     """
@@ -29,11 +28,11 @@ class EarlyStopping(Generic[S]):
     def __init__(self, steps: int, checks: int, patience: int, psnr: float, first: S) -> None:
         """
         Args:
-            steps: at most.
+            steps: maximum number.
             checks: evaluations over the run.
-            patience: evaluations without a gain after which it ends.
+            patience: evaluations without a gain before the end.
             psnr: of the views before the first step, dB; NaN without any.
-            first: the state then.
+            first: initial state.
         """
         self._steps, self._patience = steps, patience
         self._every = max(1, -(-steps // checks))

@@ -44,7 +44,7 @@ def drop_unseen(
     baked: BakeState, cameras: Sequence[Camera], progress: Progress = no_progress
 ) -> tuple[BakeState, BakeInput]:
     """Leave out, and count, the surfels that cannot be drawn or stored and, if the options say so, those that no view
-    blends; also returns the others with what the views see of them, on the device of the cameras.
+    blends. Also returns the kept surfels and their visibility, on the cameras' device.
 
     Raises:
         ValueError: no surfel is left.

@@ -42,34 +42,34 @@ class BakeableScene(Protocol):
 class BakeState:
     """A baked scene, before it is written."""
 
-    # the surfels that are kept, N of them on the CPU, without an atlas; their view colours are lean
-    # (`ops.view_color.LEAN`) where they were reduced
+    # the N kept surfels, on the CPU, without an atlas; view colours, where reduced, are lean
+    # (`ops.view_color.LEAN`)
     scene: BakedScene
     rows: Tensor  # [N] int64, their rows in the scene
-    packing: Packing  # where the tiles lie; `scene.tiles` are the same memory
+    packing: Packing  # layout of the tiles; shares memory with `scene.tiles`
     # [T, C] float32 before quantisation, in the order of `ops.TexelTiles`: residual colours and, where C = 4, alpha; a
-    # surfel without a tile has one, its constant
+    # surfel without a tile has one texel, its constant
     texels: Tensor
     atlas: EncodedAtlas | None  # the encoded atlas, None without texture
-    options: BakeOptions  # what it was baked with
-    # what was left out, what it cost, and the error of the quantisation
+    options: BakeOptions  # options of the bake
+    # surfels left out, sizes, and errors
     statistics: Statistics = field(default_factory=Statistics)
     codes: SceneCodes | None = None  # integer codes of the surfels, and of the texels once coded; None = not compact
-    # [T, C] the texels of which the codes were made; None = `texels`
+    # [T, C] texels before coding; None = `texels`
     uncoded: Tensor | None = None
-    alpha_codes: TexelCodes | None = None  # codes whose alphas those of the bundle keep; None = not coded, or opaque
-    # [N] transmittance in front of the surfels, by which errors of their tiles count; None = 1
+    alpha_codes: TexelCodes | None = None  # codes whose alphas and grades are reused; None = not coded, or opaque
+    # [N] transmittance in front of the surfels, the weight of errors of their tiles; None = 1
     in_front: Tensor | None = None
     colors: ColorChoices | None = None  # view colours of fewer terms; None = they were not reduced
-    # [T, 2] in pixels, the sums over views and fragments of blending weight, and of its square, times bilinear weight;
-    # None = not measured yet
+    # [T, 2] in pixels, the sums over views and fragments of w b and w^2 b, with blending weight w and bilinear weight
+    # b; None = not measured yet
     coverage: Tensor | None = None
 
     @classmethod
     def of(
         cls, scene: BakeableScene, surfels: Mapping[str, Tensor], rows: Tensor, tiles: Tiles, options: BakeOptions
     ) -> BakeState:
-        """Start from surfels, rows [N] of a scene, and their tiles, not encoded yet.
+        """Create from surfels (rows [N] of `scene`) and their tiles, not encoded.
 
         Raises:
             ValueError: the atlas would be too large.
@@ -107,7 +107,7 @@ class BakeState:
         return self.packing.texels > 0
 
     def with_constants(self, constants: Tensor) -> BakeState:
-        """Replace the means by [N, C], or by [N, 3] to keep those of alpha."""
+        """Replace tile means by [N, C], or by [N, 3] to keep mean alphas."""
         return replace(self, scene=with_means(self.scene, constants))
 
     @cached_property
@@ -173,7 +173,7 @@ class BakeState:
         return replace(self.with_constants(means), texels=texels.contiguous(), atlas=None, statistics=statistics)
 
     def encoded(self, progress: Progress = no_progress) -> BakeState:
-        """Quantise and encode the texels, unless that is done."""
+        """Quantise and encode the texels, unless encoded."""
         if not self.textured or self.atlas is not None:
             return self
         return self.with_atlas(encoded_texels(self.texels, self.packing, self.options, progress))
@@ -183,7 +183,7 @@ class BakeState:
         return replace(self, atlas=atlas, statistics=self.statistics.replace(atlas=atlas_cost(self.packing, atlas)))
 
     def with_texel_codes(self, codes: TexelCodes, uncoded: Tensor) -> BakeState:
-        """Replace the residual colours by those decoded from codes of `uncoded` [T, 3]."""
+        """Replace the residual colours by decoded `codes` of `uncoded` [T, 3]."""
         assert self.codes is not None
         alphas, options = codes.alphas(), replace(self.options, format="uint8")
         texels = codes.texels() if alphas is None else joined(codes.texels(), alphas)
@@ -207,13 +207,13 @@ def export(
     first: Camera | None = None,
     **options: Any,
 ) -> Path:
-    """Encode a baked scene, unless that is done, and write a bundle; errors are those of `write_bundle`.
+    """Encode a baked scene, unless encoded, and write a bundle; raises what `write_bundle` raises.
 
     Args:
         background: colour behind the surfels.
         statistics: added to those of the bake.
-        first: camera with which a viewer opens, the first of cameras.json that was held out, or its first: the poster
-            is drawn from there; None = the bundle gets no poster.
+        first: initial camera of viewers, which the poster shows: the first held-out one of cameras.json, else its
+            first; None = the bundle gets no poster.
     """
     baked = baked.encoded()
     return write_bundle(

@@ -27,7 +27,7 @@ def sketch(texels: Tensor) -> npt.NDArray[np.float64]:
 
 
 def sketches_text(before: Tensor, stored: Tensor) -> str:
-    """Encode the sketches of texels [T, 3] before quantisation and as stored for bundle.json: base64 of little-endian
+    """Encode for bundle.json the sketches of texels [T, 3] before quantisation and as stored: base64 of little-endian
     float32."""
     return base64.b64encode(np.stack([sketch(before), sketch(stored)]).astype("<f4").tobytes()).decode()
 

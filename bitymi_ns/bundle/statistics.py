@@ -63,8 +63,8 @@ class Percentiles(Part):
 
 
 class Certificate(Part):
-    """Numbers of surfels whose stored residual is within the tolerance as seen by the closest training view: weighted
-    by blending weight, averaged per pixel, root mean square over the tile; alphas are ignored."""
+    """Numbers of surfels whose stored residual is within the tolerance in the closest training view: error times
+    blending weight, averaged per pixel, root mean square over the tile; alphas are ignored."""
 
     against: Literal["field", "texels"]  # reference: texels before quantisation; earlier: the field
     tolerance: NotNegative
@@ -78,7 +78,7 @@ class Certificate(Part):
 
     @classmethod
     def of(cls, errors: Tensor, tolerance: float) -> Certificate:
-        """Certify errors [n], 8-bit steps."""
+        """Count errors [n], 8-bit steps, by the tolerance."""
         within = int((errors <= tolerance).sum())
         worst = float(errors.amax()) if len(errors) else 0.0
         return cls(against="texels", tolerance=tolerance, within=within, beyond=len(errors) - within, worst=worst)
@@ -158,12 +158,12 @@ class Rounding(Part):
     """Mean squared error in the training views before texels were tuned, colours in [0, 1]."""
     steps: dict[str, NotNegative] = {}  # by column, as in `surfel_codes.REFERENCE`
     alternatives: Annotated[list[tuple[NotNegative, Decibels]], Field(max_length=16)] | None = None
-    """Other precisions: bytes as a multiple of the chosen ones, and change of the PSNR of the training views, dB, both
-    before texels were tuned."""
+    """Other precisions: bytes relative to the chosen one, and PSNR difference over the training views, dB, before
+    texels were tuned."""
 
 
 class FineTuning(Part):
-    """Fine-tuning or polish; no steps with too few views."""
+    """Fine-tuning or polish; 0 steps if too few views."""
 
     views: Whole | None = None
     held_in_views: Whole | None = None  # validation views

@@ -101,8 +101,8 @@ def check_world(stated: WorldEntry, world: World) -> Check:
 
 
 def check_certificate(bundle: Bundle) -> list[Check]:
-    """Check the texels' colours by the sketches of the certificate: equal to those measured, and as close to the
-    unquantised ones as stated. Returns no checks without a certificate."""
+    """Check texel colours by the certificate's sketches: equal to the stored colours, and as close to the unquantised
+    ones as stated. Returns no checks without a certificate."""
     stated, atlas = bundle.info.statistics.certificate, bundle.info.atlas
     if stated is None:
         return []

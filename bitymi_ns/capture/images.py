@@ -29,13 +29,13 @@ EMPTY: dict[str, Callable[[npt.NDArray[np.uint8]], bool]] = {
     "transparent everywhere": lambda image: image.shape[-1] == 4 and not image[..., 3].any(),
     "of one color throughout": lambda image: bool((image == image[0, 0]).all()),
 }
-"""Photographs from which nothing can be learned."""
+"""Tests for blank photographs, by reason."""
 FINGERPRINT_SIZE = 64  # pixels across, and down, by which photographs are compared
 
 
 def set_up_pillow() -> None:
-    """Raise Pillow's limit from 179 million pixels to MAX_PIXELS, and keep it, in nerfstudio's readers too, from
-    running Ghostscript on PostScript files of any name."""
+    """Raise Pillow's limit from 179 million pixels to MAX_PIXELS, and disable Ghostscript, which PostScript files of
+    any name would start, in nerfstudio's readers too."""
     EpsImagePlugin.gs_binary = False
     Image.MAX_IMAGE_PIXELS = MAX_PIXELS // 2  # PIL refuses twice as many
 
@@ -90,8 +90,8 @@ def orientation(path: Path) -> int:
 def exposure_stops(paths: Sequence[Path]) -> list[float]:
     """Compute log2 of the exposure of photographs from shutter time, aperture and ISO in EXIF; NaN = unknown.
 
-    Lenses without electronics write no f-number, some cameras no ISO: what most photographs lack counts as equal for
-    all. Photographs with other entries than most cannot be compared, and are NaN.
+    An entry that most photographs lack (f-number of manual lenses, ISO of some cameras) counts as equal for all.
+    Photographs with other entries than most are NaN.
     """
     found = in_threads(lambda path: from_header(path, exposure_settings, None), paths)
     kinds = [None if each is None else tuple(value is not None for value in each) for each in found]
@@ -141,7 +141,7 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
     Args:
         stored: width and height that it must have; None = any.
         wanted: width and height to which it is downscaled, averaging over pixels. A JPEG is decoded at a half, a
-            quarter or an eighth of its size if that is at least twice as large: the average of fewer is the nearest.
+            quarter or an eighth of its size if that is at least twice as large, to average over 2 x 2 or more.
 
     Raises:
         CaptureError: it is missing, cannot be read, or has another size.
@@ -155,7 +155,7 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
             picture = picture.convert("RGBA" if has_transparency(file) else "RGB")
             if wanted is None or picture.size == wanted == size:
                 return picture
-            # half of an odd number of pixels is rounded up: what is beyond the photograph is not part of the picture
+            # decoders round half an odd size up: the box leaves out the part beyond the photograph
             return picture.resize(wanted, Image.Resampling.BOX, drafted[1] if drafted else (0, 0, *size))
     except FileNotFoundError as error:
         fail(f"the image {path} is missing, but the capture has a pose for it", error)
@@ -171,7 +171,7 @@ def eight_bits(image: Image.Image) -> Image.Image:
     low, high = float(values.min()), float(values.max())
     if image.mode.startswith("I;16") or image.format == "PNG":
         whites = (65535.0,)
-    else:  # TIFF and the like, which do not say what white is
+    else:  # TIFF and others, which do not state their white
         whites = (1.0, 255.0) if image.mode == "F" else (255.0, 65535.0)
     white = next((white for white in whites if high <= white), None)
     if white is None or not low >= 0.0:  # also NaN
@@ -200,7 +200,7 @@ def in_srgb(image: Image.Image) -> Image.Image:
 
 @lru_cache(maxsize=8)
 def _to_srgb(profile: bytes) -> ImageCms.ImageCmsTransform | None:
-    """Make the transform of an RGB profile to sRGB; None = it changes next to nothing, or there is none."""
+    """Make the transform of an RGB profile to sRGB; None = no transform, or hardly a change."""
     try:
         source = ImageCms.ImageCmsProfile(BytesIO(profile))
         convert = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), "RGB", "RGB")
@@ -236,7 +236,7 @@ def wrong_size(path: Path, size: tuple[int, int], declared: tuple[int, int]) -> 
 
 
 class ImageSummary(NamedTuple):
-    """Why nothing can be learned from a photograph ("" = something can), and a fingerprint equal for equal pixels."""
+    """Reason why a photograph is blank ("" = it is not), and a fingerprint, equal for equal pixels."""
 
     empty: str
     fingerprint: bytes
@@ -263,7 +263,7 @@ def duplicate_files(train: Sequence[Path], held_out: Sequence[Path]) -> list[Pai
 
 
 def duplicates(train: Sequence[Any], held_out: Sequence[Any]) -> list[Pair]:
-    """Pair equal items, each held-out one with its first equal; None equals nothing."""
+    """Pair held-out items with the first equal training item; None equals nothing."""
     first: dict[Any, int] = {}
     for i, content in enumerate(train):
         first.setdefault(content, i)

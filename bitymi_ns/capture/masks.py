@@ -26,11 +26,11 @@ MIDDLE = 127  # threshold of lossy masks, of 255
 
 
 def mask_folder(photographs: Path, data: Path, stated: Path | None = None, downscale: int = 1) -> Path | None:
-    """Find the folder of masks, or of reduced ones (`masks_2` for a `downscale` of 2): the stated one, else the first
-    `masks` beside the folder of photographs, in it, or in that of the data.
+    """Find the folder of masks, or of reduced ones (`masks_2` for a `downscale` of 2): `stated`, else the first `masks`
+    beside the folder `photographs`, in it, or in `data`.
 
-    Other things than the capture lie beside the folder of the data. There `masks` is used if the photographs' folder
-    has a usual name: `bed/masks` for `bed/images`, but not `all/masks` for `all/bed`.
+    If `data` is the folder of photographs, or in it, a `masks` beside it may belong to something else. It is used if
+    the folder has a usual name: `bed/masks` for `bed/images`, but not `all/masks` for `all/bed`.
 
     Raises:
         CaptureError: the stated one does not exist.
@@ -114,9 +114,9 @@ def masks_named(masks: Path, names: Sequence[str], needed: bool = True) -> list[
 
 
 def with_masks(photographs: Sequence[Photograph], capture: Path, base: Path | None = None) -> list[Photograph]:
-    """Give photographs the masks beside them, and report so: instant-ngp's, of which some may be missing, or those of a
-    folder `masks`; see `mask_folder`. `base`: folder to which names of masks are relative; None = that of all
-    photographs. Raises CaptureError: the folder has masks of some photographs only."""
+    """Add masks to photographs, and report it: instant-ngp's beside them, where some may be missing, or from a folder
+    `masks` (`mask_folder`). `base`: folder to which names of masks are relative; None = the photographs' common
+    folder. Raises CaptureError: the folder has masks of some photographs only."""
     files = [each.file for each in photographs]
     dynamic = [file.with_name(f"{DYNAMIC_MASK}{file.stem}.png") for file in files]
     found: Sequence[Path | None] | None = [file if os.path.isfile(file) else None for file in dynamic]

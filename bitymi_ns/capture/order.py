@@ -1,4 +1,4 @@
-"""Order of a capture's photographs by their names."""
+"""Find the neighbours of photographs by file name."""
 
 from bisect import bisect_left
 from collections import defaultdict
@@ -11,8 +11,8 @@ Position = tuple[int, ...]
 
 
 class Neighbours:
-    """Finds the photographs before and after another one in its sequence: those of its folder whose names differ in
-    numbers alone, as several cameras may write to one folder."""
+    """Finds the previous and next photograph of a sequence: files in one folder, which several cameras may share, whose
+    names differ only in numbers."""
 
     def __init__(self, files: Sequence[Path]) -> None:
         found = defaultdict(list)
@@ -22,8 +22,8 @@ class Neighbours:
         self._sequences = {sequence: sorted(members) for sequence, members in found.items()}
 
     def of(self, file: Path) -> tuple[int, int, float] | None:
-        """Return the indices of the photographs before and after a file, and how far it is between them by the first
-        number that differs, 0 to 1; beyond an end twice that photograph. None: its sequence has none."""
+        """Return the indices of the previous and next photograph, and the file's position between them, 0 to 1, by the
+        first number that differs; past an end, twice the last one. None: unknown sequence."""
         sequence, position = _numbered(file)
         members = self._sequences.get(sequence)
         if members is None:
@@ -35,6 +35,6 @@ class Neighbours:
 
 
 def _numbered(file: Path) -> tuple[tuple[str, ...], Position]:
-    """Split a path into what a sequence has in common, and the numbers in its name."""
+    """Split a path into a sequence's key (folder, text) and the numbers in its name."""
     parts = natural(file.stem)
     return (str(file.parent), *(text for kind, _, text in parts if not kind)), tuple(n for kind, n, _ in parts if kind)

@@ -31,7 +31,7 @@ from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.reading import read_json
 
 GUESSED_FOCAL = 1.2  # initial focal length if unknown, in longer sides; COLMAP's own
-TELLING = 0.25  # share of 360-degree pictures from which on all photographs of one size count as such
+TELLING = 0.25  # least share of 360-degree pictures in a size for all of it to count as 360-degree
 LEAST = 3  # photographs
 SPARSE = Path("sparse/0")  # the model's path in a result
 

@@ -25,19 +25,19 @@ from bitymi_ns.trust import listed
 
 
 class ScannedPhotograph(NamedTuple):
-    """Photograph as a program states it."""
+    """Photograph as a scanner states it."""
 
     file: Path
     pose: Pose  # in nerfstudio's axes
     pinhole: tuple[float, ...]  # fx, fy, cx, cy
-    size: tuple[int, int] | None = None  # that these are for; None = the file's
-    maps: MapFiles | None = None  # None = those in folders beside that of the photographs
+    size: tuple[int, int] | None = None  # of pinhole's image; None = the file's
+    maps: MapFiles | None = None  # None = maps in folders beside the photographs' folder
 
 
 AGAIN = "Export the capture again."
 MOST_POSE = 1 << 20  # bytes of a file with a pose or a camera
 Y_UP = np.array([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-"""ARKit's world, in which y is up, to one with z up."""
+"""Transform of ARKit's world, y up, to z up."""
 
 
 def scanner_photographs(found: Found, need_photos: bool) -> list[Photograph]:
@@ -110,8 +110,8 @@ def _record3d(folder: Path) -> list[ScannedPhotograph]:
 
 
 def _scanner_app(folder: Path) -> list[ScannedPhotograph]:
-    """Read 3D Scanner App's frames: frame_00012.json with camera to world and camera matrix, both by rows; beside it
-    depth and confidence, and of some frames a picture."""
+    """Read 3D Scanner App's frames: frame_00012.json with camera to world and camera matrix, both row-major; beside it
+    depth, confidence and, for some frames, a picture."""
     rows = []
     for path in sorted(folder.glob("frame_*.json"), key=lambda path: natural(path.name)):
         picture = next(filter(is_photograph, folder.glob(f"{path.stem}.*")), None)
@@ -128,8 +128,8 @@ def _scanner_app(folder: Path) -> list[ScannedPhotograph]:
 
 
 def _stray_scanner(folder: Path) -> list[ScannedPhotograph]:
-    """Read Stray Scanner's video, without frames that show much the same, camera matrix and poses: positions and
-    quaternions xyzw in ARKit's world, of cameras with OpenCV axes."""
+    """Read Stray Scanner's camera matrix, video (without near-duplicate frames) and poses: positions and quaternions
+    xyzw in ARKit's world, cameras with OpenCV axes."""
     from bitymi_ns.capture.video import frames_with_poses  # slow to import
 
     odometry, matrix, video = (folder / name for name in STRAY)
@@ -175,7 +175,7 @@ def _pose_files(folder: Path) -> list[ScannedPhotograph]:
 
 
 def _intrinsics(folder: Path) -> tuple[float, ...]:
-    """Read fx, fy, cx, cy of all photographs from the first usual file: a matrix, or these four numbers."""
+    """Read fx, fy, cx, cy of all photographs from the first known file name: a matrix, or four numbers."""
     names = ("intrinsic/intrinsic_color.txt", "intrinsics_color.txt", "intrinsic_color.txt", "intrinsics.txt",
              "intrinsic.txt", "camera-intrinsics.txt", "calibration.txt", "../camera-intrinsics.txt")  # fmt: skip
     path = next((folder / name for name in names if (folder / name).is_file()), None)
@@ -206,7 +206,7 @@ def _pose(values: Sequence[float]) -> Pose:
 
 
 def _numbers(values: Any, count: int) -> list[float]:
-    """Require this number of values: missing ones would be repeated, and further ones dropped silently."""
+    """Convert to floats. Raises ValueError unless there are `count`: numpy would repeat or drop some."""
     numbers = [float(value) for value in values]
     if len(numbers) != count:
         raise ValueError(f"it has {len(numbers)} numbers, not {count}")

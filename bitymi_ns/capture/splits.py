@@ -50,15 +50,15 @@ class Split(NamedTuple):
 
 
 def of_members(split: Split, groups: Sequence[int]) -> Split:
-    """Split members by the sides of their groups: views by photographs, photographs by frames of a rig."""
+    """Put each member on the side of its group: views by photograph, photographs by rig frame."""
     sides = [set(side) for side in (split.train, split.held_out)]
     train, held_out = ([i for i, group in enumerate(groups) if group in side] for side in sides)
     return Split(train, held_out, split.rule)
 
 
 def choose_split(photographs: Sequence[Photograph], lists: NameLists, options: SplitOptions) -> Split:
-    """Split photographs by the stated names, else the capture's lists, else a rule; frames of a rig stay together.
-    Raises CaptureError: a name is that of no photograph, or of several."""
+    """Split photographs by `eval_names`, else the capture's lists, else a rule; frames of a rig stay together, except
+    by lists. Raises CaptureError: a name matches no photograph, or several."""
     names = [photograph.file for photograph in photographs]
     first: dict[object, int] = {}
     frames = [first.setdefault(i if each.frame is None else ("frame", each.frame), i)
@@ -77,7 +77,7 @@ def choose_split(photographs: Sequence[Photograph], lists: NameLists, options: S
 
 
 def by_mode(names: Sequence[Path], mode: Mode, interval: int, fraction: float) -> Split:
-    """Split photographs in this order by one of nerfstudio's rules."""
+    """Split ordered photographs by a rule of nerfstudio."""
     indices = list(range(len(names)))
     if mode == "interval":
         suffix = {1: "st", 2: "nd", 3: "rd"}.get(interval % 10 * (interval % 100 not in (11, 12, 13)), "th")
@@ -99,8 +99,8 @@ def by_mode(names: Sequence[Path], mode: Mode, interval: int, fraction: float) -
 
 
 def by_names(names: Sequence[Path], wanted: Sequence[str], source: str) -> Split:
-    """Hold out photographs by names, each with as many folders as make it unambiguous. Raises CaptureError: one is the
-    name of no photograph, or of several."""
+    """Hold out photographs by name, with folders in front if needed. Raises CaptureError: a name matches no photograph,
+    or several."""
     held_out = set(find(names, wanted, source))
     return Split([i for i in range(len(names)) if i not in held_out], sorted(held_out), f"by {source}")
 
@@ -156,7 +156,7 @@ def find(names: Sequence[Path], wanted: Sequence[str], source: str, any_folder: 
 
 
 def read_names(names_or_file: Sequence[str]) -> tuple[str, ...]:
-    """Return the names, or those in the text file that they name, one per line."""
+    """Return the names; read them from a text file if one is named, one per line."""
     if len(names_or_file) != 1 or not names_or_file[0].lower().endswith((".txt", ".lst", ".list")):
         return tuple(names_or_file)
     path = Path(os.path.expanduser(names_or_file[0]))

@@ -57,7 +57,7 @@ class TexelCodeOptions:
 
 @dataclass(frozen=True)
 class Blocks:
-    """All tiles' blocks of one size, by surfel, then from the top, then from the left."""
+    """Blocks of one size of all tiles, sorted by surfel, row and column."""
 
     size: tuple[int, int]  # (b_u, b_v) texels
     tile: Tensor  # [B] int64 index among the surfels that have a tile

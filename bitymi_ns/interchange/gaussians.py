@@ -21,7 +21,7 @@ from bitymi_ns.train.init import rotate_in_plane, tangents
 
 FLAT_LOG_SCALE = -16.0
 """Log of the Gaussians' third scale, in the scene's frame, whose cameras lie within a unit of the origin."""
-GRID = 24  # points along both axes of a kernel in the sums for the moments under alpha texels
+GRID = 24  # grid points per axis of a kernel, to sum moments under alpha texels
 LEAST_OPACITY = 1e-4  # of a surfel that alpha texels cut away
 HARD_BETA = 0.5658
 """Exponent below which a disc approximates the kernel better than a Gaussian of equal moments, in squared error."""
@@ -74,8 +74,8 @@ def gaussians_of(scene: BakedScene, coefficients: Tensor) -> Gaussians:
 
     Gaussians have the opacities and second moments of the surfels' kernels: under (1 - r^2 / R^2)^beta on the disc of
     radius R the mean of u^2 is R^2 / (2 (beta + 2)). With alpha texels m they have centre and covariance of
-    f = min(0.99, o k m), and their opacity is multiplied by the f-weighted mean of f over the (o k)-weighted mean of
-    o k.
+    f = min(0.99, o k m), and their opacity is multiplied by (f-weighted mean of f) / ((o k)-weighted mean of
+    o k).
     """
     surfels = scene.surfels
     means, quats = surfels["means"].float(), torch.nn.functional.normalize(surfels["quats"].float(), dim=1)

@@ -1,4 +1,4 @@
-"""Renderer of 3D Gaussians as in 3DGS (elliptical weighted average, Zwicker et al. 2001), to measure previews.
+"""Render 3D Gaussians as in 3DGS (elliptical weighted average, Zwicker et al. 2001), to measure previews.
 
 Simple rather than fast: torch on the CPU, one tile of the image at a time.
 """
@@ -16,7 +16,7 @@ from bitymi_ns.train.init import tangents
 
 DILATION = 0.3  # added to the variances of a footprint, pixels squared
 REACH = 3.0  # radius of a footprint, in standard deviations along its longer axis
-BEYOND = 1.3  # limit on the means' positions in the Jacobian, in half images from the centre
+BEYOND = 1.3  # limit on |x / z| and |y / z| in the Jacobian, in half images
 _AT_ONCE = 512
 
 
@@ -102,7 +102,7 @@ def _footprints(gaussians: Gaussians, camera: Camera, near: float) -> tuple[Tens
 def _blend(
     pixels: Tensor, center: Tensor, conic: Tensor, opacity: Tensor, colors: Tensor, hard: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Blend pixels [P, 2]: colours [P, 3] and final transmittance [P]."""
+    """Blend at pixels [P, 2]: colours [P, 3], final transmittance [P]."""
     rgb, transmittance = pixels.new_zeros(len(pixels), 3), pixels.new_ones(len(pixels))
     ended = torch.zeros(len(pixels), dtype=torch.bool)
     for part in torch.arange(len(center)).split(_AT_ONCE):

@@ -69,8 +69,7 @@ def residual_parts(scene: Scene, output: RenderOutput) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def decompose(scene: Scene, camera: Any, background: Tensor, photo: Tensor) -> dict[str, Tensor]:
-    """Render the images of one view, [H, W, 3] each, by their names in `KINDS`; without a texture none of the
-    residual."""
+    """Render the images of one view, [H, W, 3] each, by name (`KINDS`); view colour and residual need a texture."""
     output = scene.render(camera, background, "frozen")
     final = output.rgb.clamp(0.0, 1.0)
     pictures = {"photo": photo, "final": final, "error": heat_map((final - photo).abs().mean(-1), ERROR_SCALE)}
@@ -101,7 +100,7 @@ def draw_worst(load_config: Path, output_dir: Path, views: int) -> None:
 
     Args:
         load_config: config.yml of a trained run.
-        output_dir: folder of the files; replaces an earlier one, and must hold nothing else.
+        output_dir: folder of the files; earlier ones are replaced, others refused.
         views: number of views.
     """
     if views < 1:

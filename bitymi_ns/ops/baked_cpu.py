@@ -26,7 +26,7 @@ def gather(atlas: Tensor | None, tiles: Tensor) -> Any:
         tiles: [N, 5] int32: x, y, layer, r_u, r_v in texels; r_u = 0: no tile.
 
     Raises:
-        ValueError: names a surfel whose tile lies outside its page.
+        ValueError: the tile of a surfel lies outside its page.
         RuntimeError: the tiles are not on the CPU.
     """
     require("baked_cpu.gather", "cpu", tiles.device, ON_CUDA)

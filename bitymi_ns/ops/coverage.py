@@ -1,4 +1,4 @@
-"""Coverage: what a view shows of its surfels, and of their texels.
+"""Sum a view's blending weights by surfel and by texel (coverage).
 
 On the CPU fragments are summed as they are found; on a CUDA device they are listed first."""
 
@@ -16,16 +16,16 @@ from .texel import TexelTiles
 from .trace import Fragments
 from .trace_cpu import tile_lists
 
-PART = 1 << 20  # fragments of a list summed at a time
+PART = 1 << 20  # fragments summed at a time
 
 
 @torch.no_grad()
 def surfel_coverage(projection: Projection, bound: float) -> Tensor:
-    """Measure what a view shows of its surfels.
+    """Measure the coverage of each surfel in a view.
 
     Returns:
-        [N, 3]: the largest transmittance in front of a blended fragment, the sum of the blending weights from `bound`
-        on, and the sum of all squared blending weights, in pixels; 0 for surfels that are not blended.
+        [N, 3]: largest transmittance in front of a blended fragment; sum of blending weights >= `bound`, pixels; sum
+        of all squared blending weights, pixels. 0 for surfels that are not blended.
     """
     geom = projection.geom.detach()
     shown = geom.new_zeros(len(geom), 3)
@@ -37,7 +37,7 @@ def surfel_coverage(projection: Projection, bound: float) -> Tensor:
         lists = (fragments.surfel, fragments.weight, fragments.sigma)
         for surfel, weight, sigma in zip(*(values.split(PART) for values in lists), strict=True):
             rows = surfel.long()
-            largest.scatter_reduce_(0, rows, weight / sigma.abs(), "amax")  # sigma's sign is the low-pass branch
+            largest.scatter_reduce_(0, rows, weight / sigma.abs(), "amax")  # sigma < 0 flags the low-pass branch
             weights.index_add_(0, rows, torch.where(weight >= bound, weight, 0.0).to(shown.dtype))
             squares.index_add_(0, rows, weight.square())
         del fragments, lists, surfel, weight, sigma  # frees memory before the next list
@@ -55,8 +55,8 @@ def add_texel_coverage(
         tiles: of the T texels.
         mask: [H, W] or [H, W, 1] bool, True for pixels that count; None: all.
         bound: fragments of smaller weight are ignored.
-        covered: [T, 2] of the tiles' dtype, dense, added to: the sums over fragments of blending weight, and of squared
-            blending weight, times bilinear weight.
+        covered: [T, 2] of the tiles' dtype, contiguous; increased by the sums over fragments of w b and w^2 b, with
+            blending weight w and bilinear weight b.
     """
     counts = None if mask is None else mask.to(covered.device).reshape(-1)
     if not cuda_backend(covered.device):
@@ -83,8 +83,8 @@ def _sum_fragments(name: str, projection: Projection, bound: float, **arguments:
 def _add_of_list(
     fragments: Fragments, tiles: TexelTiles, mask: Tensor | None, bound: float, total: Tensor, squares: Tensor
 ) -> None:
-    """Add the coverage of a list's fragments on a CUDA device to total [T, 3], of equal columns, and squares [T]: a
-    step of length -1 for colours with no clamped channel."""
+    """Add the coverage by listed fragments to total [T, 3] (equal columns) and squares [T] on CUDA: a backward pass of
+    blending with image gradient 1 and texel rate -1."""
     like, surfels, pixels = tiles.extent, fragments.surfels, fragments.width * fragments.height
     counts = like.new_ones(pixels) if mask is None else mask.to(like.dtype)
     base, geom = like.new_zeros(surfels, 3), like.new_zeros(surfels, GEOM)

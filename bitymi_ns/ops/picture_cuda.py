@@ -35,8 +35,7 @@ class Photograph:
     gamma: float
 
     def check(self, like: Tensor, size: tuple[int, ...]) -> None:
-        """Raise a ValueError if the shapes do not fit a picture of height and width `size`, or a device is not that of
-        `like`."""
+        """Raise a ValueError unless shapes fit a picture [H, W] = `size`, the mask is bool and devices are `like`'s."""
         if tuple(self.target.shape) != (*size, 3):
             raise ValueError(f"the picture is {list(size)} and the photograph {list(self.target.shape)}")
         on_same_device(like, target=self.target)

@@ -156,7 +156,7 @@ def training_view(
     prefilter: Prefilter = "low_pass",
     rim: float = 1e-3,
 ) -> ComparedView:
-    """Draw a view over the photograph's background, as the photograph is exposed, and compare both.
+    """Draw a view over the photograph's background, correct its exposure, and compute the losses.
 
     Differentiable in the surfels, the camera's pose (see `project`), the correction, texels and alpha texels. The
     backward pass fills `mean2d_grad` and `mean2d_absgrad` of the projection. Only sums over texels depend on the

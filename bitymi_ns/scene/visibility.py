@@ -20,10 +20,9 @@ class Visibility:
     Attributes:
         transmittance: [N] float32 in [0, 1], maximum T over the surfel's blended fragments in all views (blending
             weight = sigma T); 0 for a surfel that no view blends.
-        pixels: [N] float32, maximum over the views of the sum of the surfel's blending weights, without those that get
-            no residual.
-        squares: [V, N] bfloat16, sum over the view's pixels of the surfel's squared blending weight: an error e of its
-            colour adds e^2 times as much to the picture.
+        pixels: [N] float32, maximum over the views of the sum of the surfel's blending weights that get a residual.
+        squares: [V, N] bfloat16, sum over the view's pixels of the surfel's squared blending weight: a colour error e
+            adds e^2 times this to the squared error.
     """
 
     transmittance: Tensor

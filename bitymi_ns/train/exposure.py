@@ -65,7 +65,7 @@ class Exposure:
         Args:
             exif: log2 exposure of each training view (`exif_stops`), NaN: unknown; None: unknown for every view.
             files: photograph of each training view; views of one photograph share its correction. None: one view per
-                photograph, and `at` knows none.
+                photograph, and `at` returns None.
         """
         self.kind: ExposureKind = kind
         self.table: Tensor | None = None
@@ -247,7 +247,7 @@ class Exposure:
         """Restore what `state_dict` returned. Ignores state saved with another option or number of photographs.
 
         Args:
-            state: None: a checkpoint from before there were corrections; `auto` then makes none, nor after `off`.
+            state: None: saved before corrections existed. Then, and after `off`, `auto` makes none.
             count: number of training views.
             device: of the corrections; None: that of `state`.
         """
@@ -272,7 +272,7 @@ class Exposure:
 
 
 def restored(state: Mapping[str, Any] | None, views: int, files: Sequence[Path] | None = None) -> Exposure:
-    """Restore the corrections of a finished run for its number of views; none if they were of more or fewer."""
+    """Restore the corrections of a finished run of `views` training views; none if their number differs."""
     exposure = Exposure("off" if state is None else state["kind"], files=files)
     exposure.load_state_dict(state, views)
     return exposure
@@ -431,7 +431,7 @@ def _disagreement(logs: Tensor) -> float:
 def _median(values: Tensor, dim: int) -> Tensor:
     """Compute the median along a dimension without NaN, the mean of the middle two for even counts; NaN if empty.
 
-    torch's lower median would overestimate the differences between photographs in pairs."""
+    torch's lower median would overestimate differences between photographs for even counts."""
     if values.shape[dim] == 0:
         return torch.full_like(values.sum(dim), math.nan)
     return 0.5 * (values.nanmedian(dim).values - (-values).nanmedian(dim).values)

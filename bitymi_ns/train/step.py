@@ -43,11 +43,11 @@ def view_losses(
     Args:
         view: on the scene's device, with its image at its camera's size.
         schedule, step: decide which parts of the scene are trained.
-        background: [3] colour behind the scene where it is the same in all steps; None: that of the options.
+        background: [3] colour behind the scene, where it is constant over steps; None: as the options say.
 
     Returns:
-        The weighted loss terms (their sum is the objective) and the rendered view, on CUDA devices without its picture
-        where one function does all.
+        The weighted loss terms (their sum is the objective) and the rendered view: a `ComparedView` without image if
+        one CUDA function does both.
 
     Raises:
         TrainingDiverged: the loss is not finite.
@@ -95,7 +95,7 @@ class Training:
         exposure: colour corrections of the training photographs; decided when the first step begins.
         poses: pose corrections of the training photographs.
         clock: time spent between `begin` and `finish`.
-        background: [3] colour behind the scene where it is the same in all steps; None: that of the options.
+        background: [3] colour behind the scene, where it is constant over steps; None: as the options say.
     """
 
     def __init__(
@@ -224,7 +224,7 @@ class Training:
         """Densify, prune, check for divergence and stop the clock; call it after the optimisers.
 
         Returns:
-            Counts of what was done, by name; empty if nothing was due.
+            Numbers by action (pruned, rolled_back, ...); empty if none.
 
         Raises:
             TrainingDiverged: the limit of rollbacks is reached, or rollbacks are disabled.

@@ -197,7 +197,7 @@ BT_HD MaskOf<T> project(const Pinhole<S>& cam, const SurfelRow<T>& in, S near, T
   g[kNx] = -sign * n.x, g[kNy] = -sign * n.y, g[kNz] = -sign * n.z;
   g[kArea] = T(0.0f);
   if constexpr (Kernel::kPixel) {
-    // discs of a million pixels need no filter, and their squared areas could overflow
+    // discs a million pixels wide need no filter, and their squared areas could overflow
     const T area = T(cam.fx) * T(cam.fy) * su * sv * iz * iz;
     g[kArea] = select(area < T(1e12), area, T(0.0f));
   }

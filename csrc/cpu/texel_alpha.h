@@ -9,7 +9,7 @@
 
 namespace bt {
 
-// Marks fragments whose sigma was multiplied by the last bit of v.
+// Marks, in the last bit of v, fragments whose sigma was multiplied.
 template <class S> Lanes<S> marked(Lanes<S> v, uint32_t lanes) {
   using V = typename Lanes<S>::V;
   using I = typename Lanes<S>::I;
@@ -22,7 +22,7 @@ template <class S> uint32_t marks(Lanes<S> v) {
   return bits(Lanes<S>(convert<V>(same_bits<I>(v.v) & 1)) > Lanes<S>(S(0.5)));
 }
 
-// Prefetches the tile entry of a surfel a few steps ahead, and the texels of one that comes next; also the gradients
+// Prefetches the tile entry of a surfel a few steps ahead, the texels of the next surfel, and their gradients
 // `of_texels`, unless null.
 template <class S> BT_HD void prefetch_tile(const AlphaTiles<S>& tiles, int64_t id) {
   __builtin_prefetch(tiles.first + id), __builtin_prefetch(tiles.size + 2 * id), __builtin_prefetch(tiles.extent + id);
@@ -76,7 +76,7 @@ template <class S> class AlphaLanes {
   P sigma(P uncut) const {
     return select(mask_of<S>(lanes_), alpha_cut(uncut, texel_lerp(t_, x_.fraction, y_.fraction)), uncut);
   }
-  // Computes alpha_vjp, and adds the texels' gradients to those of their tile, unless null.
+  // Computes alpha_vjp, and adds the texels' gradients to `to`, unless null.
   void gradient(P& listed, P& gs, P& gu, P& gv, S* to) const {
     P of[] = {listed, gs, gu, gv};
     const P dm = alpha_vjp(patch_, t_, x_, y_, of[0], of[1], of[2], of[3]);

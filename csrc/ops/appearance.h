@@ -50,9 +50,9 @@ template <class S> struct ViewColorBackward {
   }
 };
 
-// Corrections of photographs, table [photographs, width] with Adam's state of them: steps on row `number` by the
-// gradient [width] of its correction, in which log gains are gains, and unless settle is 0, makes all rows admissible
-// as `train.exposure.settled`.
+// Takes an Adam step on row `number` of the photographs' corrections, table [photographs, width], by the gradient
+// [width] with respect to the correction (gains, not log gains). Unless settle is 0, makes all rows admissible as
+// `train.exposure.settled`.
 template <class S> struct LearnExposure {
   int64_t photographs, number;
   int width, settle;
@@ -70,7 +70,7 @@ template <class S> struct LearnExposure {
     r.numbers("limit", limit, "other_limit", other_limit);
   }
   BT_HD S limit_of(int column) const { return is_log_gain(width, column) ? limit : other_limit; }
-  // Steps on one entry of the row.
+  // Updates one entry of the row.
   BT_HD void move(int column) const {
     const int64_t at = number * width + column;
     const S value = gradient[column], chained = is_log_gain(width, column) ? value * S(exp(table[at])) : value;

@@ -1,4 +1,4 @@
-"""Run COLMAP in a process of its own: Ctrl-C ends it at once, and only it ends where COLMAP aborts."""
+"""Run COLMAP in its own process, which Ctrl-C ends at once and which alone ends if COLMAP aborts."""
 
 import json
 import os
@@ -18,12 +18,12 @@ from bitymi_ns.progress import Progress
 from bitymi_ns.trust import no_links, python_command
 
 LOG = "colmap.log"
-LITTLE_SPACE = 50_000_000  # bytes free below which the disk has stopped COLMAP
+LITTLE_SPACE = 50_000_000  # free bytes below which a failure counts as a full disk
 
 
 def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:
-    """Run a job, and return what the worker found; `source` is for messages. Raises CaptureError: there are no poses,
-    or COLMAP ended otherwise."""
+    """Run a job, and return the worker's result; `source` is for messages. Raises CaptureError: there are no poses, or
+    COLMAP ended without a result."""
     work = Path(job.work)
     watching = ExitStack()
     with open(work / LOG, "wb", opener=no_links) as log:

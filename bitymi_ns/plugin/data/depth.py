@@ -25,22 +25,22 @@ DepthKind = Literal["auto", "metric", "relative", "off"]
 FITTED = "fitted maps"  # metadata key of the views' `FittedMaps`
 SIDE = 320  # longest side of compared maps, pixels
 TOLERANCE = 0.05  # relative difference of depths of one surface
-FEW_PAIRS = 20  # least points in a photograph that tell scale and shift of its depth
-AGREES = 0.25  # least share of points that usable depth agrees with: many are hidden in pictures
+FEW_PAIRS = 20  # fewest points in a photograph to fit scale and shift of its depth
+AGREES = 0.25  # least share of agreeing points for usable depth; hidden points disagree
 AGREE_MUTUALLY = 0.45
-"""Least share of pixels that another photograph confirms, of those that it confirms or sees through, for usable depth.
-In the sample room 0.95; 0.57 with noise of 5 %; at most 0.39 in another unit, from 0.001 to 1,000 times."""
-BETTER = 0.15  # share of points by which scale and shift of each map have to fit better
+"""Least ratio, for usable depth, of pixels that another photograph confirms to those that it confirms or sees through.
+Sample room: 0.95; with noise of 5 % 0.57; with the unit wrong by a factor of 0.001 to 1,000 at most 0.39."""
+BETTER = 0.15  # least gain in agreeing points, as a share, for relative depth
 TRIALS = 200  # pairs of points for scale and shift
 SEEN_BY = 16  # photographs compared with a new point
-PIXELS_PER_POINT = 30  # of the training photographs per initial point
+PIXELS_PER_POINT = 30  # pixels of training photographs per initial point
 MOST_POINTS = 200_000  # initial points
 
 Floats = npt.NDArray[np.float64]
 
 
 class DepthFit(NamedTuple):
-    """Camera z in units of the scene from a map's values: scale value + shift, or its inverse."""
+    """Camera z in units of the scene from values v of a map: z, or 1 / z, is scale v + shift."""
 
     scale: float
     shift: float = 0.0
@@ -68,7 +68,7 @@ class FittedMaps(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """Map, camera and pose of a view: position, and rotation of OpenCV's camera axes to the world."""
+    """Depth map, lens and pose of a view: centre [3], rotation [3, 3] of OpenCV axes to world."""
 
     values: Values
     lens: Lens
@@ -87,9 +87,9 @@ class _Seen(NamedTuple):
 def with_depth(
     outputs: DataparserOutputs, kind: DepthKind = "auto", unit: float | None = None, add_points: bool = True
 ) -> DataparserOutputs:
-    """Fit depth maps of training views of limited size to the scene, set `FittedMaps` in the metadata if depth is used,
-    and add points from them, one for PIXELS_PER_POINT pixels. Raises InputError: a map cannot be read, or has another
-    shape than its photograph."""
+    """Fit depth maps of training views, downscaled to SIDE, to the scene; set `FittedMaps` in the metadata, and add
+    points from depth up to one per PIXELS_PER_POINT pixels. Raises InputError: a map cannot be read, or its shape is
+    not its photograph's."""
     maps: Sequence[MapFiles] = outputs.metadata.get(MAPS) or []
     if kind == "off" or not maps:
         return outputs
@@ -164,7 +164,7 @@ def _unproject(pixels: npt.NDArray[np.intp], view: _Seen) -> Floats:
 
 
 def _fits(seen: Sequence[_Seen], xyz: Floats, kind: DepthKind, unit: float) -> list[DepthFit | None] | None:
-    """Fit each map to points [N, 3], or take it as metric without any, `unit` units per metre; None = depth is
+    """Fit each map to points [N, 3]; with too few, take it as metric, `unit` units per metre. None = depth is
     unused."""
     if not any(each.values.any() for each in seen):
         warn("The depth maps have no valid pixel: depth is not used.")
@@ -223,7 +223,7 @@ def _pairs(view: _Seen, xyz: Floats) -> tuple[Floats, Floats]:
 
 
 def _mode(ratios: Floats) -> float:
-    """Find the most frequent ratio: hidden points are farther than what hides them."""
+    """Find the most frequent ratio: occluded points have larger ones."""
     logs = np.sort(np.log(ratios))
     width = np.searchsorted(logs, logs + 2 * TOLERANCE) - np.arange(len(logs))
     start = int(width.argmax())
@@ -262,7 +262,7 @@ def _affine(values: Floats, z: Floats, inverse: bool) -> tuple[DepthFit | None, 
 
 
 def _agreement(seen: Sequence[_Seen]) -> float | None:
-    """Compute the share of pixels that others see at the same depth, without those that they hide; None = too few."""
+    """Compute agreeing / (agreeing + seen through) votes of other views on sampled pixels; None = too few."""
     rng = np.random.default_rng(0)
     counts = np.zeros(3, np.int64)
     for i in spread(len(seen), SEEN_BY):
@@ -274,7 +274,7 @@ def _agreement(seen: Sequence[_Seen]) -> float | None:
 
 
 def _votes(xyz: Floats, own: int, seen: Sequence[_Seen]) -> npt.NDArray[np.int64]:
-    """Count [3, N] the other fitted views that agree with points [N, 3], see through them, and hide them."""
+    """Count other fitted views that agree with, see through and occlude points [N, 3]: [3, N]."""
     votes = np.zeros((3, len(xyz)), np.int64)
     others = [j for j in range(len(seen)) if j != own]
     for j in (others[k] for k in spread(len(others), SEEN_BY)):
@@ -287,8 +287,8 @@ def _votes(xyz: Floats, own: int, seen: Sequence[_Seen]) -> npt.NDArray[np.int64
 
 
 def _new_points(seen: Sequence[_Seen], files: Sequence[Path], count: int) -> tuple[Floats, npt.NDArray[np.uint8]]:
-    """Sample at most `count` points [N, 3] with colors [N, 3] evenly from the maps, weighted by one over the views that
-    show them; leave out points that more views see through than agree with."""
+    """Sample at most `count` points [N, 3] with colors [N, 3] from the maps, weighted by 1 / (number of views that show
+    a point); leave out points that more views see through than agree with."""
     if count < 1 or not seen:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     rng = np.random.default_rng(0)

@@ -1,6 +1,6 @@
 """`ns-export bitymi-atlas`: bake a trained scene into a bundle, and measure the loss.
 
-Also `python -m bitymi_ns.plugin.export.command`, should nerfstudio not take the command in.
+Also `python -m bitymi_ns.plugin.export.command`, if nerfstudio does not list the command.
 """
 
 from dataclasses import asdict, dataclass, fields, replace
@@ -35,16 +35,16 @@ _MUCH_SMALLER = 0.9
 class CompactOptions:
     """Size and quality of a compact bundle."""
 
-    interchange: bool = False  # Write surfels.ply into a compact bundle, too; those of other formats have it.
+    interchange: bool = False  # Write surfels.ply into a compact bundle, too; bundles of other formats have it.
     compact_error: float = Compact.share
-    """Share by which compacting may raise the mean square error against the training photographs before texels are
-    tuned, or less if texels were too coarse to learn; the bytes go to surfels, view colours or texels as they help."""
+    """Share by which compacting may raise the mean square error against the training photographs, before texels are
+    tuned; less if texels would become too coarse to learn. Surfels, view colours and texels share the bytes by gain."""
     target_mb: float | None = None
-    """Bytes of a compact bundle, in MB (10^6), instead of compact_error: everything becomes as coarse as it takes, or
-    less if fewer bytes show the photographs as well, to 0.01 dB."""
+    """Largest size of a compact bundle in MB (10^6 bytes), instead of compact_error; smaller if that shows the
+    photographs as well, to 0.01 dB."""
     target_psnr: float | None = None
-    """PSNR in dB against the training photographs before texels are tuned, instead of compact_error: everything becomes
-    as coarse as it may. Held-out views reach less."""
+    """PSNR in dB against the training photographs before texels are tuned, instead of compact_error: the smallest
+    bundle that reaches it. Held-out views reach less."""
 
     def check_compact(self, form: BundleFormat) -> None:
         """Stop at options out of range, or for another format."""
@@ -95,8 +95,8 @@ class ExportAtlas(BakeOptions, CompactOptions):
     the network, before tiles and view colours are reduced; 0 = surfels stay as trained. Not given: 0 if texels learned
     in training, and on a GPU, which lacks kernels for it; else 300, or 4 per photograph if more."""
     finetune_steps: int | None = None
-    """Steps of fine-tuning texels alone, after that; 0 = none. Not given: 400 if only a field has learned yet, 100
-    after a polish, both with 120 more on texels as stored; 100 on these if texels learned in training."""
+    """Steps of fine-tuning texels alone, after the polish; 0 = none. Not given: 400 without a polish, 100 after one,
+    each with 120 more on texels as stored; only 100 on stored texels if texels learned in training."""
     finetune_memory: float = TuneOptions.cache_bytes / 1e9
     """GB of memory for traced views in the fine-tuning; changes its time, not its result."""
     compare: bool = True  # Render the held-out views from bundle and trained scene, and state the difference.

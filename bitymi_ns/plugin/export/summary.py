@@ -16,12 +16,12 @@ from bitymi_ns.trust import printable
 
 
 def decibels(value: float | None) -> str:
-    """Format a PSNR; equal pictures, and those without pixels that count, have none."""
+    """Format a PSNR; None: equal pictures, or no pixel that counts."""
     return "no number" if value is None else f"{value:.2f} dB"
 
 
 def print_summary(folder: Path, info: Manifest) -> None:
-    """Print what was written, left out, and lost."""
+    """Print sizes, left-out surfels and errors."""
     statistics = info.statistics
     surfels = statistics.surfels
     table = Table("", "", title=escape(printable(f"Bundle {folder}")), show_header=False)
@@ -65,7 +65,7 @@ def print_summary(folder: Path, info: Manifest) -> None:
 
 
 def print_savings(table: Table, info: Manifest) -> None:
-    """Add rows for tiles, texels and bytes of rule and bundle, and the error of coding."""
+    """Add rows for tiles, texels, atlas bytes (by rule, in the bundle) and coding error."""
     statistics, options = info.statistics, info.statistics.options
     texels = statistics.texels
     kept, count = texels.kept, info.surfels.count

@@ -16,12 +16,12 @@ from bitymi_ns.ranges import first_problem
 from bitymi_ns.reading import read_json, reading
 
 MOST_PIXELS = 16_384  # along a side of a frame
-SLACK = 1e-3  # rounding of a stored rotation
+SLACK = 1e-3  # tolerance of R R^T = I
 HELP = "Record it in the viewer of the run or bundle, or write nerfstudio's format."
 
 
 def _pose(value: list[Any]) -> list[float]:
-    """Check 16 numbers of a matrix [4, 4] by rows: a rotation and a position."""
+    """Check a row-major camera-to-world matrix [4, 4]: rotation, position."""
     try:
         matrix = np.array(value, np.float64).reshape(4, 4)
     except (TypeError, ValueError, OverflowError):
@@ -52,7 +52,7 @@ class _Crop(BaseModel):
 
 
 class CameraPath(BaseModel):
-    """A camera path that can be rendered, without meaningless entries of nerfstudio's format."""
+    """Checked camera path in nerfstudio's format, without its unused entries."""
 
     render_width: _Side
     render_height: _Side
@@ -78,7 +78,7 @@ class CameraPath(BaseModel):
 
 
 def read_camera_path(file: Path) -> CameraPath:
-    """Read a camera path; warn of what is ignored or looks mistaken. Raises InputError: it cannot be rendered."""
+    """Read a camera path; warn if its fields of view look like radians. Raises InputError: not renderable."""
     with reading(f"the camera path {file}", fail, f"{HELP} (--camera-path-filename)"):
         found = read_json(file)
     if isinstance(found, dict) and (found.get("seconds") == 0 or found.get("camera_path") == []):

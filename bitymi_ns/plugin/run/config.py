@@ -71,8 +71,8 @@ class BitymiTrainerConfig(TrainerConfig):
             fail(f"a run is of one capture, and two are given: {named}. Leave out one of them.")
 
     def set_timestamp(self) -> None:
-        """Fix what depends on moment and machine, before nerfstudio writes config.yml. Start the processes of a run of
-        several, and end with them; those after the first take what the first has fixed."""
+        """Set timestamp, seeds, device and absolute paths before nerfstudio writes config.yml. Start a run's several
+        processes, and exit with them; all but the first copy the first one's settings."""
         if not torchrun.own().first:
             torchrun.join(self)
             return
@@ -95,7 +95,7 @@ class BitymiTrainerConfig(TrainerConfig):
             self.resolve_length()  # resumed runs take it from the checkpoint
 
     def _seed_by_machine(self) -> None:
-        """Seed all that has a seed of its own by --machine.seed, unless that or theirs is given."""
+        """Copy --machine.seed, if given, to the other seeds that are not given."""
         seed, pipeline = self.machine.seed, self.pipeline
         if seed != MachineConfig().seed:
             for owner, name in ((pipeline.datamanager, "train_cameras_sampling_seed"), (pipeline.model.train, "seed")):
@@ -123,7 +123,7 @@ class BitymiTrainerConfig(TrainerConfig):
         """Print nothing: nerfstudio prints every option before checks; `save_config` reports what matters."""
 
     def save_config(self) -> None:
-        """Check what can be checked before writing, write config.yml, the run's first file, and summarize the run."""
+        """Check capture and output folder, write config.yml, the run's first file, and print a summary."""
         if not torchrun.own().first:
             return
         check_capture(self.pipeline.datamanager, read=True)
@@ -149,7 +149,7 @@ class BitymiTrainerConfig(TrainerConfig):
         return "\n".join(f"{name:8} {value}" for name, value in lines.items())
 
     def resolve_length(self, trained_for: int | None = None) -> None:
-        """Fill in a length that was not given; a resumed run was `trained_for` steps."""
+        """Set run length and save interval if not given; `trained_for`: resumed length."""
         if self.max_num_iterations is None:
             default = self.default_iterations_cpu if self.machine.device_type == "cpu" else self.default_iterations
             self.max_num_iterations = trained_for or default
@@ -184,7 +184,7 @@ class BitymiTrainerConfig(TrainerConfig):
 
     @as_input_error()
     def _take_poses_of_resumed(self) -> None:
-        """Have a resumed run read the poses of its origin; a new one finds its own."""
+        """Make a resumed run use the resumed one's poses; a new run finds its own."""
         checkpoints_of = self.load_dir or (None if self.load_checkpoint is None else Path(self.load_checkpoint).parent)
         if checkpoints_of is not None:
             self.take_poses_of(Path(os.path.expanduser(checkpoints_of)).absolute().parent)
@@ -196,7 +196,7 @@ class BitymiTrainerConfig(TrainerConfig):
             self.pipeline.datamanager.dataparser.poses = None
 
     def take_poses_of(self, run: Path) -> None:
-        """Have the data read with poses that this run's folder keeps, if any."""
+        """Make the dataparser read poses kept in the folder `run`, if any."""
         dataparser = self.pipeline.datamanager.dataparser
         if isinstance(dataparser, BitymiDataParserConfig) and has_kept_poses(run / run_folder.POSES):
             dataparser.poses = run / run_folder.POSES
@@ -209,7 +209,7 @@ class BitymiTrainerConfig(TrainerConfig):
         return hooks.answer_checkpoint_dir(self, super().get_checkpoint_dir)
 
     def get_base_dir(self) -> Path:
-        """Return the folder of the run; of an evaluated one that of its config.yml, wherever it was moved."""
+        """Return the run's folder; in evaluation, the folder of its config.yml, which may have been moved."""
         return super().get_base_dir() if self.read_from is None else self.read_from
 
 

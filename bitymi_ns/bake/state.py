@@ -118,7 +118,7 @@ class BakeState:
         tiles = TexelTiles.of_sizes(self.sizes.clamp(min=1), self.extent.float())
         return TexelAlpha(tiles, self.texels[:, 3].contiguous(), self.scene.weight_bound)
 
-    def cut(self, colors: Tensor) -> Tensor:
+    def with_alpha(self, colors: Tensor) -> Tensor:
         """Append the alphas of the bake, if any, to residual colours [T, 3]: [T, C]."""
         return colors if self.alpha is None else joined(colors, self.alpha.values)
 
@@ -165,7 +165,9 @@ class BakeState:
 
     def with_texels(self, texels: Tensor) -> BakeState:
         """Replace the texels by [T, C], or by [T, 3] to keep the alphas; they are not encoded yet."""
-        texels = self.cut(texels.detach().float().cpu()) if texels.shape[-1] == 3 else texels.detach().float().cpu()
+        texels = (
+            self.with_alpha(texels.detach().float().cpu()) if texels.shape[-1] == 3 else texels.detach().float().cpu()
+        )
         if not self.textured or texels.shape != self.texels.shape:
             raise ValueError(f"texels of shape {tuple(texels.shape)} do not fit the bake")
         statistics = self.statistics.replace(atlas=None, certificate=None)

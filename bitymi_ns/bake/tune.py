@@ -83,7 +83,7 @@ class Pages:
     def again(self, texels: Tensor) -> Coded:
         """Encode later texels, see `Cosines.again`."""
         baked, packing = self._baked, self._baked.packing
-        atlas = encoded_texels(baked.cut(texels), packing, baked.options, value_range=self._range)
+        atlas = encoded_texels(baked.with_alpha(texels), packing, baked.options, value_range=self._range)
         constants = texels[first_texels(baked.sizes)]
         drawn = listed_texels(torch.from_numpy(atlas.decoded()[..., :3]), packing, constants)
         return Coded(texels.clone(), drawn, atlas)

@@ -20,7 +20,6 @@ from bitymi_ns.capture.types import fail, parsing, warn
 from bitymi_ns.trust import listed
 
 S, T = TypeVar("S"), TypeVar("T")
-MAX_PIXELS = 1_000_000_000  # most pixels of a photograph; phones take 200 million
 MAX_PIXELS = 1_000_000_000  # photographs with more pixels are refused; phones take some of 200 million
 THREADS = 4
 PROPORTIONS = 0.02  # relative difference of aspect ratios by rounding
@@ -30,7 +29,6 @@ EMPTY: dict[str, Callable[[npt.NDArray[np.uint8]], bool]] = {
     "of one color throughout": lambda image: bool((image == image[0, 0]).all()),
 }
 """Tests for blank photographs, by reason."""
-FINGERPRINT_SIZE = 64  # pixels across, and down, by which photographs are compared
 
 
 def set_up_pillow() -> None:

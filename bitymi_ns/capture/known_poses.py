@@ -64,7 +64,7 @@ def triangulate(
 
     def make(work: Path) -> None:
         process.run(_job(names, views, work), capture, progress or no_progress)
-        process.forget(work, "links", "masks")
+        process.delete_work(work, "links", "masks")
         replace_stale(work, folder, content_key(inputs, "contents"))
 
     return made_once(capture, key, "points", tell, make) / MODEL

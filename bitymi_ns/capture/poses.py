@@ -52,7 +52,7 @@ def find_poses(
     """
     options = options or SfmOptions()
     tell = progress or no_progress
-    source, folder, names = _what(Path(source))
+    source, folder, names = _photographs_in(Path(source))
     check_names(folder, names)
     masks = mask_folder(folder, source, options.masks) if options.use_masks and folder.is_dir() else None
     if masks is not None and source.is_dir():
@@ -73,7 +73,7 @@ def find_poses(
             return found
 
 
-def _what(source: Path) -> tuple[Path, Path, list[str]]:
+def _photographs_in(source: Path) -> tuple[Path, Path, list[str]]:
     """Return the source, its folder of photographs and their names; for a video no names."""
     if source.suffix.lower() in VIDEOS and source.is_file():
         return source, source, []
@@ -252,7 +252,7 @@ def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence
         write_frame(result, frame)
         write_report(result, values, model)
         write_file(result / "poses.json", json.dumps({"made": images == work / IMAGES, **kept}).encode())
-    process.forget(work, "links", "masks", MODEL)
+    process.delete_work(work, "links", "masks", MODEL)
     found = _finished(work, images)
     assert found is not None
     return found

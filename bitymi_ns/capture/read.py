@@ -19,7 +19,7 @@ from bitymi_ns.capture.pose_checks import fit_scale
 from bitymi_ns.capture.recognise import Format, Found, is_model, recognise
 from bitymi_ns.capture.scanner_views import scanner_photographs
 from bitymi_ns.capture.sfm_poses import KeptPoses, find_sfm_source, kept_source, read_kept_poses
-from bitymi_ns.capture.splits import NameLists, SplitOptions, choose_split, list_files
+from bitymi_ns.capture.splits import NameLists, SplitOptions, choose_split, read_split_lists
 from bitymi_ns.capture.transforms import Transforms, check_number, read_transforms
 from bitymi_ns.capture.types import FrameOptions, Orientation, Photograph, Pose, SfmSettings, fail, say, warn
 from bitymi_ns.trust import listed
@@ -224,7 +224,7 @@ class _Reader:
         if need_photos and self.want_points and options.points == "auto":
             own = self._colored(own, model.without_colors, photographs, source.folder)
             check_conventions(own, photographs, COLMAP_POSES, where, TO_Z_UP)
-        points, lists = self._points(own, photographs, where), list_files(found.folder)
+        points, lists = self._points(own, photographs, where), read_split_lists(found.folder)
         return Capture(
             found.format, where, photographs, points, options, lists, {}, source.downscale, TO_Z_UP,
             report=source.report, model=None if source.origin is None else source,

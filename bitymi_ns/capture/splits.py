@@ -49,7 +49,7 @@ class Split(NamedTuple):
         return f"Held out for evaluation: {len(self.held_out)} of {len(names)} photographs, {self.rule} ({shown})."
 
 
-def of_members(split: Split, groups: Sequence[int]) -> Split:
+def split_members(split: Split, groups: Sequence[int]) -> Split:
     """Put each member on the side of its group: views by photograph, photographs by rig frame."""
     sides = [set(side) for side in (split.train, split.held_out)]
     train, held_out = ([i for i, group in enumerate(groups) if group in side] for side in sides)
@@ -67,13 +67,13 @@ def choose_split(photographs: Sequence[Photograph], lists: NameLists, options: S
     if options.eval_names:
         split = by_names(names, options.eval_names, "--eval-names")
         held = {frames[i] for i in split.held_out}
-        return of_members(Split(sorted(set(frames) - held), sorted(held), split.rule), frames)
+        return split_members(Split(sorted(set(frames) - held), sorted(held), split.rule), frames)
     if lists:
         return by_lists(names, lists)
     of_first = [names[i] for i in groups]
     split = by_mode(of_first, options.eval_mode, options.eval_interval, options.train_split_fraction)
     sides = ([groups[i] for i in side] for side in (split.train, split.held_out))
-    return of_members(Split(*sides, split.rule), frames)
+    return split_members(Split(*sides, split.rule), frames)
 
 
 def by_mode(names: Sequence[Path], mode: Mode, interval: int, fraction: float) -> Split:
@@ -168,7 +168,7 @@ def read_names(names_or_file: Sequence[str]) -> tuple[str, ...]:
     return names
 
 
-def list_files(folder: Path) -> NameLists:
+def read_split_lists(folder: Path) -> NameLists:
     """Read train_list.txt, test_list.txt and validation_list.txt of nerfstudio's COLMAP parser."""
     lists = {}
     for split, name in (("train", "train"), ("val", "val"), ("val", "validation"), ("test", "test")):

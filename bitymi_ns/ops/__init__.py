@@ -4,7 +4,7 @@ Functions take float32 or float64 tensors and dispatch on device and dtype. `bak
 (`baked_cpu`) or a CUDA device (`baked_cuda`).
 """
 
-from .bands import Bands, band, by_bands, fitting_lists, refused
+from .bands import Bands, band, by_bands, fitting_lists, split_refused
 from .blend import blended_image, composite, soft_overdraw
 from .capacity import TooManyFragments
 from .coverage import add_texel_coverage, surfel_coverage
@@ -41,7 +41,7 @@ __all__ = [
     "masked_counts",
     "project",
     "rasterize_image",
-    "refused",
+    "split_refused",
     "select",
     "soft_overdraw",
     "ssim",

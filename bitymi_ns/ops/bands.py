@@ -97,7 +97,7 @@ def by_bands(waiting: list[tuple[int, int]], draw: Callable[[int, int], T]) -> I
         try:
             drawn = draw(top, bottom)
         except TooManyFragments as error:
-            parts = refused(top, bottom, error)
+            parts = split_refused(top, bottom, error)
             if len(parts) == 1:
                 raise
             waiting = parts + rest
@@ -107,7 +107,7 @@ def by_bands(waiting: list[tuple[int, int]], draw: Callable[[int, int], T]) -> I
         waiting = rest
 
 
-def refused(top: int, bottom: int, error: TooManyFragments) -> list[tuple[int, int]]:
+def split_refused(top: int, bottom: int, error: TooManyFragments) -> list[tuple[int, int]]:
     """Split refused rows into bands by their number of fragments, at least two."""
     return split(top, bottom, max(2, -(-error.count // max(1, error.most))))
 

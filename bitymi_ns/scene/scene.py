@@ -23,8 +23,8 @@ from bitymi_ns.ops import (
     can_rasterize,
     project,
     rasterize_image,
-    refused,
     soft_overdraw,
+    split_refused,
     trace,
     view_color,
 )
@@ -257,7 +257,7 @@ class Scene(nn.Module):
             return image, found[0]
 
         images, rows, count = [], [], 0
-        for top, bottom, (image, length) in by_bands(refused(0, height, error), draw_band):
+        for top, bottom, (image, length) in by_bands(split_refused(0, height, error), draw_band):
             images.append(image)
             rows.append((top, bottom))
             count += length

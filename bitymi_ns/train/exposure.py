@@ -4,27 +4,22 @@ A photograph maps the scene's colour c to gain c, with a gain per channel, or to
 relative to the mean photograph: after every step log gains and other entries are shifted to sum to zero over the
 photographs, so that they do not tint the scene. They are not part of the scene: a free camera shows the mean exposure;
 `Exposure.at` interpolates that of a held-out photograph.
-
-Gains are initialised from the colours of the sparse points. In logarithms, observation = point + photograph, solved by
-alternating medians (median polish), which are robust to highlights, occluders and wrong points. Points occluded by
-others in a photograph are ignored there.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from bitymi_ns.capture.order import Neighbours
 from bitymi_ns.ops.backend import dense, kernel
-from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.config import ExposureKind
+from bitymi_ns.train.gains import estimate_gains
 from bitymi_ns.train.processes import ALONE, Processes
-from bitymi_ns.train.views import OnDemand, View, as_float
+from bitymi_ns.train.views import OnDemand, View
 
 LIMIT = 2.0  # largest log gain: 7.4 times as bright, about 6 stops in gamma-encoded colours
 OTHER_LIMIT = 0.5  # largest other entry of an affine correction
@@ -35,17 +30,6 @@ PRIOR_POINTS = 20  # weight of the EXIF prior (mean exposure if unknown), in poi
 BETAS = (0.9, 0.99)  # Adam's betas: a photograph is used once per epoch, so averages must be short
 EPS = 1e-8  # Adam's epsilon
 ENCODING = 2.2  # gamma of encoded colours
-
-# comparison at the points
-POINTS = 6000  # maximum number of points compared
-HIDING = 100_000  # maximum number of points that may occlude them
-OBSERVATIONS = 1_200_000  # maximum of points times photographs
-SWEEPS = 10  # passes of the median polish
-DARKEST, BRIGHTEST = 0.03, 0.97  # range of channels used: beyond it noise, rounding and clipping dominate
-FEWEST_PHOTOGRAPHS = 3  # minimum number of photographs that show a point
-CELL = 2.0  # side of the cells of the occlusion test, in mean distances of the points in the image
-HIDDEN = 0.05  # an occluding point is nearer by this share of its depth, or of twice the view's depth range if less
-FEWEST_TESTED = 1000  # minimum number of observations to test gains on the other half of the points
 
 
 class Exposure:
@@ -90,7 +74,7 @@ class Exposure:
         """
         self.decided = True
         agreement = estimate_gains(points, views, near)
-        prior = self._pooled(seeds(self._exif, len(views)), torch.ones(len(views)))
+        prior = self._pooled(exif_gains(self._exif, len(views)), torch.ones(len(views)))
         if self.kind == "auto":
             if math.isnan(agreement.explained):
                 enabled = float(prior.std(0, correction=0).max()) > EXIF_SPREAD
@@ -327,7 +311,7 @@ def _diagonal(table: Tensor) -> slice:
     return slice(None) if table.shape[-1] == 3 else slice(0, None, 5)
 
 
-def seeds(stops: Sequence[float] | None, count: int) -> Tensor:
+def exif_gains(stops: Sequence[float] | None, count: int) -> Tensor:
     """Compute initial log gains [V, 3] from EXIF exposures, for gamma-encoded colours; 0 if unknown.
 
     Args:
@@ -339,99 +323,3 @@ def seeds(stops: Sequence[float] | None, count: int) -> Tensor:
     light = torch.tensor(stops, dtype=torch.float64) * math.log(2.0)
     light = torch.where(light.isfinite(), light, math.nan) / ENCODING
     return settled((light - light.nanmean()).nan_to_num(0.0).float()[:, None].expand(-1, 3))
-
-
-class ExposureGains(NamedTuple):
-    """Gains of the photographs, and how well they explain the colour differences."""
-
-    log_gains: Tensor  # [V, 3] float32 natural logarithm of each photograph's gain per channel; each channel has mean 0
-    points: Tensor  # [V] int64, number of points used for each photograph
-    # share by which gains reduce the median deviation of log colours from their point's median, measured on points not
-    # used for the gains; NaN: too few points, or no deviation
-    explained: float
-
-
-@torch.no_grad()
-def estimate_gains(points: Tensor, views: Sequence[View], near: float) -> ExposureGains:
-    """Estimate the photographs' gains from their colours at the points.
-
-    Args:
-        points: [M, 3] world positions.
-        views: V photographs at full size, each read once; masked and transparent pixels are ignored.
-        near: near plane, camera z.
-    """
-    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:HIDING]
-    points = points.detach()[order.to(points.device)]
-    count = min(len(points), POINTS, max(1, OBSERVATIONS // max(1, len(views))))
-    logs = torch.full((len(views), count, 3), math.nan)
-    for row, view in enumerate(views):
-        logs[row] = _log_colors(view, points, count, near).cpu()
-    logs = logs[:, logs.isfinite().all(-1).sum(0) >= FEWEST_PHOTOGRAPHS]
-    count = logs.isfinite().all(-1).sum(1)
-    half, other = logs[:, ::2], logs[:, 1::2]
-    explained = math.nan
-    if int(other.isfinite().sum()) >= FEWEST_TESTED and (before := _disagreement(other)) > 0.0:
-        explained = 1.0 - _disagreement(other - _log_gains(half)[:, None]) / before
-    return ExposureGains(_log_gains(logs), count, explained)
-
-
-def _log_colors(view: View, points: Tensor, count: int, near: float) -> Tensor:
-    """Read the log colours [count, 3] of a view at the first `count` points; NaN if occluded by any of the points,
-    masked, transparent or out of range."""
-    camera = view.camera.to(points.device)
-    x, y, z, inside = camera.project(points, near)
-    side = max(2.0, CELL * math.sqrt(camera.width * camera.height / max(1, int(inside.sum()))))
-    columns, rows = math.ceil(camera.width / side), math.ceil(camera.height / side)
-    cell = (y / side).long().clamp(0, rows - 1) * columns + (x / side).long().clamp(0, columns - 1)
-    nearest = torch.full((rows * columns,), math.inf, device=z.device)
-    nearest = nearest.scatter_reduce(0, cell[inside], z[inside], "amin").view(1, 1, rows, columns)
-    around = -max_pool2d(-nearest, 3, stride=1, padding=1).flatten()
-    depths = z[inside].sort().values if bool(inside.any()) else z.new_zeros(1)
-    spread = depths[int(0.99 * (len(depths) - 1))] - depths[int(0.01 * (len(depths) - 1))]
-    shown = inside & (z <= around[cell] + HIDDEN * torch.minimum(around[cell], 2.0 * spread))
-
-    color = as_float(_pixels(view.image, camera, x[:count], y[:count]))
-    shown = shown[:count].to(color.device)
-    if color.shape[-1] == 4:
-        shown = shown & (color[:, 3] > 0.99)
-    if view.mask is not None:
-        shown = shown & _pixels(view.mask, camera, x[:count], y[:count]).flatten().bool()
-    color = color[:, :3]
-    counts = shown[:, None] & (color > DARKEST) & (color < BRIGHTEST)
-    return torch.where(counts, color.log(), math.nan)
-
-
-def _pixels(image: Tensor, camera: Camera, x: Tensor, y: Tensor) -> Tensor:
-    """Read pixels [C, ...] of an image [H, W, ...] at positions in a camera's image, whose size may differ."""
-    at = (
-        (along.nan_to_num(0.0) * size / full).long().clamp(0, size - 1).to(image.device)
-        for along, size, full in zip((y, x), image.shape[:2], (camera.height, camera.width), strict=True)
-    )
-    return image[tuple(at)]
-
-
-def _log_gains(logs: Tensor) -> Tensor:
-    """Compute log gains [V, 3] by median polish, mean 0 per channel; 0 for photographs without points."""
-    gains = torch.zeros(len(logs), 3)
-    if logs.shape[1] == 0:
-        return gains
-    for _ in range(SWEEPS):
-        colors = _median(logs - gains[:, None], 0)
-        gains = _median(logs - colors, 1).nan_to_num(0.0)
-        gains -= gains.mean(0)
-    return gains
-
-
-def _disagreement(logs: Tensor) -> float:
-    """Compute the median deviation of the observations from their point's median."""
-    apart = (logs - _median(logs, 0)).abs()
-    return float(_median(apart[apart.isfinite()], 0))
-
-
-def _median(values: Tensor, dim: int) -> Tensor:
-    """Compute the median along a dimension without NaN, the mean of the middle two for even counts; NaN if empty.
-
-    torch's lower median would overestimate differences between photographs for even counts."""
-    if values.shape[dim] == 0:
-        return torch.full_like(values.sum(dim), math.nan)
-    return 0.5 * (values.nanmedian(dim).values - (-values).nanmedian(dim).values)

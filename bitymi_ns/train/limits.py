@@ -38,7 +38,7 @@ def short_run(schedule: Schedule, views: int, field: bool = True, at_once: int =
     return found
 
 
-def start(points: PointReport, config: TrainConfig, image_pixels: int, scene: SceneConfig) -> list[str]:
+def warnings_at_start(points: PointReport, config: TrainConfig, image_pixels: int, scene: SceneConfig) -> list[str]:
     """Describe the limits that the initial scene hits.
 
     Args:

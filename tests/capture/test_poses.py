@@ -15,7 +15,7 @@ from PIL import ExifTags, Image
 from bitymi_ns.capture.exif import Exif
 from bitymi_ns.capture.known_poses import KnownView, triangulate
 from bitymi_ns.capture.photos import Photo
-from bitymi_ns.capture.poses import _finished, _what, by_camera, camera_group, find_poses, make_job, ordered
+from bitymi_ns.capture.poses import _finished, _photographs_in, by_camera, camera_group, find_poses, make_job, ordered
 from bitymi_ns.capture.types import CaptureError, ColmapCamera, SfmOptions, SfmSettings
 from bitymi_ns.cli import main
 from bitymi_ns.sample.capture import RoomView, render
@@ -72,11 +72,11 @@ def test_a_capture_whose_photographs_lie_below_is_theirs(copied: Copy, tmp_path:
     """`ns-train` names the folder of the photographs."""
     (tmp_path / "cap").mkdir()
     copied("flat").rename(tmp_path / "cap/shots")
-    assert _what(tmp_path / "cap")[1:] == _what(tmp_path / "cap/shots")[1:]
+    assert _photographs_in(tmp_path / "cap")[1:] == _photographs_in(tmp_path / "cap/shots")[1:]
     mixed = copied("mixed")
     (mixed / "more").mkdir()
     (mixed / "photo_1.png").rename(mixed / "more/photo_1.png")
-    assert _what(mixed)[1] == mixed and "more/photo_1.png" in _what(mixed)[2]
+    assert _photographs_in(mixed)[1] == mixed and "more/photo_1.png" in _photographs_in(mixed)[2]
 
 
 @pytest.mark.parametrize(

@@ -21,14 +21,13 @@ from bitymi_ns.train.exposure import (
     LIMIT,
     OTHER_LIMIT,
     Exposure,
-    ExposureGains,
     corrected,
-    estimate_gains,
+    exif_gains,
     restored,
-    seeds,
     settled,
 )
 from bitymi_ns.train.fit import Trainer, fit
+from bitymi_ns.train.gains import ExposureGains, estimate_gains
 from bitymi_ns.train.score import multi_view_scores
 from bitymi_ns.train.views import View, shown
 from tests.train.test_step_sizes import fine
@@ -162,11 +161,11 @@ def test_a_photograph_that_is_not_shown_keeps_its_moments() -> None:
 def test_exif_is_where_the_corrections_start_from() -> None:
     stops = [exif_stops(1 / 60, 2.8, 100), exif_stops(1 / 30, 2.8, 100), exif_stops(1 / 60, 2.8, 400), math.nan]
     assert stops[1] - stops[0] == pytest.approx(1.0) and stops[2] - stops[0] == pytest.approx(2.0)
-    gains = seeds(stops, 4)
+    gains = exif_gains(stops, 4)
     torch.testing.assert_close(gains[1:3] - gains[0], math.log(2) / 2.2 * torch.tensor([[1.0], [2.0]]).expand(-1, 3))
     torch.testing.assert_close(gains.mean(0), torch.zeros(3), atol=1e-6, rtol=0)
-    assert not gains[3].any() and not seeds(None, 3).any() and not seeds([math.nan, math.inf], 2).any()
-    assert seeds([0.0, 1e6], 2).abs().max() <= LIMIT
+    assert not gains[3].any() and not exif_gains(None, 3).any() and not exif_gains([math.nan, math.inf], 2).any()
+    assert exif_gains([0.0, 1e6], 2).abs().max() <= LIMIT
     unseen = started("gain", torch.zeros(4, 3), stops, points=0)
     torch.testing.assert_close(unseen.log_gains, gains)
     well_seen = started("gain", torch.tensor([[0.1], [-0.1], [0.2], [-0.2]]).expand(-1, 3).clone(), stops)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.train.exposure import estimate_gains
+from bitymi_ns.train.gains import estimate_gains
 from bitymi_ns.train.views import View
 
 SIZE = 64

@@ -26,20 +26,20 @@ def test_a_table_smaller_than_the_photographs_could_fill_is_announced() -> None:
         (SceneConfig(log2_table_size=19), 0),
         (SceneConfig(texture="texels"), 0),
     ):
-        sentences = limits.start(PointReport(given=9), TrainConfig(), 10**12, config)
+        sentences = limits.warnings_at_start(PointReport(given=9), TrainConfig(), 10**12, config)
         assert [("log2-table-size" in s and "2^35" in s) for s in sentences] == [True] * number
-    assert limits.start(PointReport(given=100), TrainConfig(), 44 * 270 * 480, SceneConfig()) == []
+    assert limits.warnings_at_start(PointReport(given=100), TrainConfig(), 44 * 270 * 480, SceneConfig()) == []
 
 
 def test_points_that_do_not_fit_are_announced() -> None:
     config, points = TrainConfig(densify=DensifyConfig(max_surfels=10_000)), PointReport(given=12_000, over_cap=2_000)
     for first, option in ((None, "(--max-surfels)"), (20_000, "(--max-surfels)"), (9_000, "train.first-surfels)")):
         config.first_surfels = first
-        (sentence,) = limits.start(points, config, 0, SceneConfig())
+        (sentence,) = limits.warnings_at_start(points, config, 0, SceneConfig())
         assert f"from {min(10_000, first or 10_000):,} surfels: 2,000 of 12,000 points" in sentence
         assert option in sentence
     points = PointReport(given=0, random=20_000, over_cap=15_000)
-    (sentence,) = limits.start(points, TrainConfig(first_surfels=5_000), 1, SceneConfig())
+    (sentence,) = limits.warnings_at_start(points, TrainConfig(first_surfels=5_000), 1, SceneConfig())
     assert "from 5,000 surfels: 15,000 of 20,000 random points are left out" in sentence
 
 

@@ -89,7 +89,7 @@ def rows(database: Path, table: str) -> int:
         return 0
 
 
-def forget(work: Path, *folders: str) -> None:
+def delete_work(work: Path, *folders: str) -> None:
     """Remove features and matches, and these folders."""
     for name in (DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm", PAIRS):
         with suppress(OSError):
@@ -109,7 +109,7 @@ def _why_ended(work: Path, source: Path, code: int) -> str:
         advice = "Free some space, and start again: what is done is kept"
         return f"{work} cannot be written: the disk or the quota is full ({size_text(free)} free on the disk). {advice}"
     if "database disk image is malformed" in log:
-        forget(work)
+        delete_work(work)
         return f"what was kept of an earlier run in {work} was damaged and has been removed: start again"
     if code in (-9, 137):
         advice = "Start it again, it goes on where it stopped; a smaller max_image_size needs less"

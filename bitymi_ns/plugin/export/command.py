@@ -61,7 +61,7 @@ class CompactOptions:
         if not 0 < self.compact_error < 1:
             fail(f"--compact-error must lie between 0 and 1, not at {self.compact_error}")
 
-    def state_size(self, written: int) -> None:
+    def print_size(self, written: int) -> None:
         """Report a bundle much smaller than --target-mb."""
         if self.target_mb is not None and written < _MUCH_SMALLER * 1e6 * self.target_mb:
             more = "with more, the training photographs are shown no better by 0.01 dB."
@@ -200,7 +200,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
                 why = reason(error, self.output_dir)
                 warn(f"The bundle {self.output_dir} is complete, but does not state how well it shows them: {why}.")
         print_summary(self.output_dir, bundle.info)
-        self.state_size(download_bytes(self.output_dir, bundle.info))
+        self.print_size(download_bytes(self.output_dir, bundle.info))
         if self.extras:
             folder = extras_folder(self.output_dir)
             how = {"frame": self.extras_frame, "overwrite": self.overwrite}

@@ -225,7 +225,7 @@ def new_scene(
         background = find_background() if find_background and train.background_points else None
         bounded = metadata.get("has_alpha", False)
         scene, report = build_scene(xyz, rgb, centers, config, train, bounded, pixels, box, declared, background)
-    for sentence in limits.start(report, train, pixels, config):
+    for sentence in limits.warnings_at_start(report, train, pixels, config):
         say(sentence)
     if report.random:
         say(f"Surfels are made of {report.random:,} random points.")

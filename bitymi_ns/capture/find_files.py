@@ -5,10 +5,10 @@ import os
 import re
 import unicodedata
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
 from bitymi_ns.capture.pictures import PHOTOGRAPHS, passed_over, result_in
@@ -216,6 +216,44 @@ def find_maps(path: Path, frames: Sequence[dict[str, Any]], need_photos: bool) -
         if lacking and need_photos:
             warn(f"{path}: {len(lacking)} files of {key} are missing, and not used: {listed(lacking)}.")
     return [MapFiles(depth, normal=normal) for depth, normal in zip(*found.values(), strict=True)]
+
+
+def find_named(names: Sequence[Path], wanted: Sequence[str], source: str, any_folder: bool = False) -> list[int]:
+    """Find photographs by names that may differ in case, Unicode form, extension, and with `any_folder` leading
+    folders; see `splits.by_names`."""
+    forms: list[Callable[[str], tuple[str, ...]]] = [
+        lambda name: PurePath(name.replace("\\", "/")).parts,
+        folded,
+        lambda name: without_extension(folded(name) or ("",)),
+    ]
+    whole = [[form(str(name)) for name in names] for form in forms]
+    tables: list[dict[str, list[int]]] = [defaultdict(list) for _ in forms]
+    for table, keys in zip(tables, whole, strict=True):
+        for i, key in enumerate(keys):
+            table[key[-1]].append(i)
+
+    def fit(name: str) -> list[int]:
+        for form, table, keys in zip(forms, tables, whole, strict=True):
+            parts = form(name)
+            for start in range(len(parts) if any_folder else min(1, len(parts))):
+                tail = parts[start:]
+                fitting = [i for i in table.get(tail[-1], []) if keys[i][-len(tail) :] == tail]
+                if fitting:
+                    return fitting
+        return []
+
+    unknown, found = [], []
+    for name in wanted:
+        fitting = fit(name)
+        if len(fitting) > 1:
+            several = f"{len(fitting)} photographs, {listed([names[i] for i in fitting])}"
+            fail(f"{source}: {name} is the name of {several}. Give its folder, too.")
+        found += fitting
+        unknown += [] if fitting else [name]
+    if unknown:
+        which = f"{listed(unknown)}. Its photographs are {listed([name.name for name in names])}."
+        fail(f"{source}: {len(unknown)} of {len(wanted)} names are of no photograph of the capture: {which}")
+    return found
 
 
 def downscaled(photographs: list[Photograph], folder: Path, downscale: int) -> list[Photograph]:

@@ -130,7 +130,8 @@ def read_kept_poses(folder: Path) -> KeptPoses | None:
 
 
 def kept_settings(folder: Path, requested: SfmSettings) -> SfmSettings:
-    """Return the settings of kept poses; warn of requested ones, other than defaults, that are not used."""
+    """Return the settings with which structure from motion found the kept poses; warn of requested ones, other than
+    defaults, that are not used."""
     kept = read_kept_poses(folder)
     settings = None if kept is None else kept.origin.settings
     unused = []

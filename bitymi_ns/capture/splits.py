@@ -2,15 +2,14 @@
 
 import math
 import os
-from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-from bitymi_ns.capture.find_files import folded, without_extension
+from bitymi_ns.capture.find_files import find_named
 from bitymi_ns.capture.types import Photograph, fail, parsing
 from bitymi_ns.reading import read_text
 from bitymi_ns.trust import listed
@@ -101,7 +100,7 @@ def by_mode(names: Sequence[Path], mode: Mode, interval: int, fraction: float) -
 def by_names(names: Sequence[Path], wanted: Sequence[str], source: str) -> Split:
     """Hold out photographs by name, with folders in front if needed. Raises CaptureError: a name matches no photograph,
     or several."""
-    held_out = set(find(names, wanted, source))
+    held_out = set(find_named(names, wanted, source))
     return Split([i for i in range(len(names)) if i not in held_out], sorted(held_out), f"by {source}")
 
 
@@ -110,49 +109,11 @@ def by_lists(names: Sequence[Path], lists: NameLists) -> Split:
     source = "the capture's own lists"
 
     def indices(split: str) -> set[int]:  # downscaled photographs are in another folder than the lists state
-        return set(find(names, lists.get(split, []), source, any_folder=True))
+        return set(find_named(names, lists.get(split, []), source, any_folder=True))
 
     held_out = indices("val") | indices("test")
     train = indices("train") if "train" in lists else set(range(len(names))) - held_out
     return Split(sorted(train), sorted(held_out), f"by {source}")
-
-
-def find(names: Sequence[Path], wanted: Sequence[str], source: str, any_folder: bool = False) -> list[int]:
-    """Find photographs by names that may differ in case, Unicode form, extension, and with `any_folder` leading
-    folders; see `by_names`."""
-    forms: list[Callable[[str], tuple[str, ...]]] = [
-        lambda name: PurePath(name.replace("\\", "/")).parts,
-        folded,
-        lambda name: without_extension(folded(name) or ("",)),
-    ]
-    whole = [[form(str(name)) for name in names] for form in forms]
-    tables: list[dict[str, list[int]]] = [defaultdict(list) for _ in forms]
-    for table, keys in zip(tables, whole, strict=True):
-        for i, key in enumerate(keys):
-            table[key[-1]].append(i)
-
-    def fit(name: str) -> list[int]:
-        for form, table, keys in zip(forms, tables, whole, strict=True):
-            parts = form(name)
-            for start in range(len(parts) if any_folder else min(1, len(parts))):
-                tail = parts[start:]
-                fitting = [i for i in table.get(tail[-1], []) if keys[i][-len(tail) :] == tail]
-                if fitting:
-                    return fitting
-        return []
-
-    unknown, found = [], []
-    for name in wanted:
-        fitting = fit(name)
-        if len(fitting) > 1:
-            several = f"{len(fitting)} photographs, {listed([names[i] for i in fitting])}"
-            fail(f"{source}: {name} is the name of {several}. Give its folder, too.")
-        found += fitting
-        unknown += [] if fitting else [name]
-    if unknown:
-        which = f"{listed(unknown)}. Its photographs are {listed([name.name for name in names])}."
-        fail(f"{source}: {len(unknown)} of {len(wanted)} names are of no photograph of the capture: {which}")
-    return found
 
 
 def read_names(names_or_file: Sequence[str]) -> tuple[str, ...]:

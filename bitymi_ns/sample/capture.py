@@ -16,7 +16,7 @@ from bitymi_ns.files import complete_folder
 from bitymi_ns.ply import write_cloud
 from bitymi_ns.progress import no_progress, rich_progress
 from bitymi_ns.reading import read_json
-from bitymi_ns.sample.room import RayHits, Room
+from bitymi_ns.sample.room import Room, RoomHits
 from bitymi_ns.trust import check_replaceable
 
 FOCAL = 0.80  # focal length in image widths
@@ -85,7 +85,7 @@ def render(room: Room, view: RoomView, supersample: int = 3) -> NDArray[np.uint8
     return (color * 255 + 0.5).astype(np.uint8)
 
 
-def first_hits(room: Room, view: RoomView, pixels: NDArray[np.int64]) -> tuple[NDArray[np.float32], RayHits]:
+def first_hits(room: Room, view: RoomView, pixels: NDArray[np.int64]) -> tuple[NDArray[np.float32], RoomHits]:
     """Trace the centres of pixels, flat indices [n]: world points [n, 3], and the hits."""
     origin, directions = view.rays()
     flat = directions.reshape(-1, 3)[pixels]

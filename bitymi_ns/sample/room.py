@@ -56,7 +56,7 @@ def _bars() -> tuple[np.ndarray, np.ndarray]:
 
 
 @dataclass
-class RayHits:
+class RoomHits:
     """First hits of n rays."""
 
     t: Image  # [n] distance in direction lengths
@@ -160,11 +160,11 @@ class Room:
     def _blocked(self, o: Vec, d: Vec) -> np.ndarray:
         """Test for an occluder between o and o + d; [n] bool."""
         t = np.full(d[0].shape, 1.0, np.float32)
-        hits = RayHits(t, np.zeros(t.shape, np.int8), np.zeros(t.shape, np.int8))
+        hits = RoomHits(t, np.zeros(t.shape, np.int8), np.zeros(t.shape, np.int8))
         self._objects(o, d, hits)
         return hits.t < np.float32(0.999)
 
-    def _objects(self, o: Vec, d: Vec, hits: RayHits) -> None:
+    def _objects(self, o: Vec, d: Vec, hits: RoomHits) -> None:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             inverse = tuple(np.float32(1) / a for a in d)
             self._hit_sphere(o, d, inverse, hits, SPHERE_CENTRE, SPHERE_RADIUS, SPHERE)
@@ -177,14 +177,14 @@ class Room:
                 self._hit_boxes(o, inverse, hits, BARS, self.bars_low[first:last], self.bars_high[first:last], first)
 
     def _hit_sphere(
-        self, o: Vec, d: Vec, inverse: Vec, hits: RayHits, centre: np.ndarray, radius: np.float32, surface: int
+        self, o: Vec, d: Vec, inverse: Vec, hits: RoomHits, centre: np.ndarray, radius: np.float32, surface: int
     ) -> None:
         index = hits.candidates(o, inverse, centre - radius, centre + radius)
         o, d = _take(o, index), _take(d, index)
         oc = tuple(o[a] - centre[a] for a in range(3))
         hits.shorten(index, *_entry(_dot(d, d), _dot(oc, d), _dot(oc, oc) - radius * radius), surface)
 
-    def _hit_box(self, o: Vec, d: Vec, inverse: Vec, hits: RayHits) -> None:
+    def _hit_box(self, o: Vec, d: Vec, inverse: Vec, hits: RoomHits) -> None:
         reach = np.float32([np.hypot(BOX_HALF[0], BOX_HALF[1])] * 2 + [BOX_HALF[2]])
         index = hits.candidates(o, inverse, BOX_CENTRE - reach, BOX_CENTRE + reach)
         o, d = _to_box(_take(o, index), True), _to_box(_take(d, index), False)
@@ -192,7 +192,7 @@ class Room:
         hits.shorten(index, near, near < far, BOX)
 
     def _hit_pole(
-        self, o: Vec, d: Vec, inverse: Vec, hits: RayHits, part: int, x: float, y: float, radius: float, height: float
+        self, o: Vec, d: Vec, inverse: Vec, hits: RoomHits, part: int, x: float, y: float, radius: float, height: float
     ) -> None:
         low, high = np.float32([x - radius, y - radius, 0]), np.float32([x + radius, y + radius, height])
         index = hits.candidates(o, inverse, low, high)
@@ -205,7 +205,7 @@ class Room:
         hits.shorten(index, t, meets & (z > 0) & (z < height), POLE, part)
 
     def _hit_boxes(
-        self, o: Vec, inverse: Vec, hits: RayHits, surface: int, lows: np.ndarray, highs: np.ndarray, first: int = 0
+        self, o: Vec, inverse: Vec, hits: RoomHits, surface: int, lows: np.ndarray, highs: np.ndarray, first: int = 0
     ) -> None:
         """Hit axis-aligned boxes, corners [m, 3], which are parts `first`, `first` + 1, ... of a surface."""
         index = hits.candidates(o, inverse, lows.min(axis=0), highs.max(axis=0))
@@ -214,7 +214,7 @@ class Room:
             near, far = _slab(o, inverse, lows[k], highs[k])
             hits.shorten(index, near, near < far, surface, first + k)
 
-    def hit(self, o: Vec, d: Vec) -> RayHits:
+    def hit(self, o: Vec, d: Vec) -> RoomHits:
         """Compute the first hits of rays that start inside the room."""
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             exits = []
@@ -227,7 +227,7 @@ class Room:
             np.where(d[0] > 0, 1, 0),
             np.where(t == exits[1], np.where(d[1] > 0, 3, 2), np.where(d[2] > 0, 5, 4)),
         ).astype(np.int8)
-        hits = RayHits(t, surface, np.zeros(t.shape, np.int8))
+        hits = RoomHits(t, surface, np.zeros(t.shape, np.int8))
         index = np.flatnonzero(surface == 3)
         if len(index):
             oo, dd = _take(o, index), _take(d, index)
@@ -239,7 +239,7 @@ class Room:
         self._objects(o, d, hits)
         return hits
 
-    def color(self, o: Vec, d: Vec, hits: RayHits, mirrors: bool = True) -> Image:
+    def color(self, o: Vec, d: Vec, hits: RoomHits, mirrors: bool = True) -> Image:
         """Compute colors [n, 3] of rays with unit directions; `mirrors`: trace one reflection on glossy surfaces."""
         result = np.zeros((hits.t.shape[0], 3), np.float32)
         for surface in np.unique(hits.surface):

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from bitymi_ns.capture import splits
+from bitymi_ns.capture.find_files import find_named
 from tests.captures import refused
 
 NAMES = [Path(f"/c/images/{n:02}.jpg") for n in range(20)]
@@ -52,13 +53,13 @@ def test_names_from_a_file(tmp_path: Path) -> None:
 
 
 def test_names_in_another_case_or_with_another_ending() -> None:
-    assert splits.find(TWINS, ["RIGHT/A.JPG", "b c.png", "a\u0308", "Left\\a"], "the lists") == [2, 1, 3, 0]
+    assert find_named(TWINS, ["RIGHT/A.JPG", "b c.png", "a\u0308", "Left\\a"], "the lists") == [2, 1, 3, 0]
     with refused("a.png is the name of 2 photographs"):
-        splits.find(TWINS, ["a.png"], "the lists")
+        find_named(TWINS, ["a.png"], "the lists")
 
 
 def test_names_of_another_machine() -> None:
     names = ["D:\\scan\\left\\a.jpg", "/home/me/scan/right/a.jpg", "b c.jpg"]
-    assert splits.find(TWINS, names, "the lists", any_folder=True) == [0, 2, 1]
+    assert find_named(TWINS, names, "the lists", any_folder=True) == [0, 2, 1]
     with refused("2 of 3 names are of no photograph"):  # user-given names match exactly
-        splits.find(TWINS, names, "--eval-names")
+        find_named(TWINS, names, "--eval-names")

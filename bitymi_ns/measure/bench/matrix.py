@@ -32,7 +32,7 @@ class SceneSpec:
 
 @dataclass(frozen=True)
 class MethodSpec:
-    """A method with further options of ns-train."""
+    """A method of the bench: its nerfstudio method with further options of ns-train."""
 
     name: str
     method: str

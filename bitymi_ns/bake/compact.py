@@ -38,9 +38,6 @@ LEAST_ERROR = 1e-7  # mean square error that is always allowed, of colours from 
 MANIFEST_BYTES = 28_000  # upper estimate of bundle.json and config.yml
 COARSER, FINER = 12.0, 1.0 / 32
 """Factors of lambda that give about half and twice the bytes (bonsai, 45,000 surfels: 0.52 and 1.98)."""
-NOISE_VIEWS = 3
-"""Training views drawn to measure the error of each column. The steps are within 18 % of those by 24 views (8 views: 16
-%), where bytes at equal error hardly depend on them."""
 _SEARCH = 7
 _CPU = torch.device("cpu")
 
@@ -131,8 +128,7 @@ class Coder:
         self.error, self.psnr = self._pictures.square(drawn), self._pictures.psnr(drawn)
         self._numbers = self._pictures.numbers / max(1, self._pictures.views) * len(views)
         reduced = replace(scene, surfels={**scene.surfels, **self._view_colors(START)})
-        few = Pictures(views, background, min(NOISE_VIEWS, options.views), device)
-        self._noise = column_noise(reduced, self._sizes, few, progress)
+        self._noise = column_noise(reduced, self._sizes, self._pictures, progress)
         self._tiles = self._texels = self._coverage = self._alphas = None
         if baked.textured:
             texels = TexelList(baked, device)

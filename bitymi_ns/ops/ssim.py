@@ -6,24 +6,18 @@ from torch import Tensor
 from .backend import cuda_backend, dense, kernel, workspace
 
 
-def similarity(a: Tensor, b: Tensor, gradient: bool) -> tuple[Tensor, Tensor | None]:
-    """Compute `ssim` without a graph and, if asked for, its gradient with respect to a, [H, W, C]."""
-    height, width, channels = a.shape
-    x, y = dense(a, a), dense(b, a)
-    grad = torch.empty_like(x) if gradient else None
-    value = x.new_empty(())  # the host does not wait for it
-    size = {"height": height, "width": width, "channels": channels}
-    work = {}
-    if cuda_backend(x.device):
-        work["workspace"] = workspace("ssim", x, **size, gradient=gradient)
-    kernel("ssim", x)(a=x, b=y, **size, value=value, da=grad, **work)
-    return value, grad
-
-
 class _Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx, a, b):
-        value, ctx.grad = similarity(a, b, ctx.needs_input_grad[0])
+        height, width, channels = a.shape
+        x, y = dense(a, a), dense(b, a)
+        ctx.grad = torch.empty_like(x) if ctx.needs_input_grad[0] else None
+        value = x.new_empty(())  # the host does not wait for it
+        size = {"height": height, "width": width, "channels": channels}
+        work = {}
+        if cuda_backend(x.device):
+            work["workspace"] = workspace("ssim", x, **size, gradient=ctx.grad is not None)
+        kernel("ssim", x)(a=x, b=y, **size, value=value, da=ctx.grad, **work)
         return value
 
     @staticmethod

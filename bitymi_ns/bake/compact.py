@@ -180,9 +180,8 @@ class Coder:
             rounded = replace(rounded, alpha_codes=coded)
         shown = rounded
         if coded is not None:
-            shown = replace(rounded, texels=rounded.with_alpha(coded.texels_of(coder.blocks))).with_constants(
-                coded.constants
-            )
+            decoded = rounded.with_alpha(coded.texels_of(coder.blocks))
+            shown = replace(rounded, texels=decoded).with_constants(coded.constants)
         drawn = self._pictures.of(shown.unquantised())
         return RatePoint(lmbda, rounded, coding, coded, self._pictures.square(drawn), self._pictures.psnr(drawn))
 

@@ -165,9 +165,9 @@ class BakeState:
 
     def with_texels(self, texels: Tensor) -> BakeState:
         """Replace the texels by [T, C], or by [T, 3] to keep the alphas; they are not encoded yet."""
-        texels = (
-            self.with_alpha(texels.detach().float().cpu()) if texels.shape[-1] == 3 else texels.detach().float().cpu()
-        )
+        texels = texels.detach().float().cpu()
+        if texels.shape[-1] == 3:
+            texels = self.with_alpha(texels)
         if not self.textured or texels.shape != self.texels.shape:
             raise ValueError(f"texels of shape {tuple(texels.shape)} do not fit the bake")
         statistics = self.statistics.replace(atlas=None, certificate=None)

@@ -16,7 +16,7 @@ from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bundle import Bundle, check_target, read_bundle
 from bitymi_ns.bundle.cameras import CapturedCamera, cameras_data
 from bitymi_ns.bundle.parts import CAMERAS
-from bitymi_ns.capture.images import in_threads, pixels_of, read_image
+from bitymi_ns.capture.image_files import in_threads, pixels_of, read_image
 from bitymi_ns.capture.lens import Lens, make_lenses
 from bitymi_ns.capture.masks import checked_mask
 from bitymi_ns.capture.points import Points

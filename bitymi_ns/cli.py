@@ -58,8 +58,8 @@ class Sfm:
     options: tyro.conf.OmitArgPrefixes[SfmOptions] = SfmOptions()
 
     def run(self) -> None:
+        from bitymi_ns.capture.folder_contents import passed_over
         from bitymi_ns.capture.nerfstudio import write_capture
-        from bitymi_ns.capture.pictures import passed_over
         from bitymi_ns.capture.poses import find_poses
         from bitymi_ns.progress import rich_progress
 

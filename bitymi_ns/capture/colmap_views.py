@@ -12,8 +12,8 @@ import pycolmap
 
 from bitymi_ns.capture.colmap_model import Model, ModelImage, read_model
 from bitymi_ns.capture.find_files import FileFinder, renamed_message
+from bitymi_ns.capture.folder_contents import is_photograph, photographs_below, result_in
 from bitymi_ns.capture.masks import LEAVE_OUT, USUAL_FOLDERS, downscaled_masks, mask_folder, masks_named
-from bitymi_ns.capture.pictures import is_photograph, photographs_below, result_in
 from bitymi_ns.capture.points import Points
 from bitymi_ns.capture.recognise import Found
 from bitymi_ns.capture.types import OPENCV_AXES, CaptureError, Photograph, Pose, SfmSettings, fail, say, warn

@@ -11,13 +11,13 @@ import numpy as np
 
 from bitymi_ns.capture.cache import content_key, made_once, replace_stale
 from bitymi_ns.capture.colmap_model import read_model
-from bitymi_ns.capture.images import eight_bits, image_size, in_srgb
-from bitymi_ns.capture.photos import check_names, is_plain
-from bitymi_ns.capture.pictures import open_picture
+from bitymi_ns.capture.folder_contents import open_picture
+from bitymi_ns.capture.image_files import eight_bits, image_size, in_srgb
 from bitymi_ns.capture.points import Points
 from bitymi_ns.capture.prepare import colmap_mask, emptied
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
+from bitymi_ns.capture.sfm_photos import check_names, is_plain
 from bitymi_ns.capture.types import OPENCV_AXES, CaptureError, ColmapCamera, Photograph, say, warn
 from bitymi_ns.files import Tell
 from bitymi_ns.progress import Progress, no_progress, rich_progress

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from bitymi_ns.capture.images import image_size, in_proportion, in_threads, wrong_size
+from bitymi_ns.capture.image_files import image_size, in_proportion, in_threads, wrong_size
 from bitymi_ns.capture.types import ColmapCamera, Photograph, fail, is_full_sphere, say, warn
 
 MAX_VIEW_ANGLE = 110.0  # degrees, across and down; a wider pinhole picture wastes pixels: it becomes faces of a cube

@@ -14,10 +14,10 @@ import numpy as np
 import numpy.typing as npt
 from PIL import TiffImagePlugin
 
-from bitymi_ns.capture.images import wrong_size
+from bitymi_ns.capture.folder_contents import open_picture
+from bitymi_ns.capture.image_files import wrong_size
 from bitymi_ns.capture.lens import Lens
 from bitymi_ns.capture.masks import in_proportion
-from bitymi_ns.capture.pictures import open_picture
 from bitymi_ns.capture.types import MAP_FILES, MapFiles, fail, parsing, warn
 from bitymi_ns.ranges import spread
 from bitymi_ns.reading import open_regular

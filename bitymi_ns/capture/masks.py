@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from bitymi_ns.capture.images import has_transparency, image_size, in_proportion, in_threads, wrong_size
-from bitymi_ns.capture.photos import COPY
-from bitymi_ns.capture.pictures import DYNAMIC_MASK, PHOTOGRAPHS, open_picture
+from bitymi_ns.capture.folder_contents import DYNAMIC_MASK, PHOTOGRAPHS, open_picture
+from bitymi_ns.capture.image_files import has_transparency, image_size, in_proportion, in_threads, wrong_size
+from bitymi_ns.capture.sfm_photos import COPY
 from bitymi_ns.capture.types import Photograph, fail, parsing, say
 from bitymi_ns.trust import listed
 

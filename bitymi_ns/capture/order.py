@@ -1,13 +1,17 @@
-"""Find the neighbours of photographs by file name."""
+"""Order photographs by file name and find their neighbours."""
 
+import re
 from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
-from bitymi_ns.capture.photos import natural
-
 Position = tuple[int, ...]
+
+
+def natural(name: str) -> list[tuple[int, int, str]]:
+    """Make a sort key with numbers by value: frame_2 before frame_10."""
+    return [(1, int(part), "") if part.isdecimal() else (0, 0, part.lower()) for part in re.split(r"(\d+)", name)]
 
 
 class Neighbours:

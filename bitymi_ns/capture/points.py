@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from bitymi_ns.capture.images import read_image
+from bitymi_ns.capture.image_files import read_image
 from bitymi_ns.capture.types import OPENCV_AXES, Photograph, Pose, fail, say, warn
 from bitymi_ns.ply import PlyError, read_header, read_rows, rows_there, text_lines
 from bitymi_ns.ranges import spread

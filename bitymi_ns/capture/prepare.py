@@ -7,9 +7,9 @@ from pathlib import Path
 
 from PIL import Image
 
-from bitymi_ns.capture.images import in_proportion
+from bitymi_ns.capture.image_files import in_proportion
 from bitymi_ns.capture.masks import checked_mask, mask_of
-from bitymi_ns.capture.photos import COPY, Photo, upright
+from bitymi_ns.capture.sfm_photos import COPY, Photo, upright
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import complete_folder
 from bitymi_ns.progress import Progress

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from bitymi_ns.capture import pictures
+from bitymi_ns.capture import folder_contents
 from bitymi_ns.capture.types import fail
 from bitymi_ns.reading import MOST_TEXT, open_regular, open_text, read_json
 from bitymi_ns.trust import listed
@@ -71,7 +71,7 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
         if format not in ("auto", "colmap"):
             fail(f"--colmap-path is for COLMAP models: leave out --format {format}, or the path.")
         return _colmap_given(data, colmap_path)
-    if why := pictures.refusal(data):
+    if why := folder_contents.refusal(data):
         fail(why)
     folder = data if data.is_dir() else data.parent
     candidates = list(_in_folder(data) if data.is_dir() else _of_file(data))
@@ -90,17 +90,17 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
     others = [each for each in candidates if each[1] != path and (each[0] != "photographs" or chosen == "video")]
     if chosen == "stray-scanner":
         others = [each for each in others if each[1].name != STRAY[2]]
-    poses = tuple(pictures.poses_in(folder)) if chosen in ("photographs", "video") else ()
+    poses = tuple(folder_contents.poses_in(folder)) if chosen in ("photographs", "video") else ()
     return Found(chosen, path, path if chosen == "blender" else folder, tuple(others), poses)
 
 
 def _capture_within(folder: Path, format: Format | Literal["auto"]) -> Path | None:
     """Find the only subfolder that is a capture with poses, as archives unpack to; None = none, several, or photographs
     beside it."""
-    if pictures.has_photographs(folder):
+    if folder_contents.has_photographs(folder):
         return None
     found = []
-    for path in sorted(path for path in folder.iterdir() if path.is_dir() and not pictures.no_photographs(path)):
+    for path in sorted(path for path in folder.iterdir() if path.is_dir() and not folder_contents.no_photographs(path)):
         candidates = [*_transforms_in(path), *_scanned(path)]
         if any(format in ("auto", each) for each, _ in candidates):
             found.append(path)
@@ -113,7 +113,7 @@ def _of_file(file: Path) -> Iterator[tuple[Format, Path]]:
         yield "blender", file.parent
     elif suffix == ".json":
         yield _kind_of(file), file
-    elif suffix in pictures.VIDEOS:
+    elif suffix in folder_contents.VIDEOS:
         yield "video", file
     elif file.stem in ("cameras", "images", "points3D") and is_model(file.parent):
         yield "colmap", file.parent
@@ -128,7 +128,7 @@ def _in_folder(folder: Path) -> Iterator[tuple[Format, Path]]:
     photographs = _photographs_in(folder)
     if photographs is not None:
         yield "photographs", photographs
-    yield from (("video", video) for video in pictures.videos_in(folder))
+    yield from (("video", video) for video in folder_contents.videos_in(folder))
 
 
 def _transforms_in(folder: Path) -> Iterator[tuple[Format, Path]]:
@@ -141,7 +141,7 @@ def _transforms_in(folder: Path) -> Iterator[tuple[Format, Path]]:
         yield "blender", folder
     elif not there:
         for path in sorted(folder.glob("*.json")):
-            if path.name not in SPLITS and pictures.holds(path, b'"transform_matrix"', MOST_TEXT):
+            if path.name not in SPLITS and folder_contents.holds(path, b'"transform_matrix"', MOST_TEXT):
                 yield _kind_of(path), path
 
 
@@ -151,11 +151,11 @@ def _scanned(folder: Path) -> Iterator[tuple[Format, Path]]:
     if any((keyframes / i).is_dir() and any((keyframes / c).glob("*.json")) for i, c in POLYCAM):
         yield "polycam", folder
     for name in ("metadata", "metadata.json"):
-        if pictures.holds(folder / name, b'"poses"', MOST_TEXT):
+        if folder_contents.holds(folder / name, b'"poses"', MOST_TEXT):
             yield "record3d", folder
             break
     first = min(folder.glob("frame_*.json"), default=None)
-    if first is not None and pictures.holds(first, b'"cameraPoseARFrame"', MOST_TEXT):
+    if first is not None and folder_contents.holds(first, b'"cameraPoseARFrame"', MOST_TEXT):
         yield "3d-scanner", folder
     if all((folder / name).is_file() for name in STRAY):
         yield "stray-scanner", folder
@@ -217,9 +217,9 @@ def image_count(model: Path) -> int:
 def _photographs_in(folder: Path) -> Path | None:
     """Choose the folder to search for photographs: this one if it or its `images` holds some, or several
     subfolders do; else the only subfolder that does. None = no photographs, or captures of their own."""
-    if pictures.has_photographs(folder) or pictures.has_photographs(folder / "images", below=True):
+    if folder_contents.has_photographs(folder) or folder_contents.has_photographs(folder / "images", below=True):
         return folder
-    holding = [path for path in pictures.folders_in(folder) if pictures.has_photographs(path, below=True)]
+    holding = [path for path in folder_contents.folders_in(folder) if folder_contents.has_photographs(path, below=True)]
     if not holding or captures_in(folder):
         return None
     return _photographs_in(holding[0]) if len(holding) == 1 else folder
@@ -227,7 +227,11 @@ def _photographs_in(folder: Path) -> Path | None:
 
 def captures_in(folder: Path) -> list[Path]:
     """List subfolders that are captures of their own: more than one has `images` with photographs."""
-    found = [path for path in pictures.folders_in(folder) if pictures.has_photographs(path / "images", below=True)]
+    found = [
+        path
+        for path in folder_contents.folders_in(folder)
+        if folder_contents.has_photographs(path / "images", below=True)
+    ]
     return found if len(found) > 1 else []
 
 
@@ -254,11 +258,11 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
             return f"{data} is a bundle in one file, not a capture: give the folder of its photographs."
         if data.suffix.lower() in (".zip", ".tar", ".7z", ".gz", ".rar"):
             return f"{data} is an archive. Unpack it, and give the folder."
-        if data.suffix.lower() in pictures.PHOTOGRAPHS:
+        if data.suffix.lower() in folder_contents.PHOTOGRAPHS:
             return f"{data} is one photograph. A scene needs many: give the folder that holds them."
         return (
             f"{data} is no file that can be trained on. Give a folder of photographs, a video "
-            f"({', '.join(pictures.VIDEOS[:4])}, ...), a transforms.json, or the folder of a capture."
+            f"({', '.join(folder_contents.VIDEOS[:4])}, ...), a transforms.json, or the folder of a capture."
         )
     if not any(data.iterdir()):
         return f"the folder {data} is empty. Give a folder of photographs, a video, or a capture with poses."
@@ -267,14 +271,14 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
     several = captures_in(data)
     if several:
         hint = f" It holds {len(several)} captures: give one of them, as {several[0]}."
-    counts = pictures.pictures_among([path.name for path in data.rglob("*")], [])
+    counts = folder_contents.pictures_among([path.name for path in data.rglob("*")], [])
     if counts and not several:
         most = max(counts, key=counts.__getitem__)
-        hint = f" It holds {counts[most]} files {most} ({pictures.UNREAD[most]}): save them as JPEG or TIFF."
+        hint = f" It holds {counts[most]} files {most} ({folder_contents.UNREAD[most]}): save them as JPEG or TIFF."
     archive = next((path for path in sorted(data.iterdir()) if path.suffix.lower() in (".zip", ".tar", ".7z")), None)
     if archive is not None and not several:
         hint = f" Unpack {archive.name} first."
-    if not hint and (others := pictures.passed_over(data)):
+    if not hint and (others := folder_contents.passed_over(data)):
         hint = f" It holds what is not taken for photographs: {listed(others)}."
     return (
         f"{data} holds nothing to train on: no transforms.json, no transforms_train.json, no COLMAP model (sparse/0), "

@@ -11,10 +11,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bitymi_ns.capture.find_files import check_photographs_exist
-from bitymi_ns.capture.images import image_size, in_proportion
+from bitymi_ns.capture.folder_contents import is_photograph
+from bitymi_ns.capture.image_files import image_size, in_proportion
 from bitymi_ns.capture.maps import MapFiles, maps_beside, maps_called
-from bitymi_ns.capture.photos import natural
-from bitymi_ns.capture.pictures import is_photograph
+from bitymi_ns.capture.order import natural
 from bitymi_ns.capture.pose_checks import rotations
 from bitymi_ns.capture.recognise import POLYCAM, STRAY, Found
 from bitymi_ns.capture.transforms import MAX_SIDE

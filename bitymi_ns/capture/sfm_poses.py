@@ -11,10 +11,10 @@ from typing import Any
 
 from bitymi_ns.capture.cache import keep_work_folder
 from bitymi_ns.capture.colmap_views import Origin, Source, find_masks, make_source
-from bitymi_ns.capture.images import image_size, in_threads
-from bitymi_ns.capture.photos import photo_folder
-from bitymi_ns.capture.pictures import passed_over, videos_in
+from bitymi_ns.capture.folder_contents import passed_over, videos_in
+from bitymi_ns.capture.image_files import image_size, in_threads
 from bitymi_ns.capture.recognise import Found
+from bitymi_ns.capture.sfm_photos import photo_folder
 from bitymi_ns.capture.types import SfmOptions, SfmSettings, fail, parsing, say, warn
 from bitymi_ns.files import copy_files
 from bitymi_ns.reading import read_json

@@ -22,7 +22,7 @@ from bitymi_ns.capture.find_files import (
     folded,
     report_files,
 )
-from bitymi_ns.capture.images import image_size
+from bitymi_ns.capture.image_files import image_size
 from bitymi_ns.capture.masks import with_masks
 from bitymi_ns.capture.pose_checks import as_matrix, check_repeated, correct_poses
 from bitymi_ns.capture.recognise import SPLITS

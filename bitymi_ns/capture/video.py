@@ -12,8 +12,8 @@ import numpy.typing as npt
 from PIL import Image
 
 from bitymi_ns.capture.cache import content_key, made_once
-from bitymi_ns.capture.photos import sharpness
 from bitymi_ns.capture.prepare import IMAGES, JPEG_QUALITY
+from bitymi_ns.capture.sfm_photos import sharpness
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import Tell, complete_folder
 from bitymi_ns.progress import Progress

@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from bitymi_ns.capture.images import read_image
+from bitymi_ns.capture.image_files import read_image
 from bitymi_ns.capture.lens import MAX_VIEW_ANGLE, Lens, lenses_of
 from bitymi_ns.capture.types import ColmapCamera
 from tests.captures import refused

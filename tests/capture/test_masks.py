@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bitymi_ns.capture.images import in_proportion
+from bitymi_ns.capture.image_files import in_proportion
 from bitymi_ns.capture.masks import mask_folder, mask_of, mask_pixels
 from bitymi_ns.capture.types import CaptureError
 

@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 
 from bitymi_ns.capture.known_poses import KnownView, triangulate
-from bitymi_ns.capture.photos import has_panorama_metadata, looks_panoramic
 from bitymi_ns.capture.poses import find_poses
+from bitymi_ns.capture.sfm_photos import has_panorama_metadata, looks_panoramic
 from bitymi_ns.capture.types import SPHERICAL_MODEL, CaptureError, ColmapCamera, SfmOptions
 from bitymi_ns.sample.room import Room
 

@@ -14,8 +14,8 @@ from PIL import ExifTags, Image
 
 from bitymi_ns.capture.exif import Exif
 from bitymi_ns.capture.known_poses import KnownView, triangulate
-from bitymi_ns.capture.photos import Photo
 from bitymi_ns.capture.poses import _finished, _photographs_in, by_camera, camera_group, find_poses, make_job, ordered
+from bitymi_ns.capture.sfm_photos import Photo
 from bitymi_ns.capture.types import CaptureError, ColmapCamera, SfmOptions, SfmSettings
 from bitymi_ns.cli import main
 from bitymi_ns.sample.capture import RoomView, render

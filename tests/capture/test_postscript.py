@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 from PIL import EpsImagePlugin, Image
 
-from bitymi_ns.capture.images import file_has_transparency, orientation, read_image, set_up_pillow
+from bitymi_ns.capture.image_files import file_has_transparency, orientation, read_image, set_up_pillow
 from bitymi_ns.capture.masks import checked_mask
-from bitymi_ns.capture.photos import read_photo
 from bitymi_ns.capture.prepare import colmap_mask
+from bitymi_ns.capture.sfm_photos import read_photo
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.measure.report.pictures import open_image
 

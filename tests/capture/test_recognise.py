@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from bitymi_ns.capture.photos import find_photos, photo_folder
-from bitymi_ns.capture.pictures import passed_over
+from bitymi_ns.capture.folder_contents import passed_over
 from bitymi_ns.capture.recognise import image_count, models_in, recognise
+from bitymi_ns.capture.sfm_photos import find_photos, photo_folder
 from bitymi_ns.capture.types import CaptureError
 
 POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]

@@ -19,7 +19,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image, UnidentifiedImageError
 
 from bitymi_ns.capture.colmap_model import forget_model
-from bitymi_ns.capture.images import MAX_PIXELS
+from bitymi_ns.capture.image_files import MAX_PIXELS
 from bitymi_ns.capture.recognise import Format
 from bitymi_ns.capture.transforms import HOW_TO_GET_ONE
 from bitymi_ns.capture.types import CaptureError

@@ -18,7 +18,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, Datapa
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from torch import Tensor
 
-from bitymi_ns.capture import images
+from bitymi_ns.capture import image_files
 from bitymi_ns.capture.find_files import check_photographs_exist
 from bitymi_ns.capture.pose_checks import check_outliers, check_point_unit, warn_of_mirrored
 from bitymi_ns.plugin.console import as_input_error, fail, listed, warn
@@ -89,7 +89,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
     ) -> None:
         # makes a training view by its index, at full size; a run replaces it by one for the size of its step
         self.step_view: Callable[[int], View] = lambda index: self.train_views[index]
-        images.set_up_pillow()
+        image_files.set_up_pillow()
         check_capture(config, trains=test_mode == "val")
         with reporting_input_errors(config), reading_points(test_mode == "val"):
             super().__init__(config, test_mode=test_mode, **kwargs)
@@ -100,11 +100,11 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         cameras, color, files = outputs.cameras, outputs.alpha_color, dataset.files
         dataset.metadata |= {
             "alpha_color": None if color is None else torch.as_tensor(color).float(),
-            "has_alpha": bool(files) and images.file_has_transparency(files[0]),
+            "has_alpha": bool(files) and image_files.file_has_transparency(files[0]),
             # for a run with a background; photographs may be missing without training
             "transparent": self._has_photos(test_mode)
             and any(
-                images.file_has_transparency(files[i]) and dataset.get_numpy_image(i).shape[-1] == 4
+                image_files.file_has_transparency(files[i]) and dataset.get_numpy_image(i).shape[-1] == 4
                 for i in spread(len(files), ALPHA_SAMPLES)
             ),
             "declares_box": declares_box(config.dataparser),
@@ -152,10 +152,10 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         check_outliers(poses[:, :, 3], names)
         every = list(dict.fromkeys([*files[0], *files[1]]))
         check_photographs_exist(self.get_datapath(), every)
-        images.check_sizes(every)
-        images.check_orientation(every)
-        self._duplicates = images.duplicate_files(*files)
-        images.warn_of_duplicates(self._duplicates, train, held_out)
+        image_files.check_sizes(every)
+        image_files.check_orientation(every)
+        self._duplicates = image_files.duplicate_files(*files)
+        image_files.warn_of_duplicates(self._duplicates, train, held_out)
         if count == 1 and test_mode == "val":
             one = f"only one training view in {self.config.data}"
             fail(f"{one}. A scene cannot be learned from one image: take photographs from more sides.")
@@ -209,8 +209,8 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         reported = {j for _, j in self._duplicates}
         summaries = [[d.summary(i) for i in range(len(d))] for d in (train, held_out)]
         fingerprints = [[None if each.empty else each.fingerprint for each in some] for some in summaries]
-        pairs = [pair for pair in images.duplicates(*fingerprints) if pair[1] not in reported]
-        images.warn_of_duplicates(pairs, train.image_filenames, held_out.image_filenames)
+        pairs = [pair for pair in image_files.duplicates(*fingerprints) if pair[1] not in reported]
+        image_files.warn_of_duplicates(pairs, train.image_filenames, held_out.image_filenames)
 
     @cached_property
     def _budget(self) -> MemoryBudget:

@@ -18,7 +18,7 @@ from rich.progress import track
 from torch import Tensor
 
 from bitymi_ns.bundle.sizes import memory_limit
-from bitymi_ns.capture.images import ImageSummary, in_threads, pixels_of, read_image, summarize, wrong_size
+from bitymi_ns.capture.image_files import ImageSummary, in_threads, pixels_of, read_image, summarize, wrong_size
 from bitymi_ns.capture.lens import Lens
 from bitymi_ns.capture.masks import checked_mask
 from bitymi_ns.capture.pose_checks import rotations

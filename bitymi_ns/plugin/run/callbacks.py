@@ -15,7 +15,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.nn import Parameter
 
-from bitymi_ns.capture.images import exposure_stops
+from bitymi_ns.capture.image_files import exposure_stops
 from bitymi_ns.files import reason, write_errors_as, write_file
 from bitymi_ns.plugin.console import InputError, fail, listed, say, warn
 from bitymi_ns.plugin.data.cameras import to_camera

@@ -8,8 +8,8 @@ import pytest
 import torch
 from PIL import Image
 
-from bitymi_ns.capture import images
-from bitymi_ns.capture.images import read_image
+from bitymi_ns.capture import image_files
+from bitymi_ns.capture.image_files import read_image
 from bitymi_ns.capture.lens import lenses_of
 from bitymi_ns.capture.types import ColmapCamera
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManagerConfig
@@ -100,7 +100,7 @@ def test_jpegs_are_decoded_small_and_stay_in_their_place(
     pixels = np.stack(np.broadcast_arrays(waves, x / 7, y / 5), -1)
     Image.fromarray(pixels.astype(np.uint8)).save(tmp_path / "a.jpg", quality=95, subsampling=0)
     decoded = []
-    monkeypatch.setattr(images, "in_srgb", lambda image: decoded.append(image.size) or image)
+    monkeypatch.setattr(image_files, "in_srgb", lambda image: decoded.append(image.size) or image)
     wanted = (round(size[0] / reduction), round(size[1] / reduction))
     small = read_image(tmp_path / "a.jpg", size, wanted)
     whole = read_image(tmp_path / "a.jpg", size)

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from bitymi_ns.capture.exif import Exif, exposure_exif, exposure_settings, read_exif
-from bitymi_ns.capture.images import exposure_stops
+from bitymi_ns.capture.image_files import exposure_stops
 from bitymi_ns.measure.report.page import build
 from bitymi_ns.measure.report.records import ReportError
 from bitymi_ns.plugin.console import InputError

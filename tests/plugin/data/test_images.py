@@ -13,7 +13,7 @@ import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
-from bitymi_ns.capture.images import ImageSummary, read_image, summarize
+from bitymi_ns.capture.image_files import ImageSummary, read_image, summarize
 from bitymi_ns.capture.masks import checked_mask
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from tests.captures import add_masks, edit, expect, images_of, load, load_with, printed, refused

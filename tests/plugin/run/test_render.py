@@ -20,7 +20,7 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.scripts import render
 from PIL import Image
 
-from bitymi_ns.capture.pictures import is_rendered_film, result_in
+from bitymi_ns.capture.folder_contents import is_rendered_film, result_in
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.hooks import patch_render

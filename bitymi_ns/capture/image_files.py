@@ -15,7 +15,7 @@ import numpy.typing as npt
 from PIL import EpsImagePlugin, ExifTags, Image, ImageCms
 
 from bitymi_ns.capture.exif import exif_stops, exposure_settings
-from bitymi_ns.capture.pictures import open_picture
+from bitymi_ns.capture.folder_contents import open_picture
 from bitymi_ns.capture.types import fail, parsing, warn
 from bitymi_ns.trust import listed
 

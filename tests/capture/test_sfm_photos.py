@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
-from bitymi_ns.capture.photos import (
+from bitymi_ns.capture.sfm_photos import (
     blurred,
     duplicates,
     find_photos,

@@ -7,10 +7,10 @@ import pytest
 from PIL import Image
 
 from bitymi_ns.bundle.manifest import FORMAT
-from bitymi_ns.capture.photos import find_photos
-from bitymi_ns.capture.pictures import RENDERED, passed_over, pictures_among, poses_in, result_in
+from bitymi_ns.capture.folder_contents import RENDERED, passed_over, pictures_among, poses_in, result_in
 from bitymi_ns.capture.poses import find_poses
 from bitymi_ns.capture.recognise import recognise
+from bitymi_ns.capture.sfm_photos import find_photos
 from bitymi_ns.capture.types import CaptureError
 
 MANIFEST = json.dumps({"format": FORMAT})

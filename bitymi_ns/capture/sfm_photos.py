@@ -15,8 +15,9 @@ import numpy.typing as npt
 from PIL import ExifTags, Image, ImageOps
 
 from bitymi_ns.capture.exif import Exif, exposure_exif, read_exif
-from bitymi_ns.capture.images import eight_bits, in_srgb
-from bitymi_ns.capture.pictures import is_photograph, open_picture, photographs_below
+from bitymi_ns.capture.folder_contents import is_photograph, open_picture, photographs_below
+from bitymi_ns.capture.image_files import eight_bits, in_srgb
+from bitymi_ns.capture.order import natural
 from bitymi_ns.capture.types import CaptureError, is_full_sphere
 from bitymi_ns.progress import Progress
 from bitymi_ns.reading import open_regular, why
@@ -53,11 +54,6 @@ class Photo:
     thumb: np.ndarray  # [h,w] float32 grey levels, longer side THUMB
     sharpness: float  # see `sharpness`
     panorama: bool = False  # a 360-degree picture
-
-
-def natural(name: str) -> list[tuple[int, int, str]]:
-    """Make a sort key with numbers by value: frame_2 before frame_10."""
-    return [(1, int(part), "") if part.isdecimal() else (0, 0, part.lower()) for part in re.split(r"(\d+)", name)]
 
 
 def photo_folder(source: Path) -> Path:

@@ -2,38 +2,15 @@
 
 import gc
 import importlib.util
-import inspect
 import os
 import sys
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 import pytest
 
 os.environ.setdefault("BITYMI_NO_DOWNLOAD", "1")  # no downloads, also in child processes
-
-_stack = inspect.stack
-
-
-def _cheap_stack(context: int = 1) -> list[Any]:
-    """Replace `inspect.stack` for nerfstudio's list of external methods.
-
-    Its import asks 26 times for a caller's name, for which `inspect` searches every loaded module for every frame; with
-    pytest's frames that dominates the time of collection.
-    """
-    frame = sys._getframe(1)
-    if frame.f_globals.get("__name__") != "nerfstudio.configs.external_methods":
-        return _stack(context)
-    names = []
-    while frame is not None:
-        names.append(SimpleNamespace(function=frame.f_code.co_name))
-        frame = frame.f_back
-    return names
-
-
-inspect.stack = _cheap_stack
-
 
 class _MissingEncoder(ModuleType):
     """Stub for the missing BC7 encoder (Python 3.10), which skips tests that use it."""

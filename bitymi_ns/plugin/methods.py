@@ -42,6 +42,7 @@ def _install() -> None:
 
         CONSOLE.quiet = CONSOLE.quiet or not torchrun.own().first  # of several processes the first prints
         hooks.allow_numpy_scalars()
+        hooks.read_names_of_callers()
         hooks.extend_exporter(_exports)
     except Exception as error:  # noqa: BLE001 - see the module's docstring
         warnings.warn(

@@ -58,7 +58,7 @@ def test_nerfstudio_reads_a_camera_path(page_bundle: Path, tmp_path: Path) -> No
     file = tmp_path / "camera_path.json"
     steps = [["settle"], ["press", "#add-keyframe"], ["wheel", (60, 40), 200], ["settle"], ["press", "#add-keyframe"]]
     with served(site_of(page_bundle)) as address:
-        found = drive([["goto", address], *steps, ["save", "#save-path", file]], viewport=(160, 120))
+        found = drive([["goto", address], *steps, ["save", "#save-path", file]], viewport=(160, 120), drawn=False)
     assert not found.problems
     path = json.loads(file.read_text())
     cameras = get_path_from_json(path)

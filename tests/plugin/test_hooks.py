@@ -1,7 +1,9 @@
 """Changes to nerfstudio: its exporter's commands, its viewer, what its console shows."""
 
+import inspect
 import sys
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Annotated, Any, Union
@@ -12,6 +14,7 @@ pytest.importorskip("nerfstudio")
 
 import rich
 import tyro
+from nerfstudio.configs import external_methods
 from nerfstudio.scripts.viewer import run_viewer
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.panel import Panel
@@ -38,6 +41,19 @@ def test_only_the_exporters_own_union_is_extended(monkeypatch: pytest.MonkeyPatc
     assert seen[1] == Annotated[Union[First, Second, Third], "marker"]  # noqa: UP007
     assert module.tyro.conf is fake_tyro.conf
     assert fake_tyro.cli is not module.tyro.cli
+
+
+def test_the_list_of_methods_to_install_reads_no_source(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It asks for the stack whenever nerfstudio is imported; naming such a method still offers its installation."""
+    monkeypatch.setattr(inspect, "getmodule", lambda *args: pytest.fail("sources of all callers are searched"))
+    configs = external_methods.get_external_methods()[0]
+    assert "in2n" in configs
+    monkeypatch.setattr(external_methods.Confirm, "ask", lambda *args, **options: False)
+    with pytest.raises(SystemExit) as stop:
+        replace(configs["in2n"])
+    assert stop.value.code == 0 and "instruct-nerf2nerf" in capsys.readouterr().out
 
 
 @pytest.mark.slow

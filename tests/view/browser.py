@@ -57,14 +57,20 @@ def drive(
     steps: Sequence[Sequence[Any]],
     viewport: tuple[int, int] = (320, 240),
     touch: bool = False,
+    drawn: bool = True,
     ratio: float = 1.0,
     patience: float = 90.0,
 ) -> Outcome:
-    """Run steps of drive.mjs in a new page; `patience`: seconds allowed per step."""
+    """Run steps of drive.mjs in a new page.
+
+    `drawn`: False for a page without shaders, which opens several times faster; its pictures are black, nothing has a
+    depth, and everything else is as ever. `patience`: seconds allowed per step.
+    """
     process = driver()
     assert process.stdin is not None and process.stdout is not None
     job = {
         "steps": [[str(x) if isinstance(x, Path) else x for x in step] for step in steps],
+        "drawn": drawn,
         "viewport": {"width": viewport[0], "height": viewport[1]},
         "touch": touch,
         "ratio": ratio,

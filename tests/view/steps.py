@@ -85,13 +85,13 @@ class Steps:
         self.do(["press", "#share"])
         return self.ask("location.hash")
 
-    def run(self, bundle: Path, start: str = "", **options: Any) -> None:
-        """Run all steps on a page of the bundle; fails on console errors."""
+    def run(self, bundle: Path, start: str = "", drawn: bool = False, **options: Any) -> None:
+        """Run all steps on a page of the bundle; fails on console errors. `drawn`: see `drive`."""
         with served(site_of(bundle)) as address:
             before = [["goto", address + start], ["settle"]]
             if options.pop("quarter", True):
                 before.insert(0, ["init", QUARTER])
-            self.outcome = drive([*before, *self.steps], **{"viewport": SCREEN, **options})
+            self.outcome = drive([*before, *self.steps], drawn=drawn, **{"viewport": SCREEN, **options})
         assert not self.outcome.problems
         self.outcome.results = self.outcome.results[len(before) :]
 

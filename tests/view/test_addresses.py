@@ -59,7 +59,9 @@ def splats(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_scene_is_shown_at_every_address(splats: Path, address: str) -> None:
     with clean_server(splats) as server:
         steps = [["goto", server + address], ["settle"], ["press", "#share"], ["ask", PLACE]]
-        found = drive([*steps, ["ask", "location.href"], ["ask", "getComputedStyle(document.body).margin"]])
+        found = drive(
+            [*steps, ["ask", "location.href"], ["ask", "getComputedStyle(document.body).margin"]], drawn=False
+        )
     state, href, margin = found.results[-3:]
     assert state == f"{address.partition('?')[0]} ready little" and margin == "0px"
     assert href.startswith(f"{server}{address}#")
@@ -68,7 +70,7 @@ def test_the_scene_is_shown_at_every_address(splats: Path, address: str) -> None
 def test_a_page_without_its_script_says_so(splats: Path) -> None:
     with clean_server(splats) as server:
         for address in ("/broken", "/broken/"):
-            found = drive([["goto", server + address], ["settle"], ["ask", TEXT]])
+            found = drive([["goto", server + address], ["settle"], ["ask", TEXT]], drawn=False)
             assert "The viewer cannot start" in found.results[-1] and "index.html at the end" in found.results[-1]
             assert "If this stays" not in found.results[-1]
 

@@ -47,7 +47,7 @@ def page_of(site: Site, *before: list[object], path: str = "") -> tuple[str, str
     """Open a page; returns its state and text."""
     with served(site) as address:
         ask = [["ask", STATE], ["ask", "document.body.innerText"]]
-        state, text = drive([*before, ["goto", address + path], ["settle"], *ask], SCREEN).results[-2:]
+        state, text = drive([*before, ["goto", address + path], ["settle"], *ask], SCREEN, drawn=False).results[-2:]
     return state, text
 
 
@@ -218,7 +218,9 @@ def test_what_the_device_says_of_itself_has_a_page(what: str, bundle: Path) -> N
     wait = "new Promise((resolve) => setTimeout(resolve, 2000))"
     with served(site_of(bundle)) as address:
         steps = [["init", script], ["goto", address], ["settle"], ["ask", wait]]
-        found = drive([*steps, ["ask", STATE], ["ask", "document.getElementById('page').innerText"]], SCREEN)
+        found = drive(
+            [*steps, ["ask", STATE], ["ask", "document.getElementById('page').innerText"]], SCREEN, drawn=False
+        )
     assert found.results[-2] == "error" and said in found.results[-1]
 
 
@@ -226,7 +228,7 @@ def test_a_page_that_is_opened_as_a_file_says_what_to_do(bundle: Path, tmp_path:
     """Browsers do not load modules from files."""
     write_static(site_of(bundle), tmp_path / "site")
     ask = [["ask", STATE], ["ask", "document.getElementById('page').innerText"]]
-    found = drive([["goto", f"file://{tmp_path}/site/index.html"], ["settle"], *ask], SCREEN)
+    found = drive([["goto", f"file://{tmp_path}/site/index.html"], ["settle"], *ask], SCREEN, drawn=False)
     assert found.results[-2] == "error"
     assert "opened as a file" in found.results[-1] and "web server" in found.results[-1]
     assert "Loading" not in found.results[-1]

@@ -231,7 +231,7 @@ def test_what_is_shown(bundle: Path, tmp_path: Path) -> None:
     shot("followed")
     page.do(["click", "#previous"])
     shot("again")
-    page.run(bundle, viewport=(800, 300))
+    page.run(bundle, drawn=True, viewport=(800, 300))
 
     pictures = {name: np.asarray(Image.open(path).convert("RGB"), np.float32) for name, path in names.items()}
     off = {name: np.abs(picture - pictures["color"]).mean() for name, picture in pictures.items()}
@@ -265,7 +265,7 @@ def test_screenshot_link_resolution_and_theme(bundle: Path, tmp_path: Path) -> N
     for _ in range(3):
         page.do(["click", "#theme"])
         colours.append(page.ask("getComputedStyle(document.body.parentElement).backgroundColor"))
-    page.run(bundle, viewport=(800, 200))
+    page.run(bundle, drawn=True, viewport=(800, 200))
 
     a, b = (np.asarray(Image.open(tmp_path / name)) for name in ("a.png", "b.png"))
     assert a.shape[:2] == (200, 800) and np.array_equal(a, b) and page[named] == f"{bundle.name}.png"

@@ -65,7 +65,7 @@ def cropped(solid: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
     page.do(["press", "#apply-crop"], ["settle"])
     whole = page.ask(STATUS)
     page.do(["save", "#crop-panel .save-notes", folder / "notes.json"])
-    page.run(solid)
+    page.run(solid, drawn=True)
 
     assert page[labels] == "2 m" and page[whole] == "120 surfels"
     assert page[status] == page[again] and page[status] != page[wide] != page[hidden] != "120 surfels"
@@ -136,7 +136,7 @@ def test_a_resting_finger_measures(solid: Path) -> None:
     half = page.ask(hint)
     page.do(["fingers", [second], [second]], ["until", f"{LABELS}.includes('units')"])
     after = page.ask(f"[{hint}, {dots}].join()")
-    page.run(solid, viewport=PHONE, touch=True)
+    page.run(solid, drawn=True, viewport=PHONE, touch=True)
     assert [page[number] for number in (before, half, after)] == [
         "Click the first surface.",
         "Click the other surface.",
@@ -160,7 +160,7 @@ def test_keys_end_what_they_should(solid: Path) -> None:
     undone = page.ask(f"document.getElementById('crop-hint').textContent + {pressed}")
     page.do(["press", "#notes"], ["click", "#view-name"], ["key", "a"], ["key", "Enter"])
     view = page.ask("document.getElementById('view-rows').textContent")
-    page.run(solid)
+    page.run(solid, drawn=True)
     assert "measure" in page[cancelled] and "add-measure" not in page[cancelled]
     assert not page[cancelled].startswith("M") and "measure" not in page[closed]
     assert page[length] == "3 m" and page[view].startswith("a")
@@ -182,7 +182,7 @@ def test_a_double_click_turns_around_a_surface(solid: Path) -> None:
     page = Steps()
     page.do(["double", FIRST], ["until", "document.documentElement.dataset.frame === 'moving'"], ["settle"])
     middle = page.view()
-    page.run(solid)
+    page.run(solid, drawn=True)
     seen, row = page.seen(middle), json.loads((solid / "cameras.json").read_text())["cameras"][0]
     x, y, z = (np.array(row["viewmat"]).reshape(4, 4) @ [*seen.target, 1])[:3]
     k = min(900 / row["width"], 500 / row["height"])

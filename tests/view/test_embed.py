@@ -70,6 +70,7 @@ def test_messages_of_the_page_around(bundle: Path, tmp_path: Path) -> None:
                 ["until", "of('error').some((m) => m.title === 'There is no bundle')"],
                 ["ask", "got.filter((m) => m.from === 'b').length"],
             ],
+            drawn=False,
             viewport=(700, 200),
         )
     errors, ready, strangers = found.results[-7], found.results[-4], found.results[-1]

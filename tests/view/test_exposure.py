@@ -65,7 +65,7 @@ def test_a_photograph_s_exposure_is_shown_at_its_camera(tmp_path: Path) -> None:
     moved = page.view()
     page.do(["press", "#home"], ["press", "#share"])
     link = page.ask("location.hash")
-    page.run(bundle, quarter=False, viewport=(WIDTH, HEIGHT))
+    page.run(bundle, drawn=True, quarter=False, viewport=(WIDTH, HEIGHT))
 
     assert page[switch] == "false,true" and page[off] == "false"
     pictures = {
@@ -84,7 +84,7 @@ def test_a_photograph_s_exposure_is_shown_at_its_camera(tmp_path: Path) -> None:
 
     again = Steps()
     again.do(["save", "#screenshot", tmp_path / "link.png"])
-    again.run(bundle, page[link], quarter=False, viewport=(WIDTH, HEIGHT))
+    again.run(bundle, page[link], drawn=True, quarter=False, viewport=(WIDTH, HEIGHT))
     assert (tmp_path / "link.png").read_bytes() == (tmp_path / "0.png").read_bytes()
 
 

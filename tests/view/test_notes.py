@@ -89,7 +89,7 @@ def test_a_note_is_pinned_to_the_surface_that_was_clicked(solid: Path, tmp_path:
     page.do(["key", "h"], ["settle"], ["press", "#add-note"], ["drag", (3, 3), (3, 3)])
     page.do(["until", "document.getElementById('notice').textContent.includes('surface')"])
     none = page.ask(REMARKS)
-    page.run(solid)
+    page.run(solid, drawn=True)
 
     assert page[waiting] == "true" and page[rows] == HTML and page[none] == HTML and page[shown]
     assert (page[marker]["text"], page[marker]["hidden"], page[marker]["behind"]) == (HTML, False, False)
@@ -113,7 +113,7 @@ def test_notes_beside_the_bundle_are_shown_where_they_are(noted: Path) -> None:
     forward, position = viewmat[2, :3], -viewmat[:3, :3].T @ viewmat[:3, 3]
     notes = [{"text": f"{z}", "position": (position + z * forward).tolist()} for z in (0.2, 50, -1)]
     (noted / "notes.json").write_bytes(text({**NOTES, "notes": notes}))
-    page.run(noted)
+    page.run(noted, drawn=True)
     near, far, back = page[found]
     assert page[views] == "door|Tür <b>" and [near["text"], far["text"]] == ["0.2", "50"]
     assert not near["hidden"] and not near["behind"] and far["behind"] and not far["hidden"] and back["hidden"]
@@ -131,7 +131,8 @@ def test_a_damaged_file_leaves_the_scene_without(noted: Path, tmp_path: Path) ->
                 *([["goto", f"{address}one/"], ["settle"], ["ask", VIEWS], ["ask", REMARKS]]),
                 *([["goto", f"{address}site/"], ["until", f"{notice}.includes('notes.json')"], ["ask", notice]]),
                 *([["settle"], ["ask", "document.documentElement.dataset.state"], ["ask", VIEWS]]),
-            ]
+            ],
+            drawn=False,
         )
     assert found.results[2:4] == ["door|Tür <b>", "first line\nsecond"]
     assert "notes.0.position: must be three numbers" in found.results[6] and found.results[8:] == ["ready", ""]

@@ -75,7 +75,7 @@ def test_another_file_beside_the_page(query: str, words: str, bundle: Path, tmp_
     (site / "altered.bitymi").write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
     with plain_server(site, True) as (address, _):
         ask = [["ask", STATE], ["ask", "document.body.innerText"], ["ask", "document.title"]]
-        found = drive([["goto", address + query], ["settle"], *ask], SCREEN)
+        found = drive([["goto", address + query], ["settle"], *ask], SCREEN, drawn=False)
     state, text, title = found.results[-3:]
     if words:
         assert state == "error" and words in text

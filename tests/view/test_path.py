@@ -109,7 +109,7 @@ def test_a_film_has_the_size_and_time_of_what_is_shown(bundle: Path, tmp_path: P
     page.do(["press", "#add-keyframe"], there(SECOND), ["settle"], ["press", "#add-keyframe"])
     page.do(["save", "#record", tmp_path / "film.webm"])
     named = len(page.steps) - 1
-    page.run(bundle, START, viewport=(320, 200))
+    page.run(bundle, START, drawn=True, viewport=(320, 200))
 
     assert page[named] == f"{bundle.name}.webm"
     with av.open(str(tmp_path / "film.webm")) as film:

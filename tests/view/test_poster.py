@@ -100,7 +100,7 @@ def test_it_is_there_before_the_surfels_and_where_their_picture_will_be(
 def test_a_link_to_another_view_shows_none(tmp_path: Path) -> None:
     bundle, asked = write(tmp_path / "b", "uint8", compact=True, poster=True), list[str]()
     with served(kept(site_of(bundle), asked)) as address:
-        found = drive([["goto", address + LINK], ["settle"], ["ask", SHOWN]], SCREEN)
+        found = drive([["goto", address + LINK], ["settle"], ["ask", SHOWN]], SCREEN, drawn=False)
     assert not found.problems and found.results[-1] is False
     assert "bundle/texels.bin" in asked and f"bundle/{POSTER}" not in asked
 
@@ -140,7 +140,9 @@ def test_it_is_a_range_of_one_file(tmp_path: Path) -> None:
     size = (bundle / POSTER).stat().st_size
     with plain_server(tmp_path / "site", True) as (address, asked):
         found = drive(
-            [["goto", address], ["settle"], ["ask", "document.getElementById('poster').naturalWidth"]], SCREEN
+            [["goto", address], ["settle"], ["ask", "document.getElementById('poster').naturalWidth"]],
+            SCREEN,
+            drawn=False,
         )
     assert not found.problems and found.results[-1] > 0
     # the end, bundle.json, the poster
